@@ -1,0 +1,146 @@
+"""Frames, constants and colour: every convention of the project, in one place.
+
+World: metres, +Z up. Camera: OpenCV (x right, y down, z forward), pixel centres at +0.5.
+Quaternions: wxyz. Colours: linear RGB inside, sRGB in PNG files only. Depth: z-depth in metres, 0 = no return.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mgs.errors import InputError
+
+SH_C0 = 0.28209479177387814
+"""Spherical harmonic of degree 0, 1 / (2 sqrt(pi)); rgb = 0.5 + SH_C0 * sh0 (3DGS file layout)."""
+
+_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera.
+
+    K: [3,3] float64, pixels (no skew). width, height: pixels.
+    world_to_camera: [4,4] float64, rigid, OpenCV axes, metres.
+    Raises InputError where K or the pose is not finite, K has a non-positive focal length, or the pose is not rigid.
+    """
+
+    K: NDArray[np.float64]
+    width: int
+    height: int
+    world_to_camera: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        K = np.asarray(self.K, np.float64)
+        pose = np.asarray(self.world_to_camera, np.float64)
+        object.__setattr__(self, "K", K)
+        object.__setattr__(self, "world_to_camera", pose)
+        if K.shape != (3, 3) or not np.isfinite(K).all():
+            raise InputError("camera: K must be a finite 3x3 matrix; correct the intrinsics")
+        if K[0, 0] <= 0 or K[1, 1] <= 0:
+            raise InputError("camera: focal lengths must be positive; correct fl_x and fl_y")
+        if self.width < 1 or self.height < 1:
+            raise InputError(f"camera: image size {self.width}x{self.height} must be at least 1x1")
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise InputError("camera: the pose has NaN or infinite entries; correct its transform matrix")
+        rotation = pose[:3, :3]
+        rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
+        if not rigid or not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-9):
+            raise InputError("camera: the pose is singular or not rigid; its rotation must be orthonormal")
+
+    @property
+    def camera_to_world(self) -> NDArray[np.float64]:
+        """[4,4] OpenCV camera-to-world."""
+        R, t = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = R.T, -R.T @ t
+        return pose
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """[3] camera centre in the world, metres."""
+        return self.camera_to_world[:3, 3]
+
+    def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """World points [N,3] -> (pixels [N,2], z-depth [N]); pixels are meaningless where z <= 0."""
+        p = np.asarray(points, np.float64) @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+        z = p[:, 2]
+        safe = np.where(z > 0, z, 1.0)
+        u = self.K[0, 0] * p[:, 0] / safe + self.K[0, 2]
+        v = self.K[1, 1] * p[:, 1] / safe + self.K[1, 2]
+        return np.stack([u, v], 1), z
+
+    def unproject(self, depth: ArrayLike) -> NDArray[np.float64]:
+        """z-depth image [H,W], metres -> world points [H,W,3]; meaningless where depth is 0."""
+        depth = np.asarray(depth, np.float64)
+        v, u = np.mgrid[: self.height, : self.width] + 0.5
+        x = (u - self.K[0, 2]) / self.K[0, 0] * depth
+        y = (v - self.K[1, 2]) / self.K[1, 1] * depth
+        pose = self.camera_to_world
+        return np.stack([x, y, depth], -1) @ pose[:3, :3].T + pose[:3, 3]
+
+
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:
+    """OpenCV world_to_camera [4,4] of a camera at `eye` that looks at `target` with world `up` (metres)."""
+    eye = np.asarray(eye, np.float64)
+    forward = np.asarray(target, np.float64) - eye
+    norm = np.linalg.norm(forward)
+    if norm == 0:
+        raise InputError("look_at: eye and target are the same point")
+    forward /= norm
+    right = np.cross(forward, np.asarray(up, np.float64))
+    if np.linalg.norm(right) < 1e-9:
+        right = np.cross(forward, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    return pose
+
+
+def opencv_from_opengl(camera_to_world: ArrayLike) -> NDArray[np.float64]:
+    """nerfstudio's OpenGL camera-to-world [4,4] -> our OpenCV world_to_camera [4,4]."""
+    return np.linalg.inv(np.asarray(camera_to_world, np.float64) @ _OPENGL_FROM_OPENCV)
+
+
+def opengl_from_opencv(world_to_camera: ArrayLike) -> NDArray[np.float64]:
+    """Our OpenCV world_to_camera [4,4] -> nerfstudio's OpenGL camera-to-world [4,4]."""
+    return np.linalg.inv(np.asarray(world_to_camera, np.float64)) @ _OPENGL_FROM_OPENCV
+
+
+def rotmat_from_quat(quats: ArrayLike) -> NDArray[np.float64]:
+    """Quaternions wxyz [...,4] of any norm -> rotation matrices [...,3,3]; a zero quaternion is the identity."""
+    q = np.asarray(quats, np.float64)
+    norm = np.linalg.norm(q, axis=-1, keepdims=True)
+    q = np.where(norm > 0, q / np.where(norm > 0, norm, 1.0), [1.0, 0.0, 0.0, 0.0])
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def quat_from_normals(normals: ArrayLike) -> NDArray[np.float64]:
+    """Unit quaternions wxyz [N,4] that turn local +Z onto each normal [N,3] (the shortest rotation)."""
+    n = np.asarray(normals, np.float64)
+    n = n / np.linalg.norm(n, axis=1, keepdims=True)
+    q = np.stack([1 + n[:, 2], -n[:, 1], n[:, 0], np.zeros(len(n))], 1)
+    q[n[:, 2] < -1 + 1e-9] = [0.0, 1.0, 0.0, 0.0]
+    return q / np.linalg.norm(q, axis=1, keepdims=True)
+
+
+def srgb_from_linear(linear: ArrayLike) -> NDArray[np.float32]:
+    """Linear RGB -> sRGB in [0,1] (IEC 61966-2-1), clipped."""
+    c = np.clip(np.asarray(linear, np.float32), 0, 1)
+    return np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055).astype(np.float32)
+
+
+def linear_from_srgb(srgb: ArrayLike) -> NDArray[np.float32]:
+    """sRGB in [0,1] -> linear RGB (IEC 61966-2-1)."""
+    c = np.asarray(srgb, np.float32)
+    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)

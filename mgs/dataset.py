@@ -1,0 +1,148 @@
+"""A dataset folder in nerfstudio style: transforms.json, images/, depth/, masks/."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.conventions import Camera, opencv_from_opengl, opengl_from_opencv
+from mgs.errors import InputError
+from mgs.files import read_exr, read_json, read_mask, read_png, write_json
+
+FRAME_INTERVAL = 0.5
+"""Seconds between keyframes (paper, section IV-A)."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One keyframe: a camera, its time in seconds, and where its pixels lie."""
+
+    name: str
+    camera: Camera
+    timestamp: float
+    image_path: Path
+    depth_path: Path | None = None
+    mask_path: Path | None = None
+
+    def rgb(self) -> np.ndarray:
+        """Linear RGB float32 [H,W,3]. Raises InputError where it is missing, damaged or of another size."""
+        return self._sized(self.image_path, read_png(self.image_path))
+
+    def depth(self) -> np.ndarray:
+        """z-depth float32 [H,W], metres, 0 = no return. Raises InputError as `rgb`, or where the frame has none."""
+        if self.depth_path is None:
+            raise InputError(f"frame {self.name}: has no depth_file_path; this command needs RGB-D frames")
+        channels = read_exr(self.depth_path)
+        depth = channels.get("Z", next(iter(channels.values())))
+        return np.nan_to_num(self._sized(self.depth_path, depth), nan=0.0, posinf=0.0, neginf=0.0)
+
+    def mask(self) -> np.ndarray:
+        """Rock mask bool [H,W]; all true where the frame has none. Raises InputError as `rgb`."""
+        if self.mask_path is None:
+            return np.ones((self.camera.height, self.camera.width), bool)
+        return self._sized(self.mask_path, read_mask(self.mask_path))
+
+    def masked_rgb(self) -> np.ndarray:
+        """Linear RGB float32 [H,W,3] of the rock alone, black elsewhere: the training and evaluation target."""
+        return self.rgb() * self.mask()[..., None]
+
+    def _sized(self, path: Path, pixels: np.ndarray) -> np.ndarray:
+        expected = (self.camera.height, self.camera.width)
+        if pixels.shape[:2] != expected:
+            found = f"{pixels.shape[1]}x{pixels.shape[0]}"
+            raise InputError(f"{path}: is {found}, but transforms.json says {expected[1]}x{expected[0]}; correct either")
+        return pixels
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A folder of keyframes in order of time."""
+
+    root: Path
+    frames: tuple[Frame, ...]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+
+def load_dataset(root: str | Path) -> Dataset:
+    """Read transforms.json and check that every file it names exists; pixels are read when asked for.
+
+    Raises InputError: missing folder or file, no intrinsics, NaN or singular pose, no frames.
+    """
+    root = Path(root)
+    path = root / "transforms.json"
+    if not root.is_dir():
+        raise InputError(f"{root}: no such dataset folder; make one with `mgs synth-orbit {root}`")
+    data = read_json(path)
+    records = data.get("frames") if isinstance(data, dict) else None
+    if not records:
+        raise InputError(f"{path}: lists no frames; expected a nerfstudio transforms.json")
+    frames = [_frame(root, path, data, i, record) for i, record in enumerate(records)]
+    return Dataset(root, tuple(sorted(frames, key=lambda frame: (frame.timestamp, frame.name))))
+
+
+def _frame(root: Path, path: Path, data: dict[str, Any], index: int, record: dict[str, Any]) -> Frame:
+    where = f"{path}: frame {index}"
+    if "file_path" not in record or "transform_matrix" not in record:
+        raise InputError(f"{where} lacks file_path or transform_matrix; add it")
+    try:
+        fl_x, fl_y, cx, cy, w, h = (record.get(k, data.get(k)) for k in ("fl_x", "fl_y", "cx", "cy", "w", "h"))
+        K = np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]], np.float64)
+        width, height = int(w), int(h)
+        pose = np.array(record["transform_matrix"], np.float64)
+        timestamp = float(record.get("timestamp", FRAME_INTERVAL * index))
+    except (TypeError, ValueError):
+        raise InputError(f"{where} has no usable intrinsics or pose; fl_x fl_y cx cy w h and a 4x4 matrix are needed") from None
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise InputError(f"{where} has a transform_matrix that is not a finite 4x4 matrix; correct the pose")
+    try:
+        world_to_camera = opencv_from_opengl(pose)
+        camera = Camera(K, width, height, world_to_camera)
+    except np.linalg.LinAlgError:
+        raise InputError(f"{where} has a singular transform_matrix; correct the pose") from None
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+
+    def file(key: str) -> Path | None:
+        if not record.get(key):
+            return None
+        target = root / record[key]
+        if not target.is_file():
+            raise InputError(f"{where}: {key} {record[key]} does not exist in {root}; restore it or remove the frame")
+        return target
+
+    image = file("file_path")
+    assert image is not None
+    name = Path(record["file_path"]).stem
+    return Frame(name, camera, timestamp, image, file("depth_file_path"), file("mask_path"))
+
+
+def write_transforms(root: str | Path, frames: list[Frame] | tuple[Frame, ...]) -> None:
+    """Write transforms.json for frames that share one camera model; paths are relative to `root`. Written last: it is
+    what makes a folder a dataset."""
+    root = Path(root)
+    first = frames[0].camera
+    header = {
+        "camera_model": "OPENCV",
+        "fl_x": first.K[0, 0],
+        "fl_y": first.K[1, 1],
+        "cx": first.K[0, 2],
+        "cy": first.K[1, 2],
+        "w": first.width,
+        "h": first.height,
+    }
+    records = []
+    for frame in frames:
+        record: dict[str, Any] = {"file_path": frame.image_path.relative_to(root).as_posix()}
+        if frame.depth_path is not None:
+            record["depth_file_path"] = frame.depth_path.relative_to(root).as_posix()
+        if frame.mask_path is not None:
+            record["mask_path"] = frame.mask_path.relative_to(root).as_posix()
+        record["transform_matrix"] = opengl_from_opencv(frame.camera.world_to_camera).tolist()
+        record["timestamp"] = frame.timestamp
+        records.append(record)
+    write_json(root / "transforms.json", header | {"frames": records})

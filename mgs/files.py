@@ -1,0 +1,128 @@
+"""Files: nothing is ever half-written. Outputs go to a temporary name beside the target and are renamed."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.conventions import linear_from_srgb, srgb_from_linear
+from mgs.errors import InputError
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path` (same suffix); rename it on success, delete it on failure.
+
+    Raises InputError where the folder cannot be written.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        os.replace(temporary, path)
+    except PermissionError:
+        raise InputError(f"{path}: cannot be written; choose a folder you may write to") from None
+    finally:
+        temporary.unlink(missing_ok=True) if os.access(path.parent, os.W_OK) else None
+
+
+def write_json(path: str | Path, data: Any) -> None:
+    """Write JSON (indented, UTF-8), atomically."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
+
+
+def read_json(path: str | Path) -> Any:
+    """Read JSON. Raises InputError where the file is missing or not JSON."""
+    path = Path(path)
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid JSON ({error}); the file is damaged, write it again") from None
+
+
+def new_folder(path: str | Path) -> Path:
+    """Create an output folder. Raises InputError where it is a file, is not empty, or cannot be written."""
+    path = Path(path)
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path}: is a file, not a folder; choose another output folder")
+    if path.is_dir() and any(path.iterdir()):
+        raise InputError(f"{path}: the output folder is not empty; choose a new one or delete it")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe = path / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose a folder you may write to") from None
+    return path
+
+
+def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> None:
+    """Write an 8-bit PNG: linear RGB float [H,W,3] (converted to sRGB), display values with linear=False, or a bool mask [H,W]."""
+    from PIL import Image
+
+    if image.dtype == bool:
+        pixels = image.astype(np.uint8) * 255
+    else:
+        display = srgb_from_linear(image) if linear else np.clip(image, 0, 1)
+        pixels = np.round(display * 255).astype(np.uint8)
+    with atomic_path(path) as temporary:
+        Image.fromarray(pixels).save(temporary, format="PNG")
+
+
+def _open_png(path: str | Path) -> Any:
+    from PIL import Image, UnidentifiedImageError
+
+    path = Path(path)
+    try:
+        image = Image.open(path)
+        image.load()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such image") from None
+    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+        raise InputError(f"{path}: not a readable image ({error}); the file is damaged, write it again") from None
+    return image
+
+
+def read_png(path: str | Path) -> np.ndarray:
+    """8-bit sRGB image -> linear RGB float32 [H,W,3]. Raises InputError where it is missing or damaged."""
+    return linear_from_srgb(np.asarray(_open_png(path).convert("RGB"), np.float32) / 255)
+
+
+def read_mask(path: str | Path) -> np.ndarray:
+    """Mask image -> bool [H,W] (at least half white is inside). Raises InputError where it is missing or damaged."""
+    return np.asarray(_open_png(path).convert("L")) >= 128
+
+
+def write_exr(path: str | Path, channels: dict[str, np.ndarray]) -> None:
+    """Write a float32 OpenEXR with one named channel per [H,W] array (linear)."""
+    import OpenEXR
+
+    data = {name: np.ascontiguousarray(array, np.float32) for name, array in channels.items()}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with atomic_path(path) as temporary, OpenEXR.File(header, data) as file:
+        file.write(str(temporary))
+
+
+def read_exr(path: str | Path) -> dict[str, np.ndarray]:
+    """OpenEXR -> {channel: float32 [H,W]}. Raises InputError where it is missing or damaged."""
+    import OpenEXR
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such EXR file")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            return {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
+    except (RuntimeError, OSError, ValueError, TypeError) as error:
+        raise InputError(f"{path}: not a readable EXR ({error}); the file is damaged, write it again") from None

@@ -1,0 +1,140 @@
+"""The Gaussians: parameters, activations and the 3DGS PLY layout.
+
+`Gaussians` is a plain dataclass, so Dr.Jit can carry it as a PyTree; on disk and between stations its fields are NumPy arrays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from plyfile import PlyData, PlyElement, PlyParseError
+
+from mgs.conventions import SH_C0
+from mgs.errors import InputError
+from mgs.files import atomic_path
+
+MAX_SH_DEGREE = 3
+
+
+@dataclass
+class Gaussians:
+    """N Gaussians with appearance; float32 NumPy arrays (or Dr.Jit tensors of the same shapes inside `mgs.splat`).
+
+    means [N,3] world, metres; log_scales [N,3] ln metres; quats [N,4] wxyz, any norm; logit_opacities [N];
+    sh [N,(d+1)^2,3] spherical-harmonic colour of degree d in 0..3, linear RGB, rgb = 0.5 + sum_k Y_k(direction) sh_k.
+    """
+
+    means: Any
+    log_scales: Any
+    quats: Any
+    logit_opacities: Any
+    sh: Any
+
+    def __len__(self) -> int:
+        return int(self.means.shape[0])
+
+    @property
+    def sh_degree(self) -> int:
+        return int(round(self.sh.shape[1] ** 0.5)) - 1
+
+    @property
+    def rgb(self) -> np.ndarray:
+        """View-independent part of the colour, linear RGB [N,3], clamped at 0."""
+        return np.maximum(0.5 + SH_C0 * self.sh[:, 0, :], 0.0)
+
+    @property
+    def opacities(self) -> np.ndarray:
+        """[N] in (0,1)."""
+        return 1.0 / (1.0 + np.exp(-self.logit_opacities.astype(np.float64))).astype(np.float32)
+
+    def check(self) -> Gaussians:
+        """Shapes and finiteness of NumPy fields; returns self. Raises InputError naming the parameter and first index."""
+        n = len(self)
+        coefficients = {(d + 1) ** 2 for d in range(MAX_SH_DEGREE + 1)}
+        shapes = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "logit_opacities": (n,)}
+        for name, shape in shapes.items():
+            if tuple(getattr(self, name).shape) != shape:
+                raise InputError(f"gaussians: {name} has shape {getattr(self, name).shape}, expected {shape}")
+        if len(self.sh.shape) != 3 or self.sh.shape[0] != n or self.sh.shape[2] != 3 or self.sh.shape[1] not in coefficients:
+            raise InputError(f"gaussians: sh has shape {self.sh.shape}, expected ({n}, 1|4|9|16, 3)")
+        for field in fields(self):
+            bad = ~np.isfinite(np.asarray(getattr(self, field.name)))
+            if bad.any():
+                first = int(np.argwhere(bad)[0][0])
+                raise InputError(f"gaussians: {field.name} is NaN or infinite, first at Gaussian {first}; remove or repair it")
+        return self
+
+
+def sh_from_rgb(rgb: np.ndarray) -> np.ndarray:
+    """Linear RGB [N,3] -> degree-0 coefficients [N,1,3]."""
+    return ((np.asarray(rgb, np.float32) - 0.5) / SH_C0)[:, None, :].astype(np.float32)
+
+
+def _ply_names(coefficients: int) -> list[str]:
+    """Property names of the 3DGS layout for a number of SH coefficients per channel."""
+    rest = 3 * (coefficients - 1)
+    return (
+        ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+        + [f"f_rest_{i}" for i in range(rest)]
+        + ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    )
+
+
+def write_ply(path: str | Path, gaussians: Gaussians) -> None:
+    """Write a binary 3DGS PLY (opens in any splat viewer); f_rest is channel-major, colours stay linear RGB."""
+    g, n = gaussians, len(gaussians)
+    names = _ply_names(g.sh.shape[1])
+    rest = np.transpose(g.sh[:, 1:, :], (0, 2, 1)).reshape(n, -1)
+    columns = np.concatenate(
+        [g.means, np.zeros((n, 3)), g.sh[:, 0, :], rest, np.reshape(g.logit_opacities, (n, 1)), g.log_scales, g.quats], axis=1
+    ).astype(np.float32)
+    vertices = np.empty(n, dtype=[(name, "f4") for name in names])
+    for i, name in enumerate(names):
+        vertices[name] = columns[:, i]
+    with atomic_path(path) as temporary:
+        PlyData([PlyElement.describe(vertices, "vertex")]).write(str(temporary))
+
+
+def read_ply(path: str | Path) -> Gaussians:
+    """Read any standard 3DGS PLY (binary or ascii, SH degree 0 to 3), by property name.
+
+    Raises InputError where the file is missing, is not a PLY, lacks a property, or holds NaN or infinite values.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give a 3DGS PLY")
+    try:
+        vertices = PlyData.read(str(path))["vertex"].data
+    except (PlyParseError, KeyError, ValueError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a readable 3DGS PLY ({error}); export it again") from None
+    present = set(vertices.dtype.names)
+    rest = sum(name.startswith("f_rest_") for name in present)
+    coefficients = 1 + rest // 3
+    if rest % 3 or coefficients not in (1, 4, 9, 16):
+        raise InputError(f"{path}: {rest} f_rest properties fit no SH degree from 0 to 3; expected 0, 9, 24 or 45")
+    missing = [name for name in _ply_names(coefficients) if name not in present and name not in ("nx", "ny", "nz")]
+    if missing:
+        raise InputError(f"{path}: not a 3DGS PLY, property {missing[0]!r} is missing; export it with a splatting tool")
+
+    def stack(*names: str) -> np.ndarray:
+        return np.stack([np.asarray(vertices[name], np.float32) for name in names], 1)
+
+    n = len(vertices)
+    sh = stack("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :]
+    if rest:
+        higher = stack(*(f"f_rest_{i}" for i in range(rest))).reshape(n, 3, coefficients - 1)
+        sh = np.concatenate([sh, np.transpose(higher, (0, 2, 1))], axis=1)
+    gaussians = Gaussians(
+        means=stack("x", "y", "z"),
+        log_scales=stack("scale_0", "scale_1", "scale_2"),
+        quats=stack("rot_0", "rot_1", "rot_2", "rot_3"),
+        logit_opacities=np.asarray(vertices["opacity"], np.float32).copy(),
+        sh=np.ascontiguousarray(sh),
+    )
+    try:
+        return gaussians.check()
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None

@@ -1,0 +1,13 @@
+"""Start Dr.Jit: find a libLLVM that works, then set the variant. The command line and the tests call this, nothing else does."""
+
+from __future__ import annotations
+
+VARIANT = "llvm_ad_rgb"
+
+
+def start() -> None:
+    """Set the Mitsuba variant once. Raises InputError where no libLLVM of version 19 or newer is found."""
+    import mitsuba as mi
+
+    if mi.variant() != VARIANT:
+        mi.set_variant(VARIANT)
