@@ -68,7 +68,7 @@ def new_folder(path: str | Path) -> Path:
 
 
 def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> None:
-    """Write an 8-bit PNG: linear RGB float [H,W,3] (converted to sRGB), display values with linear=False, or a bool mask [H,W]."""
+    """Write an 8-bit PNG: linear RGB [H,W,3] (converted to sRGB), display values with linear=False, or a bool mask [H,W]."""
     from PIL import Image
 
     if image.dtype == bool:

@@ -1,4 +1,4 @@
-"""Start Dr.Jit: find a libLLVM that works, then set the variant. The command line and the tests call this, nothing else does."""
+"""Start Dr.Jit: find a libLLVM that works, then set the variant. Only the command line and the tests call this."""
 
 from __future__ import annotations
 
