@@ -1,0 +1,167 @@
+"""Next-best-view policies: pure NumPy scores, each a row of a table. The loop that uses them is `mgs.nbv`.
+
+Two kinds, because they look at different things:
+
+- a *criterion* scores one candidate from Fisher information alone, `(F, H, lam) -> Score`;
+- a *pose policy* scores all candidates from camera positions alone, `(candidates, taken, centre, rng) -> scores`.
+
+Neither ever sees a candidate's image. In both the largest score wins and the first candidate wins a tie.
+
+Notation, after the paper's Eq. 7 and POp-GS: H [N,P] is the diagonal of J^T J summed over the training set, F [N,P] that of
+one candidate, lam [P] the regularisation (`regularisation`); l = N P is the number of parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
+Score = tuple[float, ...]
+"""Compared entry by entry: the first is the gain that is reported, the rest break ties."""
+Criterion = Callable[[Array, Array, Array], Score]
+PosePolicy = Callable[[Array, Array, Array, np.random.Generator], Array]
+
+PIXEL_NOISE = 0.02
+"""sigma_e, standard deviation of a pixel's residual, linear RGB: what a fitted model leaves on a textured rock
+(34 dB), and the scale at which one pixel's evidence counts as one."""
+
+PRIOR_STD = {"colour": 1.0, "scale": 0.5, "rotation": 0.5, "opacity": 2.0}
+"""tau: how far each parameter may plausibly lie from its start before any image is seen, in the parameter's own unit:
+colour 1 SH unit (0.28 linear RGB: albedo and shading of a rock), scale 0.5 (a factor 1.65), quaternion 0.5 (about 60
+degrees), opacity logit 2 (0.12 to 0.88 about one half)."""
+
+
+def regularisation(
+    groups: dict[str, slice], pixel_noise: float = PIXEL_NOISE, prior_std: dict[str, float] | None = None
+) -> NDArray[np.float64]:
+    """lam [P], the prior's information about each parameter, in the units of H: (sigma_e / tau)^2.
+
+    J^T J has units (pixel value / parameter)^2, which differ between parameters, so one number cannot serve all of them.
+    With a prior theta ~ N(theta_0, tau^2) the posterior precision is H / sigma_e^2 + 1 / tau^2 = (H + lam) / sigma_e^2, so this
+    lam makes Eq. 7 equal 2/l times the mutual information of the parameters and the new image (diagonal, linearised), in
+    nats. groups: columns of each kind of parameter, from `mgs.splat.groups`.
+    """
+    std = PRIOR_STD if prior_std is None else prior_std
+    lam = np.empty(max(columns.stop for columns in groups.values()))
+    for name, columns in groups.items():
+        lam[columns] = (pixel_noise / std[name]) ** 2
+    return lam
+
+
+def observed(H: Array, lam: Array) -> NDArray[np.bool_]:
+    """[N] which Gaussians the images say more about than the prior does (Eq. 9 with epsilon = lam).
+
+    Read off the colour columns: colour information is the sum of squared blending weights, whatever the training did.
+    """
+    return np.asarray((H[:, :3] > lam[:3]).any(axis=1))
+
+
+def coverage(H: Array, lam: Array) -> float:
+    """Surface coverage C_0 of Eq. 9: the share of Gaussians that are `observed`, 0 to 1."""
+    return float(observed(H, lam).mean())
+
+
+def d_optimal(F: Array, H: Array, lam: Array) -> Score:
+    """Paper's Eq. 7: 1/l sum log(1 + F / (H + lam)), the decrease of the log-volume of the posterior."""
+    return (float(np.log1p(F / (H + lam)).mean(dtype=np.float64)),)
+
+
+def t_optimal(F: Array, H: Array, lam: Array) -> Score:
+    """1/l sum [1/(H+lam) - 1/(H+F+lam)], the decrease of the average variance.
+
+    The paper calls this A-optimal; POp-GS (and here) T-optimal, keeping A for its own p = -1.
+    """
+    return (float((F / ((H + lam) * (H + F + lam))).mean(dtype=np.float64)),)
+
+
+def a_optimal(F: Array, H: Array, lam: Array) -> Score:
+    """POp-GS's A-optimal (p = -1): the increase of the trace of the inverse covariance, 1/l sum F. Blind to H."""
+    return (float(F.mean(dtype=np.float64)),)
+
+
+def e_optimal(F: Array, H: Array, lam: Array) -> Score:
+    """Increase of the smallest eigenvalue of H + lam. It is 0 while any parameter stays unobserved: a tie goes to the mean."""
+    return (float((H + F + lam).min() - (H + lam).min()), float(F.mean(dtype=np.float64)))
+
+
+def fisherrf(F: Array, H: Array, lam: Array) -> Score:
+    """FisherRF's trace criterion, 1/l sum F / (H + lam): Eq. 7 without the logarithm, so nothing saturates."""
+    return (float((F / (H + lam)).mean(dtype=np.float64)),)
+
+
+def coverage_greedy(F: Array, H: Array, lam: Array) -> Score:
+    """Number of Gaussians newly `observed`; a tie goes to the view with the most colour information (it sees most surface)."""
+    new = int((observed(H + F, lam) & ~observed(H, lam)).sum())
+    return (float(new), float(F[:, :3].sum(dtype=np.float64)))
+
+
+CRITERIA: dict[str, Criterion] = {
+    "d-optimal": d_optimal,
+    "coverage": coverage_greedy,
+    "t-optimal": t_optimal,
+    "a-optimal": a_optimal,
+    "e-optimal": e_optimal,
+    "fisherrf": fisherrf,
+}
+
+
+def azimuths(positions: Array, centre: Array) -> NDArray[np.float64]:
+    """Camera centres [C,3] -> angle about the vertical through `centre` [3], radians in [0, 2 pi), 0 = +X."""
+    offset = np.asarray(positions, np.float64) - centre
+    return np.arctan2(offset[:, 1], offset[:, 0]) % (2 * np.pi)
+
+
+def angle_between(a: Array, b: Array) -> NDArray[np.float64]:
+    """Smallest angle between azimuths (broadcast), radians in [0, pi]."""
+    return np.abs((a - b + np.pi) % (2 * np.pi) - np.pi)
+
+
+def random_order(candidates: Array, taken: Array, centre: Array, rng: np.random.Generator) -> Array:
+    """A draw at random. The loop derives `rng` from the run's seed and the step: reproducible, and new in every round."""
+    return rng.random(len(candidates))
+
+
+def uniform_azimuth(candidates: Array, taken: Array, centre: Array, rng: np.random.Generator) -> Array:
+    """Gap to the taken azimuth on the left times that on the right, square radians: spreads the views evenly at every count.
+
+    Splitting a gap a + b lowers the sum of squared gaps by 2ab, so this is greedy for the most even spread.
+    """
+    gaps = (azimuths(taken, centre)[None, :] - azimuths(candidates, centre)[:, None]) % (2 * np.pi)
+    return _rounded(gaps.min(axis=1) * (2 * np.pi - gaps.max(axis=1)))
+
+
+def farthest_pose(candidates: Array, taken: Array, centre: Array, rng: np.random.Generator) -> Array:
+    """Distance to the nearest camera already taken, metres (farthest-point sampling)."""
+    distance = np.linalg.norm(candidates[:, None, :] - taken[None, :, :], axis=2)
+    return _rounded(distance.min(axis=1))
+
+
+def _rounded(scores: Array) -> Array:
+    """Equal distances differ in the last bits; without them a tie is a tie (first candidate wins)."""
+    return np.round(scores, 9)
+
+
+POSE_POLICIES: dict[str, PosePolicy] = {
+    "random": random_order,
+    "uniform": uniform_azimuth,
+    "farthest": farthest_pose,
+}
+
+POLICIES: tuple[str, ...] = (*CRITERIA, *POSE_POLICIES)
+"""Every policy that `mgs nbv --policy` accepts."""
+
+
+def seed_views(positions: Array, centre: Array, count: int) -> list[int]:
+    """Frames nearest to `count` evenly spaced azimuths (0, 360/count, ...), each frame once; in that order.
+
+    positions [C,3] camera centres, centre [3] the rock; metres. Needs count <= C.
+    """
+    angles, seeds = azimuths(positions, centre), list[int]()
+    for target in 2 * np.pi * np.arange(count) / count:
+        distance = _rounded(angle_between(angles, target))
+        distance[seeds] = np.inf
+        seeds.append(int(np.argmin(distance)))
+    return seeds

@@ -1,0 +1,144 @@
+"""Policies as algebra: the properties that make a score an information gain."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from mgs import policies
+from mgs.seeds import generator
+
+GROUPS = {"colour": slice(0, 3), "scale": slice(3, 6), "rotation": slice(6, 10), "opacity": slice(10, 11)}
+LAM = policies.regularisation(GROUPS)
+N = 5
+information = arrays(np.float64, (N, 11), elements=st.floats(0, 1e4, allow_subnormal=False))
+scales = arrays(np.float64, 11, elements=st.floats(1e-3, 1e3))
+CIRCLE = np.stack([np.cos(np.arange(12) * np.pi / 6), np.sin(np.arange(12) * np.pi / 6), np.full(12, 0.5)], 1)
+CENTRE = np.zeros(3)
+
+
+@given(information, information)
+def test_d_optimal_is_the_exact_log_determinant_difference(F, H):
+    before = np.linalg.slogdet(np.diag((H + LAM).ravel()))[1]
+    after = np.linalg.slogdet(np.diag((H + F + LAM).ravel()))[1]
+    assert policies.d_optimal(F, H, LAM)[0] * H.size == pytest.approx(after - before, rel=1e-9, abs=1e-9)
+
+
+@given(information, information, st.sampled_from(sorted(policies.CRITERIA)))
+def test_no_view_loses_information(F, H, name):
+    assert policies.CRITERIA[name](F, H, LAM)[0] >= 0
+
+
+@given(information, st.sampled_from(sorted(policies.CRITERIA)))
+def test_a_view_that_sees_nothing_gains_nothing(H, name):
+    assert policies.CRITERIA[name](np.zeros_like(H), H, LAM)[0] == 0
+
+
+@given(information, information, information, st.sampled_from(sorted(policies.CRITERIA)))
+def test_seeing_more_is_never_worse(F, more, H, name):
+    score = policies.CRITERIA[name]
+    assert score(F + more, H, LAM)[0] >= score(F, H, LAM)[0] * (1 - 1e-12)
+
+
+@given(information, information, information, st.sampled_from(["d-optimal", "t-optimal", "fisherrf"]))
+def test_returns_diminish(F, H, seen, name):
+    """Submodularity: with the model held fixed, a view is worth less once others have been taken."""
+    score = policies.CRITERIA[name]
+    assert score(F, H + seen, LAM)[0] <= score(F, H, LAM)[0] * (1 + 1e-12)
+
+
+@given(information, information, scales, st.sampled_from(["d-optimal", "fisherrf", "coverage"]))
+def test_units_do_not_matter_when_lambda_carries_them(F, H, unit, name):
+    """theta -> unit * theta divides J by unit; lam = (sigma / tau)^2 follows, so the gain must not change."""
+    score = policies.CRITERIA[name]
+    # Powers of two: exact in floating point, so the threshold of `coverage` cannot flip by rounding.
+    unit = 2.0 ** np.round(np.log2(unit))
+    assert score(F / unit**2, H / unit**2, LAM / unit**2)[0] == pytest.approx(score(F, H, LAM)[0], rel=1e-9)
+
+
+@settings(max_examples=30)
+@given(arrays(np.float64, (6, N, 11), elements=st.floats(0, 10, allow_subnormal=False)))
+def test_greedy_d_optimal_reaches_its_guarantee(views):
+    """Monotone and submodular, so greedy is within 1 - 1/e of the best pair (Nemhauser et al. 1978)."""
+    H = np.zeros((N, 11))
+
+    def value(chosen):
+        return policies.d_optimal(views[list(chosen)].sum(0), H, LAM)[0]
+
+    first = max(range(6), key=lambda i: value([i]))
+    second = max((i for i in range(6) if i != first), key=lambda i: value([first, i]))
+    best = max(value([i, j]) for i in range(6) for j in range(i))
+    assert value([first, second]) >= (1 - 1 / np.e) * best - 1e-12
+
+
+def test_regularisation_is_the_priors_information_per_group():
+    lam = policies.regularisation(GROUPS, pixel_noise=0.1, prior_std={"colour": 1, "scale": 2, "rotation": 0.5, "opacity": 10})
+    assert lam == pytest.approx([0.01] * 3 + [0.0025] * 3 + [0.04] * 4 + [0.0001])
+
+
+def test_gain_is_twice_the_mutual_information_of_a_linear_gaussian_model():
+    """y = J theta + e with diagonal J^T J: I(theta; y) = 1/2 log det(I + J Sigma J^T / sigma^2)."""
+    rng = np.random.default_rng(0)
+    j, sigma = rng.normal(size=11), policies.PIXEL_NOISE
+    tau = sigma / np.sqrt(LAM)
+    mutual = 0.5 * np.linalg.slogdet(np.eye(11) + np.diag((j * tau / sigma) ** 2))[1]
+    assert policies.d_optimal(j[None] ** 2, np.zeros((1, 11)), LAM)[0] == pytest.approx(2 / 11 * mutual)
+
+
+def test_coverage_counts_newly_observed_gaussians_and_breaks_ties_by_information():
+    H = np.zeros((4, 11))
+    H[0, :3] = 1.0
+    sees_two = np.zeros((4, 11))
+    sees_two[[0, 1, 2], :3] = 1.0
+    assert policies.coverage(H, LAM) == 0.25
+    assert policies.coverage_greedy(sees_two, H, LAM)[0] == 2
+    sees_old = np.zeros((4, 11))
+    sees_old[0, :3] = 5.0
+    assert policies.coverage_greedy(2 * sees_old, H, LAM) > policies.coverage_greedy(sees_old, H, LAM)
+    assert policies.coverage_greedy(sees_two, H, LAM) > policies.coverage_greedy(100 * sees_old, H, LAM)
+
+
+def test_t_optimal_is_the_difference_the_paper_writes():
+    rng = np.random.default_rng(1)
+    F, H = rng.random((N, 11)), rng.random((N, 11))
+    assert policies.t_optimal(F, H, LAM)[0] == pytest.approx((1 / (H + LAM) - 1 / (H + F + LAM)).mean())
+
+
+def test_random_differs_between_rounds_and_repeats_between_runs():
+    def draws(seed):
+        return [
+            int(np.argmax(policies.random_order(CIRCLE, CIRCLE[:1], CENTRE, generator(seed, f"random/{k}")))) for k in range(20)
+        ]
+
+    assert draws(7) == draws(7)
+    assert draws(7) != draws(8)
+    assert len(set(draws(7))) > 5
+
+
+def test_uniform_leaves_even_gaps_at_every_count():
+    taken = [0, 3, 6, 9]
+    for largest in (3, 3, 3, 2, 2, 2, 2, 1):
+        left = [i for i in range(12) if i not in taken]
+        scores = policies.uniform_azimuth(CIRCLE[left], CIRCLE[taken], CENTRE, np.random.default_rng(0))
+        taken.append(left[int(np.argmax(scores))])
+        assert np.diff([*sorted(taken), 12]).max() == largest
+
+
+def test_farthest_looks_at_height_too():
+    poles = np.array([[1.0, 0, 0.5], [0, 0, 9.0], [-1, 0, 0.5]])
+    assert np.argmax(policies.farthest_pose(poles, CIRCLE, CENTRE, np.random.default_rng(0))) == 1
+
+
+def test_seeds_are_evenly_spaced_wherever_the_orbit_starts():
+    rock = np.array([3.0, 4.0, 0.0])
+    assert policies.seed_views(CIRCLE, CENTRE, 4) == [0, 3, 6, 9]
+    assert policies.seed_views(np.roll(CIRCLE, 5, axis=0) + rock, rock, 4) == [5, 8, 11, 2]
+    assert sorted(policies.seed_views(CIRCLE, CENTRE, 12)) == list(range(12))
+
+
+def test_azimuth_is_measured_about_the_rock():
+    positions = np.array([[2.0, 1.0, 9.0], [1.0, 2.0, -1.0], [0.0, 1.0, 0.0]])
+    assert policies.azimuths(positions, np.array([1.0, 1.0, 0.0])) == pytest.approx([0, np.pi / 2, np.pi])
