@@ -86,16 +86,16 @@ class Camera:
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:
     """OpenCV world_to_camera [4,4] of a camera at `eye` that looks at `target` with world `up` (metres)."""
     eye = np.asarray(eye, np.float64)
-    forward = np.asarray(target, np.float64) - eye
+    forward: NDArray[np.float64] = np.asarray(target, np.float64) - eye
     norm = np.linalg.norm(forward)
     if norm == 0:
         raise InputError("look_at: eye and target are the same point")
-    forward /= norm
-    right = np.cross(forward, np.asarray(up, np.float64))
+    forward = forward / norm
+    right: NDArray[np.float64] = np.cross(forward, np.asarray(up, np.float64))
     if np.linalg.norm(right) < 1e-9:
         right = np.cross(forward, [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
+    right = right / np.linalg.norm(right)
+    pose = np.eye(4, dtype=np.float64)
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
     pose[:3, 3] = -pose[:3, :3] @ eye
     return pose
@@ -103,12 +103,12 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
 
 def opencv_from_opengl(camera_to_world: ArrayLike) -> NDArray[np.float64]:
     """nerfstudio's OpenGL camera-to-world [4,4] -> our OpenCV world_to_camera [4,4]."""
-    return np.linalg.inv(np.asarray(camera_to_world, np.float64) @ _OPENGL_FROM_OPENCV)
+    return np.asarray(np.linalg.inv(np.asarray(camera_to_world, np.float64) @ _OPENGL_FROM_OPENCV), np.float64)
 
 
 def opengl_from_opencv(world_to_camera: ArrayLike) -> NDArray[np.float64]:
     """Our OpenCV world_to_camera [4,4] -> nerfstudio's OpenGL camera-to-world [4,4]."""
-    return np.linalg.inv(np.asarray(world_to_camera, np.float64)) @ _OPENGL_FROM_OPENCV
+    return np.asarray(np.linalg.inv(np.asarray(world_to_camera, np.float64)) @ _OPENGL_FROM_OPENCV, np.float64)
 
 
 def rotmat_from_quat(quats: ArrayLike) -> NDArray[np.float64]:

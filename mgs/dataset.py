@@ -92,7 +92,7 @@ def _frame(root: Path, path: Path, data: dict[str, Any], index: int, record: dic
     try:
         fl_x, fl_y, cx, cy, w, h = (record.get(k, data.get(k)) for k in ("fl_x", "fl_y", "cx", "cy", "w", "h"))
         K = np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]], np.float64)
-        width, height = int(w), int(h)
+        width, height = int(w or 0), int(h or 0)
         pose = np.array(record["transform_matrix"], np.float64)
         timestamp = float(record.get("timestamp", FRAME_INTERVAL * index))
     except (TypeError, ValueError):

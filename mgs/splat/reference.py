@@ -1,0 +1,188 @@
+"""The oracle: O(N x pixels) float64 NumPy, the kernels' names and constants, nothing clever.
+
+Every function here has a fast twin in Dr.Jit and a test that compares the two. Derivatives are written independently of the
+kernels (dense per-pixel Jacobians of alpha compositing) and are themselves tested against central differences.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mgs.conventions import Camera, rotmat_from_quat
+from mgs.gaussians import Gaussians
+from mgs.splat.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, LOG_SCALE_RANGE, NEAR, TRANSMITTANCE_MIN
+
+
+@dataclass
+class Projected:
+    """means2d [N,2] px; cov2d [N,2,2] px^2 with EPS2D; depths [N] m; opacities [N]; colours [N,3]; visible [N] bool;
+    T [N,2,3] px/m: the EWA map from world offsets to pixels."""
+
+    means2d: np.ndarray
+    cov2d: np.ndarray
+    depths: np.ndarray
+    opacities: np.ndarray
+    colours: np.ndarray
+    visible: np.ndarray
+    T: np.ndarray
+
+
+def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
+    """Real spherical harmonics of unit directions [N,3] -> [N,(degree+1)^2], in the order and sign of the 3DGS file layout."""
+    x, y, z = directions.T
+    xx, yy, zz = x * x, y * y, z * z
+    basis = [np.full(len(x), 0.28209479177387814)]
+    if degree > 0:
+        c = 0.4886025119029199
+        basis += [-c * y, c * z, -c * x]
+    if degree > 1:
+        basis += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * zz - xx - yy),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (xx - yy),
+        ]
+    if degree > 2:
+        basis += [
+            -0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3 * yy),
+        ]
+    return np.stack(basis, 1)
+
+
+def project(gaussians: Gaussians, camera: Camera) -> Projected:
+    """EWA projection (Zwicker et al. 2002; 3DGS), float64."""
+    means = np.asarray(gaussians.means, np.float64)
+    R, t = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
+    x, y, z = (means @ R.T + t).T
+    visible = z > NEAR
+    z = np.where(visible, z, 1.0)
+    margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * camera.width / fx, FRUSTUM_MARGIN * 0.5 * camera.height / fy
+    tx = np.clip(x / z, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
+    ty = np.clip(y / z, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
+    zero = np.zeros_like(z)
+    J = np.stack([np.stack([fx / z, zero, -fx * tx / z], 1), np.stack([zero, fy / z, -fy * ty / z], 1)], 1)
+    T = J @ R
+    scales = np.exp(np.clip(np.asarray(gaussians.log_scales, np.float64), *LOG_SCALE_RANGE))
+    A = T @ (rotmat_from_quat(gaussians.quats) * scales[:, None, :])
+    cov2d = A @ A.transpose(0, 2, 1) + EPS2D * np.eye(2)
+    directions = means - camera.position
+    directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
+    sh = np.asarray(gaussians.sh, np.float64)
+    raw = 0.5 + np.einsum("nk,nkc->nc", sh_basis(directions, gaussians.sh_degree), sh)
+    opacities = 1 / (1 + np.exp(-np.asarray(gaussians.logit_opacities, np.float64)))
+    means2d = np.stack([fx * x / z + cx, fy * y / z + cy], 1)
+    return Projected(means2d, cov2d, z, opacities, np.maximum(raw, 0), visible, T)
+
+
+def composite(projected: Projected, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Front-to-back alpha compositing, per pixel and splat.
+
+    Returns order [M] (visible Gaussians by depth, ties by index), alpha [P,M] after thresholds (0 where skipped or behind
+    the stop), T [P,M] transmittance in front of each splat, clipped [P,M] where ALPHA_MAX holds. P = H*W, row-major.
+    """
+    index = np.flatnonzero(projected.visible)
+    order = index[np.argsort(projected.depths[index].astype(np.float32), kind="stable")]
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    pixels = np.stack([u.ravel(), v.ravel()], 1)
+    alpha = np.zeros((len(pixels), len(order)))
+    transmittance = np.zeros_like(alpha)
+    clipped = np.zeros(alpha.shape, bool)
+    T = np.ones(len(pixels))
+    live = np.ones(len(pixels), bool)
+    for i, j in enumerate(order):
+        d = pixels - projected.means2d[j]
+        sigma = 0.5 * np.einsum("pi,ij,pj->p", d, np.linalg.inv(projected.cov2d[j]), d)
+        raw = projected.opacities[j] * np.exp(-sigma)
+        a = np.where(raw >= ALPHA_MIN, np.minimum(raw, ALPHA_MAX), 0.0)
+        live &= (a == 0) | (T * (1 - a) > TRANSMITTANCE_MIN)
+        a = np.where(live, a, 0.0)
+        alpha[:, i], transmittance[:, i], clipped[:, i] = a, T, raw > ALPHA_MAX
+        T = T * (1 - a)
+    return order, alpha, transmittance, clipped
+
+
+def render(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -> dict[str, np.ndarray]:
+    """rgb [H,W,3] over the background, alpha [H,W], depth [H,W] = sum of alpha T z / alpha (0 where alpha is 0)."""
+    projected = project(gaussians, camera)
+    order, alpha, T, _ = composite(projected, camera)
+    weights = alpha * T
+    total = weights.sum(1)
+    rgb = weights @ projected.colours[order] + (1 - total)[:, None] * np.asarray(background, np.float64)
+    depth = weights @ projected.depths[order] / np.where(total > 0, total, 1.0)
+    shape = (camera.height, camera.width)
+    return {"rgb": rgb.reshape(*shape, 3), "alpha": total.reshape(shape), "depth": depth.reshape(shape)}
+
+
+PARAMETERS = ("sh", "log_scales", "quats", "logit_opacities")
+"""Learnable parameters in the column order of Fisher information: 3K colour, 3, 4, 1."""
+
+
+def _projection_jacobian(gaussians: Gaussians, camera: Camera, j: int, step: float = 1e-5) -> np.ndarray:
+    """d(cov2d)/d(log-scale 3, quaternion 4) of Gaussian j -> [7,2,2], by central differences of `project` in float64."""
+    rows = []
+    for name, size in (("log_scales", 3), ("quats", 4)):
+        for k in range(size):
+            ends = []
+            for sign in (+1, -1):
+                one = Gaussians(*(np.asarray(getattr(gaussians, f))[j : j + 1].astype(np.float64) for f in vars(gaussians)))
+                getattr(one, name)[0, k] += sign * step
+                ends.append(project(one, camera).cov2d[0])
+            rows.append((ends[0] - ends[1]) / (2 * step))
+    return np.stack(rows)
+
+
+def jacobian(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -> np.ndarray:
+    """Dense Jacobian of the rgb image, [H*W, 3, N, 3K+8], columns as PARAMETERS. Brute force: toy scenes only."""
+    projected = project(gaussians, camera)
+    order, alpha, T, clipped = composite(projected, camera)
+    weights = alpha * T
+    n, degree = len(gaussians), gaussians.sh_degree
+    K = (degree + 1) ** 2
+    directions = np.asarray(gaussians.means, np.float64) - camera.position
+    directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
+    basis = sh_basis(directions, degree)
+    contribution = weights[:, :, None] * projected.colours[order]
+    image = contribution.sum(1) + (1 - weights.sum(1))[:, None] * np.asarray(background, np.float64)
+    behind = image[:, None, :] - np.cumsum(contribution, 1)
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    pixels = np.stack([u.ravel(), v.ravel()], 1)
+    J = np.zeros((len(pixels), 3, n, 3 * K + 8))
+    for i, j in enumerate(order):
+        drawn = alpha[:, i] > 0
+        free = drawn & ~clipped[:, i]
+        D = projected.colours[j] * T[:, i, None] - behind[:, i] / (1 - alpha[:, i, None])
+        dalpha = np.where(free, alpha[:, i], 0.0)
+        for c in range(3):
+            positive = projected.colours[j, c] > 0
+            for k in range(K):
+                J[:, c, j, 3 * k + c] = weights[:, i] * basis[j, k] * positive
+        d = pixels - projected.means2d[j]
+        conic = np.linalg.inv(projected.cov2d[j])
+        e = d @ conic
+        dcov = _projection_jacobian(gaussians, camera, j)
+        dlog = np.concatenate(
+            [0.5 * np.einsum("pi,kij,pj->pk", e, dcov, e), np.full((len(d), 1), 1 - projected.opacities[j])], 1
+        )
+        J[:, :, j, 3 * K :] = D[:, :, None] * (dalpha[:, None] * dlog)[:, None, :]
+    return J
+
+
+def fisher(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -> np.ndarray:
+    """diag(J^T J) over pixels and channels, [N, 3K+8]."""
+    return (jacobian(gaussians, camera, background) ** 2).sum((0, 1))
+
+
+def fisher_block(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -> np.ndarray:
+    """The [N, 3K+8, 3K+8] diagonal blocks of J^T J."""
+    J = jacobian(gaussians, camera, background)
+    return np.einsum("pcna,pcnb->nab", J, J)
