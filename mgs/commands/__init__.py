@@ -4,4 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-COMMANDS: dict[str, Callable[..., None]] = {}
+from mgs.commands.doctor import doctor
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "doctor": doctor,
+}

@@ -1,0 +1,32 @@
+# make demo   the whole way on a small rock: dataset, prior, three policies, table and pictures
+# make test   lint, format, types, tests
+# Both do all the set-up on their own (Python 3.11 or newer, libLLVM 19 or newer).
+
+VENV  := .venv
+BIN   := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: demo test setup lock clean
+.DEFAULT_GOAL := demo
+
+demo: setup
+	@$(BIN)/mgs demo
+
+test: setup
+	@echo "ruff check";  $(BIN)/ruff check -q .
+	@echo "ruff format"; $(BIN)/ruff format -q --check .
+	@echo "mypy";        $(BIN)/mypy --no-error-summary
+	@echo "pytest";      $(BIN)/python -m pytest
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml requirements.lock tools/setup.sh
+	@sh tools/setup.sh $(VENV)
+	@touch $@
+
+# Resolve pyproject.toml anew and write requirements.lock.
+lock:
+	@sh tools/lock.sh
+
+clean:
+	rm -rf $(VENV) out demo .mypy_cache .ruff_cache .pytest_cache

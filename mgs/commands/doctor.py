@@ -1,0 +1,88 @@
+"""`mgs doctor`: what this machine has, what is wrong, and how to mend it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+
+import typer
+
+from mgs.errors import InputError
+
+_PACKAGES = ("mgs", "mitsuba", "drjit", "numpy", "pyoidn")
+
+
+def doctor() -> None:
+    """Print versions, the libLLVM in use, processor and memory; say what is wrong and how to mend it.
+
+    Exit code 0 where all is well, 2 where something stops mgs from working.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(show_header=False, box=None, pad_edge=False)
+    problems = []
+    for name, value, problem in _software() + _machine() + _resources():
+        table.add_row(name, value, style="red" if problem else None)
+        if problem:
+            problems.append(problem)
+    console = Console(highlight=False)
+    console.print(table)
+    for problem in problems:
+        console.print(f"wrong: {problem}", style="red", markup=False, soft_wrap=True)
+    if problems:
+        raise typer.Exit(2)
+    console.print("all is well")
+
+
+def _software() -> list[tuple[str, str, str]]:
+    """(name, value, what is wrong or "") of Python and the packages."""
+    rows = [("python", platform.python_version(), "")]
+    for package in _PACKAGES:
+        try:
+            rows.append((package, importlib.metadata.version(package), ""))
+        except importlib.metadata.PackageNotFoundError:
+            optional = package == "pyoidn"
+            absent = "absent: images are rendered with more samples instead of being denoised"
+            problem = f"the package {package} is missing; install mgs again (`make setup`, or `pip install .`)"
+            rows.append((package, absent if optional else "missing", "" if optional else problem))
+    return rows
+
+
+def _machine() -> list[tuple[str, str, str]]:
+    """(name, value, what is wrong or "") of libLLVM, processor and memory."""
+    from mgs import runtime
+
+    page, gib = os.sysconf("SC_PAGE_SIZE"), 1024**3
+    total, free = os.sysconf("SC_PHYS_PAGES") * page / gib, os.sysconf("SC_AVPHYS_PAGES") * page / gib
+    rows = [("cores", str(os.cpu_count()), ""), ("memory", f"{total:.1f} GiB, {free:.1f} GiB free", "")]
+    try:
+        library = runtime.find_libllvm()
+    except InputError as error:
+        return [*rows, ("libLLVM", "not usable", str(error))]
+    try:
+        runtime.start()
+        runtime.check_kernel()
+    except (InputError, ImportError) as error:
+        return [*rows, ("libLLVM", str(library), str(error))]
+    facts = runtime.processor()
+    rows.append(("libLLVM", str(library), ""))
+    rows.append(("SIMD", f"{facts['simd_width']} float32 lanes ({facts['cpu']})", ""))
+    rows.append(("threads", f"{facts['threads']} (Dr.Jit)", ""))
+    return rows
+
+
+def _resources() -> list[tuple[str, str, str]]:
+    """(name, value, what is wrong or "") of the folders that come with the package."""
+    from mgs.resources import resource_folder
+
+    rows = []
+    for name, pattern in (("scenes", "*.toml"), ("plugins", "*.py")):
+        try:
+            found = sorted(path.stem for path in resource_folder(name).glob(pattern))
+        except InputError as error:
+            rows.append((name, "missing", str(error)))
+        else:
+            rows.append((name, ", ".join(found) or "none", ""))
+    return rows

@@ -1,0 +1,96 @@
+"""The libLLVM that is chosen, and one clear line for every one that would not work."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mgs import runtime
+from mgs.errors import InputError
+from mgs.runtime import MIN_LLVM, Libllvm
+
+OLD = [path for path in runtime._candidates() if runtime.load_libllvm(path).version[0] < MIN_LLVM]
+
+
+def test_finds_a_good_one_and_is_what_dr_jit_uses():
+    import drjit as dr
+
+    assert runtime.find_libllvm().version == dr.detail.llvm_version()
+    runtime.check_kernel()
+
+
+def test_facts_of_the_processor():
+    facts = runtime.processor()
+    assert facts["threads"] >= 1
+    assert facts["simd_width"] in (4, 8, 16)
+
+
+def fake(monkeypatch, libraries: dict[str, int | None]) -> None:
+    """Pretend that these libraries are what the system has, in Dr.Jit's order; None: does not load."""
+
+    def load(path: str) -> Libllvm:
+        version = libraries.get(path)
+        if version is None:
+            raise InputError(f"libLLVM {path}: does not load")
+        return Libllvm(path, (version, 0, 0))
+
+    monkeypatch.setattr(runtime, "load_libllvm", load)
+    monkeypatch.setattr(runtime, "_candidates", lambda: list(libraries))
+
+
+def test_order(monkeypatch):
+    monkeypatch.delenv(runtime.LIBRARY_VARIABLE, raising=False)
+    fake(monkeypatch, {"first": 22, "second": 19})
+    assert runtime.find_libllvm().path == "first"
+    fake(monkeypatch, {"old": 14, "broken": None, "good": 19})
+    assert runtime.find_libllvm().path == "good"
+    fake(monkeypatch, {"old": 15, "older": 14})
+    with pytest.raises(InputError, match=r"old: is version 15, older than 19; install version 19 or newer.*apt-get.*conda"):
+        runtime.find_libllvm()
+    fake(monkeypatch, {})
+    with pytest.raises(InputError, match="none found; install version 19"):
+        runtime.find_libllvm()
+
+
+def test_an_explicit_choice_is_honoured(monkeypatch):
+    fake(monkeypatch, {"good": 19, "old": 15})
+    monkeypatch.setenv(runtime.LIBRARY_VARIABLE, "old")
+    with pytest.raises(InputError, match="is version 15, older than 19, but DRJIT_LIBLLVM_PATH names it"):
+        runtime.find_libllvm()
+    monkeypatch.setenv(runtime.LIBRARY_VARIABLE, "")
+    assert runtime.find_libllvm().path == "good"
+
+
+def test_versions_are_compared_as_numbers(tmp_path):
+    for name in ("libLLVM-9.so.1", "libLLVM-15.so.1", "libLLVM.so.19.1", "libLLVM.so.22.1"):
+        (tmp_path / name).touch()
+    names = [Path(path).name for path in runtime._installed((str(tmp_path),), "libLLVM*.so.*")]
+    assert names == ["libLLVM.so.22.1", "libLLVM.so.19.1", "libLLVM-15.so.1", "libLLVM-9.so.1"]
+
+
+@pytest.mark.parametrize(
+    ("library", "message"),
+    [("/nowhere/libLLVM.so", "no such file"), (__file__, "does not load"), ("libm.so.6", "is another library")]
+    + [(path, f"is version 1[0-8], older than {MIN_LLVM}") for path in OLD],
+)
+def test_bad_libraries_are_one_line_and_exit_code_2(library, message):
+    """In a process of its own: an abort would show as a negative exit code."""
+    code = "from mgs.cli import main; import sys; sys.argv = ['mgs', 'doctor']; main()"
+    environment = {runtime.LIBRARY_VARIABLE: library, "PATH": "/usr/bin:/bin", "COLUMNS": "400"}
+    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
+    assert result.returncode == 2, result.stderr
+    lines = [line for line in result.stdout.splitlines() if line.startswith("wrong:")]
+    assert len(lines) == 1
+    assert re.search(message, lines[0])
+    assert runtime.LIBRARY_VARIABLE in lines[0]
+
+
+def test_start_raises_instead_of_aborting():
+    code = "from mgs import runtime\ntry:\n    runtime.start()\nexcept runtime.InputError as error:\n    print(error)"
+    environment = {runtime.LIBRARY_VARIABLE: OLD[0] if OLD else "/nowhere.so"}
+    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
+    assert result.returncode == 0, result.stderr
+    assert "libLLVM" in result.stdout
+    assert "install libLLVM" in result.stdout or "names it" in result.stdout
