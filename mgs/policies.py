@@ -13,7 +13,7 @@ one candidate, lam [P] the regularisation (`regularisation`); l = N P is the num
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ degrees), opacity logit 2 (0.12 to 0.88 about one half)."""
 
 
 def regularisation(
-    groups: dict[str, slice], pixel_noise: float = PIXEL_NOISE, prior_std: dict[str, float] | None = None
+    groups: dict[str, slice], pixel_noise: float = PIXEL_NOISE, prior_std: Mapping[str, float] = PRIOR_STD
 ) -> NDArray[np.float64]:
     """lam [P], the prior's information about each parameter, in the units of H: (sigma_e / tau)^2.
 
@@ -44,10 +44,9 @@ def regularisation(
     lam makes Eq. 7 equal 2/l times the mutual information of the parameters and the new image (diagonal, linearised), in
     nats. groups: columns of each kind of parameter, from `mgs.splat.groups`.
     """
-    std = PRIOR_STD if prior_std is None else prior_std
     lam = np.empty(max(columns.stop for columns in groups.values()))
     for name, columns in groups.items():
-        lam[columns] = (pixel_noise / std[name]) ** 2
+        lam[columns] = (pixel_noise / prior_std[name]) ** 2
     return lam
 
 

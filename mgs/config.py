@@ -1,0 +1,66 @@
+"""Run settings: validated once, frozen, and written whole beside the results."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+from mgs import __version__
+from mgs.errors import InputError
+from mgs.policies import PIXEL_NOISE, POLICIES, PRIOR_STD
+
+
+def _known_policy(name: str) -> str:
+    if name not in POLICIES:
+        raise ValueError(f"unknown policy {name!r}; choose one of {', '.join(POLICIES)}")
+    return name
+
+
+class NbvSettings(BaseModel):
+    """Everything that decides what `mgs nbv` does; the same settings give the same choice of views."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    dataset: Path
+    prior: Path
+    policy: Annotated[str, AfterValidator(_known_policy)] = "d-optimal"
+    budget: Annotated[int, Field(ge=0)] = 50
+    """Views chosen beyond the seeds."""
+    seeds: Annotated[int, Field(ge=1)] = 4
+    """Views at evenly spaced azimuths that start the model."""
+    seed: Annotated[int, Field(ge=0)] = 0
+    """Root of every random draw."""
+    pixel_noise: Annotated[float, Field(gt=0)] = PIXEL_NOISE
+    """sigma_e in lambda = (sigma_e / tau)^2, linear RGB; `mgs.policies.regularisation`."""
+    prior_std: dict[str, Annotated[float, Field(gt=0)]] = PRIOR_STD
+    """tau of each kind of parameter."""
+    evaluate_every: Annotated[int, Field(ge=0)] = 0
+    """Measure PSNR on all views after every so many steps; 0 = only at the end. Never feeds back into the choice."""
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def validated(model: type[Model], values: dict[str, Any]) -> Model:
+    """Build settings. Raises InputError with one line for the first value that is wrong."""
+    try:
+        return model(**values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        option = "--" + "-".join(str(part) for part in first["loc"]).replace("_", "-")
+        message = first["msg"].removeprefix("Value error, ")
+        raise InputError(f"{option} {first['input']}: {message}") from None
+
+
+def versions() -> dict[str, str]:
+    """What a result depends on: versions of mgs and of the libraries that compute it."""
+    found = {"mgs": __version__}
+    for package in ("mitsuba", "drjit", "numpy"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "unknown"
+    return found

@@ -1,0 +1,256 @@
+"""The paper's loop: seeds -> fit -> information of the training set -> choose a pose -> capture -> fit -> ... until the budget.
+
+A run lives in one folder:
+
+- `config.json`: settings, versions and the names of all frames; written first;
+- `checkpoint.npz`: the whole state after the last finished step, replaced atomically: this is the commit of a step;
+- `steps.jsonl`: one line a step, rebuilt from the checkpoint, so it can lag behind by a killed step but never disagree;
+- `gaussians.ply`: the model, once the budget is spent.
+
+A line of `steps.jsonl` holds: `step` (0 = the seeds), `frame` and `name` of the chosen view (null at step 0, which has `seeds`
+and `seed_names` instead), `images` (how many the model has now), `gain` (the policy's own score), `information_gain` (Eq. 7 of
+the chosen view, whatever the policy), `coverage` (Eq. 9 after the fit), `iterations`, `loss` and `stop_reason` of the fit,
+`seconds` per stage, and, where the step was evaluated, `psnr` entries.
+
+The candidates' images are never read: only the cameras of frames not taken yet are touched before a choice.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from mgs import policies
+from mgs.config import NbvSettings, validated, versions
+from mgs.conventions import Camera
+from mgs.dataset import Dataset, Frame
+from mgs.errors import InputError
+from mgs.files import atomic_path, read_json, write_json
+from mgs.gaussians import Gaussians, write_ply
+from mgs.seeds import generator
+
+Progress = Callable[[str, int, int], None]
+"""Called as progress(stage, done, total)."""
+
+
+class Fit(Protocol):
+    """What a fit returns: `mgs.train.Fit`."""
+
+    gaussians: Gaussians
+    loss: float
+    iterations: int
+    stop_reason: str
+
+
+@dataclass(frozen=True)
+class Stations:
+    """The stations the loop calls; NumPy in and out, deterministic.
+
+    centre: [3] the rock, metres; groups: columns of the Fisher information by kind of parameter;
+    initial(seed frames) -> Gaussians; fit(gaussians, cameras, targets, on_iteration) -> Fit;
+    fisher(gaussians, camera) -> [N,P]; measure(gaussians, taken frame indices) -> entries for steps.jsonl.
+    """
+
+    centre: np.ndarray
+    groups: dict[str, slice]
+    initial: Callable[[list[Frame]], Gaussians]
+    fit: Callable[[Gaussians, list[Camera], list[np.ndarray], Callable[[int, int], None]], Fit]
+    fisher: Callable[[Gaussians, Camera], np.ndarray]
+    measure: Callable[[Gaussians, list[int]], dict[str, float]]
+
+
+@dataclass
+class State:
+    """What is known after a step: the model, H [N,P] of its training set at that model, frames taken in order, all lines."""
+
+    gaussians: Gaussians
+    H: np.ndarray
+    taken: list[int]
+    steps: list[dict[str, Any]]
+
+
+@dataclass
+class _Stopwatch:
+    """Seconds per stage."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[stage] = round(time.perf_counter() - start, 4)
+
+
+def check_counts(settings: NbvSettings, frames: int) -> None:
+    """Raises InputError where the dataset has too few frames for the seeds and the budget."""
+    if frames < settings.seeds:
+        raise InputError(f"{settings.dataset}: has {frames} frames, fewer than {settings.seeds} seeds; lower --seeds")
+    left = frames - settings.seeds
+    if settings.budget > left:
+        raise InputError(f"{settings.dataset}: --budget {settings.budget} exceeds its {left} candidates; lower --budget")
+
+
+def start(out: Path, settings: NbvSettings, dataset: Dataset) -> None:
+    """Write config.json, the first file of a run. Raises InputError as `check_counts`."""
+    check_counts(settings, len(dataset))
+    config = {
+        "settings": settings.model_dump(mode="json"),
+        "versions": versions(),
+        "frames": [frame.name for frame in dataset.frames],
+    }
+    write_json(out / "config.json", config)
+
+
+def read_settings(out: Path) -> NbvSettings:
+    """Settings of a run folder. Raises InputError where there is no run, or its config.json is damaged."""
+    path = out / "config.json"
+    if not path.is_file():
+        raise InputError(f"{out}: holds no run (no config.json); start one with `mgs nbv DATASET --out {out}`")
+    config = read_json(path)
+    if not isinstance(config, dict) or not isinstance(config.get("settings"), dict):
+        raise InputError(f"{path}: has no settings; the file is damaged, start the run anew")
+    return validated(NbvSettings, config["settings"])
+
+
+def check_same_frames(out: Path, dataset: Dataset) -> None:
+    """Raises InputError where the dataset is no longer the one the run was started on."""
+    if read_json(out / "config.json").get("frames") != [frame.name for frame in dataset.frames]:
+        raise InputError(f"{dataset.root}: its frames differ from those {out} was started on; restore them or start a new run")
+
+
+def run(out: Path, settings: NbvSettings, dataset: Dataset, stations: Stations, progress: Progress) -> State:
+    """Run or resume the loop in `out` (which has its config.json) until the budget is spent; returns the last state.
+
+    Killed at any moment and called again, it takes the same views as a run that was never interrupted.
+    """
+    for leftover in out.glob(".*.part*"):  # of a killed write
+        leftover.unlink()
+    loop = _Loop(settings, dataset, stations, progress)
+    state = read_checkpoint(out)
+    if state is None:
+        state = loop.first()
+        write_checkpoint(out, state)
+    while len(state.steps) <= settings.budget:
+        state = loop.next(state)
+        write_checkpoint(out, state)
+    write_steps(out, state)
+    write_ply(out / "gaussians.ply", state.gaussians)
+    return state
+
+
+class _Loop:
+    """What stays the same from step to step; each method is a function of the state."""
+
+    def __init__(self, settings: NbvSettings, dataset: Dataset, stations: Stations, progress: Progress) -> None:
+        self.settings, self.frames, self.stations, self.progress = settings, dataset.frames, stations, progress
+        self.cameras = [frame.camera for frame in dataset.frames]
+        self.positions = np.array([camera.position for camera in self.cameras])
+        self.lam = policies.regularisation(stations.groups, settings.pixel_noise, settings.prior_std)
+        self.images: dict[int, np.ndarray] = {}
+
+    def first(self) -> State:
+        """Step 0: the seeds."""
+        watch = _Stopwatch()
+        seeds = policies.seed_views(self.positions, self.stations.centre, self.settings.seeds)
+        with watch("initial"):
+            gaussians = self.stations.initial([self.frames[i] for i in seeds])
+        names = [self.frames[i].name for i in seeds]
+        choice = {"frame": None, "name": None, "seeds": seeds, "seed_names": names, "gain": None, "information_gain": None}
+        return self.learn(gaussians, seeds, [], choice, watch)
+
+    def next(self, state: State) -> State:
+        """One step: choose a pose, capture its image, learn."""
+        watch = _Stopwatch()
+        with watch("score"):
+            frame, gain = self.choose(state)
+            F = self.stations.fisher(state.gaussians, self.cameras[frame])
+            information_gain = policies.d_optimal(F, state.H, self.lam)[0]
+        choice = {"frame": frame, "name": self.frames[frame].name, "gain": gain, "information_gain": information_gain}
+        return self.learn(state.gaussians, [*state.taken, frame], state.steps, choice, watch)
+
+    def choose(self, state: State) -> tuple[int, float]:
+        """Frame with the largest score among those not taken, and its gain: poses only, one candidate in memory at a time."""
+        policy = self.settings.policy
+        left = [i for i in range(len(self.frames)) if i not in state.taken]
+        scores: list[policies.Score] = []
+        if policy in policies.CRITERIA:
+            for done, i in enumerate(left):
+                self.progress("scoring candidates", done, len(left))
+                F = self.stations.fisher(state.gaussians, self.cameras[i])
+                scores.append(policies.CRITERIA[policy](F, state.H, self.lam))
+        else:
+            rng = generator(self.settings.seed, f"{policy}/{len(state.steps)}")
+            taken = self.positions[state.taken]
+            values = policies.POSE_POLICIES[policy](self.positions[left], taken, self.stations.centre, rng)
+            scores = [(float(value),) for value in values]
+        best = max(range(len(left)), key=scores.__getitem__)
+        return left[best], scores[best][0]
+
+    def learn(
+        self, gaussians: Gaussians, taken: list[int], steps: list[dict[str, Any]], choice: dict[str, Any], watch: _Stopwatch
+    ) -> State:
+        """Read the new images, fit to convergence on all so far, sum their information at the new model."""
+        step, cameras = len(steps), [self.cameras[i] for i in taken]
+        with watch("capture"):
+            for i in taken:
+                if i not in self.images:
+                    self.images[i] = self.frames[i].masked_rgb()
+        with watch("fit"):
+            targets = [self.images[i] for i in taken]
+            fit = self.stations.fit(gaussians, cameras, targets, lambda done, total: self.progress("fitting", done, total))
+        with watch("information"):
+            H = np.zeros((len(fit.gaussians), len(self.lam)))
+            for done, camera in enumerate(cameras):
+                self.progress("information of the training set", done, len(cameras))
+                H += self.stations.fisher(fit.gaussians, camera)
+        line = {
+            "step": step,
+            **choice,
+            "images": len(taken),
+            "coverage": policies.coverage(H, self.lam),
+            "iterations": int(fit.iterations),
+            "loss": float(fit.loss),
+            "stop_reason": str(fit.stop_reason),
+            "seconds": watch.seconds,
+        }
+        if self.settings.evaluate_every and step % self.settings.evaluate_every == 0:
+            with watch("evaluate"):
+                line |= self.stations.measure(fit.gaussians, taken)
+        return State(fit.gaussians, H, taken, [*steps, line])
+
+
+def write_checkpoint(out: Path, state: State) -> None:
+    """Commit a step: the state in one file, renamed into place; then the readable lines."""
+    text = json.dumps({"taken": state.taken, "steps": state.steps})
+    with atomic_path(out / "checkpoint.npz") as temporary, open(temporary, "wb") as file:
+        np.savez(file, H=state.H, json=np.array(text), **asdict(state.gaussians))
+    write_steps(out, state)
+
+
+def write_steps(out: Path, state: State) -> None:
+    """Write steps.jsonl from the state, atomically."""
+    with atomic_path(out / "steps.jsonl") as temporary:
+        temporary.write_text("".join(json.dumps(line) + "\n" for line in state.steps), encoding="utf-8")
+
+
+def read_checkpoint(out: Path) -> State | None:
+    """State after the last finished step; None before the first. Raises InputError where the file is damaged."""
+    path = out / "checkpoint.npz"
+    if not path.is_file():
+        return None
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as data:
+            record = json.loads(str(data["json"]))
+            gaussians = Gaussians(*(data[name] for name in ("means", "log_scales", "quats", "logit_opacities", "sh")))
+            return State(gaussians, data["H"], record["taken"], record["steps"])
+    except (zipfile.BadZipFile, KeyError, ValueError, OSError, EOFError) as error:
+        raise InputError(f"{path}: not a readable checkpoint ({error}); delete it to start the run from its seeds") from None

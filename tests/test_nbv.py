@@ -1,0 +1,236 @@
+"""The loop alone, on NumPy stand-ins for its stations (tests/tiny.py); the real stations meet in test_end_to_end.py."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+
+from mgs import nbv, policies
+from mgs.dataset import load_dataset
+from mgs.errors import InputError
+from mgs.gaussians import read_ply
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return load_dataset(tiny.write_dataset(tmp_path_factory.mktemp("tiny") / "dataset"))
+
+
+def run(out, dataset, stations=None, **values):
+    settings = tiny.start(out, dataset, **values)
+    return nbv.run(out, settings, dataset, stations or tiny.stations(), tiny.silent)
+
+
+def lines(out: Path) -> list[dict]:
+    return [json.loads(line) for line in (out / "steps.jsonl").read_text().splitlines()]
+
+
+def timeless(steps: list[dict]) -> list[dict]:
+    return [{key: value for key, value in step.items() if key != "seconds"} for step in steps]
+
+
+@pytest.mark.parametrize("policy", policies.POLICIES)
+def test_run_writes_what_it_did(dataset, tmp_path, policy):
+    state = run(tmp_path / "run", dataset, policy=policy)
+    steps = lines(tmp_path / "run")
+    assert [step["step"] for step in steps] == list(range(6))
+    assert steps[0]["seeds"] == state.taken[:3]
+    assert steps[0]["seed_names"] == [dataset.frames[i].name for i in state.taken[:3]]
+    assert [step["frame"] for step in steps[1:]] == state.taken[3:]
+    assert [step["name"] for step in steps[1:]] == [dataset.frames[i].name for i in state.taken[3:]]
+    assert len(set(state.taken)) == len(state.taken)
+    assert [step["images"] for step in steps] == list(range(3, 9))
+    assert all(step["stop_reason"] == "converged" and step["iterations"] == 7 for step in steps)
+    assert {"capture", "fit", "information"} <= set(steps[1]["seconds"])
+    assert "psnr" not in steps[1]
+    config = json.loads((tmp_path / "run/config.json").read_text())
+    assert config["settings"]["policy"] == policy
+    assert {"mgs", "mitsuba", "drjit", "numpy"} == set(config["versions"])
+    np.testing.assert_array_equal(read_ply(tmp_path / "run/gaussians.ply").means, state.gaussians.means)
+
+
+def test_d_optimal_takes_the_best_candidate_at_every_step(dataset, tmp_path):
+    state = run(tmp_path / "run", dataset, budget=1)
+    before = nbv.run(
+        tmp_path / "seeds", tiny.start(tmp_path / "seeds", dataset, budget=0), dataset, tiny.stations(), tiny.silent
+    )
+    lam = policies.regularisation(tiny.GROUPS)
+    H = sum(tiny.fisher(before.gaussians, dataset.frames[i].camera).astype(float) for i in before.taken)
+    np.testing.assert_allclose(before.H, H)
+    left = [i for i in range(len(dataset)) if i not in before.taken]
+    gains = [policies.d_optimal(tiny.fisher(before.gaussians, dataset.frames[i].camera), H, lam)[0] for i in left]
+    assert state.taken[-1] == left[int(np.argmax(gains))]
+    assert state.steps[-1]["gain"] == state.steps[-1]["information_gain"] == max(gains)
+
+
+def test_coverage_in_the_lines_is_of_the_fitted_model(dataset, tmp_path):
+    state = run(tmp_path / "run", dataset, policy="coverage")
+    covered = [step["coverage"] for step in state.steps]
+    assert covered == sorted(covered)
+    assert covered[-1] == policies.coverage(state.H, policies.regularisation(tiny.GROUPS))
+    assert 0 < covered[0] < 1
+
+
+def test_candidate_images_are_never_read_before_they_are_chosen(dataset, tmp_path, monkeypatch):
+    """Every image that is opened is logged; at each choice the opened ones must be exactly those taken."""
+    import mgs.dataset
+
+    opened: set[str] = set()
+    read_png, read_mask, read_exr = mgs.dataset.read_png, mgs.dataset.read_mask, mgs.dataset.read_exr
+    for name, function in {"read_png": read_png, "read_mask": read_mask, "read_exr": read_exr}.items():
+        monkeypatch.setattr(mgs.dataset, name, lambda path, f=function: opened.add(Path(path).stem) or f(path))
+    at_choice = []
+    choose = nbv._Loop.choose
+
+    def watched(self, state):
+        at_choice.append((set(opened), {dataset.frames[i].name for i in state.taken}))
+        return choose(self, state)
+
+    monkeypatch.setattr(nbv._Loop, "choose", watched)
+    state = run(tmp_path / "run", dataset)
+    assert len(at_choice) == 5
+    assert all(seen == taken for seen, taken in at_choice)
+    assert opened == {dataset.frames[i].name for i in state.taken}
+
+
+def test_poisoned_candidates_do_not_change_the_choice(tmp_path):
+    """The files of views that are never chosen may hold anything: same views, same model."""
+    root = tiny.write_dataset(tmp_path / "dataset")
+    dataset = load_dataset(root)
+    clean = run(tmp_path / "clean", dataset)
+    for i, frame in enumerate(dataset.frames):
+        if i not in clean.taken:
+            for path in (frame.image_path, frame.depth_path, frame.mask_path):
+                path.write_bytes(b"poison")
+    poisoned = run(tmp_path / "poisoned", dataset)
+    assert poisoned.taken == clean.taken
+    np.testing.assert_array_equal(poisoned.gaussians.sh, clean.gaussians.sh)
+
+
+def test_one_candidate_in_memory_at_a_time(dataset, tmp_path):
+    """Streaming: when the next candidate's information is asked for, the previous one has been let go."""
+    import weakref
+
+    alive: list[weakref.ref] = []
+
+    def fisher(gaussians, camera):
+        assert sum(ref() is not None for ref in alive) <= 1
+        F = tiny.fisher(gaussians, camera)
+        alive.append(weakref.ref(F))
+        return F
+
+    run(tmp_path / "run", dataset, tiny.stations(fisher=fisher))
+    assert len(alive) > 50
+
+
+def test_random_depends_on_the_seed_only(dataset, tmp_path):
+    taken = [run(tmp_path / str(i), dataset, policy="random", seed=seed).taken for i, seed in enumerate((1, 1, 2))]
+    assert taken[0] == taken[1]
+    assert taken[0] != taken[2]
+
+
+def test_evaluation_is_logged_and_changes_nothing(dataset, tmp_path):
+    plain = run(tmp_path / "plain", dataset)
+    measured = run(tmp_path / "measured", dataset, evaluate_every=2)
+    assert ["psnr" in step for step in measured.steps] == [True, False, True, False, True, False]
+    assert measured.taken == plain.taken
+
+
+MOMENTS = [
+    ("initial", 1),
+    ("fit", 1),
+    ("fit", 4),
+    ("fisher", 2),
+    ("fisher", 40),
+    ("before the lines are written", 1),
+    ("before the lines are written", 3),
+    ("while the checkpoint is written", 1),
+    ("while the checkpoint is written", 3),
+]
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(dataset, tmp_path_factory):
+    out = tmp_path_factory.mktemp("whole") / "run"
+    return run(out, dataset, seed=3), (out / "gaussians.ply").read_bytes(), lines(out)
+
+
+@pytest.mark.parametrize(("moment", "count"), MOMENTS)
+def test_killed_at_any_moment_then_resumed_takes_the_same_views(dataset, tmp_path, uninterrupted, moment, count):
+    whole, ply, steps = uninterrupted
+    out = tmp_path / "run"
+    command = [sys.executable, tiny.__file__, str(dataset.root), str(out), "d-optimal", moment, str(count)]
+    process = subprocess.run(command, capture_output=True, text=True)
+    assert process.returncode == -signal.SIGKILL, process.stderr
+    half = nbv.read_checkpoint(out)
+    if half is not None and (out / "steps.jsonl").exists():
+        # The lines may lag behind the checkpoint, never run ahead of it or differ.
+        written = lines(out)
+        assert written == half.steps[: len(written)]
+        assert len(half.steps) - len(written) <= 1
+    resumed = nbv.run(out, nbv.read_settings(out), dataset, tiny.stations(), tiny.silent)
+    assert resumed.taken == whole.taken
+    assert timeless(lines(out)) == timeless(steps)
+    assert (out / "gaussians.ply").read_bytes() == ply
+    assert not list(out.glob(".*"))
+
+
+def test_interrupted_by_the_keyboard_then_resumed(dataset, tmp_path, uninterrupted):
+    calls = []
+
+    def fit(*arguments):
+        calls.append(1)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return tiny.fit(*arguments)
+
+    out = tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        run(out, dataset, tiny.stations(fit=fit), seed=3)
+    assert len(lines(out)) == 3
+    assert nbv.run(out, nbv.read_settings(out), dataset, tiny.stations(), tiny.silent).taken == uninterrupted[0].taken
+
+
+def test_resuming_a_finished_run_changes_nothing(dataset, tmp_path):
+    state = run(tmp_path / "run", dataset)
+    before = (tmp_path / "run/steps.jsonl").read_bytes()
+
+    def never(*arguments):
+        raise AssertionError("nothing is left to do")
+
+    again = nbv.run(
+        tmp_path / "run", nbv.read_settings(tmp_path / "run"), dataset, tiny.stations(fit=never, fisher=never), tiny.silent
+    )
+    assert again.taken == state.taken
+    assert (tmp_path / "run/steps.jsonl").read_bytes() == before
+
+
+def test_damaged_or_missing_runs_are_told_apart(dataset, tmp_path):
+    with pytest.raises(InputError, match=r"holds no run"):
+        nbv.read_settings(tmp_path)
+    out = tmp_path / "run"
+    run(out, dataset, budget=0)
+    nbv.check_same_frames(out, dataset)
+    other = load_dataset(tiny.write_dataset(tmp_path / "other", frames=5))
+    with pytest.raises(InputError, match="frames differ"):
+        nbv.check_same_frames(out, other)
+    (out / "checkpoint.npz").write_bytes((out / "checkpoint.npz").read_bytes()[:100])
+    with pytest.raises(InputError, match="not a readable checkpoint"):
+        nbv.read_checkpoint(out)
+    (out / "config.json").write_text("{}")
+    with pytest.raises(InputError, match="no settings"):
+        nbv.read_settings(out)
+
+
+@pytest.mark.parametrize(("values", "message"), [({"seeds": 13}, "fewer than 13 seeds"), ({"budget": 10}, "9 candidates")])
+def test_counts_are_checked_before_anything_is_written(dataset, tmp_path, values, message):
+    with pytest.raises(InputError, match=message):
+        tiny.start(tmp_path / "run", dataset, **values)
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,163 @@
+"""A rock of a few pixels: a dataset on disk and NumPy stand-ins for the stations of the loop, so the loop is tested alone.
+
+As a program, `python tiny.py DATASET OUT POLICY MOMENT COUNT` starts a run and kills itself (SIGKILL) at the COUNT-th MOMENT.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mgs import nbv
+from mgs.config import NbvSettings
+from mgs.conventions import Camera, look_at, quat_from_normals
+from mgs.dataset import Dataset, Frame, load_dataset, write_transforms
+from mgs.files import write_exr, write_png
+from mgs.gaussians import Gaussians, sh_from_rgb
+
+FRAMES, POINTS, WIDTH, HEIGHT = 12, 40, 16, 12
+GROUPS = {"colour": slice(0, 3), "scale": slice(3, 6), "rotation": slice(6, 10), "opacity": slice(10, 11)}
+
+
+def orbit(frames: int = FRAMES) -> list[Camera]:
+    """Cameras on a circle of 3 m at 1.5 m around a unit sphere at the origin."""
+    K = np.array([[16.0, 0, WIDTH / 2], [0, 16.0, HEIGHT / 2], [0, 0, 1]])
+    angles = 2 * np.pi * np.arange(frames) / frames
+    eyes = [(3 * np.cos(a), 3 * np.sin(a), 1.5) for a in angles]
+    return [Camera(K, WIDTH, HEIGHT, look_at(eye, (0, 0, 0))) for eye in eyes]
+
+
+def write_dataset(root: Path, frames: int = FRAMES) -> Path:
+    """A bumpy-coloured sphere on black, with exact depth and masks."""
+    records = []
+    for i, camera in enumerate(orbit(frames)):
+        v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+        rays = np.stack([(u - camera.K[0, 2]) / camera.K[0, 0], (v - camera.K[1, 2]) / camera.K[1, 1], np.ones_like(u)], -1)
+        directions = rays @ camera.camera_to_world[:3, :3].T
+        a, b = (directions**2).sum(-1), directions @ camera.position
+        root_term = b**2 - a * (camera.position @ camera.position - 1)
+        mask = root_term > 0
+        depth = np.where(mask, (-b - np.sqrt(np.maximum(root_term, 0))) / a, 0)
+        points = camera.unproject(depth)
+        rgb = np.where(mask[..., None], 0.4 + 0.3 * np.sin(5 * points + [0, 1, 2]), 0).astype(np.float32)
+        name = f"kf_{i:04d}"
+        paths = root / f"images/{name}.png", root / f"depth/{name}.exr", root / f"masks/{name}.png"
+        frame = Frame(name, camera, 0.5 * i, *paths)
+        write_png(frame.image_path, rgb)
+        write_exr(frame.depth_path, {"Z": depth.astype(np.float32)})
+        write_png(frame.mask_path, mask)
+        records.append(frame)
+    write_transforms(root, records)
+    return root
+
+
+@dataclass
+class Fit:
+    gaussians: Gaussians
+    loss: float
+    iterations: int
+    stop_reason: str
+
+
+def _normals() -> np.ndarray:
+    """Points of a Fibonacci sphere."""
+    z = 1 - (2 * np.arange(POINTS) + 1) / POINTS
+    angle = np.pi * (1 + 5**0.5) * np.arange(POINTS)
+    radius = np.sqrt(1 - z**2)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
+
+
+def initial(seed_frames: list[Frame]) -> Gaussians:
+    """Grey discs on the sphere."""
+    n = _normals()
+    quats = quat_from_normals(n).astype(np.float32)
+    scales = np.full((POINTS, 3), -1.5, np.float32)
+    return Gaussians(n.astype(np.float32), scales, quats, np.zeros(POINTS, np.float32), sh_from_rgb(np.full((POINTS, 3), 0.5)))
+
+
+def _facing(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """How squarely each point of the sphere faces the camera, 0 where it is turned away."""
+    to_camera = camera.position - gaussians.means
+    return np.maximum((gaussians.means * to_camera).sum(1) / np.linalg.norm(to_camera, axis=1) - 0.2, 0)
+
+
+def fisher(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """Facing points are informative, brighter ones more so: the choice depends on the fitted model, as the real one does."""
+    brightness = gaussians.rgb.mean(1)
+    return (_facing(gaussians, camera) ** 2 * brightness)[:, None].astype(np.float32) * np.linspace(1, 2, 11, dtype=np.float32)
+
+
+def fit(gaussians: Gaussians, cameras: list[Camera], targets: list[np.ndarray], on_iteration) -> Fit:
+    """Each point's colour moves half way to the mean of its pixels."""
+    on_iteration(0, 1)
+    total, weight = np.zeros((POINTS, 3)), np.full(POINTS, 1e-6)
+    for camera, target in zip(cameras, targets, strict=True):
+        pixels, _ = camera.project(gaussians.means)
+        u, v = np.clip(pixels.astype(int), 0, [WIDTH - 1, HEIGHT - 1]).T
+        facing = _facing(gaussians, camera)
+        total += facing[:, None] * target[v, u]
+        weight += facing
+    rgb = 0.5 * gaussians.rgb + 0.5 * total / weight[:, None]
+    g = gaussians
+    fitted = Gaussians(g.means, g.log_scales, g.quats, g.logit_opacities, sh_from_rgb(rgb))
+    return Fit(fitted, float(np.abs(rgb - g.rgb).mean()), 7, "converged")
+
+
+def stations(**replaced) -> nbv.Stations:
+    """Stand-ins for every station; any of them replaced."""
+    parts = {"initial": initial, "fit": fit, "fisher": fisher, "measure": lambda gaussians, taken: {"psnr": float(len(taken))}}
+    return nbv.Stations(centre=np.zeros(3), groups=GROUPS, **(parts | replaced))
+
+
+def start(out: Path, dataset: Dataset, **values) -> NbvSettings:
+    """Begin a run folder with these settings over small defaults."""
+    settings = NbvSettings(**({"dataset": dataset.root, "prior": dataset.root, "budget": 5, "seeds": 3} | values))
+    nbv.start(out, settings, dataset)
+    return settings
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """No progress bar."""
+
+
+def die_at(moment: str, count: int) -> nbv.Stations:
+    """Stations of which one kills this process, as the system would, when it is called for the count-th time."""
+    calls = {"n": 0}
+
+    def dying(function):
+        def call(*arguments, **keywords):
+            calls["n"] += 1
+            if calls["n"] == count:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return function(*arguments, **keywords)
+
+        return call
+
+    if moment in ("fit", "fisher", "initial"):
+        return stations(**{moment: dying(globals()[moment])})
+    if moment == "before the lines are written":
+        nbv.write_steps = dying(nbv.write_steps)
+    if moment == "while the checkpoint is written":
+        savez = np.savez
+
+        def half_then_die(file, **arrays):
+            calls["n"] += 1
+            if calls["n"] == count:
+                file.write(b"half")
+                file.flush()
+                os.kill(os.getpid(), signal.SIGKILL)
+            savez(file, **arrays)
+
+        np.savez = half_then_die
+    return stations()
+
+
+if __name__ == "__main__":
+    loaded, folder = load_dataset(sys.argv[1]), Path(sys.argv[2])
+    chosen = nbv.read_settings(folder) if folder.exists() else start(folder, loaded, policy=sys.argv[3], seed=3)
+    nbv.run(folder, chosen, loaded, die_at(sys.argv[4], int(sys.argv[5])), silent)
