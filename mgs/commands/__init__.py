@@ -5,7 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from mgs.commands.doctor import doctor
+from mgs.commands.prior import prior
+from mgs.commands.synth_orbit import synth_orbit
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "doctor": doctor,
+    "synth-orbit": synth_orbit,
+    "prior": prior,
 }

@@ -1,0 +1,204 @@
+"""RGB-D frames -> one world cloud -> ground plane (RANSAC) -> the rock's points (DBSCAN)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.spatial import cKDTree
+
+from mgs.dataset import Frame
+from mgs.errors import InputError
+
+MAX_PIXELS = 6_000_000
+"""Pixels that enter the cloud; more are thinned by a stride (100 frames at 640x480 still see each voxel ten times)."""
+EDGE_JUMP = 0.05
+"""A pixel whose 3x3 neighbourhood spans more than this share of its depth is a silhouette or a grazing view: its depth mixes
+surfaces, so it is left out."""
+FAR_LIMIT = 3.0
+"""Points farther than this many median depths are far ground that no station needs."""
+PLANE_TOLERANCE = 0.02
+"""RANSAC inlier distance as a share of the median camera distance: larger than the grain of a floor, smaller than a rock."""
+PLANE_MIN_SHARE = 0.2
+"""With fewer inliers than this share of the cloud, there is no dominant plane."""
+CLUSTER_POINTS = 20_000
+"""DBSCAN runs on a cloud thinned to at most this many points; its labels are then passed to the full cloud."""
+CLUSTER_NEIGHBOURS = 8
+"""DBSCAN min_samples, and the neighbour whose median distance sets eps."""
+EQUAL_SIZE = 0.8
+"""Clusters of at least this share of the largest's points count as equally large; then nearness to the focus decides."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """A fused cloud: points [N,3] world, metres; views [N,3] unit, mean direction from each point to the cameras that saw it;
+    voxel: edge of the fusion grid, metres, so also the distance of neighbouring points; pixels: how many depths were fused."""
+
+    points: np.ndarray
+    views: np.ndarray
+    voxel: float
+    pixels: int
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Points x with normal . x = offset; normal [3] unit, towards the cameras. sigma: robust spread of the inliers, metres;
+    tolerance: points nearer than this to the plane, or below it, belong to the ground."""
+
+    normal: np.ndarray
+    offset: float
+    sigma: float
+    tolerance: float
+
+    def height(self, points: np.ndarray) -> np.ndarray:
+        """Signed distance [N] of points [N,3] above the plane, metres."""
+        return points @ self.normal - self.offset
+
+
+def focus(frames: Sequence[Frame]) -> np.ndarray:
+    """[3] the world point nearest to all optical axes (least squares): what the cameras look at."""
+    A, b = np.zeros((3, 3)), np.zeros(3)
+    for frame in frames:
+        axis = frame.camera.world_to_camera[2, :3]
+        across = np.eye(3) - np.outer(axis, axis)
+        A, b = A + across, b + across @ frame.camera.position
+    return np.linalg.lstsq(A, b, rcond=1e-9)[0]
+
+
+def usable_depth(depth: np.ndarray) -> np.ndarray:
+    """Depth [H,W] with silhouettes and grazing pixels set to 0 (see EDGE_JUMP)."""
+    jump = maximum_filter(depth, 3) - minimum_filter(depth, 3)
+    return np.where(jump <= EDGE_JUMP * depth, depth, 0.0)
+
+
+def fuse_frames(frames: Sequence[Frame], depths: Sequence[np.ndarray] | None = None) -> Cloud:
+    """Fuse RGB-D frames into one world cloud, averaged on a grid of one pixel footprint.
+
+    depths: [H,W] z-depth each, metres, in place of the frames' own (a noisy sensor, say).
+    Raises InputError where frames have no depth, or no pixel has a return.
+    """
+    depths = [frame.depth() for frame in frames] if depths is None else depths
+    returns = [depth[depth > 0] for depth in depths]
+    total = sum(map(len, returns))
+    if total == 0:
+        raise InputError("cloud: no depth image has a return (all pixels are 0); check the depth files or their unit (metres)")
+    stride = max(1, int(np.ceil(np.sqrt(total / MAX_PIXELS))))
+    # The lower quartile of depth: the rock stands in front of the ground that fills most of a frame.
+    near = [np.quantile(z, 0.25) / frame.camera.K[0, 0] for frame, z in zip(frames, returns, strict=True) if len(z)]
+    voxel = float(np.median(near))
+    limit = FAR_LIMIT * float(np.median([np.median(z) for z in returns if len(z)]))
+    points, views = [], []
+    for frame, depth in zip(frames, depths, strict=True):
+        z = usable_depth(depth)
+        keep = np.zeros(z.shape, bool)
+        keep[::stride, ::stride] = True
+        keep &= (z > 0) & (z < limit)
+        p = frame.camera.unproject(z)[keep]
+        view = frame.camera.position - p
+        points.append(p)
+        views.append(view / np.linalg.norm(view, axis=1, keepdims=True))
+    p, index = _voxel_means(np.concatenate(points), voxel)
+    if len(p) == 0:
+        raise InputError("cloud: every depth pixel is a silhouette or a grazing view; check the depth files")
+    view = _group_means(np.concatenate(views), index, len(p))
+    norm = np.linalg.norm(view, axis=1, keepdims=True)
+    return Cloud(p, view / np.where(norm > 0, norm, 1.0), voxel, len(index))
+
+
+def _group_means(values: np.ndarray, index: np.ndarray, groups: int) -> np.ndarray:
+    """Mean of values [N,3] by group index [N] -> [groups,3]."""
+    count = np.bincount(index, minlength=groups)
+    return np.stack([np.bincount(index, values[:, k], groups) for k in range(3)], 1) / count[:, None]
+
+
+def _voxel_means(points: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
+    """Mean point of each occupied voxel [M,3], and the voxel of each point [N]."""
+    if len(points) == 0:
+        return points, np.zeros(0, int)
+    cells = np.floor((points - points.min(0)) / voxel).astype(np.int64)
+    size = cells.max(0) + 1
+    key = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+    unique, index = np.unique(key, return_inverse=True)
+    return _group_means(points, index, len(unique)), index
+
+
+class _PlaneModel:
+    """Least-squares plane in the interface of skimage.measure.ransac."""
+
+    def __init__(self, normal: np.ndarray, offset: float) -> None:
+        self.normal, self.offset = normal, offset
+
+    @classmethod
+    def from_estimate(cls, points: np.ndarray) -> _PlaneModel:
+        centre = points.mean(0)
+        normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
+        return cls(normal, float(normal @ centre))
+
+    def residuals(self, points: np.ndarray) -> np.ndarray:
+        return points @ self.normal - self.offset
+
+
+def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
+    """The dominant plane by RANSAC (Fischler and Bolles 1981, scikit-image) on 10,000 points, refined on all its inliers.
+
+    Raises InputError where no plane holds a fifth of the cloud.
+    """
+    from skimage.measure import ransac
+
+    cameras = np.stack([frame.camera.position for frame in frames])
+    distance = float(np.median(np.linalg.norm(cameras - np.median(cloud.points, 0), axis=1)))
+    tolerance = PLANE_TOLERANCE * distance
+    rng = np.random.default_rng(seed)
+    sample = cloud.points if len(cloud.points) <= 10_000 else rng.choice(cloud.points, 10_000, replace=False)
+    if len(sample) < 3:
+        raise InputError(f"cloud: only {len(sample)} points; too few for a plane, give more depth frames")
+    model, inliers = ransac(sample, _PlaneModel, 3, tolerance, max_trials=300, rng=rng)
+    share = 0.0 if inliers is None else float(np.mean(inliers))
+    if share < PLANE_MIN_SHARE:
+        raise InputError(f"cloud: no ground plane (the best holds {share:.0%} of the points); the prior needs visible ground")
+    for _ in range(3):
+        residual = model.residuals(cloud.points)
+        core = np.abs(residual) < tolerance
+        sigma = 1.4826 * float(np.median(np.abs(residual[core] - np.median(residual[core]))))
+        tolerance = min(tolerance, max(3 * sigma, 2 * cloud.voxel))
+        model = _PlaneModel.from_estimate(cloud.points[core & (np.abs(residual) < tolerance)])
+    sign = 1.0 if np.median(cameras @ model.normal) > model.offset else -1.0
+    return Plane(sign * model.normal, sign * model.offset, sigma, tolerance)
+
+
+def rock_cluster(points: np.ndarray, voxel: float, target: np.ndarray, root: str = "cloud") -> tuple[np.ndarray, float, int]:
+    """The rock among the points above ground [N,3] (metres), by DBSCAN (Ester et al. 1996, scikit-learn).
+
+    eps is twice the median distance to the 8th neighbour. The cluster with the most points is the rock; among clusters of
+    nearly that size, the one nearest to `target` [3], the point the cameras look at.
+    Returns (inside [N] bool, eps in metres, number of clusters).
+    Raises InputError where there is no cluster, or where two clusters are equally large and equally near.
+    """
+    from sklearn.cluster import DBSCAN
+
+    thin, cell = points, voxel
+    while len(thin) > CLUSTER_POINTS:
+        cell *= 1.25
+        thin = _voxel_means(points, cell)[0]
+    if len(thin) <= CLUSTER_NEIGHBOURS:
+        raise InputError(f"{root}: no rock in the cloud ({len(points)} points stand above the ground plane); aim the cameras at one")
+    eps = 2 * float(np.median(cKDTree(thin).query(thin, CLUSTER_NEIGHBOURS + 1)[0][:, -1]))
+    labels = DBSCAN(eps=eps, min_samples=CLUSTER_NEIGHBOURS).fit_predict(thin)
+    count = int(labels.max()) + 1
+    if count == 0:
+        raise InputError(f"{root}: no rock in the cloud (only scattered points above the ground plane); aim the cameras at one")
+    sizes = np.bincount(labels[labels >= 0])
+    large = np.flatnonzero(sizes >= EQUAL_SIZE * sizes.max())
+    away = np.array([np.linalg.norm(thin[labels == k].mean(0) - target) for k in large])
+    order = np.argsort(away, kind="stable")
+    if len(large) > 1 and away[order[1]] < 1.25 * away[order[0]]:
+        raise InputError(
+            f"{root}: two clusters of {sizes[large[order[0]]]} and {sizes[large[order[1]]]} points are equally large and equally "
+            "near to where the cameras look; aim the cameras at one rock"
+        )
+    rock = int(large[order[0]])
+    distance, nearest = cKDTree(thin).query(points, distance_upper_bound=eps)
+    inside = np.isfinite(distance) & (np.append(labels, -1)[nearest] == rock)
+    return inside, eps, count

@@ -1,0 +1,70 @@
+"""The prior and the seed frames -> initial Gaussians (paper, section III-A)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from mgs.conventions import quat_from_normals
+from mgs.dataset import Frame
+from mgs.gaussians import Gaussians, sh_from_rgb
+from mgs.visibility import depth_of_points, visible
+
+if TYPE_CHECKING:
+    from mgs.prior import Prior
+
+IN_PLANE_SCALE = 0.75
+"""Standard deviation along the surface over the spacing, and
+INITIAL_OPACITY: with Gaussians of standard deviation s, opacity o and one per spacing^2, light crosses one layer face on with a
+mean log-transmittance of -2 pi (s / spacing)^2 Li2(o) (the integral of ln(1 - o exp(-r^2 / 2 s^2)) over the plane). 0.75 and
+0.9 give -4.6: one per cent shines through, so the far side of the rock is hidden from the first render, and the derivative of
+opacity by its logit, o (1 - o) = 0.09, does not vanish as it would for 0.99."""
+INITIAL_OPACITY = 0.9
+THICKNESS = 0.1
+"""Standard deviation along the normal over the spacing: flat on the surface, yet thick enough to stay well conditioned."""
+GREY = 0.5
+"""Linear RGB of a Gaussian that no seed frame sees: zero spherical harmonics."""
+
+
+def initial_gaussians(prior: Prior, seed_frames: Sequence[Frame]) -> tuple[Gaussians, np.ndarray]:
+    """One flat Gaussian per sample of the prior; colours averaged over the seed frames that see it, grey where none does.
+
+    A frame sees a point that is inside its rock mask, faces it, and agrees with its depth image (or, where it has none, with
+    a z-buffer of the samples) within the tolerance of `depth_tolerance`.
+    Returns (Gaussians of SH degree 0, seen [N] bool). Raises InputError where a seed frame cannot be read.
+    """
+    n = len(prior.points)
+    total, count = np.zeros((n, 3)), np.zeros(n)
+    for frame in seed_frames:
+        seen = frame_sees(prior, frame)
+        pixels, _ = frame.camera.project(prior.points[seen])
+        at = [pixels[:, 1] - 0.5, pixels[:, 0] - 0.5]
+        rgb = frame.rgb()
+        total[seen] += np.stack([map_coordinates(rgb[..., k], at, order=1, mode="nearest") for k in range(3)], 1)
+        count[seen] += 1
+    seen = count > 0
+    rgb = np.where(seen[:, None], total / np.maximum(count, 1)[:, None], GREY)
+    scales = np.log(prior.spacing * np.array([IN_PLANE_SCALE, IN_PLANE_SCALE, THICKNESS]))
+    gaussians = Gaussians(
+        means=prior.points.astype(np.float32),
+        log_scales=np.tile(scales, (n, 1)).astype(np.float32),
+        quats=quat_from_normals(prior.normals).astype(np.float32),
+        logit_opacities=np.full(n, np.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)), np.float32),
+        sh=sh_from_rgb(rgb),
+    )
+    return gaussians, seen
+
+
+def frame_sees(prior: Prior, frame: Frame) -> np.ndarray:
+    """[N] bool: the samples of the prior that the frame sees (see `initial_gaussians`)."""
+    camera = frame.camera
+    has_depth = frame.depth_path is not None
+    depth = frame.depth() if has_depth else depth_of_points(prior.points, camera, prior.spacing)
+    seen = visible(prior.points, prior.normals, camera, depth, prior.depth_tolerance)
+    pixels, _ = camera.project(prior.points)
+    column = np.clip(np.floor(pixels[:, 0]), 0, camera.width - 1).astype(int)
+    row = np.clip(np.floor(pixels[:, 1]), 0, camera.height - 1).astype(int)
+    return seen & frame.mask()[row, column]

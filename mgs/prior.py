@@ -1,0 +1,192 @@
+"""The mesh prior: survey cloud -> plane removal -> rock cluster -> Poisson mesh -> surface samples (paper, section III-A)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyData, PlyElement, PlyParseError
+from scipy.spatial import cKDTree
+
+from mgs.cloud import Cloud, Plane, focus, fuse_frames, ground_plane, rock_cluster
+from mgs.dataset import Dataset, Frame
+from mgs.errors import InputError
+from mgs.files import atomic_path, new_folder, read_json, write_json
+from mgs.initial import initial_gaussians as initial_gaussians
+from mgs.seeds import derive_seed
+from mgs.surface import Mesh, distances_to_mesh, estimate_normals, poisson_mesh, sample_surface
+from mgs.visibility import visible
+
+TRUTH_SAMPLES = 50_000
+"""Samples of the true rock that its errors are measured on."""
+
+
+@dataclass(frozen=True)
+class PriorSettings:
+    """gaussians: exactly N samples, or spacing: metres between them (both None: one per voxel of the cloud, a pixel's
+    footprint on the rock); poisson_depth: octree depth, None = cells of 1.5 voxels; seed: root seed."""
+
+    gaussians: int | None = None
+    spacing: float | None = None
+    poisson_depth: int | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Prior:
+    """points [N,3] world, metres; normals [N,3] unit; spacing: sqrt(area / N), metres; depth_tolerance: metres a depth may
+    differ from the prior and still be the same surface; numbers: what prior.json holds."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    spacing: float
+    depth_tolerance: float
+    numbers: dict
+
+
+@dataclass(frozen=True)
+class Stages:
+    """What the figure shows: the cloud, its ground plane, the rock's points, the mesh."""
+
+    cloud: Cloud
+    plane: Plane
+    ground: np.ndarray
+    cluster: np.ndarray
+    mesh: Mesh
+
+
+def build_prior(
+    dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None] | None = None
+) -> tuple[Prior, Stages]:
+    """Build the prior of a dataset of RGB-D frames. on_stage is told the name of each stage as it starts.
+
+    Raises InputError: no depth, no ground plane, no rock (empty cluster), two equal rocks, no closed surface, N below 2.
+    """
+    if settings.gaussians is not None and settings.gaussians < 2:
+        raise InputError(f"prior: {settings.gaussians} Gaussians are too few for a model; ask for more with --gaussians")
+    if settings.gaussians is not None and settings.spacing is not None:
+        raise InputError("prior: --gaussians and --spacing fix the same number; give one of them")
+    tell = on_stage or (lambda stage: None)
+    tell("cloud")
+    cloud = fuse_frames(dataset.frames)
+    tell("ground plane")
+    plane = ground_plane(cloud, dataset.frames, derive_seed(settings.seed, "prior/plane"))
+    height = plane.height(cloud.points)
+    above = height > plane.tolerance
+    tell("rock cluster")
+    inside, eps, clusters = rock_cluster(cloud.points[above], cloud.voxel, focus(dataset.frames), str(dataset.root))
+    cluster = cloud.points[above][inside]
+    tell("Poisson mesh")
+    normals = estimate_normals(cluster, cloud.views[above][inside])
+    mesh, depth = poisson_mesh(cluster, normals, cloud.voxel, plane, settings.poisson_depth)
+    tell("surface samples")
+    spacing = settings.spacing or (None if settings.gaussians else cloud.voxel)
+    seed = derive_seed(settings.seed, "prior/samples")
+    points, normals, spacing = sample_surface(mesh, seed, count=settings.gaussians, spacing=spacing)
+    residual = float(np.sqrt(np.mean(distances_to_mesh(cluster, mesh.vertices, mesh.faces) ** 2)))
+    nearest = cKDTree(points).query(points, 2)[0][:, 1]
+    numbers = {
+        "frames": len(dataset.frames),
+        "pixels": cloud.pixels,
+        "points": len(cloud.points),
+        "voxel": cloud.voxel,
+        "plane_inliers": int((np.abs(height) <= plane.tolerance).sum()),
+        "plane_sigma": plane.sigma,
+        "plane_tolerance": plane.tolerance,
+        "eps": eps,
+        "clusters": clusters,
+        "cluster_size": len(cluster),
+        "poisson_depth": depth,
+        "mesh_faces": len(mesh.faces),
+        "mesh_area": float(mesh.areas.sum()),
+        "base_area": float(mesh.areas[mesh.base].sum()),
+        "fit_rms": residual,
+        "depth_tolerance": max(3 * residual, cloud.voxel),
+        "n": len(points),
+        "spacing": spacing,
+        "nearest_neighbour_mean": float(nearest.mean()),
+        "nearest_neighbour_min": float(nearest.min()),
+        "settings": asdict(settings),
+    }
+    truth = dataset.root / "rock.glb"
+    if truth.is_file():
+        tell("distance to the true rock")
+        numbers["truth"] = error_to_truth(points, spacing, mesh, truth, dataset.frames, plane, settings.seed)
+    prior = Prior(points, normals, spacing, numbers["depth_tolerance"], numbers)
+    return prior, Stages(cloud, plane, np.abs(height) <= plane.tolerance, cluster, mesh)
+
+
+def error_to_truth(
+    points: np.ndarray, spacing: float, mesh: Mesh, truth: Path, frames: tuple[Frame, ...], plane: Plane, seed: int
+) -> dict[str, float]:
+    """How far the prior is from the true rock, metres (Knapitsch et al. 2017 name accuracy and completeness).
+
+    accuracy: mean distance of the prior's samples to the true surface; completeness: mean distance of the true surface that
+    some frame sees to the prior's mesh; chamfer: their mean; hausdorff: the largest distance either way;
+    visible_within_2_spacing: share of that visible surface within two spacings of the mesh; visible_share: share of the true
+    surface above the ground that some frame sees.
+    """
+    import trimesh
+
+    rock = trimesh.load(truth, force="mesh")
+    if len(rock.faces) == 0 or not np.isfinite(rock.vertices).all():
+        raise InputError(f"{truth}: the true rock has no faces, or NaN vertices; restore it or delete it")
+    surface, face = trimesh.sample.sample_surface(rock, TRUTH_SAMPLES, seed=derive_seed(seed, "prior/truth"))
+    surface, normals = np.asarray(surface), rock.face_normals[face]
+    exposed = plane.height(surface) > 0
+    surface, normals = surface[exposed], normals[exposed]
+    seen = np.zeros(len(surface), bool)
+    for frame in frames:
+        footprint = 2 * float(np.linalg.norm(frame.camera.position - surface.mean(0))) / frame.camera.K[0, 0]
+        seen |= visible(surface, normals, frame.camera, frame.depth(), footprint)
+    if not seen.any():
+        raise InputError(f"{truth}: no frame sees the true rock; it does not belong to this dataset (or is in another frame)")
+    there = distances_to_mesh(points, rock.vertices, rock.faces)
+    back = distances_to_mesh(surface[seen], mesh.vertices, mesh.faces)
+    return {
+        "accuracy": float(there.mean()),
+        "completeness": float(back.mean()),
+        "chamfer": float((there.mean() + back.mean()) / 2),
+        "hausdorff": float(max(there.max(), back.max())),
+        "visible_within_2_spacing": float((back < 2 * spacing).mean()),
+        "visible_share": float(seen.mean()),
+    }
+
+
+def save_prior(out: str | Path, prior: Prior, mesh: Mesh) -> Path:
+    """Write mesh.ply, points.ply (x y z nx ny nz) and prior.json into a new folder. Raises InputError if it is not empty."""
+    import trimesh
+
+    out = new_folder(out)
+    with atomic_path(out / "mesh.ply") as temporary:
+        trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(temporary)
+    columns = np.concatenate([prior.points, prior.normals], 1).astype(np.float32)
+    vertices = np.empty(len(columns), dtype=[(name, "f4") for name in ("x", "y", "z", "nx", "ny", "nz")])
+    for k, name in enumerate(vertices.dtype.names or ()):
+        vertices[name] = columns[:, k]
+    with atomic_path(out / "points.ply") as temporary:
+        PlyData([PlyElement.describe(vertices, "vertex")]).write(str(temporary))
+    write_json(out / "prior.json", prior.numbers)
+    return out
+
+
+def load_prior(folder: str | Path) -> Prior:
+    """Read a folder that `save_prior` wrote. Raises InputError where a file is missing, damaged or holds NaN."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such prior; make one with `mgs prior DATASET --out {folder}`")
+    numbers = read_json(folder / "prior.json")
+    path = folder / "points.ply"
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; make the prior again with `mgs prior`")
+    try:
+        data = PlyData.read(str(path))["vertex"].data
+        columns = np.stack([np.asarray(data[name], np.float64) for name in ("x", "y", "z", "nx", "ny", "nz")], 1)
+        spacing, tolerance = float(numbers["spacing"]), float(numbers["depth_tolerance"])
+    except (PlyParseError, KeyError, ValueError, TypeError, UnicodeDecodeError) as error:
+        raise InputError(f"{folder}: not a readable prior ({error}); make it again with `mgs prior`") from None
+    if not np.isfinite(columns).all() or len(columns) < 2:
+        raise InputError(f"{path}: has NaN values, or fewer than two points; make the prior again with `mgs prior`")
+    return Prior(columns[:, :3], columns[:, 3:], spacing, tolerance, numbers)

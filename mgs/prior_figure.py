@@ -1,0 +1,89 @@
+"""One picture of the prior: cloud, ground plane, rock cluster, mesh, samples, all seen from the same side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from mgs.files import atomic_path
+from mgs.prior import Prior, Stages
+
+MAX_DOTS = 60_000
+"""Points drawn per panel; more do not show."""
+LIGHT = np.array([-0.5, 0.4, 0.77])
+"""Direction to the light in the picture's frame (right, up, towards the viewer)."""
+
+
+def draw_prior(path: str | Path, prior: Prior, stages: Stages) -> None:
+    """Write the figure as a PNG, atomically."""
+    from matplotlib.figure import Figure
+
+    up = stages.plane.normal
+    frame = _oblique(up)
+    centre = (stages.cluster.min(0) + stages.cluster.max(0)) / 2
+    reach = 0.62 * float(np.linalg.norm(np.ptp(stages.cluster, axis=0)))
+    cloud, height = stages.cloud.points, stages.plane.height(stages.cloud.points)
+    near = np.linalg.norm(cloud - centre, axis=1) < 3 * reach
+    ground = stages.ground
+    truth = prior.numbers.get("truth")
+    error = f"\naccuracy {1e3 * truth['accuracy']:.2f} mm" if truth else ""
+    figure = Figure(figsize=(17, 3.9), layout="constrained")
+    axes = figure.subplots(1, 5)
+    panels = [
+        (f"cloud: {len(cloud):,} points\ncoloured by height", cloud[near], height[near], "viridis", 1.5),
+        (f"ground plane: {int(ground.sum()):,} inliers (tan)\nthe rest in blue", cloud[near], (~ground[near]) * 1.0, None, 1.5),
+        (f"rock cluster: {len(stages.cluster):,} points", stages.cluster, stages.plane.height(stages.cluster), "viridis", 1.0),
+    ]
+    for axis, (title, points, value, colours, zoom) in zip(axes, panels, strict=False):
+        tint = np.where(value[:, None] > 0.5, [0.15, 0.35, 0.75], [0.85, 0.76, 0.6]) if colours is None else value
+        _dots(axis, (points - centre) @ frame.T, tint, colours, zoom * reach, 0.8)
+        axis.set_title(title, fontsize=10)
+    _shaded_mesh(axes[3], stages, frame, centre, reach)
+    area = prior.numbers["mesh_area"] - prior.numbers["base_area"]
+    axes[3].set_title(f"Poisson mesh: {len(stages.mesh.faces):,} faces\n{area:.3f} m² above the ground{error}", fontsize=10)
+    shade = np.clip(0.25 + 0.75 * (prior.normals @ frame.T) @ LIGHT, 0.05, 1)[:, None] * [0.95, 0.85, 0.7]
+    towards = (prior.normals @ frame.T)[:, 2] > 0
+    _dots(axes[4], ((prior.points - centre) @ frame.T)[towards], shade[towards], None, reach, None)
+    axes[4].set_title(f"samples: N = {len(prior.points):,}\nspacing {1e3 * prior.spacing:.2f} mm = √(area / N)", fontsize=10)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=100)
+
+
+def _oblique(up: np.ndarray) -> np.ndarray:
+    """[3,3] rows right, up, towards the viewer: from 30 degrees above the ground, at an arbitrary fixed azimuth."""
+    side = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
+    side /= np.linalg.norm(side)
+    ahead = np.cross(side, up)
+    level = np.cos(0.8) * side + np.sin(0.8) * ahead
+    towards = np.cos(np.pi / 6) * level + np.sin(np.pi / 6) * up
+    right = np.cross(up, towards)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(towards, right), towards])
+
+
+def _dots(axis, points: np.ndarray, colour: np.ndarray, colours: str | None, reach: float, size: float | None) -> None:
+    """Scatter points [N,3] (picture frame), nearest drawn last; size in points^2, by default from their number."""
+    if len(points) > MAX_DOTS:
+        chosen = np.random.default_rng(0).choice(len(points), MAX_DOTS, replace=False)
+        points, colour = points[chosen], colour[chosen]
+    order = np.argsort(points[:, 2])
+    size = float(np.clip(60_000 / len(points), 0.3, 12)) if size is None else size
+    axis.scatter(*points[order, :2].T, c=colour[order], cmap=colours, s=size, linewidths=0, rasterized=True)
+    axis.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xticks=[], yticks=[])
+
+
+def _shaded_mesh(axis, stages: Stages, frame: np.ndarray, centre: np.ndarray, reach: float) -> None:
+    """Faces towards the viewer, painted far to near with Lambert shading."""
+    from matplotlib.collections import PolyCollection
+
+    corners = ((stages.mesh.vertices - centre) @ frame.T)[stages.mesh.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    front = np.flatnonzero(normal[:, 2] > 0)
+    front = front[np.argsort(corners[front].mean(1)[:, 2])]
+    shade = np.clip(0.25 + 0.75 * normal[front] @ LIGHT, 0.05, 1)[:, None] * [0.8, 0.8, 0.85]
+    axis.add_collection(
+        PolyCollection(corners[front, :, :2], facecolors=shade, edgecolors=shade, linewidths=0.2, rasterized=True)
+    )
+    axis.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xticks=[], yticks=[])

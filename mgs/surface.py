@@ -1,0 +1,165 @@
+"""The rock's points -> watertight Poisson mesh -> blue-noise surface samples; and distances between surfaces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from mgs.cloud import Plane
+from mgs.errors import InputError
+
+NORMAL_NEIGHBOURS = 16
+"""Points of the local plane fit of a normal."""
+POISSON_SCALE = 2.0
+"""Edge of Poisson's cube over the extent of the points: at pymeshlab's 1.1 the bulge below the open underside leaves the cube
+and the surface is not closed."""
+POISSON_CELL = 1.5
+"""Edge of Poisson's finest cell over the cloud's voxel: finer cells fit noise and cost time (halving it gained nothing)."""
+POISSON_DEPTHS = (5, 10)
+"""Octree depths chosen automatically."""
+OVERSAMPLING = 5
+"""Random candidates per blue-noise sample."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """vertices [V,3] world, metres; faces [F,3]; base [F] bool: the flat cap that closes the rock where it meets the ground."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    base: np.ndarray
+
+    @property
+    def areas(self) -> np.ndarray:
+        """[F] square metres."""
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+    @property
+    def vertex_normals(self) -> np.ndarray:
+        """[V,3] unit, area-weighted over the faces that are not base (zero at vertices of the base alone)."""
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        cross = np.cross(b - a, c - a) * ~self.base[:, None]
+        normals = np.zeros_like(self.vertices)
+        for k in range(3):
+            np.add.at(normals, self.faces[:, k], cross)
+        norm = np.linalg.norm(normals, axis=1, keepdims=True)
+        return normals / np.where(norm > 0, norm, 1.0)
+
+
+def estimate_normals(points: np.ndarray, views: np.ndarray) -> np.ndarray:
+    """Unit normals [N,3] by plane fits to 16 neighbours (Hoppe et al. 1992), turned towards the cameras (views [N,3])."""
+    neighbours = points[cKDTree(points).query(points, min(NORMAL_NEIGHBOURS, len(points)))[1]]
+    centred = neighbours - neighbours.mean(1, keepdims=True)
+    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))[1][..., 0]
+    return normals * np.where(np.einsum("nk,nk->n", normals, views) < 0, -1.0, 1.0)[:, None]
+
+
+def poisson_mesh(points: np.ndarray, normals: np.ndarray, voxel: float, plane: Plane, depth: int | None) -> tuple[Mesh, int]:
+    """Screened Poisson surface (Kazhdan and Hoppe 2013, pymeshlab) cut flat at the ground plane (manifold3d).
+
+    Poisson closes the unseen underside with a bulge that no data supports; the cut replaces it by a flat cap on the ground, so
+    that the mesh stays watertight and its base is known. depth: octree depth; by default the finest cell is at most 1.5 voxels.
+    Returns (mesh, octree depth). Raises InputError where Poisson gives no closed surface above the ground.
+    """
+    import manifold3d
+    import pymeshlab
+
+    if depth is None:
+        cells = POISSON_SCALE * float(np.ptp(points, axis=0).max()) / (POISSON_CELL * voxel)
+        depth = int(np.clip(np.ceil(np.log2(cells)), *POISSON_DEPTHS))
+    meshes = pymeshlab.MeshSet()
+    meshes.add_mesh(pymeshlab.Mesh(points, v_normals_matrix=normals))
+    meshes.generate_surface_reconstruction_screened_poisson(depth=depth, scale=POISSON_SCALE, threads=1)
+    surface = meshes.current_mesh()
+    vertices, faces = surface.vertex_matrix(), surface.face_matrix()
+    failure = InputError(f"prior: Poisson at depth {depth} gives no closed surface; try another --poisson-depth or more frames")
+    if len(faces) == 0:
+        raise failure
+    solid = manifold3d.Manifold(manifold3d.Mesh64(vertices, faces.astype(np.uint64)))
+    if solid.status() != manifold3d.Error.NoError:
+        raise failure
+    solid = max(solid.trim_by_plane(plane.normal, plane.offset).decompose(), key=lambda part: part.volume(), default=None)
+    if solid is None or solid.is_empty():
+        raise failure
+    cut = solid.to_mesh64()
+    vertices, faces = np.asarray(cut.vert_properties)[:, :3], np.asarray(cut.tri_verts).astype(np.int64)
+    base = (np.abs(plane.height(vertices)) < 1e-6 * np.ptp(vertices, axis=0).max())[faces].all(1)
+    return Mesh(vertices, faces, base), depth
+
+
+def sample_surface(
+    mesh: Mesh, seed: int, *, count: int | None = None, spacing: float | None = None
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Blue-noise samples of the surface that is not base: exactly N = A / spacing^2 of them (rounded), A its area.
+
+    Give count N or spacing (metres). A greedy Poisson-disk subset of 5 N uniform candidates, with the largest radius that
+    keeps N of them; the few too many with the nearest neighbours are dropped.
+    Returns (points [N,3], unit normals [N,3], spacing in metres). Raises InputError for fewer than two samples.
+    """
+    areas = np.where(mesh.base, 0.0, mesh.areas)
+    area = float(areas.sum())
+    if spacing is not None and not spacing > 0:
+        raise InputError(f"prior: spacing {spacing} m must be positive; correct --spacing")
+    if count is None:
+        assert spacing is not None
+        count = round(area / spacing**2)
+    if count < 2:
+        raise InputError(f"prior: {count} samples are too few for a model; ask for more Gaussians (or a smaller --spacing)")
+    spacing = float(np.sqrt(area / count))
+    rng = np.random.default_rng(seed)
+    face = rng.choice(len(areas), OVERSAMPLING * count, p=areas / area)
+    u, v = rng.random((2, len(face)))
+    root = np.sqrt(u)
+    weights = np.stack([1 - root, root * (1 - v), root * v], 1)
+    points = np.einsum("nk,nki->ni", weights, mesh.vertices[mesh.faces[face]])
+    keep = _blue_noise(points, count, spacing)
+    normals = np.einsum("nk,nki->ni", weights[keep], mesh.vertex_normals[mesh.faces[face[keep]]])
+    return points[keep], normals / np.linalg.norm(normals, axis=1, keepdims=True), spacing
+
+
+def _blue_noise(points: np.ndarray, count: int, spacing: float) -> np.ndarray:
+    """Indices [count] of a Poisson-disk subset of random points [N,3]."""
+    pairs = cKDTree(points).query_pairs(0.95 * spacing, output_type="ndarray")
+    distance = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    low, high = 0.0, 0.95 * spacing
+    best = np.arange(len(points))
+    for _ in range(12):
+        radius = (low + high) / 2
+        kept = _independent(pairs[distance < radius], len(points))
+        if len(kept) >= count:
+            best, low = kept, radius
+        else:
+            high = radius
+        if len(best) <= 1.002 * count:
+            break
+    nearest = cKDTree(points[best]).query(points[best], 2)[0][:, 1]
+    return np.sort(best[np.argsort(-nearest, kind="stable")[:count]])
+
+
+def _independent(pairs: np.ndarray, n: int) -> np.ndarray:
+    """The greedy (first come, first kept) subset of 0..n-1 in which no pair of `pairs` [P,2] is together."""
+    low, high = pairs.min(1), pairs.max(1)
+    undecided, kept = np.ones(n, bool), np.zeros(n, bool)
+    while undecided.any():
+        chosen = undecided.copy()
+        chosen[high] = False
+        kept |= chosen
+        undecided &= ~chosen
+        undecided[high[chosen[low]]] = False
+        active = undecided[low] & undecided[high]
+        low, high = low[active], high[active]
+    return np.flatnonzero(kept)
+
+
+def distances_to_mesh(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Exact distances [N], metres, from points [N,3] to a triangle mesh (pymeshlab)."""
+    import pymeshlab
+
+    meshes = pymeshlab.MeshSet()
+    meshes.add_mesh(pymeshlab.Mesh(vertices, faces))
+    meshes.add_mesh(pymeshlab.Mesh(points))
+    meshes.compute_scalar_by_distance_from_another_mesh_per_vertex(measuremesh=1, refmesh=0, signeddist=False)
+    return meshes.mesh(1).vertex_scalar_array()

@@ -1,0 +1,82 @@
+"""A small analytic RGB-D dataset: an ellipsoid half buried in a plane, ray-cast in closed form. No renderer is needed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from mgs.conventions import Camera, look_at
+from mgs.dataset import Dataset, Frame, load_dataset, write_transforms
+from mgs.files import write_exr, write_png
+
+CENTRE = np.array([0.1, -0.05, 0.2])
+AXES = np.array([0.6, 0.5, 0.45])
+"""Centre and semi-axes of the rock, metres; the ground is z = 0."""
+GROUND = 4.0
+"""Half edge of the square arena, metres: beyond it there is no return."""
+
+
+def orbit_cameras(count: int = 8, width: int = 64, height: int = 48, radius: float = 2.6, altitude: float = 1.5) -> list[Camera]:
+    """Cameras on a circle that look at the rock; the focal length is 1.1 image widths."""
+    K = np.array([[1.1 * width, 0, width / 2], [0, 1.1 * width, height / 2], [0, 0, 1]])
+    angles = 2 * np.pi * np.arange(count) / count
+    eyes = np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full(count, altitude)], 1)
+    return [Camera(K, width, height, look_at(eye, CENTRE)) for eye in eyes]
+
+
+def albedo(points: np.ndarray) -> np.ndarray:
+    """Smooth colour of a world point, linear RGB in [0.1, 0.9]: any error of a projection shows in it."""
+    return 0.5 + 0.4 * np.sin(np.stack([4 * points[..., 0], 3 * points[..., 1] + 1, 5 * points[..., 2] + 2], -1))
+
+
+def cast(camera: Camera, rocks: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Exact z-depth [H,W] (0 = sky), rock mask [H,W] and world points [H,W,3] of ellipsoids (centre, axes) on z = 0."""
+    directions = camera.unproject(np.ones((camera.height, camera.width))) - camera.position
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ground = -camera.position[2] / directions[..., 2]
+        hit = camera.position + ground[..., None] * directions
+        depth = np.where((ground > 0) & (np.abs(hit[..., :2]).max(-1) < GROUND), ground, np.inf)
+        mask = np.zeros(depth.shape, bool)
+        for centre, axes in rocks:
+            o, d = (camera.position - centre) / axes, directions / axes
+            a, b, c = (d * d).sum(-1), (d @ o), o @ o - 1
+            t = (-b - np.sqrt(b * b - a * c)) / a
+            nearer = np.isfinite(t) & (t > 0) & (t < depth)
+            depth[nearer], mask[nearer] = t[nearer], True
+    depth = np.where(np.isfinite(depth), depth, 0.0)
+    return depth, mask, camera.unproject(depth)
+
+
+def rock_mesh(centre: np.ndarray = CENTRE, axes: np.ndarray = AXES) -> trimesh.Trimesh:
+    """The ellipsoid as a mesh, world coordinates."""
+    mesh = trimesh.creation.icosphere(subdivisions=5)
+    mesh.vertices = mesh.vertices * axes + centre
+    return mesh
+
+
+def write_dataset(
+    root: Path,
+    cameras: list[Camera] | None = None,
+    rocks: list[tuple[np.ndarray, np.ndarray]] | None = None,
+    *,
+    depth: bool = True,
+) -> Dataset:
+    """Write and load a dataset of the ellipsoids; the true rock is the first. depth=False leaves the depth images out."""
+    rocks = [(CENTRE, AXES)] if rocks is None else rocks
+    frames = []
+    for i, camera in enumerate(cameras or orbit_cameras()):
+        z, mask, points = cast(camera, rocks)
+        frame = Frame(f"kf_{i:04d}", camera, 0.5 * i, root / f"images/kf_{i:04d}.png", mask_path=root / f"masks/kf_{i:04d}.png")
+        write_png(frame.image_path, np.where(z[..., None] > 0, albedo(points), 0.0))
+        write_png(root / f"masks/kf_{i:04d}.png", mask)
+        if depth:
+            frame = replace(frame, depth_path=root / f"depth/kf_{i:04d}.exr")
+            write_exr(root / f"depth/kf_{i:04d}.exr", {"Z": z})
+        frames.append(frame)
+    if rocks:
+        rock_mesh(*rocks[0]).export(root / "rock.glb")
+    write_transforms(root, frames)
+    return load_dataset(root)
