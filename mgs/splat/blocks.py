@@ -1,0 +1,207 @@
+"""Block lists: for every block of pixels, the splats that touch it, front to back.
+
+A block is what one SIMD lane owns. Lists are built with a margin around every footprint and stay valid while each footprint
+stays inside its margin (`outgrown`), as neighbour lists with a skin do in molecular dynamics. That works because the means,
+and with them centres and depth order, are frozen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mgs.splat.project import Splats
+
+BLOCK_X, BLOCK_Y = 8, 4
+"""Pixels of one lane: the fastest shape measured with AVX-512 (see docs/splatting.md)."""
+
+LOG2_INV_ALPHA_MIN = 7.994353436858858
+"""log2(255): a footprint ends where xi^2 + eta^2 = log2_opacity + log2(255)."""
+
+SLACK = 1e-2
+"""Bits added to a footprint's level so that rounding never drops a pixel at its rim."""
+
+
+@dataclass
+class Footprints:
+    """Centres and depths of the splats as the lists were built, whitening and level q of their footprints (inflated; q <= 0:
+    not drawn). Float [N] each."""
+
+    u: Any
+    v: Any
+    z: Any
+    k: Any
+    p: Any
+    e: Any
+    q: Any
+
+
+@dataclass
+class BlockLists:
+    """Pairs (splat, block), sorted by block, in each block by depth.
+
+    splat, slot: UInt32 [M]; a pair's slot is its place in the order where the pairs of one splat are contiguous, and
+    slot_start, slot_end: UInt32 [N] are the slots of each splat. block: UInt32 [L] of each lane, longest list first, and
+    start, end: UInt32 [L] its range of pairs. width, height: UInt32, pixels; blocks_x: UInt32.
+    """
+
+    splat: Any
+    slot: Any
+    slot_start: Any
+    slot_end: Any
+    block: Any
+    start: Any
+    end: Any
+    width: Any
+    height: Any
+    blocks_x: Any
+    footprints: Footprints
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held, bytes."""
+        return 4 * (2 * len(self.splat) + 9 * len(self.slot_start) + 3 * len(self.block))
+
+
+def level(splats: Splats) -> Any:
+    """q [N]: the value of xi^2 + eta^2 at the rim where alpha = ALPHA_MIN; not positive where nothing is drawn."""
+    return dr.select(splats.visible, splats.log2_opacity + LOG2_INV_ALPHA_MIN, -1)
+
+
+def inflate(splats: Splats, margin: float) -> Footprints:
+    """Footprints grown by `margin` (a share of their size; 0: exact)."""
+    q = level(splats)
+    growth = 1 / (1 + margin)
+    return Footprints(
+        splats.u,
+        splats.v,
+        splats.z,
+        splats.k,
+        splats.p * growth,
+        splats.e * growth,
+        dr.select(q > -margin, q + margin + SLACK, -1),
+    )
+
+
+def outgrown(built: Footprints, splats: Splats) -> Any:
+    """Mask [N]: the splat moved, or its footprint now is not wholly inside the one its lists were built with.
+
+    In the whitened coordinates of the built ellipse, the present one is {x: x^T S^T S x <= 1}; it is inside the unit disc
+    exactly where the smaller eigenvalue of S^T S is at least 1.
+    """
+    q = level(splats)
+    ratio = dr.sqrt(dr.maximum(built.q, 0) / dr.maximum(q, 1e-6))
+    s00 = ratio * splats.p / built.p
+    s01 = ratio * splats.p * (built.k - splats.k) / built.e
+    s11 = ratio * splats.e / built.e
+    a, b, c = s00 * s00, s00 * s01, s01 * s01 + s11 * s11
+    half = 0.5 * (a + c)
+    spread = dr.sqrt(0.25 * (a - c) * (a - c) + b * b)
+    smallest = s00 * s00 * (s11 * s11) / (half + spread)
+    moved = (built.u != splats.u) | (built.v != splats.v) | (built.z != splats.z)
+    return (q > 0) & (moved | ~(smallest >= 1))
+
+
+def depth_order(depth: Any) -> Any:
+    """UInt32 [N]: indices front to back, ties by index (a radix sort of the float bits; depths are positive)."""
+    bits = dr.reinterpret_array(mi.UInt32, depth)
+    n = len(depth)
+    order = dr.detail.block_mkperm(bits & 0xFFFF, n, 1 << 16)
+    high = dr.gather(mi.UInt32, bits, order) >> 16
+    return dr.gather(mi.UInt32, order, dr.detail.block_mkperm(high, n, 1 << 16))
+
+
+def build(splats: Splats, order: Any, width: int, height: int, margin: float) -> BlockLists:
+    """Block lists of detached splats, given their depth order. Exact ellipse-block overlap, not bounding boxes."""
+    blocks_x, blocks_y = -(-width // BLOCK_X), -(-height // BLOCK_Y)
+    n, lanes = len(splats.u), blocks_x * blocks_y
+    foot = inflate(splats, margin)
+    drawn = foot.q > 0
+    root = dr.sqrt(dr.maximum(foot.q, 0))
+    hx, hy = root * dr.sqrt(dr.square(dr.rcp(foot.p)) + dr.square(foot.k * dr.rcp(foot.e))), root * dr.rcp(foot.e)
+
+    def first_last(centre: Any, half: Any, size: int, count: int) -> tuple[Any, Any]:
+        lo = dr.clip(dr.floor((centre - half - 0.5) / size), 0, count)
+        hi = dr.clip(dr.floor((centre + half - 0.5) / size) + 1, 0, count)
+        return mi.UInt32(lo), mi.UInt32(dr.maximum(hi, lo))
+
+    x0, x1 = first_last(splats.u, hx, BLOCK_X, blocks_x)
+    y0, y1 = first_last(splats.v, hy, BLOCK_Y, blocks_y)
+    count = dr.select(drawn, (x1 - x0) * (y1 - y0), 0)
+    dr.eval(foot, x0, x1, y0, count)
+
+    ranked = dr.gather(mi.UInt32, count, order)
+    first = dr.prefix_sum(ranked)
+    rank = dr.repeat(dr.arange(mi.UInt32, n), ranked)
+    splat = dr.gather(mi.UInt32, order, rank)
+    offset = dr.arange(mi.UInt32, len(rank)) - dr.gather(mi.UInt32, first, rank)
+    columns = dr.gather(mi.UInt32, x1, splat) - dr.gather(mi.UInt32, x0, splat)
+    bx = dr.gather(mi.UInt32, x0, splat) + offset % dr.maximum(columns, 1)
+    by = dr.gather(mi.UInt32, y0, splat) + offset // dr.maximum(columns, 1)
+    touched = _touches(splats, foot, splat, bx, by)
+    block = by * blocks_x + bx
+
+    kept = dr.compress(touched)
+    before = dr.prefix_sum(mi.UInt32(touched))
+    before_end = dr.concat([before, mi.UInt32(len(kept))]) if len(rank) else mi.UInt32(0)
+    slot_start, slot_end = dr.empty(mi.UInt32, n), dr.empty(mi.UInt32, n)
+    dr.scatter(slot_start, dr.gather(mi.UInt32, before_end, first), order, mode=dr.ReduceMode.NoConflicts)
+    dr.scatter(slot_end, dr.gather(mi.UInt32, before_end, first + ranked), order, mode=dr.ReduceMode.NoConflicts)
+
+    key, splat = dr.gather(mi.UInt32, block, kept), dr.gather(mi.UInt32, splat, kept)
+    start, end, slot = _group(key, lanes)
+    length = dr.minimum(end - start, 4095)
+    longest_first = dr.detail.block_mkperm(4095 - length, lanes, 4096)
+    lists = BlockLists(
+        splat=dr.gather(mi.UInt32, splat, slot),
+        slot=slot,
+        slot_start=slot_start,
+        slot_end=slot_end,
+        block=longest_first,
+        start=dr.gather(mi.UInt32, start, longest_first),
+        end=dr.gather(mi.UInt32, end, longest_first),
+        width=dr.opaque(mi.UInt32, width),
+        height=dr.opaque(mi.UInt32, height),
+        blocks_x=dr.opaque(mi.UInt32, blocks_x),
+        footprints=foot,
+    )
+    dr.eval(lists)
+    return lists
+
+
+def _touches(splats: Splats, foot: Footprints, splat: Any, bx: Any, by: Any) -> Any:
+    """Does the inflated ellipse reach a pixel centre's hull of the block? Minimum of xi^2 + eta^2 over the rectangle."""
+    u, v = dr.gather(mi.Float, splats.u, splat), dr.gather(mi.Float, splats.v, splat)
+    k, p, e, q = (dr.gather(mi.Float, a, splat) for a in (foot.k, foot.p, foot.e, foot.q))
+    x0, y0 = mi.Float(bx * BLOCK_X) + 0.5 - u, mi.Float(by * BLOCK_Y) + 0.5 - v
+    x1, y1 = x0 + (BLOCK_X - 1), y0 + (BLOCK_Y - 1)
+
+    def value(x: Any, y: Any) -> Any:
+        return dr.square(p * (x - k * y)) + dr.square(e * y)
+
+    inside = (x0 <= 0) & (x1 >= 0) & (y0 <= 0) & (y1 >= 0)
+    x_edge, y_edge = dr.clip(0, x0, x1), dr.clip(0, y0, y1)
+    slope = k * p * p / (k * k * p * p + e * e)
+    on_vertical = value(x_edge, dr.clip(x_edge * slope, y0, y1))
+    on_horizontal = value(dr.clip(y_edge * k, x0, x1), y_edge)
+    return inside | (dr.minimum(on_vertical, on_horizontal) <= q)
+
+
+def _group(key: Any, buckets: int) -> tuple[Any, Any, Any]:
+    """(start, end) [buckets] of each bucket in the stably sorted keys, and the sorting permutation."""
+    start, end = dr.zeros(mi.UInt32, buckets), dr.zeros(mi.UInt32, buckets)
+    m = len(key)
+    if m == 0:
+        return start, end, mi.UInt32()
+    slot = dr.detail.block_mkperm(key, m, buckets)
+    place = dr.arange(mi.UInt32, m)
+    sorted_key = dr.gather(mi.UInt32, key, slot)
+    dr.eval(sorted_key)
+    previous = dr.gather(mi.UInt32, sorted_key, dr.maximum(place, 1) - 1)
+    following = dr.gather(mi.UInt32, sorted_key, dr.minimum(place + 1, m - 1))
+    dr.scatter(start, place, sorted_key, (place == 0) | (previous != sorted_key), mode=dr.ReduceMode.NoConflicts)
+    dr.scatter(end, place + 1, sorted_key, (place == m - 1) | (following != sorted_key), mode=dr.ReduceMode.NoConflicts)
+    return start, end, slot

@@ -1,0 +1,208 @@
+"""Fisher information of one view, per Gaussian: a registry of estimators, each a small function.
+
+The pixel model is h(theta) -> rgb image with unit noise, so the information is H = J^T J over pixels and channels.
+Columns of a Gaussian's P = 3K + 8 parameters: spherical harmonics (coefficient-major, channel-minor; colour itself for degree
+0 up to the factor SH_C0^2), log-scales 3, quaternion 4, opacity logit 1. Means are frozen and have no columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mgs.conventions import Camera
+from mgs.errors import InputError
+from mgs.gaussians import Gaussians
+from mgs.seeds import derive_seed
+from mgs.splat import kernels
+from mgs.splat.constants import LOG_SCALE_RANGE
+from mgs.splat.kernels import LN2
+from mgs.splat.project import axes2d, camera_array, columns, sh_basis
+from mgs.splat.render import ListCache, as_drjit, render, splats_and_lists
+
+LEARNED = ("sh", "log_scales", "quats", "logit_opacities")
+"""Learned parameters, in the order of the columns."""
+
+
+def groups(sh_degree: int) -> dict[str, slice]:
+    """Columns of each parameter group for colours of the given degree."""
+    k = 3 * (sh_degree + 1) ** 2
+    return {"colour": slice(0, k), "scale": slice(k, k + 3), "rotation": slice(k + 3, k + 7), "opacity": slice(k + 7, k + 8)}
+
+
+def fisher(
+    gaussians: Gaussians,
+    camera: Camera,
+    estimator: str = "exact",
+    background: Any = (0.0, 0.0, 0.0),
+    cache: ListCache | None = None,
+) -> np.ndarray:
+    """Fisher information that one view carries about each Gaussian: float32 [N,P], or [N,P,P] for `block`.
+
+    The camera's image is not needed: information depends on the pose and the model alone. Estimators: see `ESTIMATORS`.
+    Raises InputError for an unknown estimator, or a parameter that is NaN or infinite.
+    """
+    if estimator not in ESTIMATORS:
+        raise InputError(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
+    return ESTIMATORS[estimator](as_drjit(gaussians), camera, background, cache)
+
+
+@dataclass
+class Geometry:
+    """What turns the kernel's sums into parameters: for each of the 8 geometric columns (3 log-scales, 4 quaternion, 1 logit)
+    the derivative of ln alpha as coefficients on (xi^2, xi eta, eta^2, 1); and the colour basis [K]."""
+
+    shape: list[tuple[Any, Any, Any]]
+    logit: Any
+    basis: list[Any]
+    positive: list[Any]
+
+
+def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
+    """Closed-form derivatives of the footprint, in whitened coordinates, where all of them are of order one.
+
+    With a_i the i-th semi-axis of the Gaussian in whitened pixels and b_i = a_i / s_i, ln alpha changes with log-scale i by
+    4 ln2^2 (a_i.x)^2 and with a rotation about local axis k by 4 ln2^2 (s_i^2 - s_j^2)(b_i.x)(b_j.x), (i, j, k) cyclic; a
+    quaternion q of norm n turns the local frame by (2/n) Im(conj(q/n) dq).
+    """
+    mean, quats = columns(gaussians.means, mi.Vector3f), columns(gaussians.quats, mi.Vector4f)
+    log_scales = columns(gaussians.log_scales, mi.Vector3f)
+    _, unit, _ = axes2d(mean, quats, camera)
+    scales = dr.exp(dr.clip(log_scales, *LOG_SCALE_RANGE))
+    b = [mi.Vector2f(splats.p * (t.x - splats.k * t.y), splats.e * t.y) for t in unit]
+
+    def product(s: Any, i: int, j: int) -> Any:
+        x, y = b[i], b[j]
+        f = 4 * LN2 * LN2 * s
+        return mi.Vector3f(f * x.x * y.x, f * (x.x * y.y + x.y * y.x), f * x.y * y.y)
+
+    free = [(s > LOG_SCALE_RANGE[0]) & (s < LOG_SCALE_RANGE[1]) for s in log_scales]
+    by_scale = [dr.select(free[i], product(scales[i] * scales[i], i, i), 0) for i in range(3)]
+    turn = []
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        turn.append(product((scales[i] - scales[j]) * (scales[i] + scales[j]), i, j))
+    norm2 = dr.squared_norm(quats)
+    w, x, y, z = quats * dr.select(norm2 > 0, 2 * dr.rcp(dr.select(norm2 > 0, norm2, 1)), 0)
+    X, Y, Z = turn
+    by_quat = [-x * X - y * Y - z * Z, w * X - z * Y + y * Z, z * X + w * Y - x * Z, -y * X + x * Y + w * Z]
+    opacity = dr.exp2(splats.log2_opacity)
+    basis = sh_basis(mean, camera, gaussians.sh.shape[1])
+    positive = [dr.select(c > 0, mi.Float(1), 0) for c in (splats.r, splats.g, splats.b)]
+    return Geometry([tuple(m) for m in (*by_scale, *by_quat)], 1 - opacity, basis, positive)
+
+
+def _sums(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None, block: bool) -> tuple[Any, Geometry]:
+    device = camera_array(camera)
+    splats, lists = splats_and_lists(gaussians, camera, cache)
+    packed = kernels.pack(splats)
+    rgba, _ = kernels.forward(lists, packed)
+    colour = mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in background))
+    sums = kernels.fisher(lists, packed, rgba, colour, block)
+    return sums, geometry(gaussians, device, splats)
+
+
+def _quadratic(m: tuple[Any, Any, Any], n: tuple[Any, Any, Any], q: list[Any]) -> Any:
+    """sum (m . f)(n . f) from the five fourth-order moments q of f = (xi^2, xi eta, eta^2)."""
+    return (
+        m[0] * n[0] * q[0]
+        + (m[0] * n[1] + m[1] * n[0]) * q[1]
+        + (m[0] * n[2] + m[2] * n[0] + m[1] * n[1]) * q[2]
+        + (m[1] * n[2] + m[2] * n[1]) * q[3]
+        + m[2] * n[2] * q[4]
+    )
+
+
+def exact(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None) -> np.ndarray:
+    """diag(J^T J), exactly, for all parameters in one pass: seven sums per splat (design: one backward pass, no Jacobian)."""
+    (w2, s2, *quartic), g = _sums(gaussians, camera, background, cache, block=False)
+    columns_ = [w2 * basis * basis * positive for basis in g.basis for positive in g.positive]
+    columns_ += [dr.maximum(_quadratic(m, m, quartic), 0) for m in g.shape]
+    columns_.append(g.logit * g.logit * s2)
+    return _stack(columns_)
+
+
+def block(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None) -> np.ndarray:
+    """The exact [N,P,P] diagonal blocks of J^T J: 22 sums per splat."""
+    (w2, s2, *rest), g = _sums(gaussians, camera, background, cache, block=True)
+    quartic, quadratic, cross = rest[:5], rest[5:8], [rest[8 + 4 * c : 12 + 4 * c] for c in range(3)]
+    colour = [(basis, c) for basis in g.basis for c in range(3)]
+    k = len(colour)
+    upper: dict[tuple[int, int], Any] = {}
+    for i, (basis_i, c) in enumerate(colour):
+        scaled = basis_i * g.positive[c]
+        for j, (basis_j, d) in enumerate(colour[: i + 1]):
+            if c == d:
+                upper[j, i] = w2 * scaled * basis_j
+        ws, *wsf = cross[c]
+        for j, m in enumerate(g.shape):
+            upper[i, k + j] = scaled * sum(a * b for a, b in zip(m, wsf, strict=True))
+        upper[i, k + 7] = scaled * ws * g.logit
+    for i, m in enumerate(g.shape):
+        for j in range(i, 7):
+            upper[k + i, k + j] = _quadratic(m, g.shape[j], quartic)
+        upper[k + i, k + 7] = g.logit * sum(a * b for a, b in zip(m, quadratic, strict=True))
+    upper[k + 7, k + 7] = g.logit * g.logit * s2
+    keys = sorted(upper)
+    values = _stack([upper[key] for key in keys])
+    size = k + 8
+    blocks = np.zeros((len(gaussians), size, size), np.float32)
+    for n, (i, j) in enumerate(keys):
+        blocks[:, i, j] = blocks[:, j, i] = values[:, n]
+    return blocks
+
+
+def _gradient(
+    gaussians: Gaussians, image_gradient: Any, camera: Camera, background: Any, cache: ListCache | None
+) -> np.ndarray:
+    """J^T z by Dr.Jit's own AD: [N,P]. image_gradient(rgb) -> TensorXf [H,W,3]."""
+    watched = Gaussians(**{f.name: dr.detach(getattr(gaussians, f.name)) for f in fields(gaussians)})
+    watched = Gaussians(
+        watched.means, *(dr.copy(getattr(watched, n)) for n in ("log_scales", "quats", "logit_opacities", "sh"))
+    )
+    dr.enable_grad([getattr(watched, name) for name in LEARNED])
+    rgb = render(watched, camera, background, cache).rgb
+    dr.backward_from(dr.sum(rgb * image_gradient(dr.detach(rgb)), axis=None))
+    return np.concatenate([np.asarray(dr.grad(getattr(watched, name))).reshape(len(gaussians), -1) for name in LEARNED], axis=1)
+
+
+def hutchinson(
+    gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None, probes: int = 8, seed: int = 0
+) -> np.ndarray:
+    """Mean of (J^T z)^2 over `probes` images z of independent +-1, whose expectation is diag(J^T J) (Hutchinson 1990)."""
+    cache = cache or ListCache()
+    total = np.zeros((len(gaussians), 0), np.float64)
+    for probe in range(probes):
+        rng = np.random.default_rng(derive_seed(seed, f"hutchinson/{probe}"))
+        z = rng.choice(np.float32([-1, 1]), (camera.height, camera.width, 3))
+        squared = _gradient(gaussians, lambda _, z=z: mi.TensorXf(z), camera, background, cache).astype(np.float64) ** 2
+        total = squared if probe == 0 else total + squared
+    return (total / probes).astype(np.float32)
+
+
+def loss_gradient(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None) -> np.ndarray:
+    """The paper's Eq. 7 to the letter: squared gradient of one scalar "dummy photometric loss" per image.
+
+    The paper names no loss; here it is the mean squared error against mid-grey 0.5, L = mean (rgb - 0.5)^2. This is not
+    diag(J^T J): gradients of different pixels cancel before they are squared.
+    """
+    return _gradient(gaussians, lambda rgb: (rgb - 0.5) * (2 / len(rgb.array)), camera, background, cache) ** 2
+
+
+def _stack(columns_: list[Any]) -> np.ndarray:
+    """Dr.Jit Floats [N] -> NumPy [N, len]."""
+    dr.eval(columns_)
+    return np.stack([np.asarray(c) for c in columns_], axis=1)
+
+
+ESTIMATORS: dict[str, Callable[..., np.ndarray]] = {
+    "exact": exact,
+    "block": block,
+    "hutchinson": hutchinson,
+    "loss-gradient": loss_gradient,
+}

@@ -1,0 +1,293 @@
+"""The three kernels: forward, adjoint, Fisher. One SIMD lane owns one block of pixels and walks its list front to back.
+
+All loops here run at trace time over the BLOCK_X x BLOCK_Y pixels of a lane; nothing runs over Gaussians or pixels in Python.
+One gather of a splat serves all the lane's pixels, and one store per (splat, block) pair carries their sum: gathers and
+stores, not arithmetic, are what splatting on a CPU spends its time on. Sums go to the pair's own slot and a second kernel adds
+each splat's contiguous slots, so there are no atomics and every rerun is bitwise equal, whatever the number of threads.
+
+Notation (Kerbl et al. 2023): w = alpha T, C = sum w c; behind splat j lies S_j, and dC/d(alpha_j) = D_j = c_j T_j - S_j/(1 - alpha_j).
+The adjoint and Fisher walk front to back again with S = C - (colour so far): decisions (thresholds, stop) are recomputed by
+the same instructions, so they are the same, and no per-pixel index has to be kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mgs.splat.blocks import BLOCK_X, BLOCK_Y, BlockLists
+from mgs.splat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from mgs.splat.project import Splats
+
+PIXELS = BLOCK_X * BLOCK_Y
+
+LN2 = 0.6931471805599453
+
+DENORMAL = 1e-30
+"""Sums smaller than this become 0: threads differ in how they flush denormals, and nothing else would differ between reruns."""
+
+
+@dataclass
+class Packed:
+    """Splats interleaved for one gather each: (u, v, k, p), (e, log2_opacity, z, 0), (r, g, b, 0)."""
+
+    shape: Any
+    rest: Any
+    colour: Any
+
+
+def pack(s: Splats) -> Packed:
+    """Interleave detached splats."""
+    zero = dr.zeros(mi.Float, len(s.u))
+    packed = Packed(
+        dr.ravel(mi.Vector4f(s.u, s.v, s.k, s.p)),
+        dr.ravel(mi.Vector4f(s.e, s.log2_opacity, s.z, zero)),
+        dr.ravel(mi.Vector4f(s.r, s.g, s.b, zero)),
+    )
+    dr.eval(packed)
+    return packed
+
+
+@dataclass
+class Lane:
+    """Where a lane is: pixel of its first corner (Float), its range of pairs (UInt32)."""
+
+    x: Any
+    y: Any
+    start: Any
+    end: Any
+
+
+def _lane(lists: BlockLists) -> tuple[Lane, list[Any]]:
+    """The lanes and, per pixel, transmittance 1 inside the image and 0 (finished) outside."""
+    x, y = (lists.block % lists.blocks_x) * BLOCK_X, (lists.block // lists.blocks_x) * BLOCK_Y
+    T = [
+        dr.select((x + i < lists.width) & (y + j < lists.height), mi.Float(1), mi.Float(0))
+        for j in range(BLOCK_Y)
+        for i in range(BLOCK_X)
+    ]
+    return Lane(mi.Float(x) + 0.5, mi.Float(y) + 0.5, lists.start, lists.end), T
+
+
+@dataclass
+class Row:
+    """One row of a lane's pixels under one splat: eta (Float) and, per pixel, xi and the unclamped alpha."""
+
+    eta: Any
+    xi: list[Any]
+    raw: list[Any]
+
+
+def _rows(lane: Lane, shape: Any, rest: Any) -> list[Row]:
+    """alpha = 2^(log2_opacity - xi^2 - eta^2) on the lane's pixels."""
+    u, v, k, p = shape
+    e, log2_opacity = rest.x, rest.y
+    dx, dy = lane.x - u, lane.y - v
+    rows = []
+    for j in range(BLOCK_Y):
+        y = dy + j
+        eta = e * y
+        xi0 = p * (dx - k * y)
+        top = dr.fma(-eta, eta, log2_opacity)
+        xi = [dr.fma(p, mi.Float(i), xi0) for i in range(BLOCK_X)]
+        rows.append(Row(eta, xi, [dr.exp2(dr.fma(-t, t, top)) for t in xi]))
+    return rows
+
+
+def _blend(raw: Any, T: Any) -> tuple[Any, Any, Any]:
+    """One splat at one pixel: (alpha or 0 where it is not drawn, w = alpha T, transmittance after it).
+
+    A finished pixel carries its transmittance negated, so it draws nothing more and its alpha is still known.
+    """
+    alpha = dr.minimum(raw, ALPHA_MAX)
+    after = dr.fma(-alpha, T, T)
+    touched, room = raw >= ALPHA_MIN, after > TRANSMITTANCE_MIN
+    drawn = touched & room
+    alpha = dr.select(drawn, alpha, 0)
+    return alpha, alpha * T, dr.select(touched, dr.select(room, after, -dr.abs(T)), T)
+
+
+def _walk(
+    lists: BlockLists, packed: Packed, lane: Lane, T: list[Any], state: Any, visit: Callable[..., Any]
+) -> tuple[Any, Any]:
+    """Walk the lists front to back until they end or no pixel has transmittance left.
+
+    visit(i, rows, rest, colour, T, state) -> (T, state) draws the splat of pair i. Returns the last (T, state).
+    """
+
+    def body(i: Any, T: list[Any], state: Any, alive: Any) -> Any:
+        splat = dr.gather(mi.UInt32, lists.splat, i)
+        shape, rest, colour = (dr.gather(mi.Vector4f, a, splat) for a in (packed.shape, packed.rest, packed.colour))
+        T, state = visit(i, _rows(lane, shape, rest), rest, colour, T, state)
+        most = T[0]
+        for t in T[1:]:
+            most = dr.maximum(most, t)
+        return i + 1, T, state, (i + 1 < lane.end) & (most > 0)
+
+    start = mi.UInt32(lane.start)
+    _, T, state, _ = dr.while_loop((start, T, state, start < lane.end), lambda i, T, state, alive: alive, body)
+    return T, state
+
+
+def forward(lists: BlockLists, packed: Packed) -> tuple[Any, Any]:
+    """Composite. Returns block-major pixels: rgba Float [L*32*4] (premultiplied, no background) and weighted depth [L*32]."""
+    lane, T = _lane(lists)
+    state = [[dr.zeros(mi.Float, len(lists.block)) for _ in range(4)] for _ in range(PIXELS)]
+
+    def visit(i: Any, rows: list[Row], rest: Any, colour: Any, T: list[Any], state: Any) -> Any:
+        T_next, state_next = [], []
+        for pixel in range(PIXELS):
+            _, w, after = _blend(rows[pixel // BLOCK_X].raw[pixel % BLOCK_X], T[pixel])
+            r, g, b, z = state[pixel]
+            T_next.append(after)
+            state_next.append([dr.fma(colour.x, w, r), dr.fma(colour.y, w, g), dr.fma(colour.z, w, b), dr.fma(rest.z, w, z)])
+        return T_next, state_next
+
+    T, state = _walk(lists, packed, lane, T, state, visit)
+    rgba, depth = dr.empty(mi.Float, len(lists.block) * PIXELS * 4), dr.empty(mi.Float, len(lists.block) * PIXELS)
+    for pixel in range(PIXELS):
+        r, g, b, z = state[pixel]
+        place = lists.block * PIXELS + pixel
+        dr.scatter(rgba, mi.Vector4f(r, g, b, 1 - dr.abs(T[pixel])), place, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter(depth, z, place, mode=dr.ReduceMode.NoConflicts)
+    return rgba, depth
+
+
+def _slope(c: Any, T: Any, S: Any, alpha: Any, raw: Any) -> Any:
+    """D alpha, the derivative of the pixel with respect to ln alpha; 0 where alpha is clamped."""
+    return dr.select(raw <= ALPHA_MAX, alpha * dr.fma(c, T, -S * dr.rcp(1 - alpha)), 0)
+
+
+def _buffers(lists: BlockLists, count: int) -> list[Any]:
+    """Room for `count` sums per pair, four to a buffer."""
+    return [dr.zeros(mi.Float, len(lists.splat) * 4) for _ in range(-(-count // 4))]
+
+
+def _store(buffers: list[Any], sums: list[Any], slot: Any) -> None:
+    padded = sums + [mi.Float(0)] * (-len(sums) % 4)
+    for n, buffer in enumerate(buffers):
+        dr.scatter(buffer, mi.Vector4f(*padded[4 * n : 4 * n + 4]), slot, mode=dr.ReduceMode.NoConflicts)
+
+
+def _per_splat(lists: BlockLists, buffers: list[Any], count: int) -> list[Any]:
+    """Add each splat's contiguous slots, in order: `count` Floats [N]."""
+    dr.eval(buffers)
+    total = [mi.Vector4f(0) for _ in buffers]
+
+    def body(i: Any, total: list[Any]) -> Any:
+        return i + 1, [t + dr.gather(mi.Vector4f, buffer, i) for t, buffer in zip(total, buffers, strict=True)]
+
+    _, total = dr.while_loop((mi.UInt32(lists.slot_start), total), lambda i, total: i < lists.slot_end, body)
+    flat = [component for t in total for component in t][:count]
+    return [dr.select(dr.abs(x) > DENORMAL, x, 0) for x in flat]
+
+
+def adjoint(lists: BlockLists, packed: Packed, out: tuple[Any, Any], d_out: tuple[Any, Any], means: bool) -> Splats:
+    """Gradient with respect to each splat's numbers, given `forward`'s output (rgba, depth) and the gradient of it.
+
+    With means=False the gradients of u and v are not computed (None): frozen means need two sums less.
+    """
+    lane, T = _lane(lists)
+    dL, S = [], []
+    for pixel in range(PIXELS):
+        place = lists.block * PIXELS + pixel
+        rgba, d_rgba = (dr.gather(mi.Vector4f, a[0], place) for a in (out, d_out))
+        z, dz = (dr.gather(mi.Float, a[1], place) for a in (out, d_out))
+        dL.append((*d_rgba, dz))
+        S.append(dr.dot(rgba, d_rgba) + z * dz)
+    count = 10 if means else 8
+    buffers = _buffers(lists, count)
+
+    def visit(i: Any, rows: list[Row], rest: Any, colour: Any, T: list[Any], S: Any) -> Any:
+        T_next, S_next = [], []
+        sums = [mi.Float(0)] * 10
+        for j, row in enumerate(rows):
+            m0, m1, m2 = mi.Float(0), mi.Float(0), mi.Float(0)
+            for x, (raw, xi) in enumerate(zip(row.raw, row.xi, strict=True)):
+                pixel = j * BLOCK_X + x
+                alpha, w, after = _blend(raw, T[pixel])
+                dr_, dg, db, da, dz = dL[pixel]
+                c = dr.fma(colour.x, dr_, dr.fma(colour.y, dg, dr.fma(colour.z, db, dr.fma(rest.z, dz, da))))
+                behind = dr.fma(-c, w, S[pixel])
+                slope = _slope(c, T[pixel], behind, alpha, raw)
+                T_next.append(after)
+                S_next.append(behind)
+                sums[:4] = [dr.fma(w, d, s) for d, s in zip((dr_, dg, db, dz), sums[:4], strict=True)]
+                first = slope * xi
+                m0, m1, m2 = m0 + slope, m1 + first, dr.fma(first, xi, m2)
+            eta_m0 = row.eta * m0
+            moments = (m0, m2, m1 * row.eta, eta_m0 * row.eta, m1, eta_m0)
+            sums[4:] = [a + b for a, b in zip(sums[4:], moments, strict=True)]
+        _store(buffers, sums[:count], dr.gather(mi.UInt32, lists.slot, i))
+        return T_next, S_next
+
+    _walk(lists, packed, lane, T, S, visit)
+    r, g, b, z, d, xx, xy, yy, *first = _per_splat(lists, buffers, count)
+    shape, rest = dr.unravel(mi.Vector4f, packed.shape), dr.unravel(mi.Vector4f, packed.rest)
+    k, p, e = shape.z, shape.w, rest.x
+    du = dv = None
+    if means:
+        fx, fy = first
+        du, dv = 2 * LN2 * p * fx, 2 * LN2 * (e * fy - p * k * fx)
+    return Splats(du, dv, 2 * LN2 * p / e * xy, -2 * LN2 / p * xx, -2 * LN2 / e * yy, LN2 * d, z, r, g, b)
+
+
+def fisher(lists: BlockLists, packed: Packed, rgba: Any, background: Any, block: bool) -> list[Any]:
+    """Sums over pixels and channels, Float [N] each, from which O(N) work makes the Fisher information.
+
+    With f = (xi^2, xi eta, eta^2), s_c = D_c alpha and |s|^2 summed over channels:
+    sum w^2, sum |s|^2, the five moments sum |s|^2 (xi^4, xi^3 eta, xi^2 eta^2, xi eta^3, eta^4): seven, the exact diagonal.
+    block=True appends sum |s|^2 f (3) and, for c = r, g, b, sum w s_c (1) and sum w s_c f (3): 22, the exact blocks.
+    rgba: `forward`'s; background: Color3f.
+    """
+    lane, T = _lane(lists)
+    S = []
+    for pixel in range(PIXELS):
+        out = dr.gather(mi.Vector4f, rgba, lists.block * PIXELS + pixel)
+        S.append([c + (1 - out.w) * b for c, b in zip((out.x, out.y, out.z), background, strict=True)])
+    count = 22 if block else 7
+    buffers = _buffers(lists, count)
+
+    def visit(i: Any, rows: list[Row], rest: Any, colour: Any, T: list[Any], S: Any) -> Any:
+        T_next, S_next = [], []
+        sums = [mi.Float(0)] * 22
+        for j, row in enumerate(rows):
+            m = [mi.Float(0)] * 5
+            cross = [[mi.Float(0)] * 3 for _ in range(3)]
+            for x, (raw, xi) in enumerate(zip(row.raw, row.xi, strict=True)):
+                pixel = j * BLOCK_X + x
+                alpha, w, after = _blend(raw, T[pixel])
+                behind = [dr.fma(-c, w, s) for c, s in zip((colour.x, colour.y, colour.z), S[pixel], strict=True)]
+                slopes = [
+                    _slope(c, T[pixel], s, alpha, raw) for c, s in zip((colour.x, colour.y, colour.z), behind, strict=True)
+                ]
+                T_next.append(after)
+                S_next.append(behind)
+                sums[0] = dr.fma(w, w, sums[0])
+                square = sum(s * s for s in slopes)
+                power, xi2 = square, xi * xi
+                m[0], m[1], m[2] = m[0] + square, dr.fma(square, xi, m[1]), dr.fma(square, xi2, m[2])
+                power = square * xi2
+                m[3], m[4] = dr.fma(power, xi, m[3]), dr.fma(power, xi2, m[4])
+                if block:
+                    for c, s in enumerate(slopes):
+                        ws = w * s
+                        a = cross[c]
+                        cross[c] = [a[0] + ws, dr.fma(ws, xi, a[1]), dr.fma(ws, xi2, a[2])]
+            eta = row.eta
+            eta2 = eta * eta
+            new = [m[0], m[4], m[3] * eta, m[2] * eta2, m[1] * eta2 * eta, m[0] * eta2 * eta2]
+            if block:
+                new += [m[2], m[1] * eta, m[0] * eta2]
+                for a in cross:
+                    new += [a[0], a[2], a[1] * eta, a[0] * eta2]
+            sums[1 : 1 + len(new)] = [a + b for a, b in zip(sums[1:], new, strict=False)]
+        _store(buffers, sums[:count], dr.gather(mi.UInt32, lists.slot, i))
+        return T_next, S_next
+
+    _walk(lists, packed, lane, T, S, visit)
+    return _per_splat(lists, buffers, count)

@@ -1,0 +1,141 @@
+"""Render Gaussians: one differentiable call, with block lists cached per camera."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass, fields
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mgs.conventions import Camera
+from mgs.errors import InputError
+from mgs.gaussians import Gaussians
+from mgs.splat import blocks, kernels
+from mgs.splat.blocks import BLOCK_X, BLOCK_Y, BlockLists
+from mgs.splat.kernels import PIXELS
+from mgs.splat.project import Splats, camera_array, project
+
+MARGIN = 0.15
+"""Growth of a footprint, as a share of its size (and bits of its opacity), before the lists it is in are rebuilt."""
+
+CACHE_BYTES = 1 << 30
+"""Default memory budget of a `ListCache`, bytes: 100 cameras of 100,000 Gaussians at 640x480."""
+
+
+@dataclass
+class Image:
+    """A rendered view, Dr.Jit TensorXf: rgb [H,W,3] linear over the background, alpha [H,W], depth [H,W].
+
+    depth: expected z-depth in metres, sum w z / sum w; 0 where alpha is 0.
+    """
+
+    rgb: Any
+    alpha: Any
+    depth: Any
+
+
+class ListCache:
+    """Block lists per camera, least recently used first out, within a budget in bytes.
+
+    Lists serve as long as they are exact for the splats: same centres and depths, no footprint outside the margin it was
+    built with. Otherwise they are rebuilt, so a stale list can never change an image.
+    """
+
+    def __init__(self, budget: int = CACHE_BYTES) -> None:
+        self.budget = budget
+        self.builds = 0
+        self._entries: OrderedDict[tuple[Any, ...], BlockLists] = OrderedDict()
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held, bytes."""
+        return sum(lists.nbytes for lists in self._entries.values())
+
+    def get(self, camera: Camera, splats: Splats) -> BlockLists:
+        """Lists for detached, evaluated splats seen by the camera. Raises InputError where a parameter is not finite."""
+        key = (camera.K.tobytes(), camera.world_to_camera.tobytes(), camera.width, camera.height)
+        lists = self._entries.get(key)
+        if lists is not None and len(lists.slot_start) != len(splats.u):
+            lists = None
+        if lists is None:
+            _raise_unless_finite(dr.all(splats.finite))
+        else:
+            stale = dr.select(splats.finite, mi.UInt32(blocks.outgrown(lists.footprints, splats)), 2)
+            worst = int(dr.max(stale)[0]) if len(stale) else 0
+            _raise_unless_finite(worst < 2)
+            lists = None if worst else lists
+        if lists is None:
+            lists = blocks.build(splats, blocks.depth_order(splats.z), camera.width, camera.height, MARGIN)
+            self.builds += 1
+        self._entries[key] = lists
+        self._entries.move_to_end(key)
+        while len(self._entries) > 1 and self.nbytes > self.budget:
+            self._entries.popitem(last=False)
+        return lists
+
+
+def _raise_unless_finite(finite: Any) -> None:
+    if not finite:
+        raise InputError("gaussians: a parameter is NaN or infinite")
+
+
+def as_drjit(gaussians: Gaussians) -> Gaussians:
+    """The same Gaussians with TensorXf fields; fields that are Dr.Jit already are kept, gradients included."""
+    values = {f.name: getattr(gaussians, f.name) for f in fields(gaussians)}
+    return Gaussians(**{k: v if dr.is_array_v(v) else mi.TensorXf(np.asarray(v, np.float32)) for k, v in values.items()})
+
+
+class _Rasterise(dr.CustomOp):
+    """Splats -> block-major pixels, with the hand-written adjoint: compositing is no sum that AD could replay."""
+
+    def eval(self, splats: Splats, lists: BlockLists, means: bool) -> Any:
+        self.lists, self.means, self.packed = lists, means, kernels.pack(splats)
+        self.out = kernels.forward(lists, self.packed)
+        return self.out
+
+    def backward(self) -> None:
+        gradient = kernels.adjoint(self.lists, self.packed, self.out, self.grad_out(), self.means)
+        self.set_grad_in("splats", gradient)
+
+
+def _places(width: int, height: int) -> Any:
+    """UInt32 [H*W]: where each pixel of an image lies in block-major order."""
+    index = dr.arange(mi.UInt32, width * height)
+    x, y = index % width, index // width
+    block = (y // BLOCK_Y) * (-(-width // BLOCK_X)) + x // BLOCK_X
+    return block * PIXELS + (y % BLOCK_Y) * BLOCK_X + x % BLOCK_X
+
+
+def splats_and_lists(gaussians: Gaussians, camera: Camera, cache: ListCache | None) -> tuple[Splats, BlockLists]:
+    """Project Gaussians with Dr.Jit fields and find their block lists. Raises InputError where a parameter is not finite."""
+    splats = project(gaussians, camera_array(camera))
+    dr.eval(splats)
+    try:
+        return splats, (cache or ListCache()).get(camera, dr.detach(splats))
+    except InputError:
+        Gaussians(*(np.asarray(dr.detach(getattr(gaussians, f.name))) for f in fields(gaussians))).check()
+        raise
+
+
+def render(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.0), cache: ListCache | None = None) -> Image:
+    """Render Gaussians by EWA splatting (Kerbl et al. 2023, with the constants of `mgs.splat.constants`).
+
+    gaussians: NumPy fields, or Dr.Jit TensorXf fields, any of which may have gradients enabled: `dr.backward` then reaches
+    log_scales, quats, logit_opacities, sh and, where enabled, means. Not differentiated: the camera, the thresholds
+    (alpha < 1/255, transmittance), the depth order; forward-mode derivatives are not available.
+    background: linear RGB. cache: keep one between calls so that a camera seen again reuses its block lists.
+    Raises InputError where a parameter is NaN or infinite (names the parameter and the first Gaussian).
+    """
+    splats, lists = splats_and_lists(as_drjit(gaussians), camera, cache)
+    rgba, depth = dr.custom(_Rasterise, splats, lists, dr.grad_enabled(splats.u))
+    places = _places(camera.width, camera.height)
+    pixel = dr.gather(mi.Vector4f, rgba, places, mode=dr.ReduceMode.NoConflicts)
+    alpha = pixel.w
+    rgb = mi.Color3f(pixel.x, pixel.y, pixel.z) + (1 - alpha) * mi.Color3f(background)
+    weighted = dr.gather(mi.Float, depth, places, mode=dr.ReduceMode.NoConflicts)
+    expected = dr.select(alpha > 0, weighted / dr.select(alpha > 0, alpha, 1), 0)
+    shape = (camera.height, camera.width)
+    return Image(mi.TensorXf(dr.ravel(rgb), (*shape, 3)), mi.TensorXf(alpha, shape), mi.TensorXf(expected, shape))
