@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from mgs.commands.doctor import doctor
+from mgs.commands.nbv import nbv
 from mgs.commands.prior import prior
 from mgs.commands.synth_orbit import synth_orbit
 
@@ -12,4 +13,5 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "doctor": doctor,
     "synth-orbit": synth_orbit,
     "prior": prior,
+    "nbv": nbv,
 }

@@ -1,0 +1,128 @@
+"""Scene files: one readable TOML per scene, validated. Lengths in metres, angles in degrees, colours linear RGB."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from mgs.errors import InputError
+from mgs.resources import scene_path
+
+Positive = Annotated[float, Field(gt=0)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Colour = tuple[Fraction, Fraction, Fraction]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Lobe(_Strict):
+    """One ellipsoid of the rock's body, before it is cut and weathered; unitless, scaled with the rock."""
+
+    centre: tuple[float, float, float] = (0, 0, 0)
+    radii: tuple[Positive, Positive, Positive] = (1, 1, 1)
+
+
+class Rock(_Strict):
+    """The rock: body, weathering, colour."""
+
+    size: Positive = 1.8
+    """Longest side of its bounding box, metres; a mesh given by --mesh is scaled to it too."""
+    buried: Fraction = 0.12
+    """Share of its height below the ground."""
+    lobes: tuple[Lobe, ...] = (Lobe(radii=(1.0, 0.8, 0.72)),)
+    facets: Annotated[int, Field(ge=0)] = 16
+    """Planes that cut each lobe."""
+    relief: Fraction = 0.06
+    """Amplitude of the coarsest displacement, as a share of the size."""
+    cracks: Fraction = 0.012
+    """Depth of cracks, as a share of the size."""
+    layers: Annotated[int, Field(ge=0)] = 0
+    """Number of strata over the height; 0 for none."""
+    plain_half: bool = False
+    """Leave the half at negative x without albedo texture."""
+    colours: tuple[Colour, Colour] = ((0.30, 0.24, 0.19), (0.14, 0.115, 0.10))
+    """Light and dark mineral."""
+    dust: Colour = (0.42, 0.30, 0.20)
+    """Dust on faces that look up."""
+    detail: Positive = 0.015
+    """Length of a mesh edge, metres."""
+
+
+class Arena(_Strict):
+    """The ground: regolith with grain, undulation and small stones."""
+
+    colour: Colour = (0.36, 0.26, 0.18)
+    undulation: Annotated[float, Field(ge=0)] = 0.02
+    """Amplitude of the terrain near the rock, metres."""
+    stones: Annotated[int, Field(ge=0)] = 700
+    stone_size: Positive = 0.05
+    """Median diameter, metres; sizes follow a power law up to `largest_stone`."""
+    largest_stone: Positive = 0.16
+    clearance: Positive = 1.15
+    """Stones keep this far from the rock, as a multiple of its radius."""
+
+
+class Sky(_Strict):
+    """Sun and clear sky (Hosek-Wilkie, Mitsuba's `sunsky`)."""
+
+    sun_elevation: Annotated[float, Field(gt=0, le=90)] = 42
+    sun_azimuth: float = 35
+    """Counter-clockwise from +x."""
+    turbidity: Annotated[float, Field(ge=1, le=10)] = 3.5
+    sun_scale: Positive = 1.0
+    sky_scale: Positive = 1.0
+
+
+class Lens(_Strict):
+    """The camera; the image size comes from the preset."""
+
+    fov: Annotated[float, Field(gt=1, lt=150)] = 44
+    """Horizontal field of view."""
+
+
+class Orbit(_Strict):
+    """Where the keyframes are taken from; every camera looks at the middle of the rock."""
+
+    kind: Literal["circle", "rings", "spiral", "hemisphere"] = "circle"
+    radius: Positive = 4.0
+    """Horizontal distance from the rock's axis (circle), or distance from its middle (the others)."""
+    altitude: Annotated[float, Field(ge=0)] = 2.3
+    """Height above the ground (circle)."""
+    elevations: tuple[float, float] = (12, 65)
+    """Lowest and highest elevation above the rock's middle (the others)."""
+    turns: Positive = 3
+    """Turns of the spiral, or number of rings."""
+
+
+class SceneFile(_Strict):
+    """A scene: rock, arena, sun and sky, camera, orbit."""
+
+    description: str = ""
+    rock: Rock = Rock()
+    arena: Arena = Arena()
+    sky: Sky = Sky()
+    camera: Lens = Lens()
+    orbit: Orbit = Orbit()
+
+
+def load_scene_file(scene: str | Path) -> SceneFile:
+    """Read a scene by its name (`boulder`) or path (`my.toml`).
+
+    Raises InputError where it does not exist, is not TOML, or has an unknown key or a value out of range.
+    """
+    path = scene_path(scene)
+    try:
+        return SceneFile.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid TOML ({error}); correct it") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            raise InputError(f"{path}: unknown key {key!r}; compare it with scenes/boulder.toml") from None
+        raise InputError(f"{path}: {key}: {first['msg']} (is {first['input']!r}); correct it") from None

@@ -1,0 +1,177 @@
+"""Render an orbit around a rock into a dataset folder. Needs the variant to be set (`mgs.runtime.start`)."""
+
+from __future__ import annotations
+
+import importlib.util
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from mgs import __version__
+from mgs.conventions import Camera
+from mgs.dataset import FRAME_INTERVAL, Dataset, Frame, load_dataset, write_transforms
+from mgs.errors import InputError
+from mgs.files import atomic_path, new_folder, read_json, write_exr, write_json, write_png
+from mgs.orbit import orbit_cameras
+from mgs.rock import load_rock, make_rock
+from mgs.scene import Scene
+from mgs.scene_file import SceneFile
+from mgs.seeds import derive_seed, generator
+
+NOISY_FACTOR = 8
+"""Samples are multiplied by this where pyoidn is not installed."""
+
+ROCK_EXPOSURE = 0.2
+"""Mean linear value of the rock's pixels over the orbit: the exposure is metered once on the rock, as a photographer does."""
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Image size in pixels, number of frames, samples per pixel."""
+
+    width: int
+    height: int
+    frames: int
+    spp: int
+
+
+PRESETS = {"quick": Preset(320, 240, 32, 12), "paper": Preset(640, 480, 100, 16)}
+
+
+def synthesise(
+    out: str | Path,
+    settings: SceneFile,
+    preset: Preset,
+    seed: int = 0,
+    mesh: str | Path | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    say: Callable[[str], None] = lambda message: None,
+) -> Dataset:
+    """Render the dataset `out`: images, depth, masks, rock.glb, config.json, contact_sheet.png, transforms.json (last).
+
+    A folder that an interrupted run of the same settings left is completed; the result is the same as in one run.
+    Raises InputError: output folder not empty or not writable, bad mesh, rock not wholly in every frame.
+    """
+    started, out = time.perf_counter(), Path(out)
+    denoise = importlib.util.find_spec("pyoidn") is not None
+    resolved = {
+        "scene": settings.model_dump(mode="json"),
+        "preset": asdict(preset),
+        "seed": seed,
+        "mesh": None if mesh is None else Path(mesh).name,
+        "denoise": denoise,
+    }
+    rock, scale = (make_rock(settings.rock, generator(seed, "rock")), 1.0) if mesh is None else load_rock(mesh, settings.rock)
+    if mesh is not None:
+        extents = " x ".join(f"{x:.2f}" for x in rock.extents)
+        say(f"{mesh}: scaled {scale:.4g} times to the scene's rock size, now {extents} m")
+    cameras = rock_cameras(settings, preset, rock)
+    frames = _frames(out, cameras)
+    _open_folder(out, resolved)
+    with atomic_path(out / "rock.glb") as temporary:
+        rock.export(temporary, file_type="glb", include_normals=True)
+    spp = preset.spp
+    if not denoise:
+        spp *= NOISY_FACTOR
+        say(f"pyoidn is not installed: {spp} samples per pixel in place of denoising; `pip install pyoidn` is faster")
+
+    scene = Scene(settings, rock, cameras[0], seed)
+    exposure = _meter(scene, cameras, seed)
+    prepared = time.perf_counter()
+    seconds: list[float] = []
+    for index, frame in enumerate(frames):
+        if not _is_done(frame):
+            begun = time.perf_counter()
+            rendered = scene.render(frame.camera, spp, derive_seed(seed, frame.name), denoise)
+            assert frame.depth_path
+            assert frame.mask_path
+            write_exr(frame.depth_path, {"Z": rendered.depth})
+            write_png(frame.mask_path, rendered.mask)
+            write_png(frame.image_path, rendered.rgb * exposure)
+            seconds.append(time.perf_counter() - begun)
+        progress(index + 1, len(frames))
+
+    write_contact_sheet(out / "contact_sheet.png", frames)
+    timings = {
+        "prepare_s": round(prepared - started, 2),
+        "frame_s": round(float(np.median(seconds)), 3) if seconds else None,
+        "total_s": round(time.perf_counter() - started, 2),
+    }
+    write_json(out / "config.json", resolved | _record(scale, exposure, spp) | {"timings": timings})
+    write_transforms(out, frames)
+    return load_dataset(out)
+
+
+def rock_cameras(settings: SceneFile, preset: Preset, rock: trimesh.Trimesh) -> list[Camera]:
+    """The orbit's cameras, aimed at the middle of the rock above the ground.
+
+    Raises InputError where the rock is not wholly inside a frame.
+    """
+    target = np.array([0, 0, rock.bounds[1, 2] / 2])
+    cameras = orbit_cameras(settings.orbit, preset.frames, target, settings.camera.fov, preset.width, preset.height)
+    for index, camera in enumerate(cameras):
+        pixels, z = camera.project(rock.vertices[rock.vertices[:, 2] > 0])
+        if (z <= 0).any() or (pixels < 1).any() or (pixels > np.array([preset.width, preset.height]) - 1).any():
+            raise InputError(f"scene: the rock is not wholly in frame {index}; raise orbit.radius or camera.fov")
+    return cameras
+
+
+def write_contact_sheet(path: str | Path, frames: list[Frame], columns: int = 8, width: int = 160) -> None:
+    """Up to 32 evenly chosen frames side by side, as PNG."""
+    chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, min(32, len(frames))).astype(int))]
+    height = round(width * frames[0].camera.height / frames[0].camera.width)
+    sheet = Image.new("RGB", (columns * width, -(-len(chosen) // columns) * height))
+    for i, frame in enumerate(chosen):
+        with Image.open(frame.image_path) as image:
+            small = image.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)
+        sheet.paste(small, (i % columns * width, i // columns * height))
+    with atomic_path(path) as temporary:
+        sheet.save(temporary)
+
+
+def _frames(out: Path, cameras: list[Camera]) -> list[Frame]:
+    return [
+        Frame(
+            name := f"kf_{i:04d}", camera, FRAME_INTERVAL * i,
+            out / f"images/{name}.png", out / f"depth/{name}.exr", out / f"masks/{name}.png",
+        )
+        for i, camera in enumerate(cameras)
+    ]  # fmt: skip
+
+
+def _is_done(frame: Frame) -> bool:
+    return all(path is not None and path.is_file() for path in (frame.image_path, frame.depth_path, frame.mask_path))
+
+
+def _open_folder(out: Path, resolved: dict[str, Any]) -> None:
+    """Start a new folder, or go on with one that the same settings began. Raises InputError."""
+    if (out / "config.json").is_file() and not (out / "transforms.json").exists():
+        begun = read_json(out / "config.json")
+        if any(begun.get(key) != value for key, value in resolved.items()):
+            raise InputError(f"{out}: holds an unfinished dataset of other settings; choose a new folder or delete it")
+        return
+    new_folder(out)
+    write_json(out / "config.json", resolved)
+
+
+def _meter(scene: Scene, cameras: list[Camera], seed: int) -> float:
+    """One exposure for the whole orbit, from four evenly spaced cameras."""
+    means = []
+    for index in np.unique(np.linspace(0, len(cameras), 4, endpoint=False).astype(int)):
+        rendered = scene.render(cameras[index], 2, derive_seed(seed, f"meter {index}"), denoise=False)
+        means.append(float(rendered.rgb[rendered.mask].mean()))
+    return ROCK_EXPOSURE / float(np.mean(means))
+
+
+def _record(scale: float, exposure: float, spp: int) -> dict[str, Any]:
+    versions = {"mgs": __version__, "python": platform.python_version()}
+    versions |= {name: version(name) for name in ("mitsuba", "drjit", "numpy")}
+    return {"mesh_scale": scale, "exposure": exposure, "samples_per_pixel": spp, "versions": versions}

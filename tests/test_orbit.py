@@ -1,0 +1,53 @@
+"""Orbits: where the cameras are, and what they look at."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mgs.orbit import intrinsics, orbit_cameras, orbit_positions
+from mgs.scene_file import Orbit
+
+TARGET = np.array([0.3, -0.2, 0.6])
+KINDS = ["circle", "rings", "spiral", "hemisphere"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_camera_has_the_target_in_the_middle(kind):
+    for camera in orbit_cameras(Orbit(kind=kind), 24, TARGET, 44, 96, 72):
+        pixel, z = camera.project(TARGET[None])
+        np.testing.assert_allclose(pixel[0], [48, 36], atol=1e-9)
+        assert z[0] > 0
+        assert camera.world_to_camera[1, 2] < 0  # image down is world down: no camera is upside down
+
+
+def test_circle_is_the_papers_orbit():
+    p = orbit_positions(Orbit(radius=3, altitude=2), 8, TARGET)
+    np.testing.assert_allclose(np.linalg.norm(p[:, :2] - TARGET[:2], axis=1), 3)
+    np.testing.assert_allclose(p[:, 2], 2)
+    azimuth = np.unwrap(np.arctan2(*(p - TARGET).T[1::-1]))
+    np.testing.assert_allclose(np.diff(azimuth), np.pi / 4)
+
+
+@pytest.mark.parametrize("kind", KINDS[1:])
+def test_domes_keep_distance_and_elevation(kind):
+    p = orbit_positions(Orbit(kind=kind, radius=3, elevations=(10, 60)), 40, TARGET) - TARGET
+    np.testing.assert_allclose(np.linalg.norm(p, axis=1), 3)
+    elevation = np.degrees(np.arcsin(p[:, 2] / 3))
+    assert elevation.min() >= 10 - 1e-9
+    assert elevation.max() <= 60 + 1e-9
+    assert np.ptp(elevation) > 40
+    assert len(np.unique(p.round(6), axis=0)) == 40
+
+
+def test_hemisphere_is_even():
+    """Nearest-neighbour distances of a Fibonacci lattice are within a factor of two and a half of each other."""
+    p = orbit_positions(Orbit(kind="hemisphere", radius=1, elevations=(0, 90)), 100, np.zeros(3))
+    distance = np.linalg.norm(p[:, None] - p[None], axis=-1) + 9 * np.eye(100)
+    nearest = distance.min(1)
+    assert nearest.max() < 2.5 * nearest.min()
+
+
+def test_intrinsics_match_the_field_of_view():
+    K = intrinsics(90, 640, 480)
+    np.testing.assert_allclose(K, [[320, 0, 320], [0, 320, 240], [0, 0, 1]])

@@ -1,0 +1,97 @@
+"""Rocks: procedural and given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from mgs.errors import InputError
+from mgs.noise import Noise
+from mgs.rock import load_rock, make_rock
+from mgs.scene_file import Rock
+from mgs.seeds import generator
+
+COARSE = Rock(detail=0.08)
+APOLLO = Path(__file__).parents[2] / "shared/data/rocks/apollo_sample1.glb"
+
+
+def test_noise_is_band_limited_and_normalised():
+    points = np.random.default_rng(0).uniform(-50, 50, (20000, 3))
+    noise = Noise(np.random.default_rng(1))
+    values = noise.octave(points, 1.0)
+    assert abs(values.mean()) < 0.05
+    assert 0.8 < values.std() < 1.1
+    line = np.zeros((4096, 3))
+    line[:, 0] = np.arange(4096) / 16
+    power = np.abs(np.fft.rfft(noise.octave(line, 2.0))) ** 2
+    frequency = np.fft.rfftfreq(4096, 1 / 16)
+    assert power[frequency < 0.55].sum() > 0.95 * power.sum()
+
+
+def test_rock_stands_in_the_ground_at_its_size():
+    rock = make_rock(COARSE, generator(0, "rock"))
+    assert rock.extents.max() == pytest.approx(COARSE.size)
+    assert rock.bounds[0, 2] == pytest.approx(-COARSE.buried * rock.extents[2])
+    welded = trimesh.Trimesh(rock.vertices, rock.faces)
+    assert welded.is_watertight
+    assert welded.volume > 0  # outward faces
+
+
+def test_rock_is_a_function_of_the_seed():
+    a, b, c = (make_rock(COARSE, generator(seed, "rock")) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(a.vertices, b.vertices)
+    assert a.visual.material.baseColorTexture.tobytes() == b.visual.material.baseColorTexture.tobytes()
+    assert len(a.vertices) != len(c.vertices) or not np.allclose(a.vertices, c.vertices)
+
+
+def test_glb_round_trip_keeps_geometry_and_colours(tmp_path):
+    rock = make_rock(COARSE, generator(0, "rock"))
+    rock.export(tmp_path / "rock.glb", include_normals=True)
+    back = trimesh.load(tmp_path / "rock.glb", force="mesh", process=False)
+    np.testing.assert_allclose(back.vertices, rock.vertices, atol=1e-6)
+    np.testing.assert_array_equal(back.visual.to_color().vertex_colors, rock.visual.to_color().vertex_colors)
+
+
+@pytest.mark.parametrize("suffix", ["glb", "obj", "ply"])
+def test_given_mesh_is_scaled_and_stood_up(tmp_path, suffix):
+    """A centimetre-sized box, longest side up in its own format's convention, comes out metres tall."""
+    up = [0.01, 0.01, 0.03] if suffix == "ply" else [0.01, 0.03, 0.01]
+    trimesh.creation.box(up).export(tmp_path / f"box.{suffix}")
+    rock, scale = load_rock(tmp_path / f"box.{suffix}", Rock(size=1.5, buried=0.0))
+    np.testing.assert_allclose(rock.extents, [0.5, 0.5, 1.5])
+    assert scale == pytest.approx(50)
+    assert rock.bounds[0, 2] == pytest.approx(0)
+
+
+@pytest.mark.skipif(not APOLLO.exists(), reason="the Apollo sample is not part of the repository")
+def test_photo_texture_is_kept():
+    rock, scale = load_rock(APOLLO, Rock())
+    assert rock.visual.material.baseColorTexture.size == (1024, 1024)
+    assert scale == pytest.approx(1.8 / 0.0514, rel=0.02)
+
+
+def _nan_ply(path):
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 nan 0\n0 1 0\n3 0 1 2\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "message"),
+    [
+        ("missing.glb", lambda p: None, "no such mesh"),
+        ("garbage.glb", lambda p: p.write_bytes(b"not a mesh"), "not a readable mesh"),
+        ("points.ply", lambda p: trimesh.PointCloud(np.eye(3)).export(p), "no faces"),
+        ("nan.ply", _nan_ply, "vertex 1 is NaN"),
+        ("rock.xyz9", lambda p: p.write_text("1 2 3"), "not a readable mesh"),
+    ],
+)
+def test_bad_meshes(tmp_path, name, write, message):
+    write(tmp_path / name)
+    with pytest.raises(InputError, match=message) as error:
+        load_rock(tmp_path / name, Rock())
+    assert "\n" not in str(error.value)

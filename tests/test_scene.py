@@ -1,0 +1,67 @@
+"""Mitsuba sees what `Camera` says: the same pixels, in colour and in depth."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+from mgs.conventions import Camera, look_at
+from mgs.errors import InputError
+from mgs.scene import Scene, sensor_dict
+from mgs.scene_file import Arena, Rock, SceneFile, load_scene_file
+
+K = np.array([[70.0, 0, 30.5], [0, 70.0, 27.25], [0, 0, 1]])
+
+
+def test_known_point_lands_on_its_pixel():
+    """A small bright ball off every axis, an off-centre principal point: the rendered centroid is the projection."""
+    camera = Camera(K, 64, 48, look_at([3.0, -1.0, 1.5], [0.1, 0.2, 0.3]))
+    point = np.array([0.25, -0.2, 0.45])
+    ball = {"type": "sphere", "center": point.tolist(), "radius": 0.05, "light": {"type": "area", "radiance": 1.0}}
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "direct"}, "sensor": sensor_dict(camera), "ball": ball})
+    image = np.array(mi.render(scene, spp=256)).sum(-1)
+    v, u = np.mgrid[:48, :64] + 0.5
+    centroid = np.array([(image * u).sum(), (image * v).sum()]) / image.sum()
+    np.testing.assert_allclose(centroid, camera.project(point[None])[0][0], atol=0.05)
+
+
+def test_colour_and_depth_agree_on_the_silhouette():
+    """Path-traced albedo (Mitsuba's sensor) and the depth rays (NumPy camera) see the same rock after the sensor moved."""
+    rock = trimesh.creation.icosphere(3, 0.7)
+    rock.apply_translation([0.1, 0, 0.5])
+    rock.visual = trimesh.visual.ColorVisuals(rock, vertex_colors=np.tile([255, 0, 0, 255], (len(rock.vertices), 1)))
+    cameras = [Camera(K, 64, 48, look_at(eye, [0, 0, 0.6])) for eye in ([3, 0, 1.5], [-1, 2.5, 2.0])]
+    settings = SceneFile(arena=Arena(colour=(0.3, 0.3, 0.3), stones=0))
+    scene = Scene(settings, rock, cameras[0], seed=0)
+    for index, camera in enumerate(cameras):
+        rendered = scene.render(camera, spp=16, seed=index, denoise=False)
+        redness = rendered.rgb[..., 0] / np.maximum(rendered.rgb.sum(-1), 1e-6)
+        assert np.mean((redness > 0.7) == rendered.mask) > 0.985
+        middle, z = camera.project(np.array([[0.1, 0, 0.5]]))
+        u, v = middle[0].astype(int)
+        assert rendered.depth[v, u] == pytest.approx(z[0] - 0.7, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[rock]\nsiz = 1\n", "unknown key 'rock.siz'"),
+        ("[rock]\nsize = -1\n", "rock.size"),
+        ("[rock\n", "not valid TOML"),
+        ("[orbit]\nkind = 'figure-eight'\n", "orbit.kind"),
+        ("[sky]\nturbidity = nan\n", "sky.turbidity"),
+    ],
+)
+def test_bad_scene_files(tmp_path, text, message):
+    (tmp_path / "s.toml").write_text(text)
+    with pytest.raises(InputError, match=message) as error:
+        load_scene_file(tmp_path / "s.toml")
+    assert "\n" not in str(error.value)
+
+
+def test_unknown_scene_names_the_known_ones():
+    with pytest.raises(InputError, match="boulder"):
+        load_scene_file("boulders")
+    assert load_scene_file("boulder").rock == Rock(**load_scene_file("boulder").rock.model_dump())

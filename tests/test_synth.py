@@ -1,0 +1,86 @@
+"""The synthetic dataset: what is on disk agrees with the true rock, to the pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from mgs.dataset import load_dataset
+from mgs.errors import InputError
+from mgs.scene_file import Arena, Rock, SceneFile
+from mgs.synth import Preset, synthesise
+
+TINY = Preset(width=64, height=48, frames=5, spp=2)
+SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=20))
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return synthesise(tmp_path_factory.mktemp("synth") / "tiny", SCENE, TINY, seed=3)
+
+
+def test_depth_inside_the_mask_lies_on_the_rock(dataset):
+    """Proves camera convention, z-depth (not ray distance) and mask at once, over all azimuths."""
+    rock = trimesh.load(dataset.root / "rock.glb", force="mesh")
+    for frame in dataset.frames:
+        points = frame.camera.unproject(frame.depth())[frame.mask()]
+        assert len(points) > 200
+        assert _distance(rock, points).max() < 1e-4
+
+
+def _distance(mesh, points):
+    """Exact distance to the nearest of the 40 triangles whose centroids are nearest."""
+    near = cKDTree(mesh.triangles_center).query(points, 40)[1]
+    triangles = mesh.triangles[near].reshape(-1, 3, 3)
+    closest = trimesh.triangles.closest_point(triangles, np.repeat(points, 40, axis=0))
+    return np.linalg.norm(closest.reshape(-1, 40, 3) - points[:, None], axis=-1).min(1)
+
+
+def test_rock_is_in_frame_and_fills_it(dataset):
+    for frame in dataset.frames:
+        rows, columns = np.where(frame.mask())
+        assert 0.35 < np.ptp(rows) / frame.camera.height < 0.75
+        assert rows.min() > 0
+        assert columns.min() > 0
+        assert columns.max() < frame.camera.width - 1
+
+
+def test_poses_on_disk_are_the_orbit(dataset):
+    positions = np.array([frame.camera.position for frame in load_dataset(dataset.root).frames])
+    np.testing.assert_allclose(np.hypot(positions[:, 0], positions[:, 1]), 4.0, atol=1e-9)
+    np.testing.assert_allclose(positions[:, 2], 2.3, atol=1e-9)
+    assert [frame.timestamp for frame in dataset.frames] == [0.0, 0.5, 1.0, 1.5, 2.0]
+
+
+def test_same_seed_same_bytes_and_resume(dataset, tmp_path):
+    """An interrupted run that is completed gives the same files as one run."""
+    seen = []
+
+    class Stop(Exception):
+        pass
+
+    def interrupt(done, total):
+        seen.append(done)
+        if done == 2:
+            raise Stop
+
+    with pytest.raises(Stop):
+        synthesise(tmp_path / "again", SCENE, TINY, seed=3, progress=interrupt)
+    assert not (tmp_path / "again/transforms.json").exists()
+    again = synthesise(tmp_path / "again", SCENE, TINY, seed=3)
+    for a, b in zip(dataset.frames, again.frames, strict=True):
+        assert a.image_path.read_bytes() == b.image_path.read_bytes()
+        assert a.mask_path.read_bytes() == b.mask_path.read_bytes()
+        np.testing.assert_array_equal(a.depth(), b.depth())
+    assert (dataset.root / "transforms.json").read_bytes() == (tmp_path / "again/transforms.json").read_bytes()
+    assert (dataset.root / "rock.glb").read_bytes() == (tmp_path / "again/rock.glb").read_bytes()
+
+
+def test_output_folder_that_is_not_empty(dataset, tmp_path):
+    with pytest.raises(InputError, match="not empty"):
+        synthesise(dataset.root, SCENE, TINY, seed=3)
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(InputError, match="other settings"):
+        synthesise(tmp_path, SCENE, TINY, seed=3)
