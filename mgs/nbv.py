@@ -10,7 +10,8 @@ A run lives in one folder:
 A line of `steps.jsonl` holds: `step` (0 = the seeds), `frame` and `name` of the chosen view (null at step 0, which has `seeds`
 and `seed_names` instead), `images` (how many the model has now), `gain` (the policy's own score), `information_gain` (Eq. 7 of
 the chosen view, whatever the policy), `coverage` (Eq. 9 after the fit), `iterations`, `loss` and `stop_reason` of the fit,
-`seconds` per stage, and, where the step was evaluated, `psnr` entries.
+`seconds` per stage, and, where the step was evaluated, mean PSNR in dB over all views (`psnr`; `psnr_mask` in the rock mask)
+and over those never trained on (`held_out_psnr`, `held_out_psnr_mask`).
 
 The candidates' images are never read: only the cameras of frames not taken yet are touched before a choice.
 """
@@ -127,8 +128,17 @@ def check_same_frames(out: Path, dataset: Dataset) -> None:
         raise InputError(f"{dataset.root}: its frames differ from those {out} was started on; restore them or start a new run")
 
 
-def run(out: Path, settings: NbvSettings, dataset: Dataset, stations: Stations, progress: Progress) -> State:
+def run(
+    out: Path,
+    settings: NbvSettings,
+    dataset: Dataset,
+    stations: Stations,
+    progress: Progress,
+    on_step: Callable[[State], None] = lambda state: None,
+) -> State:
     """Run or resume the loop in `out` (which has its config.json) until the budget is spent; returns the last state.
+
+    progress is told of the work inside a step, on_step of every state that is committed.
 
     Killed at any moment and called again, it takes the same views as a run that was never interrupted.
     """
@@ -139,9 +149,11 @@ def run(out: Path, settings: NbvSettings, dataset: Dataset, stations: Stations, 
     if state is None:
         state = loop.first()
         write_checkpoint(out, state)
+    on_step(state)
     while len(state.steps) <= settings.budget:
         state = loop.next(state)
         write_checkpoint(out, state)
+        on_step(state)
     write_steps(out, state)
     write_ply(out / "gaussians.ply", state.gaussians)
     return state

@@ -121,6 +121,24 @@ def start(out: Path, dataset: Dataset, **values) -> NbvSettings:
     return settings
 
 
+def write_prior(out: Path) -> Path:
+    """A prior folder of the sphere's points, as `mgs prior` would write it."""
+    from mgs.prior import Prior, save_prior
+    from mgs.surface import Mesh
+
+    n = _normals()
+    mesh = Mesh(n[:3], np.array([[0, 1, 2]]), np.zeros(1, bool))
+    return save_prior(out, Prior(n, n, 0.5, 0.2, {"spacing": 0.5, "depth_tolerance": 0.2, "n": POINTS}), mesh)
+
+
+def write_run(out: Path, root: Path, prior: Path) -> Path:
+    """A run folder of the seeds alone, on the stand-ins."""
+    dataset = load_dataset(root)
+    settings = start(out, dataset, prior=prior, budget=2)
+    nbv.run(out, settings.model_copy(update={"budget": 0}), dataset, stations(), silent)
+    return out
+
+
 def silent(stage: str, done: int, total: int) -> None:
     """No progress bar."""
 

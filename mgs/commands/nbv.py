@@ -1,0 +1,158 @@
+"""`mgs nbv`: choose views one by one, as the paper does."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mgs.policies import PIXEL_NOISE, POLICIES
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from mgs.nbv import State
+
+
+def nbv(
+    dataset: Annotated[Path | None, typer.Argument(help="Dataset folder (transforms.json). Not needed with --resume.")] = None,
+    out: Annotated[Path | None, typer.Option(help="New folder for the run.")] = None,
+    prior: Annotated[Path | None, typer.Option(help="Folder of `mgs prior`; built inside the run where none is given.")] = None,
+    gaussians: Annotated[int | None, typer.Option(help="Number of Gaussians where the prior is built here.")] = None,
+    policy: Annotated[str, typer.Option(help=f"One of {', '.join(POLICIES)}.")] = "d-optimal",
+    budget: Annotated[int, typer.Option(help="Views chosen beyond the seeds.")] = 50,
+    seeds: Annotated[int, typer.Option(help="Views at evenly spaced azimuths that start the model.")] = 4,
+    seed: Annotated[int, typer.Option(help="Root of every random draw.")] = 0,
+    pixel_noise: Annotated[
+        float, typer.Option(help="Residual of a pixel, linear RGB: sets lambda of every criterion.")
+    ] = PIXEL_NOISE,
+    evaluate_every: Annotated[int, typer.Option(help="Measure PSNR on all views every so many steps; 0: only at the end.")] = 0,
+    resume: Annotated[
+        Path | None, typer.Option(help="Continue this run; every other setting comes from its config.json.")
+    ] = None,
+) -> None:
+    """Fit to the seeds, then choose, capture and fit again, view by view, until the budget is spent.
+
+    Writes config.json, steps.jsonl (one line a step), checkpoint.npz, gaussians.ply and metrics.json into the run folder. A run
+    that was interrupted at any moment, kill -9 included, goes on with --resume and takes the same views.
+    """
+    from rich.console import Console
+
+    from mgs.errors import InputError
+
+    console = Console(highlight=False)
+    if resume is not None:
+        if dataset is not None or out is not None:
+            raise InputError("nbv: --resume RUN continues RUN as it was started; leave DATASET and --out out")
+        run_folder(resume, console)
+        return
+    if dataset is None or out is None:
+        raise InputError("nbv: give a DATASET and --out RUN, or --resume RUN")
+    values = {
+        "policy": policy, "budget": budget, "seeds": seeds, "seed": seed,
+        "pixel_noise": pixel_noise, "evaluate_every": evaluate_every,
+    }  # fmt: skip
+    start_run(dataset, out, prior, gaussians, values, console)
+    run_folder(out, console)
+
+
+def start_run(
+    dataset: Path, out: Path, prior: Path | None, gaussians: int | None, values: dict[str, Any], console: Console
+) -> None:
+    """Check everything, build the prior where none is given, write config.json. Leaves no folder behind where it fails."""
+    from mgs.config import NbvSettings, validated
+    from mgs.dataset import load_dataset
+    from mgs.errors import InputError
+    from mgs.files import new_folder
+    from mgs.nbv import check_counts, start
+    from mgs.prior import PriorSettings, build_prior, load_prior, save_prior
+
+    if prior is not None and gaussians is not None:
+        raise InputError("nbv: --gaussians is for a prior that is built here; leave it out, or leave out --prior")
+    where = prior or out / "prior"
+    settings = validated(NbvSettings, {"dataset": dataset.resolve(), "prior": where.resolve(), **values})
+    frames = load_dataset(dataset)
+    check_counts(settings, len(frames))
+    if prior is not None:
+        load_prior(prior)
+    existed = out.exists()
+    new_folder(out)
+    try:
+        if prior is None:
+            with console.status("building the prior") as status:
+                built, stages = build_prior(
+                    frames,
+                    PriorSettings(gaussians=gaussians, seed=settings.seed),
+                    on_stage=lambda stage: status.update(f"prior: {stage}"),
+                )
+            save_prior(where, built, stages.mesh)
+        start(out, settings, frames)
+    except BaseException:
+        shutil.rmtree(out)
+        if existed:
+            out.mkdir()
+        raise
+
+
+def run_folder(out: Path, console: Console) -> None:
+    """Run or resume the loop in a run folder, evaluate, print the table."""
+    from mgs import nbv as loop
+    from mgs import runtime
+    from mgs.dataset import load_dataset
+    from mgs.prior import load_prior
+
+    settings = loop.read_settings(out)
+    dataset = load_dataset(settings.dataset)
+    loop.check_same_frames(out, dataset)
+    prior = load_prior(settings.prior)
+    runtime.start()
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from mgs.evaluate import evaluate_run
+    from mgs.stations import real_stations
+    from mgs.train import TrainSettings
+
+    stations = real_stations(dataset, prior, TrainSettings())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console, transient=True) as bar:
+        whole = bar.add_task(f"{out.name}: images", total=settings.seeds + settings.budget)
+        part = bar.add_task("reading", total=1)
+
+        def progress(stage: str, done: int, total: int) -> None:
+            bar.update(part, description=stage, completed=done, total=total)
+
+        def on_step(state: State) -> None:
+            bar.update(whole, completed=len(state.taken))
+
+        state = loop.run(out, settings, dataset, stations, progress, on_step)
+        metrics = evaluate_run(out, pictures=False, progress=lambda done, total: progress("evaluating", done, total))
+    print_run(out, state, metrics, console)
+
+
+def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console) -> None:
+    """The steps as a table, then the quality of the model."""
+    from rich.table import Table
+
+    table = Table("step", "image", "gain", "coverage", "iterations", "loss", "stopped", "seconds", box=None)
+    for line in state.steps:
+        gain = "" if line["gain"] is None else f"{line['gain']:.4g}"
+        table.add_row(
+            str(line["step"]), line["name"] or " ".join(line["seed_names"]), gain, f"{100 * line['coverage']:.2f} %",
+            str(line["iterations"]), f"{line['loss']:.3g}", line["stop_reason"], f"{sum(line['seconds'].values()):.1f}",
+        )  # fmt: skip
+    console.print(table)
+    for name, label in (("all", "all views"), ("held_out", "views never trained on")):
+        mean = metrics[name]
+        if mean["count"]:
+            console.print(
+                f"{label} ({mean['count']}): PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.4f}; "
+                f"inside the rock mask PSNR {mean['psnr_mask']:.2f} dB, SSIM {mean['ssim_mask']:.4f}"
+            )
+    console.print(f"wrote {out}", soft_wrap=True)

@@ -1,0 +1,322 @@
+"""Every kind of bad input, through the real command line: one line that says what is wrong, exit code 2, nothing left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+
+from mgs.cli import main
+from mgs.files import write_exr, write_png
+
+Change = Callable[[Path], object]
+
+
+def edit_transforms(change: Callable[[dict], object]) -> Change:
+    """A change of transforms.json."""
+
+    def apply(root: Path) -> None:
+        path = root / "transforms.json"
+        data = json.loads(path.read_text())
+        change(data)
+        path.write_text(json.dumps(data))
+
+    return apply
+
+
+def truncate(name: str) -> Change:
+    """Cut a file in half, as a full disk does."""
+
+    def apply(root: Path) -> None:
+        data = (root / name).read_bytes()
+        (root / name).write_bytes(data[: len(data) // 2])
+
+    return apply
+
+
+def no_intrinsics(data: dict) -> None:
+    for key in ("fl_x", "fl_y", "cx", "cy"):
+        data.pop(key)
+
+
+def set_pose(matrix: list) -> Change:
+    return edit_transforms(lambda data: data["frames"][2].update(transform_matrix=matrix))
+
+
+def every_depth(value: Callable[[Path], np.ndarray]) -> Change:
+    def apply(root: Path) -> None:
+        for path in sorted((root / "depth").glob("*.exr")):
+            write_exr(path, {"Z": value(path)})
+
+    return apply
+
+
+def wrong_size(root: Path) -> None:
+    write_png(root / "images/kf_0000.png", np.zeros((5, 7, 3), np.float32))
+
+
+def small_mask(root: Path) -> None:
+    write_png(root / "masks/kf_0000.png", np.ones((5, 7), bool))
+
+
+NAN_POSE = [[1, 0, 0, float("nan")], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+ZERO_POSE = [[0] * 4] * 3 + [[0, 0, 0, 1]]
+FLAT_POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]
+
+DATASETS: dict[str, tuple[Change, str]] = {
+    "no transforms.json": (lambda root: (root / "transforms.json").unlink(), "transforms.json"),
+    "truncated transforms.json": (truncate("transforms.json"), "transforms.json"),
+    "transforms.json of another shape": (lambda root: (root / "transforms.json").write_text("[1, 2]"), "no frames"),
+    "no frames": (edit_transforms(lambda data: data.update(frames=[])), "no frames"),
+    "no intrinsics": (edit_transforms(no_intrinsics), "intrinsics"),
+    "focal length 0": (edit_transforms(lambda data: data.update(fl_x=0)), "focal"),
+    "NaN pose": (set_pose(NAN_POSE), "frame 2"),
+    "singular pose": (set_pose(ZERO_POSE), "frame 2"),
+    "pose that flattens": (set_pose(FLAT_POSE), "frame 2"),
+    "pose that is no matrix": (set_pose([1, 2, 3]), "frame 2"),
+    "pose of words": (set_pose([["a"] * 4] * 4), "frame 2"),
+    "missing image": (lambda root: (root / "images/kf_0003.png").unlink(), "kf_0003.png"),
+    "missing depth": (lambda root: (root / "depth/kf_0003.exr").unlink(), "kf_0003.exr"),
+    "missing mask": (lambda root: (root / "masks/kf_0003.png").unlink(), "kf_0003.png"),
+}
+"""Datasets that no command accepts: (what to break, what the line must name)."""
+
+PIXELS: dict[str, tuple[Change, str]] = {
+    "truncated image": (truncate("images/kf_0000.png"), "kf_0000.png"),
+    "image that is text": (lambda root: (root / "images/kf_0000.png").write_text("no pixels"), "kf_0000.png"),
+    "image of the wrong size": (wrong_size, "7x5"),
+    "mask of the wrong size": (small_mask, "7x5"),
+    "truncated depth": (truncate("depth/kf_0000.exr"), "kf_0000.exr"),
+}
+"""Broken pixels, found when a frame is used: `mgs nbv` uses frame 0 as a seed, `mgs prior` every depth."""
+
+SURVEYS: dict[str, tuple[Change, str]] = {
+    "truncated depth": (truncate("depth/kf_0005.exr"), "kf_0005.exr"),
+    "no depth in transforms.json": (
+        edit_transforms(lambda data: [frame.pop("depth_file_path") for frame in data["frames"]]),
+        "depth_file_path",
+    ),
+    "no return in any pixel": (every_depth(lambda path: np.zeros((tiny.HEIGHT, tiny.WIDTH))), "return"),
+    "NaN in every pixel": (every_depth(lambda path: np.full((tiny.HEIGHT, tiny.WIDTH), np.nan)), "return"),
+}
+"""Depths from which no prior can be built."""
+
+
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory):
+    return tiny.write_dataset(tmp_path_factory.mktemp("pristine") / "dataset")
+
+
+@pytest.fixture
+def dataset(pristine, tmp_path):
+    return Path(shutil.copytree(pristine, tmp_path / "dataset"))
+
+
+@pytest.fixture
+def prior(tmp_path):
+    return tiny.write_prior(tmp_path / "prior")
+
+
+def listing(root: Path) -> dict[str, bytes | None]:
+    """Every file under a folder with its content, every folder with None."""
+    paths = (root, *root.rglob("*")) if root.exists() else ()
+    return {str(path.relative_to(root)): path.read_bytes() if path.is_file() else None for path in paths}
+
+
+def refused(capsys, arguments: list, out: Path | None = None) -> str:
+    """Run `mgs ARGUMENTS`, check that it is refused as it should be, return the line."""
+    before = listing(out) if out else None
+    with pytest.raises(SystemExit) as stop:
+        main([str(argument) for argument in arguments])
+    error = capsys.readouterr().err
+    assert stop.value.code == 2, error
+    lines = error.splitlines()
+    assert len(lines) == 1, error
+    assert lines[0].startswith("mgs: ")
+    assert "Traceback" not in error
+    if out:
+        assert listing(out) == before, "something was left behind"
+    return lines[0]
+
+
+@pytest.mark.parametrize("command", ["nbv", "prior"])
+@pytest.mark.parametrize("case", DATASETS)
+def test_broken_dataset(capsys, dataset, tmp_path, command, case):
+    change, named = DATASETS[case]
+    change(dataset)
+    assert named in refused(capsys, [command, dataset, "--out", tmp_path / "out"], tmp_path / "out")
+
+
+@pytest.mark.parametrize("case", PIXELS)
+def test_broken_pixels(capsys, dataset, prior, tmp_path, case):
+    change, named = PIXELS[case]
+    change(dataset)
+    line = refused(capsys, ["nbv", dataset, "--out", tmp_path / "out", "--prior", prior, "--budget", 1])
+    assert named in line
+    assert not (tmp_path / "out/steps.jsonl").exists()
+
+
+@pytest.mark.parametrize("command", ["nbv", "prior"])
+@pytest.mark.parametrize("case", SURVEYS)
+def test_survey_without_a_rock(capsys, dataset, tmp_path, command, case):
+    change, named = SURVEYS[case]
+    change(dataset)
+    arguments = [command, dataset, "--out", tmp_path / "out", *(["--budget", 1] if command == "nbv" else [])]
+    assert named in refused(capsys, arguments, tmp_path / "out")
+
+
+NBV: dict[str, tuple[list, str]] = {
+    "unknown policy": (["--policy", "best"], "best"),
+    "more seeds than frames": (["--seeds", 13], "13 seeds"),
+    "no seeds": (["--seeds", 0], "--seeds"),
+    "budget larger than the candidates": (["--budget", 9], "8 candidates"),
+    "negative budget": (["--budget", -1], "--budget"),
+    "negative seed": (["--seed", -1], "--seed"),
+    "no pixel noise": (["--pixel-noise", 0], "--pixel-noise"),
+    "NaN pixel noise": (["--pixel-noise", "nan"], "--pixel-noise"),
+    "negative evaluation interval": (["--evaluate-every", -2], "--evaluate-every"),
+}
+
+
+@pytest.mark.parametrize("case", NBV)
+def test_nbv_settings(capsys, dataset, prior, tmp_path, case):
+    options, named = NBV[case]
+    budget = [] if "--budget" in options else ["--budget", 1]
+    arguments = ["nbv", dataset, "--out", tmp_path / "out", "--prior", prior, *budget, *options]
+    assert named in refused(capsys, arguments, tmp_path / "out")
+
+
+@pytest.mark.parametrize("command", ["nbv", "prior"])
+@pytest.mark.parametrize("count", [0, 1, -5])
+def test_too_few_gaussians(capsys, dataset, tmp_path, command, count):
+    arguments = [command, dataset, "--out", tmp_path / "out", "--gaussians", count]
+    assert "Gaussians" in refused(capsys, arguments + (["--budget", 1] if command == "nbv" else []), tmp_path / "out")
+
+
+def occupied(path: Path) -> Path:
+    path.mkdir()
+    (path / "precious.txt").write_text("keep me")
+    return path
+
+
+def a_file(path: Path) -> Path:
+    path.write_text("keep me")
+    return path
+
+
+@pytest.mark.parametrize("command", ["nbv", "prior", "synth-orbit"])
+@pytest.mark.parametrize(("make", "named"), [(occupied, "not empty"), (a_file, "is a file")])
+def test_output_that_is_in_the_way(capsys, dataset, prior, tmp_path, command, make, named):
+    out = make(tmp_path / "out")
+    arguments = {
+        "nbv": ["nbv", dataset, "--out", out, "--prior", prior, "--budget", 1],
+        "prior": ["prior", dataset, "--out", out],
+        "synth-orbit": ["synth-orbit", out, "--frames", 2, "--size", "16x12"],
+    }[command]
+    assert named in refused(capsys, arguments, out)
+
+
+def read_only_folder(tmp_path: Path) -> Path:
+    """A folder nobody may write to: root is not held back by permissions, so for root it is the kernel's own."""
+    if os.geteuid() == 0:
+        return Path("/proc/mgs")
+    folder = tmp_path / "locked"
+    folder.mkdir(mode=0o555)
+    return folder / "out"
+
+
+@pytest.mark.parametrize("command", ["nbv", "prior", "synth-orbit"])
+def test_read_only_folder(capsys, dataset, prior, tmp_path, command):
+    out = read_only_folder(tmp_path)
+    arguments = {
+        "nbv": ["nbv", dataset, "--out", out, "--prior", prior, "--budget", 1],
+        "prior": ["prior", dataset, "--out", out],
+        "synth-orbit": ["synth-orbit", out, "--frames", 2, "--size", "16x12"],
+    }[command]
+    assert "cannot be written" in refused(capsys, arguments)
+    assert not out.exists()
+
+
+MESHES: dict[str, tuple[str, str]] = {
+    "no faces": ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "faces"),
+    "NaN vertices": ("v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n", "NaN"),
+    "not a mesh": ("this is no mesh", "mesh.obj"),
+}
+
+
+@pytest.mark.parametrize("case", MESHES)
+def test_broken_mesh(capsys, tmp_path, case):
+    text, named = MESHES[case]
+    (tmp_path / "mesh.obj").write_text(text)
+    arguments = ["synth-orbit", tmp_path / "out", "--mesh", tmp_path / "mesh.obj"]
+    line = refused(capsys, arguments, tmp_path / "out")
+    assert named in line
+    assert "mesh.obj" in line
+
+
+SYNTH: dict[str, tuple[list, str]] = {
+    "missing mesh": (["--mesh", "nowhere.glb"], "nowhere.glb"),
+    "unknown scene": (["--scene", "moonbase"], "moonbase"),
+    "missing scene file": (["--scene", "nowhere/x.toml"], "x.toml"),
+    "unknown preset": (["--preset", "huge"], "huge"),
+    "size of words": (["--size", "big"], "--size"),
+    "size 0": (["--size", "0x12"], "--size"),
+}
+
+
+@pytest.mark.parametrize("case", SYNTH)
+def test_synth_orbit_options(capsys, tmp_path, case):
+    options, named = SYNTH[case]
+    assert named in refused(capsys, ["synth-orbit", tmp_path / "out", *options], tmp_path / "out")
+
+
+PRIORS: dict[str, tuple[Change, str]] = {
+    "missing": (shutil.rmtree, "mgs prior"),
+    "without points": (lambda root: (root / "points.ply").unlink(), "points.ply"),
+    "truncated points": (truncate("points.ply"), "prior"),
+    "truncated numbers": (truncate("prior.json"), "prior.json"),
+}
+
+
+@pytest.mark.parametrize("case", PRIORS)
+def test_broken_prior(capsys, dataset, prior, tmp_path, case):
+    change, named = PRIORS[case]
+    change(prior)
+    arguments = ["nbv", dataset, "--out", tmp_path / "out", "--prior", prior, "--budget", 1]
+    assert named in refused(capsys, arguments, tmp_path / "out")
+
+
+def test_nbv_needs_to_know_what_to_do(capsys, dataset, tmp_path):
+    assert "--resume" in refused(capsys, ["nbv"])
+    assert "--resume" in refused(capsys, ["nbv", dataset])
+    assert "--resume" in refused(capsys, ["nbv", dataset, "--resume", tmp_path])
+
+
+RUNS: dict[str, tuple[Change, str]] = {
+    "missing": (shutil.rmtree, "holds no run"),
+    "without config": (lambda root: (root / "config.json").unlink(), "holds no run"),
+    "truncated config": (truncate("config.json"), "config.json"),
+    "truncated checkpoint": (truncate("checkpoint.npz"), "checkpoint.npz"),
+}
+
+
+@pytest.mark.parametrize("command", [["nbv", "--resume"], ["eval"]])
+@pytest.mark.parametrize("case", RUNS)
+def test_broken_run(capsys, dataset, prior, tmp_path, command, case):
+    change, named = RUNS[case]
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    change(run)
+    assert named in refused(capsys, [*command, run], run)
+
+
+@pytest.mark.parametrize("command", [["nbv", "--resume"], ["eval"]])
+def test_run_whose_dataset_is_gone(capsys, dataset, prior, tmp_path, command):
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    shutil.rmtree(dataset)
+    assert "no such dataset" in refused(capsys, [*command, run], run)
