@@ -41,7 +41,7 @@ class Footprints:
 
 @dataclass
 class BlockLists:
-    """Pairs (splat, block), sorted by block, in each block by depth.
+    """Pairs (splat, block), sorted by block, in each block by depth; M counts some unused room at the end.
 
     splat, slot: UInt32 [M]; a pair's slot is its place in the order where the pairs of one splat are contiguous, and
     slot_start, slot_end: UInt32 [N] are the slots of each splat. block: UInt32 [L] of each lane, longest list first, and
@@ -155,9 +155,10 @@ def build(splats: Splats, order: Any, width: int, height: int, margin: float) ->
     start, end, slot = _group(key, lanes)
     length = dr.minimum(end - start, 4095)
     longest_first = dr.detail.block_mkperm(4095 - length, lanes, 4096)
+    padding = dr.zeros(mi.UInt32, _rounded(len(key)) - len(key))
     lists = BlockLists(
-        splat=dr.gather(mi.UInt32, splat, slot),
-        slot=slot,
+        splat=dr.concat([dr.gather(mi.UInt32, splat, slot), padding]),
+        slot=dr.concat([slot, padding]),
         slot_start=slot_start,
         slot_end=slot_end,
         block=longest_first,
@@ -170,6 +171,12 @@ def build(splats: Splats, order: Any, width: int, height: int, margin: float) ->
     )
     dr.eval(lists)
     return lists
+
+
+def _rounded(pairs: int) -> int:
+    """Room for this many pairs, rounded up by at most an eighth: few distinct sizes, so recorded kernels are reused."""
+    step = max(1024, 1 << max(pairs.bit_length() - 4, 0))
+    return -(-max(pairs, 1) // step) * step
 
 
 def _touches(splats: Splats, foot: Footprints, splat: Any, bx: Any, by: Any) -> Any:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -29,6 +30,15 @@ LN2 = 0.6931471805599453
 
 DENORMAL = 1e-30
 """Sums smaller than this become 0: threads differ in how they flush denormals, and nothing else would differ between reruns."""
+
+
+def _sizes(lists: BlockLists, *_: Any) -> tuple[int, ...]:
+    """What a recording of a kernel bakes in: the lengths of its buffers."""
+    return len(lists.splat), len(lists.slot_start), len(lists.block)
+
+
+frozen = partial(dr.freeze, state_fn=_sizes, limit=64, warn_after=1 << 30)
+"""Record a kernel once per set of sizes and replay it: tracing costs more than a small image does."""
 
 
 @dataclass
@@ -133,6 +143,7 @@ def _walk(
     return T, state
 
 
+@frozen
 def forward(lists: BlockLists, packed: Packed) -> tuple[Any, Any]:
     """Composite. Returns block-major pixels: rgba Float [L*32*4] (premultiplied, no background) and weighted depth [L*32]."""
     lane, T = _lane(lists)
@@ -186,6 +197,7 @@ def _per_splat(lists: BlockLists, buffers: list[Any], count: int) -> list[Any]:
     return [dr.select(dr.abs(x) > DENORMAL, x, 0) for x in flat]
 
 
+@frozen
 def adjoint(lists: BlockLists, packed: Packed, out: tuple[Any, Any], d_out: tuple[Any, Any], means: bool) -> Splats:
     """Gradient with respect to each splat's numbers, given `forward`'s output (rgba, depth) and the gradient of it.
 
@@ -236,6 +248,7 @@ def adjoint(lists: BlockLists, packed: Packed, out: tuple[Any, Any], d_out: tupl
     return Splats(du, dv, 2 * LN2 * p / e * xy, -2 * LN2 / p * xx, -2 * LN2 / e * yy, LN2 * d, z, r, g, b)
 
 
+@frozen
 def fisher(lists: BlockLists, packed: Packed, rgba: Any, background: Any, block: bool) -> list[Any]:
     """Sums over pixels and channels, Float [N] each, from which O(N) work makes the Fisher information.
 

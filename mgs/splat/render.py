@@ -130,12 +130,17 @@ def render(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.
     Raises InputError where a parameter is NaN or infinite (names the parameter and the first Gaussian).
     """
     splats, lists = splats_and_lists(as_drjit(gaussians), camera, cache)
+    return composite(splats, lists, camera.width, camera.height, background)
+
+
+def composite(splats: Splats, lists: BlockLists, width: int, height: int, background: Any = (0.0, 0.0, 0.0)) -> Image:
+    """Composite projected splats whose block lists are known; differentiable in the splats' numbers."""
     rgba, depth = dr.custom(_Rasterise, splats, lists, dr.grad_enabled(splats.u))
-    places = _places(camera.width, camera.height)
+    places = _places(width, height)
     pixel = dr.gather(mi.Vector4f, rgba, places, mode=dr.ReduceMode.NoConflicts)
     alpha = pixel.w
     rgb = mi.Color3f(pixel.x, pixel.y, pixel.z) + (1 - alpha) * mi.Color3f(background)
     weighted = dr.gather(mi.Float, depth, places, mode=dr.ReduceMode.NoConflicts)
     expected = dr.select(alpha > 0, weighted / dr.select(alpha > 0, alpha, 1), 0)
-    shape = (camera.height, camera.width)
+    shape = (height, width)
     return Image(mi.TensorXf(dr.ravel(rgb), (*shape, 3)), mi.TensorXf(alpha, shape), mi.TensorXf(expected, shape))

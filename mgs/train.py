@@ -1,0 +1,133 @@
+"""Learn the appearance of frozen Gaussians from posed images: maximum likelihood, to convergence.
+
+The loss is the mean squared error over pixels and channels, the paper's Eq. 2 up to a constant: it is the model for which the
+Fisher information is exact. One optimiser step draws one image; a pass draws all of them once, in an order of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import partial
+from typing import Any, Literal
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mgs.conventions import Camera
+from mgs.gaussians import Gaussians
+from mgs.seeds import generator
+from mgs.splat import ListCache, as_drjit
+from mgs.splat.blocks import BlockLists
+from mgs.splat.project import camera_array, project
+from mgs.splat.render import composite
+
+LEARNED = ("sh", "log_scales", "quats", "logit_opacities")
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """Learning rates are Adam's, per step, in each parameter's own unit; they fall by `decay` over `passes`."""
+
+    passes: int = 40
+    """Most passes over the images."""
+    tolerance: float = 0.01
+    """Converged when a pass lowers the loss by less than this share, twice in a row."""
+    rates: tuple[float, float, float, float] = (0.02, 0.02, 0.01, 0.05)
+    """For sh, log_scales, quats, logit_opacities."""
+    decay: float = 0.1
+    """Last rate over first."""
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted model (NumPy fields), its mean squared error over the images in the last pass, and why fitting stopped."""
+
+    gaussians: Gaussians
+    loss: float
+    passes: int
+    iterations: int
+    stop_reason: Literal["converged", "iteration-limit"]
+
+
+def _sizes(parameters: Any, moments: Any, camera: Any, lists: BlockLists, target: Any, *_: Any) -> tuple[int, ...]:
+    return len(lists.splat), len(lists.slot_start), len(lists.block), len(target)
+
+
+frozen = partial(dr.freeze, limit=64, warn_after=1 << 30)
+
+
+@frozen(state_fn=lambda gaussians, camera: (len(gaussians),))
+def _project(gaussians: Gaussians, camera: Any) -> Any:
+    return project(gaussians, camera)
+
+
+@frozen(state_fn=_sizes)
+def _step(
+    gaussians: Gaussians, moments: list[list[Any]], camera: Any, lists: BlockLists, target: Any, size: Any, rates: list[Any], t: Any
+) -> tuple[Gaussians, list[list[Any]], Any]:
+    """One Adam step (Kingma & Ba 2015, beta 0.9 and 0.999) on one image. Returns parameters, moments, mean squared error.
+
+    size: (width, height); t: UInt32, step number from 1; target: Float [H*W*3].
+    """
+    values = [dr.copy(getattr(gaussians, name)) for name in LEARNED]
+    dr.enable_grad(values)
+    watched = Gaussians(gaussians.means, **dict(zip(LEARNED, values, strict=True)))
+    rgb = composite(project(watched, camera), lists, *size).rgb
+    error = rgb.array - target
+    loss = dr.mean(dr.square(error))
+    dr.backward(loss)
+    new_values, new_moments = [], []
+    step = mi.Float(t)
+    unbias1, unbias2 = 1 - dr.power(mi.Float(0.9), step), 1 - dr.power(mi.Float(0.999), step)
+    for value, (m, v), rate in zip(values, moments, rates, strict=True):
+        gradient = dr.grad(value)
+        m, v = dr.lerp(gradient, m, 0.9), dr.lerp(dr.square(gradient), v, 0.999)
+        update = (m.array / unbias1) / (dr.sqrt(v.array / unbias2) + 1e-15) * rate
+        new_values.append(mi.TensorXf(dr.detach(value).array - update, value.shape))
+        new_moments.append([m, v])
+    return Gaussians(gaussians.means, **dict(zip(LEARNED, new_values, strict=True))), new_moments, dr.detach(loss)
+
+
+def fit(
+    gaussians: Gaussians,
+    cameras: list[Camera],
+    targets: list[np.ndarray],
+    settings: TrainSettings | None = None,
+    on_pass: Callable[[int, int], None] | None = None,
+    cache: ListCache | None = None,
+) -> Fit:
+    """Fit appearance (not means) to images: cameras and targets [H,W,3] linear RGB, rock on black.
+
+    Starts with fresh optimiser moments, so the result depends on its arguments alone, bitwise. on_pass(done, most) reports.
+    """
+    settings, cache = settings or TrainSettings(), cache or ListCache()
+    model = as_drjit(gaussians)
+    arrays = [camera_array(camera) for camera in cameras]
+    pixels = [mi.Float(np.ascontiguousarray(target, np.float32).ravel()) for target in targets]
+    moments = [[dr.zeros(mi.TensorXf, getattr(model, n).shape) for _ in range(2)] for n in LEARNED]
+    rng = generator(settings.seed, "train/order")
+    history: list[float] = []
+    t, small, stop = 0, 0, "iteration-limit"
+    for done in range(settings.passes):
+        fall = settings.decay ** (done / max(settings.passes - 1, 1))
+        rates = [dr.opaque(mi.Float, rate * fall) for rate in settings.rates]
+        losses = []
+        for i in rng.permutation(len(cameras)):
+            t += 1
+            splats = _project(model, arrays[i])
+            lists = cache.get(cameras[i], splats)
+            size = (cameras[i].width, cameras[i].height)
+            model, moments, loss = _step(model, moments, arrays[i], lists, pixels[i], size, rates, dr.opaque(mi.UInt32, t))
+            losses.append(loss)
+        history.append(float(np.mean([float(loss[0]) for loss in losses])))
+        if on_pass:
+            on_pass(done + 1, settings.passes)
+        small = small + 1 if len(history) > 1 and history[-1] > (1 - settings.tolerance) * history[-2] else 0
+        if small == 2:
+            stop = "converged"
+            break
+    numpy = Gaussians(*(np.asarray(getattr(model, f.name)) for f in fields(model)))
+    return Fit(numpy, history[-1] if history else float("nan"), len(history), t, stop)
