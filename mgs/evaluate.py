@@ -16,7 +16,7 @@ import numpy as np
 from mgs.conventions import Camera, srgb_from_linear
 from mgs.dataset import Dataset, Frame
 from mgs.errors import InputError
-from mgs.files import atomic_path, write_json
+from mgs.files import atomic_path, read_png, write_json
 from mgs.gaussians import Gaussians
 
 Renderer = Callable[[Gaussians, Camera], np.ndarray]
@@ -142,19 +142,32 @@ def _without_nan(view: dict[str, Any]) -> dict[str, Any]:
 
 
 def write_comparison(path: str | Path, truth: np.ndarray, rendered: np.ndarray, decibels: float) -> None:
-    """Write truth | render | brightened |difference|, with captions, as one PNG. Linear RGB [H,W,3] twice."""
+    """Write truth | render | brightened |difference| as one PNG, captions in a strip above. Linear RGB [H,W,3] twice."""
     from PIL import Image, ImageDraw, ImageFont
 
     a, b = srgb_from_linear(truth), srgb_from_linear(rendered)
     panels = np.concatenate([a, b, np.clip(DIFFERENCE_GAIN * np.abs(a - b), 0, 1)], axis=1)
-    width, size = a.shape[1], max(10, a.shape[0] // 24)
-    picture = Image.fromarray(np.round(panels * 255).astype(np.uint8))
+    height, width = a.shape[:2]
+    size = max(10, height // 24)
+    picture = Image.new("RGB", (3 * width, height + 2 * size), (255, 255, 255))
+    picture.paste(Image.fromarray(np.round(panels * 255).astype(np.uint8)), (0, 2 * size))
     draw, font = ImageDraw.Draw(picture), ImageFont.load_default(size)
     captions = ("truth", f"render, {decibels:.2f} dB", f"|difference| x {DIFFERENCE_GAIN}")
     for i, caption in enumerate(captions):
-        draw.text((i * width + size // 2, size // 3), caption, fill=(255, 255, 255), font=font)
+        draw.text(((i + 0.5) * width, size), caption, fill=(0, 0, 0), font=font, anchor="mm")
     with atomic_path(path) as temporary:
         picture.save(temporary, format="PNG")
+
+
+def read_comparison(path: str | Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """(truth, render), linear RGB [H,W,3], out of a picture by `write_comparison`; to 8 bits.
+
+    Raises InputError where the picture is missing, damaged or not of this camera's size.
+    """
+    pixels, (height, width) = read_png(path), (camera.height, camera.width)
+    if pixels.shape[0] <= height or pixels.shape[1] != 3 * width:
+        raise InputError(f"{path}: is not a comparison of {width}x{height} views; write it again with `mgs eval`")
+    return pixels[-height:, :width], pixels[-height:, width : 2 * width]
 
 
 def evaluate_run(run: str | Path, *, pictures: bool = True, progress: Progress | None = None) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from synthetic import orbit_cameras, write_dataset
 
 from mgs.conventions import srgb_from_linear
 from mgs.errors import InputError
-from mgs.evaluate import PSNR_LIMIT, evaluate, psnr, ssim, write_comparison
+from mgs.evaluate import PSNR_LIMIT, evaluate, psnr, read_comparison, ssim, write_comparison
 from mgs.gaussians import Gaussians, sh_from_rgb
 
 
@@ -129,9 +129,14 @@ def test_comparison_picture(tmp_path):
     rendered = truth.copy()
     rendered[30:, 40:] = 0.4
     write_comparison(tmp_path / "a.png", truth, rendered, 20.0)
+    strip = 20
     picture = np.asarray(Image.open(tmp_path / "a.png")) / 255
-    assert picture.shape == (48, 192, 3)
+    assert picture.shape == (48 + strip, 192, 3)
     expected = 4 * (srgb_from_linear([0.5]) - srgb_from_linear([0.4]))[0]
-    assert picture[40, 128 + 50, 0] == pytest.approx(expected, abs=2 / 255)
-    assert picture[40, 128 + 10].max() == 0
-    assert picture[40, 64 + 50, 0] == pytest.approx(srgb_from_linear([0.4])[0], abs=1 / 255)
+    assert picture[strip + 40, 128 + 50, 0] == pytest.approx(expected, abs=2 / 255)
+    assert picture[strip + 40, 128 + 10].max() == 0
+    camera = orbit_cameras(1)[0]
+    for written, read in zip((truth, rendered), read_comparison(tmp_path / "a.png", camera), strict=True):
+        np.testing.assert_allclose(srgb_from_linear(read), srgb_from_linear(written), atol=0.51 / 255)
+    with pytest.raises(InputError, match="not a comparison of 60x48"):
+        read_comparison(tmp_path / "a.png", orbit_cameras(1, 60)[0])

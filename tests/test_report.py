@@ -1,0 +1,113 @@
+"""Figures and tables from run folders: right numbers, right picture sizes, and a clear line where a file is missing."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+import tiny
+from PIL import Image
+from rich.console import Console
+
+from mgs import nbv, report
+from mgs.dataset import load_dataset
+from mgs.errors import InputError
+from mgs.evaluate import evaluate, load_run
+from mgs.files import write_json
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Two runs of the real loop on stand-in stations, evaluated with a renderer of one grey."""
+    root = tmp_path_factory.mktemp("report")
+    dataset = load_dataset(tiny.write_dataset(root / "data"))
+    folders = []
+    for policy in ("d-optimal", "random"):
+        out = root / policy
+        settings = tiny.start(out, dataset, policy=policy, evaluate_every=1)
+        nbv.run(out, settings, dataset, tiny.stations(), tiny.silent)
+        gaussians, _, trained, _ = load_run(out)
+        grey = 0.2 if policy == "random" else 0.3
+        metrics = evaluate(
+            gaussians,
+            dataset.frames,
+            trained,
+            renderer=lambda g, camera, grey=grey: np.full((camera.height, camera.width, 3), grey, np.float32),
+            pictures=out / "renders",
+        )
+        write_json(out / "metrics.json", {"policy": policy} | metrics)
+        folders.append(out)
+    return folders
+
+
+def test_run_folder(runs):
+    run = report.read_run(runs[0])
+    assert run.policy == "d-optimal"
+    assert len(run.seeds) == 3
+    assert len(set(run.seeds + run.chosen)) == 8
+    assert [run.settings["budget"], len(run.steps)] == [5, 6]
+
+
+def test_report_writes_every_figure(runs, tmp_path):
+    written = report.write_report(tmp_path / "report", runs)
+    assert [path.name for path in written] == [
+        "orbit.png",
+        "gain.png",
+        "coverage.png",
+        "comparison.png",
+        "psnr.png",
+        "table.md",
+    ]
+    for path in written[:-1]:
+        with Image.open(path) as picture:
+            picture.load()
+            assert min(picture.size) > 400
+            assert len(picture.convert("RGB").getcolors(1 << 24)) > 50
+        assert path.stat().st_size < 400_000
+    assert {path.name for path in (tmp_path / "report").iterdir()} == {path.name for path in written}
+
+
+def test_unseen_view(runs):
+    read = [report.read_run(folder) for folder in runs]
+    index = report.unseen_view(read, tiny.FRAMES)
+    counts = [sum(i in run.seeds + run.chosen for run in read) for i in range(tiny.FRAMES)]
+    assert counts[index] == min(counts)
+
+
+def test_table(runs):
+    rows = report.table_rows(runs)
+    metrics = json.loads((runs[1] / "metrics.json").read_text())
+    row = dict(zip(report.COLUMNS, rows[1], strict=True))
+    assert row["policy"] == "random"
+    assert row["images"] == "8"
+    assert row["all.psnr"] == f"{metrics['all']['psnr']:.2f}"
+    assert row["held_out.ssim_mask"] == f"{metrics['held_out']['ssim_mask']:.4f}"
+    lines = report.markdown_table(rows).splitlines()
+    assert len(lines) == 4
+    assert {line.count("|") for line in lines} == {len(report.COLUMNS) + 1}
+    console = Console(width=300, file=io.StringIO())
+    report.print_table(console, rows)
+    assert row["all.psnr"] in console.file.getvalue()
+
+
+def test_missing_and_damaged_files(runs, tmp_path):
+    with pytest.raises(InputError, match=r"config\.json: no such file"):
+        report.read_run(tmp_path)
+    (tmp_path / "config.json").write_text((runs[0] / "config.json").read_text())
+    with pytest.raises(InputError, match=r"steps\.jsonl: no such file; .*--resume"):
+        report.read_run(tmp_path)
+    for damaged in ("", "{", "{}\n"):
+        (tmp_path / "steps.jsonl").write_text(damaged)
+        with pytest.raises(InputError, match="damaged"):
+            report.read_run(tmp_path)
+    (tmp_path / "steps.jsonl").write_text((runs[0] / "steps.jsonl").read_text())
+    with pytest.raises(InputError, match="mgs eval"):
+        report.table_rows([tmp_path])
+
+
+def test_comparison_is_cropped_to_the_rock():
+    image = np.zeros((100, 200, 3))
+    image[40:60, 50:80] = 0.5
+    rows, columns = report._crop(image)
+    assert (rows.start, rows.stop, columns.start, columns.stop) == (34, 66, 38, 92)
+    assert report._crop(np.zeros((4, 4, 3))) == (slice(None), slice(None))
