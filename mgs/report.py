@@ -92,13 +92,15 @@ def read_run(folder: str | Path) -> Run:
     return Run(folder, policy, steps, read_json(metrics) if metrics.is_file() else None, config["settings"])
 
 
-def _figure(width: float, height: float) -> Figure:
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure, width and height in inches."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), dpi=DPI, layout="constrained")
 
 
-def _save(figure: Figure, path: str | Path) -> None:
+def save_figure(figure: Figure, path: str | Path) -> None:
+    """Write a figure as PNG, atomically."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png")
 
@@ -124,7 +126,7 @@ def orbit_figure(
     from matplotlib.colors import Normalize
 
     with matplotlib.rc_context(STYLE):
-        figure = _figure(3.1 * len(choices) + 0.8, 3.9)
+        figure = new_figure(3.1 * len(choices) + 0.8, 3.9)
         axes = figure.subplots(1, len(choices), sharex=True, sharey=True, squeeze=False)[0]
         last = max((len(chosen) for _, chosen in choices.values()), default=1)
         norm = Normalize(1, max(last, 2))
@@ -135,7 +137,7 @@ def orbit_figure(
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
         bar = figure.colorbar(ScalarMappable(norm, "viridis"), ax=list(axes), shrink=0.8, pad=0.01)
         bar.set_label("step at which the view was chosen")
-        _save(figure, path)
+        save_figure(figure, path)
 
 
 def _orbit_panel(
@@ -168,7 +170,7 @@ def gain_figure(path: str | Path, gains: Mapping[str, Sequence[float]]) -> None:
     import matplotlib
 
     with matplotlib.rc_context(STYLE):
-        figure = _figure(4.8, 3.1)
+        figure = new_figure(4.8, 3.1)
         axis = figure.subplots()
         for policy, values in gains.items():
             axis.plot(np.arange(1, len(values) + 1), values, **_style(policy))
@@ -176,7 +178,7 @@ def gain_figure(path: str | Path, gains: Mapping[str, Sequence[float]]) -> None:
         axis.set_ylim(bottom=0)
         _whole_steps(axis)
         axis.legend()
-        _save(figure, path)
+        save_figure(figure, path)
 
 
 def coverage_figure(path: str | Path, coverage: Mapping[str, tuple[Sequence[int], Sequence[float]]]) -> None:
@@ -187,7 +189,7 @@ def coverage_figure(path: str | Path, coverage: Mapping[str, tuple[Sequence[int]
     import matplotlib
 
     with matplotlib.rc_context(STYLE):
-        figure = _figure(7.2, 3.1)
+        figure = new_figure(7.2, 3.1)
         left, right = figure.subplots(1, 2)
         for policy, (images, shares) in coverage.items():
             percent = 100 * np.asarray(shares, float)
@@ -199,7 +201,7 @@ def coverage_figure(path: str | Path, coverage: Mapping[str, tuple[Sequence[int]
         for axis in (left, right):
             _whole_steps(axis)
         left.legend()
-        _save(figure, path)
+        save_figure(figure, path)
 
 
 def psnr_figure(path: str | Path, curves: Mapping[str, tuple[Sequence[int], Sequence[float]]], what: str = "all views") -> None:
@@ -207,14 +209,14 @@ def psnr_figure(path: str | Path, curves: Mapping[str, tuple[Sequence[int], Sequ
     import matplotlib
 
     with matplotlib.rc_context(STYLE):
-        figure = _figure(4.8, 3.1)
+        figure = new_figure(4.8, 3.1)
         axis = figure.subplots()
         for policy, (images, decibels) in curves.items():
             axis.plot(images, decibels, **_style(policy))
         axis.set(xlabel="images in the training set", ylabel=f"PSNR, {what} (dB)")
         _whole_steps(axis)
         axis.legend()
-        _save(figure, path)
+        save_figure(figure, path)
 
 
 def _whole_steps(axis: Axes) -> None:
@@ -237,14 +239,14 @@ def comparison_figure(
     """
     import matplotlib
 
-    window = _crop(truth)
+    window = crop(truth.max(axis=2) > 0)
     shown = srgb_from_linear(truth)[window]
     images = {policy: srgb_from_linear(image)[window] for policy, image in renders.items()}
     differences = {policy: np.abs(image - shown).mean(axis=2) for policy, image in images.items()}
     limit = max(float(np.quantile(d, 0.995)) for d in differences.values()) or 1.0
     columns, aspect = 1 + len(images), shown.shape[0] / shown.shape[1]
     with matplotlib.rc_context(STYLE | {"axes.grid": False}):
-        figure = _figure(2.7 * columns, 2.7 * aspect * 2 + 0.9)
+        figure = new_figure(2.7 * columns, 2.7 * aspect * 2 + 0.9)
         axes = figure.subplots(2, columns)
         axes[0, 0].imshow(shown, interpolation="nearest")
         axes[0, 0].set_title(f"truth\n{title}")
@@ -257,19 +259,19 @@ def comparison_figure(
         axes[1, 0].text(0.97, 0.5, "|render $-$ truth|", ha="right", va="center", transform=axes[1, 0].transAxes)
         bar = figure.colorbar(map_, ax=list(axes[1, 1:]), orientation="horizontal", shrink=0.6, pad=0.02, aspect=40)
         bar.set_label("mean absolute difference of the sRGB channels, in [0, 1]")
-        _save(figure, path)
+        save_figure(figure, path)
 
 
-def _crop(image: np.ndarray, margin: float = 0.06) -> tuple[slice, slice]:
-    """Rows and columns around what is not black, with a margin as a share of the image."""
-    rows, columns = np.nonzero(image.max(axis=2) > 0)
+def crop(mask: np.ndarray, margin: float = 0.06) -> tuple[slice, slice]:
+    """Rows and columns around a mask [H,W], with a margin as a share of the image; the whole image where the mask is empty."""
+    rows, columns = np.nonzero(mask)
     if len(rows) == 0:
         return slice(None), slice(None)
-    h, w = image.shape[:2]
+    h, w = mask.shape
     dy, dx = round(margin * h), round(margin * w)
     return (
-        slice(max(0, rows.min() - dy), min(h, rows.max() + dy + 1)),
-        slice(max(0, columns.min() - dx), min(w, columns.max() + dx + 1)),
+        slice(max(0, int(rows.min()) - dy), min(h, int(rows.max()) + dy + 1)),
+        slice(max(0, int(columns.min()) - dx), min(w, int(columns.max()) + dx + 1)),
     )
 
 

@@ -106,8 +106,8 @@ def test_missing_and_damaged_files(runs, tmp_path):
 
 
 def test_comparison_is_cropped_to_the_rock():
-    image = np.zeros((100, 200, 3))
-    image[40:60, 50:80] = 0.5
-    rows, columns = report._crop(image)
+    mask = np.zeros((100, 200), bool)
+    mask[40:60, 50:80] = True
+    rows, columns = report.crop(mask)
     assert (rows.start, rows.stop, columns.start, columns.stop) == (34, 66, 38, 92)
-    assert report._crop(np.zeros((4, 4, 3))) == (slice(None), slice(None))
+    assert report.crop(np.zeros((4, 4), bool)) == (slice(None), slice(None))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from mgs.commands.diagnose import diagnose
 from mgs.commands.doctor import doctor
+from mgs.commands.evaluate import evaluate
 from mgs.commands.nbv import nbv
 from mgs.commands.prior import prior
 from mgs.commands.synth_orbit import synth_orbit
@@ -14,4 +16,6 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "synth-orbit": synth_orbit,
     "prior": prior,
     "nbv": nbv,
+    "eval": evaluate,
+    "diagnose": diagnose,
 }

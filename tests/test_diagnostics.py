@@ -1,0 +1,116 @@
+"""Maps of information: the scalars against their formulas, the maps against a direct composite, the files read back."""
+
+import numpy as np
+import pytest
+import tiny
+from PIL import Image
+from plyfile import PlyData
+
+from mgs import diagnostics, nbv, policies
+from mgs.conventions import Camera, look_at
+from mgs.dataset import load_dataset
+from mgs.errors import InputError
+from mgs.files import read_exr
+from mgs.gaussians import Gaussians, sh_from_rgb
+from mgs.splat import groups
+
+CHANNELS = {"R", "G", "B", "A", "Z", "fisher.colour", "fisher.scale", "fisher.rotation", "fisher.opacity"} | {
+    "information",
+    "uncertainty",
+    "unobserved",
+}
+
+
+def test_scalars_follow_their_formulas():
+    rng = np.random.default_rng(0)
+    H, lam = rng.random((5, 11)) * 10, policies.regularisation(groups(0))
+    H[2] = 0
+    scalars = diagnostics.gaussian_scalars(H, lam, groups(0))
+    np.testing.assert_allclose(scalars["fisher.scale"], H[:, 3] + H[:, 4] + H[:, 5])
+    np.testing.assert_allclose(scalars["fisher.opacity"], H[:, 10])
+    assert scalars["information"][2] == 0
+    assert scalars["uncertainty"][2] == 1
+    assert scalars["unobserved"].tolist() == [0, 0, 1, 0, 0]
+    j = 3
+    expected = sum(0.5 * np.log((H[j, k] + lam[k]) / lam[k]) for k in range(11))
+    assert scalars["information"][j] == pytest.approx(expected)
+    assert scalars["uncertainty"][j] == pytest.approx(np.mean([lam[k] / (H[j, k] + lam[k]) for k in range(11)]))
+
+
+def two_in_a_row() -> tuple[Gaussians, Camera]:
+    """Two Gaussians, 20 pixels wide, one 2 m and one 3 m before the camera; the near one is half transparent."""
+    K = np.array([[40.0, 0, 16.5], [0, 40.0, 12.5], [0, 0, 1]])
+    camera = Camera(K, 33, 25, look_at((0, -2, 0), (0, 0, 0)))
+    means = np.array([[0, 0, 0], [0, 1, 0]], np.float32)
+    gaussians = Gaussians(
+        means,
+        np.log(np.full((2, 3), 1.0, np.float32)),
+        np.eye(4, dtype="f4")[[0, 0]],
+        np.array([0, 9], "f4"),
+        sh_from_rgb(np.ones((2, 3))),
+    )
+    return gaussians, camera
+
+
+def test_maps_are_means_over_what_a_pixel_shows():
+    """At the centre the weights are 1/2 and nearly 1/2, so the map is the mean of the two values, whatever their magnitude."""
+    gaussians, camera = two_in_a_row()
+    scalars = {"information": np.array([1e-4, 3e-4]), "large": np.array([4e6, 0]), "flat": np.array([7.0, 7.0])}
+    scalars |= {"unobserved": np.array([0.0, 1.0])}
+    maps = diagnostics.view_maps(gaussians, camera, scalars)
+    near, far = 0.5, 0.5 * (1 / (1 + np.exp(-9.0)))
+    assert maps["A"][12, 16] == pytest.approx(near + far, abs=1e-3)
+    mean = (1e-4 * near + 3e-4 * far) / (near + far)
+    assert maps["information"][12, 16] == pytest.approx(mean, rel=1e-3)
+    assert maps["large"][12, 16] == pytest.approx(4e6 * near / (near + far), rel=1e-3)
+    np.testing.assert_allclose(maps["flat"][maps["A"] > 0.1], 7.0, rtol=1e-4)
+    assert set(np.unique(maps["unobserved"])) <= {0.0, 1.0}
+    assert maps["Z"][12, 16] == pytest.approx((2 * near + 3 * far) / (near + far), rel=1e-3)
+
+
+def test_maps_of_an_empty_view_are_zero():
+    gaussians, camera = two_in_a_row()
+    away = Camera(camera.K, 33, 25, look_at((0, -2, 0), (0, -3, 0)))
+    maps = diagnostics.view_maps(gaussians, away, {"information": np.ones(2)})
+    assert all((values == 0).all() for values in maps.values())
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    root = tmp_path_factory.mktemp("diagnostics")
+    dataset = load_dataset(tiny.write_dataset(root / "data"))
+    settings = tiny.start(root / "run", dataset)
+    nbv.run(root / "run", settings, dataset, tiny.stations(), tiny.silent)
+    return root / "run"
+
+
+def test_files(run):
+    written = diagnostics.diagnose_run(run, ["kf_0001", "kf_0007"])
+    assert [path.name for path in written] == ["information.ply", "kf_0001.exr", "kf_0001.png", "kf_0007.exr", "kf_0007.png"]
+    channels = read_exr(run / "diagnostics/kf_0007.exr")
+    assert set(channels) == CHANNELS
+    assert {values.shape for values in channels.values()} == {(tiny.HEIGHT, tiny.WIDTH)}
+    assert channels["A"].max() > 0.3
+    assert channels["information"].max() > 0
+    with Image.open(run / "diagnostics/kf_0007.png") as picture:
+        picture.load()
+    assert (run / "diagnostics/kf_0007.png").stat().st_size < 400_000
+    vertices = PlyData.read(str(run / "diagnostics/information.ply"))["vertex"]
+    state = nbv.read_checkpoint(run)
+    assert len(vertices.data) == tiny.POINTS
+    assert vertices["red"].dtype == np.uint8
+    np.testing.assert_allclose(vertices["fisher_opacity"], state.H[:, 10], rtol=1e-6)
+    np.testing.assert_allclose(np.stack([vertices[a] for a in "xyz"], 1), state.gaussians.means)
+
+
+def test_views(run):
+    frames = load_dataset(nbv.read_settings(run).dataset).frames
+    state = nbv.read_checkpoint(run)
+    trained = [frames[i].name for i in state.taken]
+    chosen = diagnostics.choose_views(frames, trained, None)
+    assert len(chosen) == diagnostics.VIEWS
+    assert not {frame.name for frame in chosen} & set(trained)
+    everything = [frame.name for frame in frames]
+    assert len(diagnostics.choose_views(frames, everything, None)) == diagnostics.VIEWS
+    with pytest.raises(InputError, match="kf_9999: no such frame; the dataset has kf_0000 to kf_0011"):
+        diagnostics.diagnose_run(run, ["kf_9999"])
