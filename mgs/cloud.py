@@ -17,10 +17,12 @@ MAX_PIXELS = 6_000_000
 EDGE_JUMP = 0.05
 """A pixel whose 3x3 neighbourhood spans more than this share of its depth is a silhouette or a grazing view: its depth mixes
 surfaces, so it is left out."""
-FAR_LIMIT = 3.0
-"""Points farther than this many median depths are far ground that no station needs."""
+REACH = 1.0
+"""The cloud ends this many camera distances from the focus: far ground is not the ground under the rock."""
 PLANE_TOLERANCE = 0.02
-"""RANSAC inlier distance as a share of the median camera distance: larger than the grain of a floor, smaller than a rock."""
+"""RANSAC inlier distance as a share of the camera distance: larger than the grain of a floor, smaller than a rock."""
+PLANE_REACH = 0.5
+"""The plane is refined on its inliers within this many camera distances of the focus: real ground undulates."""
 PLANE_MIN_SHARE = 0.2
 """With fewer inliers than this share of the cloud, there is no dominant plane."""
 CLUSTER_POINTS = 20_000
@@ -57,14 +59,23 @@ class Plane:
         return points @ self.normal - self.offset
 
 
-def focus(frames: Sequence[Frame]) -> np.ndarray:
-    """[3] the world point nearest to all optical axes (least squares): what the cameras look at."""
+@dataclass(frozen=True)
+class Focus:
+    """What the cameras look at: point [3] world, metres; distance: of the median camera from it, metres."""
+
+    point: np.ndarray
+    distance: float
+
+
+def focus(frames: Sequence[Frame]) -> Focus:
+    """The point nearest to all optical axes (least squares), and how far the cameras are from it."""
     A, b = np.zeros((3, 3)), np.zeros(3)
     for frame in frames:
         axis = frame.camera.world_to_camera[2, :3]
         across = np.eye(3) - np.outer(axis, axis)
         A, b = A + across, b + across @ frame.camera.position
-    return np.linalg.lstsq(A, b, rcond=1e-9)[0]
+    point = np.linalg.lstsq(A, b, rcond=1e-9)[0]
+    return Focus(point, float(np.median([np.linalg.norm(frame.camera.position - point) for frame in frames])))
 
 
 def usable_depth(depth: np.ndarray) -> np.ndarray:
@@ -88,20 +99,21 @@ def fuse_frames(frames: Sequence[Frame], depths: Sequence[np.ndarray] | None = N
     # The lower quartile of depth: the rock stands in front of the ground that fills most of a frame.
     near = [np.quantile(z, 0.25) / frame.camera.K[0, 0] for frame, z in zip(frames, returns, strict=True) if len(z)]
     voxel = float(np.median(near))
-    limit = FAR_LIMIT * float(np.median([np.median(z) for z in returns if len(z)]))
+    target = focus(frames)
     points, views = [], []
     for frame, depth in zip(frames, depths, strict=True):
         z = usable_depth(depth)
         keep = np.zeros(z.shape, bool)
         keep[::stride, ::stride] = True
-        keep &= (z > 0) & (z < limit)
-        p = frame.camera.unproject(z)[keep]
+        world = frame.camera.unproject(z)
+        keep &= (z > 0) & (np.linalg.norm(world - target.point, axis=-1) < REACH * target.distance)
+        p = world[keep]
         view = frame.camera.position - p
         points.append(p)
         views.append(view / np.linalg.norm(view, axis=1, keepdims=True))
     p, index = _voxel_means(np.concatenate(points), voxel)
     if len(p) == 0:
-        raise InputError("cloud: every depth pixel is a silhouette or a grazing view; check the depth files")
+        raise InputError("cloud: no usable depth near what the cameras look at; check the depth files and poses")
     view = _group_means(np.concatenate(views), index, len(p))
     norm = np.linalg.norm(view, axis=1, keepdims=True)
     return Cloud(p, view / np.where(norm > 0, norm, 1.0), voxel, len(index))
@@ -147,9 +159,8 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
     """
     from skimage.measure import ransac
 
-    cameras = np.stack([frame.camera.position for frame in frames])
-    distance = float(np.median(np.linalg.norm(cameras - np.median(cloud.points, 0), axis=1)))
-    tolerance = PLANE_TOLERANCE * distance
+    target = focus(frames)
+    tolerance = PLANE_TOLERANCE * target.distance
     rng = np.random.default_rng(seed)
     sample = cloud.points if len(cloud.points) <= 10_000 else rng.choice(cloud.points, 10_000, replace=False)
     if len(sample) < 3:
@@ -158,12 +169,16 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
     share = 0.0 if inliers is None else float(np.mean(inliers))
     if share < PLANE_MIN_SHARE:
         raise InputError(f"cloud: no ground plane (the best holds {share:.0%} of the points); the prior needs visible ground")
+    around = cloud.points[np.linalg.norm(cloud.points - target.point, axis=1) < PLANE_REACH * target.distance]
     for _ in range(3):
-        residual = model.residuals(cloud.points)
+        residual = model.residuals(around)
         core = np.abs(residual) < tolerance
+        if core.sum() < 3:
+            raise InputError("cloud: no ground around what the cameras look at; the prior needs visible ground")
         sigma = 1.4826 * float(np.median(np.abs(residual[core] - np.median(residual[core]))))
         tolerance = min(tolerance, max(3 * sigma, 2 * cloud.voxel))
-        model = _PlaneModel.from_estimate(cloud.points[core & (np.abs(residual) < tolerance)])
+        model = _PlaneModel.from_estimate(around[core & (np.abs(residual) < tolerance)])
+    cameras = np.stack([frame.camera.position for frame in frames])
     sign = 1.0 if np.median(cameras @ model.normal) > model.offset else -1.0
     return Plane(sign * model.normal, sign * model.offset, sigma, tolerance)
 
@@ -183,7 +198,7 @@ def rock_cluster(points: np.ndarray, voxel: float, target: np.ndarray, root: str
         cell *= 1.25
         thin = _voxel_means(points, cell)[0]
     if len(thin) <= CLUSTER_NEIGHBOURS:
-        raise InputError(f"{root}: no rock in the cloud ({len(points)} points stand above the ground plane); aim the cameras at one")
+        raise InputError(f"{root}: no rock in the cloud ({len(points)} points above the ground plane); aim the cameras at one")
     eps = 2 * float(np.median(cKDTree(thin).query(thin, CLUSTER_NEIGHBOURS + 1)[0][:, -1]))
     labels = DBSCAN(eps=eps, min_samples=CLUSTER_NEIGHBOURS).fit_predict(thin)
     count = int(labels.max()) + 1
@@ -195,8 +210,8 @@ def rock_cluster(points: np.ndarray, voxel: float, target: np.ndarray, root: str
     order = np.argsort(away, kind="stable")
     if len(large) > 1 and away[order[1]] < 1.25 * away[order[0]]:
         raise InputError(
-            f"{root}: two clusters of {sizes[large[order[0]]]} and {sizes[large[order[1]]]} points are equally large and equally "
-            "near to where the cameras look; aim the cameras at one rock"
+            f"{root}: clusters of {sizes[large[order[0]]]} and {sizes[large[order[1]]]} points are equally large and equally "
+            "near to what the cameras look at; aim them at one rock"
         )
     rock = int(large[order[0]])
     distance, nearest = cKDTree(thin).query(points, distance_upper_bound=eps)

@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 from mgs.conventions import quat_from_normals
 from mgs.dataset import Frame
 from mgs.gaussians import Gaussians, sh_from_rgb
-from mgs.visibility import depth_of_points, visible
+from mgs.visibility import depth_of_surfels, visible
 
 if TYPE_CHECKING:
     from mgs.prior import Prior
@@ -33,7 +33,7 @@ def initial_gaussians(prior: Prior, seed_frames: Sequence[Frame]) -> tuple[Gauss
     """One flat Gaussian per sample of the prior; colours averaged over the seed frames that see it, grey where none does.
 
     A frame sees a point that is inside its rock mask, faces it, and agrees with its depth image (or, where it has none, with
-    a z-buffer of the samples) within the tolerance of `depth_tolerance`.
+    a z-buffer of the samples) within `prior.depth_tolerance` and the slope of the surface in its pixel.
     Returns (Gaussians of SH degree 0, seen [N] bool). Raises InputError where a seed frame cannot be read.
     """
     n = len(prior.points)
@@ -61,8 +61,10 @@ def initial_gaussians(prior: Prior, seed_frames: Sequence[Frame]) -> tuple[Gauss
 def frame_sees(prior: Prior, frame: Frame) -> np.ndarray:
     """[N] bool: the samples of the prior that the frame sees (see `initial_gaussians`)."""
     camera = frame.camera
-    has_depth = frame.depth_path is not None
-    depth = frame.depth() if has_depth else depth_of_points(prior.points, camera, prior.spacing)
+    if frame.depth_path is not None:
+        depth = frame.depth()
+    else:
+        depth = depth_of_surfels(prior.points, prior.normals, camera, prior.spacing)
     seen = visible(prior.points, prior.normals, camera, depth, prior.depth_tolerance)
     pixels, _ = camera.project(prior.points)
     column = np.clip(np.floor(pixels[:, 0]), 0, camera.width - 1).astype(int)

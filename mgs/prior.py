@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
@@ -21,6 +22,10 @@ from mgs.visibility import visible
 
 TRUTH_SAMPLES = 50_000
 """Samples of the true rock that its errors are measured on."""
+
+FLOOR_UPRIGHT = 0.9
+"""A cluster point within two plane tolerances of the ground whose normal is this upright (cosine) is a swell of the ground at
+the foot of the rock, not rock."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +48,7 @@ class Prior:
     normals: np.ndarray
     spacing: float
     depth_tolerance: float
-    numbers: dict
+    numbers: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,8 @@ def build_prior(
     """
     if settings.gaussians is not None and settings.gaussians < 2:
         raise InputError(f"prior: {settings.gaussians} Gaussians are too few for a model; ask for more with --gaussians")
+    if settings.spacing is not None and not settings.spacing > 0:
+        raise InputError(f"prior: spacing {settings.spacing} m must be positive; correct --spacing")
     if settings.gaussians is not None and settings.spacing is not None:
         raise InputError("prior: --gaussians and --spacing fix the same number; give one of them")
     tell = on_stage or (lambda stage: None)
@@ -76,10 +83,12 @@ def build_prior(
     height = plane.height(cloud.points)
     above = height > plane.tolerance
     tell("rock cluster")
-    inside, eps, clusters = rock_cluster(cloud.points[above], cloud.voxel, focus(dataset.frames), str(dataset.root))
+    inside, eps, clusters = rock_cluster(cloud.points[above], cloud.voxel, focus(dataset.frames).point, str(dataset.root))
     cluster = cloud.points[above][inside]
     tell("Poisson mesh")
     normals = estimate_normals(cluster, cloud.views[above][inside])
+    floor = (plane.height(cluster) < 2 * plane.tolerance) & (normals @ plane.normal > FLOOR_UPRIGHT)
+    cluster, normals = cluster[~floor], normals[~floor]
     mesh, depth = poisson_mesh(cluster, normals, cloud.voxel, plane, settings.poisson_depth)
     tell("surface samples")
     spacing = settings.spacing or (None if settings.gaussians else cloud.voxel)
@@ -87,7 +96,8 @@ def build_prior(
     points, normals, spacing = sample_surface(mesh, seed, count=settings.gaussians, spacing=spacing)
     residual = float(np.sqrt(np.mean(distances_to_mesh(cluster, mesh.vertices, mesh.faces) ** 2)))
     nearest = cKDTree(points).query(points, 2)[0][:, 1]
-    numbers = {
+    tolerance = max(3 * residual, cloud.voxel)
+    numbers: dict[str, Any] = {
         "frames": len(dataset.frames),
         "pixels": cloud.pixels,
         "points": len(cloud.points),
@@ -103,7 +113,7 @@ def build_prior(
         "mesh_area": float(mesh.areas.sum()),
         "base_area": float(mesh.areas[mesh.base].sum()),
         "fit_rms": residual,
-        "depth_tolerance": max(3 * residual, cloud.voxel),
+        "depth_tolerance": tolerance,
         "n": len(points),
         "spacing": spacing,
         "nearest_neighbour_mean": float(nearest.mean()),
@@ -114,7 +124,7 @@ def build_prior(
     if truth.is_file():
         tell("distance to the true rock")
         numbers["truth"] = error_to_truth(points, spacing, mesh, truth, dataset.frames, plane, settings.seed)
-    prior = Prior(points, normals, spacing, numbers["depth_tolerance"], numbers)
+    prior = Prior(points, normals, spacing, tolerance, numbers)
     return prior, Stages(cloud, plane, np.abs(height) <= plane.tolerance, cluster, mesh)
 
 
@@ -131,16 +141,16 @@ def error_to_truth(
     import trimesh
 
     rock = trimesh.load(truth, force="mesh")
+    assert isinstance(rock, trimesh.Trimesh)
     if len(rock.faces) == 0 or not np.isfinite(rock.vertices).all():
         raise InputError(f"{truth}: the true rock has no faces, or NaN vertices; restore it or delete it")
     surface, face = trimesh.sample.sample_surface(rock, TRUTH_SAMPLES, seed=derive_seed(seed, "prior/truth"))
-    surface, normals = np.asarray(surface), rock.face_normals[face]
-    exposed = plane.height(surface) > 0
-    surface, normals = surface[exposed], normals[exposed]
+    exposed = plane.height(np.asarray(surface)) > 0
+    surface, normals = np.asarray(surface)[exposed], rock.face_normals[face[exposed]]
     seen = np.zeros(len(surface), bool)
     for frame in frames:
-        footprint = 2 * float(np.linalg.norm(frame.camera.position - surface.mean(0))) / frame.camera.K[0, 0]
-        seen |= visible(surface, normals, frame.camera, frame.depth(), footprint)
+        # Two-sided: scanned rocks come with either winding.
+        seen |= visible(surface, normals, frame.camera, frame.depth(), spacing / 2, two_sided=True)
     if not seen.any():
         raise InputError(f"{truth}: no frame sees the true rock; it does not belong to this dataset (or is in another frame)")
     there = distances_to_mesh(points, rock.vertices, rock.faces)

@@ -22,17 +22,17 @@ def draw_prior(path: str | Path, prior: Prior, stages: Stages) -> None:
     up = stages.plane.normal
     frame = _oblique(up)
     centre = (stages.cluster.min(0) + stages.cluster.max(0)) / 2
-    reach = 0.62 * float(np.linalg.norm(np.ptp(stages.cluster, axis=0)))
+    reach = 0.5 * float(np.linalg.norm(np.ptp(stages.cluster, axis=0)))
     cloud, height = stages.cloud.points, stages.plane.height(stages.cloud.points)
-    near = np.linalg.norm(cloud - centre, axis=1) < 3 * reach
+    near = np.linalg.norm(cloud - centre, axis=1) < 4 * reach
     ground = stages.ground
     truth = prior.numbers.get("truth")
-    error = f"\naccuracy {1e3 * truth['accuracy']:.2f} mm" if truth else ""
-    figure = Figure(figsize=(17, 3.9), layout="constrained")
+    error = f", accuracy {1e3 * truth['accuracy']:.2f} mm" if truth else ""
+    figure = Figure(figsize=(17, 4.2), layout="constrained")
     axes = figure.subplots(1, 5)
     panels = [
-        (f"cloud: {len(cloud):,} points\ncoloured by height", cloud[near], height[near], "viridis", 1.5),
-        (f"ground plane: {int(ground.sum()):,} inliers (tan)\nthe rest in blue", cloud[near], (~ground[near]) * 1.0, None, 1.5),
+        (f"cloud: {len(cloud):,} points\ncoloured by height", cloud[near], height[near], "viridis", 2.2),
+        (f"ground plane: {int(ground.sum()):,} inliers (tan)\nthe rest in blue", cloud[near], (~ground[near]) * 1.0, None, 2.2),
         (f"rock cluster: {len(stages.cluster):,} points", stages.cluster, stages.plane.height(stages.cluster), "viridis", 1.0),
     ]
     for axis, (title, points, value, colours, zoom) in zip(axes, panels, strict=False):
@@ -41,7 +41,7 @@ def draw_prior(path: str | Path, prior: Prior, stages: Stages) -> None:
         axis.set_title(title, fontsize=10)
     _shaded_mesh(axes[3], stages, frame, centre, reach)
     area = prior.numbers["mesh_area"] - prior.numbers["base_area"]
-    axes[3].set_title(f"Poisson mesh: {len(stages.mesh.faces):,} faces\n{area:.3f} m² above the ground{error}", fontsize=10)
+    axes[3].set_title(f"Poisson mesh: {len(stages.mesh.faces):,} faces\n{area:.3f} m²{error}", fontsize=10)
     shade = np.clip(0.25 + 0.75 * (prior.normals @ frame.T) @ LIGHT, 0.05, 1)[:, None] * [0.95, 0.85, 0.7]
     towards = (prior.normals @ frame.T)[:, 2] > 0
     _dots(axes[4], ((prior.points - centre) @ frame.T)[towards], shade[towards], None, reach, None)

@@ -18,7 +18,7 @@ and the surface is not closed."""
 POISSON_CELL = 1.5
 """Edge of Poisson's finest cell over the cloud's voxel: finer cells fit noise and cost time (halving it gained nothing)."""
 POISSON_DEPTHS = (5, 10)
-"""Octree depths chosen automatically."""
+"""Least and largest octree depth chosen automatically; a caller may ask for 3 to 12 (beyond, pymeshlab crashes)."""
 OVERSAMPLING = 5
 """Random candidates per blue-noise sample."""
 
@@ -67,6 +67,8 @@ def poisson_mesh(points: np.ndarray, normals: np.ndarray, voxel: float, plane: P
     import manifold3d
     import pymeshlab
 
+    if depth is not None and not 3 <= depth <= 12:
+        raise InputError(f"prior: Poisson depth {depth} is not within 3 to 12; correct --poisson-depth")
     if depth is None:
         cells = POISSON_SCALE * float(np.ptp(points, axis=0).max()) / (POISSON_CELL * voxel)
         depth = int(np.clip(np.ceil(np.log2(cells)), *POISSON_DEPTHS))
@@ -101,8 +103,6 @@ def sample_surface(
     """
     areas = np.where(mesh.base, 0.0, mesh.areas)
     area = float(areas.sum())
-    if spacing is not None and not spacing > 0:
-        raise InputError(f"prior: spacing {spacing} m must be positive; correct --spacing")
     if count is None:
         assert spacing is not None
         count = round(area / spacing**2)

@@ -3,49 +3,62 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import maximum_filter, minimum_filter
 
 from mgs.conventions import Camera
 
-SILHOUETTE_JUMP = 0.05
-"""A 3x3 neighbourhood that spans more than this share of its depth holds two surfaces."""
+GRAZING = 0.2
+"""Cosine between normal and view below which the slope no longer widens the tolerance."""
 
 
-def visible(points: np.ndarray, normals: np.ndarray, camera: Camera, depth: np.ndarray, tolerance: float) -> np.ndarray:
-    """[N] bool: inside the frame, facing the camera, and not behind the surface in `depth`.
+def visible(
+    points: np.ndarray,
+    normals: np.ndarray,
+    camera: Camera,
+    depth: np.ndarray,
+    tolerance: float,
+    *,
+    two_sided: bool = False,
+) -> np.ndarray:
+    """[N] bool: inside the frame, facing the camera (or two_sided), and at the depth that its pixel shows.
 
-    points [N,3] world, metres; normals [N,3]; depth [H,W] z-depth, metres, 0 = no return; tolerance: metres. The point is
-    compared with the range of depth in the 3x3 pixels around it, because a slanted surface changes depth within a pixel; at a
-    silhouette, where that range spans two surfaces, with its own pixel alone.
+    points [N,3] world, metres; normals [N,3] unit; depth [H,W] z-depth, metres, 0 = no return; tolerance: metres. A slanted
+    surface changes depth within its pixel, so the tolerance grows by one pixel footprint times the slope.
     """
     pixels, z = camera.project(points)
-    facing = np.einsum("nk,nk->n", normals, camera.position - points) > 0
+    view = camera.position - points
+    cosine = np.einsum("nk,nk->n", normals, view) / np.maximum(np.linalg.norm(view, axis=1), 1e-30)
     column, row = np.floor(pixels[:, 0]), np.floor(pixels[:, 1])
-    inside = (z > 0) & facing & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    seen = np.zeros(len(points), bool)
-    r, c = row[inside].astype(int), column[inside].astype(int)
-    here = depth[r, c]
-    far, near = maximum_filter(depth, 3)[r, c], minimum_filter(depth, 3)[r, c]
-    slanted = far - near < SILHOUETTE_JUMP * far
-    far, near = np.where(slanted, far, here), np.where(slanted, near, here)
-    seen[inside] = (here > 0) & (np.abs(z[inside] - np.clip(z[inside], near, far)) < tolerance)
-    return seen
+    seen = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    if not two_sided:
+        seen &= cosine > 0
+    shown = np.zeros(len(points))
+    shown[seen] = depth[row[seen].astype(int), column[seen].astype(int)]
+    steep = np.maximum(np.abs(cosine), GRAZING)
+    slack = tolerance + z / camera.K[0, 0] * np.sqrt(np.maximum(1 - steep**2, 0)) / steep
+    return seen & (shown > 0) & (np.abs(z - shown) < slack)
 
 
-def depth_of_points(points: np.ndarray, camera: Camera, spacing: float) -> np.ndarray:
-    """z-buffer [H,W] of a sampled surface, metres, 0 where it is not hit: each point covers the pixels within `spacing`.
-
-    points [N,3] world, metres; spacing: distance of neighbouring points, metres.
-    """
+def depth_of_surfels(points: np.ndarray, normals: np.ndarray, camera: Camera, radius: float) -> np.ndarray:
+    """z-buffer [H,W] of one-sided discs of `radius` (metres) at points [N,3] with unit normals [N,3]; 0 where none is hit."""
     pixels, z = camera.project(points)
-    near = z[z > 0]
-    if len(near) == 0:
-        return np.zeros((camera.height, camera.width))
-    pad = int(np.ceil(spacing * camera.K[0, 0] / near.min()))
-    column, row = np.floor(pixels[:, 0]).astype(int) + pad, np.floor(pixels[:, 1]).astype(int) + pad
-    shape = (camera.height + 2 * pad, camera.width + 2 * pad)
-    inside = (z > 0) & (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
-    buffer = np.full(shape, np.inf)
-    np.minimum.at(buffer, (row[inside], column[inside]), z[inside])
-    buffer = minimum_filter(buffer, 2 * pad + 1)[pad : shape[0] - pad, pad : shape[1] - pad]
+    rotation = camera.world_to_camera[:3, :3]
+    facing = (z > radius) & (np.einsum("nk,nk->n", normals, camera.position - points) > 0)
+    pixels, z = pixels[facing], z[facing]
+    centre = points[facing] @ rotation.T + camera.world_to_camera[:3, 3]
+    normal = normals[facing] @ rotation.T
+    buffer = np.full((camera.height, camera.width), np.inf)
+    if len(z) == 0:
+        return np.zeros_like(buffer)
+    reach = int(np.ceil(radius * camera.K[0, 0] / z.min()))
+    for dv in range(-reach, reach + 1):
+        for du in range(-reach, reach + 1):
+            column, row = np.floor(pixels[:, 0]) + du, np.floor(pixels[:, 1]) + dv
+            x = (column + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
+            y = (row + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
+            ray = np.stack([x, y, np.ones_like(x)], 1)
+            along = np.einsum("nk,nk->n", normal, ray)
+            hit = np.einsum("nk,nk->n", normal, centre) / np.where(along < -1e-9, along, -1e-9)
+            inside = (along < -1e-9) & (np.linalg.norm(hit[:, None] * ray - centre, axis=1) <= radius) & (hit > 0)
+            inside &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+            np.minimum.at(buffer, (row[inside].astype(int), column[inside].astype(int)), hit[inside])
     return np.where(np.isfinite(buffer), buffer, 0.0)

@@ -19,7 +19,9 @@ GROUND = 4.0
 """Half edge of the square arena, metres: beyond it there is no return."""
 
 
-def orbit_cameras(count: int = 8, width: int = 64, height: int = 48, radius: float = 2.6, altitude: float = 1.5) -> list[Camera]:
+def orbit_cameras(
+    count: int = 8, width: int = 64, height: int = 48, radius: float = 2.6, altitude: float = 1.5
+) -> list[Camera]:
     """Cameras on a circle that look at the rock; the focal length is 1.1 image widths."""
     K = np.array([[1.1 * width, 0, width / 2], [0, 1.1 * width, height / 2], [0, 0, 1]])
     angles = 2 * np.pi * np.arange(count) / count

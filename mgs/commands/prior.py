@@ -12,7 +12,9 @@ def prior(
     dataset: Annotated[Path, typer.Argument(help="Folder with transforms.json and depth images.")],
     out: Annotated[Path | None, typer.Option(help="Folder to write; default DATASET/prior.")] = None,
     gaussians: Annotated[int | None, typer.Option(help="Exact number N of surface samples.")] = None,
-    spacing: Annotated[float | None, typer.Option(help="Distance between samples, metres; default a pixel's footprint.")] = None,
+    spacing: Annotated[
+        float | None, typer.Option(help="Distance between samples, metres; default a pixel's footprint.")
+    ] = None,
     poisson_depth: Annotated[int | None, typer.Option(help="Poisson octree depth; default from the cloud's density.")] = None,
     seed: Annotated[int, typer.Option(help="Root seed.")] = 0,
 ) -> None:
@@ -48,14 +50,17 @@ def _table(numbers: dict[str, Any]) -> Any:
     table.add_row("points of the fused cloud", f"{numbers['points']:,} on a {1e3 * numbers['voxel']:.2f} mm grid")
     table.add_row(
         "ground plane inliers (RANSAC)",
-        f"{numbers['plane_inliers']:,} within {1e3 * numbers['plane_tolerance']:.1f} mm (sigma {1e3 * numbers['plane_sigma']:.2f} mm)",
+        f"{numbers['plane_inliers']:,} within {1e3 * numbers['plane_tolerance']:.1f} mm "
+        f"(sigma {1e3 * numbers['plane_sigma']:.2f} mm)",
     )
     table.add_row(
         "rock cluster (DBSCAN)",
         f"{numbers['cluster_size']:,} points, one of {numbers['clusters']} clusters, eps {1e3 * numbers['eps']:.1f} mm",
     )
     table.add_row("mesh (Poisson)", f"{numbers['mesh_faces']:,} faces, octree depth {numbers['poisson_depth']}, watertight")
-    table.add_row("mesh area above the ground, A", f"{area:.4f} m² (and a flat base of {numbers['base_area']:.4f} m², not sampled)")
+    table.add_row(
+        "mesh area above the ground, A", f"{area:.4f} m² (and a flat base of {numbers['base_area']:.4f} m², not sampled)"
+    )
     table.add_row("samples, N = A / spacing²", f"{n:,} = {area:.4f} / {spacing:.6f}²")
     table.add_row(
         "nearest neighbour over spacing",

@@ -1,0 +1,351 @@
+"""The prior on an analytic scene: every station against what is known exactly."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+sys.path.insert(0, str(Path(__file__).parent))
+import synthetic
+
+from mgs.cli import main
+from mgs.cloud import Cloud, Plane, focus, fuse_frames, ground_plane, rock_cluster
+from mgs.conventions import Camera
+from mgs.dataset import Dataset, load_dataset, write_transforms
+from mgs.errors import InputError
+from mgs.files import write_exr
+from mgs.prior import PriorSettings, build_prior, load_prior, save_prior
+from mgs.surface import Mesh, distances_to_mesh, estimate_normals, sample_surface
+from mgs.visibility import depth_of_surfels, visible
+
+X, Y, Z = np.eye(3)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return synthetic.write_dataset(tmp_path_factory.mktemp("orbit"), synthetic.orbit_cameras(12, 96, 72))
+
+
+@pytest.fixture(scope="module")
+def built(dataset: Dataset):
+    return build_prior(dataset, PriorSettings(gaussians=1500))
+
+
+def _ball(centre=(0.0, 0.0, 0.5), radius=0.5) -> Mesh:
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=radius)
+    return Mesh(np.asarray(ball.vertices) + centre, np.asarray(ball.faces), np.zeros(len(ball.faces), bool))
+
+
+def test_fused_cloud_lies_on_the_surfaces(dataset: Dataset) -> None:
+    cloud = fuse_frames(dataset.frames)
+    on_rock = ((cloud.points - synthetic.CENTRE) / synthetic.AXES) ** 2
+    distance = np.minimum(np.abs(cloud.points[:, 2]), np.abs(np.sqrt(on_rock.sum(1)) - 1) * synthetic.AXES.min())
+    # A voxel averages points of a curved patch, or of ground and rock where they meet.
+    assert np.quantile(distance, 0.99) < 0.2 * cloud.voxel
+    assert distance.max() < cloud.voxel
+    assert np.allclose(np.linalg.norm(cloud.views, axis=1), 1)
+    assert (cloud.views[:, 2] > 0).all()  # every camera is above
+
+
+def test_focus_is_what_the_orbit_looks_at(dataset: Dataset) -> None:
+    found = focus(dataset.frames)
+    assert np.allclose(found.point, synthetic.CENTRE, atol=1e-9)
+    assert found.distance == pytest.approx(np.hypot(2.6, 1.3), rel=0.05)
+
+
+def test_ground_plane_is_found_and_faces_the_cameras(dataset: Dataset) -> None:
+    plane = ground_plane(fuse_frames(dataset.frames), dataset.frames, seed=1)
+    assert plane.normal[2] > np.cos(np.radians(0.1))
+    assert abs(plane.offset) < 1e-3
+
+
+def test_ground_plane_of_a_tilted_noisy_floor(dataset: Dataset) -> None:
+    rng = np.random.default_rng(0)
+    normal = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
+    xy = rng.uniform(-2, 2, (20_000, 2))
+    points = np.column_stack([xy, (0.3 - xy @ normal[:2]) / normal[2]]) + 0.004 * rng.standard_normal((20_000, 1)) * normal
+    rock = rng.uniform([-0.3, -0.3, 0.4], [0.3, 0.3, 1.0], (5_000, 3))
+    cloud = Cloud(np.concatenate([points, rock]), np.tile([0, 0, 1.0], (25_000, 1)), 0.002, 25_000)
+    plane = ground_plane(cloud, dataset.frames, seed=2)
+    assert plane.normal @ normal > np.cos(np.radians(0.1))
+    assert plane.offset == pytest.approx(0.3, abs=1e-3)
+    assert plane.sigma == pytest.approx(0.004, rel=0.1)
+
+
+def test_largest_cluster_wins() -> None:
+    rng = np.random.default_rng(3)
+    large, small = rng.uniform(0, 1, (3000, 3)), np.array([3.0, 0, 0]) + rng.uniform(0, 0.3, (300, 3))
+    inside, eps, count = rock_cluster(np.concatenate([small, large]), 0.05, np.array([3.0, 0.0, 0.0]))
+    assert count == 2
+    assert inside[300:].mean() > 0.99
+    assert not inside[:300].any()
+    assert 0.05 < eps < 0.5
+
+
+def test_of_two_equal_clusters_the_one_looked_at_wins_and_a_tie_is_an_error() -> None:
+    blob = np.random.default_rng(4).uniform(-0.5, 0.5, (2000, 3))
+    both = np.concatenate([blob - 2 * X, blob + 2 * X])
+    inside, _, _ = rock_cluster(both, 0.05, np.array([1.5, 0.0, 0.0]))
+    assert inside[2000:].all()
+    assert not inside[:2000].any()
+    with pytest.raises(InputError, match="equally large and equally near"):
+        rock_cluster(both, 0.05, np.zeros(3))
+
+
+def test_normals_of_a_sphere_point_at_the_cameras() -> None:
+    points = np.random.default_rng(5).standard_normal((4000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    normals = estimate_normals(points, points)
+    assert np.degrees(np.arccos(np.einsum("nk,nk->n", normals, points).min())) < 15
+    assert np.einsum("nk,nk->n", normals, points).mean() > 0.998
+
+
+@pytest.mark.parametrize("count", [2, 3, 137, 5000])
+def test_samples_are_exactly_n_on_the_surface_and_blue(count: int) -> None:
+    mesh = _ball()
+    points, normals, spacing = sample_surface(mesh, 7, count=count)
+    assert points.shape == normals.shape == (count, 3)
+    assert spacing == pytest.approx(np.sqrt(mesh.areas.sum() / count))
+    outward = (points - [0, 0, 0.5]) / 0.5
+    assert np.abs(np.linalg.norm(outward, axis=1) - 1).max() < 5e-3
+    assert np.einsum("nk,nk->n", normals, outward).min() > 0.99
+    if count > 100:
+        nearest = cKDTree(points).query(points, 2)[0][:, 1]
+        # Uniform random points have mean 0.5 and least near 0.
+        assert nearest.min() > 0.6 * spacing
+        assert nearest.mean() > 0.75 * spacing
+
+
+def test_spacing_sets_n_by_area_and_the_base_is_left_out() -> None:
+    mesh = _ball()
+    below = mesh.vertices[mesh.faces].mean(1)[:, 2] < 0.5
+    half = Mesh(mesh.vertices, mesh.faces, below)
+    points, _, spacing = sample_surface(half, 0, spacing=0.02)
+    assert len(points) == round(mesh.areas[~below].sum() / 0.02**2)
+    assert spacing == pytest.approx(0.02, rel=1e-3)
+    assert points[:, 2].min() > 0.5 - 0.05
+
+
+def test_samples_repeat_by_seed_and_differ_between_seeds() -> None:
+    mesh = _ball()
+    a, b, c = (sample_surface(mesh, seed, count=200)[0] for seed in (1, 1, 2))
+    assert np.array_equal(a, b)
+    assert not np.array_equal(a, c)
+
+
+def test_distances_to_mesh_are_exact() -> None:
+    cube = trimesh.creation.box((2, 2, 2))
+    points = np.array([[0, 0, 3.0], [2.0, 2.0, 0.0], [0.0, 0.0, 0.4]])
+    assert np.allclose(distances_to_mesh(points, cube.vertices, cube.faces), [2, np.sqrt(2), 0.6])
+
+
+def test_visible_is_the_near_side() -> None:
+    camera = synthetic.orbit_cameras(1, 160, 120)[0]
+    depth, _, _ = synthetic.cast(camera, [(synthetic.CENTRE, synthetic.AXES)])
+    mesh = synthetic.rock_mesh()
+    points, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
+    facing = np.einsum("nk,nk->n", normals, camera.position - points)
+    facing /= np.linalg.norm(camera.position - points, axis=1)
+    above = points[:, 2] > 0.02
+    for sides in (1, -1):
+        seen = visible(points, sides * normals, camera, depth, 0.005, two_sided=sides < 0)
+        assert seen[(facing > 0.25) & above].mean() > 0.999
+        assert not seen[facing < (0 if sides > 0 else -0.3)].any()
+        assert not seen[points[:, 2] < -0.1].any()
+
+
+def test_depth_of_surfels_agrees_with_ray_casting() -> None:
+    camera = synthetic.orbit_cameras(1, 64, 48)[0]
+    mesh = synthetic.rock_mesh()
+    points, normals, spacing = sample_surface(Mesh(mesh.vertices, mesh.faces, np.zeros(len(mesh.faces), bool)), 0, count=20_000)
+    depth = depth_of_surfels(points, normals, camera, spacing)
+    rock, ground = (synthetic.CENTRE + 10 * Z, synthetic.AXES), camera.world_to_camera.copy()
+    ground[:3, 3] -= ground[:3, :3] @ (10 * Z)
+    true, mask, _ = synthetic.cast(Camera(camera.K, 64, 48, ground), [rock])  # lifted off the ground
+    both = mask & (depth > 0)
+    assert (depth > 0)[mask].all()
+    assert (depth > 0).sum() < 1.1 * mask.sum()
+    assert np.quantile(np.abs(depth - true)[both], 0.95) < 2e-3
+
+
+def test_prior_is_near_the_truth(built) -> None:
+    prior, stages = built
+    numbers, voxel = prior.numbers, stages.cloud.voxel
+    truth = numbers["truth"]
+    assert len(prior.points) == 1500
+    assert numbers["n"] == pytest.approx((numbers["mesh_area"] - numbers["base_area"]) / prior.spacing**2)
+    assert truth["accuracy"] < 0.1 * voxel
+    assert truth["completeness"] < 0.1 * voxel
+    assert truth["hausdorff"] < voxel
+    assert truth["chamfer"] == pytest.approx((truth["accuracy"] + truth["completeness"]) / 2)
+    assert truth["visible_within_2_spacing"] == 1
+    assert truth["visible_share"] > 0.98
+    assert trimesh.Trimesh(stages.mesh.vertices, stages.mesh.faces).is_watertight
+    assert np.allclose(stages.plane.height(stages.mesh.vertices[stages.mesh.faces[stages.mesh.base]]), 0, atol=1e-6)
+    analytic = (prior.points - synthetic.CENTRE) / synthetic.AXES**2
+    analytic /= np.linalg.norm(analytic, axis=1, keepdims=True)
+    assert np.quantile(np.einsum("nk,nk->n", analytic, prior.normals), 0.01) > np.cos(np.radians(10))
+
+
+def test_error_to_truth_sees_a_wrong_prior(built, dataset: Dataset) -> None:
+    from mgs.prior import error_to_truth
+
+    prior, stages = built
+    moved = Mesh(stages.mesh.vertices + 0.05 * Z, stages.mesh.faces, stages.mesh.base)
+    plane = Plane(stages.plane.normal, stages.plane.offset, 0.0, 0.0)
+    error = error_to_truth(prior.points + 0.05 * Z, prior.spacing, moved, dataset.root / "rock.glb", dataset.frames, plane, 0)
+    assert 0.02 < error["accuracy"] < 0.05
+    assert error["hausdorff"] == pytest.approx(0.05, abs=0.02)
+
+
+def test_prior_round_trip_and_determinism(built, dataset: Dataset, tmp_path: Path) -> None:
+    prior, stages = built
+    again, _ = build_prior(dataset, PriorSettings(gaussians=1500))
+    assert np.array_equal(prior.points, again.points)
+    assert prior.numbers == again.numbers
+    loaded = load_prior(save_prior(tmp_path / "prior", prior, stages.mesh))
+    assert np.allclose(loaded.points, prior.points, atol=1e-6)
+    assert np.allclose(loaded.normals, prior.normals, atol=1e-6)
+    assert loaded.spacing == prior.spacing
+    assert loaded.depth_tolerance == prior.depth_tolerance
+    assert trimesh.load(tmp_path / "prior/mesh.ply").is_watertight
+
+
+def test_command_writes_everything(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(["prior", str(dataset.root), "--out", str(tmp_path / "p"), "--gaussians", "500"])
+    assert exit_.value.code == 0
+    assert {path.name for path in (tmp_path / "p").iterdir()} == {"mesh.ply", "points.ply", "prior.json", "prior.png"}
+    assert json.loads((tmp_path / "p/prior.json").read_text())["n"] == 500
+    assert "500" in capsys.readouterr().out
+
+
+def _flat(root: Path) -> Path:
+    return synthetic.write_dataset(root, rocks=[]).root
+
+
+def _twins(root: Path) -> Path:
+    axes = np.full(3, 0.25)
+    twins = [(synthetic.CENTRE + y * Y, axes) for y in (-0.6, 0.6)]
+    cameras = synthetic.orbit_cameras(12, 96, 72)
+    return synthetic.write_dataset(root, cameras, twins).root
+
+
+def _no_depth(root: Path) -> Path:
+    return synthetic.write_dataset(root, depth=False).root
+
+
+def _no_return(root: Path) -> Path:
+    dataset = synthetic.write_dataset(root)
+    for frame in dataset.frames:
+        assert frame.depth_path is not None
+        write_exr(frame.depth_path, {"Z": np.zeros((48, 64))})
+    return root
+
+
+def _truncated_depth(root: Path) -> Path:
+    path = synthetic.write_dataset(root).frames[3].depth_path
+    assert path is not None
+    path.write_bytes(path.read_bytes()[:200])
+    return root
+
+
+def _small_depth(root: Path) -> Path:
+    path = synthetic.write_dataset(root).frames[3].depth_path
+    assert path is not None
+    write_exr(path, {"Z": np.ones((10, 10))})
+    return root
+
+
+def _one_frame(root: Path) -> Path:
+    dataset = synthetic.write_dataset(root)
+    write_transforms(root, dataset.frames[:1])
+    (root / "rock.glb").unlink()
+    return root
+
+
+def _occupied(root: Path) -> Path:
+    synthetic.write_dataset(root)
+    (root / "prior").mkdir()
+    (root / "prior/mine.txt").write_text("keep")
+    return root
+
+
+def _faceless_truth(root: Path) -> Path:
+    synthetic.write_dataset(root)
+    trimesh.PointCloud(np.random.default_rng(0).random((10, 3))).export(root / "rock.glb")
+    return root
+
+
+def _plain(root: Path) -> Path:
+    return synthetic.write_dataset(root).root
+
+
+@pytest.mark.parametrize(
+    ("make", "options", "message"),
+    [
+        (_flat, [], "no rock in the cloud"),
+        (_twins, [], "equally large and equally near"),
+        (_no_depth, [], "depth_file_path"),
+        (_no_return, [], "no depth image has a return"),
+        (_truncated_depth, [], "kf_0003.exr: not a readable EXR"),
+        (_small_depth, [], "is 10x10"),
+        (_occupied, [], "not empty"),
+        (_faceless_truth, [], "no faces"),
+        (_plain, ["--gaussians", "0"], "0 Gaussians are too few"),
+        (_plain, ["--gaussians", "1"], "1 Gaussians are too few"),
+        (_plain, ["--gaussians", "-5"], "-5 Gaussians are too few"),
+        (_plain, ["--spacing", "0"], "must be positive"),
+        (_plain, ["--spacing", "9"], "samples are too few"),
+        (_plain, ["--spacing", "nan"], "must be positive"),
+        (_plain, ["--gaussians", "50", "--spacing", "0.1"], "give one of them"),
+        (_plain, ["--poisson-depth", "0"], "poisson-depth"),
+        (_plain, ["--poisson-depth", "30"], "poisson-depth"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    make, options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = make(tmp_path / "data")
+    with pytest.raises(SystemExit) as exit_:
+        main(["prior", str(root), *options])
+    error = capsys.readouterr().err.strip()
+    assert exit_.value.code == 2
+    assert message in error
+    assert "\n" not in error
+    assert not (root / "prior/mesh.ply").exists()
+    assert make is _occupied or not (root / "prior").exists()
+
+
+@pytest.mark.parametrize("damage", ["missing", "cut", "nan", "json"])
+def test_damaged_prior_is_one_line(built, tmp_path: Path, damage: str) -> None:
+    folder = save_prior(tmp_path / "prior", built[0], built[1].mesh)
+    points = folder / "points.ply"
+    if damage == "missing":
+        points.unlink()
+    elif damage == "cut":
+        points.write_bytes(points.read_bytes()[:5000])
+    elif damage == "nan":
+        content = points.read_bytes()
+        points.write_bytes(content[:-4] + np.float32(np.nan).tobytes())
+    else:
+        (folder / "prior.json").write_text("{}")
+    with pytest.raises(InputError):
+        load_prior(folder)
+    with pytest.raises(InputError, match="no such prior"):
+        load_prior(tmp_path / "elsewhere")
+
+
+def test_a_dataset_is_loaded_before_anything_is_written(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(["prior", str(tmp_path / "nowhere")])
+    assert exit_.value.code == 2
+    assert not (tmp_path / "nowhere").exists()
+    with pytest.raises(InputError):
+        load_dataset(tmp_path / "nowhere")
