@@ -5,97 +5,104 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from mgs.noise import Noise
+from mgs.noise import Noise, tile
 from mgs.rock import make_rock
 from mgs.scene_file import Arena, Lobe, Rock
 
-REACH = 45.0
+REACH = 60.0
 """Half the side of the terrain, metres: its edge is the horizon."""
-ROWS = 420
-"""Vertices along one side of the terrain; their spacing grows outwards, 2 cm near the rock to metres at the horizon."""
-TEXELS = 1600
-"""Texels along one side of the regolith's texture."""
+ROWS = 480
+"""Vertices along one side of the terrain; about 3 cm apart near the rock, metres at the horizon."""
+TILE = 4.0
+"""Side of the regolith's texture tile, metres."""
+TEXELS = 1024
+"""Texels along one side of the tile."""
 
 
-def make_ground(settings: Arena, rock: trimesh.Trimesh, rng: np.random.Generator) -> tuple[trimesh.Trimesh, np.ndarray]:
-    """Terrain mesh (metres, z about 0) with UVs, and its albedo texture, linear RGB [TEXELS, TEXELS, 3] (row 0 at v = 1)."""
+def _grid() -> np.ndarray:
+    """Coordinates [ROWS] of the terrain's grid lines along x and y, metres: even within 7 m, then ever wider."""
+    u = np.linspace(-1, 1, ROWS)
+    return 7 * u + (REACH - 7) * u**9
+
+
+def make_ground(settings: Arena, rock: trimesh.Trimesh, rng: np.random.Generator) -> trimesh.Trimesh:
+    """Terrain mesh, metres, z about 0: swells that grow with distance, ripples, and an apron of dust around the rock.
+
+    UVs count texture tiles; the vertex attribute `blend` [V,1] in 0..1 says how much of the second tile shows.
+    """
     noise = Noise(rng)
-    x, y = np.meshgrid(*2 * [_spread(np.linspace(-1, 1, ROWS))], indexing="xy")
-    z = ground_height(settings, x, y, rock, noise)
-    u, v = np.meshgrid(*2 * [np.linspace(0, 1, ROWS)], indexing="xy")
-    i, j = np.meshgrid(*2 * [np.arange(ROWS - 1)], indexing="xy")
-    a = (j * ROWS + i).ravel()
-    faces = np.concatenate([np.stack([a, a + 1, a + ROWS], 1), np.stack([a + 1, a + ROWS + 1, a + ROWS], 1)])
-    visual = trimesh.visual.TextureVisuals(uv=np.stack([u, v], -1).reshape(-1, 2))
-    mesh = trimesh.Trimesh(np.stack([x, y, z], -1).reshape(-1, 3), faces, visual=visual, process=False)
-
-    centre = _spread((np.arange(TEXELS) + 0.5) / TEXELS * 2 - 1)
-    tx, ty = np.meshgrid(centre, -centre, indexing="xy")
-    p = np.stack([tx, ty, np.zeros_like(tx)], -1).astype(np.float32)
-    tone = 1 + 0.10 * noise.fractal(p, 1.5, 4, 0.7) + 0.13 * noise.fractal(p, 0.05, 3, 1.0)
-    tone -= 0.35 * np.clip(noise.octave(p, 0.03) - 1.6, 0, 1)
-    tint = 1 + 0.04 * noise.fractal(p, 4.0, 3)[..., None] * np.array([1, 0, -1], np.float32)
-    return mesh, np.clip(np.asarray(settings.colour, np.float32) * tone[..., None] * tint, 0.01, 0.9)
-
-
-def ground_height(settings: Arena, x: np.ndarray, y: np.ndarray, rock: trimesh.Trimesh, noise: Noise) -> np.ndarray:
-    """Height of the terrain, metres: swells that grow with distance, ripples and grain, and an apron around the rock."""
+    x, y = np.meshgrid(_grid(), _grid())
     p = np.stack([x, y, np.zeros_like(x)], -1).astype(np.float32)
     far = np.hypot(x, y)
-    foot = np.abs(rock.vertices[np.abs(rock.vertices[:, 2]) < 0.1 * rock.extents[2]][:, :2])
+    foot = rock.vertices[np.abs(rock.vertices[:, 2]) < 0.1 * rock.extents[2]][:, :2]
     radius = np.linalg.norm(foot, axis=1).mean() if len(foot) else 0.5 * rock.extents[:2].mean()
     swell = settings.undulation * noise.fractal(p, 2.5, 4, 0.45) * (1 + (far / 9) ** 1.5)
-    ripples = 0.004 * noise.fractal(p, 0.16, 2, 0.6)
+    ripples = 0.006 * noise.fractal(p, 0.3, 2, 0.6)
     apron = 0.05 * np.exp(-(((far - radius) / (0.35 * radius)) ** 2))
-    return swell + ripples + apron
+    vertices = np.stack([x, y, swell + ripples + apron], -1).reshape(-1, 3)
+
+    a = (np.arange(ROWS - 1)[:, None] * ROWS + np.arange(ROWS - 1)).ravel()
+    faces = np.concatenate([np.stack([a, a + 1, a + ROWS], 1), np.stack([a + 1, a + ROWS + 1, a + ROWS], 1)])
+    visual = trimesh.visual.TextureVisuals(uv=vertices[:, :2] / TILE)
+    mesh = trimesh.Trimesh(vertices, faces, visual=visual, process=False)
+    blend = 0.5 + 0.5 * noise.fractal(p, 1.8, 5, 0.75)
+    mesh.vertex_attributes["blend"] = np.clip(blend, 0, 1).reshape(-1, 1).astype(np.float32)
+    return mesh
+
+
+def regolith(settings: Arena, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Two texture tiles that repeat seamlessly: pale drift and darker lag with coarse grains, linear RGB [TEXELS,TEXELS,3]."""
+    fine, soft, tint = (tile(TEXELS, exponent, rng) for exponent in (0.35, 1.1, 1.3))
+    grains = np.clip(tile(TEXELS, 0.2, rng, shortest=4) - 1.4, 0, 1)
+    colour = np.asarray(settings.colour, np.float32)
+    hue = 1 + 0.04 * tint[..., None] * np.array([1, 0, -1], np.float32)
+    drift = colour * (1.04 + 0.16 * fine + 0.06 * soft)[..., None] * hue
+    lag = 0.92 * colour * (1 + 0.3 * fine + 0.08 * soft - 0.6 * grains)[..., None] * hue
+    return np.clip(drift, 0.02, 0.9), np.clip(lag, 0.02, 0.9)
 
 
 def make_stones(
     settings: Arena, rock: trimesh.Trimesh, ground: trimesh.Trimesh, rng: np.random.Generator
 ) -> trimesh.Trimesh | None:
-    """Small stones scattered over the ground as one mesh with vertex colours (linear RGB, float), or None for no stones."""
+    """Small stones scattered over the ground as one mesh, with the vertex attribute `color` (linear RGB); None for none."""
     if not settings.stones:
         return None
-    templates = []
-    for _ in range(6):
-        radii = (1.0, rng.uniform(0.6, 0.9), rng.uniform(0.4, 0.7))
-        shape = Rock(size=1.0, lobes=(Lobe(radii=radii),), detail=0.07, buried=0.25, cracks=0)
-        stone = make_rock(shape, rng)
-        stone.merge_vertices(merge_tex=True, merge_norm=True)
-        templates.append(stone)
+    templates = [_stone(rng) for _ in range(8)]
     keep_out = settings.clearance * np.linalg.norm(rock.vertices[rock.vertices[:, 2] > 0][:, :2], axis=1).max()
-    # Density falls with distance as the terrain's vertices do; sizes follow the power law of fragmented rock.
-    at = _spread(rng.uniform(-0.8, 0.8, (4 * settings.stones, 2)))
-    at = at[np.linalg.norm(at, axis=1) > keep_out][: settings.stones]
+    distance = 12 * rng.uniform(0, 1, 4 * settings.stones) ** 0.7
+    azimuth = rng.uniform(0, 2 * np.pi, 4 * settings.stones)
+    at = np.stack([distance * np.cos(azimuth), distance * np.sin(azimuth)], 1)[distance > keep_out][: settings.stones]
+    # Fragmented rock: the number of stones above a size falls as a power of it.
     sizes = np.minimum(0.6 * settings.stone_size * rng.uniform(0, 1, len(at)) ** (-1 / 1.8), settings.largest_stone)
-    z = _height_at(ground, at)
     vertices, faces, colours, offset = [], [], [], 0
-    for (x, y), height, size in zip(at, z, sizes, strict=True):
+    for position, height, size in zip(at, _height_at(ground, at), sizes, strict=True):
         stone = templates[rng.integers(len(templates))]
         turn = rng.uniform(0, 2 * np.pi)
         c, s = np.cos(turn), np.sin(turn)
         turned = stone.vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-        vertices.append(turned * size + [x, y, height])
+        vertices.append(turned * size + [*position, height])
         faces.append(stone.faces + offset)
-        tone = np.asarray(settings.colour, np.float32) * rng.uniform(0.45, 1.1)
-        colours.append(np.broadcast_to(tone + (tone.mean() - tone) * rng.uniform(0, 0.7), (len(turned), 3)))
+        tone = np.asarray(settings.colour) * rng.uniform(0.35, 1.1)
+        grey = tone + (tone.mean() - tone) * rng.uniform(0, 0.8)
+        colours.append(np.broadcast_to(grey, (len(turned), 3)))
         offset += len(turned)
     mesh = trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
     mesh.vertex_attributes["color"] = np.concatenate(colours).astype(np.float32)
     return mesh
 
 
-def _spread(u: np.ndarray) -> np.ndarray:
-    """[-1,1] -> [-REACH, REACH], dense at the middle (hyperbolic sine)."""
-    return REACH * np.sinh(5.5 * u) / np.sinh(5.5)
+def _stone(rng: np.random.Generator) -> trimesh.Trimesh:
+    """One stone of size 1, standing in the ground, without texture."""
+    lobe = Lobe(radii=(1.0, rng.uniform(0.6, 0.9), rng.uniform(0.4, 0.7)))
+    stone = make_rock(Rock(size=1.0, lobes=(lobe,), detail=0.08, buried=0.25, cracks=0, relief=0.08), rng)
+    return trimesh.Trimesh(stone.vertices, stone.faces)
 
 
 def _height_at(ground: trimesh.Trimesh, at: np.ndarray) -> np.ndarray:
-    """Terrain height at points [N,2], bilinear in the terrain's own grid."""
-    u = (np.arcsinh(at / REACH * np.sinh(5.5)) / 5.5 + 1) / 2 * (ROWS - 1)
-    z = ground.vertices[:, 2].reshape(ROWS, ROWS)
+    """Terrain height [N] at points [N,2], bilinear in the terrain's own grid."""
+    u = np.interp(at, _grid(), np.arange(ROWS))
     i = np.clip(u.astype(int), 0, ROWS - 2)
-    f = u - i
-    (ix, iy), (fx, fy) = i.T, f.T
+    (ix, iy), (fx, fy) = i.T, (u - i).T
+    z = ground.vertices[:, 2].reshape(ROWS, ROWS)
     low = z[iy, ix] * (1 - fx) + z[iy, ix + 1] * fx
     return low * (1 - fy) + (z[iy + 1, ix] * (1 - fx) + z[iy + 1, ix + 1] * fx) * fy

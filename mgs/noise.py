@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
 
 LATTICE = 96
 """Samples along one side of the periodic noise volume."""
@@ -44,3 +45,29 @@ class Noise:
         """As `fractal`, of 1 - |noise|: sharp crests, zero mean (roughly)."""
         octave = (gain**i * (0.8 - np.abs(self.octave(points, wavelength / 2**i))) for i in range(octaves))
         return sum(octave, np.zeros(points.shape[:-1]))
+
+    def fracture(self, points: np.ndarray, wavelength: float) -> np.ndarray:
+        """Piecewise linear field at points [N,3], about -1 to 1: Voronoi cells of a `wavelength`, each a tilted plane.
+
+        Flat faces, narrow edges and ledges, as broken rock has (cells: Worley 1996).
+        """
+        low, high = points.min(0) - wavelength, points.max(0) + wavelength
+        centres = self.rng.uniform(low, high, (int(np.prod((high - low) / wavelength)) + 4, 3))
+        tilt = self.rng.normal(size=centres.shape)
+        distance, nearest = cKDTree(centres).query(points, 4)
+        weight = np.exp(-(distance - distance[:, :1]) / (0.08 * wavelength))
+        height = np.einsum("nck,nck->nc", points[:, None] - centres[nearest], tilt[nearest]) / wavelength
+        return (weight * height).sum(1) / weight.sum(1)
+
+
+def tile(size: int, exponent: float, rng: np.random.Generator, shortest: float = 2) -> np.ndarray:
+    """A periodic image [size,size] of Gaussian noise, zero mean, unit variance, amplitude falling as frequency^-exponent.
+
+    Nothing is finer than `shortest` pixels.
+    """
+    k = np.fft.fftfreq(size)
+    frequency = np.hypot(k[:, None], k[None, : size // 2 + 1])
+    frequency[0, 0] = np.inf
+    amplitude = np.where(frequency <= 1 / shortest, frequency**-exponent, 0)
+    image = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((size, size))) * amplitude)
+    return ((image - image.mean()) / image.std()).astype(np.float32)

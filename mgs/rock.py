@@ -107,10 +107,9 @@ def _relief(mesh: trimesh.Trimesh, settings: Rock, noise: Noise) -> np.ndarray:
     size, amplitude = settings.size, settings.relief * settings.size
     warped = p + 0.06 * size * np.stack([noise.fractal(p, 0.4 * size, 2) for _ in range(3)], -1).astype(np.float32)
     broken = np.clip(0.6 + 0.5 * noise.octave(p, 0.5 * size), 0.15, 1.3)
-    height = amplitude * (
-        0.55 * noise.ridged(warped, 0.45 * size, 3, 0.5) + 0.16 * broken * noise.ridged(p, 0.09 * size, 3, 0.6)
-    )
-    height += 0.0022 * size * broken * noise.fractal(p, 0.022 * size, 2, 0.7)
+    height = amplitude * (0.2 * noise.fractal(p, 0.5 * size, 2) - 0.15 * noise.ridged(warped, 0.3 * size, 2))
+    height += amplitude * (0.4 * noise.fracture(warped, 0.3 * size) + 0.18 * broken * noise.fracture(warped, 0.11 * size))
+    height += amplitude * broken * (0.06 * noise.fracture(p, 0.04 * size) + 0.05 * noise.fractal(p, 0.045 * size, 4, 0.75))
     height -= 0.006 * size * np.clip(noise.octave(p, 0.045 * size) - 1.5, 0, 1)
     crack = np.exp(-((noise.octave(warped, 0.8 * size) / 0.025) ** 2)) + 0.6 * np.exp(
         -((noise.octave(warped, 0.5 * size) / 0.03) ** 2)
@@ -173,14 +172,14 @@ def _albedo(p: np.ndarray, normal: np.ndarray, height: np.ndarray, settings: Roc
         band = np.sin(2 * np.pi * level) + 0.8 * np.sin(2 * np.pi * 2.7 * level + 1)
         patches = 0.4 * patches + 1.3 * band
     mix = _smoothstep(-1.2, 1.2, patches)
-    grains = 0.10 * noise.fractal(p, 0.02 * size, 3, 0.9) - 0.25 * _smoothstep(1.5, 2.2, noise.octave(p, 0.012 * size))
+    grains = 0.15 * noise.fractal(p, 0.02 * size, 3, 0.9) - 0.35 * _smoothstep(1.5, 2.2, noise.octave(p, 0.012 * size))
     hollow = _smoothstep(1.0, -2.5, height / (settings.relief * size + 1e-9) * 3)
     if settings.plain_half:
         textured = _smoothstep(-0.05, 0.05, p[..., 0] / size)
         mix, grains = 0.6 + textured * (mix - 0.6), textured * grains
     colour = dark + (light - dark) * mix[..., None]
     colour = colour * (1 + grains - 0.35 * hollow)[..., None]
-    settled = _smoothstep(0.35, 0.95, normal[..., 2] + 0.25 * noise.fractal(p, 0.12 * size, 4, 0.7)) * 0.75
+    settled = 0.65 * _smoothstep(0.4, 1.1, normal[..., 2] + 0.3 * noise.fractal(p, 0.12 * size, 4, 0.7))
     return np.clip(colour + (dust - colour) * settled[..., None], 0.01, 0.9)
 
 

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from mgs.arena import make_ground, make_stones
+from mgs.arena import make_ground, make_stones, regolith
 from mgs.conventions import Camera, linear_from_srgb
 from mgs.scene_file import SceneFile, Sky
 from mgs.seeds import generator
@@ -41,10 +41,13 @@ class Scene:
     """A rock on its arena under sun and sky, seen through cameras of one size and one K."""
 
     def __init__(self, settings: SceneFile, rock: trimesh.Trimesh, camera: Camera, seed: int) -> None:
-        ground, regolith = make_ground(settings.arena, rock, generator(seed, "ground"))
+        ground = make_ground(settings.arena, rock, generator(seed, "ground"))
         stones = make_stones(settings.arena, rock, ground, generator(seed, "stones"))
         shapes = {"rock": _mesh("rock", rock, _rock_bsdf(rock, settings.rock.colours[0]))}
-        shapes["ground"] = _mesh("ground", ground, {"type": "diffuse", "reflectance": _bitmap(regolith)})
+        tiles = regolith(settings.arena, generator(seed, "regolith"))
+        drift, lag = ({"type": "diffuse", "reflectance": _bitmap(tile)} for tile in tiles)
+        weight = {"type": "mesh_attribute", "name": "vertex_blend"}
+        shapes["ground"] = _mesh("ground", ground, {"type": "blendbsdf", "weight": weight, "drift": drift, "lag": lag})
         if stones is not None:
             colour = {"type": "mesh_attribute", "name": "vertex_color"}
             shapes["stones"] = _mesh("stones", stones, {"type": "diffuse", "reflectance": colour})
@@ -137,15 +140,15 @@ def _texture_image(material: Any) -> Any:
 
 
 def _mesh(name: str, mesh: trimesh.Trimesh, bsdf: dict[str, Any]) -> Any:
-    """trimesh -> mi.Mesh with normals, UVs (v turned to Mitsuba's, downwards) and the vertex attribute `color`."""
+    """trimesh -> mi.Mesh with normals, UVs (v turned to Mitsuba's, downwards) and vertex attributes."""
     uv = getattr(mesh.visual, "uv", None)
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict({"type": "twosided", "material": bsdf})
     shape = mi.Mesh(name, len(mesh.vertices), len(mesh.faces), has_vertex_normals=True, has_vertex_texcoords=uv is not None,
                     props=properties)  # fmt: skip
-    if "color" in mesh.vertex_attributes:
-        colour: Any = np.ravel(mesh.vertex_attributes["color"])
-        shape.add_attribute("vertex_color", 3, colour)
+    for attribute, values in mesh.vertex_attributes.items():
+        flat: Any = np.ravel(values)
+        shape.add_attribute(f"vertex_{attribute}", np.shape(values)[1], flat)
     params = mi.traverse(shape)
     params["vertex_positions"] = mi.Float(mesh.vertices.astype(np.float32).ravel())
     params["vertex_normals"] = mi.Float(mesh.vertex_normals.astype(np.float32).ravel())

@@ -49,7 +49,7 @@ class Rock(_Strict):
     """Light and dark mineral."""
     dust: Colour = (0.42, 0.30, 0.20)
     """Dust on faces that look up."""
-    detail: Positive = 0.015
+    detail: Positive = 0.011
     """Length of a mesh edge, metres."""
 
 
