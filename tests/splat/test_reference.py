@@ -1,4 +1,4 @@
-"""The oracle itself: camera convention, projection against the camera, derivatives against central differences, all in float64."""
+"""The oracle itself: camera convention, projection, derivatives against central differences, all in float64."""
 
 import numpy as np
 import pytest
