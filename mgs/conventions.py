@@ -16,6 +16,9 @@ from mgs.errors import InputError
 SH_C0 = 0.28209479177387814
 """Spherical harmonic of degree 0, 1 / (2 sqrt(pi)); rgb = 0.5 + SH_C0 * sh0 (3DGS file layout)."""
 
+QUAT_MIN = 1e-12
+"""A quaternion whose components are all smaller is zero and means the identity: its derivatives would overflow float32."""
+
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -114,8 +117,9 @@ def opengl_from_opencv(world_to_camera: ArrayLike) -> NDArray[np.float64]:
 def rotmat_from_quat(quats: ArrayLike) -> NDArray[np.float64]:
     """Quaternions wxyz [...,4] of any norm -> rotation matrices [...,3,3]; a zero quaternion is the identity."""
     q = np.asarray(quats, np.float64)
+    valid = np.abs(q).max(-1, keepdims=True) > QUAT_MIN
     norm = np.linalg.norm(q, axis=-1, keepdims=True)
-    q = np.where(norm > 0, q / np.where(norm > 0, norm, 1.0), [1.0, 0.0, 0.0, 0.0])
+    q = np.where(valid, q / np.where(valid, norm, 1.0), [1.0, 0.0, 0.0, 0.0])
     w, x, y, z = np.moveaxis(q, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -87,7 +87,7 @@ def inflate(splats: Splats, margin: float) -> Footprints:
 
 
 def outgrown(built: Footprints, splats: Splats) -> Any:
-    """Mask [N]: the splat moved, or its footprint now is not wholly inside the one its lists were built with.
+    """Mask [N]: the splat moved (or left the view), or its footprint is not wholly inside the one its lists were built with.
 
     In the whitened coordinates of the built ellipse, the present one is {x: x^T S^T S x <= 1}; it is inside the unit disc
     exactly where the smaller eigenvalue of S^T S is at least 1.
@@ -102,7 +102,7 @@ def outgrown(built: Footprints, splats: Splats) -> Any:
     spread = dr.sqrt(0.25 * (a - c) * (a - c) + b * b)
     smallest = s00 * s00 * (s11 * s11) / (half + spread)
     moved = (built.u != splats.u) | (built.v != splats.v) | (built.z != splats.z)
-    return (q > 0) & (moved | ~(smallest >= 1))
+    return (moved & ((q > 0) | (built.q > 0))) | ((q > 0) & ~(smallest >= 1))
 
 
 def depth_order(depth: Any) -> Any:

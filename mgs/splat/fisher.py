@@ -22,7 +22,7 @@ from mgs.seeds import derive_seed
 from mgs.splat import kernels
 from mgs.splat.constants import LOG_SCALE_RANGE
 from mgs.splat.kernels import LN2
-from mgs.splat.project import axes2d, camera_array, columns, sh_basis
+from mgs.splat.project import axes2d, camera_array, columns, quat_size, sh_basis
 from mgs.splat.render import ListCache, as_drjit, render, splats_and_lists
 
 LEARNED = ("sh", "log_scales", "quats", "logit_opacities")
@@ -87,8 +87,9 @@ def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         turn.append(product((scales[i] - scales[j]) * (scales[i] + scales[j]), i, j))
-    norm2 = dr.squared_norm(quats)
-    w, x, y, z = quats * dr.select(norm2 > 0, 2 * dr.rcp(dr.select(norm2 > 0, norm2, 1)), 0)
+    size, valid = quat_size(quats)
+    q = quats / size
+    w, x, y, z = q * dr.select(valid, 2 / (dr.squared_norm(q) * size), 0)
     X, Y, Z = turn
     by_quat = [-x * X - y * Y - z * Z, w * X - z * Y + y * Z, z * X + w * Y - x * Z, -y * X + x * Y + w * Z]
     opacity = dr.exp2(splats.log2_opacity)

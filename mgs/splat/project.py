@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mgs.conventions import Camera
+from mgs.conventions import QUAT_MIN, Camera
 from mgs.gaussians import Gaussians
 from mgs.splat.constants import EPS2D, FRUSTUM_MARGIN, LOG_SCALE_RANGE, NEAR
 
@@ -69,11 +69,18 @@ def _unpack(array: Any) -> tuple[Any, Any, list[Any], list[Any], Any]:
     return R, mi.Vector3f(*c[9:12]), c[12:16], c[16:20], mi.Point3f(*c[20:23])
 
 
+def quat_size(quats: Any) -> tuple[Any, Any]:
+    """(largest component, 1 where the quaternion is zero; mask of those that are not): squares of q / size cannot overflow."""
+    size = dr.max(dr.abs(dr.detach(quats)))
+    valid = size > QUAT_MIN
+    return dr.select(valid, size, 1), valid
+
+
 def rotation_columns(quats: Any) -> list[Any]:
     """Columns of the rotation of quaternions wxyz (any norm; zero is the identity), three Vector3f."""
-    norm2 = dr.squared_norm(quats)
-    valid = norm2 > 0
-    w, x, y, z = dr.select(valid, quats * dr.rsqrt(dr.select(valid, norm2, 1)), mi.Vector4f(1, 0, 0, 0))
+    size, valid = quat_size(quats)
+    quats = dr.select(valid, quats / size, mi.Vector4f(1, 0, 0, 0))
+    w, x, y, z = quats * dr.rsqrt(dr.squared_norm(quats))
     return [
         mi.Vector3f(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
         mi.Vector3f(2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
