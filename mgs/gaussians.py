@@ -52,6 +52,16 @@ class Gaussians:
 
     def check(self) -> Gaussians:
         """Shapes and finiteness of NumPy fields; returns self. Raises InputError naming the parameter and first index."""
+        self.check_shapes()
+        for field in fields(self):
+            bad = ~np.isfinite(np.asarray(getattr(self, field.name)))
+            if bad.any():
+                first = int(np.argwhere(bad)[0][0])
+                raise InputError(f"gaussians: {field.name} is NaN or infinite, first at Gaussian {first}; remove or repair it")
+        return self
+
+    def check_shapes(self) -> None:
+        """Raises InputError where the shape of a parameter (NumPy or Dr.Jit) does not fit that of the means."""
         n = len(self)
         coefficients = {(d + 1) ** 2 for d in range(MAX_SH_DEGREE + 1)}
         shapes = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "logit_opacities": (n,)}
@@ -60,12 +70,6 @@ class Gaussians:
                 raise InputError(f"gaussians: {name} has shape {getattr(self, name).shape}, expected {shape}")
         if len(self.sh.shape) != 3 or self.sh.shape[0] != n or self.sh.shape[2] != 3 or self.sh.shape[1] not in coefficients:
             raise InputError(f"gaussians: sh has shape {self.sh.shape}, expected ({n}, 1|4|9|16, 3)")
-        for field in fields(self):
-            bad = ~np.isfinite(np.asarray(getattr(self, field.name)))
-            if bad.any():
-                first = int(np.argwhere(bad)[0][0])
-                raise InputError(f"gaussians: {field.name} is NaN or infinite, first at Gaussian {first}; remove or repair it")
-        return self
 
 
 def sh_from_rgb(rgb: np.ndarray) -> np.ndarray:

@@ -49,6 +49,9 @@ def fisher(
     """
     if estimator not in ESTIMATORS:
         raise InputError(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
+    if len(gaussians) == 0:
+        size = groups(gaussians.sh_degree)["opacity"].stop
+        return np.zeros((0, size, size) if estimator == "block" else (0, size), np.float32)
     return ESTIMATORS[estimator](as_drjit(gaussians), camera, background, cache)
 
 

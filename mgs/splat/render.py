@@ -83,7 +83,11 @@ def _raise_unless_finite(finite: Any) -> None:
 
 
 def as_drjit(gaussians: Gaussians) -> Gaussians:
-    """The same Gaussians with TensorXf fields; fields that are Dr.Jit already are kept, gradients included."""
+    """The same Gaussians with TensorXf fields; fields that are Dr.Jit already are kept, gradients included.
+
+    Raises InputError where shapes do not fit each other: a kernel would read beyond the end.
+    """
+    gaussians.check_shapes()
     values = {f.name: getattr(gaussians, f.name) for f in fields(gaussians)}
     return Gaussians(**{k: v if dr.is_array_v(v) else mi.TensorXf(np.asarray(v, np.float32)) for k, v in values.items()})
 
@@ -129,8 +133,17 @@ def render(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.
     background: linear RGB. cache: keep one between calls so that a camera seen again reuses its block lists.
     Raises InputError where a parameter is NaN or infinite (names the parameter and the first Gaussian).
     """
+    if len(gaussians) == 0:
+        return _empty(camera, background)
     splats, lists = splats_and_lists(as_drjit(gaussians), camera, cache)
     return composite(splats, lists, camera.width, camera.height, background)
+
+
+def _empty(camera: Camera, background: Any) -> Image:
+    """What a camera sees of no Gaussians."""
+    shape = (camera.height, camera.width)
+    rgb = np.broadcast_to(np.asarray(background, np.float32), (*shape, 3))
+    return Image(mi.TensorXf(np.ascontiguousarray(rgb)), dr.zeros(mi.TensorXf, shape), dr.zeros(mi.TensorXf, shape))
 
 
 def composite(splats: Splats, lists: BlockLists, width: int, height: int, background: Any = (0.0, 0.0, 0.0)) -> Image:
