@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from mgs.files import atomic_path, new_folder, read_json, write_json
 from mgs.initial import initial_gaussians as initial_gaussians
 from mgs.seeds import derive_seed
 from mgs.surface import Mesh, distances_to_mesh, estimate_normals, poisson_mesh, sample_surface
-from mgs.visibility import visible
+from mgs.visibility import in_mask, visible
 
 TRUTH_SAMPLES = 50_000
 """Samples of the true rock that its errors are measured on."""
@@ -90,13 +90,14 @@ def build_prior(
     floor = (plane.height(cluster) < 2 * plane.tolerance) & (normals @ plane.normal > FLOOR_UPRIGHT)
     cluster, normals = cluster[~floor], normals[~floor]
     mesh, depth = poisson_mesh(cluster, normals, cloud.voxel, plane, settings.poisson_depth)
+    residual = float(np.sqrt(np.mean(distances_to_mesh(cluster, mesh.vertices, mesh.faces) ** 2)))
+    tolerance = max(3 * residual, cloud.voxel)
     tell("surface samples")
+    mesh = _seen_by(mesh, dataset.frames, tolerance)
     spacing = settings.spacing or (None if settings.gaussians else cloud.voxel)
     seed = derive_seed(settings.seed, "prior/samples")
     points, normals, spacing = sample_surface(mesh, seed, count=settings.gaussians, spacing=spacing)
-    residual = float(np.sqrt(np.mean(distances_to_mesh(cluster, mesh.vertices, mesh.faces) ** 2)))
     nearest = cKDTree(points).query(points, 2)[0][:, 1]
-    tolerance = max(3 * residual, cloud.voxel)
     numbers: dict[str, Any] = {
         "frames": len(dataset.frames),
         "pixels": cloud.pixels,
@@ -111,7 +112,7 @@ def build_prior(
         "poisson_depth": depth,
         "mesh_faces": len(mesh.faces),
         "mesh_area": float(mesh.areas.sum()),
-        "base_area": float(mesh.areas[mesh.base].sum()),
+        "sampled_area": float(mesh.areas[mesh.seen].sum()),
         "fit_rms": residual,
         "depth_tolerance": tolerance,
         "n": len(points),
@@ -126,6 +127,21 @@ def build_prior(
         numbers["truth"] = error_to_truth(points, spacing, mesh, truth, dataset.frames, plane, settings.seed)
     prior = Prior(points, normals, spacing, tolerance, numbers)
     return prior, Stages(cloud, plane, np.abs(height) <= plane.tolerance, cluster, mesh)
+
+
+def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:
+    """The mesh with `seen` narrowed to faces with a corner that some frame sees inside its rock mask.
+
+    What no frame sees is buried, bridges a gap that frames look through, or lies where no view could ever use it: Gaussians
+    there are wasted, or show where they should not.
+    """
+    seen, normals = np.zeros(len(mesh.vertices), bool), mesh.vertex_normals
+    for frame in frames:
+        seen |= visible(mesh.vertices, normals, frame.camera, frame.depth(), tolerance) & in_mask(mesh.vertices, frame)
+    narrowed = mesh.seen & seen[mesh.faces].any(1)
+    if not narrowed.any():
+        raise InputError("prior: no frame sees the mesh in its rock mask; check masks and poses")
+    return replace(mesh, seen=narrowed)
 
 
 def error_to_truth(

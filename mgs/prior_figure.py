@@ -40,8 +40,9 @@ def draw_prior(path: str | Path, prior: Prior, stages: Stages) -> None:
         _dots(axis, (points - centre) @ frame.T, tint, colours, zoom * reach, 0.8)
         axis.set_title(title, fontsize=10)
     _shaded_mesh(axes[3], stages, frame, centre, reach)
-    area = prior.numbers["mesh_area"] - prior.numbers["base_area"]
-    axes[3].set_title(f"Poisson mesh: {len(stages.mesh.faces):,} faces\n{area:.3f} m²{error}", fontsize=10)
+    axes[3].set_title(
+        f"Poisson mesh, {prior.numbers['mesh_area']:.2f} m²{error}\nblue: seen by no frame, not sampled", fontsize=10
+    )
     shade = np.clip(0.25 + 0.75 * (prior.normals @ frame.T) @ LIGHT, 0.05, 1)[:, None] * [0.95, 0.85, 0.7]
     towards = (prior.normals @ frame.T)[:, 2] > 0
     _dots(axes[4], ((prior.points - centre) @ frame.T)[towards], shade[towards], None, reach, None)
@@ -80,9 +81,10 @@ def _shaded_mesh(axis, stages: Stages, frame: np.ndarray, centre: np.ndarray, re
     corners = ((stages.mesh.vertices - centre) @ frame.T)[stages.mesh.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    colour = np.where(stages.mesh.seen[:, None], [0.82, 0.8, 0.78], [0.25, 0.4, 0.8])
     front = np.flatnonzero(normal[:, 2] > 0)
     front = front[np.argsort(corners[front].mean(1)[:, 2])]
-    shade = np.clip(0.25 + 0.75 * normal[front] @ LIGHT, 0.05, 1)[:, None] * [0.8, 0.8, 0.85]
+    shade = np.clip(0.25 + 0.75 * normal[front] @ LIGHT, 0.05, 1)[:, None] * colour[front]
     axis.add_collection(
         PolyCollection(corners[front, :, :2], facecolors=shade, edgecolors=shade, linewidths=0.2, rasterized=True)
     )

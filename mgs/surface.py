@@ -25,11 +25,11 @@ OVERSAMPLING = 5
 
 @dataclass(frozen=True)
 class Mesh:
-    """vertices [V,3] world, metres; faces [F,3]; base [F] bool: the flat cap that closes the rock where it meets the ground."""
+    """vertices [V,3] world, metres; faces [F,3]; seen [F] bool: faces that the survey saw, so those that samples cover."""
 
     vertices: np.ndarray
     faces: np.ndarray
-    base: np.ndarray
+    seen: np.ndarray
 
     @property
     def areas(self) -> np.ndarray:
@@ -39,9 +39,9 @@ class Mesh:
 
     @property
     def vertex_normals(self) -> np.ndarray:
-        """[V,3] unit, area-weighted over the faces that are not base (zero at vertices of the base alone)."""
+        """[V,3] unit, area-weighted over the seen faces (zero at vertices of none)."""
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
-        cross = np.cross(b - a, c - a) * ~self.base[:, None]
+        cross = np.cross(b - a, c - a) * self.seen[:, None]
         normals = np.zeros_like(self.vertices)
         for k in range(3):
             np.add.at(normals, self.faces[:, k], cross)
@@ -61,7 +61,7 @@ def poisson_mesh(points: np.ndarray, normals: np.ndarray, voxel: float, plane: P
     """Screened Poisson surface (Kazhdan and Hoppe 2013, pymeshlab) cut flat at the ground plane (manifold3d).
 
     Poisson closes the unseen underside with a bulge that no data supports; the cut replaces it by a flat cap on the ground, so
-    that the mesh stays watertight and its base is known. depth: octree depth; by default the finest cell is at most 1.5 voxels.
+    that the mesh stays watertight; the cap counts as not seen. depth: octree depth; by default the finest cell is at most 1.5 voxels.
     Returns (mesh, octree depth). Raises InputError where Poisson gives no closed surface above the ground.
     """
     import manifold3d
@@ -89,19 +89,19 @@ def poisson_mesh(points: np.ndarray, normals: np.ndarray, voxel: float, plane: P
     cut = solid.to_mesh64()
     vertices, faces = np.asarray(cut.vert_properties)[:, :3], np.asarray(cut.tri_verts).astype(np.int64)
     base = (np.abs(plane.height(vertices)) < 1e-6 * np.ptp(vertices, axis=0).max())[faces].all(1)
-    return Mesh(vertices, faces, base), depth
+    return Mesh(vertices, faces, ~base), depth
 
 
 def sample_surface(
     mesh: Mesh, seed: int, *, count: int | None = None, spacing: float | None = None
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Blue-noise samples of the surface that is not base: exactly N = A / spacing^2 of them (rounded), A its area.
+    """Blue-noise samples of the seen surface: exactly N = A / spacing^2 of them (rounded), A its area.
 
     Give count N or spacing (metres). A greedy Poisson-disk subset of 5 N uniform candidates, with the largest radius that
     keeps N of them; the few too many with the nearest neighbours are dropped.
     Returns (points [N,3], unit normals [N,3], spacing in metres). Raises InputError for fewer than two samples.
     """
-    areas = np.where(mesh.base, 0.0, mesh.areas)
+    areas = np.where(mesh.seen, mesh.areas, 0.0)
     area = float(areas.sum())
     if count is None:
         assert spacing is not None

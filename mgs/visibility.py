@@ -1,10 +1,11 @@
-"""Which surface points a camera sees, by depth test."""
+"""Which surface points a camera sees: depth test and mask."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from mgs.conventions import Camera
+from mgs.dataset import Frame
 
 GRAZING = 0.2
 """Cosine between normal and view below which the slope no longer widens the tolerance."""
@@ -36,6 +37,14 @@ def visible(
     steep = np.maximum(np.abs(cosine), GRAZING)
     slack = tolerance + z / camera.K[0, 0] * np.sqrt(np.maximum(1 - steep**2, 0)) / steep
     return seen & (shown > 0) & (np.abs(z - shown) < slack)
+
+
+def in_mask(points: np.ndarray, frame: Frame) -> np.ndarray:
+    """[N] bool: the pixel of each point [N,3] (clamped to the frame) is inside the frame's rock mask."""
+    pixels, _ = frame.camera.project(points)
+    column = np.clip(np.floor(pixels[:, 0]), 0, frame.camera.width - 1).astype(int)
+    row = np.clip(np.floor(pixels[:, 1]), 0, frame.camera.height - 1).astype(int)
+    return frame.mask()[row, column]
 
 
 def depth_of_surfels(points: np.ndarray, normals: np.ndarray, camera: Camera, radius: float) -> np.ndarray:

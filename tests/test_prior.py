@@ -39,7 +39,7 @@ def built(dataset: Dataset):
 
 def _ball(centre=(0.0, 0.0, 0.5), radius=0.5) -> Mesh:
     ball = trimesh.creation.icosphere(subdivisions=4, radius=radius)
-    return Mesh(np.asarray(ball.vertices) + centre, np.asarray(ball.faces), np.zeros(len(ball.faces), bool))
+    return Mesh(np.asarray(ball.vertices) + centre, np.asarray(ball.faces), np.ones(len(ball.faces), bool))
 
 
 def test_fused_cloud_lies_on_the_surfaces(dataset: Dataset) -> None:
@@ -122,10 +122,10 @@ def test_samples_are_exactly_n_on_the_surface_and_blue(count: int) -> None:
         assert nearest.mean() > 0.75 * spacing
 
 
-def test_spacing_sets_n_by_area_and_the_base_is_left_out() -> None:
+def test_spacing_sets_n_by_area_and_the_unseen_is_left_out() -> None:
     mesh = _ball()
     below = mesh.vertices[mesh.faces].mean(1)[:, 2] < 0.5
-    half = Mesh(mesh.vertices, mesh.faces, below)
+    half = Mesh(mesh.vertices, mesh.faces, ~below)
     points, _, spacing = sample_surface(half, 0, spacing=0.02)
     assert len(points) == round(mesh.areas[~below].sum() / 0.02**2)
     assert spacing == pytest.approx(0.02, rel=1e-3)
@@ -163,7 +163,7 @@ def test_visible_is_the_near_side() -> None:
 def test_depth_of_surfels_agrees_with_ray_casting() -> None:
     camera = synthetic.orbit_cameras(1, 64, 48)[0]
     mesh = synthetic.rock_mesh()
-    points, normals, spacing = sample_surface(Mesh(mesh.vertices, mesh.faces, np.zeros(len(mesh.faces), bool)), 0, count=20_000)
+    points, normals, spacing = sample_surface(Mesh(mesh.vertices, mesh.faces, np.ones(len(mesh.faces), bool)), 0, count=20_000)
     depth = depth_of_surfels(points, normals, camera, spacing)
     rock, ground = (synthetic.CENTRE + 10 * Z, synthetic.AXES), camera.world_to_camera.copy()
     ground[:3, 3] -= ground[:3, :3] @ (10 * Z)
@@ -179,7 +179,7 @@ def test_prior_is_near_the_truth(built) -> None:
     numbers, voxel = prior.numbers, stages.cloud.voxel
     truth = numbers["truth"]
     assert len(prior.points) == 1500
-    assert numbers["n"] == pytest.approx((numbers["mesh_area"] - numbers["base_area"]) / prior.spacing**2)
+    assert numbers["n"] == pytest.approx(numbers["sampled_area"] / prior.spacing**2)
     assert truth["accuracy"] < 0.1 * voxel
     assert truth["completeness"] < 0.1 * voxel
     assert truth["hausdorff"] < voxel
@@ -187,7 +187,9 @@ def test_prior_is_near_the_truth(built) -> None:
     assert truth["visible_within_2_spacing"] == 1
     assert truth["visible_share"] > 0.98
     assert trimesh.Trimesh(stages.mesh.vertices, stages.mesh.faces).is_watertight
-    assert np.allclose(stages.plane.height(stages.mesh.vertices[stages.mesh.faces[stages.mesh.base]]), 0, atol=1e-6)
+    # All but the flat base is seen, and no less of the ellipsoid is sampled than stands above the ground.
+    height = stages.plane.height(stages.mesh.vertices[stages.mesh.faces[~stages.mesh.seen]].mean(1))
+    assert np.abs(height).max() < 1e-6
     analytic = (prior.points - synthetic.CENTRE) / synthetic.AXES**2
     analytic /= np.linalg.norm(analytic, axis=1, keepdims=True)
     assert np.quantile(np.einsum("nk,nk->n", analytic, prior.normals), 0.01) > np.cos(np.radians(10))
@@ -197,7 +199,7 @@ def test_error_to_truth_sees_a_wrong_prior(built, dataset: Dataset) -> None:
     from mgs.prior import error_to_truth
 
     prior, stages = built
-    moved = Mesh(stages.mesh.vertices + 0.05 * Z, stages.mesh.faces, stages.mesh.base)
+    moved = Mesh(stages.mesh.vertices + 0.05 * Z, stages.mesh.faces, stages.mesh.seen)
     plane = Plane(stages.plane.normal, stages.plane.offset, 0.0, 0.0)
     error = error_to_truth(prior.points + 0.05 * Z, prior.spacing, moved, dataset.root / "rock.glb", dataset.frames, plane, 0)
     assert 0.02 < error["accuracy"] < 0.05

@@ -44,7 +44,7 @@ def _table(numbers: dict[str, Any]) -> Any:
     """The numbers a person wants."""
     from rich.table import Table
 
-    n, spacing, area = numbers["n"], numbers["spacing"], numbers["mesh_area"] - numbers["base_area"]
+    n, spacing, area = numbers["n"], numbers["spacing"], numbers["sampled_area"]
     table = Table("station", "number", title="Mesh prior")
     table.add_row("depth pixels in the cloud", f"{numbers['pixels']:,}")
     table.add_row("points of the fused cloud", f"{numbers['points']:,} on a {1e3 * numbers['voxel']:.2f} mm grid")
@@ -58,9 +58,7 @@ def _table(numbers: dict[str, Any]) -> Any:
         f"{numbers['cluster_size']:,} points, one of {numbers['clusters']} clusters, eps {1e3 * numbers['eps']:.1f} mm",
     )
     table.add_row("mesh (Poisson)", f"{numbers['mesh_faces']:,} faces, octree depth {numbers['poisson_depth']}, watertight")
-    table.add_row(
-        "mesh area above the ground, A", f"{area:.4f} m² (and a flat base of {numbers['base_area']:.4f} m², not sampled)"
-    )
+    table.add_row("area, A", f"{area:.4f} m² seen by some frame, of {numbers['mesh_area']:.4f} m²; only A is sampled")
     table.add_row("samples, N = A / spacing²", f"{n:,} = {area:.4f} / {spacing:.6f}²")
     table.add_row(
         "nearest neighbour over spacing",
