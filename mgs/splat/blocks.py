@@ -136,6 +136,8 @@ def build(splats: Splats, order: Any, width: int, height: int, margin: float) ->
     ranked = dr.gather(mi.UInt32, count, order)
     first = dr.prefix_sum(ranked)
     rank = dr.repeat(dr.arange(mi.UInt32, n), ranked)
+    if len(rank) == 0:
+        return _nothing_seen(foot, width, height)
     splat = dr.gather(mi.UInt32, order, rank)
     offset = dr.arange(mi.UInt32, len(rank)) - dr.gather(mi.UInt32, first, rank)
     columns = dr.gather(mi.UInt32, x1, splat) - dr.gather(mi.UInt32, x0, splat)
@@ -145,6 +147,8 @@ def build(splats: Splats, order: Any, width: int, height: int, margin: float) ->
     block = by * blocks_x + bx
 
     kept = dr.compress(touched)
+    if len(kept) == 0:
+        return _nothing_seen(foot, width, height)
     before = dr.prefix_sum(mi.UInt32(touched))
     before_end = dr.concat([before, mi.UInt32(len(kept))]) if len(rank) else mi.UInt32(0)
     slot_start, slot_end = dr.empty(mi.UInt32, n), dr.empty(mi.UInt32, n)
@@ -164,6 +168,28 @@ def build(splats: Splats, order: Any, width: int, height: int, margin: float) ->
         block=longest_first,
         start=dr.gather(mi.UInt32, start, longest_first),
         end=dr.gather(mi.UInt32, end, longest_first),
+        width=dr.opaque(mi.UInt32, width),
+        height=dr.opaque(mi.UInt32, height),
+        blocks_x=dr.opaque(mi.UInt32, blocks_x),
+        footprints=foot,
+    )
+    dr.eval(lists)
+    return lists
+
+
+def _nothing_seen(foot: Footprints, width: int, height: int) -> BlockLists:
+    """Lists of a camera that sees no splat: Dr.Jit has no operations on arrays of length 0."""
+    n, blocks_x = len(foot.u), -(-width // BLOCK_X)
+    lanes = blocks_x * -(-height // BLOCK_Y)
+    padding, no_slot, no_pair = (dr.zeros(mi.UInt32, size) for size in (_rounded(0), n, lanes))
+    lists = BlockLists(
+        splat=padding,
+        slot=padding,
+        slot_start=no_slot,
+        slot_end=no_slot,
+        block=dr.arange(mi.UInt32, lanes),
+        start=no_pair,
+        end=no_pair,
         width=dr.opaque(mi.UInt32, width),
         height=dr.opaque(mi.UInt32, height),
         blocks_x=dr.opaque(mi.UInt32, blocks_x),
