@@ -204,18 +204,19 @@ def coverage_figure(path: str | Path, coverage: Mapping[str, tuple[Sequence[int]
         save_figure(figure, path)
 
 
-def psnr_figure(path: str | Path, curves: Mapping[str, tuple[Sequence[int], Sequence[float]]], what: str = "all views") -> None:
-    """PSNR against the number of images, a line a policy. curves: policy -> (images, dB)."""
+def psnr_figure(path: str | Path, panels: Mapping[str, Mapping[str, tuple[Sequence[int], Sequence[float]]]]) -> None:
+    """PSNR against the number of images, a line a policy. panels: what is measured -> policy -> (images, dB)."""
     import matplotlib
 
     with matplotlib.rc_context(STYLE):
-        figure = new_figure(4.8, 3.1)
-        axis = figure.subplots()
-        for policy, (images, decibels) in curves.items():
-            axis.plot(images, decibels, **_style(policy))
-        axis.set(xlabel="images in the training set", ylabel=f"PSNR, {what} (dB)")
-        _whole_steps(axis)
-        axis.legend()
+        figure = new_figure(3.6 * len(panels), 3.1)
+        axes = figure.subplots(1, len(panels), squeeze=False)[0]
+        for axis, (what, curves) in zip(axes, panels.items(), strict=True):
+            for policy, (images, decibels) in curves.items():
+                axis.plot(images, decibels, **_style(policy))
+            axis.set(xlabel="images in the training set", ylabel=f"PSNR, {what} (dB)")
+            _whole_steps(axis)
+        axes[0].legend()
         save_figure(figure, path)
 
 
@@ -315,13 +316,23 @@ def markdown_table(rows: Sequence[Sequence[str]]) -> str:
 
 
 def print_table(console: Console, rows: Sequence[Sequence[str]]) -> None:
-    """Print the table to a terminal."""
+    """Print the table to a terminal of 80 columns."""
     from rich import box
     from rich.table import Table
 
-    table = Table(box=box.SIMPLE_HEAD)
-    for i, heading in enumerate(COLUMNS.values()):
-        table.add_column(heading, justify="right" if i else "left")
+    short = [
+        "policy",
+        "images",
+        *(f"{name}\n{views}" for views in ("all", "unseen", "rock") for name in ("PSNR", "SSIM")),
+        "cover",
+    ]
+    table = Table(
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        caption="dB and %; unseen: views never trained on; rock: those, inside its mask",
+    )
+    for i, heading in enumerate(short):
+        table.add_column(heading, justify="right" if i else "left", no_wrap=True)
     for row in rows:
         table.add_row(*row)
     console.print(table)
@@ -361,9 +372,11 @@ def write_report(out: str | Path, folders: Sequence[str | Path]) -> list[Path]:
 
     measured = {policy: [s for s in run.steps if "psnr" in s] for policy, run in runs.items()}
     if all(measured.values()):
-        psnr_figure(
-            out / "psnr.png", {p: ([s["images"] for s in steps], [s["psnr"] for s in steps]) for p, steps in measured.items()}
-        )
+        panels = {
+            what: {policy: ([s["images"] for s in steps], [s[key] for s in steps]) for policy, steps in measured.items()}
+            for what, key in (("all views", "psnr"), ("all views, rock only", "psnr_mask"))
+        }
+        psnr_figure(out / "psnr.png", panels)
         written.append(out / "psnr.png")
     with atomic_path(out / "table.md") as temporary:
         temporary.write_text(markdown_table(rows), encoding="utf-8")
