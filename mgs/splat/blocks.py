@@ -159,10 +159,10 @@ def build(splats: Splats, order: Any, width: int, height: int, margin: float) ->
     start, end, slot = _group(key, lanes)
     length = dr.minimum(end - start, 4095)
     longest_first = dr.detail.block_mkperm(4095 - length, lanes, 4096)
-    padding = dr.zeros(mi.UInt32, _rounded(len(key)) - len(key))
+    room = _rounded(len(key))
     lists = BlockLists(
-        splat=dr.concat([dr.gather(mi.UInt32, splat, slot), padding]),
-        slot=dr.concat([slot, padding]),
+        splat=_padded(dr.gather(mi.UInt32, splat, slot), room),
+        slot=_padded(slot, room),
         slot_start=slot_start,
         slot_end=slot_end,
         block=longest_first,
@@ -197,6 +197,13 @@ def _nothing_seen(foot: Footprints, width: int, height: int) -> BlockLists:
     )
     dr.eval(lists)
     return lists
+
+
+def _padded(values: Any, size: int) -> Any:
+    """UInt32 values, then zeros up to `size` (dr.concat refuses arrays of length 0)."""
+    padded = dr.zeros(mi.UInt32, size)
+    dr.scatter(padded, values, dr.arange(mi.UInt32, len(values)), mode=dr.ReduceMode.NoConflicts)
+    return padded
 
 
 def _rounded(pairs: int) -> int:
