@@ -39,6 +39,11 @@ class NbvSettings(BaseModel):
     """tau of each kind of parameter."""
     evaluate_every: Annotated[int, Field(ge=0)] = 0
     """Measure PSNR on all views after every so many steps; 0 = only at the end. Never feeds back into the choice."""
+    warm_rate: Annotated[float, Field(gt=0)] = 0.3
+    """Learning rates of the fits after the first, over those of the first. They start from a model that has converged on all
+    but one image: full rates shake it loose at every step, which costs passes and hides Gaussians behind others."""
+    train: dict[str, Any] = {}
+    """Fields of `mgs.train.TrainSettings`; those left out take its defaults."""
 
 
 Model = TypeVar("Model", bound=BaseModel)

@@ -85,8 +85,8 @@ def _open_png(path: str | Path) -> Any:
 
     path = Path(path)
     try:
-        image = Image.open(path)
-        image.load()
+        with Image.open(path) as image:  # Closed even where the pixels are damaged; they stay in memory.
+            image.load()
     except FileNotFoundError:
         raise InputError(f"{path}: no such image") from None
     except (UnidentifiedImageError, OSError, SyntaxError) as error:

@@ -45,10 +45,14 @@ Progress = Callable[[str, int, int], None]
 class Fit(Protocol):
     """What a fit returns: `mgs.train.Fit`."""
 
-    gaussians: Gaussians
-    loss: float
-    iterations: int
-    stop_reason: str
+    @property
+    def gaussians(self) -> Gaussians: ...
+    @property
+    def loss(self) -> float: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def stop_reason(self) -> str: ...
 
 
 @dataclass(frozen=True)
@@ -56,14 +60,14 @@ class Stations:
     """The stations the loop calls; NumPy in and out, deterministic.
 
     centre: [3] the rock, metres; groups: columns of the Fisher information by kind of parameter;
-    initial(seed frames) -> Gaussians; fit(gaussians, cameras, targets, on_iteration) -> Fit;
+    initial(seed frames) -> Gaussians; fit(gaussians, cameras, targets, rate, on_pass) -> Fit, rate scaling the learning rates;
     fisher(gaussians, camera) -> [N,P]; measure(gaussians, taken frame indices) -> entries for steps.jsonl.
     """
 
     centre: np.ndarray
     groups: dict[str, slice]
     initial: Callable[[list[Frame]], Gaussians]
-    fit: Callable[[Gaussians, list[Camera], list[np.ndarray], Callable[[int, int], None]], Fit]
+    fit: Callable[[Gaussians, list[Camera], list[np.ndarray], float, Callable[[int, int], None]], Fit]
     fisher: Callable[[Gaussians, Camera], np.ndarray]
     measure: Callable[[Gaussians, list[int]], dict[str, float]]
 
@@ -218,7 +222,10 @@ class _Loop:
                     self.images[i] = self.frames[i].masked_rgb()
         with watch("fit"):
             targets = [self.images[i] for i in taken]
-            fit = self.stations.fit(gaussians, cameras, targets, lambda done, total: self.progress("fitting", done, total))
+            rate = self.settings.warm_rate if step else 1.0
+            fit = self.stations.fit(
+                gaussians, cameras, targets, rate, lambda done, total: self.progress("fitting", done, total)
+            )
         with watch("information"):
             H = np.zeros((len(fit.gaussians), len(self.lam)))
             for done, camera in enumerate(cameras):

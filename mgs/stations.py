@@ -2,45 +2,49 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
-from functools import cache
+from dataclasses import replace
 
 import numpy as np
 
 from mgs.conventions import Camera, srgb_from_linear
 from mgs.dataset import Dataset
-from mgs.evaluate import psnr, render_rgb
+from mgs.evaluate import psnr
 from mgs.gaussians import Gaussians
 from mgs.nbv import Stations
 from mgs.prior import Prior, initial_gaussians
-from mgs.splat import fisher, groups
+from mgs.splat import ListCache, fisher, groups, render
 from mgs.train import Fit, TrainSettings, fit
 
 
 def real_stations(dataset: Dataset, prior: Prior, settings: TrainSettings) -> Stations:
     """Stations on the splat core, starting from the prior; the rock is at the prior's centre of mass."""
+    cache = ListCache()
 
     def run_fit(
-        gaussians: Gaussians, cameras: list[Camera], targets: list[np.ndarray], on_iteration: Callable[[int, int], None]
+        gaussians: Gaussians, cameras: list[Camera], targets: list[np.ndarray], rate: float, on_pass: Callable[[int, int], None]
     ) -> Fit:
-        return fit(gaussians, cameras, targets, settings, on_iteration)
+        first, second, third, fourth = settings.rates
+        scaled = replace(settings, rates=(rate * first, rate * second, rate * third, rate * fourth))
+        return fit(gaussians, cameras, targets, scaled, on_pass, cache)
 
     return Stations(
         centre=prior.points.mean(axis=0),
         groups=groups(0),
         initial=lambda frames: initial_gaussians(prior, frames)[0],
         fit=run_fit,
-        fisher=fisher,
-        measure=psnr_measure(dataset),
+        fisher=lambda gaussians, camera: fisher(gaussians, camera, cache=cache),
+        measure=psnr_measure(dataset, cache),
     )
 
 
-def psnr_measure(dataset: Dataset) -> Callable[[Gaussians, list[int]], dict[str, float]]:
+def psnr_measure(dataset: Dataset, cache: ListCache) -> Callable[[Gaussians, list[int]], dict[str, float]]:
     """measure(gaussians, frames taken) -> mean PSNR, dB: `psnr` and `psnr_mask` (inside the rock mask) over all views,
     `held_out_psnr` and `held_out_psnr_mask` over those never trained on. As `mgs.evaluate`, without its SSIM, which costs more.
     """
 
-    @cache
+    @functools.cache
     def truth(index: int) -> tuple[np.ndarray, np.ndarray]:
         frame = dataset.frames[index]
         return srgb_from_linear(frame.masked_rgb()), frame.mask()
@@ -49,7 +53,7 @@ def psnr_measure(dataset: Dataset) -> Callable[[Gaussians, list[int]], dict[str,
         values = np.empty((len(dataset), 2))
         for i, frame in enumerate(dataset.frames):
             image, mask = truth(i)
-            rendered = srgb_from_linear(render_rgb(gaussians, frame.camera))
+            rendered = srgb_from_linear(np.asarray(render(gaussians, frame.camera, cache=cache).rgb))
             values[i] = psnr(rendered, image), psnr(rendered, image, mask)
         means = dict(zip(("psnr", "psnr_mask"), np.nanmean(values, axis=0).tolist(), strict=True))
         if len(taken) < len(dataset):

@@ -1,4 +1,4 @@
-"""Every kind of bad input, through the real command line: one line that says what is wrong, exit code 2, nothing left behind."""
+"""Every kind of bad input, through the real command line: one line that says what is wrong, exit code 2, nothing left over."""
 
 from __future__ import annotations
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from mgs.commands.demo import demo
 from mgs.commands.diagnose import diagnose
 from mgs.commands.doctor import doctor
 from mgs.commands.evaluate import evaluate
@@ -18,4 +19,5 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "nbv": nbv,
     "eval": evaluate,
     "diagnose": diagnose,
+    "demo": demo,
 }

@@ -28,6 +28,7 @@ def nbv(
     pixel_noise: Annotated[
         float, typer.Option(help="Residual of a pixel, linear RGB: sets lambda of every criterion.")
     ] = PIXEL_NOISE,
+    passes: Annotated[int | None, typer.Option(help="Most passes over the images of one fit.")] = None,
     evaluate_every: Annotated[int, typer.Option(help="Measure PSNR on all views every so many steps; 0: only at the end.")] = 0,
     resume: Annotated[
         Path | None, typer.Option(help="Continue this run; every other setting comes from its config.json.")
@@ -40,8 +41,10 @@ def nbv(
     """
     from rich.console import Console
 
+    from mgs import runtime
     from mgs.errors import InputError
 
+    runtime.start()
     console = Console(highlight=False)
     if resume is not None:
         if dataset is not None or out is not None:
@@ -52,10 +55,22 @@ def nbv(
         raise InputError("nbv: give a DATASET and --out RUN, or --resume RUN")
     values = {
         "policy": policy, "budget": budget, "seeds": seeds, "seed": seed,
-        "pixel_noise": pixel_noise, "evaluate_every": evaluate_every,
+        "pixel_noise": pixel_noise, "evaluate_every": evaluate_every, "train": train_settings(passes, seed),
     }  # fmt: skip
     start_run(dataset, out, prior, gaussians, values, console)
     run_folder(out, console)
+
+
+def train_settings(passes: int | None, seed: int) -> dict[str, Any]:
+    """Every setting of the fit, resolved. Raises InputError for fewer than one pass."""
+    from dataclasses import asdict
+
+    from mgs.errors import InputError
+    from mgs.train import TrainSettings
+
+    if passes is not None and passes < 1:
+        raise InputError(f"--passes {passes}: a fit needs at least one pass; raise it")
+    return asdict(TrainSettings(seed=seed) if passes is None else TrainSettings(seed=seed, passes=passes))
 
 
 def start_run(
@@ -99,7 +114,6 @@ def start_run(
 def run_folder(out: Path, console: Console) -> None:
     """Run or resume the loop in a run folder, evaluate, print the table."""
     from mgs import nbv as loop
-    from mgs import runtime
     from mgs.dataset import load_dataset
     from mgs.prior import load_prior
 
@@ -107,14 +121,13 @@ def run_folder(out: Path, console: Console) -> None:
     dataset = load_dataset(settings.dataset)
     loop.check_same_frames(out, dataset)
     prior = load_prior(settings.prior)
-    runtime.start()
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from mgs.evaluate import evaluate_run
     from mgs.stations import real_stations
     from mgs.train import TrainSettings
 
-    stations = real_stations(dataset, prior, TrainSettings())
+    stations = real_stations(dataset, prior, TrainSettings(**settings.train))
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),

@@ -1,0 +1,68 @@
+"""`mgs demo`: the whole way on a small rock."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+POLICIES = ("d-optimal", "coverage", "random")
+GAUSSIANS = 10_000
+"""About one Gaussian per pixel of the rock at 320x240."""
+BUDGET = 8
+"""Views beyond the four seeds, the same for every policy."""
+DIAGNOSED = 2
+"""Views of the d-optimal run whose EXR and previews are written."""
+
+
+def demo(
+    out: Annotated[Path, typer.Argument(help="Folder for everything; the same command again continues or shows it.")] = Path(
+        "demo"
+    ),
+    seed: Annotated[int, typer.Option(help="Root seed.")] = 0,
+) -> None:
+    """The whole way in minutes: render a rock orbit, build the prior, choose views by three policies, compare, draw."""
+    import time
+
+    from rich.console import Console
+
+    from mgs.commands.diagnose import diagnose
+    from mgs.commands.evaluate import evaluate
+    from mgs.commands.nbv import nbv
+    from mgs.commands.prior import prior
+    from mgs.commands.synth_orbit import synth_orbit
+    from mgs.files import new_folder
+    from mgs.report import print_table, table_rows, write_report
+
+    console, started = Console(highlight=False), time.monotonic()
+    dataset, folder, report = out / "dataset", out / "prior", out / "report"
+    runs = [out / policy for policy in POLICIES]
+    if not dataset.exists():
+        new_folder(out)
+
+    def heading(text: str) -> None:
+        console.rule(f"{text}   [dim]{time.monotonic() - started:.0f} s", align="left")
+
+    heading("1/5 a photoreal orbit: 32 frames with depth and masks")
+    if not (dataset / "transforms.json").is_file():
+        synth_orbit(dataset, seed=seed)
+    heading(f"2/5 the prior: {GAUSSIANS:,} points on the rock's mesh")
+    if not (folder / "prior.json").is_file():
+        prior(dataset, out=folder, gaussians=GAUSSIANS, seed=seed)
+    for policy, run in zip(POLICIES, runs, strict=True):
+        heading(f"3/5 next best views: {policy}, 4 seeds and {BUDGET} views")
+        if (run / "config.json").is_file():
+            nbv(resume=run)
+        else:
+            nbv(dataset, out=run, prior=folder, policy=policy, budget=BUDGET, seed=seed, evaluate_every=1)
+        if not (run / "renders").is_dir():
+            evaluate(run)
+    heading("4/5 what the views told about each Gaussian")
+    diagnose(runs[0])
+    heading("5/5 the report")
+    written = write_report(report, runs)
+    print_table(console, table_rows(runs))
+    console.print(f"done in {time.monotonic() - started:.0f} s; look at:")
+    for picture in (dataset / "contact_sheet.png", folder / "prior.png", *written):
+        console.print(f"  {picture}", soft_wrap=True)
