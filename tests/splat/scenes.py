@@ -32,7 +32,7 @@ def make_gaussians(n, seed, degree=0, log_scales=(-4.0, -1.2), logits=(-4.0, 5.0
         log_scales=rng.uniform(*log_scales, (n, 3)).astype(np.float32),
         quats=rng.normal(0, 1, (n, 4)).astype(np.float32),
         logit_opacities=rng.uniform(*logits, n).astype(np.float32),
-        sh=rng.normal(0, colour, (n, (degree + 1) ** 2, 3)).astype(np.float32),
+        sh=rng.normal(0, colour / (degree + 1), (n, (degree + 1) ** 2, 3)).astype(np.float32),
     )
 
 

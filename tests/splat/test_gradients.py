@@ -1,0 +1,178 @@
+"""Gradients of images against the oracle: colours by its Jacobian, everything else by central differences in float64.
+
+Judged as vectors: relative L2 error, cosine and signed bias. Scenes have no pixel near a threshold, where no gradient exists.
+"""
+
+from dataclasses import fields
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mgs.splat import as_drjit, reference, render
+
+from .scenes import PARAMETERS, calm, compare, double, make_camera, make_gaussians
+
+BACKGROUND = (0.3, 0.6, 0.1)
+OUTPUTS = ("rgb", "alpha", "depth")
+TOLERANCE = 1e-4
+
+
+def image_weights(gaussians, camera, seed=0) -> dict[str, np.ndarray]:
+    """Gradients of the loss with respect to each output image: independent normal numbers; those of depth times alpha.
+
+    Depth is a quotient by alpha = 1 - T, whose rounding is 1.5e-5 of it where alpha is 1/255, so faint pixels say little.
+    """
+    rng = np.random.default_rng([seed, 99])
+    shape = (camera.height, camera.width)
+    alpha = reference.render(gaussians, camera)["alpha"]
+    return {"rgb": rng.normal(0, 1, (*shape, 3)), "alpha": rng.normal(0, 1, shape), "depth": rng.normal(0, 1, shape) * alpha}
+
+
+def gradients(gaussians, camera, weights, wanted=PARAMETERS) -> dict[str, np.ndarray]:
+    """By `dr.backward` through `render`: the gradient of sum over outputs of sum(weight * image)."""
+    watched = as_drjit(gaussians)
+    for name in wanted:
+        setattr(watched, name, dr.copy(getattr(watched, name)))
+        dr.enable_grad(getattr(watched, name))
+    image = render(watched, camera, BACKGROUND)
+    loss = sum(dr.sum(getattr(image, name) * mi.TensorXf(w.astype(np.float32)), axis=None) for name, w in weights.items())
+    dr.backward(loss)
+    return {name: np.asarray(dr.grad(getattr(watched, name))) for name in wanted}
+
+
+def dot(image, weights) -> np.ndarray:
+    return np.array([(image[name] * weights[name]).sum() for name in OUTPUTS])
+
+
+def differences(gaussians, camera, weights, wanted, step=1e-6) -> dict[str, np.ndarray]:
+    """{parameter: [3 outputs, shape of the parameter]} by central differences of the oracle."""
+    result = {}
+    for name in wanted:
+        values = getattr(gaussians, name)
+        gradient = np.zeros((len(OUTPUTS), *values.shape))
+        for index in np.ndindex(values.shape):
+            ends = []
+            for sign in (+1, -1):
+                moved = double(gaussians)
+                getattr(moved, name)[index] += sign * step
+                ends.append(dot(reference.render(moved, camera, BACKGROUND), weights))
+            gradient[(slice(None), *index)] = (ends[0] - ends[1]) / (2 * step)
+        result[name] = gradient
+    return result
+
+
+@cache
+def case(degree: int, n=10):
+    """(gaussians, camera, weights, expected gradients per output): computed once for all tests of a degree."""
+    camera = make_camera()
+    gaussians = calm(lambda seed: make_gaussians(n, seed, degree, log_scales=(-4.0, -1.0)), camera, 10 + degree)
+    weights = image_weights(gaussians, camera, degree)
+    expected = differences(gaussians, camera, weights, ("means", "log_scales", "quats", "logit_opacities"))
+    J = reference.jacobian(gaussians, camera, BACKGROUND)
+    flat = np.tensordot(weights["rgb"].reshape(-1, 3), J, axes=([0, 1], [0, 1]))
+    K = (degree + 1) ** 2
+    sh = np.zeros((len(OUTPUTS), n, K, 3))
+    sh[0] = flat[:, : 3 * K].reshape(n, K, 3)
+    geometry = np.concatenate([expected["log_scales"][0], expected["quats"][0], expected["logit_opacities"][0][:, None]], 1)
+    assert compare(flat[:, 3 * K :], geometry)[0] < 1e-7, "the oracle disagrees with its own differences"
+    return gaussians, camera, weights, {**expected, "sh": sh}
+
+
+@pytest.mark.parametrize("output", OUTPUTS)
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_gradient_of_each_output(degree, output, record_property):
+    gaussians, camera, weights, expected = case(degree)
+    wanted = PARAMETERS if output == "rgb" else PARAMETERS[:4]
+    found = gradients(gaussians, camera, {output: weights[output]}, wanted)
+    for name in wanted:
+        truth = expected[name][OUTPUTS.index(output)]
+        assert found[name].shape == getattr(gaussians, name).shape
+        error, sine, bias = compare(found[name], truth)
+        record_property(name, (error, sine, bias))
+        print(f"degree {degree} {output:5} {name:16} relative L2 {error:.1e}  1 - cosine {sine:.1e}  bias {bias:+.1e}")
+        assert error < TOLERANCE, name
+        assert sine < TOLERANCE**2, name
+        assert abs(bias) < TOLERANCE / 2, name
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_gradient_of_all_outputs_together(degree):
+    gaussians, camera, weights, expected = case(degree)
+    found = gradients(gaussians, camera, weights)
+    for name in PARAMETERS:
+        assert compare(found[name], expected[name].sum(0))[0] < TOLERANCE, name
+
+
+@pytest.mark.parametrize("output", ["alpha", "depth"])
+def test_colours_do_not_move_alpha_or_depth(output):
+    gaussians, camera, weights, _ = case(1)
+    found = gradients(gaussians, camera, {output: weights[output]}, ("sh", "logit_opacities"))
+    assert (found["sh"] == 0).all()
+    assert (found["logit_opacities"] != 0).any()
+
+
+def test_frozen_means_change_no_other_gradient():
+    """Without gradients for the means the kernel leaves out two sums; every other gradient is bitwise the same."""
+    gaussians, camera, weights, _ = case(1)
+    free = gradients(gaussians, camera, weights)
+    frozen = gradients(gaussians, camera, weights, PARAMETERS[1:])
+    for name in PARAMETERS[1:]:
+        np.testing.assert_array_equal(free[name], frozen[name], err_msg=name)
+
+
+def test_one_parameter_alone_has_the_same_gradient():
+    gaussians, camera, weights, _ = case(1)
+    everything = gradients(gaussians, camera, weights)
+    for name in PARAMETERS:
+        alone = gradients(gaussians, camera, weights, (name,))
+        assert compare(alone[name], everything[name])[0] < 1e-6, name
+
+
+def test_gradient_stops_where_something_is_clamped():
+    """A colour below 0, an alpha above ALPHA_MAX, a log-scale outside its range: no gradient, as in the oracle."""
+    gaussians, camera, weights, _ = case(0)
+    dark = gaussians.sh.copy()
+    dark[3] = -10
+    values = {f.name: getattr(gaussians, f.name) for f in fields(gaussians)}
+    scene = type(gaussians)(**{**values, "sh": dark})
+    assert (gradients(scene, camera, {"rgb": weights["rgb"]})["sh"][3] == 0).all()
+    scales = gaussians.log_scales.copy()
+    scales[2, 1], scales[4, 0] = -30, 30
+    scene = type(gaussians)(**{**values, "log_scales": scales})
+    found = gradients(scene, camera, {"rgb": weights["rgb"]})
+    assert found["log_scales"][2, 1] == found["log_scales"][4, 0] == 0
+    assert all(np.isfinite(g).all() for g in found.values())
+
+
+@settings(derandomize=True, deadline=None, max_examples=10)
+@given(
+    seed=st.integers(0, 2**31),
+    degree=st.integers(0, 3),
+    scale=st.floats(-5, -0.5),
+    stretch=st.floats(0.1, 4),
+    logit=st.floats(-2, 10),
+    focal=st.floats(20, 80),
+)
+def test_gradient_for_any_scene(seed, degree, scale, stretch, logit, focal):
+    """Scales, rotations and opacities in any scene, by the oracle's Jacobian."""
+    camera = make_camera(focal=focal)
+    gaussians = calm(lambda s: make_gaussians(10, s, degree, (scale - stretch, scale), (logit - 4, logit)), camera, seed)
+    weights = {"rgb": image_weights(gaussians, camera, seed)["rgb"]}
+    J = reference.jacobian(gaussians, camera, BACKGROUND)
+    expected = np.tensordot(weights["rgb"].reshape(-1, 3), J, axes=([0, 1], [0, 1]))
+    found = gradients(gaussians, camera, weights, PARAMETERS[1:])
+    K = 3 * (degree + 1) ** 2
+    parts = {
+        "sh": slice(0, K),
+        "log_scales": slice(K, K + 3),
+        "quats": slice(K + 3, K + 7),
+        "logit_opacities": slice(K + 7, None),
+    }
+    for name, part in parts.items():
+        if np.linalg.norm(expected[:, part]) > 1e-8:
+            assert compare(found[name], expected[:, part])[0] < TOLERANCE, name

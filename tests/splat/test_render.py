@@ -1,0 +1,166 @@
+"""Images against the float64 oracle: error where no decision flips, share of pixels where one does, thresholds."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mgs.conventions import SH_C0
+from mgs.gaussians import Gaussians
+from mgs.splat import ListCache, as_drjit, reference, render
+from mgs.splat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+
+from .scenes import SIZE, changed, make_camera, make_gaussians, margins, place
+
+TOLERANCE = 2e-5
+"""Of rgb and alpha, absolute; of depth weighted by alpha, in units of the farthest splat's depth (it is one more colour)."""
+
+NEAR = 3e-5
+"""Relative error of alpha that float32 may make: pixels whose decisions are nearer than this may flip."""
+
+STYLES = {
+    "mixed": {},
+    "fine": {"log_scales": (-7.0, -2.5)},
+    "broad": {"log_scales": (-3.0, 0.0), "logits": (-1.0, 8.0)},
+    "opaque": {"log_scales": (-5.0, -1.0), "logits": (0.0, 12.0)},
+    "faint": {"logits": (-7.0, -2.0)},
+}
+
+
+def errors(gaussians, camera, background) -> tuple[np.ndarray, np.ndarray]:
+    """Per pixel: the largest error in units of the tolerance, and whether no decision is near."""
+    image = render(gaussians, camera, background)
+    truth = reference.render(gaussians, camera, background)
+    rgb, alpha, depth = (np.asarray(a, np.float64) for a in (image.rgb, image.alpha, image.depth))
+    assert rgb.shape == (camera.height, camera.width, 3)
+    assert alpha.shape == depth.shape == (camera.height, camera.width)
+    farthest = max(1.0, truth["depth"].max())
+    worst = np.maximum(np.abs(rgb - truth["rgb"]).max(-1), np.abs(alpha - truth["alpha"]))
+    worst = np.maximum(worst, np.abs(depth - truth["depth"]) * truth["alpha"] / farthest)
+    assert ((depth == 0) == (alpha == 0)).all()
+    return worst / TOLERANCE, margins(gaussians, camera) > NEAR
+
+
+@pytest.fixture(scope="module")
+def population():
+    """All random scenes, five styles by four SH degrees by three seeds: errors and decided masks, [60, H, W]."""
+    results = []
+    for number, style in enumerate(STYLES.values()):
+        for degree in range(4):
+            for seed in range(3):
+                camera = make_camera(eye=((2.0, 0.4, 1.1), (-1.2, 1.5, 0.3), (0.1, -0.2, 2.5))[seed])
+                gaussians = make_gaussians(60, 100 * number + seed, degree, **style)
+                results.append(errors(gaussians, camera, (0.1, 0.5, 0.9)))
+    return np.stack([r[0] for r in results]), np.stack([r[1] for r in results])
+
+
+def test_error_where_nothing_flips(population, record_property):
+    error, decided = population
+    record_property("worst_error", float(error[decided].max() * TOLERANCE))
+    assert decided.mean() > 0.99
+    assert error[decided].max() <= 1
+
+
+def test_share_of_flipped_pixels(population, record_property):
+    error, _ = population
+    share = float((error > 1).mean())
+    record_property("flipped_share", share)
+    print(f"flipped pixels: {share:.2e} of {error.size}")
+    assert share < 1e-4
+
+
+@settings(derandomize=True, deadline=None, max_examples=40)
+@given(
+    seed=st.integers(0, 2**31),
+    n=st.sampled_from([1, 16]),
+    size=st.sampled_from([SIZE, (8, 4), (9, 5), (1, 1)]),
+    degree=st.integers(0, 3),
+    scale=st.floats(-8, 1),
+    stretch=st.floats(0, 5),
+    logit=st.floats(-6, 20),
+    background=st.tuples(*[st.floats(0, 1)] * 3),
+    eye=st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(0.1, 2)),
+    focal=st.floats(10, 100),
+)
+def test_matches_oracle_for_any_scene(seed, n, size, degree, scale, stretch, logit, background, eye, focal):
+    gaussians = make_gaussians(n, seed, degree, (scale - stretch, scale), (logit - 3, logit), colour=1.0)
+    camera = make_camera(size, focal, eye, target=(0.05, 0.02, 0.01))
+    error, decided = errors(gaussians, camera, background)
+    assert np.isfinite(error).all()
+    assert error[decided].max(initial=0) <= 1
+
+
+def stack(camera, opacities, rgb=1.0) -> Gaussians:
+    """Round Gaussians one behind the other, all centred on the middle of pixel (20, 12)."""
+    n = len(opacities)
+    opacities = np.asarray(opacities, np.float64)
+    return Gaussians(
+        place(camera, [(20.5, 12.5)] * n, 1.5 + 0.1 * np.arange(n)).astype(np.float32),
+        np.full((n, 3), -2.0, np.float32),
+        np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        np.log(opacities / (1 - opacities)).astype(np.float32),
+        np.full((n, 1, 3), (rgb - 0.5) / SH_C0, np.float32),
+    )
+
+
+@pytest.mark.parametrize("above", [False, True])
+def test_threshold_of_alpha(above):
+    camera = make_camera()
+    gaussians = stack(camera, [ALPHA_MIN * (1.001 if above else 0.999)])
+    alpha = np.asarray(render(gaussians, camera).alpha)
+    assert alpha[12, 20] == pytest.approx(ALPHA_MIN * 1.001 if above else 0, rel=1e-4)
+    np.testing.assert_allclose(alpha, reference.render(gaussians, camera)["alpha"], atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("above", [False, True])
+def test_threshold_of_transmittance(above):
+    """Three splats leave T1; a fourth would leave 1e-4 (1 +- 1e-3) and is drawn only if that is above the limit."""
+    camera = make_camera()
+    last = 1 - TRANSMITTANCE_MIN * (1.001 if above else 0.999) / 0.1**3
+    gaussians = stack(camera, [0.9, 0.9, 0.9, last])
+    alpha = float(np.asarray(render(gaussians, camera).alpha)[12, 20])
+    assert alpha == pytest.approx(1 - 1.001 * TRANSMITTANCE_MIN if above else 1 - 0.1**3, abs=1e-6)
+    assert alpha == pytest.approx(reference.render(gaussians, camera)["alpha"][12, 20], abs=1e-6)
+
+
+def test_alpha_is_clamped():
+    camera = make_camera()
+    alpha = np.asarray(render(changed(stack(camera, [0.5]), logit_opacities=[20]), camera).alpha)
+    assert alpha[12, 20] == pytest.approx(ALPHA_MAX, abs=1e-6)
+
+
+def test_numpy_and_drjit_parameters_give_the_same_image():
+    camera, gaussians = make_camera(), make_gaussians(60, 5, 1)
+    a, b = render(gaussians, camera), render(as_drjit(gaussians), camera)
+    for name in ("rgb", "alpha", "depth"):
+        assert isinstance(getattr(a, name), mi.TensorXf)
+        np.testing.assert_array_equal(np.asarray(getattr(a, name)), np.asarray(getattr(b, name)))
+
+
+def test_background_changes_no_alpha_and_no_depth():
+    camera, gaussians = make_camera(), make_gaussians(60, 6)
+    black, red = render(gaussians, camera), render(gaussians, camera, (1, 0, 0))
+    np.testing.assert_array_equal(np.asarray(black.alpha), np.asarray(red.alpha))
+    np.testing.assert_array_equal(np.asarray(black.depth), np.asarray(red.depth))
+    np.testing.assert_array_equal(np.asarray(black.rgb)[..., 1:], np.asarray(red.rgb)[..., 1:])
+    difference = np.asarray(red.rgb)[..., 0] - np.asarray(black.rgb)[..., 0]
+    np.testing.assert_allclose(difference, 1 - np.asarray(black.alpha), atol=1e-6)
+
+
+def test_adam_of_mitsuba_fits_an_image_through_the_renderer():
+    """`mi.ad.Adam` on colours and opacities, from grey: the loss falls a hundredfold."""
+    camera, truth = make_camera(), make_gaussians(16, 7, log_scales=(-2.5, -1.5), logits=(0, 3), colour=1.0)
+    target = dr.detach(render(truth, camera).rgb)
+    model = as_drjit(changed(truth, sh=0 * truth.sh, logit_opacities=0 * truth.logit_opacities))
+    optimiser = mi.ad.Adam(lr=0.1)
+    optimiser["sh"], optimiser["logit_opacities"] = model.sh, model.logit_opacities
+    cache, losses = ListCache(), []
+    for _ in range(150):
+        model.sh, model.logit_opacities = optimiser["sh"], optimiser["logit_opacities"]
+        loss = dr.mean(dr.square(render(model, camera, cache=cache).rgb - target), axis=None)
+        dr.backward(loss)
+        optimiser.step()
+        losses.append(float(loss.array[0]))
+    assert losses[-1] < 0.01 * losses[0]
