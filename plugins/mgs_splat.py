@@ -1,0 +1,92 @@
+"""`mgs_splat`: Gaussian splatting as a Mitsuba integrator.
+
+    scene = mi.load_dict({"type": "scene", "sensor": {...}, "integrator": {"type": "mgs_splat", "filename": "splats.ply"}})
+    params = mi.traverse(scene)  # integrator.means, .log_scales, .quats, .logit_opacities, .sh
+    image = mi.render(scene, params)
+
+Properties: `filename`, a 3DGS PLY; `background`, linear RGB behind the Gaussians (default black); `depth`, a boolean: append
+the expected z-depth in metres as an AOV (default false). The film decides about alpha (`pixel_format` rgb or rgba). Shapes,
+emitters, the sampler and the film's reconstruction filter play no part: a pixel is the value at its centre.
+
+Reverse-mode gradients reach every parameter on which they are enabled. Not differentiated: the sensor. No forward mode.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mgs.errors import InputError
+from mgs.gaussians import Gaussians, read_ply
+from mgs.splat import ListCache, as_drjit, render
+from mgs.splat.sensor import camera_from_sensor
+
+
+class MgsSplat(mi.CppADIntegrator):
+    """Draws Gaussians, which are its own parameters: Mitsuba has no Python shapes that could hold them."""
+
+    def __init__(self, props: Any) -> None:
+        super().__init__(props)
+        if "filename" not in props:
+            raise InputError("mgs_splat: `filename` is missing; name a 3DGS PLY")
+        self.gaussians = as_drjit(read_ply(str(mi.file_resolver().resolve(props["filename"]))))
+        self.background = mi.ScalarColor3f(props.get("background", mi.ScalarColor3f(0)))
+        self.depth = bool(props.get("depth", False))
+        self.cache = ListCache()
+
+    def traverse(self, cb: Any) -> None:
+        """Show the five parameters, shapes as in `mgs.gaussians.Gaussians`."""
+        for field in fields(Gaussians):
+            cb.put(field.name, getattr(self.gaussians, field.name), mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: Any) -> None:
+        """Nothing to do: the block lists check themselves against the Gaussians at every use."""
+
+    def aov_names(self) -> list[str]:
+        """Channels that follow colour and alpha."""
+        return ["depth.z"] if self.depth else []
+
+    def render(
+        self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
+    ) -> Any:
+        """The sensor's image through its film, TensorXf [H,W,C]; `seed` and `spp` change nothing.
+
+        Raises InputError for a sensor that is not `perspective`, or a parameter that is not finite.
+        """
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        film = sensor.film()
+        image = render(self.gaussians, camera_from_sensor(sensor), self.background, self.cache)
+        film.prepare(self.aov_names())
+        film.put_block(mi.ImageBlock(self._channels(image, film), film.crop_offset()))
+        developed = film.develop() if develop else mi.TensorXf()
+        if evaluate:
+            dr.eval(developed)
+        return developed
+
+    def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> None:
+        """Take the gradient of an image back to the parameters."""
+        with dr.resume_grad():
+            image = self.render(scene, sensor)
+            dr.set_grad(image, grad_in)
+            dr.enqueue(dr.ADMode.Backward, image)
+            dr.traverse(dr.ADMode.Backward)
+
+    def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
+        """Raises InputError: compositing has a hand-written adjoint and no forward-mode derivative."""
+        raise InputError("mgs_splat: has no forward-mode derivatives; use dr.backward")
+
+    def _channels(self, image: Any, film: Any) -> Any:
+        """What an image block of this film holds: R G B, A where the film asks for it, filter weight, AOVs. [H,W,C]."""
+        alpha = [image.alpha] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
+        rest = [*alpha, dr.ones(mi.TensorXf, image.alpha.shape), *([image.depth] if self.depth else [])]
+        return dr.concat([image.rgb, *(channel[..., None] for channel in rest)], axis=2)
+
+    def to_string(self) -> str:
+        """One line."""
+        return f"MgsSplat[{len(self.gaussians)} Gaussians, SH degree {self.gaussians.sh_degree}]"
+
+
+mi.register_integrator("mgs_splat", lambda props: MgsSplat(props))
