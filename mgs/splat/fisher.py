@@ -95,10 +95,10 @@ def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
     w, x, y, z = q * dr.select(valid, 2 / (dr.squared_norm(q) * size), 0)
     X, Y, Z = turn
     by_quat = [-x * X - y * Y - z * Z, w * X - z * Y + y * Z, z * X + w * Y - x * Z, -y * X + x * Y + w * Z]
-    opacity = dr.exp2(splats.log2_opacity)
+    transparency = dr.rcp(1 + dr.exp(gaussians.logit_opacities.array))
     basis = sh_basis(mean, camera, gaussians.sh.shape[1])
     positive = [dr.select(c > 0, mi.Float(1), 0) for c in (splats.r, splats.g, splats.b)]
-    return Geometry([tuple(m) for m in (*by_scale, *by_quat)], 1 - opacity, basis, positive)
+    return Geometry([tuple(m) for m in (*by_scale, *by_quat)], transparency, basis, positive)
 
 
 def _sums(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None, block: bool) -> tuple[Any, Geometry]:
