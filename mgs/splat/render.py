@@ -19,7 +19,8 @@ from mgs.splat.kernels import PIXELS
 from mgs.splat.project import Splats, camera_array, project
 
 MARGIN = 0.15
-"""Growth of a footprint, as a share of its size (and bits of its opacity), before the lists it is in are rebuilt."""
+"""Growth of a footprint, as a share of its size (and bits of its opacity), that lists allow for once their camera's first,
+exact lists were outgrown: a model that is only looked at pays for no margin, one in training seldom rebuilds."""
 
 CACHE_BYTES = 1 << 30
 """Default memory budget of a `ListCache`, bytes: 100 cameras of 100,000 Gaussians at 640x480."""
@@ -58,9 +59,9 @@ class ListCache:
         """Lists for detached, evaluated splats seen by the camera. Raises InputError where a parameter is not finite."""
         key = (camera.K.tobytes(), camera.world_to_camera.tobytes(), camera.width, camera.height)
         lists = self._entries.get(key)
-        if lists is not None and len(lists.slot_start) != len(splats.u):
+        margin = 0.0 if lists is None else MARGIN
+        if lists is None or len(lists.slot_start) != len(splats.u):
             lists = None
-        if lists is None:
             _raise_unless_finite(dr.all(splats.finite))
         else:
             stale = dr.select(splats.finite, mi.UInt32(blocks.outgrown(lists.footprints, splats)), 2)
@@ -68,7 +69,7 @@ class ListCache:
             _raise_unless_finite(worst < 2)
             lists = None if worst else lists
         if lists is None:
-            lists = blocks.build(splats, blocks.depth_order(splats.z), camera.width, camera.height, MARGIN)
+            lists = blocks.build(splats, blocks.depth_order(splats.z), camera.width, camera.height, margin)
             self.builds += 1
         self._entries[key] = lists
         self._entries.move_to_end(key)
