@@ -11,12 +11,12 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 from scipy.spatial import cKDTree
 
-from mgs.cloud import Cloud, Plane, focus, fuse_frames, ground_plane, rock_cluster
+from mgs.cloud import FILTERED_SHARE, Cloud, Plane, degrade, focus, fuse_frames, ground_plane, rock_cluster
 from mgs.dataset import Dataset, Frame
 from mgs.errors import InputError
 from mgs.files import atomic_path, new_folder, read_json, write_json
 from mgs.initial import initial_gaussians as initial_gaussians
-from mgs.seeds import derive_seed
+from mgs.seeds import derive_seed, generator
 from mgs.surface import Mesh, distances_to_mesh, estimate_normals, poisson_mesh, sample_surface
 from mgs.visibility import in_mask, visible
 
@@ -31,11 +31,14 @@ the foot of the rock, not rock."""
 @dataclass(frozen=True)
 class PriorSettings:
     """gaussians: exactly N samples, or spacing: metres between them (both None: one per voxel of the cloud, a pixel's
-    footprint on the rock); poisson_depth: octree depth, None = cells of 1.5 voxels; seed: root seed."""
+    footprint on the rock); poisson_depth: octree depth, None = cells of 1.5 voxels; noise: metres, and holes: share of the
+    rock's points, by which the cloud is spoilt on purpose (see `degrade`); seed: root seed."""
 
     gaussians: int | None = None
     spacing: float | None = None
     poisson_depth: int | None = None
+    noise: float = 0.0
+    holes: float = 0.0
     seed: int = 0
 
 
@@ -69,27 +72,24 @@ def build_prior(
 
     Raises InputError: no depth, no ground plane, no rock (empty cluster), two equal rocks, no closed surface, N below 2.
     """
-    if settings.gaussians is not None and settings.gaussians < 2:
-        raise InputError(f"prior: {settings.gaussians} Gaussians are too few for a model; ask for more with --gaussians")
-    if settings.spacing is not None and not settings.spacing > 0:
-        raise InputError(f"prior: spacing {settings.spacing} m must be positive; correct --spacing")
-    if settings.gaussians is not None and settings.spacing is not None:
-        raise InputError("prior: --gaussians and --spacing fix the same number; give one of them")
+    _check(settings)
     tell = on_stage or (lambda stage: None)
     tell("cloud")
     cloud = fuse_frames(dataset.frames)
     tell("ground plane")
     plane = ground_plane(cloud, dataset.frames, derive_seed(settings.seed, "prior/plane"))
-    height = plane.height(cloud.points)
-    above = height > plane.tolerance
+    ground = np.abs(plane.height(cloud.points)) <= plane.tolerance
+    above = plane.height(cloud.points) > plane.tolerance
     tell("rock cluster")
     inside, eps, clusters = rock_cluster(cloud.points[above], cloud.voxel, focus(dataset.frames).point, str(dataset.root))
-    cluster = cloud.points[above][inside]
+    cluster, views = cloud.points[above][inside], cloud.views[above][inside]
+    cluster, kept = degrade(cluster, settings.noise, settings.holes, generator(settings.seed, "prior/degrade"))
+    cluster, views = cluster[kept], views[kept]
     tell("Poisson mesh")
-    normals = estimate_normals(cluster, cloud.views[above][inside])
+    normals = estimate_normals(cluster, views, (FILTERED_SHARE * cloud.noise + settings.noise) / cloud.voxel)
     floor = (plane.height(cluster) < 2 * plane.tolerance) & (normals @ plane.normal > FLOOR_UPRIGHT)
     cluster, normals = cluster[~floor], normals[~floor]
-    mesh, depth = poisson_mesh(cluster, normals, cloud.voxel, plane, settings.poisson_depth)
+    mesh, depth = poisson_mesh(cluster, normals, max(cloud.voxel, settings.noise), plane, settings.poisson_depth)
     residual = float(np.sqrt(np.mean(distances_to_mesh(cluster, mesh.vertices, mesh.faces) ** 2)))
     tolerance = max(3 * residual, cloud.voxel)
     tell("surface samples")
@@ -103,7 +103,8 @@ def build_prior(
         "pixels": cloud.pixels,
         "points": len(cloud.points),
         "voxel": cloud.voxel,
-        "plane_inliers": int((np.abs(height) <= plane.tolerance).sum()),
+        "depth_noise": cloud.noise,
+        "plane_inliers": int(ground.sum()),
         "plane_sigma": plane.sigma,
         "plane_tolerance": plane.tolerance,
         "eps": eps,
@@ -126,7 +127,20 @@ def build_prior(
         tell("distance to the true rock")
         numbers["truth"] = error_to_truth(points, spacing, mesh, truth, dataset.frames, plane, settings.seed)
     prior = Prior(points, normals, spacing, tolerance, numbers)
-    return prior, Stages(cloud, plane, np.abs(height) <= plane.tolerance, cluster, mesh)
+    return prior, Stages(cloud, plane, ground, cluster, mesh)
+
+
+def _check(settings: PriorSettings) -> None:
+    if settings.gaussians is not None and settings.gaussians < 2:
+        raise InputError(f"prior: {settings.gaussians} Gaussians are too few for a model; ask for more with --gaussians")
+    if settings.spacing is not None and not settings.spacing > 0:
+        raise InputError(f"prior: spacing {settings.spacing} m must be positive; correct --spacing")
+    if settings.gaussians is not None and settings.spacing is not None:
+        raise InputError("prior: --gaussians and --spacing fix the same number; give one of them")
+    if not 0 <= settings.noise < np.inf:
+        raise InputError(f"prior: noise {settings.noise} m must be 0 or more; correct --prior-noise")
+    if not 0 <= settings.holes <= 0.9:
+        raise InputError(f"prior: holes {settings.holes} is a share of the rock's points, 0 to 0.9; correct --holes")
 
 
 def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:

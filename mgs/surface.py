@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from mgs.cloud import Plane
 from mgs.errors import InputError
 
-NORMAL_NEIGHBOURS = 16
-"""Points of the local plane fit of a normal."""
+NORMAL_NEIGHBOURS = (16, 128)
+"""Points of the local plane fit of a normal: without noise, and at most."""
 POISSON_SCALE = 2.0
 """Edge of Poisson's cube over the extent of the points: at pymeshlab's 1.1 the bulge below the open underside leaves the cube
 and the surface is not closed."""
@@ -49,9 +49,14 @@ class Mesh:
         return normals / np.where(norm > 0, norm, 1.0)
 
 
-def estimate_normals(points: np.ndarray, views: np.ndarray) -> np.ndarray:
-    """Unit normals [N,3] by plane fits to 16 neighbours (Hoppe et al. 1992), turned towards the cameras (views [N,3])."""
-    neighbours = points[cKDTree(points).query(points, min(NORMAL_NEIGHBOURS, len(points)))[1]]
+def estimate_normals(points: np.ndarray, views: np.ndarray, roughness: float = 0.0) -> np.ndarray:
+    """Unit normals [N,3] by plane fits to neighbours (Hoppe et al. 1992), turned towards the cameras (views [N,3]).
+
+    roughness: noise over the distance of neighbouring points; the number of neighbours, 16, grows with it.
+    """
+    least, most = NORMAL_NEIGHBOURS
+    count = min(int(least * (1 + 2 * roughness)), most, len(points))
+    neighbours = points[cKDTree(points).query(points, count)[1]]
     centred = neighbours - neighbours.mean(1, keepdims=True)
     normals = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))[1][..., 0]
     return normals * np.where(np.einsum("nk,nk->n", normals, views) < 0, -1.0, 1.0)[:, None]
@@ -61,7 +66,7 @@ def poisson_mesh(points: np.ndarray, normals: np.ndarray, voxel: float, plane: P
     """Screened Poisson surface (Kazhdan and Hoppe 2013, pymeshlab) cut flat at the ground plane (manifold3d).
 
     Poisson closes the unseen underside with a bulge that no data supports; the cut replaces it by a flat cap on the ground, so
-    that the mesh stays watertight; the cap counts as not seen. depth: octree depth; by default the finest cell is at most 1.5 voxels.
+    that the mesh stays watertight; the cap counts as not seen. depth: octree depth; by default cells of at most 1.5 voxels.
     Returns (mesh, octree depth). Raises InputError where Poisson gives no closed surface above the ground.
     """
     import manifold3d

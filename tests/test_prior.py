@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import synthetic
 
 from mgs.cli import main
-from mgs.cloud import Cloud, Plane, focus, fuse_frames, ground_plane, rock_cluster
+from mgs.cloud import Cloud, Plane, degrade, focus, fuse_frames, ground_plane, rock_cluster
 from mgs.conventions import Camera
 from mgs.dataset import Dataset, load_dataset, write_transforms
 from mgs.errors import InputError
@@ -71,7 +71,7 @@ def test_ground_plane_of_a_tilted_noisy_floor(dataset: Dataset) -> None:
     xy = rng.uniform(-2, 2, (20_000, 2))
     points = np.column_stack([xy, (0.3 - xy @ normal[:2]) / normal[2]]) + 0.004 * rng.standard_normal((20_000, 1)) * normal
     rock = rng.uniform([-0.3, -0.3, 0.4], [0.3, 0.3, 1.0], (5_000, 3))
-    cloud = Cloud(np.concatenate([points, rock]), np.tile([0, 0, 1.0], (25_000, 1)), 0.002, 25_000)
+    cloud = Cloud(np.concatenate([points, rock]), np.tile([0, 0, 1.0], (25_000, 1)), 0.002, 0.0, 25_000)
     plane = ground_plane(cloud, dataset.frames, seed=2)
     assert plane.normal @ normal > np.cos(np.radians(0.1))
     assert plane.offset == pytest.approx(0.3, abs=1e-3)
@@ -307,6 +307,9 @@ def _plain(root: Path) -> Path:
         (_plain, ["--spacing", "9"], "samples are too few"),
         (_plain, ["--spacing", "nan"], "must be positive"),
         (_plain, ["--gaussians", "50", "--spacing", "0.1"], "give one of them"),
+        (_plain, ["--prior-noise", "-1"], "must be 0 or more"),
+        (_plain, ["--prior-noise", "nan"], "must be 0 or more"),
+        (_plain, ["--holes", "1.0"], "0 to 0.9"),
         (_plain, ["--poisson-depth", "0"], "poisson-depth"),
         (_plain, ["--poisson-depth", "30"], "poisson-depth"),
     ],
@@ -351,3 +354,23 @@ def test_a_dataset_is_loaded_before_anything_is_written(tmp_path: Path) -> None:
     assert not (tmp_path / "nowhere").exists()
     with pytest.raises(InputError):
         load_dataset(tmp_path / "nowhere")
+
+
+def test_error_grows_with_noise_holes_and_a_coarse_poisson(built, dataset: Dataset) -> None:
+    def error(**options) -> dict[str, float]:
+        return build_prior(dataset, PriorSettings(gaussians=1500, **options))[0].numbers["truth"]
+
+    exact = built[0].numbers["truth"]
+    assert exact["chamfer"] < error(noise=0.01)["chamfer"] < error(noise=0.04)["chamfer"]
+    assert exact["completeness"] < error(holes=0.4)["completeness"]
+    assert exact["chamfer"] < error(poisson_depth=4)["chamfer"]
+
+
+def test_holes_remove_the_share_asked_for() -> None:
+    points = np.random.default_rng(0).random((5000, 3))
+    moved, kept = degrade(points, 0.0, 0.3, np.random.default_rng(1))
+    assert np.array_equal(moved, points)
+    assert 0.3 <= (~kept).mean() < 0.35
+    moved, kept = degrade(points, 0.02, 0.0, np.random.default_rng(1))
+    assert kept.all()
+    assert (moved - points).std() == pytest.approx(0.02, rel=0.05)

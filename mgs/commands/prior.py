@@ -16,6 +16,8 @@ def prior(
         float | None, typer.Option(help="Distance between samples, metres; default a pixel's footprint.")
     ] = None,
     poisson_depth: Annotated[int | None, typer.Option(help="Poisson octree depth; default from the cloud's density.")] = None,
+    prior_noise: Annotated[float, typer.Option(help="Spoil the rock's points on purpose: standard deviation, metres.")] = 0.0,
+    holes: Annotated[float, typer.Option(help="Spoil them by round holes: share of the points to remove.")] = 0.0,
     seed: Annotated[int, typer.Option(help="Root seed.")] = 0,
 ) -> None:
     """Depth images to a rock's mesh and N samples on it: plane removal, clustering, Poisson surface, blue noise."""
@@ -30,7 +32,7 @@ def prior(
     frames = load_dataset(dataset)
     folder = out if out is not None else dataset / "prior"
     new_folder(folder).rmdir()  # Empty and writable, known before the work; a failure leaves nothing behind.
-    settings = PriorSettings(gaussians=gaussians, spacing=spacing, poisson_depth=poisson_depth, seed=seed)
+    settings = PriorSettings(gaussians, spacing, poisson_depth, prior_noise, holes, seed)
     with console.status("reading") as status:
         result, stages = build_prior(frames, settings, lambda stage: status.update(f"prior: {stage}"))
         save_prior(folder, result, stages.mesh)
@@ -47,6 +49,7 @@ def _table(numbers: dict[str, Any]) -> Any:
     n, spacing, area = numbers["n"], numbers["spacing"], numbers["sampled_area"]
     table = Table("station", "number", title="Mesh prior")
     table.add_row("depth pixels in the cloud", f"{numbers['pixels']:,}")
+    table.add_row("noise of a depth pixel", f"{1e3 * numbers['depth_noise']:.2f} mm")
     table.add_row("points of the fused cloud", f"{numbers['points']:,} on a {1e3 * numbers['voxel']:.2f} mm grid")
     table.add_row(
         "ground plane inliers (RANSAC)",
