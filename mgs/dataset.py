@@ -77,35 +77,59 @@ def load_dataset(root: str | Path) -> Dataset:
     path = root / "transforms.json"
     if not root.is_dir():
         raise InputError(f"{root}: no such dataset folder; make one with `mgs synth-orbit {root}`")
-    data = read_json(path)
-    records = data.get("frames") if isinstance(data, dict) else None
-    if not records:
-        raise InputError(f"{path}: lists no frames; expected a nerfstudio transforms.json")
+    data, records = _records(path)
     frames = [_frame(root, path, data, i, record) for i, record in enumerate(records)]
     return Dataset(root, tuple(sorted(frames, key=lambda frame: (frame.timestamp, frame.name))))
 
 
-def _frame(root: Path, path: Path, data: dict[str, Any], index: int, record: dict[str, Any]) -> Frame:
+def load_cameras(path: str | Path) -> list[tuple[str, Camera]]:
+    """(file_path, camera) of every frame of a transforms.json (or of the folder that holds one), in the file's order.
+
+    The files that the frames name need not exist. Raises InputError as `load_dataset`, but for those files.
+    """
+    path = Path(path) / "transforms.json" if Path(path).is_dir() else Path(path)
+    data, records = _records(path)
+    return [(record["file_path"], _camera(path, data, i, record)) for i, record in enumerate(records)]
+
+
+def _records(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The contents of a transforms.json, and its frames."""
+    data = read_json(path)
+    records = data.get("frames") if isinstance(data, dict) else None
+    if not records or not isinstance(records, list):
+        raise InputError(f"{path}: lists no frames; expected a nerfstudio transforms.json")
+    for index, record in enumerate(records):
+        if not isinstance(record, dict) or "file_path" not in record or "transform_matrix" not in record:
+            raise InputError(f"{path}: frame {index} lacks file_path or transform_matrix; add it")
+    return data, records
+
+
+def _camera(path: Path, data: dict[str, Any], index: int, record: dict[str, Any]) -> Camera:
     where = f"{path}: frame {index}"
-    if "file_path" not in record or "transform_matrix" not in record:
-        raise InputError(f"{where} lacks file_path or transform_matrix; add it")
     try:
         fl_x, fl_y, cx, cy, w, h = (record.get(k, data.get(k)) for k in ("fl_x", "fl_y", "cx", "cy", "w", "h"))
         K = np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]], np.float64)
         width, height = int(w or 0), int(h or 0)
         pose = np.array(record["transform_matrix"], np.float64)
-        timestamp = float(record.get("timestamp", FRAME_INTERVAL * index))
     except (TypeError, ValueError):
         raise InputError(f"{where} has no usable intrinsics or pose; fl_x fl_y cx cy w h and a 4x4 matrix are needed") from None
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise InputError(f"{where} has a transform_matrix that is not a finite 4x4 matrix; correct the pose")
     try:
-        world_to_camera = opencv_from_opengl(pose)
-        camera = Camera(K, width, height, world_to_camera)
+        return Camera(K, width, height, opencv_from_opengl(pose))
     except np.linalg.LinAlgError:
         raise InputError(f"{where} has a singular transform_matrix; correct the pose") from None
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
+
+
+def _frame(root: Path, path: Path, data: dict[str, Any], index: int, record: dict[str, Any]) -> Frame:
+    where = f"{path}: frame {index}"
+    camera = _camera(path, data, index, record)
+    try:
+        timestamp = float(record.get("timestamp", FRAME_INTERVAL * index))
+    except (TypeError, ValueError):
+        raise InputError(f"{where} has a timestamp that is no number; give seconds") from None
 
     def file(key: str) -> Path | None:
         if not record.get(key):

@@ -18,6 +18,9 @@ from mgs.files import atomic_path
 
 MAX_SH_DEGREE = 3
 
+LINEAR_COMMENT = "mgs: colours are linear RGB"
+"""Header comment of our PLY files. The layout itself has no field for it, and other tools train in display space (sRGB)."""
+
 
 @dataclass
 class Gaussians:
@@ -99,7 +102,18 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
     for i, name in enumerate(names):
         vertices[name] = columns[:, i]
     with atomic_path(path) as temporary:
-        PlyData([PlyElement.describe(vertices, "vertex")]).write(str(temporary))
+        PlyData([PlyElement.describe(vertices, "vertex")], comments=[LINEAR_COMMENT]).write(str(temporary))
+
+
+def ply_colour_space(path: str | Path) -> str:
+    """The space in which a readable 3DGS PLY's colours are blended: "linear" for our files, "srgb" for other tools'."""
+    with Path(path).open("rb") as file:
+        for line in file:
+            if line.strip() == f"comment {LINEAR_COMMENT}".encode():
+                return "linear"
+            if line.strip() == b"end_header":
+                break
+    return "srgb"
 
 
 def read_ply(path: str | Path) -> Gaussians:

@@ -4,9 +4,11 @@
     params = mi.traverse(scene)  # integrator.means, .log_scales, .quats, .logit_opacities, .sh
     image = mi.render(scene, params)
 
-Properties: `filename`, a 3DGS PLY; `background`, linear RGB behind the Gaussians (default black); `depth`, a boolean: append
-the expected z-depth in metres as an AOV (default false). The film decides about alpha (`pixel_format` rgb or rgba). Shapes,
-emitters, the sampler and the film's reconstruction filter play no part: a pixel is the value at its centre.
+Properties: `filename`, a 3DGS PLY; `colour_space`, "linear" or "srgb", in which its colours are blended (default: linear for
+files of mgs, srgb for other tools'); `background`, RGB behind the Gaussians in that space (default black); `depth`, a boolean:
+append the expected z-depth in metres as an AOV (default false). The image is linear, as Mitsuba's images are. The film decides
+about alpha (`pixel_format` rgb or rgba). Shapes, emitters, the sampler and the film's reconstruction filter play no part: a
+pixel is the value at its centre.
 
 Reverse-mode gradients reach every parameter on which they are enabled. Not differentiated: the sensor. No forward mode.
 """
@@ -20,7 +22,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mgs.errors import InputError
-from mgs.gaussians import Gaussians, read_ply
+from mgs.gaussians import Gaussians, ply_colour_space, read_ply
 from mgs.splat import ListCache, as_drjit, render
 from mgs.splat.sensor import camera_from_sensor
 
@@ -32,7 +34,11 @@ class MgsSplat(mi.CppADIntegrator):
         super().__init__(props)
         if "filename" not in props:
             raise InputError("mgs_splat: `filename` is missing; name a 3DGS PLY")
-        self.gaussians = as_drjit(read_ply(str(mi.file_resolver().resolve(props["filename"]))))
+        path = str(mi.file_resolver().resolve(props["filename"]))
+        self.gaussians = as_drjit(read_ply(path))
+        self.colour_space = props.get("colour_space", ply_colour_space(path))
+        if self.colour_space not in ("linear", "srgb"):
+            raise InputError(f"mgs_splat: colour_space {self.colour_space!r} is unknown; choose linear or srgb")
         self.background = mi.ScalarColor3f(props.get("background", mi.ScalarColor3f(0)))
         self.depth = bool(props.get("depth", False))
         self.cache = ListCache()
@@ -80,9 +86,12 @@ class MgsSplat(mi.CppADIntegrator):
 
     def _channels(self, image: Any, film: Any) -> Any:
         """What an image block of this film holds: R G B, A where the film asks for it, filter weight, AOVs. [H,W,C]."""
+        rgb = image.rgb
+        if self.colour_space == "srgb":
+            rgb = mi.TensorXf(mi.math.srgb_to_linear(rgb.array), rgb.shape)
         alpha = [image.alpha] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
         rest = [*alpha, dr.ones(mi.TensorXf, image.alpha.shape), *([image.depth] if self.depth else [])]
-        return dr.concat([image.rgb, *(channel[..., None] for channel in rest)], axis=2)
+        return dr.concat([rgb, *(channel[..., None] for channel in rest)], axis=2)
 
     def to_string(self) -> str:
         """One line."""

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mgs.conventions import Camera, look_at
+from mgs.conventions import Camera, linear_from_srgb, look_at
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians, read_ply, write_ply
 from mgs.splat import as_drjit, camera_from_sensor, render
@@ -125,6 +125,27 @@ def test_alpha_depth_and_background(ply):
     assert scene.integrator().aov_names() == ["depth.z"]
 
 
+def test_colours_in_display_space(ply):
+    """A PLY of another tool is blended in sRGB; the image is linear all the same, and gradients flow through the conversion."""
+    scene = load(ply, colour_space="srgb")
+    params = mi.traverse(scene)
+    dr.enable_grad(params["integrator.sh"])
+    image = mi.render(scene, params)
+    blended = np.asarray(render(read_ply(ply), camera()).rgb)
+    np.testing.assert_allclose(
+        np.asarray(image), np.where(blended > 1, np.asarray(image), linear_from_srgb(blended)), atol=4e-6
+    )
+    dr.backward(dr.sum(image, axis=None))
+
+    model = as_drjit(read_ply(ply))
+    dr.enable_grad(model.sh)
+    rgb = render(model, camera()).rgb.array
+    dr.backward(dr.sum(dr.select(rgb <= 0.04045, rgb / 12.92, dr.power((rgb + 0.055) / 1.055, 2.4))))
+    truth = np.asarray(dr.grad(model.sh))
+    assert np.linalg.norm(np.asarray(dr.grad(params["integrator.sh"])) - truth) <= 1e-5 * np.linalg.norm(truth)
+    assert load(ply).integrator().colour_space == "linear"
+
+
 def test_traverse_lists_the_parameters(ply):
     params = mi.traverse(load(ply))
     model = gaussians()
@@ -226,12 +247,15 @@ BAD_FILES = [
     ({}, "mgs_splat: `filename` is missing; name a 3DGS PLY"),
     ({"filename": "nowhere.ply"}, "nowhere.ply: no such file; give a 3DGS PLY"),
     ({"filename": __file__}, "export it again"),
+    ({"filename": "PLY", "colour_space": "Lab"}, "mgs_splat: colour_space 'Lab' is unknown; choose linear or srgb"),
 ]
 
 
 @pytest.mark.parametrize(("options", "message"), BAD_FILES)
-def test_bad_files(options, message):
+def test_bad_files(ply, options, message):
     """Mitsuba makes a RuntimeError of what a plugin raises; our one line is its last."""
+    if options.get("filename") == "PLY":
+        options = options | {"filename": str(ply)}
     with pytest.raises(RuntimeError) as error:
         mi.load_dict({"type": "mgs_splat"} | options)
     last = str(error.value).splitlines()[-1]

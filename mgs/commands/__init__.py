@@ -4,20 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from mgs.commands.dataset import dataset
 from mgs.commands.demo import demo
 from mgs.commands.diagnose import diagnose
 from mgs.commands.doctor import doctor
 from mgs.commands.evaluate import evaluate
 from mgs.commands.nbv import nbv
 from mgs.commands.prior import prior
+from mgs.commands.render import render
 from mgs.commands.synth_orbit import synth_orbit
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "doctor": doctor,
     "synth-orbit": synth_orbit,
+    "dataset": dataset,
     "prior": prior,
     "nbv": nbv,
     "eval": evaluate,
     "diagnose": diagnose,
+    "render": render,
     "demo": demo,
 }
