@@ -1,0 +1,168 @@
+"""Fisher information against a brute-force Jacobian per pixel and channel, in float64; the other estimators against theirs."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mgs.errors import InputError
+from mgs.splat import ESTIMATORS, ListCache, fisher, groups, reference
+from mgs.splat.fisher import hutchinson
+from mgs.splat.render import as_drjit
+
+from .scenes import calm, double, make_camera, make_gaussians
+
+BACKGROUND = (0.3, 0.6, 0.1)
+TOLERANCE = 1e-3
+FLOOR = 1e-6
+"""Entries below this share of the largest are compared as absolute numbers."""
+
+
+def assert_close(found, expected, what="", bound=None):
+    """Relative error TOLERANCE on entries above FLOOR of the largest; FLOOR * TOLERANCE * 10 of the largest on the others.
+
+    bound [N,P,P]: sqrt(H_ii H_jj). Off-diagonal entries are sums of either sign; where they cancel below a hundredth of their
+    bound, what float32 promises is an error of 1e-5 of the bound (measured: 2e-6), and that is asked for.
+    """
+    assert found.dtype == np.float32
+    assert found.shape == expected.shape
+    size, error = np.abs(expected), np.abs(found - expected)
+    big = size > FLOOR * size.max()
+    relative = error[big] / (size if bound is None else np.maximum(size, 1e-2 * bound))[big]
+    print(f"{what} worst relative error {relative.max(initial=0):.1e} of {big.sum()} entries")
+    assert relative.max(initial=0) < TOLERANCE, what
+    assert error[~big].max(initial=0) <= 10 * TOLERANCE * FLOOR * size.max(), what
+
+
+def diagonal(blocks) -> np.ndarray:
+    return np.einsum("nii->ni", blocks)
+
+
+def make(seed, degree=0, n=16, **style):
+    """A random scene with a wide splat whose alpha is clamped in the middle and one whose colours are clamped at 0."""
+    g = make_gaussians(n, seed, degree, **{"log_scales": (-4.0, -1.0), **style})
+    g.means[0], g.log_scales[0], g.logit_opacities[0] = 0, (-0.5, -0.8, -0.3), 20
+    g.sh[1] = 0
+    g.sh[1, 0] = (-4, 2, -4)
+    return g
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_exact_and_block_against_brute_force(degree):
+    camera = make_camera()
+    g = calm(lambda seed: make(seed, degree), camera, 20 + degree)
+    projected = reference.project(g, camera)
+    assert reference.composite(projected, camera)[3].any(), "no clamped alpha"
+    assert (projected.colours[1] == 0).any(), "no clamped colour"
+    expected = reference.fisher_block(g, camera, BACKGROUND)
+    block = fisher(g, camera, "block", BACKGROUND)
+    exact = fisher(g, camera, "exact", BACKGROUND)
+    assert_close(block, expected, f"degree {degree} block")
+    assert_close(exact, diagonal(expected), f"degree {degree} exact")
+    np.testing.assert_array_equal(block, block.transpose(0, 2, 1))
+
+
+@settings(derandomize=True, deadline=None, max_examples=15)
+@given(
+    seed=st.integers(0, 2**31),
+    scale=st.floats(-5, -0.5),
+    stretch=st.floats(0.1, 6),
+    logit=st.floats(-2, 20),
+    background=st.tuples(*[st.floats(0, 1)] * 3),
+)
+def test_exact_and_block_for_any_scene(seed, scale, stretch, logit, background):
+    camera = make_camera()
+    style = {"log_scales": (scale - stretch, scale), "logits": (logit - 4, logit)}
+    g = calm(lambda s: make(s, **style), camera, seed)
+    expected = reference.fisher_block(g, camera, background)
+    H = diagonal(expected)
+    assert_close(fisher(g, camera, "block", background), expected, "block", np.sqrt(H[:, :, None] * H[:, None, :]))
+    assert_close(fisher(g, camera, "exact", background), H, "exact")
+
+
+def test_blocks_are_positive_semidefinite():
+    block = fisher(make_gaussians(60, 4), make_camera(), "block").astype(np.float64)
+    values = np.linalg.eigvalsh(block)
+    assert (values[:, 0] > -1e-5 * values[:, -1]).all()
+
+
+def test_unseen_gaussian_carries_no_information():
+    camera, g = make_camera(), make_gaussians(16, 5)
+    g.means[3] = camera.position - 2 * camera.world_to_camera[2, :3]
+    g.means[4] = camera.position + np.array([3, 3, 3])
+    assert (fisher(g, camera)[[3, 4]] == 0).all()
+    assert (fisher(g, camera, "block")[[3, 4]] == 0).all()
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_groups_tile_the_columns(degree):
+    parts = list(groups(degree).values())
+    assert [p.start for p in parts] == [0, *(p.stop for p in parts[:-1])]
+    assert parts[-1].stop == 3 * (degree + 1) ** 2 + 8
+    assert fisher(make_gaussians(16, 1, degree), make_camera()).shape == (16, parts[-1].stop)
+
+
+def test_hutchinson_converges_as_one_over_sqrt_k():
+    """The squared error of the mean of k probes is 2 (H^2 - sum J^4) / k, exactly; averaged over parameters, to sampling error.
+
+    Probes are nested (the first k of 256), as the estimator draws them, so this also fixes its seeds.
+    """
+    camera = make_camera((21, 14), focal=24)
+    g = calm(lambda seed: make_gaussians(16, seed, log_scales=(-3.5, -1.0), logits=(-2, 3)), camera, 3)
+    J2 = reference.jacobian(g, camera, BACKGROUND).reshape(-1, 16, 11) ** 2
+    H = J2.sum(0)
+    variance = 2 * (H**2 - (J2**2).sum(0))
+    seen = (H / H.max()) > 1e-9
+    ks = (4, 16, 64, 256)
+    cache, errors = ListCache(), []
+    for k in ks:
+        estimate = hutchinson(as_drjit(g), camera, BACKGROUND, cache, probes=k, seed=1)
+        errors.append(np.sqrt(((estimate - H)[seen] ** 2 / variance[seen]).mean()))
+    slope = np.polyfit(np.log(ks), np.log(errors), 1)[0]
+    print("k", ks, "rms error / sigma", [f"{e:.3f}" for e in errors], f"slope {slope:.3f}")
+    assert abs(slope + 0.5) < 0.08
+    assert np.all(np.abs(np.sqrt(ks) * errors - 1) < 0.35)
+
+
+def test_hutchinson_is_the_same_with_and_without_a_cache():
+    camera, g = make_camera(), make_gaussians(16, 6)
+    np.testing.assert_array_equal(fisher(g, camera, "hutchinson"), fisher(g, camera, "hutchinson", cache=ListCache()))
+
+
+def test_loss_gradient_is_the_square_of_its_loss_by_central_differences():
+    """L = mean (rgb - 0.5)^2 of the oracle, differentiated numerically and squared."""
+    camera = make_camera()
+    g = calm(lambda seed: make_gaussians(8, seed, log_scales=(-3.0, -1.0), logits=(-1, 4)), camera, 8)
+
+    def loss(gaussians):
+        return ((reference.render(gaussians, camera, BACKGROUND)["rgb"] - 0.5) ** 2).mean()
+
+    columns = [("sh", (0, c)) for c in range(3)]
+    columns += [("log_scales", (i,)) for i in range(3)] + [("quats", (i,)) for i in range(4)] + [("logit_opacities", ())]
+    expected = np.zeros((8, 11))
+    for j in range(8):
+        for column, (name, index) in enumerate(columns):
+            ends = []
+            for sign in (+1, -1):
+                moved = double(g)
+                getattr(moved, name)[(j, *index)] += sign * 1e-5
+                ends.append(loss(moved))
+            expected[j, column] = ((ends[0] - ends[1]) / 2e-5) ** 2
+    found = fisher(g, camera, "loss-gradient", BACKGROUND)
+    assert np.linalg.norm(np.sqrt(found) - np.sqrt(expected)) < 1e-4 * np.linalg.norm(np.sqrt(expected))
+    assert np.linalg.norm(found - expected) < 2e-4 * np.linalg.norm(expected)
+
+
+def test_loss_gradient_is_not_the_fisher_information():
+    """Gradients of pixels cancel before they are squared, so the two differ by far more than a factor."""
+    camera, g = make_camera(), make_gaussians(16, 9)
+    exact, scalar = fisher(g, camera), fisher(g, camera, "loss-gradient")
+    seen = exact > 1e-6 * exact.max()
+    ratio = np.log(scalar[seen] / exact[seen] + 1e-30)
+    assert ratio.std() > 1
+
+
+def test_every_estimator_is_named_and_unknown_ones_are_an_error():
+    assert set(ESTIMATORS) == {"exact", "block", "hutchinson", "loss-gradient"}
+    with pytest.raises(InputError, match=r"estimator 'magic' is unknown; choose one of .*exact"):
+        fisher(make_gaussians(1, 1), make_camera(), "magic")
