@@ -8,10 +8,10 @@ A run lives in one folder:
 - `gaussians.ply`: the model, once the budget is spent.
 
 A line of `steps.jsonl` holds: `step` (0 = the seeds), `frame` and `name` of the chosen view (null at step 0, which has `seeds`
-and `seed_names` instead), `images` (how many the model has now), `gain` (the policy's own score), `information_gain` (Eq. 7 of
-the chosen view, whatever the policy), `coverage` (Eq. 9 after the fit), `iterations`, `loss` and `stop_reason` of the fit,
-`seconds` per stage, and, where the step was evaluated, mean PSNR in dB over all views (`psnr`; `psnr_mask` in the rock mask)
-and over those never trained on (`held_out_psnr`, `held_out_psnr_mask`).
+and `seed_names` instead), `images` (how many the model has now), `gain` (the policy's own score; null for random),
+`information_gain` (Eq. 7 of the chosen view, whatever the policy), `coverage` (Eq. 9 of all images), `iterations`, `loss` and
+`stop_reason` of the fit, `seconds` per stage, and, where the step was evaluated, mean PSNR in dB over all views (`psnr`;
+`psnr_mask` in the rock mask) and over those never trained on (`held_out_psnr`, `held_out_psnr_mask`).
 
 The candidates' images are never read: only the cameras of frames not taken yet are touched before a choice.
 """
@@ -24,6 +24,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -74,10 +75,12 @@ class Stations:
 
 @dataclass
 class State:
-    """What is known after a step: the model, H [N,P] of its training set at that model, frames taken in order, all lines."""
+    """What is known after a step: the model, frames taken in order, all lines, and the information of the training set, H [N,P]
+    at that model and surface [N,P] at the prior's Gaussians before training (what the views see of the surface)."""
 
     gaussians: Gaussians
     H: np.ndarray
+    surface: np.ndarray
     taken: list[int]
     steps: list[dict[str, Any]]
 
@@ -172,16 +175,15 @@ class _Loop:
         self.positions = np.array([camera.position for camera in self.cameras])
         self.lam = policies.regularisation(stations.groups, settings.pixel_noise, settings.prior_std)
         self.images: dict[int, np.ndarray] = {}
+        self.seeds = policies.seed_views(self.positions, stations.centre, settings.seeds)
+        self.start = stations.initial([self.frames[i] for i in self.seeds])
 
     def first(self) -> State:
         """Step 0: the seeds."""
-        watch = _Stopwatch()
-        seeds = policies.seed_views(self.positions, self.stations.centre, self.settings.seeds)
-        with watch("initial"):
-            gaussians = self.stations.initial([self.frames[i] for i in seeds])
-        names = [self.frames[i].name for i in seeds]
-        choice = {"frame": None, "name": None, "seeds": seeds, "seed_names": names, "gain": None, "information_gain": None}
-        return self.learn(gaussians, seeds, [], choice, watch)
+        names = [self.frames[i].name for i in self.seeds]
+        choice = {"frame": None, "name": None, "seeds": self.seeds, "seed_names": names, "gain": None, "information_gain": None}
+        nothing = np.zeros((len(self.start), len(self.lam)))
+        return self.learn(State(self.start, nothing, nothing, [], []), self.seeds, choice, _Stopwatch())
 
     def next(self, state: State) -> State:
         """One step: choose a pose, capture its image, learn."""
@@ -191,31 +193,30 @@ class _Loop:
             F = self.stations.fisher(state.gaussians, self.cameras[frame])
             information_gain = policies.d_optimal(F, state.H, self.lam)[0]
         choice = {"frame": frame, "name": self.frames[frame].name, "gain": gain, "information_gain": information_gain}
-        return self.learn(state.gaussians, [*state.taken, frame], state.steps, choice, watch)
+        return self.learn(state, [frame], choice, watch)
 
-    def choose(self, state: State) -> tuple[int, float]:
+    def choose(self, state: State) -> tuple[int, float | None]:
         """Frame with the largest score among those not taken, and its gain: poses only, one candidate in memory at a time."""
         policy = self.settings.policy
         left = [i for i in range(len(self.frames)) if i not in state.taken]
         scores: list[policies.Score] = []
         if policy in policies.CRITERIA:
+            model, H = (self.start, state.surface) if policy == "coverage" else (state.gaussians, state.H)
             for done, i in enumerate(left):
                 self.progress("scoring candidates", done, len(left))
-                F = self.stations.fisher(state.gaussians, self.cameras[i])
-                scores.append(policies.CRITERIA[policy](F, state.H, self.lam))
+                scores.append(policies.CRITERIA[policy](self.stations.fisher(model, self.cameras[i]), H, self.lam))
         else:
             rng = generator(self.settings.seed, f"{policy}/{len(state.steps)}")
             taken = self.positions[state.taken]
             values = policies.POSE_POLICIES[policy](self.positions[left], taken, self.stations.centre, rng)
             scores = [(float(value),) for value in values]
         best = max(range(len(left)), key=scores.__getitem__)
-        return left[best], scores[best][0]
+        return left[best], None if policy == "random" else scores[best][0]
 
-    def learn(
-        self, gaussians: Gaussians, taken: list[int], steps: list[dict[str, Any]], choice: dict[str, Any], watch: _Stopwatch
-    ) -> State:
+    def learn(self, state: State, new: list[int], choice: dict[str, Any], watch: _Stopwatch) -> State:
         """Read the new images, fit to convergence on all so far, sum their information at the new model."""
-        step, cameras = len(steps), [self.cameras[i] for i in taken]
+        step, taken = len(state.steps), [*state.taken, *new]
+        cameras = [self.cameras[i] for i in taken]
         with watch("capture"):
             for i in taken:
                 if i not in self.images:
@@ -223,19 +224,18 @@ class _Loop:
         with watch("fit"):
             targets = [self.images[i] for i in taken]
             rate = self.settings.warm_rate if step else 1.0
-            fit = self.stations.fit(
-                gaussians, cameras, targets, rate, lambda done, total: self.progress("fitting", done, total)
-            )
+            fit = self.stations.fit(state.gaussians, cameras, targets, rate, partial(self.progress, "fitting"))
         with watch("information"):
             H = np.zeros((len(fit.gaussians), len(self.lam)))
             for done, camera in enumerate(cameras):
                 self.progress("information of the training set", done, len(cameras))
                 H += self.stations.fisher(fit.gaussians, camera)
+            surface = state.surface + sum(self.stations.fisher(self.start, self.cameras[i]) for i in new)
         line = {
             "step": step,
             **choice,
             "images": len(taken),
-            "coverage": policies.coverage(H, self.lam),
+            "coverage": policies.coverage(surface, self.lam),
             "iterations": int(fit.iterations),
             "loss": float(fit.loss),
             "stop_reason": str(fit.stop_reason),
@@ -244,14 +244,14 @@ class _Loop:
         if self.settings.evaluate_every and step % self.settings.evaluate_every == 0:
             with watch("evaluate"):
                 line |= self.stations.measure(fit.gaussians, taken)
-        return State(fit.gaussians, H, taken, [*steps, line])
+        return State(fit.gaussians, H, surface, taken, [*state.steps, line])
 
 
 def write_checkpoint(out: Path, state: State) -> None:
     """Commit a step: the state in one file, renamed into place; then the readable lines."""
     text = json.dumps({"taken": state.taken, "steps": state.steps})
     with atomic_path(out / "checkpoint.npz") as temporary, open(temporary, "wb") as file:
-        np.savez(file, H=state.H, json=np.array(text), **asdict(state.gaussians))
+        np.savez(file, H=state.H, surface=state.surface, json=np.array(text), **asdict(state.gaussians))
     write_steps(out, state)
 
 
@@ -270,6 +270,6 @@ def read_checkpoint(out: Path) -> State | None:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as data:
             record = json.loads(str(data["json"]))
             gaussians = Gaussians(*(data[name] for name in ("means", "log_scales", "quats", "logit_opacities", "sh")))
-            return State(gaussians, data["H"], record["taken"], record["steps"])
+            return State(gaussians, data["H"], data["surface"], record["taken"], record["steps"])
     except (zipfile.BadZipFile, KeyError, ValueError, OSError, EOFError) as error:
         raise InputError(f"{path}: not a readable checkpoint ({error}); delete it to start the run from its seeds") from None

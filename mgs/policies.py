@@ -53,13 +53,17 @@ def regularisation(
 def observed(H: Array, lam: Array) -> NDArray[np.bool_]:
     """[N] which Gaussians the images say more about than the prior does (Eq. 9 with epsilon = lam).
 
-    Read off the colour columns: colour information is the sum of squared blending weights, whatever the training did.
+    Read off the colour columns: colour information is the sum of squared blending weights, what the views see of a Gaussian.
     """
     return np.asarray((H[:, :3] > lam[:3]).any(axis=1))
 
 
 def coverage(H: Array, lam: Array) -> float:
-    """Surface coverage C_0 of Eq. 9: the share of Gaussians that are `observed`, 0 to 1."""
+    """Surface coverage C_0 of Eq. 9: the share of Gaussians that are `observed`, 0 to 1.
+
+    The loop passes H of the prior's Gaussians, as they were before training. At the trained model Eq. 9 mixes two things: a
+    tenth of the Gaussians fade behind their neighbours as training goes on, and would count as surface that no view sees.
+    """
     return float(observed(H, lam).mean())
 
 

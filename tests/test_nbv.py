@@ -70,12 +70,22 @@ def test_d_optimal_takes_the_best_candidate_at_every_step(dataset, tmp_path):
     assert state.steps[-1]["gain"] == state.steps[-1]["information_gain"] == max(gains)
 
 
-def test_coverage_in_the_lines_is_of_the_fitted_model(dataset, tmp_path):
+def test_coverage_is_of_the_surface_and_does_not_depend_on_training(dataset, tmp_path):
+    def forgetful(*arguments):
+        fit = tiny.fit(*arguments)
+        fit.gaussians.sh[:] = -100  # black: no information is left at the trained model
+        return fit
+
     state = run(tmp_path / "run", dataset, policy="coverage")
     covered = [step["coverage"] for step in state.steps]
+    start, lam = tiny.initial([]), policies.regularisation(tiny.GROUPS)
+    for step, share in enumerate(covered):
+        H = sum(tiny.fisher(start, dataset.frames[i].camera) for i in state.taken[: 3 + step])
+        assert share == policies.coverage(H, lam)
     assert covered == sorted(covered)
-    assert covered[-1] == policies.coverage(state.H, policies.regularisation(tiny.GROUPS))
-    assert 0 < covered[0] < 1
+    assert 0 < covered[0] < covered[-1]
+    forgot = run(tmp_path / "forgot", dataset, tiny.stations(fit=forgetful), policy="coverage")
+    assert forgot.taken == state.taken
 
 
 def test_candidate_images_are_never_read_before_they_are_chosen(dataset, tmp_path, monkeypatch):

@@ -12,8 +12,6 @@ GAUSSIANS = 10_000
 """About one Gaussian per pixel of the rock at 320x240."""
 BUDGET = 8
 """Views beyond the four seeds, the same for every policy."""
-DIAGNOSED = 2
-"""Views of the d-optimal run whose EXR and previews are written."""
 
 
 def demo(
@@ -27,14 +25,15 @@ def demo(
 
     from rich.console import Console
 
+    from mgs import runtime
     from mgs.commands.diagnose import diagnose
-    from mgs.commands.evaluate import evaluate
-    from mgs.commands.nbv import nbv
+    from mgs.commands.nbv import run_folder, start_run
     from mgs.commands.prior import prior
     from mgs.commands.synth_orbit import synth_orbit
     from mgs.files import new_folder
     from mgs.report import print_table, table_rows, write_report
 
+    runtime.start()
     console, started = Console(highlight=False), time.monotonic()
     dataset, folder, report = out / "dataset", out / "prior", out / "report"
     runs = [out / policy for policy in POLICIES]
@@ -52,12 +51,11 @@ def demo(
         prior(dataset, out=folder, gaussians=GAUSSIANS, seed=seed)
     for policy, run in zip(POLICIES, runs, strict=True):
         heading(f"3/5 next best views: {policy}, 4 seeds and {BUDGET} views")
-        if (run / "config.json").is_file():
-            nbv(resume=run)
-        else:
-            nbv(dataset, out=run, prior=folder, policy=policy, budget=BUDGET, seed=seed, evaluate_every=1)
-        if not (run / "renders").is_dir():
-            evaluate(run)
+        if not (run / "config.json").is_file():
+            start_run(
+                dataset, run, folder, None, {"policy": policy, "budget": BUDGET, "seed": seed, "evaluate_every": 1}, console
+            )
+        run_folder(run, console, pictures=True)
     heading("4/5 what the views told about each Gaussian")
     diagnose(runs[0])
     heading("5/5 the report")

@@ -111,8 +111,8 @@ def start_run(
         raise
 
 
-def run_folder(out: Path, console: Console) -> None:
-    """Run or resume the loop in a run folder, evaluate, print the table."""
+def run_folder(out: Path, console: Console, pictures: bool = False) -> None:
+    """Run or resume the loop in a run folder, evaluate (with pictures where asked), print the table."""
     from mgs import nbv as loop
     from mgs.dataset import load_dataset
     from mgs.prior import load_prior
@@ -145,7 +145,7 @@ def run_folder(out: Path, console: Console) -> None:
             bar.update(whole, completed=len(state.taken))
 
         state = loop.run(out, settings, dataset, stations, progress, on_step)
-        metrics = evaluate_run(out, pictures=False, progress=lambda done, total: progress("evaluating", done, total))
+        metrics = evaluate_run(out, pictures=pictures, progress=lambda done, total: progress("evaluating", done, total))
     print_run(out, state, metrics, console)
 
 
