@@ -5,7 +5,7 @@ set -eu
 venv=$1
 say() { printf 'set-up: %s\n' "$*"; }
 stop() { printf 'set-up: %s\n' "$*" >&2; exit 2; }
-is_root() { [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; }
+can_apt() { [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; }
 apt_install() {
     apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@"
 } >"$log" 2>&1
@@ -26,7 +26,7 @@ done
 find_llvm() { "$python" -c 'from mgs.runtime import find_libllvm; print(find_libllvm())' 2>"$log"; }
 if ! llvm=$(find_llvm); then
     reason=$(tail -n 1 "$log" | sed 's/^[A-Za-z.]*InputError: //')
-    [ -z "${DRJIT_LIBLLVM_PATH:-}" ] && is_root || stop "$reason"
+    [ -z "${DRJIT_LIBLLVM_PATH:-}" ] && can_apt || stop "$reason"
     say "installing libllvm19 with apt-get"
     apt_install libllvm19 || { cat "$log" >&2; stop "apt-get could not install libllvm19; $reason"; }
     llvm=$(find_llvm) || stop "$(tail -n 1 "$log" | sed 's/^[A-Za-z.]*InputError: //')"
@@ -39,7 +39,7 @@ if ! "$venv/bin/python" -m pip --version >/dev/null 2>&1; then
     rm -rf "$venv"
     if ! "$python" -m venv "$venv" >"$log" 2>&1; then
         package="python$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')-venv"
-        is_root || stop "$python cannot make a virtual environment; install $package (apt-get install $package)"
+        can_apt || stop "$python cannot make a virtual environment; install $package (apt-get install $package)"
         say "installing $package with apt-get"
         apt_install "$package" || { cat "$log" >&2; stop "apt-get could not install $package; install it yourself"; }
         "$python" -m venv --clear "$venv"
@@ -49,3 +49,12 @@ say "installing $(grep -c == requirements.lock) packages, versions as in require
 [ -t 1 ] && quiet= || quiet=-qq
 "$venv/bin/python" -m pip install $quiet --disable-pip-version-check --no-input -r requirements.lock
 "$venv/bin/python" -m pip install -qq --disable-pip-version-check --no-input --no-deps --no-build-isolation -e .
+
+# pymeshlab's wheel wants libGL and libOpenGL of the system, though nothing is drawn with them.
+if ! "$venv/bin/python" -c 'import pymeshlab' 2>"$log"; then
+    reason="pymeshlab does not load ($(tail -n 1 "$log")); install libGL (apt-get install libgl1 libopengl0)"
+    can_apt || stop "$reason"
+    say "installing libgl1 and libopengl0 with apt-get"
+    apt_install libgl1 libopengl0 || { cat "$log" >&2; stop "$reason"; }
+    "$venv/bin/python" -c 'import pymeshlab' 2>"$log" || stop "pymeshlab still does not load ($(tail -n 1 "$log"))"
+fi

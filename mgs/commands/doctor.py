@@ -10,7 +10,7 @@ import typer
 
 from mgs.errors import InputError
 
-_PACKAGES = ("mgs", "mitsuba", "drjit", "numpy", "pyoidn")
+_PACKAGES = ("mgs", "mitsuba", "drjit", "numpy", "pyoidn", "pymeshlab")
 
 
 def doctor() -> None:
@@ -47,6 +47,12 @@ def _software() -> list[tuple[str, str, str]]:
             absent = "absent: images are rendered with more samples instead of being denoised"
             problem = f"the package {package} is missing; install mgs again (`make setup`, or `pip install .`)"
             rows.append((package, absent if optional else "missing", "" if optional else problem))
+    try:  # its wheel wants libGL of the system, though nothing is drawn with it
+        import pymeshlab  # noqa: F401
+    except ModuleNotFoundError:
+        pass  # told above
+    except ImportError as error:
+        rows.append(("pymeshlab", "does not load", f"pymeshlab: {error}; install libGL (`apt-get install libgl1 libopengl0`)"))
     return rows
 
 
