@@ -9,7 +9,7 @@ from mgs.noise import Noise, tile
 from mgs.rock import make_rock
 from mgs.scene_file import Arena, Lobe, Rock
 
-REACH = 60.0
+REACH = 400.0
 """Half the side of the terrain, metres: its edge is the horizon."""
 ROWS = 480
 """Vertices along one side of the terrain; about 3 cm apart near the rock, metres at the horizon."""
@@ -36,8 +36,10 @@ def make_ground(settings: Arena, rock: trimesh.Trimesh, rng: np.random.Generator
     far = np.hypot(x, y)
     foot = rock.vertices[np.abs(rock.vertices[:, 2]) < 0.1 * rock.extents[2]][:, :2]
     radius = np.linalg.norm(foot, axis=1).mean() if len(foot) else 0.5 * rock.extents[:2].mean()
-    swell = settings.undulation * noise.fractal(p, 2.5, 4, 0.45) * (1 + (far / 9) ** 1.5)
-    ripples = 0.006 * noise.fractal(p, 0.3, 2, 0.6)
+    # The grid widens with distance, so fine detail fades where it cannot be resolved and dunes take over.
+    swell = settings.undulation * noise.fractal(p, 2.5, 4, 0.45) * np.exp(-far / 12)
+    swell += (0.3 + 10 * settings.undulation) * noise.octave(p, 40) * np.clip(far / 50 - 0.2, 0, 1)
+    ripples = 0.006 * noise.fractal(p, 0.3, 2, 0.6) * (far < 7)
     apron = 0.05 * np.exp(-(((far - radius) / (0.35 * radius)) ** 2))
     vertices = np.stack([x, y, swell + ripples + apron], -1).reshape(-1, 3)
 
@@ -67,16 +69,16 @@ def make_stones(
     """Small stones scattered over the ground as one mesh, with the vertex attribute `color` (linear RGB); None for none."""
     if not settings.stones:
         return None
-    templates = [_stone(rng) for _ in range(8)]
+    fine, coarse = ([_stone(rng, detail) for _ in range(8)] for detail in (0.04, 0.08))
     keep_out = settings.clearance * np.linalg.norm(rock.vertices[rock.vertices[:, 2] > 0][:, :2], axis=1).max()
-    distance = 12 * rng.uniform(0, 1, 4 * settings.stones) ** 0.7
+    distance = settings.spread * rng.uniform(0, 1, 4 * settings.stones) ** 0.7
     azimuth = rng.uniform(0, 2 * np.pi, 4 * settings.stones)
     at = np.stack([distance * np.cos(azimuth), distance * np.sin(azimuth)], 1)[distance > keep_out][: settings.stones]
     # Fragmented rock: the number of stones above a size falls as a power of it.
     sizes = np.minimum(0.6 * settings.stone_size * rng.uniform(0, 1, len(at)) ** (-1 / 1.8), settings.largest_stone)
     vertices, faces, colours, offset = [], [], [], 0
     for position, height, size in zip(at, _height_at(ground, at), sizes, strict=True):
-        stone = templates[rng.integers(len(templates))]
+        stone = (fine if size > 0.15 else coarse)[rng.integers(8)]
         turn = rng.uniform(0, 2 * np.pi)
         c, s = np.cos(turn), np.sin(turn)
         turned = stone.vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
@@ -91,10 +93,10 @@ def make_stones(
     return mesh
 
 
-def _stone(rng: np.random.Generator) -> trimesh.Trimesh:
+def _stone(rng: np.random.Generator, detail: float) -> trimesh.Trimesh:
     """One stone of size 1, standing in the ground, without texture."""
     lobe = Lobe(radii=(1.0, rng.uniform(0.6, 0.9), rng.uniform(0.4, 0.7)))
-    stone = make_rock(Rock(size=1.0, lobes=(lobe,), detail=0.08, buried=0.25, cracks=0, relief=0.08), rng)
+    stone = make_rock(Rock(size=1.0, lobes=(lobe,), detail=detail, buried=0.25, cracks=0, relief=0.08), rng)
     return trimesh.Trimesh(stone.vertices, stone.faces)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mgs.conventions import Camera, look_at
 from mgs.scene_file import Orbit
@@ -47,3 +48,18 @@ def orbit_cameras(settings: Orbit, frames: int, target: np.ndarray, fov: float, 
     """The cameras of an orbit; `target` [3] is the point they look at, world metres."""
     K = intrinsics(fov, width, height)
     return [Camera(K, width, height, look_at(eye, target)) for eye in orbit_positions(settings, frames, target)]
+
+
+def perturb(cameras: list[Camera], position: float, rotation: float, rng: np.random.Generator) -> list[Camera]:
+    """What a reconstruction is told in place of the true poses: independent Gaussian errors of each camera.
+
+    position: standard deviation along each axis, metres. rotation: about each axis, degrees.
+    """
+    noisy = []
+    for camera in cameras:
+        pose = camera.camera_to_world
+        pose[:3, 3] += rng.normal(0, position, 3)
+        pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(rng.normal(0, np.radians(rotation), 3)).as_matrix()
+        world_to_camera = np.linalg.inv(pose).astype(np.float64)
+        noisy.append(Camera(camera.K, camera.width, camera.height, world_to_camera))
+    return noisy

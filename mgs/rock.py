@@ -117,7 +117,7 @@ def _relief(mesh: trimesh.Trimesh, settings: Rock, noise: Noise) -> np.ndarray:
     height -= settings.cracks * size * crack * np.clip(0.5 + noise.octave(p, 0.6 * size), 0, 1)
     if settings.layers:
         level = settings.layers * (p[:, 2] - p[:, 2].min()) / np.ptp(p[:, 2]) + 0.35 * noise.fractal(p, 0.8 * size, 3)
-        height += 0.012 * size * (np.abs(2 * (level % 1) - 1) > 0.45)
+        height += 0.009 * size * _smoothstep(0.3, 0.6, np.abs(2 * (level % 1) - 1))
     return height
 
 

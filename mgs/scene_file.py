@@ -63,6 +63,8 @@ class Arena(_Strict):
     stone_size: Positive = 0.05
     """Median diameter, metres; sizes follow a power law up to `largest_stone`."""
     largest_stone: Positive = 0.16
+    spread: Positive = 12.0
+    """Stones lie within this distance of the rock's axis, metres."""
     clearance: Positive = 1.15
     """Stones keep this far from the rock, as a multiple of its radius."""
 

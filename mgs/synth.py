@@ -6,7 +6,7 @@ import importlib.util
 import platform
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,11 @@ import trimesh
 from PIL import Image
 
 from mgs import __version__
-from mgs.conventions import Camera
+from mgs.conventions import Camera, opengl_from_opencv
 from mgs.dataset import FRAME_INTERVAL, Dataset, Frame, load_dataset, write_transforms
 from mgs.errors import InputError
 from mgs.files import atomic_path, new_folder, read_json, write_exr, write_json, write_png
-from mgs.orbit import orbit_cameras
+from mgs.orbit import orbit_cameras, perturb
 from mgs.rock import load_rock, make_rock
 from mgs.scene import Scene
 from mgs.scene_file import SceneFile
@@ -43,6 +43,14 @@ class Preset:
     spp: int
 
 
+@dataclass(frozen=True)
+class PoseNoise:
+    """Standard deviations of the poses that the reconstruction is told: metres and degrees, per axis."""
+
+    position: float = 0.0
+    rotation: float = 0.0
+
+
 PRESETS = {"quick": Preset(320, 240, 32, 12), "paper": Preset(640, 480, 100, 16)}
 
 
@@ -52,11 +60,13 @@ def synthesise(
     preset: Preset,
     seed: int = 0,
     mesh: str | Path | None = None,
+    pose_noise: PoseNoise | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     say: Callable[[str], None] = lambda message: None,
 ) -> Dataset:
     """Render the dataset `out`: images, depth, masks, rock.glb, config.json, contact_sheet.png, transforms.json (last).
 
+    With `pose_noise` transforms.json holds noisy poses, and true_poses.json the cameras that took the images.
     A folder that an interrupted run of the same settings left is completed; the result is the same as in one run.
     Raises InputError: output folder not empty or not writable, bad mesh, rock not wholly in every frame.
     """
@@ -68,6 +78,7 @@ def synthesise(
         "seed": seed,
         "mesh": None if mesh is None else Path(mesh).name,
         "denoise": denoise,
+        "pose_noise": None if pose_noise is None else asdict(pose_noise),
     }
     rock, scale = (make_rock(settings.rock, generator(seed, "rock")), 1.0) if mesh is None else load_rock(mesh, settings.rock)
     if mesh is not None:
@@ -106,6 +117,11 @@ def synthesise(
         "total_s": round(time.perf_counter() - started, 2),
     }
     write_json(out / "config.json", resolved | _record(scale, exposure, spp) | {"timings": timings})
+    if pose_noise is not None:
+        told = perturb(cameras, pose_noise.position, pose_noise.rotation, generator(seed, "pose noise"))
+        truth = {frame.name: opengl_from_opencv(frame.camera.world_to_camera).tolist() for frame in frames}
+        write_json(out / "true_poses.json", {"convention": "OpenGL camera-to-world, as transforms.json", "poses": truth})
+        frames = [replace(frame, camera=camera) for frame, camera in zip(frames, told, strict=True)]
     write_transforms(out, frames)
     return load_dataset(out)
 

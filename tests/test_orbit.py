@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mgs.orbit import intrinsics, orbit_cameras, orbit_positions
+from mgs.orbit import intrinsics, orbit_cameras, orbit_positions, perturb
 from mgs.scene_file import Orbit
 
 TARGET = np.array([0.3, -0.2, 0.6])
@@ -51,3 +51,13 @@ def test_hemisphere_is_even():
 def test_intrinsics_match_the_field_of_view():
     K = intrinsics(90, 640, 480)
     np.testing.assert_allclose(K, [[320, 0, 320], [0, 320, 240], [0, 0, 1]])
+
+
+def test_pose_noise_has_the_stated_size():
+    cameras = orbit_cameras(Orbit(), 400, TARGET, 44, 96, 72)
+    noisy = perturb(cameras, 0.02, 0.5, np.random.default_rng(0))
+    moved = np.array([b.position - a.position for a, b in zip(cameras, noisy, strict=True)])
+    assert moved.std(0) == pytest.approx([0.02] * 3, rel=0.15)
+    turns = [b.world_to_camera[:3, :3] @ a.world_to_camera[:3, :3].T for a, b in zip(cameras, noisy, strict=True)]
+    angles = np.degrees(np.arccos(np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1)))
+    assert np.sqrt((angles**2).mean() / 3) == pytest.approx(0.5, rel=0.1)

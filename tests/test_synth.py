@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from mgs.conventions import opencv_from_opengl
 from mgs.dataset import load_dataset
 from mgs.errors import InputError
-from mgs.scene_file import Arena, Rock, SceneFile
-from mgs.synth import Preset, synthesise
+from mgs.scene_file import Arena, Orbit, Rock, SceneFile
+from mgs.synth import PoseNoise, Preset, synthesise
 
 TINY = Preset(width=64, height=48, frames=5, spp=2)
 SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=20))
@@ -84,3 +87,19 @@ def test_output_folder_that_is_not_empty(dataset, tmp_path):
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(InputError, match="other settings"):
         synthesise(tmp_path, SCENE, TINY, seed=3)
+
+
+def test_pose_noise_changes_what_is_told_and_nothing_else(dataset, tmp_path):
+    noisy = synthesise(tmp_path / "noisy", SCENE, TINY, seed=3, pose_noise=PoseNoise(0.01, 0.1))
+    truth = json.loads((noisy.root / "true_poses.json").read_text())["poses"]
+    for a, b in zip(dataset.frames, noisy.frames, strict=True):
+        assert a.image_path.read_bytes() == b.image_path.read_bytes()
+        assert 0 < np.linalg.norm(a.camera.position - b.camera.position) < 0.06
+        np.testing.assert_allclose(opencv_from_opengl(truth[b.name]), a.camera.world_to_camera, atol=1e-12)
+
+
+def test_rock_that_does_not_fit_the_frame(tmp_path):
+    near = SCENE.model_copy(update={"orbit": Orbit(radius=1.5, altitude=1.5)})
+    with pytest.raises(InputError, match="not wholly in frame 0"):
+        synthesise(tmp_path / "near", near, TINY)
+    assert not (tmp_path / "near").exists()

@@ -17,6 +17,8 @@ def synth_orbit(
     spp: Annotated[int | None, typer.Option(min=1, help="Samples per pixel, in place of the preset's.")] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Number of frames, in place of the preset's.")] = None,
     size: Annotated[str | None, typer.Option(help="Image size WIDTHxHEIGHT, in place of the preset's.")] = None,
+    pose_noise: Annotated[float, typer.Option(min=0, help="Error of the poses in transforms.json, metres per axis.")] = 0.0,
+    rotation_noise: Annotated[float, typer.Option(min=0, help="The same for the rotations, degrees per axis.")] = 0.0,
     seed: Annotated[int, typer.Option(help="Root seed: the same seed gives the same dataset, bit for bit.")] = 0,
 ) -> None:
     """Render an RGB-D orbit around a rock with Mitsuba: photoreal images, z-depth, rock masks, exact poses.
@@ -32,17 +34,18 @@ def synth_orbit(
     from mgs.scene_file import load_scene_file
 
     runtime.start()
-    from mgs.synth import PRESETS, synthesise
+    from mgs.synth import PRESETS, PoseNoise, synthesise
 
     if preset not in PRESETS:
         raise InputError(f"preset {preset!r}: unknown; choose one of {', '.join(PRESETS)}")
     given = {"spp": spp, "frames": frames, **_parse_size(size)}
     chosen = replace(PRESETS[preset], **{key: value for key, value in given.items() if value is not None})
+    noise = PoseNoise(pose_noise, rotation_noise) if pose_noise or rotation_noise else None
     console = Console()
     with Progress(console=console) as bar:
         task = bar.add_task(f"{chosen.frames} frames, {chosen.width}x{chosen.height}", total=chosen.frames)
         dataset = synthesise(
-            out, load_scene_file(scene), chosen, seed, mesh,
+            out, load_scene_file(scene), chosen, seed, mesh, noise,
             progress=lambda done, total: bar.update(task, completed=done), say=console.print,
         )  # fmt: skip
     console.print(f"{out}: {len(dataset)} frames; look at {out / 'contact_sheet.png'}")

@@ -1,0 +1,178 @@
+"""Datasets on disk: round trips, bad input, and the check of their consistency."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mgs.check import check_dataset
+from mgs.conventions import Camera, look_at, opencv_from_opengl
+from mgs.dataset import Dataset, Frame, load_dataset, write_transforms
+from mgs.errors import InputError
+from mgs.files import write_exr, write_png
+from mgs.orbit import intrinsics
+
+W, H = 40, 30
+K = intrinsics(50, W, H)
+
+
+def _sphere(camera):
+    """z-depth [H,W] and mask of the unit sphere at the origin, by ray casting."""
+    origin = camera.position
+    rays = camera.unproject(np.ones((H, W))) - origin  # z-depth 1 along each
+    a, b, c = (rays**2).sum(-1), rays @ origin, origin @ origin - 1
+    root = b * b - a * c
+    mask = root > 0
+    return np.where(mask, (-b - np.sqrt(np.maximum(root, 0))) / a, 0).astype(np.float32), mask
+
+
+def _write(root, count=6, depth_scale=1.0):
+    frames = []
+    for i, azimuth in enumerate(np.linspace(0, 2 * np.pi, count, endpoint=False)):
+        camera = Camera(K, W, H, look_at([4 * np.cos(azimuth), 4 * np.sin(azimuth), 1.5], [0, 0, 0]))
+        frame = Frame(
+            f"kf_{i:04d}", camera, 0.5 * i, root / f"images/kf_{i:04d}.png", root / f"depth/kf_{i:04d}.exr",
+            root / f"masks/kf_{i:04d}.png",
+        )  # fmt: skip
+        depth, mask = _sphere(camera)
+        write_png(frame.image_path, np.random.default_rng(i).uniform(0, 1, (H, W, 3)).astype(np.float32))
+        write_exr(frame.depth_path, {"Z": depth * depth_scale})
+        write_png(frame.mask_path, mask)
+        frames.append(frame)
+    write_transforms(root, frames)
+    return Dataset(root, tuple(frames))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return _write(tmp_path / "data").root
+
+
+def _edit(folder, change):
+    data = json.loads((folder / "transforms.json").read_text())
+    change(data)
+    (folder / "transforms.json").write_text(json.dumps(data))
+
+
+def test_round_trip_keeps_cameras_and_pixels(folder):
+    first = load_dataset(folder)
+    write_transforms(folder, first.frames)
+    again = load_dataset(folder)
+    for a, b in zip(first.frames, again.frames, strict=True):
+        assert (a.name, a.timestamp) == (b.name, b.timestamp)
+        np.testing.assert_allclose(a.camera.world_to_camera, b.camera.world_to_camera, atol=1e-12)
+        np.testing.assert_array_equal(a.camera.K, b.camera.K)
+        np.testing.assert_array_equal(a.rgb(), b.rgb())
+        np.testing.assert_array_equal(a.depth(), _sphere(a.camera)[0])
+        np.testing.assert_array_equal(a.mask(), _sphere(a.camera)[1])
+        np.testing.assert_array_equal(a.masked_rgb()[~a.mask()], 0)
+
+
+def test_transforms_are_nerfstudios(folder):
+    """OpenGL camera-to-world: the camera looks along -z of the matrix, at the origin."""
+    data = json.loads((folder / "transforms.json").read_text())
+    assert {"fl_x", "fl_y", "cx", "cy", "w", "h"} <= set(data)
+    pose = np.array(data["frames"][1]["transform_matrix"])
+    np.testing.assert_allclose(-pose[:3, 2], -pose[:3, 3] / np.linalg.norm(pose[:3, 3]), atol=1e-9)
+    assert pose[2, 1] > 0  # its y is up
+    np.testing.assert_allclose(load_dataset(folder).frames[1].camera.world_to_camera, opencv_from_opengl(pose))
+
+
+def test_frames_come_in_order_of_time_and_may_have_their_own_intrinsics(folder):
+    def change(data):
+        data["frames"].reverse()
+        data["frames"][0]["fl_x"] = 99.0
+
+    _edit(folder, change)
+    frames = load_dataset(folder).frames
+    assert [frame.timestamp for frame in frames] == sorted(frame.timestamp for frame in frames)
+    assert frames[-1].camera.K[0, 0] == 99.0
+    assert frames[0].camera.K[0, 0] == K[0, 0]
+
+
+def _set_pose(value):
+    return lambda data: data["frames"][2].update(transform_matrix=value)
+
+
+SINGULAR = np.diag([1.0, 1.0, 0.0, 1.0]).tolist()
+NAN = np.full((4, 4), np.nan).tolist()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.pop("fl_x"), "intrinsics"),
+        (lambda d: d.update(w=0), "image size"),
+        (lambda d: d.update(fl_x=-1), "focal lengths"),
+        (lambda d: d.update(frames=[]), "lists no frames"),
+        (_set_pose(NAN), "frame 2 .* not a finite 4x4"),
+        (_set_pose(SINGULAR), "frame 2.*singular"),
+        (_set_pose([[1, 0], [0, 1]]), "frame 2 .* not a finite 4x4"),
+        (_set_pose("left"), "frame 2"),
+        (lambda d: d["frames"][1].pop("transform_matrix"), "frame 1 lacks"),
+        (lambda d: d["frames"][1].update(file_path="images/none.png"), "does not exist"),
+    ],
+)
+def test_bad_transforms(folder, change, message):
+    _edit(folder, change)
+    with pytest.raises(InputError, match=message) as error:
+        load_dataset(folder)
+    assert "\n" not in str(error.value)
+
+
+def test_bad_files(folder, tmp_path):
+    with pytest.raises(InputError, match="no such dataset folder"):
+        load_dataset(tmp_path / "nowhere")
+    frame = load_dataset(folder).frames[0]
+    data = frame.image_path.read_bytes()
+    frame.image_path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(InputError, match="not a readable image"):
+        frame.rgb()
+    exr = frame.depth_path.read_bytes()
+    frame.depth_path.write_bytes(exr[: len(exr) // 2])
+    with pytest.raises(InputError, match="EXR"):
+        frame.depth()
+    write_png(frame.mask_path, np.ones((H + 1, W), bool))
+    with pytest.raises(InputError, match=f"{W}x{H + 1}, but transforms.json says {W}x{H}"):
+        frame.mask()
+    with pytest.raises(InputError, match="no depth_file_path"):
+        replace(frame, depth_path=None).depth()
+    (folder / "transforms.json").write_text('{"frames": [')
+    with pytest.raises(InputError, match="not valid JSON"):
+        load_dataset(folder)
+
+
+def test_check_passes_a_sound_dataset(tmp_path):
+    check = check_dataset(_write(tmp_path, count=12))
+    assert check.problems == []
+    assert check.seen_through < 0.05
+    assert 2.5 < check.depth_range[0] < check.depth_range[1] < 4.5
+
+
+def test_check_finds_wrong_depth_units_and_wrong_axes(tmp_path):
+    """Depth 30 % too large, or OpenCV poses in an OpenGL file: neighbouring views contradict one another."""
+    dataset = _write(tmp_path / "far", count=12, depth_scale=1.3)
+    assert any("see through" in problem for problem in check_dataset(dataset).problems)
+    folder = _write(tmp_path / "axes", count=12).root
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+
+    def change(data):
+        for frame in data["frames"]:
+            frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ flip).tolist()
+
+    _edit(folder, change)
+    assert any("share no point" in problem for problem in check_dataset(load_dataset(folder)).problems)
+
+
+def test_check_lists_every_problem(folder):
+    frames = load_dataset(folder).frames
+    frames[0].image_path.write_bytes(b"")
+    write_png(frames[1].mask_path, np.zeros((H, W), bool))
+    write_exr(frames[2].depth_path, {"Z": np.zeros((H, W), np.float32)})
+    _edit(folder, lambda d: d["frames"][4].update(transform_matrix=d["frames"][3]["transform_matrix"]))
+    problems = "\n".join(check_dataset(load_dataset(folder)).problems)
+    for expected in ("not a readable image", "mask is empty", "most of the mask has no depth", "same pose as kf_0003"):
+        assert expected in problems
