@@ -6,7 +6,8 @@ Gaussian has
 - `fisher.colour|scale|rotation|opacity`: the sum of H over the parameters of that kind, in (pixel value / parameter)^2;
 - `information`: 1/2 sum_k log(1 + H_k / lam_k), nats: what the training images say about it, all kinds in one unit;
 - `uncertainty`: mean_k lam_k / (H_k + lam_k): the share of the prior's variance that is left, 1 = nothing known, 0 = all known;
-- `unobserved`: 1 where the images say less about its colour than the prior does (`mgs.policies.observed`).
+- `unobserved`: 1 where no training view sees its place on the surface, as in the coverage of a run: by the information about
+  its colour before training (`mgs.policies.observed`), because training hides some Gaussians behind others.
 
 A pixel of a map is the mean over the Gaussians it shows, with their blending weights: sum w v / sum w; 0 where it shows none.
 """
@@ -34,12 +35,16 @@ DECADES = 4
 """Range of the logarithmic colour scales, powers of ten below the largest value shown."""
 
 
-def gaussian_scalars(H: np.ndarray, lam: np.ndarray, groups: dict[str, slice]) -> dict[str, np.ndarray]:
-    """The scalars of the module's docstring, [N] each, from H [N,P], lam [P] and the columns of each kind of parameter."""
+def gaussian_scalars(H: np.ndarray, surface: np.ndarray, lam: np.ndarray, groups: dict[str, slice]) -> dict[str, np.ndarray]:
+    """The scalars of the module's docstring, [N] each.
+
+    H, surface: [N,P] information of the training set at the fitted model, and at the Gaussians before training
+    (`mgs.nbv.State`); lam: [P]; groups: columns of each kind of parameter.
+    """
     scalars = {f"fisher.{name}": H[:, columns].sum(axis=1, dtype=np.float64) for name, columns in groups.items()}
     scalars["information"] = 0.5 * np.log1p(H / lam).sum(axis=1)
     scalars["uncertainty"] = (lam / (H + lam)).mean(axis=1)
-    scalars["unobserved"] = (~policies.observed(H, lam)).astype(np.float64)
+    scalars["unobserved"] = (~policies.observed(surface, lam)).astype(np.float64)
     return scalars
 
 
@@ -189,7 +194,8 @@ def diagnose_run(
     settings, state = nbv.read_settings(run), nbv.read_checkpoint(run)
     assert state is not None
     columns = groups(gaussians.sh_degree)
-    scalars = gaussian_scalars(state.H, policies.regularisation(columns, settings.pixel_noise, settings.prior_std), columns)
+    lam = policies.regularisation(columns, settings.pixel_noise, settings.prior_std)
+    scalars = gaussian_scalars(state.H, state.surface, lam, columns)
     out = run / "diagnostics"
     write_information_ply(out / "information.ply", gaussians, scalars)
     written = [out / "information.ply"]

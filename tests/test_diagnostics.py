@@ -25,12 +25,14 @@ def test_scalars_follow_their_formulas():
     rng = np.random.default_rng(0)
     H, lam = rng.random((5, 11)) * 10, policies.regularisation(groups(0))
     H[2] = 0
-    scalars = diagnostics.gaussian_scalars(H, lam, groups(0))
+    surface = np.ones((5, 11))
+    surface[4] = 1e-5
+    scalars = diagnostics.gaussian_scalars(H, surface, lam, groups(0))
     np.testing.assert_allclose(scalars["fisher.scale"], H[:, 3] + H[:, 4] + H[:, 5])
     np.testing.assert_allclose(scalars["fisher.opacity"], H[:, 10])
     assert scalars["information"][2] == 0
     assert scalars["uncertainty"][2] == 1
-    assert scalars["unobserved"].tolist() == [0, 0, 1, 0, 0]
+    assert scalars["unobserved"].tolist() == [0, 0, 0, 0, 1]
     j = 3
     expected = sum(0.5 * np.log((H[j, k] + lam[k]) / lam[k]) for k in range(11))
     assert scalars["information"][j] == pytest.approx(expected)
