@@ -1,0 +1,198 @@
+"""Block lists: complete, ordered, and never able to change an image, however old they are."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mgs.splat import ListCache, as_drjit, fisher, reference, render
+from mgs.splat.blocks import BLOCK_X, BLOCK_Y, build, depth_order, inflate, outgrown
+from mgs.splat.project import camera_array, project
+from mgs.splat.render import MARGIN
+
+from .scenes import PARAMETERS, changed, make_camera, make_gaussians, place
+
+
+def projected(gaussians, camera):
+    splats = project(as_drjit(gaussians), camera_array(camera))
+    dr.eval(splats)
+    return splats
+
+
+def lists_of(gaussians, camera, margin=MARGIN):
+    splats = projected(gaussians, camera)
+    return build(splats, depth_order(splats.z), camera.width, camera.height, margin), splats
+
+
+def pairs_of(lists) -> set[tuple[int, int]]:
+    """{(splat, block)}."""
+    splat, block, start, end = (np.asarray(a) for a in (lists.splat, lists.block, lists.start, lists.end))
+    return {(int(j), int(b)) for b, s, e in zip(block, start, end, strict=True) for j in splat[s:e]}
+
+
+def needed_pairs(gaussians, camera) -> set[tuple[int, int]]:
+    """The pairs with a pixel where the splat is above the threshold of alpha, by the oracle, whatever is in front of it."""
+    needed = set()
+    across = -(-camera.width // BLOCK_X)
+    for j in range(len(gaussians)):
+        one = type(gaussians)(*(getattr(gaussians, name)[j : j + 1] for name in vars(gaussians)))
+        y, x = np.nonzero(reference.render(one, camera)["alpha"] > 0)
+        needed |= {(j, int(b)) for b in (y // BLOCK_Y) * across + x // BLOCK_X}
+    return needed
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_lists_hold_every_pair_and_little_more(seed):
+    camera, g = make_camera(), make_gaussians(60, seed, log_scales=(-6.0, -1.0))
+    needed, exact, wide = needed_pairs(g, camera), pairs_of(lists_of(g, camera, 0)[0]), pairs_of(lists_of(g, camera)[0])
+    assert needed <= exact <= wide
+    assert len(exact) < 1.25 * len(needed), "ellipse and block touch, but no pixel centre: rare"
+    assert len(wide) < 2 * len(exact)
+
+
+def test_lists_are_in_depth_order_and_slots_of_a_splat_contiguous():
+    camera, g = make_camera(), make_gaussians(60, 9)
+    lists, splats = lists_of(g, camera)
+    splat, slot, start, end = (np.asarray(a) for a in (lists.splat, lists.slot, lists.start, lists.end))
+    z, used = np.asarray(splats.z), int((end - start).sum())
+    for s, e in zip(start, end, strict=True):
+        assert (np.diff(z[splat[s:e]]) >= 0).all()
+    assert sorted(slot[:used]) == list(range(used))
+    first, last = np.asarray(lists.slot_start), np.asarray(lists.slot_end)
+    for j in range(len(g)):
+        assert sorted(slot[:used][splat[:used] == j]) == list(range(first[j], last[j]))
+    assert (np.diff((end - start).astype(int)) <= 0).all(), "longest list first"
+
+
+def test_depth_order_is_a_stable_sort():
+    rng = np.random.default_rng(0)
+    depth = rng.choice(rng.uniform(0.01, 50, 300), 1000).astype(np.float32)
+    np.testing.assert_array_equal(np.asarray(depth_order(mi.Float(depth))), np.argsort(depth, kind="stable"))
+
+
+def test_not_outgrown_means_inside():
+    """Sound on random pairs of ellipses: where the test says still inside, every point of the new rim is in the old one."""
+    camera = make_camera()
+    n = 2000
+    base = make_gaussians(n, 1, spread=0.3)
+    rng = np.random.default_rng(2)
+    size = rng.choice([0.03, 0.1, 0.3], n).astype(np.float32)
+    moved = changed(
+        base,
+        log_scales=base.log_scales + size[:, None] * rng.normal(size=(n, 3)),
+        quats=base.quats + size[:, None] * rng.normal(size=(n, 4)),
+        logit_opacities=base.logit_opacities + size * rng.normal(size=n),
+    )
+    old, new = inflate(projected(base, camera), MARGIN), projected(moved, camera)
+    stale = np.asarray(outgrown(old, new))
+    drawn = np.asarray(inflate(new, 0).q) > 0
+    assert 0.2 < stale[drawn].mean() < 0.8
+    k, p, e, q = (np.asarray(a, np.float64)[None] for a in (new.k, new.p, new.e, new.log2_opacity))
+    angle = np.linspace(0, 2 * np.pi, 64)[:, None]
+    rim = np.sqrt(np.maximum(q + np.log2(255), 0))
+    y = rim * np.sin(angle) / e
+    x = rim * np.cos(angle) / p + k * y
+    k, p, e, q = (np.asarray(a, np.float64)[None] for a in (old.k, old.p, old.e, old.q))
+    inside = ((p * (x - k * y)) ** 2 + (e * y) ** 2 <= q).all(0)
+    assert inside[drawn & ~stale].all()
+    assert (inside & stale & drawn).mean() < 0.25, "rebuilds for nothing"
+
+
+def images(gaussians, camera, cache=None) -> list[np.ndarray]:
+    image = render(gaussians, camera, (0.2, 0.4, 0.6), cache)
+    return [np.asarray(image.rgb), np.asarray(image.alpha), np.asarray(image.depth)]
+
+
+@settings(derandomize=True, deadline=None, max_examples=12)
+@given(
+    seed=st.integers(0, 2**31),
+    drift=st.sampled_from([1e-3, 1e-2, 0.1, 1.0]),
+    names=st.sets(st.sampled_from(PARAMETERS), min_size=1),
+    teleport=st.booleans(),
+)
+def test_stale_lists_never_change_an_image(seed, drift, names, teleport):
+    """Parameters drift, jump behind the camera and back; the cached render is bitwise the cold one, gradients' sums too."""
+    camera, g = make_camera(), make_gaussians(60, seed, log_scales=(-5.0, -1.5))
+    rng, cache = np.random.default_rng(seed), ListCache()
+    behind = place(camera, rng.uniform(0, 30, (60, 2)), np.full(60, -1.5))
+    for step in range(6):
+        for a, b in zip(images(g, camera, cache), images(g, camera), strict=True):
+            np.testing.assert_array_equal(a, b)
+        if step in (2, 4):
+            np.testing.assert_array_equal(fisher(g, camera, cache=cache), fisher(g, camera))
+        values = {name: getattr(g, name) + drift * rng.normal(size=getattr(g, name).shape) for name in names}
+        if teleport:
+            jump = rng.random(60) < 0.3
+            values["means"] = np.where(jump[:, None], behind if step % 2 else rng.uniform(-0.6, 0.6, (60, 3)), g.means)
+        g = changed(g, **values)
+
+
+def test_lists_are_reused_until_a_footprint_outgrows_them():
+    """The first lists are exact; a scene that grows gets lists with a margin, and they serve while it stays inside."""
+    camera, g, cache = make_camera(), make_gaussians(60, 3), ListCache()
+
+    def see(growth, faint=0.0):
+        values = {"log_scales": g.log_scales + growth, "logit_opacities": g.logit_opacities - faint, "sh": g.sh + growth}
+        render(changed(g, **values), camera, cache=cache)
+        return cache.builds
+
+    assert [see(0), see(0), see(-0.5), see(-2, faint=3)] == [1] * 4
+    assert see(0.05) == 2
+    assert [see(0.05 + 0.02 * i) for i in range(5)] == [2] * 5
+    assert [see(-1), see(0.1)] == [2, 2]
+    assert see(0.4) == 3
+    fisher(changed(g, log_scales=g.log_scales + 0.4), camera, cache=cache)
+    assert cache.builds == 3
+
+
+def test_each_camera_has_its_own_lists():
+    g, cache = make_gaussians(60, 3), ListCache()
+    cameras = [
+        make_camera(),
+        make_camera(eye=(1, 1, 1)),
+        make_camera(focal=40.0),
+        make_camera((24, 16)),
+        make_camera(centre=(9, 9)),
+    ]
+    for _ in range(2):
+        for camera in cameras:
+            for a, b in zip(images(g, camera, cache), images(g, camera), strict=True):
+                np.testing.assert_array_equal(a, b)
+    assert cache.builds == len(cameras)
+
+
+def test_another_number_of_gaussians_is_another_scene():
+    camera, cache = make_camera(), ListCache()
+    for n in (60, 16, 60):
+        g = make_gaussians(n, 4)
+        for a, b in zip(images(g, camera, cache), images(g, camera), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_cache_keeps_to_its_budget_and_drops_the_oldest():
+    g, cameras = make_gaussians(60, 3), [make_camera(eye=(2.0, 0.1 * i, 1.0)) for i in range(6)]
+    unlimited = ListCache()
+    for camera in cameras:
+        render(g, camera, cache=unlimited)
+    each = unlimited.nbytes // 6
+    assert each > 4 * 9 * 60
+    cache = ListCache(budget=int(3.5 * each))
+    for camera in cameras:
+        render(g, camera, cache=cache)
+        assert cache.nbytes <= cache.budget
+    assert cache.builds == 6
+    for camera in cameras[3:]:
+        render(g, camera, cache=cache)
+    assert cache.builds == 6, "the last three are held"
+    render(g, cameras[0], cache=cache)
+    assert cache.builds == 7, "the first was dropped"
+
+
+def test_one_view_larger_than_the_budget_still_renders():
+    g, camera, cache = make_gaussians(60, 3), make_camera(), ListCache(budget=1)
+    for a, b in zip(images(g, camera, cache), images(g, camera), strict=True):
+        np.testing.assert_array_equal(a, b)
+    images(g, make_camera(focal=40.0), cache)
+    assert cache.builds == 2

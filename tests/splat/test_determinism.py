@@ -1,0 +1,82 @@
+"""The same input gives bitwise the same image, gradient and Fisher information: reruns, 1 or 2 threads, a new process."""
+
+import hashlib
+import json
+import subprocess
+import sys
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from mgs.splat import ListCache, as_drjit, fisher, render
+
+from .scenes import PARAMETERS, make_camera, make_gaussians
+
+BACKGROUND = (0.1, 0.2, 0.7)
+
+
+def results(threads: int | None = None, degree: int = 1) -> dict[str, bytes]:
+    """Bytes of every output: images, gradients of all parameters, Fisher information by every estimator."""
+    before = dr.thread_count()
+    if threads is not None:
+        dr.set_thread_count(threads)
+    try:
+        camera = make_camera((200, 150), focal=200.0)
+        gaussians = make_gaussians(1500, 11, degree, log_scales=(-6.0, -2.5))
+        watched = as_drjit(gaussians)
+        for name in PARAMETERS:
+            setattr(watched, name, dr.copy(getattr(watched, name)))
+            dr.enable_grad(getattr(watched, name))
+        image = render(watched, camera, BACKGROUND)
+        out = {name: np.asarray(dr.detach(getattr(image, name))) for name in ("rgb", "alpha", "depth")}
+        loss = dr.sum(dr.square(image.rgb - 0.3), axis=None) + dr.sum(image.alpha * image.depth, axis=None)
+        dr.backward(loss)
+        out |= {f"d {name}": np.asarray(dr.grad(getattr(watched, name))) for name in PARAMETERS}
+        cache = ListCache()
+        for estimator in ("exact", "block", "loss-gradient"):
+            out[estimator] = fisher(gaussians, camera, estimator, BACKGROUND, cache)
+        assert all(np.isfinite(a).all() and np.any(a) for a in out.values())
+        return {name: a.tobytes() for name, a in out.items()}
+    finally:
+        dr.set_thread_count(before)
+
+
+def differing(a: dict, b: dict) -> list[str]:
+    assert a.keys() == b.keys()
+    return [name for name in a if a[name] != b[name]]
+
+
+@pytest.fixture(scope="module")
+def first():
+    return results()
+
+
+def test_reruns_are_bitwise_equal(first):
+    assert differing(first, results()) == []
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_threads_change_nothing(first, threads):
+    assert differing(first, results(threads)) == []
+
+
+def test_hutchinson_draws_the_same_probes():
+    camera, gaussians = make_camera(), make_gaussians(16, 2)
+    a, b = (fisher(gaussians, camera, "hutchinson") for _ in range(2))
+    np.testing.assert_array_equal(a, b)
+
+
+def test_another_process_with_one_thread_agrees(first):
+    """A fresh process: no recorded kernels, another thread pool, another memory layout."""
+    code = (
+        "from mgs import runtime; runtime.start()\n"
+        "import json, hashlib\n"
+        "from splat.test_determinism import results\n"
+        "print(json.dumps({k: hashlib.sha256(v).hexdigest() for k, v in results(1).items()}))\n"
+    )
+    root = __file__.rsplit("/splat/", 1)[0]
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    other = json.loads(done.stdout.splitlines()[-1])
+    assert differing({k: hashlib.sha256(v).hexdigest() for k, v in first.items()}, other) == []
