@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 
 from mgs.noise import Noise, tile
-from mgs.rock import make_rock
+from mgs.rock import rock_shape
 from mgs.scene_file import Arena, Lobe, Rock
 
 REACH = 400.0
@@ -69,7 +69,8 @@ def make_stones(
     """Small stones scattered over the ground as one mesh, with the vertex attribute `color` (linear RGB); None for none."""
     if not settings.stones:
         return None
-    fine, coarse = ([_stone(rng, detail) for _ in range(8)] for detail in (0.04, 0.08))
+    noise = Noise(rng)
+    fine, coarse = ([_stone(noise, detail) for _ in range(8)] for detail in (0.04, 0.08))
     keep_out = settings.clearance * np.linalg.norm(rock.vertices[rock.vertices[:, 2] > 0][:, :2], axis=1).max()
     distance = settings.spread * rng.uniform(0, 1, 4 * settings.stones) ** 0.7
     azimuth = rng.uniform(0, 2 * np.pi, 4 * settings.stones)
@@ -93,11 +94,10 @@ def make_stones(
     return mesh
 
 
-def _stone(rng: np.random.Generator, detail: float) -> trimesh.Trimesh:
+def _stone(noise: Noise, detail: float) -> trimesh.Trimesh:
     """One stone of size 1, standing in the ground, without texture."""
-    lobe = Lobe(radii=(1.0, rng.uniform(0.6, 0.9), rng.uniform(0.4, 0.7)))
-    stone = make_rock(Rock(size=1.0, lobes=(lobe,), detail=detail, buried=0.25, cracks=0, relief=0.08), rng)
-    return trimesh.Trimesh(stone.vertices, stone.faces)
+    lobe = Lobe(radii=(1.0, noise.rng.uniform(0.6, 0.9), noise.rng.uniform(0.4, 0.7)))
+    return rock_shape(Rock(size=1.0, lobes=(lobe,), detail=detail, buried=0.25, cracks=0, relief=0.08), noise)[0]
 
 
 def _height_at(ground: trimesh.Trimesh, at: np.ndarray) -> np.ndarray:

@@ -25,10 +25,16 @@ def make_rock(settings: Rock, rng: np.random.Generator) -> trimesh.Trimesh:
     Returns a mesh in world coordinates (metres, +Z up), partly below z = 0, with UVs and an sRGB base-colour texture.
     """
     noise = Noise(rng)
-    mesh = _body(settings, noise, rng).subdivide()
+    mesh, height = rock_shape(settings, noise)
+    return _bake(mesh, height, settings, noise)
+
+
+def rock_shape(settings: Rock, noise: Noise) -> tuple[trimesh.Trimesh, np.ndarray]:
+    """The rock's geometry alone, standing on the ground, and the displacement [V], metres, that shaped each vertex."""
+    mesh = _body(settings, noise).subdivide()
     height = _relief(mesh, settings, noise)
     mesh.vertices += height[:, None] * mesh.vertex_normals
-    return _bake(_stand(mesh, settings), height, settings, noise)
+    return _stand(mesh, settings), height
 
 
 def load_rock(path: str | Path, settings: Rock) -> tuple[trimesh.Trimesh, float]:
@@ -66,7 +72,7 @@ def _stand(mesh: trimesh.Trimesh, settings: Rock) -> trimesh.Trimesh:
     return mesh
 
 
-def _body(settings: Rock, noise: Noise, rng: np.random.Generator) -> trimesh.Trimesh:
+def _body(settings: Rock, noise: Noise) -> trimesh.Trimesh:
     """Smooth union of ellipsoids, each cut by random planes; size 1, centred."""
     low = np.min([np.subtract(lobe.centre, lobe.radii) for lobe in settings.lobes], axis=0)
     high = np.max([np.add(lobe.centre, lobe.radii) for lobe in settings.lobes], axis=0)
@@ -80,14 +86,10 @@ def _body(settings: Rock, noise: Noise, rng: np.random.Generator) -> trimesh.Tri
     for lobe in settings.lobes:
         local = (points - np.asarray(lobe.centre, np.float32)) / np.asarray(lobe.radii, np.float32)
         inside = np.linalg.norm(local, axis=-1) - 1
-        for normal in rng.standard_normal((settings.facets, 3)):
-            cut = local @ (normal / np.linalg.norm(normal)).astype(np.float32) - rng.uniform(0.62, 0.92)
+        for normal in noise.rng.standard_normal((settings.facets, 3)):
+            cut = local @ (normal / np.linalg.norm(normal)).astype(np.float32) - noise.rng.uniform(0.62, 0.92)
             inside = _smooth_max(inside, cut, 0.05)
-        distance = (
-            -_smooth_max(-distance, -inside * min(lobe.radii), 0.12)
-            if np.isfinite(distance).all()
-            else inside * min(lobe.radii)
-        )
+        distance = -_smooth_max(-distance, -inside * min(lobe.radii), 0.12)
     vertices, faces, _, _ = marching_cubes(gaussian_filter(distance, 0.7), 0.0, spacing=(step,) * 3)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh = max(mesh.split(only_watertight=False), key=lambda part: len(part.faces))

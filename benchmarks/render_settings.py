@@ -1,0 +1,109 @@
+"""Which samples per pixel, with or without denoising? PSNR against a 1024-sample reference over seconds per frame.
+
+    python benchmarks/render_settings.py docs/benchmarks
+
+Two views of the default scene (sunlit and shaded), 640x480. Writes render_settings.json and render_settings.png; with
+--plot-only, draws the figure again from the JSON.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import time
+from pathlib import Path
+
+import numpy as np
+
+from mgs import runtime
+from mgs.files import read_json, write_json
+
+SPP = (2, 4, 8, 16, 32, 64)
+REFERENCE_SPP = 1024
+SIZE = (640, 480)
+VIEWS = (2, 17)
+"""Of a circle of 32: the first looks along the sun, the second against it."""
+
+
+def psnr(image: np.ndarray, reference: np.ndarray) -> float:
+    """Of display values in [0,1], dB."""
+    return float(-10 * np.log10(np.mean((image - reference) ** 2)))
+
+
+def measure() -> dict:
+    """Render every setting; times are medians over the views after one warm-up frame."""
+    runtime.start()
+    from mgs.conventions import srgb_from_linear
+    from mgs.rock import make_rock
+    from mgs.scene import Scene
+    from mgs.scene_file import load_scene_file
+    from mgs.seeds import generator
+    from mgs.synth import ROCK_EXPOSURE, Preset, rock_cameras
+
+    settings = load_scene_file("boulder")
+    rock = make_rock(settings.rock, generator(0, "rock"))
+    cameras = rock_cameras(settings, Preset(*SIZE, 32, 1), rock)
+    scene = Scene(settings, rock, cameras[0], 0)
+
+    def reference(index: int) -> tuple[np.ndarray, np.ndarray]:
+        parts = [scene.render(cameras[index], 64, 1000 + i, denoise=False) for i in range(REFERENCE_SPP // 64)]
+        return np.mean([part.rgb for part in parts], axis=0), parts[0].mask
+
+    truth = {index: reference(index) for index in VIEWS}
+    exposure = ROCK_EXPOSURE / np.mean([rgb[mask].mean() for rgb, mask in truth.values()])
+    rows = []
+    for denoise in (False, True):
+        for spp in SPP:
+            scene.render(cameras[0], spp, 0, denoise)
+            seconds, full, inside = [], [], []
+            for index, (rgb, mask) in truth.items():
+                begun = time.perf_counter()
+                image = srgb_from_linear(scene.render(cameras[index], spp, 7, denoise).rgb * exposure)
+                seconds.append(time.perf_counter() - begun)
+                expected = srgb_from_linear(rgb * exposure)
+                full.append(psnr(image, expected))
+                inside.append(psnr(image[mask], expected[mask]))
+            rows.append(
+                {
+                    "spp": spp,
+                    "denoise": denoise,
+                    "seconds": round(float(np.median(seconds)), 3),
+                    "psnr": round(float(np.mean(full)), 2),
+                    "psnr_rock": round(float(np.mean(inside)), 2),
+                }
+            )
+            print(rows[-1], flush=True)
+    machine = {"cores": os.cpu_count(), "processor": platform.machine()}
+    return {"reference_spp": REFERENCE_SPP, "size": SIZE, "machine": machine, "settings": rows}
+
+
+def plot(data: dict, path: Path) -> None:
+    """PSNR of the rock's pixels over seconds, one line with and one without denoising."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(6.4, 4), constrained_layout=True)
+    for denoise, label, colour in ((True, "denoised (albedo and normal guides)", "C0"), (False, "plain", "C1")):
+        rows = [row for row in data["settings"] if row["denoise"] == denoise]
+        x, y = [row["seconds"] for row in rows], [row["psnr_rock"] for row in rows]
+        axes.plot(x, y, "o-", color=colour, label=label)
+        for row, at in zip(rows, zip(x, y, strict=True), strict=True):
+            axes.annotate(str(row["spp"]), at, textcoords="offset points", xytext=(0, 7), ha="center", fontsize=8)
+    axes.set(xscale="log", xlabel="seconds per frame", ylabel=f"PSNR on the rock against {data['reference_spp']} spp (dB)")
+    axes.set_title(
+        f"boulder, {data['size'][0]}x{data['size'][1]}, {data['machine']['cores']} cores; numbers are spp", fontsize=10
+    )
+    axes.grid(alpha=0.3, which="both")
+    axes.legend()
+    figure.savefig(path, dpi=130)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--plot-only", action="store_true")
+    arguments = parser.parse_args()
+    json_path = arguments.out / "render_settings.json"
+    if not arguments.plot_only:
+        write_json(json_path, measure())
+    plot(read_json(json_path), arguments.out / "render_settings.png")
