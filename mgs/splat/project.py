@@ -46,7 +46,7 @@ class Splats:
 
 
 def camera_array(camera: Camera) -> Any:
-    """The camera as one Dr.Jit array of 23 floats, so that a change of camera never recompiles a kernel.
+    """The camera as one Dr.Jit array of 23 doubles, so that a change of camera never recompiles a kernel.
 
     Layout: rotation (9, row-major), translation (3), fx fy cx cy, the clamp range of x/z and y/z (4), camera position (3).
     """
@@ -60,13 +60,13 @@ def camera_array(camera: Camera) -> Any:
     ]
     pose = camera.world_to_camera
     numbers = [*pose[:3, :3].ravel(), *pose[:3, 3], fx, fy, cx, cy, *clamp, *camera.position]
-    return mi.Float(np.array(numbers, np.float32))
+    return mi.Float64(np.array(numbers, np.float64))
 
 
 def _unpack(array: Any) -> tuple[Any, Any, list[Any], list[Any], Any]:
-    c = [dr.gather(mi.Float, array, mi.UInt32(i)) for i in range(23)]
-    R = [mi.Vector3f(*c[3 * i : 3 * i + 3]) for i in range(3)]
-    return R, mi.Vector3f(*c[9:12]), c[12:16], c[16:20], mi.Point3f(*c[20:23])
+    c = [dr.gather(mi.Float64, array, mi.UInt32(i)) for i in range(23)]
+    R = [mi.Vector3d(*c[3 * i : 3 * i + 3]) for i in range(3)]
+    return R, mi.Vector3d(*c[9:12]), c[12:16], c[16:20], mi.Vector3d(*c[20:23])
 
 
 def quat_size(quats: Any) -> tuple[Any, Any]:
@@ -90,7 +90,7 @@ def rotation_columns(quats: Any) -> list[Any]:
 
 def sh_basis(means: Any, camera: Any, coefficients: int) -> list[Any]:
     """Spherical harmonics [K] of the directions from the camera to the means (Vector3f), Float [N] each."""
-    offset = means - _unpack(camera)[4]
+    offset = mi.Vector3f(mi.Vector3d(means) - _unpack(camera)[4])
     directions = offset * dr.rsqrt(dr.maximum(dr.squared_norm(offset), 1e-24))
     return dr.sh_eval(directions, round(coefficients**0.5) - 1)
 
@@ -101,16 +101,21 @@ def columns(tensor: Any, dtype: Any) -> Any:
 
 
 def axes2d(mean: Any, quats: Any, camera: Any) -> tuple[Any, list[Any], Any]:
-    """(camera-space mean Vector3f with z made safe, the axes R e_i of each Gaussian in pixels per metre, visible mask)."""
-    R, t, (fx, fy, _, _), (x0, x1, y0, y1), _ = _unpack(camera)
-    x, y, z = (dr.dot(row, mean) + t[i] for i, row in enumerate(R))
+    """((u, v) px and z m of each mean, z made safe; the axes R e_i of each Gaussian in pixels per metre; visible mask).
+
+    Centres are found in double: in single precision those of a 640x480 image would be off by 1e-4 px, and images by as much.
+    """
+    R, t, (fx, fy, cx, cy), (x0, x1, y0, y1), _ = _unpack(camera)
+    point = mi.Vector3d(mean)
+    x, y, z = (dr.dot(row, point) + t[i] for i, row in enumerate(R))
     visible = z > NEAR
     z = dr.select(visible, z, 1)
-    inv_z = dr.rcp(z)
-    tx, ty = dr.clip(x * inv_z, x0, x1), dr.clip(y * inv_z, y0, y1)
-    T0, T1 = (R[0] - tx * R[2]) * (fx * inv_z), (R[1] - ty * R[2]) * (fy * inv_z)
+    x, y, inv_z = x / z, y / z, mi.Float(dr.rcp(z))
+    R0, R1, R2 = (mi.Vector3f(row) for row in R)
+    tx, ty = mi.Float(dr.clip(x, x0, x1)), mi.Float(dr.clip(y, y0, y1))
+    T0, T1 = (R0 - tx * R2) * (mi.Float(fx) * inv_z), (R1 - ty * R2) * (mi.Float(fy) * inv_z)
     unit = [mi.Vector2f(dr.dot(T0, c), dr.dot(T1, c)) for c in rotation_columns(quats)]
-    return mi.Vector3f(x, y, z), unit, visible
+    return (mi.Float(fx * x + cx), mi.Float(fy * y + cy), mi.Float(z)), unit, visible
 
 
 def whitening(axes: list[Any]) -> tuple[Any, Any, Any]:
@@ -131,10 +136,9 @@ def project(gaussians: Gaussians, camera: Any) -> Splats:
 
     Source: EWA splatting (Zwicker et al. 2002) as in 3DGS.
     """
-    _, _, (fx, fy, cx, cy), _, _ = _unpack(camera)
     mean, quats = columns(gaussians.means, mi.Vector3f), columns(gaussians.quats, mi.Vector4f)
     log_scales, logit = columns(gaussians.log_scales, mi.Vector3f), gaussians.logit_opacities.array
-    point, unit, visible = axes2d(mean, quats, camera)
+    (u, v, z), unit, visible = axes2d(mean, quats, camera)
     scales = dr.exp(dr.clip(log_scales, *LOG_SCALE_RANGE))
     k, p, e = whitening([a * s for a, s in zip(unit, scales, strict=True)])
     log2_opacity = LOG2E * (dr.minimum(logit, 0) - dr.log(1 + dr.exp(-dr.abs(logit))))
@@ -146,6 +150,4 @@ def project(gaussians: Gaussians, camera: Any) -> Splats:
         finite &= dr.all(dr.isfinite(sh))
         colour += basis * sh
     colour = dr.maximum(colour, 0)
-    inv_z = dr.rcp(point.z)
-    u, v = fx * point.x * inv_z + cx, fy * point.y * inv_z + cy
-    return Splats(u, v, k, p, e, log2_opacity, point.z, colour.x, colour.y, colour.z, visible, finite)
+    return Splats(u, v, k, p, e, log2_opacity, z, colour.x, colour.y, colour.z, visible, finite)
