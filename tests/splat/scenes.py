@@ -77,7 +77,8 @@ def margins(gaussians: Gaussians, camera: Camera) -> np.ndarray:
         least = np.where(live & (a > 0), np.minimum(least, np.abs(after) / np.maximum(amplification, 1)), least)
         live &= (a == 0) | (after > 0)
         T = np.where(live, T * (1 - a), T)
-        if i and p.depths[j] - p.depths[order[i - 1]] < 1e-6 * p.depths[j]:
+        before = order[i - 1]
+        if i and 0 < p.depths[j] - p.depths[before] < 1e-6 * p.depths[j]:
             least = np.where((alpha[:, i] > 0) & (alpha[:, i - 1] > 0), 0.0, least)
     return least.reshape(camera.height, camera.width)
 

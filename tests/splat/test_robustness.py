@@ -1,0 +1,227 @@
+"""Extreme input: finite, right against the oracle, and finite gradients; what is not a number is an error that names it."""
+
+import re
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mgs.splat
+from mgs.errors import InputError
+from mgs.gaussians import Gaussians
+from mgs.splat import ESTIMATORS, ListCache, as_drjit, fisher, reference, render
+from mgs.splat.constants import NEAR
+
+from .scenes import PARAMETERS, SIZE, changed, compare, make_camera, make_gaussians, margins, place
+
+BACKGROUND = (0.2, 0.5, 0.7)
+CAMERA = make_camera()
+N = 16
+
+
+def scene(seed=0, **values) -> Gaussians:
+    return changed(make_gaussians(N, seed, log_scales=(-4.0, -1.5)), **values)
+
+
+def with_first(name: str, value, seed=0) -> Gaussians:
+    """A random scene whose first four Gaussians have one parameter replaced."""
+    values = getattr(scene(seed), name).copy()
+    values[:4] = value
+    return scene(seed, **{name: values})
+
+
+def behind_camera() -> Gaussians:
+    return with_first("means", place(CAMERA, [(5, 5), (20, 13), (30, 20), (44, 2)], [-1e-3, -0.5, -2, -100]))
+
+
+def around_near_plane() -> Gaussians:
+    """In front of it by a micrometre and behind it by as much; small enough that EWA means something there."""
+    means = place(CAMERA, [(5, 5), (20, 13), (30, 20), (44, 2)], [NEAR * 1.001, NEAR * 0.999, NEAR * 1.1, 0])
+    g = with_first("means", means)
+    g.log_scales[:4] = -8
+    return g
+
+
+def thin(ratio: float) -> Gaussians:
+    g = scene(1)
+    g.log_scales[:] = np.log(0.4) + np.array([0, -np.log(ratio), -np.log(ratio)], np.float32)
+    return g
+
+
+CASES = {
+    "behind the camera": behind_camera,
+    "near plane": around_near_plane,
+    "all behind": lambda: scene(means=scene().means + 100 * CAMERA.position.astype(np.float32)),
+    "none in the image": lambda: scene(means=scene().means + 3 * CAMERA.world_to_camera[0, :3]),
+    "on the camera": lambda: with_first("means", CAMERA.position),
+    "far away": lambda: with_first("means", place(CAMERA, [(22, 13)] * 4, [1e3, 1e4, 1e5, 1e6])),
+    "a light year aside": lambda: with_first("means", 1e16),
+    "scales of e^-30": lambda: scene(log_scales=np.full((N, 3), -30.0)),
+    "scales of e^30": lambda: with_first("log_scales", 30),
+    "scales of e^30 and e^-30": lambda: with_first("log_scales", (30, -30, -30)),
+    "scales of 3e38": lambda: with_first("log_scales", 3e38),
+    "1:1000": lambda: thin(1e3),
+    "1:1000000": lambda: thin(1e6),
+    "opaque": lambda: scene(logit_opacities=np.full(N, 20.0)),
+    "transparent": lambda: scene(logit_opacities=np.full(N, -20.0)),
+    "opacity of 1 and 0": lambda: scene(logit_opacities=np.where(np.arange(N) % 2, 200.0, -200.0)),
+    "zero quaternions": lambda: with_first("quats", 0),
+    "quaternions of norm 1e-30": lambda: scene(quats=scene().quats * 1e-30),
+    "quaternions of norm 1e-9": lambda: scene(quats=scene().quats * 1e-9),
+    "quaternions of norm 1e30": lambda: scene(quats=scene().quats * 1e30),
+    "black": lambda: scene(sh=np.full((N, 1, 3), -100.0)),
+    "all at one place": lambda: scene(means=np.zeros((N, 3))),
+}
+
+
+def gradients(gaussians, camera) -> dict[str, np.ndarray]:
+    watched = as_drjit(gaussians)
+    for name in PARAMETERS:
+        setattr(watched, name, dr.copy(getattr(watched, name)))
+        dr.enable_grad(getattr(watched, name))
+    image = render(watched, camera, BACKGROUND)
+    dr.backward(dr.sum(image.rgb, axis=None) + dr.sum(image.alpha, axis=None) + dr.sum(image.depth * image.alpha, axis=None))
+    return {name: np.asarray(dr.grad(getattr(watched, name))) for name in PARAMETERS}
+
+
+def assert_right(gaussians, camera) -> None:
+    """Image against the oracle where no decision is near (and few are), Fisher against the oracle, gradients finite."""
+    image = render(gaussians, camera, BACKGROUND)
+    with np.errstate(all="ignore"):
+        truth = reference.render(gaussians, camera, BACKGROUND)
+        decided = margins(gaussians, camera) > 1e-4
+    for name in ("rgb", "alpha"):
+        found = np.asarray(getattr(image, name))
+        assert np.isfinite(found).all(), name
+        assert np.abs(found - truth[name])[decided].max(initial=0) < 2e-5, name
+    assert decided.mean() > 0.99
+    depth = np.asarray(image.depth)
+    assert np.isfinite(depth).all()
+    error = np.abs(depth - truth["depth"]) * truth["alpha"] / max(1, truth["depth"].max())
+    assert error[decided].max(initial=0) < 2e-5
+    for name, gradient in gradients(gaussians, camera).items():
+        assert np.isfinite(gradient).all(), f"gradient of {name}"
+    with np.errstate(all="ignore"):
+        expected = reference.fisher(gaussians, camera, BACKGROUND)
+    found = fisher(gaussians, camera, "exact", BACKGROUND)
+    assert np.isfinite(found).all()
+    assert np.isfinite(fisher(gaussians, camera, "block", BACKGROUND)).all()
+    assert (found >= 0).all()
+    if np.any(expected) and decided.all():
+        for part in (slice(0, 3), slice(3, 6), slice(10, 11)):
+            big = expected[:, part] > 1e-6 * expected.max()
+            np.testing.assert_allclose(found[:, part][big], expected[:, part][big], rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_extreme_gaussians(name):
+    assert_right(CASES[name](), CAMERA)
+
+
+def test_splats_behind_the_camera_change_nothing():
+    g = behind_camera()
+    rest = Gaussians(*(getattr(g, name)[4:] for name in vars(g)))
+    np.testing.assert_array_equal(np.asarray(render(g, CAMERA).rgb), np.asarray(render(rest, CAMERA).rgb))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 30), (30, 1), (7, 3), (8, 4), (9, 5), (16, 8), (33, 17)])
+def test_any_image_size(size):
+    camera = make_camera(size, focal=0.8 * max(size))
+    assert_right(scene(2), camera)
+    shape = size[::-1]
+    image = render(scene(2), camera)
+    assert (image.rgb.shape, image.alpha.shape, image.depth.shape) == ((*shape, 3), shape, shape)
+
+
+def test_one_gaussian():
+    assert_right(make_gaussians(1, 3, spread=0.1, log_scales=(-2, -1), logits=(1, 2)), CAMERA)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_no_gaussians_is_the_background(degree):
+    g = make_gaussians(0, 0, degree)
+    for cache in (None, ListCache()):
+        image = render(g, CAMERA, BACKGROUND, cache)
+        np.testing.assert_allclose(np.asarray(image.rgb), np.broadcast_to(BACKGROUND, (SIZE[1], SIZE[0], 3)), atol=1e-7)
+        assert not np.any(np.asarray(image.alpha))
+        assert not np.any(np.asarray(image.depth))
+    columns = 3 * (degree + 1) ** 2 + 8
+    for estimator in ESTIMATORS:
+        shape = (0, columns, columns) if estimator == "block" else (0, columns)
+        assert fisher(g, CAMERA, estimator).shape == shape
+
+
+def test_gradient_of_extreme_scenes_is_right_too():
+    """1:1000 and opacity logits of 20 at once: scales and colours against the oracle's Jacobian."""
+    g = thin(1e3)
+    g.logit_opacities[::2] = 20
+    least = margins(g, CAMERA)
+    weights = np.where((least > 1e-4)[..., None], np.random.default_rng(0).normal(size=(SIZE[1], SIZE[0], 3)), 0)
+    watched = as_drjit(g)
+    for name in PARAMETERS[1:]:
+        setattr(watched, name, dr.copy(getattr(watched, name)))
+        dr.enable_grad(getattr(watched, name))
+    dr.backward(dr.sum(render(watched, CAMERA, BACKGROUND).rgb * mi.TensorXf(weights.astype(np.float32)), axis=None))
+    J = reference.jacobian(g, CAMERA, BACKGROUND)
+    expected = np.tensordot(weights.reshape(-1, 3), J, axes=([0, 1], [0, 1]))
+    parts = {"sh": slice(0, 3), "log_scales": slice(3, 6), "quats": slice(6, 10), "logit_opacities": slice(10, 11)}
+    for name, part in parts.items():
+        assert compare(np.asarray(dr.grad(getattr(watched, name))), expected[:, part])[0] < 1e-4, name
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_not_a_number_names_the_parameter_and_the_first_gaussian(name, value):
+    g = scene()
+    getattr(g, name)[5] = value
+    getattr(g, name)[9] = value
+    cache = ListCache()
+    render(scene(), CAMERA, cache=cache)
+    pattern = f"{name} is NaN or infinite, first at Gaussian 5"
+    for call in (
+        lambda: render(g, CAMERA),
+        lambda: render(as_drjit(g), CAMERA),
+        lambda: render(g, CAMERA, cache=cache),
+        lambda: fisher(g, CAMERA),
+        lambda: fisher(g, CAMERA, "hutchinson"),
+    ):
+        with pytest.raises(InputError, match=pattern):
+            call()
+    assert "\n" not in pattern
+
+
+def test_a_bad_number_behind_the_camera_is_an_error_too():
+    g = behind_camera()
+    g.sh[0, 0, 1] = np.nan
+    with pytest.raises(InputError, match="sh is NaN or infinite, first at Gaussian 0"):
+        render(g, CAMERA)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("means", (N, 2)),
+        ("log_scales", (N, 2)),
+        ("quats", (N - 1, 4)),
+        ("logit_opacities", (N, 1)),
+        ("sh", (N, 3)),
+        ("sh", (N, 5, 3)),
+    ],
+)
+def test_shapes_that_do_not_fit_are_an_error(name, shape):
+    values = {**vars(scene()), name: np.zeros(shape, np.float32)}
+    for call in (render, fisher):
+        with pytest.raises(InputError, match=f"{name} has shape"):
+            call(Gaussians(**values), CAMERA)
+
+
+def test_no_variant_is_named_in_the_code():
+    """The same code runs on any variant: nothing in the kernels or the plugins names one, or its backend's module."""
+    folders = [Path(mgs.splat.__file__).parent, Path(mgs.splat.__file__).parents[2] / "plugins"]
+    files = [path for folder in folders for path in folder.rglob("*.py")]
+    assert len(files) >= 6
+    for path in files:
+        found = re.search(r"llvm_|cuda_|scalar_rgb|metal_|drjit\.(llvm|cuda)|set_variant", path.read_text())
+        assert found is None, f"{path} names {found.group()}"
