@@ -1,0 +1,139 @@
+"""The real stations together on a rock of a few pixels: dataset, prior, next best views, evaluation, diagnosis, report."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic
+
+from mgs import nbv, policies
+from mgs.cli import main
+from mgs.dataset import load_dataset
+from mgs.gaussians import read_ply
+
+OPTIONS = ["--gaussians", "300", "--seeds", "3", "--budget", "4", "--passes", "6", "--seed", "1"]
+PROGRAM = [sys.executable, "-c", "from mgs.cli import main; main()"]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    root = tmp_path_factory.mktemp("end") / "dataset"
+    synthetic.write_dataset(root, synthetic.orbit_cameras(10, 48, 36))
+    return root
+
+
+@pytest.fixture(scope="module")
+def run(dataset):
+    out = dataset.parent / "run"
+    command("nbv", dataset, "--out", out, *OPTIONS, "--evaluate-every", 2)
+    return out
+
+
+def command(*arguments) -> None:
+    """A command of the program, in this process; it must end well."""
+    with pytest.raises(SystemExit) as stop:
+        main([str(argument) for argument in arguments])
+    assert stop.value.code == 0
+
+
+def steps(out: Path) -> list[dict]:
+    return [json.loads(line) for line in (out / "steps.jsonl").read_text().splitlines()]
+
+
+def test_the_run_is_whole(dataset, run):
+    lines, metrics = steps(run), json.loads((run / "metrics.json").read_text())
+    frames = load_dataset(dataset).frames
+    assert [line["images"] for line in lines] == [3, 4, 5, 6, 7]
+    assert all(line["gain"] == line["information_gain"] > 0 for line in lines[1:])
+    assert ["psnr" in line for line in lines] == [True, False, True, False, True]
+    assert metrics["all"]["count"] == 10
+    assert metrics["held_out"]["count"] == 3
+    assert metrics["all"]["psnr"] == pytest.approx(lines[-1]["psnr"], abs=1e-4)
+    assert metrics["held_out"]["psnr_mask"] == pytest.approx(lines[-1]["held_out_psnr_mask"], abs=1e-4)
+    assert {line["name"] for line in lines[1:]} < {frame.name for frame in frames}
+    assert len(read_ply(run / "gaussians.ply")) == 300
+    config = json.loads((run / "config.json").read_text())
+    assert config["settings"]["train"]["passes"] == 6
+    assert Path(config["settings"]["prior"]) == (run / "prior").resolve()
+
+
+def test_learning_helps_and_so_do_more_images(dataset, run):
+    from mgs.prior import initial_gaussians, load_prior
+    from mgs.splat import ListCache
+    from mgs.stations import psnr_measure
+
+    loaded, lines = load_dataset(dataset), steps(run)
+    start, _ = initial_gaussians(load_prior(run / "prior"), [loaded.frames[i] for i in lines[0]["seeds"]])
+    untrained = psnr_measure(loaded, ListCache())(start, lines[0]["seeds"])["psnr"]
+    measured = [line["psnr"] for line in lines if "psnr" in line]
+    assert untrained < measured[0] < measured[1] < measured[2]
+
+
+def test_choice_is_the_best_of_the_real_information(dataset, run):
+    """Redo the last choice from the checkpoint of a run one view shorter, candidate by candidate."""
+    from mgs.splat import fisher, groups
+
+    shorter = dataset.parent / "shorter"
+    command("nbv", dataset, "--out", shorter, "--prior", run / "prior", *OPTIONS[2:4], "--budget", 3, *OPTIONS[6:])
+    state, frames = nbv.read_checkpoint(shorter), load_dataset(dataset).frames
+    lam = policies.regularisation(groups(0))
+    H = sum(fisher(state.gaussians, frames[i].camera).astype(np.float64) for i in state.taken)
+    left = [i for i in range(10) if i not in state.taken]
+    gains = [policies.d_optimal(fisher(state.gaussians, frames[i].camera), H, lam)[0] for i in left]
+    last = steps(run)[-1]
+    assert last["frame"] == left[int(np.argmax(gains))]
+    assert last["gain"] == pytest.approx(max(gains), rel=1e-5)
+
+
+@pytest.mark.parametrize(("blow", "code"), [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 130)])
+def test_interrupted_in_the_middle_of_a_step_then_resumed(dataset, run, tmp_path, blow, code):
+    """A real process, a real signal after the second step is committed; the same views, the same model, bit for bit."""
+    out = tmp_path / "run"
+    arguments = ["nbv", str(dataset), "--out", str(out), *OPTIONS, "--evaluate-every", "2"]
+    process = subprocess.Popen([*PROGRAM, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    while not (out / "steps.jsonl").exists() or len(steps(out)) < 2:
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.002)
+    os.kill(process.pid, blow)
+    error = process.communicate()[1]
+    assert process.returncode == code, error
+    assert "Traceback" not in error
+    before = steps(out)
+    assert len(before) < 5, "the run was over before the blow"
+    command("nbv", "--resume", out)
+    assert timeless(steps(out)) == timeless(steps(run))
+    assert (out / "gaussians.ply").read_bytes() == (run / "gaussians.ply").read_bytes()
+
+
+def timeless(lines: list[dict]) -> list[dict]:
+    return [{key: value for key, value in line.items() if key != "seconds"} for line in lines]
+
+
+def test_resuming_a_finished_run_shows_it_again(run, capsys):
+    before = (run / "checkpoint.npz").read_bytes()
+    command("nbv", "--resume", run)
+    assert (run / "checkpoint.npz").read_bytes() == before
+    assert "views never trained on" in capsys.readouterr().out
+
+
+def test_compare_policies_and_report(dataset, run, tmp_path):
+    from mgs.report import write_report
+
+    other = dataset.parent / "random"
+    command("nbv", dataset, "--out", other, "--prior", run / "prior", "--policy", "random", *OPTIONS[2:])
+    for folder in (run, other):
+        command("eval", folder)
+    command("diagnose", run, "--views", "kf_0001")
+    written = write_report(tmp_path / "report", [run, other])
+    assert {"orbit.png", "gain.png", "coverage.png", "comparison.png", "table.md"} <= {path.name for path in written}
+    assert all(path.stat().st_size > 0 for path in written)
+    assert len(list((run / "renders").iterdir())) == 10
+    assert (run / "diagnostics/kf_0001.exr").is_file()
