@@ -43,7 +43,7 @@ frozen = partial(dr.freeze, state_fn=_sizes, limit=64, warn_after=1 << 30)
 
 @dataclass
 class Packed:
-    """Splats interleaved for one gather each: (u, v, k, p), (e, log2_opacity, z, 0), (r, g, b, 0)."""
+    """Splats interleaved for one gather each: (u, v, k, p), (e, log2_opacity, z, u_rest), (r, g, b, v_rest)."""
 
     shape: Any
     rest: Any
@@ -52,11 +52,10 @@ class Packed:
 
 def pack(s: Splats) -> Packed:
     """Interleave detached splats."""
-    zero = dr.zeros(mi.Float, len(s.u))
     packed = Packed(
         dr.ravel(mi.Vector4f(s.u, s.v, s.k, s.p)),
-        dr.ravel(mi.Vector4f(s.e, s.log2_opacity, s.z, zero)),
-        dr.ravel(mi.Vector4f(s.r, s.g, s.b, zero)),
+        dr.ravel(mi.Vector4f(s.e, s.log2_opacity, s.z, s.u_rest)),
+        dr.ravel(mi.Vector4f(s.r, s.g, s.b, s.v_rest)),
     )
     dr.eval(packed)
     return packed
@@ -96,7 +95,7 @@ CENTRE = BLOCK_X // 2
 """Column from which a row's alphas are stepped outwards."""
 
 
-def _rows(lane: Lane, shape: Any, rest: Any) -> list[Row]:
+def _rows(lane: Lane, shape: Any, rest: Any, colour: Any) -> list[Row]:
     """alpha = 2^(log2_opacity - xi^2 - eta^2) on the lane's pixels.
 
     Along a row the exponent is quadratic, so alpha is stepped by multiplication: three exp2 a row, not eight. Starting from the
@@ -104,7 +103,7 @@ def _rows(lane: Lane, shape: Any, rest: Any) -> list[Row]:
     """
     u, v, k, p = shape
     e, log2_opacity = rest.x, rest.y
-    dx, dy = lane.x - u, lane.y - v
+    dx, dy = lane.x - u - rest.w, lane.y - v - colour.w
     bend = dr.exp2(-2 * p * p)
     rows = []
     for j in range(BLOCK_Y):
@@ -146,7 +145,7 @@ def _walk(
     def body(i: Any, T: list[Any], state: Any, alive: Any) -> Any:
         splat = dr.gather(mi.UInt32, lists.splat, i)
         shape, rest, colour = (dr.gather(mi.Vector4f, a, splat) for a in (packed.shape, packed.rest, packed.colour))
-        T, state = visit(i, _rows(lane, shape, rest), rest, colour, T, state)
+        T, state = visit(i, _rows(lane, shape, rest, colour), rest, colour, T, state)
         most = T[0]
         for t in T[1:]:
             most = dr.maximum(most, t)

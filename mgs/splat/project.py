@@ -29,6 +29,7 @@ class Splats:
     """Projected Gaussians, Dr.Jit Float [N] each: means2d (u, v) px; whitening k, p, e; log2_opacity; depth z m; rgb.
 
     visible: in front of the near plane; elsewhere the other fields are meaningless. finite: no parameter is NaN or infinite.
+    u_rest, v_rest: px, what rounding to float32 took from u and v (up to 3e-5 in a 640x480 image); not differentiated.
     """
 
     u: Any
@@ -43,6 +44,8 @@ class Splats:
     b: Any
     visible: Any = None
     finite: Any = None
+    u_rest: Any = None
+    v_rest: Any = None
 
 
 def camera_array(camera: Camera) -> Any:
@@ -101,7 +104,7 @@ def columns(tensor: Any, dtype: Any) -> Any:
 
 
 def axes2d(mean: Any, quats: Any, camera: Any) -> tuple[Any, list[Any], Any]:
-    """((u, v) px and z m of each mean, z made safe; the axes R e_i of each Gaussian in pixels per metre; visible mask).
+    """((u, v) px and z m of each mean in double, z made safe; the axes R e_i of each Gaussian in pixels per metre; visible mask).
 
     Centres are found in double: in single precision those of a 640x480 image would be off by 1e-4 px, and images by as much.
     """
@@ -115,7 +118,7 @@ def axes2d(mean: Any, quats: Any, camera: Any) -> tuple[Any, list[Any], Any]:
     tx, ty = mi.Float(dr.clip(x, x0, x1)), mi.Float(dr.clip(y, y0, y1))
     T0, T1 = (R0 - tx * R2) * (mi.Float(fx) * inv_z), (R1 - ty * R2) * (mi.Float(fy) * inv_z)
     unit = [mi.Vector2f(dr.dot(T0, c), dr.dot(T1, c)) for c in rotation_columns(quats)]
-    return (mi.Float(fx * x + cx), mi.Float(fy * y + cy), mi.Float(z)), unit, visible
+    return (fx * x + cx, fy * y + cy, z), unit, visible
 
 
 def whitening(axes: list[Any]) -> tuple[Any, Any, Any]:
@@ -138,7 +141,9 @@ def project(gaussians: Gaussians, camera: Any) -> Splats:
     """
     mean, quats = columns(gaussians.means, mi.Vector3f), columns(gaussians.quats, mi.Vector4f)
     log_scales, logit = columns(gaussians.log_scales, mi.Vector3f), gaussians.logit_opacities.array
-    (u, v, z), unit, visible = axes2d(mean, quats, camera)
+    (u64, v64, z), unit, visible = axes2d(mean, quats, camera)
+    u, v = mi.Float(u64), mi.Float(v64)
+    u_rest, v_rest = (mi.Float(dr.detach(whole - mi.Float64(rounded))) for whole, rounded in ((u64, u), (v64, v)))
     scales = dr.exp(dr.clip(log_scales, *LOG_SCALE_RANGE))
     k, p, e = whitening([a * s for a, s in zip(unit, scales, strict=True)])
     log2_opacity = LOG2E * (dr.minimum(logit, 0) - dr.log(1 + dr.exp(-dr.abs(logit))))
@@ -150,4 +155,5 @@ def project(gaussians: Gaussians, camera: Any) -> Splats:
         finite &= dr.all(dr.isfinite(sh))
         colour += basis * sh
     colour = dr.maximum(colour, 0)
-    return Splats(u, v, k, p, e, log2_opacity, z, colour.x, colour.y, colour.z, visible, finite)
+    z = mi.Float(z)
+    return Splats(u, v, k, p, e, log2_opacity, z, colour.x, colour.y, colour.z, visible, finite, u_rest, v_rest)
