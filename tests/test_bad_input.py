@@ -10,10 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import synthetic
 import tiny
 
 from mgs.cli import main
 from mgs.files import write_exr, write_png
+from mgs.gaussians import write_ply
 
 Change = Callable[[Path], object]
 
@@ -171,6 +173,13 @@ def test_survey_without_a_rock(capsys, dataset, tmp_path, command, case):
     assert named in refused(capsys, arguments, tmp_path / "out")
 
 
+@pytest.mark.parametrize("command", ["nbv", "prior"])
+def test_ground_without_a_rock(capsys, tmp_path, command):
+    synthetic.write_dataset(tmp_path / "plain", rocks=[])
+    arguments = [command, tmp_path / "plain", "--out", tmp_path / "out", *(["--budget", 1] if command == "nbv" else [])]
+    assert "no rock" in refused(capsys, arguments, tmp_path / "out")
+
+
 NBV: dict[str, tuple[list, str]] = {
     "unknown policy": (["--policy", "best"], "best"),
     "more seeds than frames": (["--seeds", 13], "13 seeds"),
@@ -180,6 +189,7 @@ NBV: dict[str, tuple[list, str]] = {
     "negative seed": (["--seed", -1], "--seed"),
     "no pixel noise": (["--pixel-noise", 0], "--pixel-noise"),
     "NaN pixel noise": (["--pixel-noise", "nan"], "--pixel-noise"),
+    "no passes": (["--passes", 0], "--passes"),
     "negative evaluation interval": (["--evaluate-every", -2], "--evaluate-every"),
 }
 
@@ -306,7 +316,7 @@ RUNS: dict[str, tuple[Change, str]] = {
 }
 
 
-@pytest.mark.parametrize("command", [["nbv", "--resume"], ["eval"]])
+@pytest.mark.parametrize("command", [["nbv", "--resume"], ["eval"], ["diagnose"]])
 @pytest.mark.parametrize("case", RUNS)
 def test_broken_run(capsys, dataset, prior, tmp_path, command, case):
     change, named = RUNS[case]
@@ -315,8 +325,37 @@ def test_broken_run(capsys, dataset, prior, tmp_path, command, case):
     assert named in refused(capsys, [*command, run], run)
 
 
-@pytest.mark.parametrize("command", [["nbv", "--resume"], ["eval"]])
+@pytest.mark.parametrize("command", [["nbv", "--resume"], ["eval"], ["diagnose"]])
 def test_run_whose_dataset_is_gone(capsys, dataset, prior, tmp_path, command):
     run = tiny.write_run(tmp_path / "run", dataset, prior)
     shutil.rmtree(dataset)
     assert "no such dataset" in refused(capsys, [*command, run], run)
+
+
+@pytest.mark.parametrize("views", ["kf_9999", "kf_0000,nothing"])
+def test_diagnose_of_views_that_are_not_there(capsys, dataset, prior, tmp_path, views):
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    refused(capsys, ["diagnose", run, "--views", views], run)
+
+
+def test_demo_keeps_out_of_a_folder_of_something_else(capsys, tmp_path):
+    assert "not empty" in refused(capsys, ["demo", occupied(tmp_path / "out")], tmp_path / "out")
+
+
+SPLATS: dict[str, tuple[Change, str]] = {
+    "missing": (lambda path: path.unlink(), "no such file"),
+    "truncated": (lambda path: path.write_bytes(path.read_bytes()[:-100]), "not a readable"),
+    "not a PLY": (lambda path: path.write_text("no splats"), "not a readable"),
+    "no opacity": (lambda path: path.write_bytes(path.read_bytes().replace(b"opacity", b"opaaaaa")), "opacity"),
+    "NaN": (lambda path: path.write_bytes(path.read_bytes()[:-4] + np.float32(np.nan).tobytes()), "quats"),
+}
+
+
+@pytest.mark.parametrize("case", SPLATS)
+def test_broken_splats(capsys, dataset, tmp_path, case):
+    change, named = SPLATS[case]
+    path = tmp_path / "splats.ply"
+    write_ply(path, tiny.initial([]))
+    change(path)
+    arguments = ["render", path, "--cameras", dataset, "--out", tmp_path / "out"]
+    assert named in refused(capsys, arguments, tmp_path / "out")
