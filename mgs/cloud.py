@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from plyfile import PlyData, PlyElement
 from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
 from mgs.dataset import Frame
 from mgs.errors import InputError
+from mgs.files import atomic_path
 from mgs.sensor import depth_noise, filter_depth
 
 MAX_PIXELS = 6_000_000
@@ -83,9 +86,9 @@ def focus(frames: Sequence[Frame]) -> Focus:
     return Focus(point, float(np.median([np.linalg.norm(frame.camera.position - point) for frame in frames])))
 
 
-def usable_depth(depth: np.ndarray) -> np.ndarray:
-    """Depth [H,W] with silhouettes and grazing pixels set to 0 (see EDGE_JUMP)."""
-    jump = maximum_filter(depth, 3) - minimum_filter(depth, 3)
+def usable_depth(depth: np.ndarray, size: int = 3) -> np.ndarray:
+    """Depth [H,W] with silhouettes and grazing pixels set to 0 (see EDGE_JUMP); size: edge of the neighbourhood, pixels."""
+    jump = maximum_filter(depth, size) - minimum_filter(depth, size)
     return np.where(jump <= EDGE_JUMP * depth, depth, 0.0)
 
 
@@ -237,3 +240,13 @@ def degrade(points: np.ndarray, noise: float, holes: float, rng: np.random.Gener
         centre = points[rng.choice(np.flatnonzero(kept))]
         kept &= np.linalg.norm(points - centre, axis=1) > radius
     return points + noise * rng.standard_normal(points.shape), kept
+
+
+def write_points(path: str | Path, points: np.ndarray, normals: np.ndarray) -> None:
+    """Write points and normals [N,3] as a binary PLY (x y z nx ny nz, float32), atomically."""
+    columns = np.concatenate([points, normals], 1).astype(np.float32)
+    vertices = np.empty(len(columns), dtype=[(name, "f4") for name in ("x", "y", "z", "nx", "ny", "nz")])
+    for k, name in enumerate(vertices.dtype.names or ()):
+        vertices[name] = columns[:, k]
+    with atomic_path(path) as temporary:
+        PlyData([PlyElement.describe(vertices, "vertex")]).write(str(temporary))

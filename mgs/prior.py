@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyParseError
 from scipy.spatial import cKDTree
 
-from mgs.cloud import FILTERED_SHARE, Cloud, Plane, degrade, focus, fuse_frames, ground_plane, rock_cluster
+from mgs.cloud import FILTERED_SHARE, Cloud, Plane, degrade, focus, fuse_frames, ground_plane, rock_cluster, write_points
 from mgs.dataset import Dataset, Frame
 from mgs.errors import InputError
 from mgs.files import atomic_path, new_folder, read_json, write_json
@@ -202,12 +202,7 @@ def save_prior(out: str | Path, prior: Prior, mesh: Mesh) -> Path:
     out = new_folder(out)
     with atomic_path(out / "mesh.ply") as temporary:
         trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(temporary)
-    columns = np.concatenate([prior.points, prior.normals], 1).astype(np.float32)
-    vertices = np.empty(len(columns), dtype=[(name, "f4") for name in ("x", "y", "z", "nx", "ny", "nz")])
-    for k, name in enumerate(vertices.dtype.names or ()):
-        vertices[name] = columns[:, k]
-    with atomic_path(out / "points.ply") as temporary:
-        PlyData([PlyElement.describe(vertices, "vertex")]).write(str(temporary))
+    write_points(out / "points.ply", prior.points, prior.normals)
     write_json(out / "prior.json", prior.numbers)
     return out
 

@@ -44,7 +44,8 @@ def noisy_depth(depth: np.ndarray, camera: Camera, rng: np.random.Generator, sca
     """What the sensor measures for a true z-depth [H,W], metres (0 = no return).
 
     scale multiplies every standard deviation and the quantisation step, and narrows the drop-out ramp towards 90 degrees;
-    0 returns the true depth. Order: lateral shift, axial noise, quantisation, drop-outs.
+    0 returns the true depth. Order: lateral shift, axial noise, quantisation, drop-outs. Silhouettes and
+    the rim of the image, which have no normal, count as grazing.
     """
     if scale <= 0:
         return depth.copy()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from mgs.commands.bench import bench
 from mgs.commands.dataset import dataset
 from mgs.commands.demo import demo
 from mgs.commands.diagnose import diagnose
@@ -12,16 +13,19 @@ from mgs.commands.evaluate import evaluate
 from mgs.commands.nbv import nbv
 from mgs.commands.prior import prior
 from mgs.commands.render import render
+from mgs.commands.survey import survey
 from mgs.commands.synth_orbit import synth_orbit
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "doctor": doctor,
     "synth-orbit": synth_orbit,
     "dataset": dataset,
+    "survey": survey,
     "prior": prior,
     "nbv": nbv,
     "eval": evaluate,
     "diagnose": diagnose,
     "render": render,
     "demo": demo,
+    "bench": bench,
 }

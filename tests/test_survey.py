@@ -1,0 +1,327 @@
+"""The survey: sensor statistics, odometry, registration, loop closure and pose graph, against known truth."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+sys.path.insert(0, str(Path(__file__).parent))
+import synthetic
+
+from mgs.cli import main
+from mgs.conventions import Camera, look_at
+from mgs.dataset import Dataset, load_dataset, write_transforms
+from mgs.files import write_exr
+from mgs.prior import PriorSettings, build_prior
+from mgs.sensor import (
+    AXIAL_FLOOR,
+    AXIAL_GROWTH,
+    AXIAL_START,
+    QUANTUM,
+    depth_noise,
+    filter_depth,
+    noisy_depth,
+    normals_from_depth,
+)
+from mgs.survey import (
+    Edge,
+    SurveySettings,
+    chain,
+    drifting_odometry,
+    fly,
+    loop_candidates,
+    optimise,
+    survey_numbers,
+    trajectory_error,
+    write_survey,
+)
+
+ROCKS = [
+    (np.array(centre), np.array(axes))
+    for centre, axes in [
+        ((0.1, -0.05, 0.2), (0.6, 0.4, 0.5)),
+        ((0.7, 0.5, 0.05), (0.2, 0.3, 0.25)),
+        ((-0.6, 0.6, 0.0), (0.3, 0.15, 0.3)),
+        ((-0.4, -0.8, 0.05), (0.15, 0.25, 0.2)),
+        ((1.0, -0.6, 0.0), (0.25, 0.15, 0.35)),
+    ]
+]
+"""An orbit round one smooth ellipsoid looks the same from everywhere; stones around it pin the registration down."""
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    cameras = synthetic.orbit_cameras(24, 128, 96)
+    return synthetic.write_dataset(tmp_path_factory.mktemp("orbit"), cameras, ROCKS)
+
+
+@pytest.fixture(scope="module")
+def survey(dataset: Dataset):
+    return fly(dataset, SurveySettings(sensor=0.2, drift=1.0))
+
+
+def _wall(z: float, tilt: float = 0.0) -> tuple[np.ndarray, Camera]:
+    """Depth of a wall through the optical axis at z metres, turned by `tilt` radians, and its camera."""
+    camera = Camera(np.array([[600.0, 0, 320], [0, 600.0, 240], [0, 0, 1]]), 640, 480, np.eye(4))
+    x = (np.arange(640) + 0.5 - 320) / 600
+    return np.broadcast_to(z / (1 - x * np.tan(tilt)), (480, 640)).copy(), camera
+
+
+@pytest.mark.parametrize("z", [1.0, 2.0, 4.0])
+def test_axial_noise_grows_as_published(z: float) -> None:
+    depth, camera = _wall(z)
+    measured = noisy_depth(depth, camera, np.random.default_rng(0))
+    error = (measured - depth)[measured > 0]
+    assert len(error) > 0.99 * (depth.size - 2 * (640 + 480))
+    expected = np.hypot(AXIAL_FLOOR + AXIAL_GROWTH * (z - AXIAL_START) ** 2, QUANTUM * z * z / np.sqrt(12))
+    assert error.std() == pytest.approx(expected, rel=0.15)
+    # A coarse step rounds z itself, so the mean may be off by a part of it, never by all.
+    assert abs(error.mean()) < 0.5 * QUANTUM * z * z
+
+
+def test_sensor_scale_and_missing_returns() -> None:
+    depth, camera = _wall(3.0)
+    depth[:100] = 0
+    rng = np.random.default_rng(0)
+    assert np.array_equal(noisy_depth(depth, camera, rng, 0.0), depth)
+    full, half = (noisy_depth(depth, camera, np.random.default_rng(0), s) for s in (1.0, 0.5))
+    assert not full[:100].any()
+    inner = np.s_[110:-10, 10:-10]
+    assert (half - depth)[inner].std() == pytest.approx(0.5 * (full - depth)[inner].std(), rel=0.2)
+
+
+def test_quantised_depth_is_on_its_steps() -> None:
+    depth, camera = _wall(2.0)
+    levels = np.unique(noisy_depth(depth, camera, np.random.default_rng(0)))
+    assert np.allclose(np.diff(levels[1:]), QUANTUM * 4, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("degrees", "least", "most"), [(30, 0, 0.01), (75, 0.3, 0.7), (84, 0.85, 1)])
+def test_grazing_returns_are_lost(degrees: float, least: float, most: float) -> None:
+    depth, camera = _wall(2.0, np.radians(degrees))
+    depth = np.where((depth > 0) & (depth < 5), depth, 0)
+    centre = np.s_[200:280, 300:340]
+    lost = (noisy_depth(depth, camera, np.random.default_rng(0)) == 0)[centre].mean()
+    assert least <= lost <= most
+
+
+def test_normals_from_depth_of_the_ground_and_the_rock() -> None:
+    camera = synthetic.orbit_cameras(1, 160, 120)[0]
+    depth, mask, points = synthetic.cast(camera, [(synthetic.CENTRE, synthetic.AXES)])
+    normals = normals_from_depth(depth, camera)
+    near = np.linalg.norm(points - synthetic.CENTRE, axis=-1) < 1.5
+    ground = ~mask & near & (normals[..., 2] > 0)
+    assert np.median(normals[ground][:, 2]) > 0.9999
+    analytic = (points - synthetic.CENTRE) / synthetic.AXES**2
+    analytic /= np.linalg.norm(analytic, axis=-1, keepdims=True)
+    agreement = np.einsum("hwk,hwk->hw", analytic, normals)[mask]
+    assert np.median(agreement) > 0.999
+
+
+def test_noise_is_measured_and_filtered_without_blurring_edges() -> None:
+    depth, _ = _wall(2.0)
+    depth[:, 320:] = 3.0
+    noisy = depth + 0.02 * np.random.default_rng(0).standard_normal(depth.shape)
+    assert depth_noise(noisy) == pytest.approx(0.02, rel=0.05)
+    assert depth_noise(depth) < 1e-6
+    smooth = filter_depth(noisy, 0.02)
+    assert (smooth - depth).std() < 0.3 * 0.02
+    assert np.abs(smooth - depth)[:, 318:322].max() < 0.06
+    assert filter_depth(depth, 0.0) is depth
+    noisy[100, 100] = 0
+    assert filter_depth(noisy, 0.02)[100, 100] == 0
+
+
+def _circle(count: int = 24, turns: float = 1.0) -> np.ndarray:
+    angles = 2 * np.pi * turns * np.arange(count) / count
+    eyes = np.stack([3 * np.cos(angles), 3 * np.sin(angles), np.full(count, 1.5)], 1)
+    return np.stack([np.linalg.inv(look_at(eye, [0, 0, 0])) for eye in eyes])
+
+
+def test_odometry_without_drift_is_exact_and_with_it_drifts() -> None:
+    truth = _circle()
+    exact = drifting_odometry(truth, 0.0, np.random.default_rng(0))
+    assert np.allclose(chain(truth[0], exact), truth, atol=1e-12)
+    drift = [
+        trajectory_error(chain(truth[0], drifting_odometry(truth, d, np.random.default_rng(0))), truth)["ate_rms"]
+        for d in (0.5, 1.0, 2.0)
+    ]
+    assert 0 < drift[0] < drift[1] < drift[2]
+
+
+def test_loops_are_where_the_flight_returns() -> None:
+    circle = _circle()
+    assert (0, 23) in loop_candidates(circle)
+    assert all(j - i >= 20 for i, j in loop_candidates(circle))
+    assert loop_candidates(_circle(24, 0.5)) == []
+    twice = loop_candidates(_circle(48, 2.0))
+    assert (3, 27) in twice
+    assert (0, 12) not in twice
+
+
+def test_trajectory_error_of_known_displacements() -> None:
+    truth = _circle()
+    moved = truth.copy()
+    moved[:, :3, 3] += [0.3, 0, 0.4]
+    error = trajectory_error(moved, truth)
+    assert error["ate_rms"] == pytest.approx(0.5)
+    assert error["ate_max"] == pytest.approx(0.5)
+    assert error["rotation_rms"] == pytest.approx(0, abs=1e-5)
+    assert error["aligned_rms"] == pytest.approx(0, abs=1e-9)
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("z", 10, degrees=True).as_matrix()
+    error = trajectory_error(turn @ truth, truth)
+    assert error["rotation_rms"] == pytest.approx(10)
+    assert error["aligned_rms"] == pytest.approx(0, abs=1e-9)
+    assert error["ate_rms"] == pytest.approx(2 * 3 * np.sin(np.radians(5)))
+
+
+def _graph(truth: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[Edge]]:
+    """Odometry, registered chain and edges whose yaw is biased by 0.2 degrees a step."""
+    steps = np.linalg.inv(truth[:-1]) @ truth[1:]
+    biased = steps.copy()
+    bias = [Rotation.from_rotvec(np.radians(0.2) * pose[2, :3]).as_matrix() for pose in truth[1:]]
+    biased[:, :3, :3] = steps[:, :3, :3] @ np.stack(bias)
+    return biased, chain(truth[0], biased), [Edge(k, k + 1, step, 1.0, 0.0) for k, step in enumerate(biased)]
+
+
+def test_a_loop_closure_spreads_the_error() -> None:
+    truth = _circle()
+    steps, registered, edges = _graph(truth)
+    loop = Edge(0, 23, np.linalg.inv(truth[0]) @ truth[23], 1.0, 0.0)
+    optimised = optimise(registered, steps, edges, [loop], 1.0, 0.03)
+    assert np.allclose(optimised[0], truth[0], atol=1e-9)
+    before, after = trajectory_error(registered, truth), trajectory_error(optimised, truth)
+    assert after["ate_rms"] < 0.5 * before["ate_rms"]
+    assert np.array_equal(optimise(registered, steps, edges, [], 1.0, 0.03), registered)
+
+
+def test_a_wrong_loop_is_outvoted() -> None:
+    truth = _circle()
+    steps, registered, edges = _graph(truth)
+    right = [Edge(i, 23 - j, np.linalg.inv(truth[i]) @ truth[23 - j], 1.0, 0.0) for i in range(2) for j in range(2)]
+    wrong_pose = np.linalg.inv(truth[2]) @ truth[23]
+    wrong_pose[:3, 3] += [0.5, 0, 0]
+    optimised = optimise(registered, steps, edges, [*right, Edge(2, 23, wrong_pose, 1.0, 0.0)], 1.0, 0.03)
+    assert trajectory_error(optimised, truth)["ate_rms"] < trajectory_error(registered, truth)["ate_rms"]
+
+
+def test_registration_and_loop_closure_beat_odometry(dataset: Dataset, survey) -> None:
+    settings = SurveySettings(sensor=0.2, drift=1.0)
+    numbers = survey_numbers(dataset, survey, settings)
+    error = {name: value["ate_rms"] for name, value in numbers["error"].items()}
+    assert (0, 23) in [(loop.i, loop.j) for loop in survey.loops]
+    assert error["optimised"] < 0.25 * error["odometry"]
+    assert error["registered"] < 0.5 * error["odometry"]
+    assert error["optimised"] < 0.03
+    assert numbers["steps_by_odometry"] <= 3
+    json.dumps(numbers)
+
+
+def test_the_survey_repeats_by_seed(dataset: Dataset, survey) -> None:
+    again = fly(dataset, SurveySettings(sensor=0.2, drift=1.0))
+    assert np.array_equal(again.optimised, survey.optimised)
+    assert all(np.array_equal(a, b) for a, b in zip(again.depths, survey.depths, strict=True))
+    other = fly(dataset, SurveySettings(sensor=0.2, drift=1.0, seed=1))
+    assert not np.array_equal(other.depths[0], survey.depths[0])
+
+
+def test_a_featureless_orbit_falls_back_on_odometry(tmp_path: Path) -> None:
+    """From 45 degrees apart round a smooth ellipsoid registration slides; odometry must not be made worse by it."""
+    flat = synthetic.write_dataset(tmp_path)
+    survey = fly(flat, SurveySettings(sensor=0.0, drift=1.0))
+    odometry, optimised = (trajectory_error(poses, survey.truth)["ate_rms"] for poses in (survey.odometry, survey.optimised))
+    assert sum(not edge.registered for edge in survey.edges) > 0
+    assert optimised < 1.5 * odometry
+
+
+def test_exact_poses_keep_the_truth(dataset: Dataset) -> None:
+    survey = fly(dataset, SurveySettings(sensor=1.0, exact_poses=True))
+    assert np.array_equal(survey.optimised, survey.truth)
+    assert not survey.loops
+    assert not np.array_equal(survey.depths[0], dataset.frames[0].depth())
+
+
+def test_the_survey_is_a_dataset_and_gives_a_prior(dataset: Dataset, survey, tmp_path: Path) -> None:
+    result = write_survey(tmp_path, dataset, survey)
+    assert [frame.name for frame in result.frames] == [frame.name for frame in dataset.frames]
+    assert np.allclose(result.frames[5].camera.camera_to_world, survey.optimised[5], atol=1e-9)
+    assert np.allclose(result.frames[5].depth(), survey.depths[5], atol=1e-6)
+    assert np.array_equal(result.frames[5].rgb(), dataset.frames[5].rgb())
+    prior, _ = build_prior(result, PriorSettings(gaussians=1000))
+    exact, _ = build_prior(dataset, PriorSettings(gaussians=1000))
+    assert exact.numbers["truth"]["accuracy"] < prior.numbers["truth"]["accuracy"] < 0.04
+
+
+def test_command_writes_a_dataset_with_its_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = synthetic.write_dataset(tmp_path / "data", synthetic.orbit_cameras(12, 64, 48), ROCKS).root
+    with pytest.raises(SystemExit) as exit_:
+        main(["survey", str(root), "--sensor-noise", "0.2"])
+    assert exit_.value.code == 0
+    out = root / "survey"
+    assert {path.name for path in out.iterdir()} >= {"transforms.json", "cloud.ply", "survey.json", "survey.png", "depth"}
+    assert len(load_dataset(out)) == 12
+    assert "after loop closure" in capsys.readouterr().out
+
+
+def _two_frames(root: Path) -> None:
+    write_transforms(root, synthetic.write_dataset(root).frames[:2])
+
+
+def _no_depth(root: Path) -> None:
+    synthetic.write_dataset(root, depth=False)
+
+
+def _blind_frame(root: Path) -> None:
+    path = synthetic.write_dataset(root).frames[2].depth_path
+    assert path is not None
+    write_exr(path, {"Z": np.zeros((48, 64))})
+
+
+def _plain(root: Path) -> None:
+    synthetic.write_dataset(root)
+
+
+def _occupied(root: Path) -> None:
+    synthetic.write_dataset(root)
+    (root / "survey").mkdir()
+    (root / "survey/mine.txt").write_text("keep")
+
+
+@pytest.mark.parametrize(
+    ("make", "options", "message"),
+    [
+        (_two_frames, [], "too few for a survey"),
+        (_no_depth, [], "depth_file_path"),
+        (_blind_frame, [], "cannot be registered"),
+        (_plain, ["--sensor-noise", "-1"], "factors of 0 or more"),
+        (_plain, ["--drift", "nan"], "factors of 0 or more"),
+        (_occupied, [], "not empty"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    make, options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make(tmp_path / "data")
+    with pytest.raises(SystemExit) as exit_:
+        main(["survey", str(tmp_path / "data"), *options])
+    error = capsys.readouterr().err.strip()
+    assert exit_.value.code == 2
+    assert message in error
+    assert "\n" not in error
+    assert make is _occupied or not (tmp_path / "data/survey").exists()
+
+
+def test_duplicate_frames_are_no_trouble(tmp_path: Path) -> None:
+    """A hovering drone: the same pose twice."""
+    dataset = synthetic.write_dataset(tmp_path, synthetic.orbit_cameras(12, 96, 72), ROCKS)
+    twice = (*dataset.frames[:2], replace(dataset.frames[1], name="again", timestamp=0.7), *dataset.frames[2:])
+    survey = fly(Dataset(tmp_path, twice), SurveySettings(sensor=0.0))
+    assert np.isfinite(survey.optimised).all()
+    assert np.linalg.norm(survey.optimised[1, :3, 3] - survey.optimised[2, :3, 3]) < 0.02
