@@ -90,9 +90,8 @@ def plot(data: dict, path: Path) -> None:
         for row, at in zip(rows, zip(x, y, strict=True), strict=True):
             axes.annotate(str(row["spp"]), at, textcoords="offset points", xytext=(0, 7), ha="center", fontsize=8)
     axes.set(xscale="log", xlabel="seconds per frame", ylabel=f"PSNR on the rock against {data['reference_spp']} spp (dB)")
-    axes.set_title(
-        f"boulder, {data['size'][0]}x{data['size'][1]}, {data['machine']['cores']} cores; numbers are spp", fontsize=10
-    )
+    size, cores = "x".join(map(str, data["size"])), data["machine"]["cores"]
+    axes.set_title(f"boulder, {size}, {cores} cores; numbers are spp", fontsize=10)
     axes.grid(alpha=0.3, which="both")
     axes.legend()
     figure.savefig(path, dpi=130)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -13,6 +13,8 @@ from mgs.resources import scene_path
 
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
+OrbitKind = Literal["circle", "rings", "spiral", "hemisphere"]
+ORBITS: tuple[str, ...] = get_args(OrbitKind)
 Colour = tuple[Fraction, Fraction, Fraction]
 
 
@@ -90,7 +92,7 @@ class Lens(_Strict):
 class Orbit(_Strict):
     """Where the keyframes are taken from; every camera looks at the middle of the rock."""
 
-    kind: Literal["circle", "rings", "spiral", "hemisphere"] = "circle"
+    kind: OrbitKind = "circle"
     radius: Positive = 4.0
     """Horizontal distance from the rock's axis (circle), or distance from its middle (the others)."""
     altitude: Annotated[float, Field(ge=0)] = 2.3

@@ -9,9 +9,11 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from mgs.cli import main
 from mgs.conventions import opencv_from_opengl
 from mgs.dataset import load_dataset
 from mgs.errors import InputError
+from mgs.files import read_json
 from mgs.scene_file import Arena, Orbit, Rock, SceneFile
 from mgs.synth import PoseNoise, Preset, synthesise
 
@@ -96,3 +98,33 @@ def test_rock_that_does_not_fit_the_frame(tmp_path):
     with pytest.raises(InputError, match="not wholly in frame 0"):
         synthesise(tmp_path / "near", near, TINY)
     assert not (tmp_path / "near").exists()
+
+
+def test_without_the_denoiser_more_samples_and_a_note(tmp_path, monkeypatch):
+    monkeypatch.setattr("mgs.synth.importlib.util.find_spec", lambda name: None)
+    notes = []
+    small = Preset(width=32, height=24, frames=1, spp=1)
+    dataset = synthesise(tmp_path / "plain", SCENE, small, say=notes.append)
+    assert "pip install pyoidn" in notes[0]
+    assert read_json(dataset.root / "config.json")["samples_per_pixel"] == 8
+    assert dataset.frames[0].rgb()[dataset.frames[0].mask()].mean() == pytest.approx(0.2, rel=0.5)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--scene", "moon"], "scene 'moon': unknown"),
+        (["--preset", "huge"], "preset 'huge': unknown"),
+        (["--orbit", "figure-eight"], "orbit 'figure-eight': unknown"),
+        (["--size", "320"], "expected WIDTHxHEIGHT"),
+        (["--mesh", "nowhere.glb"], "no such mesh"),
+    ],
+)
+def test_bad_options_leave_nothing_behind(tmp_path, capsys, options, message):
+    with pytest.raises(SystemExit) as stop:
+        main(["synth-orbit", str(tmp_path / "out"), *options])
+    assert stop.value.code == 2
+    captured = capsys.readouterr().err
+    assert message in captured
+    assert captured.count("\n") == 1
+    assert not (tmp_path / "out").exists()

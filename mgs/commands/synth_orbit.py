@@ -12,6 +12,7 @@ import typer
 def synth_orbit(
     out: Annotated[Path, typer.Argument(help="Folder for the dataset; new, or one that an interrupted run left.")],
     scene: Annotated[str, typer.Option(help="A scene of mgs (boulder, ...) or the path of a .toml file.")] = "boulder",
+    orbit: Annotated[str | None, typer.Option(help="circle, rings, spiral or hemisphere, in place of the scene's.")] = None,
     mesh: Annotated[Path | None, typer.Option(help="A real rock (textured GLB, OBJ or PLY), scaled to the scene.")] = None,
     preset: Annotated[str, typer.Option(help="quick: 320x240, 32 frames. paper: 640x480, 100 frames.")] = "quick",
     spp: Annotated[int | None, typer.Option(min=1, help="Samples per pixel, in place of the preset's.")] = None,
@@ -31,11 +32,16 @@ def synth_orbit(
 
     from mgs import runtime
     from mgs.errors import InputError
-    from mgs.scene_file import load_scene_file
+    from mgs.scene_file import ORBITS, load_scene_file
 
     runtime.start()
     from mgs.synth import PRESETS, PoseNoise, synthesise
 
+    settings = load_scene_file(scene)
+    if orbit is not None:
+        if orbit not in ORBITS:
+            raise InputError(f"orbit {orbit!r}: unknown; choose one of {', '.join(ORBITS)}")
+        settings = settings.model_copy(update={"orbit": settings.orbit.model_copy(update={"kind": orbit})})
     if preset not in PRESETS:
         raise InputError(f"preset {preset!r}: unknown; choose one of {', '.join(PRESETS)}")
     given = {"spp": spp, "frames": frames, **_parse_size(size)}
@@ -45,7 +51,7 @@ def synth_orbit(
     with Progress(console=console) as bar:
         task = bar.add_task(f"{chosen.frames} frames, {chosen.width}x{chosen.height}", total=chosen.frames)
         dataset = synthesise(
-            out, load_scene_file(scene), chosen, seed, mesh, noise,
+            out, settings, chosen, seed, mesh, noise,
             progress=lambda done, total: bar.update(task, completed=done), say=console.print,
         )  # fmt: skip
     console.print(f"{out}: {len(dataset)} frames; look at {out / 'contact_sheet.png'}")

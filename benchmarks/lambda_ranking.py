@@ -1,0 +1,74 @@
+"""How the ranking of candidates depends on lambda: `python benchmarks/lambda_ranking.py RUN OUT.png`.
+
+Scores every candidate of a run's last state by Eq. 7 with the default lambda (one number per kind of parameter, see
+`mgs.policies.regularisation`) times 10^-8 ... 10^8, and with a single number for all parameters, as in the paper; prints and
+draws Spearman's rank correlation with the default's ranking, and which view would be chosen.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import spearmanr
+
+from mgs import nbv, policies, runtime
+from mgs.dataset import load_dataset
+
+FACTORS = 10.0 ** np.arange(-8, 9)
+SINGLE = 10.0 ** np.arange(-12, 3)
+"""Values found in public code lie between 4e-12 and 2."""
+
+
+def main(run: Path, out: Path) -> None:
+    """Print the table, draw the figure."""
+    runtime.start()
+    from mgs.splat import fisher, groups
+
+    settings, state = nbv.read_settings(run), nbv.read_checkpoint(run)
+    if state is None:
+        raise SystemExit(f"{run}: has no finished step")
+    frames = load_dataset(settings.dataset).frames
+    left = [i for i in range(len(frames)) if i not in state.taken]
+    default = policies.regularisation(groups(0), settings.pixel_noise, settings.prior_std)
+    kinds = {"default times": [(f, f * default) for f in FACTORS], "single": [(s, np.full_like(default, s)) for s in SINGLE]}
+    scores = {kind: np.empty((len(rows), len(left))) for kind, rows in kinds.items()}
+    reference = np.empty(len(left))
+    for column, i in enumerate(left):
+        F = fisher(state.gaussians, frames[i].camera)
+        reference[column] = policies.d_optimal(F, state.H, default)[0]
+        for kind, rows in kinds.items():
+            scores[kind][:, column] = [policies.d_optimal(F, state.H, lam)[0] for _, lam in rows]
+    print(f"{len(state.taken)} images, {len(left)} candidates; default chooses {frames[left[int(reference.argmax())]].name}")
+    curves = {}
+    for kind, rows in kinds.items():
+        values, correlations = [value for value, _ in rows], [spearmanr(row, reference).statistic for row in scores[kind]]
+        curves[kind] = values, correlations
+        for value, correlation, row in zip(values, correlations, scores[kind], strict=True):
+            best = frames[left[int(row.argmax())]].name
+            print(f"{kind:14} {value:7.0e}  Spearman {correlation:+.3f}  chooses {best}  gain {row.max():.4g}")
+    draw(out, curves)
+
+
+def draw(out: Path, curves: dict[str, tuple[list[float], list[float]]]) -> None:
+    """Rank correlation against lambda."""
+    import matplotlib
+
+    from mgs.report import STYLE
+
+    with matplotlib.rc_context(STYLE):
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(6.4, 2.8), dpi=150, layout="constrained")
+        axes = figure.subplots(1, 2, sharey=True)
+        labels = r"$\lambda$ over the default (per kind of parameter)", r"one $\lambda$ for all parameters"
+        for axis, (values, correlations), label in zip(axes, curves.values(), labels, strict=True):
+            axis.semilogx(values, correlations, "o-", color="#0072B2")
+            axis.set(xlabel=label)
+        axes[0].set(ylabel="rank correlation")
+        figure.savefig(out)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
