@@ -122,68 +122,65 @@ def _rows(lane: Lane, shape: Any, rest: Any, colour: Any) -> list[Row]:
     return rows
 
 
-def _blend(raw: Any, T: Any) -> tuple[Any, Any, Any]:
-    """One splat at one pixel: (alpha, 0 where it is not drawn; w = alpha T; transmittance after it).
+def _blend(raw: Any, T: Any) -> tuple[Any, Any, Any, Any]:
+    """One splat at one pixel: alpha (0 where it is not drawn), w = alpha T, transmittance after it, and whether any is left.
 
-    A finished pixel carries its transmittance negated, so it draws nothing more and its alpha is still known.
+    A finished pixel carries its transmittance negated, so it draws nothing more and its alpha is still known. Comparisons and
+    selects, not dr.minimum: that must propagate NaN, which costs five instructions.
     """
-    alpha = dr.select(raw >= ALPHA_MIN, dr.minimum(raw, ALPHA_MAX), 0)
+    alpha = dr.select(raw >= ALPHA_MIN, dr.select(raw <= ALPHA_MAX, raw, ALPHA_MAX), 0)
     after = dr.fma(-alpha, T, T)
     room = after > TRANSMITTANCE_MIN
     alpha = dr.select(room, alpha, 0)
-    return alpha, alpha * T, dr.select(room, after, -dr.abs(T))
+    return alpha, alpha * T, dr.select(room, after, -dr.abs(T)), room
 
 
-def _walk(
-    lists: BlockLists, packed: Packed, lane: Lane, T: list[Any], state: Any, visit: Callable[..., Any]
-) -> tuple[Any, Any]:
-    """Walk the lists front to back until they end or no pixel has transmittance left.
+def _walk(lists: BlockLists, packed: Packed, lane: Lane, pixels: list[list[Any]], visit: Callable[..., Any]) -> list[list[Any]]:
+    """Walk the lists front to back until they end or no pixel has transmittance left; returns the last state of the pixels.
 
-    visit(i, rows, rest, colour, T, state) -> (T, state) draws the splat of pair i. Returns the last (T, state).
+    visit(i, rows, rest, colour, pixels) -> (pixels, alive) draws the splat of pair i on the lane's pixels. Their states stay
+    together, pixel by pixel, since the compiler keeps that order: each is then finished before the next needs registers.
     """
 
-    def body(i: Any, T: list[Any], state: Any, alive: Any) -> Any:
+    def body(i: Any, pixels: Any, alive: Any) -> Any:
         splat = dr.gather(mi.UInt32, lists.splat, i)
         shape, rest, colour = (dr.gather(mi.Vector4f, a, splat) for a in (packed.shape, packed.rest, packed.colour))
-        T, state = visit(i, _rows(lane, shape, rest, colour), rest, colour, T, state)
-        most = T[0]
-        for t in T[1:]:
-            most = dr.maximum(most, t)
-        return i + 1, T, state, (i + 1 < lane.end) & (most > 0)
+        pixels, alive = visit(i, _rows(lane, shape, rest, colour), rest, colour, pixels)
+        return i + 1, pixels, (i + 1 < lane.end) & alive
 
     start = mi.UInt32(lane.start)
-    _, T, state, _ = dr.while_loop((start, T, state, start < lane.end), lambda i, T, state, alive: alive, body)
-    return T, state
+    _, pixels, _ = dr.while_loop((start, pixels, start < lane.end), lambda i, pixels, alive: alive, body)
+    return pixels
 
 
 @frozen
 def forward(lists: BlockLists, packed: Packed) -> tuple[Any, Any]:
     """Composite. Returns block-major pixels: rgba Float [L*32*4] (premultiplied, no background) and weighted depth [L*32]."""
     lane, T = _lane(lists)
-    state = [[dr.zeros(mi.Float, len(lists.block)) for _ in range(4)] for _ in range(PIXELS)]
+    pixels = [[t, *(dr.zeros(mi.Float, len(lists.block)) for _ in range(4))] for t in T]
 
-    def visit(i: Any, rows: list[Row], rest: Any, colour: Any, T: list[Any], state: Any) -> Any:
-        T_next, state_next = [], []
-        for pixel in range(PIXELS):
-            _, w, after = _blend(rows[pixel // BLOCK_X].raw[pixel % BLOCK_X], T[pixel])
-            r, g, b, z = state[pixel]
-            T_next.append(after)
-            state_next.append([dr.fma(colour.x, w, r), dr.fma(colour.y, w, g), dr.fma(colour.z, w, b), dr.fma(rest.z, w, z)])
-        return T_next, state_next
+    def visit(i: Any, rows: list[Row], rest: Any, colour: Any, pixels: Any) -> Any:
+        new, alive = [], mi.Bool(False)
+        for pixel, (T, r, g, b, z) in enumerate(pixels):
+            _, w, after, room = _blend(rows[pixel // BLOCK_X].raw[pixel % BLOCK_X], T)
+            drawn = [dr.fma(c, w, s) for c, s in zip((colour.x, colour.y, colour.z, rest.z), (r, g, b, z), strict=True)]
+            new.append([after, *drawn])
+            alive |= room
+        return new, alive
 
-    T, state = _walk(lists, packed, lane, T, state, visit)
+    pixels = _walk(lists, packed, lane, pixels, visit)
     rgba, depth = dr.empty(mi.Float, len(lists.block) * PIXELS * 4), dr.empty(mi.Float, len(lists.block) * PIXELS)
-    for pixel in range(PIXELS):
-        r, g, b, z = state[pixel]
+    for pixel, (transmittance, r, g, b, z) in enumerate(pixels):
         place = lists.block * PIXELS + pixel
-        dr.scatter(rgba, mi.Vector4f(r, g, b, 1 - dr.abs(T[pixel])), place, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter(rgba, mi.Vector4f(r, g, b, 1 - dr.abs(transmittance)), place, mode=dr.ReduceMode.NoConflicts)
         dr.scatter(depth, z, place, mode=dr.ReduceMode.NoConflicts)
     return rgba, depth
 
 
-def _slope(c: Any, T: Any, S: Any, alpha: Any, raw: Any) -> Any:
-    """D alpha, the derivative of the pixel with respect to ln alpha; 0 where alpha is clamped."""
-    return dr.select(raw <= ALPHA_MAX, alpha * dr.fma(c, T, -S * dr.rcp(1 - alpha)), 0)
+def _held_and_lost(alpha: Any, w: Any, raw: Any) -> tuple[Any, Any]:
+    """(a, b) such that the derivative of a pixel by ln alpha is D alpha = a c - b S; 0 where alpha is clamped."""
+    free = raw <= ALPHA_MAX
+    return dr.select(free, w, 0), dr.select(free, alpha * dr.rcp(1 - alpha), 0)
 
 
 def _buffers(lists: BlockLists, count: int) -> list[Any]:
@@ -217,30 +214,31 @@ def adjoint(lists: BlockLists, packed: Packed, out: tuple[Any, Any], d_out: tupl
     With means=False the gradients of u and v are not computed (None): frozen means need two sums less.
     """
     lane, T = _lane(lists)
-    dL, S = [], []
+    dL, pixels = [], []
     for pixel in range(PIXELS):
         place = lists.block * PIXELS + pixel
         rgba, d_rgba = (dr.gather(mi.Vector4f, a[0], place) for a in (out, d_out))
         z, dz = (dr.gather(mi.Float, a[1], place) for a in (out, d_out))
         dL.append((*d_rgba, dz))
-        S.append(dr.dot(rgba, d_rgba) + z * dz)
+        pixels.append([T[pixel], dr.dot(rgba, d_rgba) + z * dz])
     count = 10 if means else 8
     buffers = _buffers(lists, count)
 
-    def visit(i: Any, rows: list[Row], rest: Any, colour: Any, T: list[Any], S: Any) -> Any:
-        T_next, S_next = [], []
+    def visit(i: Any, rows: list[Row], rest: Any, colour: Any, pixels: Any) -> Any:
+        new, alive = [], mi.Bool(False)
         sums = [mi.Float(0)] * 10
         for j, row in enumerate(rows):
             m0, m1, m2 = mi.Float(0), mi.Float(0), mi.Float(0)
             for x, (raw, xi) in enumerate(zip(row.raw, row.xi, strict=True)):
-                pixel = j * BLOCK_X + x
-                alpha, w, after = _blend(raw, T[pixel])
-                dr_, dg, db, da, dz = dL[pixel]
+                transmittance, behind = pixels[j * BLOCK_X + x]
+                dr_, dg, db, da, dz = dL[j * BLOCK_X + x]
+                alpha, w, after, room = _blend(raw, transmittance)
                 c = dr.fma(colour.x, dr_, dr.fma(colour.y, dg, dr.fma(colour.z, db, dr.fma(rest.z, dz, da))))
-                behind = dr.fma(-c, w, S[pixel])
-                slope = _slope(c, T[pixel], behind, alpha, raw)
-                T_next.append(after)
-                S_next.append(behind)
+                behind = dr.fma(-c, w, behind)
+                new.append([after, behind])
+                alive |= room
+                held, lost = _held_and_lost(alpha, w, raw)
+                slope = dr.fma(c, held, -behind * lost)
                 sums[:4] = [dr.fma(w, d, s) for d, s in zip((dr_, dg, db, dz), sums[:4], strict=True)]
                 first = slope * xi
                 m0, m1, m2 = m0 + slope, m1 + first, dr.fma(first, xi, m2)
@@ -248,9 +246,9 @@ def adjoint(lists: BlockLists, packed: Packed, out: tuple[Any, Any], d_out: tupl
             moments = (m0, m2, m1 * row.eta, eta_m0 * row.eta, m1, eta_m0)
             sums[4:] = [a + b for a, b in zip(sums[4:], moments, strict=True)]
         _store(buffers, sums[:count], dr.gather(mi.UInt32, lists.slot, i))
-        return T_next, S_next
+        return new, alive
 
-    _walk(lists, packed, lane, T, S, visit)
+    _walk(lists, packed, lane, pixels, visit)
     r, g, b, z, d, xx, xy, yy, *first = _per_splat(lists, buffers, count)
     shape, rest = dr.unravel(mi.Vector4f, packed.shape), dr.unravel(mi.Vector4f, packed.rest)
     k, p, e = shape.z, shape.w, rest.x
@@ -271,28 +269,27 @@ def fisher(lists: BlockLists, packed: Packed, rgba: Any, background: Any, block:
     rgba: `forward`'s; background: Color3f.
     """
     lane, T = _lane(lists)
-    S = []
+    pixels = []
     for pixel in range(PIXELS):
         out = dr.gather(mi.Vector4f, rgba, lists.block * PIXELS + pixel)
-        S.append([c + (1 - out.w) * b for c, b in zip((out.x, out.y, out.z), background, strict=True)])
+        pixels.append([T[pixel], *(c + (1 - out.w) * b for c, b in zip((out.x, out.y, out.z), background, strict=True))])
     count = 22 if block else 7
     buffers = _buffers(lists, count)
 
-    def visit(i: Any, rows: list[Row], rest: Any, colour: Any, T: list[Any], S: Any) -> Any:
-        T_next, S_next = [], []
-        sums = [mi.Float(0)] * 22
+    def visit(i: Any, rows: list[Row], rest: Any, colour: Any, pixels: Any) -> Any:
+        new, alive = [], mi.Bool(False)
+        sums, rgb = [mi.Float(0)] * 22, (colour.x, colour.y, colour.z)
         for j, row in enumerate(rows):
             m = [mi.Float(0)] * 5
             cross = [[mi.Float(0)] * 3 for _ in range(3)]
             for x, (raw, xi) in enumerate(zip(row.raw, row.xi, strict=True)):
-                pixel = j * BLOCK_X + x
-                alpha, w, after = _blend(raw, T[pixel])
-                behind = [dr.fma(-c, w, s) for c, s in zip((colour.x, colour.y, colour.z), S[pixel], strict=True)]
-                slopes = [
-                    _slope(c, T[pixel], s, alpha, raw) for c, s in zip((colour.x, colour.y, colour.z), behind, strict=True)
-                ]
-                T_next.append(after)
-                S_next.append(behind)
+                transmittance, *behind = pixels[j * BLOCK_X + x]
+                alpha, w, after, room = _blend(raw, transmittance)
+                behind = [dr.fma(-c, w, s) for c, s in zip(rgb, behind, strict=True)]
+                new.append([after, *behind])
+                alive |= room
+                held, lost = _held_and_lost(alpha, w, raw)
+                slopes = [dr.fma(c, held, -s * lost) for c, s in zip(rgb, behind, strict=True)]
                 sums[0] = dr.fma(w, w, sums[0])
                 square = sum(s * s for s in slopes)
                 power, xi2 = square, xi * xi
@@ -306,14 +303,14 @@ def fisher(lists: BlockLists, packed: Packed, rgba: Any, background: Any, block:
                         cross[c] = [a[0] + ws, dr.fma(ws, xi, a[1]), dr.fma(ws, xi2, a[2])]
             eta = row.eta
             eta2 = eta * eta
-            new = [m[0], m[4], m[3] * eta, m[2] * eta2, m[1] * eta2 * eta, m[0] * eta2 * eta2]
+            moments = [m[0], m[4], m[3] * eta, m[2] * eta2, m[1] * eta2 * eta, m[0] * eta2 * eta2]
             if block:
-                new += [m[2], m[1] * eta, m[0] * eta2]
+                moments += [m[2], m[1] * eta, m[0] * eta2]
                 for a in cross:
-                    new += [a[0], a[2], a[1] * eta, a[0] * eta2]
-            sums[1 : 1 + len(new)] = [a + b for a, b in zip(sums[1:], new, strict=False)]
+                    moments += [a[0], a[2], a[1] * eta, a[0] * eta2]
+            sums[1 : 1 + len(moments)] = [a + b for a, b in zip(sums[1:], moments, strict=False)]
         _store(buffers, sums[:count], dr.gather(mi.UInt32, lists.slot, i))
-        return T_next, S_next
+        return new, alive
 
-    _walk(lists, packed, lane, T, S, visit)
+    _walk(lists, packed, lane, pixels, visit)
     return _per_splat(lists, buffers, count)
