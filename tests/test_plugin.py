@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from dataclasses import fields
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -309,3 +310,15 @@ def test_registered_at_import(ply, program, tmp_path):
     lines = f"import mitsuba as mi\nVARIANT = {mi.variant()!r}\n{program}\n{load_it}"
     done = subprocess.run([sys.executable, "-c", lines], cwd=tmp_path, capture_output=True, text=True)
     assert done.stdout.strip() == "MgsSplat[60 Gaussians, SH degree 1]", done.stderr
+
+
+def test_the_documented_example(tmp_path, monkeypatch):
+    """The program in docs/mitsuba.md runs, and lowers its loss."""
+    page = (Path(__file__).parent.parent / "docs/mitsuba.md").read_text()
+    program = page.split("```python\n")[1].split("```")[0]
+    monkeypatch.chdir(tmp_path)
+    write_ply("splats.ply", gaussians())
+    variables: dict = {}
+    exec(program, variables)
+    first = np.mean(np.asarray(variables["target"]) ** 2)  # The target is half the image, so this is the loss of the start.
+    assert variables["loss"].array[0] < 0.3 * first
