@@ -66,7 +66,14 @@ def _project(gaussians: Gaussians, camera: Any) -> Any:
 
 @frozen(state_fn=_sizes)
 def _step(
-    gaussians: Gaussians, moments: list[list[Any]], camera: Any, lists: BlockLists, target: Any, size: Any, rates: list[Any], t: Any
+    gaussians: Gaussians,
+    moments: list[list[Any]],
+    camera: Any,
+    lists: BlockLists,
+    target: Any,
+    size: Any,
+    rates: list[Any],
+    t: Any,
 ) -> tuple[Gaussians, list[list[Any]], Any]:
     """One Adam step (Kingma & Ba 2015, beta 0.9 and 0.999) on one image. Returns parameters, moments, mean squared error.
 
@@ -110,7 +117,8 @@ def fit(
     moments = [[dr.zeros(mi.TensorXf, getattr(model, n).shape) for _ in range(2)] for n in LEARNED]
     rng = generator(settings.seed, "train/order")
     history: list[float] = []
-    t, small, stop = 0, 0, "iteration-limit"
+    stop: Literal["converged", "iteration-limit"] = "iteration-limit"
+    t, small = 0, 0
     for done in range(settings.passes):
         fall = settings.decay ** (done / max(settings.passes - 1, 1))
         rates = [dr.opaque(mi.Float, rate * fall) for rate in settings.rates]

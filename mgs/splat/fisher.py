@@ -128,7 +128,7 @@ def exact(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCach
     columns_ = [w2 * basis * basis * positive for basis in g.basis for positive in g.positive]
     columns_ += [dr.maximum(_quadratic(m, m, quartic), 0) for m in g.shape]
     columns_.append(g.logit * g.logit * s2)
-    return _stack(columns_)
+    return _interleaved(dict(enumerate(columns_)), len(columns_), len(gaussians))
 
 
 def block(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None) -> np.ndarray:
@@ -152,13 +152,10 @@ def block(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCach
             upper[k + i, k + j] = _quadratic(m, g.shape[j], quartic)
         upper[k + i, k + 7] = g.logit * sum(a * b for a, b in zip(m, quadratic, strict=True))
     upper[k + 7, k + 7] = g.logit * g.logit * s2
-    keys = sorted(upper)
-    values = _stack([upper[key] for key in keys])
     size = k + 8
-    blocks = np.zeros((len(gaussians), size, size), np.float32)
-    for n, (i, j) in enumerate(keys):
-        blocks[:, i, j] = blocks[:, j, i] = values[:, n]
-    return blocks
+    both = {i * size + j: value for (i, j), value in upper.items()} | {j * size + i: value for (i, j), value in upper.items()}
+    flat = _interleaved(both, size * size, len(gaussians))
+    return flat.reshape(-1, size, size)
 
 
 def _gradient(
@@ -183,7 +180,7 @@ def hutchinson(
     total = np.zeros((len(gaussians), 0), np.float64)
     for probe in range(probes):
         rng = np.random.default_rng(derive_seed(seed, f"hutchinson/{probe}"))
-        z = rng.choice(np.float32([-1, 1]), (camera.height, camera.width, 3))
+        z = rng.choice(np.array([-1, 1], np.float32), (camera.height, camera.width, 3))
         squared = _gradient(gaussians, lambda _, z=z: mi.TensorXf(z), camera, background, cache).astype(np.float64) ** 2
         total = squared if probe == 0 else total + squared
     return (total / probes).astype(np.float32)
@@ -198,10 +195,13 @@ def loss_gradient(gaussians: Gaussians, camera: Camera, background: Any, cache: 
     return _gradient(gaussians, lambda rgb: (rgb - 0.5) * (2 / len(rgb.array)), camera, background, cache) ** 2
 
 
-def _stack(columns_: list[Any]) -> np.ndarray:
-    """Dr.Jit Floats [N] -> NumPy [N, len]."""
-    dr.eval(columns_)
-    return np.stack([np.asarray(c) for c in columns_], axis=1)
+def _interleaved(columns_: dict[int, Any], size: int, n: int) -> np.ndarray:
+    """Dr.Jit Floats [N] by column -> NumPy [N, size], 0 in columns not given."""
+    index = dr.arange(mi.UInt32, n) * size
+    flat = dr.zeros(mi.Float, n * size)
+    for column, values in columns_.items():
+        dr.scatter(flat, values, index + column, mode=dr.ReduceMode.NoConflicts)
+    return np.array(flat, copy=False).reshape(n, size)
 
 
 ESTIMATORS: dict[str, Callable[..., np.ndarray]] = {

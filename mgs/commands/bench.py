@@ -1,0 +1,88 @@
+"""`mgs bench`: timings on this machine, as ratios against a peer in the same run."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+
+class Kind(StrEnum):
+    """What to measure."""
+
+    splat = "splat"
+    scaling = "scaling"
+
+
+def bench(
+    kind: Annotated[
+        Kind, typer.Argument(help="splat: against Mitsuba's volprim_rf_basic; scaling: against N, pixels, threads.")
+    ],
+    json: Annotated[Path | None, typer.Option(help="Write everything measured to this file.")] = None,
+    chart: Annotated[Path | None, typer.Option(help="scaling only: write the log-log charts to this PNG.")] = None,
+    gaussians: Annotated[
+        int | None, typer.Option(min=1000, help="splat: how many [100000]; scaling: the most [1000000].")
+    ] = None,
+    repeats: Annotated[int, typer.Option(min=3, help="Runs that each median is of.")] = 9,
+) -> None:
+    """Time the splat core on 100,000 Gaussians of a rock at 640x480 (splat), or its growth up to a million (scaling).
+
+    Nothing else should run on the machine meanwhile. The command line, machine and versions are written beside the numbers.
+    """
+    from rich.console import Console
+
+    from mgs import runtime
+    from mgs.config import versions
+    from mgs.files import write_json
+
+    runtime.start()
+    console = Console()
+    with console.status("rock") as status:
+        report = lambda what: status.update(f"timing {what}")  # noqa: E731
+        if kind is Kind.splat:
+            from mgs.bench import bench_splat
+
+            result: dict[str, Any] = bench_splat(gaussians or 100_000, 640, 480, repeats, report)
+        else:
+            from mgs.bench import bench_scaling
+
+            result = {"points": bench_scaling(repeats, report, gaussians or 1_000_000)}
+    result |= {"command": f"mgs bench {kind.value}", "machine": runtime.processor(), "versions": versions()}
+    if kind is Kind.splat:
+        _print_splat(console, result)
+    else:
+        from mgs.bench_chart import scaling_exponents, scaling_figure
+
+        result["exponents"] = scaling_exponents(result["points"])
+        for name, value in result["exponents"].items():
+            console.print(f"{name}: {value:.2f}")
+        if chart:
+            scaling_figure(chart, result["points"], result["exponents"])
+            console.print(f"wrote {chart}")
+    if json:
+        write_json(json, result)
+        console.print(f"wrote {json}")
+
+
+def _print_splat(console: Any, result: dict[str, Any]) -> None:
+    """Seconds, then each figure beside its target."""
+    from rich.table import Table
+
+    from mgs.bench import TARGETS
+
+    scene = result["scene"]
+    title = f"{scene['gaussians']:,} Gaussians, {scene['width']}x{scene['height']}, {result['pairs']:,} (splat, block) pairs"
+    seconds = Table("operation", "milliseconds", title=title)
+    for name, value in result["seconds"].items():
+        seconds.add_row(name.replace("_", " "), f"{1e3 * value:.1f}")
+    figures = Table("figure", "measured", "asked for")
+    for name, (bound, target) in TARGETS.items():
+        figures.add_row(name.replace("_", " "), f"{result['figures'][name]:.2f}", f"{bound} {target:g}")
+    console.print(seconds, figures)
+    console.print(
+        f"peak arithmetic measured {result['peak_gflops_measured']:.0f} Gflop/s, share used: "
+        + ", ".join(f"{k} {v:.0%}" for k, v in result["share_of_peak"].items())
+        + f"; peak memory {result['peak_memory_megabytes']:.0f} MB"
+    )
