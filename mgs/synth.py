@@ -51,7 +51,7 @@ class PoseNoise:
     rotation: float = 0.0
 
 
-PRESETS = {"quick": Preset(320, 240, 32, 12), "paper": Preset(640, 480, 100, 16)}
+PRESETS = {"quick": Preset(320, 240, 32, 8), "paper": Preset(640, 480, 100, 16)}
 
 
 def synthesise(
