@@ -5,7 +5,7 @@ One gather of a splat serves all the lane's pixels, and one store per (splat, bl
 stores, not arithmetic, are what splatting on a CPU spends its time on. Sums go to the pair's own slot and a second kernel adds
 each splat's contiguous slots, so there are no atomics and every rerun is bitwise equal, whatever the number of threads.
 
-Notation (Kerbl et al. 2023): w = alpha T, C = sum w c; behind splat j lies S_j, and dC/d(alpha_j) = D_j = c_j T_j - S_j/(1 - alpha_j).
+Notation as in 3DGS: w = alpha T, C = sum w c; S is the colour behind a splat, and D = dC/d(alpha) = c T - S / (1 - alpha).
 The adjoint and Fisher walk front to back again with S = C - (colour so far): decisions (thresholds, stop) are recomputed by
 the same instructions, so they are the same, and no per-pixel index has to be kept.
 """

@@ -104,7 +104,7 @@ def columns(tensor: Any, dtype: Any) -> Any:
 
 
 def axes2d(mean: Any, quats: Any, camera: Any) -> tuple[Any, list[Any], Any]:
-    """((u, v) px and z m of each mean in double, z made safe; the axes R e_i of each Gaussian in pixels per metre; visible mask).
+    """((u, v) px, z m of each mean in double, z made safe; the axes R e_i of each Gaussian, pixels per metre; visible mask).
 
     Centres are found in double: in single precision those of a 640x480 image would be off by 1e-4 px, and images by as much.
     """
