@@ -81,7 +81,7 @@ def measure() -> dict:
 
 
 def plot(data: dict, path: Path) -> None:
-    """PSNR of the rock's pixels over CPU seconds (all cores together, so that other work does not count), one line with and one without denoising."""
+    """PSNR of the rock's pixels over CPU seconds of all cores together, so that other work on the machine does not count."""
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(6.4, 4), constrained_layout=True)
