@@ -86,6 +86,16 @@ def test_blocks_are_positive_semidefinite():
     assert (values[:, 0] > -1e-5 * values[:, -1]).all()
 
 
+def test_clamped_scale_carries_no_information():
+    """A log-scale beyond LOG_SCALE_RANGE has derivative zero, and its neighbours have not."""
+    camera, g = make_camera(), make_gaussians(16, 5)
+    g.means[2], g.log_scales[2] = 0, (-30, -2, 30)
+    exact, block = fisher(g, camera)[2], fisher(g, camera, "block")[2]
+    assert (exact[[3, 5]] == 0).all()
+    assert (exact[[0, 4, 10]] > 0).all()
+    assert (block[[3, 5]] == 0).all()
+
+
 def test_unseen_gaussian_carries_no_information():
     camera, g = make_camera(), make_gaussians(16, 5)
     g.means[3] = camera.position - 2 * camera.world_to_camera[2, :3]

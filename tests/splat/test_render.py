@@ -92,6 +92,19 @@ def test_matches_oracle_for_any_scene(seed, n, size, degree, scale, stretch, log
     assert error[decided].max(initial=0) <= 1
 
 
+@pytest.mark.parametrize("centre", [(320.0, 4.0), (-300.0, -200.0), (600.0, 240.0)])
+def test_error_at_the_edge_of_a_large_image(centre):
+    """Splats of a pixel's size, 640 pixels from the corner or far from the principal point, where float32 pixels are coarse."""
+    camera = make_camera((640, 6), focal=600.0, centre=centre)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        means = place(camera, rng.uniform((500, 0), (640, 6), (60, 2)), rng.uniform(1, 3, 60))
+        gaussians = changed(make_gaussians(60, seed, log_scales=(-9.0, -5.0)), means=means)
+        error, decided = errors(gaussians, camera, (0.1, 0.5, 0.9))
+        assert decided.mean() > 0.99
+        assert error[decided].max() <= 1
+
+
 def stack(camera, opacities, rgb=1.0) -> Gaussians:
     """Round Gaussians one behind the other, all centred on the middle of pixel (20, 12)."""
     n = len(opacities)
