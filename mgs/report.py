@@ -92,11 +92,11 @@ def read_run(folder: str | Path) -> Run:
     return Run(folder, policy, steps, read_json(metrics) if metrics.is_file() else None, config["settings"])
 
 
-def new_figure(width: float, height: float) -> Figure:
+def new_figure(width: float, height: float, dpi: int = DPI) -> Figure:
     """An empty figure, width and height in inches."""
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width, height), dpi=DPI, layout="constrained")
+    return Figure(figsize=(width, height), dpi=dpi, layout="constrained")
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:
@@ -323,13 +323,13 @@ def print_table(console: Console, rows: Sequence[Sequence[str]]) -> None:
     short = [
         "policy",
         "images",
-        *(f"{name}\n{views}" for views in ("all", "unseen", "rock") for name in ("PSNR", "SSIM")),
+        *(f"{name}\n{views}" for views in ("all", "new", "rock") for name in ("PSNR", "SSIM")),
         "cover",
     ]
     table = Table(
         box=box.SIMPLE_HEAD,
         pad_edge=False,
-        caption="dB and %; unseen: views never trained on; rock: those, inside its mask",
+        caption="dB and %; new: views never trained on; rock: those, inside its mask",
     )
     for i, heading in enumerate(short):
         table.add_column(heading, justify="right" if i else "left", no_wrap=True)
