@@ -110,7 +110,7 @@ def _rows(lane: Lane, shape: Any, rest: Any, colour: Any) -> list[Row]:
     for j in range(BLOCK_Y):
         y = dy + j
         eta = e * y
-        first = p * (dx - k * y)
+        first = p * dr.fma(-k, y, dx)
         xi = [dr.fma(p, mi.Float(i), first) for i in range(BLOCK_X)]
         middle = xi[CENTRE]
         raw = [dr.exp2(dr.fma(-middle, middle, dr.fma(-eta, eta, log2_opacity)))] * BLOCK_X
