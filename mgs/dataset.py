@@ -145,20 +145,16 @@ def _frame(root: Path, path: Path, data: dict[str, Any], index: int, record: dic
     return Frame(name, camera, timestamp, image, file("depth_file_path"), file("mask_path"))
 
 
+def _intrinsics(camera: Camera) -> dict[str, float]:
+    K = camera.K
+    return {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": camera.width, "h": camera.height}
+
+
 def write_transforms(root: str | Path, frames: list[Frame] | tuple[Frame, ...]) -> None:
-    """Write transforms.json for frames that share one camera model; paths are relative to `root`. Written last: it is
-    what makes a folder a dataset."""
+    """Write transforms.json; paths are relative to `root`. The first frame's intrinsics are the file's, those of frames that
+    differ are their own. Written last: it is what makes a folder a dataset."""
     root = Path(root)
-    first = frames[0].camera
-    header = {
-        "camera_model": "OPENCV",
-        "fl_x": first.K[0, 0],
-        "fl_y": first.K[1, 1],
-        "cx": first.K[0, 2],
-        "cy": first.K[1, 2],
-        "w": first.width,
-        "h": first.height,
-    }
+    header = {"camera_model": "OPENCV", **_intrinsics(frames[0].camera)}
     records = []
     for frame in frames:
         record: dict[str, Any] = {"file_path": frame.image_path.relative_to(root).as_posix()}
@@ -168,5 +164,7 @@ def write_transforms(root: str | Path, frames: list[Frame] | tuple[Frame, ...]) 
             record["mask_path"] = frame.mask_path.relative_to(root).as_posix()
         record["transform_matrix"] = opengl_from_opencv(frame.camera.world_to_camera).tolist()
         record["timestamp"] = frame.timestamp
+        own = _intrinsics(frame.camera)
+        record |= {key: value for key, value in own.items() if value != header[key]}
         records.append(record)
     write_json(root / "transforms.json", header | {"frames": records})

@@ -99,6 +99,11 @@ def read_png(path: str | Path) -> np.ndarray:
     return linear_from_srgb(np.asarray(_open_png(path).convert("RGB"), np.float32) / 255)
 
 
+def read_rgba(path: str | Path) -> np.ndarray:
+    """Image -> uint8 [H,W,4], sRGB and straight alpha (255 where it has none). Raises InputError as `read_png`."""
+    return np.asarray(_open_png(path).convert("RGBA"))
+
+
 def read_mask(path: str | Path) -> np.ndarray:
     """Mask image -> bool [H,W] (at least half white is inside). Raises InputError where it is missing or damaged."""
     return np.asarray(_open_png(path).convert("L")) >= 128

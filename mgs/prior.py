@@ -11,13 +11,24 @@ import numpy as np
 from plyfile import PlyData, PlyParseError
 from scipy.spatial import cKDTree
 
-from mgs.cloud import FILTERED_SHARE, Cloud, Plane, degrade, focus, fuse_frames, ground_plane, rock_cluster, write_points
+from mgs.cloud import (
+    FILTERED_SHARE,
+    Cloud,
+    Plane,
+    degrade,
+    focus,
+    fuse_frames,
+    ground_plane,
+    rock_cluster,
+    sparse_cloud,
+    write_points,
+)
 from mgs.dataset import Dataset, Frame
 from mgs.errors import InputError
 from mgs.files import atomic_path, new_folder, read_json, write_json
 from mgs.initial import initial_gaussians as initial_gaussians
 from mgs.seeds import derive_seed, generator
-from mgs.surface import Mesh, distances_to_mesh, estimate_normals, poisson_mesh, sample_surface
+from mgs.surface import Mesh, distances_to_mesh, estimate_normals, poisson_mesh, read_mesh, sample_surface
 from mgs.visibility import in_mask, visible
 
 TRUTH_SAMPLES = 50_000
@@ -56,26 +67,29 @@ class Prior:
 
 @dataclass(frozen=True)
 class Stages:
-    """What the figure shows: the cloud, its ground plane, the rock's points, the mesh."""
+    """What the figure shows: the mesh, and the cloud, ground plane and rock's points it came from (none for a given mesh)."""
 
-    cloud: Cloud
-    plane: Plane
-    ground: np.ndarray
-    cluster: np.ndarray
     mesh: Mesh
+    cloud: Cloud | None = None
+    plane: Plane | None = None
+    ground: np.ndarray | None = None
+    cluster: np.ndarray | None = None
 
 
 def build_prior(
     dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None] | None = None
 ) -> tuple[Prior, Stages]:
-    """Build the prior of a dataset of RGB-D frames. on_stage is told the name of each stage as it starts.
+    """Build the prior of a dataset of RGB-D frames; of its imported sparse points where frames have no depth.
+
+    on_stage is told the name of each stage as it starts.
 
     Raises InputError: no depth, no ground plane, no rock (empty cluster), two equal rocks, no closed surface, N below 2.
     """
     _check(settings)
     tell = on_stage or (lambda stage: None)
     tell("cloud")
-    cloud = fuse_frames(dataset.frames)
+    sparse, has_depth = dataset.root / "sparse.ply", any(frame.depth_path for frame in dataset.frames)
+    cloud = sparse_cloud(sparse) if sparse.is_file() and not has_depth else fuse_frames(dataset.frames)
     tell("ground plane")
     plane = ground_plane(cloud, dataset.frames, derive_seed(settings.seed, "prior/plane"))
     ground = np.abs(plane.height(cloud.points)) <= plane.tolerance
@@ -123,11 +137,32 @@ def build_prior(
         "settings": asdict(settings),
     }
     truth = dataset.root / "rock.glb"
-    if truth.is_file():
+    if truth.is_file() and has_depth:
         tell("distance to the true rock")
         numbers["truth"] = error_to_truth(points, spacing, mesh, truth, dataset.frames, plane, settings.seed)
     prior = Prior(points, normals, spacing, tolerance, numbers)
-    return prior, Stages(cloud, plane, ground, cluster, mesh)
+    return prior, Stages(mesh, cloud, plane, ground, cluster)
+
+
+def prior_from_mesh(path: str | Path, settings: PriorSettings) -> tuple[Prior, Stages]:
+    """The prior of a given mesh in world coordinates, metres: it is only sampled. Raises InputError as `read_mesh`."""
+    _check(settings)
+    mesh = read_mesh(path)
+    if settings.gaussians is None and settings.spacing is None:
+        raise InputError(f"{path}: a given mesh says nothing of how finely to sample it; give --gaussians or --spacing")
+    seed = derive_seed(settings.seed, "prior/samples")
+    points, normals, spacing = sample_surface(mesh, seed, count=settings.gaussians, spacing=settings.spacing)
+    numbers: dict[str, Any] = {
+        "mesh": str(path),
+        "mesh_faces": len(mesh.faces),
+        "mesh_area": float(mesh.areas.sum()),
+        "sampled_area": float(mesh.areas.sum()),
+        "depth_tolerance": spacing,
+        "n": len(points),
+        "spacing": spacing,
+        "settings": asdict(settings),
+    }
+    return Prior(points, normals, spacing, spacing, numbers), Stages(mesh)
 
 
 def _check(settings: PriorSettings) -> None:
@@ -147,8 +182,11 @@ def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:
     """The mesh with `seen` narrowed to faces with a corner that some frame sees inside its rock mask.
 
     What no frame sees is buried, bridges a gap that frames look through, or lies where no view could ever use it: Gaussians
-    there are wasted, or show where they should not.
+    there are wasted, or show where they should not. Without depth nothing is narrowed.
     """
+    frames = [frame for frame in frames if frame.depth_path is not None]
+    if not frames:
+        return mesh
     seen, normals = np.zeros(len(mesh.vertices), bool), mesh.vertex_normals
     for frame in frames:
         seen |= visible(mesh.vertices, normals, frame.camera, frame.depth(), tolerance) & in_mask(mesh.vertices, frame)
@@ -170,10 +208,8 @@ def error_to_truth(
     """
     import trimesh
 
-    rock = trimesh.load(truth, force="mesh")
-    assert isinstance(rock, trimesh.Trimesh)
-    if len(rock.faces) == 0 or not np.isfinite(rock.vertices).all():
-        raise InputError(f"{truth}: the true rock has no faces, or NaN vertices; restore it or delete it")
+    known = read_mesh(truth)
+    rock = trimesh.Trimesh(known.vertices, known.faces, process=False)
     surface, face = trimesh.sample.sample_surface(rock, TRUTH_SAMPLES, seed=derive_seed(seed, "prior/truth"))
     exposed = plane.height(np.asarray(surface)) > 0
     surface, normals = np.asarray(surface)[exposed], rock.face_normals[face[exposed]]

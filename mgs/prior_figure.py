@@ -19,36 +19,42 @@ def draw_prior(path: str | Path, prior: Prior, stages: Stages) -> None:
     """Write the figure as a PNG, atomically."""
     from matplotlib.figure import Figure
 
-    up = stages.plane.normal
+    up = np.array([0.0, 0.0, 1.0]) if stages.plane is None else stages.plane.normal
     frame = _oblique(up)
-    centre = (stages.cluster.min(0) + stages.cluster.max(0)) / 2
-    reach = 0.5 * float(np.linalg.norm(np.ptp(stages.cluster, axis=0)))
-    cloud, height = stages.cloud.points, stages.plane.height(stages.cloud.points)
-    near = np.linalg.norm(cloud - centre, axis=1) < 4 * reach
-    ground = stages.ground
+    body = stages.mesh.vertices
+    centre = (body.min(0) + body.max(0)) / 2
+    reach = 0.5 * float(np.linalg.norm(np.ptp(body, axis=0)))
     truth = prior.numbers.get("truth")
     error = f", accuracy {1e3 * truth['accuracy']:.2f} mm" if truth else ""
-    figure = Figure(figsize=(17, 4.2), layout="constrained")
-    axes = figure.subplots(1, 5)
+    figure = Figure(figsize=(17 if stages.plane is not None else 7, 4.2), layout="constrained")
+    axes = figure.subplots(1, 5 if stages.plane is not None else 2)
+    _cloud_panels(axes[:-2], stages, frame, centre, reach)
+    _shaded_mesh(axes[-2], stages, frame, centre, reach)
+    unseen = "" if stages.mesh.seen.all() else "\nblue: seen by no frame, not sampled"
+    axes[-2].set_title(f"mesh, {prior.numbers['mesh_area']:.2f} m²{error}{unseen}", fontsize=10)
+    shade = np.clip(0.25 + 0.75 * (prior.normals @ frame.T) @ LIGHT, 0.05, 1)[:, None] * [0.95, 0.85, 0.7]
+    towards = (prior.normals @ frame.T)[:, 2] > 0
+    _dots(axes[-1], ((prior.points - centre) @ frame.T)[towards], shade[towards], None, reach, None)
+    axes[-1].set_title(f"samples: N = {len(prior.points):,}\nspacing {1e3 * prior.spacing:.2f} mm = √(area / N)", fontsize=10)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=100)
+
+
+def _cloud_panels(axes, stages: Stages, frame: np.ndarray, centre: np.ndarray, reach: float) -> None:
+    """The cloud, its plane inliers and the rock's points; nothing for a prior of a given mesh."""
+    if stages.cloud is None or stages.plane is None or stages.ground is None or stages.cluster is None:
+        return
+    cloud, height, ground = stages.cloud.points, stages.plane.height(stages.cloud.points), stages.ground
+    near = np.linalg.norm(cloud - centre, axis=1) < 4 * reach
     panels = [
         (f"cloud: {len(cloud):,} points\ncoloured by height", cloud[near], height[near], "viridis", 2.2),
         (f"ground plane: {int(ground.sum()):,} inliers (tan)\nthe rest in blue", cloud[near], (~ground[near]) * 1.0, None, 2.2),
         (f"rock cluster: {len(stages.cluster):,} points", stages.cluster, stages.plane.height(stages.cluster), "viridis", 1.0),
     ]
-    for axis, (title, points, value, colours, zoom) in zip(axes, panels, strict=False):
+    for axis, (title, points, value, colours, zoom) in zip(axes, panels, strict=True):
         tint = np.where(value[:, None] > 0.5, [0.15, 0.35, 0.75], [0.85, 0.76, 0.6]) if colours is None else value
         _dots(axis, (points - centre) @ frame.T, tint, colours, zoom * reach, 0.8)
         axis.set_title(title, fontsize=10)
-    _shaded_mesh(axes[3], stages, frame, centre, reach)
-    axes[3].set_title(
-        f"Poisson mesh, {prior.numbers['mesh_area']:.2f} m²{error}\nblue: seen by no frame, not sampled", fontsize=10
-    )
-    shade = np.clip(0.25 + 0.75 * (prior.normals @ frame.T) @ LIGHT, 0.05, 1)[:, None] * [0.95, 0.85, 0.7]
-    towards = (prior.normals @ frame.T)[:, 2] > 0
-    _dots(axes[4], ((prior.points - centre) @ frame.T)[towards], shade[towards], None, reach, None)
-    axes[4].set_title(f"samples: N = {len(prior.points):,}\nspacing {1e3 * prior.spacing:.2f} mm = √(area / N)", fontsize=10)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=100)
 
 
 def _oblique(up: np.ndarray) -> np.ndarray:

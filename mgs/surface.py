@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -47,6 +48,29 @@ class Mesh:
             np.add.at(normals, self.faces[:, k], cross)
         norm = np.linalg.norm(normals, axis=1, keepdims=True)
         return normals / np.where(norm > 0, norm, 1.0)
+
+
+def read_mesh(path: str | Path) -> Mesh:
+    """A triangle mesh (GLB, OBJ, PLY ...) in world coordinates, metres; all of it counts as seen.
+
+    Raises InputError where it is missing or unreadable, has no faces, or holds NaN vertices.
+    """
+    import trimesh
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such mesh; give a GLB, OBJ or PLY file")
+    try:
+        mesh = trimesh.load(path, force="mesh", process=False)
+    except Exception as error:  # trimesh's readers raise many types; each means a damaged or unknown file.
+        reason = " ".join(str(error).split())[:120]
+        raise InputError(f"{path}: not a readable mesh ({reason}); export it again as GLB, OBJ or PLY") from None
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise InputError(f"{path}: has no faces; a prior needs a triangle mesh, not a point cloud")
+    if not np.isfinite(mesh.vertices).all():
+        first = int(np.argwhere(~np.isfinite(mesh.vertices))[0][0])
+        raise InputError(f"{path}: has NaN or infinite vertices, first vertex {first}; repair the mesh")
+    return Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64), np.ones(len(mesh.faces), bool))
 
 
 def estimate_normals(points: np.ndarray, views: np.ndarray, roughness: float = 0.0) -> np.ndarray:

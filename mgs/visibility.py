@@ -47,6 +47,15 @@ def in_mask(points: np.ndarray, frame: Frame) -> np.ndarray:
     return frame.mask()[row, column]
 
 
+def silhouette(points: np.ndarray, normals: np.ndarray, camera: Camera, spacing: float) -> np.ndarray:
+    """[H,W] bool: the pixels that a sampled surface covers; either side of it counts.
+
+    points [N,3] world, metres, at most a pixel apart; normals [N,3] unit; spacing: metres.
+    """
+    towards = np.einsum("nk,nk->n", normals, camera.position - points)
+    return depth_of_surfels(points, normals * np.where(towards < 0, -1.0, 1.0)[:, None], camera, spacing) > 0
+
+
 def depth_of_surfels(points: np.ndarray, normals: np.ndarray, camera: Camera, radius: float) -> np.ndarray:
     """z-buffer [H,W] of one-sided discs of `radius` (metres) at points [N,3] with unit normals [N,3]; 0 where none is hit."""
     pixels, z = camera.project(points)

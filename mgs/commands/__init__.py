@@ -10,6 +10,7 @@ from mgs.commands.demo import demo
 from mgs.commands.diagnose import diagnose
 from mgs.commands.doctor import doctor
 from mgs.commands.evaluate import evaluate
+from mgs.commands.import_data import import_data
 from mgs.commands.nbv import nbv
 from mgs.commands.prior import prior
 from mgs.commands.render import render
@@ -20,6 +21,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "doctor": doctor,
     "synth-orbit": synth_orbit,
     "dataset": dataset,
+    "import": import_data,
     "survey": survey,
     "prior": prior,
     "nbv": nbv,

@@ -15,6 +15,9 @@ def prior(
     spacing: Annotated[
         float | None, typer.Option(help="Distance between samples, metres; default a pixel's footprint.")
     ] = None,
+    mesh: Annotated[
+        Path | None, typer.Option(help="Sample this mesh (world coordinates, metres) instead of building one.")
+    ] = None,
     poisson_depth: Annotated[int | None, typer.Option(help="Poisson octree depth; default from the cloud's density.")] = None,
     prior_noise: Annotated[float, typer.Option(help="Spoil the rock's points on purpose: standard deviation, metres.")] = 0.0,
     holes: Annotated[float, typer.Option(help="Spoil them by round holes: share of the points to remove.")] = 0.0,
@@ -25,7 +28,7 @@ def prior(
 
     from mgs.dataset import load_dataset
     from mgs.files import new_folder
-    from mgs.prior import PriorSettings, build_prior, save_prior
+    from mgs.prior import PriorSettings, build_prior, prior_from_mesh, save_prior
     from mgs.prior_figure import draw_prior
 
     console = Console()
@@ -34,7 +37,10 @@ def prior(
     new_folder(folder).rmdir()  # Empty and writable, known before the work; a failure leaves nothing behind.
     settings = PriorSettings(gaussians, spacing, poisson_depth, prior_noise, holes, seed)
     with console.status("reading") as status:
-        result, stages = build_prior(frames, settings, lambda stage: status.update(f"prior: {stage}"))
+        if mesh is not None:
+            result, stages = prior_from_mesh(mesh, settings)
+        else:
+            result, stages = build_prior(frames, settings, lambda stage: status.update(f"prior: {stage}"))
         save_prior(folder, result, stages.mesh)
         status.update("prior: picture")
         draw_prior(folder / "prior.png", result, stages)
@@ -48,6 +54,23 @@ def _table(numbers: dict[str, Any]) -> Any:
 
     n, spacing, area = numbers["n"], numbers["spacing"], numbers["sampled_area"]
     table = Table("station", "number", title="Mesh prior")
+    if "points" in numbers:
+        _add_cloud_rows(table, numbers)
+    table.add_row("area, A", f"{area:.4f} m² sampled (what some frame saw), of {numbers['mesh_area']:.4f} m²")
+    table.add_row("samples, N = A / spacing²", f"{n:,} = {area:.4f} / {spacing:.6f}²")
+    truth = numbers.get("truth")
+    if truth is None:
+        table.add_row("distance to the true rock", "unknown: the dataset holds no rock.glb")
+        return table
+    table.add_section()
+    for name in ("accuracy", "completeness", "chamfer", "hausdorff"):
+        table.add_row(f"{name} to the true rock", f"{1e3 * truth[name]:.2f} mm")
+    table.add_row("true surface seen by some frame", f"{truth['visible_share']:.2%} of what is above the ground")
+    table.add_row("seen surface within 2 spacings", f"{truth['visible_within_2_spacing']:.2%}")
+    return table
+
+
+def _add_cloud_rows(table: Any, numbers: dict[str, Any]) -> None:
     table.add_row("depth pixels in the cloud", f"{numbers['pixels']:,}")
     table.add_row("noise of a depth pixel", f"{1e3 * numbers['depth_noise']:.2f} mm")
     table.add_row("points of the fused cloud", f"{numbers['points']:,} on a {1e3 * numbers['voxel']:.2f} mm grid")
@@ -61,20 +84,6 @@ def _table(numbers: dict[str, Any]) -> Any:
         f"{numbers['cluster_size']:,} points, one of {numbers['clusters']} clusters, eps {1e3 * numbers['eps']:.1f} mm",
     )
     table.add_row("mesh (Poisson)", f"{numbers['mesh_faces']:,} faces, octree depth {numbers['poisson_depth']}, watertight")
-    table.add_row("area, A", f"{area:.4f} m² seen by some frame, of {numbers['mesh_area']:.4f} m²; only A is sampled")
-    table.add_row("samples, N = A / spacing²", f"{n:,} = {area:.4f} / {spacing:.6f}²")
-    table.add_row(
-        "nearest neighbour over spacing",
-        f"mean {numbers['nearest_neighbour_mean'] / spacing:.2f}, least {numbers['nearest_neighbour_min'] / spacing:.2f}",
-    )
     table.add_row("cloud to mesh, rms", f"{1e3 * numbers['fit_rms']:.2f} mm")
-    truth = numbers.get("truth")
-    if truth is None:
-        table.add_row("distance to the true rock", "unknown: the dataset holds no rock.glb")
-        return table
-    table.add_section()
-    for name in ("accuracy", "completeness", "chamfer", "hausdorff"):
-        table.add_row(f"{name} to the true rock", f"{1e3 * truth[name]:.2f} mm")
-    table.add_row("true surface seen by some frame", f"{truth['visible_share']:.2%} of what is above the ground")
-    table.add_row("seen surface within 2 spacings", f"{truth['visible_within_2_spacing']:.2%}")
-    return table
+    spacing, mean, least = (numbers[key] for key in ("spacing", "nearest_neighbour_mean", "nearest_neighbour_min"))
+    table.add_row("nearest neighbour over spacing", f"mean {mean / spacing:.2f}, least {least / spacing:.2f}")

@@ -1,0 +1,310 @@
+"""Other people's data -> a dataset folder: nerfstudio, NeRF-synthetic and COLMAP, with lens distortion undone."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.cloud import write_points
+from mgs.conventions import Camera, opencv_from_opengl
+from mgs.dataset import FRAME_INTERVAL, Dataset, Frame, load_dataset, write_transforms
+from mgs.errors import InputError
+from mgs.files import read_exr, read_json, read_mask, read_rgba, write_exr, write_png
+from mgs.surface import read_mesh, sample_surface
+from mgs.visibility import silhouette
+
+DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
+"""Coefficients of the OPENCV camera model, in OpenCV's order."""
+SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
+"""NeRF-synthetic names images without a suffix."""
+COLMAP_MODELS: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": (),
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"),
+    "OPENCV": ("k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+}
+"""Distortion coefficients of COLMAP's camera models, in its order after focal lengths and principal point."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One frame of a foreign data set: its camera before undistortion, distortion in OpenCV's order, and its files."""
+
+    name: str
+    camera: Camera
+    distortion: np.ndarray
+    timestamp: float
+    image: Path
+    depth: Path | None = None
+    depth_unit: float = 1.0
+    mask: Path | None = None
+
+
+@dataclass(frozen=True)
+class Source:
+    """What was found: its format, the shots whose image exists, how many do not, and sparse points (points, views)."""
+
+    kind: str
+    shots: list[Shot]
+    missing: int
+    sparse: tuple[np.ndarray, np.ndarray] | None = None
+
+
+def read_source(source: str | Path, images: Path | None = None, split: str = "train") -> Source:
+    """Recognise and read a data set: a folder or a transforms*.json, or a folder with a COLMAP model (or sparse/0 in it).
+
+    images: COLMAP's image folder (by default `images` beside the model). split: of NeRF-synthetic data.
+    Raises InputError: nothing recognised, no frame whose image exists, a frame listed twice, an unsupported camera model.
+    """
+    source = Path(source)
+    if not source.exists():
+        raise InputError(f"{source}: no such file or folder; give a transforms.json, its folder, or a COLMAP folder")
+    if source.is_file() or (source / "transforms.json").is_file():
+        result = _read_transforms(source if source.is_file() else source / "transforms.json")
+    elif (source / f"transforms_{split}.json").is_file():
+        result = _read_transforms(source / f"transforms_{split}.json")
+    else:
+        model = next((folder for folder in (source / "sparse/0", source / "sparse", source) if _is_colmap(folder)), None)
+        if model is None:
+            raise InputError(f"{source}: holds no transforms.json, transforms_{split}.json or COLMAP model; check the folder")
+        result = _read_colmap(model, images if images is not None else source / "images")
+    if not result.shots:
+        raise InputError(f"{source}: none of the {result.missing} images it lists exists; restore them or give --images")
+    repeated = [name for name, count in Counter(shot.name for shot in result.shots).items() if count > 1]
+    if repeated:
+        raise InputError(f"{source}: lists {repeated[0]} more than once; remove the duplicate frames")
+    return result
+
+
+def _find(folder: Path, name: str) -> Path | None:
+    return next((path for suffix in SUFFIXES if (path := folder / f"{name}{suffix}").is_file()), None)
+
+
+def _frame_name(path: str) -> str:
+    """A flat name for an image path: images/left/0001.png -> left_0001."""
+    parts = [part for part in Path(path).with_suffix("").parts if part not in (".", "..", "/", "images")]
+    return "_".join(parts)
+
+
+def _read_transforms(path: Path) -> Source:
+    """nerfstudio's transforms.json, or NeRF-synthetic's (camera_angle_x, image names without suffix)."""
+    data = read_json(path)
+    records = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(records, list) or not records:
+        raise InputError(f"{path}: lists no frames; expected a transforms.json")
+    model = data.get("camera_model", "OPENCV")
+    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE"):
+        raise InputError(f"{path}: camera model {model} is not supported; undistort the images to OPENCV or PINHOLE first")
+    shots, missing = [], 0
+    for index, record in enumerate(records):
+        if not isinstance(record, dict) or "file_path" not in record or "transform_matrix" not in record:
+            raise InputError(f"{path}: frame {index} lacks file_path or transform_matrix; add it")
+        image = _find(path.parent, record["file_path"])
+        if image is None:
+            missing += 1
+            continue
+        depth, mask = (path.parent / record[key] if record.get(key) else None for key in ("depth_file_path", "mask_path"))
+        camera, distortion = _transforms_camera(path, index, {**data, **record}, image)
+        unit = 1.0 if depth is None or depth.suffix.lower() == ".exr" else float(data.get("depth_unit_scale_factor", 1e-3))
+        time = float(record.get("timestamp", FRAME_INTERVAL * index))
+        shots.append(Shot(_frame_name(record["file_path"]), camera, distortion, time, image, depth, unit, mask))
+    kind = "NeRF-synthetic" if "camera_angle_x" in data and "fl_x" not in data else "nerfstudio"
+    return Source(kind, shots, missing)
+
+
+def _transforms_camera(path: Path, index: int, record: dict[str, Any], image: Path) -> tuple[Camera, np.ndarray]:
+    where = f"{path}: frame {index}"
+    try:
+        if "w" in record and "h" in record:
+            width, height = int(record["w"]), int(record["h"])
+        else:
+            height, width = read_rgba(image).shape[:2]
+        fl_x = float(record["fl_x"]) if "fl_x" in record else width / 2 / np.tan(float(record["camera_angle_x"]) / 2)
+        fl_y, cx, cy = (float(record.get(*pair)) for pair in (("fl_y", fl_x), ("cx", width / 2), ("cy", height / 2)))
+        K = np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]])
+        distortion = np.array([float(record.get(key, 0)) for key in DISTORTION_KEYS])
+        pose = np.array(record["transform_matrix"], np.float64)
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{where} has no usable intrinsics or pose; give fl_x (or camera_angle_x) and a matrix") from None
+    if record.get("k4"):
+        raise InputError(f"{where} has k4, which the OPENCV model lacks; undistort the images first")
+    if pose.shape == (3, 4):
+        pose = np.vstack([pose, [0, 0, 0, 1]])
+    if pose.shape != (4, 4) or not np.isfinite(pose).all() or not np.isfinite(distortion).all():
+        raise InputError(f"{where} has a pose or distortion that is not finite, or no 4x4 matrix; correct it")
+    try:
+        return Camera(K, width, height, opencv_from_opengl(pose)), distortion
+    except (np.linalg.LinAlgError, InputError) as error:
+        raise InputError(f"{where}: {error}; correct the pose") from None
+
+
+def _is_colmap(folder: Path) -> bool:
+    return all((folder / f"{name}.bin").is_file() for name in ("cameras", "images", "points3D")) or all(
+        (folder / f"{name}.txt").is_file() for name in ("cameras", "images", "points3D")
+    )
+
+
+def _read_colmap(model: Path, images: Path) -> Source:
+    """A COLMAP sparse model, text or binary (pycolmap)."""
+    import pycolmap
+
+    try:
+        reconstruction = pycolmap.Reconstruction(model)
+    except Exception as error:  # pycolmap raises many types; each means a damaged model.
+        reason = " ".join(str(error).split())[:120]
+        raise InputError(f"{model}: not a readable COLMAP model ({reason}); export it again") from None
+    shots, missing = [], 0
+    for index, image in enumerate(sorted(reconstruction.images.values(), key=lambda image: image.name)):
+        path = images / image.name
+        if not path.is_file():
+            missing += 1
+            continue
+        lens = image.camera
+        keys = COLMAP_MODELS.get(lens.model_name)
+        if keys is None:
+            raise InputError(f"{model}: camera model {lens.model_name} is not supported; run COLMAP's image_undistorter first")
+        pose = np.eye(4)
+        pose[:3] = image.cam_from_world().matrix()
+        camera = Camera(lens.calibration_matrix(), lens.width, lens.height, pose)
+        values = dict(zip(keys, lens.params[len(lens.params) - len(keys) :], strict=True))
+        order = (*DISTORTION_KEYS, "k4", "k5", "k6")
+        distortion = np.array([values.get(key, 0.0) for key in order])
+        shots.append(Shot(_frame_name(image.name), camera, distortion, FRAME_INTERVAL * index, path))
+    return Source("COLMAP", shots, missing, _sparse_points(reconstruction))
+
+
+def _sparse_points(reconstruction: Any) -> tuple[np.ndarray, np.ndarray] | None:
+    """Triangulated points [N,3] and the mean unit direction [N,3] to the cameras that saw each."""
+    centres = {image.image_id: image.projection_center() for image in reconstruction.images.values()}
+    points, views = [], []
+    for point in reconstruction.points3D.values():
+        seen = {element.image_id for element in point.track.elements}
+        if seen:
+            rays = np.stack([centres[image] for image in seen]) - point.xyz
+            points.append(point.xyz)
+            views.append((rays / np.linalg.norm(rays, axis=1, keepdims=True)).mean(0))
+    if not points:
+        return None
+    directions = np.stack(views)
+    return np.stack(points), directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
+
+
+def import_source(
+    source: Source,
+    out: Path,
+    *,
+    masks: Path | None = None,
+    project: Callable[[Camera], np.ndarray] | None = None,
+    on_frame: Callable[[int, int], None] | None = None,
+) -> Dataset:
+    """Write a source as a dataset into the existing empty folder `out`; transforms.json is written last.
+
+    Masks come from, in this order: files of `masks` with the image's stem, `project` (a function of a camera, bool [H,W]),
+    the source's own mask files, the images' alpha. Distorted images, depth and masks are undistorted to a pinhole camera that
+    holds valid pixels only. Raises InputError where a file is missing, damaged or of another size than the camera.
+    """
+    frames = []
+    for k, shot in enumerate(source.shots):
+        if on_frame:
+            on_frame(k, len(source.shots))
+        frames.append(_import_shot(shot, out, masks, project))
+    if source.sparse is not None:
+        write_points(out / "sparse.ply", *source.sparse)
+    write_transforms(out, frames)
+    return load_dataset(out)
+
+
+def _import_shot(shot: Shot, out: Path, masks: Path | None, project: Callable[[Camera], np.ndarray] | None) -> Frame:
+    camera, undo = undistorter(shot.camera, shot.distortion)
+    rgba = _sized(shot.image, read_rgba(shot.image), shot.camera)
+    mask = None
+    if masks is not None:
+        path = _find(masks, shot.image.stem) or _find(masks, shot.name)
+        if path is None:
+            raise InputError(f"{masks}: no mask for image {shot.image.name}; name masks as their images")
+        mask = undo(_sized(path, read_mask(path), shot.camera).astype(np.uint8) * 255, True) >= 128
+    elif project is not None:
+        mask = project(camera)
+    elif shot.mask is not None:
+        mask = undo(_sized(shot.mask, read_mask(shot.mask), shot.camera).astype(np.uint8) * 255, True) >= 128
+    elif rgba[..., 3].min() < 255:
+        mask = undo(rgba[..., 3], True) >= 128
+    image, mask_path = out / "images" / f"{shot.name}.png", out / "masks" / f"{shot.name}.png"
+    write_png(image, undo(rgba[..., :3], True).astype(np.float64) / 255, linear=False)
+    if mask is not None:
+        write_png(mask_path, mask)
+    depth_path = None
+    if shot.depth is not None:
+        depth_path = out / "depth" / f"{shot.name}.exr"
+        write_exr(depth_path, {"Z": undo(_sized(shot.depth, _read_depth(shot.depth, shot.depth_unit), shot.camera), False)})
+    return Frame(shot.name, camera, shot.timestamp, image, depth_path, mask_path if mask is not None else None)
+
+
+def _sized(path: Path, pixels: np.ndarray, camera: Camera) -> np.ndarray:
+    if pixels.shape[:2] != (camera.height, camera.width):
+        found = f"{pixels.shape[1]}x{pixels.shape[0]}"
+        expected = f"{camera.width}x{camera.height}"
+        raise InputError(f"{path}: is {found}, but its camera is {expected}; resize it or correct w and h")
+    return pixels
+
+
+def _read_depth(path: Path, unit: float) -> np.ndarray:
+    """Depth in metres, float32 [H,W], from EXR or from a 16-bit PNG in steps of `unit` metres."""
+    if path.suffix.lower() == ".exr":
+        channels = read_exr(path)
+        return channels.get("Z", next(iter(channels.values())))
+    import cv2
+
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+    if pixels is None or pixels.ndim != 2:
+        raise InputError(f"{path}: not a readable depth image; expected EXR (metres) or one-channel 16-bit PNG")
+    return pixels.astype(np.float32) * unit
+
+
+def undistorter(camera: Camera, distortion: np.ndarray) -> tuple[Camera, Callable[[np.ndarray, bool], np.ndarray]]:
+    """The pinhole camera inside a distorted one, and a function (pixels, smooth) that resamples an image to it (OpenCV).
+
+    distortion: k1 k2 p1 p2 k3 (k4 k5 k6), OpenCV's rational model. smooth: bilinear, otherwise nearest (depth). OpenCV puts
+    pixel centres at integers, we at +0.5; the shift is made here. Without distortion nothing is resampled.
+    Raises InputError where no valid pixel is left.
+    """
+    import cv2
+
+    if not distortion.any():
+        return camera, lambda pixels, smooth: pixels
+    shift = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    size = (camera.width, camera.height)
+    K, _ = cv2.getOptimalNewCameraMatrix(camera.K - shift, distortion, size, alpha=0.0)
+    if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise InputError("import: the distortion leaves no valid pixel; check k1 k2 p1 p2 and the focal length")
+    maps = cv2.initUndistortRectifyMap(camera.K - shift, distortion, None, K, size, cv2.CV_32FC1)
+
+    def undo(pixels: np.ndarray, smooth: bool) -> np.ndarray:
+        method = cv2.INTER_LINEAR if smooth else cv2.INTER_NEAREST
+        return cv2.remap(np.ascontiguousarray(pixels), *maps, method, borderMode=cv2.BORDER_REPLICATE)
+
+    return Camera(K + shift, camera.width, camera.height, camera.world_to_camera), undo
+
+
+def mesh_silhouette(path: Path, shots: list[Shot]) -> Callable[[Camera], np.ndarray]:
+    """A function of a camera that gives the mesh's silhouette, bool [H,W]; sampled finer than the nearest camera's pixels.
+
+    Raises InputError as `read_mesh`.
+    """
+    mesh = read_mesh(path)
+    centre = mesh.vertices.mean(0)
+    reach = float(np.linalg.norm(mesh.vertices - centre, axis=1).max())
+    footprints = [
+        max(float(np.linalg.norm(shot.camera.position - centre)) - reach, 0.1 * reach) / shot.camera.K[0, 0] for shot in shots
+    ]
+    area = float(mesh.areas.sum())
+    spacing = float(np.clip(0.7 * min(footprints), np.sqrt(area / 1e6), np.sqrt(area / 1e3)))
+    points, normals, spacing = sample_surface(mesh, 0, spacing=spacing)
+    return lambda camera: silhouette(points, normals, camera, spacing)
