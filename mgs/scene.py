@@ -16,11 +16,11 @@ from mgs.scene_file import SceneFile, Sky
 from mgs.seeds import generator
 
 MAX_DEPTH = 4
-"""Path length: camera, surface, and two more bounces; light between rock and ground matters in the shade."""
+"""Path length: direct light and two bounces; light between rock and ground matters in the shade."""
 
 GUIDES_PER_SAMPLE = 2
 """Samples of the denoiser's guides for each sample of light. Guides are cheap and, nearly free of noise, can be declared clean:
-the denoiser then keeps the texture they show (2 to 3 dB; docs/data.md)."""
+the denoiser then keeps the texture they show (3 dB; docs/data.md)."""
 
 _MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Mitsuba's camera frame is x to the image's left, y up, z forward."""

@@ -6,11 +6,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 
-from mgs.conventions import Camera, look_at
+from mgs.conventions import Camera, linear_from_srgb, look_at
 from mgs.errors import InputError
+from mgs.rock import make_rock
 from mgs.scene import Scene, sensor_dict
 from mgs.scene_file import Arena, Rock, SceneFile, load_scene_file
+from mgs.seeds import generator
 
 K = np.array([[70.0, 0, 30.5], [0, 70.0, 27.25], [0, 0, 1]])
 
@@ -42,6 +45,20 @@ def test_colour_and_depth_agree_on_the_silhouette():
         middle, z = camera.project(np.array([[0.1, 0, 0.5]]))
         u, v = middle[0].astype(int)
         assert rendered.depth[v, u] == pytest.approx(z[0] - 0.7, abs=0.01)
+
+
+def test_texture_lies_on_the_rock_as_in_the_mesh():
+    """Mitsuba's albedo at each pixel is the colour that the exported mesh has at that point (a flipped v would be noise)."""
+    rock = make_rock(Rock(detail=0.04), generator(0, "rock"))
+    camera = Camera(K * [[2], [2], [1]], 128, 96, look_at([3, 1, 1.5], [0, 0, 0.6]))
+    scene = Scene(SceneFile(arena=Arena(stones=0)), rock, camera, seed=0)
+    albedo = np.array(mi.render(scene.scene, integrator=scene.guides, spp=16, seed=0))[..., :3]
+    depth, mask = scene.cast(camera)
+    points = camera.unproject(depth)[mask]
+    nearest = cKDTree(rock.vertices).query(points)[1]
+    expected = linear_from_srgb(rock.visual.to_color().vertex_colors[nearest, :3] / 255)
+    assert np.corrcoef(albedo[mask].mean(-1), expected.mean(-1))[0, 1] > 0.7
+    assert albedo[mask].mean(0) == pytest.approx(expected.mean(0), rel=0.05)
 
 
 @pytest.mark.parametrize(
