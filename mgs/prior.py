@@ -56,7 +56,8 @@ class PriorSettings:
 @dataclass(frozen=True)
 class Prior:
     """points [N,3] world, metres; normals [N,3] unit; spacing: sqrt(area / N), metres; depth_tolerance: metres a depth may
-    differ from the prior and still be the same surface; numbers: what prior.json holds."""
+    differ from the prior and still be the same surface (the largest of three rms residuals of the cloud, a voxel, and two
+    standard deviations of the depth images); numbers: what prior.json holds."""
 
     points: np.ndarray
     normals: np.ndarray
@@ -66,14 +67,25 @@ class Prior:
 
 
 @dataclass(frozen=True)
+class Rock:
+    """From the cloud to the rock: ground [P] bool, points of the cloud on the plane; points [M,3], the rock's cluster, and
+    normals [M,3]; eps: metres, and clusters: how many DBSCAN found."""
+
+    cloud: Cloud
+    plane: Plane
+    ground: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
+    eps: float
+    clusters: int
+
+
+@dataclass(frozen=True)
 class Stages:
-    """What the figure shows: the mesh, and the cloud, ground plane and rock's points it came from (none for a given mesh)."""
+    """What the figure shows: the mesh, and the rock it was built from (none for a given mesh)."""
 
     mesh: Mesh
-    cloud: Cloud | None = None
-    plane: Plane | None = None
-    ground: np.ndarray | None = None
-    cluster: np.ndarray | None = None
+    rock: Rock | None = None
 
 
 def build_prior(
@@ -82,66 +94,80 @@ def build_prior(
     """Build the prior of a dataset of RGB-D frames; of its imported sparse points where frames have no depth.
 
     on_stage is told the name of each stage as it starts.
-
     Raises InputError: no depth, no ground plane, no rock (empty cluster), two equal rocks, no closed surface, N below 2.
     """
     _check(settings)
     tell = on_stage or (lambda stage: None)
-    tell("cloud")
-    sparse, has_depth = dataset.root / "sparse.ply", any(frame.depth_path for frame in dataset.frames)
-    cloud = sparse_cloud(sparse) if sparse.is_file() and not has_depth else fuse_frames(dataset.frames)
-    tell("ground plane")
-    plane = ground_plane(cloud, dataset.frames, derive_seed(settings.seed, "prior/plane"))
-    ground = np.abs(plane.height(cloud.points)) <= plane.tolerance
-    above = plane.height(cloud.points) > plane.tolerance
-    tell("rock cluster")
-    inside, eps, clusters = rock_cluster(cloud.points[above], cloud.voxel, focus(dataset.frames).point, str(dataset.root))
-    cluster, views = cloud.points[above][inside], cloud.views[above][inside]
-    cluster, kept = degrade(cluster, settings.noise, settings.holes, generator(settings.seed, "prior/degrade"))
-    cluster, views = cluster[kept], views[kept]
+    rock = find_rock(dataset, settings, tell)
+    cloud = rock.cloud
     tell("Poisson mesh")
-    normals = estimate_normals(cluster, views, (FILTERED_SHARE * cloud.noise + settings.noise) / cloud.voxel)
-    floor = (plane.height(cluster) < 2 * plane.tolerance) & (normals @ plane.normal > FLOOR_UPRIGHT)
-    cluster, normals = cluster[~floor], normals[~floor]
-    mesh, depth = poisson_mesh(cluster, normals, max(cloud.voxel, settings.noise), plane, settings.poisson_depth)
-    residual = float(np.sqrt(np.mean(distances_to_mesh(cluster, mesh.vertices, mesh.faces) ** 2)))
-    tolerance = max(3 * residual, cloud.voxel)
+    cell = max(cloud.voxel, settings.noise)
+    mesh, depth = poisson_mesh(rock.points, rock.normals, cell, rock.plane, settings.poisson_depth)
+    residual = float(np.sqrt(np.mean(distances_to_mesh(rock.points, mesh.vertices, mesh.faces) ** 2)))
+    tolerance = max(3 * residual, cloud.voxel, 2 * cloud.noise)
     tell("surface samples")
     mesh = _seen_by(mesh, dataset.frames, tolerance)
     spacing = settings.spacing or (None if settings.gaussians else cloud.voxel)
     seed = derive_seed(settings.seed, "prior/samples")
     points, normals, spacing = sample_surface(mesh, seed, count=settings.gaussians, spacing=spacing)
-    nearest = cKDTree(points).query(points, 2)[0][:, 1]
-    numbers: dict[str, Any] = {
+    numbers = {
         "frames": len(dataset.frames),
         "pixels": cloud.pixels,
         "points": len(cloud.points),
         "voxel": cloud.voxel,
         "depth_noise": cloud.noise,
-        "plane_inliers": int(ground.sum()),
-        "plane_sigma": plane.sigma,
-        "plane_tolerance": plane.tolerance,
-        "eps": eps,
-        "clusters": clusters,
-        "cluster_size": len(cluster),
+        "plane_inliers": int(rock.ground.sum()),
+        "plane_sigma": rock.plane.sigma,
+        "plane_tolerance": rock.plane.tolerance,
+        "eps": rock.eps,
+        "clusters": rock.clusters,
+        "cluster_size": len(rock.points),
         "poisson_depth": depth,
+        "fit_rms": residual,
+        "depth_tolerance": tolerance,
+        **_sample_numbers(mesh, points, spacing, settings),
+    }
+    truth = dataset.root / "rock.glb"
+    if truth.is_file() and any(frame.depth_path for frame in dataset.frames):
+        tell("distance to the true rock")
+        numbers["truth"] = error_to_truth(points, spacing, mesh, truth, dataset.frames, rock, settings.seed)
+    return Prior(points, normals, spacing, tolerance, numbers), Stages(mesh, rock)
+
+
+def find_rock(dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None]) -> Rock:
+    """Cloud, ground plane, rock cluster and its normals (spoilt as `settings` say). Raises InputError as `build_prior`."""
+    on_stage("cloud")
+    sparse = dataset.root / "sparse.ply"
+    if sparse.is_file() and not any(frame.depth_path for frame in dataset.frames):
+        cloud = sparse_cloud(sparse)
+    else:
+        cloud = fuse_frames(dataset.frames)
+    on_stage("ground plane")
+    plane = ground_plane(cloud, dataset.frames, derive_seed(settings.seed, "prior/plane"))
+    ground = np.abs(plane.height(cloud.points)) <= plane.tolerance
+    above = plane.height(cloud.points) > plane.tolerance
+    on_stage("rock cluster")
+    inside, eps, clusters = rock_cluster(cloud.points[above], cloud.voxel, focus(dataset.frames).point, str(dataset.root))
+    points, views = cloud.points[above][inside], cloud.views[above][inside]
+    points, kept = degrade(points, settings.noise, settings.holes, generator(settings.seed, "prior/degrade"))
+    points, views = points[kept], views[kept]
+    normals = estimate_normals(points, views, (FILTERED_SHARE * cloud.noise + settings.noise) / cloud.voxel)
+    floor = (plane.height(points) < 2 * plane.tolerance) & (normals @ plane.normal > FLOOR_UPRIGHT)
+    return Rock(cloud, plane, ground, points[~floor], normals[~floor], eps, clusters)
+
+
+def _sample_numbers(mesh: Mesh, points: np.ndarray, spacing: float, settings: PriorSettings) -> dict[str, Any]:
+    nearest = cKDTree(points).query(points, 2)[0][:, 1]
+    return {
         "mesh_faces": len(mesh.faces),
         "mesh_area": float(mesh.areas.sum()),
         "sampled_area": float(mesh.areas[mesh.seen].sum()),
-        "fit_rms": residual,
-        "depth_tolerance": tolerance,
         "n": len(points),
         "spacing": spacing,
         "nearest_neighbour_mean": float(nearest.mean()),
         "nearest_neighbour_min": float(nearest.min()),
         "settings": asdict(settings),
     }
-    truth = dataset.root / "rock.glb"
-    if truth.is_file() and has_depth:
-        tell("distance to the true rock")
-        numbers["truth"] = error_to_truth(points, spacing, mesh, truth, dataset.frames, plane, settings.seed)
-    prior = Prior(points, normals, spacing, tolerance, numbers)
-    return prior, Stages(mesh, cloud, plane, ground, cluster)
 
 
 def prior_from_mesh(path: str | Path, settings: PriorSettings) -> tuple[Prior, Stages]:
@@ -152,16 +178,7 @@ def prior_from_mesh(path: str | Path, settings: PriorSettings) -> tuple[Prior, S
         raise InputError(f"{path}: a given mesh says nothing of how finely to sample it; give --gaussians or --spacing")
     seed = derive_seed(settings.seed, "prior/samples")
     points, normals, spacing = sample_surface(mesh, seed, count=settings.gaussians, spacing=settings.spacing)
-    numbers: dict[str, Any] = {
-        "mesh": str(path),
-        "mesh_faces": len(mesh.faces),
-        "mesh_area": float(mesh.areas.sum()),
-        "sampled_area": float(mesh.areas.sum()),
-        "depth_tolerance": spacing,
-        "n": len(points),
-        "spacing": spacing,
-        "settings": asdict(settings),
-    }
+    numbers = {"mesh": str(path), "depth_tolerance": spacing, **_sample_numbers(mesh, points, spacing, settings)}
     return Prior(points, normals, spacing, spacing, numbers), Stages(mesh)
 
 
@@ -197,7 +214,7 @@ def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:
 
 
 def error_to_truth(
-    points: np.ndarray, spacing: float, mesh: Mesh, truth: Path, frames: tuple[Frame, ...], plane: Plane, seed: int
+    points: np.ndarray, spacing: float, mesh: Mesh, truth: Path, frames: Sequence[Frame], rock: Rock, seed: int
 ) -> dict[str, float]:
     """How far the prior is from the true rock, metres (Knapitsch et al. 2017 name accuracy and completeness).
 
@@ -209,17 +226,18 @@ def error_to_truth(
     import trimesh
 
     known = read_mesh(truth)
-    rock = trimesh.Trimesh(known.vertices, known.faces, process=False)
-    surface, face = trimesh.sample.sample_surface(rock, TRUTH_SAMPLES, seed=derive_seed(seed, "prior/truth"))
-    exposed = plane.height(np.asarray(surface)) > 0
-    surface, normals = np.asarray(surface)[exposed], rock.face_normals[face[exposed]]
+    true = trimesh.Trimesh(known.vertices, known.faces, process=False)
+    surface, face = trimesh.sample.sample_surface(true, TRUTH_SAMPLES, seed=derive_seed(seed, "prior/truth"))
+    exposed = rock.plane.height(np.asarray(surface)) > 0
+    surface, normals = np.asarray(surface)[exposed], true.face_normals[face[exposed]]
+    tolerance = max(spacing / 2, 2 * rock.cloud.noise)
     seen = np.zeros(len(surface), bool)
     for frame in frames:
         # Two-sided: scanned rocks come with either winding.
-        seen |= visible(surface, normals, frame.camera, frame.depth(), spacing / 2, two_sided=True)
+        seen |= visible(surface, normals, frame.camera, frame.depth(), tolerance, two_sided=True)
     if not seen.any():
         raise InputError(f"{truth}: no frame sees the true rock; it does not belong to this dataset (or is in another frame)")
-    there = distances_to_mesh(points, rock.vertices, rock.faces)
+    there = distances_to_mesh(points, true.vertices, true.faces)
     back = distances_to_mesh(surface[seen], mesh.vertices, mesh.faces)
     return {
         "accuracy": float(there.mean()),

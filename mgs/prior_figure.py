@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from mgs.files import atomic_path
-from mgs.prior import Prior, Stages
+from mgs.prior import Prior, Rock, Stages
 
 MAX_DOTS = 60_000
 """Points drawn per panel; more do not show."""
@@ -19,16 +19,17 @@ def draw_prior(path: str | Path, prior: Prior, stages: Stages) -> None:
     """Write the figure as a PNG, atomically."""
     from matplotlib.figure import Figure
 
-    up = np.array([0.0, 0.0, 1.0]) if stages.plane is None else stages.plane.normal
+    up = np.array([0.0, 0.0, 1.0]) if stages.rock is None else stages.rock.plane.normal
     frame = _oblique(up)
     body = stages.mesh.vertices
     centre = (body.min(0) + body.max(0)) / 2
     reach = 0.5 * float(np.linalg.norm(np.ptp(body, axis=0)))
     truth = prior.numbers.get("truth")
     error = f", accuracy {1e3 * truth['accuracy']:.2f} mm" if truth else ""
-    figure = Figure(figsize=(17 if stages.plane is not None else 7, 4.2), layout="constrained")
-    axes = figure.subplots(1, 5 if stages.plane is not None else 2)
-    _cloud_panels(axes[:-2], stages, frame, centre, reach)
+    figure = Figure(figsize=(17 if stages.rock is not None else 7, 4.2), layout="constrained")
+    axes = figure.subplots(1, 5 if stages.rock is not None else 2)
+    if stages.rock is not None:
+        _cloud_panels(axes[:3], stages.rock, frame, centre, reach)
     _shaded_mesh(axes[-2], stages, frame, centre, reach)
     unseen = "" if stages.mesh.seen.all() else "\nblue: seen by no frame, not sampled"
     axes[-2].set_title(f"mesh, {prior.numbers['mesh_area']:.2f} m²{error}{unseen}", fontsize=10)
@@ -40,16 +41,14 @@ def draw_prior(path: str | Path, prior: Prior, stages: Stages) -> None:
         figure.savefig(temporary, dpi=100)
 
 
-def _cloud_panels(axes, stages: Stages, frame: np.ndarray, centre: np.ndarray, reach: float) -> None:
-    """The cloud, its plane inliers and the rock's points; nothing for a prior of a given mesh."""
-    if stages.cloud is None or stages.plane is None or stages.ground is None or stages.cluster is None:
-        return
-    cloud, height, ground = stages.cloud.points, stages.plane.height(stages.cloud.points), stages.ground
+def _cloud_panels(axes, rock: Rock, frame: np.ndarray, centre: np.ndarray, reach: float) -> None:
+    """The cloud, its plane inliers and the rock's points."""
+    cloud, height, ground = rock.cloud.points, rock.plane.height(rock.cloud.points), rock.ground
     near = np.linalg.norm(cloud - centre, axis=1) < 4 * reach
     panels = [
         (f"cloud: {len(cloud):,} points\ncoloured by height", cloud[near], height[near], "viridis", 2.2),
         (f"ground plane: {int(ground.sum()):,} inliers (tan)\nthe rest in blue", cloud[near], (~ground[near]) * 1.0, None, 2.2),
-        (f"rock cluster: {len(stages.cluster):,} points", stages.cluster, stages.plane.height(stages.cluster), "viridis", 1.0),
+        (f"rock cluster: {len(rock.points):,} points", rock.points, rock.plane.height(rock.points), "viridis", 1.0),
     ]
     for axis, (title, points, value, colours, zoom) in zip(axes, panels, strict=True):
         tint = np.where(value[:, None] > 0.5, [0.15, 0.35, 0.75], [0.85, 0.76, 0.6]) if colours is None else value

@@ -126,8 +126,8 @@ def test_a_prior_from_sparse_points(dataset: Dataset, tmp_path: Path) -> None:
     prior, stages = build_prior(copy, PriorSettings(gaussians=800))
     on_rock = np.sqrt((((prior.points - synthetic.CENTRE) / synthetic.AXES) ** 2).sum(1))
     assert np.median(np.abs(on_rock - 1)) < 0.02
-    assert stages.cluster is not None
-    assert len(stages.cluster) > 2000
+    assert stages.rock is not None
+    assert len(stages.rock.points) > 2000
 
 
 def test_nerf_synthetic_with_alpha(dataset: Dataset, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import synthetic
 
 from mgs.cli import main
-from mgs.cloud import Cloud, Plane, degrade, focus, fuse_frames, ground_plane, rock_cluster
+from mgs.cloud import Cloud, degrade, focus, fuse_frames, ground_plane, rock_cluster
 from mgs.conventions import Camera
 from mgs.dataset import Dataset, load_dataset, write_transforms
 from mgs.errors import InputError
@@ -176,7 +176,7 @@ def test_depth_of_surfels_agrees_with_ray_casting() -> None:
 
 def test_prior_is_near_the_truth(built) -> None:
     prior, stages = built
-    numbers, voxel = prior.numbers, stages.cloud.voxel
+    numbers, voxel = prior.numbers, stages.rock.cloud.voxel
     truth = numbers["truth"]
     assert len(prior.points) == 1500
     assert numbers["n"] == pytest.approx(numbers["sampled_area"] / prior.spacing**2)
@@ -188,7 +188,7 @@ def test_prior_is_near_the_truth(built) -> None:
     assert truth["visible_share"] > 0.98
     assert trimesh.Trimesh(stages.mesh.vertices, stages.mesh.faces).is_watertight
     # All but the flat base is seen, and no less of the ellipsoid is sampled than stands above the ground.
-    height = stages.plane.height(stages.mesh.vertices[stages.mesh.faces[~stages.mesh.seen]].mean(1))
+    height = stages.rock.plane.height(stages.mesh.vertices[stages.mesh.faces[~stages.mesh.seen]].mean(1))
     assert np.abs(height).max() < 1e-6
     analytic = (prior.points - synthetic.CENTRE) / synthetic.AXES**2
     analytic /= np.linalg.norm(analytic, axis=1, keepdims=True)
@@ -200,8 +200,9 @@ def test_error_to_truth_sees_a_wrong_prior(built, dataset: Dataset) -> None:
 
     prior, stages = built
     moved = Mesh(stages.mesh.vertices + 0.05 * Z, stages.mesh.faces, stages.mesh.seen)
-    plane = Plane(stages.plane.normal, stages.plane.offset, 0.0, 0.0)
-    error = error_to_truth(prior.points + 0.05 * Z, prior.spacing, moved, dataset.root / "rock.glb", dataset.frames, plane, 0)
+    error = error_to_truth(
+        prior.points + 0.05 * Z, prior.spacing, moved, dataset.root / "rock.glb", dataset.frames, stages.rock, 0
+    )
     assert 0.02 < error["accuracy"] < 0.05
     assert error["hausdorff"] == pytest.approx(0.05, abs=0.02)
 

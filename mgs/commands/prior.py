@@ -58,6 +58,8 @@ def _table(numbers: dict[str, Any]) -> Any:
         _add_cloud_rows(table, numbers)
     table.add_row("area, A", f"{area:.4f} m² sampled (what some frame saw), of {numbers['mesh_area']:.4f} m²")
     table.add_row("samples, N = A / spacing²", f"{n:,} = {area:.4f} / {spacing:.6f}²")
+    mean, least = (numbers[key] / spacing for key in ("nearest_neighbour_mean", "nearest_neighbour_min"))
+    table.add_row("nearest neighbour over spacing", f"mean {mean:.2f}, least {least:.2f}")
     truth = numbers.get("truth")
     if truth is None:
         table.add_row("distance to the true rock", "unknown: the dataset holds no rock.glb")
@@ -85,5 +87,3 @@ def _add_cloud_rows(table: Any, numbers: dict[str, Any]) -> None:
     )
     table.add_row("mesh (Poisson)", f"{numbers['mesh_faces']:,} faces, octree depth {numbers['poisson_depth']}, watertight")
     table.add_row("cloud to mesh, rms", f"{1e3 * numbers['fit_rms']:.2f} mm")
-    spacing, mean, least = (numbers[key] for key in ("spacing", "nearest_neighbour_mean", "nearest_neighbour_min"))
-    table.add_row("nearest neighbour over spacing", f"mean {mean / spacing:.2f}, least {least / spacing:.2f}")
