@@ -80,13 +80,16 @@ def synthesise(
         "denoise": denoise,
         "pose_noise": None if pose_noise is None else asdict(pose_noise),
     }
+    resumes = _resumes(out, resolved)
     rock, scale = (make_rock(settings.rock, generator(seed, "rock")), 1.0) if mesh is None else load_rock(mesh, settings.rock)
     if mesh is not None:
         extents = " x ".join(f"{x:.2f}" for x in rock.extents)
         say(f"{mesh}: scaled {scale:.4g} times to the scene's rock size, now {extents} m")
     cameras = rock_cameras(settings, preset, rock)
     frames = _frames(out, cameras)
-    _open_folder(out, resolved)
+    if not resumes:
+        new_folder(out)
+        write_json(out / "config.json", resolved)
     with atomic_path(out / "rock.glb") as temporary:
         rock.export(temporary, file_type="glb", include_normals=True)
     spp = preset.spp
@@ -97,19 +100,7 @@ def synthesise(
     scene = Scene(settings, rock, cameras[0], seed)
     exposure = _meter(scene, cameras, seed)
     prepared = time.perf_counter()
-    seconds: list[float] = []
-    for index, frame in enumerate(frames):
-        if not _is_done(frame):
-            begun = time.perf_counter()
-            rendered = scene.render(frame.camera, spp, derive_seed(seed, frame.name), denoise)
-            assert frame.depth_path
-            assert frame.mask_path
-            write_exr(frame.depth_path, {"Z": rendered.depth})
-            write_png(frame.mask_path, rendered.mask)
-            write_png(frame.image_path, rendered.rgb * exposure)
-            seconds.append(time.perf_counter() - begun)
-        progress(index + 1, len(frames))
-
+    seconds = _render_frames(scene, frames, exposure, spp, seed, denoise, progress)
     write_contact_sheet(out / "contact_sheet.png", frames)
     timings = {
         "prepare_s": round(prepared - started, 2),
@@ -124,6 +115,31 @@ def synthesise(
         frames = [replace(frame, camera=camera) for frame, camera in zip(frames, told, strict=True)]
     write_transforms(out, frames)
     return load_dataset(out)
+
+
+def _render_frames(
+    scene: Scene,
+    frames: list[Frame],
+    exposure: float,
+    spp: int,
+    seed: int,
+    denoise: bool,
+    progress: Callable[[int, int], None],
+) -> list[float]:
+    """Render and write the frames that are not on disk yet; returns the seconds that each took."""
+    seconds = []
+    for index, frame in enumerate(frames):
+        if not _is_done(frame):
+            begun = time.perf_counter()
+            rendered = scene.render(frame.camera, spp, derive_seed(seed, frame.name), denoise)
+            assert frame.depth_path
+            assert frame.mask_path
+            write_exr(frame.depth_path, {"Z": rendered.depth})
+            write_png(frame.mask_path, rendered.mask)
+            write_png(frame.image_path, rendered.rgb * exposure)
+            seconds.append(time.perf_counter() - begun)
+        progress(index + 1, len(frames))
+    return seconds
 
 
 def rock_cameras(settings: SceneFile, preset: Preset, rock: trimesh.Trimesh) -> list[Camera]:
@@ -167,15 +183,18 @@ def _is_done(frame: Frame) -> bool:
     return all(path is not None and path.is_file() for path in (frame.image_path, frame.depth_path, frame.mask_path))
 
 
-def _open_folder(out: Path, resolved: dict[str, Any]) -> None:
-    """Start a new folder, or go on with one that the same settings began. Raises InputError."""
+def _resumes(out: Path, resolved: dict[str, Any]) -> bool:
+    """Whether `out` holds an unfinished dataset of the same settings. Raises InputError where it holds anything else."""
     if (out / "config.json").is_file() and not (out / "transforms.json").exists():
         begun = read_json(out / "config.json")
         if any(begun.get(key) != value for key, value in resolved.items()):
             raise InputError(f"{out}: holds an unfinished dataset of other settings; choose a new folder or delete it")
-        return
-    new_folder(out)
-    write_json(out / "config.json", resolved)
+        for left in out.rglob(".*.part*"):  # of a process that was killed while it wrote
+            left.unlink()
+        return True
+    if out.exists():
+        new_folder(out)  # complains where it is not empty
+    return False
 
 
 def _meter(scene: Scene, cameras: list[Camera], seed: int) -> float:

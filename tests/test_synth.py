@@ -74,8 +74,10 @@ def test_same_seed_same_bytes_and_resume_and_pose_noise(dataset, tmp_path):
     with pytest.raises(Stop):
         synthesise(tmp_path / "again", SCENE, TINY, seed=3, pose_noise=PoseNoise(0.01, 0.1), progress=interrupt)
     assert not (tmp_path / "again/transforms.json").exists()
+    (tmp_path / "again/images/.kf_0003.1.part.png").touch()
     again = synthesise(tmp_path / "again", SCENE, TINY, seed=3, pose_noise=PoseNoise(0.01, 0.1))
     truth = json.loads((again.root / "true_poses.json").read_text())["poses"]
+    assert not list(again.root.rglob("*part*"))
     for a, b in zip(dataset.frames, again.frames, strict=True):
         assert a.image_path.read_bytes() == b.image_path.read_bytes()
         assert a.mask_path.read_bytes() == b.mask_path.read_bytes()
