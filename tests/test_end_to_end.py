@@ -137,3 +137,24 @@ def test_compare_policies_and_report(dataset, run, tmp_path):
     assert all(path.stat().st_size > 0 for path in written)
     assert len(list((run / "renders").iterdir())) == 10
     assert (run / "diagnostics/kf_0001.exr").is_file()
+
+
+def test_demo_shows_the_table_and_the_pictures_and_can_be_given_again(tmp_path, capsys, monkeypatch):
+    """`mgs demo` over a dataset that is there already (rendering takes minutes): every later station, then nothing to do."""
+    from mgs.synth import write_contact_sheet
+
+    out = tmp_path / "demo"
+    dataset = synthetic.write_dataset(out / "dataset", synthetic.orbit_cameras(13, 48, 36))
+    write_contact_sheet(out / "dataset/contact_sheet.png", dataset.frames)
+    for name, value in {"GAUSSIANS": 200, "BUDGET": 2}.items():
+        monkeypatch.setattr(sys.modules["mgs.commands.demo"], name, value)
+    command("demo", out)
+    shown = capsys.readouterr().out
+    assert all(policy in shown for policy in ("d-optimal", "coverage", "random"))
+    pictures = [Path(line.strip()) for line in shown.splitlines() if line.startswith("  ") and "demo/" in line]
+    assert len(pictures) >= 7
+    assert all(picture.is_file() for picture in pictures)
+    kept = {path: path.read_bytes() for path in out.glob("*/steps.jsonl")}
+    assert len(kept) == 3
+    command("demo", out)
+    assert {path: path.read_bytes() for path in out.glob("*/steps.jsonl")} == kept
