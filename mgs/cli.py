@@ -9,6 +9,9 @@ import typer
 from mgs.commands import COMMANDS
 from mgs.errors import InputError
 
+INTERRUPTED = 130
+"""Exit code after Ctrl-C: 128 + SIGINT."""
+
 app = typer.Typer(
     name="mgs",
     help="Active Gaussian splatting: exact Fisher information and next-best-view selection.",
@@ -27,9 +30,10 @@ def main(arguments: list[str] | None = None) -> None:
     except InputError as error:
         print(f"mgs: {error}", file=sys.stderr)
         raise SystemExit(2) from None
-    except KeyboardInterrupt:
-        print("mgs: interrupted; what was finished is kept", file=sys.stderr)
-        raise SystemExit(130) from None
+    except SystemExit as stop:
+        if stop.code == INTERRUPTED:  # typer has turned Ctrl-C into this, without a word
+            print("mgs: interrupted; what was finished is kept", file=sys.stderr)
+        raise
 
 
 if __name__ == "__main__":

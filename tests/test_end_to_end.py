@@ -106,6 +106,7 @@ def test_interrupted_in_the_middle_of_a_step_then_resumed(dataset, run, tmp_path
     error = process.communicate()[1]
     assert process.returncode == code, error
     assert "Traceback" not in error
+    assert ("mgs: interrupted" in error) == (blow == signal.SIGINT)
     before = steps(out)
     assert len(before) < 5, "the run was over before the blow"
     command("nbv", "--resume", out)
