@@ -1,4 +1,4 @@
-"""The pictures of docs/data.md: one strip of frames per scene, from datasets in a folder.
+"""The pictures of docs/data.md: one strip of frames per scene, from datasets in a folder, and the four orbits.
 
 for s in boulder contact-binary strata low-sun pebbles; do mgs synth-orbit out/$s --scene $s --frames 8; done
 python benchmarks/scene_gallery.py out docs/images
@@ -9,9 +9,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import matplotlib.pyplot as plt
+import numpy as np
 from PIL import Image
 
 from mgs.dataset import load_dataset
+from mgs.orbit import orbit_positions
+from mgs.scene_file import ORBITS, load_scene_file
 
 WIDTH = 232
 """Of one frame in a strip, pixels."""
@@ -29,6 +33,21 @@ def strip(folder: Path, columns: int = 4) -> Image.Image:
     return picture
 
 
+def draw_orbits(path: Path, frames: int = 60) -> None:
+    """The four orbits of the default scene: camera centres, coloured by the order in which they are flown."""
+    settings = load_scene_file("boulder").orbit
+    figure = plt.figure(figsize=(10, 2.7), constrained_layout=True)
+    for i, kind in enumerate(ORBITS):
+        x, y, z = orbit_positions(settings.model_copy(update={"kind": kind}), frames, np.array([0, 0, 0.6])).T
+        axes = figure.add_subplot(1, 4, i + 1, projection="3d")
+        axes.plot(x, y, z, color="0.75", linewidth=0.8)
+        axes.scatter(x, y, z, c=np.arange(frames), s=8, cmap="viridis", depthshade=False)
+        axes.scatter(0, 0, 0.6, color="saddlebrown", s=60)
+        axes.set(title=kind, xlim=(-4, 4), ylim=(-4, 4), zlim=(0, 4), xticks=[-4, 0, 4], yticks=[-4, 0, 4], zticks=[0, 2, 4])
+        axes.set_box_aspect((2, 2, 1))
+    figure.savefig(path, dpi=110)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("datasets", type=Path)
@@ -37,3 +56,4 @@ if __name__ == "__main__":
     arguments.out.mkdir(parents=True, exist_ok=True)
     for dataset in sorted(path.parent for path in arguments.datasets.glob("*/transforms.json")):
         strip(dataset).save(arguments.out / f"scene_{dataset.name}.png", optimize=True)
+    draw_orbits(arguments.out / "orbits.png")

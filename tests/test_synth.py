@@ -14,8 +14,11 @@ from mgs.conventions import opencv_from_opengl
 from mgs.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import read_json
-from mgs.scene_file import Arena, Orbit, Rock, SceneFile
-from mgs.synth import PoseNoise, Preset, synthesise
+from mgs.resources import resource_folder
+from mgs.rock import make_rock
+from mgs.scene_file import ORBITS, Arena, Orbit, Rock, SceneFile, load_scene_file
+from mgs.seeds import generator
+from mgs.synth import PoseNoise, Preset, rock_cameras, synthesise
 
 TINY = Preset(width=64, height=48, frames=5, spp=2)
 SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=20))
@@ -130,3 +133,14 @@ def test_bad_options_leave_nothing_behind(tmp_path, capsys, options, message):
     assert message in captured
     assert captured.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("scene", sorted(path.stem for path in resource_folder("scenes").glob("*.toml")))
+def test_every_scene_frames_its_rock_on_every_orbit(scene):
+    settings = load_scene_file(scene)
+    rock = make_rock(settings.rock.model_copy(update={"detail": 0.06}), generator(0, "rock"))
+    for kind in ORBITS:
+        flown = settings.model_copy(update={"orbit": settings.orbit.model_copy(update={"kind": kind})})
+        cameras = rock_cameras(flown, Preset(640, 480, 36, 1), rock)
+        heights = [np.ptp(camera.project(rock.vertices[rock.vertices[:, 2] > 0])[0][:, 1]) / 480 for camera in cameras]
+        assert 0.35 < np.mean(heights) < 0.75
