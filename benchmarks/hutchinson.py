@@ -16,8 +16,8 @@ runtime.start()
 
 from mgs.bench import exponent, surface_camera, surface_gaussians  # noqa: E402
 from mgs.config import versions  # noqa: E402
+from mgs.figures import new_figure, save_figure  # noqa: E402
 from mgs.files import write_json  # noqa: E402
-from mgs.report import new_figure, save_figure  # noqa: E402
 from mgs.splat import ListCache, as_drjit, fisher  # noqa: E402
 from mgs.splat.fisher import hutchinson  # noqa: E402
 

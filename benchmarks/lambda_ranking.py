@@ -55,7 +55,7 @@ def draw(out: Path, curves: dict[str, tuple[list[float], list[float]]]) -> None:
     """Rank correlation against lambda."""
     import matplotlib
 
-    from mgs.report import STYLE
+    from mgs.figures import STYLE
 
     with matplotlib.rc_context(STYLE):
         from matplotlib.figure import Figure

@@ -16,7 +16,7 @@ runtime.start()
 
 from mgs.bench import surface_camera, surface_gaussians  # noqa: E402
 from mgs.conventions import srgb_from_linear  # noqa: E402
-from mgs.report import new_figure, save_figure  # noqa: E402
+from mgs.figures import new_figure, save_figure  # noqa: E402
 from mgs.splat import ListCache, as_drjit, reference, render  # noqa: E402
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y  # noqa: E402
 from mgs.splat.project import camera_array, project  # noqa: E402

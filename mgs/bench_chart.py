@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mgs.bench import exponent
-from mgs.report import new_figure, save_figure
+from mgs.figures import new_figure, save_figure
 
 OPERATIONS = {
     "forward_warm": ("forward, warm", "#0072b2", "o"),

@@ -118,7 +118,7 @@ def write_preview(path: str | Path, maps: dict[str, np.ndarray], title: str) -> 
     """Write the channels of one view as a sheet of nine panels with colour bars, cropped to the model."""
     import matplotlib
 
-    from mgs.report import STYLE, crop, new_figure, save_figure
+    from mgs.figures import STYLE, crop, new_figure, save_figure
 
     rgb = np.stack([maps[channel] for channel in "RGB"], axis=-1)
     visible = maps["A"] >= VISIBLE

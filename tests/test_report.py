@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import tiny
 from PIL import Image
 from rich.console import Console
 
-from mgs import nbv, report
+from mgs import figures, nbv, report
 from mgs.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.evaluate import evaluate, load_run
@@ -97,6 +98,31 @@ def test_table(runs):
         assert value in console.file.getvalue()
 
 
+def test_runs_of_one_policy_are_told_apart_by_their_folders(runs, tmp_path):
+    other = shutil.copytree(runs[1], tmp_path / "again")
+    assert list(report.evaluated_runs([*runs, other])) == ["d-optimal", "random (random)", "random (again)"]
+    with pytest.raises(InputError, match="same policy and folder name"):
+        report.evaluated_runs([runs[1], runs[1]])
+
+
+def test_runs_that_cannot_be_compared(runs, tmp_path):
+    other = shutil.copytree(runs[1], tmp_path / "other")
+    metrics = json.loads((other / "metrics.json").read_text())
+    (other / "metrics.json").write_text(json.dumps(metrics | {"images": 7}))
+    with pytest.raises(InputError, match="not evaluated since its last step; measure it with `mgs eval"):
+        report.write_report(tmp_path / "report", [runs[0], other])
+    (other / "metrics.json").write_text(json.dumps(metrics))
+    config = json.loads((other / "config.json").read_text())
+    config["settings"]["dataset"] = "/elsewhere"
+    (other / "config.json").write_text(json.dumps(config))
+    with pytest.raises(InputError, match="another dataset"):
+        report.write_report(tmp_path / "report", [runs[0], other])
+    shutil.rmtree(shutil.copytree(runs[0], tmp_path / "undrawn") / "renders")
+    with pytest.raises(InputError, match="draw it with `mgs eval"):
+        report.write_report(tmp_path / "report", [tmp_path / "undrawn"])
+    assert not (tmp_path / "report").exists()
+
+
 def test_missing_and_damaged_files(runs, tmp_path):
     with pytest.raises(InputError, match=r"config\.json: no such file"):
         report.read_run(tmp_path)
@@ -115,6 +141,6 @@ def test_missing_and_damaged_files(runs, tmp_path):
 def test_comparison_is_cropped_to_the_rock():
     mask = np.zeros((100, 200), bool)
     mask[40:60, 50:80] = True
-    rows, columns = report.crop(mask)
+    rows, columns = figures.crop(mask)
     assert (rows.start, rows.stop, columns.start, columns.stop) == (34, 66, 38, 92)
-    assert report.crop(np.zeros((4, 4), bool)) == (slice(None), slice(None))
+    assert figures.crop(np.zeros((4, 4), bool)) == (slice(None), slice(None))

@@ -14,6 +14,7 @@ from mgs.commands.import_data import import_data
 from mgs.commands.nbv import nbv
 from mgs.commands.prior import prior
 from mgs.commands.render import render
+from mgs.commands.report import report
 from mgs.commands.survey import survey
 from mgs.commands.synth_orbit import synth_orbit
 
@@ -27,6 +28,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "nbv": nbv,
     "eval": evaluate,
     "diagnose": diagnose,
+    "report": report,
     "render": render,
     "demo": demo,
     "bench": bench,
