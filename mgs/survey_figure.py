@@ -73,7 +73,7 @@ def _depth_error(axis, dataset: Dataset, survey: Survey, numbers: dict[str, Any]
     limit = max(3e3 * numbers["depth_error_on_rock"], 1.0)
     axis.set_facecolor("0.85")
     picture = axis.imshow(error, cmap="RdBu", vmin=-limit, vmax=limit, interpolation="nearest")
-    axis.figure.colorbar(picture, ax=axis, shrink=0.7, label="mm")
+    axis.figure.colorbar(picture, ax=axis, shrink=0.7, label="mm; blue: too far")
     axis.set(
         title=f"depth error of frame 0; grey: no return\n{numbers['returns_lost']:.0%} of all returns lost",
         xticks=[],
