@@ -37,9 +37,9 @@ def main(run: Path, out: Path) -> None:
     reference = np.empty(len(left))
     for column, i in enumerate(left):
         F = fisher(state.gaussians, frames[i].camera)
-        reference[column] = policies.d_optimal(F, state.H, default)[0]
+        reference[column] = policies.d_optimal(F, state.H, default)
         for kind, rows in kinds.items():
-            scores[kind][:, column] = [policies.d_optimal(F, state.H, lam)[0] for _, lam in rows]
+            scores[kind][:, column] = [policies.d_optimal(F, state.H, lam) for _, lam in rows]
     print(f"{len(state.taken)} images, {len(left)} candidates; default chooses {frames[left[int(reference.argmax())]].name}")
     curves = {}
     for kind, rows in kinds.items():

@@ -191,7 +191,7 @@ class _Loop:
         with watch("score"):
             frame, gain = self.choose(state)
             F = self.stations.fisher(state.gaussians, self.cameras[frame])
-            information_gain = policies.d_optimal(F, state.H, self.lam)[0]
+            information_gain = policies.d_optimal(F, state.H, self.lam)
         choice = {"frame": frame, "name": self.frames[frame].name, "gain": gain, "information_gain": information_gain}
         return self.learn(state, [frame], choice, watch)
 
@@ -199,19 +199,19 @@ class _Loop:
         """Frame with the largest score among those not taken, and its gain: poses only, one candidate in memory at a time."""
         policy = self.settings.policy
         left = [i for i in range(len(self.frames)) if i not in state.taken]
-        scores: list[policies.Score] = []
+        poses = self.positions[left], self.positions[state.taken], self.stations.centre
+        rng = generator(self.settings.seed, f"{policy}/{len(state.steps)}")
         if policy in policies.CRITERIA:
             model, H = (self.start, state.surface) if policy == "coverage" else (state.gaussians, state.H)
+            scores: np.ndarray = np.empty(len(left))
             for done, i in enumerate(left):
                 self.progress("scoring candidates", done, len(left))
-                scores.append(policies.CRITERIA[policy](self.stations.fisher(model, self.cameras[i]), H, self.lam))
+                scores[done] = policies.CRITERIA[policy](self.stations.fisher(model, self.cameras[i]), H, self.lam)
         else:
-            rng = generator(self.settings.seed, f"{policy}/{len(state.steps)}")
-            taken = self.positions[state.taken]
-            values = policies.POSE_POLICIES[policy](self.positions[left], taken, self.stations.centre, rng)
-            scores = [(float(value),) for value in values]
-        best = max(range(len(left)), key=scores.__getitem__)
-        return left[best], None if policy == "random" else scores[best][0]
+            scores = policies.POSE_POLICIES[policy](*poses, rng)
+        farthest = policies.farthest_pose(*poses, rng)
+        best = max(range(len(left)), key=lambda k: (scores[k], farthest[k]))
+        return left[best], None if policy == "random" else float(scores[best])
 
     def learn(self, state: State, new: list[int], choice: dict[str, Any], watch: _Stopwatch) -> State:
         """Read the new images, fit to convergence on all so far, sum their information at the new model."""

@@ -2,10 +2,11 @@
 
 Two kinds, because they look at different things:
 
-- a *criterion* scores one candidate from Fisher information alone, `(F, H, lam) -> Score`;
+- a *criterion* scores one candidate from Fisher information alone, `(F, H, lam) -> float`;
 - a *pose policy* scores all candidates from camera positions alone, `(candidates, taken, centre, rng) -> scores`.
 
-Neither ever sees a candidate's image. In both the largest score wins and the first candidate wins a tie.
+Neither ever sees a candidate's image. The largest score wins; a tie goes to the camera farthest from those taken (a rule of
+our own, the same for all: the paper names none, and coverage ties at every step once it has saturated).
 
 Notation, after the paper's Eq. 7 and POp-GS: H [N,P] is the diagonal of J^T J summed over the training set, F [N,P] that of
 one candidate, lam [P] the regularisation (`regularisation`); l = N P is the number of parameters.
@@ -19,9 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
-Score = tuple[float, ...]
-"""Compared entry by entry: the first is the gain that is reported, the rest break ties."""
-Criterion = Callable[[Array, Array, Array], Score]
+Criterion = Callable[[Array, Array, Array], float]
 PosePolicy = Callable[[Array, Array, Array, np.random.Generator], Array]
 
 PIXEL_NOISE = 0.02
@@ -67,38 +66,37 @@ def coverage(H: Array, lam: Array) -> float:
     return float(observed(H, lam).mean())
 
 
-def d_optimal(F: Array, H: Array, lam: Array) -> Score:
+def d_optimal(F: Array, H: Array, lam: Array) -> float:
     """Paper's Eq. 7: 1/l sum log(1 + F / (H + lam)), the decrease of the log-volume of the posterior."""
-    return (float(np.log1p(F / (H + lam)).mean(dtype=np.float64)),)
+    return float(np.log1p(F / (H + lam)).mean(dtype=np.float64))
 
 
-def t_optimal(F: Array, H: Array, lam: Array) -> Score:
+def t_optimal(F: Array, H: Array, lam: Array) -> float:
     """1/l sum [1/(H+lam) - 1/(H+F+lam)], the decrease of the average variance.
 
     The paper calls this A-optimal; POp-GS (and here) T-optimal, keeping A for its own p = -1.
     """
-    return (float((F / ((H + lam) * (H + F + lam))).mean(dtype=np.float64)),)
+    return float((F / ((H + lam) * (H + F + lam))).mean(dtype=np.float64))
 
 
-def a_optimal(F: Array, H: Array, lam: Array) -> Score:
+def a_optimal(F: Array, H: Array, lam: Array) -> float:
     """POp-GS's A-optimal (p = -1): the increase of the trace of the inverse covariance, 1/l sum F. Blind to H."""
-    return (float(F.mean(dtype=np.float64)),)
+    return float(F.mean(dtype=np.float64))
 
 
-def e_optimal(F: Array, H: Array, lam: Array) -> Score:
-    """Increase of the smallest eigenvalue of H + lam. It is 0 while any parameter stays unobserved: a tie goes to the mean."""
-    return (float((H + F + lam).min() - (H + lam).min()), float(F.mean(dtype=np.float64)))
+def e_optimal(F: Array, H: Array, lam: Array) -> float:
+    """Increase of the smallest eigenvalue of H + lam. It is 0 while any parameter stays unobserved."""
+    return float((H + F + lam).min() - (H + lam).min())
 
 
-def fisherrf(F: Array, H: Array, lam: Array) -> Score:
+def fisherrf(F: Array, H: Array, lam: Array) -> float:
     """FisherRF's trace criterion, 1/l sum F / (H + lam): Eq. 7 without the logarithm, so nothing saturates."""
-    return (float((F / (H + lam)).mean(dtype=np.float64)),)
+    return float((F / (H + lam)).mean(dtype=np.float64))
 
 
-def coverage_greedy(F: Array, H: Array, lam: Array) -> Score:
-    """Number of Gaussians newly `observed`; a tie goes to the view with the most colour information (it sees most surface)."""
-    new = int((observed(H + F, lam) & ~observed(H, lam)).sum())
-    return (float(new), float(F[:, :3].sum(dtype=np.float64)))
+def coverage_greedy(F: Array, H: Array, lam: Array) -> float:
+    """Number of Gaussians newly `observed`."""
+    return float((observed(H + F, lam) & ~observed(H, lam)).sum())
 
 
 CRITERIA: dict[str, Criterion] = {

@@ -65,7 +65,7 @@ def test_d_optimal_takes_the_best_candidate_at_every_step(dataset, tmp_path):
     H = sum(tiny.fisher(before.gaussians, dataset.frames[i].camera).astype(float) for i in before.taken)
     np.testing.assert_allclose(before.H, H)
     left = [i for i in range(len(dataset)) if i not in before.taken]
-    gains = [policies.d_optimal(tiny.fisher(before.gaussians, dataset.frames[i].camera), H, lam)[0] for i in left]
+    gains = [policies.d_optimal(tiny.fisher(before.gaussians, dataset.frames[i].camera), H, lam) for i in left]
     assert state.taken[-1] == left[int(np.argmax(gains))]
     assert state.steps[-1]["gain"] == state.steps[-1]["information_gain"] == max(gains)
 
@@ -86,6 +86,14 @@ def test_coverage_is_of_the_surface_and_does_not_depend_on_training(dataset, tmp
     assert 0 < covered[0] < covered[-1]
     forgot = run(tmp_path / "forgot", dataset, tiny.stations(fit=forgetful), policy="coverage")
     assert forgot.taken == state.taken
+
+
+def test_a_tie_goes_to_the_farthest_camera(dataset, tmp_path):
+    """Where every view sees everything, coverage has nothing to say after the seeds: the views must spread all the same."""
+    stations = tiny.stations(fisher=lambda gaussians, camera: np.ones((tiny.POINTS, 11), np.float32))
+    state = run(tmp_path / "run", dataset, stations, policy="coverage", seeds=1, budget=3)
+    assert [step["gain"] for step in state.steps[1:]] == [0, 0, 0]
+    assert sorted(state.taken) == [0, 3, 6, 9]
 
 
 def test_candidate_images_are_never_read_before_they_are_chosen(dataset, tmp_path, monkeypatch):

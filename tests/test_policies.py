@@ -24,30 +24,30 @@ CENTRE = np.zeros(3)
 def test_d_optimal_is_the_exact_log_determinant_difference(F, H):
     before = np.linalg.slogdet(np.diag((H + LAM).ravel()))[1]
     after = np.linalg.slogdet(np.diag((H + F + LAM).ravel()))[1]
-    assert policies.d_optimal(F, H, LAM)[0] * H.size == pytest.approx(after - before, rel=1e-9, abs=1e-9)
+    assert policies.d_optimal(F, H, LAM) * H.size == pytest.approx(after - before, rel=1e-9, abs=1e-9)
 
 
 @given(information, information, st.sampled_from(sorted(policies.CRITERIA)))
 def test_no_view_loses_information(F, H, name):
-    assert policies.CRITERIA[name](F, H, LAM)[0] >= 0
+    assert policies.CRITERIA[name](F, H, LAM) >= 0
 
 
 @given(information, st.sampled_from(sorted(policies.CRITERIA)))
 def test_a_view_that_sees_nothing_gains_nothing(H, name):
-    assert policies.CRITERIA[name](np.zeros_like(H), H, LAM)[0] == 0
+    assert policies.CRITERIA[name](np.zeros_like(H), H, LAM) == 0
 
 
 @given(information, information, information, st.sampled_from(sorted(policies.CRITERIA)))
 def test_seeing_more_is_never_worse(F, more, H, name):
     score = policies.CRITERIA[name]
-    assert score(F + more, H, LAM)[0] >= score(F, H, LAM)[0] * (1 - 1e-12)
+    assert score(F + more, H, LAM) >= score(F, H, LAM) * (1 - 1e-12)
 
 
 @given(information, information, information, st.sampled_from(["d-optimal", "t-optimal", "fisherrf"]))
 def test_returns_diminish(F, H, seen, name):
     """Submodularity: with the model held fixed, a view is worth less once others have been taken."""
     score = policies.CRITERIA[name]
-    assert score(F, H + seen, LAM)[0] <= score(F, H, LAM)[0] * (1 + 1e-12)
+    assert score(F, H + seen, LAM) <= score(F, H, LAM) * (1 + 1e-12)
 
 
 @given(information, information, scales, st.sampled_from(["d-optimal", "fisherrf", "coverage"]))
@@ -56,7 +56,7 @@ def test_units_do_not_matter_when_lambda_carries_them(F, H, unit, name):
     score = policies.CRITERIA[name]
     # Powers of two: exact in floating point, so the threshold of `coverage` cannot flip by rounding.
     unit = 2.0 ** np.round(np.log2(unit))
-    assert score(F / unit**2, H / unit**2, LAM / unit**2)[0] == pytest.approx(score(F, H, LAM)[0], rel=1e-9)
+    assert score(F / unit**2, H / unit**2, LAM / unit**2) == pytest.approx(score(F, H, LAM), rel=1e-9)
 
 
 @settings(max_examples=30)
@@ -66,7 +66,7 @@ def test_greedy_d_optimal_reaches_its_guarantee(views):
     H = np.zeros((N, 11))
 
     def value(chosen):
-        return policies.d_optimal(views[list(chosen)].sum(0), H, LAM)[0]
+        return policies.d_optimal(views[list(chosen)].sum(0), H, LAM)
 
     first = max(range(6), key=lambda i: value([i]))
     second = max((i for i in range(6) if i != first), key=lambda i: value([first, i]))
@@ -85,26 +85,25 @@ def test_gain_is_twice_the_mutual_information_of_a_linear_gaussian_model():
     j, sigma = rng.normal(size=11), policies.PIXEL_NOISE
     tau = sigma / np.sqrt(LAM)
     mutual = 0.5 * np.linalg.slogdet(np.eye(11) + np.diag((j * tau / sigma) ** 2))[1]
-    assert policies.d_optimal(j[None] ** 2, np.zeros((1, 11)), LAM)[0] == pytest.approx(2 / 11 * mutual)
+    assert policies.d_optimal(j[None] ** 2, np.zeros((1, 11)), LAM) == pytest.approx(2 / 11 * mutual)
 
 
-def test_coverage_counts_newly_observed_gaussians_and_breaks_ties_by_information():
+def test_coverage_counts_newly_observed_gaussians():
     H = np.zeros((4, 11))
     H[0, :3] = 1.0
     sees_two = np.zeros((4, 11))
     sees_two[[0, 1, 2], :3] = 1.0
     assert policies.coverage(H, LAM) == 0.25
-    assert policies.coverage_greedy(sees_two, H, LAM)[0] == 2
+    assert policies.coverage_greedy(sees_two, H, LAM) == 2
     sees_old = np.zeros((4, 11))
     sees_old[0, :3] = 5.0
-    assert policies.coverage_greedy(2 * sees_old, H, LAM) > policies.coverage_greedy(sees_old, H, LAM)
-    assert policies.coverage_greedy(sees_two, H, LAM) > policies.coverage_greedy(100 * sees_old, H, LAM)
+    assert policies.coverage_greedy(sees_old, H, LAM) == 0
 
 
 def test_t_optimal_is_the_difference_the_paper_writes():
     rng = np.random.default_rng(1)
     F, H = rng.random((N, 11)), rng.random((N, 11))
-    assert policies.t_optimal(F, H, LAM)[0] == pytest.approx((1 / (H + LAM) - 1 / (H + F + LAM)).mean())
+    assert policies.t_optimal(F, H, LAM) == pytest.approx((1 / (H + LAM) - 1 / (H + F + LAM)).mean())
 
 
 def test_random_differs_between_rounds_and_repeats_between_runs():
