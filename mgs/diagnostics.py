@@ -125,7 +125,7 @@ def write_preview(path: str | Path, maps: dict[str, np.ndarray], title: str) -> 
     window = crop(visible)
     height, width = visible[window].shape
     with matplotlib.rc_context(STYLE | {"axes.grid": False}):
-        figure = new_figure(8.4, 3 * (2.3 * height / width + 0.35), dpi=160)
+        figure = new_figure(8.4, 3 * (2.3 * height / width + 0.35), dpi=130)
         axes = figure.subplots(3, 3).flat
         axes[0].imshow(srgb_from_linear(rgb)[window], interpolation="nearest")
         axes[0].set_title(title)

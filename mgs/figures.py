@@ -200,7 +200,7 @@ def comparison_figure(
     limit = max(float(np.quantile(d, 0.995)) for d in differences.values()) or 1.0
     columns, aspect = 1 + len(images), shown.shape[0] / shown.shape[1]
     with matplotlib.rc_context(STYLE | {"axes.grid": False}):
-        figure = new_figure(2.7 * columns, 2.7 * aspect * 2 + 0.9)
+        figure = new_figure(2.7 * columns, 2.7 * aspect * 2 + 0.9, dpi=150)
         axes = figure.subplots(2, columns)
         axes[0, 0].imshow(shown, interpolation="nearest")
         axes[0, 0].set_title(f"truth\n{title}")
