@@ -225,7 +225,9 @@ def test_command_writes_everything(dataset: Dataset, tmp_path: Path, capsys: pyt
         main(["prior", str(dataset.root), "--out", str(tmp_path / "p"), "--gaussians", "500"])
     assert exit_.value.code == 0
     assert {path.name for path in (tmp_path / "p").iterdir()} == {"mesh.ply", "points.ply", "prior.json", "prior.png"}
-    assert json.loads((tmp_path / "p/prior.json").read_text())["n"] == 500
+    numbers = json.loads((tmp_path / "p/prior.json").read_text())
+    assert numbers["n"] == 500
+    assert 0.8 < numbers["seen_by_seeds"] < 1
     assert "500" in capsys.readouterr().out
 
 

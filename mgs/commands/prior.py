@@ -7,6 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
+SEEDS = 4
+"""Seed frames of the paper."""
+
 
 def prior(
     dataset: Annotated[Path, typer.Argument(help="Folder with transforms.json and depth images.")],
@@ -24,10 +27,15 @@ def prior(
     seed: Annotated[int, typer.Option(help="Root seed.")] = 0,
 ) -> None:
     """Depth images to a rock's mesh and N samples on it: plane removal, clustering, Poisson surface, blue noise."""
+    from dataclasses import replace
+
+    import numpy as np
     from rich.console import Console
 
     from mgs.dataset import load_dataset
     from mgs.files import new_folder
+    from mgs.initial import initial_gaussians
+    from mgs.policies import seed_views
     from mgs.prior import PriorSettings, build_prior, prior_from_mesh, save_prior
     from mgs.prior_figure import draw_prior
 
@@ -41,6 +49,11 @@ def prior(
             result, stages = prior_from_mesh(mesh, settings)
         else:
             result, stages = build_prior(frames, settings, lambda stage: status.update(f"prior: {stage}"))
+        status.update("prior: what four seed frames see")
+        positions = np.stack([frame.camera.position for frame in frames.frames])
+        seeds = seed_views(positions, result.points.mean(0), min(SEEDS, len(frames)))
+        seen = initial_gaussians(result, [frames.frames[k] for k in seeds])[1]
+        result = replace(result, numbers=result.numbers | {"seen_by_seeds": float(seen.mean())})
         save_prior(folder, result, stages.mesh)
         status.update("prior: picture")
         draw_prior(folder / "prior.png", result, stages)
@@ -60,6 +73,7 @@ def _table(numbers: dict[str, Any]) -> Any:
     table.add_row("samples, N = A / spacing²", f"{n:,} = {area:.4f} / {spacing:.6f}²")
     mean, least = (numbers[key] / spacing for key in ("nearest_neighbour_mean", "nearest_neighbour_min"))
     table.add_row("nearest neighbour over spacing", f"mean {mean:.2f}, least {least:.2f}")
+    table.add_row(f"samples that {SEEDS} evenly spaced frames see", f"{numbers['seen_by_seeds']:.1%}; the rest starts grey")
     truth = numbers.get("truth")
     if truth is None:
         table.add_row("distance to the true rock", "unknown: the dataset holds no rock.glb")
