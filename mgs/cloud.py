@@ -191,7 +191,7 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
     model, inliers = ransac(sample, _PlaneModel, 3, tolerance, max_trials=300, rng=rng)
     share = 0.0 if inliers is None else float(np.mean(inliers))
     if share < PLANE_MIN_SHARE:
-        raise InputError(f"cloud: no ground plane (the best holds {share:.0%} of the points); the prior needs visible ground, or --mesh")
+        raise InputError(f"cloud: no ground plane (the best holds {share:.0%} of the cloud); it needs visible ground, or --mesh")
     around = cloud.points[np.linalg.norm(cloud.points - target.point, axis=1) < PLANE_REACH * target.distance]
     for _ in range(3):
         residual = model.residuals(around)
