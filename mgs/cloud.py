@@ -191,13 +191,13 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
     model, inliers = ransac(sample, _PlaneModel, 3, tolerance, max_trials=300, rng=rng)
     share = 0.0 if inliers is None else float(np.mean(inliers))
     if share < PLANE_MIN_SHARE:
-        raise InputError(f"cloud: no ground plane (the best holds {share:.0%} of the cloud); it needs visible ground, or --mesh")
+        raise InputError(f"cloud: no ground plane (the best holds {share:.0%} of the cloud); show ground, or give --mesh")
     around = cloud.points[np.linalg.norm(cloud.points - target.point, axis=1) < PLANE_REACH * target.distance]
     for _ in range(3):
         residual = model.residuals(around)
         core = np.abs(residual) < tolerance
         if core.sum() < 3:
-            raise InputError("cloud: no ground around what the cameras look at; the prior needs visible ground, or --mesh")
+            raise InputError("cloud: no ground around what the cameras look at; show ground, or give --mesh")
         sigma = 1.4826 * float(np.median(np.abs(residual[core] - np.median(residual[core]))))
         tolerance = min(tolerance, max(3 * sigma, 2 * cloud.voxel))
         model = _PlaneModel.from_estimate(around[core & (np.abs(residual) < tolerance)])

@@ -377,3 +377,10 @@ def test_holes_remove_the_share_asked_for() -> None:
     moved, kept = degrade(points, 0.02, 0.0, np.random.default_rng(1))
     assert kept.all()
     assert (moved - points).std() == pytest.approx(0.02, rel=0.05)
+
+
+def test_a_rock_without_ground_is_one_line(dataset: Dataset) -> None:
+    """A cloud in which no plane dominates."""
+    points = np.random.default_rng(0).standard_normal((4000, 3))
+    with pytest.raises(InputError, match="no ground plane"):
+        ground_plane(Cloud(points, points, 0.05, 0.0, 4000), dataset.frames, seed=0)
