@@ -87,7 +87,11 @@ def focus(frames: Sequence[Frame]) -> Focus:
 
 
 def usable_depth(depth: np.ndarray, size: int = 3) -> np.ndarray:
-    """Depth [H,W] with silhouettes and grazing pixels set to 0 (see EDGE_JUMP); size: edge of the neighbourhood, pixels."""
+    """Depth [H,W] with silhouettes and grazing pixels set to 0 (see EDGE_JUMP); size: edge of the neighbourhood, pixels.
+
+    A neighbour without return counts as a silhouette: returns are lost where the view grazes, and what is left there is the
+    worst (with such pixels kept, a survey's registration drifted twice as far).
+    """
     jump = maximum_filter(depth, size) - minimum_filter(depth, size)
     return np.where(jump <= EDGE_JUMP * depth, depth, 0.0)
 
