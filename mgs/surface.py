@@ -51,7 +51,7 @@ class Mesh:
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """A triangle mesh (GLB, OBJ, PLY ...) in world coordinates, metres; all of it counts as seen.
+    """A triangle mesh (GLB, OBJ, PLY ...) in world coordinates, metres, turned right side out; all of it counts as seen.
 
     Raises InputError where it is missing or unreadable, has no faces, or holds NaN vertices.
     """
@@ -70,7 +70,10 @@ def read_mesh(path: str | Path) -> Mesh:
     if not np.isfinite(mesh.vertices).all():
         first = int(np.argwhere(~np.isfinite(mesh.vertices))[0][0])
         raise InputError(f"{path}: has NaN or infinite vertices, first vertex {first}; repair the mesh")
-    return Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64), np.ones(len(mesh.faces), bool))
+    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    a, b, c = (vertices[faces[:, k]] - vertices.mean(0) for k in range(3))
+    inside_out = np.einsum("fk,fk->f", a, np.cross(b, c)).sum() < 0  # six times the signed volume
+    return Mesh(vertices, faces[:, ::-1] if inside_out else faces, np.ones(len(faces), bool))
 
 
 def estimate_normals(points: np.ndarray, views: np.ndarray, roughness: float = 0.0) -> np.ndarray:

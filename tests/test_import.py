@@ -25,7 +25,7 @@ from mgs.conventions import Camera, look_at, opengl_from_opencv
 from mgs.dataset import Dataset, Frame, load_dataset, write_transforms
 from mgs.files import read_json, write_json, write_png
 from mgs.imports import import_source, read_source, undistorter
-from mgs.prior import PriorSettings, build_prior, load_prior
+from mgs.prior import PriorSettings, build_prior, load_prior, prior_from_mesh
 
 
 def _import(source: Path, out: Path, **options: Any) -> Dataset:
@@ -372,10 +372,16 @@ def test_an_empty_mask_in_every_frame_is_one_line(dataset: Dataset) -> None:
 
 
 def test_a_mesh_with_holes_is_sampled(tmp_path: Path, dataset: Dataset) -> None:
-    from mgs.prior import prior_from_mesh
-
     mesh = synthetic.rock_mesh()
     mesh.update_faces(np.random.default_rng(0).random(len(mesh.faces)) > 0.2)
     mesh.export(tmp_path / "holes.ply")
     prior, _ = prior_from_mesh(tmp_path / "holes.ply", PriorSettings(gaussians=200))
     assert len(prior.points) == 200
+
+
+def test_a_mesh_inside_out_is_turned(tmp_path: Path) -> None:
+    mesh = synthetic.rock_mesh()
+    mesh.invert()
+    mesh.export(tmp_path / "inverted.ply")
+    prior, _ = prior_from_mesh(tmp_path / "inverted.ply", PriorSettings(gaussians=200))
+    assert (((prior.points - synthetic.CENTRE) * prior.normals).sum(1) > 0).all()

@@ -76,7 +76,7 @@ def _table(numbers: dict[str, Any]) -> Any:
     table.add_row(f"samples that {SEEDS} evenly spaced frames see", f"{numbers['seen_by_seeds']:.1%}; the rest starts grey")
     truth = numbers.get("truth")
     if truth is None:
-        table.add_row("distance to the true rock", "unknown: the dataset holds no rock.glb")
+        table.add_row("distance to the true rock", "not measured: a given mesh, no depth, or no rock.glb in the dataset")
         return table
     table.add_section()
     for name in ("accuracy", "completeness", "chamfer", "hausdorff"):
