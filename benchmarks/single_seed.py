@@ -1,0 +1,74 @@
+"""The paper's Eq. 13, tested: `python benchmarks/single_seed.py RUN OUT.png`, RUN made with `mgs nbv ... --seeds 1 --budget 0`.
+
+The paper expects that after a single seed the gain of a view is near zero where it sees only unobserved Gaussians, so that
+the drone stays pinned near its first image. Prints and draws Eq. 7 of every candidate against its azimuth from the seed, with
+the exact diagonal of J^T J and with squared gradients of one scalar loss per image (Eq. 7 to the letter).
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from mgs import nbv, policies, runtime
+from mgs.dataset import load_dataset
+from mgs.prior import load_prior
+
+ESTIMATORS = {"exact": "exact $J^TJ$", "loss-gradient": "squared gradient of a scalar loss"}
+
+
+def main(run: Path, out: Path) -> None:
+    """Print the table, draw the figure."""
+    runtime.start()
+    from mgs.splat import fisher, groups
+
+    settings, state = nbv.read_settings(run), nbv.read_checkpoint(run)
+    if state is None or len(state.taken) != 1:
+        raise SystemExit(f"{run}: is not a run of one seed; make it with --seeds 1 --budget 0")
+    frames = load_dataset(settings.dataset).frames
+    lam = policies.regularisation(groups(0), settings.pixel_noise, settings.prior_std)
+    angles = policies.azimuths(np.array([f.camera.position for f in frames]), load_prior(settings.prior).points.mean(0))
+    away = np.degrees((angles - angles[state.taken[0]] + np.pi) % (2 * np.pi) - np.pi)
+    left = [i for i in np.argsort(away) if i != state.taken[0]]
+    gains: dict[str, np.ndarray] = {}
+    means: dict[str, float] = {}
+    for estimator in ESTIMATORS:
+
+        def information(i: int, estimator: str = estimator) -> np.ndarray:
+            return fisher(state.gaussians, frames[i].camera, estimator=estimator).astype(np.float64)
+
+        H = information(state.taken[0])
+        means[estimator] = float(H.mean())
+        scaled = lam * means[estimator] / means["exact"]  # lambda in the units of a mean loss, which it would swamp otherwise
+        gains[estimator] = np.array([policies.d_optimal(information(i), H, scaled) for i in left])
+    for k, i in enumerate(left):
+        print(f"{frames[i].name}  {away[i]:+6.0f} degrees  " + "  ".join(f"{e} {g[k]:.4f}" for e, g in gains.items()))
+    draw(out, away[left], gains)
+
+
+def draw(out: Path, away: np.ndarray, gains: dict[str, np.ndarray]) -> None:
+    """Gain against azimuth."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    from mgs.figures import STYLE
+
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(4.8, 2.8), dpi=150, layout="constrained")
+        axis = figure.subplots()
+        for (estimator, values), colour in zip(gains.items(), ("#0072B2", "#D55E00"), strict=True):
+            axis.plot(away, values / values.max(), "o-", color=colour, label=ESTIMATORS[estimator])
+        axis.set(
+            xlabel="azimuth from the seed (degrees)",
+            ylabel="gain over the largest",
+            ylim=(0, None),
+            xticks=range(-180, 181, 60),
+        )
+        axis.legend()
+        figure.savefig(out)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
