@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,9 @@ from mgs.conventions import Camera, opencv_from_opengl, opengl_from_opencv
 from mgs.errors import InputError
 from mgs.files import read_exr, read_json, read_mask, read_png, write_json
 
+PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
+"""Camera models of transforms.json that are a pinhole once their distortion is zero."""
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 FRAME_INTERVAL = 0.5
 """Seconds between keyframes (paper, section IV-A)."""
 
@@ -71,7 +76,7 @@ class Dataset:
 def load_dataset(root: str | Path) -> Dataset:
     """Read transforms.json and check that every file it names exists; pixels are read when asked for.
 
-    Raises InputError: missing folder or file, no intrinsics, NaN or singular pose, no frames.
+    Raises InputError: missing folder or file, no intrinsics, distorted images, NaN or singular pose, no frames, a frame twice.
     """
     root = Path(root)
     path = root / "transforms.json"
@@ -79,6 +84,9 @@ def load_dataset(root: str | Path) -> Dataset:
         raise InputError(f"{root}: no such dataset folder; make one with `mgs synth-orbit {root}`")
     data, records = _records(path)
     frames = [_frame(root, path, data, i, record) for i, record in enumerate(records)]
+    for name, count in Counter(frame.name for frame in frames).items():
+        if count > 1:  # a name is what runs and pictures know a frame by
+            raise InputError(f"{path}: lists {count} frames named {name}; remove or rename all but one")
     return Dataset(root, tuple(sorted(frames, key=lambda frame: (frame.timestamp, frame.name))))
 
 
@@ -101,17 +109,22 @@ def _records(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     for index, record in enumerate(records):
         if not isinstance(record, dict) or "file_path" not in record or "transform_matrix" not in record:
             raise InputError(f"{path}: frame {index} lacks file_path or transform_matrix; add it")
+        if not isinstance(record["file_path"], str) or not record["file_path"]:
+            raise InputError(f"{path}: frame {index} has a file_path that names no file; correct it")
     return data, records
 
 
 def _camera(path: Path, data: dict[str, Any], index: int, record: dict[str, Any]) -> Camera:
     where = f"{path}: frame {index}"
+    both = data | record
+    if both.get("camera_model", "OPENCV") not in PINHOLES or any(both.get(key) not in (None, 0) for key in DISTORTION):
+        raise InputError(f"{where} is distorted, or not of a pinhole camera; undistort the images with `mgs import`")
     try:
-        fl_x, fl_y, cx, cy, w, h = (record.get(k, data.get(k)) for k in ("fl_x", "fl_y", "cx", "cy", "w", "h"))
+        fl_x, fl_y, cx, cy, w, h = (both.get(k) for k in ("fl_x", "fl_y", "cx", "cy", "w", "h"))
         K = np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]], np.float64)
         width, height = int(w or 0), int(h or 0)
         pose = np.array(record["transform_matrix"], np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"{where} has no usable intrinsics or pose; fl_x fl_y cx cy w h and a 4x4 matrix are needed") from None
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise InputError(f"{where} has a transform_matrix that is not a finite 4x4 matrix; correct the pose")
@@ -128,12 +141,16 @@ def _frame(root: Path, path: Path, data: dict[str, Any], index: int, record: dic
     camera = _camera(path, data, index, record)
     try:
         timestamp = float(record.get("timestamp", FRAME_INTERVAL * index))
-    except (TypeError, ValueError):
-        raise InputError(f"{where} has a timestamp that is no number; give seconds") from None
+    except (TypeError, ValueError, OverflowError):
+        timestamp = math.nan
+    if not math.isfinite(timestamp):
+        raise InputError(f"{where} has a timestamp that is no finite number; give seconds")
 
     def file(key: str) -> Path | None:
         if not record.get(key):
             return None
+        if not isinstance(record[key], str):
+            raise InputError(f"{where} has a {key} that is no text; correct it")
         target = root / record[key]
         if not target.is_file():
             raise InputError(f"{where}: {key} {record[key]} does not exist in {root}; restore it or remove the frame")

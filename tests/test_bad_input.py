@@ -47,8 +47,16 @@ def no_intrinsics(data: dict) -> None:
         data.pop(key)
 
 
+def set_header(**values) -> Change:
+    return edit_transforms(lambda data: data.update(values))
+
+
+def set_frame(**values) -> Change:
+    return edit_transforms(lambda data: data["frames"][2].update(values))
+
+
 def set_pose(matrix: list) -> Change:
-    return edit_transforms(lambda data: data["frames"][2].update(transform_matrix=matrix))
+    return set_frame(transform_matrix=matrix)
 
 
 def every_depth(value: Callable[[Path], np.ndarray]) -> Change:
@@ -67,6 +75,12 @@ def small_mask(root: Path) -> None:
     write_png(root / "masks/kf_0000.png", np.ones((5, 7), bool))
 
 
+def same_name(root: Path) -> None:
+    (root / "images/left").mkdir()
+    shutil.copy(root / "images/kf_0000.png", root / "images/left/kf_0000.png")
+    set_frame(file_path="images/left/kf_0000.png")(root)
+
+
 NAN_POSE = [[1, 0, 0, float("nan")], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 ZERO_POSE = [[0] * 4] * 3 + [[0, 0, 0, 1]]
 FLAT_POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]
@@ -83,6 +97,23 @@ DATASETS: dict[str, tuple[Change, str]] = {
     "pose that flattens": (set_pose(FLAT_POSE), "frame 2"),
     "pose that is no matrix": (set_pose([1, 2, 3]), "frame 2"),
     "pose of words": (set_pose([["a"] * 4] * 4), "frame 2"),
+    "width without end": (set_header(w=float("inf")), "frame 0"),
+    "focal length without end": (set_header(fl_x=float("inf")), "frame 0"),
+    "distortion": (set_header(k1=0.1), "mgs import"),
+    "distortion of one frame": (set_frame(p2=-1e-3), "mgs import"),
+    "distortion that is no number": (set_header(k4="a"), "mgs import"),
+    "fisheye": (set_header(camera_model="OPENCV_FISHEYE"), "mgs import"),
+    "fisheye in one frame": (set_frame(camera_model="OPENCV_FISHEYE"), "mgs import"),
+    "camera model that is no text": (set_header(camera_model=[1]), "mgs import"),
+    "frame twice": (edit_transforms(lambda data: data["frames"].append(data["frames"][0])), "kf_0000"),
+    "name twice": (same_name, "kf_0000"),
+    "file_path that is a number": (set_frame(file_path=5), "frame 2"),
+    "file_path null": (set_frame(file_path=None), "frame 2"),
+    "file_path empty": (set_frame(file_path=""), "frame 2"),
+    "file_path with a null character": (set_frame(file_path="a\0b"), "frame 2"),
+    "mask_path that is a list": (set_frame(mask_path=["a"]), "mask_path"),
+    "timestamp NaN": (set_frame(timestamp=float("nan")), "timestamp"),
+    "timestamp of words": (set_frame(timestamp="noon"), "timestamp"),
     "missing image": (lambda root: (root / "images/kf_0003.png").unlink(), "kf_0003.png"),
     "missing depth": (lambda root: (root / "depth/kf_0003.exr").unlink(), "kf_0003.exr"),
     "missing mask": (lambda root: (root / "masks/kf_0003.png").unlink(), "kf_0003.png"),
