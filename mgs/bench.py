@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from mgs.conventions import Camera, look_at, quat_from_normals
-from mgs.gaussians import Gaussians, sh_from_rgb
+from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
 from mgs.seeds import derive_seed, generator
 from mgs.splat import ListCache, as_drjit, fisher, render
 from mgs.splat.kernels import PIXELS
@@ -33,8 +33,6 @@ TARGETS = {
 
 FORWARD_FLOPS, FISHER_FLOPS = 24, 50
 """Floating-point operations of a kernel per pixel of a (splat, block) pair, counted in `mgs.splat.kernels` (an FMA is two)."""
-
-LEARNED = ("log_scales", "quats", "logit_opacities", "sh")
 
 
 def surface_gaussians(n: int, seed: int = 0) -> Gaussians:
@@ -178,6 +176,7 @@ def bench_splat(n: int, width: int, height: int, repeats: int, report: Callable[
     tiny = surface_gaussians(1000)
     tiny_device, tiny_camera, cache = as_drjit(tiny), surface_camera(tiny, 64, 48), ListCache()
     tiny_seconds = median_seconds(lambda: render(tiny_device, tiny_camera, cache=cache).rgb, 20)
+    memory = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) / 1e3
     report("Mitsuba's volprim_rf_basic")
     peer = time_volprim(gaussians, camera, max(repeats // 3, 3))
     report("peak arithmetic")
@@ -206,7 +205,7 @@ def bench_splat(n: int, width: int, height: int, repeats: int, report: Callable[
             "fisher_exact": (FORWARD_FLOPS + FISHER_FLOPS) * pixels / own["fisher_exact"] / peak,
         },
         "list_megabytes": own["list_bytes"] / 1e6,
-        "peak_memory_megabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3,
+        "peak_memory_megabytes": memory,
     }
 
 

@@ -18,6 +18,9 @@ from mgs.files import atomic_path
 
 MAX_SH_DEGREE = 3
 
+LEARNED = ("sh", "log_scales", "quats", "logit_opacities")
+"""Learned parameters, in the order of their columns in the Fisher information: 3K colour, 3, 4, 1. Means are frozen."""
+
 LINEAR_COMMENT = "mgs: colours are linear RGB"
 """Header comment of our PLY files. The layout itself has no field for it, and other tools train in display space (sRGB)."""
 

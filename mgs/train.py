@@ -16,14 +16,12 @@ import mitsuba as mi
 import numpy as np
 
 from mgs.conventions import Camera
-from mgs.gaussians import Gaussians
+from mgs.gaussians import LEARNED, Gaussians
 from mgs.seeds import generator
 from mgs.splat import ListCache, as_drjit
 from mgs.splat.blocks import BlockLists
 from mgs.splat.project import camera_array, project
 from mgs.splat.render import composite
-
-LEARNED = ("sh", "log_scales", "quats", "logit_opacities")
 
 
 @dataclass(frozen=True)

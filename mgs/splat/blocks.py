@@ -119,49 +119,18 @@ def build(splats: Splats, order: Any, width: int, height: int, margin: float) ->
     blocks_x, blocks_y = -(-width // BLOCK_X), -(-height // BLOCK_Y)
     n, lanes = len(splats.u), blocks_x * blocks_y
     foot = inflate(splats, margin)
-    drawn = foot.q > 0
-    root = dr.sqrt(dr.maximum(foot.q, 0))
-    hx, hy = root * dr.sqrt(dr.square(dr.rcp(foot.p)) + dr.square(foot.k * dr.rcp(foot.e))), root * dr.rcp(foot.e)
-
-    def first_last(centre: Any, half: Any, size: int, count: int) -> tuple[Any, Any]:
-        lo = dr.clip(dr.floor((centre - half - 0.5) / size), 0, count)
-        hi = dr.clip(dr.floor((centre + half - 0.5) / size) + 1, 0, count)
-        return mi.UInt32(lo), mi.UInt32(dr.maximum(hi, lo))
-
-    x0, x1 = first_last(splats.u, hx, BLOCK_X, blocks_x)
-    y0, y1 = first_last(splats.v, hy, BLOCK_Y, blocks_y)
-    count = dr.select(drawn, (x1 - x0) * (y1 - y0), 0)
-    dr.eval(foot, x0, x1, y0, count)
-
-    ranked = dr.gather(mi.UInt32, count, order)
-    first = dr.prefix_sum(ranked)
-    rank = dr.repeat(dr.arange(mi.UInt32, n), ranked)
-    if len(rank) == 0:
-        return _nothing_seen(foot, width, height)
-    splat = dr.gather(mi.UInt32, order, rank)
-    offset = dr.arange(mi.UInt32, len(rank)) - dr.gather(mi.UInt32, first, rank)
-    columns = dr.gather(mi.UInt32, x1, splat) - dr.gather(mi.UInt32, x0, splat)
-    bx = dr.gather(mi.UInt32, x0, splat) + offset % dr.maximum(columns, 1)
-    by = dr.gather(mi.UInt32, y0, splat) + offset // dr.maximum(columns, 1)
-    touched = _touches(splats, foot, splat, bx, by)
-    block = by * blocks_x + bx
-
-    kept = dr.compress(touched)
-    if len(kept) == 0:
-        return _nothing_seen(foot, width, height)
-    before = dr.prefix_sum(mi.UInt32(touched))
-    before_end = dr.concat([before, mi.UInt32(len(kept))]) if len(rank) else mi.UInt32(0)
-    slot_start, slot_end = dr.empty(mi.UInt32, n), dr.empty(mi.UInt32, n)
-    dr.scatter(slot_start, dr.gather(mi.UInt32, before_end, first), order, mode=dr.ReduceMode.NoConflicts)
-    dr.scatter(slot_end, dr.gather(mi.UInt32, before_end, first + ranked), order, mode=dr.ReduceMode.NoConflicts)
-
-    key, splat = dr.gather(mi.UInt32, block, kept), dr.gather(mi.UInt32, splat, kept)
-    start, end, slot = _group(key, lanes)
-    length = dr.minimum(end - start, 4095)
-    longest_first = dr.detail.block_mkperm(4095 - length, lanes, 4096)
-    room = _rounded(len(key))
+    splat, block, slot_start, slot_end = _pairs(splats, foot, order, blocks_x, blocks_y)
+    if len(splat) == 0:  # Dr.Jit has no operations on arrays of length 0
+        slot_start = slot_end = dr.zeros(mi.UInt32, n)
+        start = end = dr.zeros(mi.UInt32, lanes)
+        slot, longest_first = splat, dr.arange(mi.UInt32, lanes)
+    else:
+        start, end, slot = _group(block, lanes)
+        splat = dr.gather(mi.UInt32, splat, slot)
+        longest_first = dr.detail.block_mkperm(4095 - dr.minimum(end - start, 4095), lanes, 4096)
+    room = _rounded(len(splat))
     lists = BlockLists(
-        splat=_padded(dr.gather(mi.UInt32, splat, slot), room),
+        splat=_padded(splat, room),
         slot=_padded(slot, room),
         slot_start=slot_start,
         slot_end=slot_end,
@@ -177,26 +146,43 @@ def build(splats: Splats, order: Any, width: int, height: int, margin: float) ->
     return lists
 
 
-def _nothing_seen(foot: Footprints, width: int, height: int) -> BlockLists:
-    """Lists of a camera that sees no splat: Dr.Jit has no operations on arrays of length 0."""
-    n, blocks_x = len(foot.u), -(-width // BLOCK_X)
-    lanes = blocks_x * -(-height // BLOCK_Y)
-    padding, no_slot, no_pair = (dr.zeros(mi.UInt32, size) for size in (_rounded(0), n, lanes))
-    lists = BlockLists(
-        splat=padding,
-        slot=padding,
-        slot_start=no_slot,
-        slot_end=no_slot,
-        block=dr.arange(mi.UInt32, lanes),
-        start=no_pair,
-        end=no_pair,
-        width=dr.opaque(mi.UInt32, width),
-        height=dr.opaque(mi.UInt32, height),
-        blocks_x=dr.opaque(mi.UInt32, blocks_x),
-        footprints=foot,
-    )
-    dr.eval(lists)
-    return lists
+def _pairs(splats: Splats, foot: Footprints, order: Any, blocks_x: int, blocks_y: int) -> tuple[Any, Any, Any, Any]:
+    """(splat, block) of every pair, splats in depth order and the pairs of one splat contiguous; first and end of each
+    splat's pairs [N]. Empty arrays where no splat touches a block."""
+    root = dr.sqrt(dr.maximum(foot.q, 0))
+    hx, hy = root * dr.sqrt(dr.square(dr.rcp(foot.p)) + dr.square(foot.k * dr.rcp(foot.e))), root * dr.rcp(foot.e)
+
+    def first_last(centre: Any, half: Any, size: int, count: int) -> tuple[Any, Any]:
+        lo = dr.clip(dr.floor((centre - half - 0.5) / size), 0, count)
+        hi = dr.clip(dr.floor((centre + half - 0.5) / size) + 1, 0, count)
+        return mi.UInt32(lo), mi.UInt32(dr.maximum(hi, lo))
+
+    x0, x1 = first_last(splats.u, hx, BLOCK_X, blocks_x)
+    y0, y1 = first_last(splats.v, hy, BLOCK_Y, blocks_y)
+    count = dr.select(foot.q > 0, (x1 - x0) * (y1 - y0), 0)
+    dr.eval(foot, x0, x1, y0, count)
+
+    n, none = len(splats.u), mi.UInt32()
+    ranked = dr.gather(mi.UInt32, count, order)
+    first = dr.prefix_sum(ranked)
+    rank = dr.repeat(dr.arange(mi.UInt32, n), ranked)
+    if len(rank) == 0:
+        return none, none, none, none
+    splat = dr.gather(mi.UInt32, order, rank)
+    offset = dr.arange(mi.UInt32, len(rank)) - dr.gather(mi.UInt32, first, rank)
+    columns = dr.maximum(dr.gather(mi.UInt32, x1, splat) - dr.gather(mi.UInt32, x0, splat), 1)
+    bx = dr.gather(mi.UInt32, x0, splat) + offset % columns
+    by = dr.gather(mi.UInt32, y0, splat) + offset // columns
+    touched = _touches(splats, foot, splat, bx, by)
+    kept = dr.compress(touched)
+    if len(kept) == 0:
+        return none, none, none, none
+    before = dr.concat([dr.prefix_sum(mi.UInt32(touched)), mi.UInt32(len(kept))])
+    slot_start, slot_end = dr.empty(mi.UInt32, n), dr.empty(mi.UInt32, n)
+    dr.scatter(slot_start, dr.gather(mi.UInt32, before, first), order, mode=dr.ReduceMode.NoConflicts)
+    dr.scatter(slot_end, dr.gather(mi.UInt32, before, first + ranked), order, mode=dr.ReduceMode.NoConflicts)
+    block = by * blocks_x + bx
+    return dr.gather(mi.UInt32, splat, kept), dr.gather(mi.UInt32, block, kept), slot_start, slot_end
 
 
 def _padded(values: Any, size: int) -> Any:

@@ -17,16 +17,13 @@ import numpy as np
 
 from mgs.conventions import Camera
 from mgs.errors import InputError
-from mgs.gaussians import Gaussians
+from mgs.gaussians import LEARNED, Gaussians
 from mgs.seeds import derive_seed
 from mgs.splat import kernels
 from mgs.splat.constants import LOG_SCALE_RANGE
 from mgs.splat.kernels import LN2
 from mgs.splat.project import axes2d, camera_array, columns, quat_size, sh_basis
 from mgs.splat.render import ListCache, as_drjit, render, splats_and_lists
-
-LEARNED = ("sh", "log_scales", "quats", "logit_opacities")
-"""Learned parameters, in the order of the columns."""
 
 
 def groups(sh_degree: int) -> dict[str, slice]:

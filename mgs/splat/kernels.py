@@ -293,7 +293,7 @@ def fisher(lists: BlockLists, packed: Packed, rgba: Any, background: Any, block:
                 slopes = [dr.fma(c, held, -s * lost) for c, s in zip(rgb, behind, strict=True)]
                 sums[0] = dr.fma(w, w, sums[0])
                 square = sum(s * s for s in slopes)
-                power, xi2 = square, xi * xi
+                xi2 = xi * xi
                 m[0], m[1], m[2] = m[0] + square, dr.fma(square, xi, m[1]), dr.fma(square, xi2, m[2])
                 power = square * xi2
                 m[3], m[4] = dr.fma(power, xi, m[3]), dr.fma(power, xi2, m[4])

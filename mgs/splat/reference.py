@@ -123,10 +123,6 @@ def render(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -> 
     return {"rgb": rgb.reshape(*shape, 3), "alpha": total.reshape(shape), "depth": depth.reshape(shape)}
 
 
-PARAMETERS = ("sh", "log_scales", "quats", "logit_opacities")
-"""Learnable parameters in the column order of Fisher information: 3K colour, 3, 4, 1."""
-
-
 def _projection_jacobian(gaussians: Gaussians, camera: Camera, j: int, step: float = 1e-5) -> np.ndarray:
     """d(cov2d)/d(log-scale 3, quaternion 4) of Gaussian j -> [7,2,2], by central differences of `project` in float64."""
     rows = []
@@ -142,7 +138,7 @@ def _projection_jacobian(gaussians: Gaussians, camera: Camera, j: int, step: flo
 
 
 def jacobian(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -> np.ndarray:
-    """Dense Jacobian of the rgb image, [H*W, 3, N, 3K+8], columns as PARAMETERS. Brute force: toy scenes only."""
+    """Dense Jacobian of the rgb image, [H*W, 3, N, 3K+8], columns as `mgs.gaussians.LEARNED`. Brute force: toy scenes only."""
     projected = project(gaussians, camera)
     order, alpha, T, clipped = composite(projected, camera)
     weights = alpha * T
