@@ -179,22 +179,14 @@ def test_distortion_is_undone() -> None:
     assert keep(pixels, True) is pixels
 
 
-def _nerfstudio(root: Path, **header: Any) -> dict[str, Any]:
-    """Rewrite the transforms.json of a synthetic dataset with other header entries; returns what it holds."""
-    dataset = synthetic.write_dataset(root)
-    data = read_json(root / "transforms.json") | header
-    write_json(root / "transforms.json", data)
-    return dict(data, _frames=len(dataset))
-
-
 def test_nerfstudio_with_distortion_in_the_frames(tmp_path: Path) -> None:
     keys = dict(zip(("k1", "k2", "p1", "p2"), DISTORTION, strict=False))
-    _nerfstudio(tmp_path / "src", **keys)
+    source = synthetic.write_dataset(tmp_path / "src").frames[0]
+    write_json(tmp_path / "src/transforms.json", read_json(tmp_path / "src/transforms.json") | keys)
     copy = _import(tmp_path / "src", tmp_path / "copy")
-    expected, _ = undistorter(load_dataset(tmp_path / "src").frames[0].camera, DISTORTION)
+    expected, _ = undistorter(source.camera, DISTORTION)
     assert np.allclose(copy.frames[0].camera.K, expected.K)
     # Depth is resampled to the nearest pixel, never blended, and the mask stays a mask.
-    source = load_dataset(tmp_path / "src").frames[0]
     assert np.isin(copy.frames[0].depth(), source.depth()).all()
     assert 0.3 < copy.frames[0].mask().sum() / source.mask().sum() < 3
 
@@ -311,6 +303,13 @@ BAD: dict[str, tuple[Callable[[Path], Path], list[str], str]] = {
     "duplicate frames": (lambda root: _edit(root, _first("file_path", "images/kf_0001.png")), [], "more than once"),
     "wrong size": (lambda root: _edit(root, lambda data: data.update(w=100)), [], "is 64x48, but its camera is 100x48"),
     "no depth file": (lambda root: _edit(root, _first("depth_file_path", "depth/none.exr")), [], "no such EXR"),
+    "image path a number": (lambda root: _edit(root, _first("file_path", 5)), [], "frame 0"),
+    "image path empty": (lambda root: _edit(root, _first("file_path", "")), [], "frame 0"),
+    "mask path a list": (lambda root: _edit(root, _first("mask_path", ["a"])), [], "frame 0"),
+    "nan time": (lambda root: _edit(root, _first("timestamp", float("nan"))), [], "frame 0"),
+    "time of words": (lambda root: _edit(root, _first("timestamp", "noon")), [], "frame 0"),
+    "infinite width": (lambda root: _edit(root, lambda data: data.update(w=float("inf"))), [], "frame 0"),
+    "unit of words": (lambda root: _edit(root, lambda data: data.update(depth_unit_scale_factor="mm")), [], "depth_unit"),
     "no images": (_no_images, [], "none of the 8 images"),
     "truncated image": (_truncated_image, [], "not a readable image"),
     "truncated colmap": (lambda root: _colmap(root, _truncate), [], "not a readable COLMAP model"),
