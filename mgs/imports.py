@@ -102,21 +102,35 @@ def _read_transforms(path: Path) -> Source:
     model = data.get("camera_model", "OPENCV")
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE"):
         raise InputError(f"{path}: camera model {model} is not supported; undistort the images to OPENCV or PINHOLE first")
+    scale = _number(path, "depth_unit_scale_factor", data.get("depth_unit_scale_factor", 1e-3))
     shots, missing = [], 0
     for index, record in enumerate(records):
         if not isinstance(record, dict) or "file_path" not in record or "transform_matrix" not in record:
             raise InputError(f"{path}: frame {index} lacks file_path or transform_matrix; add it")
+        paths = [record["file_path"], *(record.get(key) or "-" for key in ("depth_file_path", "mask_path"))]
+        if not all(isinstance(name, str) and name for name in paths):
+            raise InputError(f"{path}: frame {index} has a path that names no file; correct it")
         image = _find(path.parent, record["file_path"])
         if image is None:
             missing += 1
             continue
         depth, mask = (path.parent / record[key] if record.get(key) else None for key in ("depth_file_path", "mask_path"))
         camera, distortion = _transforms_camera(path, index, {**data, **record}, image)
-        unit = 1.0 if depth is None or depth.suffix.lower() == ".exr" else float(data.get("depth_unit_scale_factor", 1e-3))
-        time = float(record.get("timestamp", FRAME_INTERVAL * index))
+        time = _number(path, f"timestamp of frame {index}", record.get("timestamp", FRAME_INTERVAL * index))
+        unit = 1.0 if depth is None or depth.suffix.lower() == ".exr" else scale
         shots.append(Shot(_frame_name(record["file_path"]), camera, distortion, time, image, depth, unit, mask))
     kind = "NeRF-synthetic" if "camera_angle_x" in data and "fl_x" not in data else "nerfstudio"
     return Source(kind, shots, missing)
+
+
+def _number(path: Path, what: str, value: Any) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = np.nan
+    if not np.isfinite(number):
+        raise InputError(f"{path}: {what} is {value!r}, no finite number; correct it")
+    return number
 
 
 def _transforms_camera(path: Path, index: int, record: dict[str, Any], image: Path) -> tuple[Camera, np.ndarray]:
@@ -131,7 +145,7 @@ def _transforms_camera(path: Path, index: int, record: dict[str, Any], image: Pa
         K = np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]])
         distortion = np.array([float(record.get(key, 0)) for key in DISTORTION_KEYS])
         pose = np.array(record["transform_matrix"], np.float64)
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise InputError(f"{where} has no usable intrinsics or pose; give fl_x (or camera_angle_x) and a matrix") from None
     if record.get("k4"):
         raise InputError(f"{where} has k4, which the OPENCV model lacks; undistort the images first")
