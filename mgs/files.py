@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,7 @@ from mgs.errors import InputError
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path` (same suffix); rename it on success, delete it on failure.
 
-    Raises InputError where the folder cannot be written.
+    Raises InputError where it cannot be written: no permission, a file in place of a folder, a full disk.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
@@ -27,10 +29,26 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
         os.replace(temporary, path)
-    except PermissionError:
-        raise InputError(f"{path}: cannot be written; choose a folder you may write to") from None
+    except OSError as error:
+        raise _not_writable(path, error) from None
     finally:
-        temporary.unlink(missing_ok=True) if os.access(path.parent, os.W_OK) else None
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def _not_writable(path: Path, error: OSError) -> InputError:
+    return InputError(f"{path}: cannot be written ({error.strerror or error}); choose a place you may write to, with room")
+
+
+def check_writable(path: str | Path) -> Path:
+    """The path, where a file or folder could be made there. Makes nothing. Raises InputError where it could not."""
+    path = Path(path)
+    try:
+        there = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
+        with TemporaryFile(dir=there if there.is_dir() or there != path else there.parent):
+            return path
+    except OSError as error:
+        raise _not_writable(path, error) from None
 
 
 def write_json(path: str | Path, data: Any) -> None:
@@ -50,21 +68,59 @@ def read_json(path: str | Path) -> Any:
         raise InputError(f"{path}: not valid JSON ({error}); the file is damaged, write it again") from None
 
 
-def new_folder(path: str | Path) -> Path:
-    """Create an output folder. Raises InputError where it is a file, is not empty, or cannot be written."""
-    path = Path(path)
+def check_new_folder(path: str | Path) -> Path:
+    """The path, where an output folder could be made there; makes nothing. Raises InputError as `new_folder`."""
+    path = check_writable(path)
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file, not a folder; choose another output folder")
     if path.is_dir() and any(path.iterdir()):
         raise InputError(f"{path}: the output folder is not empty; choose a new one or delete it")
+    return path
+
+
+def new_folder(path: str | Path) -> Path:
+    """Create an output folder. Raises InputError where it is a file, is not empty, or cannot be written."""
+    path = check_new_folder(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
-        probe = path / ".writable"
-        probe.touch()
-        probe.unlink()
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose a folder you may write to") from None
+        raise _not_writable(path, error) from None
     return path
+
+
+@contextmanager
+def folder_or_nothing(path: str | Path) -> Iterator[Path]:
+    """Yield a new folder; where the block fails, all is as it was: no folder, no parents, or the empty one there was."""
+    path = check_new_folder(path)
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    new_folder(path)
+    try:
+        yield path
+    except BaseException:
+        if made:
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            for child in path.iterdir():
+                shutil.rmtree(child) if child.is_dir() else child.unlink()
+        with suppress(OSError):
+            for folder in made[1:]:
+                folder.rmdir()
+        raise
+
+
+@contextmanager
+def atomic_folder(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary folder beside `path`, which becomes `path` at the end: a kill leaves no half of it.
+
+    Raises InputError as `new_folder`.
+    """
+    path = check_new_folder(path).resolve()
+    with folder_or_nothing(path.with_name(f".{path.name}.{os.getpid()}.part")) as temporary:
+        yield temporary
+        try:
+            os.replace(temporary, path)
+        except OSError as error:
+            raise _not_writable(path, error) from None
 
 
 def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> None:
@@ -116,7 +172,10 @@ def write_exr(path: str | Path, channels: dict[str, np.ndarray]) -> None:
     data = {name: np.ascontiguousarray(array, np.float32) for name, array in channels.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic_path(path) as temporary, OpenEXR.File(header, data) as file:
-        file.write(str(temporary))
+        try:
+            file.write(str(temporary))
+        except RuntimeError as error:  # how OpenEXR says that the disk is full
+            raise InputError(f"{path}: cannot be written ({error}); choose a place you may write to, with room") from None
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:

@@ -19,7 +19,7 @@ from mgs import __version__
 from mgs.conventions import Camera, opengl_from_opencv
 from mgs.dataset import FRAME_INTERVAL, Dataset, Frame, load_dataset, write_transforms
 from mgs.errors import InputError
-from mgs.files import atomic_path, new_folder, read_json, write_exr, write_json, write_png
+from mgs.files import atomic_path, check_new_folder, check_writable, new_folder, read_json, write_exr, write_json, write_png
 from mgs.orbit import orbit_cameras, perturb
 from mgs.rock import load_rock, make_rock
 from mgs.scene import Scene
@@ -185,6 +185,7 @@ def _is_done(frame: Frame) -> bool:
 
 def _resumes(out: Path, resolved: dict[str, Any]) -> bool:
     """Whether `out` holds an unfinished dataset of the same settings. Raises InputError where it holds anything else."""
+    check_writable(out)
     if (out / "config.json").is_file() and not (out / "transforms.json").exists():
         begun = read_json(out / "config.json")
         if any(begun.get(key) != value for key, value in resolved.items()):
@@ -192,8 +193,7 @@ def _resumes(out: Path, resolved: dict[str, Any]) -> bool:
         for left in out.rglob(".*.part*"):  # of a process that was killed while it wrote
             left.unlink()
         return True
-    if out.exists():
-        new_folder(out)  # complains where it is not empty
+    check_new_folder(out)
     return False
 
 

@@ -251,19 +251,7 @@ def a_file(path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("command", ["nbv", "prior", "synth-orbit"])
-@pytest.mark.parametrize(("make", "named"), [(occupied, "not empty"), (a_file, "is a file")])
-def test_output_that_is_in_the_way(capsys, dataset, prior, tmp_path, command, make, named):
-    out = make(tmp_path / "out")
-    arguments = {
-        "nbv": ["nbv", dataset, "--out", out, "--prior", prior, "--budget", 1],
-        "prior": ["prior", dataset, "--out", out],
-        "synth-orbit": ["synth-orbit", out, "--frames", 2, "--size", "16x12"],
-    }[command]
-    assert named in refused(capsys, arguments, out)
-
-
-def read_only_folder(tmp_path: Path) -> Path:
+def read_only(tmp_path: Path) -> Path:
     """A folder nobody may write to: root is not held back by permissions, so for root it is the kernel's own."""
     if os.geteuid() == 0:
         return Path("/proc/mgs")
@@ -272,16 +260,62 @@ def read_only_folder(tmp_path: Path) -> Path:
     return folder / "out"
 
 
-@pytest.mark.parametrize("command", ["nbv", "prior", "synth-orbit"])
-def test_read_only_folder(capsys, dataset, prior, tmp_path, command):
-    out = read_only_folder(tmp_path)
-    arguments = {
+def writers(dataset: Path, prior: Path, splats: Path, out: Path) -> dict[str, list]:
+    """Every command that writes into a folder of one's choice."""
+    return {
         "nbv": ["nbv", dataset, "--out", out, "--prior", prior, "--budget", 1],
-        "prior": ["prior", dataset, "--out", out],
+        "prior": ["prior", dataset, "--out", out, "--gaussians", 40],
         "synth-orbit": ["synth-orbit", out, "--frames", 2, "--size", "16x12"],
-    }[command]
-    assert "cannot be written" in refused(capsys, arguments)
-    assert not out.exists()
+        "survey": ["survey", dataset, "--out", out],
+        "import": ["import", dataset, "--out", out],
+        "render": ["render", splats, "--cameras", dataset, "--out", out],
+        "demo": ["demo", out],
+    }
+
+
+@pytest.mark.parametrize("command", writers(*[Path()] * 4))
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda tmp_path: occupied(tmp_path / "out"), "not empty"),
+        (lambda tmp_path: a_file(tmp_path / "out"), "is a file"),
+        (lambda tmp_path: a_file(tmp_path / "file") / "out", "cannot be written"),
+        (lambda tmp_path: tmp_path / ("long" * 99), "cannot be written"),
+        (read_only, "cannot be written"),
+    ],
+)
+def test_output_that_is_in_the_way(capsys, dataset, prior, tmp_path, command, make, named):
+    write_ply(tmp_path / "splats.ply", tiny.initial([]))
+    out = make(tmp_path)
+    before = listing(tmp_path)
+    assert named in refused(capsys, writers(dataset, prior, tmp_path / "splats.ply", out)[command])
+    assert listing(tmp_path) == before
+    assert "mgs" not in os.listdir("/proc")
+
+
+@pytest.mark.parametrize(("folder", "command"), [("renders", "eval"), ("diagnostics", "diagnose")])
+def test_a_file_where_a_run_keeps_its_pictures(capsys, dataset, prior, tmp_path, folder, command):
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    a_file(run / folder)
+    assert "cannot be written" in refused(capsys, [command, run], run)
+
+
+@pytest.mark.parametrize("option", ["--json", "--chart"])
+@pytest.mark.parametrize(("make", "named"), [(lambda path: a_file(path) / "x", "cannot be written"), (occupied, "is a folder")])
+def test_bench_knows_before_it_measures_that_it_cannot_write(capsys, tmp_path, option, make, named):
+    assert named in refused(capsys, ["bench", "scaling", option, make(tmp_path / "out")])
+
+
+@pytest.mark.parametrize("existing", [False, True])
+def test_a_prior_that_fails_leaves_all_as_it_was(capsys, dataset, tmp_path, existing):
+    out = tmp_path / "new/deeper/prior"
+    if existing:
+        out.mkdir(parents=True)
+    before = listing(tmp_path)
+    refused(capsys, ["prior", dataset, "--out", out, "--gaussians", 1])
+    refused(capsys, ["prior", dataset, "--out", out, "--mesh", tmp_path / "none.glb", "--gaussians", 9])
+    refused(capsys, ["nbv", dataset, "--out", out, "--gaussians", 1, "--budget", 1])
+    assert listing(tmp_path) == before
 
 
 MESHES: dict[str, tuple[str, str]] = {

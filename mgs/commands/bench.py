@@ -35,8 +35,14 @@ def bench(
 
     from mgs import runtime
     from mgs.config import versions
-    from mgs.files import write_json
+    from mgs.errors import InputError
+    from mgs.files import check_writable, write_json
 
+    for target in (json, chart):
+        if target is not None:  # known before the minutes of measuring
+            check_writable(target)
+            if target.is_dir():
+                raise InputError(f"{target}: is a folder; name a file to write")
     runtime.start()
     console = Console()
     with console.status("rock") as status:

@@ -30,15 +30,16 @@ def demo(
     from mgs.commands.nbv import run_folder, start_run
     from mgs.commands.prior import prior
     from mgs.commands.synth_orbit import synth_orbit
-    from mgs.files import new_folder
+    from mgs.files import check_new_folder, check_writable
     from mgs.report import print_table, table_rows, write_report
 
     runtime.start()
     console, started = Console(highlight=False), time.monotonic()
     dataset, folder, report = out / "dataset", out / "prior", out / "report"
     runs = [out / policy for policy in POLICIES]
+    check_writable(out)
     if not dataset.exists():
-        new_folder(out)
+        check_new_folder(out)
 
     def heading(text: str) -> None:
         console.rule(f"{text}   [dim]{time.monotonic() - started:.0f} s", align="left")

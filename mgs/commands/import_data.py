@@ -21,13 +21,11 @@ def import_data(
     Masks come from --masks, from --mesh, from the source's own mask files or from the images' alpha, in this order. Without
     depth, the prior comes from `mgs prior OUT --mesh MESH`, or from COLMAP's sparse points.
     """
-    import shutil
-
     from rich.console import Console
     from rich.progress import Progress
 
     from mgs.errors import InputError
-    from mgs.files import new_folder
+    from mgs.files import folder_or_nothing
     from mgs.imports import import_source, mesh_silhouette, read_source
 
     console, notes = Console(), Console(stderr=True)
@@ -35,20 +33,15 @@ def import_data(
         raise InputError("import: --masks and --mesh both say where masks come from; give one of them")
     found = read_source(source, images, split)
     project = mesh_silhouette(mesh, found.shots) if mesh is not None else None
-    new_folder(out)
-    try:
-        with Progress(console=console, transient=True) as progress:
-            bar = progress.add_task("importing")
-            result = import_source(
-                found,
-                out,
-                masks=masks,
-                project=project,
-                on_frame=lambda done, total: progress.update(bar, completed=done, total=total),
-            )
-    except BaseException:
-        shutil.rmtree(out)
-        raise
+    with folder_or_nothing(out), Progress(console=console, transient=True) as progress:
+        bar = progress.add_task("importing")
+        result = import_source(
+            found,
+            out,
+            masks=masks,
+            project=project,
+            on_frame=lambda done, total: progress.update(bar, completed=done, total=total),
+        )
     if found.missing:
         notes.print(f"mgs: {found.missing} of {found.missing + len(found.shots)} listed images do not exist; skipped them")
     masked, deep = (sum(bool(getattr(frame, key)) for frame in result.frames) for key in ("mask_path", "depth_path"))

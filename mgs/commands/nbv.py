@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,8 +18,11 @@ if TYPE_CHECKING:
 def nbv(
     dataset: Annotated[Path | None, typer.Argument(help="Dataset folder (transforms.json). Not needed with --resume.")] = None,
     out: Annotated[Path | None, typer.Option(help="New folder for the run.")] = None,
-    prior: Annotated[Path | None, typer.Option(help="Folder of `mgs prior`; built inside the run where none is given.")] = None,
-    gaussians: Annotated[int | None, typer.Option(help="Number of Gaussians where the prior is built here.")] = None,
+    prior: Annotated[
+        Path | None,
+        typer.Option(help="Folder of `mgs prior`; default DATASET/prior, or built inside the run where there is none."),
+    ] = None,
+    gaussians: Annotated[int | None, typer.Option(help="Build a prior of this many Gaussians inside the run.")] = None,
     policy: Annotated[str, typer.Option(help=f"One of {', '.join(POLICIES)}.")] = "d-optimal",
     budget: Annotated[int, typer.Option(help="Views chosen beyond the seeds.")] = 50,
     seeds: Annotated[int, typer.Option(help="Views at evenly spaced azimuths that start the model.")] = 4,
@@ -76,25 +78,26 @@ def train_settings(passes: int | None, seed: int) -> dict[str, Any]:
 def start_run(
     dataset: Path, out: Path, prior: Path | None, gaussians: int | None, values: dict[str, Any], console: Console
 ) -> None:
-    """Check everything, build the prior where none is given, write config.json. Leaves no folder behind where it fails."""
+    """Check everything, find or build the prior, write config.json. Leaves no folder behind where it fails."""
     from mgs.config import NbvSettings, validated
     from mgs.dataset import load_dataset
     from mgs.errors import InputError
-    from mgs.files import new_folder
+    from mgs.files import folder_or_nothing
     from mgs.nbv import check_counts, start
     from mgs.prior import PriorSettings, build_prior, load_prior, save_prior
 
     if prior is not None and gaussians is not None:
         raise InputError("nbv: --gaussians is for a prior that is built here; leave it out, or leave out --prior")
+    if prior is None and gaussians is None and (dataset / "prior/prior.json").is_file():
+        prior = dataset / "prior"
+        console.print(f"prior: {prior}", soft_wrap=True)
     where = prior or out / "prior"
     settings = validated(NbvSettings, {"dataset": dataset.resolve(), "prior": where.resolve(), **values})
     frames = load_dataset(dataset)
     check_counts(settings, len(frames))
     if prior is not None:
         load_prior(prior)
-    existed = out.exists()
-    new_folder(out)
-    try:
+    with folder_or_nothing(out):
         if prior is None:
             with console.status("building the prior") as status:
                 built, stages = build_prior(
@@ -104,11 +107,6 @@ def start_run(
                 )
             save_prior(where, built, stages.mesh)
         start(out, settings, frames)
-    except BaseException:
-        shutil.rmtree(out)
-        if existed:
-            out.mkdir()
-        raise
 
 
 def run_folder(out: Path, console: Console, pictures: bool = False) -> None:

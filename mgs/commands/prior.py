@@ -33,7 +33,7 @@ def prior(
     from rich.console import Console
 
     from mgs.dataset import load_dataset
-    from mgs.files import new_folder
+    from mgs.files import atomic_folder, check_new_folder
     from mgs.initial import initial_gaussians
     from mgs.policies import seed_views
     from mgs.prior import PriorSettings, build_prior, prior_from_mesh, save_prior
@@ -41,8 +41,7 @@ def prior(
 
     console = Console()
     frames = load_dataset(dataset)
-    folder = out if out is not None else dataset / "prior"
-    new_folder(folder).rmdir()  # Empty and writable, known before the work; a failure leaves nothing behind.
+    folder = check_new_folder(out if out is not None else dataset / "prior")  # known before the work
     settings = PriorSettings(gaussians, spacing, poisson_depth, prior_noise, holes, seed)
     with console.status("reading") as status:
         if mesh is not None:
@@ -54,9 +53,10 @@ def prior(
         seeds = seed_views(positions, result.points.mean(0), min(SEEDS, len(frames)))
         seen = initial_gaussians(result, [frames.frames[k] for k in seeds])[1]
         result = replace(result, numbers=result.numbers | {"seen_by_seeds": float(seen.mean())})
-        save_prior(folder, result, stages.mesh)
         status.update("prior: picture")
-        draw_prior(folder / "prior.png", result, stages)
+        with atomic_folder(folder) as unfinished:
+            save_prior(unfinished, result, stages.mesh)
+            draw_prior(unfinished / "prior.png", result, stages)
     console.print(_table(result.numbers))
     console.print(f"wrote {folder}: mesh.ply, points.ply, prior.json, prior.png")
 

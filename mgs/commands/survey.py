@@ -31,21 +31,18 @@ def survey(
     The result is itself a dataset (estimated poses, measured depth), so `mgs prior OUT` builds the prior that such a flight
     would have given. It also holds cloud.ply, survey.json and survey.png.
     """
-    import shutil
-
     from rich.console import Console
     from rich.progress import Progress
 
     from mgs.cloud import fuse_frames, write_points
     from mgs.dataset import load_dataset
-    from mgs.files import new_folder, write_json
+    from mgs.files import check_new_folder, folder_or_nothing, write_json
     from mgs.survey import SurveySettings, fly, survey_numbers, write_survey
     from mgs.survey_figure import draw_survey
 
     console = Console()
     frames = load_dataset(dataset)
-    folder = out if out is not None else dataset / "survey"
-    new_folder(folder).rmdir()
+    folder = check_new_folder(out if out is not None else dataset / "survey")  # known before the work
     settings = SurveySettings(sensor_noise, drift, poses is Poses.exact, seed)
     with Progress(console=console, transient=True) as progress:
         bar = progress.add_task("survey")
@@ -53,18 +50,13 @@ def survey(
             frames, settings, lambda name, done, total: progress.update(bar, description=name, completed=done, total=total)
         )
     numbers = survey_numbers(frames, flown, settings)
-    new_folder(folder)
-    try:
-        with console.status("writing"):
-            result = write_survey(folder, frames, flown)
-            cloud = fuse_frames(result.frames)
-            numbers["points"] = len(cloud.points)
-            write_points(folder / "cloud.ply", cloud.points, cloud.views)
-            draw_survey(folder / "survey.png", frames, flown, cloud, numbers)
-            write_json(folder / "survey.json", numbers)
-    except BaseException:
-        shutil.rmtree(folder)
-        raise
+    with folder_or_nothing(folder), console.status("writing"):
+        result = write_survey(folder, frames, flown)
+        cloud = fuse_frames(result.frames)
+        numbers["points"] = len(cloud.points)
+        write_points(folder / "cloud.ply", cloud.points, cloud.views)
+        draw_survey(folder / "survey.png", frames, flown, cloud, numbers)
+        write_json(folder / "survey.json", numbers)
     console.print(_table(numbers))
     console.print(f"wrote {folder}: a dataset with estimated poses and measured depth, cloud.ply, survey.json, survey.png")
 

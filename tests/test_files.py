@@ -1,0 +1,78 @@
+"""Outputs: whole or not at all, and a line where a disk says no."""
+
+from __future__ import annotations
+
+import errno
+import os
+
+import pytest
+
+from mgs.errors import InputError
+from mgs.files import atomic_folder, atomic_path, check_writable, folder_or_nothing
+
+
+class Stop(BaseException):
+    """As Ctrl-C is."""
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+def test_what_the_disk_says_is_one_line(tmp_path, number):
+    (tmp_path / "a.txt").write_text("before")
+
+    def write():
+        with atomic_path(tmp_path / "a.txt") as temporary:
+            temporary.write_text("half")
+            raise OSError(number, os.strerror(number))
+
+    with pytest.raises(InputError, match=os.strerror(number)):
+        write()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+    assert (tmp_path / "a.txt").read_text() == "before"
+
+
+def test_under_a_file(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot be written"), atomic_path(tmp_path / "file/a.txt"):
+        pass
+    with pytest.raises(InputError, match="cannot be written"):
+        check_writable(tmp_path / "file/deeper/a.txt")
+
+
+@pytest.mark.parametrize("there", [False, True])
+@pytest.mark.parametrize("folder", [folder_or_nothing, atomic_folder])
+def test_a_folder_that_fails_leaves_all_as_it_was(tmp_path, folder, there):
+    out = tmp_path / "new/deeper/out"
+    if there:
+        out.mkdir(parents=True)
+    before = list(tmp_path.rglob("*"))
+
+    def fill():
+        with folder(out) as made:
+            (made / "sub").mkdir()
+            (made / "sub/file").touch()
+            (made / "file").touch()
+            raise Stop
+
+    with pytest.raises(Stop):
+        fill()
+    assert list(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("folder", [folder_or_nothing, atomic_folder])
+def test_what_is_in_a_folder_is_never_touched(tmp_path, folder):
+    (tmp_path / "precious.txt").touch()
+    with pytest.raises(InputError, match="not empty"), folder(tmp_path):
+        pass
+    assert (tmp_path / "precious.txt").exists()
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_an_atomic_folder_appears_whole(tmp_path, there):
+    out = tmp_path / "new/out"
+    if there:
+        out.mkdir(parents=True)
+    with atomic_folder(out) as made:
+        (made / "file").touch()
+        assert not (out / "file").exists()
+    assert [path.name for path in out.parent.iterdir()] == ["out"]
+    assert (out / "file").exists()
