@@ -54,6 +54,10 @@ def _sizes(parameters: Any, moments: Any, camera: Any, lists: BlockLists, target
     return len(lists.splat), len(lists.slot_start), len(lists.block), len(target)
 
 
+EPSILON = 1e-3
+"""Adam's epsilon, (pixel value)^2 per unit of the parameter: a gradient of the summed squared error below it is noise, and a
+parameter that no image sees stays where the prior put it instead of walking full steps."""
+
 frozen = partial(dr.freeze, limit=64, warn_after=1 << 30)
 
 
@@ -83,14 +87,14 @@ def _step(
     rgb = composite(project(watched, camera), lists, *size).rgb
     error = rgb.array - target
     loss = dr.mean(dr.square(error))
-    dr.backward(loss)
+    dr.backward(0.5 * dr.sum(dr.square(error)))
     new_values, new_moments = [], []
     step = mi.Float(t)
     unbias1, unbias2 = 1 - dr.power(mi.Float(0.9), step), 1 - dr.power(mi.Float(0.999), step)
     for value, (m, v), rate in zip(values, moments, rates, strict=True):
         gradient = dr.grad(value)
         m, v = dr.lerp(gradient, m, 0.9), dr.lerp(dr.square(gradient), v, 0.999)
-        update = (m.array / unbias1) / (dr.sqrt(v.array / unbias2) + 1e-15) * rate
+        update = (m.array / unbias1) / (dr.sqrt(v.array / unbias2) + EPSILON) * rate
         new_values.append(mi.TensorXf(dr.detach(value).array - update, value.shape))
         new_moments.append([m, v])
     return Gaussians(gaussians.means, **dict(zip(LEARNED, new_values, strict=True))), new_moments, dr.detach(loss)

@@ -1,0 +1,95 @@
+"""Fitting appearance: it finds what images say, leaves alone what they do not, and repeats itself bit for bit."""
+
+import numpy as np
+import pytest
+
+from mgs.bench import surface_camera, surface_gaussians
+from mgs.conventions import Camera, look_at
+from mgs.gaussians import LEARNED, Gaussians
+from mgs.splat import ListCache, fisher, render
+from mgs.train import TrainSettings, fit
+
+
+@pytest.fixture(scope="module")
+def truth() -> Gaussians:
+    gaussians = surface_gaussians(600)
+    gaussians.logit_opacities[:] = 6.0  # opaque: the far side is hidden
+    gaussians.log_scales += 0.7
+    return gaussians
+
+
+@pytest.fixture(scope="module")
+def cameras(truth) -> list[Camera]:
+    first = surface_camera(truth, 40, 32)
+    distance = np.linalg.norm(first.position)
+    eyes = [distance * np.array([np.cos(a), np.sin(a), 0.4]) for a in (0.0, 2.1, 4.2)]
+    return [Camera(first.K, 40, 32, look_at(eye, [0, 0, 0.4])) for eye in eyes]
+
+
+@pytest.fixture(scope="module")
+def targets(truth, cameras) -> list[np.ndarray]:
+    return [np.asarray(render(truth, camera).rgb) for camera in cameras]
+
+
+def grey(truth: Gaussians) -> Gaussians:
+    return Gaussians(truth.means, truth.log_scales, truth.quats, truth.logit_opacities, np.zeros_like(truth.sh))
+
+
+def mean_square(gaussians, cameras, targets) -> float:
+    return float(np.mean([(np.asarray(render(gaussians, c).rgb) - t) ** 2 for c, t in zip(cameras, targets, strict=True)]))
+
+
+def test_fit_lowers_the_loss_a_hundredfold_and_reports_it(truth, cameras, targets):
+    start = grey(truth)
+    found = fit(start, cameras, targets, TrainSettings(passes=60, tolerance=0.0, rates=(0.05, 0.01, 0.01, 0.02)))
+    assert found.stop_reason == "iteration-limit"
+    assert (found.passes, found.iterations) == (60, 180)
+    assert mean_square(found.gaussians, cameras, targets) < 0.01 * mean_square(start, cameras, targets)
+    assert found.loss == pytest.approx(mean_square(found.gaussians, cameras, targets), rel=0.1)
+    assert np.array_equal(found.gaussians.means, truth.means)
+
+
+def test_one_step_is_adam_on_the_gradient_of_the_summed_squared_error(truth, cameras, targets):
+    """The first Adam step moves each parameter by its rate times g / (|g| + epsilon): against finite differences."""
+    from mgs.train import EPSILON
+
+    start = grey(truth)
+    found = fit(start, cameras[:1], targets[:1], TrainSettings(passes=1, rates=(0.02, 0.0, 0.0, 0.0)))
+    step = (found.gaussians.sh - start.sh)[:, 0, :]
+
+    def half_sum(sh):
+        moved = Gaussians(start.means, start.log_scales, start.quats, start.logit_opacities, sh)
+        return 0.5 * float(((np.asarray(render(moved, cameras[0]).rgb, np.float64) - targets[0]) ** 2).sum())
+
+    for i in np.argsort(-np.abs(step[:, 0]))[:3]:
+        up, down = start.sh.copy(), start.sh.copy()
+        up[i, 0, 0] += 0.05
+        down[i, 0, 0] -= 0.05
+        g = (half_sum(up) - half_sum(down)) / 0.1
+        assert step[i, 0] == pytest.approx(-0.02 * g / (abs(g) + EPSILON), rel=1e-2)
+
+
+def test_what_no_image_shows_stays_where_the_prior_put_it(truth, cameras, targets):
+    start = grey(truth)
+    found = fit(start, cameras[:1], targets[:1], TrainSettings(passes=3))
+    hidden = (fisher(start, cameras[0])[:, 0] == 0) & (fisher(found.gaussians, cameras[0])[:, 0] == 0)
+    assert hidden.sum() > 20
+    for name in LEARNED:
+        assert np.array_equal(getattr(found.gaussians, name)[hidden], getattr(start, name)[hidden])
+        assert not np.array_equal(getattr(found.gaussians, name)[~hidden], getattr(start, name)[~hidden])
+
+
+def test_fit_repeats_bitwise_and_owes_nothing_to_a_used_cache(truth, cameras, targets):
+    settings, cache = TrainSettings(passes=5), ListCache()
+    first = fit(grey(truth), cameras, targets, settings, cache=cache)
+    again = fit(grey(truth), cameras, targets, settings, cache=cache)
+    assert first.loss == again.loss
+    assert all(np.array_equal(getattr(first.gaussians, n), getattr(again.gaussians, n)) for n in LEARNED)
+    other = fit(grey(truth), cameras, targets, TrainSettings(passes=5, seed=1))
+    assert not np.array_equal(first.gaussians.sh, other.gaussians.sh)
+
+
+def test_stops_when_passes_no_longer_help(truth, cameras, targets):
+    found = fit(grey(truth), cameras, targets, TrainSettings(passes=50, rates=(1e-4,) * 4))
+    assert found.stop_reason == "converged"
+    assert found.passes < 50
