@@ -147,7 +147,8 @@ def run(
 
     progress is told of the work inside a step, on_step of every state that is committed.
 
-    Killed at any moment and called again, it takes the same views as a run that was never interrupted.
+    Killed at any moment and called again, it takes the same views as a run that was never interrupted. Raises InputError
+    where a frame it takes cannot be read or has an empty mask, before the fit.
     """
     for leftover in out.glob(".*.part*"):  # of a killed write
         leftover.unlink()
@@ -220,7 +221,7 @@ class _Loop:
         with watch("capture"):
             for i in taken:
                 if i not in self.images:
-                    self.images[i] = self.frames[i].masked_rgb()
+                    self.images[i] = _target(self.frames[i])
         with watch("fit"):
             targets = [self.images[i] for i in taken]
             rate = self.settings.warm_rate if step else 1.0
@@ -245,6 +246,13 @@ class _Loop:
             with watch("evaluate"):
                 line |= self.stations.measure(fit.gaussians, taken)
         return State(fit.gaussians, H, surface, taken, [*state.steps, line])
+
+
+def _target(frame: Frame) -> np.ndarray:
+    """`Frame.masked_rgb`. Raises InputError where the mask is empty: a fit to black would hide the rock."""
+    if not frame.mask().any():
+        raise InputError(f"{frame.mask_path}: the rock mask of frame {frame.name} is empty; correct it, or remove the frame")
+    return frame.masked_rgb()
 
 
 def write_checkpoint(out: Path, state: State) -> None:

@@ -5,11 +5,16 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tiny
 from rich.console import Console
 
-from mgs.commands.nbv import start_run
+from mgs import nbv
+from mgs.commands.nbv import print_run, start_run
+from mgs.dataset import load_dataset
+from mgs.errors import InputError
+from mgs.files import write_png
 
 
 @pytest.fixture
@@ -32,3 +37,34 @@ def test_the_datasets_own_prior_is_the_default(dataset, tmp_path):
     assert not (tmp_path / "run/prior").exists()
     settings, _ = started(dataset, tmp_path / "given", other, budget=2)
     assert Path(settings["prior"]) == other.resolve()
+
+
+def blacken(dataset: Path, *frames: int) -> None:
+    """Empty the masks of these frames."""
+    for i in frames:
+        write_png(dataset / f"masks/kf_{i:04d}.png", np.zeros((tiny.HEIGHT, tiny.WIDTH), bool))
+
+
+@pytest.mark.parametrize(("frames", "images", "named"), [(range(12), 0, "kf_0000"), ([4], 0, "kf_0004"), ([6], 4, "kf_0006")])
+def test_a_frame_without_rock_is_refused_before_it_is_fitted_to(dataset, tmp_path, frames, images, named):
+    """Of 12 frames on a circle 0, 4 and 8 are seeds; `farthest` takes 2 first, then 6."""
+    blacken(dataset, *frames)
+    fits = []
+
+    def fit(gaussians, cameras, *rest):
+        fits.append(len(cameras))
+        return tiny.fit(gaussians, cameras, *rest)
+
+    loaded = load_dataset(dataset)
+    settings = tiny.start(tmp_path / "run", loaded, policy="farthest")
+    with pytest.raises(InputError, match=f"{named}.*is empty"):
+        nbv.run(tmp_path / "run", settings, loaded, tiny.stations(fit=fit), tiny.silent)
+    assert max(fits, default=0) == images
+
+
+def test_a_quality_that_could_not_be_measured_is_a_dash(dataset, tmp_path):
+    state = nbv.State(tiny.initial([]), np.zeros(0), np.zeros(0), [0], [])
+    views = {"count": 2, "psnr": 30.123, "ssim": 0.95, "psnr_mask": None, "ssim_mask": None}
+    console = Console(record=True, width=500)
+    print_run(tmp_path, state, {"all": views, "held_out": {"count": 0}}, console)
+    assert "all views (2): PSNR 30.12 dB, SSIM 0.9500; inside the rock mask PSNR – dB, SSIM –" in console.export_text()

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 
     from mgs.nbv import State
 
+DIGITS = {"psnr": 2, "ssim": 4, "psnr_mask": 2, "ssim_mask": 4}
+"""Decimals of the qualities that are printed."""
+
 
 def nbv(
     dataset: Annotated[Path | None, typer.Argument(help="Dataset folder (transforms.json). Not needed with --resume.")] = None,
@@ -162,8 +165,9 @@ def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console
     for name, label in (("all", "all views"), ("held_out", "views never trained on")):
         mean = metrics[name]
         if mean["count"]:
+            shown = {key: "–" if mean[key] is None else f"{mean[key]:.{digits}f}" for key, digits in DIGITS.items()}
             console.print(
-                f"{label} ({mean['count']}): PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.4f}; "
-                f"inside the rock mask PSNR {mean['psnr_mask']:.2f} dB, SSIM {mean['ssim_mask']:.4f}"
+                f"{label} ({mean['count']}): PSNR {shown['psnr']} dB, SSIM {shown['ssim']}; "
+                f"inside the rock mask PSNR {shown['psnr_mask']} dB, SSIM {shown['ssim_mask']}"
             )
     console.print(f"wrote {out}", soft_wrap=True)
