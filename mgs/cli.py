@@ -3,37 +3,57 @@
 from __future__ import annotations
 
 import sys
+from typing import Annotated
 
 import typer
 
+from mgs import __version__
 from mgs.commands import COMMANDS
 from mgs.errors import InputError
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C: 128 + SIGINT."""
 
-app = typer.Typer(
-    name="mgs",
-    help="Active Gaussian splatting: exact Fisher information and next-best-view selection.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
+app = typer.Typer(name="mgs", add_completion=False, pretty_exceptions_enable=False)
 for name, command in COMMANDS.items():
     app.command(name)(command)
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"mgs {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _program(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop.")
+    ] = False,
+) -> None:
+    """Active Gaussian splatting: exact Fisher information and next-best-view selection."""
+
+
 def main(arguments: list[str] | None = None) -> None:
-    """Run a command: bad input is one line and exit code 2, an interruption is one line and exit code 130."""
+    """Run a command and end the process: bad input and wrong options are one line and exit code 2, an interruption is one
+    line and exit code 130. Raises SystemExit, always."""
+    arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        app(arguments, standalone_mode=True)
+        code = app(arguments or ["--help"], prog_name="mgs", standalone_mode=False)
     except InputError as error:
-        print(f"mgs: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    except SystemExit as stop:
-        if stop.code == INTERRUPTED:  # typer has turned Ctrl-C into this, without a word
-            print("mgs: interrupted; what was finished is kept", file=sys.stderr)
-        raise
+        raise _stop(str(error), 2) from None
+    except typer.TyperException as error:
+        raise _stop(" ".join(error.format_message().replace("Value error, ", "").split()), 2) from None
+    except typer.Abort:
+        raise _stop("stopped", 1) from None
+    if code == INTERRUPTED:  # typer has turned Ctrl-C into this, without a word
+        raise _stop("interrupted; what was finished is kept", INTERRUPTED)
+    raise SystemExit(code or 0)
+
+
+def _stop(message: str, code: int) -> SystemExit:
+    print(f"mgs: {message}", file=sys.stderr)
+    return SystemExit(code)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import pytest
 import synthetic
 import tiny
 
+from mgs import __version__
 from mgs.cli import main
 from mgs.files import write_exr, write_png
 from mgs.gaussians import write_ply
@@ -316,6 +317,34 @@ def test_a_prior_that_fails_leaves_all_as_it_was(capsys, dataset, tmp_path, exis
     refused(capsys, ["prior", dataset, "--out", out, "--mesh", tmp_path / "none.glb", "--gaussians", 9])
     refused(capsys, ["nbv", dataset, "--out", out, "--gaussians", 1, "--budget", 1])
     assert listing(tmp_path) == before
+
+
+OPTIONS: dict[str, tuple[list, str]] = {
+    "unknown command": (["fly"], "fly"),
+    "unknown option": (["nbv", "--fast"], "--fast"),
+    "missing argument": (["prior"], "dataset"),
+    "missing option": (["import", "somewhere"], "--out"),
+    "number of words": (["bench", "splat", "--repeats", "many"], "--repeats"),
+    "number out of range": (["bench", "splat", "--repeats", 1], "--repeats"),
+    "unknown choice": (["bench", "speed"], "speed"),
+    "unknown option of the program": (["--fast"], "--fast"),
+}
+
+
+@pytest.mark.parametrize("case", OPTIONS)
+def test_wrong_options(capsys, case):
+    arguments, named = OPTIONS[case]
+    assert named in refused(capsys, arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"), [([], "Usage"), (["nbv", "--help"], "Usage"), (["--version"], f"mgs {__version__}")]
+)
+def test_help_and_version(capsys, arguments, said):
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 0
+    assert said in capsys.readouterr().out
 
 
 MESHES: dict[str, tuple[str, str]] = {
