@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,15 @@ def test_the_datasets_own_prior_is_the_default(dataset, tmp_path):
     assert not (tmp_path / "run/prior").exists()
     settings, _ = started(dataset, tmp_path / "given", other, budget=2)
     assert Path(settings["prior"]) == other.resolve()
+
+
+def test_every_setting_of_the_fit_is_written_down_and_the_root_seed_reaches_it(dataset, tmp_path):
+    from mgs.train import TrainSettings
+
+    prior = tiny.write_prior(tmp_path / "prior")
+    settings, _ = started(dataset, tmp_path / "run", prior, budget=2, seed=7)
+    assert set(settings["train"]) == {field.name for field in fields(TrainSettings)}
+    assert settings["train"]["seed"] == settings["seed"] == 7
 
 
 def blacken(dataset: Path, *frames: int) -> None:

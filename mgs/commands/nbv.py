@@ -60,14 +60,17 @@ def nbv(
         raise InputError("nbv: give a DATASET and --out RUN, or --resume RUN")
     values = {
         "policy": policy, "budget": budget, "seeds": seeds, "seed": seed,
-        "pixel_noise": pixel_noise, "evaluate_every": evaluate_every, "train": train_settings(passes, seed),
+        "pixel_noise": pixel_noise, "evaluate_every": evaluate_every,
     }  # fmt: skip
-    start_run(dataset, out, prior, gaussians, values, console)
+    start_run(dataset, out, prior, gaussians, values, console, passes)
     run_folder(out, console)
 
 
 def train_settings(passes: int | None, seed: int) -> dict[str, Any]:
-    """Every setting of the fit, resolved. Raises InputError for fewer than one pass."""
+    """Every setting of the fit, resolved; `mgs.train.fit` derives its draws by name from the run's root seed.
+
+    Raises InputError for fewer than one pass.
+    """
     from dataclasses import asdict
 
     from mgs.errors import InputError
@@ -79,9 +82,18 @@ def train_settings(passes: int | None, seed: int) -> dict[str, Any]:
 
 
 def start_run(
-    dataset: Path, out: Path, prior: Path | None, gaussians: int | None, values: dict[str, Any], console: Console
+    dataset: Path,
+    out: Path,
+    prior: Path | None,
+    gaussians: int | None,
+    values: dict[str, Any],
+    console: Console,
+    passes: int | None = None,
 ) -> None:
-    """Check everything, find or build the prior, write config.json. Leaves no folder behind where it fails."""
+    """Check everything, find or build the prior, write config.json with every setting resolved.
+
+    values: fields of `mgs.config.NbvSettings`. Leaves no folder behind where it fails.
+    """
     from mgs.config import NbvSettings, validated
     from mgs.dataset import load_dataset
     from mgs.errors import InputError
@@ -96,6 +108,7 @@ def start_run(
         console.print(f"prior: {prior}", soft_wrap=True)
     where = prior or out / "prior"
     settings = validated(NbvSettings, {"dataset": dataset.resolve(), "prior": where.resolve(), **values})
+    settings = settings.model_copy(update={"train": train_settings(passes, settings.seed)})
     frames = load_dataset(dataset)
     check_counts(settings, len(frames))
     if prior is not None:
