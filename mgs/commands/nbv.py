@@ -27,9 +27,11 @@ def nbv(
     ] = None,
     gaussians: Annotated[int | None, typer.Option(help="Build a prior of this many Gaussians inside the run.")] = None,
     policy: Annotated[str, typer.Option(help=f"One of {', '.join(POLICIES)}.")] = "d-optimal",
-    budget: Annotated[int, typer.Option(help="Views chosen beyond the seeds.")] = 50,
+    budget: Annotated[
+        int | None, typer.Option(help="Views chosen beyond the seeds; default 50, or all candidates where they are fewer.")
+    ] = None,
     seeds: Annotated[int, typer.Option(help="Views at evenly spaced azimuths that start the model.")] = 4,
-    seed: Annotated[int, typer.Option(help="Root of every random draw.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Root of every random draw.")] = 0,
     pixel_noise: Annotated[
         float, typer.Option(help="Residual of a pixel, linear RGB: sets lambda of every criterion.")
     ] = PIXEL_NOISE,
@@ -59,9 +61,10 @@ def nbv(
     if dataset is None or out is None:
         raise InputError("nbv: give a DATASET and --out RUN, or --resume RUN")
     values = {
-        "policy": policy, "budget": budget, "seeds": seeds, "seed": seed,
-        "pixel_noise": pixel_noise, "evaluate_every": evaluate_every,
+        "policy": policy, "seeds": seeds, "seed": seed, "pixel_noise": pixel_noise, "evaluate_every": evaluate_every,
     }  # fmt: skip
+    if budget is not None:
+        values["budget"] = budget
     start_run(dataset, out, prior, gaussians, values, console, passes)
     run_folder(out, console)
 
@@ -107,9 +110,12 @@ def start_run(
         prior = dataset / "prior"
         console.print(f"prior: {prior}", soft_wrap=True)
     where = prior or out / "prior"
-    settings = validated(NbvSettings, {"dataset": dataset.resolve(), "prior": where.resolve(), **values})
-    settings = settings.model_copy(update={"train": train_settings(passes, settings.seed)})
+    given = validated(NbvSettings, {"dataset": dataset.resolve(), "prior": where.resolve(), **values})
     frames = load_dataset(dataset)
+    resolved: dict[str, Any] = {"train": train_settings(passes, given.seed)}
+    if "budget" not in values:
+        resolved["budget"] = min(given.budget, max(0, len(frames) - given.seeds))
+    settings = given.model_copy(update=resolved)
     check_counts(settings, len(frames))
     if prior is not None:
         load_prior(prior)
