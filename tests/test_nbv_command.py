@@ -12,10 +12,11 @@ import tiny
 from rich.console import Console
 
 from mgs import nbv
+from mgs.cli import main
 from mgs.commands.nbv import print_run, start_run
 from mgs.dataset import load_dataset
 from mgs.errors import InputError
-from mgs.files import write_png
+from mgs.files import write_json, write_png
 
 
 @pytest.fixture
@@ -49,6 +50,14 @@ def test_every_setting_of_the_fit_is_written_down_and_the_root_seed_reaches_it(d
     assert settings["train"]["seed"] == settings["seed"] == 7
 
 
+@pytest.mark.parametrize(("frames", "budget"), [(12, 8), (4, 0), (60, 50)])
+def test_the_default_budget_is_50_or_all_candidates(tmp_path, frames, budget):
+    dataset, prior = tiny.write_dataset(tmp_path / "orbit", frames=frames), tiny.write_prior(tmp_path / "prior")
+    assert started(dataset, tmp_path / "run", prior)[0]["budget"] == budget
+    with pytest.raises(InputError, match=f"exceeds its {frames - 4} candidates"):
+        started(dataset, tmp_path / "more", prior, budget=frames - 3)
+
+
 def blacken(dataset: Path, *frames: int) -> None:
     """Empty the masks of these frames."""
     for i in frames:
@@ -78,3 +87,17 @@ def test_a_quality_that_could_not_be_measured_is_a_dash(dataset, tmp_path):
     console = Console(record=True, width=500)
     print_run(tmp_path, state, {"all": views, "held_out": {"count": 0}}, console)
     assert "all views (2): PSNR 30.12 dB, SSIM 0.9500; inside the rock mask PSNR – dB, SSIM –" in console.export_text()
+
+
+@pytest.mark.parametrize("made", ["dataset", "coverage"])
+def test_demo_does_not_show_another_seeds_results(tmp_path, capsys, made):
+    root = tiny.write_dataset(tmp_path / "demo/dataset")
+    if made == "dataset":
+        write_json(root / "config.json", {"seed": 3})
+    else:
+        tiny.start(tmp_path / "demo/coverage", load_dataset(root), seed=3)
+    with pytest.raises(SystemExit) as stop:
+        main(["demo", str(tmp_path / "demo"), "--seed", "1"])
+    assert stop.value.code == 2
+    assert f"demo/{made}: was made with --seed 3, not 1" in capsys.readouterr().err
+    assert not (tmp_path / "demo/prior").exists()

@@ -18,7 +18,7 @@ def demo(
     out: Annotated[Path, typer.Argument(help="Folder for everything; the same command again continues or shows it.")] = Path(
         "demo"
     ),
-    seed: Annotated[int, typer.Option(help="Root seed.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Root seed.")] = 0,
 ) -> None:
     """The whole way in minutes: render a rock orbit, build the prior, choose views by three policies, compare, draw."""
     import time
@@ -37,6 +37,7 @@ def demo(
     console, started = Console(highlight=False), time.monotonic()
     dataset, folder, report = out / "dataset", out / "prior", out / "report"
     runs = [out / policy for policy in POLICIES]
+    check_seed(dataset, runs, seed)
     check_writable(out)
     if not dataset.exists():
         check_new_folder(out)
@@ -65,3 +66,17 @@ def demo(
     console.print(f"done in {time.monotonic() - started:.0f} s; look at:")
     for picture in (dataset / "contact_sheet.png", folder / "prior.png", *written):
         console.print(f"  {picture}", soft_wrap=True)
+
+
+def check_seed(dataset: Path, runs: list[Path], seed: int) -> None:
+    """Raises InputError where the dataset or a run is there already, of another seed."""
+    from mgs.errors import InputError
+    from mgs.files import read_json
+    from mgs.nbv import read_settings
+
+    recorded = {run: read_settings(run).seed for run in runs if (run / "config.json").is_file()}
+    if (dataset / "config.json").is_file():
+        recorded[dataset] = read_json(dataset / "config.json").get("seed", seed)
+    for folder, found in recorded.items():
+        if found != seed:
+            raise InputError(f"{folder}: was made with --seed {found}, not {seed}; give that seed, or another folder")
