@@ -19,6 +19,9 @@ SH_C0 = 0.28209479177387814
 QUAT_MIN = 1e-12
 """A quaternion whose components are all smaller is zero and means the identity: its derivatives would overflow float32."""
 
+MAX_PIXELS = 2**27
+"""Largest image of a camera: what is larger is a slip of the keyboard, and would end in a lack of memory."""
+
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -45,8 +48,9 @@ class Camera:
             raise InputError("camera: K must be a finite 3x3 matrix; correct the intrinsics")
         if K[0, 0] <= 0 or K[1, 1] <= 0:
             raise InputError("camera: focal lengths must be positive; correct fl_x and fl_y")
-        if self.width < 1 or self.height < 1:
-            raise InputError(f"camera: image size {self.width}x{self.height} must be at least 1x1")
+        if self.width < 1 or self.height < 1 or self.width * self.height > MAX_PIXELS:
+            size = f"{self.width}x{self.height}"
+            raise InputError(f"camera: image size {size} must be at least 1x1, and at most {MAX_PIXELS:,} pixels in all")
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise InputError("camera: the pose has NaN or infinite entries; correct its transform matrix")
         rotation = pose[:3, :3]

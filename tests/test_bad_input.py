@@ -98,6 +98,7 @@ DATASETS: dict[str, tuple[Change, str]] = {
     "pose that flattens": (set_pose(FLAT_POSE), "frame 2"),
     "pose that is no matrix": (set_pose([1, 2, 3]), "frame 2"),
     "pose of words": (set_pose([["a"] * 4] * 4), "frame 2"),
+    "width of a slip": (set_header(w=10**9), "1000000000x"),
     "width without end": (set_header(w=float("inf")), "frame 0"),
     "focal length without end": (set_header(fl_x=float("inf")), "frame 0"),
     "distortion": (set_header(k1=0.1), "mgs import"),
@@ -307,6 +308,18 @@ def test_bench_knows_before_it_measures_that_it_cannot_write(capsys, tmp_path, o
     assert named in refused(capsys, ["bench", "scaling", option, make(tmp_path / "out")])
 
 
+@pytest.mark.parametrize("command", ["nbv", "prior", "synth-orbit", "survey", "demo"])
+def test_negative_seed(capsys, dataset, prior, tmp_path, command):
+    arguments = writers(dataset, prior, tmp_path, tmp_path / "out")[command]
+    assert "--seed" in refused(capsys, [*arguments, "--seed", -1], tmp_path)
+
+
+def test_a_picture_too_large(capsys, dataset, tmp_path):
+    write_ply(tmp_path / "splats.ply", tiny.initial([]))
+    arguments = ["render", tmp_path / "splats.ply", "--cameras", dataset, "--out", tmp_path / "out"]
+    assert "100000000x" in refused(capsys, [*arguments, "--width", 100_000_000], tmp_path)
+
+
 @pytest.mark.parametrize("existing", [False, True])
 def test_a_prior_that_fails_leaves_all_as_it_was(capsys, dataset, tmp_path, existing):
     out = tmp_path / "new/deeper/prior"
@@ -371,6 +384,8 @@ SYNTH: dict[str, tuple[list, str]] = {
     "unknown preset": (["--preset", "huge"], "huge"),
     "size of words": (["--size", "big"], "--size"),
     "size 0": (["--size", "0x12"], "--size"),
+    "size of a slip": (["--size", "99999999x99999999"], "--size"),
+    "size in other digits": (["--size", "3²x24"], "--size"),
 }
 
 
@@ -426,7 +441,7 @@ def test_run_whose_dataset_is_gone(capsys, dataset, prior, tmp_path, command):
     assert "no such dataset" in refused(capsys, [*command, run], run)
 
 
-@pytest.mark.parametrize("views", ["kf_9999", "kf_0000,nothing"])
+@pytest.mark.parametrize("views", ["kf_9999", "kf_0000,nothing", ",", ""])
 def test_diagnose_of_views_that_are_not_there(capsys, dataset, prior, tmp_path, views):
     run = tiny.write_run(tmp_path / "run", dataset, prior)
     refused(capsys, ["diagnose", run, "--views", views], run)

@@ -23,9 +23,12 @@ def diagnose(
 
     from mgs import runtime
     from mgs.diagnostics import diagnose_run
+    from mgs.errors import InputError
 
+    wanted = None if views is None else [name.strip() for name in views.split(",") if name.strip()]
+    if wanted == []:
+        raise InputError(f"--views {views!r}: names no frame; give some, as in kf_0003,kf_0010, or leave it out")
     runtime.start()
-    wanted = [name.strip() for name in views.split(",") if name.strip()] if views else None
     with Progress(transient=True) as bar:
         task = bar.add_task("mapping", total=None)
         written = diagnose_run(run, wanted, progress=lambda done, total: bar.update(task, completed=done, total=total))

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from mgs.nbv import State
+    from mgs.train import TrainSettings
 
 DIGITS = {"psnr": 2, "ssim": 4, "psnr_mask": 2, "ssim_mask": 4}
 """Decimals of the qualities that are printed."""
@@ -84,6 +85,22 @@ def train_settings(passes: int | None, seed: int) -> dict[str, Any]:
     return asdict(TrainSettings(seed=seed) if passes is None else TrainSettings(seed=seed, passes=passes))
 
 
+def read_train_settings(out: Path, values: dict[str, Any]) -> TrainSettings:
+    """Settings of the fit from `train` of a run's config.json. Raises InputError for one that is unknown or wrong."""
+    from pydantic import ConfigDict, ValidationError
+    from pydantic.dataclasses import dataclass
+
+    from mgs.errors import InputError
+    from mgs.train import TrainSettings
+
+    try:
+        return dataclass(TrainSettings, config=ConfigDict(extra="forbid", allow_inf_nan=False))(**values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key = ".".join(str(part) for part in ("train", *first["loc"]))
+        raise InputError(f"{out / 'config.json'}: {key}: {first['msg']}; correct it, or start the run anew") from None
+
+
 def start_run(
     dataset: Path,
     out: Path,
@@ -138,6 +155,7 @@ def run_folder(out: Path, console: Console, pictures: bool = False) -> None:
     from mgs.prior import load_prior
 
     settings = loop.read_settings(out)
+    train = read_train_settings(out, settings.train)
     dataset = load_dataset(settings.dataset)
     loop.check_same_frames(out, dataset)
     prior = load_prior(settings.prior)
@@ -145,9 +163,8 @@ def run_folder(out: Path, console: Console, pictures: bool = False) -> None:
 
     from mgs.evaluate import evaluate_run
     from mgs.stations import real_stations
-    from mgs.train import TrainSettings
 
-    stations = real_stations(dataset, prior, TrainSettings(**settings.train))
+    stations = real_stations(dataset, prior, train)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),

@@ -24,7 +24,7 @@ def prior(
     poisson_depth: Annotated[int | None, typer.Option(help="Poisson octree depth; default from the cloud's density.")] = None,
     prior_noise: Annotated[float, typer.Option(help="Spoil the rock's points on purpose: standard deviation, metres.")] = 0.0,
     holes: Annotated[float, typer.Option(help="Spoil them by round holes: share of the points to remove.")] = 0.0,
-    seed: Annotated[int, typer.Option(help="Root seed.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Root seed.")] = 0,
 ) -> None:
     """Depth images to a rock's mesh and N samples on it: plane removal, clustering, Poisson surface, blue noise."""
     from dataclasses import replace

@@ -24,7 +24,7 @@ def survey(
     ] = Poses.estimated,
     sensor_noise: Annotated[float, typer.Option(help="Factor on the depth camera's noise; 0 is exact depth.")] = 1.0,
     drift: Annotated[float, typer.Option(help="Factor on the odometry's drift.")] = 1.0,
-    seed: Annotated[int, typer.Option(help="Root seed.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Root seed.")] = 0,
 ) -> None:
     """Fly the dataset's orbit with a noisy depth camera and drifting odometry; register, close the loop, fuse the cloud.
 

@@ -20,7 +20,7 @@ def synth_orbit(
     size: Annotated[str | None, typer.Option(help="Image size WIDTHxHEIGHT, in place of the preset's.")] = None,
     pose_noise: Annotated[float, typer.Option(min=0, help="Error of the poses in transforms.json, metres per axis.")] = 0.0,
     rotation_noise: Annotated[float, typer.Option(min=0, help="The same for the rotations, degrees per axis.")] = 0.0,
-    seed: Annotated[int, typer.Option(help="Root seed: the same seed gives the same dataset, bit for bit.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Root seed: the same seed gives the same dataset, bit for bit.")] = 0,
 ) -> None:
     """Render an RGB-D orbit around a rock with Mitsuba: photoreal images, z-depth, rock masks, exact poses.
 
@@ -58,11 +58,15 @@ def synth_orbit(
 
 
 def _parse_size(size: str | None) -> dict[str, int | None]:
+    import re
+
+    from mgs.conventions import MAX_PIXELS
     from mgs.errors import InputError
 
     if size is None:
         return {}
-    width, _, height = size.lower().partition("x")
-    if not (width.isdigit() and height.isdigit() and int(width) > 0 and int(height) > 0):
-        raise InputError(f"--size {size!r}: expected WIDTHxHEIGHT in pixels, as in 320x240")
-    return {"width": int(width), "height": int(height)}
+    found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", size.lower(), re.ASCII)
+    width, height = (int(side) for side in found.groups()) if found else (0, 0)
+    if not 0 < width * height <= MAX_PIXELS:
+        raise InputError(f"--size {size!r}: expected WIDTHxHEIGHT, at most {MAX_PIXELS:,} pixels in all, as in 320x240")
+    return {"width": width, "height": height}
