@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -33,15 +34,15 @@ class NbvSettings(BaseModel):
     """Views at evenly spaced azimuths that start the model."""
     seed: Annotated[int, Field(ge=0)] = 0
     """Root of every random draw."""
-    pixel_noise: Annotated[float, Field(gt=0)] = PIXEL_NOISE
+    pixel_noise: Annotated[float, Field(gt=0, allow_inf_nan=False)] = PIXEL_NOISE
     """sigma_e in lambda = (sigma_e / tau)^2, linear RGB; `mgs.policies.regularisation`."""
-    prior_std: dict[str, Annotated[float, Field(gt=0)]] = PRIOR_STD
+    prior_std: dict[str, Annotated[float, Field(gt=0, allow_inf_nan=False)]] = PRIOR_STD
     """tau of each kind of parameter."""
     evaluate_every: Annotated[int, Field(ge=0)] = 0
     """Measure PSNR on all views after every so many steps; 0 = only at the end. Never feeds back into the choice."""
-    warm_rate: Annotated[float, Field(gt=0)] = 0.3
-    """Learning rates of the fits after the first, over those of the first. They start from a model that has converged on all
-    but one image: full rates shake it loose at every step, which costs passes and hides Gaussians behind others."""
+    warm_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.3
+    """Learning rates of the fits after the first, over those of the first: they start from a model that has converged on all
+    but one image, so less is left to move. A chosen constant."""
     train: dict[str, Any] = {}
     """Fields of `mgs.train.TrainSettings`; those left out take its defaults."""
 
@@ -61,8 +62,8 @@ def validated(model: type[Model], values: dict[str, Any]) -> Model:
 
 
 def versions() -> dict[str, str]:
-    """What a result depends on: versions of mgs and of the libraries that compute it."""
-    found = {"mgs": __version__}
+    """What a result depends on: versions of mgs, Python and the libraries that compute it."""
+    found = {"mgs": __version__, "python": platform.python_version()}
     for package in ("mitsuba", "drjit", "numpy"):
         try:
             found[package] = version(package)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from rich.console import Console
 
 from mgs import nbv
 from mgs.cli import main
-from mgs.commands.nbv import print_run, start_run
+from mgs.commands.nbv import print_run, read_train_settings, start_run, train_settings
 from mgs.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import write_json, write_png
@@ -101,3 +101,27 @@ def test_demo_does_not_show_another_seeds_results(tmp_path, capsys, made):
     assert stop.value.code == 2
     assert f"demo/{made}: was made with --seed 3, not 1" in capsys.readouterr().err
     assert not (tmp_path / "demo/prior").exists()
+
+
+@pytest.mark.parametrize("train", [{"speed": 1}, {"passes": "many"}, {"rates": [0.1, 0.2]}, {"decay": float("nan")}])
+def test_damaged_settings_of_the_fit_are_one_line_on_resume(dataset, tmp_path, capsys, train):
+    prior = tiny.write_prior(tmp_path / "prior")
+    tiny.start(tmp_path / "run", load_dataset(dataset), prior=prior, train=train)
+    with pytest.raises(SystemExit) as stop:
+        main(["nbv", "--resume", str(tmp_path / "run")])
+    assert stop.value.code == 2
+    shown = capsys.readouterr().err
+    assert f"config.json: train.{next(iter(train))}" in shown
+    assert len(shown.splitlines()) == 1
+
+
+@pytest.mark.parametrize("values", [{"pixel_noise": float("inf")}, {"prior_std": {"colour": float("inf")}}])
+def test_scales_of_lambda_are_finite(dataset, tmp_path, values):
+    with pytest.raises(InputError, match="finite"):
+        started(dataset, tmp_path / "run", tiny.write_prior(tmp_path / "prior"), **values)
+
+
+def test_settings_of_the_fit_are_read_back_as_they_were(tmp_path):
+    from mgs.train import TrainSettings
+
+    assert asdict(read_train_settings(tmp_path, train_settings(6, 2))) == asdict(TrainSettings(passes=6, seed=2))

@@ -87,14 +87,17 @@ def train_settings(passes: int | None, seed: int) -> dict[str, Any]:
 
 def read_train_settings(out: Path, values: dict[str, Any]) -> TrainSettings:
     """Settings of the fit from `train` of a run's config.json. Raises InputError for one that is unknown or wrong."""
+    from dataclasses import asdict
+
     from pydantic import ConfigDict, ValidationError
     from pydantic.dataclasses import dataclass
 
     from mgs.errors import InputError
     from mgs.train import TrainSettings
 
+    checked: Any = dataclass(TrainSettings, frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))
     try:
-        return dataclass(TrainSettings, config=ConfigDict(extra="forbid", allow_inf_nan=False))(**values)
+        return TrainSettings(**asdict(checked(**values)))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         key = ".".join(str(part) for part in ("train", *first["loc"]))
