@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
-import platform
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from mgs import __version__
+from mgs.config import versions
 from mgs.conventions import Camera, opengl_from_opencv
 from mgs.dataset import FRAME_INTERVAL, Dataset, Frame, load_dataset, write_transforms
 from mgs.errors import InputError
@@ -71,23 +70,15 @@ def synthesise(
     Raises InputError: output folder not empty or not writable, bad mesh, rock not wholly in every frame.
     """
     started, out = time.perf_counter(), Path(out)
-    denoise = importlib.util.find_spec("pyoidn") is not None
-    resolved = {
-        "scene": settings.model_dump(mode="json"),
-        "preset": asdict(preset),
-        "seed": seed,
-        "mesh": None if mesh is None else Path(mesh).name,
-        "denoise": denoise,
-        "pose_noise": None if pose_noise is None else asdict(pose_noise),
-    }
-    resumes = _resumes(out, resolved)
     rock, scale = (make_rock(settings.rock, generator(seed, "rock")), 1.0) if mesh is None else load_rock(mesh, settings.rock)
     if mesh is not None:
         extents = " x ".join(f"{x:.2f}" for x in rock.extents)
         say(f"{mesh}: scaled {scale:.4g} times to the scene's rock size, now {extents} m")
     cameras = rock_cameras(settings, preset, rock)
     frames = _frames(out, cameras)
-    if not resumes:
+    denoise = importlib.util.find_spec("pyoidn") is not None
+    resolved = _resolved(settings, preset, seed, mesh, denoise, pose_noise)
+    if not _resumes(out, resolved):
         new_folder(out)
         write_json(out / "config.json", resolved)
     with atomic_path(out / "rock.glb") as temporary:
@@ -107,14 +98,35 @@ def synthesise(
         "frame_s": round(float(np.median(seconds)), 3) if seconds else None,
         "total_s": round(time.perf_counter() - started, 2),
     }
-    write_json(out / "config.json", resolved | _record(scale, exposure, spp) | {"timings": timings})
-    if pose_noise is not None:
-        told = perturb(cameras, pose_noise.position, pose_noise.rotation, generator(seed, "pose noise"))
-        truth = {frame.name: opengl_from_opencv(frame.camera.world_to_camera).tolist() for frame in frames}
-        write_json(out / "true_poses.json", {"convention": "OpenGL camera-to-world, as transforms.json", "poses": truth})
-        frames = [replace(frame, camera=camera) for frame, camera in zip(frames, told, strict=True)]
-    write_transforms(out, frames)
+    record = {"mesh_scale": scale, "exposure": exposure, "samples_per_pixel": spp, "versions": versions(), "timings": timings}
+    write_json(out / "config.json", resolved | record)
+    write_transforms(out, frames if pose_noise is None else _told(out, frames, pose_noise, seed))
     return load_dataset(out)
+
+
+def _resolved(
+    settings: SceneFile, preset: Preset, seed: int, mesh: str | Path | None, denoise: bool, pose_noise: PoseNoise | None
+) -> dict[str, Any]:
+    """All that decides the dataset: what a run that goes on must agree with."""
+    return {
+        "scene": settings.model_dump(mode="json"),
+        "preset": asdict(preset),
+        "seed": seed,
+        "mesh": None
+        if mesh is None
+        else {"name": Path(mesh).name, "sha256": hashlib.sha256(Path(mesh).read_bytes()).hexdigest()},
+        "denoise": denoise,
+        "pose_noise": None if pose_noise is None else asdict(pose_noise),
+    }
+
+
+def _told(out: Path, frames: list[Frame], pose_noise: PoseNoise, seed: int) -> list[Frame]:
+    """The frames with noisy poses; writes true_poses.json."""
+    cameras = [frame.camera for frame in frames]
+    told = perturb(cameras, pose_noise.position, pose_noise.rotation, generator(seed, "pose noise"))
+    truth = {frame.name: opengl_from_opencv(frame.camera.world_to_camera).tolist() for frame in frames}
+    write_json(out / "true_poses.json", {"convention": "OpenGL camera-to-world, as transforms.json", "poses": truth})
+    return [replace(frame, camera=camera) for frame, camera in zip(frames, told, strict=True)]
 
 
 def _render_frames(
@@ -204,9 +216,3 @@ def _meter(scene: Scene, cameras: list[Camera], seed: int) -> float:
         rendered = scene.render(cameras[index], 2, derive_seed(seed, f"meter {index}"), denoise=False)
         means.append(float(rendered.rgb[rendered.mask].mean()))
     return ROCK_EXPOSURE / float(np.mean(means))
-
-
-def _record(scale: float, exposure: float, spp: int) -> dict[str, Any]:
-    versions = {"mgs": __version__, "python": platform.python_version()}
-    versions |= {name: version(name) for name in ("mitsuba", "drjit", "numpy")}
-    return {"mesh_scale": scale, "exposure": exposure, "samples_per_pixel": spp, "versions": versions}

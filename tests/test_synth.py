@@ -98,6 +98,24 @@ def test_output_folder_that_is_not_empty(dataset, tmp_path):
         synthesise(tmp_path, SCENE, TINY, seed=3)
 
 
+def test_another_mesh_of_the_same_name_is_not_gone_on_with(tmp_path):
+    class Stop(Exception):
+        pass
+
+    def stop(done, total):
+        raise Stop
+
+    path, small = tmp_path / "rock.ply", Preset(width=32, height=24, frames=2, spp=1)
+    trimesh.creation.icosphere(subdivisions=2).export(path)
+    with pytest.raises(Stop):
+        synthesise(tmp_path / "out", SCENE, small, mesh=path, progress=stop)
+    trimesh.creation.icosphere(subdivisions=3).export(path)
+    with pytest.raises(InputError, match="other settings"):
+        synthesise(tmp_path / "out", SCENE, small, mesh=path)
+    trimesh.creation.icosphere(subdivisions=2).export(path)
+    assert len(synthesise(tmp_path / "out", SCENE, small, mesh=path)) == 2
+
+
 def test_rock_that_does_not_fit_the_frame(tmp_path):
     near = SCENE.model_copy(update={"orbit": Orbit(radius=1.5, altitude=1.5)})
     with pytest.raises(InputError, match="not wholly in frame 0"):
