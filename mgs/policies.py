@@ -24,8 +24,8 @@ Criterion = Callable[[Array, Array, Array], float]
 PosePolicy = Callable[[Array, Array, Array, np.random.Generator], Array]
 
 PIXEL_NOISE = 0.02
-"""sigma_e, standard deviation of a pixel's residual, linear RGB: what a fitted model leaves on a textured rock
-(34 dB), and the scale at which one pixel's evidence counts as one."""
+"""sigma_e, standard deviation of a pixel's residual, linear RGB (34 dB): the scale at which one pixel's evidence counts as one.
+A chosen constant."""
 
 PRIOR_STD = {"colour": 1.0, "scale": 0.5, "rotation": 0.5, "opacity": 2.0}
 """tau: how far each parameter may plausibly lie from its start before any image is seen, in the parameter's own unit:
@@ -60,14 +60,15 @@ def observed(H: Array, lam: Array) -> NDArray[np.bool_]:
 def coverage(H: Array, lam: Array) -> float:
     """Surface coverage C_0 of Eq. 9: the share of Gaussians that are `observed`, 0 to 1.
 
-    The loop passes H of the prior's Gaussians, as they were before training. At the trained model Eq. 9 mixes two things: a
-    tenth of the Gaussians fade behind their neighbours as training goes on, and would count as surface that no view sees.
+    The loop passes H of the prior's Gaussians, as they were before training. At the trained model Eq. 9 mixes two things:
+    Gaussians that fade behind their neighbours as training goes on would count as surface that no view sees.
     """
     return float(observed(H, lam).mean())
 
 
 def d_optimal(F: Array, H: Array, lam: Array) -> float:
-    """Paper's Eq. 7: 1/l sum log(1 + F / (H + lam)), the decrease of the log-volume of the posterior."""
+    """Paper's Eq. 7: 1/l sum log(1 + F / (H + lam)), the decrease of the log-determinant of the posterior's covariance,
+    per parameter."""
     return float(np.log1p(F / (H + lam)).mean(dtype=np.float64))
 
 
