@@ -153,17 +153,16 @@ def peak_flops() -> float:
     n, rounds = 1 << 16, 256
     scale = dr.opaque(mi.Float, 0.999)
 
-    @dr.freeze
-    def chains(x: Any, scale: Any) -> Any:
-        start = [x + i for i in range(8)]
-        _, end = dr.while_loop(
-            (mi.UInt32(0), start), lambda i, a: i < rounds, lambda i, a: (i + 1, [dr.fma(v, scale, x) for v in a])
-        )
-        return sum(end)
+    def body(i: Any, chains: list[Any]) -> Any:
+        for _ in range(16):
+            chains = [dr.fma(value, scale, x) for value in chains]
+        return i + 1, chains
 
     x = dr.arange(mi.Float, n) * (1 / n)
     dr.eval(x)
-    return 2 * 8 * 16 * n * rounds / median_seconds(lambda: chains(x, scale), 5)
+    start = [x + i for i in range(8)]
+    seconds = median_seconds(lambda: dr.while_loop((mi.UInt32(0), start), lambda i, _: i < rounds, body)[1], 5)
+    return 2 * 8 * 16 * n * rounds / seconds
 
 
 def bench_splat(n: int, width: int, height: int, repeats: int, report: Callable[[str], None]) -> dict[str, Any]:
