@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,9 +11,8 @@ import numpy as np
 import pytest
 import synthetic
 import tiny
+from refusals import occupied, refused
 
-from mgs import __version__
-from mgs.cli import main
 from mgs.files import write_exr, write_png
 from mgs.gaussians import write_ply
 
@@ -158,28 +156,6 @@ def prior(tmp_path):
     return tiny.write_prior(tmp_path / "prior")
 
 
-def listing(root: Path) -> dict[str, bytes | None]:
-    """Every file under a folder with its content, every folder with None."""
-    paths = (root, *root.rglob("*")) if root.exists() else ()
-    return {str(path.relative_to(root)): path.read_bytes() if path.is_file() else None for path in paths}
-
-
-def refused(capsys, arguments: list, out: Path | None = None) -> str:
-    """Run `mgs ARGUMENTS`, check that it is refused as it should be, return the line."""
-    before = listing(out) if out else None
-    with pytest.raises(SystemExit) as stop:
-        main([str(argument) for argument in arguments])
-    error = capsys.readouterr().err
-    assert stop.value.code == 2, error
-    lines = error.splitlines()
-    assert len(lines) == 1, error
-    assert lines[0].startswith("mgs: ")
-    assert "Traceback" not in error
-    if out:
-        assert listing(out) == before, "something was left behind"
-    return lines[0]
-
-
 @pytest.mark.parametrize("command", ["nbv", "prior"])
 @pytest.mark.parametrize("case", DATASETS)
 def test_broken_dataset(capsys, dataset, tmp_path, command, case):
@@ -240,124 +216,6 @@ def test_nbv_settings(capsys, dataset, prior, tmp_path, case):
 def test_too_few_gaussians(capsys, dataset, tmp_path, command, count):
     arguments = [command, dataset, "--out", tmp_path / "out", "--gaussians", count]
     assert "Gaussians" in refused(capsys, arguments + (["--budget", 1] if command == "nbv" else []), tmp_path / "out")
-
-
-def occupied(path: Path) -> Path:
-    path.mkdir()
-    (path / "precious.txt").write_text("keep me")
-    return path
-
-
-def a_file(path: Path) -> Path:
-    path.write_text("keep me")
-    return path
-
-
-def read_only(tmp_path: Path) -> Path:
-    """A folder nobody may write to: root is not held back by permissions, so for root it is the kernel's own."""
-    if os.geteuid() == 0:
-        return Path("/proc/mgs")
-    folder = tmp_path / "locked"
-    folder.mkdir(mode=0o555)
-    return folder / "out"
-
-
-def writers(dataset: Path, prior: Path, splats: Path, out: Path) -> dict[str, list]:
-    """Every command that writes into a folder of one's choice."""
-    return {
-        "nbv": ["nbv", dataset, "--out", out, "--prior", prior, "--budget", 1],
-        "prior": ["prior", dataset, "--out", out, "--gaussians", 40],
-        "synth-orbit": ["synth-orbit", out, "--frames", 2, "--size", "16x12"],
-        "survey": ["survey", dataset, "--out", out],
-        "import": ["import", dataset, "--out", out],
-        "render": ["render", splats, "--cameras", dataset, "--out", out],
-        "demo": ["demo", out],
-    }
-
-
-@pytest.mark.parametrize("command", writers(*[Path()] * 4))
-@pytest.mark.parametrize(
-    ("make", "named"),
-    [
-        (lambda tmp_path: occupied(tmp_path / "out"), "not empty"),
-        (lambda tmp_path: a_file(tmp_path / "out"), "is a file"),
-        (lambda tmp_path: a_file(tmp_path / "file") / "out", "cannot be written"),
-        (lambda tmp_path: tmp_path / ("long" * 99), "cannot be written"),
-        (read_only, "cannot be written"),
-    ],
-)
-def test_output_that_is_in_the_way(capsys, dataset, prior, tmp_path, command, make, named):
-    write_ply(tmp_path / "splats.ply", tiny.initial([]))
-    out = make(tmp_path)
-    before = listing(tmp_path)
-    assert named in refused(capsys, writers(dataset, prior, tmp_path / "splats.ply", out)[command])
-    assert listing(tmp_path) == before
-    assert "mgs" not in os.listdir("/proc")
-
-
-@pytest.mark.parametrize(("folder", "command"), [("renders", "eval"), ("diagnostics", "diagnose")])
-def test_a_file_where_a_run_keeps_its_pictures(capsys, dataset, prior, tmp_path, folder, command):
-    run = tiny.write_run(tmp_path / "run", dataset, prior)
-    a_file(run / folder)
-    assert "cannot be written" in refused(capsys, [command, run], run)
-
-
-@pytest.mark.parametrize("option", ["--json", "--chart"])
-@pytest.mark.parametrize(("make", "named"), [(lambda path: a_file(path) / "x", "cannot be written"), (occupied, "is a folder")])
-def test_bench_knows_before_it_measures_that_it_cannot_write(capsys, tmp_path, option, make, named):
-    assert named in refused(capsys, ["bench", "scaling", option, make(tmp_path / "out")])
-
-
-@pytest.mark.parametrize("command", ["nbv", "prior", "synth-orbit", "survey", "demo"])
-def test_negative_seed(capsys, dataset, prior, tmp_path, command):
-    arguments = writers(dataset, prior, tmp_path, tmp_path / "out")[command]
-    assert "--seed" in refused(capsys, [*arguments, "--seed", -1], tmp_path)
-
-
-def test_a_picture_too_large(capsys, dataset, tmp_path):
-    write_ply(tmp_path / "splats.ply", tiny.initial([]))
-    arguments = ["render", tmp_path / "splats.ply", "--cameras", dataset, "--out", tmp_path / "out"]
-    assert "100000000x" in refused(capsys, [*arguments, "--width", 100_000_000], tmp_path)
-
-
-@pytest.mark.parametrize("existing", [False, True])
-def test_a_prior_that_fails_leaves_all_as_it_was(capsys, dataset, tmp_path, existing):
-    out = tmp_path / "new/deeper/prior"
-    if existing:
-        out.mkdir(parents=True)
-    before = listing(tmp_path)
-    refused(capsys, ["prior", dataset, "--out", out, "--gaussians", 1])
-    refused(capsys, ["prior", dataset, "--out", out, "--mesh", tmp_path / "none.glb", "--gaussians", 9])
-    refused(capsys, ["nbv", dataset, "--out", out, "--gaussians", 1, "--budget", 1])
-    assert listing(tmp_path) == before
-
-
-OPTIONS: dict[str, tuple[list, str]] = {
-    "unknown command": (["fly"], "fly"),
-    "unknown option": (["nbv", "--fast"], "--fast"),
-    "missing argument": (["prior"], "dataset"),
-    "missing option": (["import", "somewhere"], "--out"),
-    "number of words": (["bench", "splat", "--repeats", "many"], "--repeats"),
-    "number out of range": (["bench", "splat", "--repeats", 1], "--repeats"),
-    "unknown choice": (["bench", "speed"], "speed"),
-    "unknown option of the program": (["--fast"], "--fast"),
-}
-
-
-@pytest.mark.parametrize("case", OPTIONS)
-def test_wrong_options(capsys, case):
-    arguments, named = OPTIONS[case]
-    assert named in refused(capsys, arguments)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"), [([], "Usage"), (["nbv", "--help"], "Usage"), (["--version"], f"mgs {__version__}")]
-)
-def test_help_and_version(capsys, arguments, said):
-    with pytest.raises(SystemExit) as stop:
-        main(arguments)
-    assert stop.value.code == 0
-    assert said in capsys.readouterr().out
 
 
 MESHES: dict[str, tuple[str, str]] = {

@@ -37,8 +37,8 @@ def demo(
     console, started = Console(highlight=False), time.monotonic()
     dataset, folder, report = out / "dataset", out / "prior", out / "report"
     runs = [out / policy for policy in POLICIES]
-    check_seed(dataset, runs, seed)
     check_writable(out)
+    check_seed(dataset, runs, seed)
     if not dataset.exists():
         check_new_folder(out)
 

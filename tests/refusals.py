@@ -1,0 +1,42 @@
+"""What every refusal has in common, and places that a command must keep out of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mgs.cli import main
+
+
+def listing(root: Path) -> dict[str, bytes | None]:
+    """Every file under a folder with its content, every folder with None."""
+    paths = (root, *root.rglob("*")) if root.exists() else ()
+    return {str(path.relative_to(root)): path.read_bytes() if path.is_file() else None for path in paths}
+
+
+def refused(capsys, arguments: list, out: Path | None = None) -> str:
+    """Run `mgs ARGUMENTS`, check that it is refused as it should be, return the line."""
+    before = listing(out) if out else None
+    with pytest.raises(SystemExit) as stop:
+        main([str(argument) for argument in arguments])
+    error = capsys.readouterr().err
+    assert stop.value.code == 2, error
+    lines = error.splitlines()
+    assert len(lines) == 1, error
+    assert lines[0].startswith("mgs: ")
+    assert "Traceback" not in error
+    if out:
+        assert listing(out) == before, "something was left behind"
+    return lines[0]
+
+
+def occupied(path: Path) -> Path:
+    path.mkdir()
+    (path / "precious.txt").write_text("keep me")
+    return path
+
+
+def a_file(path: Path) -> Path:
+    path.write_text("keep me")
+    return path

@@ -1,0 +1,158 @@
+"""Outputs that cannot be written and options that are wrong, through the real command line: known before any work."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+import synthetic
+import tiny
+from refusals import a_file, listing, occupied, refused
+
+from mgs import __version__
+from mgs.cli import main
+from mgs.gaussians import write_ply
+
+
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory):
+    return tiny.write_dataset(tmp_path_factory.mktemp("pristine") / "dataset")
+
+
+@pytest.fixture
+def dataset(pristine, tmp_path):
+    return Path(shutil.copytree(pristine, tmp_path / "dataset"))
+
+
+@pytest.fixture
+def prior(tmp_path):
+    return tiny.write_prior(tmp_path / "prior")
+
+
+def read_only(tmp_path: Path) -> Path:
+    """A folder nobody may write to: root is not held back by permissions, so for root it is the kernel's own."""
+    if os.geteuid() == 0:
+        return Path("/proc/mgs")
+    folder = tmp_path / "locked"
+    folder.mkdir(mode=0o555)
+    return folder / "out"
+
+
+def writers(dataset: Path, prior: Path, splats: Path, out: Path) -> dict[str, list]:
+    """Every command that writes into a folder of one's choice."""
+    return {
+        "nbv": ["nbv", dataset, "--out", out, "--prior", prior, "--budget", 1],
+        "prior": ["prior", dataset, "--out", out, "--gaussians", 40],
+        "synth-orbit": ["synth-orbit", out, "--frames", 2, "--size", "16x12"],
+        "survey": ["survey", dataset, "--out", out],
+        "import": ["import", dataset, "--out", out],
+        "render": ["render", splats, "--cameras", dataset, "--out", out],
+        "demo": ["demo", out],
+    }
+
+
+@pytest.mark.parametrize("command", writers(*[Path()] * 4))
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda tmp_path: occupied(tmp_path / "out"), "not empty"),
+        (lambda tmp_path: a_file(tmp_path / "out"), "is a file"),
+        (lambda tmp_path: a_file(tmp_path / "file") / "out", "cannot be written"),
+        (lambda tmp_path: tmp_path / ("long" * 99), "cannot be written"),
+        (read_only, "cannot be written"),
+    ],
+)
+def test_output_that_is_in_the_way(capsys, dataset, prior, tmp_path, command, make, named):
+    write_ply(tmp_path / "splats.ply", tiny.initial([]))
+    out = make(tmp_path)
+    before = listing(tmp_path)
+    assert named in refused(capsys, writers(dataset, prior, tmp_path / "splats.ply", out)[command])
+    assert listing(tmp_path) == before
+    assert "mgs" not in os.listdir("/proc")
+
+
+@pytest.mark.parametrize(("folder", "command"), [("renders", "eval"), ("diagnostics", "diagnose")])
+def test_a_file_where_a_run_keeps_its_pictures(capsys, dataset, prior, tmp_path, folder, command):
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    a_file(run / folder)
+    assert "cannot be written" in refused(capsys, [command, run], run)
+
+
+@pytest.mark.parametrize("option", ["--json", "--chart"])
+@pytest.mark.parametrize(("make", "named"), [(lambda path: a_file(path) / "x", "cannot be written"), (occupied, "is a folder")])
+def test_bench_knows_before_it_measures_that_it_cannot_write(capsys, tmp_path, option, make, named):
+    assert named in refused(capsys, ["bench", "scaling", option, make(tmp_path / "out")])
+
+
+@pytest.mark.parametrize("command", ["nbv", "prior", "synth-orbit", "survey", "demo"])
+def test_negative_seed(capsys, dataset, prior, tmp_path, command):
+    arguments = writers(dataset, prior, tmp_path, tmp_path / "out")[command]
+    assert "--seed" in refused(capsys, [*arguments, "--seed", -1], tmp_path)
+
+
+def test_a_picture_too_large(capsys, dataset, tmp_path):
+    write_ply(tmp_path / "splats.ply", tiny.initial([]))
+    arguments = ["render", tmp_path / "splats.ply", "--cameras", dataset, "--out", tmp_path / "out"]
+    assert "100000000x" in refused(capsys, [*arguments, "--width", 100_000_000], tmp_path)
+
+
+@pytest.mark.parametrize("existing", [False, True])
+def test_a_prior_that_fails_leaves_all_as_it_was(capsys, dataset, tmp_path, existing):
+    out = tmp_path / "new/deeper/prior"
+    if existing:
+        out.mkdir(parents=True)
+    before = listing(tmp_path)
+    refused(capsys, ["prior", dataset, "--out", out, "--gaussians", 1])
+    refused(capsys, ["prior", dataset, "--out", out, "--mesh", tmp_path / "none.glb", "--gaussians", 9])
+    refused(capsys, ["nbv", dataset, "--out", out, "--gaussians", 1, "--budget", 1])
+    assert listing(tmp_path) == before
+
+
+def test_a_prior_appears_whole(tmp_path, monkeypatch):
+    """Nothing under its name while the last of its files, the picture, is drawn; all of it afterwards."""
+    from mgs import prior_figure
+
+    root = synthetic.write_dataset(tmp_path / "data").root
+    drawn, out, draw = [], tmp_path / "prior", prior_figure.draw_prior
+
+    def watched(path, *rest):
+        drawn.append((path.parent / "prior.json").is_file() and not out.exists())
+        draw(path, *rest)
+
+    monkeypatch.setattr(prior_figure, "draw_prior", watched)
+    with pytest.raises(SystemExit) as exit_:
+        main(["prior", str(root), "--out", str(out), "--gaussians", "60"])
+    assert exit_.value.code == 0
+    assert drawn == [True]
+    assert {path.name for path in out.iterdir()} == {"mesh.ply", "points.ply", "prior.json", "prior.png"}
+    assert not list(tmp_path.glob(".*"))
+
+
+OPTIONS: dict[str, tuple[list, str]] = {
+    "unknown command": (["fly"], "fly"),
+    "unknown option": (["nbv", "--fast"], "--fast"),
+    "missing argument": (["prior"], "dataset"),
+    "missing option": (["import", "somewhere"], "--out"),
+    "number of words": (["bench", "splat", "--repeats", "many"], "--repeats"),
+    "number out of range": (["bench", "splat", "--repeats", 1], "--repeats"),
+    "unknown choice": (["bench", "speed"], "speed"),
+    "unknown option of the program": (["--fast"], "--fast"),
+}
+
+
+@pytest.mark.parametrize("case", OPTIONS)
+def test_wrong_options(capsys, case):
+    arguments, named = OPTIONS[case]
+    assert named in refused(capsys, arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"), [([], "Usage"), (["nbv", "--help"], "Usage"), (["--version"], f"mgs {__version__}")]
+)
+def test_help_and_version(capsys, arguments, said):
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 0
+    assert said in capsys.readouterr().out
