@@ -26,7 +26,6 @@ from mgs.cloud import (
 from mgs.dataset import Dataset, Frame
 from mgs.errors import InputError
 from mgs.files import atomic_path, new_folder, read_json, write_json
-from mgs.initial import initial_gaussians as initial_gaussians
 from mgs.seeds import derive_seed, generator
 from mgs.surface import Mesh, distances_to_mesh, estimate_normals, poisson_mesh, read_mesh, sample_surface
 from mgs.visibility import in_mask, visible

@@ -12,8 +12,9 @@ from mgs.conventions import Camera, srgb_from_linear
 from mgs.dataset import Dataset
 from mgs.evaluate import psnr
 from mgs.gaussians import Gaussians
+from mgs.initial import initial_gaussians
 from mgs.nbv import Stations
-from mgs.prior import Prior, initial_gaussians
+from mgs.prior import Prior
 from mgs.splat import ListCache, fisher, groups, render
 from mgs.train import Fit, TrainSettings, fit
 

@@ -66,7 +66,8 @@ def test_the_run_is_whole(dataset, run):
 
 
 def test_learning_helps_and_so_do_more_images(dataset, run):
-    from mgs.prior import initial_gaussians, load_prior
+    from mgs.initial import initial_gaussians
+    from mgs.prior import load_prior
     from mgs.splat import ListCache
     from mgs.stations import psnr_measure
 

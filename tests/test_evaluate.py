@@ -140,3 +140,11 @@ def test_comparison_picture(tmp_path):
         np.testing.assert_allclose(srgb_from_linear(read), srgb_from_linear(written), atol=0.51 / 255)
     with pytest.raises(InputError, match="not a comparison of 60x48"):
         read_comparison(tmp_path / "a.png", orbit_cameras(1, 60)[0])
+
+
+def test_ssim_of_a_frame_leaves_out_its_border_and_ssim_of_a_mask_does_not():
+    truth = np.random.default_rng(0).random((40, 40, 3))
+    wrong = truth.copy()
+    wrong[0, 0] = 1 - wrong[0, 0]
+    assert ssim(truth, wrong) == pytest.approx(1, abs=1e-6)
+    assert ssim(truth, wrong, np.ones((40, 40), bool)) < 1 - 1e-4
