@@ -80,6 +80,13 @@ def test_a_file_where_a_run_keeps_its_pictures(capsys, dataset, prior, tmp_path,
     assert "cannot be written" in refused(capsys, [command, run], run)
 
 
+@pytest.mark.parametrize("out", ["file", "file/report"])
+def test_a_report_under_a_file(capsys, dataset, prior, tmp_path, out):
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    a_file(tmp_path / "file")
+    assert "cannot be written" in refused(capsys, ["report", run, "--out", tmp_path / out], tmp_path)
+
+
 @pytest.mark.parametrize("option", ["--json", "--chart"])
 @pytest.mark.parametrize(("make", "named"), [(lambda path: a_file(path) / "x", "cannot be written"), (occupied, "is a folder")])
 def test_bench_knows_before_it_measures_that_it_cannot_write(capsys, tmp_path, option, make, named):

@@ -20,8 +20,10 @@ def report(
     """
     from rich.console import Console
 
+    from mgs.files import check_writable
     from mgs.report import print_table, table_rows, write_report
 
+    check_writable(out / "table.md")  # known before the figures are drawn
     written = write_report(out, runs)
     print_table(Console(), table_rows(runs))
     for path in written:
