@@ -142,7 +142,7 @@ def farthest_pose(candidates: Array, taken: Array, centre: Array, rng: np.random
 
 
 def _rounded(scores: Array) -> Array:
-    """Equal distances differ in the last bits; without them a tie is a tie (the loop takes the farthest, `seed_views` the first)."""
+    """Equal distances differ in the last bits; without them a tie is a tie (the loop takes the farthest, seeds the first)."""
     return np.round(scores, 9)
 
 
