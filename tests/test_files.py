@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mgs.errors import InputError
-from mgs.files import atomic_folder, atomic_path, check_writable, folder_or_nothing
+from mgs.files import atomic_folder, atomic_path, check_writable, folder_or_nothing, write_exr, write_json, write_png
 
 
 class Stop(BaseException):
@@ -28,6 +30,23 @@ def test_what_the_disk_says_is_one_line(tmp_path, number):
         write()
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
     assert (tmp_path / "a.txt").read_text() == "before"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's device that is always full")
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        ("a.json", lambda path: write_json(path, {"a": 1})),
+        ("a.png", lambda path: write_png(path, np.random.default_rng(0).random((90, 90, 3)))),
+        ("a.exr", lambda path: write_exr(path, {"Z": np.random.default_rng(0).random((90, 90))})),
+    ],
+)
+def test_a_full_disk_is_one_line(tmp_path, name, write):
+    stem, suffix = name.split(".")
+    (tmp_path / f".{stem}.{os.getpid()}.part.{suffix}").symlink_to("/dev/full")
+    with pytest.raises(InputError, match="No space left"):
+        write(tmp_path / name)
+    assert not list(tmp_path.iterdir())
 
 
 def test_under_a_file(tmp_path):
