@@ -31,7 +31,8 @@ class Camera:
 
     K: [3,3] float64, pixels (no skew). width, height: pixels.
     world_to_camera: [4,4] float64, rigid, OpenCV axes, metres.
-    Raises InputError where K or the pose is not finite, K has a non-positive focal length, or the pose is not rigid.
+    Raises InputError where K or the pose is not finite, K has a non-positive focal length, the image has no pixel or more than
+    MAX_PIXELS, or the pose is not rigid.
     """
 
     K: NDArray[np.float64]
