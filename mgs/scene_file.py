@@ -9,6 +9,7 @@ from typing import Annotated, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mgs.errors import InputError
+from mgs.files import read_json
 from mgs.resources import scene_path
 
 Positive = Annotated[float, Field(gt=0)]
@@ -103,8 +104,17 @@ class Orbit(_Strict):
     """Turns of the spiral, or number of rings."""
 
 
+class Sensor(_Strict):
+    """What a survey of the scene is flown with (`mgs survey`); the images of `mgs synth-orbit` are exact."""
+
+    noise: Annotated[float, Field(ge=0)] = 1.0
+    """Factor on the depth camera's noise (`mgs.sensor`)."""
+    drift: Annotated[float, Field(ge=0)] = 1.0
+    """Factor on the odometry's drift (`mgs.survey`)."""
+
+
 class SceneFile(_Strict):
-    """A scene: rock, arena, sun and sky, camera, orbit."""
+    """A scene: rock, arena, sun and sky, camera, orbit, sensor noise."""
 
     description: str = ""
     rock: Rock = Rock()
@@ -112,6 +122,7 @@ class SceneFile(_Strict):
     sky: Sky = Sky()
     camera: Lens = Lens()
     orbit: Orbit = Orbit()
+    sensor: Sensor = Sensor()
 
 
 def load_scene_file(scene: str | Path) -> SceneFile:
@@ -130,3 +141,13 @@ def load_scene_file(scene: str | Path) -> SceneFile:
         if first["type"] == "extra_forbidden":
             raise InputError(f"{path}: unknown key {key!r}; compare it with scenes/boulder.toml") from None
         raise InputError(f"{path}: {key}: {first['msg']} (is {first['input']!r}); correct it") from None
+
+
+def sensor_of(dataset: Path) -> Sensor:
+    """The sensor of the scene that a dataset was rendered from; the default where the dataset does not say."""
+    path = dataset / "config.json"
+    recorded = read_json(path) if path.is_file() else {}
+    try:
+        return Sensor.model_validate(recorded.get("scene", {}).get("sensor", {}))
+    except (ValidationError, AttributeError):
+        raise InputError(f"{path}: its scene.sensor is damaged; correct it or give --sensor-noise and --drift") from None

@@ -82,3 +82,16 @@ def test_unknown_scene_names_the_known_ones():
     with pytest.raises(InputError, match="boulder"):
         load_scene_file("boulders")
     assert load_scene_file("boulder").rock == Rock(**load_scene_file("boulder").rock.model_dump())
+
+
+def test_the_sensor_of_a_dataset_is_its_scenes(tmp_path):
+    from mgs.errors import InputError
+    from mgs.files import write_json
+    from mgs.scene_file import Sensor, sensor_of
+
+    assert sensor_of(tmp_path) == Sensor()
+    write_json(tmp_path / "config.json", {"scene": {"sensor": {"noise": 2.5, "drift": 0.0}}})
+    assert sensor_of(tmp_path) == Sensor(noise=2.5, drift=0.0)
+    write_json(tmp_path / "config.json", {"scene": {"sensor": {"noise": -1}}})
+    with pytest.raises(InputError, match=r"scene\.sensor is damaged"):
+        sensor_of(tmp_path)

@@ -17,7 +17,7 @@ import synthetic
 from mgs.cli import main
 from mgs.conventions import Camera, look_at
 from mgs.dataset import Dataset, load_dataset, write_transforms
-from mgs.files import write_exr
+from mgs.files import read_json, write_exr, write_json
 from mgs.prior import PriorSettings, build_prior
 from mgs.sensor import (
     AXIAL_FLOOR,
@@ -261,10 +261,13 @@ def test_the_survey_is_a_dataset_and_gives_a_prior(dataset: Dataset, survey, tmp
 
 def test_command_writes_a_dataset_with_its_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = synthetic.write_dataset(tmp_path / "data", synthetic.orbit_cameras(12, 64, 48), ROCKS).root
+    write_json(root / "config.json", {"scene": {"sensor": {"noise": 5.0, "drift": 0.5}}})
     with pytest.raises(SystemExit) as exit_:
         main(["survey", str(root), "--sensor-noise", "0.2"])
     assert exit_.value.code == 0
     out = root / "survey"
+    settings = read_json(out / "survey.json")["settings"]
+    assert (settings["sensor"], settings["drift"]) == (0.2, 0.5)  # an option goes before the scene, the scene before 1
     assert {path.name for path in out.iterdir()} >= {"transforms.json", "cloud.ply", "survey.json", "survey.png", "depth"}
     assert len(load_dataset(out)) == 12
     assert "after loop closure" in capsys.readouterr().out

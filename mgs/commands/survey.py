@@ -22,8 +22,10 @@ def survey(
     poses: Annotated[
         Poses, typer.Option(help="estimated: odometry, registration, loop closure; exact: as flown.")
     ] = Poses.estimated,
-    sensor_noise: Annotated[float, typer.Option(help="Factor on the depth camera's noise; 0 is exact depth.")] = 1.0,
-    drift: Annotated[float, typer.Option(help="Factor on the odometry's drift.")] = 1.0,
+    sensor_noise: Annotated[
+        float | None, typer.Option(help="Factor on the depth camera's noise, 0 is exact depth; default: the scene's, else 1.")
+    ] = None,
+    drift: Annotated[float | None, typer.Option(help="Factor on the odometry's drift; default: the scene's, else 1.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Root seed.")] = 0,
 ) -> None:
     """Fly the dataset's orbit with a noisy depth camera and drifting odometry; register, close the loop, fuse the cloud.
@@ -37,13 +39,16 @@ def survey(
     from mgs.cloud import fuse_frames, write_points
     from mgs.dataset import load_dataset
     from mgs.files import check_new_folder, folder_or_nothing, write_json
+    from mgs.scene_file import sensor_of
     from mgs.survey import SurveySettings, fly, survey_numbers, write_survey
     from mgs.survey_figure import draw_survey
 
     console = Console()
     frames = load_dataset(dataset)
     folder = check_new_folder(out if out is not None else dataset / "survey")  # known before the work
-    settings = SurveySettings(sensor_noise, drift, poses is Poses.exact, seed)
+    sensor = sensor_of(dataset)
+    noise, drift = (own if given is None else given for given, own in ((sensor_noise, sensor.noise), (drift, sensor.drift)))
+    settings = SurveySettings(noise, drift, poses is Poses.exact, seed)
     with Progress(console=console, transient=True) as progress:
         bar = progress.add_task("survey")
         flown = fly(
