@@ -1,5 +1,29 @@
-"""Shared test set-up: the variant is set once, before any test module that imports kernels."""
+"""Shared test set-up: the variant is set once, before any test module that imports kernels; and a tiny dataset to spoil."""
+
+import shutil
+from pathlib import Path
+
+import pytest
 
 from mgs import runtime
 
 runtime.start()
+
+import tiny  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory):
+    return tiny.write_dataset(tmp_path_factory.mktemp("pristine") / "dataset")
+
+
+@pytest.fixture
+def dataset(pristine, tmp_path):
+    """A copy of a tiny dataset, for this test alone."""
+    return Path(shutil.copytree(pristine, tmp_path / "dataset"))
+
+
+@pytest.fixture
+def prior(tmp_path):
+    """A tiny prior that fits the tiny dataset."""
+    return tiny.write_prior(tmp_path / "prior")

@@ -141,21 +141,6 @@ SURVEYS: dict[str, tuple[Change, str]] = {
 """Depths from which no prior can be built."""
 
 
-@pytest.fixture(scope="module")
-def pristine(tmp_path_factory):
-    return tiny.write_dataset(tmp_path_factory.mktemp("pristine") / "dataset")
-
-
-@pytest.fixture
-def dataset(pristine, tmp_path):
-    return Path(shutil.copytree(pristine, tmp_path / "dataset"))
-
-
-@pytest.fixture
-def prior(tmp_path):
-    return tiny.write_prior(tmp_path / "prior")
-
-
 @pytest.mark.parametrize("command", ["nbv", "prior"])
 @pytest.mark.parametrize("case", DATASETS)
 def test_broken_dataset(capsys, dataset, tmp_path, command, case):

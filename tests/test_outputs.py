@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from pathlib import Path
 
 import pytest
@@ -14,21 +13,6 @@ from refusals import a_file, listing, occupied, refused
 from mgs import __version__
 from mgs.cli import main
 from mgs.gaussians import write_ply
-
-
-@pytest.fixture(scope="module")
-def pristine(tmp_path_factory):
-    return tiny.write_dataset(tmp_path_factory.mktemp("pristine") / "dataset")
-
-
-@pytest.fixture
-def dataset(pristine, tmp_path):
-    return Path(shutil.copytree(pristine, tmp_path / "dataset"))
-
-
-@pytest.fixture
-def prior(tmp_path):
-    return tiny.write_prior(tmp_path / "prior")
 
 
 def read_only(tmp_path: Path) -> Path:
