@@ -22,7 +22,7 @@ from mgs.seeds import derive_seed
 from mgs.splat import kernels
 from mgs.splat.constants import LOG_SCALE_RANGE
 from mgs.splat.kernels import LN2
-from mgs.splat.project import axes2d, camera_array, columns, quat_size, sh_basis
+from mgs.splat.project import axes2d, camera_array, columns, sh_basis, turns, whitening
 from mgs.splat.render import ListCache, as_drjit, render, splats_and_lists
 
 
@@ -70,29 +70,27 @@ def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
     4 ln2^2 (a_i.x)^2 and with a rotation about local axis k by 4 ln2^2 (s_i^2 - s_j^2)(b_i.x)(b_j.x), (i, j, k) cyclic; a
     quaternion q of norm n turns the local frame by (2/n) Im(conj(q/n) dq).
     """
-    mean, quats = columns(gaussians.means, mi.Vector3f), columns(gaussians.quats, mi.Vector4f)
-    log_scales = columns(gaussians.log_scales, mi.Vector3f)
+    mean, quats = mi.Vector3d(columns(gaussians.means, mi.Vector3f)), mi.Vector4d(columns(gaussians.quats, mi.Vector4f))
+    log_scales = mi.Vector3d(columns(gaussians.log_scales, mi.Vector3f))
     _, unit, _ = axes2d(mean, quats, camera)
     scales = dr.exp(dr.clip(log_scales, *LOG_SCALE_RANGE))
-    b = [mi.Vector2f(splats.p * (t.x - splats.k * t.y), splats.e * t.y) for t in unit]
+    k, p, e = whitening([a * s for a, s in zip(unit, scales, strict=True)])
+    b = [mi.Vector2d(p * (t.x - k * t.y), e * t.y) for t in unit]
 
     def product(s: Any, i: int, j: int) -> Any:
         x, y = b[i], b[j]
         f = 4 * LN2 * LN2 * s
-        return mi.Vector3f(f * x.x * y.x, f * (x.x * y.y + x.y * y.x), f * x.y * y.y)
+        return mi.Vector3d(f * x.x * y.x, f * (x.x * y.y + x.y * y.x), f * x.y * y.y)
 
     free = [(s > LOG_SCALE_RANGE[0]) & (s < LOG_SCALE_RANGE[1]) for s in log_scales]
     by_scale = [dr.select(free[i], product(scales[i] * scales[i], i, i), 0) for i in range(3)]
     turn = []
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
+    for i, j in ((1, 2), (2, 0), (0, 1)):
         turn.append(product((scales[i] - scales[j]) * (scales[i] + scales[j]), i, j))
-    size, valid = quat_size(quats)
-    q = quats / size
-    w, x, y, z = q * dr.select(valid, 2 / (dr.squared_norm(q) * size), 0)
+    w, x, y, z = quats * dr.select(turns(quats), 2 / dr.squared_norm(quats), 0)
     X, Y, Z = turn
     by_quat = [-x * X - y * Y - z * Z, w * X - z * Y + y * Z, z * X + w * Y - x * Z, -y * X + x * Y + w * Z]
-    transparency = dr.rcp(1 + dr.exp(gaussians.logit_opacities.array))
+    transparency = dr.rcp(1 + dr.exp(mi.Float64(gaussians.logit_opacities.array)))
     basis = sh_basis(mean, camera, gaussians.sh.shape[1])
     positive = [dr.select(c > 0, mi.Float(1), 0) for c in (splats.r, splats.g, splats.b)]
     return Geometry([tuple(m) for m in (*by_scale, *by_quat)], transparency, basis, positive)
@@ -102,7 +100,7 @@ def _sums(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCach
     device = camera_array(camera)
     splats, lists = splats_and_lists(gaussians, camera, cache)
     packed = kernels.pack(splats)
-    rgba, _ = kernels.forward(lists, packed)
+    rgba, _ = kernels.forward(lists, packed, stepped=not block)
     colour = mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in background))
     sums = kernels.fisher(lists, packed, rgba, colour, block)
     return sums, geometry(gaussians, device, splats)
@@ -193,11 +191,11 @@ def loss_gradient(gaussians: Gaussians, camera: Camera, background: Any, cache: 
 
 
 def _interleaved(columns_: dict[int, Any], size: int, n: int) -> np.ndarray:
-    """Dr.Jit Floats [N] by column -> NumPy [N, size], 0 in columns not given."""
+    """Dr.Jit arrays [N] by column -> NumPy float32 [N, size], 0 in columns not given."""
     index = dr.arange(mi.UInt32, n) * size
     flat = dr.zeros(mi.Float, n * size)
     for column, values in columns_.items():
-        dr.scatter(flat, values, index + column, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter(flat, mi.Float(values), index + column, mode=dr.ReduceMode.NoConflicts)
     return np.array(flat, copy=False).reshape(n, size)
 
 

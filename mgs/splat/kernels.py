@@ -33,7 +33,7 @@ DENORMAL = 1e-24
 So far above the smallest float (1e-38), no product of a sum that is kept, and no error of one that is, can be denormal."""
 
 
-def _sizes(lists: BlockLists, *_: Any) -> tuple[int, ...]:
+def _sizes(lists: BlockLists, *_: Any, **__: Any) -> tuple[int, ...]:
     """What a recording of a kernel bakes in: the lengths of its buffers."""
     return len(lists.splat), len(lists.slot_start), len(lists.block)
 
@@ -44,11 +44,11 @@ frozen = partial(dr.freeze, state_fn=_sizes, limit=64, warn_after=1 << 30)
 
 def pack(s: Splats) -> Any:
     """Detached splats as Float [16 N], one cache line each, so that a gather misses the cache once:
-    (u, v, k, p), (e, log2_opacity, z, u_rest), (r, g, b, v_rest), four unused."""
+    (u, v, k, p), (e, log2_opacity, z, u_rest), (r, g, b, v_rest), (k_rest, three unused)."""
     n = len(s.u)
     packed = dr.empty(mi.Float, 16 * n)
     place = dr.arange(mi.UInt32, n) * 4
-    parts = ((s.u, s.v, s.k, s.p), (s.e, s.log2_opacity, s.z, s.u_rest), (s.r, s.g, s.b, s.v_rest))
+    parts = ((s.u, s.v, s.k, s.p), (s.e, s.log2_opacity, s.z, s.u_rest), (s.r, s.g, s.b, s.v_rest), (s.k_rest, 0, 0, 0))
     for i, part in enumerate(parts):
         dr.scatter(packed, mi.Vector4f(*part), place + i, mode=dr.ReduceMode.NoConflicts)
     dr.eval(packed)
@@ -56,8 +56,8 @@ def pack(s: Splats) -> Any:
 
 
 def _unpack(packed: Any, splat: Any) -> list[Any]:
-    """The three Vector4f of the given splats, as `pack` lists them."""
-    return [dr.gather(mi.Vector4f, packed, splat * 4 + i) for i in range(3)]
+    """The four Vector4f of the given splats, as `pack` lists them."""
+    return [dr.gather(mi.Vector4f, packed, splat * 4 + i) for i in range(4)]
 
 
 @dataclass
@@ -94,24 +94,30 @@ CENTRE = BLOCK_X // 2
 """Column from which a row's alphas are stepped outwards."""
 
 
-def _rows(lane: Lane, shape: Any, rest: Any, colour: Any) -> list[Row]:
+def _rows(lane: Lane, splat: list[Any], stepped: bool = True) -> list[Row]:
     """alpha = 2^(log2_opacity - xi^2 - eta^2) on the lane's pixels.
 
-    Along a row the exponent is quadratic, so alpha is stepped by multiplication: three exp2 a row, not eight. Starting from the
-    middle, nothing underflows: EPS2D keeps p below 1.6, so alpha there is at least 2^-100 wherever the row has a pixel drawn.
+    The lane's corner is placed in double: far along a slanted needle, xi is a small difference of large numbers.
+    stepped: the exponent is quadratic along a row, so alpha is stepped by multiplication: three exp2 a row, not eight, for
+    rounding errors four times as large. Starting from the middle, nothing underflows: EPS2D keeps p below 1.6, so alpha there
+    is at least 2^-100 wherever the row has a pixel drawn.
     """
-    u, v, k, p = shape
-    e, log2_opacity = rest.x, rest.y
-    dx, dy = lane.x - u - rest.w, lane.y - v - colour.w
-    bend = dr.exp2(-2 * p * p)
+    (u, v, k, p), (e, log2_opacity, _, u_rest), (*_, v_rest), (k_rest, *_) = splat
+    double = mi.Float64
+    dx, dy = double(lane.x) - double(u) - double(u_rest), double(lane.y) - double(v) - double(v_rest)
+    corner, down = mi.Float(double(p) * (dx - (double(k) + double(k_rest)) * dy)), mi.Float(dy)
+    pk, bend = p * k, dr.exp2(-2 * p * p)
     rows = []
     for j in range(BLOCK_Y):
-        y = dy + j
-        eta = e * y
-        first = p * dr.fma(-k, y, dx)
+        eta = e * (down + j)
+        first = dr.fma(-pk, mi.Float(j), corner)
         xi = [dr.fma(p, mi.Float(i), first) for i in range(BLOCK_X)]
+        row = dr.fma(-eta, eta, log2_opacity)
+        if not stepped:
+            rows.append(Row(eta, xi, [dr.exp2(dr.fma(-x, x, row)) for x in xi]))
+            continue
         middle = xi[CENTRE]
-        raw = [dr.exp2(dr.fma(-middle, middle, dr.fma(-eta, eta, log2_opacity)))] * BLOCK_X
+        raw = [dr.exp2(dr.fma(-middle, middle, row))] * BLOCK_X
         for columns, sign in ((range(CENTRE + 1, BLOCK_X), -1), (range(CENTRE - 1, -1, -1), 1)):
             ratio = dr.exp2(p * dr.fma(mi.Float(2 * sign), middle, -p))
             for i in columns:
@@ -134,7 +140,9 @@ def _blend(raw: Any, T: Any) -> tuple[Any, Any, Any, Any]:
     return alpha, alpha * T, dr.select(room, after, -dr.abs(T)), room
 
 
-def _walk(lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], visit: Callable[..., Any]) -> list[list[Any]]:
+def _walk(
+    lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], visit: Callable[..., Any], stepped: bool = True
+) -> list[list[Any]]:
     """Walk the lists front to back until they end or no pixel has transmittance left; returns the last state of the pixels.
 
     visit(i, rows, rest, colour, pixels) -> (pixels, alive) draws the splat of pair i on the lane's pixels. Their states stay
@@ -142,9 +150,9 @@ def _walk(lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], v
     """
 
     def body(i: Any, pixels: Any, alive: Any) -> Any:
-        splat = dr.gather(mi.UInt32, lists.splat, i)
-        shape, rest, colour = _unpack(packed, splat)
-        pixels, alive = visit(i, _rows(lane, shape, rest, colour), rest, colour, pixels)
+        splat = _unpack(packed, dr.gather(mi.UInt32, lists.splat, i))
+        _, rest, colour, _ = splat
+        pixels, alive = visit(i, _rows(lane, splat, stepped), rest, colour, pixels)
         return i + 1, pixels, (i + 1 < lane.end) & alive
 
     start = mi.UInt32(lane.start)
@@ -153,8 +161,9 @@ def _walk(lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], v
 
 
 @frozen
-def forward(lists: BlockLists, packed: Any) -> tuple[Any, Any]:
-    """Composite. Returns block-major pixels: rgba Float [L*32*4] (premultiplied, no background) and weighted depth [L*32]."""
+def forward(lists: BlockLists, packed: Any, stepped: bool = True) -> tuple[Any, Any]:
+    """Composite; stepped: see `_rows`. Returns block-major pixels: rgba Float [L*32*4] (premultiplied, no background) and
+    weighted depth [L*32]."""
     lane, T = _lane(lists)
     pixels = [[t, *(dr.zeros(mi.Float, len(lists.block)) for _ in range(4))] for t in T]
 
@@ -167,7 +176,7 @@ def forward(lists: BlockLists, packed: Any) -> tuple[Any, Any]:
             alive |= room
         return new, alive
 
-    pixels = _walk(lists, packed, lane, pixels, visit)
+    pixels = _walk(lists, packed, lane, pixels, visit, stepped)
     rgba, depth = dr.empty(mi.Float, len(lists.block) * PIXELS * 4), dr.empty(mi.Float, len(lists.block) * PIXELS)
     for pixel, (transmittance, r, g, b, z) in enumerate(pixels):
         place = lists.block * PIXELS + pixel
@@ -194,12 +203,12 @@ def _store(buffers: list[Any], sums: list[Any], slot: Any) -> None:
 
 
 def _per_splat(lists: BlockLists, buffers: list[Any], count: int) -> list[Any]:
-    """Add each splat's contiguous slots, in order: `count` Floats [N]."""
+    """Add each splat's contiguous slots, in order and in double: `count` Float64 [N]."""
     dr.eval(buffers)
-    total = [mi.Vector4f(0) for _ in buffers]
+    total = [mi.Vector4d(0) for _ in buffers]
 
     def body(i: Any, total: list[Any]) -> Any:
-        return i + 1, [t + dr.gather(mi.Vector4f, buffer, i) for t, buffer in zip(total, buffers, strict=True)]
+        return i + 1, [t + mi.Vector4d(dr.gather(mi.Vector4f, buffer, i)) for t, buffer in zip(total, buffers, strict=True)]
 
     _, total = dr.while_loop((mi.UInt32(lists.slot_start), total), lambda i, total: i < lists.slot_end, body)
     flat = [component for t in total for component in t][:count]
@@ -248,8 +257,8 @@ def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, Any], d_out: tuple[A
         return new, alive
 
     _walk(lists, packed, lane, pixels, visit)
-    r, g, b, z, d, xx, xy, yy, *first = _per_splat(lists, buffers, count)
-    shape, rest, _ = _unpack(packed, dr.arange(mi.UInt32, len(lists.slot_start)))
+    r, g, b, z, d, xx, xy, yy, *first = (mi.Float(x) for x in _per_splat(lists, buffers, count))
+    shape, rest, *_ = _unpack(packed, dr.arange(mi.UInt32, len(lists.slot_start)))
     k, p, e = shape.z, shape.w, rest.x
     du = dv = None
     if means:
@@ -260,12 +269,13 @@ def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, Any], d_out: tuple[A
 
 @frozen
 def fisher(lists: BlockLists, packed: Any, rgba: Any, background: Any, block: bool) -> list[Any]:
-    """Sums over pixels and channels, Float [N] each, from which O(N) work makes the Fisher information.
+    """Sums over pixels and channels, Float64 [N] each, from which O(N) work makes the Fisher information.
 
     With f = (xi^2, xi eta, eta^2), s_c = D_c alpha and |s|^2 summed over channels:
     sum w^2, sum |s|^2, the five moments sum |s|^2 (xi^4, xi^3 eta, xi^2 eta^2, xi eta^3, eta^4): seven, the exact diagonal.
     block=True appends sum |s|^2 f (3) and, for c = r, g, b, sum w s_c (1) and sum w s_c f (3): 22, the exact blocks.
-    rgba: `forward`'s; background: Color3f.
+    rgba: of `forward`, stepped where block is False: entries off the diagonal cancel, so blocks need alphas as exact as can be;
+    background: Color3f.
     """
     lane, T = _lane(lists)
     pixels = []
@@ -311,5 +321,5 @@ def fisher(lists: BlockLists, packed: Any, rgba: Any, background: Any, block: bo
         _store(buffers, sums[:count], dr.gather(mi.UInt32, lists.slot, i))
         return new, alive
 
-    _walk(lists, packed, lane, pixels, visit)
+    _walk(lists, packed, lane, pixels, visit, stepped=not block)
     return _per_splat(lists, buffers, count)

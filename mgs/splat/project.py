@@ -6,6 +6,9 @@ A splat's footprint is kept as a *whitening* of pixel offsets, not as a conic: w
 
 This is the Cholesky factor of the conic in units of bits. It stays accurate in float32 where the conic cancels (a footprint
 of 1:1000), and moments of (xi, eta) are of order one, so fourth-order moments (Fisher) are well conditioned too.
+
+All of it is worked out in double and rounded once: it is O(N) work, and in single precision its errors would be the largest
+of the whole renderer.
 """
 
 from __future__ import annotations
@@ -29,7 +32,8 @@ class Splats:
     """Projected Gaussians, Dr.Jit Float [N] each: means2d (u, v) px; whitening k, p, e; log2_opacity; depth z m; rgb.
 
     visible: in front of the near plane; elsewhere the other fields are meaningless. finite: no parameter is NaN or infinite.
-    u_rest, v_rest: px, what rounding to float32 took from u and v (up to 3e-5 in a 640x480 image); not differentiated.
+    u_rest, v_rest (px), k_rest: what rounding to float32 took from u, v and k (3e-5 px in a 640x480 image; as much at the far
+    end of a long slanted footprint); not differentiated.
     """
 
     u: Any
@@ -46,6 +50,7 @@ class Splats:
     finite: Any = None
     u_rest: Any = None
     v_rest: Any = None
+    k_rest: Any = None
 
 
 def camera_array(camera: Camera) -> Any:
@@ -72,28 +77,25 @@ def _unpack(array: Any) -> tuple[Any, Any, list[Any], list[Any], Any]:
     return R, mi.Vector3d(*c[9:12]), c[12:16], c[16:20], mi.Vector3d(*c[20:23])
 
 
-def quat_size(quats: Any) -> tuple[Any, Any]:
-    """(largest component, 1 where the quaternion is zero; mask of those that are not): squares of q / size cannot overflow."""
-    size = dr.max(dr.abs(dr.detach(quats)))
-    valid = size > QUAT_MIN
-    return dr.select(valid, size, 1), valid
-
-
 def rotation_columns(quats: Any) -> list[Any]:
-    """Columns of the rotation of quaternions wxyz (any norm; zero is the identity), three Vector3f."""
-    size, valid = quat_size(quats)
-    quats = dr.select(valid, quats / size, mi.Vector4f(1, 0, 0, 0))
+    """Columns of the rotation of quaternions wxyz (Vector4d of any norm; zero is the identity), three Vector3d."""
+    quats = dr.select(turns(quats), quats, mi.Vector4d(1, 0, 0, 0))
     w, x, y, z = quats * dr.rsqrt(dr.squared_norm(quats))
     return [
-        mi.Vector3f(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        mi.Vector3f(2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        mi.Vector3f(2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+        mi.Vector3d(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        mi.Vector3d(2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        mi.Vector3d(2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
     ]
 
 
+def turns(quats: Any) -> Any:
+    """Mask of the quaternions that are not zero."""
+    return dr.max(dr.abs(dr.detach(quats))) > QUAT_MIN
+
+
 def sh_basis(means: Any, camera: Any, coefficients: int) -> list[Any]:
-    """Spherical harmonics [K] of the directions from the camera to the means (Vector3f), Float [N] each."""
-    offset = mi.Vector3f(mi.Vector3d(means) - _unpack(camera)[4])
+    """Spherical harmonics [K] of the directions from the camera to the means (Vector3d), Float [N] each."""
+    offset = mi.Vector3f(means - _unpack(camera)[4])
     directions = offset * dr.rsqrt(dr.maximum(dr.squared_norm(offset), 1e-24))
     return dr.sh_eval(directions, round(coefficients**0.5) - 1)
 
@@ -104,20 +106,17 @@ def columns(tensor: Any, dtype: Any) -> Any:
 
 
 def axes2d(mean: Any, quats: Any, camera: Any) -> tuple[Any, list[Any], Any]:
-    """((u, v) px, z m of each mean in double, z made safe; the axes R e_i of each Gaussian, pixels per metre; visible mask).
+    """((u, v) px, z m of each mean, z made safe; the axes R e_i of each Gaussian, pixels per metre, Vector2d; visible mask).
 
-    Centres are found in double: in single precision those of a 640x480 image would be off by 1e-4 px, and images by as much.
+    mean: Vector3d; quats: Vector4d.
     """
     R, t, (fx, fy, cx, cy), (x0, x1, y0, y1), _ = _unpack(camera)
-    point = mi.Vector3d(mean)
-    x, y, z = (dr.dot(row, point) + t[i] for i, row in enumerate(R))
+    x, y, z = (dr.dot(row, mean) + t[i] for i, row in enumerate(R))
     visible = z > NEAR
     z = dr.select(visible, z, 1)
-    x, y, inv_z = x / z, y / z, mi.Float(dr.rcp(z))
-    R0, R1, R2 = (mi.Vector3f(row) for row in R)
-    tx, ty = mi.Float(dr.clip(x, x0, x1)), mi.Float(dr.clip(y, y0, y1))
-    T0, T1 = (R0 - tx * R2) * (mi.Float(fx) * inv_z), (R1 - ty * R2) * (mi.Float(fy) * inv_z)
-    unit = [mi.Vector2f(dr.dot(T0, c), dr.dot(T1, c)) for c in rotation_columns(quats)]
+    x, y, inv_z = x / z, y / z, dr.rcp(z)
+    T0, T1 = (R[0] - dr.clip(x, x0, x1) * R[2]) * (fx * inv_z), (R[1] - dr.clip(y, y0, y1) * R[2]) * (fy * inv_z)
+    unit = [mi.Vector2d(dr.dot(T0, c), dr.dot(T1, c)) for c in rotation_columns(quats)]
     return (fx * x + cx, fy * y + cy, z), unit, visible
 
 
@@ -134,16 +133,21 @@ def whitening(axes: list[Any]) -> tuple[Any, Any, Any]:
     return b / c, dr.sqrt(0.5 * LOG2E * c / det), dr.sqrt(0.5 * LOG2E / c)
 
 
+def _rounded(value: Any) -> tuple[Any, Any]:
+    """A Float64 as Float, and what rounding took from it (not differentiated)."""
+    rounded = mi.Float(value)
+    return rounded, mi.Float(dr.detach(value - mi.Float64(rounded)))
+
+
 def project(gaussians: Gaussians, camera: Any) -> Splats:
     """Project Gaussians with Dr.Jit TensorXf fields through a `camera_array`. Differentiable in every parameter.
 
     Source: EWA splatting (Zwicker et al. 2002) as in 3DGS.
     """
-    mean, quats = columns(gaussians.means, mi.Vector3f), columns(gaussians.quats, mi.Vector4f)
-    log_scales, logit = columns(gaussians.log_scales, mi.Vector3f), gaussians.logit_opacities.array
-    (u64, v64, z), unit, visible = axes2d(mean, quats, camera)
-    u, v = mi.Float(u64), mi.Float(v64)
-    u_rest, v_rest = (mi.Float(dr.detach(whole - mi.Float64(rounded))) for whole, rounded in ((u64, u), (v64, v)))
+    mean, quats = mi.Vector3d(columns(gaussians.means, mi.Vector3f)), mi.Vector4d(columns(gaussians.quats, mi.Vector4f))
+    log_scales = mi.Vector3d(columns(gaussians.log_scales, mi.Vector3f))
+    logit = mi.Float64(gaussians.logit_opacities.array)
+    (u, v, z), unit, visible = axes2d(mean, quats, camera)
     scales = dr.exp(dr.clip(log_scales, *LOG_SCALE_RANGE))
     k, p, e = whitening([a * s for a, s in zip(unit, scales, strict=True)])
     log2_opacity = LOG2E * (dr.minimum(logit, 0) - dr.log(1 + dr.exp(-dr.abs(logit))))
@@ -155,5 +159,6 @@ def project(gaussians: Gaussians, camera: Any) -> Splats:
         finite &= dr.all(dr.isfinite(sh))
         colour += basis * sh
     colour = dr.maximum(colour, 0)
-    z = mi.Float(z)
-    return Splats(u, v, k, p, e, log2_opacity, z, colour.x, colour.y, colour.z, visible, finite, u_rest, v_rest)
+    (u, u_rest), (v, v_rest), (k, k_rest) = (_rounded(value) for value in (u, v, k))
+    p, e, log2_opacity, z = (mi.Float(value) for value in (p, e, log2_opacity, z))
+    return Splats(u, v, k, p, e, log2_opacity, z, colour.x, colour.y, colour.z, visible, finite, u_rest, v_rest, k_rest)

@@ -18,19 +18,15 @@ FLOOR = 1e-6
 """Entries below this share of the largest are compared as absolute numbers."""
 
 
-def assert_close(found, expected, what="", bound=None):
-    """Relative error TOLERANCE on entries above FLOOR of the largest; FLOOR * TOLERANCE * 10 of the largest on the others.
-
-    bound [N,P,P]: sqrt(H_ii H_jj). Off-diagonal entries are sums of either sign; where they cancel below a hundredth of their
-    bound, what float32 promises is an error of 1e-5 of the bound (measured: 2e-6), and that is asked for.
-    """
+def assert_close(found, expected, what=""):
+    """Relative error TOLERANCE on entries above FLOOR of the largest; FLOOR * TOLERANCE * 10 of the largest on the others."""
     assert found.dtype == np.float32
     assert found.shape == expected.shape
     size, error = np.abs(expected), np.abs(found - expected)
     big = size > FLOOR * size.max()
-    relative = error[big] / (size if bound is None else np.maximum(size, 1e-2 * bound))[big]
-    print(f"{what} worst relative error {relative.max(initial=0):.1e} of {big.sum()} entries")
-    assert relative.max(initial=0) < TOLERANCE, what
+    relative = (error[big] / size[big]).max(initial=0)
+    print(f"{what} worst relative error {relative:.1e} of {big.sum()} entries")
+    assert relative < TOLERANCE, what
     assert error[~big].max(initial=0) <= 10 * TOLERANCE * FLOOR * size.max(), what
 
 
@@ -62,7 +58,7 @@ def test_exact_and_block_against_brute_force(degree):
     np.testing.assert_array_equal(block, block.transpose(0, 2, 1))
 
 
-@settings(derandomize=True, deadline=None, max_examples=15)
+@settings(derandomize=True, deadline=None, max_examples=60)
 @given(
     seed=st.integers(0, 2**31),
     scale=st.floats(-5, -0.5),
@@ -75,9 +71,8 @@ def test_exact_and_block_for_any_scene(seed, scale, stretch, logit, background):
     style = {"log_scales": (scale - stretch, scale), "logits": (logit - 4, logit)}
     g = calm(lambda s: make(s, **style), camera, seed)
     expected = reference.fisher_block(g, camera, background)
-    H = diagonal(expected)
-    assert_close(fisher(g, camera, "block", background), expected, "block", np.sqrt(H[:, :, None] * H[:, None, :]))
-    assert_close(fisher(g, camera, "exact", background), H, "exact")
+    assert_close(fisher(g, camera, "block", background), expected, "block")
+    assert_close(fisher(g, camera, "exact", background), diagonal(expected), "exact")
 
 
 def test_blocks_are_positive_semidefinite():

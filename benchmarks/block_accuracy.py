@@ -1,0 +1,77 @@
+"""How far off an entry of the `block` Fisher information is, against how much its sum cancels.
+
+    PYTHONPATH=. .venv/bin/python benchmarks/block_accuracy.py docs/benchmarks/block_accuracy [SCENES]
+
+Writes PREFIX.png and PREFIX.json. Random scenes of 16 Gaussians as in tests/splat/test_fisher.py (sizes, anisotropy, opacities
+and backgrounds far apart), each entry above 1e-6 of its scene's largest against the float64 oracle. Diagonal entries are sums
+of squares; the others are sums of either sign, as small beside sqrt(H_ii H_jj) as chance makes them.
+"""
+
+import sys
+
+import numpy as np
+from rich.progress import track
+
+from mgs import runtime
+
+runtime.start()
+
+from mgs.config import versions  # noqa: E402
+from mgs.figures import new_figure, save_figure  # noqa: E402
+from mgs.files import write_json  # noqa: E402
+from mgs.seeds import generator  # noqa: E402
+from mgs.splat import fisher, reference  # noqa: E402
+from tests.splat.scenes import calm, make_camera  # noqa: E402
+from tests.splat.test_fisher import FLOOR, TOLERANCE, make  # noqa: E402
+
+BINS = np.logspace(-6, 0, 25)
+
+
+def entries(camera, rng) -> tuple[np.ndarray, np.ndarray]:
+    """(|H_ij| / sqrt(H_ii H_jj), relative error) of the entries of one random scene that count."""
+    scale, stretch, logit = rng.uniform(-5, -0.5), rng.uniform(0.1, 6), rng.uniform(-2, 20)
+    background = tuple(rng.choice([0, 1, rng.uniform()], 3))
+    style = {"log_scales": (scale - stretch, scale), "logits": (logit - 4, logit)}
+    gaussians = calm(lambda seed: make(seed, **style), camera, int(rng.integers(2**31)))
+    expected = reference.fisher_block(gaussians, camera, background)
+    error = np.abs(fisher(gaussians, camera, "block", background) - expected)
+    diagonal = np.einsum("nii->ni", expected)
+    size, bound = np.abs(expected), np.sqrt(diagonal[:, :, None] * diagonal[:, None, :])
+    counts = (size > FLOOR * size.max()) & (np.tri(size.shape[1]) > 0)
+    return size[counts] / bound[counts], error[counts] / size[counts]
+
+
+def main(prefix: str, scenes: int = 1500) -> None:
+    camera, rng = make_camera(), generator(0, "block_accuracy")
+    found = [entries(camera, rng) for _ in track(range(scenes), "scenes")]
+    worst = np.array([error.max() for _, error in found])
+    share, error = (np.concatenate(column) for column in zip(*found, strict=True))
+    of_bound = share * error
+    summary = {
+        "command": f"benchmarks/block_accuracy.py {prefix} {scenes}",
+        "scenes": scenes,
+        "entries": len(error),
+        "worst_relative_error": worst.max(),
+        "scenes_beyond_tolerance": int((worst >= TOLERANCE).sum()),
+        "entries_beyond_tolerance": int((error >= TOLERANCE).sum()),
+        "error_over_sqrt_HiiHjj": {"median": np.median(of_bound), "p99": np.quantile(of_bound, 0.99), "max": of_bound.max()},
+        "versions": versions(),
+    }
+    write_json(f"{prefix}.json", summary)
+    print({key: value for key, value in summary.items() if key != "versions"})
+    figure = new_figure(4.6, 3.4)
+    axis = figure.subplots()
+    part = np.digitize(share, BINS)
+    middle = np.sqrt(BINS[1:] * BINS[:-1])
+    for label, of, colour in (("largest", np.max, "#d55e00"), ("median", np.median, "#0072b2")):
+        drawn = [of(error[part == i]) if (part == i).any() else np.nan for i in range(1, len(BINS))]
+        axis.loglog(middle, drawn, "o-", color=colour, ms=3, label=label)
+    axis.axhline(TOLERANCE, color="#999999", ls="--", label="asked for")
+    axis.set_xlabel(r"$|H_{ij}|\;/\;\sqrt{H_{ii} H_{jj}}$")
+    axis.set_ylabel("relative error")
+    axis.legend()
+    save_figure(figure, f"{prefix}.png")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], *(int(n) for n in sys.argv[2:]))
