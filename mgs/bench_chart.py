@@ -50,6 +50,7 @@ def scaling_figure(path: str | Path, points: list[dict[str, Any]], exponents: di
                 [p[key] for p in chosen], [1e3 * p[name] for p in chosen], line + marker, color=colour, ms=4, label=text
             )
         axis.set(xlabel=label, ylabel="time, ms")
+        axis.tick_params(which="minor", labelsize=6)
         axis.grid(True, which="both", alpha=0.2)
         axis.legend(fontsize=7, frameon=False)
     memory = panels[1, 1]
