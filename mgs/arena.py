@@ -66,7 +66,10 @@ def regolith(settings: Arena, rng: np.random.Generator) -> tuple[np.ndarray, np.
 def make_stones(
     settings: Arena, rock: trimesh.Trimesh, ground: trimesh.Trimesh, rng: np.random.Generator
 ) -> trimesh.Trimesh | None:
-    """Small stones scattered over the ground as one mesh, with the vertex attribute `color` (linear RGB); None for none."""
+    """Small stones scattered over the ground as one mesh, with the vertex attribute `color` (linear RGB); None for none.
+
+    None also where `spread` ends within the rock's clearance.
+    """
     if not settings.stones:
         return None
     noise = Noise(rng)
@@ -75,6 +78,8 @@ def make_stones(
     distance = settings.spread * rng.uniform(0, 1, 4 * settings.stones) ** 0.7
     azimuth = rng.uniform(0, 2 * np.pi, 4 * settings.stones)
     at = np.stack([distance * np.cos(azimuth), distance * np.sin(azimuth)], 1)[distance > keep_out][: settings.stones]
+    if len(at) == 0:
+        return None
     # Fragmented rock: the number of stones above a size falls as a power of it.
     sizes = np.minimum(0.6 * settings.stone_size * rng.uniform(0, 1, len(at)) ** (-1 / 1.8), settings.largest_stone)
     vertices, faces, colours, offset = [], [], [], 0

@@ -15,6 +15,8 @@ from mgs.errors import InputError
 from mgs.noise import Noise
 from mgs.scene_file import Rock
 
+MAX_GRID = 10**8
+"""Points of the grid that a rock is cut from: more would take tens of gigabytes."""
 CELL = 6
 """Texels along one side of an atlas cell; a cell holds two triangles."""
 
@@ -23,6 +25,7 @@ def make_rock(settings: Rock, rng: np.random.Generator) -> trimesh.Trimesh:
     """A weathered rock: cut ellipsoids -> marching cubes at `detail` -> displacement -> baked albedo texture.
 
     Returns a mesh in world coordinates (metres, +Z up), partly below z = 0, with UVs and an sRGB base-colour texture.
+    Raises InputError where `detail` is too coarse or too fine for the rock.
     """
     noise = Noise(rng)
     mesh, height = rock_shape(settings, noise)
@@ -79,7 +82,10 @@ def _body(settings: Rock, noise: Noise) -> trimesh.Trimesh:
     extent = float((high - low).max())
     step = 2.2 * settings.detail / settings.size * extent  # marching cubes' edges are 0.9 steps long, and are halved
     origin = low - 0.15 * extent
-    shape = np.ceil((high - low + 0.3 * extent) / step).astype(int) + 1
+    shape = np.ceil((high - low + 0.3 * extent) / step) + 1
+    if shape.prod() > MAX_GRID:
+        raise InputError(f"scene: rock.detail {settings.detail} m is too fine for a rock of {settings.size} m; raise it")
+    shape = shape.astype(int)
     points = (origin + step * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)).astype(np.float32)
     points += 0.05 * np.stack([noise.octave(points, 1.1) for _ in range(3)], -1)
     distance = np.full(shape, 1e3)
@@ -90,7 +96,10 @@ def _body(settings: Rock, noise: Noise) -> trimesh.Trimesh:
             cut = local @ (normal / np.linalg.norm(normal)).astype(np.float32) - noise.rng.uniform(0.62, 0.92)
             inside = _smooth_max(inside, cut, 0.05)
         distance = -_smooth_max(-distance, -inside * min(lobe.radii), 0.12)
-    vertices, faces, _, _ = marching_cubes(gaussian_filter(distance, 0.7), 0.0, spacing=(step,) * 3)
+    distance = gaussian_filter(distance, 0.7)
+    if distance.min() >= 0:  # nothing is inside
+        raise InputError(f"scene: rock.detail {settings.detail} m is too coarse for a rock of {settings.size} m; lower it")
+    vertices, faces, _, _ = marching_cubes(distance, 0.0, spacing=(step,) * 3)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh = max(mesh.split(only_watertight=False), key=lambda part: len(part.faces))
     mesh.apply_scale(settings.size / mesh.extents.max())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -14,6 +14,7 @@ from mgs.resources import scene_path
 
 Positive = Annotated[float, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
+Elevation = Annotated[float, Field(ge=0, le=90)]
 OrbitKind = Literal["circle", "rings", "spiral", "hemisphere"]
 ORBITS: tuple[str, ...] = get_args(OrbitKind)
 Colour = tuple[Fraction, Fraction, Fraction]
@@ -35,9 +36,9 @@ class Rock(_Strict):
 
     size: Positive = 1.8
     """Longest side of its bounding box, metres; a mesh given by --mesh is scaled to it too."""
-    buried: Fraction = 0.12
+    buried: Annotated[float, Field(ge=0, lt=1)] = 0.12
     """Share of its height below the ground."""
-    lobes: tuple[Lobe, ...] = (Lobe(radii=(1.0, 0.8, 0.72)),)
+    lobes: Annotated[tuple[Lobe, ...], Field(min_length=1)] = (Lobe(radii=(1.0, 0.8, 0.72)),)
     facets: Annotated[int, Field(ge=0)] = 16
     """Planes that cut each lobe."""
     relief: Fraction = 0.06
@@ -98,7 +99,7 @@ class Orbit(_Strict):
     """Horizontal distance from the rock's axis (circle), or distance from its middle (the others)."""
     altitude: Annotated[float, Field(ge=0)] = 2.3
     """Height above the ground (circle)."""
-    elevations: tuple[float, float] = (12, 65)
+    elevations: tuple[Elevation, Elevation] = (12, 65)
     """Lowest and highest elevation above the rock's middle (the others)."""
     turns: Positive = 3
     """Turns of the spiral, or number of rings."""
@@ -139,8 +140,18 @@ def load_scene_file(scene: str | Path) -> SceneFile:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise InputError(f"{path}: unknown key {key!r}; compare it with scenes/boulder.toml") from None
+            raise InputError(f"{path}: unknown key {key!r}; choose one of {', '.join(_keys_beside(first['loc']))}") from None
         raise InputError(f"{path}: {key}: {first['msg']} (is {first['input']!r}); correct it") from None
+
+
+def _keys_beside(where: tuple[int | str, ...]) -> list[str]:
+    """The keys that a scene file may have in the section of the key `where`, a path such as ("rock", "lobes", 0, "radius")."""
+    section: Any = SceneFile
+    for part in where[:-1]:
+        if isinstance(part, str):  # not the place in a list
+            kind = section.model_fields[part].annotation
+            section = next(iter(get_args(kind)), kind)
+    return list(section.model_fields)
 
 
 def sensor_of(dataset: Path) -> Sensor:

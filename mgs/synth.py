@@ -67,7 +67,7 @@ def synthesise(
 
     With `pose_noise` transforms.json holds noisy poses, and true_poses.json the cameras that took the images.
     A folder that an interrupted run of the same settings left is completed; the result is the same as in one run.
-    Raises InputError: output folder not empty or not writable, bad mesh, rock not wholly in every frame.
+    Raises InputError: output folder not empty or not writable, bad mesh, rock not wholly in every frame, or nowhere in sight.
     """
     started, out = time.perf_counter(), Path(out)
     rock, scale = (make_rock(settings.rock, generator(seed, "rock")), 1.0) if mesh is None else load_rock(mesh, settings.rock)
@@ -78,18 +78,20 @@ def synthesise(
     frames = _frames(out, cameras)
     denoise = importlib.util.find_spec("pyoidn") is not None
     resolved = _resolved(settings, preset, seed, mesh, denoise, pose_noise)
-    if not _resumes(out, resolved):
+    goes_on = _resumes(out, resolved)
+    glb: Any = rock.export(None, file_type="glb", include_normals=True)  # before the scene adds its attributes to the mesh
+    scene = Scene(settings, rock, cameras[0], seed)
+    exposure = _meter(scene, cameras, seed)
+    if not goes_on:
         new_folder(out)
         write_json(out / "config.json", resolved)
     with atomic_path(out / "rock.glb") as temporary:
-        rock.export(temporary, file_type="glb", include_normals=True)
+        temporary.write_bytes(glb)
     spp = preset.spp
     if not denoise:
         spp *= NOISY_FACTOR
         say(f"pyoidn is not installed: {spp} samples per pixel in place of denoising; `pip install pyoidn` is faster")
 
-    scene = Scene(settings, rock, cameras[0], seed)
-    exposure = _meter(scene, cameras, seed)
     prepared = time.perf_counter()
     seconds = _render_frames(scene, frames, exposure, spp, seed, denoise, progress)
     write_contact_sheet(out / "contact_sheet.png", frames)
@@ -168,8 +170,9 @@ def rock_cameras(settings: SceneFile, preset: Preset, rock: trimesh.Trimesh) -> 
     return cameras
 
 
-def write_contact_sheet(path: str | Path, frames: list[Frame], columns: int = 8, width: int = 160) -> None:
-    """Up to 32 evenly chosen frames side by side, as PNG."""
+def write_contact_sheet(path: str | Path, frames: list[Frame]) -> None:
+    """Up to 32 evenly chosen frames, eight side by side, as PNG."""
+    columns, width = 8, 160
     chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, min(32, len(frames))).astype(int))]
     height = round(width * frames[0].camera.height / frames[0].camera.width)
     sheet = Image.new("RGB", (columns * width, -(-len(chosen) // columns) * height))
@@ -210,9 +213,11 @@ def _resumes(out: Path, resolved: dict[str, Any]) -> bool:
 
 
 def _meter(scene: Scene, cameras: list[Camera], seed: int) -> float:
-    """One exposure for the whole orbit, from four evenly spaced cameras."""
+    """One exposure for the whole orbit, from four evenly spaced cameras. Raises InputError where one does not see the rock."""
     means = []
     for index in np.unique(np.linspace(0, len(cameras), 4, endpoint=False).astype(int)):
         rendered = scene.render(cameras[index], 2, derive_seed(seed, f"meter {index}"), denoise=False)
+        if not rendered.mask.any():
+            raise InputError(f"scene: the rock is hidden in frame {index}; raise orbit.altitude, or lower rock.buried")
         means.append(float(rendered.rgb[rendered.mask].mean()))
     return ROCK_EXPOSURE / float(np.mean(means))

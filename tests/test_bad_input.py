@@ -238,6 +238,27 @@ def test_synth_orbit_options(capsys, tmp_path, case):
     assert named in refused(capsys, ["synth-orbit", tmp_path / "out", *options], tmp_path / "out")
 
 
+SCENES: dict[str, tuple[str, str]] = {
+    "unknown section": ("[rok]", "description, rock, arena"),
+    "unknown key": ("[orbit]\nradiu = 4", "kind, radius, altitude"),
+    "unknown key of a lobe": ("[[rock.lobes]]\nradius = 1", "centre, radii"),
+    "no lobes": ("[rock]\nlobes = []", "rock.lobes"),
+    "rock wholly buried": ("[rock]\nburied = 1", "rock.buried"),
+    "detail coarser than the rock": ("[rock]\ndetail = 2", "rock.detail"),
+    "detail of a slip": ("[rock]\ndetail = 1e-9", "rock.detail"),
+    "cameras under the ground": ("[orbit]\nkind = 'rings'\nelevations = [-60, -20]", "orbit.elevations"),
+    "rock behind its dust": ("[rock]\ndetail = 0.1\nburied = 0.999\n[orbit]\naltitude = 0\n[arena]\nstones = 0", "altitude"),
+}
+
+
+@pytest.mark.parametrize("case", SCENES)
+def test_scene_files(capsys, tmp_path, case):
+    text, named = SCENES[case]
+    (tmp_path / "mine.toml").write_text(text)
+    arguments = ["synth-orbit", tmp_path / "out", "--scene", tmp_path / "mine.toml", "--frames", 1, "--size", "16x12"]
+    assert named in refused(capsys, arguments, tmp_path / "out")
+
+
 PRIORS: dict[str, tuple[Change, str]] = {
     "missing": (shutil.rmtree, "mgs prior"),
     "without points": (lambda root: (root / "points.ply").unlink(), "points.ply"),

@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from mgs.arena import make_ground, make_stones
 from mgs.conventions import Camera, linear_from_srgb, look_at
 from mgs.errors import InputError
 from mgs.rock import make_rock
@@ -76,6 +77,13 @@ def test_bad_scene_files(tmp_path, text, message):
     with pytest.raises(InputError, match=message) as error:
         load_scene_file(tmp_path / "s.toml")
     assert "\n" not in str(error.value)
+
+
+def test_no_stones_where_the_rock_keeps_them_out():
+    rock, rng = trimesh.creation.icosphere(subdivisions=1), np.random.default_rng(0)
+    ground = make_ground(Arena(), rock, rng)
+    assert make_stones(Arena(spread=0.8), rock, ground, rng) is None
+    assert make_stones(Arena(spread=2, stones=9), rock, ground, rng) is not None
 
 
 def test_unknown_scene_names_the_known_ones():
