@@ -173,7 +173,7 @@ def read_comparison(path: str | Path, camera: Camera) -> tuple[np.ndarray, np.nd
 def evaluate_run(run: str | Path, *, pictures: bool = True, progress: Progress | None = None) -> dict[str, Any]:
     """`evaluate` of a run of `mgs nbv` on its dataset; writes RUN/metrics.json, and RUN/renders/*.png where `pictures`.
 
-    Raises InputError where the run is missing, unfinished or its dataset has changed.
+    Raises InputError where the run is missing, it has no finished step, or its dataset has changed.
     """
     run = Path(run)
     gaussians, dataset, trained, policy = load_run(run)
@@ -186,7 +186,7 @@ def evaluate_run(run: str | Path, *, pictures: bool = True, progress: Progress |
 def load_run(run: Path) -> tuple[Gaussians, Dataset, list[str], str]:
     """(model, dataset, names of the views trained on in order, policy) of a run folder.
 
-    Raises InputError where there is no run, it has no step yet, or its dataset has changed.
+    Raises InputError where the run is missing, it has no finished step, or its dataset has changed.
     """
     from mgs import nbv
     from mgs.dataset import load_dataset

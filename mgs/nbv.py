@@ -98,8 +98,11 @@ class _Stopwatch:
         self.seconds[stage] = round(time.perf_counter() - start, 4)
 
 
-def check_counts(settings: NbvSettings, frames: int) -> None:
-    """Raises InputError where the dataset has too few frames for the seeds and the budget."""
+def check_settings(settings: NbvSettings, frames: int) -> None:
+    """Raises InputError where the policy is unknown, or the dataset has too few frames for the seeds and the budget."""
+    if settings.policy not in policies.policy_names():
+        known = ", ".join(policies.policy_names())
+        raise InputError(f"--policy {settings.policy}: unknown; choose one of {known}, or register your own (docs/nbv.md)")
     if frames < settings.seeds:
         raise InputError(f"{settings.dataset}: has {frames} frames, fewer than {settings.seeds} seeds; lower --seeds")
     left = frames - settings.seeds
@@ -108,8 +111,8 @@ def check_counts(settings: NbvSettings, frames: int) -> None:
 
 
 def start(out: Path, settings: NbvSettings, dataset: Dataset) -> None:
-    """Write config.json, the first file of a run. Raises InputError as `check_counts`."""
-    check_counts(settings, len(dataset))
+    """Write config.json, the first file of a run. Raises InputError as `check_settings`."""
+    check_settings(settings, len(dataset))
     config = {
         "settings": settings.model_dump(mode="json"),
         "versions": versions(),
@@ -119,14 +122,17 @@ def start(out: Path, settings: NbvSettings, dataset: Dataset) -> None:
 
 
 def read_settings(out: Path) -> NbvSettings:
-    """Settings of a run folder. Raises InputError where there is no run, or its config.json is damaged."""
+    """Settings of a run folder. Raises InputError where there is no run, its config.json is damaged, or the dataset is gone."""
     path = out / "config.json"
     if not path.is_file():
         raise InputError(f"{out}: holds no run (no config.json); start one with `mgs nbv DATASET --out {out}`")
     config = read_json(path)
     if not isinstance(config, dict) or not isinstance(config.get("settings"), dict):
         raise InputError(f"{path}: has no settings; the file is damaged, start the run anew")
-    return validated(NbvSettings, config["settings"])
+    settings = validated(NbvSettings, config["settings"])
+    if not settings.dataset.is_dir():
+        raise InputError(f"{path}: dataset {settings.dataset} is not there; if it was moved, correct `dataset` in this file")
+    return settings
 
 
 def check_same_frames(out: Path, dataset: Dataset) -> None:
@@ -148,8 +154,9 @@ def run(
     progress is told of the work inside a step, on_step of every state that is committed.
 
     Killed at any moment and called again, it takes the same views as a run that was never interrupted. Raises InputError
-    where a frame it takes cannot be read or has an empty mask, before the fit.
+    as `check_settings`, and where a frame it takes cannot be read or has an empty mask, before the fit.
     """
+    check_settings(settings, len(dataset))
     for leftover in out.glob(".*.part*"):  # of a killed write
         leftover.unlink()
     loop = _Loop(settings, dataset, stations, progress)

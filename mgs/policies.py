@@ -2,11 +2,13 @@
 
 Two kinds, because they look at different things:
 
-- a *criterion* scores one candidate from Fisher information alone, `(F, H, lam) -> float`;
-- a *pose policy* scores all candidates from camera positions alone, `(candidates, taken, centre, rng) -> scores`.
+- a *criterion* scores one candidate from Fisher information alone, `(F [N,P], H [N,P], lam [P]) -> float`;
+- a *pose policy* scores all candidates from camera positions alone, `(candidates [C,3], taken [T,3], centre [3], rng)
+  -> scores [C]`, metres.
 
 Neither ever sees a candidate's image. The largest score wins; a tie goes to the camera farthest from those taken (a rule of
-our own, the same for all: the paper names none, and coverage ties at every step once it has saturated).
+our own, the same for all: the paper names none, and coverage ties at every step once it has saturated). A policy of your own is
+one more row (docs/nbv.md).
 
 Notation, after the paper's Eq. 7 and POp-GS: H [N,P] is the diagonal of J^T J summed over the training set, F [N,P] that of
 one candidate, lam [P] the regularisation (`regularisation`); l = N P is the number of parameters.
@@ -152,8 +154,10 @@ POSE_POLICIES: dict[str, PosePolicy] = {
     "farthest": farthest_pose,
 }
 
-POLICIES: tuple[str, ...] = (*CRITERIA, *POSE_POLICIES)
-"""Every policy that `mgs nbv --policy` accepts."""
+
+def policy_names() -> list[str]:
+    """Every policy that `mgs nbv --policy` accepts: the rows of both tables, as they are now."""
+    return [*CRITERIA, *POSE_POLICIES]
 
 
 def seed_views(positions: Array, centre: Array, count: int) -> list[int]:

@@ -36,7 +36,7 @@ def timeless(steps: list[dict]) -> list[dict]:
     return [{key: value for key, value in step.items() if key != "seconds"} for step in steps]
 
 
-@pytest.mark.parametrize("policy", policies.POLICIES)
+@pytest.mark.parametrize("policy", policies.policy_names())
 def test_run_writes_what_it_did(dataset, tmp_path, policy):
     state = run(tmp_path / "run", dataset, policy=policy)
     steps = lines(tmp_path / "run")

@@ -11,11 +11,12 @@ import pytest
 import tiny
 from rich.console import Console
 
-from mgs import nbv
+from mgs import nbv, policies
 from mgs.cli import main
 from mgs.commands.nbv import print_run, read_train_settings, start_run, train_settings
 from mgs.dataset import load_dataset
 from mgs.errors import InputError
+from mgs.evaluate import load_run
 from mgs.files import write_json, write_png
 
 
@@ -125,3 +126,39 @@ def test_settings_of_the_fit_are_read_back_as_they_were(tmp_path):
     from mgs.train import TrainSettings
 
     assert asdict(read_train_settings(tmp_path, train_settings(6, 2))) == asdict(TrainSettings(passes=6, seed=2))
+
+
+def test_the_documented_policy_of_ones_own(dataset, tmp_path, monkeypatch):
+    """The program in docs/nbv.md, its command caught: the policy is started, run, and read back where nobody registered it."""
+    monkeypatch.setattr(policies, "CRITERIA", dict(policies.CRITERIA))
+    commands: list[list[str]] = []
+    monkeypatch.setattr("mgs.cli.main", commands.append)
+    page = (Path(__file__).parent.parent / "docs/nbv.md").read_text()
+    exec(page.split("```python\n")[1].split("```")[0], {})
+    name = commands[0][commands[0].index("--policy") + 1]
+    started(dataset, tmp_path / "run", tiny.write_prior(tmp_path / "prior"), policy=name, budget=1)
+
+    loaded, scores = load_dataset(dataset), []
+    own = policies.CRITERIA[name]
+    monkeypatch.setitem(policies.CRITERIA, name, lambda *given: scores.append(own(*given)) or scores[-1])
+    state = nbv.run(tmp_path / "run", nbv.read_settings(tmp_path / "run"), loaded, tiny.stations(), tiny.silent)
+    assert len(scores) == len(loaded) - 4
+    assert state.steps[-1]["gain"] == max(scores) > 0
+
+    monkeypatch.undo()
+    assert load_run(tmp_path / "run")[3] == name
+    with pytest.raises(InputError, match=f"--policy {name}: unknown; choose one of d-optimal"):
+        nbv.run(tmp_path / "run", nbv.read_settings(tmp_path / "run"), loaded, tiny.stations(), tiny.silent)
+
+
+@pytest.mark.parametrize("moved", ["dataset", "prior"])
+def test_what_a_run_was_made_from_has_moved(dataset, prior, tmp_path, capsys, moved):
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    (tmp_path / moved).rename(tmp_path / "elsewhere")
+    with pytest.raises(SystemExit) as stop:
+        main(["nbv", "--resume", str(run)])
+    assert stop.value.code == 2
+    assert (
+        f"run/config.json: {moved} {tmp_path / moved} is not there; if it was moved, correct `{moved}`"
+        in capsys.readouterr().err
+    )

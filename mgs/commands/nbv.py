@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mgs.policies import PIXEL_NOISE, POLICIES
+from mgs.policies import PIXEL_NOISE, policy_names
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -27,7 +27,7 @@ def nbv(
         typer.Option(help="Folder of `mgs prior`; default DATASET/prior, or built inside the run where there is none."),
     ] = None,
     gaussians: Annotated[int | None, typer.Option(help="Build a prior of this many Gaussians inside the run.")] = None,
-    policy: Annotated[str, typer.Option(help=f"One of {', '.join(POLICIES)}.")] = "d-optimal",
+    policy: Annotated[str, typer.Option(help=f"One of {', '.join(policy_names())}.")] = "d-optimal",
     budget: Annotated[
         int | None, typer.Option(help="Views chosen beyond the seeds; default 50, or all candidates where they are fewer.")
     ] = None,
@@ -121,7 +121,7 @@ def start_run(
     from mgs.dataset import load_dataset
     from mgs.errors import InputError
     from mgs.files import folder_or_nothing
-    from mgs.nbv import check_counts, start
+    from mgs.nbv import check_settings, start
     from mgs.prior import PriorSettings, build_prior, load_prior, save_prior
 
     if prior is not None and gaussians is not None:
@@ -136,7 +136,7 @@ def start_run(
     if "budget" not in values:
         resolved["budget"] = min(given.budget, max(0, len(frames) - given.seeds))
     settings = given.model_copy(update=resolved)
-    check_counts(settings, len(frames))
+    check_settings(settings, len(frames))
     if prior is not None:
         load_prior(prior)
     with folder_or_nothing(out):
@@ -155,9 +155,12 @@ def run_folder(out: Path, console: Console, pictures: bool = False) -> None:
     """Run or resume the loop in a run folder, evaluate (with pictures where asked), print the table."""
     from mgs import nbv as loop
     from mgs.dataset import load_dataset
+    from mgs.errors import InputError
     from mgs.prior import load_prior
 
     settings = loop.read_settings(out)
+    if not settings.prior.is_dir():
+        raise InputError(f"{out / 'config.json'}: prior {settings.prior} is not there; if it was moved, correct `prior` there")
     train = read_train_settings(out, settings.train)
     dataset = load_dataset(settings.dataset)
     loop.check_same_frames(out, dataset)
