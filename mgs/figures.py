@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain, cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,8 +41,10 @@ POLICY_STYLE = {
     "farthest": ("#E69F00", "v"),
     "t-optimal": ("#56B4E9", "P"),
     "a-optimal": ("#000000", "X"),
+    "fisherrf": ("#7f7f7f", "p"),
+    "e-optimal": ("#8c510a", "*"),
 }
-"""Colour (Okabe and Ito's colour-blind-safe set) and marker of a policy, the same in every figure."""
+"""Colour (Okabe and Ito's colour-blind-safe set, grey and brown) and marker of a policy, the same in every figure."""
 
 
 def new_figure(width: float, height: float, dpi: int = DPI) -> Figure:
@@ -57,10 +60,22 @@ def save_figure(figure: Figure, path: str | Path) -> None:
         figure.savefig(temporary, format="png")
 
 
-def _style(label: str) -> dict[str, Any]:
-    """Colour and marker of a line; its label starts with the policy."""
-    colour, marker = POLICY_STYLE.get(label.split(" ")[0], ("#7f7f7f", "."))
-    return {"color": colour, "marker": marker, "label": label}
+def line_styles(labels: Iterable[str]) -> list[dict[str, Any]]:
+    """Colour, marker and label of each line; a label starts with the policy.
+
+    The first line of a policy in POLICY_STYLE has its style. A second one, and a policy of the user's own, takes the next
+    that no line has, from the end of the table; where they run out they repeat, dashed.
+    """
+    labels = list(labels)
+    first = {label.split(" ")[0]: label for label in reversed(labels)}
+    taken = {label: POLICY_STYLE[policy] for policy, label in first.items() if policy in POLICY_STYLE}
+    free = [style for style in reversed(POLICY_STYLE.values()) if style not in taken.values()]
+    spare = chain(((style, "-") for style in free), cycle((style, "--") for style in POLICY_STYLE.values()))
+    styles = []
+    for label in labels:
+        (colour, marker), dashes = (taken[label], "-") if label in taken else next(spare)
+        styles.append({"color": colour, "marker": marker, "linestyle": dashes, "label": label})
+    return styles
 
 
 def orbit_figure(
@@ -125,8 +140,8 @@ def gain_figure(path: str | Path, gains: Mapping[str, Sequence[float]]) -> None:
     with matplotlib.rc_context(STYLE):
         figure = new_figure(4.8, 3.1)
         axis = figure.subplots()
-        for policy, values in gains.items():
-            axis.plot(np.arange(1, len(values) + 1), values, **_style(policy))
+        for values, style in zip(gains.values(), line_styles(gains), strict=True):
+            axis.plot(np.arange(1, len(values) + 1), values, **style)
         axis.set(xlabel="active step", ylabel=r"$\mathrm{IG}_D$ of the selected view")
         axis.set_ylim(bottom=0)
         _whole_steps(axis)
@@ -144,10 +159,10 @@ def coverage_figure(path: str | Path, coverage: Mapping[str, tuple[Sequence[int]
     with matplotlib.rc_context(STYLE):
         figure = new_figure(7.2, 3.1)
         left, right = figure.subplots(1, 2)
-        for policy, (images, shares) in coverage.items():
+        for (images, shares), style in zip(coverage.values(), line_styles(coverage), strict=True):
             percent = 100 * np.asarray(shares, float)
-            left.plot(images, percent, **_style(policy))
-            right.plot(list(images)[1:], np.diff(percent), **_style(policy))
+            left.plot(images, percent, **style)
+            right.plot(list(images)[1:], np.diff(percent), **style)
         left.set(xlabel="images", ylabel=r"surface coverage $C$ (%)")
         right.set(xlabel="images", ylabel="coverage gained (percentage points)")
         right.axhline(0, color="#9a9a9a", linewidth=0.8, zorder=0)
@@ -165,8 +180,8 @@ def psnr_figure(path: str | Path, panels: Mapping[str, Mapping[str, tuple[Sequen
         figure = new_figure(3.6 * len(panels), 3.1)
         axes = figure.subplots(1, len(panels), squeeze=False)[0]
         for axis, (what, curves) in zip(axes, panels.items(), strict=True):
-            for policy, (images, decibels) in curves.items():
-                axis.plot(images, decibels, **_style(policy))
+            for (images, decibels), style in zip(curves.values(), line_styles(curves), strict=True):
+                axis.plot(images, decibels, **style)
             axis.set(xlabel="images in the training set", ylabel=f"PSNR, {what} (dB)")
             _whole_steps(axis)
         axes[0].legend()
@@ -210,7 +225,7 @@ def comparison_figure(
             map_ = axes[1, column].imshow(differences[policy], cmap="magma", vmin=0, vmax=limit, interpolation="nearest")
         for axis in axes.flat:
             axis.set_axis_off()
-        axes[1, 0].text(0.97, 0.5, "|render $-$ truth|", ha="right", va="center", transform=axes[1, 0].transAxes)
+        axes[1, 0].text(0.97, 0.5, "absolute\ndifference", ha="right", va="center", transform=axes[1, 0].transAxes)
         bar = figure.colorbar(map_, ax=list(axes[1, 1:]), orientation="horizontal", shrink=0.6, pad=0.02, aspect=40)
         bar.set_label("mean absolute difference of the sRGB channels, in [0, 1]")
         save_figure(figure, path)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mgs.files import atomic_path
+from mgs.figures import STYLE, new_figure, save_figure
 from mgs.prior import Prior, Rock, Stages
 
 MAX_DOTS = 60_000
@@ -17,7 +17,7 @@ LIGHT = np.array([-0.5, 0.4, 0.77])
 
 def draw_prior(path: str | Path, prior: Prior, stages: Stages) -> None:
     """Write the figure as a PNG, atomically."""
-    from matplotlib.figure import Figure
+    import matplotlib
 
     up = np.array([0.0, 0.0, 1.0]) if stages.rock is None else stages.rock.plane.normal
     frame = _oblique(up)
@@ -26,19 +26,20 @@ def draw_prior(path: str | Path, prior: Prior, stages: Stages) -> None:
     reach = 0.5 * float(np.linalg.norm(np.ptp(body, axis=0)))
     truth = prior.numbers.get("truth")
     error = f", accuracy {1e3 * truth['accuracy']:.2f} mm" if truth else ""
-    figure = Figure(figsize=(17 if stages.rock is not None else 7, 4.2), layout="constrained")
-    axes = figure.subplots(1, 5 if stages.rock is not None else 2)
-    if stages.rock is not None:
-        _cloud_panels(axes[:3], stages.rock, frame, centre, reach)
-    _shaded_mesh(axes[-2], stages, frame, centre, reach)
     unseen = "" if stages.mesh.seen.all() else "\nblue: seen by no frame, not sampled"
-    axes[-2].set_title(f"mesh, {prior.numbers['mesh_area']:.2f} m²{error}{unseen}", fontsize=10)
     shade = np.clip(0.25 + 0.75 * (prior.normals @ frame.T) @ LIGHT, 0.05, 1)[:, None] * [0.95, 0.85, 0.7]
     towards = (prior.normals @ frame.T)[:, 2] > 0
-    _dots(axes[-1], ((prior.points - centre) @ frame.T)[towards], shade[towards], None, reach, None)
-    axes[-1].set_title(f"samples: N = {len(prior.points):,}\nspacing {1e3 * prior.spacing:.2f} mm = √(area / N)", fontsize=10)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=100)
+    samples = f"samples: N = {len(prior.points):,} = area / spacing²\nspacing {1e3 * prior.spacing:.2f} mm"
+    with matplotlib.rc_context(STYLE | {"axes.spines.top": True, "axes.spines.right": True}):
+        figure = new_figure(17 if stages.rock is not None else 7, 4.2, dpi=100)
+        axes = figure.subplots(1, 5 if stages.rock is not None else 2)
+        if stages.rock is not None:
+            _cloud_panels(axes[:3], stages.rock, frame, centre, reach)
+        _shaded_mesh(axes[-2], stages, frame, centre, reach)
+        axes[-2].set_title(f"mesh, {prior.numbers['mesh_area']:.2f} m²{error}{unseen}")
+        _dots(axes[-1], ((prior.points - centre) @ frame.T)[towards], shade[towards], None, reach, None)
+        axes[-1].set_title(samples)
+        save_figure(figure, path)
 
 
 def _cloud_panels(axes, rock: Rock, frame: np.ndarray, centre: np.ndarray, reach: float) -> None:
@@ -53,7 +54,7 @@ def _cloud_panels(axes, rock: Rock, frame: np.ndarray, centre: np.ndarray, reach
     for axis, (title, points, value, colours, zoom) in zip(axes, panels, strict=True):
         tint = np.where(value[:, None] > 0.5, [0.15, 0.35, 0.75], [0.85, 0.76, 0.6]) if colours is None else value
         _dots(axis, (points - centre) @ frame.T, tint, colours, zoom * reach, 0.8)
-        axis.set_title(title, fontsize=10)
+        axis.set_title(title)
 
 
 def _oblique(up: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from mgs.cloud import Cloud
 from mgs.dataset import Dataset
-from mgs.files import atomic_path
+from mgs.figures import STYLE, new_figure, save_figure
 from mgs.survey import Survey
 
 COLOURS = {"odometry": "#d1495b", "registered": "#edae49", "optimised": "#00798c"}
@@ -22,22 +22,22 @@ LABELS = {
 
 def draw_survey(path: str | Path, dataset: Dataset, survey: Survey, cloud: Cloud, numbers: dict[str, Any]) -> None:
     """Write the figure as a PNG, atomically."""
-    from matplotlib.figure import Figure
+    import matplotlib
 
-    figure = Figure(figsize=(17, 4.4), layout="constrained")
-    axes = figure.subplots(1, 4, gridspec_kw={"width_ratios": [1.1, 1, 1, 1.1]})
-    _trajectories(axes[0], survey)
-    _errors(axes[1], survey, numbers)
-    _depth_error(axes[2], dataset, survey, numbers)
     around = survey.truth[:, :3, 3].mean(0)
     reach = float(np.abs(survey.truth[:, :3, 3] - around).max())
     points = cloud.points[np.argsort(cloud.points[:, 2])]
     stride = max(1, len(points) // 120_000)
-    axes[3].scatter(*points[::stride, :2].T, c=points[::stride, 2], s=0.4, cmap="viridis", linewidths=0, rasterized=True)
-    axes[3].set(xlim=around[0] + np.array([-reach, reach]), ylim=around[1] + np.array([-reach, reach]), aspect="equal")
-    axes[3].set(title=f"fused cloud from above: {len(cloud.points):,} points", xlabel="x, m", ylabel="y, m")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=100)
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(17, 4.4, dpi=100)
+        axes = figure.subplots(1, 4, gridspec_kw={"width_ratios": [1.1, 1, 1, 1.1]})
+        _trajectories(axes[0], survey)
+        _errors(axes[1], survey, numbers)
+        _depth_error(axes[2], dataset, survey, numbers)
+        axes[3].scatter(*points[::stride, :2].T, c=points[::stride, 2], s=0.4, cmap="viridis", linewidths=0, rasterized=True)
+        axes[3].set(xlim=around[0] + np.array([-reach, reach]), ylim=around[1] + np.array([-reach, reach]), aspect="equal")
+        axes[3].set(title=f"fused cloud from above: {len(cloud.points):,} points", xlabel="x, m", ylabel="y, m")
+        save_figure(figure, path)
 
 
 def _trajectories(axis, survey: Survey) -> None:
@@ -49,7 +49,7 @@ def _trajectories(axis, survey: Survey) -> None:
         axis.plot(*ends.T, color="k", lw=1.5, label="loop closures" if k == 0 else None)
     axis.plot(*survey.truth[0, :2, 3], "k^", ms=8, label="start")
     axis.set(aspect="equal", title="trajectory from above", xlabel="x, m", ylabel="y, m")
-    axis.legend(fontsize=7, loc="center")
+    axis.legend(fontsize=8, loc="center")
 
 
 def _errors(axis, survey: Survey, numbers: dict[str, Any]) -> None:
@@ -63,8 +63,7 @@ def _errors(axis, survey: Survey, numbers: dict[str, Any]) -> None:
             label=f"{LABELS[name]}: rms {1e3 * rms:.0f} mm",
         )
     axis.set(title="position error against truth", xlabel="frame", ylabel="mm")
-    axis.grid(alpha=0.3)
-    axis.legend(fontsize=7)
+    axis.legend(fontsize=8)
 
 
 def _depth_error(axis, dataset: Dataset, survey: Survey, numbers: dict[str, Any]) -> None:
@@ -72,6 +71,8 @@ def _depth_error(axis, dataset: Dataset, survey: Survey, numbers: dict[str, Any]
     error = np.where((measured > 0) & (true > 0), 1e3 * (measured - true), np.nan)
     limit = max(3e3 * numbers["depth_error_on_rock"], 1.0)
     axis.set_facecolor("0.85")
+    axis.grid(visible=False)
+    axis.spines[:].set_visible(False)
     picture = axis.imshow(error, cmap="RdBu", vmin=-limit, vmax=limit, interpolation="nearest")
     axis.figure.colorbar(picture, ax=axis, shrink=0.7, label="mm; blue: too far")
     axis.set(

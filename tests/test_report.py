@@ -14,6 +14,7 @@ from mgs import figures, nbv, report
 from mgs.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.evaluate import evaluate, load_run
+from mgs.figures import POLICY_STYLE
 from mgs.files import write_json
 
 
@@ -144,3 +145,18 @@ def test_comparison_is_cropped_to_the_rock():
     rows, columns = figures.crop(mask)
     assert (rows.start, rows.stop, columns.start, columns.stop) == (34, 66, 38, 92)
     assert figures.crop(np.zeros((4, 4), bool)) == (slice(None), slice(None))
+
+
+@pytest.mark.parametrize(
+    "labels",
+    [list(POLICY_STYLE), ["mine", "d-optimal", "yours"], ["random (a)", "random (b)"], [f"mine-{i}" for i in range(15)]],
+)
+def test_every_line_of_a_figure_looks_different(labels):
+    styles = figures.line_styles(labels)
+    assert [style["label"] for style in styles] == labels
+    assert len({(style["color"], style["marker"], style["linestyle"]) for style in styles}) == len(labels)
+
+
+def test_a_policy_keeps_its_style_whatever_it_is_compared_with():
+    ours = figures.line_styles(["mine", "random (a)", "random (b)"])[1]
+    assert (ours["color"], ours["marker"]) == POLICY_STYLE["random"]
