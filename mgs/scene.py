@@ -20,7 +20,7 @@ MAX_DEPTH = 4
 
 GUIDES_PER_SAMPLE = 2
 """Samples of the denoiser's guides for each sample of light. Guides are cheap and, nearly free of noise, can be declared clean:
-the denoiser then keeps the texture they show (3 dB; docs/data.md)."""
+the denoiser then keeps the texture they show."""
 
 _MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Mitsuba's camera frame is x to the image's left, y up, z forward."""
