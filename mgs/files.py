@@ -51,6 +51,12 @@ def check_writable(path: str | Path) -> Path:
         raise _not_writable(path, error) from None
 
 
+def copy_file(source: Path, path: Path) -> None:
+    """Copy a file, atomically."""
+    with atomic_path(path) as temporary:
+        shutil.copyfile(source, temporary)
+
+
 def write_json(path: str | Path, data: Any) -> None:
     """Write JSON (indented, UTF-8), atomically."""
     with atomic_path(path) as temporary:
@@ -58,12 +64,14 @@ def write_json(path: str | Path, data: Any) -> None:
 
 
 def read_json(path: str | Path) -> Any:
-    """Read JSON. Raises InputError where the file is missing or not JSON."""
+    """Read JSON. Raises InputError where the file is missing, not a file that can be read, or not JSON."""
     path = Path(path)
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); give a file that can be read") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not valid JSON ({error}); the file is damaged, write it again") from None
 

@@ -23,18 +23,16 @@ DROP_OUT = (np.radians(65.0), np.radians(85.0))
 REFERENCE_WIDTH = 640
 
 
-def normals_from_depth(depth: np.ndarray, camera: Camera, step: int = 1) -> np.ndarray:
-    """Unit normals [H,W,3], world, towards the camera, from differences over 2 `step` pixels; zero where depth is missing."""
+def normals_from_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """Unit normals [H,W,3], world, towards the camera, from differences over 2 pixels; zero where depth is missing."""
     points = camera.unproject(depth)
-    padded = np.pad(points, ((step, step), (step, step), (0, 0)), mode="edge")
-    valid = np.pad(depth > 0, step)
-    h, w = depth.shape
-    across = padded[step : step + h, 2 * step :] - padded[step : step + h, :w]
-    down = padded[2 * step :, step : step + w] - padded[:h, step : step + w]
+    padded = np.pad(points, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    valid = np.pad(depth > 0, 1)
+    across = padded[1:-1, 2:] - padded[1:-1, :-2]
+    down = padded[2:, 1:-1] - padded[:-2, 1:-1]
     normal = np.cross(down, across)
     norm = np.linalg.norm(normal, axis=-1)
-    whole = valid[step : step + h, 2 * step :] & valid[step : step + h, :w] & valid[2 * step :, step : step + w]
-    whole &= valid[:h, step : step + w] & (depth > 0) & (norm > 0)
+    whole = valid[1:-1, 2:] & valid[1:-1, :-2] & valid[2:, 1:-1] & valid[:-2, 1:-1] & (depth > 0) & (norm > 0)
     normal = np.where(whole[..., None], normal / np.where(norm > 0, norm, 1.0)[..., None], 0.0)
     facing = np.einsum("hwk,hwk->hw", normal, camera.position - points)
     return normal * np.where(facing < 0, -1.0, 1.0)[..., None]

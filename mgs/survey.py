@@ -6,7 +6,6 @@ origin and is taken as known; every other pose is estimated.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from mgs.cloud import focus, usable_depth
 from mgs.conventions import Camera
 from mgs.dataset import Dataset, Frame, load_dataset, write_transforms
 from mgs.errors import InputError
-from mgs.files import write_exr
+from mgs.files import copy_file, write_exr
 from mgs.seeds import generator
 from mgs.sensor import depth_noise, filter_depth, noisy_depth
 
@@ -57,14 +56,13 @@ class SurveySettings:
 
 @dataclass(frozen=True)
 class Edge:
-    """Measured pose of frame j's camera in frame i's: relative [4,4]; overlap: share of points matched; rms of their
-    distances, metres; registered: False where registration failed and odometry stands in."""
+    """Measured pose of frame j's camera in frame i's: relative [4,4]; overlap: share of points matched; registered: False
+    where registration failed and odometry stands in."""
 
     i: int
     j: int
     relative: np.ndarray
     overlap: float
-    rms: float
     registered: bool = True
 
 
@@ -197,9 +195,7 @@ def _register(clouds: list, i: int, j: int, guess: np.ndarray, grid: float, reac
     from scipy.spatial import cKDTree
 
     distance = cKDTree(target.points()[:, :3]).query(moved)[0]
-    near = distance < 2 * grid
-    rms = float(np.sqrt(np.mean(distance[near] ** 2))) if near.any() else np.inf
-    return Edge(i, j, guess, float(near.mean()), rms)
+    return Edge(i, j, guess, float((distance < 2 * grid).mean()))
 
 
 def optimise(
@@ -284,15 +280,13 @@ def write_survey(out: Path, dataset: Dataset, survey: Survey) -> Dataset:
         estimated = replace(frame.camera, world_to_camera=np.linalg.inv(pose))
         image, mask = out / "images" / frame.image_path.name, frame.mask_path and out / "masks" / frame.mask_path.name
         measured = out / "depth" / f"{frame.name}.exr"
-        image.parent.mkdir(exist_ok=True)
-        shutil.copyfile(frame.image_path, image)
+        copy_file(frame.image_path, image)
         if mask and frame.mask_path:
-            mask.parent.mkdir(exist_ok=True)
-            shutil.copyfile(frame.mask_path, mask)
+            copy_file(frame.mask_path, mask)
         write_exr(measured, {"Z": depth})
         frames.append(Frame(frame.name, estimated, frame.timestamp, image, measured, mask))
     truth = dataset.root / "rock.glb"
     if truth.is_file():
-        shutil.copyfile(truth, out / "rock.glb")
+        copy_file(truth, out / "rock.glb")
     write_transforms(out, frames)
     return load_dataset(out)

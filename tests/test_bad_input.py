@@ -86,6 +86,10 @@ FLAT_POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]
 
 DATASETS: dict[str, tuple[Change, str]] = {
     "no transforms.json": (lambda root: (root / "transforms.json").unlink(), "transforms.json"),
+    "folder in place of transforms.json": (
+        lambda root: ((root / "transforms.json").unlink(), (root / "transforms.json").mkdir()),
+        "transforms.json",
+    ),
     "truncated transforms.json": (truncate("transforms.json"), "transforms.json"),
     "transforms.json of another shape": (lambda root: (root / "transforms.json").write_text("[1, 2]"), "no frames"),
     "no frames": (edit_transforms(lambda data: data.update(frames=[])), "no frames"),
@@ -302,7 +306,7 @@ def test_broken_run(capsys, dataset, prior, tmp_path, command, case):
 def test_run_whose_dataset_is_gone(capsys, dataset, prior, tmp_path, command):
     run = tiny.write_run(tmp_path / "run", dataset, prior)
     shutil.rmtree(dataset)
-    assert "no such dataset" in refused(capsys, [*command, run], run)
+    assert "correct `dataset`" in refused(capsys, [*command, run], run)
 
 
 @pytest.mark.parametrize("views", ["kf_9999", "kf_0000,nothing", ",", ""])

@@ -10,7 +10,17 @@ import numpy as np
 import pytest
 
 from mgs.errors import InputError
-from mgs.files import atomic_folder, atomic_path, check_writable, folder_or_nothing, write_exr, write_json, write_png
+from mgs.files import (
+    atomic_folder,
+    atomic_path,
+    check_writable,
+    copy_file,
+    folder_or_nothing,
+    read_json,
+    write_exr,
+    write_json,
+    write_png,
+)
 
 
 class Stop(BaseException):
@@ -38,6 +48,7 @@ def test_what_the_disk_says_is_one_line(tmp_path, number):
     [
         ("a.json", lambda path: write_json(path, {"a": 1})),
         ("a.png", lambda path: write_png(path, np.random.default_rng(0).random((90, 90, 3)))),
+        ("a.glb", lambda path: copy_file(Path(__file__), path)),
         ("a.exr", lambda path: write_exr(path, {"Z": np.random.default_rng(0).random((90, 90))})),
     ],
 )
@@ -47,6 +58,11 @@ def test_a_full_disk_is_one_line(tmp_path, name, write):
     with pytest.raises(InputError, match="No space left"):
         write(tmp_path / name)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_in_place_of_a_file(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_json(tmp_path)
 
 
 def test_under_a_file(tmp_path):

@@ -101,23 +101,31 @@ def test_a_prior_that_fails_leaves_all_as_it_was(capsys, dataset, tmp_path, exis
     assert listing(tmp_path) == before
 
 
-def test_a_prior_appears_whole(tmp_path, monkeypatch):
-    """Nothing under its name while the last of its files, the picture, is drawn; all of it afterwards."""
-    from mgs import prior_figure
+@pytest.mark.parametrize(
+    ("command", "option", "files"),
+    [
+        ("prior", ["--gaussians", "60"], {"mesh.ply", "points.ply", "prior.json", "prior.png"}),
+        ("survey", ["--poses", "exact"], {"cloud.ply", "survey.json", "survey.png", "transforms.json", "rock.glb"}),
+    ],
+)
+def test_a_result_appears_whole(tmp_path, monkeypatch, command, option, files):
+    """Nothing under its name while its picture is drawn, from the other files; all of it afterwards."""
+    from mgs import prior_figure, survey_figure
 
     root = synthetic.write_dataset(tmp_path / "data").root
-    drawn, out, draw = [], tmp_path / "prior", prior_figure.draw_prior
+    module, name = {"prior": prior_figure, "survey": survey_figure}[command], f"draw_{command}"
+    drawn, out, draw = [], tmp_path / "out", getattr(module, name)
 
     def watched(path, *rest):
-        drawn.append((path.parent / "prior.json").is_file() and not out.exists())
+        drawn.append(len(list(path.parent.iterdir())) > 2 and not out.exists())
         draw(path, *rest)
 
-    monkeypatch.setattr(prior_figure, "draw_prior", watched)
+    monkeypatch.setattr(module, name, watched)
     with pytest.raises(SystemExit) as exit_:
-        main(["prior", str(root), "--out", str(out), "--gaussians", "60"])
+        main([command, str(root), "--out", str(out), *option])
     assert exit_.value.code == 0
     assert drawn == [True]
-    assert {path.name for path in out.iterdir()} == {"mesh.ply", "points.ply", "prior.json", "prior.png"}
+    assert {path.name for path in out.iterdir() if path.is_file()} == files
     assert not list(tmp_path.glob(".*"))
 
 

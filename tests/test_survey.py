@@ -188,13 +188,13 @@ def _graph(truth: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[Edge]]:
     biased = steps.copy()
     bias = [Rotation.from_rotvec(np.radians(0.2) * pose[2, :3]).as_matrix() for pose in truth[1:]]
     biased[:, :3, :3] = steps[:, :3, :3] @ np.stack(bias)
-    return biased, chain(truth[0], biased), [Edge(k, k + 1, step, 1.0, 0.0) for k, step in enumerate(biased)]
+    return biased, chain(truth[0], biased), [Edge(k, k + 1, step, 1.0) for k, step in enumerate(biased)]
 
 
 def test_a_loop_closure_spreads_the_error() -> None:
     truth = _circle()
     steps, registered, edges = _graph(truth)
-    loop = Edge(0, 23, np.linalg.inv(truth[0]) @ truth[23], 1.0, 0.0)
+    loop = Edge(0, 23, np.linalg.inv(truth[0]) @ truth[23], 1.0)
     optimised = optimise(registered, steps, edges, [loop], 1.0, 0.03)
     assert np.allclose(optimised[0], truth[0], atol=1e-9)
     before, after = trajectory_error(registered, truth), trajectory_error(optimised, truth)
@@ -205,10 +205,10 @@ def test_a_loop_closure_spreads_the_error() -> None:
 def test_a_wrong_loop_is_outvoted() -> None:
     truth = _circle()
     steps, registered, edges = _graph(truth)
-    right = [Edge(i, 23 - j, np.linalg.inv(truth[i]) @ truth[23 - j], 1.0, 0.0) for i in range(2) for j in range(2)]
+    right = [Edge(i, 23 - j, np.linalg.inv(truth[i]) @ truth[23 - j], 1.0) for i in range(2) for j in range(2)]
     wrong_pose = np.linalg.inv(truth[2]) @ truth[23]
     wrong_pose[:3, 3] += [0.5, 0, 0]
-    optimised = optimise(registered, steps, edges, [*right, Edge(2, 23, wrong_pose, 1.0, 0.0)], 1.0, 0.03)
+    optimised = optimise(registered, steps, edges, [*right, Edge(2, 23, wrong_pose, 1.0)], 1.0, 0.03)
     assert trajectory_error(optimised, truth)["ate_rms"] < trajectory_error(registered, truth)["ate_rms"]
 
 

@@ -38,7 +38,7 @@ def survey(
 
     from mgs.cloud import fuse_frames, write_points
     from mgs.dataset import load_dataset
-    from mgs.files import check_new_folder, folder_or_nothing, write_json
+    from mgs.files import atomic_folder, check_new_folder, write_json
     from mgs.scene_file import sensor_of
     from mgs.survey import SurveySettings, fly, survey_numbers, write_survey
     from mgs.survey_figure import draw_survey
@@ -55,13 +55,13 @@ def survey(
             frames, settings, lambda name, done, total: progress.update(bar, description=name, completed=done, total=total)
         )
     numbers = survey_numbers(frames, flown, settings)
-    with folder_or_nothing(folder), console.status("writing"):
-        result = write_survey(folder, frames, flown)
+    with atomic_folder(folder) as unfinished, console.status("writing"):
+        result = write_survey(unfinished, frames, flown)
         cloud = fuse_frames(result.frames)
         numbers["points"] = len(cloud.points)
-        write_points(folder / "cloud.ply", cloud.points, cloud.views)
-        draw_survey(folder / "survey.png", frames, flown, cloud, numbers)
-        write_json(folder / "survey.json", numbers)
+        write_points(unfinished / "cloud.ply", cloud.points, cloud.views)
+        draw_survey(unfinished / "survey.png", frames, flown, cloud, numbers)
+        write_json(unfinished / "survey.json", numbers)
     console.print(_table(numbers))
     console.print(f"wrote {folder}: a dataset with estimated poses and measured depth, cloud.ply, survey.json, survey.png")
 
