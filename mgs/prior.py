@@ -277,4 +277,6 @@ def load_prior(folder: str | Path) -> Prior:
         raise InputError(f"{folder}: not a readable prior ({error}); make it again with `mgs prior`") from None
     if not np.isfinite(columns).all() or len(columns) < 2:
         raise InputError(f"{path}: has NaN values, or fewer than two points; make the prior again with `mgs prior`")
+    if not (0 < spacing < np.inf and 0 < tolerance < np.inf):
+        raise InputError(f"{folder / 'prior.json'}: spacing and depth_tolerance must be positive metres; make the prior again")
     return Prior(columns[:, :3], columns[:, 3:], spacing, tolerance, numbers)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from mgs.errors import InputError
 from mgs.figures import comparison_figure, coverage_figure, gain_figure, orbit_figure, psnr_figure
@@ -16,6 +17,40 @@ from mgs.files import atomic_path, read_json
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+
+class _Settings(BaseModel):
+    """What a report needs of config.json; the next: of the first line of steps.jsonl, the others, and metrics.json."""
+
+    policy: str
+    dataset: str
+
+
+class _Seeds(BaseModel):
+    seeds: list[int]
+    images: int
+    coverage: float
+
+
+class _Choice(BaseModel):
+    frame: int
+    information_gain: float
+    images: int
+    coverage: float
+
+
+class _View(BaseModel):
+    name: str
+    trained: bool
+    psnr: float
+    ssim: float
+
+
+class _Metrics(BaseModel):
+    images: int
+    all: dict[str, float | None]
+    held_out: dict[str, float | None]
+    views: list[_View]
 
 
 @dataclass(frozen=True)
@@ -42,7 +77,7 @@ class Run:
 def read_run(folder: str | Path) -> Run:
     """Read config.json, steps.jsonl and, where it is there, metrics.json.
 
-    Raises InputError where the folder holds no run, or a file is damaged or empty.
+    Raises InputError where the folder holds no run, or a file is damaged, empty or lacks a number that a report needs.
     """
     folder = Path(folder)
     config = read_json(folder / "config.json")
@@ -51,12 +86,18 @@ def read_run(folder: str | Path) -> Run:
         raise InputError(f"{path}: no such file; the run has no finished step, continue it with `mgs nbv --resume {folder}`")
     try:
         steps = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        policy = config["settings"]["policy"]
-        steps[0]["seeds"]
+        _Seeds.model_validate(steps[0])
+        TypeAdapter(list[_Choice]).validate_python(steps[1:])
+        settings = _Settings.model_validate(config["settings"])
     except (ValueError, KeyError, TypeError, IndexError):
         raise InputError(f"{folder}: config.json or steps.jsonl is damaged; resume the run to write them anew") from None
-    metrics = folder / "metrics.json"
-    return Run(folder, policy, steps, read_json(metrics) if metrics.is_file() else None, config["settings"])
+    path = folder / "metrics.json"
+    metrics = read_json(path) if path.exists() else None
+    try:
+        TypeAdapter(_Metrics | None).validate_python(metrics)
+    except ValidationError:
+        raise InputError(f"{path}: is damaged; measure the run again with `mgs eval {folder}`") from None
+    return Run(folder, settings.policy, steps, metrics, config["settings"])
 
 
 COLUMNS = {
@@ -148,16 +189,20 @@ def write_report(out: str | Path, folders: Sequence[str | Path]) -> list[Path]:
     from mgs.dataset import load_dataset
     from mgs.evaluate import read_comparison
     from mgs.gaussians import read_ply
+    from mgs.nbv import check_same_frames, read_settings
 
     out, runs = Path(out), evaluated_runs(folders)
     first = next(iter(runs.values()))
-    frames = load_dataset(first.settings["dataset"]).frames
-
+    dataset = load_dataset(read_settings(first.folder).dataset)
+    for run in runs.values():
+        check_same_frames(run.folder, dataset)
+    frames = dataset.frames
     frame = frames[unseen_view(list(runs.values()), len(frames))]
     pictures = {label: run.folder / "renders" / f"{frame.name}.png" for label, run in runs.items()}
     for label, picture in pictures.items():
         if not picture.is_file():
             raise InputError(f"{picture}: no such picture; draw it with `mgs eval {runs[label].folder}`")
+    captions = {label: _caption(run, frame.name) for label, run in runs.items()}
     pairs = {label: read_comparison(picture, frame.camera) for label, picture in pictures.items()}
 
     positions = np.array([frame.camera.position for frame in frames])
@@ -168,12 +213,11 @@ def write_report(out: str | Path, folders: Sequence[str | Path]) -> list[Path]:
     coverage_figure(out / "coverage.png", curves)
 
     truth = next(iter(pairs.values()))[0]
-    captions = {label: _caption(run, frame.name) for label, run in runs.items()}
     renders = {label: rendered for label, (_, rendered) in pairs.items()}
     comparison_figure(out / "comparison.png", truth, renders, title=frame.name, captions=captions)
     written = [out / f"{name}.png" for name in ("orbit", "gain", "coverage", "comparison")]
 
-    measured = {label: [s for s in run.steps if "psnr" in s] for label, run in runs.items()}
+    measured = {label: [s for s in run.steps if {"psnr", "psnr_mask"} <= s.keys()] for label, run in runs.items()}
     if all(measured.values()):
         panels = {
             what: {label: ([s["images"] for s in steps], [s[key] for s in steps]) for label, steps in measured.items()}
@@ -194,7 +238,9 @@ def unseen_view(runs: Sequence[Run], frames: int) -> int:
 
 
 def _caption(run: Run, name: str) -> str:
-    """PSNR and SSIM of one view, and how many images the model had."""
-    view = next(view for view in (run.metrics or {})["views"] if view["name"] == name)
+    """PSNR and SSIM of one view, and how many images the model had. Raises InputError where the view was not evaluated."""
+    view = next((view for view in (run.metrics or {})["views"] if view["name"] == name), None)
+    if view is None:
+        raise InputError(f"{run.folder}: was not evaluated on {name}; measure it with `mgs eval {run.folder}`")
     seen = ", trained on" if view["trained"] else ""
     return f"{len(run.seeds) + len(run.chosen)} images{seen}; {view['psnr']:.2f} dB, SSIM {view['ssim']:.4f}"

@@ -263,11 +263,21 @@ def test_scene_files(capsys, tmp_path, case):
     assert named in refused(capsys, arguments, tmp_path / "out")
 
 
+def edit_numbers(**values) -> Change:
+    def apply(root: Path) -> None:
+        path = root / "prior.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+    return apply
+
+
 PRIORS: dict[str, tuple[Change, str]] = {
     "missing": (shutil.rmtree, "mgs prior"),
     "without points": (lambda root: (root / "points.ply").unlink(), "points.ply"),
     "truncated points": (truncate("points.ply"), "prior"),
     "truncated numbers": (truncate("prior.json"), "prior.json"),
+    "negative spacing": (edit_numbers(spacing=-1), "prior.json"),
+    "NaN tolerance": (edit_numbers(depth_tolerance=float("nan")), "prior.json"),
 }
 
 

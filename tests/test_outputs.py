@@ -148,10 +148,16 @@ def test_wrong_options(capsys, case):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"), [([], "Usage"), (["nbv", "--help"], "Usage"), (["--version"], f"mgs {__version__}")]
+    ("arguments", "said"),
+    [
+        ([], "Usage"),
+        (["nbv", "--help"], "Usage"),
+        (["render", "--help"], "--background R G B"),
+        (["--version"], f"mgs {__version__}"),
+    ],
 )
 def test_help_and_version(capsys, arguments, said):
     with pytest.raises(SystemExit) as stop:
         main(arguments)
     assert stop.value.code == 0
-    assert said in capsys.readouterr().out
+    assert said in " ".join(capsys.readouterr().out.split())

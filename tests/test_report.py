@@ -139,6 +139,46 @@ def test_missing_and_damaged_files(runs, tmp_path):
         report.table_rows([tmp_path])
 
 
+@pytest.mark.parametrize("key", ["coverage", "images", "information_gain", "frame"])
+@pytest.mark.parametrize("value", [None, "a", ...])
+def test_a_damaged_line(runs, tmp_path, key, value):
+    run = shutil.copytree(runs[0], tmp_path / "run")
+    lines = [json.loads(line) for line in (run / "steps.jsonl").read_text().splitlines()]
+    lines[2] = {k: v for k, v in (lines[2] | {key: value}).items() if v is not ...}
+    (run / "steps.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    with pytest.raises(InputError, match=r"steps\.jsonl is damaged; resume"):
+        report.write_report(tmp_path / "report", [run])
+
+
+@pytest.mark.parametrize("metrics", [{}, [], 1, {"all": {}}, {"images": 8, "all": {}, "held_out": {}, "views": [{}]}])
+def test_damaged_metrics(runs, tmp_path, metrics):
+    run = shutil.copytree(runs[0], tmp_path / "run")
+    write_json(run / "metrics.json", metrics)
+    with pytest.raises(InputError, match=r"metrics\.json: is damaged; measure"):
+        report.write_report(tmp_path / "report", [run])
+
+
+def test_a_view_that_was_not_evaluated(runs, tmp_path):
+    run = shutil.copytree(runs[0], tmp_path / "run")
+    metrics = json.loads((run / "metrics.json").read_text())
+    write_json(run / "metrics.json", metrics | {"views": []})
+    with pytest.raises(InputError, match="was not evaluated on kf_"):
+        report.write_report(tmp_path / "report", [run])
+    assert not (tmp_path / "report").exists()
+
+
+def test_a_report_of_a_dataset_that_has_changed(runs, tmp_path):
+    run = shutil.copytree(runs[0], tmp_path / "run")
+    config = json.loads((run / "config.json").read_text())
+    write_json(run / "config.json", config | {"frames": config["frames"][:-1]})
+    with pytest.raises(InputError, match="its frames differ"):
+        report.write_report(tmp_path / "report", [run])
+    config["settings"]["dataset"] = str(tmp_path / "moved")
+    write_json(run / "config.json", config)
+    with pytest.raises(InputError, match="correct `dataset` in this file"):
+        report.write_report(tmp_path / "report", [run])
+
+
 def test_comparison_is_cropped_to_the_rock():
     mask = np.zeros((100, 200), bool)
     mask[40:60, 50:80] = True

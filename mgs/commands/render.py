@@ -36,7 +36,8 @@ def render(
         ),
     ] = ColourSpace.auto,
     background: Annotated[
-        tuple[float, float, float], typer.Option(help="Red, green, blue behind the Gaussians, as displayed (sRGB), 0 to 1.")
+        tuple[float, float, float],
+        typer.Option(metavar="R G B", show_default="black", help="Colour behind the Gaussians, as displayed (sRGB), 0 to 1."),
     ] = (0.0, 0.0, 0.0),
     exr: Annotated[
         bool,
