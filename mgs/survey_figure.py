@@ -63,7 +63,8 @@ def _errors(axis, survey: Survey, numbers: dict[str, Any]) -> None:
             label=f"{LABELS[name]}: rms {1e3 * rms:.0f} mm",
         )
     axis.set(title="position error against truth", xlabel="frame", ylabel="mm")
-    axis.legend(fontsize=8)
+    axis.margins(y=0.25)
+    axis.legend(fontsize=8, loc="lower right")
 
 
 def _depth_error(axis, dataset: Dataset, survey: Survey, numbers: dict[str, Any]) -> None:
