@@ -1,0 +1,58 @@
+"""How deep into the rock a fitted model is seen: `python benchmarks/depth_error.py RUN...`, runs with exact depth images.
+
+Over the rock's pixels of all views: the shares whose expected z-depth lies more than 5 and 20 cm behind the true one, and
+whose opacity is below 0.9, for the Gaussians before training and for the model of each run.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mgs import runtime
+from mgs.dataset import Frame
+from mgs.gaussians import Gaussians
+
+TOO_DEEP = (0.05, 0.20)
+"""Metres."""
+OPAQUE = 0.9
+
+
+def shares(gaussians: Gaussians, frames: Sequence[Frame]) -> list[float]:
+    """Of the rock's pixels that have depth: shares too deep by TOO_DEEP, and of less than OPAQUE."""
+    from mgs.splat import ListCache, render
+
+    cache, rows = ListCache(), []
+    for frame in frames:
+        image, rock = render(gaussians, frame.camera, cache=cache), frame.mask() & (frame.depth() > 0)
+        behind = (np.asarray(image.depth) - frame.depth())[rock]
+        rows.append(np.stack([*(behind > limit for limit in TOO_DEEP), np.asarray(image.alpha)[rock] < OPAQUE], 1))
+    return np.concatenate(rows).mean(0).tolist()
+
+
+def main(runs: list[Path]) -> None:
+    """Print a line for the start, and one a run."""
+    runtime.start()
+    from mgs import nbv
+    from mgs.evaluate import load_run
+    from mgs.initial import initial_gaussians
+    from mgs.prior import load_prior
+
+    heading = [*(f"> {100 * limit:.0f} cm deep" for limit in TOO_DEEP), f"opacity < {OPAQUE}"]
+    print(f"{'':30}" + "".join(f"{text:>16}" for text in heading))
+    for run in runs:
+        gaussians, dataset, trained, policy = load_run(run)
+        settings, state = nbv.read_settings(run), nbv.read_checkpoint(run)
+        seeds = [dataset.frames[i] for i in state.steps[0]["seeds"]]
+        models = {f"{policy}, {len(trained)} images": gaussians}
+        if run == runs[0]:
+            models = {"before training": initial_gaussians(load_prior(settings.prior), seeds)[0]} | models
+        for name, model in models.items():
+            print(f"{name:30}" + "".join(f"{share:16.1%}" for share in shares(model, dataset.frames)))
+
+
+if __name__ == "__main__":
+    main([Path(argument) for argument in sys.argv[1:]])
