@@ -26,15 +26,11 @@ VIEWS = (2, 17)
 """Of a circle of 32: the first looks along the sun, the second against it."""
 
 
-def psnr(image: np.ndarray, reference: np.ndarray) -> float:
-    """Of display values in [0,1], dB."""
-    return float(-10 * np.log10(np.mean((image - reference) ** 2)))
-
-
 def measure() -> dict:
     """Render every setting; times are medians over the views after one warm-up frame."""
     runtime.start()
     from mgs.conventions import srgb_from_linear
+    from mgs.evaluate import psnr
     from mgs.rock import make_rock
     from mgs.scene import Scene
     from mgs.scene_file import load_scene_file
@@ -82,25 +78,29 @@ def measure() -> dict:
 
 def plot(data: dict, path: Path) -> None:
     """PSNR of the rock's pixels over CPU seconds of all cores together, so that other work on the machine does not count."""
-    import matplotlib.pyplot as plt
+    import matplotlib
 
-    figure, axes = plt.subplots(figsize=(6.4, 4), constrained_layout=True)
-    for denoise, label, colour in ((True, "denoised (albedo and normal guides)", "C0"), (False, "plain", "C1")):
-        rows = [row for row in data["settings"] if row["denoise"] == denoise]
-        x, y = [row["cpu_seconds"] for row in rows], [row["psnr_rock"] for row in rows]
-        axes.plot(x, y, "o-", color=colour, label=label)
-        for row, at in zip(rows, zip(x, y, strict=True), strict=True):
-            axes.annotate(str(row["spp"]), at, textcoords="offset points", xytext=(0, 7), ha="center", fontsize=8)
-    axes.set(
-        xscale="log",
-        xlabel="CPU seconds per frame (all cores together)",
-        ylabel=f"PSNR on the rock against {data['reference_spp']} spp (dB)",
-    )
-    size, cores = "x".join(map(str, data["size"])), data["machine"]["cores"]
-    axes.set_title(f"boulder, {size}, {cores} cores; numbers are spp", fontsize=10)
-    axes.grid(alpha=0.3, which="both")
-    axes.legend()
-    figure.savefig(path, dpi=130)
+    from mgs.figures import STYLE, new_figure, save_figure
+
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(6.4, 4, dpi=130)
+        axes = figure.subplots()
+        for denoise, label, colour in ((True, "denoised (albedo and normal guides)", "#0072B2"), (False, "plain", "#D55E00")):
+            rows = [row for row in data["settings"] if row["denoise"] == denoise]
+            x, y = [row["cpu_seconds"] for row in rows], [row["psnr_rock"] for row in rows]
+            axes.plot(x, y, "o-", color=colour, label=label)
+            for row, at in zip(rows, zip(x, y, strict=True), strict=True):
+                axes.annotate(str(row["spp"]), at, textcoords="offset points", xytext=(0, 7), ha="center", fontsize=8)
+        axes.set(
+            xscale="log",
+            xlabel="CPU seconds per frame (all cores together)",
+            ylabel=f"PSNR on the rock against {data['reference_spp']} spp (dB)",
+        )
+        axes.margins(y=0.1)
+        size, cores = "x".join(map(str, data["size"])), data["machine"]["cores"]
+        axes.set_title(f"boulder, {size}, {cores} cores; numbers are spp")
+        axes.legend()
+        save_figure(figure, path)
 
 
 if __name__ == "__main__":
