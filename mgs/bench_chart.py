@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mgs.bench import exponent
-from mgs.figures import new_figure, save_figure
+from mgs.figures import STYLE, new_figure, save_figure
 
 OPERATIONS = {
     "forward_warm": ("forward, warm", "#0072b2", "o"),
@@ -17,62 +17,77 @@ OPERATIONS = {
 }
 
 
-def scaling_exponents(points: list[dict[str, Any]]) -> dict[str, float]:
-    """Fitted growth of each operation in N (from 10,000 up), pixels, and (splat, block) pairs at equal N
-    (the image sizes; with N the O(N) projection grows too); and of peak memory in N."""
-    by_n = [p for p in points if p["sweep"] == "gaussians" and p["n"] >= 10_000] or points
-    by_pixels = [p for p in points if p["sweep"] == "pixels"]
-    found = {}
-    for name, (label, _, _) in OPERATIONS.items():
-        found[f"{label} against N"] = exponent([p["n"] for p in by_n], [p[name] for p in by_n])
-        found[f"{label} against pixels"] = exponent([p["pixels"] for p in by_pixels], [p[name] for p in by_pixels])
-        found[f"{label} against pairs"] = exponent([p["pairs"] for p in by_pixels], [p[name] for p in by_pixels])
-    found["peak memory against N"] = exponent([p["n"] for p in by_n], [p["peak_bytes"] for p in by_n])
-    return found
+def _sweep(points: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
+    return [p for p in points if p["sweep"] == name]
 
 
-def scaling_figure(path: str | Path, points: list[dict[str, Any]], exponents: dict[str, float]) -> None:
+def fitted(points: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The points along N that exponents are fitted to: the last two decades. With fewer Gaussians the image takes the time."""
+    by_n = _sweep(points, "gaussians")
+    return [p for p in by_n if 100 * p["n"] >= by_n[-1]["n"]]
+
+
+def scaling_exponents(points: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Fitted growth of each operation's time, and of peak memory, in N, pixels and (splat, block) pairs.
+
+    Pairs grow with N (more slowly than N, so the work per Gaussian gains weight) or with the image (at equal N): a fit each.
+    """
+    by_n, by_size = fitted(points), _sweep(points, "pixels")
+    fits = {
+        "N": (by_n, "n"),
+        "pixels": (by_size, "pixels"),
+        "pairs, N growing": (by_n, "pairs"),
+        "pairs, image growing": (by_size, "pairs"),
+    }
+    labels = {name: label for name, (label, _, _) in OPERATIONS.items()} | {"peak_bytes": "peak memory"}
+    return {
+        label: {what: exponent([p[key] for p in of], [p[name] for p in of]) for what, (of, key) in fits.items()}
+        for name, label in labels.items()
+    }
+
+
+def scaling_figure(path: str | Path, points: list[dict[str, Any]]) -> None:
     """Four panels: time against N, pixels and pairs, and memory against N; threads as a note."""
-    figure = new_figure(10, 7)
-    panels = figure.subplots(2, 2)
-    sweeps = [
-        ("n", "gaussians", "Gaussians N", "N"),
-        ("pixels", "pixels", "pixels", "pixels"),
-        ("pairs", "", "(splat, block) pairs (exponents: at equal N)", "pairs"),
-    ]
-    for axis, (key, sweep, label, short) in zip(panels.flat, sweeps, strict=False):
-        chosen = [p for p in points if p["sweep"] == sweep or (not sweep and p["sweep"] != "threads")]
-        chosen.sort(key=lambda p: p[key])
-        for name, (operation, colour, marker) in OPERATIONS.items():
-            text = f"{operation}, exponent {exponents[f'{operation} against {short}']:.2f}"
-            line = "-" if sweep else ""
-            axis.loglog(
-                [p[key] for p in chosen], [1e3 * p[name] for p in chosen], line + marker, color=colour, ms=4, label=text
-            )
-        axis.set(xlabel=label, ylabel="time, ms")
-        axis.tick_params(which="minor", labelsize=6)
-        axis.grid(True, which="both", alpha=0.2)
-        axis.legend(fontsize=7, frameon=False)
-    memory = panels[1, 1]
-    chosen = [p for p in points if p["sweep"] == "gaussians"]
-    memory.loglog(
-        [p["n"] for p in chosen], [p["peak_bytes"] / 1e6 for p in chosen], "o-", color="#444444", label="peak of the kernels"
-    )
-    memory.loglog(
-        [p["n"] for p in chosen],
-        [p["list_bytes"] / 1e6 for p in chosen],
-        "s-",
-        color="#999999",
-        label="block lists of one camera",
-    )
-    memory.set(xlabel="Gaussians N", ylabel="memory, MB")
-    memory.grid(True, which="both", alpha=0.2)
-    memory.legend(fontsize=7, frameon=False, title=f"exponent {exponents['peak memory against N']:.2f}", title_fontsize=7)
-    threads = sorted((p for p in points if p["sweep"] == "threads"), key=lambda p: p["threads"])
-    if len(threads) > 1:
-        gain = threads[0]["gradient_warm"] / threads[-1]["gradient_warm"]
-        figure.suptitle(
-            f"{threads[-1]['threads']} threads are {gain:.2f} times as fast as {threads[0]['threads']} (forward + adjoint)",
-            fontsize=10,
-        )
-    save_figure(figure, path)
+    import matplotlib
+
+    exponents, start = scaling_exponents(points), fitted(points)[0]["n"]
+    with matplotlib.rc_context(STYLE | {"legend.fontsize": 7, "legend.title_fontsize": 7}):
+        figure = new_figure(10, 7)
+        panels = figure.subplots(2, 2)
+        _time_panel(panels[0, 0], points, "n", {"gaussians": "N"}, exponents)
+        panels[0, 0].set(xlabel="Gaussians N")
+        panels[0, 0].legend(title=f"exponent, fitted from {start:,}")
+        _time_panel(panels[0, 1], points, "pixels", {"pixels": "pixels"}, exponents)
+        panels[0, 1].set(xlabel="pixels")
+        panels[0, 1].legend(title="exponent")
+        both = {"gaussians": "pairs, N growing", "pixels": "pairs, image growing"}
+        _time_panel(panels[1, 0], points, "pairs", both, exponents)
+        panels[1, 0].set(xlabel="(splat, block) pairs")
+        panels[1, 0].legend(title=f"exponent as N grows (solid, from {start:,})\nand as the image grows (dashed)")
+        memory, by_n = panels[1, 1], _sweep(points, "gaussians")
+        peak = f"peak of the kernels: {exponents['peak memory']['N']:.2f}"
+        for key, style, colour, label in (
+            ("peak_bytes", "o-", "#444444", peak),
+            ("list_bytes", "s-", "#999999", "block lists of one camera"),
+        ):
+            memory.loglog([p["n"] for p in by_n], [p[key] / 1e6 for p in by_n], style, color=colour, label=label)
+        memory.set(xlabel="Gaussians N", ylabel="memory, MB")
+        memory.legend(title=f"exponent, fitted from {start:,}")
+        for axis in panels.flat:
+            axis.tick_params(which="minor", labelsize=6)
+        threads = sorted(_sweep(points, "threads"), key=lambda p: p["threads"])
+        if len(threads) > 1:
+            gain = threads[0]["gradient_warm"] / threads[-1]["gradient_warm"]
+            times = f"{gain:.2f} times as fast as {threads[0]['threads']} (forward + adjoint)"
+            figure.suptitle(f"{threads[-1]['threads']} threads are {times}", fontsize=10)
+        save_figure(figure, path)
+
+
+def _time_panel(axis: Any, points: Any, key: str, sweeps: dict[str, str], exponents: Any) -> None:
+    """Time against `key`, a line for each operation and sweep, the second dashed. sweeps: sweep -> exponent in the legend."""
+    for name, (operation, colour, marker) in OPERATIONS.items():
+        values = ", ".join(f"{exponents[operation][against]:.2f}" for against in sweeps.values())
+        for sweep, dash, label in zip(sweeps, ("-", "--"), (f"{operation}: {values}", None), strict=False):
+            chosen = _sweep(points, sweep)
+            axis.loglog([p[key] for p in chosen], [1e3 * p[name] for p in chosen], dash + marker, color=colour, label=label)
+    axis.set(ylabel="time, ms")

@@ -38,38 +38,49 @@ def bench(
     from mgs.errors import InputError
     from mgs.files import check_writable, write_json
 
+    if kind is Kind.scaling and gaussians is not None and gaussians < 3000:
+        raise InputError(f"--gaussians {gaussians}: scaling fits the growth with N, from 1000 up; give at least 3000")
     for target in (json, chart):
         if target is not None:  # known before the minutes of measuring
             check_writable(target)
             if target.is_dir():
                 raise InputError(f"{target}: is a folder; name a file to write")
     runtime.start()
+    from mgs.bench import bench_scaling, bench_splat, command_line
+
     console = Console()
     with console.status("rock") as status:
         report = lambda what: status.update(f"timing {what}")  # noqa: E731
         if kind is Kind.splat:
-            from mgs.bench import bench_splat
-
             result: dict[str, Any] = bench_splat(gaussians or 100_000, 640, 480, repeats, report)
         else:
-            from mgs.bench import bench_scaling
-
-            result = {"points": bench_scaling(repeats, report, gaussians or 1_000_000)}
-    result |= {"command": f"mgs bench {kind.value}", "machine": runtime.processor(), "versions": versions()}
+            result = {"repeats": repeats, "points": bench_scaling(repeats, report, gaussians or 1_000_000)}
+    result |= {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
     if kind is Kind.splat:
         _print_splat(console, result)
     else:
-        from mgs.bench_chart import scaling_exponents, scaling_figure
+        from mgs.bench_chart import fitted, scaling_exponents, scaling_figure
 
         result["exponents"] = scaling_exponents(result["points"])
-        for name, value in result["exponents"].items():
-            console.print(f"{name}: {value:.2f}")
+        result["exponents_from_n"] = fitted(result["points"])[0]["n"]
+        _print_scaling(console, result)
         if chart:
-            scaling_figure(chart, result["points"], result["exponents"])
+            scaling_figure(chart, result["points"])
             console.print(f"wrote {chart}")
     if json:
         write_json(json, result)
         console.print(f"wrote {json}")
+
+
+def _print_scaling(console: Any, result: dict[str, Any]) -> None:
+    """Exponents: a row for each quantity, a column for what it grows with."""
+    from rich.table import Table
+
+    rows = result["exponents"]
+    table = Table("exponent of", *next(iter(rows.values())), title=f"fits against N start at {result['exponents_from_n']:,}")
+    for name, row in rows.items():
+        table.add_row(name, *(f"{value:.2f}" for value in row.values()))
+    console.print(table)
 
 
 def _print_splat(console: Any, result: dict[str, Any]) -> None:

@@ -1,0 +1,88 @@
+"""What `mgs bench` records: views never seen before, memory of one point alone, exponents, the command line."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import tiny
+from refusals import refused
+
+from mgs import bench
+from mgs.bench_chart import OPERATIONS, fitted, scaling_exponents, scaling_figure
+from mgs.cli import main
+from mgs.files import read_json
+
+
+def points(most: int = 1_000_000) -> list[dict]:
+    """Records of a machine on which N brings pairs ~ N^0.5 and time ~ pairs^1.4, pixels pairs ~ pixels^0.5 and time ~ pairs."""
+    numbers = [n for n in (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000) if n <= most]
+    rows = [("gaussians", n, 307_200, 2, n**0.5, n**0.7 if n >= most // 100 else 1.0) for n in numbers]
+    rows += [("pixels", 100_000, 4**i, 2, 2.0**i, 2.0**i) for i in range(4)]
+    rows += [("threads", 100_000, 307_200, t, 1.0, 1 / t) for t in (1, 2)]
+    return [
+        dict(zip(("sweep", "n", "pixels", "threads", "pairs"), row[:5], strict=True))
+        | dict.fromkeys(OPERATIONS, row[5])
+        | {"peak_bytes": 1e3 * row[1], "list_bytes": 1e2 * row[1]}
+        for row in rows
+    ]
+
+
+def test_growth_with_pairs_is_told_for_either_way_to_get_more(tmp_path):
+    records = points()
+    assert fitted(records)[0]["n"] == 10_000
+    row = scaling_exponents(records)["forward, cold"]
+    expected = {"N": 0.7, "pixels": 0.5, "pairs, N growing": 1.4, "pairs, image growing": 1.0}
+    assert row == pytest.approx(expected)
+    assert scaling_exponents(records)["peak memory"]["N"] == pytest.approx(1.0)
+    assert fitted(points(3000))[0]["n"] == 1000
+    scaling_figure(tmp_path / "chart.png", records)
+    assert (tmp_path / "chart.png").stat().st_size > 10_000
+
+
+def test_cold_means_a_view_never_seen_before(monkeypatch):
+    gaussians = tiny.initial([])
+    camera, seen, draw = bench.surface_camera(gaussians, 32, 24), [], bench.render
+
+    def watched(gaussians, camera, cache=None):
+        if cache is None:
+            seen.append(camera)
+        return draw(gaussians, camera, cache=cache)
+
+    monkeypatch.setattr(bench, "render", watched)
+    bench.time_core(gaussians, camera, 3)
+    poses = {c.world_to_camera.tobytes() for c in [camera, *seen]}
+    assert len(seen) == 3 + bench.WARM_UP
+    assert len(poses) == len(seen) + 1
+    centre = (gaussians.means.min(axis=0) + gaussians.means.max(axis=0)) / 2
+    for other in seen:
+        assert np.array_equal(other.K, camera.K)
+        np.testing.assert_allclose(other.world_to_camera @ [*centre, 1], camera.world_to_camera @ [*centre, 1], atol=1e-6)
+        assert other.position[2] == pytest.approx(camera.position[2])
+
+
+def test_peak_memory_is_that_of_the_point_alone():
+    dr.eval(dr.arange(mi.Float, 1 << 26))
+    assert dr.detail.malloc_watermark(dr.JitBackend.LLVM) >= 1 << 28
+    assert bench.in_new_process(bench.scaling_point, 1000, 32, 24, 1, 3)["peak_bytes"] < 1 << 27
+
+
+def test_the_json_holds_the_command_as_typed(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(bench, "bench_scaling", lambda *_: points())
+    arguments = ["bench", "scaling", "--repeats", "5", "--json", str(tmp_path / "a b.json")]
+    monkeypatch.setattr("sys.argv", ["/somewhere/bin/mgs", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 0
+    written = read_json(tmp_path / "a b.json")
+    assert written["command"] == f"mgs bench scaling --repeats 5 --json '{tmp_path}/a b.json'"
+    assert written["repeats"] == 5
+    assert written["exponents_from_n"] == 10_000
+    printed = capsys.readouterr().out
+    assert "start at 10,000" in printed
+    assert "1.40" in printed
+
+
+def test_one_n_is_too_few_to_fit(capsys):
+    assert "at least 3000" in refused(capsys, ["bench", "scaling", "--gaussians", 2999])
