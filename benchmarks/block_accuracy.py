@@ -9,6 +9,7 @@ of squares; the others are sums of either sign, as small beside sqrt(H_ii H_jj) 
 
 import sys
 
+import matplotlib
 import numpy as np
 from rich.progress import track
 
@@ -16,8 +17,9 @@ from mgs import runtime
 
 runtime.start()
 
+from mgs.bench import command_line  # noqa: E402
 from mgs.config import versions  # noqa: E402
-from mgs.figures import new_figure, save_figure  # noqa: E402
+from mgs.figures import STYLE, new_figure, save_figure  # noqa: E402
 from mgs.files import write_json  # noqa: E402
 from mgs.seeds import generator  # noqa: E402
 from mgs.splat import fisher, reference  # noqa: E402
@@ -48,7 +50,7 @@ def main(prefix: str, scenes: int = 1500) -> None:
     share, error = (np.concatenate(column) for column in zip(*found, strict=True))
     of_bound = share * error
     summary = {
-        "command": f"benchmarks/block_accuracy.py {prefix} {scenes}",
+        "command": command_line(),
         "scenes": scenes,
         "entries": len(error),
         "worst_relative_error": worst.max(),
@@ -59,18 +61,18 @@ def main(prefix: str, scenes: int = 1500) -> None:
     }
     write_json(f"{prefix}.json", summary)
     print({key: value for key, value in summary.items() if key != "versions"})
-    figure = new_figure(4.6, 3.4)
-    axis = figure.subplots()
     part = np.digitize(share, BINS)
     middle = np.sqrt(BINS[1:] * BINS[:-1])
-    for label, of, colour in (("largest", np.max, "#d55e00"), ("median", np.median, "#0072b2")):
-        drawn = [of(error[part == i]) if (part == i).any() else np.nan for i in range(1, len(BINS))]
-        axis.loglog(middle, drawn, "o-", color=colour, ms=3, label=label)
-    axis.axhline(TOLERANCE, color="#999999", ls="--", label="asked for")
-    axis.set(xlabel=r"$|H_{ij}|\;/\;\sqrt{H_{ii} H_{jj}}$", ylabel=r"relative error of $H_{ij}$")
-    axis.grid(True, which="both", alpha=0.2)
-    axis.legend(frameon=False)
-    save_figure(figure, f"{prefix}.png")
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(4.6, 3.4)
+        axis = figure.subplots()
+        for label, of, colour in (("largest", np.max, "#d55e00"), ("median", np.median, "#0072b2")):
+            drawn = [of(error[part == i]) if (part == i).any() else np.nan for i in range(1, len(BINS))]
+            axis.loglog(middle, drawn, "o-", color=colour, ms=3, label=label)
+        axis.axhline(TOLERANCE, color="#999999", ls="--", label="asked for")
+        axis.set(xlabel=r"$|H_{ij}|\;/\;\sqrt{H_{ii} H_{jj}}$", ylabel=r"relative error of $H_{ij}$")
+        axis.legend()
+        save_figure(figure, f"{prefix}.png")
 
 
 if __name__ == "__main__":

@@ -8,15 +8,16 @@ of five seeds; a fit of the slope over 1 to 256 probes, expected -1/2.
 
 import sys
 
+import matplotlib
 import numpy as np
 
 from mgs import runtime
 
 runtime.start()
 
-from mgs.bench import exponent, surface_camera, surface_gaussians  # noqa: E402
+from mgs.bench import command_line, exponent, surface_camera, surface_gaussians  # noqa: E402
 from mgs.config import versions  # noqa: E402
-from mgs.figures import new_figure, save_figure  # noqa: E402
+from mgs.figures import STYLE, new_figure, save_figure  # noqa: E402
 from mgs.files import write_json  # noqa: E402
 from mgs.splat import ListCache, as_drjit, fisher  # noqa: E402
 from mgs.splat.fisher import hutchinson  # noqa: E402
@@ -45,23 +46,23 @@ def main(prefix: str) -> None:
     write_json(
         f"{prefix}.json",
         {
-            "command": "benchmarks/hutchinson.py",
+            "command": command_line(),
             "probes": PROBES,
             "relative_l2": errors,
             "slope": slope,
             "versions": versions(),
         },
     )
-    figure = new_figure(4.6, 3.4)
-    axis = figure.subplots()
-    for row in errors:
-        axis.loglog(PROBES, row, ".", color="#999999", ms=5)
-    axis.loglog(PROBES, mean, "o-", color="#0072b2", label=f"mean of {len(errors)} seeds, slope {slope:.2f}")
-    axis.loglog(PROBES, mean[0] / np.sqrt(PROBES), "--", color="#d55e00", label=r"$1/\sqrt{k}$")
-    axis.set(xlabel="probes k", ylabel=r"relative $L_2$ error of diag($J^\top J$)")
-    axis.grid(True, which="both", alpha=0.2)
-    axis.legend(frameon=False)
-    save_figure(figure, f"{prefix}.png")
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(4.6, 3.4)
+        axis = figure.subplots()
+        for row in errors:
+            axis.loglog(PROBES, row, ".", color="#999999", ms=5)
+        axis.loglog(PROBES, mean, "o-", color="#0072b2", label=f"mean of {len(errors)} seeds, slope {slope:.2f}")
+        axis.loglog(PROBES, mean[0] / np.sqrt(PROBES), "--", color="#d55e00", label=r"$1/\sqrt{k}$")
+        axis.set(xlabel="probes k", ylabel=r"relative $L_2$ error of diag($J^\top J$)")
+        axis.legend()
+        save_figure(figure, f"{prefix}.png")
     print(f"slope {slope:.3f}; error with 256 probes {mean[-1]:.3f}")
 
 
