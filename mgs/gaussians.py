@@ -126,11 +126,14 @@ def read_ply(path: str | Path) -> Gaussians:
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path}: no such file; give a 3DGS PLY")
+        raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}; give a 3DGS PLY")
     try:
-        vertices = PlyData.read(str(path))["vertex"].data
-    except (PlyParseError, KeyError, ValueError, UnicodeDecodeError) as error:
+        ply = PlyData.read(str(path))
+    except (PlyParseError, ValueError, OverflowError, MemoryError) as error:
         raise InputError(f"{path}: not a readable 3DGS PLY ({error}); export it again") from None
+    if "vertex" not in ply:
+        raise InputError(f"{path}: not a 3DGS PLY, it has no vertices; export it with a splatting tool")
+    vertices = ply["vertex"].data
     present = set(vertices.dtype.names)
     rest = sum(name.startswith("f_rest_") for name in present)
     coefficients = 1 + rest // 3
@@ -139,9 +142,13 @@ def read_ply(path: str | Path) -> Gaussians:
     missing = [name for name in _ply_names(coefficients) if name not in present and name not in ("nx", "ny", "nz")]
     if missing:
         raise InputError(f"{path}: not a 3DGS PLY, property {missing[0]!r} is missing; export it with a splatting tool")
+    lists = [name for name in _ply_names(coefficients) if name in present and vertices.dtype[name].kind == "O"]
+    if lists:
+        raise InputError(f"{path}: not a 3DGS PLY, property {lists[0]!r} is a list; export it with a splatting tool")
 
     def stack(*names: str) -> np.ndarray:
-        return np.stack([np.asarray(vertices[name], np.float32) for name in names], 1)
+        with np.errstate(over="ignore"):  # becomes infinite, which is refused below
+            return np.stack([np.asarray(vertices[name], np.float32) for name in names], 1)
 
     n = len(vertices)
     sh = stack("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :]
@@ -152,7 +159,7 @@ def read_ply(path: str | Path) -> Gaussians:
         means=stack("x", "y", "z"),
         log_scales=stack("scale_0", "scale_1", "scale_2"),
         quats=stack("rot_0", "rot_1", "rot_2", "rot_3"),
-        logit_opacities=np.asarray(vertices["opacity"], np.float32).copy(),
+        logit_opacities=stack("opacity").ravel(),
         sh=np.ascontiguousarray(sh),
     )
     try:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from functools import partial
 from typing import Any, Literal
 
 import drjit as dr
@@ -20,6 +19,7 @@ from mgs.gaussians import LEARNED, Gaussians
 from mgs.seeds import generator
 from mgs.splat import ListCache, as_drjit
 from mgs.splat.blocks import BlockLists
+from mgs.splat.frozen import frozen
 from mgs.splat.project import camera_array, project
 from mgs.splat.render import composite
 
@@ -58,15 +58,13 @@ EPSILON = 1e-3
 """Adam's epsilon, (pixel value)^2 per unit of the parameter: a gradient of the summed squared error below it is noise, and a
 parameter that no image sees stays where the prior put it instead of walking full steps."""
 
-frozen = partial(dr.freeze, limit=64, warn_after=1 << 30)
 
-
-@frozen(state_fn=lambda gaussians, camera: (len(gaussians),))
+@frozen(lambda gaussians, camera: (len(gaussians),))
 def _project(gaussians: Gaussians, camera: Any) -> Any:
     return project(gaussians, camera)
 
 
-@frozen(state_fn=_sizes)
+@frozen(_sizes)
 def _step(
     gaussians: Gaussians,
     moments: list[list[Any]],

@@ -24,6 +24,7 @@ import mitsuba as mi
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians, ply_colour_space, read_ply
 from mgs.splat import ListCache, as_drjit, render
+from mgs.splat.render import as_colour
 from mgs.splat.sensor import camera_from_sensor
 
 
@@ -32,15 +33,18 @@ class MgsSplat(mi.CppADIntegrator):
 
     def __init__(self, props: Any) -> None:
         super().__init__(props)
-        if "filename" not in props:
-            raise InputError("mgs_splat: `filename` is missing; name a 3DGS PLY")
+        if not isinstance(props.get("filename"), str):
+            raise InputError("mgs_splat: `filename` is missing or no string; name a 3DGS PLY")
         path = str(mi.file_resolver().resolve(props["filename"]))
         self.gaussians = as_drjit(read_ply(path))
         self.colour_space = props.get("colour_space", ply_colour_space(path))
         if self.colour_space not in ("linear", "srgb"):
             raise InputError(f"mgs_splat: colour_space {self.colour_space!r} is unknown; choose linear or srgb")
-        self.background = mi.ScalarColor3f(props.get("background", mi.ScalarColor3f(0)))
-        self.depth = bool(props.get("depth", False))
+        self.background = props.get("background", 0.0)
+        as_colour(self.background)
+        self.depth = props.get("depth", False)
+        if not isinstance(self.depth, bool):
+            raise InputError(f"mgs_splat: depth {self.depth!r} must be a boolean")
         self.cache = ListCache()
 
     def traverse(self, cb: Any) -> None:

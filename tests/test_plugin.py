@@ -170,7 +170,7 @@ def test_a_changed_parameter_changes_the_image(ply):
     np.testing.assert_allclose(second, np.asarray(render(other, camera()).rgb), atol=1e-6)
 
 
-@pytest.mark.parametrize(("pixel_format", "depth", "film"), [("rgb", False, {}), ("rgba", True, CROPPED)])
+@pytest.mark.parametrize(("pixel_format", "depth", "film"), [("rgb", False, {}), ("rgba", False, {}), ("rgba", True, CROPPED)])
 def test_gradients_are_those_of_the_api(ply, pixel_format, depth, film):
     """Of every parameter, means included, through colour, and through alpha and depth where the film has them."""
     scene = load(ply, sensor_dict({"pixel_format": pixel_format} | film), depth=depth)
@@ -186,8 +186,10 @@ def test_gradients_are_those_of_the_api(ply, pixel_format, depth, film):
         dr.enable_grad(getattr(model, name))
     drawn = render(model, camera(crop=CROP) if film else camera())
     loss = dr.sum(drawn.rgb * weights[..., :3], axis=None)
+    if pixel_format == "rgba":
+        loss += dr.sum(drawn.alpha * weights[..., 3], axis=None)
     if depth:
-        loss += dr.sum(drawn.alpha * weights[..., 3] + drawn.depth * weights[..., 4], axis=None)
+        loss += dr.sum(drawn.depth * weights[..., 4], axis=None)
     dr.backward(loss)
     for name in NAMES:
         truth = np.asarray(dr.grad(getattr(model, name)))
@@ -245,7 +247,11 @@ def test_files_lie_beside_the_scene(ply, tmp_path):
 
 
 BAD_FILES = [
-    ({}, "mgs_splat: `filename` is missing; name a 3DGS PLY"),
+    ({}, "mgs_splat: `filename` is missing or no string; name a 3DGS PLY"),
+    ({"filename": 5}, "mgs_splat: `filename` is missing or no string; name a 3DGS PLY"),
+    ({"filename": "PLY", "depth": "false"}, "mgs_splat: depth 'false' must be a boolean"),
+    ({"filename": "PLY", "background": "white"}, "background white: must be one or three finite numbers, linear RGB"),
+    ({"filename": "PLY", "background": [0.0, float("nan"), 0.0]}, "must be one or three finite numbers, linear RGB"),
     ({"filename": "nowhere.ply"}, "nowhere.ply: no such file; give a 3DGS PLY"),
     ({"filename": __file__}, "export it again"),
     ({"filename": "PLY", "colour_space": "Lab"}, "mgs_splat: colour_space 'Lab' is unknown; choose linear or srgb"),
@@ -273,6 +279,13 @@ def test_bad_sensors(ply, sensor, name):
         mi.render(load(ply), sensor=mi.load_dict(sensor))
     assert isinstance(error.value.__cause__, InputError)
     assert str(error.value.__cause__) == f"sensor: {name} has no pinhole; splatting needs a `perspective` sensor"
+
+
+def test_a_mirrored_sensor(ply):
+    to_world = sensor_dict()["to_world"] @ mi.ScalarTransform4f().scale([-1, 1, 1])
+    with pytest.raises(RuntimeError) as error:
+        mi.render(load(ply, sensor_dict(to_world=to_world)))
+    assert "to_world mirrors the image" in str(error.value.__cause__)
 
 
 def test_not_finite(ply):

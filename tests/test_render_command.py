@@ -221,6 +221,28 @@ BAD = {
     "truncated": (broken(lambda text: text[:-60]), [], "not a readable 3DGS PLY"),
     "a point cloud": (broken(lambda text: text.replace("opacity", "quality")), [], "property 'opacity' is missing"),
     "odd f_rest": (broken(lambda text: text.replace("opacity", "f_rest_0")), [], "1 f_rest properties fit no SH degree"),
+    "a list for a number": (
+        broken(lambda text: text.replace("property float opacity", "property list uchar float opacity")),
+        [],
+        "x.ply: not a",
+    ),
+    "more vertices than memory": (
+        broken(lambda text: text.replace("element vertex 3", "element vertex 2147483648")),
+        [],
+        "not a readable 3DGS PLY",
+    ),
+    "more vertices than an integer": (
+        lambda tmp: (tmp / "x.ply").write_text(
+            "ply\nformat binary_little_endian 1.0\nelement vertex 9223372036854775808\nproperty float x\nend_header\n"
+        ),
+        [],
+        "not a readable 3DGS PLY",
+    ),
+    "no vertices": (
+        lambda tmp: (tmp / "x.ply").write_text("ply\nformat ascii 1.0\nelement point 0\nproperty float x\nend_header\n"),
+        [],
+        "it has no vertices",
+    ),
     "infinite opacity": (infinite_opacity, [], "logit_opacities is NaN or infinite, first at Gaussian 5"),
     "no cameras": (lambda tmp: (tmp / "transforms.json").unlink(), [], "transforms.json: no such file"),
     "frames of another shape": (

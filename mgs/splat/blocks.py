@@ -148,41 +148,60 @@ def build(splats: Splats, order: Any, width: int, height: int, margin: float) ->
 
 def _pairs(splats: Splats, foot: Footprints, order: Any, blocks_x: int, blocks_y: int) -> tuple[Any, Any, Any, Any]:
     """(splat, block) of every pair, splats in depth order and the pairs of one splat contiguous; first and end of each
-    splat's pairs [N]. Empty arrays where no splat touches a block."""
-    root = dr.sqrt(dr.maximum(foot.q, 0))
-    hx, hy = root * dr.sqrt(dr.square(dr.rcp(foot.p)) + dr.square(foot.k * dr.rcp(foot.e))), root * dr.rcp(foot.e)
+    splat's pairs [N]. Empty arrays where no splat touches a block.
 
-    def first_last(centre: Any, half: Any, size: int, count: int) -> tuple[Any, Any]:
-        lo = dr.clip(dr.floor((centre - half - 0.5) / size), 0, count)
-        hi = dr.clip(dr.floor((centre + half - 0.5) / size) + 1, 0, count)
-        return mi.UInt32(lo), mi.UInt32(dr.maximum(hi, lo))
-
-    x0, x1 = first_last(splats.u, hx, BLOCK_X, blocks_x)
-    y0, y1 = first_last(splats.v, hy, BLOCK_Y, blocks_y)
-    count = dr.select(foot.q > 0, (x1 - x0) * (y1 - y0), 0)
-    dr.eval(foot, x0, x1, y0, count)
+    First the rows of blocks that a footprint reaches, then the blocks of each row: work grows with the pairs that are kept,
+    where a bounding box would list the whole square around a slanted needle.
+    """
+    half = dr.sqrt(dr.maximum(foot.q, 0)) * dr.rcp(foot.e)
+    low = dr.clip(dr.ceil((splats.v - half + 0.5) / BLOCK_Y) - 1, 0, blocks_y)
+    high = dr.clip(dr.floor((splats.v + half - 0.5) / BLOCK_Y) + 1, 0, blocks_y)
+    rows = dr.select(foot.q > 0, mi.UInt32(dr.maximum(high - low, 0)), 0)
+    dr.eval(foot, half, low, rows)
 
     n, none = len(splats.u), mi.UInt32()
-    ranked = dr.gather(mi.UInt32, count, order)
-    first = dr.prefix_sum(ranked)
+    ranked = dr.gather(mi.UInt32, rows, order)
+    first_row = dr.prefix_sum(ranked)
     rank = dr.repeat(dr.arange(mi.UInt32, n), ranked)
     if len(rank) == 0:
         return none, none, none, none
-    splat = dr.gather(mi.UInt32, order, rank)
-    offset = dr.arange(mi.UInt32, len(rank)) - dr.gather(mi.UInt32, first, rank)
-    columns = dr.maximum(dr.gather(mi.UInt32, x1, splat) - dr.gather(mi.UInt32, x0, splat), 1)
-    bx = dr.gather(mi.UInt32, x0, splat) + offset % columns
-    by = dr.gather(mi.UInt32, y0, splat) + offset // columns
-    touched = _touches(splats, foot, splat, bx, by)
-    kept = dr.compress(touched)
-    if len(kept) == 0:
+    row_splat = dr.gather(mi.UInt32, order, rank)
+    offset = dr.arange(mi.UInt32, len(rank)) - dr.gather(mi.UInt32, first_row, rank)
+    by = mi.UInt32(dr.gather(mi.Float, low, row_splat)) + offset
+    left, columns = _columns(splats, foot, half, row_splat, by, blocks_x)
+    columns = _padded(columns, _rounded(len(rank) + 1))  # dr.repeat compiles anew for every length
+    before = dr.prefix_sum(columns)
+    row = dr.repeat(dr.arange(mi.UInt32, len(columns)), columns)
+    if len(row) == 0:
         return none, none, none, none
-    before = dr.concat([dr.prefix_sum(mi.UInt32(touched)), mi.UInt32(len(kept))])
     slot_start, slot_end = dr.empty(mi.UInt32, n), dr.empty(mi.UInt32, n)
-    dr.scatter(slot_start, dr.gather(mi.UInt32, before, first), order, mode=dr.ReduceMode.NoConflicts)
-    dr.scatter(slot_end, dr.gather(mi.UInt32, before, first + ranked), order, mode=dr.ReduceMode.NoConflicts)
-    block = by * blocks_x + bx
-    return dr.gather(mi.UInt32, splat, kept), dr.gather(mi.UInt32, block, kept), slot_start, slot_end
+    dr.scatter(slot_start, dr.gather(mi.UInt32, before, first_row), order, mode=dr.ReduceMode.NoConflicts)
+    dr.scatter(slot_end, dr.gather(mi.UInt32, before, first_row + ranked), order, mode=dr.ReduceMode.NoConflicts)
+    offset = dr.arange(mi.UInt32, len(row)) - dr.gather(mi.UInt32, before, row)
+    block = dr.gather(mi.UInt32, by * blocks_x + left, row) + offset
+    return dr.gather(mi.UInt32, row_splat, row), block, slot_start, slot_end
+
+
+def _columns(splats: Splats, foot: Footprints, half: Any, splat: Any, by: Any, blocks_x: int) -> tuple[Any, Any]:
+    """The blocks of row `by` that a footprint's ellipse reaches within the row's pixel centres: the first, and how many.
+
+    The right rim x = k y + sqrt(q - e^2 y^2) / p is concave in y, so over the row's band it is largest at its own maximum,
+    clipped to the band; likewise the left rim. half: the ellipse's half height [N].
+    """
+    gathered = (splats.u, splats.v, foot.k, foot.p, foot.e, foot.q, half)
+    u, v, k, p, e, q, half = (dr.gather(mi.Float, a, splat) for a in gathered)
+    top = mi.Float(by * BLOCK_Y) + 0.5 - v
+    low, high = dr.maximum(top, -half), dr.minimum(top + (BLOCK_Y - 1), half)
+    slant = k * p
+    summit = slant * half * dr.rsqrt(e * e + slant * slant)
+
+    def rim(side: float) -> Any:
+        y = dr.clip(side * summit, low, high)
+        return u + k * y + side * dr.sqrt(dr.maximum(dr.fma(-e * y, e * y, q), 0)) / p
+
+    first = dr.clip(dr.ceil((rim(-1) + 0.5) / BLOCK_X) - 1, 0, blocks_x)
+    last = dr.clip(dr.floor((rim(1) - 0.5) / BLOCK_X) + 1, 0, blocks_x)
+    return mi.UInt32(first), mi.UInt32(dr.select(low <= high, dr.maximum(last - first, 0), 0))
 
 
 def _padded(values: Any, size: int) -> Any:
@@ -198,36 +217,16 @@ def _rounded(pairs: int) -> int:
     return -(-max(pairs, 1) // step) * step
 
 
-def _touches(splats: Splats, foot: Footprints, splat: Any, bx: Any, by: Any) -> Any:
-    """Does the inflated ellipse reach a pixel centre's hull of the block? Minimum of xi^2 + eta^2 over the rectangle."""
-    u, v = dr.gather(mi.Float, splats.u, splat), dr.gather(mi.Float, splats.v, splat)
-    k, p, e, q = (dr.gather(mi.Float, a, splat) for a in (foot.k, foot.p, foot.e, foot.q))
-    x0, y0 = mi.Float(bx * BLOCK_X) + 0.5 - u, mi.Float(by * BLOCK_Y) + 0.5 - v
-    x1, y1 = x0 + (BLOCK_X - 1), y0 + (BLOCK_Y - 1)
-
-    def value(x: Any, y: Any) -> Any:
-        return dr.square(p * (x - k * y)) + dr.square(e * y)
-
-    inside = (x0 <= 0) & (x1 >= 0) & (y0 <= 0) & (y1 >= 0)
-    x_edge, y_edge = dr.clip(0, x0, x1), dr.clip(0, y0, y1)
-    slope = k * p * p / (k * k * p * p + e * e)
-    on_vertical = value(x_edge, dr.clip(x_edge * slope, y0, y1))
-    on_horizontal = value(dr.clip(y_edge * k, x0, x1), y_edge)
-    return inside | (dr.minimum(on_vertical, on_horizontal) <= q)
-
-
 def _group(key: Any, buckets: int) -> tuple[Any, Any, Any]:
     """(start, end) [buckets] of each bucket in the stably sorted keys, and the sorting permutation."""
     start, end = dr.zeros(mi.UInt32, buckets), dr.zeros(mi.UInt32, buckets)
     m = len(key)
-    if m == 0:
-        return start, end, mi.UInt32()
     slot = dr.detail.block_mkperm(key, m, buckets)
-    place = dr.arange(mi.UInt32, m)
+    place, last = dr.arange(mi.UInt32, m), dr.opaque(mi.UInt32, m - 1)
     sorted_key = dr.gather(mi.UInt32, key, slot)
     dr.eval(sorted_key)
     previous = dr.gather(mi.UInt32, sorted_key, dr.maximum(place, 1) - 1)
-    following = dr.gather(mi.UInt32, sorted_key, dr.minimum(place + 1, m - 1))
+    following = dr.gather(mi.UInt32, sorted_key, dr.minimum(place + 1, last))
     dr.scatter(start, place, sorted_key, (place == 0) | (previous != sorted_key), mode=dr.ReduceMode.NoConflicts)
-    dr.scatter(end, place + 1, sorted_key, (place == m - 1) | (following != sorted_key), mode=dr.ReduceMode.NoConflicts)
+    dr.scatter(end, place + 1, sorted_key, (place == last) | (following != sorted_key), mode=dr.ReduceMode.NoConflicts)
     return start, end, slot

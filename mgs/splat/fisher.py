@@ -8,7 +8,7 @@ Columns of a Gaussian's P = 3K + 8 parameters: spherical harmonics (coefficient-
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -23,7 +23,7 @@ from mgs.splat import kernels
 from mgs.splat.constants import LOG_SCALE_RANGE
 from mgs.splat.kernels import LN2
 from mgs.splat.project import axes2d, camera_array, columns, sh_basis, turns, whitening
-from mgs.splat.render import ListCache, as_drjit, render, splats_and_lists
+from mgs.splat.render import ListCache, as_colour, as_drjit, render, splats_and_lists
 
 
 def groups(sh_degree: int) -> dict[str, slice]:
@@ -38,10 +38,12 @@ def fisher(
     estimator: str = "exact",
     background: Any = (0.0, 0.0, 0.0),
     cache: ListCache | None = None,
+    **options: Any,
 ) -> np.ndarray:
     """Fisher information that one view carries about each Gaussian: float32 [N,P], or [N,P,P] for `block`.
 
-    The camera's image is not needed: information depends on the pose and the model alone. Estimators: see `ESTIMATORS`.
+    The camera's image is not needed: information depends on the pose and the model alone. Estimators: see `ESTIMATORS`;
+    options: `probes` and `seed` of `hutchinson`; the others have none.
     Raises InputError for an unknown estimator, or a parameter that is NaN or infinite.
     """
     if estimator not in ESTIMATORS:
@@ -49,7 +51,7 @@ def fisher(
     if len(gaussians) == 0:
         size = groups(gaussians.sh_degree)["opacity"].stop
         return np.zeros((0, size, size) if estimator == "block" else (0, size), np.float32)
-    return ESTIMATORS[estimator](as_drjit(gaussians), camera, background, cache)
+    return ESTIMATORS[estimator](as_drjit(gaussians), camera, background, cache, **options)
 
 
 @dataclass
@@ -100,9 +102,8 @@ def _sums(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCach
     device = camera_array(camera)
     splats, lists = splats_and_lists(gaussians, camera, cache)
     packed = kernels.pack(splats)
-    rgba, _ = kernels.forward(lists, packed, stepped=not block)
-    colour = mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in background))
-    sums = kernels.fisher(lists, packed, rgba, colour, block)
+    rgba, _, transmittance = kernels.forward(lists, packed, stepped=not block)
+    sums = kernels.fisher(lists, packed, rgba, transmittance, dr.detach(as_colour(background)), block)
     return sums, geometry(gaussians, device, splats)
 
 
@@ -157,14 +158,13 @@ def _gradient(
     gaussians: Gaussians, image_gradient: Any, camera: Camera, background: Any, cache: ListCache | None
 ) -> np.ndarray:
     """J^T z by Dr.Jit's own AD: [N,P]. image_gradient(rgb) -> TensorXf [H,W,3]."""
-    watched = Gaussians(**{f.name: dr.detach(getattr(gaussians, f.name)) for f in fields(gaussians)})
-    watched = Gaussians(
-        watched.means, *(dr.copy(getattr(watched, n)) for n in ("log_scales", "quats", "logit_opacities", "sh"))
-    )
-    dr.enable_grad([getattr(watched, name) for name in LEARNED])
-    rgb = render(watched, camera, background, cache).rgb
-    dr.backward_from(dr.sum(rgb * image_gradient(dr.detach(rgb)), axis=None))
-    return np.concatenate([np.asarray(dr.grad(getattr(watched, name))).reshape(len(gaussians), -1) for name in LEARNED], axis=1)
+    with dr.resume_grad():
+        learned = {name: dr.copy(dr.detach(getattr(gaussians, name))) for name in LEARNED}
+        dr.enable_grad(list(learned.values()))
+        rgb = render(Gaussians(dr.detach(gaussians.means), **learned), camera, background, cache).rgb
+        dr.backward_from(dr.sum(rgb * image_gradient(dr.detach(rgb)), axis=None))
+        columns_ = [np.asarray(dr.grad(value)).reshape(len(gaussians), -1) for value in learned.values()]
+    return np.concatenate(columns_, axis=1)
 
 
 def hutchinson(
@@ -190,12 +190,17 @@ def loss_gradient(gaussians: Gaussians, camera: Camera, background: Any, cache: 
     return _gradient(gaussians, lambda rgb: (rgb - 0.5) * (2 / len(rgb.array)), camera, background, cache) ** 2
 
 
+SMALLEST = 1.2e-38
+"""Smallest normal float32: threads differ in how they flush what is smaller, and nothing else differs between reruns."""
+
+
 def _interleaved(columns_: dict[int, Any], size: int, n: int) -> np.ndarray:
     """Dr.Jit arrays [N] by column -> NumPy float32 [N, size], 0 in columns not given."""
     index = dr.arange(mi.UInt32, n) * size
     flat = dr.zeros(mi.Float, n * size)
     for column, values in columns_.items():
-        dr.scatter(flat, mi.Float(values), index + column, mode=dr.ReduceMode.NoConflicts)
+        normal = dr.select(dr.abs(values) < SMALLEST, 0, values)
+        dr.scatter(flat, mi.Float(normal), index + column, mode=dr.ReduceMode.NoConflicts)
     return np.array(flat, copy=False).reshape(n, size)
 
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -22,6 +21,7 @@ import mitsuba as mi
 
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, BlockLists
 from mgs.splat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from mgs.splat.frozen import frozen
 from mgs.splat.project import Splats
 
 PIXELS = BLOCK_X * BLOCK_Y
@@ -36,10 +36,6 @@ So far above the smallest float (1e-38), no product of a sum that is kept, and n
 def _sizes(lists: BlockLists, *_: Any, **__: Any) -> tuple[int, ...]:
     """What a recording of a kernel bakes in: the lengths of its buffers."""
     return len(lists.splat), len(lists.slot_start), len(lists.block)
-
-
-frozen = partial(dr.freeze, state_fn=_sizes, limit=64, warn_after=1 << 30)
-"""Record a kernel once per set of sizes and replay it: tracing costs more than a small image does."""
 
 
 def pack(s: Splats) -> Any:
@@ -160,29 +156,34 @@ def _walk(
     return pixels
 
 
-@frozen
-def forward(lists: BlockLists, packed: Any, stepped: bool = True) -> tuple[Any, Any]:
-    """Composite; stepped: see `_rows`. Returns block-major pixels: rgba Float [L*32*4] (premultiplied, no background) and
-    weighted depth [L*32]."""
+@frozen(_sizes)
+def forward(lists: BlockLists, packed: Any, stepped: bool = True) -> tuple[Any, Any, Any]:
+    """Composite; stepped: see `_rows`. Returns block-major pixels: rgba Float [L*32*4] (premultiplied, no background),
+    weighted depth [L*32] and transmittance [L*32].
+
+    alpha is summed, not 1 - T, nor T the rest of alpha: expected depth is a quotient by alpha in faint pixels, and the colour
+    behind a splat is a multiple of T in opaque ones, where the other has kept its last bits only.
+    """
     lane, T = _lane(lists)
-    pixels = [[t, *(dr.zeros(mi.Float, len(lists.block)) for _ in range(4))] for t in T]
+    pixels = [[t, *(dr.zeros(mi.Float, len(lists.block)) for _ in range(5))] for t in T]
 
     def visit(i: Any, rows: list[Row], rest: Any, colour: Any, pixels: Any) -> Any:
         new, alive = [], mi.Bool(False)
-        for pixel, (T, r, g, b, z) in enumerate(pixels):
+        for pixel, (T, r, g, b, alpha, z) in enumerate(pixels):
             _, w, after, room = _blend(rows[pixel // BLOCK_X].raw[pixel % BLOCK_X], T)
             drawn = [dr.fma(c, w, s) for c, s in zip((colour.x, colour.y, colour.z, rest.z), (r, g, b, z), strict=True)]
-            new.append([after, *drawn])
+            new.append([after, *drawn[:3], alpha + w, drawn[3]])
             alive |= room
         return new, alive
 
     pixels = _walk(lists, packed, lane, pixels, visit, stepped)
-    rgba, depth = dr.empty(mi.Float, len(lists.block) * PIXELS * 4), dr.empty(mi.Float, len(lists.block) * PIXELS)
-    for pixel, (transmittance, r, g, b, z) in enumerate(pixels):
+    rgba, depth, through = (dr.empty(mi.Float, len(lists.block) * PIXELS * size) for size in (4, 1, 1))
+    for pixel, (transmittance, r, g, b, alpha, z) in enumerate(pixels):
         place = lists.block * PIXELS + pixel
-        dr.scatter(rgba, mi.Vector4f(r, g, b, 1 - dr.abs(transmittance)), place, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter(rgba, mi.Vector4f(r, g, b, alpha), place, mode=dr.ReduceMode.NoConflicts)
         dr.scatter(depth, z, place, mode=dr.ReduceMode.NoConflicts)
-    return rgba, depth
+        dr.scatter(through, dr.abs(transmittance), place, mode=dr.ReduceMode.NoConflicts)
+    return rgba, depth, through
 
 
 def _held_and_lost(alpha: Any, w: Any, raw: Any) -> tuple[Any, Any]:
@@ -215,7 +216,7 @@ def _per_splat(lists: BlockLists, buffers: list[Any], count: int) -> list[Any]:
     return [dr.select(dr.abs(x) > DENORMAL, x, 0) for x in flat]
 
 
-@frozen
+@frozen(_sizes)
 def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, Any], d_out: tuple[Any, Any], means: bool) -> Splats:
     """Gradient with respect to each splat's numbers, given `forward`'s output (rgba, depth) and the gradient of it.
 
@@ -267,21 +268,22 @@ def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, Any], d_out: tuple[A
     return Splats(du, dv, 2 * LN2 * p / e * xy, -2 * LN2 / p * xx, -2 * LN2 / e * yy, LN2 * d, z, r, g, b)
 
 
-@frozen
-def fisher(lists: BlockLists, packed: Any, rgba: Any, background: Any, block: bool) -> list[Any]:
+@frozen(_sizes)
+def fisher(lists: BlockLists, packed: Any, rgba: Any, transmittance: Any, background: Any, block: bool) -> list[Any]:
     """Sums over pixels and channels, Float64 [N] each, from which O(N) work makes the Fisher information.
 
     With f = (xi^2, xi eta, eta^2), s_c = D_c alpha and |s|^2 summed over channels:
     sum w^2, sum |s|^2, the five moments sum |s|^2 (xi^4, xi^3 eta, xi^2 eta^2, xi eta^3, eta^4): seven, the exact diagonal.
     block=True appends sum |s|^2 f (3) and, for c = r, g, b, sum w s_c (1) and sum w s_c f (3): 22, the exact blocks.
-    rgba: of `forward`, stepped where block is False: entries off the diagonal cancel, so blocks need alphas as exact as can be;
-    background: Color3f.
+    rgba, transmittance: of `forward`, stepped where block is False: entries off the diagonal cancel, so blocks need alphas as
+    exact as can be. background: Color3f.
     """
     lane, T = _lane(lists)
     pixels = []
     for pixel in range(PIXELS):
         out = dr.gather(mi.Vector4f, rgba, lists.block * PIXELS + pixel)
-        pixels.append([T[pixel], *(c + (1 - out.w) * b for c, b in zip((out.x, out.y, out.z), background, strict=True))])
+        through = dr.gather(mi.Float, transmittance, lists.block * PIXELS + pixel)
+        pixels.append([T[pixel], *(dr.fma(through, b, c) for c, b in zip((out.x, out.y, out.z), background, strict=True))])
     count = 22 if block else 7
     buffers = _buffers(lists, count)
 

@@ -78,6 +78,22 @@ class ListCache:
         return lists
 
 
+def as_colour(background: Any) -> Any:
+    """Linear RGB as Color3f: one number or three, or a Dr.Jit colour, which is kept with its gradient.
+
+    The numbers are opaque: literals would compile the kernel anew for every colour. Raises InputError for anything else.
+    """
+    if dr.is_jit_v(background):
+        return mi.Color3f(background)
+    try:
+        values = np.broadcast_to(np.asarray(background, np.float64), 3)
+    except (TypeError, ValueError):
+        values = np.full(3, np.nan)
+    if not np.isfinite(values).all():
+        raise InputError(f"background {background}: must be one or three finite numbers, linear RGB")
+    return mi.Color3f(*(dr.opaque(mi.Float, float(value)) for value in values))
+
+
 def _raise_unless_finite(finite: Any) -> None:
     if not finite:
         raise InputError("gaussians: a parameter is NaN or infinite")
@@ -98,7 +114,7 @@ class _Rasterise(dr.CustomOp):
 
     def eval(self, splats: Splats, lists: BlockLists, means: bool) -> Any:
         self.lists, self.means, self.packed = lists, means, kernels.pack(splats)
-        self.out = kernels.forward(lists, self.packed)
+        self.out = kernels.forward(lists, self.packed)[:2]
         return self.out
 
     def backward(self) -> None:
@@ -131,29 +147,31 @@ def render(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.
     gaussians: NumPy fields, or Dr.Jit TensorXf fields, any of which may have gradients enabled: `dr.backward` then reaches
     log_scales, quats, logit_opacities, sh and, where enabled, means. Not differentiated: the camera, the thresholds
     (alpha < 1/255, transmittance), the depth order; forward-mode derivatives are not available.
-    background: linear RGB. cache: keep one between calls so that a camera seen again reuses its block lists.
-    Raises InputError where a parameter is NaN or infinite (names the parameter and the first Gaussian).
+    background: linear RGB. cache: keep one between calls so that a camera seen again reuses its block lists. Records its own
+    kernels, so it cannot be called inside another `dr.freeze`.
+    Raises InputError where a parameter is NaN or infinite (names the parameter and the first Gaussian), or the background is.
     """
+    colour = as_colour(background)
     if len(gaussians) == 0:
-        return _empty(camera, background)
+        return _empty(camera, colour)
     splats, lists = splats_and_lists(as_drjit(gaussians), camera, cache)
-    return composite(splats, lists, camera.width, camera.height, background)
+    return composite(splats, lists, camera.width, camera.height, colour)
 
 
 def _empty(camera: Camera, background: Any) -> Image:
     """What a camera sees of no Gaussians."""
     shape = (camera.height, camera.width)
-    rgb = np.broadcast_to(np.asarray(background, np.float32), (*shape, 3))
+    rgb = np.broadcast_to(np.asarray(dr.detach(background), np.float32).ravel(), (*shape, 3))
     return Image(mi.TensorXf(np.ascontiguousarray(rgb)), dr.zeros(mi.TensorXf, shape), dr.zeros(mi.TensorXf, shape))
 
 
-def composite(splats: Splats, lists: BlockLists, width: int, height: int, background: Any = (0.0, 0.0, 0.0)) -> Image:
-    """Composite projected splats whose block lists are known; differentiable in the splats' numbers."""
+def composite(splats: Splats, lists: BlockLists, width: int, height: int, background: Any = 0.0) -> Image:
+    """Composite projected splats whose block lists are known, over a Color3f; differentiable in the splats' numbers."""
     rgba, depth = dr.custom(_Rasterise, splats, lists, dr.grad_enabled(splats.u))
     places = _places(width, height)
-    pixel = dr.gather(mi.Vector4f, rgba, places, mode=dr.ReduceMode.NoConflicts)
-    alpha = pixel.w
-    rgb = mi.Color3f(pixel.x, pixel.y, pixel.z) + (1 - alpha) * mi.Color3f(background)
+    # one by one: the adjoint of a packet gather can abort the process (Dr.Jit 1.5, "dirty variable")
+    r, g, b, alpha = (dr.gather(mi.Float, rgba, 4 * places + i, mode=dr.ReduceMode.NoConflicts) for i in range(4))
+    rgb = mi.Color3f(r, g, b) + (1 - alpha) * background
     weighted = dr.gather(mi.Float, depth, places, mode=dr.ReduceMode.NoConflicts)
     expected = dr.select(alpha > 0, weighted / dr.select(alpha > 0, alpha, 1), 0)
     shape = (height, width)

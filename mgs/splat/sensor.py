@@ -31,6 +31,8 @@ def camera_from_sensor(sensor: Any) -> Camera:
     cx = (0.5 - _number(params["principal_point_offset_x"])) * width - left
     cy = (0.5 - _number(params["principal_point_offset_y"])) * height - top
     to_world = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)
+    if np.linalg.det(to_world[:3, :3]) < 0:
+        raise InputError("sensor: to_world mirrors the image; take the negative scale out and flip the picture afterwards")
     try:
         world_to_camera = np.asarray(np.linalg.inv(to_world @ _MITSUBA_FROM_OPENCV), np.float64)
     except np.linalg.LinAlgError:

@@ -43,9 +43,10 @@ def needed_pairs(gaussians, camera) -> set[tuple[int, int]]:
     return needed
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_lists_hold_every_pair_and_little_more(seed):
-    camera, g = make_camera(), make_gaussians(60, seed, log_scales=(-6.0, -1.0))
+@pytest.mark.parametrize(("seed", "scales"), [*((seed, (-6.0, -1.0)) for seed in range(4)), (4, (-9.0, 0.5)), (5, (-2.0, 1.0))])
+def test_lists_hold_every_pair_and_little_more(seed, scales):
+    """Of small splats, of needles and of splats as large as the image, many of them partly outside it."""
+    camera, g = make_camera(), make_gaussians(60, seed, log_scales=scales)
     needed, exact, wide = needed_pairs(g, camera), pairs_of(lists_of(g, camera, 0)[0]), pairs_of(lists_of(g, camera)[0])
     assert needed <= exact <= wide
     assert len(exact) < 1.25 * len(needed), "ellipse and block touch, but no pixel centre: rare"
@@ -64,6 +65,20 @@ def test_lists_are_in_depth_order_and_slots_of_a_splat_contiguous():
     for j in range(len(g)):
         assert sorted(slot[:used][splat[:used] == j]) == list(range(first[j], last[j]))
     assert (np.diff((end - start).astype(int)) <= 0).all(), "longest list first"
+
+
+def test_a_new_camera_compiles_nothing():
+    """The kernels that build lists are the same for every camera, though the numbers of pairs differ."""
+    g = as_drjit(make_gaussians(300, 3, log_scales=(-5.0, -3.0)))
+    kernels = []
+    for angle in np.linspace(0, 0.3, 4):
+        camera = make_camera(eye=(2 * np.cos(angle), 2 * np.sin(angle), 0.9))
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            dr.eval(render(g, camera).rgb)
+            kernels.append({entry["hash"] for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT})
+    assert kernels[0]
+    assert kernels[1] == kernels[2] == kernels[3]
 
 
 def test_depth_order_is_a_stable_sort():

@@ -82,10 +82,53 @@ def test_faint_gradients_are_deterministic_too(scale):
     assert differing(*gradients) == []
 
 
+def test_faint_information_is_deterministic_too():
+    """Splats of a micrometre far away carry information that float32 can only hold as a denormal."""
+    camera = make_camera((200, 150), focal=200.0, eye=(180.0, 40.0, 90.0))
+    gaussians = make_gaussians(3000, 12, 0, log_scales=(-16.0, -12.0), logits=(-4, 20))
+    information = []
+    for threads in (1, 2):
+        before = dr.thread_count()
+        dr.set_thread_count(threads)
+        information.append({e: fisher(gaussians, camera, e).tobytes() for e in ("exact", "block")})
+        dr.set_thread_count(before)
+        values = fisher(gaussians, camera, "block")
+        assert not ((values != 0) & (np.abs(values) < np.finfo(np.float32).tiny)).any()
+    assert differing(*information) == []
+
+
 def test_hutchinson_draws_the_same_probes():
     camera, gaussians = make_camera(), make_gaussians(16, 2)
     a, b = (fisher(gaussians, camera, "hutchinson") for _ in range(2))
     np.testing.assert_array_equal(a, b)
+
+
+def test_garbage_is_not_collected_while_a_kernel_is_recorded():
+    """A Mitsuba scene that Python frees during a recording would end the process: so in a process of its own."""
+    code = """
+from mgs import runtime; runtime.start()
+import gc
+import mitsuba as mi
+from mgs.splat import kernels, render
+from splat.scenes import make_camera, make_gaussians
+
+scenes, walk = [mi.load_dict({"type": "scene", "ball": {"type": "sphere"}})], kernels._walk
+
+def littering(*arguments):
+    cycle = [scenes.pop()]
+    cycle.append(cycle)
+    del cycle
+    keep = [[] for _ in range(100_000)]
+    return walk(*arguments)
+
+gc.set_threshold(10)
+kernels._walk = littering
+render(make_gaussians(20, 0), make_camera())
+print("drawn")
+"""
+    root = __file__.rsplit("/splat/", 1)[0]
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, timeout=300, check=False)
+    assert done.stdout == "drawn\n", done.stderr
 
 
 def test_another_process_with_one_thread_agrees(first):

@@ -1,5 +1,6 @@
 """Fisher information against a brute-force Jacobian per pixel and channel, in float64; the other estimators against theirs."""
 
+import drjit as dr
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -58,7 +59,7 @@ def test_exact_and_block_against_brute_force(degree):
     np.testing.assert_array_equal(block, block.transpose(0, 2, 1))
 
 
-@settings(derandomize=True, deadline=None, max_examples=60)
+@settings(derandomize=True, deadline=None, max_examples=20)
 @given(
     seed=st.integers(0, 2**31),
     scale=st.floats(-5, -0.5),
@@ -132,6 +133,23 @@ def test_hutchinson_converges_as_one_over_sqrt_k():
 def test_hutchinson_is_the_same_with_and_without_a_cache():
     camera, g = make_camera(), make_gaussians(16, 6)
     np.testing.assert_array_equal(fisher(g, camera, "hutchinson"), fisher(g, camera, "hutchinson", cache=ListCache()))
+
+
+def test_probes_of_hutchinson_are_an_option():
+    """More probes come nearer; the other estimators have no options."""
+    camera, g = make_camera(), make_gaussians(16, 6)
+    exact = fisher(g, camera)
+    few, many = (np.linalg.norm(fisher(g, camera, "hutchinson", probes=k) - exact) for k in (2, 128))
+    assert many < 0.5 * few
+    with pytest.raises(TypeError, match="probes"):
+        fisher(g, camera, "exact", probes=2)
+
+
+def test_gradient_estimators_work_where_gradients_are_suspended():
+    camera, g = make_camera(), make_gaussians(16, 6)
+    with dr.suspend_grad():
+        found = fisher(g, camera, "loss-gradient")
+    np.testing.assert_array_equal(found, fisher(g, camera, "loss-gradient"))
 
 
 def test_loss_gradient_is_the_square_of_its_loss_by_central_differences():

@@ -13,24 +13,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mgs.splat import as_drjit, reference, render
+from mgs.splat import Image, as_drjit, reference, render
 
-from .scenes import PARAMETERS, calm, compare, double, make_camera, make_gaussians
+from .scenes import PARAMETERS, calm, compare, double, make_camera, make_gaussians, margins
 
 BACKGROUND = (0.3, 0.6, 0.1)
 OUTPUTS = ("rgb", "alpha", "depth")
 TOLERANCE = 1e-4
 
 
-def image_weights(gaussians, camera, seed=0) -> dict[str, np.ndarray]:
-    """Gradients of the loss with respect to each output image: independent normal numbers; those of depth times alpha.
-
-    Depth is a quotient by alpha = 1 - T, whose rounding is 1.5e-5 of it where alpha is 1/255, so faint pixels say little.
-    """
+def image_weights(camera, seed=0) -> dict[str, np.ndarray]:
+    """Gradients of the loss with respect to each output image: independent normal numbers."""
     rng = np.random.default_rng([seed, 99])
     shape = (camera.height, camera.width)
-    alpha = reference.render(gaussians, camera)["alpha"]
-    return {"rgb": rng.normal(0, 1, (*shape, 3)), "alpha": rng.normal(0, 1, shape), "depth": rng.normal(0, 1, shape) * alpha}
+    return {"rgb": rng.normal(0, 1, (*shape, 3)), "alpha": rng.normal(0, 1, shape), "depth": rng.normal(0, 1, shape)}
 
 
 def gradients(gaussians, camera, weights, wanted=PARAMETERS) -> dict[str, np.ndarray]:
@@ -71,7 +67,7 @@ def case(degree: int, n=10):
     """(gaussians, camera, weights, expected gradients per output): computed once for all tests of a degree."""
     camera = make_camera()
     gaussians = calm(lambda seed: make_gaussians(n, seed, degree, log_scales=(-4.0, -1.0)), camera, 10 + degree)
-    weights = image_weights(gaussians, camera, degree)
+    weights = image_weights(camera, degree)
     expected = differences(gaussians, camera, weights, ("means", "log_scales", "quats", "logit_opacities"))
     J = reference.jacobian(gaussians, camera, BACKGROUND)
     flat = np.tensordot(weights["rgb"].reshape(-1, 3), J, axes=([0, 1], [0, 1]))
@@ -114,6 +110,45 @@ def test_colours_do_not_move_alpha_or_depth(output):
     found = gradients(gaussians, camera, {output: weights[output]}, ("sh", "logit_opacities"))
     assert (found["sh"] == 0).all()
     assert (found["logit_opacities"] != 0).any()
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_gradient_of_the_depth_of_faint_splats(seed):
+    """Expected depth is a quotient by alpha, here a few 1/255: its own rounding must not be the gradient."""
+    camera = make_camera()
+    gaussians = make_gaussians(5, seed, logits=(-3, -1))
+    assert margins(gaussians, camera).min() > 1e-3
+    weights = image_weights(camera, seed)
+    wanted = PARAMETERS[:4]
+    found = gradients(gaussians, camera, {"depth": weights["depth"]}, wanted)
+    expected = differences(gaussians, camera, weights, wanted)
+    for name in wanted:
+        assert compare(found[name], expected[name][OUTPUTS.index("depth")])[0] < TOLERANCE, name
+
+
+LOSSES = {
+    "a part of alpha": lambda image: image.alpha[10:20, 5:30],
+    "columns of alpha": lambda image: dr.square(dr.sum(image.alpha, axis=0)),
+    "alpha times rgb": lambda image: image.alpha[..., None] * image.rgb,
+    "rgba": lambda image: dr.square(dr.concat([image.rgb, image.alpha[..., None]], axis=2)),
+    "columns of depth": lambda image: dr.square(dr.sum(image.depth, axis=0)),
+}
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_gradient_of_any_loss(loss):
+    """Losses that slice, join and reduce images, against the same loss in two steps: some once ended the process in Dr.Jit."""
+    gaussians, camera, _, _ = case(1)
+    watched = as_drjit(gaussians)
+    dr.enable_grad(watched.log_scales)
+    image = render(watched, camera, BACKGROUND)
+    leaf = Image(*(dr.copy(dr.detach(getattr(image, name))) for name in OUTPUTS))
+    dr.enable_grad(leaf)
+    dr.backward(dr.sum(LOSSES[loss](leaf), axis=None))
+    dr.backward(dr.sum(LOSSES[loss](image), axis=None))
+    weights = {name: np.asarray(dr.grad(getattr(leaf, name))) for name in OUTPUTS}
+    expected = gradients(gaussians, camera, weights, ("log_scales",))["log_scales"]
+    assert compare(np.asarray(dr.grad(watched.log_scales)), expected)[0] < 1e-5
 
 
 def test_frozen_means_change_no_other_gradient():
@@ -162,7 +197,7 @@ def test_gradient_for_any_scene(seed, degree, scale, stretch, logit, focal):
     """Scales, rotations and opacities in any scene, by the oracle's Jacobian."""
     camera = make_camera(focal=focal)
     gaussians = calm(lambda s: make_gaussians(10, s, degree, (scale - stretch, scale), (logit - 4, logit)), camera, seed)
-    weights = {"rgb": image_weights(gaussians, camera, seed)["rgb"]}
+    weights = {"rgb": image_weights(camera, seed)["rgb"]}
     J = reference.jacobian(gaussians, camera, BACKGROUND)
     expected = np.tensordot(weights["rgb"].reshape(-1, 3), J, axes=([0, 1], [0, 1]))
     found = gradients(gaussians, camera, weights, PARAMETERS[1:])
