@@ -82,7 +82,7 @@ def load_dataset(root: str | Path) -> Dataset:
     path = root / "transforms.json"
     if not root.is_dir():
         raise InputError(f"{root}: no such dataset folder; make one with `mgs synth-orbit {root}`")
-    data, records = _records(path)
+    data, records = read_records(path)
     frames = [_frame(root, path, data, i, record) for i, record in enumerate(records)]
     for name, count in Counter(frame.name for frame in frames).items():
         if count > 1:  # a name is what runs and pictures know a frame by
@@ -96,21 +96,25 @@ def load_cameras(path: str | Path) -> list[tuple[str, Camera]]:
     The files that the frames name need not exist. Raises InputError as `load_dataset`, but for those files.
     """
     path = Path(path) / "transforms.json" if Path(path).is_dir() else Path(path)
-    data, records = _records(path)
+    data, records = read_records(path)
     return [(record["file_path"], _camera(path, data, i, record)) for i, record in enumerate(records)]
 
 
-def _records(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The contents of a transforms.json, and its frames."""
+def read_records(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The contents of a transforms.json, and its frames: each names its image and has a transform_matrix of some kind.
+
+    Raises InputError where the file is missing or damaged, lists no frames, or a path is no text.
+    """
     data = read_json(path)
     records = data.get("frames") if isinstance(data, dict) else None
     if not records or not isinstance(records, list):
         raise InputError(f"{path}: lists no frames; expected a nerfstudio transforms.json")
     for index, record in enumerate(records):
-        if not isinstance(record, dict) or "file_path" not in record or "transform_matrix" not in record:
+        if not isinstance(record, dict) or not record.get("file_path") or "transform_matrix" not in record:
             raise InputError(f"{path}: frame {index} lacks file_path or transform_matrix; add it")
-        if not isinstance(record["file_path"], str) or not record["file_path"]:
-            raise InputError(f"{path}: frame {index} has a file_path that names no file; correct it")
+        for key in ("file_path", "depth_file_path", "mask_path"):
+            if not isinstance(record.get(key) or "", str):
+                raise InputError(f"{path}: frame {index} has a {key} that is no text; correct it")
     return data, records
 
 
@@ -149,8 +153,6 @@ def _frame(root: Path, path: Path, data: dict[str, Any], index: int, record: dic
     def file(key: str) -> Path | None:
         if not record.get(key):
             return None
-        if not isinstance(record[key], str):
-            raise InputError(f"{where} has a {key} that is no text; correct it")
         target = root / record[key]
         if not target.is_file():
             raise InputError(f"{where}: {key} {record[key]} does not exist in {root}; restore it or remove the frame")

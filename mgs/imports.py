@@ -12,9 +12,9 @@ import numpy as np
 
 from mgs.cloud import write_points
 from mgs.conventions import Camera, opencv_from_opengl
-from mgs.dataset import FRAME_INTERVAL, Dataset, Frame, load_dataset, write_transforms
+from mgs.dataset import FRAME_INTERVAL, PINHOLES, Dataset, Frame, load_dataset, read_records, write_transforms
 from mgs.errors import InputError
-from mgs.files import read_exr, read_json, read_mask, read_rgba, write_exr, write_png
+from mgs.files import read_exr, read_mask, read_rgba, write_exr, write_png
 from mgs.surface import read_mesh, sample_surface
 from mgs.visibility import silhouette
 
@@ -95,21 +95,13 @@ def _frame_name(path: str) -> str:
 
 def _read_transforms(path: Path) -> Source:
     """nerfstudio's transforms.json, or NeRF-synthetic's (camera_angle_x, image names without suffix)."""
-    data = read_json(path)
-    records = data.get("frames") if isinstance(data, dict) else None
-    if not isinstance(records, list) or not records:
-        raise InputError(f"{path}: lists no frames; expected a transforms.json")
+    data, records = read_records(path)
     model = data.get("camera_model", "OPENCV")
-    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE"):
+    if model not in PINHOLES:
         raise InputError(f"{path}: camera model {model} is not supported; undistort the images to OPENCV or PINHOLE first")
     scale = _number(path, "depth_unit_scale_factor", data.get("depth_unit_scale_factor", 1e-3))
     shots, missing = [], 0
     for index, record in enumerate(records):
-        if not isinstance(record, dict) or "file_path" not in record or "transform_matrix" not in record:
-            raise InputError(f"{path}: frame {index} lacks file_path or transform_matrix; add it")
-        paths = [record["file_path"], *(record.get(key) or "-" for key in ("depth_file_path", "mask_path"))]
-        if not all(isinstance(name, str) and name for name in paths):
-            raise InputError(f"{path}: frame {index} has a path that names no file; correct it")
         image = _find(path.parent, record["file_path"])
         if image is None:
             missing += 1

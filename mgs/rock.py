@@ -14,6 +14,7 @@ from mgs.conventions import srgb_from_linear
 from mgs.errors import InputError
 from mgs.noise import Noise
 from mgs.scene_file import Rock
+from mgs.surface import load_mesh
 
 MAX_GRID = 10**8
 """Points of the grid that a rock is cut from: more would take tens of gigabytes."""
@@ -44,23 +45,12 @@ def load_rock(path: str | Path, settings: Rock) -> tuple[trimesh.Trimesh, float]
     """Any GLB, OBJ or PLY as the rock: scaled to `settings.size` and stood on the ground; keeps its texture.
 
     Returns the mesh and the scale that was applied. GLB and OBJ are +Y up (the rule of their formats) and are turned to +Z.
-    Raises InputError where the file is missing or unreadable, has no faces, or holds NaN vertices.
+    Raises InputError as `load_mesh`, and where all vertices are one point.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such mesh; give a GLB, OBJ or PLY file")
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-    except Exception as error:  # trimesh raises whatever its parser meets
-        raise InputError(f"{path}: not a readable mesh ({error}); export it again as GLB, OBJ or PLY") from None
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise InputError(f"{path}: has no faces; a rock must be a triangle mesh, not a point cloud")
-    if not np.isfinite(mesh.vertices).all():
-        first = int(np.argwhere(~np.isfinite(mesh.vertices))[0][0])
-        raise InputError(f"{path}: vertex {first} is NaN or infinite; repair the mesh")
+    mesh = load_mesh(path)
     if mesh.extents.max() == 0:
         raise InputError(f"{path}: all vertices are one point; repair the mesh")
-    if path.suffix.lower() in (".glb", ".gltf", ".obj"):
+    if Path(path).suffix.lower() in (".glb", ".gltf", ".obj"):
         mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
     scale = settings.size / float(mesh.extents.max())
     return _stand(mesh, settings), scale

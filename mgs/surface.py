@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from mgs.cloud import Plane
 from mgs.errors import InputError
+
+if TYPE_CHECKING:
+    import trimesh
 
 NORMAL_NEIGHBOURS = (16, 128)
 """Points of the local plane fit of a normal: without noise, and at most."""
@@ -50,8 +54,8 @@ class Mesh:
         return normals / np.where(norm > 0, norm, 1.0)
 
 
-def read_mesh(path: str | Path) -> Mesh:
-    """A triangle mesh (GLB, OBJ, PLY ...) in world coordinates, metres, turned right side out; all of it counts as seen.
+def load_mesh(path: str | Path) -> trimesh.Trimesh:
+    """A triangle mesh (GLB, OBJ, PLY ...) as it is in its file, with its texture.
 
     Raises InputError where it is missing or unreadable, has no faces, or holds NaN vertices.
     """
@@ -66,10 +70,19 @@ def read_mesh(path: str | Path) -> Mesh:
         reason = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: not a readable mesh ({reason}); export it again as GLB, OBJ or PLY") from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise InputError(f"{path}: has no faces; a prior needs a triangle mesh, not a point cloud")
+        raise InputError(f"{path}: has no faces; give a triangle mesh, not a point cloud")
     if not np.isfinite(mesh.vertices).all():
         first = int(np.argwhere(~np.isfinite(mesh.vertices))[0][0])
-        raise InputError(f"{path}: has NaN or infinite vertices, first vertex {first}; repair the mesh")
+        raise InputError(f"{path}: vertex {first} is NaN or infinite; repair the mesh")
+    return mesh
+
+
+def read_mesh(path: str | Path) -> Mesh:
+    """A triangle mesh in world coordinates, metres, turned right side out; all of it counts as seen.
+
+    Raises InputError as `load_mesh`.
+    """
+    mesh = load_mesh(path)
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     a, b, c = (vertices[faces[:, k]] - vertices.mean(0) for k in range(3))
     inside_out = np.einsum("fk,fk->f", a, np.cross(b, c)).sum() < 0  # six times the signed volume

@@ -343,7 +343,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(case: str, tmp_path: Path, cap
             b"end_header\n0 0 0\n",
             "has no faces",
         ),
-        ("nan.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "NaN or infinite vertices"),
+        ("nan.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "vertex 0 is NaN"),
     ],
 )
 def test_bad_mesh_is_one_line(
