@@ -1,6 +1,6 @@
 """How far off an entry of the `block` Fisher information is, against how much its sum cancels.
 
-    PYTHONPATH=. .venv/bin/python benchmarks/block_accuracy.py docs/benchmarks/block_accuracy [SCENES]
+    PYTHONPATH=. python benchmarks/block_accuracy.py docs/benchmarks/block_accuracy [SCENES]
 
 Writes PREFIX.png and PREFIX.json. Random scenes of 16 Gaussians as in tests/splat/test_fisher.py (sizes, anisotropy, opacities
 and backgrounds far apart), each entry above 1e-6 of its scene's largest against the float64 oracle. Diagonal entries are sums

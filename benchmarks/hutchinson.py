@@ -1,6 +1,6 @@
 """Chart how the `hutchinson` estimate of diag(JᵀJ) approaches `exact` with the number of probes.
 
-    .venv/bin/python benchmarks/hutchinson.py docs/benchmarks/hutchinson
+    python benchmarks/hutchinson.py docs/benchmarks/hutchinson
 
 Writes PREFIX.png and PREFIX.json. Scene: 1,000 Gaussians of a rock at 64x48; relative L2 error over all 11,000 entries, each
 of five seeds; a fit of the slope over 1 to 256 probes, expected -1/2.
