@@ -94,8 +94,8 @@ def turns(quats: Any) -> Any:
 
 
 def sh_basis(means: Any, camera: Any, coefficients: int) -> list[Any]:
-    """Spherical harmonics [K] of the directions from the camera to the means (Vector3d), Float [N] each."""
-    offset = mi.Vector3f(means - _unpack(camera)[4])
+    """Spherical harmonics [K] of the directions from the camera to the means (Vector3d), Float64 [N] each."""
+    offset = means - _unpack(camera)[4]
     directions = offset * dr.rsqrt(dr.maximum(dr.squared_norm(offset), 1e-24))
     return dr.sh_eval(directions, round(coefficients**0.5) - 1)
 
@@ -152,13 +152,13 @@ def project(gaussians: Gaussians, camera: Any) -> Splats:
     k, p, e = whitening([a * s for a, s in zip(unit, scales, strict=True)])
     log2_opacity = LOG2E * (dr.minimum(logit, 0) - dr.log(1 + dr.exp(-dr.abs(logit))))
     finite = dr.all(dr.isfinite(mean)) & dr.all(dr.isfinite(quats)) & dr.all(dr.isfinite(log_scales)) & dr.isfinite(logit)
-    colour, index = mi.Color3f(0.5), dr.arange(mi.UInt32, len(gaussians))
+    colour, index = mi.Color3d(0.5), dr.arange(mi.UInt32, len(gaussians))
     coefficients = gaussians.sh.shape[1]
     for i, basis in enumerate(sh_basis(mean, camera, coefficients)):
         sh = dr.gather(mi.Color3f, gaussians.sh.array, index * coefficients + i, mode=dr.ReduceMode.NoConflicts)
         finite &= dr.all(dr.isfinite(sh))
-        colour += basis * sh
-    colour = dr.maximum(colour, 0)
+        colour += basis * mi.Color3d(sh)
+    colour = mi.Color3f(dr.maximum(colour, 0))
     (u, u_rest), (v, v_rest), (k, k_rest) = (_rounded(value) for value in (u, v, k))
     p, e, log2_opacity, z = (mi.Float(value) for value in (p, e, log2_opacity, z))
     return Splats(u, v, k, p, e, log2_opacity, z, colour.x, colour.y, colour.z, visible, finite, u_rest, v_rest, k_rest)
