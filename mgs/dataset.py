@@ -16,7 +16,9 @@ from mgs.files import read_exr, read_json, read_mask, read_png, write_json
 
 PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 """Camera models of transforms.json that are a pinhole once their distortion is zero."""
-DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "is_fisheye")
 FRAME_INTERVAL = 0.5
 """Seconds between keyframes (paper, section IV-A)."""
 
@@ -103,7 +105,7 @@ def load_cameras(path: str | Path) -> list[tuple[str, Camera]]:
 def read_records(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The contents of a transforms.json, and its frames: each names its image and has a transform_matrix of some kind.
 
-    Raises InputError where the file is missing or damaged, lists no frames, or a path is no text.
+    Raises InputError where the file is missing or damaged, lists no frames, or a path is none.
     """
     data = read_json(path)
     records = data.get("frames") if isinstance(data, dict) else None
@@ -113,18 +115,22 @@ def read_records(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         if not isinstance(record, dict) or not record.get("file_path") or "transform_matrix" not in record:
             raise InputError(f"{path}: frame {index} lacks file_path or transform_matrix; add it")
         for key in ("file_path", "depth_file_path", "mask_path"):
-            if not isinstance(record.get(key) or "", str):
-                raise InputError(f"{path}: frame {index} has a {key} that is no text; correct it")
+            value = record.get(key) or ""
+            if not isinstance(value, str) or not value.isprintable():
+                raise InputError(f"{path}: frame {index} has a {key} that is no text or cannot be a path; correct it")
     return data, records
 
 
 def _camera(path: Path, data: dict[str, Any], index: int, record: dict[str, Any]) -> Camera:
     where = f"{path}: frame {index}"
     both = data | record
-    if both.get("camera_model", "OPENCV") not in PINHOLES or any(both.get(key) not in (None, 0) for key in DISTORTION):
+    if (both.get("camera_model") or "OPENCV") not in PINHOLES or any(both.get(key) not in (None, 0) for key in DISTORTION):
         raise InputError(f"{where} is distorted, or not of a pinhole camera; undistort the images with `mgs import`")
+    missing = [key for key in INTRINSICS if both.get(key) is None]
+    if missing:
+        raise InputError(f"{where} lacks {missing[0]}; correct the intrinsics (`mgs import` reads files with camera_angle_x)")
     try:
-        fl_x, fl_y, cx, cy, w, h = (both.get(k) for k in ("fl_x", "fl_y", "cx", "cy", "w", "h"))
+        fl_x, fl_y, cx, cy, w, h = (both[key] for key in INTRINSICS)
         K = np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]], np.float64)
         width, height = int(w or 0), int(h or 0)
         pose = np.array(record["transform_matrix"], np.float64)

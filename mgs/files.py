@@ -67,12 +67,12 @@ def read_json(path: str | Path) -> Any:
     """Read JSON. Raises InputError where the file is missing, not a file that can be read, or not JSON."""
     path = Path(path)
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8-sig"))  # some tools put a byte-order mark in front
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); give a file that can be read") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # also of numbers or nestings that Python refuses
         raise InputError(f"{path}: not valid JSON ({error}); the file is damaged, write it again") from None
 
 

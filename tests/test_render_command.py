@@ -250,12 +250,29 @@ BAD = {
         [],
         "frame 0 lacks file_path",
     ),
+    "a path with a zero byte": (
+        lambda tmp: (tmp / "transforms.json").write_text(
+            json.dumps({"frames": [{"file_path": "a\0b.png", "transform_matrix": np.eye(4).tolist()}]})
+        ),
+        [],
+        "frame 0 has a file_path that is no text or cannot be a path",
+    ),
+    "brackets without end": (
+        lambda tmp: (tmp / "transforms.json").write_text("[" * 100_000),
+        [],
+        "transforms.json: not valid JSON",
+    ),
+    "a number of 5000 digits": (
+        lambda tmp: (tmp / "transforms.json").write_text('{"w": ' + "9" * 5000 + "}"),
+        [],
+        "transforms.json: not valid JSON",
+    ),
     "no intrinsics": (
         lambda tmp: (tmp / "transforms.json").write_text(
             json.dumps({"frames": [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]})
         ),
         [],
-        "correct the intrinsics",
+        "frame 0 lacks fl_x; correct the intrinsics",
     ),
     "output not empty": (lambda tmp: ((tmp / "out").mkdir(), (tmp / "out/kept").touch()), [], "the output folder is not empty"),
     "background": (lambda tmp: None, ["--background", "255", "255", "255"], "must be three numbers from 0 to 1"),
