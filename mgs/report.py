@@ -174,7 +174,8 @@ def print_table(console: Console, rows: Sequence[Sequence[str]]) -> None:
         caption="dB and %; new: views never trained on; rock: those, inside its mask",
     )
     for i, heading in enumerate(short):
-        table.add_column(heading, justify="right" if i else "left", no_wrap=True)
+        # only the name may be broken: a number that is cut is wrong
+        table.add_column(heading, justify="right" if i else "left", no_wrap=bool(i), overflow="fold")
     for row in rows:
         table.add_row(*row)
     console.print(table)

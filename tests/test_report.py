@@ -200,3 +200,12 @@ def test_every_line_of_a_figure_looks_different(labels):
 def test_a_policy_keeps_its_style_whatever_it_is_compared_with():
     ours = figures.line_styles(["mine", "random (a)", "random (b)"])[1]
     assert (ours["color"], ours["marker"]) == POLICY_STYLE["random"]
+
+
+def test_a_long_name_cuts_no_number():
+    console = Console(width=80, record=True, file=io.StringIO())
+    row = ["my-own-very-long-policy", "12", "30.09", "0.9426", "29.56", "0.9362", "27.54", "0.7538", "100.00"]
+    report.print_table(console, [row])
+    text = console.export_text()
+    assert all(number in text for number in row[1:])
+    assert "…" not in text
