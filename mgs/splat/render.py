@@ -110,15 +110,22 @@ def as_drjit(gaussians: Gaussians) -> Gaussians:
 
 
 class _Rasterise(dr.CustomOp):
-    """Splats -> block-major pixels, with the hand-written adjoint: compositing is no sum that AD could replay."""
+    """Splats -> r, g, b, alpha and weighted depth, Float [H*W] each, with the hand-written adjoint: compositing is no sum that
+    AD could replay. places: see `_places`."""
 
-    def eval(self, splats: Splats, lists: BlockLists, means: bool) -> Any:
-        self.lists, self.means, self.packed = lists, means, kernels.pack(splats)
+    def eval(self, splats: Splats, lists: BlockLists, places: Any, means: bool) -> Any:
+        self.lists, self.places, self.means, self.packed = lists, places, means, kernels.pack(splats)
         self.out = kernels.forward(lists, self.packed)[:2]
-        return self.out
+        pixel = dr.gather(mi.Vector4f, self.out[0], places, mode=dr.ReduceMode.NoConflicts)
+        return *pixel, dr.gather(mi.Float, self.out[1], places, mode=dr.ReduceMode.NoConflicts)
 
     def backward(self) -> None:
-        gradient = kernels.adjoint(self.lists, self.packed, self.out, self.grad_out(), self.means)
+        *d_pixel, d_weighted = self.grad_out()
+        dr.eval(d_pixel, d_weighted)  # Dr.Jit 1.5 ends the process where a scatter's value awaits a scatter itself
+        d_rgba, d_depth = (dr.zeros(mi.Float, len(out)) for out in self.out)
+        dr.scatter(d_rgba, mi.Vector4f(*d_pixel), self.places, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter(d_depth, d_weighted, self.places, mode=dr.ReduceMode.NoConflicts)
+        gradient = kernels.adjoint(self.lists, self.packed, self.out, (d_rgba, d_depth), self.means)
         self.set_grad_in("splats", gradient)
 
 
@@ -167,12 +174,9 @@ def _empty(camera: Camera, background: Any) -> Image:
 
 def composite(splats: Splats, lists: BlockLists, width: int, height: int, background: Any = 0.0) -> Image:
     """Composite projected splats whose block lists are known, over a Color3f; differentiable in the splats' numbers."""
-    rgba, depth = dr.custom(_Rasterise, splats, lists, dr.grad_enabled(splats.u))
     places = _places(width, height)
-    # one by one: the adjoint of a packet gather can abort the process (Dr.Jit 1.5, "dirty variable")
-    r, g, b, alpha = (dr.gather(mi.Float, rgba, 4 * places + i, mode=dr.ReduceMode.NoConflicts) for i in range(4))
+    r, g, b, alpha, weighted = dr.custom(_Rasterise, splats, lists, places, dr.grad_enabled(splats.u))
     rgb = mi.Color3f(r, g, b) + (1 - alpha) * background
-    weighted = dr.gather(mi.Float, depth, places, mode=dr.ReduceMode.NoConflicts)
     expected = dr.select(alpha > 0, weighted / dr.select(alpha > 0, alpha, 1), 0)
     shape = (height, width)
     return Image(mi.TensorXf(dr.ravel(rgb), (*shape, 3)), mi.TensorXf(alpha, shape), mi.TensorXf(expected, shape))
