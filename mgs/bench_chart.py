@@ -63,7 +63,9 @@ def scaling_figure(path: str | Path, points: list[dict[str, Any]]) -> None:
         both = {"gaussians": "pairs, N growing", "pixels": "pairs, image growing"}
         _time_panel(panels[1, 0], points, "pairs", both, exponents)
         panels[1, 0].set(xlabel="(splat, block) pairs")
-        panels[1, 0].legend(title=f"exponent as N grows (solid, from {start:,})\nand as the image grows (dashed)")
+        panels[1, 0].legend(
+            title=f"exponent as N grows (solid, from {start:,})\nand as the image grows (dashed)", loc="upper left"
+        )
         memory, by_n = panels[1, 1], _sweep(points, "gaussians")
         peak = f"peak of the kernels: {exponents['peak memory']['N']:.2f}"
         for key, style, colour, label in (

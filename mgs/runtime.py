@@ -1,8 +1,9 @@
 """Start Dr.Jit: find a libLLVM that works before any kernel runs, then set the variant.
 
-Only the command line and the tests call this. Dr.Jit loads a libLLVM of the system. Older ones than 19 abort the process in the
-middle of a kernel ("Cannot select: fminimum"), so the version is asked for first: loading a library and calling LLVMGetVersion
-cannot abort. Needs nothing but the standard library until `start`: the set-up uses it before anything is installed.
+The command line, the tests and programs that use mgs call this first. Dr.Jit loads a libLLVM of the system. Older ones than 19
+abort the process in the middle of a kernel ("Cannot select: fminimum"), so the version is asked for first: loading a library
+and calling LLVMGetVersion cannot abort. Needs nothing but the standard library until `start`: the set-up uses it before
+anything is installed.
 """
 
 from __future__ import annotations
