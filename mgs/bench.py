@@ -132,7 +132,7 @@ def time_core(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, f
         "fisher_exact": median_seconds(lambda: fisher(device, camera, "exact", cache=cache), repeats),
         "fisher_block": median_seconds(lambda: fisher(device, camera, "block", cache=cache), repeats),
     }
-    lists = cache.get(camera, project(device, camera_array(camera)))
+    lists, _ = cache.get(camera, project(device, camera_array(camera)))
     pairs = float(np.sum(np.asarray(lists.end).astype(np.int64) - np.asarray(lists.start)))
     return seconds | {"pairs": pairs, "list_bytes": float(cache.nbytes)}
 

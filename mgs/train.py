@@ -20,6 +20,7 @@ from mgs.seeds import generator
 from mgs.splat import ListCache, as_drjit
 from mgs.splat.blocks import BlockLists
 from mgs.splat.frozen import frozen
+from mgs.splat.kernels import pack
 from mgs.splat.project import camera_array, project
 from mgs.splat.render import composite
 
@@ -82,7 +83,8 @@ def _step(
     values = [dr.copy(getattr(gaussians, name)) for name in LEARNED]
     dr.enable_grad(values)
     watched = Gaussians(gaussians.means, **dict(zip(LEARNED, values, strict=True)))
-    rgb = composite(project(watched, camera), lists, *size).rgb
+    splats = project(watched, camera)
+    rgb = composite(splats, pack(dr.detach(splats), lists.place), lists, *size).rgb
     error = rgb.array - target
     loss = dr.mean(dr.square(error))
     dr.backward(0.5 * dr.sum(dr.square(error)))
@@ -126,7 +128,7 @@ def fit(
         for i in rng.permutation(len(cameras)):
             t += 1
             splats = _project(model, arrays[i])
-            lists = cache.get(cameras[i], splats)
+            lists, _ = cache.get(cameras[i], splats)
             size = (cameras[i].width, cameras[i].height)
             model, moments, loss = _step(model, moments, arrays[i], lists, pixels[i], size, rates, dr.opaque(mi.UInt32, t))
             losses.append(loss)

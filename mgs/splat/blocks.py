@@ -18,6 +18,10 @@ from mgs.splat.project import Splats
 BLOCK_X, BLOCK_Y = 8, 4
 """Pixels of one lane. With AVX-512, 8x2 and 4x4 were no faster forward, and slower for gradients: more pairs to store."""
 
+TILE = 16
+"""Blocks across and down a tile. Tiles are what is worked on at a time, so that its splats (64 bytes each) stay in a core's
+cache: without them, waiting for memory was a third of all time at 100,000 splats."""
+
 LOG2_INV_ALPHA_MIN = 7.994353436858858
 """log2(255): a footprint ends where xi^2 + eta^2 = log2_opacity + log2(255)."""
 
@@ -43,11 +47,13 @@ class Footprints:
 class BlockLists:
     """Pairs (splat, block), sorted by block, in each block by depth; M counts some unused room at the end.
 
+    Splats lie in memory by tile, block, depth, and are known by that place: place: UInt32 [N] is where each one lies.
     splat, slot: UInt32 [M]; a pair's slot is its place in the order where the pairs of one splat are contiguous, and
-    slot_start, slot_end: UInt32 [N] are the slots of each splat. block: UInt32 [L] of each lane, longest list first, and
-    start, end: UInt32 [L] its range of pairs. width, height: UInt32, pixels; blocks_x: UInt32.
+    slot_start, slot_end: UInt32 [N] are the slots of the splat at each place. block: UInt32 [L] of each lane, by tile, in it
+    the longest list first, and start, end: UInt32 [L] its range of pairs. width, height: UInt32, pixels; blocks_x: UInt32.
     """
 
+    place: Any
     splat: Any
     slot: Any
     slot_start: Any
@@ -63,7 +69,7 @@ class BlockLists:
     @property
     def nbytes(self) -> int:
         """Memory held, bytes."""
-        return 4 * (2 * len(self.splat) + 9 * len(self.slot_start) + 3 * len(self.block))
+        return 4 * (2 * len(self.splat) + 10 * len(self.slot_start) + 3 * len(self.block))
 
 
 def level(splats: Splats) -> Any:
@@ -119,24 +125,25 @@ def build(splats: Splats, order: Any, width: int, height: int, margin: float) ->
     blocks_x, blocks_y = -(-width // BLOCK_X), -(-height // BLOCK_Y)
     n, lanes = len(splats.u), blocks_x * blocks_y
     foot = inflate(splats, margin)
-    splat, block, slot_start, slot_end = _pairs(splats, foot, order, blocks_x, blocks_y)
+    place = _places(splats, order, blocks_x, blocks_y)
+    splat, slot, block, slot_start, slot_end = _pairs(splats, foot, order, place, blocks_x, blocks_y)
     if len(splat) == 0:  # Dr.Jit has no operations on arrays of length 0
         slot_start = slot_end = dr.zeros(mi.UInt32, n)
         start = end = dr.zeros(mi.UInt32, lanes)
-        slot, longest_first = splat, dr.arange(mi.UInt32, lanes)
     else:
-        start, end, slot = _group(block, lanes)
-        splat = dr.gather(mi.UInt32, splat, slot)
-        longest_first = dr.detail.block_mkperm(4095 - dr.minimum(end - start, 4095), lanes, 4096)
+        start, end, by_block = _group(block, lanes)
+        splat, slot = dr.gather(mi.UInt32, splat, by_block), dr.gather(mi.UInt32, slot, by_block)
     room = _rounded(len(splat))
+    lane = _lane_order(start, end, blocks_x, blocks_y)
     lists = BlockLists(
+        place=place,
         splat=_padded(splat, room),
         slot=_padded(slot, room),
         slot_start=slot_start,
         slot_end=slot_end,
-        block=longest_first,
-        start=dr.gather(mi.UInt32, start, longest_first),
-        end=dr.gather(mi.UInt32, end, longest_first),
+        block=lane,
+        start=dr.gather(mi.UInt32, start, lane),
+        end=dr.gather(mi.UInt32, end, lane),
         width=dr.opaque(mi.UInt32, width),
         height=dr.opaque(mi.UInt32, height),
         blocks_x=dr.opaque(mi.UInt32, blocks_x),
@@ -146,9 +153,42 @@ def build(splats: Splats, order: Any, width: int, height: int, margin: float) ->
     return lists
 
 
-def _pairs(splats: Splats, foot: Footprints, order: Any, blocks_x: int, blocks_y: int) -> tuple[Any, Any, Any, Any]:
-    """(splat, block) of every pair, splats in depth order and the pairs of one splat contiguous; first and end of each
-    splat's pairs [N]. Empty arrays where no splat touches a block.
+def _tile(bx: Any, by: Any, blocks_x: int) -> Any:
+    """The tile, row by row, of the blocks in column bx and row by (UInt32)."""
+    return (by // TILE) * (-(-blocks_x // TILE)) + bx // TILE
+
+
+def _tiles(blocks_x: int, blocks_y: int) -> int:
+    return -(-blocks_x // TILE) * -(-blocks_y // TILE)
+
+
+def _places(splats: Splats, order: Any, blocks_x: int, blocks_y: int) -> Any:
+    """UInt32 [N]: where each splat lies: by the tile of its centre (the nearest, outside the image), then block, then depth."""
+
+    def block(pixel: Any, size: int, count: int) -> Any:
+        return mi.UInt32(dr.select(splats.visible, dr.clip(pixel / size, 0, count - 1), 0))
+
+    n, tiles = len(splats.u), _tiles(blocks_x, blocks_y)
+    bx, by = block(splats.u, BLOCK_X, blocks_x), block(splats.v, BLOCK_Y, blocks_y)
+    key = (_tile(bx, by, blocks_x) * TILE + by % TILE) * TILE + bx % TILE
+    dr.eval(key)
+    at = dr.gather(mi.UInt32, order, dr.detail.block_mkperm(dr.gather(mi.UInt32, key, order), n, tiles * TILE * TILE))
+    place = dr.empty(mi.UInt32, n)
+    dr.scatter(place, dr.arange(mi.UInt32, n), at, mode=dr.ReduceMode.NoConflicts)
+    return place
+
+
+def _lane_order(start: Any, end: Any, blocks_x: int, blocks_y: int) -> Any:
+    """UInt32 [L]: blocks by tile, in it the longest list first, so that the lanes of one SIMD packet end together."""
+    lanes = len(start)
+    longest = dr.detail.block_mkperm(4095 - dr.minimum(end - start, 4095), lanes, 4096)
+    tile = _tile(longest % blocks_x, longest // blocks_x, blocks_x)
+    return dr.gather(mi.UInt32, longest, dr.detail.block_mkperm(tile, lanes, _tiles(blocks_x, blocks_y)))
+
+
+def _pairs(splats: Splats, foot: Footprints, order: Any, place: Any, blocks_x: int, blocks_y: int) -> tuple[Any, ...]:
+    """(place of the splat, slot, block) of every pair, splats in depth order; first and end of the slots of the splat at each
+    place [N]. Empty arrays where no splat touches a block.
 
     First the rows of blocks that a footprint reaches, then the blocks of each row: work grows with the pairs that are kept,
     where a bounding box would list the whole square around a slanted needle.
@@ -157,39 +197,56 @@ def _pairs(splats: Splats, foot: Footprints, order: Any, blocks_x: int, blocks_y
     low = dr.clip(dr.ceil((splats.v - half + 0.5) / BLOCK_Y) - 1, 0, blocks_y)
     high = dr.clip(dr.floor((splats.v + half - 0.5) / BLOCK_Y) + 1, 0, blocks_y)
     rows = dr.select(foot.q > 0, mi.UInt32(dr.maximum(high - low, 0)), 0)
-    dr.eval(foot, half, low, rows)
+    n, nothing = len(splats.u), (mi.UInt32(),) * 5
+    shapes, index = dr.empty(mi.Float, 8 * n), dr.arange(mi.UInt32, n) * 2
+    dr.scatter(shapes, mi.Vector4f(splats.u, splats.v, foot.k, foot.p), index, mode=dr.ReduceMode.NoConflicts)
+    dr.scatter(shapes, mi.Vector4f(foot.e, foot.q, half, low), index + 1, mode=dr.ReduceMode.NoConflicts)
+    dr.eval(foot, rows, shapes)
 
-    n, none = len(splats.u), mi.UInt32()
     ranked = dr.gather(mi.UInt32, rows, order)
     first_row = dr.prefix_sum(ranked)
-    rank = dr.repeat(dr.arange(mi.UInt32, n), ranked)
+    rank = _runs(first_row, int(dr.sum(rows)[0]))
     if len(rank) == 0:
-        return none, none, none, none
+        return nothing
     row_splat = dr.gather(mi.UInt32, order, rank)
     offset = dr.arange(mi.UInt32, len(rank)) - dr.gather(mi.UInt32, first_row, rank)
-    by = mi.UInt32(dr.gather(mi.Float, low, row_splat)) + offset
-    left, columns = _columns(splats, foot, half, row_splat, by, blocks_x)
-    columns = _padded(columns, _rounded(len(rank) + 1))  # dr.repeat compiles anew for every length
+    block, columns = _columns(shapes, row_splat, offset, blocks_x)
+    dr.eval(rank, row_splat, block, columns)
     before = dr.prefix_sum(columns)
-    row = dr.repeat(dr.arange(mi.UInt32, len(columns)), columns)
+    row = _runs(before, int(dr.sum(columns)[0]))
     if len(row) == 0:
-        return none, none, none, none
-    slot_start, slot_end = dr.empty(mi.UInt32, n), dr.empty(mi.UInt32, n)
-    dr.scatter(slot_start, dr.gather(mi.UInt32, before, first_row), order, mode=dr.ReduceMode.NoConflicts)
-    dr.scatter(slot_end, dr.gather(mi.UInt32, before, first_row + ranked), order, mode=dr.ReduceMode.NoConflicts)
-    offset = dr.arange(mi.UInt32, len(row)) - dr.gather(mi.UInt32, before, row)
-    block = dr.gather(mi.UInt32, by * blocks_x + left, row) + offset
-    return dr.gather(mi.UInt32, row_splat, row), block, slot_start, slot_end
+        return nothing
+    first = dr.gather(mi.UInt32, before, first_row, ranked > 0)
+    row_place, count = dr.gather(mi.UInt32, place, row_splat), dr.empty(mi.UInt32, n)
+    last = dr.gather(mi.UInt32, before + columns, first_row + ranked - 1, ranked > 0)
+    dr.scatter(count, last - first, dr.gather(mi.UInt32, place, order), mode=dr.ReduceMode.NoConflicts)
+    slot_start = dr.prefix_sum(count)
+    to_slot = dr.gather(mi.UInt32, slot_start, row_place) - dr.gather(mi.UInt32, first, rank)
+    dr.eval(row, row_place, to_slot)
+    pair = dr.arange(mi.UInt32, len(row))
+    splat, to_slot, block, before = (dr.gather(mi.UInt32, a, row) for a in (row_place, to_slot, block, before))
+    return splat, pair + to_slot, pair - before + block, slot_start, slot_start + count
 
 
-def _columns(splats: Splats, foot: Footprints, half: Any, splat: Any, by: Any, blocks_x: int) -> tuple[Any, Any]:
-    """The blocks of row `by` that a footprint's ellipse reaches within the row's pixel centres: the first, and how many.
+def _runs(start: Any, count: int) -> Any:
+    """UInt32 [count]: the run that each place belongs to, given the first places of runs (UInt32, growing; some are empty)."""
+    if count == 0:
+        return mi.UInt32()
+    begun, inside = dr.zeros(mi.UInt32, count), start < dr.opaque(mi.UInt32, count)  # a literal would compile anew
+    dr.scatter_add(begun, mi.UInt32(1), start, inside, mode=dr.ReduceMode.Direct)
+    return dr.cumsum(begun) - 1
+
+
+def _columns(shapes: Any, splat: Any, offset: Any, blocks_x: int) -> tuple[Any, Any]:
+    """The blocks of one row that a footprint's ellipse reaches within the row's pixel centres: the first, and how many.
 
     The right rim x = k y + sqrt(q - e^2 y^2) / p is concave in y, so over the row's band it is largest at its own maximum,
-    clipped to the band; likewise the left rim. half: the ellipse's half height [N].
+    clipped to the band; likewise the left rim. shapes: (u, v, k, p), (e, q, half, low) of each splat, where half is the
+    ellipse's half height and low its first row; the row is low + offset.
     """
-    gathered = (splats.u, splats.v, foot.k, foot.p, foot.e, foot.q, half)
-    u, v, k, p, e, q, half = (dr.gather(mi.Float, a, splat) for a in gathered)
+    u, v, k, p = dr.gather(mi.Vector4f, shapes, 2 * splat)
+    e, q, half, first_row = dr.gather(mi.Vector4f, shapes, 2 * splat + 1)
+    by = mi.UInt32(first_row) + offset
     top = mi.Float(by * BLOCK_Y) + 0.5 - v
     low, high = dr.maximum(top, -half), dr.minimum(top + (BLOCK_Y - 1), half)
     slant = k * p
@@ -201,7 +258,8 @@ def _columns(splats: Splats, foot: Footprints, half: Any, splat: Any, by: Any, b
 
     first = dr.clip(dr.ceil((rim(-1) + 0.5) / BLOCK_X) - 1, 0, blocks_x)
     last = dr.clip(dr.floor((rim(1) - 0.5) / BLOCK_X) + 1, 0, blocks_x)
-    return mi.UInt32(first), mi.UInt32(dr.select(low <= high, dr.maximum(last - first, 0), 0))
+    columns = mi.UInt32(dr.select(low <= high, dr.maximum(last - first, 0), 0))
+    return by * blocks_x + mi.UInt32(first), columns
 
 
 def _padded(values: Any, size: int) -> Any:

@@ -100,8 +100,7 @@ def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
 
 def _sums(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None, block: bool) -> tuple[Any, Geometry]:
     device = camera_array(camera)
-    splats, lists = splats_and_lists(gaussians, camera, cache)
-    packed = kernels.pack(splats)
+    splats, lists, packed = splats_and_lists(gaussians, camera, cache)
     rgba, _, transmittance = kernels.forward(lists, packed, stepped=not block)
     sums = kernels.fisher(lists, packed, rgba, transmittance, dr.detach(as_colour(background)), block)
     return sums, geometry(gaussians, device, splats)

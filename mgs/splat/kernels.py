@@ -38,12 +38,12 @@ def _sizes(lists: BlockLists, *_: Any, **__: Any) -> tuple[int, ...]:
     return len(lists.splat), len(lists.slot_start), len(lists.block)
 
 
-def pack(s: Splats) -> Any:
-    """Detached splats as Float [16 N], one cache line each, so that a gather misses the cache once:
+def pack(s: Splats, place: Any) -> Any:
+    """Detached splats as Float [16 N], one cache line each, at the places of their block lists:
     (u, v, k, p), (e, log2_opacity, z, u_rest), (r, g, b, v_rest), (k_rest, three unused)."""
     n = len(s.u)
     packed = dr.empty(mi.Float, 16 * n)
-    place = dr.arange(mi.UInt32, n) * 4
+    place = place * 4
     parts = ((s.u, s.v, s.k, s.p), (s.e, s.log2_opacity, s.z, s.u_rest), (s.r, s.g, s.b, s.v_rest), (s.k_rest, 0, 0, 0))
     for i, part in enumerate(parts):
         dr.scatter(packed, mi.Vector4f(*part), place + i, mode=dr.ReduceMode.NoConflicts)
@@ -204,7 +204,10 @@ def _store(buffers: list[Any], sums: list[Any], slot: Any) -> None:
 
 
 def _per_splat(lists: BlockLists, buffers: list[Any], count: int) -> list[Any]:
-    """Add each splat's contiguous slots, in order and in double: `count` Float64 [N]."""
+    """Add each splat's contiguous slots, in order and in double: `count` Float64 [N], in the Gaussians' order.
+
+    Slots are added where splats lie, one after the other in memory, and their sums move four at a time.
+    """
     dr.eval(buffers)
     total = [mi.Vector4d(0) for _ in buffers]
 
@@ -212,7 +215,12 @@ def _per_splat(lists: BlockLists, buffers: list[Any], count: int) -> list[Any]:
         return i + 1, [t + mi.Vector4d(dr.gather(mi.Vector4f, buffer, i)) for t, buffer in zip(total, buffers, strict=True)]
 
     _, total = dr.while_loop((mi.UInt32(lists.slot_start), total), lambda i, total: i < lists.slot_end, body)
-    flat = [component for t in total for component in t][:count]
+    n = len(lists.place)
+    placed = [dr.empty(mi.Float64, 4 * n) for _ in buffers]
+    for sums, buffer in zip(total, placed, strict=True):
+        dr.scatter(buffer, sums, dr.arange(mi.UInt32, n), mode=dr.ReduceMode.NoConflicts)
+    dr.eval(placed)
+    flat = [component for buffer in placed for component in dr.gather(mi.Vector4d, buffer, lists.place)][:count]
     return [dr.select(dr.abs(x) > DENORMAL, x, 0) for x in flat]
 
 
@@ -259,7 +267,7 @@ def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, Any], d_out: tuple[A
 
     _walk(lists, packed, lane, pixels, visit)
     r, g, b, z, d, xx, xy, yy, *first = (mi.Float(x) for x in _per_splat(lists, buffers, count))
-    shape, rest, *_ = _unpack(packed, dr.arange(mi.UInt32, len(lists.slot_start)))
+    shape, rest, *_ = _unpack(packed, lists.place)
     k, p, e = shape.z, shape.w, rest.x
     du = dv = None
     if means:

@@ -55,27 +55,34 @@ class ListCache:
         """Memory held, bytes."""
         return sum(lists.nbytes for lists in self._entries.values())
 
-    def get(self, camera: Camera, splats: Splats) -> BlockLists:
-        """Lists for detached, evaluated splats seen by the camera. Raises InputError where a parameter is not finite."""
+    def get(self, camera: Camera, splats: Splats) -> tuple[BlockLists, Any]:
+        """Lists for detached splats seen by the camera, and the splats packed at the places of these lists.
+
+        Raises InputError where a parameter is not finite.
+        """
         key = (camera.K.tobytes(), camera.world_to_camera.tobytes(), camera.width, camera.height)
         lists = self._entries.get(key)
         margin = 0.0 if lists is None else MARGIN
-        if lists is None or len(lists.slot_start) != len(splats.u):
-            lists = None
-            _raise_unless_finite(dr.all(splats.finite))
-        else:
+        dr.eval(splats)
+        if lists is not None and len(lists.place) == len(splats.u):
             stale = dr.select(splats.finite, mi.UInt32(blocks.outgrown(lists.footprints, splats)), 2)
-            worst = int(dr.max(stale)[0]) if len(stale) else 0
+            dr.schedule(stale)
+            packed = kernels.pack(splats, lists.place)
+            worst = int(dr.max(stale)[0])
             _raise_unless_finite(worst < 2)
             lists = None if worst else lists
+        else:
+            lists = None
         if lists is None:
+            _raise_unless_finite(dr.all(splats.finite))
             lists = blocks.build(splats, blocks.depth_order(splats.z), camera.width, camera.height, margin)
+            packed = kernels.pack(splats, lists.place)
             self.builds += 1
         self._entries[key] = lists
         self._entries.move_to_end(key)
         while len(self._entries) > 1 and self.nbytes > self.budget:
             self._entries.popitem(last=False)
-        return lists
+        return lists, packed
 
 
 def as_colour(background: Any) -> Any:
@@ -113,9 +120,9 @@ class _Rasterise(dr.CustomOp):
     """Splats -> r, g, b, alpha and weighted depth, Float [H*W] each, with the hand-written adjoint: compositing is no sum that
     AD could replay. places: see `_places`."""
 
-    def eval(self, splats: Splats, lists: BlockLists, places: Any, means: bool) -> Any:
-        self.lists, self.places, self.means, self.packed = lists, places, means, kernels.pack(splats)
-        self.out = kernels.forward(lists, self.packed)[:2]
+    def eval(self, splats: Splats, packed: Any, lists: BlockLists, places: Any, means: bool) -> Any:
+        self.packed, self.lists, self.places, self.means = packed, lists, places, means
+        self.out = kernels.forward(lists, packed)[:2]
         pixel = dr.gather(mi.Vector4f, self.out[0], places, mode=dr.ReduceMode.NoConflicts)
         return *pixel, dr.gather(mi.Float, self.out[1], places, mode=dr.ReduceMode.NoConflicts)
 
@@ -137,12 +144,14 @@ def _places(width: int, height: int) -> Any:
     return block * PIXELS + (y % BLOCK_Y) * BLOCK_X + x % BLOCK_X
 
 
-def splats_and_lists(gaussians: Gaussians, camera: Camera, cache: ListCache | None) -> tuple[Splats, BlockLists]:
-    """Project Gaussians with Dr.Jit fields and find their block lists. Raises InputError where a parameter is not finite."""
+def splats_and_lists(gaussians: Gaussians, camera: Camera, cache: ListCache | None) -> tuple[Splats, BlockLists, Any]:
+    """Project Gaussians with Dr.Jit fields, find their block lists and pack them at the places of these lists.
+
+    Raises InputError where a parameter is not finite.
+    """
     splats = project(gaussians, camera_array(camera))
-    dr.eval(splats)
     try:
-        return splats, (cache or ListCache()).get(camera, dr.detach(splats))
+        return splats, *(cache or ListCache()).get(camera, dr.detach(splats))
     except InputError:
         Gaussians(*(np.asarray(dr.detach(getattr(gaussians, f.name))) for f in fields(gaussians))).check()
         raise
@@ -161,8 +170,8 @@ def render(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.
     colour = as_colour(background)
     if len(gaussians) == 0:
         return _empty(camera, colour)
-    splats, lists = splats_and_lists(as_drjit(gaussians), camera, cache)
-    return composite(splats, lists, camera.width, camera.height, colour)
+    splats, lists, packed = splats_and_lists(as_drjit(gaussians), camera, cache)
+    return composite(splats, packed, lists, camera.width, camera.height, colour)
 
 
 def _empty(camera: Camera, background: Any) -> Image:
@@ -172,10 +181,10 @@ def _empty(camera: Camera, background: Any) -> Image:
     return Image(mi.TensorXf(np.ascontiguousarray(rgb)), dr.zeros(mi.TensorXf, shape), dr.zeros(mi.TensorXf, shape))
 
 
-def composite(splats: Splats, lists: BlockLists, width: int, height: int, background: Any = 0.0) -> Image:
-    """Composite projected splats whose block lists are known, over a Color3f; differentiable in the splats' numbers."""
+def composite(splats: Splats, packed: Any, lists: BlockLists, width: int, height: int, background: Any = 0.0) -> Image:
+    """Composite projected splats, packed for their block lists, over a Color3f; differentiable in the splats' numbers."""
     places = _places(width, height)
-    r, g, b, alpha, weighted = dr.custom(_Rasterise, splats, lists, places, dr.grad_enabled(splats.u))
+    r, g, b, alpha, weighted = dr.custom(_Rasterise, splats, packed, lists, places, dr.grad_enabled(splats.u))
     rgb = mi.Color3f(r, g, b) + (1 - alpha) * background
     expected = dr.select(alpha > 0, weighted / dr.select(alpha > 0, alpha, 1), 0)
     shape = (height, width)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mgs.splat import ListCache, as_drjit, fisher, reference, render
-from mgs.splat.blocks import BLOCK_X, BLOCK_Y, build, depth_order, inflate, outgrown
+from mgs.splat.blocks import BLOCK_X, BLOCK_Y, TILE, build, depth_order, inflate, outgrown
 from mgs.splat.project import camera_array, project
 from mgs.splat.render import MARGIN
 
@@ -28,7 +28,8 @@ def lists_of(gaussians, camera, margin=MARGIN):
 
 def pairs_of(lists) -> set[tuple[int, int]]:
     """{(splat, block)}."""
-    splat, block, start, end = (np.asarray(a) for a in (lists.splat, lists.block, lists.start, lists.end))
+    place, splat, block, start, end = (np.asarray(a) for a in (lists.place, lists.splat, lists.block, lists.start, lists.end))
+    splat = np.argsort(place)[splat]
     return {(int(j), int(b)) for b, s, e in zip(block, start, end, strict=True) for j in splat[s:e]}
 
 
@@ -57,14 +58,30 @@ def test_lists_are_in_depth_order_and_slots_of_a_splat_contiguous():
     camera, g = make_camera(), make_gaussians(60, 9)
     lists, splats = lists_of(g, camera)
     splat, slot, start, end = (np.asarray(a) for a in (lists.splat, lists.slot, lists.start, lists.end))
-    z, used = np.asarray(splats.z), int((end - start).sum())
+    by_place = np.argsort(np.asarray(lists.place))
+    assert sorted(by_place) == list(range(60)), "every splat has a place of its own"
+    z, used = np.asarray(splats.z)[by_place], int((end - start).sum())
     for s, e in zip(start, end, strict=True):
         assert (np.diff(z[splat[s:e]]) >= 0).all()
     assert sorted(slot[:used]) == list(range(used))
     first, last = np.asarray(lists.slot_start), np.asarray(lists.slot_end)
     for j in range(len(g)):
         assert sorted(slot[:used][splat[:used] == j]) == list(range(first[j], last[j]))
-    assert (np.diff((end - start).astype(int)) <= 0).all(), "longest list first"
+
+
+def test_memory_and_lanes_go_by_tile():
+    """Splats lie by the tile of their centre, then block, then depth; lanes go by tile, in it the longest list first."""
+    camera, g = make_camera((300, 200), focal=300.0), make_gaussians(500, 9, log_scales=(-5.0, -3.0))
+    lists, splats = lists_of(g, camera)
+    across = -(-camera.width // BLOCK_X)
+    u, v, z = (np.asarray(a, np.float64)[np.argsort(np.asarray(lists.place))] for a in (splats.u, splats.v, splats.z))
+    bx, by = np.clip(u // BLOCK_X, 0, across - 1), np.clip(v // BLOCK_Y, 0, camera.height // BLOCK_Y - 1)
+    tile = by // TILE * -(-across // TILE) + bx // TILE
+    assert len(set(tile)) > 4
+    np.testing.assert_array_equal(np.lexsort((z, bx, by, tile)), np.arange(len(g)))
+    block, length = np.asarray(lists.block).astype(int), (np.asarray(lists.end) - np.asarray(lists.start)).astype(int)
+    tile = block // across // TILE * -(-across // TILE) + block % across // TILE
+    np.testing.assert_array_equal(np.lexsort((-length, tile)), np.arange(len(block)))
 
 
 def test_a_new_camera_compiles_nothing():
