@@ -39,21 +39,46 @@ def _sizes(lists: BlockLists, *_: Any, **__: Any) -> tuple[int, ...]:
 
 
 def pack(s: Splats, place: Any) -> Any:
-    """Detached splats as Float [16 N], one cache line each, at the places of their block lists:
-    (u, v, k, p), (e, log2_opacity, z, u_rest), (r, g, b, v_rest), (k_rest, three unused)."""
-    n = len(s.u)
-    packed = dr.empty(mi.Float, 16 * n)
-    place = place * 4
-    parts = ((s.u, s.v, s.k, s.p), (s.e, s.log2_opacity, s.z, s.u_rest), (s.r, s.g, s.b, s.v_rest), (s.k_rest, 0, 0, 0))
+    """Detached splats at the places of their block lists: as Float [16 N], one cache line each,
+    (u, v, k, p), (e, log2_opacity, z, u_rest), (r, g, b, v_rest), (k_rest, three unused);
+    those of `project64` as Float64 [12 N], (u, v, k, p), (e, log2_opacity, z, 0), (r, g, b, 0)."""
+    parts = [[s.u, s.v, s.k, s.p], [s.e, s.log2_opacity, s.z, s.u_rest], [s.r, s.g, s.b, s.v_rest], [s.k_rest, 0, 0, 0]]
+    real, vector = mi.Float, mi.Vector4f
+    if s.u_rest is None:
+        parts = [[0 if number is None else number for number in part] for part in parts[:3]]
+        real, vector = mi.Float64, mi.Vector4d
+    packed = dr.empty(real, 4 * len(parts) * len(s.u))
     for i, part in enumerate(parts):
-        dr.scatter(packed, mi.Vector4f(*part), place + i, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter(packed, vector(*part), place * len(parts) + i, mode=dr.ReduceMode.NoConflicts)
     dr.eval(packed)
     return packed
 
 
-def _unpack(packed: Any, splat: Any) -> list[Any]:
-    """The four Vector4f of the given splats, as `pack` lists them."""
-    return [dr.gather(mi.Vector4f, packed, splat * 4 + i) for i in range(4)]
+@dataclass
+class Splat:
+    """One splat per lane: u, v, k Float64, the other numbers as exact as they were packed."""
+
+    u: Any
+    v: Any
+    k: Any
+    p: Any
+    e: Any
+    log2_opacity: Any
+    z: Any
+    colour: list[Any]
+
+
+def _unpack(packed: Any, place: Any) -> Splat:
+    """The splats at the given places."""
+    if type(packed) is mi.Float64:
+        (u, v, k, p), (e, log2_opacity, z, _), (*colour, _) = (dr.gather(mi.Vector4d, packed, place * 3 + i) for i in range(3))
+        return Splat(u, v, k, p, e, log2_opacity, z, colour)
+    (u, v, k, p), (e, log2_opacity, z, u_rest), (*colour, v_rest), (k_rest, *_) = (
+        dr.gather(mi.Vector4f, packed, place * 4 + i) for i in range(4)
+    )
+    double = mi.Float64
+    u, v, k = double(u) + double(u_rest), double(v) + double(v_rest), double(k) + double(k_rest)
+    return Splat(u, v, k, p, e, log2_opacity, z, colour)
 
 
 @dataclass
@@ -79,43 +104,57 @@ def _lane(lists: BlockLists) -> tuple[Lane, list[Any]]:
 
 @dataclass
 class Row:
-    """One row of a lane's pixels under one splat: eta (Float) and, per pixel, xi and the unclamped alpha."""
+    """One row of a lane's pixels under one splat: eta and, per pixel, xi and the unclamped alpha."""
 
     eta: Any
     xi: list[Any]
     raw: list[Any]
 
 
+EXP2 = (1.0, 0.69314720574, 0.24022646891, 0.05550328776, 0.00961848896, 0.00133999314, 0.00015345812)
+"""Polynomial of 2^x on [-1/2, 1/2] with the least relative error, 2e-9."""
+
+
+def exp2(x: Any) -> Any:
+    """2^x, relative error 2e-9 (of a Float: 8e-8), for x up to 120, and 2^-120 for x below -120. Half the instructions of
+    dr.exp2, which also knows infinity and zero: an alpha of 2^-120 is not drawn, whatever it is."""
+    integer, bits = (mi.Int64, 52) if type(x) is mi.Float64 else (mi.Int32, 23)
+    x = dr.select(x > -120, x, -120)
+    whole = dr.round(x)
+    part = x - whole
+    value = type(x)(EXP2[-1])
+    for coefficient in EXP2[-2::-1]:
+        value = dr.fma(value, part, coefficient)
+    return dr.reinterpret_array(type(x), dr.reinterpret_array(integer, value) + (integer(whole) << bits))
+
+
 CENTRE = BLOCK_X // 2
 """Column from which a row's alphas are stepped outwards."""
 
 
-def _rows(lane: Lane, splat: list[Any], stepped: bool = True) -> list[Row]:
+def _rows(lane: Lane, s: Splat) -> list[Row]:
     """alpha = 2^(log2_opacity - xi^2 - eta^2) on the lane's pixels.
 
-    The lane's corner is placed in double: far along a slanted needle, xi is a small difference of large numbers.
-    stepped: the exponent is quadratic along a row, so alpha is stepped by multiplication: three exp2 a row, not eight, for
-    rounding errors four times as large. Starting from the middle, nothing underflows: EPS2D keeps p below 1.6, so alpha there
-    is at least 2^-100 wherever the row has a pixel drawn.
+    The lane's corner is placed in double: far along a slanted needle, xi is a small difference of large numbers. alpha is
+    stepped along a row by multiplication, as the exponent is quadratic there: three exp2 a row, not eight, for rounding errors
+    four times as large. Starting from the middle, nothing underflows: EPS2D keeps p below 1.6, so alpha there is at least
+    2^-100 wherever the row has a pixel drawn.
     """
-    (u, v, k, p), (e, log2_opacity, _, u_rest), (*_, v_rest), (k_rest, *_) = splat
-    double = mi.Float64
-    dx, dy = double(lane.x) - double(u) - double(u_rest), double(lane.y) - double(v) - double(v_rest)
-    corner, down = mi.Float(double(p) * (dx - (double(k) + double(k_rest)) * dy)), mi.Float(dy)
-    pk, bend = p * k, dr.exp2(-2 * p * p)
+    real = type(s.p)
+    dx, dy = mi.Float64(lane.x) - s.u, mi.Float64(lane.y) - s.v
+    corner, down = real(mi.Float64(s.p) * (dx - s.k * dy)), real(dy)
+    pk, bend = s.p * real(s.k), exp2(-2 * s.p * s.p)
     rows = []
     for j in range(BLOCK_Y):
-        eta = e * (down + j)
-        first = dr.fma(-pk, mi.Float(j), corner)
-        xi = [dr.fma(p, mi.Float(i), first) for i in range(BLOCK_X)]
-        row = dr.fma(-eta, eta, log2_opacity)
-        if not stepped:
-            rows.append(Row(eta, xi, [dr.exp2(dr.fma(-x, x, row)) for x in xi]))
-            continue
+        eta = s.e * (down + j)
+        first = dr.fma(-pk, real(j), corner)
+        xi = [dr.fma(s.p, real(i), first) for i in range(BLOCK_X)]
+        row = dr.fma(-eta, eta, s.log2_opacity)
         middle = xi[CENTRE]
-        raw = [dr.exp2(dr.fma(-middle, middle, row))] * BLOCK_X
+        raw = [exp2(dr.fma(-middle, middle, row))] * BLOCK_X
         for columns, sign in ((range(CENTRE + 1, BLOCK_X), -1), (range(CENTRE - 1, -1, -1), 1)):
-            ratio = dr.exp2(p * dr.fma(mi.Float(2 * sign), middle, -p))
+            step = s.p * dr.fma(real(2 * sign), middle, -s.p)
+            ratio = exp2(dr.select(step < 120, step, 120))
             for i in columns:
                 raw[i] = raw[i + sign] * ratio
                 ratio = ratio * bend
@@ -136,19 +175,16 @@ def _blend(raw: Any, T: Any) -> tuple[Any, Any, Any, Any]:
     return alpha, alpha * T, dr.select(room, after, -dr.abs(T)), room
 
 
-def _walk(
-    lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], visit: Callable[..., Any], stepped: bool = True
-) -> list[list[Any]]:
+def _walk(lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], visit: Callable[..., Any]) -> list[list[Any]]:
     """Walk the lists front to back until they end or no pixel has transmittance left; returns the last state of the pixels.
 
-    visit(i, rows, rest, colour, pixels) -> (pixels, alive) draws the splat of pair i on the lane's pixels. Their states stay
+    visit(i, splat, rows, pixels) -> (pixels, alive) draws the splat of pair i on the lane's pixels. Their states stay
     together, pixel by pixel, since the compiler keeps that order: each is then finished before the next needs registers.
     """
 
     def body(i: Any, pixels: Any, alive: Any) -> Any:
         splat = _unpack(packed, dr.gather(mi.UInt32, lists.splat, i))
-        _, rest, colour, _ = splat
-        pixels, alive = visit(i, _rows(lane, splat, stepped), rest, colour, pixels)
+        pixels, alive = visit(i, splat, _rows(lane, splat), pixels)
         return i + 1, pixels, (i + 1 < lane.end) & alive
 
     start = mi.UInt32(lane.start)
@@ -156,72 +192,85 @@ def _walk(
     return pixels
 
 
-@frozen(_sizes)
-def forward(lists: BlockLists, packed: Any, stepped: bool = True) -> tuple[Any, Any, Any]:
-    """Composite; stepped: see `_rows`. Returns block-major pixels: rgba Float [L*32*4] (premultiplied, no background),
-    weighted depth [L*32] and transmittance [L*32].
+def _composite(lists: BlockLists, packed: Any, lane: Lane, T: list[Any], numbers: Callable[[Splat], list[Any]]) -> Any:
+    """For each of a lane's pixels, [transmittance, sum w n for each of the numbers n of a splat]."""
+    count = len(numbers(_unpack(packed, mi.UInt32(0))))
+    pixels = [[t, *(dr.zeros(type(packed), len(lists.block)) for _ in range(count))] for t in T]
 
-    alpha is summed, not 1 - T, nor T the rest of alpha: expected depth is a quotient by alpha in faint pixels, and the colour
-    behind a splat is a multiple of T in opaque ones, where the other has kept its last bits only.
-    """
-    lane, T = _lane(lists)
-    pixels = [[t, *(dr.zeros(mi.Float, len(lists.block)) for _ in range(5))] for t in T]
-
-    def visit(i: Any, rows: list[Row], rest: Any, colour: Any, pixels: Any) -> Any:
+    def visit(i: Any, splat: Splat, rows: list[Row], pixels: Any) -> Any:
         new, alive = [], mi.Bool(False)
-        for pixel, (T, r, g, b, alpha, z) in enumerate(pixels):
+        for pixel, (T, *sums) in enumerate(pixels):
             _, w, after, room = _blend(rows[pixel // BLOCK_X].raw[pixel % BLOCK_X], T)
-            drawn = [dr.fma(c, w, s) for c, s in zip((colour.x, colour.y, colour.z, rest.z), (r, g, b, z), strict=True)]
-            new.append([after, *drawn[:3], alpha + w, drawn[3]])
+            new.append([after, *(dr.fma(n, w, s) for n, s in zip(numbers(splat), sums, strict=True))])
             alive |= room
         return new, alive
 
-    pixels = _walk(lists, packed, lane, pixels, visit, stepped)
-    rgba, depth, through = (dr.empty(mi.Float, len(lists.block) * PIXELS * size) for size in (4, 1, 1))
-    for pixel, (transmittance, r, g, b, alpha, z) in enumerate(pixels):
-        place = lists.block * PIXELS + pixel
-        dr.scatter(rgba, mi.Vector4f(r, g, b, alpha), place, mode=dr.ReduceMode.NoConflicts)
-        dr.scatter(depth, z, place, mode=dr.ReduceMode.NoConflicts)
-        dr.scatter(through, dr.abs(transmittance), place, mode=dr.ReduceMode.NoConflicts)
-    return rgba, depth, through
+    return _walk(lists, packed, lane, pixels, visit)
 
 
-def _held_and_lost(alpha: Any, w: Any, raw: Any) -> tuple[Any, Any]:
-    """(a, b) such that the derivative of a pixel by ln alpha is D alpha = a c - b S; 0 where alpha is clamped."""
-    free = raw <= ALPHA_MAX
-    return dr.select(free, w, 0), dr.select(free, alpha * dr.rcp(1 - alpha), 0)
+@frozen(_sizes)
+def forward(lists: BlockLists, packed: Any) -> tuple[Any, Any]:
+    """Composite. Returns block-major pixels: rgba Float [L*32*4] (premultiplied, no background), weighted depth [L*32].
 
-
-def _buffers(lists: BlockLists, count: int) -> list[Any]:
-    """Room for `count` sums per pair, four to a buffer."""
-    return [dr.zeros(mi.Float, len(lists.splat) * 4) for _ in range(-(-count // 4))]
-
-
-def _store(buffers: list[Any], sums: list[Any], slot: Any) -> None:
-    padded = sums + [mi.Float(0)] * (-len(sums) % 4)
-    for n, buffer in enumerate(buffers):
-        dr.scatter(buffer, mi.Vector4f(*padded[4 * n : 4 * n + 4]), slot, mode=dr.ReduceMode.NoConflicts)
-
-
-def _per_splat(lists: BlockLists, buffers: list[Any], count: int) -> list[Any]:
-    """Add each splat's contiguous slots, in order and in double: `count` Float64 [N], in the Gaussians' order.
-
-    Slots are added where splats lie, one after the other in memory, and their sums move four at a time.
+    alpha is summed, not 1 - T: expected depth is a quotient by alpha in faint pixels, where the other has kept its last bits.
     """
-    dr.eval(buffers)
-    total = [mi.Vector4d(0) for _ in buffers]
+    pixels = _composite(lists, packed, *_lane(lists), lambda splat: [*splat.colour, mi.Float(1), splat.z])
+    rgba, depth = (dr.empty(mi.Float, len(lists.block) * PIXELS * size) for size in (4, 1))
+    for pixel, (_, *colour, z) in enumerate(pixels):
+        place = lists.block * PIXELS + pixel
+        dr.scatter(rgba, mi.Vector4f(*colour), place, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter(depth, z, place, mode=dr.ReduceMode.NoConflicts)
+    return rgba, depth
 
-    def body(i: Any, total: list[Any]) -> Any:
-        return i + 1, [t + mi.Vector4d(dr.gather(mi.Vector4f, buffer, i)) for t, buffer in zip(total, buffers, strict=True)]
 
-    _, total = dr.while_loop((mi.UInt32(lists.slot_start), total), lambda i, total: i < lists.slot_end, body)
-    n = len(lists.place)
-    placed = [dr.empty(mi.Float64, 4 * n) for _ in buffers]
-    for sums, buffer in zip(total, placed, strict=True):
-        dr.scatter(buffer, sums, dr.arange(mi.UInt32, n), mode=dr.ReduceMode.NoConflicts)
-    dr.eval(placed)
-    flat = [component for buffer in placed for component in dr.gather(mi.Vector4d, buffer, lists.place)][:count]
-    return [dr.select(dr.abs(x) > DENORMAL, x, 0) for x in flat]
+def _slopes(colours: list[Any], behind: list[Any], alpha: Any, w: Any, after: Any, free: Any) -> list[Any]:
+    """The derivatives D alpha of a pixel's channels by ln alpha, as Float; 0 where alpha is clamped or the pixel finished.
+
+    In double as alpha / (1 - alpha) (c T (1 - alpha) - S), where nothing but the difference cancels and the rest may be single.
+    In single precision 1 - alpha would lose digits in opaque pixels, so there as c w - S alpha / (1 - alpha).
+    """
+    if type(alpha) is mi.Float64:
+        odds = dr.select(free, mi.Float(w) / mi.Float(after), 0)
+        return [odds * mi.Float(dr.fma(c, after, -s)) for c, s in zip(colours, behind, strict=True)]
+    held, lost = dr.select(free, w, 0), dr.select(free, alpha / (1 - alpha), 0)
+    return [dr.fma(c, held, -s * lost) for c, s in zip(colours, behind, strict=True)]
+
+
+def _slots(lists: BlockLists, count: int) -> Any:
+    """Room for `count` sums per pair, side by side, in whole packets of four."""
+    return dr.zeros(mi.Float, len(lists.splat) * 4 * _packets(count))
+
+
+def _packets(count: int) -> int:
+    return -(-count // 4)
+
+
+def _store(slots: Any, sums: list[Any], slot: Any) -> None:
+    padded, packets = sums + [mi.Float(0)] * (-len(sums) % 4), _packets(len(sums))
+    for i in range(packets):
+        dr.scatter(slots, mi.Vector4f(*padded[4 * i : 4 * i + 4]), slot * packets + i, mode=dr.ReduceMode.NoConflicts)
+
+
+def _per_splat(lists: BlockLists, slots: Any, count: int) -> Any:
+    """Add each splat's contiguous slots, in order and in double: Float64 [N * packets * 4], where splats lie."""
+    dr.eval(slots)
+    packets = _packets(count)
+    lane = dr.arange(mi.UInt32, len(lists.place) * packets)
+    place, packet = lane // packets, lane % packets
+    start, end = (dr.gather(mi.UInt32, a, place) for a in (lists.slot_start, lists.slot_end))
+
+    def body(i: Any, total: Any) -> Any:
+        return i + 1, total + mi.Vector4d(dr.gather(mi.Vector4f, slots, i * packets + packet))
+
+    _, total = dr.while_loop((start, mi.Vector4d(0)), lambda i, total: i < end, body)
+    return dr.ravel(total)
+
+
+def by_splat(lists: BlockLists, placed: Any, count: int) -> list[Any]:
+    """The sums of `_per_splat` as `count` Float64 [N], in the Gaussians' order."""
+    packets = _packets(count)
+    flat = [x for i in range(packets) for x in dr.gather(mi.Vector4d, placed, lists.place * packets + i)]
+    return [dr.select(dr.abs(x) > DENORMAL, x, 0) for x in flat[:count]]
 
 
 @frozen(_sizes)
@@ -239,36 +288,35 @@ def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, Any], d_out: tuple[A
         dL.append((*d_rgba, dz))
         pixels.append([T[pixel], dr.dot(rgba, d_rgba) + z * dz])
     count = 10 if means else 8
-    buffers = _buffers(lists, count)
+    slots = _slots(lists, count)
 
-    def visit(i: Any, rows: list[Row], rest: Any, colour: Any, pixels: Any) -> Any:
+    def visit(i: Any, splat: Splat, rows: list[Row], pixels: Any) -> Any:
         new, alive = [], mi.Bool(False)
-        sums = [mi.Float(0)] * 10
+        sums, (r, g, b) = [mi.Float(0)] * 10, splat.colour
         for j, row in enumerate(rows):
             m0, m1, m2 = mi.Float(0), mi.Float(0), mi.Float(0)
             for x, (raw, xi) in enumerate(zip(row.raw, row.xi, strict=True)):
                 transmittance, behind = pixels[j * BLOCK_X + x]
                 dr_, dg, db, da, dz = dL[j * BLOCK_X + x]
                 alpha, w, after, room = _blend(raw, transmittance)
-                c = dr.fma(colour.x, dr_, dr.fma(colour.y, dg, dr.fma(colour.z, db, dr.fma(rest.z, dz, da))))
+                c = dr.fma(r, dr_, dr.fma(g, dg, dr.fma(b, db, dr.fma(splat.z, dz, da))))
                 behind = dr.fma(-c, w, behind)
                 new.append([after, behind])
                 alive |= room
-                held, lost = _held_and_lost(alpha, w, raw)
-                slope = dr.fma(c, held, -behind * lost)
+                (slope,) = _slopes([c], [behind], alpha, w, after, room & (raw <= ALPHA_MAX))
                 sums[:4] = [dr.fma(w, d, s) for d, s in zip((dr_, dg, db, dz), sums[:4], strict=True)]
                 first = slope * xi
                 m0, m1, m2 = m0 + slope, m1 + first, dr.fma(first, xi, m2)
             eta_m0 = row.eta * m0
             moments = (m0, m2, m1 * row.eta, eta_m0 * row.eta, m1, eta_m0)
             sums[4:] = [a + b for a, b in zip(sums[4:], moments, strict=True)]
-        _store(buffers, sums[:count], dr.gather(mi.UInt32, lists.slot, i))
+        _store(slots, sums[:count], dr.gather(mi.UInt32, lists.slot, i))
         return new, alive
 
     _walk(lists, packed, lane, pixels, visit)
-    r, g, b, z, d, xx, xy, yy, *first = (mi.Float(x) for x in _per_splat(lists, buffers, count))
-    shape, rest, *_ = _unpack(packed, lists.place)
-    k, p, e = shape.z, shape.w, rest.x
+    r, g, b, z, d, xx, xy, yy, *first = (mi.Float(x) for x in by_splat(lists, _per_splat(lists, slots, count), count))
+    s = _unpack(packed, lists.place)
+    k, p, e = mi.Float(s.k), s.p, s.e
     du = dv = None
     if means:
         fx, fy = first
@@ -276,39 +324,43 @@ def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, Any], d_out: tuple[A
     return Splats(du, dv, 2 * LN2 * p / e * xy, -2 * LN2 / p * xx, -2 * LN2 / e * yy, LN2 * d, z, r, g, b)
 
 
+FISHER_SUMS = {False: 7, True: 22}
+"""Sums per splat of `fisher`: exact diagonal, exact blocks."""
+
+
 @frozen(_sizes)
-def fisher(lists: BlockLists, packed: Any, rgba: Any, transmittance: Any, background: Any, block: bool) -> list[Any]:
-    """Sums over pixels and channels, Float64 [N] each, from which O(N) work makes the Fisher information.
+def fisher(lists: BlockLists, packed: Any, background: Any, block: bool) -> Any:
+    """Sums over pixels and channels, from which O(N) work makes the Fisher information; to be read through `by_splat`.
 
     With f = (xi^2, xi eta, eta^2), s_c = D_c alpha and |s|^2 summed over channels:
     sum w^2, sum |s|^2, the five moments sum |s|^2 (xi^4, xi^3 eta, xi^2 eta^2, xi eta^3, eta^4): seven, the exact diagonal.
-    block=True appends sum |s|^2 f (3) and, for c = r, g, b, sum w s_c (1) and sum w s_c f (3): 22, the exact blocks.
-    rgba, transmittance: of `forward`, stepped where block is False: entries off the diagonal cancel, so blocks need alphas as
-    exact as can be. background: Color3f.
+    block=True appends sum |s|^2 f (3) and, for c = r, g, b, sum w s_c (1) and sum w s_c f (3): 22, the exact blocks. Those
+    cancel, so pixels are worth splats in double there; sums over a lane's pixels are single.
+    background: Color3f.
     """
+    real = type(packed)
     lane, T = _lane(lists)
-    pixels = []
-    for pixel in range(PIXELS):
-        out = dr.gather(mi.Vector4f, rgba, lists.block * PIXELS + pixel)
-        through = dr.gather(mi.Float, transmittance, lists.block * PIXELS + pixel)
-        pixels.append([T[pixel], *(dr.fma(through, b, c) for c, b in zip((out.x, out.y, out.z), background, strict=True))])
-    count = 22 if block else 7
-    buffers = _buffers(lists, count)
+    T = [real(t) for t in T]
+    pixels = _composite(lists, packed, lane, T, lambda splat: splat.colour)
+    behind = [[dr.fma(dr.abs(t), real(b), c) for c, b in zip(rgb, background, strict=True)] for t, *rgb in pixels]
+    dr.eval(behind)
+    count = FISHER_SUMS[block]
+    slots = _slots(lists, count)
 
-    def visit(i: Any, rows: list[Row], rest: Any, colour: Any, pixels: Any) -> Any:
+    def visit(i: Any, splat: Splat, rows: list[Row], pixels: Any) -> Any:
         new, alive = [], mi.Bool(False)
-        sums, rgb = [mi.Float(0)] * 22, (colour.x, colour.y, colour.z)
+        sums = [mi.Float(0)] * 22
         for j, row in enumerate(rows):
             m = [mi.Float(0)] * 5
             cross = [[mi.Float(0)] * 3 for _ in range(3)]
             for x, (raw, xi) in enumerate(zip(row.raw, row.xi, strict=True)):
                 transmittance, *behind = pixels[j * BLOCK_X + x]
                 alpha, w, after, room = _blend(raw, transmittance)
-                behind = [dr.fma(-c, w, s) for c, s in zip(rgb, behind, strict=True)]
+                behind = [dr.fma(-c, w, s) for c, s in zip(splat.colour, behind, strict=True)]
                 new.append([after, *behind])
                 alive |= room
-                held, lost = _held_and_lost(alpha, w, raw)
-                slopes = [dr.fma(c, held, -s * lost) for c, s in zip(rgb, behind, strict=True)]
+                slopes = _slopes(splat.colour, behind, alpha, w, after, room & (raw <= ALPHA_MAX))
+                w, xi = mi.Float(w), mi.Float(xi)
                 sums[0] = dr.fma(w, w, sums[0])
                 square = sum(s * s for s in slopes)
                 xi2 = xi * xi
@@ -320,7 +372,7 @@ def fisher(lists: BlockLists, packed: Any, rgba: Any, transmittance: Any, backgr
                         ws = w * s
                         a = cross[c]
                         cross[c] = [a[0] + ws, dr.fma(ws, xi, a[1]), dr.fma(ws, xi2, a[2])]
-            eta = row.eta
+            eta = mi.Float(row.eta)
             eta2 = eta * eta
             moments = [m[0], m[4], m[3] * eta, m[2] * eta2, m[1] * eta2 * eta, m[0] * eta2 * eta2]
             if block:
@@ -328,8 +380,8 @@ def fisher(lists: BlockLists, packed: Any, rgba: Any, transmittance: Any, backgr
                 for a in cross:
                     moments += [a[0], a[2], a[1] * eta, a[0] * eta2]
             sums[1 : 1 + len(moments)] = [a + b for a, b in zip(sums[1:], moments, strict=False)]
-        _store(buffers, sums[:count], dr.gather(mi.UInt32, lists.slot, i))
+        _store(slots, sums[:count], dr.gather(mi.UInt32, lists.slot, i))
         return new, alive
 
-    _walk(lists, packed, lane, pixels, visit, stepped=not block)
-    return _per_splat(lists, buffers, count)
+    _walk(lists, packed, lane, [[t, *c] for t, c in zip(T, behind, strict=True)], visit)
+    return _per_splat(lists, slots, count)

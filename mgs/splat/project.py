@@ -139,8 +139,8 @@ def _rounded(value: Any) -> tuple[Any, Any]:
     return rounded, mi.Float(dr.detach(value - mi.Float64(rounded)))
 
 
-def project(gaussians: Gaussians, camera: Any) -> Splats:
-    """Project Gaussians with Dr.Jit TensorXf fields through a `camera_array`. Differentiable in every parameter.
+def project64(gaussians: Gaussians, camera: Any) -> Splats:
+    """Project Gaussians with Dr.Jit TensorXf fields through a `camera_array`; numbers are Float64, and the rests None.
 
     Source: EWA splatting (Zwicker et al. 2002) as in 3DGS.
     """
@@ -158,7 +158,13 @@ def project(gaussians: Gaussians, camera: Any) -> Splats:
         sh = dr.gather(mi.Color3f, gaussians.sh.array, index * coefficients + i, mode=dr.ReduceMode.NoConflicts)
         finite &= dr.all(dr.isfinite(sh))
         colour += basis * mi.Color3d(sh)
-    colour = mi.Color3f(dr.maximum(colour, 0))
-    (u, u_rest), (v, v_rest), (k, k_rest) = (_rounded(value) for value in (u, v, k))
-    p, e, log2_opacity, z = (mi.Float(value) for value in (p, e, log2_opacity, z))
-    return Splats(u, v, k, p, e, log2_opacity, z, colour.x, colour.y, colour.z, visible, finite, u_rest, v_rest, k_rest)
+    colour = dr.maximum(colour, 0)
+    return Splats(u, v, k, p, e, log2_opacity, z, colour.x, colour.y, colour.z, visible, finite)
+
+
+def project(gaussians: Gaussians, camera: Any) -> Splats:
+    """`project64`, rounded to Float. Differentiable in every parameter."""
+    s = project64(gaussians, camera)
+    (u, u_rest), (v, v_rest), (k, k_rest) = (_rounded(value) for value in (s.u, s.v, s.k))
+    p, e, log2_opacity, z, r, g, b = (mi.Float(value) for value in (s.p, s.e, s.log2_opacity, s.z, s.r, s.g, s.b))
+    return Splats(u, v, k, p, e, log2_opacity, z, r, g, b, s.visible, s.finite, u_rest, v_rest, k_rest)

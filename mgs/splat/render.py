@@ -122,7 +122,7 @@ class _Rasterise(dr.CustomOp):
 
     def eval(self, splats: Splats, packed: Any, lists: BlockLists, places: Any, means: bool) -> Any:
         self.packed, self.lists, self.places, self.means = packed, lists, places, means
-        self.out = kernels.forward(lists, packed)[:2]
+        self.out = kernels.forward(lists, packed)
         pixel = dr.gather(mi.Vector4f, self.out[0], places, mode=dr.ReduceMode.NoConflicts)
         return *pixel, dr.gather(mi.Float, self.out[1], places, mode=dr.ReduceMode.NoConflicts)
 
