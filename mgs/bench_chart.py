@@ -5,6 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scipy.optimize import nnls
+
 from mgs.bench import exponent
 from mgs.figures import STYLE, new_figure, save_figure
 
@@ -46,11 +49,29 @@ def scaling_exponents(points: list[dict[str, Any]]) -> dict[str, dict[str, float
     }
 
 
+def linear_growth(points: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Each operation's time as constant + cost per (splat, block) pair + cost per Gaussian, none negative, and the largest
+    relative deviation of a measured point from that: least squares of the relative errors, all points on most threads.
+
+    A Gaussian that is seen has at least one pair, so time that fits is bounded by constant + (both costs) x pairs.
+    """
+    most = max(p["threads"] for p in points)
+    chosen = [p for p in points if p["threads"] == most]
+    terms = np.array([[1.0, p["pairs"], p["n"]] for p in chosen])
+    found = {}
+    for name, (label, _, _) in OPERATIONS.items():
+        seconds = np.array([p[name] for p in chosen])
+        costs, _ = nnls(terms / seconds[:, None], np.ones(len(seconds)))
+        values = costs[0] * 1e3, costs[1] * 1e9, costs[2] * 1e9, np.abs(terms @ costs / seconds - 1).max()
+        found[label] = dict(zip(("constant, ms", "ns per pair", "ns per Gaussian", "worst deviation"), values, strict=True))
+    return found
+
+
 def scaling_figure(path: str | Path, points: list[dict[str, Any]]) -> None:
     """Four panels: time against N, pixels and pairs, and memory against N; threads as a note."""
     import matplotlib
 
-    exponents, start = scaling_exponents(points), fitted(points)[0]["n"]
+    exponents, start, linear = scaling_exponents(points), fitted(points)[0]["n"], linear_growth(points)
     with matplotlib.rc_context(STYLE | {"legend.fontsize": 7, "legend.title_fontsize": 7}):
         figure = new_figure(10, 7)
         panels = figure.subplots(2, 2)
@@ -66,6 +87,11 @@ def scaling_figure(path: str | Path, points: list[dict[str, Any]]) -> None:
         panels[1, 0].legend(
             title=f"exponent as N grows (solid, from {start:,})\nand as the image grows (dashed)", loc="upper left"
         )
+        worst = max(row["worst deviation"] for row in linear.values())
+        costs = [f"{row['ns per pair']:.0f} + {row['ns per Gaussian']:.0f}: {label}" for label, row in linear.items()]
+        text = "\n".join(["ns per pair + ns per Gaussian", f"(within {worst:.0%} of every point)", *costs])
+        panels[1, 0].set_ylim(bottom=0.3 * panels[1, 0].get_ylim()[0])
+        panels[1, 0].text(0.98, 0.03, text, transform=panels[1, 0].transAxes, ha="right", va="bottom", fontsize=7)
         memory, by_n = panels[1, 1], _sweep(points, "gaussians")
         peak = f"peak of the kernels: {exponents['peak memory']['N']:.2f}"
         for key, style, colour, label in (

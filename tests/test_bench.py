@@ -10,7 +10,7 @@ import tiny
 from refusals import refused
 
 from mgs import bench
-from mgs.bench_chart import OPERATIONS, fitted, scaling_exponents, scaling_figure
+from mgs.bench_chart import OPERATIONS, fitted, linear_growth, scaling_exponents, scaling_figure
 from mgs.cli import main
 from mgs.files import read_json
 
@@ -39,6 +39,19 @@ def test_growth_with_pairs_is_told_for_either_way_to_get_more(tmp_path):
     assert fitted(points(3000))[0]["n"] == 1000
     scaling_figure(tmp_path / "chart.png", records)
     assert (tmp_path / "chart.png").stat().st_size > 10_000
+
+
+def test_linear_growth_finds_the_costs_it_is_made_of():
+    """And says by how much a time that grows faster is missed."""
+    records = points()
+    for p in records:
+        p.update(dict.fromkeys(OPERATIONS, 2e-3 + 3e-9 * p["pairs"] + 5e-9 * p["n"]))
+        p["forward_cold"] = 1e-9 * p["n"] ** 1.5
+        p["fisher_exact"] = 1.0 if p["threads"] == 1 else 4e-9 * p["n"]
+    found = linear_growth(records)
+    assert list(found["forward, warm"].values()) == pytest.approx([2, 3, 5, 0], abs=1e-6)
+    assert list(found["exact Fisher"].values()) == pytest.approx([0, 0, 4, 0], abs=1e-6)
+    assert found["forward, cold"]["worst deviation"] > 0.3
 
 
 def test_cold_means_a_view_never_seen_before(monkeypatch):

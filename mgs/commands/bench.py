@@ -59,9 +59,10 @@ def bench(
     if kind is Kind.splat:
         _print_splat(console, result)
     else:
-        from mgs.bench_chart import fitted, scaling_exponents, scaling_figure
+        from mgs.bench_chart import fitted, linear_growth, scaling_exponents, scaling_figure
 
         result["exponents"] = scaling_exponents(result["points"])
+        result["linear_growth"] = linear_growth(result["points"])
         result["exponents_from_n"] = fitted(result["points"])[0]["n"]
         _print_scaling(console, result)
         if chart:
@@ -73,14 +74,19 @@ def bench(
 
 
 def _print_scaling(console: Any, result: dict[str, Any]) -> None:
-    """Exponents: a row for each quantity, a column for what it grows with."""
+    """Exponents: a row for each quantity, a column for what it grows with; and time as a sum of what grows linearly."""
     from rich.table import Table
 
     rows = result["exponents"]
     table = Table("exponent of", *next(iter(rows.values())), title=f"fits against N start at {result['exponents_from_n']:,}")
     for name, row in rows.items():
         table.add_row(name, *(f"{value:.2f}" for value in row.values()))
-    console.print(table)
+    linear = result["linear_growth"]
+    costs = Table("time of", *next(iter(linear.values())), title="linear fit to all points")
+    for name, row in linear.items():
+        *values, deviation = row.values()
+        costs.add_row(name, *(f"{value:.1f}" for value in values), f"{deviation:.0%}")
+    console.print(table, costs)
 
 
 def _print_splat(console: Any, result: dict[str, Any]) -> None:
