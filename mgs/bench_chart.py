@@ -90,7 +90,8 @@ def scaling_figure(path: str | Path, points: list[dict[str, Any]]) -> None:
         worst = max(row["worst deviation"] for row in linear.values())
         costs = [f"{row['ns per pair']:.0f} + {row['ns per Gaussian']:.0f}: {label}" for label, row in linear.items()]
         text = "\n".join(["ns per pair + ns per Gaussian", f"(within {worst:.0%} of every point)", *costs])
-        panels[1, 0].set_ylim(bottom=0.3 * panels[1, 0].get_ylim()[0])
+        low, high = panels[1, 0].get_ylim()
+        panels[1, 0].set_ylim(0.4 * low, 4 * high)
         panels[1, 0].text(0.98, 0.03, text, transform=panels[1, 0].transAxes, ha="right", va="bottom", fontsize=7)
         memory, by_n = panels[1, 1], _sweep(points, "gaussians")
         peak = f"peak of the kernels: {exponents['peak memory']['N']:.2f}"
