@@ -116,6 +116,21 @@ def test_damaged_settings_of_the_fit_are_one_line_on_resume(dataset, tmp_path, c
     assert len(shown.splitlines()) == 1
 
 
+def test_a_run_appears_whole_or_not_at_all(dataset, tmp_path, monkeypatch):
+    """Killed while its prior is built, the same command works again: the folder takes its name when all of it is there."""
+    there, start = [], nbv.start
+
+    def watched(out, *rest):
+        there.append((tmp_path / "run").exists())
+        start(out, *rest)
+
+    monkeypatch.setattr(nbv, "start", watched)
+    own = tiny.write_prior(tmp_path / "prior")
+    started(dataset, tmp_path / "run", own, budget=1)
+    assert there == [False]
+    assert {p.name for p in tmp_path.iterdir()} == {"run", "prior", dataset.name}
+
+
 @pytest.mark.parametrize("values", [{"pixel_noise": float("inf")}, {"prior_std": {"colour": float("inf")}}])
 def test_scales_of_lambda_are_finite(dataset, tmp_path, values):
     with pytest.raises(InputError, match="finite"):

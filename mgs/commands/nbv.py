@@ -120,7 +120,7 @@ def start_run(
     from mgs.config import NbvSettings, validated
     from mgs.dataset import load_dataset
     from mgs.errors import InputError
-    from mgs.files import folder_or_nothing
+    from mgs.files import atomic_folder
     from mgs.nbv import check_settings, start
     from mgs.prior import PriorSettings, build_prior, load_prior, save_prior
 
@@ -139,7 +139,7 @@ def start_run(
     check_settings(settings, len(frames))
     if prior is not None:
         load_prior(prior)
-    with folder_or_nothing(out):
+    with atomic_folder(out) as unfinished:
         if prior is None:
             with console.status("building the prior") as status:
                 built, stages = build_prior(
@@ -147,8 +147,8 @@ def start_run(
                     PriorSettings(gaussians=gaussians, seed=settings.seed),
                     on_stage=lambda stage: status.update(f"prior: {stage}"),
                 )
-            save_prior(where, built, stages.mesh)
-        start(out, settings, frames)
+            save_prior(unfinished / "prior", built, stages.mesh)
+        start(unfinished, settings, frames)
 
 
 def run_folder(out: Path, console: Console, pictures: bool = False) -> None:
