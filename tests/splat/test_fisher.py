@@ -1,13 +1,14 @@
 """Fisher information against a brute-force Jacobian per pixel and channel, in float64; the other estimators against theirs."""
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mgs.errors import InputError
-from mgs.splat import ESTIMATORS, ListCache, fisher, groups, reference
+from mgs.splat import ESTIMATORS, ListCache, fisher, groups, reference, render
 from mgs.splat.fisher import hutchinson
 from mgs.splat.render import as_drjit
 
@@ -57,6 +58,24 @@ def test_exact_and_block_against_brute_force(degree):
     assert_close(block, expected, f"degree {degree} block")
     assert_close(exact, diagonal(expected), f"degree {degree} exact")
     np.testing.assert_array_equal(block, block.transpose(0, 2, 1))
+
+
+def test_images_of_several_tiles():
+    """Splats and lanes go by tiles of 128x64 pixels; across their borders everything is as within."""
+    camera = make_camera((150, 70), focal=150.0)
+    g = calm(lambda seed: make_gaussians(30, seed, log_scales=(-4.0, -1.0)), camera, 3)
+    expected = reference.fisher_block(g, camera, BACKGROUND)
+    assert_close(fisher(g, camera, "block", BACKGROUND), expected, "block")
+    assert_close(fisher(g, camera, "exact", BACKGROUND), diagonal(expected), "exact")
+    weights = np.random.default_rng(0).normal(size=(70, 150, 3)).astype(np.float32)
+    watched = as_drjit(g)
+    dr.enable_grad(watched.log_scales)
+    image = render(watched, camera, BACKGROUND)
+    dr.backward(dr.sum(image.rgb * mi.TensorXf(weights), axis=None))
+    np.testing.assert_allclose(image.rgb, reference.render(g, camera, BACKGROUND)["rgb"], atol=2e-5)
+    scales = np.tensordot(weights.reshape(-1, 3), reference.jacobian(g, camera, BACKGROUND), axes=([0, 1], [0, 1]))[:, 3:6]
+    found = np.asarray(dr.grad(watched.log_scales))
+    assert np.linalg.norm(found - scales) < 1e-4 * np.linalg.norm(scales)
 
 
 @settings(derandomize=True, deadline=None, max_examples=20)
