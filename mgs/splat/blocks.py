@@ -19,8 +19,8 @@ BLOCK_X, BLOCK_Y = 8, 4
 """Pixels of one lane. With AVX-512, 8x2 and 4x4 were no faster forward, and slower for gradients: more pairs to store."""
 
 TILE = 16
-"""Blocks across and down a tile. Tiles are what is worked on at a time, so that its splats (64 bytes each) stay in a core's
-cache: without them, waiting for memory was a third of all time at 100,000 splats."""
+"""Blocks across and down a tile, which is walked before the next, so that its splats (64 bytes each) and their sums stay in a
+core's cache; `benchmarks/tiles.py` chose it."""
 
 LOG2_INV_ALPHA_MIN = 7.994353436858858
 """log2(255): a footprint ends where xi^2 + eta^2 = log2_opacity + log2(255)."""

@@ -40,7 +40,7 @@ def fisher(
     cache: ListCache | None = None,
     **options: Any,
 ) -> np.ndarray:
-    """Fisher information that one view carries about each Gaussian: float32 [N,P], or [N,P,P] for `block`.
+    """Fisher information that one view carries about each Gaussian: float32 [N,P], or [N,P,P] for `block`; rows are padded.
 
     The camera's image is not needed: information depends on the pose and the model alone. Estimators: see `ESTIMATORS`;
     options: `probes` and `seed` of `hutchinson`; the others have none.

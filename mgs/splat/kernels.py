@@ -138,7 +138,8 @@ def _rows(lane: Lane, s: Splat) -> list[Row]:
     The lane's corner is placed in double: far along a slanted needle, xi is a small difference of large numbers. alpha is
     stepped along a row by multiplication, as the exponent is quadratic there: three exp2 a row, not eight, for rounding errors
     four times as large. Starting from the middle, nothing underflows: EPS2D keeps p below 1.6, so alpha there is at least
-    2^-100 wherever the row has a pixel drawn.
+    2^-100 wherever the row has a pixel drawn. Where it is less (a splat that shrank since its lists were built may be far
+    away), steps only make it smaller, since `exp2` returns too much below 2^-120.
     """
     real = type(s.p)
     dx, dy = mi.Float64(lane.x) - s.u, mi.Float64(lane.y) - s.v
@@ -151,10 +152,11 @@ def _rows(lane: Lane, s: Splat) -> list[Row]:
         xi = [dr.fma(s.p, real(i), first) for i in range(BLOCK_X)]
         row = dr.fma(-eta, eta, s.log2_opacity)
         middle = xi[CENTRE]
-        raw = [exp2(dr.fma(-middle, middle, row))] * BLOCK_X
+        power = dr.fma(-middle, middle, row)
+        raw = [exp2(power)] * BLOCK_X
         for columns, sign in ((range(CENTRE + 1, BLOCK_X), -1), (range(CENTRE - 1, -1, -1), 1)):
             step = s.p * dr.fma(real(2 * sign), middle, -s.p)
-            ratio = exp2(dr.select(step < 120, step, 120))
+            ratio = exp2(dr.select(power > -120, step, -120))
             for i in columns:
                 raw[i] = raw[i + sign] * ratio
                 ratio = ratio * bend

@@ -179,6 +179,22 @@ def test_lists_are_reused_until_a_footprint_outgrows_them():
     assert cache.builds == 3
 
 
+@settings(derandomize=True, deadline=None, max_examples=12)
+@given(seed=st.integers(0, 2**31), large=st.floats(-2.5, -0.5), shrink=st.floats(0.5, 5))
+def test_splats_that_shrank_far_inside_their_lists_are_not_drawn_there(seed, large, shrink):
+    """Lists stay valid however small a splat becomes; its blocks may then lie hundreds of its widths away."""
+    camera, cache = make_camera((140, 70), focal=140.0), ListCache()
+    g = make_gaussians(12, seed, log_scales=(large - 0.5, large), logits=(0, 4))
+    render(g, camera, cache=cache)
+    small = changed(g, log_scales=g.log_scales - shrink)
+    for a, b in zip(images(small, camera, cache), images(small, camera), strict=True):
+        np.testing.assert_array_equal(a, b)
+    for estimator in ("exact", "block"):
+        cached = fisher(small, camera, estimator, cache=cache)
+        np.testing.assert_array_equal(cached, fisher(small, camera, estimator))
+    assert cache.builds == 1
+
+
 def test_each_camera_has_its_own_lists():
     g, cache = make_gaussians(60, 3), ListCache()
     cameras = [
