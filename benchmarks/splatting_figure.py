@@ -18,7 +18,7 @@ from mgs.bench import surface_camera, surface_gaussians  # noqa: E402
 from mgs.conventions import srgb_from_linear  # noqa: E402
 from mgs.figures import new_figure, save_figure  # noqa: E402
 from mgs.splat import ListCache, as_drjit, reference, render  # noqa: E402
-from mgs.splat.blocks import BLOCK_X, BLOCK_Y  # noqa: E402
+from mgs.splat.blocks import BLOCK_X, BLOCK_Y, TILE  # noqa: E402
 from mgs.splat.project import camera_array, project  # noqa: E402
 
 ORANGE, BLUE = "#d55e00", "#0072b2"
@@ -29,7 +29,7 @@ def main(path: str) -> None:
     camera = surface_camera(gaussians, 160, 120)
     image = np.asarray(render(gaussians, camera).rgb)
     splats = project(as_drjit(gaussians), camera_array(camera))
-    lists = ListCache().get(camera, splats)
+    lists, _ = ListCache().get(camera, splats)
     lengths = np.asarray(lists.end).astype(int) - np.asarray(lists.start)
     block = np.asarray(lists.block)
     blocks_x = -(-camera.width // BLOCK_X)
@@ -43,7 +43,7 @@ def main(path: str) -> None:
     pairs = np.asarray(lists.splat)
     starts = np.asarray(lists.start)
     order = np.concatenate([np.arange(s, s + n) for s, n in zip(starts, lengths, strict=True)])
-    mine = owners[pairs[order] == chosen]
+    mine = owners[pairs[order] == np.asarray(lists.place)[chosen]]
     footprint_panel(axes[0], image, camera, gaussians, chosen, mine, blocks_x)
     lists_panel(axes[1], lengths, block, blocks_x, camera)
     lanes_panel(axes[2], lengths)
@@ -82,17 +82,21 @@ def footprint_panel(axis, image, camera, gaussians, j, blocks, blocks_x) -> None
 def lists_panel(axis, lengths, block, blocks_x, camera) -> None:
     grid = np.zeros(len(block))
     grid[block] = lengths
+    for edge in range(BLOCK_X * TILE, camera.width, BLOCK_X * TILE):
+        axis.axvline(edge, color="white", lw=0.8, ls=":")
+    for edge in range(BLOCK_Y * TILE, camera.height, BLOCK_Y * TILE):
+        axis.axhline(edge, color="white", lw=0.8, ls=":")
     shown = axis.imshow(grid.reshape(-1, blocks_x), extent=(0, camera.width, camera.height, 0), cmap="viridis")
     axis.figure.colorbar(shown, ax=axis, shrink=0.75, label="splats in the list")
     axis.set(xlabel="pixels")
-    axis.set_title("2  list: for each block its splats,\nfront to back", fontsize=9)
+    axis.set_title("2  list: for each block its splats,\nfront to back (dotted: tiles)", fontsize=9)
 
 
 def lanes_panel(axis, lengths) -> None:
     packet = np.arange(len(lengths)) // 16
     axis.bar(np.arange(len(lengths)), lengths, width=1.0, color=np.where(packet % 2 == 0, BLUE, "#56b4e9"))
-    axis.set(xlabel="lane (colours: packets of 16)", ylabel="list length", xlim=(0, (lengths > 0).sum() + 4))
-    axis.set_title("3  walk: one lane a block, longest\nfirst: packets end together", fontsize=9)
+    axis.set(xlabel="lane (colours: packets of 16)", ylabel="list length")
+    axis.set_title("3  walk: one lane a block, tile by tile, in it\nlongest first: packets end together", fontsize=9)
 
 
 def sums_panels(figure, gaussians, camera, j) -> None:
