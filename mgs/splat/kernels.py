@@ -39,14 +39,15 @@ def _sizes(lists: BlockLists, *_: Any, **__: Any) -> tuple[int, ...]:
 
 
 def pack(s: Splats, place: Any) -> Any:
-    """Detached splats at the places of their block lists: as Float [16 N], one cache line each,
-    (u, v, k, p), (e, log2_opacity, z, u_rest), (r, g, b, v_rest), (k_rest, three unused);
-    those of `project64` as Float64 [12 N], (u, v, k, p), (e, log2_opacity, z, 0), (r, g, b, 0)."""
-    parts = [[s.u, s.v, s.k, s.p], [s.e, s.log2_opacity, s.z, s.u_rest], [s.r, s.g, s.b, s.v_rest], [s.k_rest, 0, 0, 0]]
-    real, vector = mi.Float, mi.Vector4f
+    """Detached splats at the places of their block lists. Of `project`: Float [16 N], one cache line each, (u, v, k, p),
+    (e, log2_opacity, z, u_rest), (r, g, b, v_rest), (k_rest, three unused). Of `project64`: Float64 [12 N], (u, v, k, p),
+    (e, log2_opacity, z, unused), (r, g, b, unused)."""
+    shape, colour = [s.u, s.v, s.k, s.p], [s.r, s.g, s.b]
     if s.u_rest is None:
-        parts = [[0 if number is None else number for number in part] for part in parts[:3]]
-        real, vector = mi.Float64, mi.Vector4d
+        real, vector, parts = mi.Float64, mi.Vector4d, [shape, [s.e, s.log2_opacity, s.z, 0], [*colour, 0]]
+    else:
+        real, vector = mi.Float, mi.Vector4f
+        parts = [shape, [s.e, s.log2_opacity, s.z, s.u_rest], [*colour, s.v_rest], [s.k_rest, 0, 0, 0]]
     packed = dr.empty(real, 4 * len(parts) * len(s.u))
     for i, part in enumerate(parts):
         dr.scatter(packed, vector(*part), place * len(parts) + i, mode=dr.ReduceMode.NoConflicts)
@@ -337,7 +338,7 @@ def fisher(lists: BlockLists, packed: Any, background: Any, block: bool) -> Any:
     With f = (xi^2, xi eta, eta^2), s_c = D_c alpha and |s|^2 summed over channels:
     sum w^2, sum |s|^2, the five moments sum |s|^2 (xi^4, xi^3 eta, xi^2 eta^2, xi eta^3, eta^4): seven, the exact diagonal.
     block=True appends sum |s|^2 f (3) and, for c = r, g, b, sum w s_c (1) and sum w s_c f (3): 22, the exact blocks. Those
-    cancel, so pixels are worth splats in double there; sums over a lane's pixels are single.
+    cancel, so give it splats packed in double: then pixels are too, and only sums over a lane's pixels are single.
     background: Color3f.
     """
     real = type(packed)

@@ -64,15 +64,15 @@ class ListCache:
         lists = self._entries.get(key)
         margin = 0.0 if lists is None else MARGIN
         dr.eval(splats)
-        if lists is not None and len(lists.place) == len(splats.u):
+        if lists is not None and len(lists.place) != len(splats.u):
+            lists = None
+        if lists is not None:
             stale = dr.select(splats.finite, mi.UInt32(blocks.outgrown(lists.footprints, splats)), 2)
             dr.schedule(stale)
             packed = kernels.pack(splats, lists.place)
             worst = int(dr.max(stale)[0])
             _raise_unless_finite(worst < 2)
             lists = None if worst else lists
-        else:
-            lists = None
         if lists is None:
             _raise_unless_finite(dr.all(splats.finite))
             lists = blocks.build(splats, blocks.depth_order(splats.z), camera.width, camera.height, margin)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mgs.splat import ListCache, as_drjit, fisher, reference, render
+from mgs.splat import ListCache, as_drjit, blocks, fisher, reference, render
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, TILE, build, depth_order, inflate, outgrown
 from mgs.splat.project import camera_array, project
 from mgs.splat.render import MARGIN
@@ -244,3 +244,21 @@ def test_one_view_larger_than_the_budget_still_renders():
         np.testing.assert_array_equal(a, b)
     images(g, make_camera(focal=40.0), cache)
     assert cache.builds == 2
+
+
+@pytest.mark.parametrize("tile", [1, 3, 1000])
+def test_the_size_of_tiles_changes_no_bit(tile, monkeypatch):
+    """Tiles are an order of memory and of work: images, gradients and Fisher information know nothing of them."""
+    camera, g = make_camera((150, 70), focal=150.0), make_gaussians(80, 7, log_scales=(-5.0, -1.5))
+
+    def everything():
+        watched = as_drjit(g)
+        dr.enable_grad(watched.means, watched.quats)
+        dr.backward(dr.sum(dr.square(render(watched, camera).rgb), axis=None))
+        gradients = [np.asarray(dr.grad(value)) for value in (watched.means, watched.quats)]
+        return [*images(g, camera), *gradients, fisher(g, camera), fisher(g, camera, "block")]
+
+    expected = everything()
+    monkeypatch.setattr(blocks, "TILE", tile)
+    for a, b in zip(everything(), expected, strict=True):
+        np.testing.assert_array_equal(a, b)
