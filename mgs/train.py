@@ -20,7 +20,6 @@ from mgs.seeds import generator
 from mgs.splat import ListCache, as_drjit
 from mgs.splat.blocks import BlockLists
 from mgs.splat.frozen import frozen
-from mgs.splat.kernels import pack
 from mgs.splat.project import camera_array, project
 from mgs.splat.render import composite
 
@@ -51,7 +50,7 @@ class Fit:
     stop_reason: Literal["converged", "iteration-limit"]
 
 
-def _sizes(parameters: Any, moments: Any, camera: Any, lists: BlockLists, target: Any, *_: Any) -> tuple[int, ...]:
+def _sizes(parameters: Any, moments: Any, camera: Any, packed: Any, lists: BlockLists, target: Any, *_: Any) -> tuple[int, ...]:
     return len(lists.splat), len(lists.slot_start), len(lists.block), len(target)
 
 
@@ -70,6 +69,7 @@ def _step(
     gaussians: Gaussians,
     moments: list[list[Any]],
     camera: Any,
+    packed: Any,
     lists: BlockLists,
     target: Any,
     size: Any,
@@ -78,13 +78,13 @@ def _step(
 ) -> tuple[Gaussians, list[list[Any]], Any]:
     """One Adam step (Kingma & Ba 2015, beta 0.9 and 0.999) on one image. Returns parameters, moments, mean squared error.
 
-    size: (width, height); t: UInt32, step number from 1; target: Float [H*W*3].
+    packed: the Gaussians' splats, packed for the lists; size: (width, height); t: UInt32, step number from 1; target: Float
+    [H*W*3].
     """
     values = [dr.copy(getattr(gaussians, name)) for name in LEARNED]
     dr.enable_grad(values)
     watched = Gaussians(gaussians.means, **dict(zip(LEARNED, values, strict=True)))
-    splats = project(watched, camera)
-    rgb = composite(splats, pack(dr.detach(splats), lists.place), lists, *size).rgb
+    rgb = composite(project(watched, camera), packed, lists, *size).rgb
     error = rgb.array - target
     loss = dr.mean(dr.square(error))
     dr.backward(0.5 * dr.sum(dr.square(error)))
@@ -128,9 +128,11 @@ def fit(
         for i in rng.permutation(len(cameras)):
             t += 1
             splats = _project(model, arrays[i])
-            lists, _ = cache.get(cameras[i], splats)
+            lists, packed = cache.get(cameras[i], splats)
             size = (cameras[i].width, cameras[i].height)
-            model, moments, loss = _step(model, moments, arrays[i], lists, pixels[i], size, rates, dr.opaque(mi.UInt32, t))
+            model, moments, loss = _step(
+                model, moments, arrays[i], packed, lists, pixels[i], size, rates, dr.opaque(mi.UInt32, t)
+            )
             losses.append(loss)
         history.append(float(np.mean([float(loss[0]) for loss in losses])))
         if on_pass:

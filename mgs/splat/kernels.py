@@ -42,7 +42,7 @@ def pack(s: Splats, place: Any) -> Any:
     """Detached splats at the places of their block lists. Of `project`: Float [16 N], one cache line each, (u, v, k, p),
     (e, log2_opacity, z, u_rest), (r, g, b, v_rest), (k_rest, three unused). Of `project64`: Float64 [12 N], (u, v, k, p),
     (e, log2_opacity, z, unused), (r, g, b, unused)."""
-    shape, colour = [s.u, s.v, s.k, s.p], [s.r, s.g, s.b]
+    shape, colour = [s.u, s.v, s.k, s.p], s.colour
     if s.u_rest is None:
         real, vector, parts = mi.Float64, mi.Vector4d, [shape, [s.e, s.log2_opacity, s.z, 0], [*colour, 0]]
     else:
@@ -55,31 +55,17 @@ def pack(s: Splats, place: Any) -> Any:
     return packed
 
 
-@dataclass
-class Splat:
-    """One splat per lane: u, v, k Float64, the other numbers as exact as they were packed."""
-
-    u: Any
-    v: Any
-    k: Any
-    p: Any
-    e: Any
-    log2_opacity: Any
-    z: Any
-    colour: list[Any]
-
-
-def _unpack(packed: Any, place: Any) -> Splat:
-    """The splats at the given places."""
+def _unpack(packed: Any, place: Any) -> Splats:
+    """The splats at the given places: u, v, k Float64, the other numbers as exact as they were packed."""
     if type(packed) is mi.Float64:
-        (u, v, k, p), (e, log2_opacity, z, _), (*colour, _) = (dr.gather(mi.Vector4d, packed, place * 3 + i) for i in range(3))
-        return Splat(u, v, k, p, e, log2_opacity, z, colour)
-    (u, v, k, p), (e, log2_opacity, z, u_rest), (*colour, v_rest), (k_rest, *_) = (
+        (u, v, k, p), (e, log2_opacity, z, _), (r, g, b, _) = (dr.gather(mi.Vector4d, packed, place * 3 + i) for i in range(3))
+        return Splats(u, v, k, p, e, log2_opacity, z, r, g, b)
+    (u, v, k, p), (e, log2_opacity, z, u_rest), (r, g, b, v_rest), (k_rest, *_) = (
         dr.gather(mi.Vector4f, packed, place * 4 + i) for i in range(4)
     )
     double = mi.Float64
     u, v, k = double(u) + double(u_rest), double(v) + double(v_rest), double(k) + double(k_rest)
-    return Splat(u, v, k, p, e, log2_opacity, z, colour)
+    return Splats(u, v, k, p, e, log2_opacity, z, r, g, b)
 
 
 @dataclass
@@ -133,7 +119,7 @@ CENTRE = BLOCK_X // 2
 """Column from which a row's alphas are stepped outwards."""
 
 
-def _rows(lane: Lane, s: Splat) -> list[Row]:
+def _rows(lane: Lane, s: Splats) -> list[Row]:
     """alpha = 2^(log2_opacity - xi^2 - eta^2) on the lane's pixels.
 
     The lane's corner is placed in double: far along a slanted needle, xi is a small difference of large numbers. alpha is
@@ -195,12 +181,12 @@ def _walk(lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], v
     return pixels
 
 
-def _composite(lists: BlockLists, packed: Any, lane: Lane, T: list[Any], numbers: Callable[[Splat], list[Any]]) -> Any:
+def _composite(lists: BlockLists, packed: Any, lane: Lane, T: list[Any], numbers: Callable[[Splats], list[Any]]) -> Any:
     """For each of a lane's pixels, [transmittance, sum w n for each of the numbers n of a splat]."""
     count = len(numbers(_unpack(packed, mi.UInt32(0))))
     pixels = [[t, *(dr.zeros(type(packed), len(lists.block)) for _ in range(count))] for t in T]
 
-    def visit(i: Any, splat: Splat, rows: list[Row], pixels: Any) -> Any:
+    def visit(i: Any, splat: Splats, rows: list[Row], pixels: Any) -> Any:
         new, alive = [], mi.Bool(False)
         for pixel, (T, *sums) in enumerate(pixels):
             _, w, after, room = _blend(rows[pixel // BLOCK_X].raw[pixel % BLOCK_X], T)
@@ -293,7 +279,7 @@ def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, Any], d_out: tuple[A
     count = 10 if means else 8
     slots = _slots(lists, count)
 
-    def visit(i: Any, splat: Splat, rows: list[Row], pixels: Any) -> Any:
+    def visit(i: Any, splat: Splats, rows: list[Row], pixels: Any) -> Any:
         new, alive = [], mi.Bool(False)
         sums, (r, g, b) = [mi.Float(0)] * 10, splat.colour
         for j, row in enumerate(rows):
@@ -350,7 +336,7 @@ def fisher(lists: BlockLists, packed: Any, background: Any, block: bool) -> Any:
     count = FISHER_SUMS[block]
     slots = _slots(lists, count)
 
-    def visit(i: Any, splat: Splat, rows: list[Row], pixels: Any) -> Any:
+    def visit(i: Any, splat: Splats, rows: list[Row], pixels: Any) -> Any:
         new, alive = [], mi.Bool(False)
         sums = [mi.Float(0)] * 22
         for j, row in enumerate(rows):

@@ -52,6 +52,11 @@ class Splats:
     v_rest: Any = None
     k_rest: Any = None
 
+    @property
+    def colour(self) -> list[Any]:
+        """[r, g, b]."""
+        return [self.r, self.g, self.b]
+
 
 def camera_array(camera: Camera) -> Any:
     """The camera as one Dr.Jit array of 23 doubles, so that a change of camera never recompiles a kernel.
