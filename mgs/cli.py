@@ -46,9 +46,20 @@ def main(arguments: list[str] | None = None) -> None:
         raise _stop(" ".join(error.format_message().replace("Value error, ", "").split()), 2) from None
     except typer.Abort:
         raise _stop("stopped", 1) from None
+    except Exception as error:
+        if not _from_interrupt(error):
+            raise
+        code = INTERRUPTED
     if code == INTERRUPTED:  # typer has turned Ctrl-C into this, without a word
         raise _stop("interrupted; what was finished is kept", INTERRUPTED)
     raise SystemExit(code or 0)
+
+
+def _from_interrupt(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is behind an exception: Dr.Jit raises one of its own where it is hit inside its calls."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _stop(message: str, code: int) -> SystemExit:

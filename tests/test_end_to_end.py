@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import synthetic
 
-from mgs import nbv, policies
+from mgs import cli, nbv, policies
 from mgs.cli import main
 from mgs.dataset import load_dataset
 from mgs.gaussians import read_ply
@@ -113,6 +113,28 @@ def test_interrupted_in_the_middle_of_a_step_then_resumed(dataset, run, tmp_path
     command("nbv", "--resume", out)
     assert timeless(steps(out)) == timeless(steps(run))
     assert (out / "gaussians.ply").read_bytes() == (run / "gaussians.ply").read_bytes()
+
+
+def test_ctrl_c_inside_a_call_of_drjit_is_one_line_too(capsys, monkeypatch):
+    """Dr.Jit turns it into an exception of its own, with Ctrl-C as the cause; an exception without it stays what it is."""
+
+    def stopped(*_, **__):
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as interrupt:
+            raise RuntimeError("an exception while processing an argument (see above)") from interrupt
+
+    def broken(*_, **__):
+        raise RuntimeError("broken")
+
+    monkeypatch.setattr(cli, "app", stopped)
+    with pytest.raises(SystemExit) as stop:
+        main(["doctor"])
+    assert stop.value.code == 130
+    assert capsys.readouterr().err == "mgs: interrupted; what was finished is kept\n"
+    monkeypatch.setattr(cli, "app", broken)
+    with pytest.raises(RuntimeError, match="broken"):
+        main(["doctor"])
 
 
 def timeless(lines: list[dict]) -> list[dict]:
