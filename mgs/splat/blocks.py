@@ -114,27 +114,26 @@ def outgrown(built: Footprints, splats: Splats) -> Any:
 def depth_order(depth: Any) -> Any:
     """UInt32 [N]: indices front to back, ties by index (a radix sort of the float bits; depths are positive)."""
     bits = dr.reinterpret_array(mi.UInt32, depth)
-    n = len(depth)
-    order = dr.detail.block_mkperm(bits & 0xFFFF, n, 1 << 16)
-    high = dr.gather(mi.UInt32, bits, order) >> 16
-    return dr.gather(mi.UInt32, order, dr.detail.block_mkperm(high, n, 1 << 16))
+    order = dr.detail.block_mkperm(bits & 0xFFFF, len(depth), 1 << 16)
+    return _sorted(order, dr.gather(mi.UInt32, bits, order) >> 16, 1 << 16)
 
 
 def build(splats: Splats, order: Any, width: int, height: int, margin: float) -> BlockLists:
     """Block lists of detached splats, given their depth order. Exact ellipse-block overlap, not bounding boxes."""
     blocks_x, blocks_y = -(-width // BLOCK_X), -(-height // BLOCK_Y)
-    n, lanes = len(splats.u), blocks_x * blocks_y
-    foot = inflate(splats, margin)
-    place = _places(splats, order, blocks_x, blocks_y)
-    splat, slot, block, slot_start, slot_end = _pairs(splats, foot, order, place, blocks_x, blocks_y)
+    foot, place = inflate(splats, margin), _places(splats, order, blocks_x, blocks_y)
+    splat, number, slot_start, slot_end = _pairs(splats, foot, place, blocks_x, blocks_y)
+    numbers = _by_tile(dr.arange(mi.UInt32, blocks_x * blocks_y), blocks_x)
     if len(splat) == 0:  # Dr.Jit has no operations on arrays of length 0
-        slot_start = slot_end = dr.zeros(mi.UInt32, n)
-        start = end = dr.zeros(mi.UInt32, lanes)
+        slot, start, end = mi.UInt32(), dr.zeros(mi.UInt32, len(numbers)), dr.zeros(mi.UInt32, len(numbers))
     else:
-        start, end, by_block = _group(block, lanes)
-        splat, slot = dr.gather(mi.UInt32, splat, by_block), dr.gather(mi.UInt32, slot, by_block)
+        slot = _front_to_back(slot_start, slot_end, dr.gather(mi.UInt32, place, order), len(splat))
+        slot = _sorted(slot, dr.gather(mi.UInt32, number, slot), _numbers(blocks_x, blocks_y))
+        splat, number = dr.gather(mi.UInt32, splat, slot), dr.gather(mi.UInt32, number, slot)
+        dr.eval(splat, number)
+        start, end = (dr.gather(mi.UInt32, a, numbers) for a in _ranges(number, _numbers(blocks_x, blocks_y)))
     room = _rounded(len(splat))
-    lane = _lane_order(start, end, blocks_x, blocks_y)
+    lane = _lane_order(end - start, numbers, _numbers(blocks_x, blocks_y))
     lists = BlockLists(
         place=place,
         splat=_padded(splat, room),
@@ -153,13 +152,24 @@ def build(splats: Splats, order: Any, width: int, height: int, margin: float) ->
     return lists
 
 
-def _tile(bx: Any, by: Any, blocks_x: int) -> Any:
-    """The tile, row by row, of the blocks in column bx and row by (UInt32)."""
-    return (by // TILE) * (-(-blocks_x // TILE)) + bx // TILE
+def _by_tile(block: Any, blocks_x: int) -> Any:
+    """UInt32: the number of a block (UInt32, row by row) when they are counted tile by tile, each of TILE x TILE blocks."""
+    bx, by = block % blocks_x, block // blocks_x
+    tile = (by // TILE) * -(-blocks_x // TILE) + bx // TILE
+    return (tile * TILE + by % TILE) * TILE + bx % TILE
 
 
-def _tiles(blocks_x: int, blocks_y: int) -> int:
-    return -(-blocks_x // TILE) * -(-blocks_y // TILE)
+def _numbers(blocks_x: int, blocks_y: int) -> int:
+    """How many numbers `_by_tile` gives; tiles are counted whole."""
+    return -(-blocks_x // TILE) * -(-blocks_y // TILE) * TILE * TILE
+
+
+def _sorted(values: Any, keys: Any, count: int) -> Any:
+    """UInt32 values, stably sorted by keys below `count`. Evaluated, as all that are read next in a random order: a random read
+    whose place awaits another one stalls, and takes longer than two kernels."""
+    values = dr.gather(mi.UInt32, values, dr.detail.block_mkperm(keys, len(values), count))
+    dr.eval(values)
+    return values
 
 
 def _places(splats: Splats, order: Any, blocks_x: int, blocks_y: int) -> Any:
@@ -168,64 +178,69 @@ def _places(splats: Splats, order: Any, blocks_x: int, blocks_y: int) -> Any:
     def block(pixel: Any, size: int, count: int) -> Any:
         return mi.UInt32(dr.select(splats.visible, dr.clip(pixel / size, 0, count - 1), 0))
 
-    n, tiles = len(splats.u), _tiles(blocks_x, blocks_y)
-    bx, by = block(splats.u, BLOCK_X, blocks_x), block(splats.v, BLOCK_Y, blocks_y)
-    key = (_tile(bx, by, blocks_x) * TILE + by % TILE) * TILE + bx % TILE
-    dr.eval(key)
-    at = dr.gather(mi.UInt32, order, dr.detail.block_mkperm(dr.gather(mi.UInt32, key, order), n, tiles * TILE * TILE))
-    place = dr.empty(mi.UInt32, n)
-    dr.scatter(place, dr.arange(mi.UInt32, n), at, mode=dr.ReduceMode.NoConflicts)
+    number = _by_tile(block(splats.v, BLOCK_Y, blocks_y) * blocks_x + block(splats.u, BLOCK_X, blocks_x), blocks_x)
+    dr.eval(number)
+    at = _sorted(order, dr.gather(mi.UInt32, number, order), _numbers(blocks_x, blocks_y))
+    place = dr.empty(mi.UInt32, len(at))
+    dr.scatter(place, dr.arange(mi.UInt32, len(at)), at, mode=dr.ReduceMode.NoConflicts)
+    dr.eval(place)
     return place
 
 
-def _lane_order(start: Any, end: Any, blocks_x: int, blocks_y: int) -> Any:
-    """UInt32 [L]: blocks by tile, in it the longest list first, so that the lanes of one SIMD packet end together."""
-    lanes = len(start)
-    longest = dr.detail.block_mkperm(4095 - dr.minimum(end - start, 4095), lanes, 4096)
-    tile = _tile(longest % blocks_x, longest // blocks_x, blocks_x)
-    return dr.gather(mi.UInt32, longest, dr.detail.block_mkperm(tile, lanes, _tiles(blocks_x, blocks_y)))
+def _lane_order(length: Any, number: Any, numbers: int) -> Any:
+    """UInt32 [L]: blocks by tile, in it the longest list first, so that the lanes of one SIMD packet end together, given the
+    length of each block's list and its number by tile."""
+    longest = _sorted(dr.arange(mi.UInt32, len(length)), 4095 - dr.minimum(length, 4095), 4096)
+    return _sorted(longest, dr.gather(mi.UInt32, number, longest) // (TILE * TILE), numbers // (TILE * TILE))
 
 
-def _pairs(splats: Splats, foot: Footprints, order: Any, place: Any, blocks_x: int, blocks_y: int) -> tuple[Any, ...]:
-    """(place of the splat, slot, block) of every pair, splats in depth order; first and end of the slots of the splat at each
-    place [N]. Empty arrays where no splat touches a block.
+def _pairs(splats: Splats, foot: Footprints, place: Any, blocks_x: int, blocks_y: int) -> tuple[Any, ...]:
+    """Place of the splat, and number by tile of the block, of every pair, in the order of slots: splats as they lie in memory,
+    the blocks of each row by row; first and end of the slots of the splat at each place [N]. Empty where no splat is drawn.
 
     First the rows of blocks that a footprint reaches, then the blocks of each row: work grows with the pairs that are kept,
     where a bounding box would list the whole square around a slanted needle.
     """
+    n = len(splats.u)
     half = dr.sqrt(dr.maximum(foot.q, 0)) * dr.rcp(foot.e)
     low = dr.clip(dr.ceil((splats.v - half + 0.5) / BLOCK_Y) - 1, 0, blocks_y)
     high = dr.clip(dr.floor((splats.v + half - 0.5) / BLOCK_Y) + 1, 0, blocks_y)
-    rows = dr.select(foot.q > 0, mi.UInt32(dr.maximum(high - low, 0)), 0)
-    n, nothing = len(splats.u), (mi.UInt32(),) * 5
-    shapes, index = dr.empty(mi.Float, 8 * n), dr.arange(mi.UInt32, n) * 2
-    dr.scatter(shapes, mi.Vector4f(splats.u, splats.v, foot.k, foot.p), index, mode=dr.ReduceMode.NoConflicts)
-    dr.scatter(shapes, mi.Vector4f(foot.e, foot.q, half, low), index + 1, mode=dr.ReduceMode.NoConflicts)
-    dr.eval(foot, rows, shapes)
+    rows, shapes = dr.select(foot.q > 0, dr.maximum(high - low, 0), 0), dr.empty(mi.Float, 8 * n)
+    dr.scatter(shapes, mi.Vector4f(splats.u, splats.v, foot.k, foot.p), 2 * place, mode=dr.ReduceMode.NoConflicts)
+    dr.scatter(shapes, mi.Vector4f(foot.e, foot.q, low, rows), 2 * place + 1, mode=dr.ReduceMode.NoConflicts)
+    dr.eval(foot, shapes)
 
-    ranked = dr.gather(mi.UInt32, rows, order)
-    first_row = dr.prefix_sum(ranked)
-    rank = _runs(first_row, int(dr.sum(rows)[0]))
-    if len(rank) == 0:
-        return nothing
-    row_splat = dr.gather(mi.UInt32, order, rank)
-    offset = dr.arange(mi.UInt32, len(rank)) - dr.gather(mi.UInt32, first_row, rank)
-    block, columns = _columns(shapes, row_splat, offset, blocks_x)
-    dr.eval(rank, row_splat, block, columns)
-    before = dr.prefix_sum(columns)
-    row = _runs(before, int(dr.sum(columns)[0]))
-    if len(row) == 0:
-        return nothing
-    first = dr.gather(mi.UInt32, before, first_row, ranked > 0)
-    row_place, count = dr.gather(mi.UInt32, place, row_splat), dr.empty(mi.UInt32, n)
-    last = dr.gather(mi.UInt32, before + columns, first_row + ranked - 1, ranked > 0)
-    dr.scatter(count, last - first, dr.gather(mi.UInt32, place, order), mode=dr.ReduceMode.NoConflicts)
-    slot_start = dr.prefix_sum(count)
-    to_slot = dr.gather(mi.UInt32, slot_start, row_place) - dr.gather(mi.UInt32, first, rank)
-    dr.eval(row, row_place, to_slot)
-    pair = dr.arange(mi.UInt32, len(row))
-    splat, to_slot, block, before = (dr.gather(mi.UInt32, a, row) for a in (row_place, to_slot, block, before))
-    return splat, pair + to_slot, pair - before + block, slot_start, slot_start + count
+    rows = mi.UInt32(dr.gather(mi.Float, shapes, 8 * dr.arange(mi.UInt32, n) + 7))
+    first_row = dr.prefix_sum(rows)
+    row_splat = _runs(first_row, int(dr.sum(rows)[0]))
+    block, columns = mi.UInt32(), mi.UInt32()
+    if len(row_splat) > 0:
+        offset = dr.arange(mi.UInt32, len(row_splat)) - dr.gather(mi.UInt32, first_row, row_splat)
+        block, columns = _columns(shapes, row_splat, offset, blocks_x)
+        dr.eval(row_splat, block, columns)
+    count = int(dr.sum(columns)[0]) if len(columns) > 0 else 0
+    if count == 0:
+        return mi.UInt32(), mi.UInt32(), dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n)
+    first = dr.prefix_sum(columns)
+    row, end = _runs(first, count), first + columns
+    number = _by_tile(dr.gather(mi.UInt32, block - first, row) + dr.arange(mi.UInt32, count), blocks_x)
+    slot_start = dr.gather(mi.UInt32, first, first_row, rows > 0)
+    slot_end = dr.gather(mi.UInt32, end, first_row + rows - 1, rows > 0)
+    pairs = dr.gather(mi.UInt32, row_splat, row), number, slot_start, slot_end
+    dr.eval(pairs)
+    return pairs
+
+
+def _front_to_back(slot_start: Any, slot_end: Any, by_depth: Any, count: int) -> Any:
+    """UInt32 [count]: the slots of the splat at each of these places, in their order."""
+    dr.eval(by_depth)
+    start, end = dr.gather(mi.UInt32, slot_start, by_depth), dr.gather(mi.UInt32, slot_end, by_depth)
+    dr.eval(start, end)
+    first = dr.prefix_sum(end - start)
+    rank = _runs(first, count)
+    slots = dr.gather(mi.UInt32, start - first, rank) + dr.arange(mi.UInt32, count)
+    dr.eval(slots)
+    return slots
 
 
 def _runs(start: Any, count: int) -> Any:
@@ -241,12 +256,12 @@ def _columns(shapes: Any, splat: Any, offset: Any, blocks_x: int) -> tuple[Any, 
     """The blocks of one row that a footprint's ellipse reaches within the row's pixel centres: the first, and how many.
 
     The right rim x = k y + sqrt(q - e^2 y^2) / p is concave in y, so over the row's band it is largest at its own maximum,
-    clipped to the band; likewise the left rim. shapes: (u, v, k, p), (e, q, half, low) of each splat, where half is the
-    ellipse's half height and low its first row; the row is low + offset.
+    clipped to the band; likewise the left rim. shapes: (u, v, k, p), (e, q, low, rows) of each splat, where low is its first
+    row; the row is low + offset.
     """
     u, v, k, p = dr.gather(mi.Vector4f, shapes, 2 * splat)
-    e, q, half, first_row = dr.gather(mi.Vector4f, shapes, 2 * splat + 1)
-    by = mi.UInt32(first_row) + offset
+    e, q, first_row, _ = dr.gather(mi.Vector4f, shapes, 2 * splat + 1)
+    by, half = mi.UInt32(first_row) + offset, dr.sqrt(q) * dr.rcp(e)
     top = mi.Float(by * BLOCK_Y) + 0.5 - v
     low, high = dr.maximum(top, -half), dr.minimum(top + (BLOCK_Y - 1), half)
     slant = k * p
@@ -275,16 +290,13 @@ def _rounded(pairs: int) -> int:
     return -(-max(pairs, 1) // step) * step
 
 
-def _group(key: Any, buckets: int) -> tuple[Any, Any, Any]:
-    """(start, end) [buckets] of each bucket in the stably sorted keys, and the sorting permutation."""
+def _ranges(key: Any, buckets: int) -> tuple[Any, Any]:
+    """(start, end) [buckets] of each bucket in the sorted keys."""
     start, end = dr.zeros(mi.UInt32, buckets), dr.zeros(mi.UInt32, buckets)
     m = len(key)
-    slot = dr.detail.block_mkperm(key, m, buckets)
     place, last = dr.arange(mi.UInt32, m), dr.opaque(mi.UInt32, m - 1)
-    sorted_key = dr.gather(mi.UInt32, key, slot)
-    dr.eval(sorted_key)
-    previous = dr.gather(mi.UInt32, sorted_key, dr.maximum(place, 1) - 1)
-    following = dr.gather(mi.UInt32, sorted_key, dr.minimum(place + 1, last))
-    dr.scatter(start, place, sorted_key, (place == 0) | (previous != sorted_key), mode=dr.ReduceMode.NoConflicts)
-    dr.scatter(end, place + 1, sorted_key, (place == last) | (following != sorted_key), mode=dr.ReduceMode.NoConflicts)
-    return start, end, slot
+    previous = dr.gather(mi.UInt32, key, dr.maximum(place, 1) - 1)
+    following = dr.gather(mi.UInt32, key, dr.minimum(place + 1, last))
+    dr.scatter(start, place, key, (place == 0) | (previous != key), mode=dr.ReduceMode.NoConflicts)
+    dr.scatter(end, place + 1, key, (place == last) | (following != key), mode=dr.ReduceMode.NoConflicts)
+    return start, end
