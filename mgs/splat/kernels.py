@@ -240,8 +240,8 @@ def _store(slots: Any, sums: list[Any], slot: Any) -> None:
         dr.scatter(slots, mi.Vector4f(*padded[4 * i : 4 * i + 4]), slot * packets + i, mode=dr.ReduceMode.NoConflicts)
 
 
-def _per_splat(lists: BlockLists, slots: Any, count: int) -> Any:
-    """Add each splat's contiguous slots, in order and in double: Float64 [N * packets * 4], where splats lie."""
+def _per_splat(lists: BlockLists, slots: Any, count: int, real: Any) -> Any:
+    """Add each splat's contiguous slots, in order and in double: [N * packets * 4] of the given type, where splats lie."""
     dr.eval(slots)
     packets = _packets(count)
     lane = dr.arange(mi.UInt32, len(lists.place) * packets)
@@ -252,19 +252,20 @@ def _per_splat(lists: BlockLists, slots: Any, count: int) -> Any:
         return i + 1, total + mi.Vector4d(dr.gather(mi.Vector4f, slots, i * packets + packet))
 
     _, total = dr.while_loop((start, mi.Vector4d(0)), lambda i, total: i < end, body)
-    return dr.ravel(total)
+    total = [dr.select(dr.abs(x) > DENORMAL, x, 0) for x in total]
+    return dr.ravel((mi.Vector4f if real is mi.Float else mi.Vector4d)(*total))
 
 
 def by_splat(lists: BlockLists, placed: Any, count: int) -> list[Any]:
-    """The sums of `_per_splat` as `count` Float64 [N], in the Gaussians' order."""
-    packets = _packets(count)
-    flat = [x for i in range(packets) for x in dr.gather(mi.Vector4d, placed, lists.place * packets + i)]
-    return [dr.select(dr.abs(x) > DENORMAL, x, 0) for x in flat[:count]]
+    """The sums of `_per_splat` as `count` arrays [N], in the Gaussians' order."""
+    packets, vector = _packets(count), mi.Vector4f if type(placed) is mi.Float else mi.Vector4d
+    return [x for i in range(packets) for x in dr.gather(vector, placed, lists.place * packets + i)][:count]
 
 
 @frozen(_sizes)
-def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, Any], d_out: tuple[Any, Any], means: bool) -> Splats:
-    """Gradient with respect to each splat's numbers, given `forward`'s output (rgba, depth) and the gradient of it.
+def adjoint(lists: BlockLists, packed: Any, whitening: Any, out: Any, d_out: Any, means: bool) -> Splats:
+    """Gradient with respect to each splat's numbers, given (k, p, e) of the splats in the Gaussians' order, `forward`'s output
+    (rgba, depth) and the gradient of it.
 
     With means=False the gradients of u and v are not computed (None): frozen means need two sums less.
     """
@@ -303,9 +304,8 @@ def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, Any], d_out: tuple[A
         return new, alive
 
     _walk(lists, packed, lane, pixels, visit)
-    r, g, b, z, d, xx, xy, yy, *first = (mi.Float(x) for x in by_splat(lists, _per_splat(lists, slots, count), count))
-    s = _unpack(packed, lists.place)
-    k, p, e = mi.Float(s.k), s.p, s.e
+    r, g, b, z, d, xx, xy, yy, *first = by_splat(lists, _per_splat(lists, slots, count, mi.Float), count)
+    k, p, e = whitening
     du = dv = None
     if means:
         fx, fy = first
@@ -373,4 +373,4 @@ def fisher(lists: BlockLists, packed: Any, background: Any, block: bool) -> Any:
         return new, alive
 
     _walk(lists, packed, lane, [[t, *c] for t, c in zip(T, behind, strict=True)], visit)
-    return _per_splat(lists, slots, count)
+    return _per_splat(lists, slots, count, mi.Float64)
