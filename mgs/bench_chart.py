@@ -24,21 +24,23 @@ def _sweep(points: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
     return [p for p in points if p["sweep"] == name]
 
 
-def fitted(points: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The points along N that exponents are fitted to: the last two decades. With fewer Gaussians the image takes the time."""
-    by_n = _sweep(points, "gaussians")
+def fitted(points: list[dict[str, Any]], sweep: str = "gaussians") -> list[dict[str, Any]]:
+    """The points of a sweep that exponents are fitted to: the last two decades of N. Below, other things take the time."""
+    by_n = _sweep(points, sweep)
     return [p for p in by_n if 100 * p["n"] >= by_n[-1]["n"]]
 
 
 def scaling_exponents(points: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
     """Fitted growth of each operation's time, and of peak memory, in N, pixels and (splat, block) pairs.
 
-    Pairs grow with N (more slowly than N, so the work per Gaussian gains weight) or with the image (at equal N): a fit each.
+    Pairs grow alone where N and the image grow together. Where N grows by itself they grow more slowly than N, so that the
+    work per Gaussian gains weight; where the image does, the work per pair: a fit each.
     """
     by_n, by_size = fitted(points), _sweep(points, "pixels")
     fits = {
         "N": (by_n, "n"),
         "pixels": (by_size, "pixels"),
+        "pairs alone": (fitted(points, "both"), "pairs"),
         "pairs, N growing": (by_n, "pairs"),
         "pairs, image growing": (by_size, "pairs"),
     }
@@ -71,7 +73,7 @@ def scaling_figure(path: str | Path, points: list[dict[str, Any]]) -> None:
     """Four panels: time against N, pixels and pairs, and memory against N; threads as a note."""
     import matplotlib
 
-    exponents, start, linear = scaling_exponents(points), fitted(points)[0]["n"], linear_growth(points)
+    exponents, start = scaling_exponents(points), fitted(points)[0]["n"]
     with matplotlib.rc_context(STYLE | {"legend.fontsize": 7, "legend.title_fontsize": 7}):
         figure = new_figure(10, 7)
         panels = figure.subplots(2, 2)
@@ -81,18 +83,13 @@ def scaling_figure(path: str | Path, points: list[dict[str, Any]]) -> None:
         _time_panel(panels[0, 1], points, "pixels", {"pixels": "pixels"}, exponents)
         panels[0, 1].set(xlabel="pixels")
         panels[0, 1].legend(title="exponent")
-        both = {"gaussians": "pairs, N growing", "pixels": "pairs, image growing"}
-        _time_panel(panels[1, 0], points, "pairs", both, exponents)
+        sweeps = {"both": "pairs alone", "gaussians": "pairs, N growing"}
+        _time_panel(panels[1, 0], points, "pairs", sweeps, exponents)
         panels[1, 0].set(xlabel="(splat, block) pairs")
         panels[1, 0].legend(
-            title=f"exponent as N grows (solid, from {start:,})\nand as the image grows (dashed)", loc="upper left"
+            title=f"exponent as N and the image grow together (solid)\nand as N grows alone (dashed), from {start:,}",
+            loc="upper left",
         )
-        worst = max(row["worst deviation"] for row in linear.values())
-        costs = [f"{row['ns per pair']:.0f} + {row['ns per Gaussian']:.0f}: {label}" for label, row in linear.items()]
-        text = "\n".join(["ns per pair + ns per Gaussian", f"(within {worst:.0%} of every point)", *costs])
-        low, high = panels[1, 0].get_ylim()
-        panels[1, 0].set_ylim(0.4 * low, 4 * high)
-        panels[1, 0].text(0.98, 0.03, text, transform=panels[1, 0].transAxes, ha="right", va="bottom", fontsize=7)
         memory, by_n = panels[1, 1], _sweep(points, "gaussians")
         peak = f"peak of the kernels: {exponents['peak memory']['N']:.2f}"
         for key, style, colour, label in (
@@ -113,10 +110,10 @@ def scaling_figure(path: str | Path, points: list[dict[str, Any]]) -> None:
 
 
 def _time_panel(axis: Any, points: Any, key: str, sweeps: dict[str, str], exponents: Any) -> None:
-    """Time against `key`, a line for each operation and sweep, the second dashed. sweeps: sweep -> exponent in the legend."""
+    """Time against `key`, a line for each operation and sweep, the second dashed. sweeps: sweep -> exponent shown."""
     for name, (operation, colour, marker) in OPERATIONS.items():
         values = ", ".join(f"{exponents[operation][against]:.2f}" for against in sweeps.values())
-        for sweep, dash, label in zip(sweeps, ("-", "--"), (f"{operation}: {values}", None), strict=False):
-            chosen = _sweep(points, sweep)
+        for sweep, dash in zip(sweeps, ("-", "--"), strict=False):
+            chosen, label = _sweep(points, sweep), f"{operation}: {values}" if dash == "-" else None
             axis.loglog([p[key] for p in chosen], [1e3 * p[name] for p in chosen], dash + marker, color=colour, label=label)
     axis.set(ylabel="time, ms")

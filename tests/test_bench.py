@@ -21,10 +21,12 @@ from mgs.splat.kernels import PIXELS
 
 
 def points(most: int = 1_000_000) -> list[dict]:
-    """Records of a machine on which N brings pairs ~ N^0.5 and time ~ pairs^1.4, pixels pairs ~ pixels^0.5 and time ~ pairs."""
+    """Records of a machine on which N brings pairs ~ N^0.5 and time ~ pairs^1.4, pixels pairs ~ pixels^0.5 and time ~ pairs,
+    both time ~ pairs^0.9."""
     numbers = [n for n in (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000) if n <= most]
     rows = [("gaussians", n, 307_200, 2, n**0.5, n**0.7 if n >= most // 100 else 1.0) for n in numbers]
     rows += [("pixels", 100_000, 4**i, 2, 2.0**i, 2.0**i) for i in range(4)]
+    rows += [("both", 4**i * most // 4096, 4**i, 2, 4.0**i, 4.0 ** (0.9 * max(i, 3))) for i in range(7)]
     rows += [("threads", 100_000, 307_200, t, 1.0, 1 / t) for t in (1, 2)]
     return [
         dict(zip(("sweep", "n", "pixels", "threads", "pairs"), row[:5], strict=True))
@@ -38,7 +40,7 @@ def test_growth_with_pairs_is_told_for_either_way_to_get_more(tmp_path):
     records = points()
     assert fitted(records)[0]["n"] == 10_000
     row = scaling_exponents(records)["forward, cold"]
-    expected = {"N": 0.7, "pixels": 0.5, "pairs, N growing": 1.4, "pairs, image growing": 1.0}
+    expected = {"N": 0.7, "pixels": 0.5, "pairs alone": 0.9, "pairs, N growing": 1.4, "pairs, image growing": 1.0}
     assert row == pytest.approx(expected)
     assert scaling_exponents(records)["peak memory"]["N"] == pytest.approx(1.0)
     assert fitted(points(3000))[0]["n"] == 1000
