@@ -178,8 +178,8 @@ def render(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.
 def _empty(camera: Camera, background: Any) -> Image:
     """What a camera sees of no Gaussians."""
     shape = (camera.height, camera.width)
-    rgb = np.broadcast_to(np.asarray(dr.detach(background), np.float32).ravel(), (*shape, 3))
-    return Image(mi.TensorXf(np.ascontiguousarray(rgb)), dr.zeros(mi.TensorXf, shape), dr.zeros(mi.TensorXf, shape))
+    rgb = background + dr.zeros(mi.Color3f, camera.height * camera.width)
+    return Image(mi.TensorXf(dr.ravel(rgb), (*shape, 3)), dr.zeros(mi.TensorXf, shape), dr.zeros(mi.TensorXf, shape))
 
 
 def composite(splats: Splats, packed: Any, lists: BlockLists, width: int, height: int, background: Any = 0.0) -> Image:

@@ -161,6 +161,16 @@ def test_no_gaussians_is_the_background(degree):
         assert fisher(g, CAMERA, estimator).shape == shape
 
 
+@pytest.mark.parametrize("n", [0, 60])
+def test_gradient_of_the_background_is_what_shines_through(n):
+    background = mi.Color3f(*BACKGROUND)
+    dr.enable_grad(background)
+    image = render(make_gaussians(n, 3), CAMERA, background)
+    dr.backward(dr.sum(image.rgb, axis=None))
+    through = float(np.sum(1 - np.asarray(dr.detach(image.alpha))))
+    np.testing.assert_allclose(np.asarray(dr.grad(background)).ravel(), [through] * 3, rtol=1e-5)
+
+
 def test_gradient_of_extreme_scenes_is_right_too():
     """1:1000 and opacity logits of 20 at once: scales and colours against the oracle's Jacobian."""
     g = thin(1e3)
