@@ -55,7 +55,7 @@ def main(prefix: str, n: int = 100_000) -> None:
     camera = surface_camera(gaussians, 640, 480)
     splats = project(as_drjit(gaussians), camera_array(camera))
     dr.eval(splats)
-    black, whitening, chosen, settings = as_colour(0.0), (splats.k, splats.p, splats.e), blocks.TILE, {}
+    black, chosen, settings = as_colour(0.0), blocks.TILE, {}
     for blocks.TILE in TILES:
         settings[blocks.TILE] = blocks.build(splats, blocks.depth_order(splats.z), camera.width, camera.height, 0.0)
     blocks.TILE = chosen
@@ -66,7 +66,7 @@ def main(prefix: str, n: int = 100_000) -> None:
         prepared[name] = lists, packed, kernels.forward(lists, packed)
     operations = {
         "forward": lambda lists, packed, out: kernels.forward(lists, packed),
-        "adjoint": lambda lists, packed, out: kernels.adjoint(lists, packed, whitening, out, out, False),
+        "adjoint": lambda lists, packed, out: kernels.adjoint(lists, packed, out, out, False),
         "exact Fisher": lambda lists, packed, out: kernels.fisher(lists, packed, black, False),
     }
     seconds = {name: {setting: [] for setting in settings} for name in operations}

@@ -243,18 +243,14 @@ def bench_splat(n: int, width: int, height: int, repeats: int, report: Callable[
 
 
 def bench_scaling(repeats: int, report: Callable[[str], None], most: int = 1_000_000) -> list[dict[str, Any]]:
-    """Time and memory against N at 640x480, image size at N = 100,000, both together, and threads; one record per point.
-
-    Where both grow together, a splat keeps its number of pairs, so nothing grows but the number of pairs.
-    """
+    """Time and memory against N at 640x480, image size at N = 100,000, both together (640x480 at 100,000), and threads; one
+    record per point. Where both grow together, a splat keeps its number of pairs, so nothing grows but that of pairs."""
     threads = dr.thread_count()
-    points = [
-        ("gaussians", n, 640, 480, threads) for n in (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000) if n <= most
-    ]
+    numbers = [n for n in (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000) if n <= most]
+    points = [("gaussians", n, 640, 480, threads) for n in numbers]
     base = min(100_000, most)
     points += [("pixels", base, w, h, threads) for w, h in ((160, 120), (320, 240), (640, 480), (1280, 960))]
-    together = [(round(base * (w / 640) ** 2), w) for w in (60, 120, 240, 480, 960, 1920)]
-    points += [("both", n, w, w * 3 // 4, threads) for n, w in together if n <= most]
+    points += [("both", n, round(640 * (n / 1e5) ** 0.5), round(480 * (n / 1e5) ** 0.5), threads) for n in numbers]
     points += [("threads", base, 640, 480, t) for t in sorted({1, threads})]
     records = []
     for sweep, n, width, height, count in points:

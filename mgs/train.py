@@ -50,8 +50,10 @@ class Fit:
     stop_reason: Literal["converged", "iteration-limit"]
 
 
-def _sizes(parameters: Any, moments: Any, camera: Any, packed: Any, lists: BlockLists, target: Any, *_: Any) -> tuple[int, ...]:
-    return len(lists.splat), len(lists.slot_start), len(lists.block), len(target)
+def _baked(
+    gaussians: Gaussians, moments: Any, camera: Any, packed: Any, lists: BlockLists, target: Any, size: Any, *_: Any
+) -> tuple[int, ...]:
+    return len(lists.splat), len(lists.block), len(target), *gaussians.sh.shape, *size
 
 
 EPSILON = 1e-3
@@ -59,12 +61,12 @@ EPSILON = 1e-3
 parameter that no image sees stays where the prior put it instead of walking full steps."""
 
 
-@frozen(lambda gaussians, camera: (len(gaussians),))
+@frozen(lambda gaussians, camera: gaussians.sh.shape)
 def _project(gaussians: Gaussians, camera: Any) -> Any:
     return project(gaussians, camera)
 
 
-@frozen(_sizes)
+@frozen(_baked)
 def _step(
     gaussians: Gaussians,
     moments: list[list[Any]],

@@ -26,7 +26,7 @@ def points(most: int = 1_000_000) -> list[dict]:
     numbers = [n for n in (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000) if n <= most]
     rows = [("gaussians", n, 307_200, 2, n**0.5, n**0.7 if n >= most // 100 else 1.0) for n in numbers]
     rows += [("pixels", 100_000, 4**i, 2, 2.0**i, 2.0**i) for i in range(4)]
-    rows += [("both", 4**i * most // 4096, 4**i, 2, 4.0**i, 4.0 ** (0.9 * max(i, 3))) for i in range(7)]
+    rows += [("both", n, 3 * n, 2, float(n), n**0.9 if n >= most // 100 else 1.0) for n in numbers]
     rows += [("threads", 100_000, 307_200, t, 1.0, 1 / t) for t in (1, 2)]
     return [
         dict(zip(("sweep", "n", "pixels", "threads", "pairs"), row[:5], strict=True))

@@ -45,7 +45,7 @@ class Footprints:
 
 @dataclass
 class BlockLists:
-    """Pairs (splat, block), sorted by block, in each block by depth; M counts some unused room at the end.
+    """Pairs (splat, block), sorted by block (tile by tile), in each block by depth; M counts some unused room at the end.
 
     Splats lie in memory by tile, block, depth, and are known by that place: place: UInt32 [N] is where each one lies.
     splat, slot: UInt32 [M]; a pair's slot is its place in the order where the pairs of one splat are contiguous, and

@@ -10,15 +10,17 @@ from typing import Any
 import drjit as dr
 
 
-def frozen(sizes: Callable[..., tuple[int, ...]]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorate with `dr.freeze`; sizes(*arguments) are the lengths that a recording bakes in.
+def frozen(baked: Callable[..., tuple[int, ...]]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Decorate with `dr.freeze`; baked(*arguments) are the lengths and plain numbers that a recording bakes in.
 
+    They are compared as one string: of a small number that also stands elsewhere among the inputs or the function's globals
+    `dr.freeze` notes only that it was seen before, not which it is, and replays what was recorded for another (Dr.Jit 1.5).
     Python's cycle collector waits meanwhile: a Mitsuba scene that it frees during a recording ends the process
     ("enqueue_host_func(): this function cannot be recorded", Dr.Jit 1.5).
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        recorded = dr.freeze(function, state_fn=sizes, limit=64, warn_after=1 << 30)
+        recorded = dr.freeze(function, state_fn=lambda *a, **k: repr(baked(*a, **k)), limit=64, warn_after=1 << 30)
 
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> Any:

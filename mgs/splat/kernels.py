@@ -33,9 +33,9 @@ DENORMAL = 1e-24
 So far above the smallest float (1e-38), no product of a sum that is kept, and no error of one that is, can be denormal."""
 
 
-def _sizes(lists: BlockLists, *_: Any, **__: Any) -> tuple[int, ...]:
-    """What a recording of a kernel bakes in: the lengths of its buffers."""
-    return len(lists.splat), len(lists.slot_start), len(lists.block)
+def _baked(lists: BlockLists, *others: Any) -> tuple[int, ...]:
+    """What a recording of a kernel bakes in: the lengths of its buffers, and its flag."""
+    return len(lists.splat), len(lists.slot_start), len(lists.block), *(x for x in others if isinstance(x, bool))
 
 
 def pack(s: Splats, place: Any) -> Any:
@@ -197,7 +197,7 @@ def _composite(lists: BlockLists, packed: Any, lane: Lane, T: list[Any], numbers
     return _walk(lists, packed, lane, pixels, visit)
 
 
-@frozen(_sizes)
+@frozen(_baked)
 def forward(lists: BlockLists, packed: Any) -> tuple[Any, Any]:
     """Composite. Returns block-major pixels: rgba Float [L*32*4] (premultiplied, no background), weighted depth [L*32].
 
@@ -257,17 +257,25 @@ def _per_splat(lists: BlockLists, slots: Any, count: int, real: Any) -> Any:
 
 
 def by_splat(lists: BlockLists, placed: Any, count: int) -> list[Any]:
-    """The sums of `_per_splat` as `count` arrays [N], in the Gaussians' order."""
+    """The sums of `_per_splat` as `count` arrays [N], in the Gaussians' order. Evaluated, since arithmetic would wait for these
+    random reads: in a kernel of its own it is faster."""
     packets, vector = _packets(count), mi.Vector4f if type(placed) is mi.Float else mi.Vector4d
-    return [x for i in range(packets) for x in dr.gather(vector, placed, lists.place * packets + i)][:count]
+    sums = [x for i in range(packets) for x in dr.gather(vector, placed, lists.place * packets + i)][:count]
+    dr.eval(sums)
+    return sums
 
 
-@frozen(_sizes)
-def adjoint(lists: BlockLists, packed: Any, whitening: Any, out: Any, d_out: Any, means: bool) -> Splats:
-    """Gradient with respect to each splat's numbers, given (k, p, e) of the splats in the Gaussians' order, `forward`'s output
-    (rgba, depth) and the gradient of it.
+ADJOINT_SUMS = {False: 8, True: 10}
+"""Sums per splat of `adjoint`: means frozen, means free."""
 
-    With means=False the gradients of u and v are not computed (None): frozen means need two sums less.
+
+@frozen(_baked)
+def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, Any], d_out: tuple[Any, Any], means: bool) -> Any:
+    """Sums over pixels, from which `splat_gradient` makes the gradient with respect to each splat's numbers, given `forward`'s
+    output (rgba, depth) and the gradient of it; to be read through `by_splat`.
+
+    sum w dL (4: r, g, b, z) and, with s = d alpha of the loss, sum s (1, xi^2, xi eta, eta^2), and with means=True (frozen
+    means need two sums less) sum s (xi, eta).
     """
     lane, T = _lane(lists)
     dL, pixels = [], []
@@ -277,7 +285,7 @@ def adjoint(lists: BlockLists, packed: Any, whitening: Any, out: Any, d_out: Any
         z, dz = (dr.gather(mi.Float, a[1], place) for a in (out, d_out))
         dL.append((*d_rgba, dz))
         pixels.append([T[pixel], dr.dot(rgba, d_rgba) + z * dz])
-    count = 10 if means else 8
+    count = ADJOINT_SUMS[means]
     slots = _slots(lists, count)
 
     def visit(i: Any, splat: Splats, rows: list[Row], pixels: Any) -> Any:
@@ -304,10 +312,15 @@ def adjoint(lists: BlockLists, packed: Any, whitening: Any, out: Any, d_out: Any
         return new, alive
 
     _walk(lists, packed, lane, pixels, visit)
-    r, g, b, z, d, xx, xy, yy, *first = by_splat(lists, _per_splat(lists, slots, count, mi.Float), count)
-    k, p, e = whitening
+    return _per_splat(lists, slots, count, mi.Float)
+
+
+def splat_gradient(sums: list[Any], splats: Splats) -> Splats:
+    """The gradient from the sums of `adjoint`; that of u and v is None where means are frozen."""
+    r, g, b, z, d, xx, xy, yy, *first = sums
+    k, p, e = splats.k, splats.p, splats.e
     du = dv = None
-    if means:
+    if first:
         fx, fy = first
         du, dv = 2 * LN2 * p * fx, 2 * LN2 * (e * fy - p * k * fx)
     return Splats(du, dv, 2 * LN2 * p / e * xy, -2 * LN2 / p * xx, -2 * LN2 / e * yy, LN2 * d, z, r, g, b)
@@ -317,7 +330,7 @@ FISHER_SUMS = {False: 7, True: 22}
 """Sums per splat of `fisher`: exact diagonal, exact blocks."""
 
 
-@frozen(_sizes)
+@frozen(_baked)
 def fisher(lists: BlockLists, packed: Any, background: Any, block: bool) -> Any:
     """Sums over pixels and channels, from which O(N) work makes the Fisher information; to be read through `by_splat`.
 

@@ -121,8 +121,7 @@ class _Rasterise(dr.CustomOp):
     AD could replay. places: see `_places`."""
 
     def eval(self, splats: Splats, packed: Any, lists: BlockLists, places: Any, means: bool) -> Any:
-        self.packed, self.lists, self.places, self.means = packed, lists, places, means
-        self.whitening = splats.k, splats.p, splats.e
+        self.splats, self.packed, self.lists, self.places, self.means = splats, packed, lists, places, means
         self.out = kernels.forward(lists, packed)
         pixel = dr.gather(mi.Vector4f, self.out[0], places, mode=dr.ReduceMode.NoConflicts)
         return *pixel, dr.gather(mi.Float, self.out[1], places, mode=dr.ReduceMode.NoConflicts)
@@ -133,8 +132,9 @@ class _Rasterise(dr.CustomOp):
         d_rgba, d_depth = (dr.zeros(mi.Float, len(out)) for out in self.out)
         dr.scatter(d_rgba, mi.Vector4f(*d_pixel), self.places, mode=dr.ReduceMode.NoConflicts)
         dr.scatter(d_depth, d_weighted, self.places, mode=dr.ReduceMode.NoConflicts)
-        gradient = kernels.adjoint(self.lists, self.packed, self.whitening, self.out, (d_rgba, d_depth), self.means)
-        self.set_grad_in("splats", gradient)
+        placed = kernels.adjoint(self.lists, self.packed, self.out, (d_rgba, d_depth), self.means)
+        sums = kernels.by_splat(self.lists, placed, kernels.ADJOINT_SUMS[self.means])
+        self.set_grad_in("splats", kernels.splat_gradient(sums, self.splats))
 
 
 def _places(width: int, height: int) -> Any:

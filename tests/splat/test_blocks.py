@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mgs.splat import ListCache, as_drjit, blocks, fisher, reference, render
+from mgs.splat import ListCache, as_drjit, blocks, fisher, kernels, reference, render
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, TILE, build, depth_order, inflate, outgrown
 from mgs.splat.project import camera_array, project
 from mgs.splat.render import MARGIN
@@ -87,15 +87,30 @@ def test_memory_and_lanes_go_by_tile():
 def test_a_new_camera_compiles_nothing():
     """The kernels that build lists are the same for every camera, though the numbers of pairs differ."""
     g = as_drjit(make_gaussians(300, 3, log_scales=(-5.0, -3.0)))
-    kernels = []
+    seen = []
     for angle in np.linspace(0, 0.3, 4):
         camera = make_camera(eye=(2 * np.cos(angle), 2 * np.sin(angle), 0.9))
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             dr.eval(render(g, camera).rgb)
-            kernels.append({entry["hash"] for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT})
-    assert kernels[0]
-    assert kernels[1] == kernels[2] == kernels[3]
+            seen.append({entry["hash"] for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT})
+    assert seen[0]
+    assert seen[1] == seen[2] == seen[3]
+
+
+def test_kernels_are_recorded_once_whether_lists_are_new_kept_or_rebuilt(monkeypatch):
+    """A recording also fixes which of its inputs are the same array, as the splats and the footprints of new lists may be."""
+    camera, g, cache, recorded = make_camera((46, 31)), make_gaussians(37, 3), ListCache(), []
+    walk = kernels._walk
+    monkeypatch.setattr(kernels, "_walk", lambda *arguments: recorded.append(1) or walk(*arguments))
+    for growth, builds in ((0, 1), (0, 1), (0.05, 2), (0.05, 2), (0.4, 3)):
+        drawn = as_drjit(changed(g, log_scales=g.log_scales + np.float32(growth)))
+        dr.enable_grad(drawn.log_scales)
+        image = render(drawn, camera, cache=cache)
+        dr.backward(dr.sum(image.rgb, axis=None))
+        fisher(changed(g, log_scales=g.log_scales + np.float32(growth)), camera, cache=cache)
+        assert cache.builds == builds
+    assert len(recorded) == 4, "forward, adjoint, and the two walks of Fisher"
 
 
 def test_depth_order_is_a_stable_sort():

@@ -60,6 +60,22 @@ def test_exact_and_block_against_brute_force(degree):
     np.testing.assert_array_equal(block, block.transpose(0, 2, 1))
 
 
+def test_recorded_kernels_know_numbers_of_gaussians_from_other_numbers():
+    """One kernel after the other for N = 8, 10, 7, 22 and 32: numbers that also stand in the kernels, for other things."""
+    camera = make_camera()
+    for n in (8, 10, 7, 22, 32, 4):
+        g = calm(lambda seed, n=n: make_gaussians(n, seed, log_scales=(-4.0, -1.0)), camera, n)
+        expected = reference.fisher_block(g, camera, BACKGROUND)
+        assert_close(fisher(g, camera, "exact", BACKGROUND), diagonal(expected), f"{n} exact")
+        assert_close(fisher(g, camera, "block", BACKGROUND), expected, f"{n} block")
+        J = reference.jacobian(g, camera, BACKGROUND)
+        for free in (False, True):
+            watched = as_drjit(g)
+            dr.enable_grad(watched.sh, *([watched.means] if free else []))
+            dr.backward(dr.sum(render(watched, camera, BACKGROUND).rgb, axis=None))
+            np.testing.assert_allclose(dr.grad(watched.sh).numpy()[:, 0], J.sum((0, 1))[:, :3], rtol=1e-4, atol=1e-4)
+
+
 def test_images_of_several_tiles():
     """Splats and lanes go by tiles of 128x64 pixels; across their borders everything is as within."""
     camera = make_camera((150, 70), focal=150.0)
