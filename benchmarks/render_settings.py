@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import platform
 import time
 from pathlib import Path
 
@@ -29,6 +28,8 @@ VIEWS = (2, 17)
 def measure() -> dict:
     """Render every setting; times are medians over the views after one warm-up frame."""
     runtime.start()
+    from mgs.bench import command_line
+    from mgs.config import versions
     from mgs.conventions import srgb_from_linear
     from mgs.evaluate import psnr
     from mgs.rock import make_rock
@@ -72,8 +73,14 @@ def measure() -> dict:
                 }
             )
             print(rows[-1], flush=True)
-    machine = {"cores": os.cpu_count(), "processor": platform.machine()}
-    return {"reference_spp": REFERENCE_SPP, "size": SIZE, "machine": machine, "settings": rows}
+    return {
+        "command": command_line(),
+        "machine": runtime.processor() | {"cores": os.cpu_count()},
+        "versions": versions(),
+        "reference_spp": REFERENCE_SPP,
+        "size": SIZE,
+        "settings": rows,
+    }
 
 
 def plot(data: dict, path: Path) -> None:
