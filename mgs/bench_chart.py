@@ -1,4 +1,4 @@
-"""The scaling chart: log-log, with fitted exponents. Reads records only, measures nothing."""
+"""The scaling charts: log-log, with fitted exponents. Read records only, measure nothing."""
 
 from __future__ import annotations
 
@@ -20,6 +20,12 @@ OPERATIONS = {
 }
 
 
+MEMORY = {
+    "peak_bytes": ("peak memory", "#444444", "o"),
+    "list_bytes": ("lists of one camera", "#999999", "s"),
+}
+
+
 def _sweep(points: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
     return [p for p in points if p["sweep"] == name]
 
@@ -36,18 +42,20 @@ def scaling_exponents(points: list[dict[str, Any]]) -> dict[str, dict[str, float
     Pairs grow alone where N and the image grow together. Where N grows by itself they grow more slowly than N, so that the
     work per Gaussian gains weight; where the image does, the work per pair: a fit each.
     """
-    by_n, by_size = fitted(points), _sweep(points, "pixels")
+    by_n, by_size, by_threads = fitted(points), _sweep(points, "pixels"), _sweep(points, "threads")
     fits = {
         "N": (by_n, "n"),
         "pixels": (by_size, "pixels"),
+        "threads": (by_threads, "threads"),
         "pairs alone": (fitted(points, "both"), "pairs"),
         "pairs, N growing": (by_n, "pairs"),
         "pairs, image growing": (by_size, "pairs"),
     }
-    labels = {name: label for name, (label, _, _) in OPERATIONS.items()} | {"peak_bytes": "peak memory"}
+    if len(by_threads) < 2:
+        del fits["threads"]
     return {
         label: {what: exponent([p[key] for p in of], [p[name] for p in of]) for what, (of, key) in fits.items()}
-        for name, label in labels.items()
+        for name, (label, *_) in (OPERATIONS | MEMORY).items()
     }
 
 
@@ -70,50 +78,45 @@ def linear_growth(points: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
 
 
 def scaling_figure(path: str | Path, points: list[dict[str, Any]]) -> None:
-    """Four panels: time against N, pixels and pairs, and memory against N; threads as a note."""
+    """Time (first row) and memory (second) against N, pixels, threads and pairs, with exponents."""
     import matplotlib
 
-    exponents, start = scaling_exponents(points), fitted(points)[0]["n"]
+    exponents, start = scaling_exponents(points), f"{fitted(points)[0]['n']:,}"
+    columns = (
+        ("n", "Gaussians N", {"gaussians": "N"}, f"exponent, fitted from {start}"),
+        ("pixels", "pixels", {"pixels": "pixels"}, "exponent"),
+        ("threads", "threads", {"threads": "threads"}, "exponent"),
+        (
+            "pairs",
+            "(splat, block) pairs",
+            {"both": "pairs alone", "gaussians": "pairs, N growing"},
+            f"exponent as N and the image grow together\n(solid), as N grows alone (dashed), from {start}",
+        ),
+    )
     with matplotlib.rc_context(STYLE | {"legend.fontsize": 7, "legend.title_fontsize": 7}):
-        figure = new_figure(10, 7)
-        panels = figure.subplots(2, 2)
-        _time_panel(panels[0, 0], points, "n", {"gaussians": "N"}, exponents)
-        panels[0, 0].set(xlabel="Gaussians N")
-        panels[0, 0].legend(title=f"exponent, fitted from {start:,}")
-        _time_panel(panels[0, 1], points, "pixels", {"pixels": "pixels"}, exponents)
-        panels[0, 1].set(xlabel="pixels")
-        panels[0, 1].legend(title="exponent")
-        sweeps = {"both": "pairs alone", "gaussians": "pairs, N growing"}
-        _time_panel(panels[1, 0], points, "pairs", sweeps, exponents)
-        panels[1, 0].set(xlabel="(splat, block) pairs")
-        panels[1, 0].legend(
-            title=f"exponent as N and the image grow together (solid)\nand as N grows alone (dashed), from {start:,}",
-            loc="upper left",
-        )
-        memory, by_n = panels[1, 1], _sweep(points, "gaussians")
-        peak = f"peak of the kernels: {exponents['peak memory']['N']:.2f}"
-        for key, style, colour, label in (
-            ("peak_bytes", "o-", "#444444", peak),
-            ("list_bytes", "s-", "#999999", "block lists of one camera"),
-        ):
-            memory.loglog([p["n"] for p in by_n], [p[key] / 1e6 for p in by_n], style, color=colour, label=label)
-        memory.set(xlabel="Gaussians N", ylabel="memory, MB")
-        memory.legend(title=f"exponent, fitted from {start:,}")
-        for axis in panels.flat:
-            axis.tick_params(which="minor", labelsize=6)
-        threads = sorted(_sweep(points, "threads"), key=lambda p: p["threads"])
-        if len(threads) > 1:
-            gain = threads[0]["gradient_warm"] / threads[-1]["gradient_warm"]
-            times = f"{gain:.2f} times as fast as {threads[0]['threads']} (forward + adjoint)"
-            figure.suptitle(f"{threads[-1]['threads']} threads are {times}", fontsize=10)
+        figure = new_figure(15, 7)
+        rows = figure.subplots(2, len(columns), sharey="row")
+        for axes, quantities, unit, scale in ((rows[0], OPERATIONS, "time, ms", 1e3), (rows[1], MEMORY, "memory, MB", 1e-6)):
+            for axis, (key, name, sweeps, title) in zip(axes, columns, strict=True):
+                for quantity, (label, *style) in quantities.items():
+                    against = [exponents[label][of] for of in sweeps.values() if of in exponents[label]]
+                    text = ": ".join([label, ", ".join(f"{round(value, 2) + 0.0:.2f}" for value in against)])
+                    _lines(axis, points, (key, quantity, scale), sweeps, style, text)
+                axis.set(xlabel=name)
+                axis.legend(title=title, loc="upper left")
+                if key == "threads":
+                    axis.set_xticks([p["threads"] for p in _sweep(points, "threads")])
+                    axis.xaxis.set_major_formatter("{x:.0f}")
+                    axis.xaxis.set_minor_formatter("")
+            low, high = axes[0].get_ylim()
+            axes[0].set(ylabel=unit, ylim=(low, high * (high / low) ** 0.35))  # room for the legends
         save_figure(figure, path)
 
 
-def _time_panel(axis: Any, points: Any, key: str, sweeps: dict[str, str], exponents: Any) -> None:
-    """Time against `key`, a line for each operation and sweep, the second dashed. sweeps: sweep -> exponent shown."""
-    for name, (operation, colour, marker) in OPERATIONS.items():
-        values = ", ".join(f"{exponents[operation][against]:.2f}" for against in sweeps.values())
-        for sweep, dash in zip(sweeps, ("-", "--"), strict=False):
-            chosen, label = _sweep(points, sweep), f"{operation}: {values}" if dash == "-" else None
-            axis.loglog([p[key] for p in chosen], [1e3 * p[name] for p in chosen], dash + marker, color=colour, label=label)
-    axis.set(ylabel="time, ms")
+def _lines(axis: Any, points: Any, what: tuple[str, str, float], sweeps: dict[str, str], style: list[str], text: str) -> None:
+    """One quantity against one key, a line for each sweep, the second dashed. what: key, quantity, its scale."""
+    key, quantity, scale = what
+    colour, marker = style
+    for sweep, dash, label in zip(sweeps, ("-", "--"), (text, None), strict=False):
+        chosen = sorted(_sweep(points, sweep), key=lambda p: p[key])
+        axis.loglog([p[key] for p in chosen], [scale * p[quantity] for p in chosen], dash + marker, color=colour, label=label)

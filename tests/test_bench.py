@@ -40,12 +40,22 @@ def test_growth_with_pairs_is_told_for_either_way_to_get_more(tmp_path):
     records = points()
     assert fitted(records)[0]["n"] == 10_000
     row = scaling_exponents(records)["forward, cold"]
-    expected = {"N": 0.7, "pixels": 0.5, "pairs alone": 0.9, "pairs, N growing": 1.4, "pairs, image growing": 1.0}
+    expected = {
+        "N": 0.7,
+        "pixels": 0.5,
+        "threads": -1,
+        "pairs alone": 0.9,
+        "pairs, N growing": 1.4,
+        "pairs, image growing": 1.0,
+    }
     assert row == pytest.approx(expected)
     assert scaling_exponents(records)["peak memory"]["N"] == pytest.approx(1.0)
     assert fitted(points(3000))[0]["n"] == 1000
-    scaling_figure(tmp_path / "chart.png", records)
-    assert (tmp_path / "chart.png").stat().st_size > 10_000
+    one_core = [p for p in records if p["sweep"] != "threads" or p["threads"] == 1]
+    assert "threads" not in scaling_exponents(one_core)["forward, cold"]
+    for chosen in (records, one_core):
+        scaling_figure(tmp_path / "chart.png", chosen)
+        assert (tmp_path / "chart.png").stat().st_size > 10_000
 
 
 def test_linear_growth_finds_the_costs_it_is_made_of():
