@@ -100,7 +100,7 @@ def scaling_figure(path: str | Path, points: list[dict[str, Any]]) -> None:
             for axis, (key, name, sweeps, title) in zip(axes, columns, strict=True):
                 for quantity, (label, *style) in quantities.items():
                     against = [exponents[label][of] for of in sweeps.values() if of in exponents[label]]
-                    text = ": ".join([label, ", ".join(f"{round(value, 2) + 0.0:.2f}" for value in against)])
+                    text = ": ".join([label, ", ".join(f"{value:z.2f}" for value in against)])
                     _lines(axis, points, (key, quantity, scale), sweeps, style, text)
                 axis.set(xlabel=name)
                 axis.legend(title=title, loc="upper left")

@@ -79,7 +79,7 @@ def _print_scaling(console: Any, result: dict[str, Any]) -> None:
     rows = result["exponents"]
     table = Table("exponent of", *next(iter(rows.values())), title=f"fits against N start at {result['exponents_from_n']:,}")
     for name, row in rows.items():
-        table.add_row(name, *(f"{value:.2f}" for value in row.values()))
+        table.add_row(name, *(f"{value:z.2f}" for value in row.values()))
     linear = result["linear_growth"]
     costs = Table("time of", *next(iter(linear.values())), title="linear fit to all points")
     for name, row in linear.items():
