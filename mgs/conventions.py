@@ -31,8 +31,8 @@ class Camera:
 
     K: [3,3] float64, pixels (no skew). width, height: pixels.
     world_to_camera: [4,4] float64, rigid, OpenCV axes, metres.
-    Raises InputError where K or the pose is not finite, K has a non-positive focal length, the image has no pixel or more than
-    MAX_PIXELS, or the pose is not rigid.
+    Raises InputError where K or the pose is not finite, K has a non-positive focal length, the image has no pixel, parts of
+    pixels or more than MAX_PIXELS, or the pose is not rigid.
     """
 
     K: NDArray[np.float64]
@@ -43,6 +43,10 @@ class Camera:
     def __post_init__(self) -> None:
         K = np.asarray(self.K, np.float64)
         pose = np.asarray(self.world_to_camera, np.float64)
+        if int(self.width) != self.width or int(self.height) != self.height:
+            raise InputError(f"camera: image size {self.width}x{self.height} must be whole pixels")
+        object.__setattr__(self, "width", int(self.width))  # NumPy's integers are no sizes to Dr.Jit
+        object.__setattr__(self, "height", int(self.height))
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "world_to_camera", pose)
         if K.shape != (3, 3) or not np.isfinite(K).all():

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -135,7 +136,7 @@ def read_ply(path: str | Path) -> Gaussians:
         raise InputError(f"{path}: not a 3DGS PLY, it has no vertices; export it with a splatting tool")
     vertices = ply["vertex"].data
     present = set(vertices.dtype.names)
-    rest = sum(name.startswith("f_rest_") for name in present)
+    rest = sum(re.fullmatch("f_rest_[0-9]+", name) is not None for name in present)
     coefficients = 1 + rest // 3
     if rest % 3 or coefficients not in (1, 4, 9, 16):
         raise InputError(f"{path}: {rest} f_rest properties fit no SH degree from 0 to 3; expected 0, 9, 24 or 45")

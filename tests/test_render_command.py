@@ -46,7 +46,8 @@ def foreign_ply(path, g: Gaussians, encoding: str, extra: bool = True, seed: int
     named = {name: ("float", "f", values) for name, values in columns(g).items()}
     if extra:
         named |= {"red": ("uchar", "B", rng.integers(0, 255, len(g))), "confidence": ("double", "d", rng.random(len(g)))}
-        named |= {"nx": ("float", "f", np.zeros(len(g))), "label": ("int", "i", rng.integers(-9, 9, len(g)))}
+        named |= {"nx": ("float", "f", np.zeros(len(g))), "f_rest_of_it": ("float", "f", np.ones(len(g)))}
+        named |= {"label": ("int", "i", rng.integers(-9, 9, len(g)))}
     order = rng.permutation(sorted(named))
     header = ["ply", f"format {encoding} 1.0", "comment from another tool", "element camera 1", "property float focal"]
     header += [f"element vertex {len(g)}", *(f"property {named[name][0]} {name}" for name in order), "end_header", ""]

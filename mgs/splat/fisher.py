@@ -133,6 +133,8 @@ def exact(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCach
 def block(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None) -> np.ndarray:
     """The exact [N,P,P] diagonal blocks of J^T J: 22 sums per splat."""
     (w2, s2, *rest), g = _sums(gaussians, camera, background, cache, block=True)
+    if gaussians.sh.shape[1] > 1:  # more than one kernel writes the blocks
+        dr.eval(g)
     quartic, quadratic, cross = rest[:5], rest[5:8], [rest[8 + 4 * c : 12 + 4 * c] for c in range(3)]
     colour = [(basis, c) for basis in g.basis for c in range(3)]
     k = len(colour)
@@ -173,10 +175,14 @@ def _gradient(
 def hutchinson(
     gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None, probes: int = 8, seed: int = 0
 ) -> np.ndarray:
-    """Mean of (J^T z)^2 over `probes` images z of independent +-1, whose expectation is diag(J^T J) (Hutchinson 1990)."""
+    """Mean of (J^T z)^2 over `probes` images z of independent +-1, whose expectation is diag(J^T J) (Hutchinson 1990).
+
+    Raises InputError for less than one probe."""
+    if int(probes) != probes or probes < 1:
+        raise InputError(f"hutchinson: probes {probes} must be a whole number from 1 up")
     cache = cache or ListCache()
     total = np.zeros((len(gaussians), 0), np.float64)
-    for probe in range(probes):
+    for probe in range(int(probes)):
         rng = np.random.default_rng(derive_seed(seed, f"hutchinson/{probe}"))
         z = rng.choice(np.array([-1, 1], np.float32), (camera.height, camera.width, 3))
         squared = _gradient(gaussians, lambda _, z=z: mi.TensorXf(z), camera, background, cache).astype(np.float64) ** 2
@@ -197,6 +203,10 @@ SMALLEST = 1.2e-38
 """Smallest normal float32: threads differ in how they flush what is smaller, and nothing else differs between reruns."""
 
 
+PACKETS = 32
+"""Packets of four columns that one kernel writes: LLVM takes minutes over a kernel with all 56 x 56 of SH degree 3."""
+
+
 def _interleaved(columns_: dict[int, Any], size: int, n: int) -> np.ndarray:
     """Dr.Jit arrays [N] by column -> NumPy float32 [N, size], 0 in columns not given. Written four columns at a time."""
     packets = -(-size // 4)
@@ -205,6 +215,8 @@ def _interleaved(columns_: dict[int, Any], size: int, n: int) -> np.ndarray:
         values = [mi.Float(columns_.get(4 * packet + i, 0)) for i in range(4)]
         normal = mi.Vector4f(*(dr.select(dr.abs(value) < SMALLEST, 0, value) for value in values))
         dr.scatter(flat, normal, row + packet, mode=dr.ReduceMode.NoConflicts)
+        if packet % PACKETS == PACKETS - 1:
+            dr.eval(flat)
     return np.array(flat, copy=False).reshape(n, -1)[:, :size]
 
 

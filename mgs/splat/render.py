@@ -39,7 +39,7 @@ class Image:
 
 
 class ListCache:
-    """Block lists per camera, least recently used first out, within a budget in bytes.
+    """Block lists per camera, least recently used first out, within a budget in bytes; those used last are always kept.
 
     Lists serve as long as they are exact for the splats: same centres and depths, no footprint outside the margin it was
     built with. Otherwise they are rebuilt, so a stale list can never change an image.
@@ -166,10 +166,12 @@ def render(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.
     (alpha < 1/255, transmittance), the depth order; forward-mode derivatives are not available.
     background: linear RGB. cache: keep one between calls so that a camera seen again reuses its block lists. Records its own
     kernels, so it cannot be called inside another `dr.freeze`.
-    Raises InputError where a parameter is NaN or infinite (names the parameter and the first Gaussian), or the background is.
+    Raises InputError where a parameter is NaN or infinite (names the parameter and the first Gaussian), or a number of the
+    background is (a Dr.Jit colour is not looked at).
     """
     colour = as_colour(background)
     if len(gaussians) == 0:
+        gaussians.check_shapes()
         return _empty(camera, colour)
     splats, lists, packed = splats_and_lists(as_drjit(gaussians), camera, cache)
     return composite(splats, packed, lists, camera.width, camera.height, colour)

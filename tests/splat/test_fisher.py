@@ -76,6 +76,13 @@ def test_recorded_kernels_know_numbers_of_gaussians_from_other_numbers():
             np.testing.assert_allclose(dr.grad(watched.sh).numpy()[:, 0], J.sum((0, 1))[:, :3], rtol=1e-4, atol=1e-4)
 
 
+def test_blocks_of_one_gaussian_of_the_highest_degree():
+    """Its kernel is the hardest on the compiler: all places are constants."""
+    camera = make_camera()
+    g = calm(lambda seed: make_gaussians(1, seed, 3, spread=0.1, log_scales=(-2, -1), logits=(1, 2)), camera, 3)
+    assert_close(fisher(g, camera, "block", BACKGROUND), reference.fisher_block(g, camera, BACKGROUND), "one, degree 3")
+
+
 def test_images_of_several_tiles():
     """Splats and lanes go by tiles of 128x64 pixels; across their borders everything is as within."""
     camera = make_camera((150, 70), focal=150.0)
@@ -176,6 +183,9 @@ def test_probes_of_hutchinson_are_an_option():
     exact = fisher(g, camera)
     few, many = (np.linalg.norm(fisher(g, camera, "hutchinson", probes=k) - exact) for k in (2, 128))
     assert many < 0.5 * few
+    for probes in (0, -1, 1.5):
+        with pytest.raises(InputError, match="probes"):
+            fisher(g, camera, "hutchinson", probes=probes)
     with pytest.raises(TypeError, match="probes"):
         fisher(g, camera, "exact", probes=2)
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import mgs.splat
+from mgs.conventions import Camera
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.splat import ESTIMATORS, ListCache, as_drjit, fisher, reference, render
@@ -141,6 +142,20 @@ def test_any_image_size(size):
     shape = size[::-1]
     image = render(scene(2), camera)
     assert (image.rgb.shape, image.alpha.shape, image.depth.shape) == ((*shape, 3), shape, shape)
+
+
+def test_image_sizes_may_be_numpys_integers_and_are_whole():
+    camera = make_camera()
+    counted = Camera(camera.K, np.int64(camera.width), np.uint16(camera.height), camera.world_to_camera)
+    np.testing.assert_array_equal(render(scene(2), counted).rgb, render(scene(2), camera).rgb)
+    with pytest.raises(InputError, match="must be whole pixels"):
+        Camera(camera.K, 45.5, 31, camera.world_to_camera)
+
+
+def test_shapes_are_looked_at_where_there_are_no_means_too():
+    g = scene()
+    with pytest.raises(InputError, match="log_scales has shape"):
+        render(changed(g, means=g.means[:0]), CAMERA)
 
 
 def test_one_gaussian():
