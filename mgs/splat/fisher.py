@@ -133,8 +133,7 @@ def exact(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCach
 def block(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None) -> np.ndarray:
     """The exact [N,P,P] diagonal blocks of J^T J: 22 sums per splat."""
     (w2, s2, *rest), g = _sums(gaussians, camera, background, cache, block=True)
-    if gaussians.sh.shape[1] > 1:  # more than one kernel writes the blocks
-        dr.eval(g)
+    dr.eval(g)  # several kernels may write the blocks
     quartic, quadratic, cross = rest[:5], rest[5:8], [rest[8 + 4 * c : 12 + 4 * c] for c in range(3)]
     colour = [(basis, c) for basis in g.basis for c in range(3)]
     k = len(colour)
