@@ -37,7 +37,7 @@ def fitted(points: list[dict[str, Any]], sweep: str = "gaussians") -> list[dict[
 
 
 def scaling_exponents(points: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Fitted growth of each operation's time, and of peak memory, in N, pixels and (splat, block) pairs.
+    """Fitted growth of each operation's time, and of memory, in N, pixels, threads and (splat, block) pairs.
 
     Pairs grow alone where N and the image grow together. Where N grows by itself they grow more slowly than N, so that the
     work per Gaussian gains weight; where the image does, the work per pair: a fit each.
