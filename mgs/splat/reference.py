@@ -1,6 +1,7 @@
 """The oracle: O(N x pixels) float64 NumPy, the kernels' names and constants, nothing clever.
 
-Every function here has a fast twin in Dr.Jit and a test that compares the two. Derivatives are written independently of the
+What is drawn and derived here has a fast twin in Dr.Jit and a test that compares the two; `margins` says in which pixels
+float32 may decide otherwise than float64, so that they must not be compared. Derivatives are written independently of the
 kernels (dense per-pixel Jacobians of alpha compositing) and are themselves tested against central differences.
 """
 
@@ -121,6 +122,35 @@ def render(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -> 
     depth = weights @ projected.depths[order] / np.where(total > 0, total, 1.0)
     shape = (camera.height, camera.width)
     return {"rgb": rgb.reshape(*shape, 3), "alpha": total.reshape(shape), "depth": depth.reshape(shape)}
+
+
+def margins(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """[H,W]: by which relative error in alpha a pixel's decisions could change, at least; infinite where nothing is near.
+
+    Decisions: alpha < ALPHA_MIN, alpha > ALPHA_MAX (its derivative jumps), the stop at TRANSMITTANCE_MIN (the error of T adds
+    up as sum alpha / (1 - alpha)) and the depth order of two splats drawn in the same pixel (equal to float32 rounding).
+    """
+    p = project(gaussians, camera)
+    order, alpha, _, _ = composite(p, camera)
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    pixels = np.stack([u.ravel(), v.ravel()], 1)
+    least = np.full(len(pixels), np.inf)
+    T, amplification, live = np.ones(len(pixels)), np.zeros(len(pixels)), np.ones(len(pixels), bool)
+    for i, j in enumerate(order):
+        d = pixels - p.means2d[j]
+        log_raw = np.log(p.opacities[j]) - 0.5 * np.einsum("pi,ij,pj->p", d, np.linalg.inv(p.cov2d[j]), d)
+        near = np.minimum(np.abs(log_raw - np.log(ALPHA_MIN)), np.abs(log_raw - np.log(ALPHA_MAX)))
+        least = np.where(live, np.minimum(least, near), least)
+        a = np.where(log_raw >= np.log(ALPHA_MIN), np.minimum(np.exp(log_raw), ALPHA_MAX), 0)
+        amplification = amplification + a / (1 - a)
+        after = np.log(T * (1 - a) / TRANSMITTANCE_MIN)
+        least = np.where(live & (a > 0), np.minimum(least, np.abs(after) / np.maximum(amplification, 1)), least)
+        live &= (a == 0) | (after > 0)
+        T = np.where(live, T * (1 - a), T)
+        before = order[i - 1]
+        if i and 0 < p.depths[j] - p.depths[before] < 1e-6 * p.depths[j]:
+            least = np.where((alpha[:, i] > 0) & (alpha[:, i - 1] > 0), 0.0, least)
+    return least.reshape(camera.height, camera.width)
 
 
 def _projection_jacobian(gaussians: Gaussians, camera: Camera, j: int, step: float = 1e-5) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Random scenes for the splat tests, and how close each pixel of a scene is to a decision (threshold, stop, depth order)."""
+"""Random scenes for the splat tests, and how a gradient is compared with the true one."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import numpy as np
 
 from mgs.conventions import Camera, look_at
 from mgs.gaussians import Gaussians
-from mgs.splat import reference
-from mgs.splat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from mgs.splat.reference import margins
 
 PARAMETERS = ("means", "log_scales", "quats", "logit_opacities", "sh")
 
@@ -52,35 +51,6 @@ def double(gaussians: Gaussians) -> Gaussians:
 def changed(gaussians: Gaussians, **values) -> Gaussians:
     """The Gaussians with some parameters replaced."""
     return replace(gaussians, **{name: np.asarray(value, np.float32) for name, value in values.items()})
-
-
-def margins(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """[H,W]: by which relative error in alpha a pixel's decisions could change, at least; infinite where nothing is near.
-
-    Decisions: alpha < ALPHA_MIN, alpha > ALPHA_MAX (its derivative jumps), the stop at TRANSMITTANCE_MIN (the error of T adds
-    up as sum alpha / (1 - alpha)) and the depth order of two splats drawn in the same pixel (equal to float32 rounding).
-    """
-    p = reference.project(gaussians, camera)
-    order, alpha, _, _ = reference.composite(p, camera)
-    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-    pixels = np.stack([u.ravel(), v.ravel()], 1)
-    least = np.full(len(pixels), np.inf)
-    T, amplification, live = np.ones(len(pixels)), np.zeros(len(pixels)), np.ones(len(pixels), bool)
-    for i, j in enumerate(order):
-        d = pixels - p.means2d[j]
-        log_raw = np.log(p.opacities[j]) - 0.5 * np.einsum("pi,ij,pj->p", d, np.linalg.inv(p.cov2d[j]), d)
-        near = np.minimum(np.abs(log_raw - np.log(ALPHA_MIN)), np.abs(log_raw - np.log(ALPHA_MAX)))
-        least = np.where(live, np.minimum(least, near), least)
-        a = np.where(log_raw >= np.log(ALPHA_MIN), np.minimum(np.exp(log_raw), ALPHA_MAX), 0)
-        amplification = amplification + a / (1 - a)
-        after = np.log(T * (1 - a) / TRANSMITTANCE_MIN)
-        least = np.where(live & (a > 0), np.minimum(least, np.abs(after) / np.maximum(amplification, 1)), least)
-        live &= (a == 0) | (after > 0)
-        T = np.where(live, T * (1 - a), T)
-        before = order[i - 1]
-        if i and 0 < p.depths[j] - p.depths[before] < 1e-6 * p.depths[j]:
-            least = np.where((alpha[:, i] > 0) & (alpha[:, i - 1] > 0), 0.0, least)
-    return least.reshape(camera.height, camera.width)
 
 
 def calm(make, camera: Camera, seed: int, least: float = 3e-5) -> Gaussians:
