@@ -50,10 +50,11 @@ def surface_gaussians(n: int, seed: int = 0) -> Gaussians:
     0.73 (logit 1), random colours; the parameters for which `TARGETS` were set."""
     import trimesh
 
-    from mgs.rock import make_rock
+    from mgs.noise import Noise
+    from mgs.rock import rock_shape
     from mgs.scene_file import load_scene_file
 
-    mesh = make_rock(load_scene_file("boulder").rock, generator(seed, "bench/rock"))
+    mesh, _ = rock_shape(load_scene_file("boulder").rock, Noise(generator(seed, "bench/rock")))
     points, faces = trimesh.sample.sample_surface(mesh, n, seed=derive_seed(seed, "bench/points"))
     spacing = np.sqrt(mesh.area / n)
     return Gaussians(
