@@ -70,6 +70,7 @@ def synthesise(
     Raises InputError: output folder not empty or not writable, bad mesh, rock not wholly in every frame, or nowhere in sight.
     """
     started, out = time.perf_counter(), Path(out)
+    _is_unfinished(out)  # before the rock is made, which takes seconds
     rock, scale = (make_rock(settings.rock, generator(seed, "rock")), 1.0) if mesh is None else load_rock(mesh, settings.rock)
     if mesh is not None:
         extents = " x ".join(f"{x:.2f}" for x in rock.extents)
@@ -198,18 +199,25 @@ def _is_done(frame: Frame) -> bool:
     return all(path is not None and path.is_file() for path in (frame.image_path, frame.depth_path, frame.mask_path))
 
 
-def _resumes(out: Path, resolved: dict[str, Any]) -> bool:
-    """Whether `out` holds an unfinished dataset of the same settings. Raises InputError where it holds anything else."""
+def _is_unfinished(out: Path) -> bool:
+    """Whether `out` holds an unfinished dataset. Raises InputError where it holds anything else, or cannot be written."""
     check_writable(out)
     if (out / "config.json").is_file() and not (out / "transforms.json").exists():
-        begun = read_json(out / "config.json")
-        if any(begun.get(key) != value for key, value in resolved.items()):
-            raise InputError(f"{out}: holds an unfinished dataset of other settings; choose a new folder or delete it")
-        for left in out.rglob(".*.part*"):  # of a process that was killed while it wrote
-            left.unlink()
         return True
     check_new_folder(out)
     return False
+
+
+def _resumes(out: Path, resolved: dict[str, Any]) -> bool:
+    """Whether `out` holds an unfinished dataset of the same settings. Raises InputError where it holds anything else."""
+    if not _is_unfinished(out):
+        return False
+    begun = read_json(out / "config.json")
+    if any(begun.get(key) != value for key, value in resolved.items()):
+        raise InputError(f"{out}: holds an unfinished dataset of other settings; choose a new folder or delete it")
+    for left in out.rglob(".*.part*"):  # of a process that was killed while it wrote
+        left.unlink()
+    return True
 
 
 def _meter(scene: Scene, cameras: list[Camera], seed: int) -> float:

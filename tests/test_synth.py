@@ -90,9 +90,11 @@ def test_same_seed_same_bytes_and_resume_and_pose_noise(dataset, tmp_path):
     assert (dataset.root / "rock.glb").read_bytes() == (tmp_path / "again/rock.glb").read_bytes()
 
 
-def test_output_folder_that_is_not_empty(dataset, tmp_path):
-    with pytest.raises(InputError, match="not empty"):
-        synthesise(dataset.root, SCENE, TINY, seed=3)
+def test_output_folder_that_is_not_empty(dataset, tmp_path, monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.setattr("mgs.synth.make_rock", None)  # what is in the way is known before the rock is made
+        with pytest.raises(InputError, match="not empty"):
+            synthesise(dataset.root, SCENE, TINY, seed=3)
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(InputError, match="other settings"):
         synthesise(tmp_path, SCENE, TINY, seed=3)
