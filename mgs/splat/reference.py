@@ -85,6 +85,11 @@ def project(gaussians: Gaussians, camera: Camera) -> Projected:
     return Projected(means2d, cov2d, z, opacities, np.maximum(raw, 0), visible, T)
 
 
+def _half_square(d: np.ndarray, cov: np.ndarray) -> np.ndarray:
+    """1/2 d^T cov^-1 d of each row of d [P,2]: the negative exponent of a Gaussian."""
+    return 0.5 * ((d @ np.linalg.inv(cov)) * d).sum(1)
+
+
 def composite(projected: Projected, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Front-to-back alpha compositing, per pixel and splat.
 
@@ -101,9 +106,7 @@ def composite(projected: Projected, camera: Camera) -> tuple[np.ndarray, np.ndar
     T = np.ones(len(pixels))
     live = np.ones(len(pixels), bool)
     for i, j in enumerate(order):
-        d = pixels - projected.means2d[j]
-        sigma = 0.5 * np.einsum("pi,ij,pj->p", d, np.linalg.inv(projected.cov2d[j]), d)
-        raw = projected.opacities[j] * np.exp(-sigma)
+        raw = projected.opacities[j] * np.exp(-_half_square(pixels - projected.means2d[j], projected.cov2d[j]))
         a = np.where(raw >= ALPHA_MIN, np.minimum(raw, ALPHA_MAX), 0.0)
         live &= (a == 0) | (T * (1 - a) > TRANSMITTANCE_MIN)
         a = np.where(live, a, 0.0)
@@ -137,8 +140,7 @@ def margins(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     least = np.full(len(pixels), np.inf)
     T, amplification, live = np.ones(len(pixels)), np.zeros(len(pixels)), np.ones(len(pixels), bool)
     for i, j in enumerate(order):
-        d = pixels - p.means2d[j]
-        log_raw = np.log(p.opacities[j]) - 0.5 * np.einsum("pi,ij,pj->p", d, np.linalg.inv(p.cov2d[j]), d)
+        log_raw = np.log(p.opacities[j]) - _half_square(pixels - p.means2d[j], p.cov2d[j])
         near = np.minimum(np.abs(log_raw - np.log(ALPHA_MIN)), np.abs(log_raw - np.log(ALPHA_MAX)))
         least = np.where(live, np.minimum(least, near), least)
         a = np.where(log_raw >= np.log(ALPHA_MIN), np.minimum(np.exp(log_raw), ALPHA_MAX), 0)
@@ -153,18 +155,18 @@ def margins(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     return least.reshape(camera.height, camera.width)
 
 
-def _projection_jacobian(gaussians: Gaussians, camera: Camera, j: int, step: float = 1e-5) -> np.ndarray:
-    """d(cov2d)/d(log-scale 3, quaternion 4) of Gaussian j -> [7,2,2], by central differences of `project` in float64."""
-    rows = []
+def _projection_jacobian(gaussians: Gaussians, camera: Camera, step: float = 1e-5) -> np.ndarray:
+    """d(cov2d)/d(log-scale 3, quaternion 4) of each Gaussian -> [N,7,2,2], by central differences of `project` in float64."""
+    columns = []
     for name, size in (("log_scales", 3), ("quats", 4)):
         for k in range(size):
             ends = []
             for sign in (+1, -1):
-                one = Gaussians(*(np.asarray(getattr(gaussians, f))[j : j + 1].astype(np.float64) for f in vars(gaussians)))
-                getattr(one, name)[0, k] += sign * step
-                ends.append(project(one, camera).cov2d[0])
-            rows.append((ends[0] - ends[1]) / (2 * step))
-    return np.stack(rows)
+                moved = Gaussians(*(np.array(getattr(gaussians, f), np.float64) for f in vars(gaussians)))
+                getattr(moved, name)[:, k] += sign * step
+                ends.append(project(moved, camera).cov2d)
+            columns.append((ends[0] - ends[1]) / (2 * step))
+    return np.stack(columns, 1)
 
 
 def jacobian(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -> np.ndarray:
@@ -182,24 +184,19 @@ def jacobian(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -
     behind = image[:, None, :] - np.cumsum(contribution, 1)
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
     pixels = np.stack([u.ravel(), v.ravel()], 1)
+    derivatives = _projection_jacobian(gaussians, camera)
     J = np.zeros((len(pixels), 3, n, 3 * K + 8))
     for i, j in enumerate(order):
-        drawn = alpha[:, i] > 0
-        free = drawn & ~clipped[:, i]
-        D = projected.colours[j] * T[:, i, None] - behind[:, i] / (1 - alpha[:, i, None])
-        dalpha = np.where(free, alpha[:, i], 0.0)
-        for c in range(3):
-            positive = projected.colours[j, c] > 0
-            for k in range(K):
-                J[:, c, j, 3 * k + c] = weights[:, i] * basis[j, k] * positive
-        d = pixels - projected.means2d[j]
-        conic = np.linalg.inv(projected.cov2d[j])
-        e = d @ conic
-        dcov = _projection_jacobian(gaussians, camera, j)
-        dlog = np.concatenate(
-            [0.5 * np.einsum("pi,kij,pj->pk", e, dcov, e), np.full((len(d), 1), 1 - projected.opacities[j])], 1
+        drawn = np.flatnonzero(alpha[:, i])  # elsewhere no parameter of it changes anything
+        for c in np.flatnonzero(projected.colours[j] > 0):
+            J[drawn, c, j, c : 3 * K : 3] = weights[drawn, i, None] * basis[j]
+        D = projected.colours[j] * T[drawn, i, None] - behind[drawn, i] / (1 - alpha[drawn, i, None])
+        dalpha = np.where(clipped[drawn, i], 0.0, alpha[drawn, i])
+        e = (pixels[drawn] - projected.means2d[j]) @ np.linalg.inv(projected.cov2d[j])
+        dlog = np.stack(
+            [*(((e @ dcov) * e).sum(1) / 2 for dcov in derivatives[j]), np.full(len(e), 1 - projected.opacities[j])], 1
         )
-        J[:, :, j, 3 * K :] = D[:, :, None] * (dalpha[:, None] * dlog)[:, None, :]
+        J[drawn, :, j, 3 * K :] = D[:, :, None] * (dalpha[:, None] * dlog)[:, None, :]
     return J
 
 
@@ -211,4 +208,5 @@ def fisher(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -> 
 def fisher_block(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -> np.ndarray:
     """The [N, 3K+8, 3K+8] diagonal blocks of J^T J."""
     J = jacobian(gaussians, camera, background)
-    return np.einsum("pcna,pcnb->nab", J, J)
+    rows = J.reshape(-1, *J.shape[2:])
+    return np.matmul(rows.transpose(1, 2, 0), rows.transpose(1, 0, 2))
