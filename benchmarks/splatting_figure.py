@@ -24,8 +24,8 @@ from mgs.splat.project import camera_array, project  # noqa: E402
 ORANGE, BLUE = "#d55e00", "#0072b2"
 
 
-def main(path: str) -> None:
-    gaussians = surface_gaussians(3000)
+def main(path: str, count: int = 3000) -> None:
+    gaussians = surface_gaussians(count)
     camera = surface_camera(gaussians, 160, 120)
     image = np.asarray(render(gaussians, camera).rgb)
     splats = project(as_drjit(gaussians), camera_array(camera))

@@ -100,9 +100,9 @@ def composite(projected: Projected, camera: Camera) -> tuple[np.ndarray, np.ndar
     order = index[np.argsort(projected.depths[index].astype(np.float32), kind="stable")]
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
     pixels = np.stack([u.ravel(), v.ravel()], 1)
-    alpha = np.zeros((len(pixels), len(order)))
+    alpha = np.zeros((len(order), len(pixels))).T  # written a splat at a time
     transmittance = np.zeros_like(alpha)
-    clipped = np.zeros(alpha.shape, bool)
+    clipped = np.zeros_like(alpha, bool)
     T = np.ones(len(pixels))
     live = np.ones(len(pixels), bool)
     for i, j in enumerate(order):
@@ -208,5 +208,5 @@ def fisher(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -> 
 def fisher_block(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -> np.ndarray:
     """The [N, 3K+8, 3K+8] diagonal blocks of J^T J."""
     J = jacobian(gaussians, camera, background)
-    rows = J.reshape(-1, *J.shape[2:])
+    rows = J.reshape(J.shape[0] * J.shape[1], *J.shape[2:])
     return np.matmul(rows.transpose(1, 2, 0), rows.transpose(1, 0, 2))

@@ -1,14 +1,55 @@
 """The picture of docs/splatting.md is drawn from the kernels' own data, so it is drawn again whenever those change."""
 
-import subprocess
-import sys
+import importlib.util
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+import numpy as np
+import pytest
+from matplotlib.patches import Rectangle
+
+from mgs.bench import surface_camera, surface_gaussians
+from mgs.conventions import SH_C0
+from mgs.splat import fisher, reference
+from mgs.splat.blocks import BLOCK_X, BLOCK_Y
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks/splatting_figure.py"
+COUNT = 300
 
 
-def test_the_figure_of_the_splat_kernel_is_drawn(tmp_path):
-    script = ROOT / "benchmarks/splatting_figure.py"
-    run = subprocess.run([sys.executable, script, tmp_path / "figure.png"], cwd=ROOT, capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
-    assert (tmp_path / "figure.png").stat().st_size > 50_000
+@pytest.fixture(scope="module")
+def script():
+    spec = importlib.util.spec_from_file_location("splatting_figure", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_figure_of_the_splat_kernel_shows_what_the_oracle_says(script, tmp_path, monkeypatch):
+    """Blocks, list lengths and sums of the showcase, read back from the figure."""
+    drawn, save = [], script.save_figure
+    monkeypatch.setattr(script, "save_figure", lambda figure, path: (drawn.append(figure), save(figure, path)))
+    script.main(str(tmp_path / "figure.png"), COUNT)
+    assert (tmp_path / "figure.png").is_file()
+    (figure,) = drawn
+    top, bottom = figure.subfigs
+    footprint, lists, lanes = (axis for axis in top.axes if axis.get_label() != "<colorbar>")
+
+    gaussians = surface_gaussians(COUNT)
+    camera = surface_camera(gaussians, 160, 120)
+    chosen = script.showcase(gaussians, camera)
+    one = type(gaussians)(*(value[[chosen]] for value in vars(gaussians).values()))
+    y, x = np.nonzero(reference.render(one, camera)["alpha"])
+    touched = set(zip((x // BLOCK_X * BLOCK_X).tolist(), (y // BLOCK_Y * BLOCK_Y).tolist(), strict=True))
+    corners = {patch.get_xy() for patch in footprint.patches if isinstance(patch, Rectangle)}
+    assert touched <= corners
+    assert len(corners) < 1.5 * len(touched)
+    assert f"touches {len(corners)} blocks" in footprint.get_title()
+
+    lengths = np.asarray(lists.images[0].get_array())
+    order, alpha, _, _ = reference.composite(reference.project(gaussians, camera), camera)
+    tiles = alpha.reshape(camera.height // BLOCK_Y, BLOCK_Y, camera.width // BLOCK_X, BLOCK_X, len(order))
+    assert (lengths >= (tiles > 0).any((1, 3)).sum(-1)).all()
+    assert sum(bar.get_height() for bar in lanes.patches) == lengths.sum()
+
+    w2 = fisher(gaussians, camera)[chosen, 0] / SH_C0**2
+    assert float(bottom.axes[0].get_title().rpartition(" ")[2]) == pytest.approx(w2, rel=6e-3)
