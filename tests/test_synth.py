@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from mgs import arena
 from mgs.cli import main
 from mgs.conventions import opencv_from_opengl
 from mgs.dataset import load_dataset
@@ -22,6 +23,15 @@ from mgs.synth import PoseNoise, Preset, rock_cameras, synthesise
 
 TINY = Preset(width=64, height=48, frames=5, spp=2)
 SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=20))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarse_arena():
+    """A ground of few vertices and texels: how fine it is decides most of a scene's cost and nothing that is tested here."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(arena, "ROWS", 60)
+        patched.setattr(arena, "TEXELS", 64)
+        yield
 
 
 @pytest.fixture(scope="module")
