@@ -25,9 +25,9 @@ MAX_PIXELS = 2**27
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera.
+    """A pinhole camera. Two are equal where all their numbers are.
 
     K: [3,3] float64, pixels (no skew). width, height: pixels.
     world_to_camera: [4,4] float64, rigid, OpenCV axes, metres.
@@ -62,6 +62,15 @@ class Camera:
         rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
         if not rigid or not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-9):
             raise InputError("camera: the pose is singular or not rigid; its rotation must be orthonormal")
+
+    def _key(self) -> tuple[object, ...]:
+        return self.K.tobytes(), self.width, self.height, self.world_to_camera.tobytes()
+
+    def __eq__(self, other: object) -> bool:
+        return self._key() == other._key() if isinstance(other, Camera) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self._key())
 
     @property
     def camera_to_world(self) -> NDArray[np.float64]:

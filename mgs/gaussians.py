@@ -26,9 +26,11 @@ LINEAR_COMMENT = "mgs: colours are linear RGB"
 """Header comment of our PLY files. The layout itself has no field for it, and other tools train in display space (sRGB)."""
 
 
-@dataclass
+@dataclass(eq=False)
 class Gaussians:
     """N Gaussians with appearance; float32 NumPy arrays (or Dr.Jit tensors of the same shapes inside `mgs.splat`).
+
+    `gaussians[10:20]`, `gaussians[mask]` and `gaussians[indices]` are Gaussians again. Two are equal where every number is.
 
     means [N,3] world, metres; log_scales [N,3] ln metres; quats [N,4] wxyz, any norm; logit_opacities [N];
     sh [N,(d+1)^2,3] spherical-harmonic colour of degree d in 0..3, linear RGB, rgb = 0.5 + sum_k Y_k(direction) sh_k.
@@ -42,6 +44,19 @@ class Gaussians:
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
+
+    def __getitem__(self, index: Any) -> Gaussians:
+        """Some of them, in this order: a slice, a mask [N], indices [M], or one index (M = 1)."""
+        chosen = [index] if isinstance(index, int | np.integer) else index
+        return Gaussians(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Gaussians):
+            return NotImplemented
+        pairs = ((np.asarray(getattr(self, f.name)), np.asarray(getattr(other, f.name))) for f in fields(self))
+        return all(np.array_equal(mine, theirs) for mine, theirs in pairs)
+
+    __hash__ = None  # type: ignore[assignment]  # its arrays can change
 
     @property
     def sh_degree(self) -> int:

@@ -1,6 +1,6 @@
-"""Start Dr.Jit: find a libLLVM that works before any kernel runs, then set the variant.
+"""Start Dr.Jit: find a libLLVM that works before any kernel runs, then set the variant, unless one is set.
 
-The command line, the tests and programs that use mgs call this first. Dr.Jit loads a libLLVM of the system. Older ones than 19
+Everything in mgs that computes with Dr.Jit calls `start` first. Dr.Jit loads a libLLVM of the system. Older ones than 19
 abort the process in the middle of a kernel ("Cannot select: fminimum"), so the version is asked for first: loading a library
 and calling LLVMGetVersion cannot abort. Needs nothing but the standard library until `start`: the set-up uses it before
 anything is installed.
@@ -111,28 +111,65 @@ def _installed(folders: tuple[str, ...], pattern: str) -> list[str]:
 
 
 def start() -> None:
-    """Set the Mitsuba variant once, on a libLLVM that works.
+    """Make sure that a Mitsuba variant is set which mgs can compute with; what is set already stays.
 
-    Raises InputError where no libLLVM of version 19 or newer is found, or where Dr.Jit cannot use this processor with it.
+    Where none is set, sets `llvm_ad_rgb` on a libLLVM that works. Calling it again costs nothing.
+    Raises InputError where the variant that is set is not differentiable RGB (`scalar_rgb`, `llvm_ad_spectral`, ...), where no
+    libLLVM of version 19 or newer is found, or where Dr.Jit cannot use this processor with it.
     """
+    if "mitsuba" not in sys.modules:
+        _choose_libllvm()
+    import mitsuba as mi
+
+    if mi.variant() in _checked:
+        return
+    if mi.variant() is None:
+        _choose_libllvm()
+        _check_libllvm()
+        mi.set_variant(VARIANT)
+    else:
+        _check_variant()
+    _checked.add(mi.variant())
+
+
+_checked: set[str] = set()
+"""Variants that have been looked at in this process."""
+
+
+def _choose_libllvm() -> None:
+    """Let Dr.Jit load a libLLVM that works. Raises InputError as `find_libllvm`."""
     library = find_libllvm()
     if "/" in library.path:
         os.environ[LIBRARY_VARIABLE] = library.path
 
+
+def _check_libllvm() -> None:
+    """Raises InputError where Dr.Jit has loaded no libLLVM, or an old one."""
     import drjit as dr
 
     used = dr.detail.llvm_version()
     if used[0] < 0:
-        raise InputError(f"Dr.Jit cannot use libLLVM {library} on this processor; it needs x86-64 with AVX and FMA, or ARM64")
+        raise InputError(
+            f"Dr.Jit cannot use libLLVM {find_libllvm()} on this processor; it needs x86-64 with AVX and FMA, or ARM64"
+        )
     if used[0] < MIN_LLVM:
         raise InputError(
             f"Dr.Jit was started with libLLVM {used[0]} before mgs could choose; let {LIBRARY_VARIABLE} name {_GOOD}"
         )
 
+
+def _check_variant() -> None:
+    """Raises InputError where the variant that is set cannot run the kernels of mgs."""
+    import drjit as dr
     import mitsuba as mi
 
-    if mi.variant() != VARIANT:
-        mi.set_variant(VARIANT)
+    if not (dr.is_jit_v(mi.Float) and dr.is_diff_v(mi.Float) and mi.is_rgb and dr.type_v(mi.Float) == dr.VarType.Float32):
+        raise InputError(
+            f"Mitsuba's variant {mi.variant()} is set, and mgs needs differentiable RGB in single precision; "
+            f"call mitsuba.set_variant('{VARIANT}') before mgs, or set none"
+        )
+    if dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
+        _check_libllvm()
 
 
 def processor() -> dict[str, str | int]:

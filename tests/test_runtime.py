@@ -11,6 +11,7 @@ from mgs import runtime
 from mgs.errors import InputError
 from mgs.runtime import MIN_LLVM, Libllvm
 
+SCALAR = "scalar_rgb Mitsuba's variant scalar_rgb is set, and mgs needs differentiable RGB"
 OLD = [path for path in runtime._candidates() if runtime.load_libllvm(path).version[0] < MIN_LLVM]
 
 
@@ -94,3 +95,34 @@ def test_start_raises_instead_of_aborting():
     assert result.returncode == 0, result.stderr
     assert "libLLVM" in result.stdout
     assert "install libLLVM" in result.stdout or "names it" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("program", "printed"),
+    [
+        ("runtime.start(); print(mi.variant())", "llvm_ad_rgb"),
+        ("mi.set_variant('llvm_ad_rgb'); runtime.start(); print(mi.variant())", "llvm_ad_rgb"),
+        ("render(one, camera); print(mi.variant())", "llvm_ad_rgb"),
+        ("mi.set_variant('scalar_rgb')\ntry: runtime.start()\nexcept InputError as e: print(mi.variant(), e)", SCALAR),
+        ("mi.set_variant('scalar_rgb')\ntry: render(one, camera)\nexcept InputError as e: print(mi.variant(), e)", SCALAR),
+        ("mi.set_variant('scalar_rgb')\ntry: fisher(one, camera)\nexcept InputError as e: print(mi.variant(), e)", SCALAR),
+        (
+            "mi.set_variant('llvm_ad_spectral')\ntry: runtime.start()\nexcept InputError as e: print(e)",
+            "llvm_ad_spectral is set",
+        ),
+    ],
+)
+def test_the_users_variant_stays(program, printed):
+    """Where it cannot be computed with, that is one line; where none is set, ours is."""
+    prepare = """
+import numpy as np, mitsuba as mi
+from mgs import runtime
+from mgs.conventions import Camera
+from mgs.errors import InputError
+from mgs.gaussians import Gaussians
+from mgs.splat import fisher, render
+one = Gaussians(*(np.ones(shape, np.float32) for shape in ((1, 3), (1, 3), (1, 4), 1, (1, 1, 3))))
+camera = Camera(np.diag([20.0, 20.0, 1.0]), 16, 12, np.eye(4))
+"""
+    done = subprocess.run([sys.executable, "-c", prepare + program], capture_output=True, text=True, timeout=120)
+    assert printed in done.stdout, done.stderr

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mgs import runtime
 from mgs.conventions import Camera
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
@@ -109,8 +110,9 @@ def _raise_unless_finite(finite: Any) -> None:
 def as_drjit(gaussians: Gaussians) -> Gaussians:
     """The same Gaussians with TensorXf fields; fields that are Dr.Jit already are kept, gradients included.
 
-    Raises InputError where shapes do not fit each other: a kernel would read beyond the end.
+    Raises InputError where shapes do not fit each other: a kernel would read beyond the end; and as `mgs.runtime.start`.
     """
+    runtime.start()
     gaussians.check_shapes()
     values = {f.name: getattr(gaussians, f.name) for f in fields(gaussians)}
     return Gaussians(**{k: v if dr.is_array_v(v) else mi.TensorXf(np.asarray(v, np.float32)) for k, v in values.items()})
@@ -169,6 +171,7 @@ def render(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.
     Raises InputError where a parameter is NaN or infinite (names the parameter and the first Gaussian), or a number of the
     background is (a Dr.Jit colour is not looked at).
     """
+    runtime.start()
     colour = as_colour(background)
     if len(gaussians) == 0:
         gaussians.check_shapes()

@@ -1,0 +1,53 @@
+"""Gaussians and cameras as values: slices, equality."""
+
+import copy
+
+import numpy as np
+import pytest
+import tiny
+
+from mgs.conventions import Camera, look_at
+from mgs.gaussians import Gaussians
+from mgs.splat import as_drjit
+
+WHOLE = tiny.initial([])
+VIEW = Camera(np.diag([20.0, 20.0, 1.0]), 16, 12, look_at([3, 0, 1], [0, 0, 0]))
+
+
+def test_slices_masks_and_indices_give_gaussians():
+    chosen = np.array([5, 2, 9])
+    mask = np.zeros(len(WHOLE), bool)
+    mask[chosen] = True
+    assert len(WHOLE[3:7]) == 4
+    np.testing.assert_array_equal(WHOLE[chosen].means, WHOLE.means[chosen])
+    assert WHOLE[mask] == WHOLE[np.sort(chosen)]
+    assert WHOLE[4] == WHOLE[4:5]
+    assert WHOLE[-1].check() == WHOLE[len(WHOLE) - 1 :]
+
+
+def test_slices_of_dr_jit_fields():
+    part = as_drjit(WHOLE)[3:7]
+    np.testing.assert_array_equal(np.asarray(part.quats), WHOLE.quats[3:7])
+
+
+@pytest.mark.parametrize("name", vars(WHOLE))
+def test_gaussians_are_equal_where_every_number_is(name):
+    other = copy.deepcopy(WHOLE)
+    assert WHOLE == other == as_drjit(WHOLE)
+    values = getattr(other, name)
+    values.flat[-1] = np.nextafter(values.flat[-1], np.float32(9))
+    assert other != WHOLE
+    assert Gaussians(**{**vars(WHOLE), name: getattr(WHOLE, name)[:-1]}) != WHOLE
+    assert WHOLE != "gaussians"
+    with pytest.raises(TypeError):
+        hash(WHOLE)
+
+
+@pytest.mark.parametrize(
+    "change", [{"width": 17}, {"height": 13}, {"K": np.diag([20.0, 21.0, 1.0])}, {"world_to_camera": np.eye(4)}, {}]
+)
+def test_cameras_are_equal_where_every_number_is(change):
+    other = Camera(**{**vars(VIEW), **change})
+    assert (other == VIEW) == (not change)
+    assert len({VIEW, other}) == (2 if change else 1)
+    assert VIEW != "camera"
