@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
+from scipy.special import expit
 
 from mgs.conventions import SH_C0
 from mgs.errors import InputError
@@ -54,8 +55,8 @@ class Gaussians:
 
     @property
     def opacities(self) -> np.ndarray:
-        """[N] in (0,1)."""
-        return 1.0 / (1.0 + np.exp(-self.logit_opacities.astype(np.float64))).astype(np.float32)
+        """[N] in [0,1]: the sigmoid of the logits, 0 or 1 where float32 has nothing nearer."""
+        return expit(self.logit_opacities.astype(np.float64)).astype(np.float32)
 
     def check(self) -> Gaussians:
         """Shapes and finiteness of NumPy fields; returns self. Raises InputError naming the parameter and first index."""

@@ -233,6 +233,16 @@ def test_not_a_number_names_the_parameter_and_the_first_gaussian(name, value):
     assert "\n" not in pattern
 
 
+def test_opacities_of_extreme_logits():
+    """0 and 1, without a warning of an overflow on the way; between them the sigmoid."""
+    logits = np.array([-3e38, -1000, -80, 0, 2, 1000], np.float32)
+    g = changed(make_gaussians(len(logits), 0), logit_opacities=logits)
+    expected = [0, 0, np.exp(-80.0), 0.5, 1 / (1 + np.exp(-2.0)), 1]
+    np.testing.assert_allclose(g.opacities, expected, rtol=1e-6)
+    assert g.opacities.dtype == np.float32
+    np.testing.assert_allclose(reference.project(g, CAMERA).opacities, expected, rtol=1e-6)
+
+
 def test_a_bad_number_behind_the_camera_is_an_error_too():
     g = behind_camera()
     g.sh[0, 0, 1] = np.nan
