@@ -78,6 +78,11 @@ class Camera:
         """[3] camera centre in the world, metres."""
         return self.camera_to_world[:3, 3]
 
+    @property
+    def key(self) -> bytes:
+        """K, pose and image size as bytes: equal where all of these are, so it names the view in caches and seeds."""
+        return self.K.tobytes() + self.world_to_camera.tobytes() + f"{self.width}x{self.height}".encode()
+
     def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """World points [N,3] -> (pixels [N,2], z-depth [N]); pixels are meaningless where z <= 0."""
         p = np.asarray(points, np.float64) @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]

@@ -48,7 +48,7 @@ class ListCache:
     def __init__(self, budget: int = CACHE_BYTES) -> None:
         self.budget = budget
         self.builds = 0
-        self._entries: OrderedDict[tuple[Any, ...], BlockLists] = OrderedDict()
+        self._entries: OrderedDict[bytes, BlockLists] = OrderedDict()
 
     @property
     def nbytes(self) -> int:
@@ -60,7 +60,7 @@ class ListCache:
 
         Raises InputError where a parameter is not finite.
         """
-        key = (camera.K.tobytes(), camera.world_to_camera.tobytes(), camera.width, camera.height)
+        key = camera.key
         lists = self._entries.get(key)
         margin = 0.0 if lists is None else MARGIN
         dr.eval(splats)
