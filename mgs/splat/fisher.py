@@ -44,7 +44,7 @@ def fisher(
 
     The camera's image is not needed: information depends on the pose and the model alone. Estimators: see `ESTIMATORS`;
     options: `probes` and `seed` of `hutchinson`; the others have none.
-    Raises InputError for an unknown estimator, or a parameter that is NaN or infinite.
+    Raises InputError for an unknown estimator, or a parameter that `render` refuses.
     """
     if estimator not in ESTIMATORS:
         raise InputError(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")

@@ -12,7 +12,7 @@ import numpy as np
 
 from mgs.conventions import Camera
 from mgs.errors import InputError
-from mgs.gaussians import Gaussians
+from mgs.gaussians import SH_MAX, Gaussians
 from mgs.splat import blocks, kernels
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, BlockLists
 from mgs.splat.kernels import PIXELS
@@ -58,7 +58,7 @@ class ListCache:
     def get(self, camera: Camera, splats: Splats) -> tuple[BlockLists, Any]:
         """Lists for detached splats seen by the camera, and the splats packed at the places of these lists.
 
-        Raises InputError where a parameter is not finite.
+        Raises InputError where a parameter is not finite, or a colour beyond SH_MAX.
         """
         key = camera.key
         lists = self._entries.get(key)
@@ -96,14 +96,14 @@ def as_colour(background: Any) -> Any:
         values = np.broadcast_to(np.asarray(background, np.float64), 3)
     except (TypeError, ValueError):
         values = np.full(3, np.nan)
-    if not np.isfinite(values).all():
-        raise InputError(f"background {background}: must be one or three finite numbers, linear RGB")
+    if not (np.abs(values) <= SH_MAX).all():
+        raise InputError(f"background {background}: must be one or three numbers, linear RGB, up to {SH_MAX:,.0f}")
     return mi.Color3f(*(dr.opaque(mi.Float, float(value)) for value in values))
 
 
 def _raise_unless_finite(finite: Any) -> None:
     if not finite:
-        raise InputError("gaussians: a parameter is NaN or infinite")
+        raise InputError(f"gaussians: a parameter is NaN or infinite, or a colour beyond {SH_MAX:,.0f}")
 
 
 def as_drjit(gaussians: Gaussians) -> Gaussians:
@@ -148,7 +148,7 @@ def _places(width: int, height: int) -> Any:
 def splats_and_lists(gaussians: Gaussians, camera: Camera, cache: ListCache | None) -> tuple[Splats, BlockLists, Any]:
     """Project Gaussians with Dr.Jit fields, find their block lists and pack them at the places of these lists.
 
-    Raises InputError where a parameter is not finite.
+    Raises InputError where a parameter is not finite, or a colour beyond SH_MAX.
     """
     splats = project(gaussians, camera_array(camera))
     try:
@@ -166,8 +166,8 @@ def render(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.
     (alpha < 1/255, transmittance), the depth order; forward-mode derivatives are not available.
     background: linear RGB. cache: keep one between calls so that a camera seen again reuses its block lists. Records its own
     kernels, so it cannot be called inside another `dr.freeze`.
-    Raises InputError where a parameter is NaN or infinite (names the parameter and the first Gaussian), or a number of the
-    background is (a Dr.Jit colour is not looked at).
+    Raises InputError where a parameter is NaN or infinite, or a colour beyond SH_MAX (names the parameter and the first
+    Gaussian); likewise for a number of the background (a Dr.Jit colour is not looked at).
     """
     colour = as_colour(background)
     if len(gaussians) == 0:
