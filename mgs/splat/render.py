@@ -38,8 +38,17 @@ class Image:
     depth: Any
 
 
+REMEMBERED = 1 << 16
+"""Most cameras whose last use a `ListCache` remembers, a few hundred bytes each."""
+
+
 class ListCache:
-    """Block lists per camera, least recently used first out, within a budget in bytes; those used last are always kept.
+    """Block lists per camera, within a budget in bytes. One camera's lists are kept even where they alone exceed it.
+
+    Views are mostly gone through again and again, in one order (scoring) or a new one each time (fitting). What was used
+    longest ago is then needed soonest, so giving it up for every newcomer (LRU) may never find anything. Here a camera takes
+    the place of the one used longest ago only if it was itself used less than half as long ago; otherwise its lists serve
+    once and are dropped. So as many stay as there is room for, and other cameras take over within three rounds.
 
     Lists serve as long as they are exact for the splats: same centres and depths, no footprint outside the margin it was
     built with. Otherwise they are rebuilt, so a stale list can never change an image.
@@ -48,12 +57,14 @@ class ListCache:
     def __init__(self, budget: int = CACHE_BYTES) -> None:
         self.budget = budget
         self.builds = 0
-        self._entries: OrderedDict[bytes, BlockLists] = OrderedDict()
+        self._lists: OrderedDict[bytes, BlockLists] = OrderedDict()  # used longest ago first
+        self._used: dict[bytes, int] = {}  # when each camera was used last, held or not, by _clock
+        self._clock = 0  # uses of all cameras
 
     @property
     def nbytes(self) -> int:
         """Memory held, bytes."""
-        return sum(lists.nbytes for lists in self._entries.values())
+        return sum(lists.nbytes for lists in self._lists.values())
 
     def get(self, camera: Camera, splats: Splats) -> tuple[BlockLists, Any]:
         """Lists for detached splats seen by the camera, and the splats packed at the places of these lists.
@@ -61,7 +72,7 @@ class ListCache:
         Raises InputError where a parameter is not finite, or a colour beyond SH_MAX.
         """
         key = camera.key
-        lists = self._entries.get(key)
+        lists = self._lists.get(key)
         margin = 0.0 if lists is None else MARGIN
         dr.eval(splats)
         if lists is not None and len(lists.place) != len(splats.u):
@@ -78,11 +89,25 @@ class ListCache:
             lists = blocks.build(splats, blocks.depth_order(splats.z), camera.width, camera.height, margin)
             packed = kernels.pack(splats, lists.place)
             self.builds += 1
-        self._entries[key] = lists
-        self._entries.move_to_end(key)
-        while len(self._entries) > 1 and self.nbytes > self.budget:
-            self._entries.popitem(last=False)
+            self._keep(key, lists)
+        self._clock += 1
+        self._used[key] = self._clock
+        if key in self._lists:
+            self._lists.move_to_end(key)
         return lists, packed
+
+    def _keep(self, key: bytes, lists: BlockLists) -> None:
+        """Hold new lists, and keep the budget: drop those used longest ago, or these."""
+        self._lists[key] = lists
+        while len(self._lists) > 1 and self.nbytes > self.budget:
+            oldest = next(other for other in self._lists if other != key)
+            if key in self._used and 2 * (self._clock - self._used[key]) < self._clock - self._used[oldest]:
+                del self._lists[oldest]
+            else:
+                del self._lists[key]
+                break
+        if len(self._used) > REMEMBERED:
+            self._used = {other: self._used[other] for other in self._lists if other in self._used}
 
 
 def as_colour(background: Any) -> Any:
