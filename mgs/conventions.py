@@ -29,10 +29,10 @@ _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 class Camera:
     """A pinhole camera. Two are equal where all their numbers are.
 
-    K: [3,3] float64, pixels (no skew). width, height: pixels.
+    K: [3,3] float64, pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]. width, height: pixels.
     world_to_camera: [4,4] float64, rigid, OpenCV axes, metres.
-    Raises InputError where K or the pose is not finite, K has a non-positive focal length, the image has no pixel, parts of
-    pixels or more than MAX_PIXELS, or the pose is not rigid.
+    Raises InputError where K or the pose is not finite, K has skew or a non-positive focal length, the image has no pixel,
+    parts of pixels or more than MAX_PIXELS, or the pose is not rigid.
     """
 
     K: NDArray[np.float64]
@@ -53,6 +53,8 @@ class Camera:
             raise InputError("camera: K must be a finite 3x3 matrix; correct the intrinsics")
         if K[0, 0] <= 0 or K[1, 1] <= 0:
             raise InputError("camera: focal lengths must be positive; correct fl_x and fl_y")
+        if K[0, 1] != 0 or K[1, 0] != 0 or not np.array_equal(K[2], [0, 0, 1]):
+            raise InputError("camera: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], without skew; resample the images")
         if self.width < 1 or self.height < 1 or self.width * self.height > MAX_PIXELS:
             size = f"{self.width}x{self.height}"
             raise InputError(f"camera: image size {size} must be at least 1x1, and at most {MAX_PIXELS:,} pixels in all")
@@ -84,6 +86,11 @@ class Camera:
     def position(self) -> NDArray[np.float64]:
         """[3] camera centre in the world, metres."""
         return self.camera_to_world[:3, 3]
+
+    @property
+    def key(self) -> bytes:
+        """K, pose and image size as bytes: equal where all of these are, so it names the view in caches and seeds."""
+        return self.K.tobytes() + self.world_to_camera.tobytes() + f"{self.width}x{self.height}".encode()
 
     def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """World points [N,3] -> (pixels [N,2], z-depth [N]); pixels are meaningless where z <= 0."""

@@ -12,12 +12,17 @@ from typing import Any
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
+from scipy.special import expit
 
 from mgs.conventions import SH_C0
 from mgs.errors import InputError
 from mgs.files import atomic_path
 
 MAX_SH_DEGREE = 3
+
+SH_MAX = 1e6
+"""Largest colour coefficient, linear RGB, of either sign: with it, gradients and Fisher information, which are of the order of
+colours squared and summed over pixels, stay far within float32. The sun itself is 1e5 times as bright as what it lights."""
 
 LEARNED = ("sh", "log_scales", "quats", "logit_opacities")
 """Learned parameters, in the order of their columns in the Fisher information: 3K colour, 3, 4, 1. Means are frozen."""
@@ -69,17 +74,22 @@ class Gaussians:
 
     @property
     def opacities(self) -> np.ndarray:
-        """[N] in (0,1)."""
-        return 1.0 / (1.0 + np.exp(-self.logit_opacities.astype(np.float64))).astype(np.float32)
+        """[N] in [0,1]: the sigmoid of the logits, 0 or 1 where float32 has nothing nearer."""
+        return expit(self.logit_opacities.astype(np.float64)).astype(np.float32)
 
     def check(self) -> Gaussians:
-        """Shapes and finiteness of NumPy fields; returns self. Raises InputError naming the parameter and first index."""
+        """Shapes and values of NumPy fields; returns self.
+
+        Raises InputError naming the parameter and the first Gaussian that is NaN, infinite or has a colour beyond SH_MAX.
+        """
         self.check_shapes()
         for field in fields(self):
-            bad = ~np.isfinite(np.asarray(getattr(self, field.name)))
+            values = np.asarray(getattr(self, field.name))
+            bad = ~np.isfinite(values) if field.name != "sh" else ~(np.abs(values) <= SH_MAX)
             if bad.any():
-                first = int(np.argwhere(bad)[0][0])
-                raise InputError(f"gaussians: {field.name} is NaN or infinite, first at Gaussian {first}; remove or repair it")
+                first = tuple(np.argwhere(bad)[0])
+                what = f"is beyond {SH_MAX:,.0f}" if np.isfinite(values[first]) else "is NaN or infinite"
+                raise InputError(f"gaussians: {field.name} {what}, first at Gaussian {first[0]}; remove or repair it")
         return self
 
     def check_shapes(self) -> None:
@@ -138,7 +148,8 @@ def ply_colour_space(path: str | Path) -> str:
 def read_ply(path: str | Path) -> Gaussians:
     """Read any standard 3DGS PLY (binary or ascii, SH degree 0 to 3), by property name.
 
-    Raises InputError where the file is missing, is not a PLY, lacks a property, or holds NaN or infinite values.
+    Raises InputError where the file is missing, is not a PLY, lacks a property, or holds values that `Gaussians.check`
+    refuses.
     """
     path = Path(path)
     if not path.is_file():

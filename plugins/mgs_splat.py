@@ -64,7 +64,7 @@ class MgsSplat(mi.CppADIntegrator):
     ) -> Any:
         """The sensor's image through its film, TensorXf [H,W,C]; `seed` and `spp` change nothing.
 
-        Raises InputError for a sensor that is not `perspective`, or a parameter that is not finite.
+        Raises InputError for a sensor that is not `perspective`, or a parameter that `mgs.splat.render` refuses.
         """
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         film = sensor.film()

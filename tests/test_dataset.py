@@ -123,6 +123,15 @@ def test_bad_transforms(folder, change, message):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("entry", [(0, 1), (1, 0), (2, 0), (2, 1), (2, 2)])
+def test_a_camera_has_no_skew(entry):
+    """Nothing reads these entries of K, so a picture would be wrong without a word."""
+    skewed = K.copy()
+    skewed[entry] += 0.5
+    with pytest.raises(InputError, match=r"K must be \[\[fx, 0, cx\].* without skew"):
+        Camera(skewed, W, H, np.eye(4))
+
+
 def test_bad_files(folder, tmp_path):
     with pytest.raises(InputError, match="no such dataset folder"):
         load_dataset(tmp_path / "nowhere")

@@ -44,7 +44,7 @@ def fisher(
 
     The camera's image is not needed: information depends on the pose and the model alone. Estimators: see `ESTIMATORS`;
     options: `probes` and `seed` of `hutchinson`; the others have none.
-    Raises InputError for an unknown estimator, or a parameter that is NaN or infinite.
+    Raises InputError for an unknown estimator, or a parameter that `render` refuses.
     """
     if estimator not in ESTIMATORS:
         raise InputError(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
@@ -176,13 +176,15 @@ def hutchinson(
 ) -> np.ndarray:
     """Mean of (J^T z)^2 over `probes` images z of independent +-1, whose expectation is diag(J^T J) (Hutchinson 1990).
 
-    Raises InputError for less than one probe."""
+    Each camera has probes of its own, drawn from `seed` and the camera: with the same ones in every view the errors of
+    neighbouring views would be alike, and would add up in a sum over views. Raises InputError for less than one probe.
+    """
     if int(probes) != probes or probes < 1:
         raise InputError(f"hutchinson: probes {probes} must be a whole number from 1 up")
     cache = cache or ListCache()
     total = np.zeros((len(gaussians), 0), np.float64)
     for probe in range(int(probes)):
-        rng = np.random.default_rng(derive_seed(seed, f"hutchinson/{probe}"))
+        rng = np.random.default_rng(derive_seed(seed, f"hutchinson/{camera.key.hex()}/{probe}"))
         z = rng.choice(np.array([-1, 1], np.float32), (camera.height, camera.width, 3))
         squared = _gradient(gaussians, lambda _, z=z: mi.TensorXf(z), camera, background, cache).astype(np.float64) ** 2
         total = squared if probe == 0 else total + squared

@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from mgs.conventions import QUAT_MIN, Camera
-from mgs.gaussians import Gaussians
+from mgs.gaussians import SH_MAX, Gaussians
 from mgs.splat.constants import EPS2D, FRUSTUM_MARGIN, LOG_SCALE_RANGE, NEAR
 
 LOG2E = 1.4426950408889634
@@ -31,7 +31,8 @@ LOG2E = 1.4426950408889634
 class Splats:
     """Projected Gaussians, Dr.Jit Float [N] each: means2d (u, v) px; whitening k, p, e; log2_opacity; depth z m; rgb.
 
-    visible: in front of the near plane; elsewhere the other fields are meaningless. finite: no parameter is NaN or infinite.
+    visible: in front of the near plane; elsewhere the other fields are meaningless. finite: no parameter is NaN or infinite,
+    no colour coefficient beyond SH_MAX.
     u_rest, v_rest (px), k_rest: what rounding to float32 took from u, v and k (3e-5 px in a 640x480 image; as much at the far
     end of a long slanted footprint); not differentiated.
     """
@@ -161,7 +162,7 @@ def project64(gaussians: Gaussians, camera: Any) -> Splats:
     coefficients = gaussians.sh.shape[1]
     for i, basis in enumerate(sh_basis(mean, camera, coefficients)):
         sh = dr.gather(mi.Color3f, gaussians.sh.array, index * coefficients + i, mode=dr.ReduceMode.NoConflicts)
-        finite &= dr.all(dr.isfinite(sh))
+        finite &= dr.all(dr.abs(sh) <= SH_MAX)
         colour += basis * mi.Color3d(sh)
     colour = dr.maximum(colour, 0)
     return Splats(u, v, k, p, e, log2_opacity, z, colour.x, colour.y, colour.z, visible, finite)

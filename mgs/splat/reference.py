@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import expit
 
 from mgs.conventions import Camera, rotmat_from_quat
 from mgs.gaussians import Gaussians
@@ -80,7 +81,7 @@ def project(gaussians: Gaussians, camera: Camera) -> Projected:
     directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
     sh = np.asarray(gaussians.sh, np.float64)
     raw = 0.5 + np.einsum("nk,nkc->nc", sh_basis(directions, gaussians.sh_degree), sh)
-    opacities = 1 / (1 + np.exp(-np.asarray(gaussians.logit_opacities, np.float64)))
+    opacities = expit(np.asarray(gaussians.logit_opacities, np.float64))
     means2d = np.stack([fx * x / z + cx, fy * y / z + cy], 1)
     return Projected(means2d, cov2d, z, opacities, np.maximum(raw, 0), visible, T)
 

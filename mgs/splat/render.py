@@ -13,7 +13,7 @@ import numpy as np
 from mgs import runtime
 from mgs.conventions import Camera
 from mgs.errors import InputError
-from mgs.gaussians import Gaussians
+from mgs.gaussians import SH_MAX, Gaussians
 from mgs.splat import blocks, kernels
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, BlockLists
 from mgs.splat.kernels import PIXELS
@@ -39,8 +39,17 @@ class Image:
     depth: Any
 
 
+REMEMBERED = 1 << 16
+"""Most cameras whose last use a `ListCache` remembers, a few hundred bytes each."""
+
+
 class ListCache:
-    """Block lists per camera, least recently used first out, within a budget in bytes; those used last are always kept.
+    """Block lists per camera, within a budget in bytes. One camera's lists are kept even where they alone exceed it.
+
+    Views are mostly gone through again and again, in one order (scoring) or a new one each time (fitting). What was used
+    longest ago is then needed soonest, so giving it up for every newcomer (LRU) may never find anything. Here a camera takes
+    the place of the one used longest ago only if it was itself used less than half as long ago; otherwise its lists serve
+    once and are dropped. So as many stay as there is room for, and other cameras take over within three rounds.
 
     Lists serve as long as they are exact for the splats: same centres and depths, no footprint outside the margin it was
     built with. Otherwise they are rebuilt, so a stale list can never change an image.
@@ -49,20 +58,22 @@ class ListCache:
     def __init__(self, budget: int = CACHE_BYTES) -> None:
         self.budget = budget
         self.builds = 0
-        self._entries: OrderedDict[tuple[Any, ...], BlockLists] = OrderedDict()
+        self._lists: OrderedDict[bytes, BlockLists] = OrderedDict()  # used longest ago first
+        self._used: dict[bytes, int] = {}  # when each camera was used last, held or not, by _clock
+        self._clock = 0  # uses of all cameras
 
     @property
     def nbytes(self) -> int:
         """Memory held, bytes."""
-        return sum(lists.nbytes for lists in self._entries.values())
+        return sum(lists.nbytes for lists in self._lists.values())
 
     def get(self, camera: Camera, splats: Splats) -> tuple[BlockLists, Any]:
         """Lists for detached splats seen by the camera, and the splats packed at the places of these lists.
 
-        Raises InputError where a parameter is not finite.
+        Raises InputError where a parameter is not finite, or a colour beyond SH_MAX.
         """
-        key = (camera.K.tobytes(), camera.world_to_camera.tobytes(), camera.width, camera.height)
-        lists = self._entries.get(key)
+        key = camera.key
+        lists = self._lists.get(key)
         margin = 0.0 if lists is None else MARGIN
         dr.eval(splats)
         if lists is not None and len(lists.place) != len(splats.u):
@@ -79,11 +90,25 @@ class ListCache:
             lists = blocks.build(splats, blocks.depth_order(splats.z), camera.width, camera.height, margin)
             packed = kernels.pack(splats, lists.place)
             self.builds += 1
-        self._entries[key] = lists
-        self._entries.move_to_end(key)
-        while len(self._entries) > 1 and self.nbytes > self.budget:
-            self._entries.popitem(last=False)
+            self._keep(key, lists)
+        self._clock += 1
+        self._used[key] = self._clock
+        if key in self._lists:
+            self._lists.move_to_end(key)
         return lists, packed
+
+    def _keep(self, key: bytes, lists: BlockLists) -> None:
+        """Hold new lists, and keep the budget: drop those used longest ago, or these."""
+        self._lists[key] = lists
+        while len(self._lists) > 1 and self.nbytes > self.budget:
+            oldest = next(other for other in self._lists if other != key)
+            if key in self._used and 2 * (self._clock - self._used[key]) < self._clock - self._used[oldest]:
+                del self._lists[oldest]
+            else:
+                del self._lists[key]
+                break
+        if len(self._used) > REMEMBERED:
+            self._used = {other: self._used[other] for other in self._lists if other in self._used}
 
 
 def as_colour(background: Any) -> Any:
@@ -97,14 +122,14 @@ def as_colour(background: Any) -> Any:
         values = np.broadcast_to(np.asarray(background, np.float64), 3)
     except (TypeError, ValueError):
         values = np.full(3, np.nan)
-    if not np.isfinite(values).all():
-        raise InputError(f"background {background}: must be one or three finite numbers, linear RGB")
+    if not (np.abs(values) <= SH_MAX).all():
+        raise InputError(f"background {background}: must be one or three numbers, linear RGB, up to {SH_MAX:,.0f}")
     return mi.Color3f(*(dr.opaque(mi.Float, float(value)) for value in values))
 
 
 def _raise_unless_finite(finite: Any) -> None:
     if not finite:
-        raise InputError("gaussians: a parameter is NaN or infinite")
+        raise InputError(f"gaussians: a parameter is NaN or infinite, or a colour beyond {SH_MAX:,.0f}")
 
 
 def as_drjit(gaussians: Gaussians) -> Gaussians:
@@ -150,7 +175,7 @@ def _places(width: int, height: int) -> Any:
 def splats_and_lists(gaussians: Gaussians, camera: Camera, cache: ListCache | None) -> tuple[Splats, BlockLists, Any]:
     """Project Gaussians with Dr.Jit fields, find their block lists and pack them at the places of these lists.
 
-    Raises InputError where a parameter is not finite.
+    Raises InputError where a parameter is not finite, or a colour beyond SH_MAX.
     """
     splats = project(gaussians, camera_array(camera))
     try:
@@ -168,8 +193,8 @@ def render(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.
     (alpha < 1/255, transmittance), the depth order; forward-mode derivatives are not available.
     background: linear RGB. cache: keep one between calls so that a camera seen again reuses its block lists. Records its own
     kernels, so it cannot be called inside another `dr.freeze`.
-    Raises InputError where a parameter is NaN or infinite (names the parameter and the first Gaussian), or a number of the
-    background is (a Dr.Jit colour is not looked at).
+    Raises InputError where a parameter is NaN or infinite, or a colour beyond SH_MAX (names the parameter and the first
+    Gaussian); likewise for a number of the background (a Dr.Jit colour is not looked at).
     """
     runtime.start()
     colour = as_colour(background)

@@ -1,5 +1,7 @@
 """Block lists: complete, ordered, and never able to change an image, however old they are."""
 
+import sys
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -234,23 +236,47 @@ def test_another_number_of_gaussians_is_another_scene():
             np.testing.assert_array_equal(a, b)
 
 
-def test_cache_keeps_to_its_budget_and_drops_the_oldest():
-    g, cameras = make_gaussians(60, 3), [make_camera(eye=(2.0, 0.1 * i, 1.0)) for i in range(6)]
-    unlimited = ListCache()
-    for camera in cameras:
-        render(g, camera, cache=unlimited)
-    each = unlimited.nbytes // 6
-    assert each > 4 * 9 * 60
-    cache = ListCache(budget=int(3.5 * each))
-    for camera in cameras:
-        render(g, camera, cache=cache)
-        assert cache.nbytes <= cache.budget
-    assert cache.builds == 6
-    for camera in cameras[3:]:
-        render(g, camera, cache=cache)
-    assert cache.builds == 6, "the last three are held"
-    render(g, cameras[0], cache=cache)
-    assert cache.builds == 7, "the first was dropped"
+RING = [make_camera(eye=(2.0 * np.cos(a), 2.0 * np.sin(a), 1.0)) for a in np.linspace(0, 2 * np.pi, 24, endpoint=False)]
+IN_ORDER = [np.arange(12)] * 5
+SHUFFLED = [np.random.default_rng(i).permutation(12) for i in range(6)]
+
+
+def misses(passes, room: int) -> list[int]:
+    """How many lists each pass over cameras of the ring had to build, in a cache with room for so many of them."""
+    splats = projected(make_gaussians(60, 3), RING[0])  # any lists serve: what is kept depends on sizes alone
+    cache = ListCache()
+    cache.get(RING[0], splats)
+    cache, built = ListCache(budget=room * cache.nbytes), []
+    for cameras in passes:
+        before = cache.builds
+        for i in cameras:
+            cache.get(RING[i], splats)
+            assert cache.nbytes <= cache.budget
+        built.append(cache.builds - before)
+    return built
+
+
+def test_cache_keeps_what_it_has_room_for_in_every_pass():
+    assert misses(IN_ORDER, 12) == [12, 0, 0, 0, 0]
+    assert misses(IN_ORDER, 11) == [12, 1, 1, 1, 1]
+    assert misses(IN_ORDER, 6) == [12, 6, 6, 6, 6]
+    assert max(misses(SHUFFLED, 11)[1:]) <= 2
+    assert np.mean(misses(SHUFFLED, 6)[1:]) < 8.5, "LRU: 10"
+
+
+@pytest.mark.parametrize("passes", [IN_ORDER, SHUFFLED])
+def test_cache_goes_over_to_other_cameras(passes):
+    others = [cameras + 12 for cameras in passes]
+    assert max(misses([*passes, *others], 11)[-2:]) <= 2
+    assert misses([[0], [1], [1], [1]], 1) == [1, 1, 1, 0], "one camera after another"
+
+
+def test_cache_remembers_a_bounded_number_of_uses(monkeypatch):
+    monkeypatch.setattr(sys.modules[ListCache.__module__], "REMEMBERED", 5)
+    cache, splats = ListCache(budget=1), projected(make_gaussians(60, 3), RING[0])
+    for camera in RING:
+        cache.get(camera, splats)
+        assert len(cache._used) <= 6
 
 
 def test_one_view_larger_than_the_budget_still_renders():

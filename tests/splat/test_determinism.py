@@ -131,6 +131,43 @@ print("drawn")
     assert done.stdout == "drawn\n", done.stderr
 
 
+def test_threads_may_draw_at_once():
+    """Same bits as one after the other; the collector is off in every recording and on in the end. In a process of its own,
+    since two recordings at a time hang or end it."""
+    code = """
+from mgs import runtime; runtime.start()
+import gc
+import time
+from concurrent.futures import ThreadPoolExecutor
+import numpy as np
+from mgs.splat import fisher, kernels, render
+from splat.scenes import make_camera, make_gaussians
+
+collecting, walk = [], kernels._walk
+
+def watched(*arguments):
+    result = walk(*arguments)
+    time.sleep(0.02)  # others try to record now
+    collecting.append(gc.isenabled())
+    return result
+
+def draw(i):
+    gaussians, camera = make_gaussians(20 + 9 * i, i), make_camera((40 + i, 30))
+    return np.asarray(render(gaussians, camera).rgb).tobytes() + fisher(gaussians, camera).tobytes()
+
+kernels._walk = watched
+with ThreadPoolExecutor(4) as pool:
+    at_once = list(pool.map(draw, range(8)))
+assert len(collecting) == 24 and not any(collecting), collecting
+assert gc.isenabled()
+assert at_once == [draw(i) for i in range(8)]
+print("drawn")
+"""
+    root = __file__.rsplit("/splat/", 1)[0]
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, timeout=120, check=False)
+    assert done.stdout == "drawn\n", done.stderr
+
+
 def test_another_process_with_one_thread_agrees(first):
     """A fresh process: no recorded kernels, another thread pool, another memory layout."""
     code = (

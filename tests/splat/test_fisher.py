@@ -172,6 +172,20 @@ def test_hutchinson_converges_as_one_over_sqrt_k():
     assert np.all(np.abs(np.sqrt(ks) * errors - 1) < 0.35)
 
 
+def test_probes_of_hutchinson_are_independent_from_view_to_view():
+    """Errors of 16 neighbouring views average out in their sum: it is off by a quarter of what one view is off by."""
+    g = make_gaussians(16, 3, log_scales=(-3.5, -1.0), logits=(-2, 3))
+    cameras = [make_camera((21, 14), focal=24, eye=(2.0, 0.4 + 1e-3 * i, 1.1)) for i in range(16)]
+    exact = [fisher(g, camera) for camera in cameras]
+    estimate = [fisher(g, camera, "hutchinson", probes=1) for camera in cameras]
+    each = np.mean([np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in zip(estimate, exact, strict=True)])
+    together = np.linalg.norm(np.sum(estimate, 0) - np.sum(exact, 0)) / np.linalg.norm(np.sum(exact, 0))
+    print(f"one view {each:.2f}, sum of 16 {together:.2f}")
+    assert together < 0.5 * each
+    again = fisher(g, cameras[3], "hutchinson", probes=1)
+    np.testing.assert_array_equal(again, estimate[3])
+
+
 def test_hutchinson_is_the_same_with_and_without_a_cache():
     camera, g = make_camera(), make_gaussians(16, 6)
     np.testing.assert_array_equal(fisher(g, camera, "hutchinson"), fisher(g, camera, "hutchinson", cache=ListCache()))

@@ -11,7 +11,7 @@ import pytest
 import mgs.splat
 from mgs.conventions import Camera
 from mgs.errors import InputError
-from mgs.gaussians import Gaussians
+from mgs.gaussians import SH_MAX, Gaussians
 from mgs.splat import ESTIMATORS, ListCache, as_drjit, fisher, reference, render
 from mgs.splat.constants import NEAR
 
@@ -231,6 +231,37 @@ def test_not_a_number_names_the_parameter_and_the_first_gaussian(name, value):
         with pytest.raises(InputError, match=pattern):
             call()
     assert "\n" not in pattern
+
+
+def test_opacities_of_extreme_logits():
+    """0 and 1, without a warning of an overflow on the way; between them the sigmoid."""
+    logits = np.array([-3e38, -1000, -80, 0, 2, 1000], np.float32)
+    g = changed(make_gaussians(len(logits), 0), logit_opacities=logits)
+    expected = [0, 0, np.exp(-80.0), 0.5, 1 / (1 + np.exp(-2.0)), 1]
+    np.testing.assert_allclose(g.opacities, expected, rtol=1e-6)
+    assert g.opacities.dtype == np.float32
+    np.testing.assert_allclose(reference.project(g, CAMERA).opacities, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("colour", [3e38, -1e38, 1.01 * SH_MAX])
+def test_colours_beyond_measure_are_an_error(colour):
+    """Their information would be infinite and their gradients NaN; a background's, too."""
+    g = scene()
+    g.sh[5, 0, 1] = colour
+    for call in (g.check, lambda: render(g, CAMERA), lambda: fisher(g, CAMERA), lambda: fisher(g, CAMERA, "hutchinson")):
+        with pytest.raises(InputError, match="sh is beyond 1,000,000, first at Gaussian 5; remove or repair it"):
+            call()
+    with pytest.raises(InputError, match="must be one or three numbers, linear RGB, up to 1,000,000"):
+        fisher(scene(), CAMERA, background=(0, colour, 0))
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_the_largest_colours_have_finite_information_and_gradients(estimator):
+    g = make_gaussians(N, 0, 3, log_scales=(-2.0, 0.0))
+    g.sh[:] = SH_MAX * np.sign(g.sh)
+    assert np.isfinite(fisher(g, CAMERA, estimator, (SH_MAX, 0, 0))).all()
+    assert fisher(g, CAMERA, estimator).max() > SH_MAX
+    assert all(np.isfinite(gradient).all() for gradient in gradients(g, CAMERA).values())
 
 
 def test_a_bad_number_behind_the_camera_is_an_error_too():
