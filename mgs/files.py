@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -15,6 +16,13 @@ import numpy as np
 
 from mgs.conventions import linear_from_srgb, srgb_from_linear
 from mgs.errors import InputError
+
+PNG_BIT_DEPTH = 24
+"""Where a PNG holds its number of bits per sample: in the header, the first chunk (PNG specification, section 11.2.1)."""
+EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
+"""Pillow's names of pixels that it converts to 8-bit RGBA without loss: grey, palette and RGB, with and without alpha."""
+LUMA = np.array([0.299, 0.587, 0.114])
+"""Weights of R, G and B in grey (ITU-R BT.601)."""
 
 
 @contextmanager
@@ -144,33 +152,50 @@ def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> No
         Image.fromarray(pixels).save(temporary, format="PNG")
 
 
-def _open_png(path: str | Path) -> Any:
+def read_rgba(path: str | Path) -> np.ndarray:
+    """PNG, JPEG or another image -> [H,W,4], sRGB and straight alpha (full where it has none).
+
+    uint16 for a PNG of 16 bits per sample, uint8 for all others: full is 65535 or 255.
+    Raises InputError where it is missing, damaged, or neither grey nor RGB (CMYK needs a colour profile to be read right).
+    """
+    import cv2
     from PIL import Image, UnidentifiedImageError
 
     path = Path(path)
     try:
-        with Image.open(path) as image:  # Closed even where the pixels are damaged; they stay in memory.
+        data = path.read_bytes()
+        with Image.open(BytesIO(data)) as image:
             image.load()
     except FileNotFoundError:
         raise InputError(f"{path}: no such image") from None
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: not a readable image ({error}); the file is damaged, write it again") from None
-    return image
+    bits = data[PNG_BIT_DEPTH] if image.format == "PNG" else 8
+    if image.mode not in EIGHT_BIT_MODES and bits < 16:
+        raise InputError(f"{path}: pixels of kind {image.mode} are not supported; convert it to grey or RGB of 8 or 16 bits")
+    if bits in (2, 4, 16) and image.mode in ("L", "I;16") and "transparency" in image.info:
+        # Pillow and OpenCV both get these wrong; at 1 and 8 bits Pillow is right.
+        raise InputError(f"{path}: a grey of {bits} bits that stands for transparent is not supported; convert it to RGBA")
+    if bits < 16:
+        return np.asarray(image.convert("RGBA"))
+    # Pillow keeps only the upper 8 bits of 16-bit colour.
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None or pixels.dtype != np.uint16:
+        raise InputError(f"{path}: not a readable 16-bit PNG; the file is damaged, write it again")
+    conversions = {1: cv2.COLOR_GRAY2RGBA, 3: cv2.COLOR_BGR2RGBA, 4: cv2.COLOR_BGRA2RGBA}
+    return cv2.cvtColor(pixels, conversions[pixels.shape[2] if pixels.ndim == 3 else 1])
 
 
 def read_png(path: str | Path) -> np.ndarray:
-    """8-bit sRGB image -> linear RGB float32 [H,W,3]. Raises InputError where it is missing or damaged."""
-    return linear_from_srgb(np.asarray(_open_png(path).convert("RGB"), np.float32) / 255)
-
-
-def read_rgba(path: str | Path) -> np.ndarray:
-    """Image -> uint8 [H,W,4], sRGB and straight alpha (255 where it has none). Raises InputError as `read_png`."""
-    return np.asarray(_open_png(path).convert("RGBA"))
+    """sRGB image of 8 or 16 bits -> linear RGB float32 [H,W,3], alpha ignored. Raises InputError as `read_rgba`."""
+    rgba = read_rgba(path)
+    return linear_from_srgb(rgba[..., :3].astype(np.float32) / np.iinfo(rgba.dtype).max)
 
 
 def read_mask(path: str | Path) -> np.ndarray:
-    """Mask image -> bool [H,W] (at least half white is inside). Raises InputError where it is missing or damaged."""
-    return np.asarray(_open_png(path).convert("L")) >= 128
+    """Mask image -> bool [H,W] (at least half white is inside, alpha ignored). Raises InputError as `read_rgba`."""
+    rgba = read_rgba(path)
+    return rgba[..., :3] @ LUMA >= 0.5 * np.iinfo(rgba.dtype).max
 
 
 def write_exr(path: str | Path, channels: dict[str, np.ndarray]) -> None:

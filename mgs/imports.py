@@ -230,6 +230,7 @@ def import_source(
 def _import_shot(shot: Shot, out: Path, masks: Path | None, project: Callable[[Camera], np.ndarray] | None) -> Frame:
     camera, undo = undistorter(shot.camera, shot.distortion)
     rgba = _sized(shot.image, read_rgba(shot.image), shot.camera)
+    full = np.iinfo(rgba.dtype).max
     mask = None
     if masks is not None:
         path = _find(masks, shot.image.stem) or _find(masks, shot.name)
@@ -240,10 +241,10 @@ def _import_shot(shot: Shot, out: Path, masks: Path | None, project: Callable[[C
         mask = project(camera)
     elif shot.mask is not None:
         mask = undo(_sized(shot.mask, read_mask(shot.mask), shot.camera).astype(np.uint8) * 255, True) >= 128
-    elif rgba[..., 3].min() < 255:
-        mask = undo(rgba[..., 3], True) >= 128
+    elif rgba[..., 3].min() < full:
+        mask = undo(rgba[..., 3], True) > full // 2
     image, mask_path = out / "images" / f"{shot.name}.png", out / "masks" / f"{shot.name}.png"
-    write_png(image, undo(rgba[..., :3], True).astype(np.float64) / 255, linear=False)
+    write_png(image, undo(rgba[..., :3], True).astype(np.float64) / full, linear=False)
     if mask is not None:
         write_png(mask_path, mask)
     depth_path = None
