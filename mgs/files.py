@@ -59,10 +59,23 @@ def check_writable(path: str | Path) -> Path:
         raise _not_writable(path, error) from None
 
 
+@contextmanager
+def reading(path: Path, what: str = "file") -> Iterator[None]:
+    """While `path` is read, errors of the file system become one line: InputError, no such `what`, or why it cannot be read."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such {what}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); give a file that can be read") from None
+
+
 def copy_file(source: Path, path: Path) -> None:
-    """Copy a file, atomically."""
+    """Copy a file, atomically. Raises InputError where the source cannot be read or the copy cannot be written."""
+    with reading(source):
+        data = source.read_bytes()
     with atomic_path(path) as temporary:
-        shutil.copyfile(source, temporary)
+        temporary.write_bytes(data)
 
 
 def write_json(path: str | Path, data: Any) -> None:
@@ -74,12 +87,10 @@ def write_json(path: str | Path, data: Any) -> None:
 def read_json(path: str | Path) -> Any:
     """Read JSON. Raises InputError where the file is missing, not a file that can be read, or not JSON."""
     path = Path(path)
+    with reading(path):
+        data = path.read_bytes()
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))  # some tools put a byte-order mark in front
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); give a file that can be read") from None
+        return json.loads(data.decode("utf-8-sig"))  # some tools put a byte-order mark in front
     except (ValueError, RecursionError) as error:  # also of numbers or nestings that Python refuses
         raise InputError(f"{path}: not valid JSON ({error}); the file is damaged, write it again") from None
 
@@ -152,28 +163,49 @@ def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> No
         Image.fromarray(pixels).save(temporary, format="PNG")
 
 
+def _open_image(path: Path) -> tuple[Any, bytes]:
+    """A decoded Pillow image and its file's bytes. Raises InputError where it is missing, cannot be read, or is damaged."""
+    from PIL import Image, UnidentifiedImageError
+
+    with reading(path, "image"):
+        data = path.read_bytes()
+    try:
+        with Image.open(BytesIO(data)) as image:
+            image.load()
+    except UnidentifiedImageError:
+        raise InputError(f"{path}: not a readable image; give a PNG or JPEG, or write it again if it is damaged") from None
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise InputError(f"{path}: not a readable image ({error}); the file is damaged, write it again") from None
+    return image, data
+
+
+def read_values(path: str | Path) -> np.ndarray:
+    """An image of one channel, such as depth, as it is: [H,W] uint8 or uint16 (TIFF: int32 or float32 too).
+
+    Raises InputError where it is missing, cannot be read, is damaged, or has other channels.
+    """
+    path = Path(path)
+    image, _ = _open_image(path)
+    if image.mode not in ("L", "I;16", "I", "F"):
+        raise InputError(f"{path}: not a depth image, its pixels are of kind {image.mode}; give one channel of 16 bits, or EXR")
+    return np.asarray(image)
+
+
 def read_rgba(path: str | Path) -> np.ndarray:
     """PNG, JPEG or another image -> [H,W,4], sRGB and straight alpha (full where it has none).
 
     uint16 for a PNG of 16 bits per sample, uint8 for all others: full is 65535 or 255.
-    Raises InputError where it is missing, damaged, or neither grey nor RGB (CMYK needs a colour profile to be read right).
+    Raises InputError where it is missing, cannot be read, is damaged, or is neither grey nor RGB (no CMYK: what its numbers
+    look like is known to its colour profile alone).
     """
     import cv2
-    from PIL import Image, UnidentifiedImageError
 
     path = Path(path)
-    try:
-        data = path.read_bytes()
-        with Image.open(BytesIO(data)) as image:
-            image.load()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such image") from None
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path}: not a readable image ({error}); the file is damaged, write it again") from None
+    image, data = _open_image(path)
     bits = data[PNG_BIT_DEPTH] if image.format == "PNG" else 8
     if image.mode not in EIGHT_BIT_MODES and bits < 16:
         raise InputError(f"{path}: pixels of kind {image.mode} are not supported; convert it to grey or RGB of 8 or 16 bits")
-    if bits in (2, 4, 16) and image.mode in ("L", "I;16") and "transparency" in image.info:
+    if bits in (2, 4, 16) and image.mode in ("L", "I", "I;16") and "transparency" in image.info:
         # Pillow and OpenCV both get these wrong; at 1 and 8 bits Pillow is right.
         raise InputError(f"{path}: a grey of {bits} bits that stands for transparent is not supported; convert it to RGBA")
     if bits < 16:
@@ -212,12 +244,12 @@ def write_exr(path: str | Path, channels: dict[str, np.ndarray]) -> None:
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:
-    """OpenEXR -> {channel: float32 [H,W]}. Raises InputError where it is missing or damaged."""
+    """OpenEXR -> {channel: float32 [H,W]}. Raises InputError where it is missing, cannot be read, or is damaged."""
     import OpenEXR
 
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such EXR file")
+    with reading(path, "EXR file"), path.open("rb") as opened:  # of a file that it cannot open OpenEXR does not say why
+        opened.read(1)
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             return {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}

@@ -14,7 +14,7 @@ from mgs.cloud import write_points
 from mgs.conventions import Camera, opencv_from_opengl
 from mgs.dataset import FRAME_INTERVAL, PINHOLES, Dataset, Frame, load_dataset, read_records, write_transforms
 from mgs.errors import InputError
-from mgs.files import read_exr, read_mask, read_rgba, write_exr, write_png
+from mgs.files import read_exr, read_mask, read_rgba, read_values, write_exr, write_png
 from mgs.surface import read_mesh, sample_surface
 from mgs.visibility import silhouette
 
@@ -267,12 +267,7 @@ def _read_depth(path: Path, unit: float) -> np.ndarray:
     if path.suffix.lower() == ".exr":
         channels = read_exr(path)
         return channels.get("Z", next(iter(channels.values())))
-    import cv2
-
-    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
-    if pixels is None or pixels.ndim != 2:
-        raise InputError(f"{path}: not a readable depth image; expected EXR (metres) or one-channel 16-bit PNG")
-    return pixels.astype(np.float32) * unit
+    return read_values(path).astype(np.float32) * unit
 
 
 def undistorter(camera: Camera, distortion: np.ndarray) -> tuple[Camera, Callable[[np.ndarray, bool], np.ndarray]]:

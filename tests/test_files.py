@@ -20,14 +20,17 @@ from mgs.files import (
     check_writable,
     copy_file,
     folder_or_nothing,
+    read_exr,
     read_json,
     read_mask,
     read_png,
     read_rgba,
+    read_values,
     write_exr,
     write_json,
     write_png,
 )
+from mgs.surface import load_mesh
 
 
 class Stop(BaseException):
@@ -67,9 +70,51 @@ def test_a_full_disk_is_one_line(tmp_path, name, write):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_in_place_of_a_file(tmp_path):
-    with pytest.raises(InputError, match="cannot be read"):
-        read_json(tmp_path)
+def forbid(path):
+    path.touch()
+    path.chmod(0)
+    if os.access(path, os.R_OK):  # root may read all files
+        path.unlink()
+        path.symlink_to("/proc/self/mem")  # opens, and fails when its first byte is read
+
+
+UNREADABLE = {
+    "missing": (lambda path: None, "no such "),
+    "a folder": (lambda path: path.mkdir(), r"cannot be read \(Is a directory\)"),
+    "forbidden": (forbid, r"cannot be read \((Permission denied|Input/output error)\)"),
+}
+READERS = {
+    "a.json": read_json,
+    "a.png": read_png,
+    "depth.png": read_values,
+    "a.exr": read_exr,
+    "a.glb": load_mesh,
+    "source.png": lambda path: copy_file(path, path.with_name("copy.png")),
+}
+
+
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="needs Linux's /proc")
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("case", UNREADABLE)
+def test_what_cannot_be_read_is_named_with_its_cause(tmp_path, case, name):
+    make, cause = UNREADABLE[case]
+    make(tmp_path / name)
+    with pytest.raises(InputError, match=f"^{tmp_path / name}: {cause}") as error:
+        READERS[name](tmp_path / name)
+    assert "damaged" not in str(error.value)
+    assert not (tmp_path / "copy.png").exists()
+
+
+def test_a_picture_that_is_none_is_named_alone(tmp_path):
+    (tmp_path / "a.png").write_text("no pixels")
+    with pytest.raises(InputError, match=f"^{tmp_path / 'a.png'}: not a readable image; give a PNG or JPEG"):
+        read_png(tmp_path / "a.png")
+
+
+def test_depth_of_three_channels_is_refused(tmp_path):
+    write_png(tmp_path / "a.png", np.zeros((3, 4, 3)))
+    with pytest.raises(InputError, match="not a depth image, its pixels are of kind RGB"):
+        read_values(tmp_path / "a.png")
 
 
 def test_under_a_file(tmp_path):

@@ -322,6 +322,7 @@ BAD: dict[str, tuple[Callable[[Path], Path], list[str], str]] = {
     "short pose": (lambda root: _edit(root, _first("transform_matrix", [[1.0] * 4] * 2)), [], "no 4x4 matrix"),
     "duplicate frames": (lambda root: _edit(root, _first("file_path", "images/kf_0001.png")), [], "more than once"),
     "wrong size": (lambda root: _edit(root, lambda data: data.update(w=100)), [], "is 64x48, but its camera is 100x48"),
+    "a folder for depth": (lambda root: _edit(root, _first("depth_file_path", "depth")), [], "depth: cannot be read (Is a dir"),
     "no depth file": (lambda root: _edit(root, _first("depth_file_path", "depth/none.exr")), [], "no such EXR"),
     "image path a number": (lambda root: _edit(root, _first("file_path", 5)), [], "frame 0"),
     "image path empty": (lambda root: _edit(root, _first("file_path", "")), [], "frame 0"),
