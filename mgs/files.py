@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -15,6 +16,13 @@ import numpy as np
 
 from mgs.conventions import linear_from_srgb, srgb_from_linear
 from mgs.errors import InputError
+
+PNG_BIT_DEPTH = 24
+"""Where a PNG holds its number of bits per sample: in the header, the first chunk (PNG specification, section 11.2.1)."""
+EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
+"""Pillow's names of pixels that it converts to 8-bit RGBA without loss: grey, palette and RGB, with and without alpha."""
+LUMA = np.array([0.299, 0.587, 0.114])
+"""Weights of R, G and B in grey (ITU-R BT.601)."""
 
 
 @contextmanager
@@ -51,10 +59,23 @@ def check_writable(path: str | Path) -> Path:
         raise _not_writable(path, error) from None
 
 
+@contextmanager
+def reading(path: Path, what: str = "file") -> Iterator[None]:
+    """While `path` is read, errors of the file system become one line: InputError, no such `what`, or why it cannot be read."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such {what}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); give a file that can be read") from None
+
+
 def copy_file(source: Path, path: Path) -> None:
-    """Copy a file, atomically."""
+    """Copy a file, atomically. Raises InputError where the source cannot be read or the copy cannot be written."""
+    with reading(source):
+        data = source.read_bytes()
     with atomic_path(path) as temporary:
-        shutil.copyfile(source, temporary)
+        temporary.write_bytes(data)
 
 
 def write_json(path: str | Path, data: Any) -> None:
@@ -66,12 +87,10 @@ def write_json(path: str | Path, data: Any) -> None:
 def read_json(path: str | Path) -> Any:
     """Read JSON. Raises InputError where the file is missing, not a file that can be read, or not JSON."""
     path = Path(path)
+    with reading(path):
+        data = path.read_bytes()
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))  # some tools put a byte-order mark in front
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); give a file that can be read") from None
+        return json.loads(data.decode("utf-8-sig"))  # some tools put a byte-order mark in front
     except (ValueError, RecursionError) as error:  # also of numbers or nestings that Python refuses
         raise InputError(f"{path}: not valid JSON ({error}); the file is damaged, write it again") from None
 
@@ -144,33 +163,71 @@ def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> No
         Image.fromarray(pixels).save(temporary, format="PNG")
 
 
-def _open_png(path: str | Path) -> Any:
+def _open_image(path: Path) -> tuple[Any, bytes]:
+    """A decoded Pillow image and its file's bytes. Raises InputError where it is missing, cannot be read, or is damaged."""
     from PIL import Image, UnidentifiedImageError
 
-    path = Path(path)
+    with reading(path, "image"):
+        data = path.read_bytes()
     try:
-        with Image.open(path) as image:  # Closed even where the pixels are damaged; they stay in memory.
+        with Image.open(BytesIO(data)) as image:
             image.load()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such image") from None
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+    except UnidentifiedImageError:
+        raise InputError(f"{path}: not a readable image; give a PNG or JPEG, or write it again if it is damaged") from None
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: not a readable image ({error}); the file is damaged, write it again") from None
-    return image
+    return image, data
 
 
-def read_png(path: str | Path) -> np.ndarray:
-    """8-bit sRGB image -> linear RGB float32 [H,W,3]. Raises InputError where it is missing or damaged."""
-    return linear_from_srgb(np.asarray(_open_png(path).convert("RGB"), np.float32) / 255)
+def read_values(path: str | Path) -> np.ndarray:
+    """An image of one channel, such as depth, as it is: [H,W] uint8 or uint16 (TIFF: int32 or float32 too).
+
+    Raises InputError where it is missing, cannot be read, is damaged, or has other channels.
+    """
+    path = Path(path)
+    image, _ = _open_image(path)
+    if image.mode not in ("L", "I;16", "I", "F"):
+        raise InputError(f"{path}: not a depth image, its pixels are of kind {image.mode}; give one channel of 16 bits, or EXR")
+    return np.asarray(image)
 
 
 def read_rgba(path: str | Path) -> np.ndarray:
-    """Image -> uint8 [H,W,4], sRGB and straight alpha (255 where it has none). Raises InputError as `read_png`."""
-    return np.asarray(_open_png(path).convert("RGBA"))
+    """PNG, JPEG or another image -> [H,W,4], sRGB and straight alpha (full where it has none).
+
+    uint16 for a PNG of 16 bits per sample, uint8 for all others: full is 65535 or 255.
+    Raises InputError where it is missing, cannot be read, is damaged, or is neither grey nor RGB (no CMYK: what its numbers
+    look like is known to its colour profile alone).
+    """
+    import cv2
+
+    path = Path(path)
+    image, data = _open_image(path)
+    bits = data[PNG_BIT_DEPTH] if image.format == "PNG" else 8
+    if image.mode not in EIGHT_BIT_MODES and bits < 16:
+        raise InputError(f"{path}: pixels of kind {image.mode} are not supported; convert it to grey or RGB of 8 or 16 bits")
+    if bits in (2, 4, 16) and image.mode in ("L", "I", "I;16") and "transparency" in image.info:
+        # Pillow and OpenCV both get these wrong; at 1 and 8 bits Pillow is right.
+        raise InputError(f"{path}: a grey of {bits} bits that stands for transparent is not supported; convert it to RGBA")
+    if bits < 16:
+        return np.asarray(image.convert("RGBA"))
+    # Pillow keeps only the upper 8 bits of 16-bit colour.
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None or pixels.dtype != np.uint16:
+        raise InputError(f"{path}: not a readable 16-bit PNG; the file is damaged, write it again")
+    conversions = {1: cv2.COLOR_GRAY2RGBA, 3: cv2.COLOR_BGR2RGBA, 4: cv2.COLOR_BGRA2RGBA}
+    return cv2.cvtColor(pixels, conversions[pixels.shape[2] if pixels.ndim == 3 else 1])
+
+
+def read_png(path: str | Path) -> np.ndarray:
+    """sRGB image of 8 or 16 bits -> linear RGB float32 [H,W,3], alpha ignored. Raises InputError as `read_rgba`."""
+    rgba = read_rgba(path)
+    return linear_from_srgb(rgba[..., :3].astype(np.float32) / np.iinfo(rgba.dtype).max)
 
 
 def read_mask(path: str | Path) -> np.ndarray:
-    """Mask image -> bool [H,W] (at least half white is inside). Raises InputError where it is missing or damaged."""
-    return np.asarray(_open_png(path).convert("L")) >= 128
+    """Mask image -> bool [H,W] (at least half white is inside, alpha ignored). Raises InputError as `read_rgba`."""
+    rgba = read_rgba(path)
+    return rgba[..., :3] @ LUMA >= 0.5 * np.iinfo(rgba.dtype).max
 
 
 def write_exr(path: str | Path, channels: dict[str, np.ndarray]) -> None:
@@ -187,12 +244,12 @@ def write_exr(path: str | Path, channels: dict[str, np.ndarray]) -> None:
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:
-    """OpenEXR -> {channel: float32 [H,W]}. Raises InputError where it is missing or damaged."""
+    """OpenEXR -> {channel: float32 [H,W]}. Raises InputError where it is missing, cannot be read, or is damaged."""
     import OpenEXR
 
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such EXR file")
+    with reading(path, "EXR file"), path.open("rb") as opened:  # of a file that it cannot open OpenEXR does not say why
+        opened.read(1)
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             return {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}

@@ -14,7 +14,7 @@ from mgs.cloud import write_points
 from mgs.conventions import Camera, opencv_from_opengl
 from mgs.dataset import FRAME_INTERVAL, PINHOLES, Dataset, Frame, load_dataset, read_records, write_transforms
 from mgs.errors import InputError
-from mgs.files import read_exr, read_mask, read_rgba, write_exr, write_png
+from mgs.files import read_exr, read_mask, read_rgba, read_values, write_exr, write_png
 from mgs.surface import read_mesh, sample_surface
 from mgs.visibility import silhouette
 
@@ -230,6 +230,7 @@ def import_source(
 def _import_shot(shot: Shot, out: Path, masks: Path | None, project: Callable[[Camera], np.ndarray] | None) -> Frame:
     camera, undo = undistorter(shot.camera, shot.distortion)
     rgba = _sized(shot.image, read_rgba(shot.image), shot.camera)
+    full = np.iinfo(rgba.dtype).max
     mask = None
     if masks is not None:
         path = _find(masks, shot.image.stem) or _find(masks, shot.name)
@@ -240,10 +241,10 @@ def _import_shot(shot: Shot, out: Path, masks: Path | None, project: Callable[[C
         mask = project(camera)
     elif shot.mask is not None:
         mask = undo(_sized(shot.mask, read_mask(shot.mask), shot.camera).astype(np.uint8) * 255, True) >= 128
-    elif rgba[..., 3].min() < 255:
-        mask = undo(rgba[..., 3], True) >= 128
+    elif rgba[..., 3].min() < full:
+        mask = undo(rgba[..., 3], True) > full // 2
     image, mask_path = out / "images" / f"{shot.name}.png", out / "masks" / f"{shot.name}.png"
-    write_png(image, undo(rgba[..., :3], True).astype(np.float64) / 255, linear=False)
+    write_png(image, undo(rgba[..., :3], True).astype(np.float64) / full, linear=False)
     if mask is not None:
         write_png(mask_path, mask)
     depth_path = None
@@ -266,12 +267,7 @@ def _read_depth(path: Path, unit: float) -> np.ndarray:
     if path.suffix.lower() == ".exr":
         channels = read_exr(path)
         return channels.get("Z", next(iter(channels.values())))
-    import cv2
-
-    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
-    if pixels is None or pixels.ndim != 2:
-        raise InputError(f"{path}: not a readable depth image; expected EXR (metres) or one-channel 16-bit PNG")
-    return pixels.astype(np.float32) * unit
+    return read_values(path).astype(np.float32) * unit
 
 
 def undistorter(camera: Camera, distortion: np.ndarray) -> tuple[Camera, Callable[[np.ndarray, bool], np.ndarray]]:

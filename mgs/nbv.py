@@ -36,8 +36,9 @@ from mgs.conventions import Camera
 from mgs.dataset import Dataset, Frame
 from mgs.errors import InputError
 from mgs.files import atomic_path, read_json, write_json
-from mgs.gaussians import Gaussians, write_ply
+from mgs.gaussians import Gaussians
 from mgs.seeds import generator
+from mgs.splat_ply import write_ply
 
 Progress = Callable[[str, int, int], None]
 """Called as progress(stage, done, total)."""

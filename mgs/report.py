@@ -189,8 +189,8 @@ def write_report(out: str | Path, folders: Sequence[str | Path]) -> list[Path]:
     """
     from mgs.dataset import load_dataset
     from mgs.evaluate import read_comparison
-    from mgs.gaussians import read_ply
     from mgs.nbv import check_same_frames, read_settings
+    from mgs.splat_ply import read_ply
 
     out, runs = Path(out), evaluated_runs(folders)
     first = next(iter(runs.values()))

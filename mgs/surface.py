@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from mgs.cloud import Plane
 from mgs.errors import InputError
+from mgs.files import reading
 
 if TYPE_CHECKING:
     import trimesh
@@ -62,8 +63,8 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     import trimesh
 
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such mesh; give a GLB, OBJ or PLY file")
+    with reading(path, "mesh; give a GLB, OBJ or PLY file"), path.open("rb") as file:
+        file.read(1)
     try:
         mesh = trimesh.load(path, force="mesh", process=False)
     except Exception as error:  # trimesh's readers raise many types; each means a damaged or unknown file.

@@ -278,7 +278,9 @@ def write_survey(out: Path, dataset: Dataset, survey: Survey) -> Dataset:
     frames = []
     for frame, pose, depth in zip(dataset.frames, survey.optimised, survey.depths, strict=True):
         estimated = replace(frame.camera, world_to_camera=np.linalg.inv(pose))
-        image, mask = out / "images" / frame.image_path.name, frame.mask_path and out / "masks" / frame.mask_path.name
+        # Frames have names of their own; their files may share one, in different folders.
+        image = out / "images" / f"{frame.name}{frame.image_path.suffix}"
+        mask = frame.mask_path and out / "masks" / f"{frame.name}{frame.mask_path.suffix}"
         measured = out / "depth" / f"{frame.name}.exr"
         copy_file(frame.image_path, image)
         if mask and frame.mask_path:

@@ -22,10 +22,11 @@ import drjit as dr
 import mitsuba as mi
 
 from mgs.errors import InputError
-from mgs.gaussians import Gaussians, ply_colour_space, read_ply
+from mgs.gaussians import Gaussians
 from mgs.splat import ListCache, as_drjit, render
 from mgs.splat.render import as_colour
 from mgs.splat.sensor import camera_from_sensor
+from mgs.splat_ply import ply_colour_space, read_ply
 
 
 class MgsSplat(mi.CppADIntegrator):

@@ -14,7 +14,7 @@ import tiny
 from refusals import occupied, refused
 
 from mgs.files import write_exr, write_png
-from mgs.gaussians import write_ply
+from mgs.splat_ply import write_ply
 
 Change = Callable[[Path], object]
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import tiny
 
-from mgs.gaussians import write_ply
 from mgs.scene_file import SceneFile, load_scene_file
+from mgs.splat_ply import write_ply
 
 DOCS = Path(__file__).parent.parent / "docs"
 

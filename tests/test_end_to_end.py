@@ -15,7 +15,7 @@ import synthetic
 from mgs import cli, nbv, policies
 from mgs.cli import main
 from mgs.dataset import load_dataset
-from mgs.gaussians import read_ply
+from mgs.splat_ply import read_ply
 
 OPTIONS = ["--gaussians", "300", "--seeds", "3", "--budget", "4", "--passes", "6", "--seed", "1"]
 STRUCK = """

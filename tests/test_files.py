@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import errno
 import os
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from mgs.conventions import linear_from_srgb
 from mgs.errors import InputError
 from mgs.files import (
     atomic_folder,
@@ -16,11 +20,17 @@ from mgs.files import (
     check_writable,
     copy_file,
     folder_or_nothing,
+    read_exr,
     read_json,
+    read_mask,
+    read_png,
+    read_rgba,
+    read_values,
     write_exr,
     write_json,
     write_png,
 )
+from mgs.surface import load_mesh
 
 
 class Stop(BaseException):
@@ -60,9 +70,51 @@ def test_a_full_disk_is_one_line(tmp_path, name, write):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_in_place_of_a_file(tmp_path):
-    with pytest.raises(InputError, match="cannot be read"):
-        read_json(tmp_path)
+def forbid(path):
+    path.touch()
+    path.chmod(0)
+    if os.access(path, os.R_OK):  # root may read all files
+        path.unlink()
+        path.symlink_to("/proc/self/mem")  # opens, and fails when its first byte is read
+
+
+UNREADABLE = {
+    "missing": (lambda path: None, "no such "),
+    "a folder": (lambda path: path.mkdir(), r"cannot be read \(Is a directory\)"),
+    "forbidden": (forbid, r"cannot be read \((Permission denied|Input/output error)\)"),
+}
+READERS = {
+    "a.json": read_json,
+    "a.png": read_png,
+    "depth.png": read_values,
+    "a.exr": read_exr,
+    "a.glb": load_mesh,
+    "source.png": lambda path: copy_file(path, path.with_name("copy.png")),
+}
+
+
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="needs Linux's /proc")
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("case", UNREADABLE)
+def test_what_cannot_be_read_is_named_with_its_cause(tmp_path, case, name):
+    make, cause = UNREADABLE[case]
+    make(tmp_path / name)
+    with pytest.raises(InputError, match=f"^{tmp_path / name}: {cause}") as error:
+        READERS[name](tmp_path / name)
+    assert "damaged" not in str(error.value)
+    assert not (tmp_path / "copy.png").exists()
+
+
+def test_a_picture_that_is_none_is_named_alone(tmp_path):
+    (tmp_path / "a.png").write_text("no pixels")
+    with pytest.raises(InputError, match=f"^{tmp_path / 'a.png'}: not a readable image; give a PNG or JPEG"):
+        read_png(tmp_path / "a.png")
+
+
+def test_depth_of_three_channels_is_refused(tmp_path):
+    write_png(tmp_path / "a.png", np.zeros((3, 4, 3)))
+    with pytest.raises(InputError, match="not a depth image, its pixels are of kind RGB"):
+        read_values(tmp_path / "a.png")
 
 
 def test_under_a_file(tmp_path):
@@ -111,3 +163,98 @@ def test_an_atomic_folder_appears_whole(tmp_path, there):
         assert not (out / "file").exists()
     assert [path.name for path in out.parent.iterdir()] == ["out"]
     assert (out / "file").exists()
+
+
+def encode_png(samples, bits, colour, palette=None, transparent=None):
+    """A PNG of samples [H,W,C], byte by byte from its specification; palette [K,3], transparent: the bytes of tRNS."""
+    big = samples.reshape(len(samples), -1).astype(">u2")
+    if bits == 16:
+        rows = [row.tobytes() for row in big]
+    else:
+        digits = (big[..., None] >> np.arange(bits)[::-1]) & 1
+        rows = [row.tobytes() for row in np.packbits(digits.reshape(len(big), -1).astype(bool), axis=1)]
+    header = struct.pack(">IIBBBBB", samples.shape[1], samples.shape[0], bits, colour, 0, 0, 0)
+    chunks = [(b"IHDR", header)]
+    chunks += [] if palette is None else [(b"PLTE", palette.astype(np.uint8).tobytes())]
+    chunks += [] if transparent is None else [(b"tRNS", transparent)]
+    chunks += [(b"IDAT", zlib.compress(b"".join(b"\0" + row for row in rows))), (b"IEND", b"")]
+    parts = [struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+GREY, RGB, PALETTE, GREY_ALPHA, RGBA = 0, 2, 3, 4, 6
+CHANNELS = {GREY: 1, RGB: 3, PALETTE: 1, GREY_ALPHA: 2, RGBA: 4}
+PNGS = [
+    *((bits, GREY, False) for bits in (1, 2, 4, 8, 16)),
+    *((bits, PALETTE, transparent) for bits in (1, 2, 4, 8) for transparent in (False, True)),
+    *((bits, colour, False) for bits in (8, 16) for colour in (GREY_ALPHA, RGB, RGBA)),
+    *((bits, GREY, True) for bits in (1, 8)),
+    *((bits, RGB, True) for bits in (8, 16)),
+]
+"""Every kind of PNG: bits per sample, colour type, and whether a colour (or colours of the palette) stands for transparent."""
+
+
+@pytest.mark.parametrize(("bits", "colour", "transparent"), PNGS)
+def test_every_kind_of_png(tmp_path, bits, colour, transparent):
+    rng = np.random.default_rng(bits)
+    levels, full = 2**bits, 65535 if bits == 16 else 255
+    samples = rng.integers(0, levels, (5, 7, CHANNELS[colour]))
+    if colour == PALETTE:
+        palette = rng.integers(0, 256, (levels, 3))
+        alphas = rng.integers(0, 256, levels) if transparent else np.full(levels, 255)
+        expected = np.dstack([palette[samples[..., 0]], alphas[samples[..., 0]]])
+        data = encode_png(samples, bits, colour, palette, bytes(alphas.tolist()) if transparent else None)
+    else:
+        scaled = samples * full // (levels - 1)
+        rgb = scaled[..., :3] if colour in (RGB, RGBA) else np.repeat(scaled[..., :1], 3, axis=-1)
+        alpha = scaled[..., -1] if colour in (GREY_ALPHA, RGBA) else np.full((5, 7), full)
+        if transparent:
+            alpha = np.where((samples == samples[2, 3]).all(-1), 0, full)
+        key = samples[2, 3].astype(">u2").tobytes() if transparent else None
+        expected = np.dstack([rgb, alpha])
+        data = encode_png(samples, bits, colour, transparent=key)
+    (tmp_path / "a.png").write_bytes(data)
+    rgba = read_rgba(tmp_path / "a.png")
+    assert rgba.dtype == (np.uint16 if bits == 16 else np.uint8)
+    np.testing.assert_array_equal(rgba, expected)
+    np.testing.assert_allclose(read_png(tmp_path / "a.png"), linear_from_srgb(expected[..., :3] / full), atol=1e-6)
+    grey = expected[..., :3] @ [0.299, 0.587, 0.114] / full
+    sure = np.abs(grey - 0.5) > 1e-3
+    np.testing.assert_array_equal(read_mask(tmp_path / "a.png")[sure], (grey > 0.5)[sure])
+
+
+@pytest.mark.parametrize("bits", [2, 4, 16])
+def test_a_transparent_grey_that_no_library_reads_right_is_refused(tmp_path, bits):
+    samples = np.arange(4).reshape(2, 2, 1)
+    (tmp_path / "a.png").write_bytes(encode_png(samples, bits, GREY, transparent=b"\0\1"))
+    with pytest.raises(InputError, match=f"a.png: a grey of {bits} bits that stands for transparent"):
+        read_png(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("mode", ["L", "RGB"])
+def test_jpeg(tmp_path, mode):
+    """Smooth values come back within the error of the compression."""
+    ramp = np.linspace(20, 230, 32).astype(np.uint8)[None].repeat(24, 0)
+    values = ramp if mode == "L" else np.dstack([ramp, 255 - ramp, ramp // 2])
+    Image.fromarray(values).save(tmp_path / "a.jpg", quality=100, subsampling=0)
+    rgba = read_rgba(tmp_path / "a.jpg")
+    assert (rgba[..., 3] == 255).all()
+    np.testing.assert_allclose(rgba[..., :3], values if mode == "RGB" else np.dstack([values] * 3), atol=3)
+
+
+@pytest.mark.parametrize(
+    ("mode", "name"), [("CMYK", "a.jpg"), ("CMYK", "a.tif"), ("I", "a.tif"), ("F", "a.tif"), ("I;16", "a.tif")]
+)
+def test_pixels_that_are_neither_grey_nor_rgb_of_8_or_16_bits_are_refused(tmp_path, mode, name):
+    Image.new(mode, (4, 3)).save(tmp_path / name)
+    for read in (read_png, read_rgba, read_mask):
+        with pytest.raises(InputError, match=f"{name}: pixels of kind {mode} are not supported; convert it to grey or RGB"):
+            read(tmp_path / name)
+
+
+@pytest.mark.parametrize("colour", [GREY, RGB])
+def test_half_a_16_bit_png_is_refused(tmp_path, colour):
+    data = encode_png(np.random.default_rng(0).integers(0, 65536, (40, 50, CHANNELS[colour])), 16, colour)
+    (tmp_path / "a.png").write_bytes(data[: len(data) // 2])
+    with pytest.raises(InputError, match="not a readable image"):
+        read_png(tmp_path / "a.png")

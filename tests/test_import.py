@@ -203,6 +203,26 @@ def test_depth_in_16_bit_png(dataset: Dataset, tmp_path: Path) -> None:
         assert np.abs(one.depth() - other.depth()).max() < 5.1e-4
 
 
+@pytest.mark.parametrize("alpha", [False, True])
+def test_images_of_16_bits(dataset: Dataset, tmp_path: Path, alpha: bool) -> None:
+    """Colours and alpha come over, rounded to the 8 bits of a dataset."""
+    data = read_json(dataset.root / "transforms.json")
+    rng = np.random.default_rng(0)
+    written = []
+    for frame, record in zip(dataset.frames, data["frames"], strict=True):
+        del record["mask_path"]
+        written.append(rng.integers(0, 65536, (frame.camera.height, frame.camera.width, 4 if alpha else 1), np.uint16))
+        cv2.imwrite(str(frame.image_path), written[-1][..., [2, 1, 0, 3] if alpha else 0])
+    write_json(dataset.root / "transforms.json", data)
+    copy = _import(dataset.root, tmp_path / "copy")
+    for frame, pixels in zip(copy.frames, written, strict=True):
+        with Image.open(frame.image_path) as image:
+            assert np.abs(np.asarray(image) - pixels[..., :3] / 257).max() <= 0.5
+        assert (frame.mask_path is not None) == alpha
+        if alpha:
+            np.testing.assert_array_equal(frame.mask(), pixels[..., 3] >= 32768)
+
+
 def test_missing_images_are_skipped_and_counted(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for frame in dataset.frames[:3]:
         frame.image_path.unlink()
@@ -302,6 +322,7 @@ BAD: dict[str, tuple[Callable[[Path], Path], list[str], str]] = {
     "short pose": (lambda root: _edit(root, _first("transform_matrix", [[1.0] * 4] * 2)), [], "no 4x4 matrix"),
     "duplicate frames": (lambda root: _edit(root, _first("file_path", "images/kf_0001.png")), [], "more than once"),
     "wrong size": (lambda root: _edit(root, lambda data: data.update(w=100)), [], "is 64x48, but its camera is 100x48"),
+    "a folder for depth": (lambda root: _edit(root, _first("depth_file_path", "depth")), [], "depth: cannot be read (Is a dir"),
     "no depth file": (lambda root: _edit(root, _first("depth_file_path", "depth/none.exr")), [], "no such EXR"),
     "image path a number": (lambda root: _edit(root, _first("file_path", 5)), [], "frame 0"),
     "image path empty": (lambda root: _edit(root, _first("file_path", "")), [], "frame 0"),

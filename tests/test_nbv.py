@@ -15,7 +15,7 @@ import tiny
 from mgs import nbv, policies
 from mgs.dataset import load_dataset
 from mgs.errors import InputError
-from mgs.gaussians import read_ply
+from mgs.splat_ply import read_ply
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from refusals import a_file, listing, occupied, refused
 
 from mgs import __version__
 from mgs.cli import main
-from mgs.gaussians import write_ply
+from mgs.splat_ply import write_ply
 
 
 def read_only(tmp_path: Path) -> Path:

@@ -12,8 +12,9 @@ import pytest
 
 from mgs.conventions import Camera, linear_from_srgb, look_at
 from mgs.errors import InputError
-from mgs.gaussians import Gaussians, read_ply, write_ply
+from mgs.gaussians import Gaussians
 from mgs.splat import as_drjit, camera_from_sensor, render
+from mgs.splat_ply import read_ply, write_ply
 
 WIDTH, HEIGHT, FOV = 70, 46, 38.0
 EYE, TARGET = (0.3, -2.0, 0.9), (0.05, 0.0, 0.0)

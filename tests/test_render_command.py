@@ -10,8 +10,9 @@ from PIL import Image
 from mgs import cli
 from mgs.conventions import Camera, linear_from_srgb, look_at, opengl_from_opencv, srgb_from_linear
 from mgs.files import read_exr
-from mgs.gaussians import Gaussians, ply_colour_space, read_ply, write_ply
+from mgs.gaussians import Gaussians
 from mgs.splat import render
+from mgs.splat_ply import ply_colour_space, read_ply, write_ply
 
 WIDTH, HEIGHT = 48, 32
 EYES = [(0.0, -2.0, 0.5), (1.6, 1.2, 0.4)]

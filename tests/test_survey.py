@@ -259,6 +259,21 @@ def test_the_survey_is_a_dataset_and_gives_a_prior(dataset: Dataset, survey, tmp
     assert exact.numbers["truth"]["accuracy"] < prior.numbers["truth"]["accuracy"] < 0.04
 
 
+def test_files_of_one_name_in_different_folders_stay_apart(tmp_path: Path) -> None:
+    dataset = synthetic.write_dataset(tmp_path / "data")
+    for frame in dataset.frames:
+        assert frame.mask_path is not None
+        (tmp_path / "data/frames" / frame.name).mkdir(parents=True)
+        frame.mask_path.rename(tmp_path / "data/frames" / frame.name / "mask.png")
+    frames = [replace(frame, mask_path=tmp_path / "data/frames" / frame.name / "mask.png") for frame in dataset.frames]
+    write_transforms(dataset.root, frames)
+    dataset = load_dataset(dataset.root)
+    result = write_survey(tmp_path / "survey", dataset, fly(dataset, SurveySettings(exact_poses=True)))
+    for surveyed, flown in zip(result.frames, dataset.frames, strict=True):
+        assert np.array_equal(surveyed.mask(), flown.mask())
+        assert np.array_equal(surveyed.rgb(), flown.rgb())
+
+
 def test_command_writes_a_dataset_with_its_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = synthetic.write_dataset(tmp_path / "data", synthetic.orbit_cameras(12, 64, 48), ROCKS).root
     write_json(root / "config.json", {"scene": {"sensor": {"noise": 5.0, "drift": 0.5}}})

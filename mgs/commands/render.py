@@ -22,7 +22,9 @@ class ColourSpace(StrEnum):
 
 
 def render(
-    splats: Annotated[Path, typer.Argument(help="3DGS PLY of SH degree 0 to 3, binary or ascii, of mgs or another tool.")],
+    splats: Annotated[
+        Path, typer.Argument(help="3DGS PLY of SH degree 0 to 3, binary, ascii or compressed, of mgs or another tool.")
+    ],
     cameras: Annotated[Path, typer.Option(help="transforms.json (nerfstudio), or the dataset folder that holds it.")],
     out: Annotated[Path, typer.Option(help="Folder to write; new or empty.")],
     width: Annotated[
@@ -54,7 +56,7 @@ def render(
     from mgs.dataset import load_cameras
     from mgs.errors import InputError
     from mgs.files import new_folder
-    from mgs.gaussians import ply_colour_space, read_ply
+    from mgs.splat_ply import ply_colour_space, read_ply
 
     if not all(0 <= value <= 1 for value in background):
         raise InputError(f"--background {' '.join(map(str, background))}: must be three numbers from 0 to 1")

@@ -1,0 +1,197 @@
+"""Gaussians on disk: the 3DGS PLY layout, written and read, and the compressed one of SuperSplat and PlayCanvas, read."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+
+import numpy as np
+from plyfile import PlyData, PlyElement, PlyParseError
+from scipy.special import logit
+
+from mgs.conventions import SH_C0
+from mgs.errors import InputError
+from mgs.files import atomic_path, reading
+from mgs.gaussians import Gaussians
+
+LINEAR_COMMENT = "mgs: colours are linear RGB"
+"""Header comment of our PLY files. The layout itself has no field for it, and other tools train in display space (sRGB)."""
+CHUNK = 256
+"""Splats that share one row of the element `chunk` of a compressed PLY."""
+PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+VECTOR_BITS = ((21, 11), (11, 10), (0, 11))
+"""Lowest bit and number of bits of x, y and z in a packed position or scale."""
+TO_ASCII = bytes(byte if byte < 128 else ord("?") for byte in range(256))
+"""Translation of bytes that leaves no others than ASCII."""
+
+
+def _ply_names(coefficients: int) -> list[str]:
+    """Property names of the 3DGS layout for a number of SH coefficients per channel."""
+    rest = 3 * (coefficients - 1)
+    return (
+        ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+        + [f"f_rest_{i}" for i in range(rest)]
+        + ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    )
+
+
+def write_ply(path: str | Path, gaussians: Gaussians) -> None:
+    """Write a binary 3DGS PLY (opens in any splat viewer); f_rest is channel-major, colours stay linear RGB."""
+    g, n = gaussians, len(gaussians)
+    names = _ply_names(g.sh.shape[1])
+    rest = np.transpose(g.sh[:, 1:, :], (0, 2, 1)).reshape(n, -1)
+    columns = np.concatenate(
+        [g.means, np.zeros((n, 3)), g.sh[:, 0, :], rest, np.reshape(g.logit_opacities, (n, 1)), g.log_scales, g.quats], axis=1
+    ).astype(np.float32)
+    vertices = np.empty(n, dtype=[(name, "f4") for name in names])
+    for i, name in enumerate(names):
+        vertices[name] = columns[:, i]
+    with atomic_path(path) as temporary:
+        PlyData([PlyElement.describe(vertices, "vertex")], comments=[LINEAR_COMMENT]).write(str(temporary))
+
+
+def ply_colour_space(path: str | Path) -> str:
+    """The space in which a readable 3DGS PLY's colours are blended: "linear" for our files, "srgb" for other tools'."""
+    with Path(path).open("rb") as file:
+        for line in file:
+            if line.strip() == f"comment {LINEAR_COMMENT}".encode():
+                return "linear"
+            if line.strip() == b"end_header":
+                break
+    return "srgb"
+
+
+def read_ply(path: str | Path) -> Gaussians:
+    """Read any standard 3DGS PLY (binary or ascii, SH degree 0 to 3), by property name, or a compressed one.
+
+    Raises InputError where the file is missing, is not a PLY, lacks a property, or holds NaN or infinite values.
+    """
+    path = Path(path)
+    ply = _parse(path)
+    if "vertex" not in ply:
+        raise InputError(f"{path}: not a 3DGS PLY, it has no vertices; export it with a splatting tool")
+    vertices = ply["vertex"].data
+    if any(name in vertices.dtype.names for name in PACKED):
+        columns = _decompress(path, ply)
+    else:
+        columns = {name: vertices[name] for name in vertices.dtype.names}
+    gaussians = _from_columns(path, columns, len(vertices))
+    try:
+        return gaussians.check()
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _parse(path: Path) -> PlyData:
+    """The elements of a PLY file. Raises InputError where it cannot be read or is damaged."""
+    try:
+        with reading(path, "file; give a 3DGS PLY"):
+            return _parse_any_comment(path)
+    except InputError:
+        raise
+    except (PlyParseError, ValueError, OverflowError, MemoryError) as error:
+        raise InputError(f"{path}: not a readable 3DGS PLY ({error}); export it again") from None
+
+
+def _parse_any_comment(path: Path) -> PlyData:
+    """As PlyData.read, which refuses a header with comments that are not ASCII."""
+    try:
+        return PlyData.read(str(path))
+    except UnicodeDecodeError:
+        header, mark, body = path.read_bytes().partition(b"end_header")
+    with NamedTemporaryFile(suffix=".ply") as copy:  # plyfile is slow on what is no file on disk
+        copy.write(header.translate(TO_ASCII) + mark + body)
+        copy.flush()
+        return PlyData.read(copy.name)
+
+
+def _from_columns(path: Path, columns: Mapping[str, np.ndarray], n: int) -> Gaussians:
+    """The Gaussians of the 3DGS layout's properties, each [n]. Raises InputError where one is missing or a list."""
+    rest = sum(re.fullmatch("f_rest_[0-9]+", name) is not None for name in columns)
+    coefficients = 1 + rest // 3
+    if rest % 3 or coefficients not in (1, 4, 9, 16):
+        raise InputError(f"{path}: {rest} f_rest properties fit no SH degree from 0 to 3; expected 0, 9, 24 or 45")
+    missing = [name for name in _ply_names(coefficients) if name not in columns and name not in ("nx", "ny", "nz")]
+    if missing:
+        raise InputError(f"{path}: not a 3DGS PLY, property {missing[0]!r} is missing; export it with a splatting tool")
+    lists = [name for name in _ply_names(coefficients) if name in columns and columns[name].dtype.kind == "O"]
+    if lists:
+        raise InputError(f"{path}: not a 3DGS PLY, property {lists[0]!r} is a list; export it with a splatting tool")
+
+    def stack(*names: str) -> np.ndarray:
+        with np.errstate(over="ignore"):  # becomes infinite, which is refused by the caller
+            return np.stack([np.asarray(columns[name], np.float32) for name in names], 1)
+
+    sh = stack("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :]
+    if rest:
+        higher = stack(*(f"f_rest_{i}" for i in range(rest))).reshape(n, 3, coefficients - 1)
+        sh = np.concatenate([sh, np.transpose(higher, (0, 2, 1))], axis=1)
+    return Gaussians(
+        means=stack("x", "y", "z"),
+        log_scales=stack("scale_0", "scale_1", "scale_2"),
+        quats=stack("rot_0", "rot_1", "rot_2", "rot_3"),
+        logit_opacities=stack("opacity").ravel(),
+        sh=np.ascontiguousarray(sh),
+    )
+
+
+def _decompress(path: Path, ply: PlyData) -> dict[str, np.ndarray]:
+    """The 3DGS layout's properties, each [N], of a compressed PLY.
+
+    Its layout is that of PlayCanvas' splat-transform (`.compressed.ply`): four 32-bit words per splat, whose fields are shares
+    of the range that each chunk of 256 splats has in the element `chunk`. Older files have no ranges of colour: 0 to 1.
+    Raises InputError where elements or properties are missing, of another type, or do not fit one another.
+    """
+    vertices, n = ply["vertex"].data, len(ply["vertex"].data)
+    chunks = ply["chunk"].data if "chunk" in ply else np.empty(0, [])
+    present = chunks.dtype.names or ()
+    coloured = any(f"{end}_{channel}" in present for end in ("min", "max") for channel in "rgb")
+    ranges = [*"xyz", "scale_x", "scale_y", "scale_z", *("rgb" if coloured else "")]
+    wanted = [(chunks, f"{end}_{name}", "f") for name in ranges for end in ("min", "max")]
+    for table, name, kind in wanted + [(vertices, name, "u") for name in PACKED]:
+        if name not in (table.dtype.names or ()) or table.dtype[name].kind != kind or table.dtype[name].itemsize < 4:
+            raise InputError(f"{path}: a compressed PLY without a usable {name!r}; export it again, or uncompressed")
+    if len(chunks) * CHUNK < n:
+        raise InputError(f"{path}: {len(chunks)} chunks are too few for {n} splats, {CHUNK} to a chunk; export it again")
+    chunk = np.arange(n) // CHUNK
+
+    def share(word: str, lowest: int, bits: int) -> np.ndarray:
+        return (vertices[word] >> lowest & (2**bits - 1)) / (2**bits - 1)
+
+    def within(name: str, t: np.ndarray) -> np.ndarray:
+        low, high = (chunks[f"{end}_{name}"][chunk].astype(np.float64) for end in ("min", "max"))
+        return low + t * (high - low)
+
+    columns = {}
+    for i, (axis, field) in enumerate(zip("xyz", VECTOR_BITS, strict=True)):
+        columns[axis] = within(axis, share("packed_position", *field))
+        columns[f"scale_{i}"] = within(f"scale_{axis}", share("packed_scale", *field))
+    for i, channel in enumerate("rgb"):
+        value = share("packed_color", 24 - 8 * i, 8)
+        columns[f"f_dc_{i}"] = ((within(channel, value) if coloured else value) - 0.5) / SH_C0
+    # The ends stand for half a step of opacities; a quarter of one inside, their logits are finite.
+    columns["opacity"] = logit(np.clip(share("packed_color", 0, 8), 0.25 / 255, 1 - 0.25 / 255))
+    three = np.stack([np.sqrt(2) * (share("packed_rotation", lowest, 10) - 0.5) for lowest in (20, 10, 0)], 1)
+    columns |= {f"rot_{i}": column for i, column in enumerate(_unit_quats(vertices["packed_rotation"] >> 30, three).T)}
+    return columns | _decompress_sh(path, ply, n)
+
+
+def _unit_quats(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Unit quaternions [N,4], wxyz, of the index of their largest component [N] (which is positive) and the others [N,3]."""
+    place = np.arange(4)
+    quats = np.take_along_axis(others, np.minimum(place - (place > largest[:, None]), 2), 1)
+    return np.where(place == largest[:, None], np.sqrt(np.maximum(1 - (others**2).sum(1), 0))[:, None], quats)
+
+
+def _decompress_sh(path: Path, ply: PlyData, n: int) -> dict[str, np.ndarray]:
+    """f_rest of a compressed PLY. A byte is a step of 1/32 from -4 to 4 and stands for its middle, 0 and 255 for the ends."""
+    if "sh" not in ply:
+        return {}
+    table = ply["sh"].data
+    if len(table) != n or any(table.dtype[name] != np.uint8 for name in table.dtype.names):
+        raise InputError(f"{path}: a compressed PLY whose element 'sh' is not {n} rows of bytes; export it again")
+    values = (np.arange(256) + 0.5) / 32 - 4
+    values[[0, 255]] = -4, 4
+    return {name: values[table[name]] for name in table.dtype.names}
