@@ -54,10 +54,11 @@ class PriorSettings:
 
 @dataclass(frozen=True)
 class Prior:
-    """points [N,3] world, metres; normals [N,3] unit; spacing: sqrt(area / N), metres; depth_tolerance: metres a depth may
-    differ from the prior and still be the same surface (the largest of three rms residuals of the cloud, a voxel, and two
-    standard deviations of the depth images); numbers: what prior.json holds."""
+    """mesh: what was sampled; points [N,3] world, metres; normals [N,3] unit; spacing: sqrt(area / N), metres;
+    depth_tolerance: metres a depth may differ from the prior and still be the same surface (the largest of three rms residuals
+    of the cloud, a voxel, and two standard deviations of the depth images); numbers: what prior.json holds."""
 
+    mesh: Mesh
     points: np.ndarray
     normals: np.ndarray
     spacing: float
@@ -79,18 +80,8 @@ class Rock:
     clusters: int
 
 
-@dataclass(frozen=True)
-class Stages:
-    """What the figure shows: the mesh, and the rock it was built from (none for a given mesh)."""
-
-    mesh: Mesh
-    rock: Rock | None = None
-
-
-def build_prior(
-    dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None] | None = None
-) -> tuple[Prior, Stages]:
-    """Build the prior of a dataset of RGB-D frames; of its imported sparse points where frames have no depth.
+def build_prior(dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None] | None = None) -> tuple[Prior, Rock]:
+    """Build the prior of a dataset of RGB-D frames, or of its imported sparse points where frames have no depth, from its rock.
 
     on_stage is told the name of each stage as it starts.
     Raises InputError: no depth, no ground plane, no rock (empty cluster), two equal rocks, no closed surface, N below 2.
@@ -130,7 +121,7 @@ def build_prior(
     if truth.is_file() and any(frame.depth_path for frame in dataset.frames):
         tell("distance to the true rock")
         numbers["truth"] = error_to_truth(points, spacing, mesh, truth, dataset.frames, rock, settings.seed)
-    return Prior(points, normals, spacing, tolerance, numbers), Stages(mesh, rock)
+    return Prior(mesh, points, normals, spacing, tolerance, numbers), rock
 
 
 def find_rock(dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None]) -> Rock:
@@ -169,7 +160,7 @@ def _sample_numbers(mesh: Mesh, points: np.ndarray, spacing: float, settings: Pr
     }
 
 
-def prior_from_mesh(path: str | Path, settings: PriorSettings) -> tuple[Prior, Stages]:
+def prior_from_mesh(path: str | Path, settings: PriorSettings) -> Prior:
     """The prior of a given mesh in world coordinates, metres: it is only sampled. Raises InputError as `read_mesh`."""
     _check(settings)
     mesh = read_mesh(path)
@@ -178,7 +169,7 @@ def prior_from_mesh(path: str | Path, settings: PriorSettings) -> tuple[Prior, S
     seed = derive_seed(settings.seed, "prior/samples")
     points, normals, spacing = sample_surface(mesh, seed, count=settings.gaussians, spacing=settings.spacing)
     numbers = {"mesh": str(path), "depth_tolerance": spacing, **_sample_numbers(mesh, points, spacing, settings)}
-    return Prior(points, normals, spacing, spacing, numbers), Stages(mesh)
+    return Prior(mesh, points, normals, spacing, spacing, numbers)
 
 
 def _check(settings: PriorSettings) -> None:
@@ -248,20 +239,23 @@ def error_to_truth(
     }
 
 
-def save_prior(out: str | Path, prior: Prior, mesh: Mesh) -> Path:
+def save_prior(out: str | Path, prior: Prior) -> Path:
     """Write mesh.ply, points.ply (x y z nx ny nz) and prior.json into a new folder. Raises InputError if it is not empty."""
     import trimesh
 
     out = new_folder(out)
     with atomic_path(out / "mesh.ply") as temporary:
-        trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(temporary)
+        trimesh.Trimesh(prior.mesh.vertices, prior.mesh.faces, process=False).export(temporary)
     write_points(out / "points.ply", prior.points, prior.normals)
     write_json(out / "prior.json", prior.numbers)
     return out
 
 
 def load_prior(folder: str | Path) -> Prior:
-    """Read a folder that `save_prior` wrote. Raises InputError where a file is missing, damaged or holds NaN."""
+    """Read a folder that `save_prior` wrote. Raises InputError where a file is missing, damaged or holds NaN.
+
+    All of the mesh counts as seen: its file does not say what was sampled.
+    """
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such prior; make one with `mgs prior DATASET --out {folder}`")
@@ -279,4 +273,4 @@ def load_prior(folder: str | Path) -> Prior:
         raise InputError(f"{path}: has NaN values, or fewer than two points; make the prior again with `mgs prior`")
     if not (0 < spacing < np.inf and 0 < tolerance < np.inf):
         raise InputError(f"{folder / 'prior.json'}: spacing and depth_tolerance must be positive metres; make the prior again")
-    return Prior(columns[:, :3], columns[:, 3:], spacing, tolerance, numbers)
+    return Prior(read_mesh(folder / "mesh.ply"), columns[:, :3], columns[:, 3:], spacing, tolerance, numbers)

@@ -32,6 +32,7 @@ def prior(
     import numpy as np
     from rich.console import Console
 
+    from mgs import runtime
     from mgs.dataset import load_dataset
     from mgs.files import atomic_folder, check_new_folder
     from mgs.initial import initial_gaussians
@@ -45,18 +46,20 @@ def prior(
     settings = PriorSettings(gaussians, spacing, poisson_depth, prior_noise, holes, seed)
     with console.status("reading") as status:
         if mesh is not None:
-            result, stages = prior_from_mesh(mesh, settings)
+            result, rock = prior_from_mesh(mesh, settings), None
         else:
-            result, stages = build_prior(frames, settings, lambda stage: status.update(f"prior: {stage}"))
+            result, rock = build_prior(frames, settings, lambda stage: status.update(f"prior: {stage}"))
         status.update("prior: what four seed frames see")
         positions = np.stack([frame.camera.position for frame in frames.frames])
         seeds = seed_views(positions, result.points.mean(0), min(SEEDS, len(frames)))
+        if not all(frames.frames[k].depth_path for k in seeds):
+            runtime.start()
         seen = initial_gaussians(result, [frames.frames[k] for k in seeds])[1]
         result = replace(result, numbers=result.numbers | {"seen_by_seeds": float(seen.mean())})
         status.update("prior: picture")
         with atomic_folder(folder) as unfinished:
-            save_prior(unfinished, result, stages.mesh)
-            draw_prior(unfinished / "prior.png", result, stages)
+            save_prior(unfinished, result)
+            draw_prior(unfinished / "prior.png", result, rock)
     console.print(_table(result.numbers))
     console.print(f"wrote {folder}: mesh.ply, points.ply, prior.json, prior.png")
 
