@@ -76,7 +76,7 @@ def _dots(axis, points: np.ndarray, colour: np.ndarray, colours: str | None, rea
         chosen = np.random.default_rng(0).choice(len(points), MAX_DOTS, replace=False)
         points, colour = points[chosen], colour[chosen]
     order = np.argsort(points[:, 2])
-    size = float(np.clip(60_000 / len(points), 0.3, 12)) if size is None else size
+    size = float(np.clip(60_000 / max(len(points), 1), 0.3, 12)) if size is None else size
     axis.scatter(*points[order, :2].T, c=colour[order], cmap=colours, s=size, linewidths=0, rasterized=True)
     axis.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xticks=[], yticks=[])
 
