@@ -115,7 +115,8 @@ def build_prior(dataset: Dataset, settings: PriorSettings, on_stage: Callable[[s
         "poisson_depth": depth,
         "fit_rms": residual,
         "depth_tolerance": tolerance,
-        **_sample_numbers(mesh, points, spacing, settings),
+        **_sample_numbers(mesh, points, spacing),
+        "settings": asdict(settings),
     }
     truth = dataset.root / "rock.glb"
     if truth.is_file() and any(frame.depth_path for frame in dataset.frames):
@@ -146,7 +147,7 @@ def find_rock(dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str
     return Rock(cloud, plane, ground, points[~floor], normals[~floor], eps, clusters)
 
 
-def _sample_numbers(mesh: Mesh, points: np.ndarray, spacing: float, settings: PriorSettings) -> dict[str, Any]:
+def _sample_numbers(mesh: Mesh, points: np.ndarray, spacing: float) -> dict[str, Any]:
     nearest = cKDTree(points).query(points, 2)[0][:, 1]
     return {
         "mesh_faces": len(mesh.faces),
@@ -156,19 +157,30 @@ def _sample_numbers(mesh: Mesh, points: np.ndarray, spacing: float, settings: Pr
         "spacing": spacing,
         "nearest_neighbour_mean": float(nearest.mean()),
         "nearest_neighbour_min": float(nearest.min()),
-        "settings": asdict(settings),
     }
 
 
 def prior_from_mesh(path: str | Path, settings: PriorSettings) -> Prior:
-    """The prior of a given mesh in world coordinates, metres: it is only sampled. Raises InputError as `read_mesh`."""
+    """The prior of a given mesh in world coordinates, metres: it is only sampled.
+
+    Raises InputError as `read_mesh`, and for settings of a cloud and of Poisson's surface: there is neither.
+    """
     _check(settings)
+    built = {
+        "--prior-noise": settings.noise > 0,
+        "--holes": settings.holes > 0,
+        "--poisson-depth": settings.poisson_depth is not None,
+    }
+    given = " and ".join(option for option, is_given in built.items() if is_given)
+    if given:
+        raise InputError(f"prior: {given} shape a mesh that is built here, but --mesh gives one; leave out either")
     mesh = read_mesh(path)
     if settings.gaussians is None and settings.spacing is None:
         raise InputError(f"{path}: a given mesh says nothing of how finely to sample it; give --gaussians or --spacing")
     seed = derive_seed(settings.seed, "prior/samples")
     points, normals, spacing = sample_surface(mesh, seed, count=settings.gaussians, spacing=settings.spacing)
-    numbers = {"mesh": str(path), "depth_tolerance": spacing, **_sample_numbers(mesh, points, spacing, settings)}
+    done = {"gaussians": settings.gaussians, "spacing": settings.spacing, "seed": settings.seed}
+    numbers = {"mesh": str(path), "depth_tolerance": spacing, **_sample_numbers(mesh, points, spacing), "settings": done}
     return Prior(mesh, points, normals, spacing, spacing, numbers)
 
 

@@ -80,6 +80,24 @@ def test_more_samples_than_memory_holds_is_one_line(
     )
 
 
+@pytest.mark.parametrize("options", [["--prior-noise", "0.01"], ["--holes", "0.2"], ["--poisson-depth", "0"]])
+def test_what_a_given_mesh_has_no_use_for_is_refused(
+    dataset: Dataset, options: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["prior", dataset.root, "--mesh", dataset.root / "rock.glb", "--gaussians", 100, *options]
+    line = refused(capsys, arguments, dataset.root)
+    assert options[0] in line
+    assert "--mesh" in line
+
+
+def test_the_record_of_a_given_mesh_says_what_was_done(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(["prior", str(dataset.root), "--mesh", str(dataset.root / "rock.glb"), "--gaussians", "100", "--seed", "3"])
+    assert exit_.value.code == 0
+    assert load_prior(dataset.root / "prior").numbers["settings"] == {"gaussians": 100, "spacing": None, "seed": 3}
+    assert "some frame saw" not in capsys.readouterr().out
+
+
 def _spoilt(how: str) -> trimesh.Trimesh:
     """The rock as a mesh with a defect that can be mended."""
     mesh = synthetic.rock_mesh()

@@ -72,7 +72,8 @@ def _table(numbers: dict[str, Any]) -> Any:
     table = Table("station", "number", title="Mesh prior")
     if "points" in numbers:
         _add_cloud_rows(table, numbers)
-    table.add_row("area, A", f"{area:.4f} m² sampled (what some frame saw), of {numbers['mesh_area']:.4f} m²")
+    part = "" if "mesh" in numbers else f" sampled (what some frame saw), of {numbers['mesh_area']:.4f} m²"
+    table.add_row("area, A", f"{area:.4f} m²{part}")
     table.add_row("samples, N = A / spacing²", f"{n:,} = {area:.4f} / {spacing:.6f}²")
     mean, least = (numbers[key] / spacing for key in ("nearest_neighbour_mean", "nearest_neighbour_min"))
     table.add_row("nearest neighbour over spacing", f"mean {mean:.2f}, least {least:.2f}")
