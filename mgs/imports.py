@@ -15,8 +15,7 @@ from mgs.conventions import Camera, opencv_from_opengl
 from mgs.dataset import FRAME_INTERVAL, PINHOLES, Dataset, Frame, load_dataset, read_records, write_transforms
 from mgs.errors import InputError
 from mgs.files import read_exr, read_mask, read_rgba, read_values, write_exr, write_png
-from mgs.surface import read_mesh, sample_surface
-from mgs.visibility import silhouette
+from mgs.surface import read_mesh
 
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 """Coefficients of the OPENCV camera model, in OpenCV's order."""
@@ -207,15 +206,17 @@ def import_source(
     out: Path,
     *,
     masks: Path | None = None,
-    project: Callable[[Camera], np.ndarray] | None = None,
+    mesh: Path | None = None,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Dataset:
     """Write a source as a dataset into the existing empty folder `out`; transforms.json is written last.
 
-    Masks come from, in this order: files of `masks` with the image's stem, `project` (a function of a camera, bool [H,W]),
-    the source's own mask files, the images' alpha. Distorted images, depth and masks are undistorted to a pinhole camera that
-    holds valid pixels only. Raises InputError where a file is missing, damaged or of another size than the camera.
+    Masks come from, in this order: files of `masks` with the image's stem, the pixels whose centre shows the `mesh` (world
+    coordinates; needs the variant to be set, `mgs.runtime.start`), the source's own mask files, the images' alpha. Distorted
+    images, depth and masks are undistorted to a pinhole camera that holds valid pixels only.
+    Raises InputError where a file is missing, damaged or of another size than the camera, or as `read_mesh`.
     """
+    project = None if mesh is None else mesh_silhouette(mesh)
     frames = []
     for k, shot in enumerate(source.shots):
         if on_frame:
@@ -295,18 +296,9 @@ def undistorter(camera: Camera, distortion: np.ndarray) -> tuple[Camera, Callabl
     return Camera(K + shift, camera.width, camera.height, camera.world_to_camera), undo
 
 
-def mesh_silhouette(path: Path, shots: list[Shot]) -> Callable[[Camera], np.ndarray]:
-    """A function of a camera that gives the mesh's silhouette, bool [H,W]; sampled finer than the nearest camera's pixels.
+def mesh_silhouette(path: Path) -> Callable[[Camera], np.ndarray]:
+    """A function of a camera: bool [H,W], the pixels whose centre shows the mesh. Raises InputError as `read_mesh`."""
+    from mgs.raycast import mesh_depth  # only here: it wants the variant to be set
 
-    Raises InputError as `read_mesh`.
-    """
-    mesh = read_mesh(path)
-    centre = mesh.vertices.mean(0)
-    reach = float(np.linalg.norm(mesh.vertices - centre, axis=1).max())
-    footprints = [
-        max(float(np.linalg.norm(shot.camera.position - centre)) - reach, 0.1 * reach) / shot.camera.K[0, 0] for shot in shots
-    ]
-    area = float(mesh.areas.sum())
-    spacing = float(np.clip(0.7 * min(footprints), np.sqrt(area / 1e6), np.sqrt(area / 1e3)))
-    points, normals, spacing = sample_surface(mesh, 0, spacing=spacing)
-    return lambda camera: silhouette(points, normals, camera, spacing)
+    depth = mesh_depth(read_mesh(path))
+    return lambda camera: depth(camera) > 0

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from mgs.conventions import quat_from_normals
+from mgs.conventions import Camera, quat_from_normals
 from mgs.dataset import Frame
 from mgs.gaussians import Gaussians, sh_from_rgb
-from mgs.visibility import depth_of_surfels, in_mask, visible
+from mgs.visibility import in_mask, visible
 
 if TYPE_CHECKING:
     from mgs.prior import Prior
@@ -32,14 +32,17 @@ GREY = 0.5
 def initial_gaussians(prior: Prior, seed_frames: Sequence[Frame]) -> tuple[Gaussians, np.ndarray]:
     """One flat Gaussian per sample of the prior; colours averaged over the seed frames that see it, grey where none does.
 
-    A frame sees a point that is inside its rock mask, faces it, and agrees with its depth image (or, where it has none, with
-    a z-buffer of the samples) within `prior.depth_tolerance` and the slope of the surface in its pixel.
+    A frame sees a point that is inside its rock mask, faces it, and agrees with its depth image within `prior.depth_tolerance`
+    and the slope of the surface in its pixel. For a frame without depth it is the depth of the prior's mesh: that needs the
+    variant to be set (`mgs.runtime.start`).
     Returns (Gaussians of SH degree 0, seen [N] bool). Raises InputError where a seed frame cannot be read.
     """
     n = len(prior.points)
     total, count = np.zeros((n, 3)), np.zeros(n)
+    depth_of_mesh = None if all(frame.depth_path for frame in seed_frames) else _depth_of_mesh(prior)
     for frame in seed_frames:
-        seen = frame_sees(prior, frame)
+        depth = depth_of_mesh(frame.camera) if depth_of_mesh and frame.depth_path is None else frame.depth()
+        seen = visible(prior.points, prior.normals, frame.camera, depth, prior.depth_tolerance) & in_mask(prior.points, frame)
         pixels, _ = frame.camera.project(prior.points[seen])
         at = [pixels[:, 1] - 0.5, pixels[:, 0] - 0.5]
         rgb = frame.rgb()
@@ -58,12 +61,7 @@ def initial_gaussians(prior: Prior, seed_frames: Sequence[Frame]) -> tuple[Gauss
     return gaussians, seen
 
 
-def frame_sees(prior: Prior, frame: Frame) -> np.ndarray:
-    """[N] bool: the samples of the prior that the frame sees (see `initial_gaussians`)."""
-    camera = frame.camera
-    if frame.depth_path is not None:
-        depth = frame.depth()
-    else:
-        depth = depth_of_surfels(prior.points, prior.normals, camera, prior.spacing)
-    seen = visible(prior.points, prior.normals, camera, depth, prior.depth_tolerance)
-    return seen & in_mask(prior.points, frame)
+def _depth_of_mesh(prior: Prior) -> Callable[[Camera], np.ndarray]:
+    from mgs.raycast import mesh_depth  # only here: it wants the variant to be set
+
+    return mesh_depth(prior.mesh)

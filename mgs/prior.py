@@ -54,10 +54,11 @@ class PriorSettings:
 
 @dataclass(frozen=True)
 class Prior:
-    """points [N,3] world, metres; normals [N,3] unit; spacing: sqrt(area / N), metres; depth_tolerance: metres a depth may
-    differ from the prior and still be the same surface (the largest of three rms residuals of the cloud, a voxel, and two
-    standard deviations of the depth images); numbers: what prior.json holds."""
+    """mesh: what was sampled; points [N,3] world, metres; normals [N,3] unit; spacing: sqrt(area / N), metres;
+    depth_tolerance: metres a depth may differ from the prior and still be the same surface (the largest of three rms residuals
+    of the cloud, a voxel, and two standard deviations of the depth images); numbers: what prior.json holds."""
 
+    mesh: Mesh
     points: np.ndarray
     normals: np.ndarray
     spacing: float
@@ -79,18 +80,8 @@ class Rock:
     clusters: int
 
 
-@dataclass(frozen=True)
-class Stages:
-    """What the figure shows: the mesh, and the rock it was built from (none for a given mesh)."""
-
-    mesh: Mesh
-    rock: Rock | None = None
-
-
-def build_prior(
-    dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None] | None = None
-) -> tuple[Prior, Stages]:
-    """Build the prior of a dataset of RGB-D frames; of its imported sparse points where frames have no depth.
+def build_prior(dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None] | None = None) -> tuple[Prior, Rock]:
+    """Build the prior of a dataset of RGB-D frames, or of its imported sparse points where frames have no depth, from its rock.
 
     on_stage is told the name of each stage as it starts.
     Raises InputError: no depth, no ground plane, no rock (empty cluster), two equal rocks, no closed surface, N below 2.
@@ -124,13 +115,14 @@ def build_prior(
         "poisson_depth": depth,
         "fit_rms": residual,
         "depth_tolerance": tolerance,
-        **_sample_numbers(mesh, points, spacing, settings),
+        **_sample_numbers(mesh, points, spacing),
+        "settings": asdict(settings),
     }
     truth = dataset.root / "rock.glb"
     if truth.is_file() and any(frame.depth_path for frame in dataset.frames):
         tell("distance to the true rock")
         numbers["truth"] = error_to_truth(points, spacing, mesh, truth, dataset.frames, rock, settings.seed)
-    return Prior(points, normals, spacing, tolerance, numbers), Stages(mesh, rock)
+    return Prior(mesh, points, normals, spacing, tolerance, numbers), rock
 
 
 def find_rock(dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None]) -> Rock:
@@ -155,7 +147,7 @@ def find_rock(dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str
     return Rock(cloud, plane, ground, points[~floor], normals[~floor], eps, clusters)
 
 
-def _sample_numbers(mesh: Mesh, points: np.ndarray, spacing: float, settings: PriorSettings) -> dict[str, Any]:
+def _sample_numbers(mesh: Mesh, points: np.ndarray, spacing: float) -> dict[str, Any]:
     nearest = cKDTree(points).query(points, 2)[0][:, 1]
     return {
         "mesh_faces": len(mesh.faces),
@@ -165,20 +157,31 @@ def _sample_numbers(mesh: Mesh, points: np.ndarray, spacing: float, settings: Pr
         "spacing": spacing,
         "nearest_neighbour_mean": float(nearest.mean()),
         "nearest_neighbour_min": float(nearest.min()),
-        "settings": asdict(settings),
     }
 
 
-def prior_from_mesh(path: str | Path, settings: PriorSettings) -> tuple[Prior, Stages]:
-    """The prior of a given mesh in world coordinates, metres: it is only sampled. Raises InputError as `read_mesh`."""
+def prior_from_mesh(path: str | Path, settings: PriorSettings) -> Prior:
+    """The prior of a given mesh in world coordinates, metres: it is only sampled.
+
+    Raises InputError as `read_mesh`, and for settings of a cloud and of Poisson's surface: there is neither.
+    """
     _check(settings)
+    built = {
+        "--prior-noise": settings.noise > 0,
+        "--holes": settings.holes > 0,
+        "--poisson-depth": settings.poisson_depth is not None,
+    }
+    given = " and ".join(option for option, is_given in built.items() if is_given)
+    if given:
+        raise InputError(f"prior: {given} shape a mesh that is built here, but --mesh gives one; leave out either")
     mesh = read_mesh(path)
     if settings.gaussians is None and settings.spacing is None:
         raise InputError(f"{path}: a given mesh says nothing of how finely to sample it; give --gaussians or --spacing")
     seed = derive_seed(settings.seed, "prior/samples")
     points, normals, spacing = sample_surface(mesh, seed, count=settings.gaussians, spacing=settings.spacing)
-    numbers = {"mesh": str(path), "depth_tolerance": spacing, **_sample_numbers(mesh, points, spacing, settings)}
-    return Prior(points, normals, spacing, spacing, numbers), Stages(mesh)
+    done = {"gaussians": settings.gaussians, "spacing": settings.spacing, "seed": settings.seed}
+    numbers = {"mesh": str(path), "depth_tolerance": spacing, **_sample_numbers(mesh, points, spacing), "settings": done}
+    return Prior(mesh, points, normals, spacing, spacing, numbers)
 
 
 def _check(settings: PriorSettings) -> None:
@@ -248,20 +251,23 @@ def error_to_truth(
     }
 
 
-def save_prior(out: str | Path, prior: Prior, mesh: Mesh) -> Path:
+def save_prior(out: str | Path, prior: Prior) -> Path:
     """Write mesh.ply, points.ply (x y z nx ny nz) and prior.json into a new folder. Raises InputError if it is not empty."""
     import trimesh
 
     out = new_folder(out)
     with atomic_path(out / "mesh.ply") as temporary:
-        trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(temporary)
+        trimesh.Trimesh(prior.mesh.vertices, prior.mesh.faces, process=False).export(temporary)
     write_points(out / "points.ply", prior.points, prior.normals)
     write_json(out / "prior.json", prior.numbers)
     return out
 
 
 def load_prior(folder: str | Path) -> Prior:
-    """Read a folder that `save_prior` wrote. Raises InputError where a file is missing, damaged or holds NaN."""
+    """Read a folder that `save_prior` wrote. Raises InputError where a file is missing, damaged or holds NaN.
+
+    All of the mesh counts as seen: its file does not say what was sampled.
+    """
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such prior; make one with `mgs prior DATASET --out {folder}`")
@@ -279,4 +285,4 @@ def load_prior(folder: str | Path) -> Prior:
         raise InputError(f"{path}: has NaN values, or fewer than two points; make the prior again with `mgs prior`")
     if not (0 < spacing < np.inf and 0 < tolerance < np.inf):
         raise InputError(f"{folder / 'prior.json'}: spacing and depth_tolerance must be positive metres; make the prior again")
-    return Prior(columns[:, :3], columns[:, 3:], spacing, tolerance, numbers)
+    return Prior(read_mesh(folder / "mesh.ply"), columns[:, :3], columns[:, 3:], spacing, tolerance, numbers)

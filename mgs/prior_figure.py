@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from mgs.figures import STYLE, new_figure, save_figure
-from mgs.prior import Prior, Rock, Stages
+from mgs.prior import Prior, Rock
+from mgs.surface import Mesh
 
 MAX_DOTS = 60_000
 """Points drawn per panel; more do not show."""
@@ -15,27 +16,27 @@ LIGHT = np.array([-0.5, 0.4, 0.77])
 """Direction to the light in the picture's frame (right, up, towards the viewer)."""
 
 
-def draw_prior(path: str | Path, prior: Prior, stages: Stages) -> None:
-    """Write the figure as a PNG, atomically."""
+def draw_prior(path: str | Path, prior: Prior, rock: Rock | None) -> None:
+    """Write the figure as a PNG, atomically; rock: what the mesh was built from, None where it was given."""
     import matplotlib
 
-    up = np.array([0.0, 0.0, 1.0]) if stages.rock is None else stages.rock.plane.normal
+    up = np.array([0.0, 0.0, 1.0]) if rock is None else rock.plane.normal
     frame = _oblique(up)
-    body = stages.mesh.vertices
+    body = prior.mesh.vertices
     centre = (body.min(0) + body.max(0)) / 2
     reach = 0.5 * float(np.linalg.norm(np.ptp(body, axis=0)))
     truth = prior.numbers.get("truth")
     error = f", accuracy {1e3 * truth['accuracy']:.2f} mm" if truth else ""
-    unseen = "" if stages.mesh.seen.all() else "\nblue: seen by no frame, not sampled"
+    unseen = "" if prior.mesh.seen.all() else "\nblue: seen by no frame, not sampled"
     shade = np.clip(0.25 + 0.75 * (prior.normals @ frame.T) @ LIGHT, 0.05, 1)[:, None] * [0.95, 0.85, 0.7]
     towards = (prior.normals @ frame.T)[:, 2] > 0
     samples = f"samples: N = {len(prior.points):,} = area / spacing²\nspacing {1e3 * prior.spacing:.2f} mm"
     with matplotlib.rc_context(STYLE | {"axes.spines.top": True, "axes.spines.right": True}):
-        figure = new_figure(17 if stages.rock is not None else 7, 4.2, dpi=100)
-        axes = figure.subplots(1, 5 if stages.rock is not None else 2)
-        if stages.rock is not None:
-            _cloud_panels(axes[:3], stages.rock, frame, centre, reach)
-        _shaded_mesh(axes[-2], stages, frame, centre, reach)
+        figure = new_figure(17 if rock is not None else 7, 4.2, dpi=100)
+        axes = figure.subplots(1, 5 if rock is not None else 2)
+        if rock is not None:
+            _cloud_panels(axes[:3], rock, frame, centre, reach)
+        _shaded_mesh(axes[-2], prior.mesh, frame, centre, reach)
         axes[-2].set_title(f"mesh, {prior.numbers['mesh_area']:.2f} m²{error}{unseen}")
         _dots(axes[-1], ((prior.points - centre) @ frame.T)[towards], shade[towards], None, reach, None)
         axes[-1].set_title(samples)
@@ -75,19 +76,19 @@ def _dots(axis, points: np.ndarray, colour: np.ndarray, colours: str | None, rea
         chosen = np.random.default_rng(0).choice(len(points), MAX_DOTS, replace=False)
         points, colour = points[chosen], colour[chosen]
     order = np.argsort(points[:, 2])
-    size = float(np.clip(60_000 / len(points), 0.3, 12)) if size is None else size
+    size = float(np.clip(60_000 / max(len(points), 1), 0.3, 12)) if size is None else size
     axis.scatter(*points[order, :2].T, c=colour[order], cmap=colours, s=size, linewidths=0, rasterized=True)
     axis.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xticks=[], yticks=[])
 
 
-def _shaded_mesh(axis, stages: Stages, frame: np.ndarray, centre: np.ndarray, reach: float) -> None:
+def _shaded_mesh(axis, mesh: Mesh, frame: np.ndarray, centre: np.ndarray, reach: float) -> None:
     """Faces towards the viewer, painted far to near with Lambert shading."""
     from matplotlib.collections import PolyCollection
 
-    corners = ((stages.mesh.vertices - centre) @ frame.T)[stages.mesh.faces]
+    corners = ((mesh.vertices - centre) @ frame.T)[mesh.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-    colour = np.where(stages.mesh.seen[:, None], [0.82, 0.8, 0.78], [0.25, 0.4, 0.8])
+    colour = np.where(mesh.seen[:, None], [0.82, 0.8, 0.78], [0.25, 0.4, 0.8])
     front = np.flatnonzero(normal[:, 2] > 0)
     front = front[np.argsort(corners[front].mean(1)[:, 2])]
     shade = np.clip(0.25 + 0.75 * normal[front] @ LIGHT, 0.05, 1)[:, None] * colour[front]

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mgs.cloud import Plane
@@ -27,6 +31,10 @@ POISSON_DEPTHS = (5, 10)
 """Least and largest octree depth chosen automatically; a caller may ask for 3 to 12 (beyond, pymeshlab crashes)."""
 OVERSAMPLING = 5
 """Random candidates per blue-noise sample."""
+FURTHEST = 1e15
+"""Largest coordinate of a mesh, metres: squares of areas beyond it leave float32."""
+SAMPLE_BYTES = 3400
+"""Memory that sampling takes per sample, most of it for pairs of candidates (measured: 3.3 to 3.5 kB from 10^5 to 10^6)."""
 
 
 @dataclass(frozen=True)
@@ -40,14 +48,12 @@ class Mesh:
     @property
     def areas(self) -> np.ndarray:
         """[F] square metres."""
-        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
-        return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+        return np.linalg.norm(_crosses(self.vertices, self.faces), axis=1) / 2
 
     @property
     def vertex_normals(self) -> np.ndarray:
         """[V,3] unit, area-weighted over the seen faces (zero at vertices of none)."""
-        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
-        cross = np.cross(b - a, c - a) * self.seen[:, None]
+        cross = _crosses(self.vertices, self.faces) * self.seen[:, None]
         normals = np.zeros_like(self.vertices)
         for k in range(3):
             np.add.at(normals, self.faces[:, k], cross)
@@ -55,10 +61,17 @@ class Mesh:
         return normals / np.where(norm > 0, norm, 1.0)
 
 
+def _crosses(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[F,3] along the normal of each face, twice its area long."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.cross(b - a, c - a)
+
+
 def load_mesh(path: str | Path) -> trimesh.Trimesh:
     """A triangle mesh (GLB, OBJ, PLY ...) as it is in its file, with its texture.
 
-    Raises InputError where it is missing or unreadable, has no faces, or holds NaN vertices.
+    Raises InputError where it is missing or unreadable, has no faces or no area, holds NaN or infinite vertices, or has faces
+    of vertices that are not there.
     """
     import trimesh
 
@@ -75,19 +88,60 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     if not np.isfinite(mesh.vertices).all():
         first = int(np.argwhere(~np.isfinite(mesh.vertices))[0][0])
         raise InputError(f"{path}: vertex {first} is NaN or infinite; repair the mesh")
+    absent = (mesh.faces < 0) | (mesh.faces >= len(mesh.vertices))
+    if absent.any():
+        face, corner = np.argwhere(absent)[0]
+        raise InputError(
+            f"{path}: face {face} names vertex {mesh.faces[face, corner]} of {len(mesh.vertices)}; repair the mesh"
+        )
+    if np.abs(mesh.vertices).max() > FURTHEST:
+        raise InputError(f"{path}: has vertices further than {FURTHEST:g} m from the origin; repair or scale the mesh")
+    if not _crosses(np.asarray(mesh.vertices, np.float64), mesh.faces).any():
+        raise InputError(f"{path}: none of its faces has an area; repair the mesh")
     return mesh
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """A triangle mesh in world coordinates, metres, turned right side out; all of it counts as seen.
+    """A triangle mesh in world coordinates, metres, as one clean surface; all of it counts as seen.
 
-    Raises InputError as `load_mesh`.
+    Left out: faces without area, faces that are there twice (whichever way round), vertices of no face. Faces wound against
+    their neighbours are turned, and then all of them where the mesh is inside out. Raises InputError as `load_mesh`.
     """
     mesh = load_mesh(path)
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    faces = faces[np.linalg.norm(_crosses(vertices, faces), axis=1) > 0]
+    place = np.unique(vertices + 0.0, axis=0, return_inverse=True)[1].ravel()  # one number for vertices at one place; -0 is 0
+    first = np.unique(np.sort(place[faces], axis=1), axis=0, return_index=True)[1]
+    faces = faces[np.sort(first)]
+    faces = np.where(_wound_against(place[faces])[:, None], faces[:, ::-1], faces)
+    used, corners = np.unique(faces, return_inverse=True)
+    vertices, faces = vertices[used], corners.reshape(faces.shape)
     a, b, c = (vertices[faces[:, k]] - vertices.mean(0) for k in range(3))
     inside_out = np.einsum("fk,fk->f", a, np.cross(b, c)).sum() < 0  # six times the signed volume
     return Mesh(vertices, faces[:, ::-1] if inside_out else faces, np.ones(len(faces), bool))
+
+
+def _wound_against(faces: np.ndarray) -> np.ndarray:
+    """[F] bool: which faces [F,3] to turn so that neighbours are wound alike; in each connected piece, the fewer.
+
+    Neighbours share an edge that no third face has, and are wound alike where they run along it in opposite directions. In a
+    graph with two nodes for each face, one for either winding, the windings that go together are connected. A piece that has
+    only one side (a Moebius strip) is left as it is.
+    """
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    forward = edges[:, 0] < edges[:, 1]
+    _, edge, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    edge = edge.ravel()
+    order = np.argsort(edge, kind="stable")
+    first, second = order[count[edge[order]] == 2].reshape(-1, 2).T
+    against = forward[first] == forward[second]
+    n, first, second = len(faces), first // 3, second // 3
+    if not against.any():
+        return np.zeros(n, bool)
+    ends = np.concatenate([first, first + n]), np.concatenate([second + n * against, second + n * ~against])
+    label = connected_components(coo_array((np.ones(len(ends[0]), bool), ends), shape=(2 * n, 2 * n)), directed=False)[1]
+    turned, piece = label[:n] > label[n:], np.minimum(label[:n], label[n:])
+    return turned ^ (np.bincount(piece, turned) > np.bincount(piece) / 2)[piece]
 
 
 def estimate_normals(points: np.ndarray, views: np.ndarray, roughness: float = 0.0) -> np.ndarray:
@@ -145,16 +199,24 @@ def sample_surface(
 
     Give count N or spacing (metres). A greedy Poisson-disk subset of 5 N uniform candidates, with the largest radius that
     keeps N of them; the few too many with the nearest neighbours are dropped.
-    Returns (points [N,3], unit normals [N,3], spacing in metres). Raises InputError for fewer than two samples.
+    Returns (points [N,3], unit normals [N,3], spacing in metres). Raises InputError for fewer than two samples, for more than
+    memory holds, and where float32, in which Gaussians are kept, does not tell neighbours apart.
     """
     areas = np.where(mesh.seen, mesh.areas, 0.0)
     area = float(areas.sum())
     if count is None:
         assert spacing is not None
-        count = round(area / spacing**2)
-    if count < 2:
-        raise InputError(f"prior: {count} samples are too few for a model; ask for more Gaussians (or a smaller --spacing)")
+        square = spacing * spacing
+        count = _count(area / square if square > 0 else np.inf)
+    else:
+        count = _count(count)
     spacing = float(np.sqrt(area / count))
+    furthest = float(np.abs(mesh.vertices[mesh.faces[mesh.seen]]).max())
+    if furthest * np.finfo(np.float32).eps > spacing / 10:
+        raise InputError(
+            f"prior: float32 does not resolve samples {spacing:.3g} m apart at {furthest:.3g} m from the origin; "
+            "move the mesh and the cameras to the origin, or ask for fewer Gaussians"
+        )
     rng = np.random.default_rng(seed)
     face = rng.choice(len(areas), OVERSAMPLING * count, p=areas / area)
     u, v = rng.random((2, len(face)))
@@ -163,7 +225,23 @@ def sample_surface(
     points = np.einsum("nk,nki->ni", weights, mesh.vertices[mesh.faces[face]])
     keep = _blue_noise(points, count, spacing)
     normals = np.einsum("nk,nki->ni", weights[keep], mesh.vertex_normals[mesh.faces[face[keep]]])
+    flat = np.linalg.norm(normals, axis=1) < 1e-6  # normals of the corners cancel (a fold): the face's own
+    normals[flat] = _crosses(mesh.vertices, mesh.faces[face[keep[flat]]])
     return points[keep], normals / np.linalg.norm(normals, axis=1, keepdims=True), spacing
+
+
+def _count(samples: float) -> int:
+    """The number of samples, rounded. Raises InputError where it is below 2, or takes more memory than the machine has."""
+    needed, there = Decimal(samples) * SAMPLE_BYTES, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if needed > there:
+        raise InputError(
+            f"prior: N = {Decimal(samples):.4g} samples take about {needed / 10**9:.3g} GB of memory, and this machine has "
+            f"{there / 1e9:.3g} GB; ask for fewer Gaussians (or a larger --spacing)"
+        )
+    count = round(samples)
+    if count < 2:
+        raise InputError(f"prior: {count} samples are too few for a model; ask for more Gaussians (or a smaller --spacing)")
+    return count
 
 
 def _blue_noise(points: np.ndarray, count: int, spacing: float) -> np.ndarray:

@@ -45,38 +45,3 @@ def in_mask(points: np.ndarray, frame: Frame) -> np.ndarray:
     column = np.clip(np.floor(pixels[:, 0]), 0, frame.camera.width - 1).astype(int)
     row = np.clip(np.floor(pixels[:, 1]), 0, frame.camera.height - 1).astype(int)
     return frame.mask()[row, column]
-
-
-def silhouette(points: np.ndarray, normals: np.ndarray, camera: Camera, spacing: float) -> np.ndarray:
-    """[H,W] bool: the pixels that a sampled surface covers; either side of it counts.
-
-    points [N,3] world, metres, at most a pixel apart; normals [N,3] unit; spacing: metres.
-    """
-    towards = np.einsum("nk,nk->n", normals, camera.position - points)
-    return depth_of_surfels(points, normals * np.where(towards < 0, -1.0, 1.0)[:, None], camera, spacing) > 0
-
-
-def depth_of_surfels(points: np.ndarray, normals: np.ndarray, camera: Camera, radius: float) -> np.ndarray:
-    """z-buffer [H,W] of one-sided discs of `radius` (metres) at points [N,3] with unit normals [N,3]; 0 where none is hit."""
-    pixels, z = camera.project(points)
-    rotation = camera.world_to_camera[:3, :3]
-    facing = (z > radius) & (np.einsum("nk,nk->n", normals, camera.position - points) > 0)
-    pixels, z = pixels[facing], z[facing]
-    centre = points[facing] @ rotation.T + camera.world_to_camera[:3, 3]
-    normal = normals[facing] @ rotation.T
-    buffer = np.full((camera.height, camera.width), np.inf)
-    if len(z) == 0:
-        return np.zeros_like(buffer)
-    reach = int(np.ceil(radius * camera.K[0, 0] / z.min()))
-    for dv in range(-reach, reach + 1):
-        for du in range(-reach, reach + 1):
-            column, row = np.floor(pixels[:, 0]) + du, np.floor(pixels[:, 1]) + dv
-            x = (column + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
-            y = (row + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
-            ray = np.stack([x, y, np.ones_like(x)], 1)
-            along = np.einsum("nk,nk->n", normal, ray)
-            hit = np.einsum("nk,nk->n", normal, centre) / np.where(along < -1e-9, along, -1e-9)
-            inside = (along < -1e-9) & (np.linalg.norm(hit[:, None] * ray - centre, axis=1) <= radius) & (hit > 0)
-            inside &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-            np.minimum.at(buffer, (row[inside].astype(int), column[inside].astype(int)), hit[inside])
-    return np.where(np.isfinite(buffer), buffer, 0.0)

@@ -25,7 +25,7 @@ from mgs.conventions import Camera, look_at, opengl_from_opencv
 from mgs.dataset import Dataset, Frame, load_dataset, write_transforms
 from mgs.files import read_json, write_json, write_png
 from mgs.imports import import_source, read_source, undistorter
-from mgs.prior import PriorSettings, build_prior, load_prior, prior_from_mesh
+from mgs.prior import PriorSettings, build_prior, load_prior
 
 
 def _import(source: Path, out: Path, **options: Any) -> Dataset:
@@ -123,11 +123,10 @@ def test_colmap_export_and_import(dataset: Dataset, tmp_path: Path, binary: bool
 def test_a_prior_from_sparse_points(dataset: Dataset, tmp_path: Path) -> None:
     _write_colmap(dataset, tmp_path / "colmap", True)
     copy = _import(tmp_path / "colmap", tmp_path / "copy")
-    prior, stages = build_prior(copy, PriorSettings(gaussians=800))
+    prior, rock = build_prior(copy, PriorSettings(gaussians=800))
     on_rock = np.sqrt((((prior.points - synthetic.CENTRE) / synthetic.AXES) ** 2).sum(1))
     assert np.median(np.abs(on_rock - 1)) < 0.02
-    assert stages.rock is not None
-    assert len(stages.rock.points) > 2000
+    assert len(rock.points) > 2000
 
 
 def test_nerf_synthetic_with_alpha(dataset: Dataset, tmp_path: Path) -> None:
@@ -353,34 +352,6 @@ def test_bad_input_is_one_line_and_leaves_nothing(case: str, tmp_path: Path, cap
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("missing.ply", None, "no such mesh"),
-        ("broken.ply", b"ply\nformat nonsense", "not a readable mesh"),
-        (
-            "points.ply",
-            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
-            b"end_header\n0 0 0\n",
-            "has no faces",
-        ),
-        ("nan.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "vertex 0 is NaN"),
-    ],
-)
-def test_bad_mesh_is_one_line(
-    dataset: Dataset, tmp_path: Path, name: str, content: bytes | None, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    if content is not None:
-        (tmp_path / name).write_bytes(content)
-    with pytest.raises(SystemExit) as exit_:
-        main(["prior", str(dataset.root), "--mesh", str(tmp_path / name), "--gaussians", "100"])
-    error = capsys.readouterr().err.strip()
-    assert exit_.value.code == 2
-    assert message in error
-    assert "\n" not in error
-    assert not (dataset.root / "prior").exists()
-
-
 def test_an_empty_mask_in_every_frame_is_one_line(dataset: Dataset) -> None:
     from mgs.errors import InputError
 
@@ -389,19 +360,3 @@ def test_an_empty_mask_in_every_frame_is_one_line(dataset: Dataset) -> None:
     blind = Dataset(dataset.root, tuple(replace(frame, mask_path=empty) for frame in dataset.frames))
     with pytest.raises(InputError, match="rock mask"):
         build_prior(blind, PriorSettings(gaussians=100))
-
-
-def test_a_mesh_with_holes_is_sampled(tmp_path: Path, dataset: Dataset) -> None:
-    mesh = synthetic.rock_mesh()
-    mesh.update_faces(np.random.default_rng(0).random(len(mesh.faces)) > 0.2)
-    mesh.export(tmp_path / "holes.ply")
-    prior, _ = prior_from_mesh(tmp_path / "holes.ply", PriorSettings(gaussians=200))
-    assert len(prior.points) == 200
-
-
-def test_a_mesh_inside_out_is_turned(tmp_path: Path) -> None:
-    mesh = synthetic.rock_mesh()
-    mesh.invert()
-    mesh.export(tmp_path / "inverted.ply")
-    prior, _ = prior_from_mesh(tmp_path / "inverted.ply", PriorSettings(gaussians=200))
-    assert (((prior.points - synthetic.CENTRE) * prior.normals).sum(1) > 0).all()

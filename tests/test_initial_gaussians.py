@@ -74,12 +74,12 @@ def test_the_far_side_of_one_frame_stays_grey(prior: Prior, dataset: Dataset) ->
     assert np.allclose(gaussians.rgb[~seen], GREY, atol=1e-6)
 
 
-def test_a_zbuffer_stands_in_for_missing_depth(prior: Prior, dataset: Dataset) -> None:
+def test_the_mesh_stands_in_for_missing_depth(prior: Prior, dataset: Dataset) -> None:
     frames = dataset.frames[::3]
     _, by_depth = initial_gaussians(prior, frames)
-    gaussians, by_buffer = initial_gaussians(prior, [replace(frame, depth_path=None) for frame in frames])
-    assert (by_depth == by_buffer).mean() > 0.93
-    error = np.abs(gaussians.rgb - synthetic.albedo(prior.points))[by_buffer]
+    gaussians, by_mesh = initial_gaussians(prior, [replace(frame, depth_path=None) for frame in frames])
+    assert (by_depth == by_mesh).mean() > 0.93
+    error = np.abs(gaussians.rgb - synthetic.albedo(prior.points))[by_mesh]
     assert np.quantile(error, 0.95) < 0.08
 
 

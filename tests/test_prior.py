@@ -16,13 +16,14 @@ import synthetic
 
 from mgs.cli import main
 from mgs.cloud import Cloud, degrade, focus, fuse_frames, ground_plane, rock_cluster
-from mgs.conventions import Camera
+from mgs.conventions import Camera, look_at
 from mgs.dataset import Dataset, load_dataset, write_transforms
 from mgs.errors import InputError
 from mgs.files import write_exr
 from mgs.prior import PriorSettings, build_prior, load_prior, save_prior
+from mgs.raycast import mesh_depth
 from mgs.surface import Mesh, distances_to_mesh, estimate_normals, sample_surface
-from mgs.visibility import depth_of_surfels, visible
+from mgs.visibility import visible
 
 X, Y, Z = np.eye(3)
 
@@ -160,23 +161,48 @@ def test_visible_is_the_near_side() -> None:
         assert not seen[points[:, 2] < -0.1].any()
 
 
-def test_depth_of_surfels_agrees_with_ray_casting() -> None:
+@pytest.mark.parametrize("far", [0.0, 1e6])
+def test_depth_of_a_box_is_exact(far: float) -> None:
+    """Against the slabs of the box in closed form; float32 even a thousand kilometres from the origin."""
+    size, middle = np.array([1.0, 0.7, 0.5]), np.array([far, -far, 0.3])
+    box = trimesh.creation.box(size)
+    K = np.array([[80.0, 0, 30.2], [0, 75.0, 25.9], [0, 0, 1]])
+    camera = Camera(K, 64, 48, look_at(middle + np.array([1.7, 1.1, 0.9]), middle))
+    found = mesh_depth(Mesh(box.vertices + middle, box.faces, np.ones(12, bool)))(camera)
+    rays = camera.unproject(np.ones((48, 64))) - camera.position
+    slabs = np.stack([(side * size / 2 + middle - camera.position) / rays for side in (-1, 1)])
+    near, away = slabs.min(0).max(-1), slabs.max(0).min(-1)
+    grazing = np.abs(near - away) < 1e-5
+    assert found.shape == (48, 64)
+    assert 300 < (found > 0).sum() < 2000
+    assert np.array_equal((found > 0)[~grazing], (near < away)[~grazing])
+    assert np.allclose(found[(near < away) & (found > 0)], near[(near < away) & (found > 0)], rtol=2e-6, atol=0)
+
+
+def test_depth_of_an_ellipsoid_agrees_with_ray_casting() -> None:
     camera = synthetic.orbit_cameras(1, 64, 48)[0]
-    mesh = synthetic.rock_mesh()
-    points, normals, spacing = sample_surface(Mesh(mesh.vertices, mesh.faces, np.ones(len(mesh.faces), bool)), 0, count=20_000)
-    depth = depth_of_surfels(points, normals, camera, spacing)
-    rock, ground = (synthetic.CENTRE + 10 * Z, synthetic.AXES), camera.world_to_camera.copy()
-    ground[:3, 3] -= ground[:3, :3] @ (10 * Z)
-    true, mask, _ = synthetic.cast(Camera(camera.K, 64, 48, ground), [rock])  # lifted off the ground
-    both = mask & (depth > 0)
-    assert (depth > 0)[mask].all()
-    assert (depth > 0).sum() < 1.1 * mask.sum()
-    assert np.quantile(np.abs(depth - true)[both], 0.95) < 2e-3
+    rock = synthetic.rock_mesh()
+    found = mesh_depth(Mesh(rock.vertices, rock.faces, np.ones(len(rock.faces), bool)))(camera)
+    lifted = camera.world_to_camera.copy()
+    lifted[:3, 3] -= lifted[:3, :3] @ (10 * Z)  # rock and camera, off the ground
+    true, mask, _ = synthetic.cast(Camera(camera.K, 64, 48, lifted), [(synthetic.CENTRE + 10 * Z, synthetic.AXES)])
+    both = mask & (found > 0)
+    assert (mask ^ (found > 0)).sum() < 5
+    assert np.quantile(np.abs(found - true)[both], 0.95) < 1e-3  # facets in place of the ellipsoid
+
+
+def test_depth_of_a_mesh_that_comes_within_a_micrometre_of_the_camera_plane() -> None:
+    """The sheet x = z - 0.5 of the camera's frame, from z = 1e-6 to 4; a splat of its nearest point would fill any image."""
+    camera = Camera(np.array([[800.0, 0, 320], [0, 800.0, 240], [0, 0, 1]]), 640, 480, np.eye(4))
+    corners = np.array([[z - 0.5, y, z] for z in (1e-6, 4.0) for y in (-9.0, 9.0)])
+    found = mesh_depth(Mesh(corners, np.array([[0, 1, 2], [2, 1, 3]]), np.ones(2, bool)))(camera)
+    slope = (np.arange(640) + 0.5 - 320) / 800
+    assert np.allclose(found, np.broadcast_to(0.5 / (1 - slope), (480, 640)), rtol=1e-5)
 
 
 def test_prior_is_near_the_truth(built) -> None:
-    prior, stages = built
-    numbers, voxel = prior.numbers, stages.rock.cloud.voxel
+    prior, rock = built
+    numbers, voxel = prior.numbers, rock.cloud.voxel
     truth = numbers["truth"]
     assert len(prior.points) == 1500
     assert numbers["n"] == pytest.approx(numbers["sampled_area"] / prior.spacing**2)
@@ -186,9 +212,9 @@ def test_prior_is_near_the_truth(built) -> None:
     assert truth["chamfer"] == pytest.approx((truth["accuracy"] + truth["completeness"]) / 2)
     assert truth["visible_within_2_spacing"] == 1
     assert truth["visible_share"] > 0.98
-    assert trimesh.Trimesh(stages.mesh.vertices, stages.mesh.faces).is_watertight
+    assert trimesh.Trimesh(prior.mesh.vertices, prior.mesh.faces).is_watertight
     # All but the flat base is seen, and no less of the ellipsoid is sampled than stands above the ground.
-    height = stages.rock.plane.height(stages.mesh.vertices[stages.mesh.faces[~stages.mesh.seen]].mean(1))
+    height = rock.plane.height(prior.mesh.vertices[prior.mesh.faces[~prior.mesh.seen]].mean(1))
     assert np.abs(height).max() < 1e-6
     analytic = (prior.points - synthetic.CENTRE) / synthetic.AXES**2
     analytic /= np.linalg.norm(analytic, axis=1, keepdims=True)
@@ -198,21 +224,19 @@ def test_prior_is_near_the_truth(built) -> None:
 def test_error_to_truth_sees_a_wrong_prior(built, dataset: Dataset) -> None:
     from mgs.prior import error_to_truth
 
-    prior, stages = built
-    moved = Mesh(stages.mesh.vertices + 0.05 * Z, stages.mesh.faces, stages.mesh.seen)
-    error = error_to_truth(
-        prior.points + 0.05 * Z, prior.spacing, moved, dataset.root / "rock.glb", dataset.frames, stages.rock, 0
-    )
+    prior, rock = built
+    moved = Mesh(prior.mesh.vertices + 0.05 * Z, prior.mesh.faces, prior.mesh.seen)
+    error = error_to_truth(prior.points + 0.05 * Z, prior.spacing, moved, dataset.root / "rock.glb", dataset.frames, rock, 0)
     assert 0.02 < error["accuracy"] < 0.05
     assert error["hausdorff"] == pytest.approx(0.05, abs=0.02)
 
 
 def test_prior_round_trip_and_determinism(built, dataset: Dataset, tmp_path: Path) -> None:
-    prior, stages = built
+    prior = built[0]
     again, _ = build_prior(dataset, PriorSettings(gaussians=1500))
     assert np.array_equal(prior.points, again.points)
     assert prior.numbers == again.numbers
-    loaded = load_prior(save_prior(tmp_path / "prior", prior, stages.mesh))
+    loaded = load_prior(save_prior(tmp_path / "prior", prior))
     assert np.allclose(loaded.points, prior.points, atol=1e-6)
     assert np.allclose(loaded.normals, prior.normals, atol=1e-6)
     assert loaded.spacing == prior.spacing
@@ -333,7 +357,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
 
 @pytest.mark.parametrize("damage", ["missing", "cut", "nan", "json"])
 def test_damaged_prior_is_one_line(built, tmp_path: Path, damage: str) -> None:
-    folder = save_prior(tmp_path / "prior", built[0], built[1].mesh)
+    folder = save_prior(tmp_path / "prior", built[0])
     points = folder / "points.ply"
     if damage == "missing":
         points.unlink()

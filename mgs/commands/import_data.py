@@ -24,22 +24,24 @@ def import_data(
     from rich.console import Console
     from rich.progress import Progress
 
+    from mgs import runtime
     from mgs.errors import InputError
     from mgs.files import folder_or_nothing
-    from mgs.imports import import_source, mesh_silhouette, read_source
+    from mgs.imports import import_source, read_source
 
     console, notes = Console(), Console(stderr=True)
     if masks is not None and mesh is not None:
         raise InputError("import: --masks and --mesh both say where masks come from; give one of them")
     found = read_source(source, images, split)
-    project = mesh_silhouette(mesh, found.shots) if mesh is not None else None
+    if mesh is not None:
+        runtime.start()  # to cast rays at it
     with folder_or_nothing(out), Progress(console=console, transient=True) as progress:
         bar = progress.add_task("importing")
         result = import_source(
             found,
             out,
             masks=masks,
-            project=project,
+            mesh=mesh,
             on_frame=lambda done, total: progress.update(bar, completed=done, total=total),
         )
     if found.missing:

@@ -142,12 +142,12 @@ def start_run(
     with atomic_folder(out) as unfinished:
         if prior is None:
             with console.status("building the prior") as status:
-                built, stages = build_prior(
+                built, _ = build_prior(
                     frames,
                     PriorSettings(gaussians=gaussians, seed=settings.seed),
                     on_stage=lambda stage: status.update(f"prior: {stage}"),
                 )
-            save_prior(unfinished / "prior", built, stages.mesh)
+            save_prior(unfinished / "prior", built)
         start(unfinished, settings, frames)
 
 

@@ -32,6 +32,7 @@ def prior(
     import numpy as np
     from rich.console import Console
 
+    from mgs import runtime
     from mgs.dataset import load_dataset
     from mgs.files import atomic_folder, check_new_folder
     from mgs.initial import initial_gaussians
@@ -45,18 +46,20 @@ def prior(
     settings = PriorSettings(gaussians, spacing, poisson_depth, prior_noise, holes, seed)
     with console.status("reading") as status:
         if mesh is not None:
-            result, stages = prior_from_mesh(mesh, settings)
+            result, rock = prior_from_mesh(mesh, settings), None
         else:
-            result, stages = build_prior(frames, settings, lambda stage: status.update(f"prior: {stage}"))
+            result, rock = build_prior(frames, settings, lambda stage: status.update(f"prior: {stage}"))
         status.update("prior: what four seed frames see")
         positions = np.stack([frame.camera.position for frame in frames.frames])
         seeds = seed_views(positions, result.points.mean(0), min(SEEDS, len(frames)))
+        if not all(frames.frames[k].depth_path for k in seeds):
+            runtime.start()
         seen = initial_gaussians(result, [frames.frames[k] for k in seeds])[1]
         result = replace(result, numbers=result.numbers | {"seen_by_seeds": float(seen.mean())})
         status.update("prior: picture")
         with atomic_folder(folder) as unfinished:
-            save_prior(unfinished, result, stages.mesh)
-            draw_prior(unfinished / "prior.png", result, stages)
+            save_prior(unfinished, result)
+            draw_prior(unfinished / "prior.png", result, rock)
     console.print(_table(result.numbers))
     console.print(f"wrote {folder}: mesh.ply, points.ply, prior.json, prior.png")
 
@@ -69,7 +72,8 @@ def _table(numbers: dict[str, Any]) -> Any:
     table = Table("station", "number", title="Mesh prior")
     if "points" in numbers:
         _add_cloud_rows(table, numbers)
-    table.add_row("area, A", f"{area:.4f} m² sampled (what some frame saw), of {numbers['mesh_area']:.4f} m²")
+    part = "" if "mesh" in numbers else f" sampled (what some frame saw), of {numbers['mesh_area']:.4f} m²"
+    table.add_row("area, A", f"{area:.4f} m²{part}")
     table.add_row("samples, N = A / spacing²", f"{n:,} = {area:.4f} / {spacing:.6f}²")
     mean, least = (numbers[key] / spacing for key in ("nearest_neighbour_mean", "nearest_neighbour_min"))
     table.add_row("nearest neighbour over spacing", f"mean {mean:.2f}, least {least:.2f}")
