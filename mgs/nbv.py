@@ -9,9 +9,10 @@ A run lives in one folder:
 
 A line of `steps.jsonl` holds: `step` (0 = the seeds), `frame` and `name` of the chosen view (null at step 0, which has `seeds`
 and `seed_names` instead), `images` (how many the model has now), `gain` (the policy's own score; null for random),
-`information_gain` (Eq. 7 of the chosen view, whatever the policy), `coverage` (Eq. 9 of all images), `iterations`, `loss` and
-`stop_reason` of the fit, `seconds` per stage, and, where the step was evaluated, mean PSNR in dB over all views (`psnr`;
-`psnr_mask` in the rock mask) and over those never trained on (`held_out_psnr`, `held_out_psnr_mask`).
+`information_gain` (Eq. 7 of the chosen view, whatever the policy), `coverage` (Eq. 9 of all images), `iterations`, `loss` (of
+the pass whose model was kept, `mgs.train.Fit`) and `stop_reason` (`mgs.stopping.StopReason`) of the fit, `seconds` per stage,
+and, where the step was evaluated, mean PSNR in dB over all views (`psnr`; `psnr_mask` in the rock mask) and over those never
+trained on (`held_out_psnr`, `held_out_psnr_mask`).
 
 The candidates' images are never read: only the cameras of frames not taken yet are touched before a choice.
 """
@@ -21,7 +22,7 @@ from __future__ import annotations
 import json
 import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -38,6 +39,7 @@ from mgs.errors import InputError
 from mgs.files import atomic_path, read_json, write_json
 from mgs.gaussians import Gaussians, write_ply
 from mgs.seeds import generator
+from mgs.stopping import StopReason
 
 Progress = Callable[[str, int, int], None]
 """Called as progress(stage, done, total)."""
@@ -53,7 +55,9 @@ class Fit(Protocol):
     @property
     def iterations(self) -> int: ...
     @property
-    def stop_reason(self) -> str: ...
+    def losses(self) -> Sequence[float]: ...
+    @property
+    def stop_reason(self) -> StopReason: ...
 
 
 @dataclass(frozen=True)
@@ -154,12 +158,13 @@ def run(
     progress is told of the work inside a step, on_step of every state that is committed.
 
     Killed at any moment and called again, it takes the same views as a run that was never interrupted. Raises InputError
-    as `check_settings`, and where a frame it takes cannot be read or has an empty mask, before the fit.
+    as `check_settings`, where a frame it takes cannot be read or has an empty mask, before the fit, and where the fit diverged:
+    the steps before it are kept.
     """
     check_settings(settings, len(dataset))
     for leftover in out.glob(".*.part*"):  # of a killed write
         leftover.unlink()
-    loop = _Loop(settings, dataset, stations, progress)
+    loop = _Loop(out, settings, dataset, stations, progress)
     state = read_checkpoint(out)
     if state is None:
         state = loop.first()
@@ -177,8 +182,8 @@ def run(
 class _Loop:
     """What stays the same from step to step; each method is a function of the state."""
 
-    def __init__(self, settings: NbvSettings, dataset: Dataset, stations: Stations, progress: Progress) -> None:
-        self.settings, self.frames, self.stations, self.progress = settings, dataset.frames, stations, progress
+    def __init__(self, out: Path, settings: NbvSettings, dataset: Dataset, stations: Stations, progress: Progress) -> None:
+        self.out, self.settings, self.frames, self.stations, self.progress = out, settings, dataset.frames, stations, progress
         self.cameras = [frame.camera for frame in dataset.frames]
         self.positions = np.array([camera.position for camera in self.cameras])
         self.lam = policies.regularisation(stations.groups, settings.pixel_noise, settings.prior_std)
@@ -233,6 +238,8 @@ class _Loop:
             targets = [self.images[i] for i in taken]
             rate = self.settings.warm_rate if step else 1.0
             fit = self.stations.fit(state.gaussians, cameras, targets, rate, partial(self.progress, "fitting"))
+        if fit.stop_reason == StopReason.DIVERGED:
+            raise InputError(_diverged(self.out, step, fit.losses))
         with watch("information"):
             H = np.zeros((len(fit.gaussians), len(self.lam)))
             for done, camera in enumerate(cameras):
@@ -260,6 +267,18 @@ def _target(frame: Frame) -> np.ndarray:
     if not frame.mask().any():
         raise InputError(f"{frame.mask_path}: the rock mask of frame {frame.name} is empty; correct it, or remove the frame")
     return frame.masked_rgb()
+
+
+def _diverged(out: Path, step: int, losses: Sequence[float]) -> str:
+    """What to say of a fit that diverged: the loss of the model it started from, and of its last passes."""
+    first, *passes = (f"{loss:.3g}" for loss in losses)
+    fit = "the fit to the seeds" if step == 0 else f"the fit of step {step}"
+    kept = {0: "", 1: "; step 0 is kept"}.get(step, f"; steps 0 to {step - 1} are kept")
+    rates = "`train.rates`" if step == 0 else "`warm_rate` or `train.rates`"
+    return (
+        f"{out}: {fit} diverged: its loss was {first} at the start, and {', '.join(passes[-3:])} in the last passes; "
+        f"lower the learning rates ({rates} in {out / 'config.json'}) and go on with `mgs nbv --resume {out}`{kept}"
+    )
 
 
 def write_checkpoint(out: Path, state: State) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,7 @@ from mgs import nbv, policies
 from mgs.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.gaussians import read_ply
+from mgs.stopping import StopReason
 
 
 @pytest.fixture(scope="module")
@@ -214,6 +217,31 @@ def test_interrupted_by_the_keyboard_then_resumed(dataset, tmp_path, uninterrupt
         run(out, dataset, tiny.stations(fit=fit), seed=3)
     assert len(lines(out)) == 3
     assert nbv.run(out, nbv.read_settings(out), dataset, tiny.stations(), tiny.silent).taken == uninterrupted[0].taken
+
+
+@pytest.mark.parametrize(
+    ("broken", "named"), [(0, "the fit to the seeds"), (1, "the fit of step 1 .*step 0 is kept"), (3, "steps 0 to 2 are kept")]
+)
+def test_a_fit_that_diverges_ends_the_run_which_can_go_on(dataset, tmp_path, uninterrupted, broken, named):
+    def fit(gaussians, cameras, *rest):
+        found = tiny.fit(gaussians, cameras, *rest)
+        if len(cameras) < 3 + broken:
+            return found
+        found.gaussians.sh[:] = np.nan
+        return replace(found, losses=(0.01234, 0.5, math.nan), stop_reason=StopReason.DIVERGED)
+
+    out = tmp_path / "run"
+    with pytest.raises(InputError, match=named) as stop:
+        run(out, dataset, tiny.stations(fit=fit), seed=3)
+    said = str(stop.value)
+    assert "diverged: its loss was 0.0123 at the start, and 0.5, nan in the last passes" in said
+    assert f"`train.rates` in {out / 'config.json'}" in said
+    assert f"mgs nbv --resume {out}" in said
+    assert "\n" not in said
+    assert ((out / "steps.jsonl").exists() and len(lines(out))) == broken
+    resumed = nbv.run(out, nbv.read_settings(out), dataset, tiny.stations(), tiny.silent)
+    assert resumed.taken == uninterrupted[0].taken
+    assert (out / "gaussians.ply").read_bytes() == uninterrupted[1]
 
 
 def test_resuming_a_finished_run_changes_nothing(dataset, tmp_path):

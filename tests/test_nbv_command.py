@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny
+from refusals import refused
 from rich.console import Console
 
 from mgs import nbv, policies
@@ -114,6 +115,22 @@ def test_damaged_settings_of_the_fit_are_one_line_on_resume(dataset, tmp_path, c
     shown = capsys.readouterr().err
     assert f"config.json: train.{next(iter(train))}" in shown
     assert len(shown.splitlines()) == 1
+
+
+def test_learning_rates_that_are_too_high_are_one_line(dataset, prior, tmp_path, capsys):
+    """The loss settles on that of a black image: flat, but above its start."""
+    run = tmp_path / "run"
+    train = train_settings(None, 0) | {"rates": [20, 20, 10, 50]}
+    tiny.start(run, load_dataset(dataset), prior=prior, budget=1, train=train)
+    said = refused(capsys, ["nbv", "--resume", run])
+    assert "the fit to the seeds diverged: its loss was" in said
+    assert "lower the learning rates (`train.rates` in" in said
+    config = json.loads((run / "config.json").read_text())
+    config["settings"]["train"] = train_settings(None, 0)
+    write_json(run / "config.json", config)
+    with pytest.raises(SystemExit) as stop:
+        main(["nbv", "--resume", str(run)])
+    assert stop.value.code == 0
 
 
 def test_a_run_appears_whole_or_not_at_all(dataset, tmp_path, monkeypatch):
