@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,8 @@ from mgs.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.evaluate import load_run
 from mgs.files import write_json, write_png
+from mgs.prior import load_prior, save_prior
+from mgs.surface import Mesh
 
 
 @pytest.fixture
@@ -128,6 +130,34 @@ def test_learning_rates_that_are_too_high_are_one_line(dataset, prior, tmp_path,
     config = json.loads((run / "config.json").read_text())
     config["settings"]["train"] = train_settings(None, 0)
     write_json(run / "config.json", config)
+    with pytest.raises(SystemExit) as stop:
+        main(["nbv", "--resume", str(run)])
+    assert stop.value.code == 0
+
+
+@pytest.mark.parametrize("change", ["normals", "spacing", "points", "count"])
+def test_a_replaced_prior_is_one_line_on_resume(dataset, prior, tmp_path, capsys, change):
+    """Whatever changed in it; nothing is lost, and with the old one back the run goes on."""
+    run = tmp_path / "run"
+    tiny.start(run, load_dataset(dataset), prior=prior, budget=0, train=train_settings(1, 0))
+    with pytest.raises(SystemExit):
+        main(["nbv", "--resume", str(run)])
+    config = json.loads((run / "config.json").read_text())
+    config["settings"]["budget"] = 1
+    write_json(run / "config.json", config)
+    known = load_prior(prior)
+    other = {
+        "normals": replace(known, normals=known.normals[::-1]),
+        "spacing": replace(known, numbers=known.numbers | {"spacing": 0.4}),
+        "points": replace(known, points=known.points[::-1]),
+        "count": replace(known, points=known.points[1:], normals=known.normals[1:]),
+    }[change]
+    prior.rename(tmp_path / "kept")
+    save_prior(prior, other, Mesh(known.points[:3], np.array([[0, 1, 2]]), np.zeros(1, bool)))
+    capsys.readouterr()
+    assert f"{prior}: is not the prior that {run} was started on" in refused(capsys, ["nbv", "--resume", run], run)
+    prior.rename(tmp_path / "other")
+    (tmp_path / "kept").rename(prior)
     with pytest.raises(SystemExit) as stop:
         main(["nbv", "--resume", str(run)])
     assert stop.value.code == 0
