@@ -37,7 +37,7 @@ from mgs.config import NbvSettings, validated, versions
 from mgs.conventions import Camera
 from mgs.dataset import Dataset, Frame
 from mgs.errors import InputError
-from mgs.files import atomic_path, read_json, write_json
+from mgs.files import atomic_path, locked, read_json, write_json
 from mgs.gaussians import Gaussians, write_ply
 from mgs.seeds import generator
 from mgs.stopping import StopReason
@@ -164,29 +164,31 @@ def run(
     progress is told of the work inside a step, on_step of every state that is committed, say of what a user should know.
 
     Killed at any moment and called again, it takes the same views as a run that was never interrupted. Raises InputError
-    as `check_settings`; where the prior, a pose or a file of a frame taken has changed since the steps that are there; before
-    the fit, where a frame it takes cannot be read or has an empty mask; and where the fit diverged: the steps before are kept.
+    as `check_settings`; where another process works on the folder; where the prior, a pose or a file of a frame taken has
+    changed since the steps that are there; before the fit, where a frame it takes cannot be read or has an empty mask; and
+    where the fit diverged: the steps before are kept.
     """
     check_settings(settings, len(dataset))
-    for leftover in out.glob(".*.part*"):  # of a killed write
-        leftover.unlink()
-    state = read_checkpoint(out)
-    if state is not None:
-        check_inputs(out, state, settings, dataset, stations.prior, say)
-    loop = _Loop(out, settings, dataset, stations, progress)
-    if state is not None and not np.array_equal(state.gaussians.means, loop.start.means):
-        raise InputError(inputs.changed_prior(out, settings.prior))
-    if state is None:
-        state = loop.first()
-        write_checkpoint(out, state)
-    on_step(state)
-    while len(state.steps) <= settings.budget:
-        state = loop.next(state)
-        write_checkpoint(out, state)
+    with locked(out):
+        for leftover in out.glob(".*.part*"):  # of a killed write
+            leftover.unlink()
+        state = read_checkpoint(out)
+        if state is not None:
+            check_inputs(out, state, settings, dataset, stations.prior, say)
+        loop = _Loop(out, settings, dataset, stations, progress)
+        if state is not None and not np.array_equal(state.gaussians.means, loop.start.means):
+            raise InputError(inputs.changed_prior(out, settings.prior))
+        if state is None:
+            state = loop.first()
+            write_checkpoint(out, state)
         on_step(state)
-    write_steps(out, state)
-    write_ply(out / "gaussians.ply", state.gaussians)
-    return state
+        while len(state.steps) <= settings.budget:
+            state = loop.next(state)
+            write_checkpoint(out, state)
+            on_step(state)
+        write_steps(out, state)
+        write_ply(out / "gaussians.ply", state.gaussians)
+        return state
 
 
 def check_inputs(

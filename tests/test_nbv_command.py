@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from mgs.commands.nbv import print_run, read_train_settings, start_run, train_se
 from mgs.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.evaluate import load_run
-from mgs.files import write_json, write_png
+from mgs.files import locked, write_json, write_png
 from mgs.prior import load_prior, save_prior
 from mgs.surface import Mesh
 
@@ -160,6 +161,18 @@ def test_a_replaced_prior_is_one_line_on_resume(dataset, prior, tmp_path, capsys
     (tmp_path / "kept").rename(prior)
     with pytest.raises(SystemExit) as stop:
         main(["nbv", "--resume", str(run)])
+    assert stop.value.code == 0
+
+
+@pytest.mark.parametrize("command", [["nbv", "--resume"], ["eval"]])
+def test_one_process_at_a_time_works_on_a_run(dataset, prior, tmp_path, capsys, command):
+    """A second one would take the other's half-written files for those of a killed process, and remove them."""
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    with locked(run):
+        (run / ".checkpoint.1.part.npz").write_bytes(b"half")
+        assert f"{run}: process {os.getpid()} works on it" in refused(capsys, [*command, run], run)
+    with pytest.raises(SystemExit) as stop:
+        main([*command, str(run)])
     assert stop.value.code == 0
 
 

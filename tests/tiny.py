@@ -135,9 +135,13 @@ def write_prior(out: Path) -> Path:
 
 def write_run(out: Path, root: Path, prior: Path) -> Path:
     """A run folder of the seeds alone, on the stand-ins."""
+    from mgs.inputs import prior_digest
+    from mgs.prior import load_prior
+
     dataset = load_dataset(root)
     settings = start(out, dataset, prior=prior, budget=2)
-    nbv.run(out, settings.model_copy(update={"budget": 0}), dataset, stations(), silent)
+    parts = stations(prior=prior_digest(load_prior(prior)))
+    nbv.run(out, settings.model_copy(update={"budget": 0}), dataset, parts, silent)
     return out
 
 
