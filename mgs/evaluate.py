@@ -16,7 +16,7 @@ import numpy as np
 from mgs.conventions import Camera, srgb_from_linear
 from mgs.dataset import Dataset, Frame
 from mgs.errors import InputError
-from mgs.files import atomic_path, read_png, write_json
+from mgs.files import atomic_path, locked, read_png, write_json
 from mgs.gaussians import Gaussians
 
 Renderer = Callable[[Gaussians, Camera], np.ndarray]
@@ -173,13 +173,14 @@ def read_comparison(path: str | Path, camera: Camera) -> tuple[np.ndarray, np.nd
 def evaluate_run(run: str | Path, *, pictures: bool = True, progress: Progress | None = None) -> dict[str, Any]:
     """`evaluate` of a run of `mgs nbv` on its dataset; writes RUN/metrics.json, and RUN/renders/*.png where `pictures`.
 
-    Raises InputError where the run is missing, it has no finished step, or its dataset has changed.
+    Raises InputError as `load_run`, and where another process works on the run.
     """
     run = Path(run)
     gaussians, dataset, trained, policy = load_run(run)
     folder = run / "renders" if pictures else None
-    metrics = {"policy": policy} | evaluate(gaussians, dataset.frames, trained, pictures=folder, progress=progress)
-    write_json(run / "metrics.json", metrics)
+    with locked(run):
+        metrics = {"policy": policy} | evaluate(gaussians, dataset.frames, trained, pictures=folder, progress=progress)
+        write_json(run / "metrics.json", metrics)
     return metrics
 
 

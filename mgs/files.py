@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -148,6 +149,47 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
             os.replace(temporary, path)
         except OSError as error:
             raise _not_writable(path, error) from None
+
+
+@contextmanager
+def locked(folder: str | Path) -> Iterator[None]:
+    """Keep every other process that asks for this lock out of a folder while the block runs.
+
+    Raises InputError where another one has it (names its id), or the folder cannot be written. The lock is the kernel's, on the
+    file FOLDER/.lock: it ends with the process, however that ends, so a file that a killed process left locks nothing.
+    """
+    path = Path(folder) / ".lock"
+    try:
+        file = _lock(path)
+    except OSError as error:
+        raise _not_writable(path, error) from None
+    with file:
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                path.unlink()
+
+
+def _lock(path: Path) -> TextIO:
+    """The file, locked and with this process's id in it. Raises InputError where another process has it."""
+    while True:
+        with ExitStack() as closed_on_failure:
+            file = closed_on_failure.enter_context(open(path, "a+", encoding="ascii"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                file.seek(0)
+                raise InputError(f"{path.parent}: process {file.read()} works on it; wait until it has ended") from None
+            try:
+                ours = os.path.samestat(os.fstat(file.fileno()), os.stat(path))
+            except FileNotFoundError:
+                ours = False
+            if ours:  # not a file that its last owner removed after we opened it
+                file.truncate(0)
+                print(os.getpid(), end="", file=file, flush=True)
+                closed_on_failure.pop_all()
+                return file
 
 
 def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> None:

@@ -13,6 +13,7 @@ from mgs.dataset import Dataset
 from mgs.evaluate import psnr
 from mgs.gaussians import Gaussians
 from mgs.initial import initial_gaussians
+from mgs.inputs import prior_digest
 from mgs.nbv import Stations
 from mgs.prior import Prior
 from mgs.splat import ListCache, fisher, groups, render
@@ -37,6 +38,7 @@ def real_stations(dataset: Dataset, prior: Prior, settings: TrainSettings) -> St
         fit=run_fit,
         fisher=lambda gaussians, camera: fisher(gaussians, camera, cache=cache),
         measure=psnr_measure(dataset, cache),
+        prior=prior_digest(prior),
     )
 
 

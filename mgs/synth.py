@@ -18,7 +18,17 @@ from mgs.config import versions
 from mgs.conventions import Camera, opengl_from_opencv
 from mgs.dataset import FRAME_INTERVAL, Dataset, Frame, load_dataset, write_transforms
 from mgs.errors import InputError
-from mgs.files import atomic_path, check_new_folder, check_writable, new_folder, read_json, write_exr, write_json, write_png
+from mgs.files import (
+    atomic_path,
+    check_new_folder,
+    check_writable,
+    locked,
+    new_folder,
+    read_json,
+    write_exr,
+    write_json,
+    write_png,
+)
 from mgs.orbit import orbit_cameras, perturb
 from mgs.rock import load_rock, make_rock
 from mgs.scene import Scene
@@ -67,7 +77,8 @@ def synthesise(
 
     With `pose_noise` transforms.json holds noisy poses, and true_poses.json the cameras that took the images.
     A folder that an interrupted run of the same settings left is completed; the result is the same as in one run.
-    Raises InputError: output folder not empty or not writable, bad mesh, rock not wholly in every frame, or nowhere in sight.
+    Raises InputError: output folder not empty, not writable or worked on by another process, bad mesh, rock not wholly in every
+    frame, or nowhere in sight.
     """
     started, out = time.perf_counter(), Path(out)
     _is_unfinished(out)  # before the rock is made, which takes seconds
@@ -86,25 +97,28 @@ def synthesise(
     if not goes_on:
         new_folder(out)
         write_json(out / "config.json", resolved)
-    with atomic_path(out / "rock.glb") as temporary:
-        temporary.write_bytes(glb)
-    spp = preset.spp
-    if not denoise:
-        spp *= NOISY_FACTOR
-        say(f"pyoidn is not installed: {spp} samples per pixel in place of denoising; `pip install pyoidn` is faster")
+    with locked(out):
+        for left in out.rglob(".*.part*"):  # of a process that was killed while it wrote
+            left.unlink()
+        with atomic_path(out / "rock.glb") as temporary:
+            temporary.write_bytes(glb)
+        spp = preset.spp
+        if not denoise:
+            spp *= NOISY_FACTOR
+            say(f"pyoidn is not installed: {spp} samples per pixel in place of denoising; `pip install pyoidn` is faster")
 
-    prepared = time.perf_counter()
-    seconds = _render_frames(scene, frames, exposure, spp, seed, denoise, progress)
-    write_contact_sheet(out / "contact_sheet.png", frames)
-    timings = {
-        "prepare_s": round(prepared - started, 2),
-        "frame_s": round(float(np.median(seconds)), 3) if seconds else None,
-        "total_s": round(time.perf_counter() - started, 2),
-    }
-    record = {"mesh_scale": scale, "exposure": exposure, "samples_per_pixel": spp, "versions": versions(), "timings": timings}
-    write_json(out / "config.json", resolved | record)
-    write_transforms(out, frames if pose_noise is None else _told(out, frames, pose_noise, seed))
-    return load_dataset(out)
+        prepared = time.perf_counter()
+        seconds = _render_frames(scene, frames, exposure, spp, seed, denoise, progress)
+        write_contact_sheet(out / "contact_sheet.png", frames)
+        timings = {
+            "prepare_s": round(prepared - started, 2),
+            "frame_s": round(float(np.median(seconds)), 3) if seconds else None,
+            "total_s": round(time.perf_counter() - started, 2),
+        }
+        record = {"mesh_scale": scale, "exposure": exposure, "samples_per_pixel": spp, "versions": versions()}
+        write_json(out / "config.json", resolved | record | {"timings": timings})
+        write_transforms(out, frames if pose_noise is None else _told(out, frames, pose_noise, seed))
+        return load_dataset(out)
 
 
 def _resolved(
@@ -215,8 +229,6 @@ def _resumes(out: Path, resolved: dict[str, Any]) -> bool:
     begun = read_json(out / "config.json")
     if any(begun.get(key) != value for key, value in resolved.items()):
         raise InputError(f"{out}: holds an unfinished dataset of other settings; choose a new folder or delete it")
-    for left in out.rglob(".*.part*"):  # of a process that was killed while it wrote
-        left.unlink()
     return True
 
 

@@ -8,20 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, Literal
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mgs.conventions import Camera
+from mgs.errors import InputError
 from mgs.gaussians import LEARNED, Gaussians
 from mgs.seeds import generator
-from mgs.splat import ListCache, as_drjit
+from mgs.splat import ListCache, as_drjit, render
 from mgs.splat.blocks import BlockLists
 from mgs.splat.frozen import frozen
 from mgs.splat.project import camera_array, project
 from mgs.splat.render import composite
+from mgs.stopping import StopReason, stop_reason
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,8 @@ class TrainSettings:
     passes: int = 40
     """Most passes over the images."""
     tolerance: float = 0.01
-    """Converged when a pass lowers the loss by less than this share, twice in a row."""
+    """Converged when a pass lowers the loss by less than this share, twice in a row, and does not raise it by more
+    (`mgs.stopping.stop_reason`)."""
     rates: tuple[float, float, float, float] = (0.02, 0.02, 0.01, 0.05)
     """For sh, log_scales, quats, logit_opacities."""
     decay: float = 0.1
@@ -41,13 +44,20 @@ class TrainSettings:
 
 @dataclass(frozen=True)
 class Fit:
-    """A fitted model (NumPy fields), its mean squared error over the images in the last pass, and why fitting stopped."""
+    """What a fit found, and why it stopped.
+
+    gaussians: the model (NumPy fields) at the end of the pass of the lowest loss; the model given, where no pass had a finite
+    one. loss: that lowest loss. losses: mean squared error of the model given, then of each pass. The loss of a pass is the
+    mean of its steps' losses, each measured before its step: of the models on the way through the pass, not of its last one.
+    passes, iterations: how many were made, those after the lowest loss too.
+    """
 
     gaussians: Gaussians
     loss: float
+    losses: tuple[float, ...]
     passes: int
     iterations: int
-    stop_reason: Literal["converged", "iteration-limit"]
+    stop_reason: StopReason
 
 
 def _baked(
@@ -113,35 +123,70 @@ def fit(
     """Fit appearance (not means) to images: cameras and targets [H,W,3] linear RGB, rock on black.
 
     Starts with fresh optimiser moments, so the result depends on its arguments alone, bitwise. on_pass(done, most) reports.
+    Stops as `mgs.stopping.stop_reason` says. Raises InputError where a parameter of the Gaussians given is not finite.
     """
     settings, cache = settings or TrainSettings(), cache or ListCache()
     model = as_drjit(gaussians)
-    arrays = [camera_array(camera) for camera in cameras]
-    pixels = [mi.Float(np.ascontiguousarray(target, np.float32).ravel()) for target in targets]
+    images = [
+        _Image(camera, camera_array(camera), mi.Float(np.ascontiguousarray(target, np.float32).ravel()))
+        for camera, target in zip(cameras, targets, strict=True)
+    ]
     moments = [[dr.zeros(mi.TensorXf, getattr(model, n).shape) for _ in range(2)] for n in LEARNED]
     rng = generator(settings.seed, "train/order")
-    history: list[float] = []
-    stop: Literal["converged", "iteration-limit"] = "iteration-limit"
-    t, small = 0, 0
+    losses, kept, stop = [_loss(model, images, cache)], model, StopReason.PASS_LIMIT
     for done in range(settings.passes):
         fall = settings.decay ** (done / max(settings.passes - 1, 1))
         rates = [dr.opaque(mi.Float, rate * fall) for rate in settings.rates]
-        losses = []
-        for i in rng.permutation(len(cameras)):
-            t += 1
-            splats = _project(model, arrays[i])
-            lists, packed = cache.get(cameras[i], splats)
-            size = (cameras[i].width, cameras[i].height)
-            model, moments, loss = _step(
-                model, moments, arrays[i], packed, lists, pixels[i], size, rates, dr.opaque(mi.UInt32, t)
-            )
-            losses.append(loss)
-        history.append(float(np.mean([float(loss[0]) for loss in losses])))
+        order = [images[i] for i in rng.permutation(len(images))]
+        model, moments, loss = _pass(model, moments, order, rates, done * len(images), cache)
+        if loss <= min(losses[1:], default=np.inf):  # never of a loss that is not a number
+            kept = model
+        losses.append(loss)
         if on_pass:
             on_pass(done + 1, settings.passes)
-        small = small + 1 if len(history) > 1 and history[-1] > (1 - settings.tolerance) * history[-2] else 0
-        if small == 2:
-            stop = "converged"
+        if found := stop_reason(losses, settings.tolerance, settings.passes):
+            stop = found
             break
-    numpy = Gaussians(*(np.asarray(getattr(model, f.name)) for f in fields(model)))
-    return Fit(numpy, history[-1] if history else float("nan"), len(history), t, stop)
+    passes = len(losses) - 1
+    numpy = Gaussians(*(np.asarray(getattr(kept, f.name)) for f in fields(kept)))
+    finite = [loss for loss in losses[1:] if np.isfinite(loss)]
+    return Fit(numpy, min(finite, default=losses[0]), tuple(losses), passes, passes * len(images), stop)
+
+
+@dataclass(frozen=True)
+class _Image:
+    """An image to fit to: its camera, the same for the kernels, and its pixels, mi.Float [H*W*3]."""
+
+    camera: Camera
+    array: Any
+    pixels: Any
+
+
+def _loss(model: Gaussians, images: list[_Image], cache: ListCache) -> float:
+    """Mean squared error of one model over the images."""
+    errors = [dr.mean(dr.square(render(model, image.camera, cache=cache).rgb.array - image.pixels)) for image in images]
+    return float(np.mean([float(error[0]) for error in errors]))
+
+
+def _pass(
+    model: Gaussians, moments: list[list[Any]], images: list[_Image], rates: list[Any], t: int, cache: ListCache
+) -> tuple[Gaussians, list[list[Any]], float]:
+    """One step on each image, in order, after t steps. Returns parameters, moments and the mean of the steps' losses.
+
+    The loss is NaN where a parameter is no longer finite: such a model cannot be rendered.
+    """
+    losses = []
+    for image in images:
+        t += 1
+        splats = _project(model, image.array)
+        try:
+            lists, packed = cache.get(image.camera, splats)
+        except InputError:
+            return model, moments, float("nan")
+        size = (image.camera.width, image.camera.height)
+        model, moments, loss = _step(
+            model, moments, image.array, packed, lists, image.pixels, size, rates, dr.opaque(mi.UInt32, t)
+        )
+        losses.append(loss)
+    finite = dr.all([dr.all(dr.isfinite(getattr(model, name).array)) for name in LEARNED])
+    return model, moments, float(np.mean([float(loss[0]) for loss in losses])) if finite[0] else float("nan")

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
+import signal
 import struct
+import subprocess
+import sys
 import zlib
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +25,7 @@ from mgs.files import (
     check_writable,
     copy_file,
     folder_or_nothing,
+    locked,
     read_exr,
     read_json,
     read_mask,
@@ -258,3 +264,58 @@ def test_half_a_16_bit_png_is_refused(tmp_path, colour):
     (tmp_path / "a.png").write_bytes(data[: len(data) // 2])
     with pytest.raises(InputError, match="not a readable image"):
         read_png(tmp_path / "a.png")
+
+
+HOLDER = """
+import sys, time
+from mgs.files import locked
+with locked(sys.argv[1]):
+    print("locked", flush=True)
+    sys.stdin.read()
+"""
+"""A process that works on a folder until its standard input is closed."""
+
+
+@contextmanager
+def holder(folder):
+    command = [sys.executable, "-c", HOLDER, str(folder)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "locked\n"
+        yield process
+
+
+@pytest.mark.parametrize("end", ["itself", "killed"])
+def test_one_process_at_a_time_works_on_a_folder(tmp_path, end):
+    with holder(tmp_path) as process:
+        for _ in range(2):  # being refused changes nothing
+            with pytest.raises(InputError, match=f"process {process.pid} works on it; wait until"), locked(tmp_path):
+                pass
+        if end == "killed":
+            process.send_signal(signal.SIGKILL)
+    assert [path.name for path in tmp_path.iterdir()] == ([".lock"] if end == "killed" else [])
+    with locked(tmp_path):
+        assert (tmp_path / ".lock").read_text() == str(os.getpid())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_lock_that_its_owner_removed_is_no_lock(tmp_path, monkeypatch):
+    """Opened while another process had it, taken after that one had removed it: a third would find no lock there."""
+    flock, calls = fcntl.flock, []
+
+    def slow(file, operation):
+        calls.append(operation)
+        if len(calls) == 1:
+            (tmp_path / ".lock").unlink()
+        flock(file, operation)
+
+    monkeypatch.setattr(fcntl, "flock", slow)
+    with locked(tmp_path):
+        assert (tmp_path / ".lock").is_file()
+        with pytest.raises(InputError, match=f"process {os.getpid()} works on it"), locked(tmp_path):
+            pass
+    assert len(calls) == 3
+
+
+def test_a_folder_that_cannot_be_locked(tmp_path):
+    with pytest.raises(InputError, match="cannot be written"), locked(tmp_path / "missing"):
+        pass

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
 import subprocess
 import sys
+from contextlib import nullcontext
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tiny
+from PIL import Image
 
 from mgs import nbv, policies
 from mgs.dataset import load_dataset
 from mgs.errors import InputError
+from mgs.files import write_exr
+from mgs.gaussians import Gaussians
 from mgs.splat_ply import read_ply
+from mgs.stopping import StopReason
 
 
 @pytest.fixture(scope="module")
@@ -99,11 +106,13 @@ def test_a_tie_goes_to_the_farthest_camera(dataset, tmp_path):
 def test_candidate_images_are_never_read_before_they_are_chosen(dataset, tmp_path, monkeypatch):
     """Every image that is opened is logged; at each choice the opened ones must be exactly those taken."""
     import mgs.dataset
+    import mgs.inputs
 
     opened: set[str] = set()
-    read_png, read_mask, read_exr = mgs.dataset.read_png, mgs.dataset.read_mask, mgs.dataset.read_exr
-    for name, function in {"read_png": read_png, "read_mask": read_mask, "read_exr": read_exr}.items():
-        monkeypatch.setattr(mgs.dataset, name, lambda path, f=function: opened.add(Path(path).stem) or f(path))
+    places = [(mgs.dataset, "read_png"), (mgs.dataset, "read_mask"), (mgs.dataset, "read_exr"), (mgs.inputs, "file_digest")]
+    for module, name in places:
+        function = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda path, f=function: opened.add(Path(path).stem) or f(path))
     at_choice = []
     choose = nbv._Loop.choose
 
@@ -216,6 +225,31 @@ def test_interrupted_by_the_keyboard_then_resumed(dataset, tmp_path, uninterrupt
     assert nbv.run(out, nbv.read_settings(out), dataset, tiny.stations(), tiny.silent).taken == uninterrupted[0].taken
 
 
+@pytest.mark.parametrize(
+    ("broken", "named"), [(0, "the fit to the seeds"), (1, "the fit of step 1 .*step 0 is kept"), (3, "steps 0 to 2 are kept")]
+)
+def test_a_fit_that_diverges_ends_the_run_which_can_go_on(dataset, tmp_path, uninterrupted, broken, named):
+    def fit(gaussians, cameras, *rest):
+        found = tiny.fit(gaussians, cameras, *rest)
+        if len(cameras) < 3 + broken:
+            return found
+        found.gaussians.sh[:] = np.nan
+        return replace(found, losses=(0.01234, 0.5, math.nan), stop_reason=StopReason.DIVERGED)
+
+    out = tmp_path / "run"
+    with pytest.raises(InputError, match=named) as stop:
+        run(out, dataset, tiny.stations(fit=fit), seed=3)
+    said = str(stop.value)
+    assert "diverged: its loss was 0.0123 at the start, and 0.5, nan in the last passes" in said
+    assert f"`train.rates` in {out / 'config.json'}" in said
+    assert f"mgs nbv --resume {out}" in said
+    assert "\n" not in said
+    assert ((out / "steps.jsonl").exists() and len(lines(out))) == broken
+    resumed = nbv.run(out, nbv.read_settings(out), dataset, tiny.stations(), tiny.silent)
+    assert resumed.taken == uninterrupted[0].taken
+    assert (out / "gaussians.ply").read_bytes() == uninterrupted[1]
+
+
 def test_resuming_a_finished_run_changes_nothing(dataset, tmp_path):
     state = run(tmp_path / "run", dataset)
     before = (tmp_path / "run/steps.jsonl").read_bytes()
@@ -228,6 +262,129 @@ def test_resuming_a_finished_run_changes_nothing(dataset, tmp_path):
     )
     assert again.taken == state.taken
     assert (tmp_path / "run/steps.jsonl").read_bytes() == before
+
+
+def retouch(path: Path) -> None:
+    """Change an image a little."""
+    with Image.open(path) as picture:
+        pixels = np.array(picture)
+    pixels[tiny.HEIGHT // 2, tiny.WIDTH // 2] ^= 1
+    Image.fromarray(pixels).save(path)
+
+
+def nudge(root: Path, name: str, **values) -> None:
+    """Change the record of a frame in transforms.json; x: its position, metres."""
+    data = json.loads((root / "transforms.json").read_text())
+    record = next(record for record in data["frames"] if name in record["file_path"])
+    record["transform_matrix"][0][3] += values.pop("x", 0)
+    record.update(values)
+    (root / "transforms.json").write_text(json.dumps(data))
+
+
+SPOILT = {
+    "image": (lambda root: retouch(root / "images/kf_0004.png"), r"images/kf_0004\.png has changed since .*run took it"),
+    "mask": (lambda root: retouch(root / "masks/kf_0008.png"), r"masks/kf_0008\.png has changed"),
+    "depth": (
+        lambda root: write_exr(root / "depth/kf_0000.exr", {"Z": np.zeros((tiny.HEIGHT, tiny.WIDTH), np.float32)}),
+        r"depth/kf_0000\.exr has changed",
+    ),
+    "no mask": (
+        lambda root: nudge(root, "kf_0000", mask_path=None),
+        r"transforms\.json: the mask of frame kf_0000 has changed",
+    ),
+    "pose": (
+        lambda root: nudge(root, "kf_0005", x=1e-6),
+        r"transforms\.json: the pose or the intrinsics of frame kf_0005 have",
+    ),
+    "intrinsics": (lambda root: nudge(root, "kf_0005", fl_x=16.1), "the intrinsics of frame kf_0005 have changed"),
+}
+"""What may change between a run and its resumption, and how it is named. Of 12 frames on a circle 0, 4 and 8 are the seeds."""
+
+
+@pytest.fixture
+def half_done(tmp_path):
+    """A dataset of its own and a run of three steps of six."""
+    root = tiny.write_dataset(tmp_path / "dataset")
+    settings = tiny.start(tmp_path / "run", load_dataset(root))
+    nbv.run(tmp_path / "run", settings.model_copy(update={"budget": 2}), load_dataset(root), tiny.stations(), tiny.silent)
+    return root, tmp_path / "run"
+
+
+def resume(root: Path, out: Path, **parts) -> tuple[nbv.State, list[str]]:
+    """The last state of a resumed run, and what was said on the way."""
+    said: list[str] = []
+    stations = tiny.stations(**parts)
+    return nbv.run(out, nbv.read_settings(out), load_dataset(root), stations, tiny.silent, say=said.append), said
+
+
+@pytest.mark.parametrize("what", SPOILT)
+def test_a_run_does_not_go_on_from_changed_inputs(half_done, what):
+    root, out = half_done
+    spoil, named = SPOILT[what]
+    spoil(root)
+    before = lines(out)
+    with pytest.raises(InputError, match=named):
+        resume(root, out)
+    assert lines(out) == before
+
+
+def test_a_run_goes_on_where_what_it_has_not_taken_changed(half_done):
+    """Only the pose of a candidate is an input until it is taken: its pixels may still change. Not those of others."""
+    root, out = half_done
+    taken = nbv.read_checkpoint(out).taken
+    for i in set(range(tiny.FRAMES)) - set(taken):
+        retouch(root / f"images/kf_{i:04d}.png")
+    for i in set(taken) - {0, 4, 8}:
+        (root / f"depth/kf_{i:04d}.exr").write_bytes(b"never read")
+    moved = root.rename(root.parent / "elsewhere")
+    config = json.loads((out / "config.json").read_text())
+    config["settings"]["dataset"] = str(moved)
+    (out / "config.json").write_text(json.dumps(config))
+    state, said = resume(moved, out)
+    assert len(state.steps) == 6
+    assert not said
+
+
+def without_record(out: Path) -> None:
+    """Make the checkpoint one of a version that kept no record of its inputs."""
+    with np.load(out / "checkpoint.npz") as data:
+        arrays = dict(data)
+    record = json.loads(str(arrays["json"]))
+    del record["inputs"]
+    arrays["json"] = np.array(json.dumps(record))
+    np.savez(out / "checkpoint.npz", **arrays)
+
+
+def test_a_run_of_a_version_without_records_goes_on_with_a_warning(half_done):
+    root, out = half_done
+    without_record(out)
+    state, said = resume(root, out)
+    assert len(state.steps) == 6
+    assert len(said) == 1
+    assert "kept no record of its inputs" in said[0]
+    without_record(out)
+    assert resume(root, out)[1] == []  # nothing is left to be mixed
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+@pytest.mark.parametrize("count", [tiny.POINTS, tiny.POINTS - 1])
+def test_a_run_does_not_go_on_from_another_prior(half_done, recorded, count):
+    """Of as many Gaussians it was mixed in; of another number it ended in a traceback."""
+    root, out = half_done
+
+    def initial(frames):
+        g = tiny.initial(frames)
+        fewer = (getattr(g, field.name)[:count] for field in fields(g))
+        return replace(Gaussians(*fewer), means=g.means[:count] + np.float32(0.01))
+
+    if not recorded:
+        without_record(out)
+    with pytest.raises(
+        InputError, match=r"dataset: is not the prior that .*run was started on; restore it, or start a new run"
+    ):
+        resume(root, out, initial=initial)
+    with pytest.raises(InputError, match=r"is not the prior") if recorded else nullcontext():
+        resume(root, out, prior="another spacing")
 
 
 def test_damaged_or_missing_runs_are_told_apart(dataset, tmp_path):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, fields
+import os
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tiny
+from refusals import refused
 from rich.console import Console
 
 from mgs import nbv, policies
@@ -17,7 +19,9 @@ from mgs.commands.nbv import print_run, read_train_settings, start_run, train_se
 from mgs.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.evaluate import load_run
-from mgs.files import write_json, write_png
+from mgs.files import locked, write_json, write_png
+from mgs.prior import load_prior, save_prior
+from mgs.surface import Mesh
 
 
 @pytest.fixture
@@ -114,6 +118,62 @@ def test_damaged_settings_of_the_fit_are_one_line_on_resume(dataset, tmp_path, c
     shown = capsys.readouterr().err
     assert f"config.json: train.{next(iter(train))}" in shown
     assert len(shown.splitlines()) == 1
+
+
+def test_learning_rates_that_are_too_high_are_one_line(dataset, prior, tmp_path, capsys):
+    """The loss settles on that of a black image: flat, but above its start."""
+    run = tmp_path / "run"
+    train = train_settings(None, 0) | {"rates": [20, 20, 10, 50]}
+    tiny.start(run, load_dataset(dataset), prior=prior, budget=1, train=train)
+    said = refused(capsys, ["nbv", "--resume", run])
+    assert "the fit to the seeds diverged: its loss was" in said
+    assert "lower the learning rates (`train.rates` in" in said
+    config = json.loads((run / "config.json").read_text())
+    config["settings"]["train"] = train_settings(None, 0)
+    write_json(run / "config.json", config)
+    with pytest.raises(SystemExit) as stop:
+        main(["nbv", "--resume", str(run)])
+    assert stop.value.code == 0
+
+
+@pytest.mark.parametrize("change", ["normals", "spacing", "points", "count"])
+def test_a_replaced_prior_is_one_line_on_resume(dataset, prior, tmp_path, capsys, change):
+    """Whatever changed in it; nothing is lost, and with the old one back the run goes on."""
+    run = tmp_path / "run"
+    tiny.start(run, load_dataset(dataset), prior=prior, budget=0, train=train_settings(1, 0))
+    with pytest.raises(SystemExit):
+        main(["nbv", "--resume", str(run)])
+    config = json.loads((run / "config.json").read_text())
+    config["settings"]["budget"] = 1
+    write_json(run / "config.json", config)
+    known = load_prior(prior)
+    other = {
+        "normals": replace(known, normals=known.normals[::-1]),
+        "spacing": replace(known, numbers=known.numbers | {"spacing": 0.4}),
+        "points": replace(known, points=known.points[::-1]),
+        "count": replace(known, points=known.points[1:], normals=known.normals[1:]),
+    }[change]
+    prior.rename(tmp_path / "kept")
+    save_prior(prior, other, Mesh(known.points[:3], np.array([[0, 1, 2]]), np.zeros(1, bool)))
+    capsys.readouterr()
+    assert f"{prior}: is not the prior that {run} was started on" in refused(capsys, ["nbv", "--resume", run], run)
+    prior.rename(tmp_path / "other")
+    (tmp_path / "kept").rename(prior)
+    with pytest.raises(SystemExit) as stop:
+        main(["nbv", "--resume", str(run)])
+    assert stop.value.code == 0
+
+
+@pytest.mark.parametrize("command", [["nbv", "--resume"], ["eval"]])
+def test_one_process_at_a_time_works_on_a_run(dataset, prior, tmp_path, capsys, command):
+    """A second one would take the other's half-written files for those of a killed process, and remove them."""
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    with locked(run):
+        (run / ".checkpoint.1.part.npz").write_bytes(b"half")
+        assert f"{run}: process {os.getpid()} works on it" in refused(capsys, [*command, run], run)
+    with pytest.raises(SystemExit) as stop:
+        main([*command, str(run)])
+    assert stop.value.code == 0
 
 
 def test_a_run_appears_whole_or_not_at_all(dataset, tmp_path, monkeypatch):

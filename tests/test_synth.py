@@ -14,7 +14,7 @@ from mgs.cli import main
 from mgs.conventions import opencv_from_opengl
 from mgs.dataset import load_dataset
 from mgs.errors import InputError
-from mgs.files import read_json
+from mgs.files import locked, read_json
 from mgs.resources import resource_folder
 from mgs.rock import make_rock
 from mgs.scene_file import ORBITS, Arena, Orbit, Rock, SceneFile, load_scene_file
@@ -88,9 +88,12 @@ def test_same_seed_same_bytes_and_resume_and_pose_noise(dataset, tmp_path):
         synthesise(tmp_path / "again", SCENE, TINY, seed=3, pose_noise=PoseNoise(0.01, 0.1), progress=interrupt)
     assert not (tmp_path / "again/transforms.json").exists()
     (tmp_path / "again/images/.kf_0003.1.part.png").touch()
+    with locked(tmp_path / "again"), pytest.raises(InputError, match="works on it"):
+        synthesise(tmp_path / "again", SCENE, TINY, seed=3, pose_noise=PoseNoise(0.01, 0.1))
+    assert (tmp_path / "again/images/.kf_0003.1.part.png").exists()  # of that process, still at work
     again = synthesise(tmp_path / "again", SCENE, TINY, seed=3, pose_noise=PoseNoise(0.01, 0.1))
     truth = json.loads((again.root / "true_poses.json").read_text())["poses"]
-    assert not list(again.root.rglob("*part*"))
+    assert not list(again.root.rglob(".*"))
     for a, b in zip(dataset.frames, again.frames, strict=True):
         assert a.image_path.read_bytes() == b.image_path.read_bytes()
         assert a.mask_path.read_bytes() == b.mask_path.read_bytes()

@@ -1,5 +1,7 @@
 """Fitting appearance: it finds what images say, leaves alone what they do not, and repeats itself bit for bit."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from mgs.bench import surface_camera, surface_gaussians
 from mgs.conventions import Camera, look_at
 from mgs.gaussians import LEARNED, Gaussians
 from mgs.splat import ListCache, fisher, render
+from mgs.stopping import LOSS_FLOOR, StopReason, stop_reason
 from mgs.train import TrainSettings, fit
 
 
@@ -42,7 +45,7 @@ def mean_square(gaussians, cameras, targets) -> float:
 def test_fit_lowers_the_loss_a_hundredfold_and_reports_it(truth, cameras, targets):
     start = grey(truth)
     found = fit(start, cameras, targets, TrainSettings(passes=60, tolerance=0.0, rates=(0.05, 0.01, 0.01, 0.02)))
-    assert found.stop_reason == "iteration-limit"
+    assert found.stop_reason == "pass-limit"
     assert (found.passes, found.iterations) == (60, 180)
     assert mean_square(found.gaussians, cameras, targets) < 0.01 * mean_square(start, cameras, targets)
     assert found.loss == pytest.approx(mean_square(found.gaussians, cameras, targets), rel=0.1)
@@ -93,3 +96,78 @@ def test_stops_when_passes_no_longer_help(truth, cameras, targets):
     found = fit(grey(truth), cameras, targets, TrainSettings(passes=50, rates=(1e-4,) * 4))
     assert found.stop_reason == "converged"
     assert found.passes < 50
+
+
+def faster(factor: float, **values) -> TrainSettings:
+    """Learning rates that many times too high."""
+    return TrainSettings(rates=tuple(factor * rate for rate in TrainSettings().rates), **values)
+
+
+def test_a_fit_whose_loss_rises_has_diverged(truth, cameras, targets):
+    found = fit(grey(truth), cameras, targets, faster(1000))
+    assert found.stop_reason == StopReason.DIVERGED
+    assert found.losses[0] == pytest.approx(mean_square(grey(truth), cameras, targets), rel=1e-5)
+    assert min(found.losses[-5:]) > 1.5 * found.losses[0]
+    assert found.passes == len(found.losses) - 1 < 40
+    assert found.loss == min(found.losses[1:])
+
+
+@pytest.mark.parametrize("views", [1, 3])
+def test_a_fit_that_leaves_the_numbers_returns_what_it_was_given(truth, cameras, targets, views):
+    start = grey(truth)
+    found = fit(start, cameras[:views], targets[:views], faster(1e40))
+    assert (found.stop_reason, found.passes) == (StopReason.DIVERGED, 1)
+    assert np.isnan(found.losses[1])
+    assert found.loss == found.losses[0]
+    for name in LEARNED:
+        assert np.array_equal(getattr(found.gaussians, name), getattr(start, name))
+
+
+def test_the_model_of_the_lowest_loss_is_kept(truth, cameras, targets):
+    long = fit(grey(truth), cameras, targets, faster(20, passes=8, decay=1.0))
+    best = int(np.argmin(long.losses[1:])) + 1
+    assert best < long.passes
+    assert long.loss == long.losses[best] < long.losses[-1]
+    short = fit(grey(truth), cameras, targets, faster(20, passes=best, decay=1.0))
+    assert short.losses == long.losses[: best + 1]
+    assert all(np.array_equal(getattr(short.gaussians, n), getattr(long.gaussians, n)) for n in LEARNED)
+
+
+LONG = [2 * 0.9**k for k in range(6)]
+"""From twice the start to 1.18 times."""
+
+
+@pytest.mark.parametrize(
+    ("losses", "limit", "expected"),
+    [
+        ([1, 0.5, 0.4, 0.3], 40, None),
+        ([1, 0.5, 0.499, 0.498], 40, StopReason.CONVERGED),
+        ([1, 0.5, 0.499, 0.498], 3, StopReason.CONVERGED),
+        ([1, 0.5, 0.499, 0.4993], 40, StopReason.CONVERGED),  # a rise within the tolerance is no fall, and no divergence
+        ([1, 0.5, 0.499], 40, None),  # twice in a row
+        ([1, 0.5, 0.499], 2, StopReason.PASS_LIMIT),
+        ([1, 0.5, 0.49, 0.4895], 40, None),
+        ([1, 0.5, 0.6, 0.7], 40, None),
+        ([1, 0.5, 0.504, 0.508], 40, None),  # small rises that add up
+        ([1, 0.5, 0.6, 0.598, 0.597], 40, None),  # flat, but well above what it had
+        ([1, 1.2, 1.2, 1.2, 1.2, 1.2], 40, None),  # flat above the start
+        ([1, 1.2, 1.2, 1.2, 1.2, 1.2], 5, StopReason.DIVERGED),
+        ([1, 1.2, 1.1, 1.05, 1.02, 1.005], 5, StopReason.PASS_LIMIT),
+        ([1, 1.04], 1, StopReason.PASS_LIMIT),  # as the first pass of a healthy fit
+        ([1, 3, 1.4, 3, 3, 3, 3], 40, None),
+        ([1, 3, 3, 3, 3], 40, None),
+        ([1, 3, 3, 3, 3, 3], 40, StopReason.DIVERGED),  # flat as a black image is
+        ([1, 3, 3], 2, StopReason.DIVERGED),
+        ([1, *LONG], 40, None),
+        ([1, 0.1, 3, 4, 5, 6, 7], 40, StopReason.DIVERGED),
+        ([1, 0.5, math.nan], 40, StopReason.DIVERGED),
+        ([1, math.inf], 40, StopReason.DIVERGED),
+        ([0, *[LOSS_FLOOR] * 3], 40, StopReason.CONVERGED),  # started from the solution
+    ],
+)
+def test_why_a_fit_stops(losses, limit, expected):
+    assert stop_reason(losses, 0.01, limit) is expected
+
+
+def test_without_tolerance_nothing_converges():
+    assert stop_reason([1, 0.5, 0.5, 0.5], 0.0, 40) is None

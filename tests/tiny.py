@@ -19,6 +19,7 @@ from mgs.conventions import Camera, look_at, quat_from_normals
 from mgs.dataset import Dataset, Frame, load_dataset, write_transforms
 from mgs.files import write_exr, write_png
 from mgs.gaussians import Gaussians, sh_from_rgb
+from mgs.stopping import StopReason
 
 FRAMES, POINTS, WIDTH, HEIGHT = 12, 40, 16, 12
 GROUPS = {"colour": slice(0, 3), "scale": slice(3, 6), "rotation": slice(6, 10), "opacity": slice(10, 11)}
@@ -61,7 +62,8 @@ class Fit:
     gaussians: Gaussians
     loss: float
     iterations: int
-    stop_reason: str
+    losses: tuple[float, ...] = ()
+    stop_reason: StopReason = StopReason.CONVERGED
 
 
 def _normals() -> np.ndarray:
@@ -105,7 +107,7 @@ def fit(gaussians: Gaussians, cameras: list[Camera], targets: list[np.ndarray], 
     rgb = 0.5 * gaussians.rgb + 0.5 * total / weight[:, None]
     g = gaussians
     fitted = Gaussians(g.means, g.log_scales, g.quats, g.logit_opacities, sh_from_rgb(rgb))
-    return Fit(fitted, float(np.abs(rgb - g.rgb).mean()), 7, "converged")
+    return Fit(fitted, float(np.abs(rgb - g.rgb).mean()), 7)
 
 
 def stations(**replaced) -> nbv.Stations:
@@ -133,9 +135,13 @@ def write_prior(out: Path) -> Path:
 
 def write_run(out: Path, root: Path, prior: Path) -> Path:
     """A run folder of the seeds alone, on the stand-ins."""
+    from mgs.inputs import prior_digest
+    from mgs.prior import load_prior
+
     dataset = load_dataset(root)
     settings = start(out, dataset, prior=prior, budget=2)
-    nbv.run(out, settings.model_copy(update={"budget": 0}), dataset, stations(), silent)
+    parts = stations(prior=prior_digest(load_prior(prior)))
+    nbv.run(out, settings.model_copy(update={"budget": 0}), dataset, parts, silent)
     return out
 
 

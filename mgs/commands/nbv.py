@@ -187,7 +187,7 @@ def run_folder(out: Path, console: Console, pictures: bool = False) -> None:
         def on_step(state: State) -> None:
             bar.update(whole, completed=len(state.taken))
 
-        state = loop.run(out, settings, dataset, stations, progress, on_step)
+        state = loop.run(out, settings, dataset, stations, progress, on_step, say=lambda text: bar.print(text, soft_wrap=True))
         metrics = evaluate_run(out, pictures=pictures, progress=lambda done, total: progress("evaluating", done, total))
     print_run(out, state, metrics, console)
 
