@@ -22,6 +22,10 @@ QUAT_MIN = 1e-12
 MAX_PIXELS = 2**27
 """Largest image of a camera: what is larger is a slip of the keyboard, and would end in a lack of memory."""
 
+MAX_SIDE = 2**20
+"""Largest width and height of an image, pixels: beyond it float32 cannot tell neighbouring pixel centres well, and a strip a
+pixel wide, drawn in whole blocks, has far more than MAX_PIXELS."""
+
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -32,7 +36,7 @@ class Camera:
     K: [3,3] float64, pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]. width, height: pixels.
     world_to_camera: [4,4] float64, rigid, OpenCV axes, metres.
     Raises InputError where K or the pose is not finite, K has skew or a non-positive focal length, the image has no pixel,
-    parts of pixels or more than MAX_PIXELS, or the pose is not rigid.
+    parts of pixels, more than MAX_PIXELS or a side beyond MAX_SIDE, or the pose is not rigid.
     """
 
     K: NDArray[np.float64]
@@ -58,6 +62,8 @@ class Camera:
         if self.width < 1 or self.height < 1 or self.width * self.height > MAX_PIXELS:
             size = f"{self.width}x{self.height}"
             raise InputError(f"camera: image size {size} must be at least 1x1, and at most {MAX_PIXELS:,} pixels in all")
+        if max(self.width, self.height) > MAX_SIDE:
+            raise InputError(f"camera: image size {self.width}x{self.height} must be at most {MAX_SIDE:,} pixels either way")
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise InputError("camera: the pose has NaN or infinite entries; correct its transform matrix")
         rotation = pose[:3, :3]

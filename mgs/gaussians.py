@@ -16,6 +16,9 @@ from mgs.errors import InputError
 
 MAX_SH_DEGREE = 3
 
+MAX_GAUSSIANS = 2**25
+"""Most Gaussians of a model: with 48 colour coefficients each, every place in a kernel's buffers is below 2^31."""
+
 SH_MAX = 1e6
 """Largest colour coefficient, linear RGB, of either sign: with it, gradients and Fisher information, which are of the order of
 colours squared and summed over pixels, stay far within float32. The sun itself is 1e5 times as bright as what it lights."""
@@ -86,8 +89,11 @@ class Gaussians:
         return self
 
     def check_shapes(self) -> None:
-        """Raises InputError where the shape of a parameter (NumPy or Dr.Jit) does not fit that of the means."""
+        """Raises InputError where the shape of a parameter (NumPy or Dr.Jit) does not fit that of the means, or there are more
+        than MAX_GAUSSIANS."""
         n = len(self)
+        if n > MAX_GAUSSIANS:
+            raise InputError(f"gaussians: {n:,} are more than {MAX_GAUSSIANS:,}, the most that kernels index; take fewer")
         coefficients = {(d + 1) ** 2 for d in range(MAX_SH_DEGREE + 1)}
         shapes = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "logit_opacities": (n,)}
         for name, shape in shapes.items():

@@ -13,6 +13,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mgs.errors import InputError
 from mgs.splat.project import Splats
 
 BLOCK_X, BLOCK_Y = 8, 4
@@ -27,6 +28,13 @@ LOG2_INV_ALPHA_MIN = 7.994353436858858
 
 SLACK = 1e-2
 """Bits added to a footprint's level so that rounding never drops a pixel at its rim."""
+
+MAX_PAIRS = 1 << 26
+"""Most (splat, block) pairs of a view, and most rows of blocks in the lists' making. With it, every place in the kernels'
+buffers, the 24 sums of a pair too, is below 2^31; so it may be lowered, but not raised."""
+
+PAIR_BYTES = 128
+"""Peak memory of a view for each of its pairs: measured 28 for an image, 58 for exact Fisher information, 123 for blocks."""
 
 
 @dataclass
@@ -119,7 +127,10 @@ def depth_order(depth: Any) -> Any:
 
 
 def build(splats: Splats, order: Any, width: int, height: int, margin: float) -> BlockLists:
-    """Block lists of detached splats, given their depth order. Exact ellipse-block overlap, not bounding boxes."""
+    """Block lists of detached splats, given their depth order. Exact ellipse-block overlap, not bounding boxes.
+
+    Raises InputError for more than MAX_PAIRS pairs, before memory is taken for them.
+    """
     blocks_x, blocks_y = -(-width // BLOCK_X), -(-height // BLOCK_Y)
     foot, place = inflate(splats, margin), _places(splats, order, blocks_x, blocks_y)
     splat, number, slot_start, slot_end = _pairs(splats, foot, place, blocks_x, blocks_y)
@@ -212,13 +223,13 @@ def _pairs(splats: Splats, foot: Footprints, place: Any, blocks_x: int, blocks_y
 
     rows = mi.UInt32(dr.gather(mi.Float, shapes, 8 * dr.arange(mi.UInt32, n) + 7))
     first_row = dr.prefix_sum(rows)
-    row_splat = _runs(first_row, int(dr.sum(rows)[0]))
+    row_splat = _runs(first_row, _total(rows, blocks_y, "rows of blocks"))
     block, columns = mi.UInt32(), mi.UInt32()
     if len(row_splat) > 0:
         offset = dr.arange(mi.UInt32, len(row_splat)) - dr.gather(mi.UInt32, first_row, row_splat)
         block, columns = _columns(shapes, row_splat, offset, blocks_x)
         dr.eval(row_splat, block, columns)
-    count = int(dr.sum(columns)[0]) if len(columns) > 0 else 0
+    count = _total(columns, blocks_x, "blocks")
     if count == 0:
         return mi.UInt32(), mi.UInt32(), dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n)
     first = dr.prefix_sum(columns)
@@ -229,6 +240,20 @@ def _pairs(splats: Splats, foot: Footprints, place: Any, blocks_x: int, blocks_y
     pairs = dr.gather(mi.UInt32, row_splat, row), number, slot_start, slot_end
     dr.eval(pairs)
     return pairs
+
+
+def _total(counts: Any, most: int, what: str) -> int:
+    """Sum of UInt32 counts of at most `most` each, in 64 bits where 32 might wrap. Raises InputError beyond MAX_PAIRS."""
+    if len(counts) == 0:
+        return 0
+    total = int(dr.sum(counts if len(counts) * most < 1 << 32 else mi.UInt64(counts))[0])
+    if total > MAX_PAIRS:
+        raise InputError(
+            f"view: {total:,} pairs of a Gaussian and one of its {what} ({BLOCK_X}x{BLOCK_Y} pixels) may take "
+            f"{total * PAIR_BYTES / 2**30:,.1f} GiB, and {MAX_PAIRS:,} are the most; draw fewer or smaller Gaussians, "
+            "or a smaller image"
+        )
+    return total
 
 
 def _front_to_back(slot_start: Any, slot_end: Any, by_depth: Any, count: int) -> Any:

@@ -44,13 +44,19 @@ def fisher(
 
     The camera's image is not needed: information depends on the pose and the model alone. Estimators: see `ESTIMATORS`;
     options: `probes` and `seed` of `hutchinson`; the others have none.
-    Raises InputError for an unknown estimator, or a parameter that `render` refuses.
+    Raises InputError for an unknown estimator, as `render` does, and for blocks of 2^31 numbers or more.
     """
     if estimator not in ESTIMATORS:
         raise InputError(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
-    if len(gaussians) == 0:
-        size = groups(gaussians.sh_degree)["opacity"].stop
+    gaussians.check_shapes()
+    n, size = len(gaussians), groups(gaussians.sh_degree)["opacity"].stop
+    if n == 0:
         return np.zeros((0, size, size) if estimator == "block" else (0, size), np.float32)
+    if estimator == "block" and n * (size * size + 3) >= 1 << 31:  # written in packets of four
+        raise InputError(
+            f"fisher: blocks of {n:,} Gaussians of SH degree {gaussians.sh_degree} would take {n * size * size / 2**28:.1f} "
+            "GiB, and 8 are the most; take fewer Gaussians, a lower degree, or the estimator `exact`"
+        )
     return ESTIMATORS[estimator](as_drjit(gaussians), camera, background, cache, **options)
 
 

@@ -70,7 +70,7 @@ class ListCache:
     def get(self, camera: Camera, splats: Splats) -> tuple[BlockLists, Any]:
         """Lists for detached splats seen by the camera, and the splats packed at the places of these lists.
 
-        Raises InputError where a parameter is not finite, or a colour beyond SH_MAX.
+        Raises InputError where a parameter is not finite, a colour beyond SH_MAX, or the view has too many pairs.
         """
         key = camera.key
         lists = self._lists.get(key)
@@ -194,7 +194,8 @@ def render(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.
     background: linear RGB. cache: keep one between calls so that a camera seen again reuses its block lists. Records its own
     kernels, so it cannot be called inside another `dr.freeze`.
     Raises InputError where a parameter is NaN or infinite, or a colour beyond SH_MAX (names the parameter and the first
-    Gaussian); likewise for a number of the background (a Dr.Jit colour is not looked at).
+    Gaussian); likewise for a number of the background (a Dr.Jit colour is not looked at); and for a view of too many pairs
+    (`mgs.splat.blocks.MAX_PAIRS`).
     """
     runtime.start()
     colour = as_colour(background)

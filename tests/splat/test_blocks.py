@@ -9,6 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mgs.conventions import MAX_PIXELS, MAX_SIDE
+from mgs.errors import InputError
+from mgs.gaussians import MAX_GAUSSIANS, Gaussians
 from mgs.splat import ListCache, as_drjit, blocks, fisher, kernels, reference, render
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, TILE, build, depth_order, inflate, outgrown
 from mgs.splat.project import camera_array, project
@@ -285,6 +288,58 @@ def test_one_view_larger_than_the_budget_still_renders():
         np.testing.assert_array_equal(a, b)
     images(g, make_camera(focal=40.0), cache)
     assert cache.builds == 2
+
+
+@pytest.mark.parametrize(("size", "n", "what"), [((65536, 4), 1 << 19, "blocks"), ((4, 65536), 1 << 18, "rows of blocks")])
+def test_pairs_are_counted_in_64_bits(size, n, what):
+    """2^32 of them, which 32 bits count as none; refused before memory is taken for them."""
+    camera, one = make_camera(size, focal=100.0), make_gaussians(1, 0, spread=0)
+    many = Gaussians(*(np.repeat(getattr(one, name), n, 0) for name in vars(one)))
+    many.log_scales[:], many.logit_opacities[:] = 9, 2
+    with pytest.raises(
+        InputError, match=f"view: 4,294,967,296 pairs of a Gaussian and one of its {what} .* 512.0 GiB"
+    ) as error:
+        render(many, camera)
+    assert "\n" not in str(error.value)
+
+
+def test_a_view_has_a_bounded_number_of_pairs(monkeypatch):
+    camera, g = make_camera(), make_gaussians(60, 3)
+    count = len(pairs_of(lists_of(g, camera, 0)[0]))
+    monkeypatch.setattr(blocks, "MAX_PAIRS", count)
+    images(g, camera)
+    monkeypatch.setattr(blocks, "MAX_PAIRS", count - 1)
+    for call in (render, fisher):
+        with pytest.raises(InputError, match=f"view: {count:,} pairs .* {count - 1:,} are the most; draw fewer or smaller"):
+            call(g, camera)
+
+
+def test_places_in_buffers_stay_below_31_bits():
+    """Of the most pairs, the most Gaussians and the largest images."""
+    most = max(kernels.ADJOINT_SUMS[True], kernels.FISHER_SUMS[True])
+    assert blocks._rounded(blocks.MAX_PAIRS) * 4 * kernels._packets(most) < 1 << 31
+    assert MAX_GAUSSIANS * max(3 * 16, 4 * kernels._packets(most)) < 1 << 31
+    for width in (1, 9, MAX_PIXELS // MAX_SIDE, 12_345, MAX_SIDE):
+        height = min(MAX_SIDE, MAX_PIXELS // width)
+        blocks_x, blocks_y = -(-width // BLOCK_X), -(-height // BLOCK_Y)
+        assert blocks_x * blocks_y * kernels.PIXELS * 4 < 1 << 31
+        assert blocks._numbers(blocks_x, blocks_y) < 1 << 31
+
+
+def test_what_is_too_large_for_the_kernels_is_refused_at_once():
+    for size in ((1, MAX_SIDE + 1), (MAX_SIDE + 1, 1)):
+        with pytest.raises(InputError, match="must be at most 1,048,576 pixels either way"):
+            make_camera(size)
+    one = make_gaussians(1, 0, 3)
+
+    def many(n):
+        return Gaussians(*(np.broadcast_to(getattr(one, name), (n, *getattr(one, name).shape[1:])) for name in vars(one)))
+
+    for call in (render, fisher):
+        with pytest.raises(InputError, match="gaussians: 33,554,433 are more than 33,554,432"):
+            call(many(MAX_GAUSSIANS + 1), make_camera())
+    with pytest.raises(InputError, match=r"blocks of 700,000 Gaussians of SH degree 3 would take 8\.2 GiB, and 8 are the most"):
+        fisher(many(700_000), make_camera(), "block")
 
 
 @pytest.mark.parametrize("tile", [1, 3, 1000])
