@@ -19,21 +19,26 @@ from mgs.splat_ply import read_ply
 
 OPTIONS = ["--gaussians", "300", "--seeds", "3", "--budget", "4", "--passes", "6", "--seed", "1"]
 STRUCK = """
-import os, threading
-from mgs import nbv
+import os
+from mgs import runtime, stations
 from mgs.cli import main
 
-write = nbv.write_steps
+fit, fits = stations.fit, []
 
-def strike_soon(out, state):
-    write(out, state)
-    if len(state.steps) == 2:
-        threading.Timer(0.02, os.kill, (os.getpid(), {blow})).start()
+def struck(gaussians, cameras, targets, settings, on_pass, cache):
+    fits.append(len(cameras))
 
-nbv.write_steps = strike_soon
+    def blow(done, most):
+        on_pass(done, most)
+        if len(fits) == 3:
+            os.kill(os.getpid(), {blow})
+
+    return fit(gaussians, cameras, targets, settings, blow, cache)
+
+stations.fit = struck
 main()
 """
-"""The program, which sends itself a signal 20 ms into its third step: from outside, a busy machine would let the run end."""
+"""The program, which sends itself a signal in the middle of its third step: between two passes of the fit."""
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +124,7 @@ def test_interrupted_in_the_middle_of_a_step_then_resumed(dataset, run, tmp_path
     assert "Traceback" not in error
     assert ("mgs: interrupted" in error) == (blow == signal.SIGINT)
     before = steps(out)
-    assert len(before) < 5, "the run was over before the blow"
+    assert len(before) == 2
     command("nbv", "--resume", out)
     assert timeless(steps(out)) == timeless(steps(run))
     assert (out / "gaussians.ply").read_bytes() == (run / "gaussians.ply").read_bytes()
@@ -168,7 +173,6 @@ def test_compare_policies_and_report(dataset, run, tmp_path):
     command("diagnose", run, "--views", "kf_0001")
     written = write_report(tmp_path / "report", [run, other])
     assert {"orbit.png", "gain.png", "coverage.png", "comparison.png", "table.md"} <= {path.name for path in written}
-    assert all(path.stat().st_size > 0 for path in written)
     assert len(list((run / "renders").iterdir())) == 10
     assert (run / "diagnostics/kf_0001.exr").is_file()
 
@@ -180,8 +184,8 @@ def test_demo_shows_the_table_and_the_pictures_and_can_be_given_again(tmp_path, 
     out = tmp_path / "demo"
     dataset = synthetic.write_dataset(out / "dataset", synthetic.orbit_cameras(13, 48, 36))
     write_contact_sheet(out / "dataset/contact_sheet.png", dataset.frames)
-    for name, value in {"GAUSSIANS": 200, "BUDGET": 2}.items():
-        monkeypatch.setattr(sys.modules["mgs.commands.demo"], name, value)
+    for name, value in {"commands.demo.GAUSSIANS": 200, "commands.demo.BUDGET": 2, "diagnostics.VIEWS": 1}.items():
+        monkeypatch.setattr(sys.modules["mgs." + name.rpartition(".")[0]], name.rpartition(".")[2], value)
     command("demo", out)
     shown = capsys.readouterr().out
     assert all(policy in shown for policy in ("d-optimal", "coverage", "random"))
