@@ -1,12 +1,13 @@
 # make demo   the whole way on a small rock: dataset, prior, three policies, table and pictures
 # make test   lint, format, types, tests
-# Both do all the set-up on their own (Python 3.11 or newer, libLLVM 19 or newer).
+# make docs   the documentation as a site, in site/
+# They do all the set-up on their own (Python 3.11 or newer, libLLVM 19 or newer).
 
 VENV  := .venv
 BIN   := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test setup lock clean
+.PHONY: demo test docs setup lock clean
 .DEFAULT_GOAL := demo
 
 demo: setup
@@ -17,6 +18,11 @@ test: setup
 	@echo "ruff format"; $(BIN)/ruff format -q --check .
 	@echo "mypy";        $(BIN)/mypy --no-error-summary
 	@echo "pytest";      $(BIN)/python -m pytest
+
+# Not --quiet: it hides warnings from --strict. NO_MKDOCS_2_WARNING silences a notice about Material's successor.
+docs: setup
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "wrote site/: open site/index.html (searching it needs a server: $(BIN)/python -m http.server --directory site)"
 
 setup: $(STAMP)
 
@@ -29,4 +35,4 @@ lock:
 	@sh tools/lock.sh
 
 clean:
-	rm -rf $(VENV) out demo .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) out demo site .mypy_cache .ruff_cache .pytest_cache

@@ -1,7 +1,8 @@
-"""How deep into the rock a fitted model is seen: `python benchmarks/depth_error.py RUN...`, runs with exact depth images.
+"""How deep into the rock a fitted model is seen: `python benchmarks/depth_error.py OUT.json RUN...`.
 
-Over the rock's pixels of all views: the shares whose expected z-depth lies more than 5 and 20 cm behind the true one, and
-whose opacity is below 0.9, for the Gaussians before training and for the model of each run.
+The runs are on a dataset with exact depth images. Over the rock's pixels of all views: the shares whose expected z-depth lies
+more than 5 and 20 cm behind the true one, and whose opacity is below 0.9, for the Gaussians before training and for the model
+of each run.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 
 from mgs import runtime
 from mgs.dataset import Frame
+from mgs.files import write_json
 from mgs.gaussians import Gaussians
 
 TOO_DEEP = (0.05, 0.20)
@@ -33,16 +35,19 @@ def shares(gaussians: Gaussians, frames: Sequence[Frame]) -> list[float]:
     return np.concatenate(rows).mean(0).tolist()
 
 
-def main(runs: list[Path]) -> None:
-    """Print a line for the start, and one a run."""
+def main(out: Path, runs: list[Path]) -> None:
+    """Print a line for the start, and one a run; write them."""
     runtime.start()
     from mgs import nbv
+    from mgs.bench import command_line
+    from mgs.config import versions
     from mgs.evaluate import load_run
     from mgs.initial import initial_gaussians
     from mgs.prior import load_prior
 
     heading = [*(f"> {100 * limit:.0f} cm deep" for limit in TOO_DEEP), f"opacity < {OPAQUE}"]
     print(f"{'':30}" + "".join(f"{text:>16}" for text in heading))
+    found = {}
     for run in runs:
         gaussians, dataset, trained, policy = load_run(run)
         settings, state = nbv.read_settings(run), nbv.read_checkpoint(run)
@@ -51,8 +56,11 @@ def main(runs: list[Path]) -> None:
         if run == runs[0]:
             models = {"before training": initial_gaussians(load_prior(settings.prior), seeds)[0]} | models
         for name, model in models.items():
-            print(f"{name:30}" + "".join(f"{share:16.1%}" for share in shares(model, dataset.frames)))
+            found[name] = shares(model, dataset.frames)
+            print(f"{name:30}" + "".join(f"{share:16.1%}" for share in found[name]))
+    limits = {"too_deep": TOO_DEEP, "opaque": OPAQUE}
+    write_json(out, {"command": command_line(), **limits, "shares": found, "versions": versions()})
 
 
 if __name__ == "__main__":
-    main([Path(argument) for argument in sys.argv[1:]])
+    main(Path(sys.argv[1]), [Path(argument) for argument in sys.argv[2:]])

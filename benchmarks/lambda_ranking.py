@@ -1,8 +1,8 @@
-"""How the ranking of candidates depends on lambda: `python benchmarks/lambda_ranking.py RUN OUT.png`.
+"""How the ranking of candidates depends on lambda: `python benchmarks/lambda_ranking.py RUN PREFIX`.
 
 Scores every candidate of a run's last state by Eq. 7 with the default lambda (one number per kind of parameter, see
-`mgs.policies.regularisation`) times 10^-8 ... 10^8, and with a single number for all parameters, as in the paper; prints and
-draws Spearman's rank correlation with the default's ranking, and which view would be chosen.
+`mgs.policies.regularisation`) times 10^-8 ... 10^8, and with a single number for all parameters, as in the paper; prints
+Spearman's rank correlation with the default's ranking and which view would be chosen, and writes PREFIX.json and PREFIX.png.
 """
 
 from __future__ import annotations
@@ -15,15 +15,18 @@ from scipy.stats import spearmanr
 
 from mgs import nbv, policies, runtime
 from mgs.dataset import load_dataset
+from mgs.files import write_json
 
 FACTORS = 10.0 ** np.arange(-8, 9)
 SINGLE = 10.0 ** np.arange(-12, 3)
 """Values found in public code lie between 4e-12 and 2."""
 
 
-def main(run: Path, out: Path) -> None:
-    """Print the table, draw the figure."""
+def main(run: Path, prefix: str) -> None:
+    """Print the table, write it, draw the figure."""
     runtime.start()
+    from mgs.bench import command_line
+    from mgs.config import versions
     from mgs.splat import fisher, groups
 
     settings, state = nbv.read_settings(run), nbv.read_checkpoint(run)
@@ -41,14 +44,16 @@ def main(run: Path, out: Path) -> None:
         for kind, rows in kinds.items():
             scores[kind][:, column] = [policies.d_optimal(F, state.H, lam) for _, lam in rows]
     print(f"{len(state.taken)} images, {len(left)} candidates; default chooses {frames[left[int(reference.argmax())]].name}")
-    curves = {}
+    curves, found = {}, []
     for kind, rows in kinds.items():
         values, correlations = [value for value, _ in rows], [spearmanr(row, reference).statistic for row in scores[kind]]
         curves[kind] = values, correlations
         for value, correlation, row in zip(values, correlations, scores[kind], strict=True):
             best = frames[left[int(row.argmax())]].name
             print(f"{kind:14} {value:7.0e}  Spearman {correlation:+.3f}  chooses {best}  gain {row.max():.4g}")
-    draw(out, curves)
+            found.append({"kind": kind, "value": value, "spearman": correlation, "chosen": best, "gain": row.max()})
+    write_json(f"{prefix}.json", {"command": command_line(), "rows": found, "versions": versions()})
+    draw(Path(f"{prefix}.png"), curves)
 
 
 def draw(out: Path, curves: dict[str, tuple[list[float], list[float]]]) -> None:
@@ -71,4 +76,4 @@ def draw(out: Path, curves: dict[str, tuple[list[float], list[float]]]) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main(Path(sys.argv[1]), sys.argv[2])

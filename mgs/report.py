@@ -13,7 +13,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from mgs.errors import InputError
 from mgs.figures import comparison_figure, coverage_figure, gain_figure, orbit_figure, psnr_figure
-from mgs.files import atomic_path, read_json
+from mgs.files import atomic_path, read_json, write_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -134,18 +134,27 @@ def evaluated_runs(folders: Sequence[str | Path]) -> dict[str, Run]:
     return labelled
 
 
-def table_rows(folders: Sequence[str | Path]) -> list[list[str]]:
-    """A row of text a run, in the order of COLUMNS. Raises InputError as `evaluated_runs`."""
+def table_numbers(folders: Sequence[str | Path]) -> list[dict[str, Any]]:
+    """A row of the table a run, as numbers: COLUMNS, in their units, and the other means of metrics.json (`all.psnr_mask`).
+
+    Raises InputError as `evaluated_runs`.
+    """
     rows = []
     for label, run in evaluated_runs(folders).items():
         metrics = run.metrics or {}
-        values = {"policy": label, "coverage": 100 * run.steps[-1]["coverage"], "images": metrics["images"]}
-        values |= {f"{views}.{name}": metrics[views][name] for views in ("all", "held_out") for name in metrics[views]}
-        rows.append([_cell(column, values.get(column)) for column in COLUMNS])
+        row = {"policy": label, "images": metrics["images"]}
+        row |= {f"{views}.{name}": metrics[views][name] for views in ("all", "held_out") for name in metrics[views]}
+        rows.append(row | {"coverage": 100 * run.steps[-1]["coverage"]})
     return rows
 
 
-def _cell(column: str, value: Any) -> str:
+def table_rows(folders: Sequence[str | Path]) -> list[list[str]]:
+    """A row of text a run, in the order of COLUMNS. Raises InputError as `evaluated_runs`."""
+    return [[table_cell(column, row.get(column)) for column in COLUMNS] for row in table_numbers(folders)]
+
+
+def table_cell(column: str, value: Any) -> str:
+    """A number of the table as text: two decimals, an SSIM four."""
     if value is None:
         return "–"
     return f"{value:.4f}" if "ssim" in column else f"{value:.2f}" if isinstance(value, float) else str(value)
@@ -185,7 +194,8 @@ def write_report(out: str | Path, folders: Sequence[str | Path]) -> list[Path]:
     """Every figure and the table of runs on one dataset, into the folder `out`; returns the files written.
 
     orbit.png, gain.png, coverage.png, comparison.png (a view that the fewest runs were trained on), psnr.png (where runs were
-    evaluated on the way), table.md. Raises InputError as `evaluated_runs`, and where the pictures of `mgs eval` are missing.
+    evaluated on the way), table.md, table.json (`table_numbers`). Raises InputError as `evaluated_runs`, and where the pictures
+    of `mgs eval` are missing.
     """
     from mgs.dataset import load_dataset
     from mgs.evaluate import read_comparison
@@ -228,7 +238,8 @@ def write_report(out: str | Path, folders: Sequence[str | Path]) -> list[Path]:
         written.append(out / "psnr.png")
     with atomic_path(out / "table.md") as temporary:
         temporary.write_text(markdown_table(table_rows(folders)), encoding="utf-8")
-    return [*written, out / "table.md"]
+    write_json(out / "table.json", table_numbers(folders))
+    return [*written, out / "table.md", out / "table.json"]
 
 
 def unseen_view(runs: Sequence[Run], frames: int) -> int:

@@ -65,14 +65,16 @@ def test_report_writes_every_figure(runs, tmp_path):
         "comparison.png",
         "psnr.png",
         "table.md",
+        "table.json",
     ]
-    for path in written[:-1]:
+    for path in written[:-2]:
         with Image.open(path) as picture:
             picture.load()
             assert min(picture.size) > 400
             assert len(picture.convert("RGB").getcolors(1 << 24)) > 50
         assert path.stat().st_size < 400_000
     assert {path.name for path in (tmp_path / "report").iterdir()} == {path.name for path in written}
+    assert json.loads((tmp_path / "report/table.json").read_text()) == report.table_numbers(runs)
 
 
 def test_unseen_view(runs):
@@ -90,6 +92,10 @@ def test_table(runs):
     assert row["images"] == "8"
     assert row["all.psnr"] == f"{metrics['all']['psnr']:.2f}"
     assert row["held_out.ssim_mask"] == f"{metrics['held_out']['ssim_mask']:.4f}"
+    numbers = report.table_numbers(runs)[1]
+    means = {f"{views}.{name}": value for views in ("all", "held_out") for name, value in metrics[views].items()}
+    last = json.loads((runs[1] / "steps.jsonl").read_text().splitlines()[-1])
+    assert numbers == means | {"policy": "random", "images": 8, "coverage": 100 * last["coverage"]}
     lines = report.markdown_table(rows).splitlines()
     assert len(lines) == 4
     assert {line.count("|") for line in lines} == {len(report.COLUMNS) + 1}
@@ -136,7 +142,7 @@ def test_missing_and_damaged_files(runs, tmp_path):
             report.read_run(tmp_path)
     (tmp_path / "steps.jsonl").write_text((runs[0] / "steps.jsonl").read_text())
     with pytest.raises(InputError, match="mgs eval"):
-        report.table_rows([tmp_path])
+        report.table_numbers([tmp_path])
 
 
 @pytest.mark.parametrize("key", ["coverage", "images", "information_gain", "frame"])

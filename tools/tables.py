@@ -1,0 +1,240 @@
+"""Tables of measured numbers in README.md and docs/*.md, made from docs/benchmarks/*.json.
+
+    python tools/tables.py            # write them anew
+    python tools/tables.py --check    # exit code 1 where one is not what its numbers say
+
+A table stands between `<!-- table: NAME -->` and `<!-- end of table -->`; NAME is a key of `TABLES`. Most of the JSON files say
+which command wrote them; demo.json is demo/report/table.json after `make demo`, and policies.json is table.json of `mgs report`
+on the five runs of docs/nbv.md.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from mgs.bench import TARGETS
+from mgs.report import COLUMNS, table_cell
+
+ROOT = Path(__file__).parent.parent
+MARK = re.compile(r"<!-- (?:table: (?P<name>\S+)|end of table) -->")
+
+
+def markdown(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table; all columns but the first are right-aligned."""
+    lines = [heading, ["---", *["---:"] * (len(heading) - 1)], *rows]
+    return "".join("|" + "".join(f" {cell} |" if cell else " |" for cell in line) + "\n" for line in lines)
+
+
+def short(value: float, digits: int = 1) -> str:
+    """A number of any size with so many significant digits, 6.1e-4."""
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+def made_by(data: dict[str, Any]) -> str:
+    """The command that measured the numbers, the machine where the file names it, and the versions."""
+    command, machine, versions = data["command"], data.get("machine"), data["versions"]
+    if not command.startswith("mgs "):
+        command = f"python benchmarks/{command}"
+    cores = f" on {machine['threads']} threads ({machine['cpu']}, {machine['simd_width']} float32 lanes)" if machine else ""
+    return f"\n`{command}`{cores}; mgs {versions['mgs']}, Mitsuba {versions['mitsuba']}, Dr.Jit {versions['drjit']}.\n"
+
+
+def demo(rows: list[dict[str, Any]]) -> str:
+    """The columns of the demo's table that the README shows."""
+    headings = {
+        "policy": "policy",
+        "images": "images",
+        "all.psnr": "PSNR, all views",
+        "held_out.psnr": "PSNR, held out",
+        "held_out.psnr_mask": "PSNR, held out, rock only",
+        "coverage": "coverage",
+    }
+    units = {"all.psnr": " dB", "held_out.psnr": " dB", "held_out.psnr_mask": " dB", "coverage": " %"}
+    return markdown(
+        list(headings.values()), [[table_cell(key, row[key]) + units.get(key, "") for key in headings] for row in rows]
+    )
+
+
+def demo_report(rows: list[dict[str, Any]]) -> str:
+    """`table.md` of the demo's report."""
+    return markdown(list(COLUMNS.values()), [[table_cell(key, row[key]) for key in COLUMNS] for row in rows])
+
+
+def policies(rows: list[dict[str, Any]]) -> str:
+    """More policies on the demo's dataset, compared inside the rock's mask too."""
+    headings = {
+        "policy": "policy",
+        "all.psnr": "all views",
+        "all.psnr_mask": "all, rock only",
+        "held_out.psnr": "held out",
+        "held_out.psnr_mask": "held out, rock only",
+        "held_out.ssim_mask": "SSIM, held out, rock only",
+    }
+    return markdown(list(headings.values()), [[table_cell(key, row[key]) for key in headings] for row in rows])
+
+
+def splat(data: dict[str, Any]) -> str:
+    """Times of `mgs bench splat`, ratios to the peer or to a gradient, and what is asked for."""
+    seconds, figures, scene = data["seconds"], data["figures"], data["scene"]
+    rows = []
+    for name, own, peer, figure in (
+        ("forward, warm", "forward_warm", "volprim_forward", "forward_warm_speedup"),
+        ("forward, cold (a view never seen before)", "forward_cold", "volprim_forward", "forward_cold_speedup"),
+        ("forward + adjoint, warm", "gradient_warm", "volprim_gradient", "gradient_warm_speedup"),
+        ("exact Fisher diagonal, warm, over forward + adjoint", "fisher_exact", None, "fisher_over_gradient"),
+        ("exact 11x11 blocks, warm, over forward + adjoint", "fisher_block", None, "block_fisher_over_gradient"),
+    ):
+        bound, target = TARGETS[figure]
+        times = [f"{1e3 * seconds[own]:.1f} ms", f"{1e3 * seconds[peer]:.0f} ms" if peer else ""]
+        rows.append([name, *times, f"{figures[figure]:.{0 if peer else 2}f}", f"{bound} {target:g}"])
+    bound, target = TARGETS["tiny_forward_ms"]
+    tiny = f"{figures['tiny_forward_ms']:.2f} ms"
+    rows.append(["forward, 1,000 Gaussians, 64x48, warm", tiny, "", "", f"{bound} {target:g} ms"])
+    title = f"{scene['gaussians']:,} Gaussians of a rock, {scene['width']}x{scene['height']}"
+    return markdown([title, "mgs", "`volprim_rf_basic`", "ratio", "asked for"], rows) + made_by(data)
+
+
+def splat_work(data: dict[str, Any]) -> str:
+    """Work and memory of the same run."""
+    peak, share = f"{data['peak_gflops_measured']:.0f} Gflop/s", data["share_of_peak"]
+    rows = [
+        ["(splat, block) pairs", f"{data['pairs']:,}"],
+        ["pixels of pairs a second, forward", f"{data['pixel_splat_pairs_per_second']['forward'] / 1e9:.1f} billion"],
+        [f"share of the measured FMA rate ({peak}), forward", f"{share['forward']:.0%}"],
+        ["share of the measured FMA rate, exact Fisher", f"{share['fisher_exact']:.0%}"],
+        ["block lists of a camera", f"{data['list_megabytes']:.0f} MB"],
+        ["most memory of the process, before the peer is loaded", f"{data['peak_memory_megabytes']:.0f} MB"],
+    ]
+    return markdown(["in the same run", ""], rows)
+
+
+def scaling(data: dict[str, Any]) -> str:
+    """Exponents of growth, and times as sums of what grows linearly."""
+    costs, start = data["linear_growth"], f"{data['exponents_from_n']:,}"
+    exponents = {
+        "exponent against pairs, N and the image growing together": "pairs alone",
+        "as the image grows alone": "pairs, image growing",
+        f"as N grows alone, from {start}": "pairs, N growing",
+    }
+    fits = {"fit: ns per pair": "ns per pair", "ns per Gaussian": "ns per Gaussian", "constant, ms": "constant, ms"}
+    rows = [[name, *(f"{data['exponents'][what][key]:.2f}" for what in costs)] for name, key in exponents.items()]
+    rows += [[name, *(f"{cost[key]:.{int('ms' in name)}f}" for cost in costs.values())] for name, key in fits.items()]
+    rows.append(["worst deviation", *(f"{cost['worst deviation']:.0%}" for cost in costs.values())])
+    return markdown(["", *costs], rows) + made_by(data)
+
+
+def block_accuracy(data: dict[str, Any]) -> str:
+    """Errors of block entries against the float64 oracle."""
+    error = data["error_over_sqrt_HiiHjj"]
+    rows = [
+        ["entries beyond the tolerance of the tests", f"{data['entries_beyond_tolerance']:,}"],
+        ["worst relative error", short(data["worst_relative_error"], 2)],
+        ["error over sqrt(H_ii H_jj), median", short(error["median"])],
+        ["error over sqrt(H_ii H_jj), 99th percentile", short(error["p99"])],
+        ["error over sqrt(H_ii H_jj), worst", short(error["max"])],
+    ]
+    title = f"{data['entries']:,} entries of blocks, {data['scenes']:,} random scenes"
+    return markdown([title, "measured"], rows) + made_by(data)
+
+
+def hutchinson(data: dict[str, Any]) -> str:
+    """Error of the estimator against the number of probes."""
+    mean = [sum(column) / len(column) for column in zip(*data["relative_l2"], strict=True)]
+    rows = [[f"relative L2 error, mean of {len(data['relative_l2'])} seeds", *(f"{value:.2f}" for value in mean)]]
+    slope = f"Growth with k: exponent {data['slope']:.2f}, expected -0.50."
+    return markdown(["probes k", *map(str, data["probes"])], rows) + f"\n{slope}\n" + made_by(data)
+
+
+def render_settings(data: dict[str, Any]) -> str:
+    """PSNR and cost of path-traced frames, plain and denoised."""
+    plain, denoised = ([row for row in data["settings"] if row["denoise"] is flag] for flag in (False, True))
+    rows = [
+        [str(a["spp"]), *(text for row in (a, b) for text in (f"{row['psnr_rock']:.1f} dB", f"{row['cpu_seconds']:.1f}"))]
+        for a, b in zip(plain, denoised, strict=True)
+    ]
+    heading = ["samples a pixel", "plain: PSNR on the rock", "CPU seconds", "denoised: PSNR on the rock", "CPU seconds"]
+    return markdown(heading, rows) + made_by(data)
+
+
+def lambda_ranking(data: dict[str, Any]) -> str:
+    """Rank correlation and choice for some of the lambdas."""
+    named = {("default times", power): f"default x 10^{power}" for power in (-8, -4, -2, 0, 1, 2, 4, 8)}
+    named |= {("single", power): f"10^{power} for all parameters" for power in (-12, -3, 0)}
+    named |= {("default times", 0): "default", ("single", 0): "1 for all parameters"}
+    found = {(row["kind"], round(math.log10(row["value"]))): row for row in data["rows"]}
+    rows = [[name, f"{found[key]['spearman']:.2f}", found[key]["chosen"]] for key, name in named.items()]
+    return markdown(["lambda", "Spearman with the default", "chosen view"], rows)
+
+
+def depth_error(data: dict[str, Any]) -> str:
+    """Shares of the rock's pixels that are drawn too deep, or not whole."""
+    deep, deeper = (f"{100 * limit:.0f} cm" for limit in data["too_deep"])
+    heading = ["", f"expected depth more than {deep} too deep", f"more than {deeper}", f"opacity below {data['opaque']}"]
+    return markdown(heading, [[name, *(f"{100 * share:.1f} %" for share in row)] for name, row in data["shares"].items()])
+
+
+TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "demo": ("demo", demo),
+    "demo-report": ("demo", demo_report),
+    "policies": ("policies", policies),
+    "splat": ("splat", splat),
+    "splat-work": ("splat", splat_work),
+    "scaling": ("scaling", scaling),
+    "block-accuracy": ("block_accuracy", block_accuracy),
+    "hutchinson": ("hutchinson", hutchinson),
+    "render-settings": ("render_settings", render_settings),
+    "lambda-ranking": ("lambda_ranking", lambda_ranking),
+    "depth-error": ("depth_error", depth_error),
+}
+"""By name: the file in docs/benchmarks, without `.json`, and what makes the table of its contents."""
+
+
+def rewritten(page: str, benchmarks: Path) -> str:
+    """A page with its tables made anew. Raises ValueError where a mark has no partner, or a table is unknown."""
+    parts, end = [], 0
+    marks = list(MARK.finditer(page))
+    for opening, closing in zip(marks[::2], marks[1::2], strict=False):
+        name = opening["name"]
+        if name is None or closing["name"] is not None:
+            raise ValueError(f"{opening[0]}, {closing[0]}: marks must come in pairs, `table: NAME` and `end of table`")
+        if name not in TABLES:
+            raise ValueError(f"{opening[0]}: no such table; tools/tables.py has {', '.join(TABLES)}")
+        file, make = TABLES[name]
+        table = make(json.loads((benchmarks / f"{file}.json").read_text(encoding="utf-8")))
+        parts += [page[end : opening.end()], f"\n\n{table}\n"]
+        end = closing.start()
+    if len(marks) % 2:
+        raise ValueError(f"{marks[-1][0]}: has no partner")
+    return "".join([*parts, page[end:]])
+
+
+def main(arguments: Sequence[str], root: Path = ROOT) -> int:
+    """Rewrite the pages, or with --check only name those that are stale. Returns the exit code."""
+    stale = 0
+    for path in (root / "README.md", *sorted((root / "docs").glob("*.md"))):
+        page = path.read_text(encoding="utf-8")
+        try:
+            new = rewritten(page, root / "docs/benchmarks")
+        except ValueError as error:
+            print(f"{path.relative_to(root)}: {error}", file=sys.stderr)
+            return 2
+        if new == page:
+            continue
+        stale += 1
+        if "--check" in arguments:
+            print(f"{path.relative_to(root)}: a table is stale; run `python tools/tables.py`", file=sys.stderr)
+        else:
+            path.write_text(new, encoding="utf-8")
+            print(f"wrote {path.relative_to(root)}")
+    return int("--check" in arguments and stale > 0)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))
