@@ -22,6 +22,9 @@ QUAT_MIN = 1e-12
 MAX_PIXELS = 2**27
 """Largest image of a camera: what is larger is a slip of the keyboard, and would end in a lack of memory."""
 
+WORLD_FROM_GLTF = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""glTF files (and GLB, their binary form) are +Y up, the world is +Z up. Its transpose is its inverse."""
+
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 

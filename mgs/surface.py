@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from mgs.cloud import Plane
+from mgs.conventions import WORLD_FROM_GLTF
 from mgs.errors import InputError
 from mgs.files import reading
 
@@ -25,6 +26,9 @@ POISSON_CELL = 1.5
 """Edge of Poisson's finest cell over the cloud's voxel: finer cells fit noise and cost time (halving it gained nothing)."""
 POISSON_DEPTHS = (5, 10)
 """Least and largest octree depth chosen automatically; a caller may ask for 3 to 12 (beyond, pymeshlab crashes)."""
+GLTF = (".glb", ".gltf")
+GLTF_UP = "+Y"
+"""What our GLB files hold in the extras of their mesh under `up`."""
 OVERSAMPLING = 5
 """Random candidates per blue-noise sample."""
 
@@ -66,7 +70,13 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     with reading(path, "mesh; give a GLB, OBJ or PLY file"), path.open("rb") as file:
         file.read(1)
     try:
-        mesh = trimesh.load(path, force="mesh", process=False)
+        mesh: Any = trimesh.load(path, process=False) if path.suffix.lower() in GLTF else None
+        parts = list(mesh.graph.nodes_geometry) if isinstance(mesh, trimesh.Scene) else []
+        if len(parts) == 1:
+            transform, name = mesh.graph[parts[0]]
+            mesh = mesh.geometry[name].apply_transform(transform)  # keeps the file's normals, which force="mesh" loses
+        else:
+            mesh = trimesh.load(path, force="mesh", process=False)
     except Exception as error:  # trimesh's readers raise many types; each means a damaged or unknown file.
         reason = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: not a readable mesh ({reason}); export it again as GLB, OBJ or PLY") from None
@@ -81,10 +91,30 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
 def read_mesh(path: str | Path) -> Mesh:
     """A triangle mesh in world coordinates, metres, turned right side out; all of it counts as seen.
 
+    glTF and GLB are +Y up, as their format has it, and are turned; other formats have no rule, and are taken as they are.
     Raises InputError as `load_mesh`.
     """
+    return _in_world(load_mesh(path), Path(path).suffix.lower() in GLTF)
+
+
+def read_rock(path: str | Path) -> Mesh:
+    """The true rock of a dataset, `rock.glb`, as `read_mesh`. One without the mark of `to_glb` is of an older mgs: +Z up."""
     mesh = load_mesh(path)
+    return _in_world(mesh, mesh.metadata.get("up") == GLTF_UP)
+
+
+def to_glb(mesh: trimesh.Trimesh) -> bytes:
+    """A GLB file of a mesh in world coordinates, with its normals and texture: turned to +Y up, and marked so."""
+    turned: Any = mesh.copy(include_cache=True)  # the cache holds the vertex normals
+    turned.apply_transform(WORLD_FROM_GLTF.T)
+    turned.metadata["up"] = GLTF_UP
+    return turned.export(None, file_type="glb", include_normals=True)
+
+
+def _in_world(mesh: trimesh.Trimesh, y_up: bool) -> Mesh:
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    if y_up:
+        vertices = vertices @ WORLD_FROM_GLTF[:3, :3].T
     a, b, c = (vertices[faces[:, k]] - vertices.mean(0) for k in range(3))
     inside_out = np.einsum("fk,fk->f", a, np.cross(b, c)).sum() < 0  # six times the signed volume
     return Mesh(vertices, faces[:, ::-1] if inside_out else faces, np.ones(len(faces), bool))
