@@ -25,6 +25,8 @@ MAX_PIXELS = 2**27
 MAX_SIDE = 2**20
 """Largest width and height of an image, pixels: beyond it float32 cannot tell neighbouring pixel centres well, and a strip a
 pixel wide, drawn in whole blocks, has far more than MAX_PIXELS."""
+WORLD_FROM_GLTF = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""glTF files (and GLB, their binary form) are +Y up, the world is +Z up. Its transpose is its inverse."""
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 

@@ -27,7 +27,7 @@ from mgs.dataset import Dataset, Frame
 from mgs.errors import InputError
 from mgs.files import atomic_path, new_folder, read_json, write_json
 from mgs.seeds import derive_seed, generator
-from mgs.surface import Mesh, distances_to_mesh, estimate_normals, poisson_mesh, read_mesh, sample_surface
+from mgs.surface import Mesh, distances_to_mesh, estimate_normals, poisson_mesh, read_mesh, read_rock, sample_surface
 from mgs.visibility import in_mask, visible
 
 TRUTH_SAMPLES = 50_000
@@ -227,7 +227,7 @@ def error_to_truth(
     """
     import trimesh
 
-    known = read_mesh(truth)
+    known = read_rock(truth)
     true = trimesh.Trimesh(known.vertices, known.faces, process=False)
     surface, face = trimesh.sample.sample_surface(true, TRUTH_SAMPLES, seed=derive_seed(seed, "prior/truth"))
     exposed = rock.plane.height(np.asarray(surface)) > 0

@@ -10,11 +10,11 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 from skimage.measure import marching_cubes
 
-from mgs.conventions import srgb_from_linear
+from mgs.conventions import WORLD_FROM_GLTF, srgb_from_linear
 from mgs.errors import InputError
 from mgs.noise import Noise
 from mgs.scene_file import Rock
-from mgs.surface import load_mesh
+from mgs.surface import GLTF, load_mesh
 
 MAX_GRID = 10**8
 """Points of the grid that a rock is cut from: more would take tens of gigabytes."""
@@ -41,17 +41,23 @@ def rock_shape(settings: Rock, noise: Noise) -> tuple[trimesh.Trimesh, np.ndarra
     return _stand(mesh, settings), height
 
 
-def load_rock(path: str | Path, settings: Rock) -> tuple[trimesh.Trimesh, float]:
+def up_axis(path: str | Path) -> str:
+    """The up axis of a mesh file, "y" or "z", where nobody says: glTF and GLB have a rule, +Y. OBJ, PLY and others have none;
+    most OBJ files are +Y up, the others are taken to be as our world is, +Z."""
+    return "y" if Path(path).suffix.lower() in (*GLTF, ".obj") else "z"
+
+
+def load_rock(path: str | Path, settings: Rock, up: str | None = None) -> tuple[trimesh.Trimesh, float]:
     """Any GLB, OBJ or PLY as the rock: scaled to `settings.size` and stood on the ground; keeps its texture.
 
-    Returns the mesh and the scale that was applied. GLB and OBJ are +Y up (the rule of their formats) and are turned to +Z.
+    up: "y" or "z", the file's up axis; by default as `up_axis`. Returns the mesh, +Z up, and the scale that was applied.
     Raises InputError as `load_mesh`, and where all vertices are one point.
     """
     mesh = load_mesh(path)
     if mesh.extents.max() == 0:
         raise InputError(f"{path}: all vertices are one point; repair the mesh")
-    if Path(path).suffix.lower() in (".glb", ".gltf", ".obj"):
-        mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
+    if (up or up_axis(path)) == "y":
+        mesh.apply_transform(WORLD_FROM_GLTF)
     scale = settings.size / float(mesh.extents.max())
     return _stand(mesh, settings), scale
 

@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mgs.cloud import Plane
+from mgs.conventions import WORLD_FROM_GLTF
 from mgs.errors import InputError
 from mgs.files import reading
 
@@ -29,6 +30,9 @@ POISSON_CELL = 1.5
 """Edge of Poisson's finest cell over the cloud's voxel: finer cells fit noise and cost time (halving it gained nothing)."""
 POISSON_DEPTHS = (5, 10)
 """Least and largest octree depth chosen automatically; a caller may ask for 3 to 12 (beyond, pymeshlab crashes)."""
+GLTF = (".glb", ".gltf")
+GLTF_UP = "+Y"
+"""What our GLB files hold in the extras of their mesh under `up`."""
 OVERSAMPLING = 5
 """Random candidates per blue-noise sample."""
 FURTHEST = 1e15
@@ -79,7 +83,13 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     with reading(path, "mesh; give a GLB, OBJ or PLY file"), path.open("rb") as file:
         file.read(1)
     try:
-        mesh = trimesh.load(path, force="mesh", process=False)
+        mesh: Any = trimesh.load(path, process=False) if path.suffix.lower() in GLTF else None
+        parts = list(mesh.graph.nodes_geometry) if isinstance(mesh, trimesh.Scene) else []
+        if len(parts) == 1:
+            transform, name = mesh.graph[parts[0]]
+            mesh = mesh.geometry[name].apply_transform(transform)  # keeps the file's normals, which force="mesh" loses
+        else:
+            mesh = trimesh.load(path, force="mesh", process=False)
     except Exception as error:  # trimesh's readers raise many types; each means a damaged or unknown file.
         reason = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: not a readable mesh ({reason}); export it again as GLB, OBJ or PLY") from None
@@ -104,11 +114,32 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
 def read_mesh(path: str | Path) -> Mesh:
     """A triangle mesh in world coordinates, metres, as one clean surface; all of it counts as seen.
 
+    glTF and GLB are +Y up, as their format has it, and are turned; other formats have no rule, and are taken as they are.
     Left out: faces without area, faces that are there twice (whichever way round), vertices of no face. Faces wound against
     their neighbours are turned, and then all of them where the mesh is inside out. Raises InputError as `load_mesh`.
     """
+    return _in_world(load_mesh(path), Path(path).suffix.lower() in GLTF)
+
+
+def read_rock(path: str | Path) -> Mesh:
+    """The true rock of a dataset, `rock.glb`, as `read_mesh`. One without the mark of `to_glb` is of an older mgs: +Z up."""
     mesh = load_mesh(path)
+    return _in_world(mesh, mesh.metadata.get("up") == GLTF_UP)
+
+
+def to_glb(mesh: trimesh.Trimesh) -> bytes:
+    """A GLB file of a mesh in world coordinates, with its normals and texture: turned to +Y up, and marked so."""
+    turned: Any = mesh.copy(include_cache=True)  # the cache holds the vertex normals
+    turned.apply_transform(WORLD_FROM_GLTF.T)
+    turned.metadata["up"] = GLTF_UP
+    return turned.export(None, file_type="glb", include_normals=True)
+
+
+def _in_world(mesh: trimesh.Trimesh, y_up: bool) -> Mesh:
+    """A mesh in world coordinates, cleaned as `read_mesh` says; y_up: it is +Y up."""
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    if y_up:
+        vertices = vertices @ WORLD_FROM_GLTF[:3, :3].T
     faces = faces[np.linalg.norm(_crosses(vertices, faces), axis=1) > 0]
     place = np.unique(vertices + 0.0, axis=0, return_inverse=True)[1].ravel()  # one number for vertices at one place; -0 is 0
     first = np.unique(np.sort(place[faces], axis=1), axis=0, return_index=True)[1]

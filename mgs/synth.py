@@ -30,10 +30,11 @@ from mgs.files import (
     write_png,
 )
 from mgs.orbit import orbit_cameras, perturb
-from mgs.rock import load_rock, make_rock
+from mgs.rock import load_rock, make_rock, up_axis
 from mgs.scene import Scene
 from mgs.scene_file import SceneFile
 from mgs.seeds import derive_seed, generator
+from mgs.surface import GLTF, to_glb
 
 NOISY_FACTOR = 8
 """Samples are multiplied by this where pyoidn is not installed."""
@@ -72,26 +73,30 @@ def synthesise(
     pose_noise: PoseNoise | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     say: Callable[[str], None] = lambda message: None,
+    mesh_up: str | None = None,
 ) -> Dataset:
     """Render the dataset `out`: images, depth, masks, rock.glb, config.json, contact_sheet.png, transforms.json (last).
 
     With `pose_noise` transforms.json holds noisy poses, and true_poses.json the cameras that took the images.
+    mesh: a file in place of the procedural rock; mesh_up: its up axis, "y" or "z", by default as `mgs.rock.up_axis`.
     A folder that an interrupted run of the same settings left is completed; the result is the same as in one run.
     Raises InputError: output folder not empty, not writable or worked on by another process, bad mesh, rock not wholly in every
     frame, or nowhere in sight.
     """
     started, out = time.perf_counter(), Path(out)
     _is_unfinished(out)  # before the rock is made, which takes seconds
-    rock, scale = (make_rock(settings.rock, generator(seed, "rock")), 1.0) if mesh is None else load_rock(mesh, settings.rock)
-    if mesh is not None:
+    if mesh is None:
+        rock, scale = make_rock(settings.rock, generator(seed, "rock")), 1.0
+    else:
+        rock, scale = load_rock(mesh, settings.rock, mesh_up)
         extents = " x ".join(f"{x:.2f}" for x in rock.extents)
-        say(f"{mesh}: scaled {scale:.4g} times to the scene's rock size, now {extents} m")
+        say(f"{mesh}: {_said_up(mesh, mesh_up)}; scaled {scale:.4g} times to the scene's rock size, now {extents} m")
     cameras = rock_cameras(settings, preset, rock)
     frames = _frames(out, cameras)
     denoise = importlib.util.find_spec("pyoidn") is not None
-    resolved = _resolved(settings, preset, seed, mesh, denoise, pose_noise)
+    resolved = _resolved(settings, preset, seed, mesh, mesh_up, denoise, pose_noise)
     goes_on = _resumes(out, resolved)
-    glb: Any = rock.export(None, file_type="glb", include_normals=True)  # before the scene adds its attributes to the mesh
+    glb = to_glb(rock)  # before the scene adds its attributes to the mesh
     scene = Scene(settings, rock, cameras[0], seed)
     exposure = _meter(scene, cameras, seed)
     if not goes_on:
@@ -121,8 +126,26 @@ def synthesise(
         return load_dataset(out)
 
 
+def _said_up(mesh: str | Path, given: str | None) -> str:
+    """In words: which axis of a mesh file is taken as up, and why."""
+    if given:
+        return f"+{given.upper()} is up, as told"
+    up = up_axis(mesh)
+    suffix = Path(mesh).suffix.lower()
+    if suffix in GLTF:
+        return f"+{up.upper()} is up, as in all {suffix[1:].upper()} files"
+    other = "y" if up == "z" else "z"
+    return f"+{up.upper()} taken as up, its format has no rule (--mesh-up {other} turns it)"
+
+
 def _resolved(
-    settings: SceneFile, preset: Preset, seed: int, mesh: str | Path | None, denoise: bool, pose_noise: PoseNoise | None
+    settings: SceneFile,
+    preset: Preset,
+    seed: int,
+    mesh: str | Path | None,
+    mesh_up: str | None,
+    denoise: bool,
+    pose_noise: PoseNoise | None,
 ) -> dict[str, Any]:
     """All that decides the dataset: what a run that goes on must agree with."""
     return {
@@ -131,7 +154,11 @@ def _resolved(
         "seed": seed,
         "mesh": None
         if mesh is None
-        else {"name": Path(mesh).name, "sha256": hashlib.sha256(Path(mesh).read_bytes()).hexdigest()},
+        else {
+            "name": Path(mesh).name,
+            "sha256": hashlib.sha256(Path(mesh).read_bytes()).hexdigest(),
+            "up": mesh_up or up_axis(mesh),
+        },
         "denoise": denoise,
         "pose_noise": None if pose_noise is None else asdict(pose_noise),
     }

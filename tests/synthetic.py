@@ -11,6 +11,7 @@ import trimesh
 from mgs.conventions import Camera, look_at
 from mgs.dataset import Dataset, Frame, load_dataset, write_transforms
 from mgs.files import write_exr, write_png
+from mgs.surface import to_glb
 
 CENTRE = np.array([0.1, -0.05, 0.2])
 AXES = np.array([0.6, 0.5, 0.45])
@@ -79,6 +80,6 @@ def write_dataset(
             write_exr(root / f"depth/kf_{i:04d}.exr", {"Z": z})
         frames.append(frame)
     if rocks:
-        rock_mesh(*rocks[0]).export(root / "rock.glb")
+        (root / "rock.glb").write_bytes(to_glb(rock_mesh(*rocks[0])))
     write_transforms(root, frames)
     return load_dataset(root)

@@ -226,6 +226,8 @@ def test_broken_mesh(capsys, tmp_path, case):
 
 SYNTH: dict[str, tuple[list, str]] = {
     "missing mesh": (["--mesh", "nowhere.glb"], "nowhere.glb"),
+    "up axis of no mesh": (["--mesh-up", "y"], "--mesh-up"),
+    "unknown up axis": (["--mesh-up", "x"], "--mesh-up"),
     "unknown scene": (["--scene", "moonbase"], "moonbase"),
     "missing scene file": (["--scene", "nowhere/x.toml"], "x.toml"),
     "unknown preset": (["--preset", "huge"], "huge"),

@@ -202,24 +202,16 @@ def test_depth_in_16_bit_png(dataset: Dataset, tmp_path: Path) -> None:
         assert np.abs(one.depth() - other.depth()).max() < 5.1e-4
 
 
-@pytest.mark.parametrize("alpha", [False, True])
-def test_images_of_16_bits(dataset: Dataset, tmp_path: Path, alpha: bool) -> None:
-    """Colours and alpha come over, rounded to the 8 bits of a dataset."""
+def test_images_of_16_bits(dataset: Dataset, tmp_path: Path) -> None:
     data = read_json(dataset.root / "transforms.json")
-    rng = np.random.default_rng(0)
-    written = []
+    written = np.random.default_rng(0).integers(0, 65536, (48, 64, 4), np.uint16)
     for frame, record in zip(dataset.frames, data["frames"], strict=True):
         del record["mask_path"]
-        written.append(rng.integers(0, 65536, (frame.camera.height, frame.camera.width, 4 if alpha else 1), np.uint16))
-        cv2.imwrite(str(frame.image_path), written[-1][..., [2, 1, 0, 3] if alpha else 0])
+        cv2.imwrite(str(frame.image_path), written[..., [2, 1, 0, 3]])
     write_json(dataset.root / "transforms.json", data)
-    copy = _import(dataset.root, tmp_path / "copy")
-    for frame, pixels in zip(copy.frames, written, strict=True):
-        with Image.open(frame.image_path) as image:
-            assert np.abs(np.asarray(image) - pixels[..., :3] / 257).max() <= 0.5
-        assert (frame.mask_path is not None) == alpha
-        if alpha:
-            np.testing.assert_array_equal(frame.mask(), pixels[..., 3] >= 32768)
+    frame = _import(dataset.root, tmp_path / "copy").frames[0]
+    assert np.abs(cv2.imread(str(frame.image_path))[..., ::-1] - written[..., :3] / 257).max() <= 0.5
+    assert np.array_equal(frame.mask(), written[..., 3] >= 32768)
 
 
 def test_missing_images_are_skipped_and_counted(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

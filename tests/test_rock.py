@@ -13,6 +13,7 @@ from mgs.noise import Noise
 from mgs.rock import load_rock, make_rock
 from mgs.scene_file import Rock
 from mgs.seeds import generator
+from mgs.surface import read_mesh, read_rock, to_glb
 
 COARSE = Rock(detail=0.08)
 APOLLO = Path(__file__).parents[2] / "shared/data/rocks/apollo_sample1.glb"
@@ -49,10 +50,31 @@ def test_rock_is_a_function_of_the_seed():
 
 def test_glb_round_trip_keeps_geometry_and_colours(tmp_path):
     rock = make_rock(COARSE, generator(0, "rock"))
-    rock.export(tmp_path / "rock.glb", include_normals=True)
-    back = trimesh.load(tmp_path / "rock.glb", force="mesh", process=False)
+    (tmp_path / "rock.glb").write_bytes(to_glb(rock))
+    back, scale = load_rock(tmp_path / "rock.glb", COARSE)
+    assert scale == pytest.approx(1)
     np.testing.assert_allclose(back.vertices, rock.vertices, atol=1e-6)
+    np.testing.assert_allclose(back.vertex_normals, rock.vertex_normals, atol=1e-6)
     np.testing.assert_array_equal(back.visual.to_color().vertex_colors, rock.visual.to_color().vertex_colors)
+    for read in (read_mesh, read_rock):
+        np.testing.assert_array_equal(read(tmp_path / "rock.glb").vertices, rock.vertices.astype(np.float32))
+
+
+def test_glb_is_y_up_as_its_format_has_it(tmp_path):
+    """In the file itself: what a viewer shows upwards is what stands upwards in the scene."""
+    box = trimesh.creation.box([1.0, 2.0, 5.0])
+    box.apply_translation([0, 0, 2.5])
+    (tmp_path / "box.glb").write_bytes(to_glb(box))
+    raw = trimesh.load(tmp_path / "box.glb", force="mesh", process=False)
+    np.testing.assert_allclose(raw.bounds, [[-0.5, 0, -1], [0.5, 5, 1]])
+    assert raw.volume > 0
+    np.testing.assert_array_equal(box.bounds, [[-0.5, -1, 0], [0.5, 1, 5]])  # itself it stays
+
+
+def test_rock_of_a_dataset_of_an_older_mgs_is_z_up(tmp_path):
+    box = trimesh.creation.box([1.0, 2.0, 5.0])
+    box.export(tmp_path / "rock.glb")
+    np.testing.assert_allclose(np.ptp(read_rock(tmp_path / "rock.glb").vertices, 0), [1, 2, 5])
 
 
 @pytest.mark.parametrize("suffix", ["glb", "obj", "ply"])
@@ -64,6 +86,14 @@ def test_given_mesh_is_scaled_and_stood_up(tmp_path, suffix):
     np.testing.assert_allclose(rock.extents, [0.5, 0.5, 1.5])
     assert scale == pytest.approx(50)
     assert rock.bounds[0, 2] == pytest.approx(0)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+@pytest.mark.parametrize("suffix", ["glb", "obj", "ply"])
+def test_the_up_axis_of_a_mesh_can_be_told(tmp_path, suffix, up):
+    trimesh.creation.box([0.01, 0.02, 0.03]).export(tmp_path / f"box.{suffix}")
+    rock, _ = load_rock(tmp_path / f"box.{suffix}", Rock(size=3.0, buried=0.0), up)
+    np.testing.assert_allclose(rock.extents, [1, 2, 3] if up == "z" else [1, 3, 2])
 
 
 @pytest.mark.skipif(not APOLLO.exists(), reason="the Apollo sample is not part of the repository")

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from mgs import arena
 from mgs.cli import main
-from mgs.conventions import opencv_from_opengl
+from mgs.conventions import WORLD_FROM_GLTF, opencv_from_opengl
 from mgs.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import locked, read_json
@@ -42,6 +42,7 @@ def dataset(tmp_path_factory):
 def test_depth_inside_the_mask_lies_on_the_rock(dataset):
     """Proves camera convention, z-depth (not ray distance) and mask at once, over all azimuths."""
     rock = trimesh.load(dataset.root / "rock.glb", force="mesh")
+    rock.apply_transform(WORLD_FROM_GLTF)
     for frame in dataset.frames:
         points = frame.camera.unproject(frame.depth())[frame.mask()]
         assert len(points) > 200
@@ -128,7 +129,38 @@ def test_another_mesh_of_the_same_name_is_not_gone_on_with(tmp_path):
     with pytest.raises(InputError, match="other settings"):
         synthesise(tmp_path / "out", SCENE, small, mesh=path)
     trimesh.creation.icosphere(subdivisions=2).export(path)
+    with pytest.raises(InputError, match="other settings"):
+        synthesise(tmp_path / "out", SCENE, small, mesh=path, mesh_up="y")
     assert len(synthesise(tmp_path / "out", SCENE, small, mesh=path)) == 2
+
+
+def test_the_rock_of_a_dataset_given_back_as_mesh_is_the_same_scene(dataset, tmp_path):
+    notes = []
+    again = synthesise(tmp_path / "again", SCENE, TINY, seed=3, mesh=dataset.root / "rock.glb", say=notes.append)
+    assert "rock.glb: +Y is up, as in all GLB files; scaled 1 times" in notes[0]
+    for a, b in zip(dataset.frames, again.frames, strict=True):
+        assert (a.mask() != b.mask()).mean() < 1e-3
+        both = a.mask() & b.mask()
+        np.testing.assert_allclose(a.depth()[both], b.depth()[both], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "up", "said"),
+    [
+        ("obj", None, "+Y taken as up, its format has no rule (--mesh-up z turns it)"),
+        ("ply", None, "+Z taken as up, its format has no rule (--mesh-up y turns it)"),
+        ("stl", None, "+Z taken as up, its format has no rule (--mesh-up y turns it)"),
+        ("ply", "y", "+Y is up, as told"),
+        ("glb", "z", "+Z is up, as told"),
+    ],
+)
+def test_what_is_taken_as_up_is_said(tmp_path, suffix, up, said):
+    path, notes = tmp_path / f"rock.{suffix}", []
+    trimesh.creation.icosphere(subdivisions=2).export(path)
+    small = Preset(width=32, height=24, frames=1, spp=1)
+    dataset = synthesise(tmp_path / "out", SCENE, small, mesh=path, mesh_up=up, say=notes.append)
+    assert f"{path}: {said}; scaled" in notes[0]
+    assert read_json(dataset.root / "config.json")["mesh"]["up"] == said[1].lower()
 
 
 def test_rock_that_does_not_fit_the_frame(tmp_path):

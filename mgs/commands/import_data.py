@@ -13,7 +13,9 @@ def import_data(
     out: Annotated[Path, typer.Option(help="Folder to write.")],
     images: Annotated[Path | None, typer.Option(help="COLMAP's images; default SOURCE/images.")] = None,
     masks: Annotated[Path | None, typer.Option(help="Rock masks, named as the images; white is rock.")] = None,
-    mesh: Annotated[Path | None, typer.Option(help="Masks by projecting this mesh (world coordinates).")] = None,
+    mesh: Annotated[
+        Path | None, typer.Option(help="Masks by projecting this mesh (world coordinates; a GLB is turned from +Y up).")
+    ] = None,
     split: Annotated[str, typer.Option(help="Split of NeRF-synthetic data: train, val or test.")] = "train",
 ) -> None:
     """Bring your own data: cameras and images (depth and masks, if any) to a dataset folder, lens distortion undone.
@@ -28,10 +30,13 @@ def import_data(
     from mgs.errors import InputError
     from mgs.files import folder_or_nothing
     from mgs.imports import import_source, read_source
+    from mgs.surface import GLTF
 
     console, notes = Console(), Console(stderr=True)
     if masks is not None and mesh is not None:
         raise InputError("import: --masks and --mesh both say where masks come from; give one of them")
+    if mesh is not None and mesh.suffix.lower() in GLTF:
+        console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
     found = read_source(source, images, split)
     if mesh is not None:
         runtime.start()  # to cast rays at it

@@ -19,7 +19,8 @@ def prior(
         float | None, typer.Option(help="Distance between samples, metres; default a pixel's footprint.")
     ] = None,
     mesh: Annotated[
-        Path | None, typer.Option(help="Sample this mesh (world coordinates, metres) instead of building one.")
+        Path | None,
+        typer.Option(help="Sample this mesh (world coordinates, metres; a GLB is turned from +Y up) instead of building one."),
     ] = None,
     poisson_depth: Annotated[int | None, typer.Option(help="Poisson octree depth; default from the cloud's density.")] = None,
     prior_noise: Annotated[float, typer.Option(help="Spoil the rock's points on purpose: standard deviation, metres.")] = 0.0,
@@ -39,6 +40,7 @@ def prior(
     from mgs.policies import seed_views
     from mgs.prior import PriorSettings, build_prior, prior_from_mesh, save_prior
     from mgs.prior_figure import draw_prior
+    from mgs.surface import GLTF
 
     console = Console()
     frames = load_dataset(dataset)
@@ -46,6 +48,8 @@ def prior(
     settings = PriorSettings(gaussians, spacing, poisson_depth, prior_noise, holes, seed)
     with console.status("reading") as status:
         if mesh is not None:
+            if mesh.suffix.lower() in GLTF:
+                console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
             result, rock = prior_from_mesh(mesh, settings), None
         else:
             result, rock = build_prior(frames, settings, lambda stage: status.update(f"prior: {stage}"))

@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+
+class Axis(StrEnum):
+    """An up axis."""
+
+    y = "y"
+    z = "z"
 
 
 def synth_orbit(
@@ -14,6 +22,9 @@ def synth_orbit(
     scene: Annotated[str, typer.Option(help="A scene of mgs (boulder, ...) or the path of a .toml file.")] = "boulder",
     orbit: Annotated[str | None, typer.Option(help="circle, rings, spiral or hemisphere, in place of the scene's.")] = None,
     mesh: Annotated[Path | None, typer.Option(help="A real rock (textured GLB, OBJ or PLY), scaled to the scene.")] = None,
+    mesh_up: Annotated[
+        Axis | None, typer.Option(help="Up axis of --mesh. Default: y for GLB (its rule) and OBJ, z for PLY and others.")
+    ] = None,
     preset: Annotated[str, typer.Option(help="quick: 320x240, 32 frames. paper: 640x480, 100 frames.")] = "quick",
     spp: Annotated[int | None, typer.Option(min=1, help="Samples per pixel, in place of the preset's.")] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Number of frames, in place of the preset's.")] = None,
@@ -44,6 +55,8 @@ def synth_orbit(
         settings = settings.model_copy(update={"orbit": settings.orbit.model_copy(update={"kind": orbit})})
     if preset not in PRESETS:
         raise InputError(f"preset {preset!r}: unknown; choose one of {', '.join(PRESETS)}")
+    if mesh_up is not None and mesh is None:
+        raise InputError("--mesh-up: says how a mesh stands, but there is none; give --mesh too")
     given = {"spp": spp, "frames": frames, **_parse_size(size)}
     chosen = replace(PRESETS[preset], **{key: value for key, value in given.items() if value is not None})
     noise = PoseNoise(pose_noise, rotation_noise) if pose_noise or rotation_noise else None
@@ -53,6 +66,7 @@ def synth_orbit(
         dataset = synthesise(
             out, settings, chosen, seed, mesh, noise,
             progress=lambda done, total: bar.update(task, completed=done), say=console.print,
+            mesh_up=mesh_up and mesh_up.value,
         )  # fmt: skip
     console.print(f"{out}: {len(dataset)} frames; look at {out / 'contact_sheet.png'}")
 
