@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -55,6 +56,11 @@ def copy_file(source: Path, path: Path) -> None:
     """Copy a file, atomically."""
     with atomic_path(path) as temporary:
         shutil.copyfile(source, temporary)
+
+
+def fingerprint(path: str | Path) -> dict[str, str]:
+    """Name and SHA-256 of a file, to tell later whether it is still the same."""
+    return {"name": Path(path).name, "sha256": hashlib.sha256(Path(path).read_bytes()).hexdigest()}
 
 
 def write_json(path: str | Path, data: Any) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 import time
 from collections.abc import Callable
@@ -16,9 +15,9 @@ from PIL import Image
 
 from mgs.config import versions
 from mgs.conventions import Camera, opengl_from_opencv
-from mgs.dataset import FRAME_INTERVAL, Dataset, Frame, load_dataset, write_transforms
+from mgs.dataset import FRAME_INTERVAL, Dataset, Frame, load_dataset, resumes, write_transforms
 from mgs.errors import InputError
-from mgs.files import atomic_path, check_new_folder, check_writable, new_folder, read_json, write_exr, write_json, write_png
+from mgs.files import atomic_path, fingerprint, new_folder, write_exr, write_json, write_png
 from mgs.orbit import orbit_cameras, perturb
 from mgs.rock import load_rock, make_rock
 from mgs.scene import Scene
@@ -78,7 +77,7 @@ def synthesise(
     frames = _frames(out, cameras)
     denoise = importlib.util.find_spec("pyoidn") is not None
     resolved = _resolved(settings, preset, seed, mesh, denoise, pose_noise)
-    goes_on = _resumes(out, resolved)
+    goes_on = resumes(out, "config.json", resolved)
     glb: Any = rock.export(None, file_type="glb", include_normals=True)  # before the scene adds its attributes to the mesh
     scene = Scene(settings, rock, cameras[0], seed)
     exposure = _meter(scene, cameras, seed)
@@ -114,9 +113,7 @@ def _resolved(
         "scene": settings.model_dump(mode="json"),
         "preset": asdict(preset),
         "seed": seed,
-        "mesh": None
-        if mesh is None
-        else {"name": Path(mesh).name, "sha256": hashlib.sha256(Path(mesh).read_bytes()).hexdigest()},
+        "mesh": None if mesh is None else fingerprint(mesh),
         "denoise": denoise,
         "pose_noise": None if pose_noise is None else asdict(pose_noise),
     }
@@ -196,20 +193,6 @@ def _frames(out: Path, cameras: list[Camera]) -> list[Frame]:
 
 def _is_done(frame: Frame) -> bool:
     return all(path is not None and path.is_file() for path in (frame.image_path, frame.depth_path, frame.mask_path))
-
-
-def _resumes(out: Path, resolved: dict[str, Any]) -> bool:
-    """Whether `out` holds an unfinished dataset of the same settings. Raises InputError where it holds anything else."""
-    check_writable(out)
-    if (out / "config.json").is_file() and not (out / "transforms.json").exists():
-        begun = read_json(out / "config.json")
-        if any(begun.get(key) != value for key, value in resolved.items()):
-            raise InputError(f"{out}: holds an unfinished dataset of other settings; choose a new folder or delete it")
-        for left in out.rglob(".*.part*"):  # of a process that was killed while it wrote
-            left.unlink()
-        return True
-    check_new_folder(out)
-    return False
 
 
 def _meter(scene: Scene, cameras: list[Camera], seed: int) -> float:
