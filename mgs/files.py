@@ -17,6 +17,10 @@ import numpy as np
 from mgs.conventions import linear_from_srgb, srgb_from_linear
 from mgs.errors import InputError
 
+PNG_LEVEL = 1
+"""zlib's level, of 9. Against Pillow's 6: a render takes 62 instead of 236 ms (0.56 Mpixel) and as many bytes, a smooth photo
+413 instead of 644 ms (3 Mpixel) and 7 % more, a mask 9 instead of 14 ms and 16 instead of 5 kB."""
+
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
@@ -138,16 +142,19 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
 
 def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> None:
-    """Write an 8-bit PNG: linear RGB [H,W,3] (converted to sRGB), display values with linear=False, or a bool mask [H,W]."""
+    """Write an 8-bit PNG: linear RGB [H,W,3] (converted to sRGB), display values with linear=False, or, as they are, a bool
+    mask [H,W] or uint8 sRGB [H,W,3]."""
     from PIL import Image
 
     if image.dtype == bool:
         pixels = image.astype(np.uint8) * 255
+    elif image.dtype == np.uint8:
+        pixels = image
     else:
         display = srgb_from_linear(image) if linear else np.clip(image, 0, 1)
         pixels = np.round(display * 255).astype(np.uint8)
     with atomic_path(path) as temporary:
-        Image.fromarray(pixels).save(temporary, format="PNG")
+        Image.fromarray(pixels).save(temporary, format="PNG", compress_level=PNG_LEVEL)
 
 
 def _open_png(path: str | Path) -> Any:

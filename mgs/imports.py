@@ -17,7 +17,7 @@ from mgs.cloud import write_points
 from mgs.conventions import Camera, opencv_from_opengl
 from mgs.dataset import FRAME_INTERVAL, PINHOLES, Dataset, Frame, load_dataset, read_records, resumes, write_transforms
 from mgs.errors import InputError
-from mgs.files import fingerprint, new_folder, read_exr, read_mask, read_rgba, write_exr, write_json, write_png
+from mgs.files import copy_file, fingerprint, new_folder, read_exr, read_mask, read_rgba, write_exr, write_json, write_png
 from mgs.surface import read_mesh
 
 RECORD = "import.json"
@@ -292,8 +292,18 @@ def _import_shot(shot: Shot, out: Path, project: Callable[[Camera], np.ndarray] 
         mask_path.unlink(missing_ok=True)
         if mask is not None:
             write_png(mask_path, mask)
-        write_png(image, undo(rgba[..., :3], True).astype(np.float64) / 255, linear=False)
+        if _is_plain_png(shot.image) and not shot.distortion.any():
+            copy_file(shot.image, image)
+        else:
+            write_png(image, undo(rgba[..., :3], True))
     return Frame(shot.name, camera, shot.timestamp, image, depth_path, mask_path if mask_path.is_file() else None)
+
+
+def _is_plain_png(path: Path) -> bool:
+    """Whether a file is what `write_png` would write: a PNG of colour type 2 (RGB) with 8 bits per channel."""
+    with path.open("rb") as file:
+        header = file.read(26)
+    return header[:8] == b"\x89PNG\r\n\x1a\n" and header[24:] == b"\x08\x02"
 
 
 def _sized(path: Path, pixels: np.ndarray, camera: Camera) -> np.ndarray:
