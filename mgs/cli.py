@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from mgs import __version__
-from mgs.commands import COMMANDS
+from mgs.commands import COMMANDS, GOES_ON
 from mgs.errors import InputError
 
 INTERRUPTED = 130
@@ -51,7 +51,8 @@ def main(arguments: list[str] | None = None) -> None:
             raise
         code = INTERRUPTED
     if code == INTERRUPTED:  # typer has turned Ctrl-C into this, without a word
-        raise _stop("interrupted; what was finished is kept", INTERRUPTED)
+        hint = GOES_ON.get(arguments[0]) if arguments else None
+        raise _stop(f"interrupted; {hint}" if hint else "interrupted", INTERRUPTED)
     raise SystemExit(code or 0)
 
 

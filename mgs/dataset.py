@@ -12,7 +12,7 @@ import numpy as np
 
 from mgs.conventions import Camera, opencv_from_opengl, opengl_from_opencv
 from mgs.errors import InputError
-from mgs.files import read_exr, read_json, read_mask, read_png, write_json
+from mgs.files import check_new_folder, check_writable, locked, read_exr, read_json, read_mask, read_png, write_json
 
 PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 """Camera models of transforms.json that are a pinhole once their distortion is zero."""
@@ -193,3 +193,27 @@ def write_transforms(root: str | Path, frames: list[Frame] | tuple[Frame, ...]) 
         record |= {key: value for key, value in own.items() if value != header[key]}
         records.append(record)
     write_json(root / "transforms.json", header | {"frames": records})
+
+
+def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:
+    """Whether `out` holds an unfinished dataset (no transforms.json yet) whose JSON file `record` agrees with what is `asked`.
+
+    Removes what a process that was killed while it wrote left behind. Raises InputError where `out` holds anything else, another
+    process works on it, or it cannot be written.
+    """
+    check_writable(out)
+    begun = out / record
+    if begun.is_file() and not (out / "transforms.json").exists():
+        told = read_json(begun)
+        if not isinstance(told, dict) or any(told.get(key) != value for key, value in asked.items()):
+            raise InputError(
+                f"{out}: holds an unfinished dataset of other settings or sources; choose a new folder or delete it"
+            )
+        with locked(out):
+            for left in out.rglob(".*.part*"):
+                left.unlink()
+        return True
+    for left in out.glob(f".{begun.stem}.*.part{begun.suffix}"):  # all that there is where the record was being written
+        left.unlink()
+    check_new_folder(out)
+    return False

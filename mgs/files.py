@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import json
 import os
 import shutil
@@ -24,6 +25,9 @@ EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
 """Pillow's names of pixels that it converts to 8-bit RGBA without loss: grey, palette and RGB, with and without alpha."""
 LUMA = np.array([0.299, 0.587, 0.114])
 """Weights of R, G and B in grey (ITU-R BT.601)."""
+PNG_LEVEL = 1
+"""zlib's level, of 9. Against Pillow's 6: a render takes 62 instead of 236 ms (0.56 Mpixel) and as many bytes, a smooth photo
+413 instead of 644 ms (3 Mpixel) and 7 % more, a mask 9 instead of 14 ms and 16 instead of 5 kB."""
 
 
 @contextmanager
@@ -77,6 +81,11 @@ def copy_file(source: Path, path: Path) -> None:
         data = source.read_bytes()
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
+
+
+def fingerprint(path: str | Path) -> dict[str, str]:
+    """Name and SHA-256 of a file, to tell later whether it is still the same."""
+    return {"name": Path(path).name, "sha256": hashlib.sha256(Path(path).read_bytes()).hexdigest()}
 
 
 def write_json(path: str | Path, data: Any) -> None:
@@ -193,16 +202,19 @@ def _lock(path: Path) -> TextIO:
 
 
 def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> None:
-    """Write an 8-bit PNG: linear RGB [H,W,3] (converted to sRGB), display values with linear=False, or a bool mask [H,W]."""
+    """Write an 8-bit PNG: linear RGB [H,W,3] (converted to sRGB), display values with linear=False, or, as they are, a bool
+    mask [H,W] or uint8 sRGB [H,W,3]."""
     from PIL import Image
 
     if image.dtype == bool:
         pixels = image.astype(np.uint8) * 255
+    elif image.dtype == np.uint8:
+        pixels = image
     else:
         display = srgb_from_linear(image) if linear else np.clip(image, 0, 1)
         pixels = np.round(display * 255).astype(np.uint8)
     with atomic_path(path) as temporary:
-        Image.fromarray(pixels).save(temporary, format="PNG")
+        Image.fromarray(pixels).save(temporary, format="PNG", compress_level=PNG_LEVEL)
 
 
 def _open_image(path: Path) -> tuple[Any, bytes]:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+import hashlib
+import json
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +16,25 @@ import numpy as np
 
 from mgs.cloud import write_points
 from mgs.conventions import Camera, opencv_from_opengl
-from mgs.dataset import FRAME_INTERVAL, PINHOLES, Dataset, Frame, load_dataset, read_records, write_transforms
+from mgs.dataset import FRAME_INTERVAL, PINHOLES, Dataset, Frame, load_dataset, read_records, resumes, write_transforms
 from mgs.errors import InputError
-from mgs.files import read_exr, read_mask, read_rgba, read_values, write_exr, write_png
+from mgs.files import (
+    copy_file,
+    fingerprint,
+    locked,
+    new_folder,
+    read_exr,
+    read_mask,
+    read_rgba,
+    read_values,
+    write_exr,
+    write_json,
+    write_png,
+)
 from mgs.surface import read_mesh
 
+RECORD = "import.json"
+"""What was asked for, written before the first frame: an import that goes on must agree with it."""
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 """Coefficients of the OPENCV camera model, in OpenCV's order."""
 SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
@@ -209,50 +227,101 @@ def import_source(
     mesh: Path | None = None,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Dataset:
-    """Write a source as a dataset into the existing empty folder `out`; transforms.json is written last.
+    """Write a source as a dataset into the folder `out`, new or empty, or with what an interrupted import of the same left.
 
+    import.json, which says what is imported, is written first and transforms.json last; a finished frame is not read again
+    unless its files have changed since, and the result is the same, bit for bit, as in one go.
     Masks come from, in this order: files of `masks` with the image's stem, the pixels whose centre shows the `mesh` (world
     coordinates; needs the variant to be set, `mgs.runtime.start`), the source's own mask files, the images' alpha. Distorted
     images, depth and masks are undistorted to a pinhole camera that holds valid pixels only.
-    Raises InputError where a file is missing, damaged or of another size than the camera, or as `read_mesh`.
+    Raises InputError where a file is missing, damaged or of another size than the camera, where `out` holds anything else or
+    another process works on it, or as `read_mesh`; the frames before are kept.
     """
-    project = None if mesh is None else mesh_silhouette(mesh)
+    shots, project = source.shots, None
+    if masks is not None:
+        shots = [replace(shot, mask=_mask_file(masks, shot)) for shot in shots]
+    elif mesh is not None:
+        shots, project = [replace(shot, mask=None) for shot in shots], mesh_silhouette(mesh)
+    by_mesh = None if project is None or mesh is None else fingerprint(mesh)
+    asked = {"kind": source.kind, "frames": len(shots), "sha256_of_frames": _digest(shots), "mesh": by_mesh}
     frames = []
-    for k, shot in enumerate(source.shots):
-        if on_frame:
-            on_frame(k, len(source.shots))
-        frames.append(_import_shot(shot, out, masks, project))
-    if source.sparse is not None:
-        write_points(out / "sparse.ply", *source.sparse)
-    write_transforms(out, frames)
+    with ExitStack() as lock:
+        if resumes(out, RECORD, asked):
+            lock.enter_context(locked(out))
+
+        def begin() -> None:
+            if not (out / RECORD).is_file():
+                new_folder(out)
+                write_json(out / RECORD, asked)
+                lock.enter_context(locked(out))
+
+        for k, shot in enumerate(shots):
+            if on_frame:
+                on_frame(k, len(shots))
+            frames.append(_import_shot(shot, out, project, begin))
+        if source.sparse is not None:
+            write_points(out / "sparse.ply", *source.sparse)
+        write_transforms(out, frames)
     return load_dataset(out)
 
 
-def _import_shot(shot: Shot, out: Path, masks: Path | None, project: Callable[[Camera], np.ndarray] | None) -> Frame:
+def _mask_file(masks: Path, shot: Shot) -> Path:
+    path = _find(masks, shot.image.stem) or _find(masks, shot.name)
+    if path is None:
+        raise InputError(f"{masks}: no mask for image {shot.image.name}; name masks as their images")
+    return path
+
+
+def _digest(shots: list[Shot]) -> str:
+    """SHA-256 of all that is known of the shots before their files are read."""
+    known = [
+        (shot.name, shot.camera.K.tolist(), shot.camera.width, shot.camera.height, shot.camera.world_to_camera.tolist(),
+         shot.distortion.tolist(), shot.timestamp, shot.depth_unit,
+         [None if path is None else str(path.resolve()) for path in (shot.image, shot.depth, shot.mask)])
+        for shot in shots
+    ]  # fmt: skip
+    return hashlib.sha256(json.dumps(known).encode()).hexdigest()
+
+
+def _import_shot(shot: Shot, out: Path, project: Callable[[Camera], np.ndarray] | None, begin: Callable[[], None]) -> Frame:
+    """Write the files of a frame, its image last, unless they are there and no older than what they are made of.
+
+    begin is called between reading and writing: a source that cannot be read leaves nothing behind.
+    """
     camera, undo = undistorter(shot.camera, shot.distortion)
-    rgba = _sized(shot.image, read_rgba(shot.image), shot.camera)
-    full = np.iinfo(rgba.dtype).max
-    mask = None
-    if masks is not None:
-        path = _find(masks, shot.image.stem) or _find(masks, shot.name)
-        if path is None:
-            raise InputError(f"{masks}: no mask for image {shot.image.name}; name masks as their images")
-        mask = undo(_sized(path, read_mask(path), shot.camera).astype(np.uint8) * 255, True) >= 128
-    elif project is not None:
-        mask = project(camera)
-    elif shot.mask is not None:
-        mask = undo(_sized(shot.mask, read_mask(shot.mask), shot.camera).astype(np.uint8) * 255, True) >= 128
-    elif rgba[..., 3].min() < full:
-        mask = undo(rgba[..., 3], True) > full // 2
     image, mask_path = out / "images" / f"{shot.name}.png", out / "masks" / f"{shot.name}.png"
-    write_png(image, undo(rgba[..., :3], True).astype(np.float64) / full, linear=False)
-    if mask is not None:
-        write_png(mask_path, mask)
-    depth_path = None
-    if shot.depth is not None:
-        depth_path = out / "depth" / f"{shot.name}.exr"
-        write_exr(depth_path, {"Z": undo(_sized(shot.depth, _read_depth(shot.depth, shot.depth_unit), shot.camera), False)})
-    return Frame(shot.name, camera, shot.timestamp, image, depth_path, mask_path if mask is not None else None)
+    depth_path = None if shot.depth is None else out / "depth" / f"{shot.name}.exr"
+    made_of = [path.stat().st_mtime_ns for path in (shot.image, shot.depth, shot.mask) if path is not None and path.is_file()]
+    if not image.is_file() or image.stat().st_mtime_ns < max(made_of):
+        rgba = _sized(shot.image, read_rgba(shot.image), shot.camera)
+        full = np.iinfo(rgba.dtype).max
+        mask = None
+        if project is not None:
+            mask = project(camera)
+        elif shot.mask is not None:
+            mask = undo(_sized(shot.mask, read_mask(shot.mask), shot.camera).astype(np.uint8) * 255, True) >= 128
+        elif rgba[..., 3].min() < full:
+            mask = undo(rgba[..., 3], True) > full // 2
+        depth = None if shot.depth is None else _sized(shot.depth, _read_depth(shot.depth, shot.depth_unit), shot.camera)
+        begin()
+        if depth_path is not None and depth is not None:
+            write_exr(depth_path, {"Z": undo(depth, False)})
+        mask_path.unlink(missing_ok=True)
+        if mask is not None:
+            write_png(mask_path, mask)
+        if _is_plain_png(shot.image) and not shot.distortion.any():
+            copy_file(shot.image, image)
+        else:
+            pixels = undo(rgba[..., :3], True)
+            write_png(image, pixels if full == 255 else pixels / full, linear=False)
+    return Frame(shot.name, camera, shot.timestamp, image, depth_path, mask_path if mask_path.is_file() else None)
+
+
+def _is_plain_png(path: Path) -> bool:
+    """Whether a file is what `write_png` would write: a PNG of colour type 2 (RGB) with 8 bits per channel."""
+    with path.open("rb") as file:
+        header = file.read(26)
+    return header[:8] == b"\x89PNG\r\n\x1a\n" and header[24:] == b"\x08\x02"
 
 
 def _sized(path: Path, pixels: np.ndarray, camera: Camera) -> np.ndarray:
@@ -287,11 +356,14 @@ def undistorter(camera: Camera, distortion: np.ndarray) -> tuple[Camera, Callabl
     K, _ = cv2.getOptimalNewCameraMatrix(camera.K - shift, distortion, size, alpha=0.0)
     if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
         raise InputError("import: the distortion leaves no valid pixel; check k1 k2 p1 p2 and the focal length")
-    maps = cv2.initUndistortRectifyMap(camera.K - shift, distortion, None, K, size, cv2.CV_32FC1)
+
+    @functools.cache
+    def maps() -> tuple[np.ndarray, np.ndarray]:
+        return cv2.initUndistortRectifyMap(camera.K - shift, distortion, None, K, size, cv2.CV_32FC1)
 
     def undo(pixels: np.ndarray, smooth: bool) -> np.ndarray:
         method = cv2.INTER_LINEAR if smooth else cv2.INTER_NEAREST
-        return cv2.remap(np.ascontiguousarray(pixels), *maps, method, borderMode=cv2.BORDER_REPLICATE)
+        return cv2.remap(np.ascontiguousarray(pixels), *maps(), method, borderMode=cv2.BORDER_REPLICATE)
 
     return Camera(K + shift, camera.width, camera.height, camera.world_to_camera), undo
 

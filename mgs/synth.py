@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 import time
 from collections.abc import Callable
@@ -16,15 +15,15 @@ from PIL import Image
 
 from mgs.config import versions
 from mgs.conventions import Camera, opengl_from_opencv
-from mgs.dataset import FRAME_INTERVAL, Dataset, Frame, load_dataset, write_transforms
+from mgs.dataset import FRAME_INTERVAL, Dataset, Frame, load_dataset, resumes, write_transforms
 from mgs.errors import InputError
 from mgs.files import (
     atomic_path,
     check_new_folder,
     check_writable,
+    fingerprint,
     locked,
     new_folder,
-    read_json,
     write_exr,
     write_json,
     write_png,
@@ -84,7 +83,9 @@ def synthesise(
     frame, or nowhere in sight.
     """
     started, out = time.perf_counter(), Path(out)
-    _is_unfinished(out)  # before the rock is made, which takes seconds
+    check_writable(out)
+    if not (out / "config.json").is_file():
+        check_new_folder(out)  # before the rock is made, which takes seconds
     if mesh is None:
         rock, scale = make_rock(settings.rock, generator(seed, "rock")), 1.0
     else:
@@ -95,7 +96,7 @@ def synthesise(
     frames = _frames(out, cameras)
     denoise = importlib.util.find_spec("pyoidn") is not None
     resolved = _resolved(settings, preset, seed, mesh, mesh_up, denoise, pose_noise)
-    goes_on = _resumes(out, resolved)
+    goes_on = resumes(out, "config.json", resolved)
     glb = to_glb(rock)  # before the scene adds its attributes to the mesh
     scene = Scene(settings, rock, cameras[0], seed)
     exposure = _meter(scene, cameras, seed)
@@ -103,8 +104,6 @@ def synthesise(
         new_folder(out)
         write_json(out / "config.json", resolved)
     with locked(out):
-        for left in out.rglob(".*.part*"):  # of a process that was killed while it wrote
-            left.unlink()
         with atomic_path(out / "rock.glb") as temporary:
             temporary.write_bytes(glb)
         spp = preset.spp
@@ -152,13 +151,7 @@ def _resolved(
         "scene": settings.model_dump(mode="json"),
         "preset": asdict(preset),
         "seed": seed,
-        "mesh": None
-        if mesh is None
-        else {
-            "name": Path(mesh).name,
-            "sha256": hashlib.sha256(Path(mesh).read_bytes()).hexdigest(),
-            "up": mesh_up or up_axis(mesh),
-        },
+        "mesh": None if mesh is None else fingerprint(mesh) | {"up": mesh_up or up_axis(mesh)},
         "denoise": denoise,
         "pose_noise": None if pose_noise is None else asdict(pose_noise),
     }
@@ -238,25 +231,6 @@ def _frames(out: Path, cameras: list[Camera]) -> list[Frame]:
 
 def _is_done(frame: Frame) -> bool:
     return all(path is not None and path.is_file() for path in (frame.image_path, frame.depth_path, frame.mask_path))
-
-
-def _is_unfinished(out: Path) -> bool:
-    """Whether `out` holds an unfinished dataset. Raises InputError where it holds anything else, or cannot be written."""
-    check_writable(out)
-    if (out / "config.json").is_file() and not (out / "transforms.json").exists():
-        return True
-    check_new_folder(out)
-    return False
-
-
-def _resumes(out: Path, resolved: dict[str, Any]) -> bool:
-    """Whether `out` holds an unfinished dataset of the same settings. Raises InputError where it holds anything else."""
-    if not _is_unfinished(out):
-        return False
-    begun = read_json(out / "config.json")
-    if any(begun.get(key) != value for key, value in resolved.items()):
-        raise InputError(f"{out}: holds an unfinished dataset of other settings; choose a new folder or delete it")
-    return True
 
 
 def _meter(scene: Scene, cameras: list[Camera], seed: int) -> float:

@@ -319,3 +319,15 @@ def test_a_lock_that_its_owner_removed_is_no_lock(tmp_path, monkeypatch):
 def test_a_folder_that_cannot_be_locked(tmp_path):
     with pytest.raises(InputError, match="cannot be written"), locked(tmp_path / "missing"):
         pass
+
+
+def test_a_png_holds_the_pixels_and_is_packed_fast(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8)
+    write_png(tmp_path / "display.png", pixels / 255, linear=False)
+    write_png(tmp_path / "bytes.png", pixels)
+    write_png(tmp_path / "mask.png", pixels[..., 0] > 99)
+    for name, expected in (("display", pixels), ("bytes", pixels), ("mask", np.where(pixels[..., 0] > 99, 255, 0))):
+        content = (tmp_path / f"{name}.png").read_bytes()
+        with Image.open(tmp_path / f"{name}.png") as image:
+            assert np.array_equal(np.asarray(image), expected)
+        assert content[content.index(b"IDAT") + 4 :].startswith(b"\x78\x01")  # zlib's header of its fastest level

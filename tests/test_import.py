@@ -214,6 +214,27 @@ def test_images_of_16_bits(dataset: Dataset, tmp_path: Path) -> None:
     assert np.array_equal(frame.mask(), written[..., 3] >= 32768)
 
 
+@pytest.mark.parametrize("kind", ["plain", "alpha", "grey", "palette", "16 bit", "jpeg", "distorted"])
+def test_only_an_image_that_stays_as_it_is_is_copied(dataset: Dataset, tmp_path: Path, kind: str) -> None:
+    path = dataset.frames[0].image_path
+    with Image.open(path) as image:
+        pixels = np.asarray(image)
+    kinds = {"alpha": "RGBA", "grey": "L", "palette": "P"}
+    if kind in kinds:
+        Image.fromarray(pixels).convert(kinds[kind]).save(path)
+    elif kind == "jpeg":
+        Image.fromarray(pixels).save(path, format="JPEG")
+    elif kind == "16 bit":
+        cv2.imwrite(str(path), pixels.astype(np.uint16)[..., ::-1] * 257)
+    elif kind == "distorted":
+        write_json(dataset.root / "transforms.json", read_json(dataset.root / "transforms.json") | {"k1": -0.1})
+    else:
+        Image.fromarray(pixels).save(path, compress_level=9)  # other bytes than ours would be
+    copy = _import(dataset.root, tmp_path / "copy").frames[0]
+    assert (copy.image_path.read_bytes() == path.read_bytes()) == (kind == "plain")
+    assert np.array_equal(copy.rgb(), replace(copy, image_path=path).rgb()) == (kind != "distorted")
+
+
 def test_missing_images_are_skipped_and_counted(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for frame in dataset.frames[:3]:
         frame.image_path.unlink()

@@ -33,3 +33,12 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "bench": bench,
 }
+
+_AGAIN = "run the same command again to continue"
+GOES_ON = {
+    "synth-orbit": _AGAIN,
+    "import": _AGAIN,
+    "demo": _AGAIN,
+    "nbv": "`mgs nbv --resume RUN` continues a run whose folder is there",
+}
+"""What a person is told after Ctrl-C, by command. The others start anew: they write at the end, or write the same again."""

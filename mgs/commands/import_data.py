@@ -10,7 +10,7 @@ import typer
 
 def import_data(
     source: Annotated[Path, typer.Argument(help="transforms.json, or a folder with one, or with a COLMAP model (sparse/0).")],
-    out: Annotated[Path, typer.Option(help="Folder to write.")],
+    out: Annotated[Path, typer.Option(help="Folder to write; new, or one that an interrupted import left.")],
     images: Annotated[Path | None, typer.Option(help="COLMAP's images; default SOURCE/images.")] = None,
     masks: Annotated[Path | None, typer.Option(help="Rock masks, named as the images; white is rock.")] = None,
     mesh: Annotated[
@@ -21,14 +21,14 @@ def import_data(
     """Bring your own data: cameras and images (depth and masks, if any) to a dataset folder, lens distortion undone.
 
     Masks come from --masks, from --mesh, from the source's own mask files or from the images' alpha, in this order. Without
-    depth, the prior comes from `mgs prior OUT --mesh MESH`, or from COLMAP's sparse points.
+    depth, the prior comes from `mgs prior OUT --mesh MESH`, or from COLMAP's sparse points. An interrupted import goes on where
+    it stopped when the same command is given again.
     """
     from rich.console import Console
     from rich.progress import Progress
 
     from mgs import runtime
     from mgs.errors import InputError
-    from mgs.files import folder_or_nothing
     from mgs.imports import import_source, read_source
     from mgs.surface import GLTF
 
@@ -40,7 +40,7 @@ def import_data(
     found = read_source(source, images, split)
     if mesh is not None:
         runtime.start()  # to cast rays at it
-    with folder_or_nothing(out), Progress(console=console, transient=True) as progress:
+    with Progress(console=console, transient=True) as progress:
         bar = progress.add_task("importing")
         result = import_source(
             found,

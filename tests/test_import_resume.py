@@ -1,0 +1,145 @@
+"""An import that was interrupted, and the same command again: the same dataset, bit for bit."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import synthetic
+import trimesh
+from refusals import listing, refused
+
+from mgs import imports
+from mgs.cli import main
+from mgs.files import read_json, write_json, write_png
+
+STRUCK = """
+import os, sys
+from mgs import imports
+from mgs.cli import main
+
+write, calls = imports.write_png, []
+
+def strike(path, *arguments, **options):
+    calls.append(path.parent.name)
+    if calls.count("images") == 4:
+        os.kill(os.getpid(), {blow})
+    write(path, *arguments, **options)
+
+imports.write_png = strike
+main()
+"""
+"""The program, which sends itself a signal when it has written three images, and all of the fourth frame but its image."""
+
+
+def _imported(arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(["import", *arguments])
+    assert exit_.value.code == 0
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    """Eight distorted frames with depth."""
+    root = synthetic.write_dataset(tmp_path / "data").root
+    write_json(root / "transforms.json", read_json(root / "transforms.json") | {"k1": -0.15, "k2": 0.04, "p1": 0.002})
+    return root
+
+
+@pytest.fixture
+def many(source: Path) -> list[str]:
+    """Its arguments, with masks from a mesh."""
+    return [str(source), "--mesh", str(source / "rock.glb")]
+
+
+@pytest.mark.parametrize(
+    ("blow", "code"), [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGTERM, -signal.SIGTERM), (signal.SIGINT, 130)]
+)
+def test_struck_in_the_middle_and_given_again(many: list[str], tmp_path: Path, blow: int, code: int, monkeypatch) -> None:
+    """A real process, a real signal; then the same folder, bit for bit, and no finished frame read again."""
+    out = tmp_path / "out"
+    program = [sys.executable, "-c", STRUCK.format(blow=int(blow)), "import", *many, "--out", str(out)]
+    process = subprocess.run(program, capture_output=True, text=True)
+    assert process.returncode == code, process.stderr
+    said = "mgs: interrupted; run the same command again to continue\n"
+    assert process.stderr.endswith(said) if blow == signal.SIGINT else "mgs:" not in process.stderr
+    assert not (out / "transforms.json").exists()
+    assert len(list((out / "images").iterdir())) == 3
+    (out / "images/.kf_0003.1.part.png").touch()  # as a kill in the middle of writing leaves it
+    kept = {path: path.stat().st_mtime_ns for path in (out / "images").glob("kf_*")}
+
+    read, load = [], imports.read_rgba
+    monkeypatch.setattr(imports, "read_rgba", lambda path: (read.append(path.stem), load(path))[1])
+    _imported([*many, "--out", str(out)])
+    assert read == [f"kf_{k:04d}" for k in range(3, 8)]
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    _imported([*many, "--out", str(tmp_path / "whole")])
+    assert listing(out) == listing(tmp_path / "whole")
+
+
+def _stopped(arguments: list[str], monkeypatch) -> None:
+    """An import that ends after two frames."""
+    write, calls = imports.write_png, []
+
+    def stop(path: Path, *rest: Any, **options: Any) -> None:
+        calls.append(path.parent.name)
+        if calls.count("images") == 3:
+            raise KeyboardInterrupt
+        write(path, *rest, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(imports, "write_png", stop)
+        with pytest.raises(SystemExit) as exit_:
+            main(["import", *arguments])
+    assert exit_.value.code == 130
+
+
+def test_an_unfinished_import_of_something_else_is_refused(
+    source: Path, many: list[str], tmp_path: Path, monkeypatch, capsys
+) -> None:
+    out = tmp_path / "out"
+    _stopped([*many, "--out", str(out)], monkeypatch)
+    capsys.readouterr()
+    other = synthetic.write_dataset(tmp_path / "other").root
+    trimesh.creation.icosphere(subdivisions=2).export(tmp_path / "ball.ply")
+    for arguments in ([source], [other], [source, "--masks", f"{source}/masks"], [source, "--mesh", tmp_path / "ball.ply"]):
+        line = refused(capsys, ["import", *arguments, "--out", out], out)
+        assert "unfinished dataset of other settings or sources" in line
+    write_json(source / "transforms.json", read_json(source / "transforms.json") | {"cx": 30.0})
+    assert "unfinished dataset" in refused(capsys, ["import", *many, "--out", out], out)
+
+
+def test_a_frame_whose_files_changed_is_made_again(source: Path, many: list[str], tmp_path: Path, monkeypatch) -> None:
+    out, image = tmp_path / "out", source / "images/kf_0000.png"
+    _stopped([*many, "--out", str(out)], monkeypatch)
+    write_png(image, np.full((48, 64, 3), 0.5))
+    _imported([*many, "--out", str(out)])
+    _imported([*many, "--out", str(tmp_path / "whole")])
+    assert listing(out) == listing(tmp_path / "whole")
+
+
+def test_a_damaged_image_in_the_middle_keeps_the_frames_before(source: Path, many: list[str], tmp_path: Path, capsys) -> None:
+    out, image = tmp_path / "out", source / "images/kf_0004.png"
+    whole = image.read_bytes()
+    image.write_bytes(whole[:100])
+    with pytest.raises(SystemExit) as exit_:
+        main(["import", *many, "--out", str(out)])
+    assert exit_.value.code == 2
+    assert "kf_0004.png: not a readable image" in capsys.readouterr().err
+    assert len(list((out / "images").iterdir())) == 4
+    image.write_bytes(whole)
+    _imported([*many, "--out", str(out)])
+    _imported([*many, "--out", str(tmp_path / "whole")])
+    assert listing(out) == listing(tmp_path / "whole")
+
+
+def test_killed_before_the_first_frame(many: list[str], tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/.import.1.part.json").touch()
+    _imported([*many, "--out", str(tmp_path / "out")])
+    assert not list((tmp_path / "out").glob(".*"))
