@@ -138,7 +138,7 @@ def read_settings(out: Path) -> NbvSettings:
     config = read_json(path)
     if not isinstance(config, dict) or not isinstance(config.get("settings"), dict):
         raise InputError(f"{path}: has no settings; the file is damaged, start the run anew")
-    settings = validated(NbvSettings, config["settings"])
+    settings = validated(NbvSettings, config["settings"], path)
     if not settings.dataset.is_dir():
         raise InputError(f"{path}: dataset {settings.dataset} is not there; if it was moved, correct `dataset` in this file")
     return settings

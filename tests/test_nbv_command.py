@@ -191,6 +191,28 @@ def test_a_run_appears_whole_or_not_at_all(dataset, tmp_path, monkeypatch):
     assert {p.name for p in tmp_path.iterdir()} == {"run", "prior", dataset.name}
 
 
+SETTINGS = {
+    "budget": (-1, "settings.budget: Input should be greater than or equal to 0"),
+    "seeds": ("four", "settings.seeds: Input should be a valid integer"),
+    "speed": (1, "settings.speed: Extra inputs are not permitted"),
+    "prior_std": ({"colour": 1.0}, "settings.prior_std: must have a number for each of colour, scale, rotation, opacity"),
+}
+
+
+@pytest.mark.parametrize("key", SETTINGS)
+@pytest.mark.parametrize("command", [["nbv", "--resume"], ["eval"], ["diagnose"]])
+def test_a_damaged_setting_is_named_with_its_file(dataset, prior, tmp_path, capsys, key, command):
+    """Not by the option of a command that nobody gave."""
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    config = json.loads((run / "config.json").read_text())
+    value, named = SETTINGS[key]
+    config["settings"][key] = value
+    write_json(run / "config.json", config)
+    said = refused(capsys, [*command, run], run)
+    assert f"{run}/config.json: {named}" in said
+    assert "--" not in said
+
+
 @pytest.mark.parametrize("values", [{"pixel_noise": float("inf")}, {"prior_std": {"colour": float("inf")}}])
 def test_scales_of_lambda_are_finite(dataset, tmp_path, values):
     with pytest.raises(InputError, match="finite"):
