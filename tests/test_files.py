@@ -66,6 +66,15 @@ def test_a_full_disk_is_one_line(tmp_path, name, write):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_what_is_no_json_is_not_written(tmp_path, value):
+    write_json(tmp_path / "a.json", {"a": 1})
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "a.json", {"a": [value]})
+    assert read_json(tmp_path / "a.json") == {"a": 1}
+    assert len(list(tmp_path.iterdir())) == 1
+
+
 def test_a_folder_in_place_of_a_file(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         read_json(tmp_path)
