@@ -7,7 +7,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from mgs import __version__
 from mgs.errors import InputError
@@ -32,7 +32,7 @@ class NbvSettings(BaseModel):
     pixel_noise: Annotated[float, Field(gt=0, allow_inf_nan=False)] = PIXEL_NOISE
     """sigma_e in lambda = (sigma_e / tau)^2, linear RGB; `mgs.policies.regularisation`."""
     prior_std: dict[str, Annotated[float, Field(gt=0, allow_inf_nan=False)]] = PRIOR_STD
-    """tau of each kind of parameter."""
+    """tau of each kind of parameter: those of `mgs.policies.PRIOR_STD`."""
     evaluate_every: Annotated[int, Field(ge=0)] = 0
     """Measure PSNR on all views after every so many steps; 0 = only at the end. Never feeds back into the choice."""
     warm_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.3
@@ -41,18 +41,29 @@ class NbvSettings(BaseModel):
     train: dict[str, Any] = {}
     """Fields of `mgs.train.TrainSettings`; those left out take its defaults."""
 
+    @field_validator("prior_std")
+    @classmethod
+    def _every_kind(cls, given: dict[str, float]) -> dict[str, float]:
+        if given.keys() != PRIOR_STD.keys():
+            raise ValueError(f"must have a number for each of {', '.join(PRIOR_STD)}, and no other")
+        return given
+
 
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def validated(model: type[Model], values: dict[str, Any]) -> Model:
-    """Build settings. Raises InputError with one line for the first value that is wrong."""
+def validated(model: type[Model], values: dict[str, Any], file: Path | None = None) -> Model:
+    """Build settings, from the options of a command or from `settings` of a file. Raises InputError with one line for the first
+    value that is wrong, which names the option, or the file and the key."""
     try:
         return model(**values)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        option = "--" + "-".join(str(part) for part in first["loc"]).replace("_", "-")
-        message = first["msg"].removeprefix("Value error, ")
+        parts, message = [str(part) for part in first["loc"]], first["msg"].removeprefix("Value error, ")
+        if file is not None:
+            key = ".".join(["settings", *parts])
+            raise InputError(f"{file}: {key}: {message}; correct it, or start the run anew") from None
+        option = "--" + "-".join(parts).replace("_", "-")
         raise InputError(f"{option} {first['input']}: {message}") from None
 
 

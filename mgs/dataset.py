@@ -198,8 +198,8 @@ def write_transforms(root: str | Path, frames: list[Frame] | tuple[Frame, ...]) 
 def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:
     """Whether `out` holds an unfinished dataset (no transforms.json yet) whose JSON file `record` agrees with what is `asked`.
 
-    Removes what a process that was killed while it wrote left behind. Raises InputError where `out` holds anything else, another
-    process works on it, or it cannot be written.
+    Removes what a process that was killed while it wrote left behind. Raises InputError where `out` holds anything else, where
+    another process works on it, or where it cannot be written.
     """
     check_writable(out)
     begun = out / record

@@ -89,9 +89,10 @@ def fingerprint(path: str | Path) -> dict[str, str]:
 
 
 def write_json(path: str | Path, data: Any) -> None:
-    """Write JSON (indented, UTF-8), atomically."""
+    """Write JSON (indented, UTF-8), atomically. Raises ValueError for NaN and infinities, which JSON has not: use None."""
+    text = json.dumps(data, indent=2, allow_nan=False)
     with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
+        temporary.write_text(text + "\n", encoding="utf-8")
 
 
 def read_json(path: str | Path) -> Any:

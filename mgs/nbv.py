@@ -13,7 +13,7 @@ and `seed_names` instead), `images` (how many the model has now), `gain` (the po
 `information_gain` (Eq. 7 of the chosen view, whatever the policy), `coverage` (Eq. 9 of all images), `iterations`, `loss` (of
 the pass whose model was kept, `mgs.train.Fit`) and `stop_reason` (`mgs.stopping.StopReason`) of the fit, `seconds` per stage,
 and, where the step was evaluated, mean PSNR in dB over all views (`psnr`; `psnr_mask` in the rock mask) and over those never
-trained on (`held_out_psnr`, `held_out_psnr_mask`).
+trained on (`held_out_psnr`, `held_out_psnr_mask`), each left out where there is no such view, or none with a mask.
 
 The candidates' images are never read: only the cameras of frames not taken yet are touched before a choice.
 """
@@ -139,7 +139,7 @@ def read_settings(out: Path) -> NbvSettings:
     config = read_json(path)
     if not isinstance(config, dict) or not isinstance(config.get("settings"), dict):
         raise InputError(f"{path}: has no settings; the file is damaged, start the run anew")
-    settings = validated(NbvSettings, config["settings"])
+    settings = validated(NbvSettings, config["settings"], path)
     if not settings.dataset.is_dir():
         raise InputError(f"{path}: dataset {settings.dataset} is not there; if it was moved, correct `dataset` in this file")
     return settings
@@ -249,6 +249,8 @@ class _Loop:
             scores = policies.POSE_POLICIES[policy](*poses, rng)
         farthest = policies.farthest_pose(*poses, rng)
         best = max(range(len(left)), key=lambda k: (scores[k], farthest[k]))
+        if np.isnan(scores).any() or np.isinf(scores[best]):
+            raise InputError(f"policy {policy}: gave a score that is NaN or infinite; correct the policy (docs/nbv.md)")
         return left[best], None if policy == "random" else float(scores[best])
 
     def learn(self, state: State, new: list[int], choice: dict[str, Any], watch: _Stopwatch) -> State:
@@ -311,7 +313,7 @@ def _diverged(out: Path, step: int, losses: Sequence[float]) -> str:
 
 def write_checkpoint(out: Path, state: State) -> None:
     """Commit a step: the state in one file, renamed into place; then the readable lines."""
-    text = json.dumps({"taken": state.taken, "steps": state.steps, "inputs": state.inputs})
+    text = json.dumps({"taken": state.taken, "steps": state.steps, "inputs": state.inputs}, allow_nan=False)
     with atomic_path(out / "checkpoint.npz") as temporary, open(temporary, "wb") as file:
         np.savez(file, H=state.H, surface=state.surface, json=np.array(text), **asdict(state.gaussians))
     write_steps(out, state)
@@ -319,8 +321,9 @@ def write_checkpoint(out: Path, state: State) -> None:
 
 def write_steps(out: Path, state: State) -> None:
     """Write steps.jsonl from the state, atomically."""
+    text = "".join(json.dumps(line, allow_nan=False) + "\n" for line in state.steps)
     with atomic_path(out / "steps.jsonl") as temporary:
-        temporary.write_text("".join(json.dumps(line) + "\n" for line in state.steps), encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8")
 
 
 def read_checkpoint(out: Path) -> State | None:
@@ -330,7 +333,7 @@ def read_checkpoint(out: Path) -> State | None:
         return None
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as data:
-            record = json.loads(str(data["json"]))
+            record = json.loads(str(data["json"]), parse_constant=lambda _: None)  # older runs could hold NaN
             gaussians = Gaussians(*(data[name] for name in ("means", "log_scales", "quats", "logit_opacities", "sh")))
             return State(gaussians, data["H"], data["surface"], record["taken"], record["steps"], record.get("inputs", {}))
     except (zipfile.BadZipFile, KeyError, ValueError, OSError, EOFError) as error:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from mgs.config import validated
 from mgs.errors import InputError
 from mgs.figures import comparison_figure, coverage_figure, gain_figure, orbit_figure, psnr_figure
 from mgs.files import atomic_path, read_json, write_json
@@ -24,6 +25,8 @@ class _Settings(BaseModel):
 
     policy: str
     dataset: str
+    seeds: int
+    budget: int
 
 
 class _Seeds(BaseModel):
@@ -80,17 +83,12 @@ def read_run(folder: str | Path) -> Run:
     Raises InputError where the folder holds no run, or a file is damaged, empty or lacks a number that a report needs.
     """
     folder = Path(folder)
-    config = read_json(folder / "config.json")
-    path = folder / "steps.jsonl"
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; the run has no finished step, continue it with `mgs nbv --resume {folder}`")
-    try:
-        steps = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        _Seeds.model_validate(steps[0])
-        TypeAdapter(list[_Choice]).validate_python(steps[1:])
-        settings = _Settings.model_validate(config["settings"])
-    except (ValueError, KeyError, TypeError, IndexError):
-        raise InputError(f"{folder}: config.json or steps.jsonl is damaged; resume the run to write them anew") from None
+    path = folder / "config.json"
+    config = read_json(path)
+    if not isinstance(config, dict) or not isinstance(config.get("settings"), dict):
+        raise InputError(f"{path}: has no settings; the file is damaged, start the run anew")
+    settings = validated(_Settings, config["settings"], path)
+    steps = _read_steps(folder)
     path = folder / "metrics.json"
     metrics = read_json(path) if path.exists() else None
     try:
@@ -98,6 +96,28 @@ def read_run(folder: str | Path) -> Run:
     except ValidationError:
         raise InputError(f"{path}: is damaged; measure the run again with `mgs eval {folder}`") from None
     return Run(folder, settings.policy, steps, metrics, config["settings"])
+
+
+def _read_steps(folder: Path) -> list[dict[str, Any]]:
+    """The lines of steps.jsonl. Raises InputError, naming the line and the key, where one lacks a number or is no JSON."""
+    path, resume = folder / "steps.jsonl", f"`mgs nbv --resume {folder}`"
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; the run has no finished step, continue it with {resume}")
+    steps: list[dict[str, Any]] = []
+    for number, text in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines() or [""], 1):
+        try:
+            steps.append(json.loads(text))
+            (_Seeds if number == 1 else _Choice).model_validate(steps[-1])
+        except ValueError as error:
+            raise InputError(f"{path}: line {number} is damaged ({_cause(error)}); write the file anew with {resume}") from None
+    return steps
+
+
+def _cause(error: ValueError) -> str:
+    if not isinstance(error, ValidationError):
+        return "no JSON"
+    first = error.errors(include_url=False)[0]
+    return ": ".join(str(part) for part in (*first["loc"], first["msg"]))
 
 
 COLUMNS = {
@@ -112,6 +132,16 @@ COLUMNS = {
     "coverage": "coverage (%)",
 }
 """Columns of the table: where the number lies in metrics.json, and its heading."""
+
+
+def check_finished(run: Run) -> None:
+    """Raises InputError where the budget of a run is not spent, or its last files are missing."""
+    taken, planned = len(run.seeds + run.chosen), run.settings["seeds"] + run.settings["budget"]
+    resume = f"`mgs nbv --resume {run.folder}`"
+    if taken < planned:
+        raise InputError(f"{run.folder}: is unfinished, with {taken} of {planned} views; go on with {resume}, then report")
+    if not (run.folder / "gaussians.ply").is_file():
+        raise InputError(f"{run.folder}: has all {planned} views, but no gaussians.ply; write it with {resume}, then report")
 
 
 def evaluated_runs(folders: Sequence[str | Path]) -> dict[str, Run]:
@@ -194,14 +224,16 @@ def write_report(out: str | Path, folders: Sequence[str | Path]) -> list[Path]:
     """Every figure and the table of runs on one dataset, into the folder `out`; returns the files written.
 
     orbit.png, gain.png, coverage.png, comparison.png (a view that the fewest runs were trained on), psnr.png (where runs were
-    evaluated on the way), table.md, table.json (`table_numbers`). Raises InputError as `evaluated_runs`, and where the pictures
-    of `mgs eval` are missing.
+    evaluated on the way), table.md, table.json (`table_numbers`). Raises InputError as `evaluated_runs`, where a run is
+    unfinished, and where the pictures of `mgs eval` are missing.
     """
     from mgs.dataset import load_dataset
     from mgs.evaluate import read_comparison
     from mgs.nbv import check_same_frames, read_settings
     from mgs.splat_ply import read_ply
 
+    for folder in folders:
+        check_finished(read_run(folder))
     out, runs = Path(out), evaluated_runs(folders)
     first = next(iter(runs.values()))
     dataset = load_dataset(read_settings(first.folder).dataset)

@@ -45,6 +45,7 @@ def real_stations(dataset: Dataset, prior: Prior, settings: TrainSettings) -> St
 def psnr_measure(dataset: Dataset, cache: ListCache) -> Callable[[Gaussians, list[int]], dict[str, float]]:
     """measure(gaussians, frames taken) -> mean PSNR, dB: `psnr` and `psnr_mask` (inside the rock mask) over all views,
     `held_out_psnr` and `held_out_psnr_mask` over those never trained on. As `mgs.evaluate`, without its SSIM, which costs more.
+    A mean over no view (all masks empty, none held out) is left out.
     """
 
     @functools.cache
@@ -58,10 +59,13 @@ def psnr_measure(dataset: Dataset, cache: ListCache) -> Callable[[Gaussians, lis
             image, mask = truth(i)
             rendered = srgb_from_linear(np.asarray(render(gaussians, frame.camera, cache=cache).rgb))
             values[i] = psnr(rendered, image), psnr(rendered, image, mask)
-        means = dict(zip(("psnr", "psnr_mask"), np.nanmean(values, axis=0).tolist(), strict=True))
-        if len(taken) < len(dataset):
-            held_out = np.nanmean(np.delete(values, taken, axis=0), axis=0)
-            means |= {"held_out_psnr": float(held_out[0]), "held_out_psnr_mask": float(held_out[1])}
-        return means
+        return _means(values, "") | _means(np.delete(values, taken, axis=0), "held_out_")
 
     return measure
+
+
+def _means(values: np.ndarray, prefix: str) -> dict[str, float]:
+    """Mean of each column of [V,2] over the views that have it, by name."""
+    known = ~np.isnan(values).all(axis=0)
+    means = np.nanmean(np.where(known, values, 0), axis=0) if known.any() else values
+    return {prefix + name: float(means[i]) for i, name in enumerate(("psnr", "psnr_mask")) if known[i]}

@@ -84,7 +84,7 @@ def synthesise(
     """
     started, out = time.perf_counter(), Path(out)
     check_writable(out)
-    if not (out / "config.json").is_file():
+    if (out / "transforms.json").exists() or not (out / "config.json").exists():
         check_new_folder(out)  # before the rock is made, which takes seconds
     if mesh is None:
         rock, scale = make_rock(settings.rock, generator(seed, "rock")), 1.0

@@ -366,6 +366,34 @@ def test_a_run_of_a_version_without_records_goes_on_with_a_warning(half_done):
     assert resume(root, out)[1] == []  # nothing is left to be mixed
 
 
+def strict(text: str) -> dict:
+    """JSON as other programs read it: without NaN and infinities."""
+    return json.loads(text, parse_constant=pytest.fail)
+
+
+def test_numbers_of_older_runs_that_are_none_are_null(half_done):
+    """A line could hold NaN where all held-out masks were empty."""
+    root, out = half_done
+    with np.load(out / "checkpoint.npz") as data:
+        arrays = dict(data)
+    record = json.loads(str(arrays["json"]))
+    record["steps"][1]["held_out_psnr_mask"] = math.nan
+    arrays["json"] = np.array(json.dumps(record))
+    np.savez(out / "checkpoint.npz", **arrays)
+    state, _ = resume(root, out)
+    written = [strict(line) for line in (out / "steps.jsonl").read_text().splitlines()]
+    assert written == state.steps
+    assert written[1]["held_out_psnr_mask"] is None
+
+
+@pytest.mark.parametrize("score", [math.nan, math.inf])
+def test_a_policy_that_gives_no_number_is_named(dataset, tmp_path, monkeypatch, score):
+    monkeypatch.setitem(policies.CRITERIA, "mine", lambda F, H, lam: score)
+    with pytest.raises(InputError, match="policy mine: gave a score that is NaN or infinite"):
+        run(tmp_path / "run", dataset, policy="mine")
+    assert len(lines(tmp_path / "run")) == 1
+
+
 @pytest.mark.parametrize("recorded", [True, False])
 @pytest.mark.parametrize("count", [tiny.POINTS, tiny.POINTS - 1])
 def test_a_run_does_not_go_on_from_another_prior(half_done, recorded, count):

@@ -86,6 +86,24 @@ def test_a_frame_without_rock_is_refused_before_it_is_fitted_to(dataset, tmp_pat
     assert max(fits, default=0) == images
 
 
+def test_a_mean_over_no_view_is_left_out(dataset, tmp_path):
+    """Held-out frames without rock: no line of steps.jsonl holds NaN, which is no JSON."""
+    from mgs.splat import ListCache
+    from mgs.stations import psnr_measure
+
+    loaded, model = load_dataset(dataset), tiny.initial([])
+    whole = psnr_measure(loaded, ListCache())(model, [0, 4, 8])
+    assert list(whole) == ["psnr", "psnr_mask", "held_out_psnr", "held_out_psnr_mask"]
+    blacken(dataset, *(set(range(12)) - {0, 4, 8}))
+    measure = psnr_measure(loaded, ListCache())
+    found = measure(model, [0, 4, 8])
+    assert list(found) == ["psnr", "psnr_mask", "held_out_psnr"]
+    assert np.isfinite(list(found.values())).all()
+    assert list(measure(model, list(range(12)))) == ["psnr", "psnr_mask"]
+    blacken(dataset, 0, 4, 8)
+    assert list(psnr_measure(loaded, ListCache())(model, [0, 4, 8])) == ["psnr", "held_out_psnr"]
+
+
 def test_a_quality_that_could_not_be_measured_is_a_dash(dataset, tmp_path):
     state = nbv.State(tiny.initial([]), np.zeros(0), np.zeros(0), [0], [])
     views = {"count": 2, "psnr": 30.123, "ssim": 0.95, "psnr_mask": None, "ssim_mask": None}
@@ -189,6 +207,28 @@ def test_a_run_appears_whole_or_not_at_all(dataset, tmp_path, monkeypatch):
     started(dataset, tmp_path / "run", own, budget=1)
     assert there == [False]
     assert {p.name for p in tmp_path.iterdir()} == {"run", "prior", dataset.name}
+
+
+SETTINGS = {
+    "budget": (-1, "settings.budget: Input should be greater than or equal to 0"),
+    "seeds": ("four", "settings.seeds: Input should be a valid integer"),
+    "speed": (1, "settings.speed: Extra inputs are not permitted"),
+    "prior_std": ({"colour": 1.0}, "settings.prior_std: must have a number for each of colour, scale, rotation, opacity"),
+}
+
+
+@pytest.mark.parametrize("key", SETTINGS)
+@pytest.mark.parametrize("command", [["nbv", "--resume"], ["eval"], ["diagnose"]])
+def test_a_damaged_setting_is_named_with_its_file(dataset, prior, tmp_path, capsys, key, command):
+    """Not by the option of a command that nobody gave."""
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    config = json.loads((run / "config.json").read_text())
+    value, named = SETTINGS[key]
+    config["settings"][key] = value
+    write_json(run / "config.json", config)
+    said = refused(capsys, [*command, run], run)
+    assert f"{run}/config.json: {named}" in said
+    assert "--" not in said
 
 
 @pytest.mark.parametrize("values", [{"pixel_noise": float("inf")}, {"prior_std": {"colour": float("inf")}}])

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import shutil
 
 import numpy as np
@@ -136,9 +137,11 @@ def test_missing_and_damaged_files(runs, tmp_path):
     (tmp_path / "config.json").write_text((runs[0] / "config.json").read_text())
     with pytest.raises(InputError, match=r"steps\.jsonl: no such file; .*--resume"):
         report.read_run(tmp_path)
-    for damaged in ("", "{", "{}\n"):
+    for damaged, cause in {"": "no JSON", "{": "no JSON", "{}\n": "seeds: Field required"}.items():
         (tmp_path / "steps.jsonl").write_text(damaged)
-        with pytest.raises(InputError, match="damaged"):
+        with pytest.raises(
+            InputError, match=rf"steps\.jsonl: line 1 is damaged \({cause}\); write the file anew with `mgs nbv --r"
+        ):
             report.read_run(tmp_path)
     (tmp_path / "steps.jsonl").write_text((runs[0] / "steps.jsonl").read_text())
     with pytest.raises(InputError, match="mgs eval"):
@@ -152,8 +155,48 @@ def test_a_damaged_line(runs, tmp_path, key, value):
     lines = [json.loads(line) for line in (run / "steps.jsonl").read_text().splitlines()]
     lines[2] = {k: v for k, v in (lines[2] | {key: value}).items() if v is not ...}
     (run / "steps.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    with pytest.raises(InputError, match=r"steps\.jsonl is damaged; resume"):
+    with pytest.raises(InputError, match=rf"steps\.jsonl: line 3 is damaged \({key}: .*anew with `mgs nbv --resume"):
         report.write_report(tmp_path / "report", [run])
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda config: config.pop("settings"), "has no settings"),
+        (lambda config: config["settings"].pop("policy"), "settings.policy: Field required"),
+        (lambda config: config["settings"].update(budget="many"), "settings.budget: Input should be a valid integer"),
+    ],
+)
+def test_a_damaged_config(runs, tmp_path, change, named):
+    """Resuming does not write it anew, and would not read it."""
+    run = shutil.copytree(runs[0], tmp_path / "run")
+    config = json.loads((run / "config.json").read_text())
+    change(config)
+    write_json(run / "config.json", config)
+    with pytest.raises(InputError, match=rf"config\.json: {named}.*start the run anew"):
+        report.read_run(run)
+
+
+def test_an_unfinished_run(runs, tmp_path):
+    """Evaluated on the way or not: what is missing is the rest of it."""
+    run = shutil.copytree(runs[0], tmp_path / "run")
+    lines = (run / "steps.jsonl").read_text().splitlines(keepends=True)
+    (run / "steps.jsonl").write_text("".join(lines[:3]))
+    (run / "gaussians.ply").unlink()
+    expected = f"{run}: is unfinished, with 5 of 8 views; go on with `mgs nbv --resume {run}`"
+    metrics = json.loads((run / "metrics.json").read_text())
+    for change in (
+        lambda: None,
+        lambda: write_json(run / "metrics.json", metrics | {"images": 5}),
+        (run / "metrics.json").unlink,
+    ):
+        change()
+        with pytest.raises(InputError, match=re.escape(expected)):
+            report.write_report(tmp_path / "report", [runs[1], run])
+    (run / "steps.jsonl").write_text("".join(lines))
+    with pytest.raises(InputError, match=r"run: has all 8 views, but no gaussians\.ply; write it with `mgs nbv --resume"):
+        report.write_report(tmp_path / "report", [run])
+    assert not (tmp_path / "report").exists()
 
 
 @pytest.mark.parametrize("metrics", [{}, [], 1, {"all": {}}, {"images": 8, "all": {}, "held_out": {}, "views": [{}]}])
