@@ -321,10 +321,12 @@ def test_run_whose_dataset_is_gone(capsys, dataset, prior, tmp_path, command):
     assert "correct `dataset`" in refused(capsys, [*command, run], run)
 
 
-@pytest.mark.parametrize("views", ["kf_9999", "kf_0000,nothing", ",", ""])
-def test_diagnose_of_views_that_are_not_there(capsys, dataset, prior, tmp_path, views):
+@pytest.mark.parametrize(
+    ("views", "named"), [("kf_9999", "kf_9999"), ("kf_0000,nothing", "nothing"), (",", "--views"), ("", "--views")]
+)
+def test_diagnose_of_views_that_are_not_there(capsys, dataset, prior, tmp_path, views, named):
     run = tiny.write_run(tmp_path / "run", dataset, prior)
-    refused(capsys, ["diagnose", run, "--views", views], run)
+    assert named in refused(capsys, ["diagnose", run, "--views", views], run)
 
 
 def test_demo_keeps_out_of_a_folder_of_something_else(capsys, tmp_path):

@@ -9,9 +9,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import tiny
+from PIL import Image
 from refusals import refused
 
-from mgs import bench
+from mgs import bench, bench_chart
 from mgs.bench_chart import OPERATIONS, fitted, linear_growth, scaling_exponents, scaling_figure
 from mgs.cli import main
 from mgs.files import read_json
@@ -36,7 +37,7 @@ def points(most: int = 1_000_000) -> list[dict]:
     ]
 
 
-def test_growth_with_pairs_is_told_for_either_way_to_get_more(tmp_path):
+def test_growth_with_pairs_is_told_for_either_way_to_get_more():
     records = points()
     assert fitted(records)[0]["n"] == 10_000
     row = scaling_exponents(records)["forward, cold"]
@@ -53,9 +54,29 @@ def test_growth_with_pairs_is_told_for_either_way_to_get_more(tmp_path):
     assert fitted(points(3000))[0]["n"] == 1000
     one_core = [p for p in records if p["sweep"] != "threads" or p["threads"] == 1]
     assert "threads" not in scaling_exponents(one_core)["forward, cold"]
-    for chosen in (records, one_core):
-        scaling_figure(tmp_path / "chart.png", chosen)
-        assert (tmp_path / "chart.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_chart_shows_the_records(tmp_path, monkeypatch, threads):
+    drawn = []
+    monkeypatch.setattr(bench_chart, "save_figure", lambda figure, path: drawn.append((figure, path)))
+    records = [p for p in points() if p["sweep"] != "threads" or p["threads"] <= threads]
+    scaling_figure(tmp_path / "chart.png", records)
+    ((figure, path),) = drawn
+    assert path == tmp_path / "chart.png"
+    forward = [axis.lines[0].get_xydata() for axis in figure.axes[:4]]
+    for found, (sweep, key) in zip(
+        forward, (("gaussians", "n"), ("pixels",) * 2, ("threads",) * 2, ("both", "pairs")), strict=True
+    ):
+        expected = [(p[key], 1e3 * p["forward_warm"]) for p in records if p["sweep"] == sweep]
+        np.testing.assert_allclose(found, expected)
+    titles = [axis.get_legend().get_texts()[0].get_text() for axis in figure.axes[:4]]
+    assert titles == [
+        "forward, warm: 0.70",
+        "forward, warm: 0.50",
+        "forward, warm: -1.00" if threads > 1 else "forward, warm: ",
+        "forward, warm: 0.90, 1.40",
+    ]
 
 
 def test_linear_growth_finds_the_costs_it_is_made_of():
@@ -100,13 +121,16 @@ def test_peak_memory_is_that_of_the_point_alone():
 
 def test_the_json_holds_the_command_as_typed(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(bench, "bench_scaling", lambda *_: points())
-    arguments = ["bench", "scaling", "--repeats", "5", "--json", str(tmp_path / "a b.json")]
+    chart, json = tmp_path / "chart.png", tmp_path / "a b.json"
+    arguments = ["bench", "scaling", "--repeats", "5", "--json", str(json), "--chart", str(chart)]
     monkeypatch.setattr("sys.argv", ["/somewhere/bin/mgs", *arguments])
     with pytest.raises(SystemExit) as stop:
         main()
     assert stop.value.code == 0
-    written = read_json(tmp_path / "a b.json")
-    assert written["command"] == f"mgs bench scaling --repeats 5 --json '{tmp_path}/a b.json'"
+    with Image.open(chart) as picture:
+        picture.load()
+    written = read_json(json)
+    assert written["command"] == f"mgs bench scaling --repeats 5 --json '{json}' --chart {chart}"
     assert written["repeats"] == 5
     assert written["exponents_from_n"] == 10_000
     printed = capsys.readouterr().out

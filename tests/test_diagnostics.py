@@ -58,7 +58,6 @@ def test_maps_are_means_over_what_a_pixel_shows():
     """At the centre the weights are 1/2 and nearly 1/2, so the map is the mean of the two values, whatever their magnitude."""
     gaussians, camera = two_in_a_row()
     scalars = {"information": np.array([1e-4, 3e-4]), "large": np.array([4e6, 0]), "flat": np.array([7.0, 7.0])}
-    scalars |= {"unobserved": np.array([0.0, 1.0])}
     maps = diagnostics.view_maps(gaussians, camera, scalars)
     near, far = 0.5, 0.5 * (1 / (1 + np.exp(-9.0)))
     assert maps["A"][12, 16] == pytest.approx(near + far, abs=1e-3)
@@ -66,8 +65,16 @@ def test_maps_are_means_over_what_a_pixel_shows():
     assert maps["information"][12, 16] == pytest.approx(mean, rel=1e-3)
     assert maps["large"][12, 16] == pytest.approx(4e6 * near / (near + far), rel=1e-3)
     np.testing.assert_allclose(maps["flat"][maps["A"] > 0.1], 7.0, rtol=1e-4)
-    assert set(np.unique(maps["unobserved"])) <= {0.0, 1.0}
     assert maps["Z"][12, 16] == pytest.approx((2 * near + 3 * far) / (near + far), rel=1e-3)
+
+
+@pytest.mark.parametrize("near", [0.0, 1.0])
+def test_a_pixel_is_unobserved_where_most_of_its_weight_is(near):
+    """The near one, more opaque than not, decides."""
+    gaussians, camera = two_in_a_row()
+    gaussians.logit_opacities[0] = 1
+    maps = diagnostics.view_maps(gaussians, camera, {"unobserved": np.array([near, 1 - near])})
+    assert maps["unobserved"][12, 16] == near
 
 
 def test_maps_of_an_empty_view_are_zero():

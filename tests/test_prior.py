@@ -338,6 +338,7 @@ def _plain(root: Path) -> Path:
         (_no_return, [], "no depth image has a return"),
         (_truncated_depth, [], "kf_0003.exr: not a readable EXR"),
         (_small_depth, [], "is 10x10"),
+        (_one_frame, [], "no closed surface"),
         (_occupied, [], "not empty"),
         (_faceless_truth, [], "no faces"),
         (_plain, ["--gaussians", "0"], "0 Gaussians are too few"),
@@ -368,8 +369,16 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert make is _occupied or not (root / "prior").exists()
 
 
-@pytest.mark.parametrize("damage", ["missing", "cut", "nan", "json"])
-def test_damaged_prior_is_one_line(built, tmp_path: Path, damage: str) -> None:
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        ("missing", r"points\.ply: no such file"),
+        ("cut", "not a readable prior .*early end-of-file"),
+        ("nan", r"points\.ply: has NaN values"),
+        ("json", "not a readable prior .*'spacing'"),
+    ],
+)
+def test_damaged_prior_is_one_line(built, tmp_path: Path, damage: str, message: str) -> None:
     folder = save_prior(tmp_path / "prior", built[0])
     points = folder / "points.ply"
     if damage == "missing":
@@ -381,8 +390,12 @@ def test_damaged_prior_is_one_line(built, tmp_path: Path, damage: str) -> None:
         points.write_bytes(content[:-4] + np.float32(np.nan).tobytes())
     else:
         (folder / "prior.json").write_text("{}")
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match=message) as error:
         load_prior(folder)
+    assert "\n" not in str(error.value)
+
+
+def test_no_prior_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such prior"):
         load_prior(tmp_path / "elsewhere")
 

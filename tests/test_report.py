@@ -12,6 +12,7 @@ from PIL import Image
 from rich.console import Console
 
 from mgs import figures, nbv, report
+from mgs.conventions import srgb_from_linear
 from mgs.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.evaluate import evaluate, load_run
@@ -57,7 +58,21 @@ def test_run_folder(runs):
     assert [run.settings["budget"], len(run.steps)] == [5, 6]
 
 
-def test_report_writes_every_figure(runs, tmp_path):
+@pytest.fixture
+def drawn(monkeypatch):
+    """{file name: figure} of every figure that is saved."""
+    found, save = {}, figures.save_figure
+    monkeypatch.setattr(figures, "save_figure", lambda figure, path: (found.update({path.name: figure}), save(figure, path)))
+    return found
+
+
+def curves(axis) -> dict[str, list[tuple[float, float]]]:
+    """{label: points} of the lines of an axis."""
+    return {line.get_label(): [tuple(xy) for xy in line.get_xydata()] for line in axis.lines}
+
+
+def test_report_writes_every_figure(runs, tmp_path, drawn):
+    """Each shows the numbers of the runs."""
     written = report.write_report(tmp_path / "report", runs)
     assert [path.name for path in written] == [
         "orbit.png",
@@ -71,11 +86,28 @@ def test_report_writes_every_figure(runs, tmp_path):
     for path in written[:-2]:
         with Image.open(path) as picture:
             picture.load()
-            assert min(picture.size) > 400
-            assert len(picture.convert("RGB").getcolors(1 << 24)) > 50
+            assert picture.size == tuple(drawn[path.name].canvas.get_width_height())
         assert path.stat().st_size < 400_000
     assert {path.name for path in (tmp_path / "report").iterdir()} == {path.name for path in written}
     assert json.loads((tmp_path / "report/table.json").read_text()) == report.table_numbers(runs)
+
+    read = {run.policy: run for run in map(report.read_run, runs)}
+    steps = {policy: run.steps for policy, run in read.items()}
+    gains = {policy: [(s["step"], s["information_gain"]) for s in lines[1:]] for policy, lines in steps.items()}
+    assert curves(drawn["gain.png"].axes[0]) == gains
+    covered = {policy: [(s["images"], 100 * s["coverage"]) for s in lines] for policy, lines in steps.items()}
+    assert curves(drawn["coverage.png"].axes[0]) == covered
+    for axis, key in zip(drawn["psnr.png"].axes, ("psnr", "psnr_mask"), strict=True):
+        assert curves(axis) == {policy: [(s["images"], s[key]) for s in lines] for policy, lines in steps.items()}
+    positions = np.array([camera.position[:2] for camera in tiny.orbit()])
+    for axis, run in zip(drawn["orbit.png"].axes, read.values(), strict=False):
+        shown = {points.get_label(): points.get_offsets() for points in axis.collections}
+        for label, frames in (("candidate", range(tiny.FRAMES)), ("seed", run.seeds), ("chosen", run.chosen)):
+            np.testing.assert_allclose(shown[label], positions[list(frames)], atol=1e-9)
+    shown = {axis.get_title().split("\n")[0]: axis for axis in drawn["comparison.png"].axes if axis.images}
+    assert list(shown) == ["truth", "d-optimal", "random", ""]
+    for policy, grey in (("d-optimal", 0.3), ("random", 0.2)):
+        np.testing.assert_allclose(shown[policy].images[0].get_array(), srgb_from_linear(np.float64(grey)), atol=1 / 255)
 
 
 def test_unseen_view(runs):

@@ -23,8 +23,11 @@ def test_finds_a_good_one_and_is_what_dr_jit_uses():
 
 
 def test_facts_of_the_processor():
+    import drjit as dr
+
     facts = runtime.processor()
-    assert facts["threads"] >= 1
+    assert facts["threads"] == dr.thread_count()
+    assert facts["cpu"] not in ("", "unknown")
     assert facts["simd_width"] in (4, 8, 16)
 
 
@@ -93,8 +96,8 @@ def test_start_raises_instead_of_aborting():
     environment = {runtime.LIBRARY_VARIABLE: OLD[0] if OLD else "/nowhere.so"}
     result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
     assert result.returncode == 0, result.stderr
-    assert "libLLVM" in result.stdout
-    assert "install libLLVM" in result.stdout or "names it" in result.stdout
+    assert result.stdout.startswith(f"libLLVM {environment[runtime.LIBRARY_VARIABLE]}: ")
+    assert f"{runtime.LIBRARY_VARIABLE} names it" in result.stdout
 
 
 @pytest.mark.parametrize(

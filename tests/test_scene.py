@@ -89,7 +89,10 @@ def test_no_stones_where_the_rock_keeps_them_out():
 def test_unknown_scene_names_the_known_ones():
     with pytest.raises(InputError, match="boulder"):
         load_scene_file("boulders")
-    assert load_scene_file("boulder").rock == Rock(**load_scene_file("boulder").rock.model_dump())
+
+
+def test_the_boulder_is_the_default_scene():
+    assert load_scene_file("boulder").model_copy(update={"description": ""}) == SceneFile()
 
 
 def test_the_sensor_of_a_dataset_is_its_scenes(tmp_path):

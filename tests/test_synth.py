@@ -87,6 +87,7 @@ def test_same_seed_same_bytes_and_resume_and_pose_noise(dataset, tmp_path):
 
     with pytest.raises(Stop):
         synthesise(tmp_path / "again", SCENE, TINY, seed=3, pose_noise=PoseNoise(0.01, 0.1), progress=interrupt)
+    assert seen == [1, 2]
     assert not (tmp_path / "again/transforms.json").exists()
     (tmp_path / "again/images/.kf_0003.1.part.png").touch()
     with locked(tmp_path / "again"), pytest.raises(InputError, match="works on it"):

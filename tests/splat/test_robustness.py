@@ -46,7 +46,7 @@ def around_near_plane() -> Gaussians:
 
 
 def thin(ratio: float) -> Gaussians:
-    g = scene(1)
+    g = scene(2)
     g.log_scales[:] = np.log(0.4) + np.array([0, -np.log(ratio), -np.log(ratio)], np.float32)
     return g
 
@@ -60,9 +60,9 @@ CASES = {
     "far away": lambda: with_first("means", place(CAMERA, [(22, 13)] * 4, [1e3, 1e4, 1e5, 1e6])),
     "a light year aside": lambda: with_first("means", 1e16),
     "scales of e^-30": lambda: scene(log_scales=np.full((N, 3), -30.0)),
-    "scales of e^30": lambda: with_first("log_scales", 30),
+    "scales of e^30": lambda: with_first("log_scales", 30, seed=2),
     "scales of e^30 and e^-30": lambda: with_first("log_scales", (30, -30, -30)),
-    "scales of 3e38": lambda: with_first("log_scales", 3e38),
+    "scales of 3e38": lambda: with_first("log_scales", 3e38, seed=2),
     "1:1000": lambda: thin(1e3),
     "1:1000000": lambda: thin(1e6),
     "opaque": lambda: scene(logit_opacities=np.full(N, 20.0)),
@@ -88,21 +88,19 @@ def gradients(gaussians, camera) -> dict[str, np.ndarray]:
 
 
 def assert_right(gaussians, camera, quats: bool = True) -> None:
-    """Image against the oracle where no decision is near (and few are), Fisher against the oracle (quats=False: but for
-    quaternions), gradients finite."""
+    """Image and Fisher against the oracle (quats=False: but for quaternions), gradients finite. No pixel is near a decision."""
     image = render(gaussians, camera, BACKGROUND)
     with np.errstate(all="ignore"):
         truth = reference.render(gaussians, camera, BACKGROUND)
-        decided = margins(gaussians, camera) > 1e-4
+        assert margins(gaussians, camera).min() > 1e-4
     for name in ("rgb", "alpha"):
         found = np.asarray(getattr(image, name))
         assert np.isfinite(found).all(), name
-        assert np.abs(found - truth[name])[decided].max(initial=0) < 2e-5, name
-    assert decided.mean() > 0.99
+        assert np.abs(found - truth[name]).max() < 2e-5, name
     depth = np.asarray(image.depth)
     assert np.isfinite(depth).all()
     error = np.abs(depth - truth["depth"]) * truth["alpha"] / max(1, truth["depth"].max())
-    assert error[decided].max(initial=0) < 2e-5
+    assert error.max() < 2e-5
     for name, gradient in gradients(gaussians, camera).items():
         assert np.isfinite(gradient).all(), f"gradient of {name}"
     with np.errstate(all="ignore"):
@@ -111,13 +109,12 @@ def assert_right(gaussians, camera, quats: bool = True) -> None:
     assert np.isfinite(found).all()
     assert np.isfinite(blocks).all()
     assert (found >= 0).all()
-    if np.any(expected) and decided.all():
-        diagonal = np.einsum("nii->ni", expected)
-        part = np.arange(11) if quats else np.array([0, 1, 2, 3, 4, 5, 10])
-        square = np.ix_(np.arange(len(found)), part, part)
-        for values, truths in ((found[:, part], diagonal[:, part]), (blocks[square], expected[square])):
-            big = np.abs(truths) > 1e-6 * np.abs(truths).max()
-            np.testing.assert_allclose(values[big], truths[big], rtol=1e-3)
+    diagonal = np.einsum("nii->ni", expected)
+    part = np.arange(11) if quats else np.array([0, 1, 2, 3, 4, 5, 10])
+    square = np.ix_(np.arange(len(found)), part, part)
+    for values, truths in ((found[:, part], diagonal[:, part]), (blocks[square], expected[square])):
+        big = np.abs(truths) >= 1e-6 * np.abs(truths).max()  # where nothing is seen all are, and must be 0
+        np.testing.assert_allclose(values[big], truths[big], rtol=1e-3)
 
 
 BEYOND_DIFFERENCES = {"scales of e^30 and e^-30", "quaternions of norm 1e-9"}
@@ -220,7 +217,6 @@ def test_not_a_number_names_the_parameter_and_the_first_gaussian(name, value):
     getattr(g, name)[9] = value
     cache = ListCache()
     render(scene(), CAMERA, cache=cache)
-    pattern = f"{name} is NaN or infinite, first at Gaussian 5"
     for call in (
         lambda: render(g, CAMERA),
         lambda: render(as_drjit(g), CAMERA),
@@ -228,9 +224,9 @@ def test_not_a_number_names_the_parameter_and_the_first_gaussian(name, value):
         lambda: fisher(g, CAMERA),
         lambda: fisher(g, CAMERA, "hutchinson"),
     ):
-        with pytest.raises(InputError, match=pattern):
+        with pytest.raises(InputError, match=f"{name} is NaN or infinite, first at Gaussian 5") as error:
             call()
-    assert "\n" not in pattern
+        assert "\n" not in str(error.value)
 
 
 def test_opacities_of_extreme_logits():
