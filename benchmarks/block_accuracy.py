@@ -17,12 +17,11 @@ from mgs import runtime
 
 runtime.start()
 
-from mgs.bench import command_line  # noqa: E402
-from mgs.config import versions  # noqa: E402
-from mgs.conventions import Camera, look_at  # noqa: E402
-from mgs.figures import STYLE, new_figure, save_figure  # noqa: E402
+from mgs.camera import Camera, look_at  # noqa: E402
 from mgs.files import write_json  # noqa: E402
 from mgs.gaussians import Gaussians  # noqa: E402
+from mgs.plotting import STYLE, new_figure, save_figure  # noqa: E402
+from mgs.provenance import command_line, versions  # noqa: E402
 from mgs.seeds import generator  # noqa: E402
 from mgs.splat import fisher, reference  # noqa: E402
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from mgs import runtime
-from mgs.dataset import Frame
+from mgs.data.dataset import Frame
 from mgs.files import write_json
 from mgs.gaussians import Gaussians
 
@@ -38,19 +38,18 @@ def shares(gaussians: Gaussians, frames: Sequence[Frame]) -> list[float]:
 def main(out: Path, runs: list[Path]) -> None:
     """Print a line for the start, and one a run; write them."""
     runtime.start()
-    from mgs import nbv
-    from mgs.bench import command_line
-    from mgs.config import versions
-    from mgs.evaluate import load_run
-    from mgs.initial import initial_gaussians
-    from mgs.prior import load_prior
+    from mgs.active import run_folder
+    from mgs.active.run_folder import load_run
+    from mgs.prior.build import load_prior
+    from mgs.prior.initial import initial_gaussians
+    from mgs.provenance import command_line, versions
 
     heading = [*(f"> {100 * limit:.0f} cm deep" for limit in TOO_DEEP), f"opacity < {OPAQUE}"]
     print(f"{'':30}" + "".join(f"{text:>16}" for text in heading))
     found = {}
     for run in runs:
         gaussians, dataset, trained, policy = load_run(run)
-        settings, state = nbv.read_settings(run), nbv.read_checkpoint(run)
+        settings, state = run_folder.read_settings(run), run_folder.read_checkpoint(run)
         seeds = [dataset.frames[i] for i in state.steps[0]["seeds"]]
         models = {f"{policy}, {len(trained)} images": gaussians}
         if run == runs[0]:

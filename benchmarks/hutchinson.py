@@ -15,12 +15,12 @@ from mgs import runtime
 
 runtime.start()
 
-from mgs.bench import command_line, exponent, surface_camera, surface_gaussians  # noqa: E402
-from mgs.config import versions  # noqa: E402
-from mgs.figures import STYLE, new_figure, save_figure  # noqa: E402
+from mgs.bench.core import exponent, surface_camera, surface_gaussians  # noqa: E402
 from mgs.files import write_json  # noqa: E402
+from mgs.plotting import STYLE, new_figure, save_figure  # noqa: E402
+from mgs.provenance import command_line, versions  # noqa: E402
 from mgs.splat import ListCache, as_drjit, fisher  # noqa: E402
-from mgs.splat.fisher import hutchinson  # noqa: E402
+from mgs.splat.information import hutchinson  # noqa: E402
 
 PROBES = (1, 4, 16, 64, 256)
 SEEDS = range(5)

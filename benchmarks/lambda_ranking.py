@@ -1,7 +1,7 @@
 """How the ranking of candidates depends on lambda: `python benchmarks/lambda_ranking.py RUN PREFIX`.
 
 Scores every candidate of a run's last state by Eq. 7 with the default lambda (one number per kind of parameter, see
-`mgs.policies.regularisation`) times 10^-8 ... 10^8, and with a single number for all parameters, as in the paper; prints
+`mgs.active.criteria.regularisation`) times 10^-8 ... 10^8, and with a single number for all parameters, as in the paper; prints
 Spearman's rank correlation with the default's ranking and which view would be chosen, and writes PREFIX.json and PREFIX.png.
 """
 
@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import spearmanr
 
-from mgs import nbv, policies, runtime
-from mgs.dataset import load_dataset
+from mgs import runtime
+from mgs.active import criteria, run_folder
+from mgs.data.dataset import load_dataset
 from mgs.files import write_json
 
 FACTORS = 10.0 ** np.arange(-8, 9)
@@ -25,24 +26,23 @@ SINGLE = 10.0 ** np.arange(-12, 3)
 def main(run: Path, prefix: str) -> None:
     """Print the table, write it, draw the figure."""
     runtime.start()
-    from mgs.bench import command_line
-    from mgs.config import versions
+    from mgs.provenance import command_line, versions
     from mgs.splat import fisher, groups
 
-    settings, state = nbv.read_settings(run), nbv.read_checkpoint(run)
+    settings, state = run_folder.read_settings(run), run_folder.read_checkpoint(run)
     if state is None:
         raise SystemExit(f"{run}: has no finished step")
     frames = load_dataset(settings.dataset).frames
     left = [i for i in range(len(frames)) if i not in state.taken]
-    default = policies.regularisation(groups(0), settings.pixel_noise, settings.prior_std)
+    default = criteria.regularisation(groups(0), settings.pixel_noise, settings.prior_std)
     kinds = {"default times": [(f, f * default) for f in FACTORS], "single": [(s, np.full_like(default, s)) for s in SINGLE]}
     scores = {kind: np.empty((len(rows), len(left))) for kind, rows in kinds.items()}
     reference = np.empty(len(left))
     for column, i in enumerate(left):
         F = fisher(state.gaussians, frames[i].camera)
-        reference[column] = policies.d_optimal(F, state.H, default)
+        reference[column] = criteria.d_optimal(F, state.H, default)
         for kind, rows in kinds.items():
-            scores[kind][:, column] = [policies.d_optimal(F, state.H, lam) for _, lam in rows]
+            scores[kind][:, column] = [criteria.d_optimal(F, state.H, lam) for _, lam in rows]
     print(f"{len(state.taken)} images, {len(left)} candidates; default chooses {frames[left[int(reference.argmax())]].name}")
     curves, found = {}, []
     for kind, rows in kinds.items():
@@ -60,7 +60,7 @@ def draw(out: Path, curves: dict[str, tuple[list[float], list[float]]]) -> None:
     """Rank correlation against lambda."""
     import matplotlib
 
-    from mgs.figures import STYLE
+    from mgs.plotting import STYLE
 
     with matplotlib.rc_context(STYLE):
         from matplotlib.figure import Figure

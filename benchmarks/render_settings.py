@@ -28,15 +28,14 @@ VIEWS = (2, 17)
 def measure() -> dict:
     """Render every setting; times are medians over the views after one warm-up frame."""
     runtime.start()
-    from mgs.bench import command_line
-    from mgs.config import versions
-    from mgs.conventions import srgb_from_linear
-    from mgs.evaluate import psnr
-    from mgs.rock import make_rock
-    from mgs.scene import Scene
-    from mgs.scene_file import load_scene_file
+    from mgs.colour import srgb_from_linear
+    from mgs.metrics import psnr
+    from mgs.provenance import command_line, versions
     from mgs.seeds import generator
-    from mgs.synth import ROCK_EXPOSURE, Preset, rock_cameras
+    from mgs.synth.rendering import ROCK_EXPOSURE, Preset, rock_cameras
+    from mgs.synth.rock import make_rock
+    from mgs.synth.scene import Scene
+    from mgs.synth.scene_file import load_scene_file
 
     settings = load_scene_file("boulder")
     rock = make_rock(settings.rock, generator(0, "rock"))
@@ -87,7 +86,7 @@ def plot(data: dict, path: Path) -> None:
     """PSNR of the rock's pixels over CPU seconds of all cores together, so that other work on the machine does not count."""
     import matplotlib
 
-    from mgs.figures import STYLE, new_figure, save_figure
+    from mgs.plotting import STYLE, new_figure, save_figure
 
     with matplotlib.rc_context(STYLE):
         figure = new_figure(6.4, 4, dpi=130)

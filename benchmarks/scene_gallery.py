@@ -13,9 +13,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 
-from mgs.dataset import load_dataset
-from mgs.orbit import orbit_positions
-from mgs.scene_file import ORBITS, load_scene_file
+from mgs.data.dataset import load_dataset
+from mgs.synth.orbit import orbit_positions
+from mgs.synth.scene_file import ORBITS, load_scene_file
 
 WIDTH = 232
 """Of one frame in a strip, pixels."""

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mgs import nbv, policies, runtime
-from mgs.dataset import load_dataset
-from mgs.prior import load_prior
+from mgs import runtime
+from mgs.active import criteria, pose_policies, run_folder
+from mgs.data.dataset import load_dataset
+from mgs.prior.build import load_prior
 
 ESTIMATORS = {"exact": "exact $J^TJ$", "loss-gradient": "squared gradient of a scalar loss"}
 
@@ -24,12 +25,12 @@ def main(run: Path, out: Path) -> None:
     runtime.start()
     from mgs.splat import fisher, groups
 
-    settings, state = nbv.read_settings(run), nbv.read_checkpoint(run)
+    settings, state = run_folder.read_settings(run), run_folder.read_checkpoint(run)
     if state is None or len(state.taken) != 1:
         raise SystemExit(f"{run}: is not a run of one seed; make it with --seeds 1 --budget 0")
     frames = load_dataset(settings.dataset).frames
-    lam = policies.regularisation(groups(0), settings.pixel_noise, settings.prior_std)
-    angles = policies.azimuths(np.array([f.camera.position for f in frames]), load_prior(settings.prior).points.mean(0))
+    lam = criteria.regularisation(groups(0), settings.pixel_noise, settings.prior_std)
+    angles = pose_policies.azimuths(np.array([f.camera.position for f in frames]), load_prior(settings.prior).points.mean(0))
     away = np.degrees((angles - angles[state.taken[0]] + np.pi) % (2 * np.pi) - np.pi)
     left = [i for i in np.argsort(away) if i != state.taken[0]]
     gains: dict[str, np.ndarray] = {}
@@ -42,7 +43,7 @@ def main(run: Path, out: Path) -> None:
         H = information(state.taken[0])
         means[estimator] = float(H.mean())
         scaled = lam * means[estimator] / means["exact"]  # lambda in the units of a mean loss, which it would swamp otherwise
-        gains[estimator] = np.array([policies.d_optimal(information(i), H, scaled) for i in left])
+        gains[estimator] = np.array([criteria.d_optimal(information(i), H, scaled) for i in left])
     for k, i in enumerate(left):
         print(f"{frames[i].name}  {away[i]:+6.0f} degrees  " + "  ".join(f"{e} {g[k]:.4f}" for e, g in gains.items()))
     draw(out, away[left], gains)
@@ -53,7 +54,7 @@ def draw(out: Path, away: np.ndarray, gains: dict[str, np.ndarray]) -> None:
     import matplotlib
     from matplotlib.figure import Figure
 
-    from mgs.figures import STYLE
+    from mgs.plotting import STYLE
 
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(4.8, 2.8), dpi=150, layout="constrained")

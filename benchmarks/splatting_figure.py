@@ -14,12 +14,12 @@ from mgs import runtime
 
 runtime.start()
 
-from mgs.bench import surface_camera, surface_gaussians  # noqa: E402
-from mgs.conventions import srgb_from_linear  # noqa: E402
-from mgs.figures import new_figure, save_figure  # noqa: E402
+from mgs.bench.core import surface_camera, surface_gaussians  # noqa: E402
+from mgs.colour import srgb_from_linear  # noqa: E402
+from mgs.plotting import new_figure, save_figure  # noqa: E402
 from mgs.splat import ListCache, as_drjit, reference, render  # noqa: E402
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, TILE  # noqa: E402
-from mgs.splat.project import camera_array, project  # noqa: E402
+from mgs.splat.projection import camera_array, project  # noqa: E402
 
 ORANGE, BLUE = "#d55e00", "#0072b2"
 

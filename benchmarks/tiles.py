@@ -22,13 +22,13 @@ runtime.start()
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
-from mgs.bench import WARM_UP, command_line, surface_camera, surface_gaussians  # noqa: E402
-from mgs.config import versions  # noqa: E402
-from mgs.figures import STYLE, new_figure, save_figure  # noqa: E402
+from mgs.bench.core import WARM_UP, surface_camera, surface_gaussians  # noqa: E402
 from mgs.files import write_json  # noqa: E402
+from mgs.plotting import STYLE, new_figure, save_figure  # noqa: E402
+from mgs.provenance import command_line, versions  # noqa: E402
 from mgs.splat import as_drjit, blocks, kernels  # noqa: E402
-from mgs.splat.project import camera_array, project  # noqa: E402
-from mgs.splat.render import as_colour  # noqa: E402
+from mgs.splat.projection import camera_array, project  # noqa: E402
+from mgs.splat.rendering import as_colour  # noqa: E402
 
 TILES = (1, 2, 4, 8, 16, 32, 64, 128)
 """Blocks across and down; 128 is the whole image."""

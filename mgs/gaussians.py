@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.special import expit
 
-from mgs.conventions import SH_C0
+from mgs.colour import SH_C0
 from mgs.errors import InputError
 
 MAX_SH_DEGREE = 3

@@ -11,18 +11,22 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 from scipy.special import logit
 
-from mgs.conventions import SH_C0
+from mgs.colour import SH_C0
 from mgs.errors import InputError
 from mgs.files import atomic_path, reading
 from mgs.gaussians import Gaussians
 
 LINEAR_COMMENT = "mgs: colours are linear RGB"
 """Header comment of our PLY files. The layout itself has no field for it, and other tools train in display space (sRGB)."""
+
 CHUNK = 256
 """Splats that share one row of the element `chunk` of a compressed PLY."""
+
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+
 VECTOR_BITS = ((21, 11), (11, 10), (0, 11))
 """Lowest bit and number of bits of x, y and z in a packed position or scale."""
+
 TO_ASCII = bytes(byte if byte < 128 else ord("?") for byte in range(256))
 """Translation of bytes that leaves no others than ASCII."""
 

@@ -24,8 +24,8 @@ import mitsuba as mi
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.splat import ListCache, as_drjit, render
-from mgs.splat.render import as_colour
-from mgs.splat.sensor import camera_from_sensor
+from mgs.splat.mitsuba_sensor import camera_from_sensor
+from mgs.splat.rendering import as_colour
 from mgs.splat_ply import ply_colour_space, read_ply
 
 
@@ -65,7 +65,7 @@ class MgsSplat(mi.CppADIntegrator):
     ) -> Any:
         """The sensor's image through its film, TensorXf [H,W,C]; `seed` and `spp` change nothing.
 
-        Raises InputError for a sensor that is not `perspective`, or a parameter that `mgs.splat.render` refuses.
+        Raises InputError for a sensor that is not `perspective`, or a parameter that `mgs.splat.rendering` refuses.
         """
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         film = sensor.film()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from mgs.cli import main
+from mgs.cli.app import main
 
 
 def listing(root: Path) -> dict[str, bytes | None]:

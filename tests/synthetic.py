@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from mgs.conventions import Camera, look_at
-from mgs.dataset import Dataset, Frame, load_dataset, write_transforms
-from mgs.files import write_exr, write_png
-from mgs.surface import to_glb
+from mgs.camera import Camera, look_at
+from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
+from mgs.data.meshes import to_glb
+from mgs.images import write_exr, write_png
 
 CENTRE = np.array([0.1, -0.05, 0.2])
 AXES = np.array([0.6, 0.5, 0.45])

@@ -13,7 +13,7 @@ import synthetic
 import tiny
 from refusals import occupied, refused
 
-from mgs.files import write_exr, write_png
+from mgs.images import write_exr, write_png
 from mgs.splat_ply import write_ply
 
 Change = Callable[[Path], object]

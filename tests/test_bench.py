@@ -12,9 +12,9 @@ import tiny
 from PIL import Image
 from refusals import refused
 
-from mgs import bench, bench_chart
-from mgs.bench_chart import OPERATIONS, fitted, linear_growth, scaling_exponents, scaling_figure
-from mgs.cli import main
+from mgs.bench import chart, core
+from mgs.bench.chart import OPERATIONS, fitted, linear_growth, scaling_exponents, scaling_figure
+from mgs.cli.app import main
 from mgs.files import read_json
 from mgs.splat import fisher, render
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y
@@ -59,7 +59,7 @@ def test_growth_with_pairs_is_told_for_either_way_to_get_more():
 @pytest.mark.parametrize("threads", [1, 2])
 def test_the_chart_shows_the_records(tmp_path, monkeypatch, threads):
     drawn = []
-    monkeypatch.setattr(bench_chart, "save_figure", lambda figure, path: drawn.append((figure, path)))
+    monkeypatch.setattr(chart, "save_figure", lambda figure, path: drawn.append((figure, path)))
     records = [p for p in points() if p["sweep"] != "threads" or p["threads"] <= threads]
     scaling_figure(tmp_path / "chart.png", records)
     ((figure, path),) = drawn
@@ -94,17 +94,17 @@ def test_linear_growth_finds_the_costs_it_is_made_of():
 
 def test_cold_means_a_view_never_seen_before(monkeypatch):
     gaussians = tiny.initial([])
-    camera, seen, draw = bench.surface_camera(gaussians, 32, 24), [], bench.render
+    camera, seen, draw = core.surface_camera(gaussians, 32, 24), [], core.render
 
     def watched(gaussians, camera, cache=None):
         if cache is None:
             seen.append(camera)
         return draw(gaussians, camera, cache=cache)
 
-    monkeypatch.setattr(bench, "render", watched)
-    bench.time_core(gaussians, camera, 3)
+    monkeypatch.setattr(core, "render", watched)
+    core.time_core(gaussians, camera, 3)
     poses = {c.world_to_camera.tobytes() for c in [camera, *seen]}
-    assert len(seen) == 3 + bench.WARM_UP
+    assert len(seen) == 3 + core.WARM_UP
     assert len(poses) == len(seen) + 1
     centre = (gaussians.means.min(axis=0) + gaussians.means.max(axis=0)) / 2
     for other in seen:
@@ -116,11 +116,11 @@ def test_cold_means_a_view_never_seen_before(monkeypatch):
 def test_peak_memory_is_that_of_the_point_alone():
     dr.eval(dr.arange(mi.Float, 1 << 26))
     assert dr.detail.malloc_watermark(dr.JitBackend.LLVM) >= 1 << 28
-    assert bench.in_new_process(bench.scaling_point, 1000, 32, 24, 1, 3)["peak_bytes"] < 1 << 27
+    assert core.in_new_process(core.scaling_point, 1000, 32, 24, 1, 3)["peak_bytes"] < 1 << 27
 
 
 def test_the_json_holds_the_command_as_typed(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(bench, "bench_scaling", lambda *_: points())
+    monkeypatch.setattr(core, "bench_scaling", lambda *_: points())
     chart, json = tmp_path / "chart.png", tmp_path / "a b.json"
     arguments = ["bench", "scaling", "--repeats", "5", "--json", str(json), "--chart", str(chart)]
     monkeypatch.setattr("sys.argv", ["/somewhere/bin/mgs", *arguments])
@@ -144,8 +144,8 @@ def test_one_n_is_too_few_to_fit(capsys):
 
 def test_operations_per_pixel_are_those_of_the_kernels():
     """Counted in the LLVM IR of every kernel that walks block lists: two for an FMA, one for each other operation."""
-    gaussians = bench.surface_gaussians(500)
-    camera = bench.surface_camera(gaussians, 184, 92)
+    gaussians = core.surface_gaussians(500)
+    camera = core.surface_camera(gaussians, 184, 92)
     lanes = -(-184 // BLOCK_X) * -(-92 // BLOCK_Y)
     counts = []
     for call in (lambda: dr.eval(render(gaussians, camera).rgb), lambda: fisher(gaussians, camera)):
@@ -159,4 +159,4 @@ def test_operations_per_pixel_are_those_of_the_kernels():
             re.findall(r"= f(?:add|sub|mul|div) <\d+ x float>", code),
         )
         counts.append(round((2 * len(fma) + len(other)) / PIXELS))
-    assert counts == [bench.FORWARD_FLOPS, bench.FISHER_FLOPS]
+    assert counts == [core.FORWARD_FLOPS, core.FISHER_FLOPS]

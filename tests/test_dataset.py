@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mgs.check import check_dataset
-from mgs.conventions import Camera, look_at, opencv_from_opengl
-from mgs.dataset import Dataset, Frame, load_dataset, write_transforms
+from mgs.camera import Camera, look_at, opencv_from_opengl
+from mgs.data.check import check_dataset
+from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
 from mgs.errors import InputError
-from mgs.files import write_exr, write_png
-from mgs.orbit import intrinsics
+from mgs.images import write_exr, write_png
+from mgs.synth.orbit import intrinsics
 
 W, H = 40, 30
 K = intrinsics(50, W, H)

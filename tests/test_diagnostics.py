@@ -6,12 +6,13 @@ import tiny
 from PIL import Image
 from plyfile import PlyData
 
-from mgs import diagnostics, nbv, policies
-from mgs.conventions import Camera, look_at
-from mgs.dataset import load_dataset
+from mgs.active import criteria, loop, run_folder
+from mgs.camera import Camera, look_at
+from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
-from mgs.files import read_exr
 from mgs.gaussians import Gaussians, sh_from_rgb
+from mgs.images import read_exr
+from mgs.report import diagnostics
 from mgs.splat import groups
 
 CHANNELS = {"R", "G", "B", "A", "Z", "fisher.colour", "fisher.scale", "fisher.rotation", "fisher.opacity"} | {
@@ -23,7 +24,7 @@ CHANNELS = {"R", "G", "B", "A", "Z", "fisher.colour", "fisher.scale", "fisher.ro
 
 def test_scalars_follow_their_formulas():
     rng = np.random.default_rng(0)
-    H, lam = rng.random((5, 11)) * 10, policies.regularisation(groups(0))
+    H, lam = rng.random((5, 11)) * 10, criteria.regularisation(groups(0))
     H[2] = 0
     surface = np.ones((5, 11))
     surface[4] = 1e-5
@@ -89,7 +90,7 @@ def run(tmp_path_factory):
     root = tmp_path_factory.mktemp("diagnostics")
     dataset = load_dataset(tiny.write_dataset(root / "data"))
     settings = tiny.start(root / "run", dataset)
-    nbv.run(root / "run", settings, dataset, tiny.stations(), tiny.silent)
+    loop.run(root / "run", settings, dataset, tiny.stations(), tiny.silent)
     return root / "run"
 
 
@@ -105,7 +106,7 @@ def test_files(run):
         picture.load()
     assert (run / "diagnostics/kf_0007.png").stat().st_size < 400_000
     vertices = PlyData.read(str(run / "diagnostics/information.ply"))["vertex"]
-    state = nbv.read_checkpoint(run)
+    state = run_folder.read_checkpoint(run)
     assert len(vertices.data) == tiny.POINTS
     assert vertices["red"].dtype == np.uint8
     np.testing.assert_allclose(vertices["fisher_opacity"], state.H[:, 10], rtol=1e-6)
@@ -113,8 +114,8 @@ def test_files(run):
 
 
 def test_views(run):
-    frames = load_dataset(nbv.read_settings(run).dataset).frames
-    state = nbv.read_checkpoint(run)
+    frames = load_dataset(run_folder.read_settings(run).dataset).frames
+    state = run_folder.read_checkpoint(run)
     trained = [frames[i].name for i in state.taken]
     chosen = diagnostics.choose_views(frames, trained, None)
     assert len(chosen) == diagnostics.VIEWS

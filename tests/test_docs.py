@@ -14,12 +14,13 @@ import pytest
 import tiny
 from markdown_it import MarkdownIt
 
-from mgs.conventions import QUAT_MIN, SH_C0
-from mgs.policies import PIXEL_NOISE
-from mgs.scene_file import SceneFile, load_scene_file
+from mgs.active.criteria import PIXEL_NOISE
+from mgs.colour import SH_C0
+from mgs.rotation import QUAT_MIN
 from mgs.splat import constants
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, TILE
 from mgs.splat_ply import write_ply
+from mgs.synth.scene_file import SceneFile, load_scene_file
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import synthetic
 
-from mgs import cli, nbv, policies
-from mgs.cli import main
-from mgs.commands import COMMANDS
-from mgs.dataset import load_dataset
+from mgs.active import criteria, run_folder
+from mgs.cli import app
+from mgs.cli.app import COMMANDS, main
+from mgs.data.dataset import load_dataset
 from mgs.splat_ply import read_ply
 
 OPTIONS = ["--gaussians", "300", "--seeds", "3", "--budget", "4", "--passes", "6", "--seed", "1"]
@@ -85,10 +85,10 @@ def test_the_run_is_whole(dataset, run):
 
 
 def test_learning_helps_and_so_do_more_images(dataset, run):
-    from mgs.initial import initial_gaussians
-    from mgs.prior import load_prior
+    from mgs.active.stations import psnr_measure
+    from mgs.prior.build import load_prior
+    from mgs.prior.initial import initial_gaussians
     from mgs.splat import ListCache
-    from mgs.stations import psnr_measure
 
     loaded, lines = load_dataset(dataset), steps(run)
     start, _ = initial_gaussians(load_prior(run / "prior"), [loaded.frames[i] for i in lines[0]["seeds"]])
@@ -103,11 +103,11 @@ def test_choice_is_the_best_of_the_real_information(dataset, run):
 
     shorter = dataset.parent / "shorter"
     command("nbv", dataset, "--out", shorter, "--prior", run / "prior", *OPTIONS[2:4], "--budget", 3, *OPTIONS[6:])
-    state, frames = nbv.read_checkpoint(shorter), load_dataset(dataset).frames
-    lam = policies.regularisation(groups(0))
+    state, frames = run_folder.read_checkpoint(shorter), load_dataset(dataset).frames
+    lam = criteria.regularisation(groups(0))
     H = sum(fisher(state.gaussians, frames[i].camera).astype(np.float64) for i in state.taken)
     left = [i for i in range(10) if i not in state.taken]
-    gains = [policies.d_optimal(fisher(state.gaussians, frames[i].camera), H, lam) for i in left]
+    gains = [criteria.d_optimal(fisher(state.gaussians, frames[i].camera), H, lam) for i in left]
     last = steps(run)[-1]
     assert last["frame"] == left[int(np.argmax(gains))]
     assert last["gain"] == pytest.approx(max(gains), rel=1e-5)
@@ -143,7 +143,7 @@ def test_ctrl_c_inside_a_call_of_drjit_is_one_line_too(capsys, monkeypatch):
     def broken(*_, **__):
         raise RuntimeError("broken")
 
-    monkeypatch.setattr(cli, "app", stopped)
+    monkeypatch.setattr(app, "app", stopped)
     for name in COMMANDS:
         with pytest.raises(SystemExit) as stop:
             main([name])
@@ -152,7 +152,7 @@ def test_ctrl_c_inside_a_call_of_drjit_is_one_line_too(capsys, monkeypatch):
         again = "; run the same command again to continue" if name in ("synth-orbit", "import", "demo") else ""
         resume = "; `mgs nbv --resume RUN` continues a run whose folder is there" if name == "nbv" else ""
         assert capsys.readouterr().err == f"mgs: interrupted{again}{resume}\n"
-    monkeypatch.setattr(cli, "app", broken)
+    monkeypatch.setattr(app, "app", broken)
     with pytest.raises(RuntimeError, match="broken"):
         main(["doctor"])
 
@@ -169,7 +169,7 @@ def test_resuming_a_finished_run_shows_it_again(run, capsys):
 
 
 def test_compare_policies_and_report(dataset, run, tmp_path):
-    from mgs.report import write_report
+    from mgs.report.writing import write_report
 
     other = dataset.parent / "random"
     command("nbv", dataset, "--out", other, "--prior", run / "prior", "--policy", "random", *OPTIONS[2:])
@@ -184,7 +184,7 @@ def test_compare_policies_and_report(dataset, run, tmp_path):
 
 def test_demo_shows_the_table_and_the_pictures_and_can_be_given_again(tmp_path, capsys, monkeypatch):
     """`mgs demo` over a dataset that is there already (rendering takes minutes): every later station, then nothing to do."""
-    from mgs.synth import write_contact_sheet
+    from mgs.synth.rendering import write_contact_sheet
 
     out = tmp_path / "demo"
     dataset = synthetic.write_dataset(out / "dataset", synthetic.orbit_cameras(13, 48, 36))

@@ -8,10 +8,11 @@ import pytest
 from PIL import Image
 from synthetic import orbit_cameras, write_dataset
 
-from mgs.conventions import srgb_from_linear
+from mgs.colour import srgb_from_linear
 from mgs.errors import InputError
-from mgs.evaluate import PSNR_LIMIT, evaluate, psnr, read_comparison, ssim, write_comparison
 from mgs.gaussians import Gaussians, sh_from_rgb
+from mgs.metrics import PSNR_LIMIT, psnr, ssim
+from mgs.report.evaluation import evaluate, read_comparison, write_comparison
 
 
 @pytest.fixture

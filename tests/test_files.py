@@ -17,26 +17,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mgs.conventions import linear_from_srgb
+from mgs.colour import linear_from_srgb
+from mgs.data.meshes import load_mesh
 from mgs.errors import InputError
-from mgs.files import (
-    atomic_folder,
-    atomic_path,
-    check_writable,
-    copy_file,
-    folder_or_nothing,
-    locked,
-    read_exr,
-    read_json,
-    read_mask,
-    read_png,
-    read_rgba,
-    read_values,
-    write_exr,
-    write_json,
-    write_png,
-)
-from mgs.surface import load_mesh
+from mgs.files import atomic_folder, atomic_path, check_writable, copy_file, folder_or_nothing, locked, read_json, write_json
+from mgs.images import read_exr, read_mask, read_png, read_rgba, read_values, write_exr, write_png
 
 
 class Stop(BaseException):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tiny
 
-from mgs.conventions import Camera, look_at
+from mgs.camera import Camera, look_at
 from mgs.gaussians import Gaussians
 from mgs.splat import as_drjit
 

@@ -20,12 +20,14 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).parent))
 import synthetic
 
-from mgs.cli import main
-from mgs.conventions import Camera, look_at, opengl_from_opencv
-from mgs.dataset import Dataset, Frame, load_dataset, write_transforms
-from mgs.files import read_json, write_json, write_png
-from mgs.imports import import_source, read_source, undistorter
-from mgs.prior import PriorSettings, build_prior, load_prior
+from mgs.camera import Camera, look_at, opengl_from_opencv
+from mgs.cli.app import main
+from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
+from mgs.data.importers import import_source, read_source, undistorter
+from mgs.files import read_json, write_json
+from mgs.images import write_png
+from mgs.prior.build import build_prior, load_prior
+from mgs.prior.settings import PriorSettings
 
 
 def _import(source: Path, out: Path, **options: Any) -> Dataset:

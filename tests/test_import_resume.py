@@ -14,9 +14,10 @@ import synthetic
 import trimesh
 from refusals import listing, refused
 
-from mgs import imports
-from mgs.cli import main
-from mgs.files import read_json, write_json, write_png
+from mgs.cli.app import main
+from mgs.data import importers
+from mgs.files import read_json, write_json
+from mgs.images import write_png
 
 STRUCK = """
 import os, sys
@@ -73,8 +74,8 @@ def test_struck_in_the_middle_and_given_again(many: list[str], tmp_path: Path, b
     (out / "images/.kf_0003.1.part.png").touch()  # as a kill in the middle of writing leaves it
     kept = {path: path.stat().st_mtime_ns for path in (out / "images").glob("kf_*")}
 
-    read, load = [], imports.read_rgba
-    monkeypatch.setattr(imports, "read_rgba", lambda path: (read.append(path.stem), load(path))[1])
+    read, load = [], importers.read_rgba
+    monkeypatch.setattr(importers, "read_rgba", lambda path: (read.append(path.stem), load(path))[1])
     _imported([*many, "--out", str(out)])
     assert read == [f"kf_{k:04d}" for k in range(3, 8)]
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
@@ -84,7 +85,7 @@ def test_struck_in_the_middle_and_given_again(many: list[str], tmp_path: Path, b
 
 def _stopped(arguments: list[str], monkeypatch) -> None:
     """An import that ends after two frames."""
-    write, calls = imports.write_png, []
+    write, calls = importers.write_png, []
 
     def stop(path: Path, *rest: Any, **options: Any) -> None:
         calls.append(path.parent.name)
@@ -93,7 +94,7 @@ def _stopped(arguments: list[str], monkeypatch) -> None:
         write(path, *rest, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(imports, "write_png", stop)
+        patch.setattr(importers, "write_png", stop)
         with pytest.raises(SystemExit) as exit_:
             main(["import", *arguments])
     assert exit_.value.code == 130

@@ -13,10 +13,11 @@ from scipy.special import spence
 sys.path.insert(0, str(Path(__file__).parent))
 import synthetic
 
-from mgs.conventions import rotmat_from_quat
-from mgs.dataset import Dataset
-from mgs.initial import GREY, IN_PLANE_SCALE, INITIAL_OPACITY, THICKNESS, initial_gaussians
-from mgs.prior import Prior, PriorSettings, build_prior
+from mgs.data.dataset import Dataset
+from mgs.prior.build import Prior, build_prior
+from mgs.prior.initial import GREY, IN_PLANE_SCALE, INITIAL_OPACITY, THICKNESS, initial_gaussians
+from mgs.prior.settings import PriorSettings
+from mgs.rotation import rotmat_from_quat
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +44,7 @@ def test_shapes_scales_and_rotations(prior: Prior, dataset: Dataset) -> None:
 
 
 def test_one_layer_hides_what_is_behind_it() -> None:
-    """The mean log-transmittance stated in `mgs.initial`, in closed form and by summing over a lattice."""
+    """The mean log-transmittance stated in `mgs.prior.initial`, in closed form and by summing over a lattice."""
     dilogarithm = spence(1 - INITIAL_OPACITY)
     closed = -2 * np.pi * IN_PLANE_SCALE**2 * dilogarithm
     x = np.arange(-8, 8) + 0.0
@@ -84,7 +85,7 @@ def test_the_mesh_stands_in_for_missing_depth(prior: Prior, dataset: Dataset) ->
 
 
 def test_colours_are_averaged_and_the_mask_counts(prior: Prior, dataset: Dataset, tmp_path: Path) -> None:
-    from mgs.files import write_png
+    from mgs.images import write_png
 
     frame = dataset.frames[0]
     shape = (frame.camera.height, frame.camera.width, 3)

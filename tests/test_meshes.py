@@ -11,10 +11,12 @@ import synthetic
 import trimesh
 from refusals import refused
 
-from mgs.cli import main
-from mgs.dataset import Dataset
-from mgs.prior import PriorSettings, load_prior, prior_from_mesh
-from mgs.surface import Mesh, sample_surface
+from mgs.cli.app import main
+from mgs.data.dataset import Dataset
+from mgs.data.meshes import Mesh
+from mgs.prior.build import load_prior, prior_from_mesh
+from mgs.prior.settings import PriorSettings
+from mgs.prior.surface import sample_surface
 
 
 @pytest.fixture

@@ -16,13 +16,13 @@ import pytest
 import tiny
 from PIL import Image
 
-from mgs import nbv, policies
-from mgs.dataset import load_dataset
+from mgs.active import criteria, loop, pose_policies, run_folder
+from mgs.active.stopping import StopReason
+from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
-from mgs.files import write_exr
 from mgs.gaussians import Gaussians
+from mgs.images import write_exr
 from mgs.splat_ply import read_ply
-from mgs.stopping import StopReason
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def dataset(tmp_path_factory):
 
 def run(out, dataset, stations=None, **values):
     settings = tiny.start(out, dataset, **values)
-    return nbv.run(out, settings, dataset, stations or tiny.stations(), tiny.silent)
+    return loop.run(out, settings, dataset, stations or tiny.stations(), tiny.silent)
 
 
 def lines(out: Path) -> list[dict]:
@@ -43,7 +43,7 @@ def timeless(steps: list[dict]) -> list[dict]:
     return [{key: value for key, value in step.items() if key != "seconds"} for step in steps]
 
 
-@pytest.mark.parametrize("policy", policies.policy_names())
+@pytest.mark.parametrize("policy", pose_policies.policy_names())
 def test_run_writes_what_it_did(dataset, tmp_path, policy):
     state = run(tmp_path / "run", dataset, policy=policy)
     steps = lines(tmp_path / "run")
@@ -65,14 +65,14 @@ def test_run_writes_what_it_did(dataset, tmp_path, policy):
 
 def test_d_optimal_takes_the_best_candidate_at_every_step(dataset, tmp_path):
     state = run(tmp_path / "run", dataset, budget=1)
-    before = nbv.run(
+    before = loop.run(
         tmp_path / "seeds", tiny.start(tmp_path / "seeds", dataset, budget=0), dataset, tiny.stations(), tiny.silent
     )
-    lam = policies.regularisation(tiny.GROUPS)
+    lam = criteria.regularisation(tiny.GROUPS)
     H = sum(tiny.fisher(before.gaussians, dataset.frames[i].camera).astype(float) for i in before.taken)
     np.testing.assert_allclose(before.H, H)
     left = [i for i in range(len(dataset)) if i not in before.taken]
-    gains = [policies.d_optimal(tiny.fisher(before.gaussians, dataset.frames[i].camera), H, lam) for i in left]
+    gains = [criteria.d_optimal(tiny.fisher(before.gaussians, dataset.frames[i].camera), H, lam) for i in left]
     assert state.taken[-1] == left[int(np.argmax(gains))]
     assert state.steps[-1]["gain"] == state.steps[-1]["information_gain"] == max(gains)
 
@@ -85,10 +85,10 @@ def test_coverage_is_of_the_surface_and_does_not_depend_on_training(dataset, tmp
 
     state = run(tmp_path / "run", dataset, policy="coverage")
     covered = [step["coverage"] for step in state.steps]
-    start, lam = tiny.initial([]), policies.regularisation(tiny.GROUPS)
+    start, lam = tiny.initial([]), criteria.regularisation(tiny.GROUPS)
     for step, share in enumerate(covered):
         H = sum(tiny.fisher(start, dataset.frames[i].camera) for i in state.taken[: 3 + step])
-        assert share == policies.coverage(H, lam)
+        assert share == criteria.coverage(H, lam)
     assert covered == sorted(covered)
     assert 0 < covered[0] < covered[-1]
     forgot = run(tmp_path / "forgot", dataset, tiny.stations(fit=forgetful), policy="coverage")
@@ -105,22 +105,27 @@ def test_a_tie_goes_to_the_farthest_camera(dataset, tmp_path):
 
 def test_candidate_images_are_never_read_before_they_are_chosen(dataset, tmp_path, monkeypatch):
     """Every image that is opened is logged; at each choice the opened ones must be exactly those taken."""
-    import mgs.dataset
-    import mgs.inputs
+    import mgs.active.inputs
+    import mgs.data.dataset
 
     opened: set[str] = set()
-    places = [(mgs.dataset, "read_png"), (mgs.dataset, "read_mask"), (mgs.dataset, "read_exr"), (mgs.inputs, "file_digest")]
+    places = [
+        (mgs.data.dataset, "read_png"),
+        (mgs.data.dataset, "read_mask"),
+        (mgs.data.dataset, "read_exr"),
+        (mgs.active.inputs, "file_digest"),
+    ]
     for module, name in places:
         function = getattr(module, name)
         monkeypatch.setattr(module, name, lambda path, f=function: opened.add(Path(path).stem) or f(path))
     at_choice = []
-    choose = nbv._Loop.choose
+    choose = loop._Loop.choose
 
     def watched(self, state):
         at_choice.append((set(opened), {dataset.frames[i].name for i in state.taken}))
         return choose(self, state)
 
-    monkeypatch.setattr(nbv._Loop, "choose", watched)
+    monkeypatch.setattr(loop._Loop, "choose", watched)
     state = run(tmp_path / "run", dataset)
     assert len(at_choice) == 5
     assert all(seen == taken for seen, taken in at_choice)
@@ -196,13 +201,13 @@ def test_killed_at_any_moment_then_resumed_takes_the_same_views(dataset, tmp_pat
     command = [sys.executable, tiny.__file__, str(dataset.root), str(out), "d-optimal", moment, str(count)]
     process = subprocess.run(command, capture_output=True, text=True)
     assert process.returncode == -signal.SIGKILL, process.stderr
-    half = nbv.read_checkpoint(out)
+    half = run_folder.read_checkpoint(out)
     # The lines may lag behind the checkpoint, never run ahead of it or differ.
     committed = half.steps if half else []
     written = lines(out) if (out / "steps.jsonl").exists() else []
     assert written == committed[: len(written)]
     assert len(committed) - len(written) <= 1
-    resumed = nbv.run(out, nbv.read_settings(out), dataset, tiny.stations(), tiny.silent)
+    resumed = loop.run(out, run_folder.read_settings(out), dataset, tiny.stations(), tiny.silent)
     assert resumed.taken == whole.taken
     assert timeless(lines(out)) == timeless(steps)
     assert (out / "gaussians.ply").read_bytes() == ply
@@ -222,7 +227,7 @@ def test_interrupted_by_the_keyboard_then_resumed(dataset, tmp_path, uninterrupt
     with pytest.raises(KeyboardInterrupt):
         run(out, dataset, tiny.stations(fit=fit), seed=3)
     assert len(lines(out)) == 3
-    assert nbv.run(out, nbv.read_settings(out), dataset, tiny.stations(), tiny.silent).taken == uninterrupted[0].taken
+    assert loop.run(out, run_folder.read_settings(out), dataset, tiny.stations(), tiny.silent).taken == uninterrupted[0].taken
 
 
 @pytest.mark.parametrize(
@@ -245,7 +250,7 @@ def test_a_fit_that_diverges_ends_the_run_which_can_go_on(dataset, tmp_path, uni
     assert f"mgs nbv --resume {out}" in said
     assert "\n" not in said
     assert ((out / "steps.jsonl").exists() and len(lines(out))) == broken
-    resumed = nbv.run(out, nbv.read_settings(out), dataset, tiny.stations(), tiny.silent)
+    resumed = loop.run(out, run_folder.read_settings(out), dataset, tiny.stations(), tiny.silent)
     assert resumed.taken == uninterrupted[0].taken
     assert (out / "gaussians.ply").read_bytes() == uninterrupted[1]
 
@@ -257,8 +262,12 @@ def test_resuming_a_finished_run_changes_nothing(dataset, tmp_path):
     def never(*arguments):
         raise AssertionError("nothing is left to do")
 
-    again = nbv.run(
-        tmp_path / "run", nbv.read_settings(tmp_path / "run"), dataset, tiny.stations(fit=never, fisher=never), tiny.silent
+    again = loop.run(
+        tmp_path / "run",
+        run_folder.read_settings(tmp_path / "run"),
+        dataset,
+        tiny.stations(fit=never, fisher=never),
+        tiny.silent,
     )
     assert again.taken == state.taken
     assert (tmp_path / "run/steps.jsonl").read_bytes() == before
@@ -306,15 +315,15 @@ def half_done(tmp_path):
     """A dataset of its own and a run of three steps of six."""
     root = tiny.write_dataset(tmp_path / "dataset")
     settings = tiny.start(tmp_path / "run", load_dataset(root))
-    nbv.run(tmp_path / "run", settings.model_copy(update={"budget": 2}), load_dataset(root), tiny.stations(), tiny.silent)
+    loop.run(tmp_path / "run", settings.model_copy(update={"budget": 2}), load_dataset(root), tiny.stations(), tiny.silent)
     return root, tmp_path / "run"
 
 
-def resume(root: Path, out: Path, **parts) -> tuple[nbv.State, list[str]]:
+def resume(root: Path, out: Path, **parts) -> tuple[run_folder.State, list[str]]:
     """The last state of a resumed run, and what was said on the way."""
     said: list[str] = []
     stations = tiny.stations(**parts)
-    return nbv.run(out, nbv.read_settings(out), load_dataset(root), stations, tiny.silent, say=said.append), said
+    return loop.run(out, run_folder.read_settings(out), load_dataset(root), stations, tiny.silent, say=said.append), said
 
 
 @pytest.mark.parametrize("what", SPOILT)
@@ -331,7 +340,7 @@ def test_a_run_does_not_go_on_from_changed_inputs(half_done, what):
 def test_a_run_goes_on_where_what_it_has_not_taken_changed(half_done):
     """Only the pose of a candidate is an input until it is taken: its pixels may still change. Not those of others."""
     root, out = half_done
-    taken = nbv.read_checkpoint(out).taken
+    taken = run_folder.read_checkpoint(out).taken
     for i in set(range(tiny.FRAMES)) - set(taken):
         retouch(root / f"images/kf_{i:04d}.png")
     for i in set(taken) - {0, 4, 8}:
@@ -388,7 +397,7 @@ def test_numbers_of_older_runs_that_are_none_are_null(half_done):
 
 @pytest.mark.parametrize("score", [math.nan, math.inf])
 def test_a_policy_that_gives_no_number_is_named(dataset, tmp_path, monkeypatch, score):
-    monkeypatch.setitem(policies.CRITERIA, "mine", lambda F, H, lam: score)
+    monkeypatch.setitem(criteria.CRITERIA, "mine", lambda F, H, lam: score)
     with pytest.raises(InputError, match="policy mine: gave a score that is NaN or infinite"):
         run(tmp_path / "run", dataset, policy="mine")
     assert len(lines(tmp_path / "run")) == 1
@@ -417,19 +426,19 @@ def test_a_run_does_not_go_on_from_another_prior(half_done, recorded, count):
 
 def test_damaged_or_missing_runs_are_told_apart(dataset, tmp_path):
     with pytest.raises(InputError, match=r"holds no run"):
-        nbv.read_settings(tmp_path)
+        run_folder.read_settings(tmp_path)
     out = tmp_path / "run"
     run(out, dataset, budget=0)
-    nbv.check_same_frames(out, dataset)
+    run_folder.check_same_frames(out, dataset)
     other = load_dataset(tiny.write_dataset(tmp_path / "other", frames=5))
     with pytest.raises(InputError, match="frames differ"):
-        nbv.check_same_frames(out, other)
+        run_folder.check_same_frames(out, other)
     (out / "checkpoint.npz").write_bytes((out / "checkpoint.npz").read_bytes()[:100])
     with pytest.raises(InputError, match="not a readable checkpoint"):
-        nbv.read_checkpoint(out)
+        run_folder.read_checkpoint(out)
     (out / "config.json").write_text("{}")
     with pytest.raises(InputError, match="no settings"):
-        nbv.read_settings(out)
+        run_folder.read_settings(out)
 
 
 @pytest.mark.parametrize(("values", "message"), [({"seeds": 13}, "fewer than 13 seeds"), ({"budget": 10}, "9 candidates")])

@@ -13,15 +13,16 @@ import tiny
 from refusals import refused
 from rich.console import Console
 
-from mgs import nbv, policies
-from mgs.cli import main
-from mgs.commands.nbv import print_run, read_train_settings, start_run, train_settings
-from mgs.dataset import load_dataset
+from mgs.active import criteria, loop, run_folder
+from mgs.active.run_folder import load_run
+from mgs.cli.app import main
+from mgs.cli.nbv import print_run, read_train_settings, start_run, train_settings
+from mgs.data.dataset import load_dataset
+from mgs.data.meshes import Mesh
 from mgs.errors import InputError
-from mgs.evaluate import load_run
-from mgs.files import locked, write_json, write_png
-from mgs.prior import load_prior, save_prior
-from mgs.surface import Mesh
+from mgs.files import locked, write_json
+from mgs.images import write_png
+from mgs.prior.build import load_prior, save_prior
 
 
 @pytest.fixture
@@ -47,7 +48,7 @@ def test_the_datasets_own_prior_is_the_default(dataset, tmp_path):
 
 
 def test_every_setting_of_the_fit_is_written_down_and_the_root_seed_reaches_it(dataset, tmp_path):
-    from mgs.train import TrainSettings
+    from mgs.active.fitting import TrainSettings
 
     prior = tiny.write_prior(tmp_path / "prior")
     settings, _ = started(dataset, tmp_path / "run", prior, budget=2, seed=7)
@@ -82,14 +83,14 @@ def test_a_frame_without_rock_is_refused_before_it_is_fitted_to(dataset, tmp_pat
     loaded = load_dataset(dataset)
     settings = tiny.start(tmp_path / "run", loaded, policy="farthest")
     with pytest.raises(InputError, match=f"{named}.*is empty"):
-        nbv.run(tmp_path / "run", settings, loaded, tiny.stations(fit=fit), tiny.silent)
+        loop.run(tmp_path / "run", settings, loaded, tiny.stations(fit=fit), tiny.silent)
     assert max(fits, default=0) == images
 
 
 def test_a_mean_over_no_view_is_left_out(dataset, tmp_path):
     """Held-out frames without rock: no line of steps.jsonl holds NaN, which is no JSON."""
+    from mgs.active.stations import psnr_measure
     from mgs.splat import ListCache
-    from mgs.stations import psnr_measure
 
     loaded, model = load_dataset(dataset), tiny.initial([])
     whole = psnr_measure(loaded, ListCache())(model, [0, 4, 8])
@@ -105,7 +106,7 @@ def test_a_mean_over_no_view_is_left_out(dataset, tmp_path):
 
 
 def test_a_quality_that_could_not_be_measured_is_a_dash(dataset, tmp_path):
-    state = nbv.State(tiny.initial([]), np.zeros(0), np.zeros(0), [0], [])
+    state = run_folder.State(tiny.initial([]), np.zeros(0), np.zeros(0), [0], [])
     views = {"count": 2, "psnr": 30.123, "ssim": 0.95, "psnr_mask": None, "ssim_mask": None}
     console = Console(record=True, width=500)
     print_run(tmp_path, state, {"all": views, "held_out": {"count": 0}}, console)
@@ -196,13 +197,13 @@ def test_one_process_at_a_time_works_on_a_run(dataset, prior, tmp_path, capsys, 
 
 def test_a_run_appears_whole_or_not_at_all(dataset, tmp_path, monkeypatch):
     """Killed while its prior is built, the same command works again: the folder takes its name when all of it is there."""
-    there, start = [], nbv.start
+    there, start = [], run_folder.start
 
     def watched(out, *rest):
         there.append((tmp_path / "run").exists())
         start(out, *rest)
 
-    monkeypatch.setattr(nbv, "start", watched)
+    monkeypatch.setattr(run_folder, "start", watched)
     own = tiny.write_prior(tmp_path / "prior")
     started(dataset, tmp_path / "run", own, budget=1)
     assert there == [False]
@@ -238,32 +239,32 @@ def test_scales_of_lambda_are_finite(dataset, tmp_path, values):
 
 
 def test_settings_of_the_fit_are_read_back_as_they_were(tmp_path):
-    from mgs.train import TrainSettings
+    from mgs.active.fitting import TrainSettings
 
     assert asdict(read_train_settings(tmp_path, train_settings(6, 2))) == asdict(TrainSettings(passes=6, seed=2))
 
 
 def test_the_documented_policy_of_ones_own(dataset, tmp_path, monkeypatch):
     """The program in docs/nbv.md, its command caught: the policy is started, run, and read back where nobody registered it."""
-    monkeypatch.setattr(policies, "CRITERIA", dict(policies.CRITERIA))
+    monkeypatch.setattr(criteria, "CRITERIA", dict(criteria.CRITERIA))
     commands: list[list[str]] = []
-    monkeypatch.setattr("mgs.cli.main", commands.append)
+    monkeypatch.setattr("mgs.cli.app.main", commands.append)
     page = (Path(__file__).parent.parent / "docs/nbv.md").read_text()
     exec(page.split("```python\n")[1].split("```")[0], {})
     name = commands[0][commands[0].index("--policy") + 1]
     started(dataset, tmp_path / "run", tiny.write_prior(tmp_path / "prior"), policy=name, budget=1)
 
     loaded, scores = load_dataset(dataset), []
-    own = policies.CRITERIA[name]
-    monkeypatch.setitem(policies.CRITERIA, name, lambda *given: scores.append(own(*given)) or scores[-1])
-    state = nbv.run(tmp_path / "run", nbv.read_settings(tmp_path / "run"), loaded, tiny.stations(), tiny.silent)
+    own = criteria.CRITERIA[name]
+    monkeypatch.setitem(criteria.CRITERIA, name, lambda *given: scores.append(own(*given)) or scores[-1])
+    state = loop.run(tmp_path / "run", run_folder.read_settings(tmp_path / "run"), loaded, tiny.stations(), tiny.silent)
     assert len(scores) == len(loaded) - 4
     assert state.steps[-1]["gain"] == max(scores) > 0
 
     monkeypatch.undo()
     assert load_run(tmp_path / "run")[3] == name
     with pytest.raises(InputError, match=f"--policy {name}: unknown; choose one of d-optimal"):
-        nbv.run(tmp_path / "run", nbv.read_settings(tmp_path / "run"), loaded, tiny.stations(), tiny.silent)
+        loop.run(tmp_path / "run", run_folder.read_settings(tmp_path / "run"), loaded, tiny.stations(), tiny.silent)
 
 
 @pytest.mark.parametrize("moved", ["dataset", "prior"])

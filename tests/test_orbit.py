@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mgs.orbit import intrinsics, orbit_cameras, orbit_positions, perturb
-from mgs.scene_file import Orbit
+from mgs.synth.orbit import intrinsics, orbit_cameras, orbit_positions, perturb
+from mgs.synth.scene_file import Orbit
 
 TARGET = np.array([0.3, -0.2, 0.6])
 KINDS = ["circle", "rings", "spiral", "hemisphere"]

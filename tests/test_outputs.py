@@ -11,7 +11,7 @@ import tiny
 from refusals import a_file, listing, occupied, refused
 
 from mgs import __version__
-from mgs.cli import main
+from mgs.cli.app import main
 from mgs.splat_ply import write_ply
 
 
@@ -109,7 +109,8 @@ def test_a_prior_that_fails_leaves_all_as_it_was(capsys, dataset, tmp_path, exis
 )
 def test_a_result_appears_whole(tmp_path, monkeypatch, command, option, files):
     """Nothing under its name while its picture is drawn, from the other files; all of it afterwards."""
-    from mgs import prior_figure, survey_figure
+    from mgs.prior import figure as prior_figure
+    from mgs.survey import figure as survey_figure
 
     root = synthetic.write_dataset(tmp_path / "data").root
     module, name = {"prior": prior_figure, "survey": survey_figure}[command], f"draw_{command}"

@@ -10,7 +10,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mgs.conventions import Camera, linear_from_srgb, look_at
+import mgs.splat.plugins  # noqa: F401  registers mgs_splat
+from mgs.camera import Camera, look_at
+from mgs.colour import linear_from_srgb
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.splat import as_drjit, camera_from_sensor, render
@@ -312,10 +314,10 @@ def test_no_forward_mode(ply):
 @pytest.mark.parametrize(
     "program",
     [
-        "mi.set_variant(VARIANT); import mgs.splat",
-        "import mgs.splat; mi.set_variant(VARIANT)",
-        "mi.set_variant('scalar_rgb'); import mgs.splat; mi.set_variant(VARIANT)",
-        "mi.set_variant(VARIANT); import mgs.splat; mi.set_variant('scalar_rgb'); mi.set_variant(VARIANT)",
+        "mi.set_variant(VARIANT); import mgs.splat.plugins",
+        "import mgs.splat.plugins; mi.set_variant(VARIANT)",
+        "mi.set_variant('scalar_rgb'); import mgs.splat.plugins; mi.set_variant(VARIANT)",
+        "mi.set_variant(VARIANT); import mgs.splat.plugins; mi.set_variant('scalar_rgb'); mi.set_variant(VARIANT)",
     ],
 )
 def test_registered_at_import(ply, program, tmp_path):

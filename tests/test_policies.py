@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mgs import policies
+from mgs.active import criteria, pose_policies
 from mgs.seeds import generator
 
 GROUPS = {"colour": slice(0, 3), "scale": slice(3, 6), "rotation": slice(6, 10), "opacity": slice(10, 11)}
-LAM = policies.regularisation(GROUPS)
+LAM = criteria.regularisation(GROUPS)
 N = 5
 information = arrays(np.float64, (N, 11), elements=st.floats(0, 1e4, allow_subnormal=False))
 scales = arrays(np.float64, 11, elements=st.floats(1e-3, 1e3))
@@ -24,36 +24,36 @@ CENTRE = np.zeros(3)
 def test_d_optimal_is_the_exact_log_determinant_difference(F, H):
     before = np.linalg.slogdet(np.diag((H + LAM).ravel()))[1]
     after = np.linalg.slogdet(np.diag((H + F + LAM).ravel()))[1]
-    assert policies.d_optimal(F, H, LAM) * H.size == pytest.approx(after - before, rel=1e-9, abs=1e-9)
+    assert criteria.d_optimal(F, H, LAM) * H.size == pytest.approx(after - before, rel=1e-9, abs=1e-9)
 
 
-@given(information, information, st.sampled_from(sorted(policies.CRITERIA)))
+@given(information, information, st.sampled_from(sorted(criteria.CRITERIA)))
 def test_no_view_loses_information(F, H, name):
-    assert policies.CRITERIA[name](F, H, LAM) >= 0
+    assert criteria.CRITERIA[name](F, H, LAM) >= 0
 
 
-@given(information, st.sampled_from(sorted(policies.CRITERIA)))
+@given(information, st.sampled_from(sorted(criteria.CRITERIA)))
 def test_a_view_that_sees_nothing_gains_nothing(H, name):
-    assert policies.CRITERIA[name](np.zeros_like(H), H, LAM) == 0
+    assert criteria.CRITERIA[name](np.zeros_like(H), H, LAM) == 0
 
 
-@given(information, information, information, st.sampled_from(sorted(policies.CRITERIA)))
+@given(information, information, information, st.sampled_from(sorted(criteria.CRITERIA)))
 def test_seeing_more_is_never_worse(F, more, H, name):
-    score = policies.CRITERIA[name]
+    score = criteria.CRITERIA[name]
     assert score(F + more, H, LAM) >= score(F, H, LAM) * (1 - 1e-12)
 
 
 @given(information, information, information, st.sampled_from(["d-optimal", "t-optimal", "fisherrf"]))
 def test_returns_diminish(F, H, seen, name):
     """Submodularity: with the model held fixed, a view is worth less once others have been taken."""
-    score = policies.CRITERIA[name]
+    score = criteria.CRITERIA[name]
     assert score(F, H + seen, LAM) <= score(F, H, LAM) * (1 + 1e-12)
 
 
 @given(information, information, scales, st.sampled_from(["d-optimal", "fisherrf", "coverage"]))
 def test_units_do_not_matter_when_lambda_carries_them(F, H, unit, name):
     """theta -> unit * theta divides J by unit; lam = (sigma / tau)^2 follows, so the gain must not change."""
-    score = policies.CRITERIA[name]
+    score = criteria.CRITERIA[name]
     # Powers of two: exact in floating point, so the threshold of `coverage` cannot flip by rounding.
     unit = 2.0 ** np.round(np.log2(unit))
     assert score(F / unit**2, H / unit**2, LAM / unit**2) == pytest.approx(score(F, H, LAM), rel=1e-9)
@@ -66,7 +66,7 @@ def test_greedy_d_optimal_reaches_its_guarantee(views):
     H = np.zeros((N, 11))
 
     def value(chosen):
-        return policies.d_optimal(views[list(chosen)].sum(0), H, LAM)
+        return criteria.d_optimal(views[list(chosen)].sum(0), H, LAM)
 
     first = max(range(6), key=lambda i: value([i]))
     second = max((i for i in range(6) if i != first), key=lambda i: value([first, i]))
@@ -75,17 +75,17 @@ def test_greedy_d_optimal_reaches_its_guarantee(views):
 
 
 def test_regularisation_is_the_priors_information_per_group():
-    lam = policies.regularisation(GROUPS, pixel_noise=0.1, prior_std={"colour": 1, "scale": 2, "rotation": 0.5, "opacity": 10})
+    lam = criteria.regularisation(GROUPS, pixel_noise=0.1, prior_std={"colour": 1, "scale": 2, "rotation": 0.5, "opacity": 10})
     assert lam == pytest.approx([0.01] * 3 + [0.0025] * 3 + [0.04] * 4 + [0.0001])
 
 
 def test_gain_is_twice_the_mutual_information_of_a_linear_gaussian_model():
     """y = J theta + e with diagonal J^T J: I(theta; y) = 1/2 log det(I + J Sigma J^T / sigma^2)."""
     rng = np.random.default_rng(0)
-    j, sigma = rng.normal(size=11), policies.PIXEL_NOISE
+    j, sigma = rng.normal(size=11), criteria.PIXEL_NOISE
     tau = sigma / np.sqrt(LAM)
     mutual = 0.5 * np.linalg.slogdet(np.eye(11) + np.diag((j * tau / sigma) ** 2))[1]
-    assert policies.d_optimal(j[None] ** 2, np.zeros((1, 11)), LAM) == pytest.approx(2 / 11 * mutual)
+    assert criteria.d_optimal(j[None] ** 2, np.zeros((1, 11)), LAM) == pytest.approx(2 / 11 * mutual)
 
 
 def test_coverage_counts_newly_observed_gaussians():
@@ -93,23 +93,24 @@ def test_coverage_counts_newly_observed_gaussians():
     H[0, :3] = 1.0
     sees_two = np.zeros((4, 11))
     sees_two[[0, 1, 2], :3] = 1.0
-    assert policies.coverage(H, LAM) == 0.25
-    assert policies.coverage_greedy(sees_two, H, LAM) == 2
+    assert criteria.coverage(H, LAM) == 0.25
+    assert criteria.coverage_greedy(sees_two, H, LAM) == 2
     sees_old = np.zeros((4, 11))
     sees_old[0, :3] = 5.0
-    assert policies.coverage_greedy(sees_old, H, LAM) == 0
+    assert criteria.coverage_greedy(sees_old, H, LAM) == 0
 
 
 def test_t_optimal_is_the_difference_the_paper_writes():
     rng = np.random.default_rng(1)
     F, H = rng.random((N, 11)), rng.random((N, 11))
-    assert policies.t_optimal(F, H, LAM) == pytest.approx((1 / (H + LAM) - 1 / (H + F + LAM)).mean())
+    assert criteria.t_optimal(F, H, LAM) == pytest.approx((1 / (H + LAM) - 1 / (H + F + LAM)).mean())
 
 
 def test_random_differs_between_rounds_and_repeats_between_runs():
     def draws(seed):
         return [
-            int(np.argmax(policies.random_order(CIRCLE, CIRCLE[:1], CENTRE, generator(seed, f"random/{k}")))) for k in range(20)
+            int(np.argmax(pose_policies.random_order(CIRCLE, CIRCLE[:1], CENTRE, generator(seed, f"random/{k}"))))
+            for k in range(20)
         ]
 
     assert draws(7) == draws(7)
@@ -121,23 +122,23 @@ def test_uniform_leaves_even_gaps_at_every_count():
     taken = [0, 3, 6, 9]
     for largest in (3, 3, 3, 2, 2, 2, 2, 1):
         left = [i for i in range(12) if i not in taken]
-        scores = policies.uniform_azimuth(CIRCLE[left], CIRCLE[taken], CENTRE, np.random.default_rng(0))
+        scores = pose_policies.uniform_azimuth(CIRCLE[left], CIRCLE[taken], CENTRE, np.random.default_rng(0))
         taken.append(left[int(np.argmax(scores))])
         assert np.diff([*sorted(taken), 12]).max() == largest
 
 
 def test_farthest_looks_at_height_too():
     poles = np.array([[1.0, 0, 0.5], [0, 0, 9.0], [-1, 0, 0.5]])
-    assert np.argmax(policies.farthest_pose(poles, CIRCLE, CENTRE, np.random.default_rng(0))) == 1
+    assert np.argmax(pose_policies.farthest_pose(poles, CIRCLE, CENTRE, np.random.default_rng(0))) == 1
 
 
 def test_seeds_are_evenly_spaced_wherever_the_orbit_starts():
     rock = np.array([3.0, 4.0, 0.0])
-    assert policies.seed_views(CIRCLE, CENTRE, 4) == [0, 3, 6, 9]
-    assert policies.seed_views(np.roll(CIRCLE, 5, axis=0) + rock, rock, 4) == [5, 8, 11, 2]
-    assert sorted(policies.seed_views(CIRCLE, CENTRE, 12)) == list(range(12))
+    assert pose_policies.seed_views(CIRCLE, CENTRE, 4) == [0, 3, 6, 9]
+    assert pose_policies.seed_views(np.roll(CIRCLE, 5, axis=0) + rock, rock, 4) == [5, 8, 11, 2]
+    assert sorted(pose_policies.seed_views(CIRCLE, CENTRE, 12)) == list(range(12))
 
 
 def test_azimuth_is_measured_about_the_rock():
     positions = np.array([[2.0, 1.0, 9.0], [1.0, 2.0, -1.0], [0.0, 1.0, 0.0]])
-    assert policies.azimuths(positions, np.array([1.0, 1.0, 0.0])) == pytest.approx([0, np.pi / 2, np.pi])
+    assert pose_policies.azimuths(positions, np.array([1.0, 1.0, 0.0])) == pytest.approx([0, np.pi / 2, np.pi])

@@ -14,16 +14,19 @@ from scipy.spatial import cKDTree
 sys.path.insert(0, str(Path(__file__).parent))
 import synthetic
 
-from mgs.cli import main
-from mgs.cloud import Cloud, degrade, focus, fuse_frames, ground_plane, rock_cluster
-from mgs.conventions import Camera, look_at
-from mgs.dataset import Dataset, load_dataset, write_transforms
+from mgs.camera import Camera, look_at
+from mgs.cli.app import main
+from mgs.data.dataset import Dataset, load_dataset, write_transforms
+from mgs.data.meshes import Mesh, distances_to_mesh
+from mgs.data.raycast import mesh_depth
+from mgs.data.visibility import visible
 from mgs.errors import InputError
-from mgs.files import write_exr
-from mgs.prior import PriorSettings, build_prior, load_prior, save_prior
-from mgs.raycast import mesh_depth
-from mgs.surface import Mesh, distances_to_mesh, estimate_normals, sample_surface
-from mgs.visibility import visible
+from mgs.images import write_exr
+from mgs.prior.build import build_prior, load_prior, save_prior
+from mgs.prior.segmentation import degrade, estimate_normals, ground_plane, rock_cluster
+from mgs.prior.settings import PriorSettings
+from mgs.prior.surface import sample_surface
+from mgs.survey.fusion import Cloud, focus, fuse_frames
 
 X, Y, Z = np.eye(3)
 
@@ -222,7 +225,7 @@ def test_prior_is_near_the_truth(built) -> None:
 
 
 def test_error_to_truth_sees_a_wrong_prior(built, dataset: Dataset) -> None:
-    from mgs.prior import error_to_truth
+    from mgs.prior.truth import error_to_truth
 
     prior, rock = built
     moved = Mesh(prior.mesh.vertices + 0.05 * Z, prior.mesh.faces, prior.mesh.seen)
@@ -233,7 +236,7 @@ def test_error_to_truth_sees_a_wrong_prior(built, dataset: Dataset) -> None:
 
 def test_error_to_truth_of_a_dataset_of_an_older_mgs(built, dataset: Dataset, tmp_path: Path) -> None:
     """Its rock.glb is +Z up and without the mark of today's."""
-    from mgs.prior import error_to_truth
+    from mgs.prior.truth import error_to_truth
 
     prior, stages = built
     synthetic.rock_mesh().export(tmp_path / "rock.glb")

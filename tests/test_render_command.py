@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mgs import cli
-from mgs.conventions import Camera, linear_from_srgb, look_at, opengl_from_opencv, srgb_from_linear
-from mgs.files import read_exr
+from mgs.camera import Camera, look_at, opengl_from_opencv
+from mgs.cli import app
+from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.gaussians import Gaussians
+from mgs.images import read_exr
 from mgs.splat import render
 from mgs.splat_ply import ply_colour_space, read_ply, write_ply
 
@@ -78,7 +79,7 @@ def pixels(path) -> np.ndarray:
 
 def run(*arguments) -> None:
     with pytest.raises(SystemExit) as end:
-        cli.main(["render", *map(str, arguments)])
+        app.main(["render", *map(str, arguments)])
     assert end.value.code in (0, None)
 
 
@@ -290,7 +291,7 @@ def test_bad_input(tmp_path, capsys, case):
     change(tmp_path)
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(SystemExit) as end:
-        cli.main(
+        app.main(
             [
                 "render",
                 str(tmp_path / "x.ply"),

@@ -11,13 +11,17 @@ import tiny
 from PIL import Image
 from rich.console import Console
 
-from mgs import figures, nbv, report
-from mgs.conventions import srgb_from_linear
-from mgs.dataset import load_dataset
+from mgs import plotting
+from mgs.active import loop
+from mgs.active.run_folder import load_run
+from mgs.cli import printing
+from mgs.colour import srgb_from_linear
+from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
-from mgs.evaluate import evaluate, load_run
-from mgs.figures import POLICY_STYLE
 from mgs.files import write_json
+from mgs.report import figures, tables, writing
+from mgs.report.evaluation import evaluate
+from mgs.report.figures import POLICY_STYLE
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +33,7 @@ def runs(tmp_path_factory):
     for policy in ("d-optimal", "random"):
         out = root / policy
         settings = tiny.start(out, dataset, policy=policy, evaluate_every=1)
-        nbv.run(
+        loop.run(
             out,
             settings,
             dataset,
@@ -51,7 +55,7 @@ def runs(tmp_path_factory):
 
 
 def test_run_folder(runs):
-    run = report.read_run(runs[0])
+    run = tables.read_run(runs[0])
     assert run.policy == "d-optimal"
     assert len(run.seeds) == 3
     assert len(set(run.seeds + run.chosen)) == 8
@@ -61,8 +65,8 @@ def test_run_folder(runs):
 @pytest.fixture
 def drawn(monkeypatch):
     """{file name: figure} of every figure that is saved."""
-    found, save = {}, figures.save_figure
-    monkeypatch.setattr(figures, "save_figure", lambda figure, path: (found.update({path.name: figure}), save(figure, path)))
+    found, save = {}, plotting.save_figure
+    monkeypatch.setattr(plotting, "save_figure", lambda figure, path: (found.update({path.name: figure}), save(figure, path)))
     return found
 
 
@@ -73,7 +77,7 @@ def curves(axis) -> dict[str, list[tuple[float, float]]]:
 
 def test_report_writes_every_figure(runs, tmp_path, drawn):
     """Each shows the numbers of the runs."""
-    written = report.write_report(tmp_path / "report", runs)
+    written = writing.write_report(tmp_path / "report", runs)
     assert [path.name for path in written] == [
         "orbit.png",
         "gain.png",
@@ -89,9 +93,9 @@ def test_report_writes_every_figure(runs, tmp_path, drawn):
             assert picture.size == tuple(drawn[path.name].canvas.get_width_height())
         assert path.stat().st_size < 400_000
     assert {path.name for path in (tmp_path / "report").iterdir()} == {path.name for path in written}
-    assert json.loads((tmp_path / "report/table.json").read_text()) == report.table_numbers(runs)
+    assert json.loads((tmp_path / "report/table.json").read_text()) == tables.table_numbers(runs)
 
-    read = {run.policy: run for run in map(report.read_run, runs)}
+    read = {run.policy: run for run in map(tables.read_run, runs)}
     steps = {policy: run.steps for policy, run in read.items()}
     gains = {policy: [(s["step"], s["information_gain"]) for s in lines[1:]] for policy, lines in steps.items()}
     assert curves(drawn["gain.png"].axes[0]) == gains
@@ -111,38 +115,38 @@ def test_report_writes_every_figure(runs, tmp_path, drawn):
 
 
 def test_unseen_view(runs):
-    read = [report.read_run(folder) for folder in runs]
-    index = report.unseen_view(read, tiny.FRAMES)
+    read = [tables.read_run(folder) for folder in runs]
+    index = writing.unseen_view(read, tiny.FRAMES)
     counts = [sum(i in run.seeds + run.chosen for run in read) for i in range(tiny.FRAMES)]
     assert counts[index] == min(counts)
 
 
 def test_table(runs):
-    rows = report.table_rows(runs)
+    rows = tables.table_rows(runs)
     metrics = json.loads((runs[1] / "metrics.json").read_text())
-    row = dict(zip(report.COLUMNS, rows[1], strict=True))
+    row = dict(zip(tables.COLUMNS, rows[1], strict=True))
     assert row["policy"] == "random"
     assert row["images"] == "8"
     assert row["all.psnr"] == f"{metrics['all']['psnr']:.2f}"
     assert row["held_out.ssim_mask"] == f"{metrics['held_out']['ssim_mask']:.4f}"
-    numbers = report.table_numbers(runs)[1]
+    numbers = tables.table_numbers(runs)[1]
     means = {f"{views}.{name}": value for views in ("all", "held_out") for name, value in metrics[views].items()}
     last = json.loads((runs[1] / "steps.jsonl").read_text().splitlines()[-1])
     assert numbers == means | {"policy": "random", "images": 8, "coverage": 100 * last["coverage"]}
-    lines = report.markdown_table(rows).splitlines()
+    lines = tables.markdown_table(rows).splitlines()
     assert len(lines) == 4
-    assert {line.count("|") for line in lines} == {len(report.COLUMNS) + 1}
+    assert {line.count("|") for line in lines} == {len(tables.COLUMNS) + 1}
     console = Console(width=80, file=io.StringIO())
-    report.print_table(console, rows)
+    printing.print_table(console, rows)
     for value in row.values():
         assert value in console.file.getvalue()
 
 
 def test_runs_of_one_policy_are_told_apart_by_their_folders(runs, tmp_path):
     other = shutil.copytree(runs[1], tmp_path / "again")
-    assert list(report.evaluated_runs([*runs, other])) == ["d-optimal", "random (random)", "random (again)"]
+    assert list(tables.evaluated_runs([*runs, other])) == ["d-optimal", "random (random)", "random (again)"]
     with pytest.raises(InputError, match="same policy and folder name"):
-        report.evaluated_runs([runs[1], runs[1]])
+        tables.evaluated_runs([runs[1], runs[1]])
 
 
 def test_runs_that_cannot_be_compared(runs, tmp_path):
@@ -150,34 +154,34 @@ def test_runs_that_cannot_be_compared(runs, tmp_path):
     metrics = json.loads((other / "metrics.json").read_text())
     (other / "metrics.json").write_text(json.dumps(metrics | {"images": 7}))
     with pytest.raises(InputError, match="not evaluated since its last step; measure it with `mgs eval"):
-        report.write_report(tmp_path / "report", [runs[0], other])
+        writing.write_report(tmp_path / "report", [runs[0], other])
     (other / "metrics.json").write_text(json.dumps(metrics))
     config = json.loads((other / "config.json").read_text())
     config["settings"]["dataset"] = "/elsewhere"
     (other / "config.json").write_text(json.dumps(config))
     with pytest.raises(InputError, match="another dataset"):
-        report.write_report(tmp_path / "report", [runs[0], other])
+        writing.write_report(tmp_path / "report", [runs[0], other])
     shutil.rmtree(shutil.copytree(runs[0], tmp_path / "undrawn") / "renders")
     with pytest.raises(InputError, match="draw it with `mgs eval"):
-        report.write_report(tmp_path / "report", [tmp_path / "undrawn"])
+        writing.write_report(tmp_path / "report", [tmp_path / "undrawn"])
     assert not (tmp_path / "report").exists()
 
 
 def test_missing_and_damaged_files(runs, tmp_path):
     with pytest.raises(InputError, match=r"config\.json: no such file"):
-        report.read_run(tmp_path)
+        tables.read_run(tmp_path)
     (tmp_path / "config.json").write_text((runs[0] / "config.json").read_text())
     with pytest.raises(InputError, match=r"steps\.jsonl: no such file; .*--resume"):
-        report.read_run(tmp_path)
+        tables.read_run(tmp_path)
     for damaged, cause in {"": "no JSON", "{": "no JSON", "{}\n": "seeds: Field required"}.items():
         (tmp_path / "steps.jsonl").write_text(damaged)
         with pytest.raises(
             InputError, match=rf"steps\.jsonl: line 1 is damaged \({cause}\); write the file anew with `mgs nbv --r"
         ):
-            report.read_run(tmp_path)
+            tables.read_run(tmp_path)
     (tmp_path / "steps.jsonl").write_text((runs[0] / "steps.jsonl").read_text())
     with pytest.raises(InputError, match="mgs eval"):
-        report.table_numbers([tmp_path])
+        tables.table_numbers([tmp_path])
 
 
 @pytest.mark.parametrize("key", ["coverage", "images", "information_gain", "frame"])
@@ -188,7 +192,7 @@ def test_a_damaged_line(runs, tmp_path, key, value):
     lines[2] = {k: v for k, v in (lines[2] | {key: value}).items() if v is not ...}
     (run / "steps.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     with pytest.raises(InputError, match=rf"steps\.jsonl: line 3 is damaged \({key}: .*anew with `mgs nbv --resume"):
-        report.write_report(tmp_path / "report", [run])
+        writing.write_report(tmp_path / "report", [run])
 
 
 @pytest.mark.parametrize(
@@ -206,7 +210,7 @@ def test_a_damaged_config(runs, tmp_path, change, named):
     change(config)
     write_json(run / "config.json", config)
     with pytest.raises(InputError, match=rf"config\.json: {named}.*start the run anew"):
-        report.read_run(run)
+        tables.read_run(run)
 
 
 def test_an_unfinished_run(runs, tmp_path):
@@ -224,10 +228,10 @@ def test_an_unfinished_run(runs, tmp_path):
     ):
         change()
         with pytest.raises(InputError, match=re.escape(expected)):
-            report.write_report(tmp_path / "report", [runs[1], run])
+            writing.write_report(tmp_path / "report", [runs[1], run])
     (run / "steps.jsonl").write_text("".join(lines))
     with pytest.raises(InputError, match=r"run: has all 8 views, but no gaussians\.ply; write it with `mgs nbv --resume"):
-        report.write_report(tmp_path / "report", [run])
+        writing.write_report(tmp_path / "report", [run])
     assert not (tmp_path / "report").exists()
 
 
@@ -236,7 +240,7 @@ def test_damaged_metrics(runs, tmp_path, metrics):
     run = shutil.copytree(runs[0], tmp_path / "run")
     write_json(run / "metrics.json", metrics)
     with pytest.raises(InputError, match=r"metrics\.json: is damaged; measure"):
-        report.write_report(tmp_path / "report", [run])
+        writing.write_report(tmp_path / "report", [run])
 
 
 def test_a_view_that_was_not_evaluated(runs, tmp_path):
@@ -244,7 +248,7 @@ def test_a_view_that_was_not_evaluated(runs, tmp_path):
     metrics = json.loads((run / "metrics.json").read_text())
     write_json(run / "metrics.json", metrics | {"views": []})
     with pytest.raises(InputError, match="was not evaluated on kf_"):
-        report.write_report(tmp_path / "report", [run])
+        writing.write_report(tmp_path / "report", [run])
     assert not (tmp_path / "report").exists()
 
 
@@ -253,19 +257,19 @@ def test_a_report_of_a_dataset_that_has_changed(runs, tmp_path):
     config = json.loads((run / "config.json").read_text())
     write_json(run / "config.json", config | {"frames": config["frames"][:-1]})
     with pytest.raises(InputError, match="its frames differ"):
-        report.write_report(tmp_path / "report", [run])
+        writing.write_report(tmp_path / "report", [run])
     config["settings"]["dataset"] = str(tmp_path / "moved")
     write_json(run / "config.json", config)
     with pytest.raises(InputError, match="correct `dataset` in this file"):
-        report.write_report(tmp_path / "report", [run])
+        writing.write_report(tmp_path / "report", [run])
 
 
 def test_comparison_is_cropped_to_the_rock():
     mask = np.zeros((100, 200), bool)
     mask[40:60, 50:80] = True
-    rows, columns = figures.crop(mask)
+    rows, columns = plotting.crop(mask)
     assert (rows.start, rows.stop, columns.start, columns.stop) == (34, 66, 38, 92)
-    assert figures.crop(np.zeros((4, 4), bool)) == (slice(None), slice(None))
+    assert plotting.crop(np.zeros((4, 4), bool)) == (slice(None), slice(None))
 
 
 @pytest.mark.parametrize(
@@ -286,7 +290,7 @@ def test_a_policy_keeps_its_style_whatever_it_is_compared_with():
 def test_a_long_name_cuts_no_number():
     console = Console(width=80, record=True, file=io.StringIO())
     row = ["my-own-very-long-policy", "12", "30.09", "0.9426", "29.56", "0.9362", "27.54", "0.7538", "100.00"]
-    report.print_table(console, [row])
+    printing.print_table(console, [row])
     text = console.export_text()
     assert all(number in text for number in row[1:])
     assert "…" not in text

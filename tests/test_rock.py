@@ -7,12 +7,12 @@ import pytest
 import trimesh
 from PIL import Image
 
+from mgs.data.meshes import read_mesh, read_rock, to_glb
 from mgs.errors import InputError
-from mgs.noise import Noise
-from mgs.rock import load_rock, make_rock
-from mgs.scene_file import Rock
 from mgs.seeds import generator
-from mgs.surface import read_mesh, read_rock, to_glb
+from mgs.synth.noise import Noise
+from mgs.synth.rock import load_rock, make_rock
+from mgs.synth.scene_file import Rock
 
 COARSE = Rock(detail=0.08)
 

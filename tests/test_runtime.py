@@ -81,7 +81,7 @@ def test_versions_are_compared_as_numbers(tmp_path):
 )
 def test_bad_libraries_are_one_line_and_exit_code_2(library, message):
     """In a process of its own: an abort would show as a negative exit code."""
-    code = "from mgs.cli import main; import sys; sys.argv = ['mgs', 'doctor']; main()"
+    code = "from mgs.cli.app import main; import sys; sys.argv = ['mgs', 'doctor']; main()"
     environment = {runtime.LIBRARY_VARIABLE: library, "PATH": "/usr/bin:/bin", "COLUMNS": "400"}
     result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
     assert result.returncode == 2, result.stderr

@@ -8,13 +8,14 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from mgs.arena import make_ground, make_stones
-from mgs.conventions import Camera, linear_from_srgb, look_at
+from mgs.camera import Camera, look_at
+from mgs.colour import linear_from_srgb
 from mgs.errors import InputError
-from mgs.rock import make_rock
-from mgs.scene import Scene, sensor_dict
-from mgs.scene_file import Arena, Rock, SceneFile, load_scene_file
 from mgs.seeds import generator
+from mgs.synth.arena import make_ground, make_stones
+from mgs.synth.rock import make_rock
+from mgs.synth.scene import Scene, sensor_dict
+from mgs.synth.scene_file import Arena, Rock, SceneFile, load_scene_file
 
 K = np.array([[70.0, 0, 30.5], [0, 70.0, 27.25], [0, 0, 1]])
 
@@ -98,7 +99,7 @@ def test_the_boulder_is_the_default_scene():
 def test_the_sensor_of_a_dataset_is_its_scenes(tmp_path):
     from mgs.errors import InputError
     from mgs.files import write_json
-    from mgs.scene_file import Sensor, sensor_of
+    from mgs.synth.scene_file import Sensor, sensor_of
 
     assert sensor_of(tmp_path) == Sensor()
     write_json(tmp_path / "config.json", {"scene": {"sensor": {"noise": 2.5, "drift": 0.0}}})

@@ -14,12 +14,14 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).parent))
 import synthetic
 
-from mgs.cli import main
-from mgs.conventions import Camera, look_at
-from mgs.dataset import Dataset, load_dataset, write_transforms
-from mgs.files import read_json, write_exr, write_json
-from mgs.prior import PriorSettings, build_prior
-from mgs.sensor import (
+from mgs.camera import Camera, look_at
+from mgs.cli.app import main
+from mgs.data.dataset import Dataset, load_dataset, write_transforms
+from mgs.files import read_json, write_json
+from mgs.images import write_exr
+from mgs.prior.build import build_prior
+from mgs.prior.settings import PriorSettings
+from mgs.survey.depth_sensor import (
     AXIAL_FLOOR,
     AXIAL_GROWTH,
     AXIAL_START,
@@ -29,7 +31,7 @@ from mgs.sensor import (
     noisy_depth,
     normals_from_depth,
 )
-from mgs.survey import (
+from mgs.survey.registration import (
     Edge,
     SurveySettings,
     chain,

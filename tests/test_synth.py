@@ -9,17 +9,18 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from mgs import arena
-from mgs.cli import main
-from mgs.conventions import WORLD_FROM_GLTF, opencv_from_opengl
-from mgs.dataset import load_dataset
+from mgs.camera import opencv_from_opengl
+from mgs.cli.app import main
+from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import locked, read_json
 from mgs.resources import resource_folder
-from mgs.rock import make_rock
-from mgs.scene_file import ORBITS, Arena, Orbit, Rock, SceneFile, load_scene_file
+from mgs.rotation import WORLD_FROM_GLTF
 from mgs.seeds import generator
-from mgs.synth import PoseNoise, Preset, rock_cameras, synthesise
+from mgs.synth import arena
+from mgs.synth.rendering import PoseNoise, Preset, rock_cameras, synthesise
+from mgs.synth.rock import make_rock
+from mgs.synth.scene_file import ORBITS, Arena, Orbit, Rock, SceneFile, load_scene_file
 
 TINY = Preset(width=64, height=48, frames=5, spp=2)
 SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=20))

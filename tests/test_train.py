@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from mgs.bench import surface_camera, surface_gaussians
-from mgs.conventions import Camera, look_at
+from mgs.active.fitting import TrainSettings, fit
+from mgs.active.stopping import LOSS_FLOOR, StopReason, stop_reason
+from mgs.bench.core import surface_camera, surface_gaussians
+from mgs.camera import Camera, look_at
 from mgs.gaussians import LEARNED, Gaussians
 from mgs.splat import ListCache, fisher, render
-from mgs.stopping import LOSS_FLOOR, StopReason, stop_reason
-from mgs.train import TrainSettings, fit
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_fit_lowers_the_loss_a_hundredfold_and_reports_it(truth, cameras, target
 
 def test_one_step_is_adam_on_the_gradient_of_the_summed_squared_error(truth, cameras, targets):
     """The first Adam step moves each parameter by its rate times g / (|g| + epsilon): against finite differences."""
-    from mgs.train import EPSILON
+    from mgs.active.fitting import EPSILON
 
     start = grey(truth)
     found = fit(start, cameras[:1], targets[:1], TrainSettings(passes=1, rates=(0.02, 0.0, 0.0, 0.0)))

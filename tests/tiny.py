@@ -13,13 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from mgs import nbv
-from mgs.config import NbvSettings
-from mgs.conventions import Camera, look_at, quat_from_normals
-from mgs.dataset import Dataset, Frame, load_dataset, write_transforms
-from mgs.files import write_exr, write_png
+from mgs.active import loop, run_folder
+from mgs.active.settings import NbvSettings
+from mgs.active.stopping import StopReason
+from mgs.camera import Camera, look_at
+from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
 from mgs.gaussians import Gaussians, sh_from_rgb
-from mgs.stopping import StopReason
+from mgs.images import write_exr, write_png
+from mgs.rotation import quat_from_normals
 
 FRAMES, POINTS, WIDTH, HEIGHT = 12, 40, 16, 12
 GROUPS = {"colour": slice(0, 3), "scale": slice(3, 6), "rotation": slice(6, 10), "opacity": slice(10, 11)}
@@ -110,23 +111,23 @@ def fit(gaussians: Gaussians, cameras: list[Camera], targets: list[np.ndarray], 
     return Fit(fitted, float(np.abs(rgb - g.rgb).mean()), 7)
 
 
-def stations(**replaced) -> nbv.Stations:
+def stations(**replaced) -> loop.Stations:
     """Stand-ins for every station; any of them replaced."""
     parts = {"initial": initial, "fit": fit, "fisher": fisher, "measure": lambda gaussians, taken: {"psnr": float(len(taken))}}
-    return nbv.Stations(centre=np.zeros(3), groups=GROUPS, **(parts | replaced))
+    return loop.Stations(centre=np.zeros(3), groups=GROUPS, **(parts | replaced))
 
 
 def start(out: Path, dataset: Dataset, **values) -> NbvSettings:
     """Begin a run folder with these settings over small defaults."""
     settings = NbvSettings(**({"dataset": dataset.root, "prior": dataset.root, "budget": 5, "seeds": 3} | values))
-    nbv.start(out, settings, dataset)
+    run_folder.start(out, settings, dataset)
     return settings
 
 
 def write_prior(out: Path) -> Path:
     """A prior folder of the sphere's points, as `mgs prior` would write it."""
-    from mgs.prior import Prior, save_prior
-    from mgs.surface import Mesh
+    from mgs.data.meshes import Mesh
+    from mgs.prior.build import Prior, save_prior
 
     n = _normals()
     mesh = Mesh(n[:3], np.array([[0, 1, 2]]), np.zeros(1, bool))
@@ -135,13 +136,13 @@ def write_prior(out: Path) -> Path:
 
 def write_run(out: Path, root: Path, prior: Path) -> Path:
     """A run folder of the seeds alone, on the stand-ins."""
-    from mgs.inputs import prior_digest
-    from mgs.prior import load_prior
+    from mgs.active.inputs import prior_digest
+    from mgs.prior.build import load_prior
 
     dataset = load_dataset(root)
     settings = start(out, dataset, prior=prior, budget=2)
     parts = stations(prior=prior_digest(load_prior(prior)))
-    nbv.run(out, settings.model_copy(update={"budget": 0}), dataset, parts, silent)
+    loop.run(out, settings.model_copy(update={"budget": 0}), dataset, parts, silent)
     return out
 
 
@@ -149,7 +150,7 @@ def silent(stage: str, done: int, total: int) -> None:
     """No progress bar."""
 
 
-def die_at(moment: str, count: int) -> nbv.Stations:
+def die_at(moment: str, count: int) -> loop.Stations:
     """Stations of which one kills this process, as the system would, when it is called for the count-th time."""
     calls = {"n": 0}
 
@@ -165,7 +166,7 @@ def die_at(moment: str, count: int) -> nbv.Stations:
     if moment in ("fit", "fisher", "initial"):
         return stations(**{moment: dying(globals()[moment])})
     if moment == "before the lines are written":
-        nbv.write_steps = dying(nbv.write_steps)
+        run_folder.write_steps = dying(run_folder.write_steps)
     if moment == "while the checkpoint is written":
         savez = np.savez
 
@@ -183,5 +184,5 @@ def die_at(moment: str, count: int) -> nbv.Stations:
 
 if __name__ == "__main__":
     loaded, folder = load_dataset(sys.argv[1]), Path(sys.argv[2])
-    chosen = nbv.read_settings(folder) if folder.exists() else start(folder, loaded, policy=sys.argv[3], seed=3)
-    nbv.run(folder, chosen, loaded, die_at(sys.argv[4], int(sys.argv[5])), silent)
+    chosen = run_folder.read_settings(folder) if folder.exists() else start(folder, loaded, policy=sys.argv[3], seed=3)
+    loop.run(folder, chosen, loaded, die_at(sys.argv[4], int(sys.argv[5])), silent)

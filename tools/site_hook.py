@@ -1,7 +1,7 @@
 """What `mkdocs build` needs beyond mkdocs.yml: pages of files that lie outside docs/.
 
-The changelog becomes a page. A link from a page of docs/ to a source file (`../mgs/policies.py`), which is right on GitHub,
-becomes a link to a page that shows the file.
+The changelog becomes a page. A link from a page of docs/ to a source file (`../mgs/active/criteria.py`), which is right on
+GitHub, becomes a link to a page that shows the file.
 """
 
 from __future__ import annotations

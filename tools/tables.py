@@ -18,8 +18,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from mgs.bench import TARGETS
-from mgs.report import COLUMNS, table_cell
+from mgs.bench.core import TARGETS
+from mgs.report.tables import COLUMNS, table_cell
 
 ROOT = Path(__file__).parent.parent
 MARK = re.compile(r"<!-- (?:table: (?P<name>\S+)|end of table) -->")

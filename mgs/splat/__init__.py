@@ -2,13 +2,11 @@
 
 `render` draws Gaussians and is differentiable by `dr.backward`; `fisher` gives the information that a view carries about each
 Gaussian; a `ListCache` kept between calls makes both faster for cameras seen before. Set a Mitsuba variant before calling them.
-Importing this package registers the Mitsuba integrator `mgs_splat` (plugins/mgs_splat.py), which draws the same images.
+`import mgs.splat.plugins` registers the Mitsuba integrator `mgs_splat` (plugins/mgs_splat.py), which draws the same images.
 """
 
-from mgs.splat.fisher import ESTIMATORS, fisher, groups
-from mgs.splat.render import Image, ListCache, as_drjit, render
-from mgs.splat.sensor import camera_from_sensor
-
-import mgs.mitsuba_plugins  # isort: skip  # noqa: F401  Last: the plugin imports the names above.
+from mgs.splat.information import ESTIMATORS, fisher, groups
+from mgs.splat.mitsuba_sensor import camera_from_sensor
+from mgs.splat.rendering import Image, ListCache, as_drjit, render
 
 __all__ = ["ESTIMATORS", "Image", "ListCache", "as_drjit", "camera_from_sensor", "fisher", "groups", "render"]

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mgs.errors import InputError
-from mgs.splat.project import Splats
+from mgs.splat.projection import Splats
 
 BLOCK_X, BLOCK_Y = 8, 4
 """Pixels of one lane. With AVX-512, 8x2 and 4x4 were no faster forward, and slower for gradients: more pairs to store."""

@@ -21,8 +21,8 @@ import mitsuba as mi
 
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, BlockLists
 from mgs.splat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from mgs.splat.frozen import frozen
-from mgs.splat.project import Splats
+from mgs.splat.projection import Splats
+from mgs.splat.recording import frozen
 
 PIXELS = BLOCK_X * BLOCK_Y
 

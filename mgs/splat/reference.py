@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import expit
 
-from mgs.conventions import Camera, rotmat_from_quat
+from mgs.camera import Camera
 from mgs.gaussians import Gaussians
+from mgs.rotation import rotmat_from_quat
 from mgs.splat.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, LOG_SCALE_RANGE, NEAR, TRANSMITTANCE_MIN
 
 

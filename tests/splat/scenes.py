@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from mgs.conventions import Camera, look_at
+from mgs.camera import Camera, look_at
 from mgs.gaussians import Gaussians
 from mgs.splat.reference import margins
 

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mgs.conventions import MAX_PIXELS, MAX_SIDE
+from mgs.camera import MAX_PIXELS, MAX_SIDE
 from mgs.errors import InputError
 from mgs.gaussians import MAX_GAUSSIANS, Gaussians
 from mgs.splat import ListCache, as_drjit, blocks, fisher, kernels, reference, render
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, TILE, build, depth_order, inflate, outgrown
-from mgs.splat.project import camera_array, project
-from mgs.splat.render import MARGIN
+from mgs.splat.projection import camera_array, project
+from mgs.splat.rendering import MARGIN
 
 from .scenes import PARAMETERS, changed, make_camera, make_gaussians, place
 

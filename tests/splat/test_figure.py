@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from matplotlib.patches import Rectangle
 
-from mgs.bench import surface_camera, surface_gaussians
-from mgs.conventions import SH_C0
+from mgs.bench.core import surface_camera, surface_gaussians
+from mgs.colour import SH_C0
 from mgs.splat import fisher, reference
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y
 

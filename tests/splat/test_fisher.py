@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from mgs.errors import InputError
 from mgs.splat import ESTIMATORS, ListCache, fisher, groups, reference, render
-from mgs.splat.fisher import hutchinson
-from mgs.splat.render import as_drjit
+from mgs.splat.information import hutchinson
+from mgs.splat.rendering import as_drjit
 
 from .scenes import calm, double, make_camera, make_gaussians
 

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from mgs.conventions import SH_C0, rotmat_from_quat
+from mgs.colour import SH_C0
 from mgs.gaussians import Gaussians
+from mgs.rotation import rotmat_from_quat
 from mgs.splat import reference
 from mgs.splat.constants import EPS2D
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mgs.conventions import SH_C0
+from mgs.colour import SH_C0
 from mgs.gaussians import Gaussians
 from mgs.splat import ListCache, as_drjit, reference, render
 from mgs.splat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mgs.splat
-from mgs.conventions import Camera
+from mgs.camera import Camera
 from mgs.errors import InputError
 from mgs.gaussians import SH_MAX, Gaussians
 from mgs.splat import ESTIMATORS, ListCache, as_drjit, fisher, reference, render

@@ -1,0 +1,5 @@
+"""`python -m mgs`."""
+
+from mgs.cli.app import main
+
+main()

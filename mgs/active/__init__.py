@@ -1,0 +1,1 @@
+"""Active selection: fit, information, criterion, capture, again."""

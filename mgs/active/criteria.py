@@ -1,0 +1,112 @@
+"""Next-best-view policies: pure NumPy scores, each a row of a table. The loop that uses them is `mgs.active.loop`.
+
+Two kinds, because they look at different things:
+
+- a *criterion* scores one candidate from Fisher information alone, `(F [N,P], H [N,P], lam [P]) -> float`;
+- a *pose policy* scores all candidates from camera positions alone, `(candidates [C,3], taken [T,3], centre [3], rng)
+  -> scores [C]`, metres.
+
+Neither ever sees a candidate's image. The largest score wins; a tie goes to the camera farthest from those taken (a rule of
+our own, the same for all: the paper names none, and coverage ties at every step once it has saturated). A policy of your own is
+one more row (docs/nbv.md).
+
+Notation, after the paper's Eq. 7 and POp-GS: H [N,P] is the diagonal of J^T J summed over the training set, F [N,P] that of
+one candidate, lam [P] the regularisation (`regularisation`); l = N P is the number of parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
+
+Criterion = Callable[[Array, Array, Array], float]
+
+PIXEL_NOISE = 0.02
+"""sigma_e, standard deviation of a pixel's residual, linear RGB (34 dB): the scale at which one pixel's evidence counts as one.
+A chosen constant."""
+
+PRIOR_STD = {"colour": 1.0, "scale": 0.5, "rotation": 0.5, "opacity": 2.0}
+"""tau: how far each parameter may plausibly lie from its start before any image is seen, in the parameter's own unit:
+colour 1 SH unit (0.28 linear RGB: albedo and shading of a rock), scale 0.5 (a factor 1.65), quaternion 0.5 (about 60
+degrees), opacity logit 2 (0.12 to 0.88 about one half)."""
+
+
+def regularisation(
+    groups: dict[str, slice], pixel_noise: float = PIXEL_NOISE, prior_std: Mapping[str, float] = PRIOR_STD
+) -> NDArray[np.float64]:
+    """lam [P], the prior's information about each parameter, in the units of H: (sigma_e / tau)^2.
+
+    J^T J has units (pixel value / parameter)^2, which differ between parameters, so one number cannot serve all of them.
+    With a prior theta ~ N(theta_0, tau^2) the posterior precision is H / sigma_e^2 + 1 / tau^2 = (H + lam) / sigma_e^2, so this
+    lam makes Eq. 7 equal 2/l times the mutual information of the parameters and the new image (diagonal, linearised), in
+    nats. groups: columns of each kind of parameter, from `mgs.splat.groups`.
+    """
+    lam = np.empty(max(columns.stop for columns in groups.values()))
+    for name, columns in groups.items():
+        lam[columns] = (pixel_noise / prior_std[name]) ** 2
+    return lam
+
+
+def observed(H: Array, lam: Array) -> NDArray[np.bool_]:
+    """[N] which Gaussians the images say more about than the prior does (Eq. 9 with epsilon = lam).
+
+    Read off the colour columns: colour information is the sum of squared blending weights, what the views see of a Gaussian.
+    """
+    return np.asarray((H[:, :3] > lam[:3]).any(axis=1))
+
+
+def coverage(H: Array, lam: Array) -> float:
+    """Surface coverage C_0 of Eq. 9: the share of Gaussians that are `observed`, 0 to 1.
+
+    The loop passes H of the prior's Gaussians, as they were before training. At the trained model Eq. 9 mixes two things:
+    Gaussians that fade behind their neighbours as training goes on would count as surface that no view sees.
+    """
+    return float(observed(H, lam).mean())
+
+
+def d_optimal(F: Array, H: Array, lam: Array) -> float:
+    """Paper's Eq. 7: 1/l sum log(1 + F / (H + lam)), the decrease of the log-determinant of the posterior's covariance,
+    per parameter."""
+    return float(np.log1p(F / (H + lam)).mean(dtype=np.float64))
+
+
+def t_optimal(F: Array, H: Array, lam: Array) -> float:
+    """1/l sum [1/(H+lam) - 1/(H+F+lam)], the decrease of the average variance.
+
+    The paper calls this A-optimal; POp-GS (and here) T-optimal, keeping A for its own p = -1.
+    """
+    return float((F / ((H + lam) * (H + F + lam))).mean(dtype=np.float64))
+
+
+def a_optimal(F: Array, H: Array, lam: Array) -> float:
+    """POp-GS's A-optimal (p = -1): the increase of the trace of the inverse covariance, 1/l sum F. Blind to H."""
+    return float(F.mean(dtype=np.float64))
+
+
+def e_optimal(F: Array, H: Array, lam: Array) -> float:
+    """Increase of the smallest eigenvalue of H + lam. It is 0 while any parameter stays unobserved."""
+    return float((H + F + lam).min() - (H + lam).min())
+
+
+def fisherrf(F: Array, H: Array, lam: Array) -> float:
+    """FisherRF's trace criterion, 1/l sum F / (H + lam): Eq. 7 without the logarithm, so nothing saturates."""
+    return float((F / (H + lam)).mean(dtype=np.float64))
+
+
+def coverage_greedy(F: Array, H: Array, lam: Array) -> float:
+    """Number of Gaussians newly `observed`."""
+    return float((observed(H + F, lam) & ~observed(H, lam)).sum())
+
+
+CRITERIA: dict[str, Criterion] = {
+    "d-optimal": d_optimal,
+    "coverage": coverage_greedy,
+    "t-optimal": t_optimal,
+    "a-optimal": a_optimal,
+    "e-optimal": e_optimal,
+    "fisherrf": fisherrf,
+}

@@ -1,0 +1,238 @@
+"""The paper's loop: seeds -> fit -> information of the training set -> choose a pose -> capture -> fit -> ... until the budget.
+
+The candidates' images are never read: only the cameras of frames not taken yet are touched before a choice.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from mgs.active import criteria, inputs, pose_policies
+from mgs.active.run_folder import State, check_settings, read_checkpoint, write_checkpoint, write_steps
+from mgs.active.settings import NbvSettings
+from mgs.active.stopping import StopReason
+from mgs.camera import Camera
+from mgs.data.dataset import Dataset, Frame
+from mgs.errors import InputError
+from mgs.files import locked
+from mgs.gaussians import Gaussians
+from mgs.seeds import generator
+from mgs.splat_ply import write_ply
+
+Progress = Callable[[str, int, int], None]
+"""Called as progress(stage, done, total)."""
+
+
+class Fit(Protocol):
+    """What a fit returns: `mgs.active.fitting.Fit`."""
+
+    @property
+    def gaussians(self) -> Gaussians: ...
+    @property
+    def loss(self) -> float: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def losses(self) -> Sequence[float]: ...
+    @property
+    def stop_reason(self) -> StopReason: ...
+
+
+@dataclass(frozen=True)
+class Stations:
+    """The stations the loop calls; NumPy in and out, deterministic.
+
+    centre: [3] the rock, metres; groups: columns of the Fisher information by kind of parameter;
+    initial(seed frames) -> Gaussians; fit(gaussians, cameras, targets, rate, on_pass) -> Fit, rate scaling the learning rates;
+    fisher(gaussians, camera) -> [N,P]; measure(gaussians, taken frame indices) -> entries for steps.jsonl; prior: hash of what
+    `initial` starts from (`mgs.active.inputs.prior_digest`).
+    """
+
+    centre: np.ndarray
+    groups: dict[str, slice]
+    initial: Callable[[list[Frame]], Gaussians]
+    fit: Callable[[Gaussians, list[Camera], list[np.ndarray], float, Callable[[int, int], None]], Fit]
+    fisher: Callable[[Gaussians, Camera], np.ndarray]
+    measure: Callable[[Gaussians, list[int]], dict[str, float]]
+    prior: str = ""
+
+
+@dataclass
+class _Stopwatch:
+    """Seconds per stage."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[stage] = round(time.perf_counter() - start, 4)
+
+
+def run(
+    out: Path,
+    settings: NbvSettings,
+    dataset: Dataset,
+    stations: Stations,
+    progress: Progress,
+    on_step: Callable[[State], None] = lambda state: None,
+    say: Callable[[str], None] = lambda text: None,
+) -> State:
+    """Run or resume the loop in `out` (which has its config.json) until the budget is spent; returns the last state.
+
+    progress is told of the work inside a step, on_step of every state that is committed, say of what a user should know.
+
+    Killed at any moment and called again, it takes the same views as a run that was never interrupted. Raises InputError
+    as `check_settings`; where another process works on the folder; where the prior, a pose or a file of a frame taken has
+    changed since the steps that are there; before the fit, where a frame it takes cannot be read or has an empty mask; and
+    where the fit diverged: the steps before are kept.
+    """
+    check_settings(settings, len(dataset))
+    with locked(out):
+        for leftover in out.glob(".*.part*"):  # of a killed write
+            leftover.unlink()
+        state = read_checkpoint(out)
+        if state is not None:
+            check_inputs(out, state, settings, dataset, stations.prior, say)
+        loop = _Loop(out, settings, dataset, stations, progress)
+        if state is not None and not np.array_equal(state.gaussians.means, loop.start.means):
+            raise InputError(inputs.changed_prior(out, settings.prior))
+        if state is None:
+            state = loop.first()
+            write_checkpoint(out, state)
+        on_step(state)
+        while len(state.steps) <= settings.budget:
+            state = loop.next(state)
+            write_checkpoint(out, state)
+            on_step(state)
+        write_steps(out, state)
+        write_ply(out / "gaussians.ply", state.gaussians)
+        return state
+
+
+def check_inputs(
+    out: Path, state: State, settings: NbvSettings, dataset: Dataset, prior: str, say: Callable[[str], None]
+) -> None:
+    """Raises InputError where the run cannot go on from what it was made from; says so where that was never recorded."""
+    if state.inputs:
+        inputs.check_unchanged(out, state.inputs, prior, settings.prior, dataset)
+    elif len(state.steps) <= settings.budget:
+        say(f"{out}: was started by a version that kept no record of its inputs; it goes on with the files as they are now")
+
+
+class _Loop:
+    """What stays the same from step to step; each method is a function of the state."""
+
+    def __init__(self, out: Path, settings: NbvSettings, dataset: Dataset, stations: Stations, progress: Progress) -> None:
+        self.out, self.settings, self.frames, self.stations, self.progress = out, settings, dataset.frames, stations, progress
+        self.cameras = [frame.camera for frame in dataset.frames]
+        self.positions = np.array([camera.position for camera in self.cameras])
+        self.lam = criteria.regularisation(stations.groups, settings.pixel_noise, settings.prior_std)
+        self.images: dict[int, np.ndarray] = {}
+        cameras = {frame.name: inputs.camera_digest(frame.camera) for frame in self.frames}
+        self.made_from = {"prior": stations.prior, "cameras": cameras}
+        self.seeds = pose_policies.seed_views(self.positions, stations.centre, settings.seeds)
+        self.start = stations.initial([self.frames[i] for i in self.seeds])
+
+    def first(self) -> State:
+        """Step 0: the seeds."""
+        names = [self.frames[i].name for i in self.seeds]
+        choice = {"frame": None, "name": None, "seeds": self.seeds, "seed_names": names, "gain": None, "information_gain": None}
+        nothing = np.zeros((len(self.start), len(self.lam)))
+        return self.learn(State(self.start, nothing, nothing, [], []), self.seeds, choice, _Stopwatch())
+
+    def next(self, state: State) -> State:
+        """One step: choose a pose, capture its image, learn."""
+        watch = _Stopwatch()
+        with watch("score"):
+            frame, gain = self.choose(state)
+            F = self.stations.fisher(state.gaussians, self.cameras[frame])
+            information_gain = criteria.d_optimal(F, state.H, self.lam)
+        choice = {"frame": frame, "name": self.frames[frame].name, "gain": gain, "information_gain": information_gain}
+        return self.learn(state, [frame], choice, watch)
+
+    def choose(self, state: State) -> tuple[int, float | None]:
+        """Frame with the largest score among those not taken, and its gain: poses only, one candidate in memory at a time."""
+        policy = self.settings.policy
+        left = [i for i in range(len(self.frames)) if i not in state.taken]
+        poses = self.positions[left], self.positions[state.taken], self.stations.centre
+        rng = generator(self.settings.seed, f"{policy}/{len(state.steps)}")
+        if policy in criteria.CRITERIA:
+            model, H = (self.start, state.surface) if policy == "coverage" else (state.gaussians, state.H)
+            scores: np.ndarray = np.empty(len(left))
+            for done, i in enumerate(left):
+                self.progress("scoring candidates", done, len(left))
+                scores[done] = criteria.CRITERIA[policy](self.stations.fisher(model, self.cameras[i]), H, self.lam)
+        else:
+            scores = pose_policies.POSE_POLICIES[policy](*poses, rng)
+        farthest = pose_policies.farthest_pose(*poses, rng)
+        best = max(range(len(left)), key=lambda k: (scores[k], farthest[k]))
+        if np.isnan(scores).any() or np.isinf(scores[best]):
+            raise InputError(f"policy {policy}: gave a score that is NaN or infinite; correct the policy (docs/nbv.md)")
+        return left[best], None if policy == "random" else float(scores[best])
+
+    def learn(self, state: State, new: list[int], choice: dict[str, Any], watch: _Stopwatch) -> State:
+        """Read the new images, fit to convergence on all so far, sum their information at the new model."""
+        step, taken = len(state.steps), [*state.taken, *new]
+        cameras = [self.cameras[i] for i in taken]
+        with watch("capture"):
+            for i in taken:
+                if i not in self.images:
+                    self.images[i] = _target(self.frames[i])
+        with watch("fit"):
+            targets = [self.images[i] for i in taken]
+            rate = self.settings.warm_rate if step else 1.0
+            fit = self.stations.fit(state.gaussians, cameras, targets, rate, partial(self.progress, "fitting"))
+        if fit.stop_reason == StopReason.DIVERGED:
+            raise InputError(_diverged(self.out, step, fit.losses))
+        with watch("information"):
+            H = np.zeros((len(fit.gaussians), len(self.lam)))
+            for done, camera in enumerate(cameras):
+                self.progress("information of the training set", done, len(cameras))
+                H += self.stations.fisher(fit.gaussians, camera)
+            surface = state.surface + sum(self.stations.fisher(self.start, self.cameras[i]) for i in new)
+        kinds = ("image", "mask") if step else ("image", "mask", "depth")  # depth gives the seeds' colours to the surface
+        files = {self.frames[i].name: inputs.frame_digests(self.frames[i], kinds) for i in new}
+        made_from = {**self.made_from, "files": state.inputs.get("files", {}) | files}
+        line = {
+            "step": step,
+            **choice,
+            "images": len(taken),
+            "coverage": criteria.coverage(surface, self.lam),
+            "iterations": int(fit.iterations),
+            "loss": float(fit.loss),
+            "stop_reason": str(fit.stop_reason),
+            "seconds": watch.seconds,
+        }
+        if self.settings.evaluate_every and step % self.settings.evaluate_every == 0:
+            with watch("evaluate"):
+                line |= self.stations.measure(fit.gaussians, taken)
+        return State(fit.gaussians, H, surface, taken, [*state.steps, line], made_from)
+
+
+def _target(frame: Frame) -> np.ndarray:
+    """`Frame.masked_rgb`. Raises InputError where the mask is empty: a fit to black would hide the rock."""
+    if not frame.mask().any():
+        raise InputError(f"{frame.mask_path}: the rock mask of frame {frame.name} is empty; correct it, or remove the frame")
+    return frame.masked_rgb()
+
+
+def _diverged(out: Path, step: int, losses: Sequence[float]) -> str:
+    """What to say of a fit that diverged: the loss of the model it started from, and of its last passes."""
+    first, *passes = (f"{loss:.3g}" for loss in losses)
+    fit = "the fit to the seeds" if step == 0 else f"the fit of step {step}"
+    kept = {0: "", 1: "; step 0 is kept"}.get(step, f"; steps 0 to {step - 1} are kept")
+    rates = "`train.rates`" if step == 0 else "`warm_rate` or `train.rates`"
+    return (
+        f"{out}: {fit} diverged: its loss was {first} at the start, and {', '.join(passes[-3:])} in the last passes; "
+        f"lower the learning rates ({rates} in {out / 'config.json'}) and go on with `mgs nbv --resume {out}`{kept}"
+    )

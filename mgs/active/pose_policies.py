@@ -1,0 +1,73 @@
+"""Pose policies: scores of candidates from camera positions alone. Pure NumPy, each a row of a table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mgs.active.criteria import CRITERIA, Array
+
+PosePolicy = Callable[[Array, Array, Array, np.random.Generator], Array]
+
+
+def azimuths(positions: Array, centre: Array) -> NDArray[np.float64]:
+    """Camera centres [C,3] -> angle about the vertical through `centre` [3], radians in [0, 2 pi), 0 = +X."""
+    offset = np.asarray(positions, np.float64) - centre
+    return np.arctan2(offset[:, 1], offset[:, 0]) % (2 * np.pi)
+
+
+def angle_between(a: Array, b: Array) -> NDArray[np.float64]:
+    """Smallest angle between azimuths (broadcast), radians in [0, pi]."""
+    return np.abs((a - b + np.pi) % (2 * np.pi) - np.pi)
+
+
+def random_order(candidates: Array, taken: Array, centre: Array, rng: np.random.Generator) -> Array:
+    """A draw at random. The loop derives `rng` from the run's seed and the step: reproducible, and new in every round."""
+    return rng.random(len(candidates))
+
+
+def uniform_azimuth(candidates: Array, taken: Array, centre: Array, rng: np.random.Generator) -> Array:
+    """Gap to the taken azimuth on the left times that on the right, square radians: spreads the views evenly at every count.
+
+    Splitting a gap a + b lowers the sum of squared gaps by 2ab, so this is greedy for the most even spread.
+    """
+    gaps = (azimuths(taken, centre)[None, :] - azimuths(candidates, centre)[:, None]) % (2 * np.pi)
+    return _rounded(gaps.min(axis=1) * (2 * np.pi - gaps.max(axis=1)))
+
+
+def farthest_pose(candidates: Array, taken: Array, centre: Array, rng: np.random.Generator) -> Array:
+    """Distance to the nearest camera already taken, metres (farthest-point sampling)."""
+    distance = np.linalg.norm(candidates[:, None, :] - taken[None, :, :], axis=2)
+    return _rounded(distance.min(axis=1))
+
+
+def _rounded(scores: Array) -> Array:
+    """Equal distances differ in the last bits; without them a tie is a tie (the loop takes the farthest, seeds the first)."""
+    return np.round(scores, 9)
+
+
+POSE_POLICIES: dict[str, PosePolicy] = {
+    "random": random_order,
+    "uniform": uniform_azimuth,
+    "farthest": farthest_pose,
+}
+
+
+def policy_names() -> list[str]:
+    """Every policy that `mgs nbv --policy` accepts: the rows of both tables, as they are now."""
+    return [*CRITERIA, *POSE_POLICIES]
+
+
+def seed_views(positions: Array, centre: Array, count: int) -> list[int]:
+    """Frames nearest to `count` evenly spaced azimuths (0, 360/count, ...), each frame once; in that order.
+
+    positions [C,3] camera centres, centre [3] the rock; metres. Needs count <= C.
+    """
+    angles, seeds = azimuths(positions, centre), list[int]()
+    for target in 2 * np.pi * np.arange(count) / count:
+        distance = _rounded(angle_between(angles, target))
+        distance[seeds] = np.inf
+        seeds.append(int(np.argmin(distance)))
+    return seeds

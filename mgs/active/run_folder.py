@@ -1,0 +1,134 @@
+"""The folder of a run: what is in it, how it is read and written.
+
+- `config.json`: settings, versions and the names of all frames; written first;
+- `checkpoint.npz`: the whole state after the last finished step, replaced atomically: this is the commit of a step;
+- `steps.jsonl`: one line a step, rebuilt from the checkpoint, so it can lag behind by a killed step but never disagree;
+- `gaussians.ply`: the model, once the budget is spent.
+
+A line of `steps.jsonl` holds: `step` (0 = the seeds), `frame` and `name` of the chosen view (null at step 0, which has `seeds`
+and `seed_names` instead), `images` (how many the model has now), `gain` (the policy's own score; null for random),
+`information_gain` (Eq. 7 of the chosen view, whatever the policy), `coverage` (Eq. 9 of all images), `iterations`, `loss` and
+`stop_reason` of the fit, `seconds` per stage, and, where the step was evaluated, mean PSNR in dB over all views (`psnr`;
+`psnr_mask` in the rock mask) and over those never trained on (`held_out_psnr`, `held_out_psnr_mask`).
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.active import pose_policies
+from mgs.active.settings import NbvSettings, validated
+from mgs.data.dataset import Dataset
+from mgs.errors import InputError
+from mgs.files import atomic_path, read_json, write_json
+from mgs.gaussians import Gaussians
+from mgs.provenance import versions
+
+
+@dataclass
+class State:
+    """What is known after a step: the model, frames taken in order, all lines, and the information of the training set, H [N,P]
+    at that model and surface [N,P] at the prior's Gaussians before training (what the views see of the surface); inputs: what
+    it was made from, a record of `mgs.active.inputs`, empty in runs of versions that kept none."""
+
+    gaussians: Gaussians
+    H: np.ndarray
+    surface: np.ndarray
+    taken: list[int]
+    steps: list[dict[str, Any]]
+    inputs: dict[str, Any] = field(default_factory=dict)
+
+
+def check_settings(settings: NbvSettings, frames: int) -> None:
+    """Raises InputError where the policy is unknown, or the dataset has too few frames for the seeds and the budget."""
+    if settings.policy not in pose_policies.policy_names():
+        known = ", ".join(pose_policies.policy_names())
+        raise InputError(f"--policy {settings.policy}: unknown; choose one of {known}, or register your own (docs/nbv.md)")
+    if frames < settings.seeds:
+        raise InputError(f"{settings.dataset}: has {frames} frames, fewer than {settings.seeds} seeds; lower --seeds")
+    left = frames - settings.seeds
+    if settings.budget > left:
+        raise InputError(f"{settings.dataset}: --budget {settings.budget} exceeds its {left} candidates; lower --budget")
+
+
+def start(out: Path, settings: NbvSettings, dataset: Dataset) -> None:
+    """Write config.json, the first file of a run. Raises InputError as `check_settings`."""
+    check_settings(settings, len(dataset))
+    config = {
+        "settings": settings.model_dump(mode="json"),
+        "versions": versions(),
+        "frames": [frame.name for frame in dataset.frames],
+    }
+    write_json(out / "config.json", config)
+
+
+def read_settings(out: Path) -> NbvSettings:
+    """Settings of a run folder. Raises InputError where there is no run, its config.json is damaged, or the dataset is gone."""
+    path = out / "config.json"
+    if not path.is_file():
+        raise InputError(f"{out}: holds no run (no config.json); start one with `mgs nbv DATASET --out {out}`")
+    config = read_json(path)
+    if not isinstance(config, dict) or not isinstance(config.get("settings"), dict):
+        raise InputError(f"{path}: has no settings; the file is damaged, start the run anew")
+    settings = validated(NbvSettings, config["settings"], path)
+    if not settings.dataset.is_dir():
+        raise InputError(f"{path}: dataset {settings.dataset} is not there; if it was moved, correct `dataset` in this file")
+    return settings
+
+
+def check_same_frames(out: Path, dataset: Dataset) -> None:
+    """Raises InputError where the dataset is no longer the one the run was started on."""
+    if read_json(out / "config.json").get("frames") != [frame.name for frame in dataset.frames]:
+        raise InputError(f"{dataset.root}: its frames differ from those {out} was started on; restore them or start a new run")
+
+
+def write_checkpoint(out: Path, state: State) -> None:
+    """Commit a step: the state in one file, renamed into place; then the readable lines."""
+    text = json.dumps({"taken": state.taken, "steps": state.steps, "inputs": state.inputs}, allow_nan=False)
+    with atomic_path(out / "checkpoint.npz") as temporary, open(temporary, "wb") as file:
+        np.savez(file, H=state.H, surface=state.surface, json=np.array(text), **asdict(state.gaussians))
+    write_steps(out, state)
+
+
+def write_steps(out: Path, state: State) -> None:
+    """Write steps.jsonl from the state, atomically."""
+    text = "".join(json.dumps(line, allow_nan=False) + "\n" for line in state.steps)
+    with atomic_path(out / "steps.jsonl") as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def read_checkpoint(out: Path) -> State | None:
+    """State after the last finished step; None before the first. Raises InputError where the file is damaged."""
+    path = out / "checkpoint.npz"
+    if not path.is_file():
+        return None
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as data:
+            record = json.loads(str(data["json"]), parse_constant=lambda _: None)  # older runs could hold NaN
+            gaussians = Gaussians(*(data[name] for name in ("means", "log_scales", "quats", "logit_opacities", "sh")))
+            return State(gaussians, data["H"], data["surface"], record["taken"], record["steps"], record.get("inputs", {}))
+    except (zipfile.BadZipFile, KeyError, ValueError, OSError, EOFError) as error:
+        raise InputError(f"{path}: not a readable checkpoint ({error}); delete it to start the run from its seeds") from None
+
+
+def load_run(run: Path) -> tuple[Gaussians, Dataset, list[str], str]:
+    """(model, dataset, names of the views trained on in order, policy) of a run folder.
+
+    Raises InputError where the run is missing, it has no finished step, or its dataset has changed.
+    """
+    from mgs.active import run_folder
+    from mgs.data.dataset import load_dataset
+
+    settings = run_folder.read_settings(run)
+    state = run_folder.read_checkpoint(run)
+    if state is None:
+        raise InputError(f"{run}: has no finished step yet; continue it with `mgs nbv --resume {run}`")
+    dataset = load_dataset(settings.dataset)
+    run_folder.check_same_frames(run, dataset)
+    return state.gaussians, dataset, [dataset.frames[i].name for i in state.taken], settings.policy

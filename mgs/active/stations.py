@@ -1,0 +1,72 @@
+"""The real stations of the loop, put together in one place. Needs the variant to be set (`mgs.runtime.start`)."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from mgs.active.fitting import Fit, TrainSettings, fit
+from mgs.active.inputs import prior_digest
+from mgs.active.loop import Stations
+from mgs.camera import Camera
+from mgs.colour import srgb_from_linear
+from mgs.data.dataset import Dataset
+from mgs.gaussians import Gaussians
+from mgs.metrics import psnr
+from mgs.prior.build import Prior
+from mgs.prior.initial import initial_gaussians
+from mgs.splat import ListCache, fisher, groups, render
+
+
+def real_stations(dataset: Dataset, prior: Prior, settings: TrainSettings) -> Stations:
+    """Stations on the splat core, starting from the prior; the rock is at the prior's centre of mass."""
+    cache = ListCache()
+
+    def run_fit(
+        gaussians: Gaussians, cameras: list[Camera], targets: list[np.ndarray], rate: float, on_pass: Callable[[int, int], None]
+    ) -> Fit:
+        first, second, third, fourth = settings.rates
+        scaled = replace(settings, rates=(rate * first, rate * second, rate * third, rate * fourth))
+        return fit(gaussians, cameras, targets, scaled, on_pass, cache)
+
+    return Stations(
+        centre=prior.points.mean(axis=0),
+        groups=groups(0),
+        initial=lambda frames: initial_gaussians(prior, frames)[0],
+        fit=run_fit,
+        fisher=lambda gaussians, camera: fisher(gaussians, camera, cache=cache),
+        measure=psnr_measure(dataset, cache),
+        prior=prior_digest(prior),
+    )
+
+
+def psnr_measure(dataset: Dataset, cache: ListCache) -> Callable[[Gaussians, list[int]], dict[str, float]]:
+    """measure(gaussians, frames taken) -> mean PSNR, dB: `psnr` and `psnr_mask` (inside the rock mask) over all views,
+    `held_out_psnr` and `held_out_psnr_mask` over those never trained on. As `mgs.report.evaluation`, without its SSIM, which
+    costs more. A mean over no view (all masks empty, none held out) is left out.
+    """
+
+    @functools.cache
+    def truth(index: int) -> tuple[np.ndarray, np.ndarray]:
+        frame = dataset.frames[index]
+        return srgb_from_linear(frame.masked_rgb()), frame.mask()
+
+    def measure(gaussians: Gaussians, taken: list[int]) -> dict[str, float]:
+        values = np.empty((len(dataset), 2))
+        for i, frame in enumerate(dataset.frames):
+            image, mask = truth(i)
+            rendered = srgb_from_linear(np.asarray(render(gaussians, frame.camera, cache=cache).rgb))
+            values[i] = psnr(rendered, image), psnr(rendered, image, mask)
+        return _means(values, "") | _means(np.delete(values, taken, axis=0), "held_out_")
+
+    return measure
+
+
+def _means(values: np.ndarray, prefix: str) -> dict[str, float]:
+    """Mean of each column of [V,2] over the views that have it, by name."""
+    known = ~np.isnan(values).all(axis=0)
+    means = np.nanmean(np.where(known, values, 0), axis=0) if known.any() else values
+    return {prefix + name: float(means[i]) for i, name in enumerate(("psnr", "psnr_mask")) if known[i]}

@@ -1,0 +1,274 @@
+"""Timings of the splat core: against Mitsuba's own splatting integrator in one process, and its growth; medians.
+
+Kernels are compiled and memory is touched before anything is timed. Ratios travel between machines; seconds do not.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import resource
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mgs import runtime
+from mgs.camera import Camera, look_at
+from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
+from mgs.rotation import quat_from_normals
+from mgs.seeds import derive_seed, generator
+from mgs.splat import ListCache, as_drjit, fisher, render
+from mgs.splat.kernels import PIXELS
+from mgs.splat.projection import camera_array, project
+
+TARGETS = {
+    "forward_warm_speedup": ("at least", 60.0),
+    "forward_cold_speedup": ("at least", 25.0),
+    "gradient_warm_speedup": ("at least", 60.0),
+    "fisher_over_gradient": ("at most", 1.2),
+    "block_fisher_over_gradient": ("at most", 2.5),
+    "tiny_forward_ms": ("at most", 5.0),
+}
+"""What this project asks of itself; `mgs bench splat` prints each beside what was measured."""
+
+WARM_UP = 2
+"""Calls before those that are timed: they compile kernels and touch memory."""
+
+FORWARD_FLOPS, FISHER_FLOPS = 21, 73
+"""Floating-point operations of a render and of an exact Fisher pass per pixel of a (splat, block) pair, counted in the LLVM IR
+of their kernels (an FMA is two)."""
+
+
+def surface_gaussians(n: int, seed: int = 0) -> Gaussians:
+    """n flat Gaussians spread over the surface of the default rock: standard deviations of 0.8, 0.8 and 0.2 spacings, opacity
+    0.73 (logit 1), random colours; the parameters for which `TARGETS` were set."""
+    import trimesh
+
+    from mgs.synth.noise import Noise
+    from mgs.synth.rock import rock_shape
+    from mgs.synth.scene_file import load_scene_file
+
+    mesh, _ = rock_shape(load_scene_file("boulder").rock, Noise(generator(seed, "bench/rock")))
+    points, faces = trimesh.sample.sample_surface(mesh, n, seed=derive_seed(seed, "bench/points"))
+    spacing = np.sqrt(mesh.area / n)
+    return Gaussians(
+        means=np.asarray(points, np.float32),
+        log_scales=np.tile(np.log(spacing * np.array([0.8, 0.8, 0.2])), (n, 1)).astype(np.float32),
+        quats=quat_from_normals(mesh.face_normals[faces]).astype(np.float32),
+        logit_opacities=np.full(n, 1.0, np.float32),
+        sh=sh_from_rgb(generator(seed, "bench/colours").uniform(0.1, 0.6, (n, 3))),
+    )
+
+
+def surface_camera(gaussians: Gaussians, width: int, height: int) -> Camera:
+    """A camera 25 degrees above the horizon, three radii away, with the focal length at which the Gaussians just fit."""
+    low, high = gaussians.means.min(axis=0), gaussians.means.max(axis=0)
+    centre, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
+    pose = look_at(centre + 3 * radius * np.array([np.cos(0.44), 0.0, np.sin(0.44)]), centre)
+    x, y, z = (gaussians.means @ pose[:3, :3].T + pose[:3, 3]).T
+    focal = 0.49 * min(width / np.abs(x / z).max(), height / np.abs(y / z).max())
+    return Camera(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), width, height, pose)
+
+
+def turned_cameras(camera: Camera, gaussians: Gaussians, count: int) -> list[Camera]:
+    """The camera carried around the vertical axis through the Gaussians' middle, in `count` even steps short of a full turn:
+    the same intrinsics, distance and elevation, so similar numbers of (splat, block) pairs (within 6 % at N = 100,000)."""
+    to_centre = np.eye(4)
+    to_centre[:3, 3] = -(gaussians.means.min(axis=0) + gaussians.means.max(axis=0)) / 2
+    cameras = []
+    for angle in 2 * np.pi * np.arange(1, count + 1) / (count + 1):
+        turn = np.eye(4)
+        turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        pose = camera.world_to_camera @ np.linalg.inv(to_centre) @ turn @ to_centre
+        cameras.append(Camera(camera.K, camera.width, camera.height, pose))
+    return cameras
+
+
+def median_seconds(call: Callable[[], Any], repeats: int) -> float:
+    """Median wall-clock seconds of evaluated calls, after WARM_UP that are not counted."""
+    seconds = []
+    for i in range(repeats + WARM_UP):
+        start = time.perf_counter()
+        dr.eval(call())
+        dr.sync_thread()
+        if i >= WARM_UP:
+            seconds.append(time.perf_counter() - start)
+    return float(np.median(seconds))
+
+
+def gradient(gaussians: Gaussians, camera: Camera, weights: Any, cache: ListCache | None) -> list[Any]:
+    """Render, and the gradient of a weighted sum of the image with respect to all learned parameters."""
+    dr.enable_grad([getattr(gaussians, name) for name in LEARNED])
+    loss = dr.sum(render(gaussians, camera, cache=cache).rgb * weights, axis=None)
+    dr.backward(loss)
+    gradients = [dr.grad(getattr(gaussians, name)) for name in LEARNED]
+    dr.disable_grad([getattr(gaussians, name) for name in LEARNED])
+    return gradients
+
+
+def time_core(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
+    """Seconds of each operation on these Gaussians, with the camera's (splat, block) pairs and list memory in bytes.
+
+    forward_cold: a view never seen before, every call another of `turned_cameras`, block lists built. All else: this camera
+    again, its lists kept from the call before.
+    """
+    device, cache = as_drjit(gaussians), ListCache()
+    new_views = iter(turned_cameras(camera, gaussians, repeats + WARM_UP))
+    weights = mi.TensorXf(np.random.default_rng(0).normal(size=(camera.height, camera.width, 3)).astype(np.float32))
+    dr.eval(device, weights)
+    seconds = {
+        "forward_cold": median_seconds(lambda: render(device, next(new_views)).rgb, repeats),
+        "forward_warm": median_seconds(lambda: render(device, camera, cache=cache).rgb, repeats),
+        "gradient_warm": median_seconds(lambda: gradient(device, camera, weights, cache), repeats),
+        "fisher_exact": median_seconds(lambda: fisher(device, camera, "exact", cache=cache), repeats),
+        "fisher_block": median_seconds(lambda: fisher(device, camera, "block", cache=cache), repeats),
+    }
+    lists, _ = cache.get(camera, project(device, camera_array(camera)))
+    pairs = float(np.sum(np.asarray(lists.end).astype(np.int64) - np.asarray(lists.start)))
+    return seconds | {"pairs": pairs, "list_bytes": float(cache.nbytes)}
+
+
+def time_volprim(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
+    """The peer: Mitsuba's `volprim_rf_basic` on the same Gaussians, forward, and forward with gradients."""
+    quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
+    forward = camera.world_to_camera[2, :3]
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "volprim_rf_basic"},
+            "sensor": {
+                "type": "perspective",
+                "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.K[0, 0]))),
+                "fov_axis": "x",
+                "to_world": mi.ScalarTransform4f().look_at(camera.position, camera.position + forward, [0, 0, 1]),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": camera.width,
+                    "height": camera.height,
+                    "rfilter": {"type": "box"},
+                    "pixel_format": "rgb",
+                },
+            },
+            "gaussians": {
+                "type": "ellipsoids",
+                "centers": mi.TensorXf(gaussians.means),
+                "scales": mi.TensorXf(np.exp(gaussians.log_scales)),
+                "quaternions": mi.TensorXf(np.ascontiguousarray(quats[:, [1, 2, 3, 0]])),
+                "opacities": mi.TensorXf(gaussians.opacities[:, None]),
+                "sh_coeffs": mi.TensorXf(gaussians.sh.reshape(len(gaussians), -1)),
+            },
+        }
+    )
+    parameters = mi.traverse(scene)
+    names = ["gaussians.data", "gaussians.opacities", "gaussians.sh_coeffs"]
+
+    def backward() -> list[Any]:
+        dr.enable_grad([parameters[name] for name in names])
+        parameters.update()
+        dr.backward(dr.sum(mi.render(scene, parameters, spp=1), axis=None))
+        return [dr.grad(parameters[name]) for name in names]
+
+    primal = median_seconds(lambda: mi.render(scene, spp=1), repeats)
+    return {"volprim_forward": primal, "volprim_gradient": median_seconds(backward, repeats)}
+
+
+def peak_flops() -> float:
+    """Floating-point operations per second of this machine, measured: 8 independent chains per lane of FMAs in registers."""
+    n, rounds = 1 << 16, 256
+    scale = dr.opaque(mi.Float, 0.999)
+
+    def body(i: Any, chains: list[Any]) -> Any:
+        for _ in range(16):
+            chains = [dr.fma(value, scale, x) for value in chains]
+        return i + 1, chains
+
+    x = dr.arange(mi.Float, n) * (1 / n)
+    dr.eval(x)
+    start = [x + i for i in range(8)]
+    seconds = median_seconds(lambda: dr.while_loop((mi.UInt32(0), start), lambda i, _: i < rounds, body)[1], 5)
+    return 2 * 8 * 16 * n * rounds / seconds
+
+
+def bench_splat(n: int, width: int, height: int, repeats: int, report: Callable[[str], None]) -> dict[str, Any]:
+    """The whole table of `mgs bench splat`: seconds, ratios, throughput, memory."""
+    gaussians = surface_gaussians(n)
+    camera = surface_camera(gaussians, width, height)
+    report("splatting")
+    own = time_core(gaussians, camera, repeats)
+    report("a tiny image")
+    tiny = surface_gaussians(1000)
+    tiny_device, tiny_camera, cache = as_drjit(tiny), surface_camera(tiny, 64, 48), ListCache()
+    tiny_seconds = median_seconds(lambda: render(tiny_device, tiny_camera, cache=cache).rgb, 20)
+    memory = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) / 1e3
+    report("Mitsuba's volprim_rf_basic")
+    peer = time_volprim(gaussians, camera, max(repeats // 3, 3))
+    report("peak arithmetic")
+    peak = peak_flops()
+    pixels = own["pairs"] * PIXELS
+    ratios = {
+        "forward_warm_speedup": peer["volprim_forward"] / own["forward_warm"],
+        "forward_cold_speedup": peer["volprim_forward"] / own["forward_cold"],
+        "gradient_warm_speedup": peer["volprim_gradient"] / own["gradient_warm"],
+        "fisher_over_gradient": own["fisher_exact"] / own["gradient_warm"],
+        "block_fisher_over_gradient": own["fisher_block"] / own["gradient_warm"],
+        "tiny_forward_ms": 1e3 * tiny_seconds,
+    }
+    return {
+        "scene": {"gaussians": n, "width": width, "height": height, "repeats": repeats},
+        "seconds": {k: v for k, v in (own | peer).items() if k not in ("pairs", "list_bytes")},
+        "figures": ratios,
+        "pairs": int(own["pairs"]),
+        "pixel_splat_pairs_per_second": {
+            "forward": pixels / own["forward_warm"],
+            "fisher_exact": 2 * pixels / own["fisher_exact"],
+        },
+        "peak_gflops_measured": peak / 1e9,
+        "share_of_peak": {
+            "forward": FORWARD_FLOPS * pixels / own["forward_warm"] / peak,
+            "fisher_exact": FISHER_FLOPS * pixels / own["fisher_exact"] / peak,
+        },
+        "list_megabytes": own["list_bytes"] / 1e6,
+        "peak_memory_megabytes": memory,
+    }
+
+
+def bench_scaling(repeats: int, report: Callable[[str], None], most: int = 1_000_000) -> list[dict[str, Any]]:
+    """Time and memory against N at 640x480, image size at N = 100,000, both together (640x480 at 100,000), and threads; one
+    record per point. Where both grow together, a splat keeps its number of pairs, so nothing grows but that of pairs."""
+    threads = dr.thread_count()
+    numbers = [n for n in (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000) if n <= most]
+    points = [("gaussians", n, 640, 480, threads) for n in numbers]
+    base = min(100_000, most)
+    points += [("pixels", base, w, h, threads) for w, h in ((160, 120), (320, 240), (640, 480), (1280, 960))]
+    points += [("both", n, round(640 * (n / 1e5) ** 0.5), round(480 * (n / 1e5) ** 0.5), threads) for n in numbers]
+    points += [("threads", base, 640, 480, t) for t in sorted({1, threads})]
+    records = []
+    for sweep, n, width, height, count in points:
+        report(f"{n:,} Gaussians, {width}x{height}, {count} threads")
+        where = {"sweep": sweep, "n": n, "pixels": width * height, "threads": count}
+        records.append(where | in_new_process(scaling_point, n, width, height, count, repeats))
+    return records
+
+
+def scaling_point(n: int, width: int, height: int, threads: int, repeats: int) -> dict[str, float]:
+    """`time_core` with this many threads, and the most memory that Dr.Jit has held in this process, bytes."""
+    dr.set_thread_count(threads)
+    gaussians = surface_gaussians(n)
+    seconds = time_core(gaussians, surface_camera(gaussians, width, height), repeats)
+    return seconds | {"peak_bytes": float(dr.detail.malloc_watermark(dr.JitBackend.LLVM))}
+
+
+def in_new_process(call: Callable[..., Any], *arguments: Any) -> Any:
+    """What the call returns, run in a process of its own: no memory, recorded kernel or view of an earlier one."""
+    spawn = multiprocessing.get_context("spawn")  # Dr.Jit's threads do not survive a fork
+    with ProcessPoolExecutor(1, spawn, initializer=runtime.start) as pool:
+        return pool.submit(call, *arguments).result()
+
+
+def exponent(x: list[float], y: list[float]) -> float:
+    """Slope of log y against log x by least squares: the growth y ~ x^slope."""
+    return float(np.polyfit(np.log(x), np.log(y), 1)[0])

@@ -1,0 +1,86 @@
+"""`mgs demo`: the whole way on a small rock."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+POLICIES = ("d-optimal", "coverage", "random")
+
+GAUSSIANS = 10_000
+"""About one Gaussian per pixel of the rock at 320x240."""
+
+BUDGET = 8
+"""Views beyond the four seeds, the same for every policy."""
+
+
+def demo(
+    out: Annotated[Path, typer.Argument(help="Folder for everything; the same command again continues or shows it.")] = Path(
+        "demo"
+    ),
+    seed: Annotated[int, typer.Option(min=0, help="Root seed.")] = 0,
+) -> None:
+    """The whole way in minutes: render a rock orbit, build the prior, choose views by three policies, compare, draw."""
+    import time
+
+    from rich.console import Console
+
+    from mgs import runtime
+    from mgs.cli.diagnose import diagnose
+    from mgs.cli.nbv import run_folder, start_run
+    from mgs.cli.printing import print_table
+    from mgs.cli.prior import prior
+    from mgs.cli.synth_orbit import synth_orbit
+    from mgs.files import check_new_folder, check_writable
+    from mgs.report.tables import table_rows
+    from mgs.report.writing import write_report
+
+    runtime.start()
+    console, started = Console(highlight=False), time.monotonic()
+    dataset, folder, report = out / "dataset", out / "prior", out / "report"
+    runs = [out / policy for policy in POLICIES]
+    check_writable(out)
+    check_seed(dataset, runs, seed)
+    if not dataset.exists():
+        check_new_folder(out)
+
+    def heading(text: str) -> None:
+        console.rule(f"{text}   [dim]{time.monotonic() - started:.0f} s", align="left")
+
+    heading("1/5 a photoreal orbit: 32 frames with depth and masks")
+    if not (dataset / "transforms.json").is_file():
+        synth_orbit(dataset, seed=seed)
+    heading(f"2/5 the prior: {GAUSSIANS:,} points on the rock's mesh")
+    if not (folder / "prior.json").is_file():
+        prior(dataset, out=folder, gaussians=GAUSSIANS, seed=seed)
+    for policy, run in zip(POLICIES, runs, strict=True):
+        heading(f"3/5 next best views: {policy}, 4 seeds and {BUDGET} views")
+        if not (run / "config.json").is_file():
+            start_run(
+                dataset, run, folder, None, {"policy": policy, "budget": BUDGET, "seed": seed, "evaluate_every": 1}, console
+            )
+        run_folder(run, console, pictures=True)
+    heading("4/5 what the views told about each Gaussian")
+    diagnose(runs[0])
+    heading("5/5 the report")
+    written = write_report(report, runs)
+    print_table(console, table_rows(runs))
+    console.print(f"done in {time.monotonic() - started:.0f} s; look at:")
+    for picture in (dataset / "contact_sheet.png", folder / "prior.png", *written):
+        console.print(f"  {picture}", soft_wrap=True)
+
+
+def check_seed(dataset: Path, runs: list[Path], seed: int) -> None:
+    """Raises InputError where the dataset or a run is there already, of another seed."""
+    from mgs.active.run_folder import read_settings
+    from mgs.errors import InputError
+    from mgs.files import read_json
+
+    recorded = {run: read_settings(run).seed for run in runs if (run / "config.json").is_file()}
+    if (dataset / "config.json").is_file():
+        recorded[dataset] = read_json(dataset / "config.json").get("seed", seed)
+    for folder, found in recorded.items():
+        if found != seed:
+            raise InputError(f"{folder}: was made with --seed {found}, not {seed}; give that seed, or another folder")

@@ -1,0 +1,32 @@
+"""`mgs eval`: PSNR and SSIM of a run, and its renders next to the truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def evaluate(
+    run: Annotated[Path, typer.Argument(help="Folder that `mgs nbv` wrote.")],
+    pictures: Annotated[bool, typer.Option(help="Write truth | render | |difference| of every view to RUN/renders.")] = True,
+) -> None:
+    """Measure PSNR and SSIM on all views and on the views never trained on; write RUN/metrics.json and renders next to truth.
+
+    Full frame: the rock on black. Inside the mask: the pixels of the rock only.
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from mgs import runtime
+    from mgs.cli.printing import print_table
+    from mgs.report.evaluation import evaluate_run
+    from mgs.report.tables import table_rows
+
+    runtime.start()
+    with Progress(transient=True) as bar:
+        task = bar.add_task("rendering and comparing", total=None)
+        evaluate_run(run, pictures=pictures, progress=lambda done, total: bar.update(task, completed=done, total=total))
+    print_table(Console(), table_rows([run]))
+    typer.echo(f"wrote {run / 'metrics.json'}" + (f" and {run / 'renders'}" if pictures else ""))

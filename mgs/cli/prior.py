@@ -1,0 +1,112 @@
+"""`mgs prior`: RGB-D frames to a mesh prior."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+SEEDS = 4
+"""Seed frames of the paper."""
+
+
+def prior(
+    dataset: Annotated[Path, typer.Argument(help="Folder with transforms.json and depth images.")],
+    out: Annotated[Path | None, typer.Option(help="Folder to write; default DATASET/prior.")] = None,
+    gaussians: Annotated[int | None, typer.Option(help="Exact number N of surface samples.")] = None,
+    spacing: Annotated[
+        float | None, typer.Option(help="Distance between samples, metres; default a pixel's footprint.")
+    ] = None,
+    mesh: Annotated[
+        Path | None,
+        typer.Option(help="Sample this mesh (world coordinates, metres; a GLB is turned from +Y up) instead of building one."),
+    ] = None,
+    poisson_depth: Annotated[int | None, typer.Option(help="Poisson octree depth; default from the cloud's density.")] = None,
+    prior_noise: Annotated[float, typer.Option(help="Spoil the rock's points on purpose: standard deviation, metres.")] = 0.0,
+    holes: Annotated[float, typer.Option(help="Spoil them by round holes: share of the points to remove.")] = 0.0,
+    seed: Annotated[int, typer.Option(min=0, help="Root seed.")] = 0,
+) -> None:
+    """Depth images to a rock's mesh and N samples on it: plane removal, clustering, Poisson surface, blue noise."""
+    from dataclasses import replace
+
+    import numpy as np
+    from rich.console import Console
+
+    from mgs import runtime
+    from mgs.active.pose_policies import seed_views
+    from mgs.data.dataset import load_dataset
+    from mgs.data.meshes import GLTF
+    from mgs.files import atomic_folder, check_new_folder
+    from mgs.prior.build import build_prior, prior_from_mesh, save_prior
+    from mgs.prior.figure import draw_prior
+    from mgs.prior.initial import initial_gaussians
+    from mgs.prior.settings import PriorSettings
+
+    console = Console()
+    frames = load_dataset(dataset)
+    folder = check_new_folder(out if out is not None else dataset / "prior")  # known before the work
+    settings = PriorSettings(gaussians, spacing, poisson_depth, prior_noise, holes, seed)
+    with console.status("reading") as status:
+        if mesh is not None:
+            if mesh.suffix.lower() in GLTF:
+                console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
+            result, rock = prior_from_mesh(mesh, settings), None
+        else:
+            result, rock = build_prior(frames, settings, lambda stage: status.update(f"prior: {stage}"))
+        status.update("prior: what four seed frames see")
+        positions = np.stack([frame.camera.position for frame in frames.frames])
+        seeds = seed_views(positions, result.points.mean(0), min(SEEDS, len(frames)))
+        if not all(frames.frames[k].depth_path for k in seeds):
+            runtime.start()
+        seen = initial_gaussians(result, [frames.frames[k] for k in seeds])[1]
+        result = replace(result, numbers=result.numbers | {"seen_by_seeds": float(seen.mean())})
+        status.update("prior: picture")
+        with atomic_folder(folder) as unfinished:
+            save_prior(unfinished, result)
+            draw_prior(unfinished / "prior.png", result, rock)
+    console.print(_table(result.numbers))
+    console.print(f"wrote {folder}: mesh.ply, points.ply, prior.json, prior.png")
+
+
+def _table(numbers: dict[str, Any]) -> Any:
+    """The numbers a person wants."""
+    from rich.table import Table
+
+    n, spacing, area = numbers["n"], numbers["spacing"], numbers["sampled_area"]
+    table = Table("station", "number", title="Mesh prior")
+    if "points" in numbers:
+        _add_cloud_rows(table, numbers)
+    part = "" if "mesh" in numbers else f" sampled (what some frame saw), of {numbers['mesh_area']:.4f} m²"
+    table.add_row("area, A", f"{area:.4f} m²{part}")
+    table.add_row("samples, N = A / spacing²", f"{n:,} = {area:.4f} / {spacing:.6f}²")
+    mean, least = (numbers[key] / spacing for key in ("nearest_neighbour_mean", "nearest_neighbour_min"))
+    table.add_row("nearest neighbour over spacing", f"mean {mean:.2f}, least {least:.2f}")
+    table.add_row(f"samples that {SEEDS} evenly spaced frames see", f"{numbers['seen_by_seeds']:.1%}; the rest starts grey")
+    truth = numbers.get("truth")
+    if truth is None:
+        table.add_row("distance to the true rock", "not measured: a given mesh, no depth, or no rock.glb in the dataset")
+        return table
+    table.add_section()
+    for name in ("accuracy", "completeness", "chamfer", "hausdorff"):
+        table.add_row(f"{name} to the true rock", f"{1e3 * truth[name]:.2f} mm")
+    table.add_row("true surface seen by some frame", f"{truth['visible_share']:.2%} of what is above the ground")
+    table.add_row("seen surface within 2 spacings", f"{truth['visible_within_2_spacing']:.2%}")
+    return table
+
+
+def _add_cloud_rows(table: Any, numbers: dict[str, Any]) -> None:
+    table.add_row("depth pixels in the cloud", f"{numbers['pixels']:,}")
+    table.add_row("noise of a depth pixel", f"{1e3 * numbers['depth_noise']:.2f} mm")
+    table.add_row("points of the fused cloud", f"{numbers['points']:,} on a {1e3 * numbers['voxel']:.2f} mm grid")
+    table.add_row(
+        "ground plane inliers (RANSAC)",
+        f"{numbers['plane_inliers']:,} within {1e3 * numbers['plane_tolerance']:.1f} mm "
+        f"(sigma {1e3 * numbers['plane_sigma']:.2f} mm)",
+    )
+    table.add_row(
+        "rock cluster (DBSCAN)",
+        f"{numbers['cluster_size']:,} points, one of {numbers['clusters']} clusters, eps {1e3 * numbers['eps']:.1f} mm",
+    )
+    table.add_row("mesh (Poisson)", f"{numbers['mesh_faces']:,} faces, octree depth {numbers['poisson_depth']}, watertight")
+    table.add_row("cloud to mesh, rms", f"{1e3 * numbers['fit_rms']:.2f} mm")

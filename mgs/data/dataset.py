@@ -1,0 +1,222 @@
+"""A dataset folder in nerfstudio style: transforms.json, images/, depth/, masks/."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.camera import Camera, opencv_from_opengl, opengl_from_opencv
+from mgs.errors import InputError
+from mgs.files import check_new_folder, check_writable, locked, read_json, write_json
+from mgs.images import read_exr, read_mask, read_png
+
+PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
+"""Camera models of transforms.json that are a pinhole once their distortion is zero."""
+
+INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "is_fisheye")
+
+FRAME_INTERVAL = 0.5
+"""Seconds between keyframes (paper, section IV-A)."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One keyframe: a camera, its time in seconds, and where its pixels lie."""
+
+    name: str
+    camera: Camera
+    timestamp: float
+    image_path: Path
+    depth_path: Path | None = None
+    mask_path: Path | None = None
+
+    def rgb(self) -> np.ndarray:
+        """Linear RGB float32 [H,W,3]. Raises InputError where it is missing, damaged or of another size."""
+        return self._sized(self.image_path, read_png(self.image_path))
+
+    def depth(self) -> np.ndarray:
+        """z-depth float32 [H,W], metres, 0 = no return. Raises InputError as `rgb`, or where the frame has none."""
+        if self.depth_path is None:
+            raise InputError(f"frame {self.name}: has no depth_file_path; this command needs RGB-D frames")
+        channels = read_exr(self.depth_path)
+        depth = channels.get("Z", next(iter(channels.values())))
+        return np.nan_to_num(self._sized(self.depth_path, depth), nan=0.0, posinf=0.0, neginf=0.0)
+
+    def mask(self) -> np.ndarray:
+        """Rock mask bool [H,W]; all true where the frame has none. Raises InputError as `rgb`."""
+        if self.mask_path is None:
+            return np.ones((self.camera.height, self.camera.width), bool)
+        return self._sized(self.mask_path, read_mask(self.mask_path))
+
+    def masked_rgb(self) -> np.ndarray:
+        """Linear RGB float32 [H,W,3] of the rock alone, black elsewhere: the training and evaluation target."""
+        return self.rgb() * self.mask()[..., None]
+
+    def _sized(self, path: Path, pixels: np.ndarray) -> np.ndarray:
+        expected = (self.camera.height, self.camera.width)
+        if pixels.shape[:2] != expected:
+            found = f"{pixels.shape[1]}x{pixels.shape[0]}"
+            raise InputError(f"{path}: is {found}, but transforms.json says {expected[1]}x{expected[0]}; correct either")
+        return pixels
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A folder of keyframes in order of time."""
+
+    root: Path
+    frames: tuple[Frame, ...]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+
+def load_dataset(root: str | Path) -> Dataset:
+    """Read transforms.json and check that every file it names exists; pixels are read when asked for.
+
+    Raises InputError: missing folder or file, no intrinsics, distorted images, NaN or singular pose, no frames, a frame twice.
+    """
+    root = Path(root)
+    path = root / "transforms.json"
+    if not root.is_dir():
+        raise InputError(f"{root}: no such dataset folder; make one with `mgs synth-orbit {root}`")
+    data, records = read_records(path)
+    frames = [_frame(root, path, data, i, record) for i, record in enumerate(records)]
+    for name, count in Counter(frame.name for frame in frames).items():
+        if count > 1:  # a name is what runs and pictures know a frame by
+            raise InputError(f"{path}: lists {count} frames named {name}; remove or rename all but one")
+    return Dataset(root, tuple(sorted(frames, key=lambda frame: (frame.timestamp, frame.name))))
+
+
+def load_cameras(path: str | Path) -> list[tuple[str, Camera]]:
+    """(file_path, camera) of every frame of a transforms.json (or of the folder that holds one), in the file's order.
+
+    The files that the frames name need not exist. Raises InputError as `load_dataset`, but for those files.
+    """
+    path = Path(path) / "transforms.json" if Path(path).is_dir() else Path(path)
+    data, records = read_records(path)
+    return [(record["file_path"], _camera(path, data, i, record)) for i, record in enumerate(records)]
+
+
+def read_records(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The contents of a transforms.json, and its frames: each names its image and has a transform_matrix of some kind.
+
+    Raises InputError where the file is missing or damaged, lists no frames, or a path is none.
+    """
+    data = read_json(path)
+    records = data.get("frames") if isinstance(data, dict) else None
+    if not records or not isinstance(records, list):
+        raise InputError(f"{path}: lists no frames; expected a nerfstudio transforms.json")
+    for index, record in enumerate(records):
+        if not isinstance(record, dict) or not record.get("file_path") or "transform_matrix" not in record:
+            raise InputError(f"{path}: frame {index} lacks file_path or transform_matrix; add it")
+        for key in ("file_path", "depth_file_path", "mask_path"):
+            value = record.get(key) or ""
+            if not isinstance(value, str) or not value.isprintable():
+                raise InputError(f"{path}: frame {index} has a {key} that is no text or cannot be a path; correct it")
+    return data, records
+
+
+def _camera(path: Path, data: dict[str, Any], index: int, record: dict[str, Any]) -> Camera:
+    where = f"{path}: frame {index}"
+    both = data | record
+    if (both.get("camera_model") or "OPENCV") not in PINHOLES or any(both.get(key) not in (None, 0) for key in DISTORTION):
+        raise InputError(f"{where} is distorted, or not of a pinhole camera; undistort the images with `mgs import`")
+    missing = [key for key in INTRINSICS if both.get(key) is None]
+    if missing:
+        raise InputError(f"{where} lacks {missing[0]}; correct the intrinsics (`mgs import` reads files with camera_angle_x)")
+    try:
+        fl_x, fl_y, cx, cy, w, h = (both[key] for key in INTRINSICS)
+        K = np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]], np.float64)
+        width, height = int(w or 0), int(h or 0)
+        pose = np.array(record["transform_matrix"], np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{where} has no usable intrinsics or pose; fl_x fl_y cx cy w h and a 4x4 matrix are needed") from None
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise InputError(f"{where} has a transform_matrix that is not a finite 4x4 matrix; correct the pose")
+    try:
+        return Camera(K, width, height, opencv_from_opengl(pose))
+    except np.linalg.LinAlgError:
+        raise InputError(f"{where} has a singular transform_matrix; correct the pose") from None
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def _frame(root: Path, path: Path, data: dict[str, Any], index: int, record: dict[str, Any]) -> Frame:
+    where = f"{path}: frame {index}"
+    camera = _camera(path, data, index, record)
+    try:
+        timestamp = float(record.get("timestamp", FRAME_INTERVAL * index))
+    except (TypeError, ValueError, OverflowError):
+        timestamp = math.nan
+    if not math.isfinite(timestamp):
+        raise InputError(f"{where} has a timestamp that is no finite number; give seconds")
+
+    def file(key: str) -> Path | None:
+        if not record.get(key):
+            return None
+        target = root / record[key]
+        if not target.is_file():
+            raise InputError(f"{where}: {key} {record[key]} does not exist in {root}; restore it or remove the frame")
+        return target
+
+    image = file("file_path")
+    assert image is not None
+    name = Path(record["file_path"]).stem
+    return Frame(name, camera, timestamp, image, file("depth_file_path"), file("mask_path"))
+
+
+def _intrinsics(camera: Camera) -> dict[str, float]:
+    K = camera.K
+    return {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": camera.width, "h": camera.height}
+
+
+def write_transforms(root: str | Path, frames: list[Frame] | tuple[Frame, ...]) -> None:
+    """Write transforms.json; paths are relative to `root`. The first frame's intrinsics are the file's, those of frames that
+    differ are their own. Written last: it is what makes a folder a dataset."""
+    root = Path(root)
+    header = {"camera_model": "OPENCV", **_intrinsics(frames[0].camera)}
+    records = []
+    for frame in frames:
+        record: dict[str, Any] = {"file_path": frame.image_path.relative_to(root).as_posix()}
+        if frame.depth_path is not None:
+            record["depth_file_path"] = frame.depth_path.relative_to(root).as_posix()
+        if frame.mask_path is not None:
+            record["mask_path"] = frame.mask_path.relative_to(root).as_posix()
+        record["transform_matrix"] = opengl_from_opencv(frame.camera.world_to_camera).tolist()
+        record["timestamp"] = frame.timestamp
+        own = _intrinsics(frame.camera)
+        record |= {key: value for key, value in own.items() if value != header[key]}
+        records.append(record)
+    write_json(root / "transforms.json", header | {"frames": records})
+
+
+def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:
+    """Whether `out` holds an unfinished dataset (no transforms.json yet) whose JSON file `record` agrees with what is `asked`.
+
+    Removes what a process that was killed while it wrote left behind. Raises InputError where `out` holds anything else, where
+    another process works on it, or where it cannot be written.
+    """
+    check_writable(out)
+    begun = out / record
+    if begun.is_file() and not (out / "transforms.json").exists():
+        told = read_json(begun)
+        if not isinstance(told, dict) or any(told.get(key) != value for key, value in asked.items()):
+            raise InputError(
+                f"{out}: holds an unfinished dataset of other settings or sources; choose a new folder or delete it"
+            )
+        with locked(out):
+            for left in out.rglob(".*.part*"):
+                left.unlink()
+        return True
+    for left in out.glob(f".{begun.stem}.*.part{begun.suffix}"):  # all that there is where the record was being written
+        left.unlink()
+    check_new_folder(out)
+    return False

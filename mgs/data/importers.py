@@ -1,0 +1,367 @@
+"""Other people's data -> a dataset folder: nerfstudio, NeRF-synthetic and COLMAP, with lens distortion undone."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.camera import Camera, opencv_from_opengl
+from mgs.data.dataset import FRAME_INTERVAL, PINHOLES, Dataset, Frame, load_dataset, read_records, resumes, write_transforms
+from mgs.data.meshes import read_mesh, write_points
+from mgs.errors import InputError
+from mgs.files import copy_file, fingerprint, locked, new_folder, write_json
+from mgs.images import read_exr, read_mask, read_rgba, read_values, write_exr, write_png
+
+RECORD = "import.json"
+"""What was asked for, written before the first frame: an import that goes on must agree with it."""
+
+DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
+"""Coefficients of the OPENCV camera model, in OpenCV's order."""
+
+SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
+"""NeRF-synthetic names images without a suffix."""
+
+COLMAP_MODELS: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": (),
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"),
+    "OPENCV": ("k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+}
+"""Distortion coefficients of COLMAP's camera models, in its order after focal lengths and principal point."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One frame of a foreign data set: its camera before undistortion, distortion in OpenCV's order, and its files."""
+
+    name: str
+    camera: Camera
+    distortion: np.ndarray
+    timestamp: float
+    image: Path
+    depth: Path | None = None
+    depth_unit: float = 1.0
+    mask: Path | None = None
+
+
+@dataclass(frozen=True)
+class Source:
+    """What was found: its format, the shots whose image exists, how many do not, and sparse points (points, views)."""
+
+    kind: str
+    shots: list[Shot]
+    missing: int
+    sparse: tuple[np.ndarray, np.ndarray] | None = None
+
+
+def read_source(source: str | Path, images: Path | None = None, split: str = "train") -> Source:
+    """Recognise and read a data set: a folder or a transforms*.json, or a folder with a COLMAP model (or sparse/0 in it).
+
+    images: COLMAP's image folder (by default `images` beside the model). split: of NeRF-synthetic data.
+    Raises InputError: nothing recognised, no frame whose image exists, a frame listed twice, an unsupported camera model.
+    """
+    source = Path(source)
+    if not source.exists():
+        raise InputError(f"{source}: no such file or folder; give a transforms.json, its folder, or a COLMAP folder")
+    if source.is_file() or (source / "transforms.json").is_file():
+        result = _read_transforms(source if source.is_file() else source / "transforms.json")
+    elif (source / f"transforms_{split}.json").is_file():
+        result = _read_transforms(source / f"transforms_{split}.json")
+    else:
+        model = next((folder for folder in (source / "sparse/0", source / "sparse", source) if _is_colmap(folder)), None)
+        if model is None:
+            raise InputError(f"{source}: holds no transforms.json, transforms_{split}.json or COLMAP model; check the folder")
+        result = _read_colmap(model, images if images is not None else source / "images")
+    if not result.shots:
+        raise InputError(f"{source}: none of the {result.missing} images it lists exists; restore them or give --images")
+    repeated = [name for name, count in Counter(shot.name for shot in result.shots).items() if count > 1]
+    if repeated:
+        raise InputError(f"{source}: lists {repeated[0]} more than once; remove the duplicate frames")
+    return result
+
+
+def _find(folder: Path, name: str) -> Path | None:
+    return next((path for suffix in SUFFIXES if (path := folder / f"{name}{suffix}").is_file()), None)
+
+
+def _frame_name(path: str) -> str:
+    """A flat name for an image path: images/left/0001.png -> left_0001."""
+    parts = [part for part in Path(path).with_suffix("").parts if part not in (".", "..", "/", "images")]
+    return "_".join(parts)
+
+
+def _read_transforms(path: Path) -> Source:
+    """nerfstudio's transforms.json, or NeRF-synthetic's (camera_angle_x, image names without suffix)."""
+    data, records = read_records(path)
+    model = data.get("camera_model", "OPENCV")
+    if model not in PINHOLES:
+        raise InputError(f"{path}: camera model {model} is not supported; undistort the images to OPENCV or PINHOLE first")
+    scale = _number(path, "depth_unit_scale_factor", data.get("depth_unit_scale_factor", 1e-3))
+    shots, missing = [], 0
+    for index, record in enumerate(records):
+        image = _find(path.parent, record["file_path"])
+        if image is None:
+            missing += 1
+            continue
+        depth, mask = (path.parent / record[key] if record.get(key) else None for key in ("depth_file_path", "mask_path"))
+        camera, distortion = _transforms_camera(path, index, {**data, **record}, image)
+        time = _number(path, f"timestamp of frame {index}", record.get("timestamp", FRAME_INTERVAL * index))
+        unit = 1.0 if depth is None or depth.suffix.lower() == ".exr" else scale
+        shots.append(Shot(_frame_name(record["file_path"]), camera, distortion, time, image, depth, unit, mask))
+    kind = "NeRF-synthetic" if "camera_angle_x" in data and "fl_x" not in data else "nerfstudio"
+    return Source(kind, shots, missing)
+
+
+def _number(path: Path, what: str, value: Any) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = np.nan
+    if not np.isfinite(number):
+        raise InputError(f"{path}: {what} is {value!r}, no finite number; correct it")
+    return number
+
+
+def _transforms_camera(path: Path, index: int, record: dict[str, Any], image: Path) -> tuple[Camera, np.ndarray]:
+    where = f"{path}: frame {index}"
+    try:
+        if "w" in record and "h" in record:
+            width, height = int(record["w"]), int(record["h"])
+        else:
+            height, width = read_rgba(image).shape[:2]
+        fl_x = float(record["fl_x"]) if "fl_x" in record else width / 2 / np.tan(float(record["camera_angle_x"]) / 2)
+        fl_y, cx, cy = (float(record.get(*pair)) for pair in (("fl_y", fl_x), ("cx", width / 2), ("cy", height / 2)))
+        K = np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]])
+        distortion = np.array([float(record.get(key, 0)) for key in DISTORTION_KEYS])
+        pose = np.array(record["transform_matrix"], np.float64)
+    except (KeyError, TypeError, ValueError, OverflowError):
+        raise InputError(f"{where} has no usable intrinsics or pose; give fl_x (or camera_angle_x) and a matrix") from None
+    if record.get("k4"):
+        raise InputError(f"{where} has k4, which the OPENCV model lacks; undistort the images first")
+    if pose.shape == (3, 4):
+        pose = np.vstack([pose, [0, 0, 0, 1]])
+    if pose.shape != (4, 4) or not np.isfinite(pose).all() or not np.isfinite(distortion).all():
+        raise InputError(f"{where} has a pose or distortion that is not finite, or no 4x4 matrix; correct it")
+    try:
+        return Camera(K, width, height, opencv_from_opengl(pose)), distortion
+    except (np.linalg.LinAlgError, InputError) as error:
+        raise InputError(f"{where}: {error}; correct the pose") from None
+
+
+def _is_colmap(folder: Path) -> bool:
+    return all((folder / f"{name}.bin").is_file() for name in ("cameras", "images", "points3D")) or all(
+        (folder / f"{name}.txt").is_file() for name in ("cameras", "images", "points3D")
+    )
+
+
+def _read_colmap(model: Path, images: Path) -> Source:
+    """A COLMAP sparse model, text or binary (pycolmap)."""
+    import pycolmap
+
+    try:
+        reconstruction = pycolmap.Reconstruction(model)
+    except Exception as error:  # pycolmap raises many types; each means a damaged model.
+        reason = " ".join(str(error).split())[:120]
+        raise InputError(f"{model}: not a readable COLMAP model ({reason}); export it again") from None
+    shots, missing = [], 0
+    for index, image in enumerate(sorted(reconstruction.images.values(), key=lambda image: image.name)):
+        path = images / image.name
+        if not path.is_file():
+            missing += 1
+            continue
+        lens = image.camera
+        keys = COLMAP_MODELS.get(lens.model_name)
+        if keys is None:
+            raise InputError(f"{model}: camera model {lens.model_name} is not supported; run COLMAP's image_undistorter first")
+        pose = np.eye(4)
+        pose[:3] = image.cam_from_world().matrix()
+        camera = Camera(lens.calibration_matrix(), lens.width, lens.height, pose)
+        values = dict(zip(keys, lens.params[len(lens.params) - len(keys) :], strict=True))
+        order = (*DISTORTION_KEYS, "k4", "k5", "k6")
+        distortion = np.array([values.get(key, 0.0) for key in order])
+        shots.append(Shot(_frame_name(image.name), camera, distortion, FRAME_INTERVAL * index, path))
+    return Source("COLMAP", shots, missing, _sparse_points(reconstruction))
+
+
+def _sparse_points(reconstruction: Any) -> tuple[np.ndarray, np.ndarray] | None:
+    """Triangulated points [N,3] and the mean unit direction [N,3] to the cameras that saw each."""
+    centres = {image.image_id: image.projection_center() for image in reconstruction.images.values()}
+    points, views = [], []
+    for point in reconstruction.points3D.values():
+        seen = {element.image_id for element in point.track.elements}
+        if seen:
+            rays = np.stack([centres[image] for image in seen]) - point.xyz
+            points.append(point.xyz)
+            views.append((rays / np.linalg.norm(rays, axis=1, keepdims=True)).mean(0))
+    if not points:
+        return None
+    directions = np.stack(views)
+    return np.stack(points), directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
+
+
+def import_source(
+    source: Source,
+    out: Path,
+    *,
+    masks: Path | None = None,
+    mesh: Path | None = None,
+    on_frame: Callable[[int, int], None] | None = None,
+) -> Dataset:
+    """Write a source as a dataset into the folder `out`, new or empty, or with what an interrupted import of the same left.
+
+    import.json, which says what is imported, is written first and transforms.json last; a finished frame is not read again
+    unless its files have changed since, and the result is the same, bit for bit, as in one go.
+    Masks come from, in this order: files of `masks` with the image's stem, the pixels whose centre shows the `mesh` (world
+    coordinates; needs the variant to be set, `mgs.runtime.start`), the source's own mask files, the images' alpha. Distorted
+    images, depth and masks are undistorted to a pinhole camera that holds valid pixels only.
+    Raises InputError where a file is missing, damaged or of another size than the camera, where `out` holds anything else or
+    another process works on it, or as `read_mesh`; the frames before are kept.
+    """
+    shots, project = source.shots, None
+    if masks is not None:
+        shots = [replace(shot, mask=_mask_file(masks, shot)) for shot in shots]
+    elif mesh is not None:
+        shots, project = [replace(shot, mask=None) for shot in shots], mesh_silhouette(mesh)
+    by_mesh = None if project is None or mesh is None else fingerprint(mesh)
+    asked = {"kind": source.kind, "frames": len(shots), "sha256_of_frames": _digest(shots), "mesh": by_mesh}
+    frames = []
+    with ExitStack() as lock:
+        if resumes(out, RECORD, asked):
+            lock.enter_context(locked(out))
+
+        def begin() -> None:
+            if not (out / RECORD).is_file():
+                new_folder(out)
+                write_json(out / RECORD, asked)
+                lock.enter_context(locked(out))
+
+        for k, shot in enumerate(shots):
+            if on_frame:
+                on_frame(k, len(shots))
+            frames.append(_import_shot(shot, out, project, begin))
+        if source.sparse is not None:
+            write_points(out / "sparse.ply", *source.sparse)
+        write_transforms(out, frames)
+    return load_dataset(out)
+
+
+def _mask_file(masks: Path, shot: Shot) -> Path:
+    path = _find(masks, shot.image.stem) or _find(masks, shot.name)
+    if path is None:
+        raise InputError(f"{masks}: no mask for image {shot.image.name}; name masks as their images")
+    return path
+
+
+def _digest(shots: list[Shot]) -> str:
+    """SHA-256 of all that is known of the shots before their files are read."""
+    known = [
+        (shot.name, shot.camera.K.tolist(), shot.camera.width, shot.camera.height, shot.camera.world_to_camera.tolist(),
+         shot.distortion.tolist(), shot.timestamp, shot.depth_unit,
+         [None if path is None else str(path.resolve()) for path in (shot.image, shot.depth, shot.mask)])
+        for shot in shots
+    ]  # fmt: skip
+    return hashlib.sha256(json.dumps(known).encode()).hexdigest()
+
+
+def _import_shot(shot: Shot, out: Path, project: Callable[[Camera], np.ndarray] | None, begin: Callable[[], None]) -> Frame:
+    """Write the files of a frame, its image last, unless they are there and no older than what they are made of.
+
+    begin is called between reading and writing: a source that cannot be read leaves nothing behind.
+    """
+    camera, undo = undistorter(shot.camera, shot.distortion)
+    image, mask_path = out / "images" / f"{shot.name}.png", out / "masks" / f"{shot.name}.png"
+    depth_path = None if shot.depth is None else out / "depth" / f"{shot.name}.exr"
+    made_of = [path.stat().st_mtime_ns for path in (shot.image, shot.depth, shot.mask) if path is not None and path.is_file()]
+    if not image.is_file() or image.stat().st_mtime_ns < max(made_of):
+        rgba = _sized(shot.image, read_rgba(shot.image), shot.camera)
+        full = np.iinfo(rgba.dtype).max
+        mask = None
+        if project is not None:
+            mask = project(camera)
+        elif shot.mask is not None:
+            mask = undo(_sized(shot.mask, read_mask(shot.mask), shot.camera).astype(np.uint8) * 255, True) >= 128
+        elif rgba[..., 3].min() < full:
+            mask = undo(rgba[..., 3], True) > full // 2
+        depth = None if shot.depth is None else _sized(shot.depth, _read_depth(shot.depth, shot.depth_unit), shot.camera)
+        begin()
+        if depth_path is not None and depth is not None:
+            write_exr(depth_path, {"Z": undo(depth, False)})
+        mask_path.unlink(missing_ok=True)
+        if mask is not None:
+            write_png(mask_path, mask)
+        if _is_plain_png(shot.image) and not shot.distortion.any():
+            copy_file(shot.image, image)
+        else:
+            pixels = undo(rgba[..., :3], True)
+            write_png(image, pixels if full == 255 else pixels / full, linear=False)
+    return Frame(shot.name, camera, shot.timestamp, image, depth_path, mask_path if mask_path.is_file() else None)
+
+
+def _is_plain_png(path: Path) -> bool:
+    """Whether a file is what `write_png` would write: a PNG of colour type 2 (RGB) with 8 bits per channel."""
+    with path.open("rb") as file:
+        header = file.read(26)
+    return header[:8] == b"\x89PNG\r\n\x1a\n" and header[24:] == b"\x08\x02"
+
+
+def _sized(path: Path, pixels: np.ndarray, camera: Camera) -> np.ndarray:
+    if pixels.shape[:2] != (camera.height, camera.width):
+        found = f"{pixels.shape[1]}x{pixels.shape[0]}"
+        expected = f"{camera.width}x{camera.height}"
+        raise InputError(f"{path}: is {found}, but its camera is {expected}; resize it or correct w and h")
+    return pixels
+
+
+def _read_depth(path: Path, unit: float) -> np.ndarray:
+    """Depth in metres, float32 [H,W], from EXR or from a 16-bit PNG in steps of `unit` metres."""
+    if path.suffix.lower() == ".exr":
+        channels = read_exr(path)
+        return channels.get("Z", next(iter(channels.values())))
+    return read_values(path).astype(np.float32) * unit
+
+
+def undistorter(camera: Camera, distortion: np.ndarray) -> tuple[Camera, Callable[[np.ndarray, bool], np.ndarray]]:
+    """The pinhole camera inside a distorted one, and a function (pixels, smooth) that resamples an image to it (OpenCV).
+
+    distortion: k1 k2 p1 p2 k3 (k4 k5 k6), OpenCV's rational model. smooth: bilinear, otherwise nearest (depth). OpenCV puts
+    pixel centres at integers, we at +0.5; the shift is made here. Without distortion nothing is resampled.
+    Raises InputError where no valid pixel is left.
+    """
+    import cv2
+
+    if not distortion.any():
+        return camera, lambda pixels, smooth: pixels
+    shift = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    size = (camera.width, camera.height)
+    K, _ = cv2.getOptimalNewCameraMatrix(camera.K - shift, distortion, size, alpha=0.0)
+    if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise InputError("import: the distortion leaves no valid pixel; check k1 k2 p1 p2 and the focal length")
+
+    @functools.cache
+    def maps() -> tuple[np.ndarray, np.ndarray]:
+        return cv2.initUndistortRectifyMap(camera.K - shift, distortion, None, K, size, cv2.CV_32FC1)
+
+    def undo(pixels: np.ndarray, smooth: bool) -> np.ndarray:
+        method = cv2.INTER_LINEAR if smooth else cv2.INTER_NEAREST
+        return cv2.remap(np.ascontiguousarray(pixels), *maps(), method, borderMode=cv2.BORDER_REPLICATE)
+
+    return Camera(K + shift, camera.width, camera.height, camera.world_to_camera), undo
+
+
+def mesh_silhouette(path: Path) -> Callable[[Camera], np.ndarray]:
+    """A function of a camera: bool [H,W], the pixels whose centre shows the mesh. Raises InputError as `read_mesh`."""
+    from mgs.data.raycast import mesh_depth  # only here: it wants the variant to be set
+
+    depth = mesh_depth(read_mesh(path))
+    return lambda camera: depth(camera) > 0

@@ -1,0 +1,42 @@
+"""Depth images of a mesh, by rays through the pixel centres. Needs the variant to be set (`mgs.runtime.start`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mgs.camera import Camera
+
+if TYPE_CHECKING:
+    from mgs.data.meshes import Mesh
+
+
+def mesh_depth(mesh: Mesh) -> Callable[[Camera], np.ndarray]:
+    """A function of a camera that gives the z-depth of the mesh, float32 [H,W], metres, 0 where a ray meets no face.
+
+    One ray per pixel, through its centre, whatever the mesh and however near it is; both sides of a face are met.
+    """
+    centre = mesh.vertices.mean(0)  # float32 resolves most near the origin
+    shape = mi.Mesh("mesh", len(mesh.vertices), len(mesh.faces))
+    params = mi.traverse(shape)
+    params["vertex_positions"] = mi.Float((mesh.vertices - centre).astype(np.float32).ravel())
+    params["faces"] = mi.UInt32(mesh.faces.astype(np.uint32).ravel())
+    params.update()
+    scene = mi.load_dict({"type": "scene", "mesh": shape})
+
+    def depth(camera: Camera) -> np.ndarray:
+        rays = mi.Matrix3f(camera.camera_to_world[:3, :3] @ np.linalg.inv(camera.K))
+        origin = mi.Point3f(*(camera.position - centre).tolist())
+        dr.make_opaque(rays, origin)  # else every camera compiles a kernel of its own
+        pixel = dr.arange(mi.UInt32, camera.width * camera.height)
+        row = pixel // camera.width
+        column = pixel - row * camera.width
+        direction = rays @ mi.Vector3f(mi.Float(column) + 0.5, mi.Float(row) + 0.5, 1)  # of z-depth 1, so t is z-depth
+        hit = scene.ray_intersect_preliminary(mi.Ray3f(origin, direction))
+        return dr.select(hit.is_valid(), hit.t, 0).numpy().reshape(camera.height, camera.width)
+
+    return depth

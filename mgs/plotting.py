@@ -1,0 +1,58 @@
+"""What every figure shares: one style, one way to make a figure and to write it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mgs.files import atomic_path
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+STYLE = {
+    "font.family": "serif",
+    "font.serif": ["STIXGeneral", "DejaVu Serif"],
+    "mathtext.fontset": "stix",
+    "font.size": 10,
+    "axes.titlesize": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "lines.linewidth": 1.5,
+    "lines.markersize": 4,
+}
+
+DPI = 200
+
+
+def new_figure(width: float, height: float, dpi: int = DPI) -> Figure:
+    """An empty figure, width and height in inches."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), dpi=dpi, layout="constrained")
+
+
+def save_figure(figure: Figure, path: str | Path) -> None:
+    """Write a figure as PNG, atomically."""
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png")
+
+
+def crop(mask: np.ndarray, margin: float = 0.06) -> tuple[slice, slice]:
+    """Rows and columns around a mask [H,W], with a margin as a share of the image; the whole image where the mask is empty."""
+    rows, columns = np.nonzero(mask)
+    if len(rows) == 0:
+        return slice(None), slice(None)
+    h, w = mask.shape
+    dy, dx = round(margin * h), round(margin * w)
+    return (
+        slice(max(0, int(rows.min()) - dy), min(h, int(rows.max()) + dy + 1)),
+        slice(max(0, int(columns.min()) - dx), min(w, int(columns.max()) + dx + 1)),
+    )

@@ -1,0 +1,1 @@
+"""The mesh prior: cloud, ground, rock, surface, samples, first Gaussians."""

@@ -1,0 +1,216 @@
+"""What a run knows, and where: maps of information and uncertainty per view (EXR, PNG) and per Gaussian (PLY).
+
+With H [N,P] the diagonal Fisher information of the training set and lam [P] the information of the prior
+(`mgs.active.criteria`), a Gaussian has
+
+- `fisher.colour|scale|rotation|opacity`: the sum of H over the parameters of that kind, in (pixel value / parameter)^2;
+- `information`: 1/2 sum_k log(1 + H_k / lam_k), nats: what the training images say about it, all kinds in one unit;
+- `uncertainty`: mean_k lam_k / (H_k + lam_k): the share of the prior's variance that is left, 1 = nothing known, 0 = all known;
+- `unobserved`: 1 where no training view sees its place on the surface, as in the coverage of a run: by the information about
+  its colour before training (`mgs.active.criteria.observed`), because training hides some Gaussians behind others.
+
+A pixel of a map is the mean over the Gaussians it shows, with their blending weights: sum w v / sum w; 0 where it shows none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.active import criteria
+from mgs.camera import Camera
+from mgs.colour import srgb_from_linear
+from mgs.data.dataset import Frame
+from mgs.errors import InputError
+from mgs.files import atomic_path
+from mgs.gaussians import Gaussians, sh_from_rgb
+from mgs.images import write_exr
+
+VIEWS = 3
+"""How many views are drawn where none are named."""
+
+VISIBLE = 0.5
+"""Opacity from which a pixel of a preview shows the model; below it is drawn as background."""
+
+DECADES = 4
+"""Range of the logarithmic colour scales, powers of ten below the largest value shown."""
+
+
+def gaussian_scalars(H: np.ndarray, surface: np.ndarray, lam: np.ndarray, groups: dict[str, slice]) -> dict[str, np.ndarray]:
+    """The scalars of the module's docstring, [N] each.
+
+    H, surface: [N,P] information of the training set at the fitted model, and at the Gaussians before training
+    (`mgs.active.run_folder.State`); lam: [P]; groups: columns of each kind of parameter.
+    """
+    scalars = {f"fisher.{name}": H[:, columns].sum(axis=1, dtype=np.float64) for name, columns in groups.items()}
+    scalars["information"] = 0.5 * np.log1p(H / lam).sum(axis=1)
+    scalars["uncertainty"] = (lam / (H + lam)).mean(axis=1)
+    scalars["unobserved"] = (~criteria.observed(surface, lam)).astype(np.float64)
+    return scalars
+
+
+def view_maps(gaussians: Gaussians, camera: Camera, scalars: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """One view as float32 [H,W] channels: R G B (linear, on black), A, Z (metres), and a map of each scalar [N].
+
+    The scalars are drawn as colours, three at a time. `unobserved` is 1 where most of the weight belongs to unobserved
+    Gaussians, otherwise 0.
+    """
+    from mgs.splat import ListCache, render
+
+    cache = ListCache()
+    image = render(gaussians, camera, cache=cache)
+    rgb, alpha = np.asarray(image.rgb), np.asarray(image.alpha)
+    maps = {"R": rgb[..., 0], "G": rgb[..., 1], "B": rgb[..., 2], "A": alpha, "Z": np.asarray(image.depth)}
+    names, shown = list(scalars), np.where(alpha > 0, alpha, 1.0)
+    for first in range(0, len(names), 3):
+        three = names[first : first + 3]
+        # As shares of the largest value: colours of about 1 keep the precision of float32.
+        largest = [max(float(scalars[name].max(initial=0)), 1e-30) for name in three]
+        values = np.zeros((len(gaussians), 3))
+        for i, name in enumerate(three):
+            values[:, i] = scalars[name] / largest[i]
+        g = gaussians
+        coloured = Gaussians(g.means, g.log_scales, g.quats, g.logit_opacities, sh_from_rgb(values))
+        mean = np.asarray(render(coloured, camera, cache=cache).rgb) / shown[..., None]
+        for i, name in enumerate(three):
+            maps[name] = (mean[..., i] * largest[i]).astype(np.float32)
+    if "unobserved" in maps:
+        maps["unobserved"] = (maps["unobserved"] > 0.5).astype(np.float32)
+    return maps
+
+
+def write_information_ply(path: str | Path, gaussians: Gaussians, scalars: dict[str, np.ndarray]) -> None:
+    """Write x y z, red green blue (viridis of the information, 0 to its largest) and every scalar, one vertex a Gaussian.
+
+    Opens in MeshLab and CloudCompare; dots in names become underscores.
+    """
+    import matplotlib
+    from plyfile import PlyData, PlyElement
+
+    information = scalars["information"]
+    rgb = matplotlib.colormaps["viridis"](information / max(float(information.max(initial=0)), 1e-30), bytes=True)[:, :3]
+    names = [name.replace(".", "_") for name in scalars]
+    layout = [(axis, "f4") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")] + [(name, "f4") for name in names]
+    vertices = np.empty(len(gaussians), dtype=layout)
+    for i, axis in enumerate("xyz"):
+        vertices[axis] = gaussians.means[:, i]
+    for i, channel in enumerate(("red", "green", "blue")):
+        vertices[channel] = rgb[:, i]
+    for name, values in zip(names, scalars.values(), strict=True):
+        vertices[name] = values
+    with atomic_path(path) as temporary:
+        PlyData([PlyElement.describe(vertices, "vertex")]).write(str(temporary))
+
+
+PANELS = {
+    "Z": ("depth (m)", "viridis"),
+    "unobserved": ("unobserved", "cividis"),
+    "fisher.colour": ("Fisher information, colour", "magma"),
+    "fisher.scale": ("Fisher information, log-scale", "magma"),
+    "fisher.rotation": ("Fisher information, quaternion", "magma"),
+    "fisher.opacity": ("Fisher information, opacity logit", "magma"),
+    "information": ("information gained (nats)", "viridis"),
+    "uncertainty": ("posterior / prior variance", "cividis"),
+}
+"""Channel -> title and colour map of its panel in a preview; all perceptually uniform."""
+
+
+def write_preview(path: str | Path, maps: dict[str, np.ndarray], title: str) -> None:
+    """Write the channels of one view as a sheet of nine panels with colour bars, cropped to the model."""
+    import matplotlib
+
+    from mgs.plotting import STYLE, crop, new_figure, save_figure
+
+    rgb = np.stack([maps[channel] for channel in "RGB"], axis=-1)
+    visible = maps["A"] >= VISIBLE
+    window = crop(visible)
+    height, width = visible[window].shape
+    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
+        figure = new_figure(8.4, 3 * (2.3 * height / width + 0.35), dpi=130)
+        axes = figure.subplots(3, 3).flat
+        axes[0].imshow(srgb_from_linear(rgb)[window], interpolation="nearest")
+        axes[0].set_title(title)
+        for axis, (channel, (label, colours)) in zip(axes[1:], PANELS.items(), strict=True):
+            values = np.ma.masked_where(~visible, maps[channel])[window]
+            shown = axis.imshow(values, cmap=_on_grey(colours), norm=_norm(channel, values), interpolation="nearest")
+            axis.set_title(label)
+            ticks = [0, 1] if channel == "unobserved" else None
+            figure.colorbar(shown, ax=axis, shrink=0.85, aspect=16, pad=0.02, ticks=ticks)
+        for axis in axes:
+            axis.set_axis_off()
+        save_figure(figure, path)
+
+
+def _on_grey(name: str) -> Any:
+    """A colour map with what is masked in light grey."""
+    import matplotlib
+
+    return matplotlib.colormaps[name].with_extremes(bad="#e8e8e8")
+
+
+def _norm(channel: str, values: np.ma.MaskedArray) -> Any:
+    """Logarithmic for Fisher information (it spans decades), 0 to 1 for shares, the data's range otherwise."""
+    from matplotlib.colors import LogNorm, Normalize
+
+    data = values.compressed()
+    if channel in ("uncertainty", "unobserved") or len(data) == 0:
+        return Normalize(0, 1)
+    high = float(np.quantile(data, 0.999))
+    if not channel.startswith("fisher.") or high <= 0:
+        return Normalize(float(data.min()), max(float(data.max()), float(data.min()) + 1e-9))
+    low = max(float(np.quantile(data, 0.001)), high * 10.0**-DECADES)
+    return LogNorm(min(low, high / 2), high, clip=True)
+
+
+def choose_views(frames: Sequence[Frame], trained: Sequence[str], wanted: Sequence[str] | None) -> list[Frame]:
+    """The frames named in `wanted`, or VIEWS evenly spread ones that were never trained on (of all, where there are none).
+
+    Raises InputError for a name that no frame has.
+    """
+    if wanted:
+        by_name = {frame.name: frame for frame in frames}
+        for name in wanted:
+            if name not in by_name:
+                raise InputError(f"--views {name}: no such frame; the dataset has {frames[0].name} to {frames[-1].name}")
+        return [by_name[name] for name in wanted]
+    pool = [frame for frame in frames if frame.name not in trained] or list(frames)
+    spread = np.linspace(0, len(pool), min(VIEWS, len(pool)), endpoint=False).astype(int)
+    return [pool[i] for i in spread]
+
+
+def diagnose_run(
+    run: str | Path, wanted: Sequence[str] | None = None, progress: Callable[[int, int], None] | None = None
+) -> list[Path]:
+    """Write RUN/diagnostics: VIEW.exr and VIEW.png for each view, and information.ply; returns the files.
+
+    Raises InputError where the run is missing or has no step yet, or a view is unknown.
+    """
+    from mgs.active import run_folder
+    from mgs.active.run_folder import load_run
+    from mgs.splat import groups
+
+    run = Path(run)
+    gaussians, dataset, trained, _ = load_run(run)
+    frames = choose_views(dataset.frames, trained, wanted)
+    settings, state = run_folder.read_settings(run), run_folder.read_checkpoint(run)
+    assert state is not None
+    columns = groups(gaussians.sh_degree)
+    lam = criteria.regularisation(columns, settings.pixel_noise, settings.prior_std)
+    scalars = gaussian_scalars(state.H, state.surface, lam, columns)
+    out = run / "diagnostics"
+    write_information_ply(out / "information.ply", gaussians, scalars)
+    written = [out / "information.ply"]
+    for done, frame in enumerate(frames):
+        if progress:
+            progress(done, len(frames))
+        maps = view_maps(gaussians, frame.camera, scalars)
+        write_exr(out / f"{frame.name}.exr", maps)
+        seen = "trained on" if frame.name in trained else "never trained on"
+        write_preview(out / f"{frame.name}.png", maps, f"{frame.name}, {seen}")
+        written += [out / f"{frame.name}.exr", out / f"{frame.name}.png"]
+    if progress:
+        progress(len(frames), len(frames))
+    return written

@@ -1,0 +1,131 @@
+"""PSNR and SSIM of a model against the images of a dataset, and renders next to the truth.
+
+Both compare sRGB display values in [0,1] with `Frame.masked_rgb()`: the rock on black, which is what the model was trained on.
+"Full frame" includes that black, which any model gets right, so it flatters; "inside the mask" is over the rock's pixels only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.active.run_folder import load_run
+from mgs.camera import Camera
+from mgs.colour import srgb_from_linear
+from mgs.data.dataset import Frame
+from mgs.errors import InputError
+from mgs.files import atomic_path, locked, write_json
+from mgs.gaussians import Gaussians
+from mgs.images import read_png
+from mgs.metrics import METRICS, compare
+
+Renderer = Callable[[Gaussians, Camera], np.ndarray]
+"""(gaussians, camera) -> linear RGB [H,W,3]."""
+
+Progress = Callable[[int, int], None]
+
+DIFFERENCE_GAIN = 4
+"""How much the pictures of differences are brightened."""
+
+
+def render_rgb(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """Linear RGB [H,W,3] of the model on black."""
+    from mgs.splat import render
+
+    return np.asarray(render(gaussians, camera).rgb)
+
+
+def evaluate(
+    gaussians: Gaussians,
+    frames: Sequence[Frame],
+    trained: Iterable[str],
+    *,
+    renderer: Renderer = render_rgb,
+    pictures: Path | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """METRICS of the model on every frame; means over all views and over the views whose name is not in `trained`.
+
+    Returns {"images": how many were trained on, "all": means, "held_out": means, "views": [one dict a view]}; means come with
+    a "count", and are None where there is nothing to average. Writes truth | render | difference as PNG into the folder
+    `pictures` where given. progress: called as progress(done, total).
+    """
+    trained = set(trained)
+    views: list[dict[str, Any]] = []
+    for done, frame in enumerate(frames):
+        if progress:
+            progress(done, len(frames))
+        truth, rendered = frame.masked_rgb(), renderer(gaussians, frame.camera)
+        measured = compare(truth, rendered, frame.mask())
+        views.append({"name": frame.name, "trained": frame.name in trained} | measured)
+        if pictures is not None:
+            write_comparison(pictures / f"{frame.name}.png", truth, rendered, measured["psnr"])
+    if progress:
+        progress(len(frames), len(frames))
+    return {
+        "images": len(trained),
+        "all": _means(views),
+        "held_out": _means([view for view in views if not view["trained"]]),
+        "views": [_without_nan(view) for view in views],
+    }
+
+
+def _means(views: list[dict[str, Any]]) -> dict[str, Any]:
+    """Mean of each metric over the views that have it."""
+    means: dict[str, Any] = {"count": len(views)}
+    for name in METRICS:
+        values = [view[name] for view in views if not math.isnan(view[name])]
+        means[name] = sum(values) / len(values) if values else None
+    return means
+
+
+def _without_nan(view: dict[str, Any]) -> dict[str, Any]:
+    """JSON knows no NaN."""
+    return {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in view.items()}
+
+
+def write_comparison(path: str | Path, truth: np.ndarray, rendered: np.ndarray, decibels: float) -> None:
+    """Write truth | render | brightened |difference| as one PNG, captions in a strip above. Linear RGB [H,W,3] twice."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    a, b = srgb_from_linear(truth), srgb_from_linear(rendered)
+    panels = np.concatenate([a, b, np.clip(DIFFERENCE_GAIN * np.abs(a - b), 0, 1)], axis=1)
+    height, width = a.shape[:2]
+    size = max(10, height // 24)
+    picture = Image.new("RGB", (3 * width, height + 2 * size), (255, 255, 255))
+    picture.paste(Image.fromarray(np.round(panels * 255).astype(np.uint8)), (0, 2 * size))
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(size)
+    captions = ("truth", f"render, {decibels:.2f} dB", f"|difference| x {DIFFERENCE_GAIN}")
+    for i, caption in enumerate(captions):
+        draw.text(((i + 0.5) * width, size), caption, fill=(0, 0, 0), font=font, anchor="mm")
+    with atomic_path(path) as temporary:
+        picture.save(temporary, format="PNG")
+
+
+def read_comparison(path: str | Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """(truth, render), linear RGB [H,W,3], out of a picture by `write_comparison`; to 8 bits.
+
+    Raises InputError where the picture is missing, damaged or not of this camera's size.
+    """
+    pixels, (height, width) = read_png(path), (camera.height, camera.width)
+    if pixels.shape[0] <= height or pixels.shape[1] != 3 * width:
+        raise InputError(f"{path}: is not a comparison of {width}x{height} views; write it again with `mgs eval`")
+    return pixels[-height:, :width], pixels[-height:, width : 2 * width]
+
+
+def evaluate_run(run: str | Path, *, pictures: bool = True, progress: Progress | None = None) -> dict[str, Any]:
+    """`evaluate` of a run of `mgs nbv` on its dataset; writes RUN/metrics.json, and RUN/renders/*.png where `pictures`.
+
+    Raises InputError as `load_run`, and where another process works on the run.
+    """
+    run = Path(run)
+    gaussians, dataset, trained, policy = load_run(run)
+    folder = run / "renders" if pictures else None
+    with locked(run):
+        metrics = {"policy": policy} | evaluate(gaussians, dataset.frames, trained, pictures=folder, progress=progress)
+        write_json(run / "metrics.json", metrics)
+    return metrics

@@ -1,0 +1,200 @@
+"""Figures of runs: one function a figure; each takes plain data and writes one PNG. `mgs.report.writing` feeds them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain, cycle
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mgs.colour import srgb_from_linear
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+from mgs.plotting import STYLE, crop, new_figure, save_figure
+
+POLICY_STYLE = {
+    "d-optimal": ("#0072B2", "o"),
+    "coverage": ("#D55E00", "s"),
+    "random": ("#009E73", "^"),
+    "uniform": ("#CC79A7", "D"),
+    "farthest": ("#E69F00", "v"),
+    "t-optimal": ("#56B4E9", "P"),
+    "a-optimal": ("#000000", "X"),
+    "fisherrf": ("#7f7f7f", "p"),
+    "e-optimal": ("#8c510a", "*"),
+}
+"""Colour (Okabe and Ito's colour-blind-safe set, grey and brown) and marker of a policy, the same in every figure."""
+
+
+def line_styles(labels: Iterable[str]) -> list[dict[str, Any]]:
+    """Colour, marker and label of each line; a label starts with the policy.
+
+    The first line of a policy in POLICY_STYLE has its style. A second one, and a policy of the user's own, takes the next
+    that no line has, from the end of the table; where they run out they repeat, dashed.
+    """
+    labels = list(labels)
+    first = {label.split(" ")[0]: label for label in reversed(labels)}
+    taken = {label: POLICY_STYLE[policy] for policy, label in first.items() if policy in POLICY_STYLE}
+    free = [style for style in reversed(POLICY_STYLE.values()) if style not in taken.values()]
+    spare = chain(((style, "-") for style in free), cycle((style, "--") for style in POLICY_STYLE.values()))
+    styles = []
+    for label in labels:
+        (colour, marker), dashes = (taken[label], "-") if label in taken else next(spare)
+        styles.append({"color": colour, "marker": marker, "linestyle": dashes, "label": label})
+    return styles
+
+
+def orbit_figure(
+    path: str | Path,
+    positions: np.ndarray,
+    surface: np.ndarray | None,
+    choices: Mapping[str, tuple[Sequence[int], Sequence[int]]],
+) -> None:
+    """The orbit from above: every pose, the seeds, the chosen views coloured and numbered in their order; a panel a policy.
+
+    positions: [C,3] camera centres, metres. surface: [N,3] points of the rock or None. choices: policy -> (seeds, chosen), as
+    indices into positions.
+    """
+    import matplotlib
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(3.1 * len(choices) + 0.8, 3.9)
+        axes = figure.subplots(1, len(choices), sharex=True, sharey=True, squeeze=False)[0]
+        last = max((len(chosen) for _, chosen in choices.values()), default=1)
+        norm = Normalize(1, max(last, 2))
+        for axis, (policy, (seeds, chosen)) in zip(axes, choices.items(), strict=True):
+            _orbit_panel(axis, positions, surface, list(seeds), list(chosen), norm)
+            axis.set(title=f"{policy}: {len(seeds)} seeds, {len(chosen)} chosen", xlabel="$x$ (m)")
+        axes[0].set_ylabel("$y$ (m)")
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        bar = figure.colorbar(ScalarMappable(norm, "viridis"), ax=list(axes), shrink=0.8, pad=0.01)
+        bar.set_label("step at which the view was chosen")
+        save_figure(figure, path)
+
+
+def _orbit_panel(
+    axis: Axes, positions: np.ndarray, surface: np.ndarray | None, seeds: list[int], chosen: list[int], norm: Any
+) -> None:
+    """One policy from above."""
+    xy = np.asarray(positions)[:, :2]
+    centre = xy.mean(axis=0) if surface is None else np.asarray(surface)[:, :2].mean(axis=0)
+    if surface is not None:
+        rock = np.asarray(surface)[:: max(1, len(surface) // 6000)]
+        axis.scatter(rock[:, 0], rock[:, 1], s=0.6, color="#b9b4ab", linewidths=0, zorder=1)
+    axis.scatter(
+        xy[:, 0], xy[:, 1], s=12, facecolors="white", edgecolors="#9a9a9a", linewidths=0.6, label="candidate", zorder=2
+    )
+    axis.scatter(xy[seeds, 0], xy[seeds, 1], s=46, marker="*", color="#D55E00", linewidths=0, label="seed", zorder=4)
+    order = np.arange(1, len(chosen) + 1)
+    axis.scatter(xy[chosen, 0], xy[chosen, 1], s=26, c=order, cmap="viridis", norm=norm, linewidths=0, label="chosen", zorder=3)
+    for number, index in zip(order, chosen, strict=True):
+        outward = xy[index] - centre
+        outward = outward / max(float(np.linalg.norm(outward)), 1e-9)
+        axis.annotate(
+            str(number), xy[index], xytext=tuple(outward * 9), textcoords="offset points", fontsize=6, ha="center", va="center"
+        )
+    span = np.abs(xy - centre).max() * 1.2
+    axis.set(xlim=(centre[0] - span, centre[0] + span), ylim=(centre[1] - span, centre[1] + span), aspect="equal")
+
+
+def gain_figure(path: str | Path, gains: Mapping[str, Sequence[float]]) -> None:
+    """Information gain (Eq. 7) of the selected view at each active step, a line a policy (the paper's Fig. 2)."""
+    import matplotlib
+
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(4.8, 3.1)
+        axis = figure.subplots()
+        for values, style in zip(gains.values(), line_styles(gains), strict=True):
+            axis.plot(np.arange(1, len(values) + 1), values, **style)
+        axis.set(xlabel="active step", ylabel=r"$\mathrm{IG}_D$ of the selected view")
+        axis.set_ylim(bottom=0)
+        _whole_steps(axis)
+        axis.legend()
+        save_figure(figure, path)
+
+
+def coverage_figure(path: str | Path, coverage: Mapping[str, tuple[Sequence[int], Sequence[float]]]) -> None:
+    """Surface coverage after each image, and what each image added (the paper's Fig. 3).
+
+    coverage: policy -> (images in the training set, share of Gaussians observed in [0,1]); the first entry is the seeds.
+    """
+    import matplotlib
+
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(7.2, 3.1)
+        left, right = figure.subplots(1, 2)
+        for (images, shares), style in zip(coverage.values(), line_styles(coverage), strict=True):
+            percent = 100 * np.asarray(shares, float)
+            left.plot(images, percent, **style)
+            right.plot(list(images)[1:], np.diff(percent), **style)
+        left.set(xlabel="images", ylabel=r"surface coverage $C$ (%)")
+        right.set(xlabel="images", ylabel="coverage gained (percentage points)")
+        right.axhline(0, color="#9a9a9a", linewidth=0.8, zorder=0)
+        for axis in (left, right):
+            _whole_steps(axis)
+        left.legend()
+        save_figure(figure, path)
+
+
+def psnr_figure(path: str | Path, panels: Mapping[str, Mapping[str, tuple[Sequence[int], Sequence[float]]]]) -> None:
+    """PSNR against the number of images, a line a policy. panels: what is measured -> policy -> (images, dB)."""
+    import matplotlib
+
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(3.6 * len(panels), 3.1)
+        axes = figure.subplots(1, len(panels), squeeze=False)[0]
+        for axis, (what, curves) in zip(axes, panels.items(), strict=True):
+            for (images, decibels), style in zip(curves.values(), line_styles(curves), strict=True):
+                axis.plot(images, decibels, **style)
+            axis.set(xlabel="images in the training set", ylabel=f"PSNR, {what} (dB)")
+            _whole_steps(axis)
+        axes[0].legend()
+        save_figure(figure, path)
+
+
+def _whole_steps(axis: Axes) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def comparison_figure(
+    path: str | Path,
+    truth: np.ndarray,
+    renders: Mapping[str, np.ndarray],
+    *,
+    title: str = "",
+    captions: Mapping[str, str] | None = None,
+) -> None:
+    """Truth and renders of one view, each with its absolute difference below (the paper's Fig. 4), cropped to the rock.
+
+    truth, renders: linear RGB [H,W,3]; captions: policy -> text under its name (PSNR, SSIM).
+    """
+    import matplotlib
+
+    window = crop(truth.max(axis=2) > 0)
+    shown = srgb_from_linear(truth)[window]
+    images = {policy: srgb_from_linear(image)[window] for policy, image in renders.items()}
+    differences = {policy: np.abs(image - shown).mean(axis=2) for policy, image in images.items()}
+    limit = max(float(np.quantile(d, 0.995)) for d in differences.values()) or 1.0
+    columns, aspect = 1 + len(images), shown.shape[0] / shown.shape[1]
+    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
+        figure = new_figure(2.7 * columns, 2.7 * aspect * 2 + 0.9, dpi=150)
+        axes = figure.subplots(2, columns)
+        axes[0, 0].imshow(shown, interpolation="nearest")
+        axes[0, 0].set_title(f"truth\n{title}")
+        for column, (policy, image) in enumerate(images.items(), 1):
+            axes[0, column].imshow(image, interpolation="nearest")
+            axes[0, column].set_title(policy + (f"\n{captions[policy]}" if captions and policy in captions else ""))
+            map_ = axes[1, column].imshow(differences[policy], cmap="magma", vmin=0, vmax=limit, interpolation="nearest")
+        for axis in axes.flat:
+            axis.set_axis_off()
+        axes[1, 0].text(0.97, 0.5, "absolute\ndifference", ha="right", va="center", transform=axes[1, 0].transAxes)
+        bar = figure.colorbar(map_, ax=list(axes[1, 1:]), orientation="horizontal", shrink=0.6, pad=0.02, aspect=40)
+        bar.set_label("mean absolute difference of the sRGB channels, in [0, 1]")
+        save_figure(figure, path)

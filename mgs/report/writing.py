@@ -1,0 +1,87 @@
+"""The report: every figure and the table of runs on one dataset, from their files alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mgs.errors import InputError
+from mgs.files import atomic_path, write_json
+from mgs.report.figures import comparison_figure, coverage_figure, gain_figure, orbit_figure, psnr_figure
+
+if TYPE_CHECKING:
+    pass
+from mgs.report.tables import Run, check_finished, evaluated_runs, markdown_table, read_run, table_numbers, table_rows
+
+
+def write_report(out: str | Path, folders: Sequence[str | Path]) -> list[Path]:
+    """Every figure and the table of runs on one dataset, into the folder `out`; returns the files written.
+
+    orbit.png, gain.png, coverage.png, comparison.png (a view that the fewest runs were trained on), psnr.png (where runs were
+    evaluated on the way), table.md, table.json (`table_numbers`). Raises InputError as `evaluated_runs`, where a run is
+    unfinished, and where the pictures of `mgs eval` are missing.
+    """
+    from mgs.active.run_folder import check_same_frames, read_settings
+    from mgs.data.dataset import load_dataset
+    from mgs.report.evaluation import read_comparison
+    from mgs.splat_ply import read_ply
+
+    for folder in folders:
+        check_finished(read_run(folder))
+    out, runs = Path(out), evaluated_runs(folders)
+    first = next(iter(runs.values()))
+    dataset = load_dataset(read_settings(first.folder).dataset)
+    for run in runs.values():
+        check_same_frames(run.folder, dataset)
+    frames = dataset.frames
+    frame = frames[unseen_view(list(runs.values()), len(frames))]
+    pictures = {label: run.folder / "renders" / f"{frame.name}.png" for label, run in runs.items()}
+    for label, picture in pictures.items():
+        if not picture.is_file():
+            raise InputError(f"{picture}: no such picture; draw it with `mgs eval {runs[label].folder}`")
+    captions = {label: _caption(run, frame.name) for label, run in runs.items()}
+    pairs = {label: read_comparison(picture, frame.camera) for label, picture in pictures.items()}
+
+    positions = np.array([frame.camera.position for frame in frames])
+    choices = {label: (run.seeds, run.chosen) for label, run in runs.items()}
+    orbit_figure(out / "orbit.png", positions, read_ply(first.folder / "gaussians.ply").means, choices)
+    gain_figure(out / "gain.png", {label: [s["information_gain"] for s in run.steps[1:]] for label, run in runs.items()})
+    curves = {label: ([s["images"] for s in run.steps], [s["coverage"] for s in run.steps]) for label, run in runs.items()}
+    coverage_figure(out / "coverage.png", curves)
+
+    truth = next(iter(pairs.values()))[0]
+    renders = {label: rendered for label, (_, rendered) in pairs.items()}
+    comparison_figure(out / "comparison.png", truth, renders, title=frame.name, captions=captions)
+    written = [out / f"{name}.png" for name in ("orbit", "gain", "coverage", "comparison")]
+
+    measured = {label: [s for s in run.steps if {"psnr", "psnr_mask"} <= s.keys()] for label, run in runs.items()}
+    if all(measured.values()):
+        panels = {
+            what: {label: ([s["images"] for s in steps], [s[key] for s in steps]) for label, steps in measured.items()}
+            for what, key in (("all views", "psnr"), ("all views, rock only", "psnr_mask"))
+        }
+        psnr_figure(out / "psnr.png", panels)
+        written.append(out / "psnr.png")
+    with atomic_path(out / "table.md") as temporary:
+        temporary.write_text(markdown_table(table_rows(folders)), encoding="utf-8")
+    write_json(out / "table.json", table_numbers(folders))
+    return [*written, out / "table.md", out / "table.json"]
+
+
+def unseen_view(runs: Sequence[Run], frames: int) -> int:
+    """A frame that the fewest runs were trained on; of those, the one in the middle."""
+    counts = [sum(index in run.seeds + run.chosen for run in runs) for index in range(frames)]
+    fewest = [index for index in range(frames) if counts[index] == min(counts)]
+    return fewest[len(fewest) // 2]
+
+
+def _caption(run: Run, name: str) -> str:
+    """PSNR and SSIM of one view, and how many images the model had. Raises InputError where the view was not evaluated."""
+    view = next((view for view in (run.metrics or {})["views"] if view["name"] == name), None)
+    if view is None:
+        raise InputError(f"{run.folder}: was not evaluated on {name}; measure it with `mgs eval {run.folder}`")
+    seen = ", trained on" if view["trained"] else ""
+    return f"{len(run.seeds) + len(run.chosen)} images{seen}; {view['psnr']:.2f} dB, SSIM {view['ssim']:.4f}"

@@ -1,0 +1,234 @@
+"""Fisher information of one view, per Gaussian: a registry of estimators, each a small function.
+
+The pixel model is h(theta) -> rgb image with unit noise, so the information is H = J^T J over pixels and channels.
+Columns of a Gaussian's P = 3K + 8 parameters: spherical harmonics (coefficient-major, channel-minor; colour itself for degree
+0 up to the factor SH_C0^2), log-scales 3, quaternion 4, opacity logit 1. Means are frozen and have no columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mgs.camera import Camera
+from mgs.errors import InputError
+from mgs.gaussians import LEARNED, Gaussians
+from mgs.seeds import derive_seed
+from mgs.splat import kernels
+from mgs.splat.constants import LOG_SCALE_RANGE
+from mgs.splat.kernels import LN2
+from mgs.splat.projection import axes2d, camera_array, columns, project64, sh_basis, turns, whitening
+from mgs.splat.rendering import ListCache, as_colour, as_drjit, render, splats_and_lists
+
+
+def groups(sh_degree: int) -> dict[str, slice]:
+    """Columns of each parameter group for colours of the given degree."""
+    k = 3 * (sh_degree + 1) ** 2
+    return {"colour": slice(0, k), "scale": slice(k, k + 3), "rotation": slice(k + 3, k + 7), "opacity": slice(k + 7, k + 8)}
+
+
+def fisher(
+    gaussians: Gaussians,
+    camera: Camera,
+    estimator: str = "exact",
+    background: Any = (0.0, 0.0, 0.0),
+    cache: ListCache | None = None,
+    **options: Any,
+) -> np.ndarray:
+    """Fisher information that one view carries about each Gaussian: float32 [N,P], or [N,P,P] for `block`; rows are padded.
+
+    The camera's image is not needed: information depends on the pose and the model alone. Estimators: see `ESTIMATORS`;
+    options: `probes` and `seed` of `hutchinson`; the others have none.
+    Raises InputError for an unknown estimator, as `render` does, and for blocks of 2^31 numbers or more.
+    """
+    if estimator not in ESTIMATORS:
+        raise InputError(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
+    gaussians.check_shapes()
+    n, size = len(gaussians), groups(gaussians.sh_degree)["opacity"].stop
+    if n == 0:
+        return np.zeros((0, size, size) if estimator == "block" else (0, size), np.float32)
+    if estimator == "block" and n * (size * size + 3) >= 1 << 31:  # written in packets of four
+        raise InputError(
+            f"fisher: blocks of {n:,} Gaussians of SH degree {gaussians.sh_degree} would take {n * size * size / 2**28:.1f} "
+            "GiB, and 8 are the most; take fewer Gaussians, a lower degree, or the estimator `exact`"
+        )
+    return ESTIMATORS[estimator](as_drjit(gaussians), camera, background, cache, **options)
+
+
+@dataclass
+class Geometry:
+    """What turns the kernel's sums into parameters: for each of the 8 geometric columns (3 log-scales, 4 quaternion, 1 logit)
+    the derivative of ln alpha as coefficients on (xi^2, xi eta, eta^2, 1); and the colour basis [K]."""
+
+    shape: list[tuple[Any, Any, Any]]
+    logit: Any
+    basis: list[Any]
+    positive: list[Any]
+
+
+def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
+    """Closed-form derivatives of the footprint, in whitened coordinates, where all of them are of order one.
+
+    With a_i the i-th semi-axis of the Gaussian in whitened pixels and b_i = a_i / s_i, ln alpha changes with log-scale i by
+    4 ln2^2 (a_i.x)^2 and with a rotation about local axis k by 4 ln2^2 (s_i^2 - s_j^2)(b_i.x)(b_j.x), (i, j, k) cyclic; a
+    quaternion q of norm n turns the local frame by (2/n) Im(conj(q/n) dq).
+    """
+    mean, quats = mi.Vector3d(columns(gaussians.means, mi.Vector3f)), mi.Vector4d(columns(gaussians.quats, mi.Vector4f))
+    log_scales = mi.Vector3d(columns(gaussians.log_scales, mi.Vector3f))
+    _, unit, _ = axes2d(mean, quats, camera)
+    scales = dr.exp(dr.clip(log_scales, *LOG_SCALE_RANGE))
+    k, p, e = whitening([a * s for a, s in zip(unit, scales, strict=True)])
+    b = [mi.Vector2d(p * (t.x - k * t.y), e * t.y) for t in unit]
+
+    def product(s: Any, i: int, j: int) -> Any:
+        x, y = b[i], b[j]
+        f = 4 * LN2 * LN2 * s
+        return mi.Vector3d(f * x.x * y.x, f * (x.x * y.y + x.y * y.x), f * x.y * y.y)
+
+    free = [(s > LOG_SCALE_RANGE[0]) & (s < LOG_SCALE_RANGE[1]) for s in log_scales]
+    by_scale = [dr.select(free[i], product(scales[i] * scales[i], i, i), 0) for i in range(3)]
+    turn = []
+    for i, j in ((1, 2), (2, 0), (0, 1)):
+        turn.append(product((scales[i] - scales[j]) * (scales[i] + scales[j]), i, j))
+    w, x, y, z = quats * dr.select(turns(quats), 2 / dr.squared_norm(quats), 0)
+    X, Y, Z = turn
+    by_quat = [-x * X - y * Y - z * Z, w * X - z * Y + y * Z, z * X + w * Y - x * Z, -y * X + x * Y + w * Z]
+    transparency = dr.rcp(1 + dr.exp(mi.Float64(gaussians.logit_opacities.array)))
+    basis = sh_basis(mean, camera, gaussians.sh.shape[1])
+    positive = [dr.select(c > 0, mi.Float(1), 0) for c in (splats.r, splats.g, splats.b)]
+    return Geometry([tuple(m) for m in (*by_scale, *by_quat)], transparency, basis, positive)
+
+
+def _sums(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None, block: bool) -> tuple[Any, Geometry]:
+    device = camera_array(camera)
+    splats, lists, packed = splats_and_lists(gaussians, camera, cache)
+    if block:
+        exact = project64(gaussians, device)
+        dr.eval(exact)
+        packed = kernels.pack(exact, lists.place)
+    placed = kernels.fisher(lists, packed, dr.detach(as_colour(background)), block)
+    sums = kernels.by_splat(lists, placed, kernels.FISHER_SUMS[block])
+    return sums, geometry(gaussians, device, splats)
+
+
+def _quadratic(m: tuple[Any, Any, Any], n: tuple[Any, Any, Any], q: list[Any]) -> Any:
+    """sum (m . f)(n . f) from the five fourth-order moments q of f = (xi^2, xi eta, eta^2)."""
+    return (
+        m[0] * n[0] * q[0]
+        + (m[0] * n[1] + m[1] * n[0]) * q[1]
+        + (m[0] * n[2] + m[2] * n[0] + m[1] * n[1]) * q[2]
+        + (m[1] * n[2] + m[2] * n[1]) * q[3]
+        + m[2] * n[2] * q[4]
+    )
+
+
+def exact(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None) -> np.ndarray:
+    """diag(J^T J), exactly, for all parameters in one pass: seven sums per splat (design: one backward pass, no Jacobian)."""
+    (w2, s2, *quartic), g = _sums(gaussians, camera, background, cache, block=False)
+    columns_ = [w2 * basis * basis * positive for basis in g.basis for positive in g.positive]
+    columns_ += [dr.maximum(_quadratic(m, m, quartic), 0) for m in g.shape]
+    columns_.append(g.logit * g.logit * s2)
+    return _interleaved(dict(enumerate(columns_)), len(columns_), len(gaussians))
+
+
+def block(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None) -> np.ndarray:
+    """The exact [N,P,P] diagonal blocks of J^T J: 22 sums per splat."""
+    (w2, s2, *rest), g = _sums(gaussians, camera, background, cache, block=True)
+    dr.eval(g)  # several kernels may write the blocks
+    quartic, quadratic, cross = rest[:5], rest[5:8], [rest[8 + 4 * c : 12 + 4 * c] for c in range(3)]
+    colour = [(basis, c) for basis in g.basis for c in range(3)]
+    k = len(colour)
+    upper: dict[tuple[int, int], Any] = {}
+    for i, (basis_i, c) in enumerate(colour):
+        scaled = basis_i * g.positive[c]
+        for j, (basis_j, d) in enumerate(colour[: i + 1]):
+            if c == d:
+                upper[j, i] = w2 * scaled * basis_j
+        ws, *wsf = cross[c]
+        for j, m in enumerate(g.shape):
+            upper[i, k + j] = scaled * sum(a * b for a, b in zip(m, wsf, strict=True))
+        upper[i, k + 7] = scaled * ws * g.logit
+    for i, m in enumerate(g.shape):
+        for j in range(i, 7):
+            upper[k + i, k + j] = _quadratic(m, g.shape[j], quartic)
+        upper[k + i, k + 7] = g.logit * sum(a * b for a, b in zip(m, quadratic, strict=True))
+    upper[k + 7, k + 7] = g.logit * g.logit * s2
+    size = k + 8
+    both = {i * size + j: value for (i, j), value in upper.items()} | {j * size + i: value for (i, j), value in upper.items()}
+    flat = _interleaved(both, size * size, len(gaussians))
+    return flat.reshape(-1, size, size)
+
+
+def _gradient(
+    gaussians: Gaussians, image_gradient: Any, camera: Camera, background: Any, cache: ListCache | None
+) -> np.ndarray:
+    """J^T z by Dr.Jit's own AD: [N,P]. image_gradient(rgb) -> TensorXf [H,W,3]."""
+    with dr.resume_grad():
+        learned = {name: dr.copy(dr.detach(getattr(gaussians, name))) for name in LEARNED}
+        dr.enable_grad(list(learned.values()))
+        rgb = render(Gaussians(dr.detach(gaussians.means), **learned), camera, background, cache).rgb
+        dr.backward_from(dr.sum(rgb * image_gradient(dr.detach(rgb)), axis=None))
+        columns_ = [np.asarray(dr.grad(value)).reshape(len(gaussians), -1) for value in learned.values()]
+    return np.concatenate(columns_, axis=1)
+
+
+def hutchinson(
+    gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None, probes: int = 8, seed: int = 0
+) -> np.ndarray:
+    """Mean of (J^T z)^2 over `probes` images z of independent +-1, whose expectation is diag(J^T J) (Hutchinson 1990).
+
+    Each camera has probes of its own, drawn from `seed` and the camera: with the same ones in every view the errors of
+    neighbouring views would be alike, and would add up in a sum over views. Raises InputError for less than one probe.
+    """
+    if int(probes) != probes or probes < 1:
+        raise InputError(f"hutchinson: probes {probes} must be a whole number from 1 up")
+    cache = cache or ListCache()
+    total = np.zeros((len(gaussians), 0), np.float64)
+    for probe in range(int(probes)):
+        rng = np.random.default_rng(derive_seed(seed, f"hutchinson/{camera.key.hex()}/{probe}"))
+        z = rng.choice(np.array([-1, 1], np.float32), (camera.height, camera.width, 3))
+        squared = _gradient(gaussians, lambda _, z=z: mi.TensorXf(z), camera, background, cache).astype(np.float64) ** 2
+        total = squared if probe == 0 else total + squared
+    return (total / probes).astype(np.float32)
+
+
+def loss_gradient(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None) -> np.ndarray:
+    """The paper's Eq. 7 to the letter: squared gradient of one scalar "dummy photometric loss" per image.
+
+    The paper names no loss; here it is the mean squared error against mid-grey 0.5, L = mean (rgb - 0.5)^2. This is not
+    diag(J^T J): gradients of different pixels cancel before they are squared.
+    """
+    return _gradient(gaussians, lambda rgb: (rgb - 0.5) * (2 / len(rgb.array)), camera, background, cache) ** 2
+
+
+SMALLEST = 1.2e-38
+"""Smallest normal float32: threads differ in how they flush what is smaller, and nothing else differs between reruns."""
+
+PACKETS = 32
+"""Packets of four columns that one kernel writes: LLVM takes minutes over a kernel with all 56 x 56 of SH degree 3."""
+
+
+def _interleaved(columns_: dict[int, Any], size: int, n: int) -> np.ndarray:
+    """Dr.Jit arrays [N] by column -> NumPy float32 [N, size], 0 in columns not given. Written four columns at a time."""
+    packets = -(-size // 4)
+    flat, row = dr.empty(mi.Float, n * packets * 4), dr.arange(mi.UInt32, n) * packets
+    for packet in range(packets):
+        values = [mi.Float(columns_.get(4 * packet + i, 0)) for i in range(4)]
+        normal = mi.Vector4f(*(dr.select(dr.abs(value) < SMALLEST, 0, value) for value in values))
+        dr.scatter(flat, normal, row + packet, mode=dr.ReduceMode.NoConflicts)
+        if packet % PACKETS == PACKETS - 1:
+            dr.eval(flat)
+    return np.array(flat, copy=False).reshape(n, -1)[:, :size]
+
+
+ESTIMATORS: dict[str, Callable[..., np.ndarray]] = {
+    "exact": exact,
+    "block": block,
+    "hutchinson": hutchinson,
+    "loss-gradient": loss_gradient,
+}

@@ -1,0 +1,45 @@
+"""A Mitsuba sensor as a `Camera`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from mgs.camera import Camera
+from mgs.errors import InputError
+
+_MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""Mitsuba's camera frame is x to the image's left, y up, z forward."""
+
+
+def camera_from_sensor(sensor: Any) -> Camera:
+    """The pinhole camera of a Mitsuba `perspective` sensor: its crop window is the image.
+
+    Whatever the fov axis, Mitsuba keeps the horizontal field of view of the whole film, and pixels are square. The principal
+    point (0.5 - ppo) is in whole films. Near and far clip and the shutter are not used (see `mgs.splat.constants.NEAR`).
+    Raises InputError for any other sensor, or a pose that is not rigid.
+    """
+    params = mi.traverse(sensor)
+    if "x_fov" not in params or sensor.needs_aperture_sample():
+        raise InputError(f"sensor: {sensor.class_name()} has no pinhole; splatting needs a `perspective` sensor")
+    width, height = params["film.size"]
+    left, top = params["film.crop_offset"]
+    columns, rows = params["film.crop_size"]
+    focal = 0.5 * width / np.tan(0.5 * np.radians(_number(params["x_fov"])))
+    cx = (0.5 - _number(params["principal_point_offset_x"])) * width - left
+    cy = (0.5 - _number(params["principal_point_offset_y"])) * height - top
+    to_world = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)
+    if np.linalg.det(to_world[:3, :3]) < 0:
+        raise InputError("sensor: to_world mirrors the image; take the negative scale out and flip the picture afterwards")
+    try:
+        world_to_camera = np.asarray(np.linalg.inv(to_world @ _MITSUBA_FROM_OPENCV), np.float64)
+    except np.linalg.LinAlgError:
+        raise InputError("sensor: to_world is singular; its rotation must be orthonormal") from None
+    return Camera(np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]]), int(columns), int(rows), world_to_camera)
+
+
+def _number(value: Any) -> float:
+    """A Mitsuba Float of one entry."""
+    return float(np.asarray(value, np.float64).ravel()[0])

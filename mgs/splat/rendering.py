@@ -1,0 +1,223 @@
+"""Render Gaussians: one differentiable call, with block lists cached per camera."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass, fields
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mgs import runtime
+from mgs.camera import Camera
+from mgs.errors import InputError
+from mgs.gaussians import SH_MAX, Gaussians
+from mgs.splat import blocks, kernels
+from mgs.splat.blocks import BLOCK_X, BLOCK_Y, BlockLists
+from mgs.splat.kernels import PIXELS
+from mgs.splat.projection import Splats, camera_array, project
+
+MARGIN = 0.15
+"""Growth of a footprint, as a share of its size (and bits of its opacity), that lists allow for once their camera's first,
+exact lists were outgrown: a model that is only looked at pays for no margin, one in training seldom rebuilds."""
+
+CACHE_BYTES = 1 << 30
+"""Default memory budget of a `ListCache`, bytes: 100 cameras of 100,000 Gaussians at 640x480."""
+
+
+@dataclass
+class Image:
+    """A rendered view, Dr.Jit TensorXf: rgb [H,W,3] linear over the background, alpha [H,W], depth [H,W].
+
+    depth: expected z-depth in metres, sum w z / sum w; 0 where alpha is 0.
+    """
+
+    rgb: Any
+    alpha: Any
+    depth: Any
+
+
+REMEMBERED = 1 << 16
+"""Most cameras whose last use a `ListCache` remembers, a few hundred bytes each."""
+
+
+class ListCache:
+    """Block lists per camera, within a budget in bytes. One camera's lists are kept even where they alone exceed it.
+
+    Views are mostly gone through again and again, in one order (scoring) or a new one each time (fitting). What was used
+    longest ago is then needed soonest, so giving it up for every newcomer (LRU) may never find anything. Here a camera takes
+    the place of the one used longest ago only if it was itself used less than half as long ago; otherwise its lists serve
+    once and are dropped. So as many stay as there is room for, and other cameras take over within three rounds.
+
+    Lists serve as long as they are exact for the splats: same centres and depths, no footprint outside the margin it was
+    built with. Otherwise they are rebuilt, so a stale list can never change an image.
+    """
+
+    def __init__(self, budget: int = CACHE_BYTES) -> None:
+        self.budget = budget
+        self.builds = 0
+        self._lists: OrderedDict[bytes, BlockLists] = OrderedDict()  # used longest ago first
+        self._used: dict[bytes, int] = {}  # when each camera was used last, held or not, by _clock
+        self._clock = 0  # uses of all cameras
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held, bytes."""
+        return sum(lists.nbytes for lists in self._lists.values())
+
+    def get(self, camera: Camera, splats: Splats) -> tuple[BlockLists, Any]:
+        """Lists for detached splats seen by the camera, and the splats packed at the places of these lists.
+
+        Raises InputError where a parameter is not finite, a colour beyond SH_MAX, or the view has too many pairs.
+        """
+        key = camera.key
+        lists = self._lists.get(key)
+        margin = 0.0 if lists is None else MARGIN
+        dr.eval(splats)
+        if lists is not None and len(lists.place) != len(splats.u):
+            lists = None
+        if lists is not None:
+            stale = dr.select(splats.finite, mi.UInt32(blocks.outgrown(lists.footprints, splats)), 2)
+            dr.schedule(stale)
+            packed = kernels.pack(splats, lists.place)
+            worst = int(dr.max(stale)[0])
+            _raise_unless_finite(worst < 2)
+            lists = None if worst else lists
+        if lists is None:
+            _raise_unless_finite(dr.all(splats.finite))
+            lists = blocks.build(splats, blocks.depth_order(splats.z), camera.width, camera.height, margin)
+            packed = kernels.pack(splats, lists.place)
+            self.builds += 1
+            self._keep(key, lists)
+        self._clock += 1
+        self._used[key] = self._clock
+        if key in self._lists:
+            self._lists.move_to_end(key)
+        return lists, packed
+
+    def _keep(self, key: bytes, lists: BlockLists) -> None:
+        """Hold new lists, and keep the budget: drop those used longest ago, or these."""
+        self._lists[key] = lists
+        while len(self._lists) > 1 and self.nbytes > self.budget:
+            oldest = next(other for other in self._lists if other != key)
+            if key in self._used and 2 * (self._clock - self._used[key]) < self._clock - self._used[oldest]:
+                del self._lists[oldest]
+            else:
+                del self._lists[key]
+                break
+        if len(self._used) > REMEMBERED:
+            self._used = {other: self._used[other] for other in self._lists if other in self._used}
+
+
+def as_colour(background: Any) -> Any:
+    """Linear RGB as Color3f: one number or three, or a Dr.Jit colour, which is kept with its gradient.
+
+    The numbers are opaque: literals would compile the kernel anew for every colour. Raises InputError for anything else.
+    """
+    if dr.is_jit_v(background):
+        return mi.Color3f(background)
+    try:
+        values = np.broadcast_to(np.asarray(background, np.float64), 3)
+    except (TypeError, ValueError):
+        values = np.full(3, np.nan)
+    if not (np.abs(values) <= SH_MAX).all():
+        raise InputError(f"background {background}: must be one or three numbers, linear RGB, up to {SH_MAX:,.0f}")
+    return mi.Color3f(*(dr.opaque(mi.Float, float(value)) for value in values))
+
+
+def _raise_unless_finite(finite: Any) -> None:
+    if not finite:
+        raise InputError(f"gaussians: a parameter is NaN or infinite, or a colour beyond {SH_MAX:,.0f}")
+
+
+def as_drjit(gaussians: Gaussians) -> Gaussians:
+    """The same Gaussians with TensorXf fields; fields that are Dr.Jit already are kept, gradients included.
+
+    Raises InputError where shapes do not fit each other: a kernel would read beyond the end; and as `mgs.runtime.start`.
+    """
+    runtime.start()
+    gaussians.check_shapes()
+    values = {f.name: getattr(gaussians, f.name) for f in fields(gaussians)}
+    return Gaussians(**{k: v if dr.is_array_v(v) else mi.TensorXf(np.asarray(v, np.float32)) for k, v in values.items()})
+
+
+class _Rasterise(dr.CustomOp):
+    """Splats -> r, g, b, alpha and weighted depth, Float [H*W] each, with the hand-written adjoint: compositing is no sum that
+    AD could replay. places: see `_places`."""
+
+    def eval(self, splats: Splats, packed: Any, lists: BlockLists, places: Any, means: bool) -> Any:
+        self.splats, self.packed, self.lists, self.places, self.means = splats, packed, lists, places, means
+        self.out = kernels.forward(lists, packed)
+        pixel = dr.gather(mi.Vector4f, self.out[0], places, mode=dr.ReduceMode.NoConflicts)
+        return *pixel, dr.gather(mi.Float, self.out[1], places, mode=dr.ReduceMode.NoConflicts)
+
+    def backward(self) -> None:
+        *d_pixel, d_weighted = self.grad_out()
+        dr.eval(d_pixel, d_weighted)  # Dr.Jit 1.5 ends the process where a scatter's value awaits a scatter itself
+        d_rgba, d_depth = (dr.zeros(mi.Float, len(out)) for out in self.out)
+        dr.scatter(d_rgba, mi.Vector4f(*d_pixel), self.places, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter(d_depth, d_weighted, self.places, mode=dr.ReduceMode.NoConflicts)
+        placed = kernels.adjoint(self.lists, self.packed, self.out, (d_rgba, d_depth), self.means)
+        sums = kernels.by_splat(self.lists, placed, kernels.ADJOINT_SUMS[self.means])
+        self.set_grad_in("splats", kernels.splat_gradient(sums, self.splats))
+
+
+def _places(width: int, height: int) -> Any:
+    """UInt32 [H*W]: where each pixel of an image lies in block-major order."""
+    index = dr.arange(mi.UInt32, width * height)
+    x, y = index % width, index // width
+    block = (y // BLOCK_Y) * (-(-width // BLOCK_X)) + x // BLOCK_X
+    return block * PIXELS + (y % BLOCK_Y) * BLOCK_X + x % BLOCK_X
+
+
+def splats_and_lists(gaussians: Gaussians, camera: Camera, cache: ListCache | None) -> tuple[Splats, BlockLists, Any]:
+    """Project Gaussians with Dr.Jit fields, find their block lists and pack them at the places of these lists.
+
+    Raises InputError where a parameter is not finite, or a colour beyond SH_MAX.
+    """
+    splats = project(gaussians, camera_array(camera))
+    try:
+        return splats, *(cache or ListCache()).get(camera, dr.detach(splats))
+    except InputError:
+        Gaussians(*(np.asarray(dr.detach(getattr(gaussians, f.name))) for f in fields(gaussians))).check()
+        raise
+
+
+def render(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.0), cache: ListCache | None = None) -> Image:
+    """Render Gaussians by EWA splatting (Kerbl et al. 2023, with the constants of `mgs.splat.constants`).
+
+    gaussians: NumPy fields, or Dr.Jit TensorXf fields, any of which may have gradients enabled: `dr.backward` then reaches
+    log_scales, quats, logit_opacities, sh and, where enabled, means. Not differentiated: the camera, the thresholds
+    (alpha < 1/255, transmittance), the depth order; forward-mode derivatives are not available.
+    background: linear RGB. cache: keep one between calls so that a camera seen again reuses its block lists. Records its own
+    kernels, so it cannot be called inside another `dr.freeze`.
+    Raises InputError where a parameter is NaN or infinite, or a colour beyond SH_MAX (names the parameter and the first
+    Gaussian); likewise for a number of the background (a Dr.Jit colour is not looked at); and for a view of too many pairs
+    (`mgs.splat.blocks.MAX_PAIRS`).
+    """
+    runtime.start()
+    colour = as_colour(background)
+    if len(gaussians) == 0:
+        gaussians.check_shapes()
+        return _empty(camera, colour)
+    splats, lists, packed = splats_and_lists(as_drjit(gaussians), camera, cache)
+    return composite(splats, packed, lists, camera.width, camera.height, colour)
+
+
+def _empty(camera: Camera, background: Any) -> Image:
+    """What a camera sees of no Gaussians."""
+    shape = (camera.height, camera.width)
+    rgb = background + dr.zeros(mi.Color3f, camera.height * camera.width)
+    return Image(mi.TensorXf(dr.ravel(rgb), (*shape, 3)), dr.zeros(mi.TensorXf, shape), dr.zeros(mi.TensorXf, shape))
+
+
+def composite(splats: Splats, packed: Any, lists: BlockLists, width: int, height: int, background: Any = 0.0) -> Image:
+    """Composite projected splats, packed for their block lists, over a Color3f; differentiable in the splats' numbers."""
+    places = _places(width, height)
+    r, g, b, alpha, weighted = dr.custom(_Rasterise, splats, packed, lists, places, dr.grad_enabled(splats.u))
+    rgb = mi.Color3f(r, g, b) + (1 - alpha) * background
+    expected = dr.select(alpha > 0, weighted / dr.select(alpha > 0, alpha, 1), 0)
+    shape = (height, width)
+    return Image(mi.TensorXf(dr.ravel(rgb), (*shape, 3)), mi.TensorXf(alpha, shape), mi.TensorXf(expected, shape))

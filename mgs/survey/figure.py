@@ -1,0 +1,84 @@
+"""One picture of the survey: trajectories from above, error per frame, depth before and after the sensor, fused cloud."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.data.dataset import Dataset
+from mgs.plotting import STYLE, new_figure, save_figure
+from mgs.survey.fusion import Cloud
+from mgs.survey.registration import Survey
+
+COLOURS = {"odometry": "#d1495b", "registered": "#edae49", "optimised": "#00798c"}
+
+LABELS = {
+    "odometry": "odometry alone",
+    "registered": "registered, before loop closure",
+    "optimised": "after loop closure",
+}
+
+
+def draw_survey(path: str | Path, dataset: Dataset, survey: Survey, cloud: Cloud, numbers: dict[str, Any]) -> None:
+    """Write the figure as a PNG, atomically."""
+    import matplotlib
+
+    around = survey.truth[:, :3, 3].mean(0)
+    reach = float(np.abs(survey.truth[:, :3, 3] - around).max())
+    points = cloud.points[np.argsort(cloud.points[:, 2])]
+    stride = max(1, len(points) // 120_000)
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(17, 4.4, dpi=100)
+        axes = figure.subplots(1, 4, gridspec_kw={"width_ratios": [1.1, 1, 1, 1.1]})
+        _trajectories(axes[0], survey)
+        _errors(axes[1], survey, numbers)
+        _depth_error(axes[2], dataset, survey, numbers)
+        axes[3].scatter(*points[::stride, :2].T, c=points[::stride, 2], s=0.4, cmap="viridis", linewidths=0, rasterized=True)
+        axes[3].set(xlim=around[0] + np.array([-reach, reach]), ylim=around[1] + np.array([-reach, reach]), aspect="equal")
+        axes[3].set(title=f"fused cloud from above: {len(cloud.points):,} points", xlabel="x, m", ylabel="y, m")
+        save_figure(figure, path)
+
+
+def _trajectories(axis, survey: Survey) -> None:
+    axis.plot(*survey.truth[:, :2, 3].T, color="0.6", lw=5, label="truth", solid_capstyle="round")
+    for name, colour in COLOURS.items():
+        axis.plot(*getattr(survey, name)[:, :2, 3].T, ".-", color=colour, lw=1.2, ms=4, label=LABELS[name])
+    for k, loop in enumerate(survey.loops):
+        ends = survey.optimised[[loop.i, loop.j], :2, 3]
+        axis.plot(*ends.T, color="k", lw=1.5, label="loop closures" if k == 0 else None)
+    axis.plot(*survey.truth[0, :2, 3], "k^", ms=8, label="start")
+    axis.set(aspect="equal", title="trajectory from above", xlabel="x, m", ylabel="y, m")
+    axis.legend(fontsize=8, loc="center")
+
+
+def _errors(axis, survey: Survey, numbers: dict[str, Any]) -> None:
+    for name, colour in COLOURS.items():
+        offset = np.linalg.norm(getattr(survey, name)[:, :3, 3] - survey.truth[:, :3, 3], axis=1)
+        rms = numbers["error"][name]["ate_rms"]
+        axis.semilogy(
+            np.arange(1, len(offset)),
+            1e3 * np.maximum(offset[1:], 1e-4),
+            color=colour,
+            label=f"{LABELS[name]}: rms {1e3 * rms:.0f} mm",
+        )
+    axis.set(title="position error against truth", xlabel="frame", ylabel="mm")
+    axis.margins(y=0.25)
+    axis.legend(fontsize=8, loc="lower right")
+
+
+def _depth_error(axis, dataset: Dataset, survey: Survey, numbers: dict[str, Any]) -> None:
+    measured, true = survey.depths[0], dataset.frames[0].depth()
+    error = np.where((measured > 0) & (true > 0), 1e3 * (measured - true), np.nan)
+    limit = max(3e3 * numbers["depth_error_on_rock"], 1.0)
+    axis.set_facecolor("0.85")
+    axis.grid(visible=False)
+    axis.spines[:].set_visible(False)
+    picture = axis.imshow(error, cmap="RdBu", vmin=-limit, vmax=limit, interpolation="nearest")
+    axis.figure.colorbar(picture, ax=axis, shrink=0.7, label="mm; blue: too far")
+    axis.set(
+        title=f"depth error of frame 0; grey: no return\n{numbers['returns_lost']:.0%} of all returns lost",
+        xticks=[],
+        yticks=[],
+    )

@@ -1,0 +1,1 @@
+"""Photoreal RGB-D orbits of a rock, rendered with Mitsuba."""

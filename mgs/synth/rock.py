@@ -1,0 +1,198 @@
+"""Rocks: procedural ones from a seed, or any textured mesh; both as a textured triangle mesh standing on the ground z = 0."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+from skimage.measure import marching_cubes
+
+from mgs.colour import srgb_from_linear
+from mgs.data.meshes import GLTF, load_mesh
+from mgs.errors import InputError
+from mgs.rotation import WORLD_FROM_GLTF
+from mgs.synth.noise import Noise
+from mgs.synth.scene_file import Rock
+
+MAX_GRID = 10**8
+"""Points of the grid that a rock is cut from: more would take tens of gigabytes."""
+
+CELL = 6
+"""Texels along one side of an atlas cell; a cell holds two triangles."""
+
+
+def make_rock(settings: Rock, rng: np.random.Generator) -> trimesh.Trimesh:
+    """A weathered rock: cut ellipsoids -> marching cubes at `detail` -> displacement -> baked albedo texture.
+
+    Returns a mesh in world coordinates (metres, +Z up), partly below z = 0, with UVs and an sRGB base-colour texture.
+    Raises InputError where `detail` is too coarse or too fine for the rock.
+    """
+    noise = Noise(rng)
+    mesh, height = rock_shape(settings, noise)
+    return _bake(mesh, height, settings, noise)
+
+
+def rock_shape(settings: Rock, noise: Noise) -> tuple[trimesh.Trimesh, np.ndarray]:
+    """The rock's geometry alone, standing on the ground, and the displacement [V], metres, that shaped each vertex."""
+    mesh = _body(settings, noise).subdivide()
+    height = _relief(mesh, settings, noise)
+    mesh.vertices += height[:, None] * mesh.vertex_normals
+    return _stand(mesh, settings), height
+
+
+def up_axis(path: str | Path) -> str:
+    """The up axis of a mesh file, "y" or "z", where nobody says: glTF and GLB have a rule, +Y. OBJ, PLY and others have none;
+    most OBJ files are +Y up, the others are taken to be as our world is, +Z."""
+    return "y" if Path(path).suffix.lower() in (*GLTF, ".obj") else "z"
+
+
+def load_rock(path: str | Path, settings: Rock, up: str | None = None) -> tuple[trimesh.Trimesh, float]:
+    """Any GLB, OBJ or PLY as the rock: scaled to `settings.size` and stood on the ground; keeps its texture.
+
+    up: "y" or "z", the file's up axis; by default as `up_axis`. Returns the mesh, +Z up, and the scale that was applied.
+    Raises InputError as `load_mesh`, and where all vertices are one point.
+    """
+    mesh = load_mesh(path)
+    if mesh.extents.max() == 0:
+        raise InputError(f"{path}: all vertices are one point; repair the mesh")
+    if (up or up_axis(path)) == "y":
+        mesh.apply_transform(WORLD_FROM_GLTF)
+    scale = settings.size / float(mesh.extents.max())
+    return _stand(mesh, settings), scale
+
+
+def _stand(mesh: trimesh.Trimesh, settings: Rock) -> trimesh.Trimesh:
+    """Scale to the settings' size, centre over the origin, and sink the share `buried` of the height into the ground."""
+    mesh.apply_scale(settings.size / mesh.extents.max())
+    low, high = mesh.bounds
+    middle = (low + high) / 2
+    mesh.apply_translation([-middle[0], -middle[1], -low[2] - settings.buried * (high - low)[2]])
+    return mesh
+
+
+def _body(settings: Rock, noise: Noise) -> trimesh.Trimesh:
+    """Smooth union of ellipsoids, each cut by random planes; size 1, centred."""
+    low = np.min([np.subtract(lobe.centre, lobe.radii) for lobe in settings.lobes], axis=0)
+    high = np.max([np.add(lobe.centre, lobe.radii) for lobe in settings.lobes], axis=0)
+    extent = float((high - low).max())
+    step = 2.2 * settings.detail / settings.size * extent  # marching cubes' edges are 0.9 steps long, and are halved
+    origin = low - 0.15 * extent
+    shape = np.ceil((high - low + 0.3 * extent) / step) + 1
+    if shape.prod() > MAX_GRID:
+        raise InputError(f"scene: rock.detail {settings.detail} m is too fine for a rock of {settings.size} m; raise it")
+    shape = shape.astype(int)
+    points = (origin + step * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)).astype(np.float32)
+    points += 0.05 * np.stack([noise.octave(points, 1.1) for _ in range(3)], -1)
+    distance = np.full(shape, 1e3)
+    for lobe in settings.lobes:
+        local = (points - np.asarray(lobe.centre, np.float32)) / np.asarray(lobe.radii, np.float32)
+        inside = np.linalg.norm(local, axis=-1) - 1
+        for normal in noise.rng.standard_normal((settings.facets, 3)):
+            cut = local @ (normal / np.linalg.norm(normal)).astype(np.float32) - noise.rng.uniform(0.62, 0.92)
+            inside = _smooth_max(inside, cut, 0.05)
+        distance = -_smooth_max(-distance, -inside * min(lobe.radii), 0.12)
+    distance = gaussian_filter(distance, 0.7)
+    if distance.min() >= 0:  # nothing is inside
+        raise InputError(f"scene: rock.detail {settings.detail} m is too coarse for a rock of {settings.size} m; lower it")
+    vertices, faces, _, _ = marching_cubes(distance, 0.0, spacing=(step,) * 3)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh = max(mesh.split(only_watertight=False), key=lambda part: len(part.faces))
+    mesh.apply_scale(settings.size / mesh.extents.max())
+    return mesh
+
+
+def _smooth_max(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
+    """Maximum with the crease rounded over `width` (polynomial smooth maximum)."""
+    h = np.clip(0.5 + 0.5 * (a - b) / width, 0, 1)
+    return b + (a - b) * h + width * h * (1 - h)
+
+
+def _relief(mesh: trimesh.Trimesh, settings: Rock, noise: Noise) -> np.ndarray:
+    """Displacement along the normals [V], metres: ridged relief, rough and smooth patches, pits, cracks, strata."""
+    p = np.asarray(mesh.vertices, np.float32)
+    size, amplitude = settings.size, settings.relief * settings.size
+    warped = p + 0.06 * size * np.stack([noise.fractal(p, 0.4 * size, 2) for _ in range(3)], -1).astype(np.float32)
+    broken = np.clip(0.6 + 0.5 * noise.octave(p, 0.5 * size), 0.15, 1.3)
+    height = amplitude * (0.2 * noise.fractal(p, 0.5 * size, 2) - 0.15 * noise.ridged(warped, 0.3 * size, 2))
+    height += amplitude * (0.4 * noise.fracture(warped, 0.3 * size) + 0.18 * broken * noise.fracture(warped, 0.11 * size))
+    height += amplitude * broken * (0.06 * noise.fracture(p, 0.04 * size) + 0.05 * noise.fractal(p, 0.045 * size, 4, 0.75))
+    height -= 0.006 * size * np.clip(noise.octave(p, 0.045 * size) - 1.5, 0, 1)
+    crack = np.exp(-((noise.octave(warped, 0.8 * size) / 0.025) ** 2)) + 0.6 * np.exp(
+        -((noise.octave(warped, 0.5 * size) / 0.03) ** 2)
+    )
+    height -= settings.cracks * size * crack * np.clip(0.5 + noise.octave(p, 0.6 * size), 0, 1)
+    if settings.layers:
+        level = settings.layers * (p[:, 2] - p[:, 2].min()) / np.ptp(p[:, 2]) + 0.35 * noise.fractal(p, 0.8 * size, 3)
+        height += 0.009 * size * _smoothstep(0.3, 0.6, np.abs(2 * (level % 1) - 1))
+    return height
+
+
+def _bake(mesh: trimesh.Trimesh, height: np.ndarray, settings: Rock, noise: Noise) -> trimesh.Trimesh:
+    """Give every pair of triangles its own cell of a texture atlas, and evaluate the albedo at every texel.
+
+    Needs no unwrapping, so it works for any shape and never stretches.
+    """
+    n_faces = len(mesh.faces)
+    cells = np.arange((n_faces + 1) // 2)
+    across = int(np.ceil(np.sqrt(len(cells))))
+    # A cell's texels: the first triangle lies at its origin, the second is the first turned by half a turn.
+    j, i = (a.ravel() for a in np.mgrid[:CELL, :CELL])
+    turned = i + j > CELL - 1
+    u, v = (np.where(turned, CELL - 1 - a, a) / (CELL - 2) for a in (i, j))
+    weights = np.stack([1 - u - v, u, v], -1).astype(np.float32)
+    face = np.minimum(2 * cells[:, None] + turned, n_faces - 1)
+
+    def at_texels(values: np.ndarray) -> np.ndarray:
+        w = weights.reshape(*weights.shape, *[1] * (values.ndim - 1))
+        a, b, c = (values.astype(np.float32)[mesh.faces[:, k]][face] for k in range(3))
+        return w[:, 0] * a + w[:, 1] * b + w[:, 2] * c
+
+    colour = _albedo(at_texels(mesh.vertices), at_texels(mesh.vertex_normals), at_texels(height), settings, noise)
+    texture = np.zeros((across * CELL, across * CELL, 3), np.float32)
+    row, column = CELL * (cells // across)[:, None] + j, CELL * (cells % across)[:, None] + i
+    texture[row, column] = colour
+
+    first = np.array([[0, 0], [CELL - 2, 0], [0, CELL - 2]])
+    corners = np.stack([first, CELL - 1 - first])[np.arange(n_faces) % 2] + 0.5
+    cell = np.arange(n_faces) // 2
+    uv = (corners + CELL * np.stack([cell % across, cell // across], -1)[:, None]) / (across * CELL)
+    uv[..., 1] = 1 - uv[..., 1]  # trimesh, as OBJ, counts v upwards from the last row
+    image = Image.fromarray(np.round(255 * srgb_from_linear(texture)).astype(np.uint8))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=0.9)
+    return trimesh.Trimesh(
+        mesh.vertices[mesh.faces].reshape(-1, 3),
+        np.arange(3 * n_faces).reshape(-1, 3),
+        vertex_normals=mesh.vertex_normals[mesh.faces].reshape(-1, 3),
+        visual=trimesh.visual.TextureVisuals(uv=uv.reshape(-1, 2), material=material),
+        process=False,
+    )
+
+
+def _albedo(p: np.ndarray, normal: np.ndarray, height: np.ndarray, settings: Rock, noise: Noise) -> np.ndarray:
+    """Linear RGB [..., 3] at points [..., 3], metres: two minerals, grains, dark hollows and dust on top."""
+    size = settings.size
+    light, dark, dust = (np.asarray(c, np.float32) for c in (*settings.colours, settings.dust))
+    patches = noise.fractal(p, 0.5 * size, 4, 0.6)
+    if settings.layers:
+        level = settings.layers * p[..., 2] / size + 0.25 * noise.fractal(p, 0.6 * size, 4)
+        band = np.sin(2 * np.pi * level) + 0.8 * np.sin(2 * np.pi * 2.7 * level + 1)
+        patches = 0.4 * patches + 1.3 * band
+    mix = _smoothstep(-1.2, 1.2, patches)
+    grains = 0.15 * noise.fractal(p, 0.02 * size, 3, 0.9) - 0.35 * _smoothstep(1.5, 2.2, noise.octave(p, 0.012 * size))
+    hollow = _smoothstep(1.0, -2.5, height / (settings.relief * size + 1e-9) * 3)
+    if settings.plain_half:
+        textured = _smoothstep(-0.05, 0.05, p[..., 0] / size)
+        mix, grains = 0.6 + textured * (mix - 0.6), textured * grains
+    colour = dark + (light - dark) * mix[..., None]
+    colour = colour * (1 + grains - 0.35 * hollow)[..., None]
+    settled = 0.65 * _smoothstep(0.4, 1.1, normal[..., 2] + 0.3 * noise.fractal(p, 0.12 * size, 4, 0.7))
+    return np.clip(colour + (dust - colour) * settled[..., None], 0.01, 0.9)
+
+
+def _smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
+    """0 below `low`, 1 above `high`, cubic between (falls where low > high)."""
+    t = np.clip((x - low) / (high - low), 0, 1)
+    return t * t * (3 - 2 * t)

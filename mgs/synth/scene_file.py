@@ -1,0 +1,169 @@
+"""Scene files: one readable TOML per scene, validated. Lengths in metres, angles in degrees, colours linear RGB."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from mgs.errors import InputError
+from mgs.files import read_json
+from mgs.resources import scene_path
+
+Positive = Annotated[float, Field(gt=0)]
+
+Fraction = Annotated[float, Field(ge=0, le=1)]
+
+Elevation = Annotated[float, Field(ge=0, le=90)]
+
+OrbitKind = Literal["circle", "rings", "spiral", "hemisphere"]
+
+ORBITS: tuple[str, ...] = get_args(OrbitKind)
+
+Colour = tuple[Fraction, Fraction, Fraction]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Lobe(_Strict):
+    """One ellipsoid of the rock's body, before it is cut and weathered; unitless, scaled with the rock."""
+
+    centre: tuple[float, float, float] = (0, 0, 0)
+    radii: tuple[Positive, Positive, Positive] = (1, 1, 1)
+
+
+class Rock(_Strict):
+    """The rock: body, weathering, colour."""
+
+    size: Positive = 1.8
+    """Longest side of its bounding box, metres; a mesh given by --mesh is scaled to it too."""
+    buried: Annotated[float, Field(ge=0, lt=1)] = 0.12
+    """Share of its height below the ground."""
+    lobes: Annotated[tuple[Lobe, ...], Field(min_length=1)] = (Lobe(radii=(1.0, 0.8, 0.72)),)
+    facets: Annotated[int, Field(ge=0)] = 16
+    """Planes that cut each lobe."""
+    relief: Fraction = 0.06
+    """Amplitude of the coarsest displacement, as a share of the size."""
+    cracks: Fraction = 0.012
+    """Depth of cracks, as a share of the size."""
+    layers: Annotated[int, Field(ge=0)] = 0
+    """Number of strata over the height; 0 for none."""
+    plain_half: bool = False
+    """Leave the half at negative x without albedo texture."""
+    colours: tuple[Colour, Colour] = ((0.30, 0.24, 0.19), (0.14, 0.115, 0.10))
+    """Light and dark mineral."""
+    dust: Colour = (0.42, 0.30, 0.20)
+    """Dust on faces that look up."""
+    detail: Positive = 0.011
+    """Length of a mesh edge, metres."""
+
+
+class Arena(_Strict):
+    """The ground: regolith with grain, undulation and small stones."""
+
+    colour: Colour = (0.36, 0.26, 0.18)
+    undulation: Annotated[float, Field(ge=0)] = 0.02
+    """Amplitude of the terrain near the rock, metres."""
+    stones: Annotated[int, Field(ge=0)] = 700
+    stone_size: Positive = 0.05
+    """Median diameter, metres; sizes follow a power law up to `largest_stone`."""
+    largest_stone: Positive = 0.16
+    spread: Positive = 12.0
+    """Stones lie within this distance of the rock's axis, metres."""
+    clearance: Positive = 1.15
+    """Stones keep this far from the rock, as a multiple of its radius."""
+
+
+class Sky(_Strict):
+    """Sun and clear sky (Hosek-Wilkie, Mitsuba's `sunsky`)."""
+
+    sun_elevation: Annotated[float, Field(gt=0, le=90)] = 42
+    sun_azimuth: float = 35
+    """Counter-clockwise from +x."""
+    turbidity: Annotated[float, Field(ge=1, le=10)] = 3.5
+    sun_scale: Positive = 1.0
+    sky_scale: Positive = 1.0
+
+
+class Lens(_Strict):
+    """The camera; the image size comes from the preset."""
+
+    fov: Annotated[float, Field(gt=1, lt=150)] = 44
+    """Horizontal field of view."""
+
+
+class Orbit(_Strict):
+    """Where the keyframes are taken from; every camera looks at the middle of the rock."""
+
+    kind: OrbitKind = "circle"
+    radius: Positive = 4.0
+    """Horizontal distance from the rock's axis (circle), or distance from its middle (the others)."""
+    altitude: Annotated[float, Field(ge=0)] = 2.3
+    """Height above the ground (circle)."""
+    elevations: tuple[Elevation, Elevation] = (12, 65)
+    """Lowest and highest elevation above the rock's middle (the others)."""
+    turns: Positive = 3
+    """Turns of the spiral, or number of rings."""
+
+
+class Sensor(_Strict):
+    """What a survey of the scene is flown with (`mgs survey`); the images of `mgs synth-orbit` are exact."""
+
+    noise: Annotated[float, Field(ge=0)] = 1.0
+    """Factor on the depth camera's noise (`mgs.survey.depth_sensor`)."""
+    drift: Annotated[float, Field(ge=0)] = 1.0
+    """Factor on the odometry's drift (`mgs.survey.registration`)."""
+
+
+class SceneFile(_Strict):
+    """A scene: rock, arena, sun and sky, camera, orbit, sensor noise."""
+
+    description: str = ""
+    rock: Rock = Rock()
+    arena: Arena = Arena()
+    sky: Sky = Sky()
+    camera: Lens = Lens()
+    orbit: Orbit = Orbit()
+    sensor: Sensor = Sensor()
+
+
+def load_scene_file(scene: str | Path) -> SceneFile:
+    """Read a scene by its name (`boulder`) or path (`my.toml`).
+
+    Raises InputError where it does not exist, is not TOML, or has an unknown key or a value out of range.
+    """
+    path = scene_path(scene)
+    try:
+        return SceneFile.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid TOML ({error}); correct it") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            raise InputError(f"{path}: unknown key {key!r}; choose one of {', '.join(_keys_beside(first['loc']))}") from None
+        raise InputError(f"{path}: {key}: {first['msg']} (is {first['input']!r}); correct it") from None
+
+
+def _keys_beside(where: tuple[int | str, ...]) -> list[str]:
+    """The keys that a scene file may have in the section of the key `where`, a path such as ("rock", "lobes", 0, "radius")."""
+    section: Any = SceneFile
+    for part in where[:-1]:
+        if isinstance(part, str):  # not the place in a list
+            kind = section.model_fields[part].annotation
+            section = next(iter(get_args(kind)), kind)
+    return list(section.model_fields)
+
+
+def sensor_of(dataset: Path) -> Sensor:
+    """The sensor of the scene that a dataset was rendered from; the default where the dataset does not say."""
+    path = dataset / "config.json"
+    recorded = read_json(path) if path.is_file() else {}
+    try:
+        return Sensor.model_validate(recorded.get("scene", {}).get("sensor", {}))
+    except (ValidationError, AttributeError):
+        raise InputError(f"{path}: its scene.sensor is damaged; correct it or give --sensor-noise and --drift") from None
