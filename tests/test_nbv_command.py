@@ -18,7 +18,6 @@ from mgs.active.run_folder import load_run
 from mgs.cli.app import main
 from mgs.cli.nbv import print_run, read_train_settings, start_run, train_settings
 from mgs.data.dataset import load_dataset
-from mgs.data.meshes import Mesh
 from mgs.errors import InputError
 from mgs.files import locked, write_json
 from mgs.images import write_png
@@ -173,7 +172,7 @@ def test_a_replaced_prior_is_one_line_on_resume(dataset, prior, tmp_path, capsys
         "count": replace(known, points=known.points[1:], normals=known.normals[1:]),
     }[change]
     prior.rename(tmp_path / "kept")
-    save_prior(prior, other, Mesh(known.points[:3], np.array([[0, 1, 2]]), np.zeros(1, bool)))
+    save_prior(prior, other)
     capsys.readouterr()
     assert f"{prior}: is not the prior that {run} was started on" in refused(capsys, ["nbv", "--resume", run], run)
     prior.rename(tmp_path / "other")
