@@ -18,7 +18,7 @@ from mgs.resources import resource_folder
 from mgs.rotation import WORLD_FROM_GLTF
 from mgs.seeds import generator
 from mgs.synth import arena
-from mgs.synth.rendering import PoseNoise, Preset, rock_cameras, synthesise
+from mgs.synth.rendering import ROCK_EXPOSURE, PoseNoise, Preset, rock_cameras, synthesise
 from mgs.synth.rock import make_rock
 from mgs.synth.scene_file import ORBITS, Arena, Orbit, Rock, SceneFile, load_scene_file
 
@@ -108,7 +108,7 @@ def test_same_seed_same_bytes_and_resume_and_pose_noise(dataset, tmp_path):
 
 def test_output_folder_that_is_not_empty(dataset, tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
-        patched.setattr("mgs.synth.make_rock", None)  # what is in the way is known before the rock is made
+        patched.setattr("mgs.synth.rendering.make_rock", None)  # what is in the way is known before the rock is made
         with pytest.raises(InputError, match="not empty"):
             synthesise(dataset.root, SCENE, TINY, seed=3)
     (tmp_path / "config.json").write_text("{}")
@@ -163,6 +163,24 @@ def test_what_is_taken_as_up_is_said(tmp_path, suffix, up, said):
     dataset = synthesise(tmp_path / "out", SCENE, small, mesh=path, mesh_up=up, say=notes.append)
     assert f"{path}: {said}; scaled" in notes[0]
     assert read_json(dataset.root / "config.json")["mesh"]["up"] == said[1].lower()
+
+
+def test_a_dark_rock_does_not_blow_out_the_ground(tmp_path):
+    black, notes = (0.01, 0.01, 0.01), []
+    scene = SCENE.model_copy(update={"rock": Rock(detail=0.06, colours=(black, black), dust=black)})
+    dataset = synthesise(tmp_path / "dark", scene, TINY, seed=3, say=notes.append)
+    clipped = [(frame.rgb().max(-1) >= 1)[frame.depth() > 0].mean() for frame in dataset.frames]
+    assert 0.05 < np.mean(clipped) < 0.25
+    assert len(notes) == 1
+    assert "times lower than a rock so dark asks for: about 20% of rock and ground clips" in notes[0]
+
+
+def test_the_exposure_of_other_rocks_is_that_of_the_rock_alone(tmp_path):
+    notes = []
+    small = Preset(width=32, height=24, frames=4, spp=64)
+    usual = synthesise(tmp_path / "usual", SCENE, small, seed=3, say=notes.append)
+    assert notes == []
+    assert np.mean([frame.rgb()[frame.mask()].mean() for frame in usual.frames]) == pytest.approx(ROCK_EXPOSURE, rel=0.05)
 
 
 def test_rock_that_does_not_fit_the_frame(tmp_path):
