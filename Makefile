@@ -16,7 +16,7 @@ test: setup
 	@echo "ruff check";  $(BIN)/ruff check -q .
 	@echo "ruff format"; $(BIN)/ruff format -q --check .
 	@echo "mypy";        $(BIN)/mypy --no-error-summary
-	@echo "pytest";      $(BIN)/python -m pytest
+	@echo "pytest";      $(BIN)/python -m pytest -n 2 --dist loadfile
 
 setup: $(STAMP)
 
