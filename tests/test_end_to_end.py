@@ -20,7 +20,7 @@ from mgs.splat_ply import read_ply
 
 OPTIONS = ["--gaussians", "300", "--seeds", "3", "--budget", "4", "--passes", "6", "--seed", "1"]
 STRUCK = """
-import os
+import os, signal
 from mgs import runtime, stations
 from mgs.cli import main
 
@@ -37,6 +37,7 @@ def struck(gaussians, cameras, targets, settings, on_pass, cache):
     return fit(gaussians, cameras, targets, settings, blow, cache)
 
 stations.fit = struck
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts what runs in the background deaf to it
 main()
 """
 """The program, which sends itself a signal in the middle of its third step: between two passes of the fit."""
