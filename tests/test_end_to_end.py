@@ -21,8 +21,8 @@ from mgs.splat_ply import read_ply
 OPTIONS = ["--gaussians", "300", "--seeds", "3", "--budget", "4", "--passes", "6", "--seed", "1"]
 STRUCK = """
 import os, signal
-from mgs import runtime, stations
-from mgs.cli import main
+from mgs.active import stations
+from mgs.cli.app import main
 
 fit, fits = stations.fit, []
 
@@ -72,7 +72,7 @@ def test_the_run_is_whole(dataset, run):
     lines, metrics = steps(run), json.loads((run / "metrics.json").read_text())
     frames = load_dataset(dataset).frames
     assert [line["images"] for line in lines] == [3, 4, 5, 6, 7]
-    assert all(line["gain"] == line["information_gain"] > 0 for line in lines[1:])
+    assert all(line["score"] == line["information_gain"] > 0 for line in lines[1:])
     assert ["psnr" in line for line in lines] == [True, False, True, False, True]
     assert metrics["all"]["count"] == 10
     assert metrics["held_out"]["count"] == 3
@@ -111,7 +111,7 @@ def test_choice_is_the_best_of_the_real_information(dataset, run):
     gains = [criteria.d_optimal(fisher(state.gaussians, frames[i].camera), H, lam) for i in left]
     last = steps(run)[-1]
     assert last["frame"] == left[int(np.argmax(gains))]
-    assert last["gain"] == pytest.approx(max(gains), rel=1e-5)
+    assert last["score"] == pytest.approx(max(gains), rel=1e-5)
 
 
 @pytest.mark.parametrize(("blow", "code"), [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 130)])
@@ -190,8 +190,8 @@ def test_demo_shows_the_table_and_the_pictures_and_can_be_given_again(tmp_path, 
     out = tmp_path / "demo"
     dataset = synthetic.write_dataset(out / "dataset", synthetic.orbit_cameras(13, 48, 36))
     write_contact_sheet(out / "dataset/contact_sheet.png", dataset.frames)
-    for name, value in {"commands.demo.GAUSSIANS": 200, "commands.demo.BUDGET": 2, "diagnostics.VIEWS": 1}.items():
-        monkeypatch.setattr(sys.modules["mgs." + name.rpartition(".")[0]], name.rpartition(".")[2], value)
+    for name, value in {"cli.demo.GAUSSIANS": 200, "cli.demo.BUDGET": 2, "report.diagnostics.VIEWS": 1}.items():
+        monkeypatch.setattr(f"mgs.{name}", value)
     command("demo", out)
     shown = capsys.readouterr().out
     assert all(policy in shown for policy in ("d-optimal", "coverage", "random"))

@@ -21,8 +21,8 @@ from mgs.images import write_png
 
 STRUCK = """
 import os, sys
-from mgs import imports
-from mgs.cli import main
+from mgs.data import importers as imports
+from mgs.cli.app import main
 
 write, calls = imports.write_png, []
 

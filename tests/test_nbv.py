@@ -74,7 +74,7 @@ def test_d_optimal_takes_the_best_candidate_at_every_step(dataset, tmp_path):
     left = [i for i in range(len(dataset)) if i not in before.taken]
     gains = [criteria.d_optimal(tiny.fisher(before.gaussians, dataset.frames[i].camera), H, lam) for i in left]
     assert state.taken[-1] == left[int(np.argmax(gains))]
-    assert state.steps[-1]["gain"] == state.steps[-1]["information_gain"] == max(gains)
+    assert state.steps[-1]["score"] == state.steps[-1]["information_gain"] == max(gains)
 
 
 def test_coverage_is_of_the_surface_and_does_not_depend_on_training(dataset, tmp_path):
@@ -99,7 +99,7 @@ def test_a_tie_goes_to_the_farthest_camera(dataset, tmp_path):
     """Where every view sees everything, coverage has nothing to say after the seeds: the views must spread all the same."""
     stations = tiny.stations(fisher=lambda gaussians, camera: np.ones((tiny.POINTS, 11), np.float32))
     state = run(tmp_path / "run", dataset, stations, policy="coverage", seeds=1, budget=3)
-    assert [step["gain"] for step in state.steps[1:]] == [0, 0, 0]
+    assert [step["score"] for step in state.steps[1:]] == [0, 0, 0]
     assert sorted(state.taken) == [0, 3, 6, 9]
 
 
@@ -397,7 +397,7 @@ def test_numbers_of_older_runs_that_are_none_are_null(half_done):
 
 @pytest.mark.parametrize("score", [math.nan, math.inf])
 def test_a_policy_that_gives_no_number_is_named(dataset, tmp_path, monkeypatch, score):
-    monkeypatch.setitem(criteria.CRITERIA, "mine", lambda F, H, lam: score)
+    monkeypatch.setitem(criteria.CRITERIA, "mine", criteria.Criterion(lambda F, H, lam: score))
     with pytest.raises(InputError, match="policy mine: gave a score that is NaN or infinite"):
         run(tmp_path / "run", dataset, policy="mine")
     assert len(lines(tmp_path / "run")) == 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +13,17 @@ import tiny
 from refusals import refused
 from rich.console import Console
 
-from mgs.active import criteria, loop, run_folder
+from mgs.active import criteria, loop, nbv, run_folder
 from mgs.active.run_folder import load_run
+from mgs.active.settings import TrainSettings
 from mgs.cli.app import main
-from mgs.cli.nbv import print_run, read_train_settings, start_run, train_settings
+from mgs.cli.nbv import print_run, start_and_print
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import locked, write_json
 from mgs.images import write_png
 from mgs.prior.build import load_prior, save_prior
+from mgs.splat import fisher
 
 
 @pytest.fixture
@@ -30,9 +32,9 @@ def dataset(tmp_path):
 
 
 def started(dataset: Path, out: Path, prior: Path | None = None, **values) -> tuple[dict, str]:
-    """Settings in the config.json of a run that `start_run` wrote, and what it printed."""
+    """Settings in the config.json of a run that `start_and_print` wrote, and what it printed."""
     console = Console(record=True, width=500)
-    start_run(dataset, out, prior, None, values, console)
+    start_and_print(dataset, out, console, prior=prior, **values)
     return json.loads((out / "config.json").read_text())["settings"], console.export_text()
 
 
@@ -47,11 +49,9 @@ def test_the_datasets_own_prior_is_the_default(dataset, tmp_path):
 
 
 def test_every_setting_of_the_fit_is_written_down_and_the_root_seed_reaches_it(dataset, tmp_path):
-    from mgs.active.fitting import TrainSettings
-
     prior = tiny.write_prior(tmp_path / "prior")
     settings, _ = started(dataset, tmp_path / "run", prior, budget=2, seed=7)
-    assert set(settings["train"]) == {field.name for field in fields(TrainSettings)}
+    assert settings["train"] == TrainSettings(seed=7).model_dump()
     assert settings["train"]["seed"] == settings["seed"] == 7
 
 
@@ -129,25 +129,28 @@ def test_demo_does_not_show_another_seeds_results(tmp_path, capsys, made):
 @pytest.mark.parametrize("train", [{"speed": 1}, {"passes": "many"}, {"rates": [0.1, 0.2]}, {"decay": float("nan")}])
 def test_damaged_settings_of_the_fit_are_one_line_on_resume(dataset, tmp_path, capsys, train):
     prior = tiny.write_prior(tmp_path / "prior")
-    tiny.start(tmp_path / "run", load_dataset(dataset), prior=prior, train=train)
+    tiny.start(tmp_path / "run", load_dataset(dataset), prior=prior)
+    config = json.loads((tmp_path / "run/config.json").read_text())
+    config["settings"]["train"] = train
+    (tmp_path / "run/config.json").write_text(json.dumps(config))
     with pytest.raises(SystemExit) as stop:
         main(["nbv", "--resume", str(tmp_path / "run")])
     assert stop.value.code == 2
     shown = capsys.readouterr().err
-    assert f"config.json: train.{next(iter(train))}" in shown
+    assert f"config.json: settings.train.{next(iter(train))}" in shown
     assert len(shown.splitlines()) == 1
 
 
 def test_learning_rates_that_are_too_high_are_one_line(dataset, prior, tmp_path, capsys):
     """The loss settles on that of a black image: flat, but above its start."""
     run = tmp_path / "run"
-    train = train_settings(None, 0) | {"rates": [20, 20, 10, 50]}
+    train = {"rates": [20, 20, 10, 50]}
     tiny.start(run, load_dataset(dataset), prior=prior, budget=1, train=train)
     said = refused(capsys, ["nbv", "--resume", run])
     assert "the fit to the seeds diverged: its loss was" in said
     assert "lower the learning rates (`train.rates` in" in said
     config = json.loads((run / "config.json").read_text())
-    config["settings"]["train"] = train_settings(None, 0)
+    config["settings"]["train"] = {}
     write_json(run / "config.json", config)
     with pytest.raises(SystemExit) as stop:
         main(["nbv", "--resume", str(run)])
@@ -158,7 +161,7 @@ def test_learning_rates_that_are_too_high_are_one_line(dataset, prior, tmp_path,
 def test_a_replaced_prior_is_one_line_on_resume(dataset, prior, tmp_path, capsys, change):
     """Whatever changed in it; nothing is lost, and with the old one back the run goes on."""
     run = tmp_path / "run"
-    tiny.start(run, load_dataset(dataset), prior=prior, budget=0, train=train_settings(1, 0))
+    tiny.start(run, load_dataset(dataset), prior=prior, budget=0, train={"passes": 1})
     with pytest.raises(SystemExit):
         main(["nbv", "--resume", str(run)])
     config = json.loads((run / "config.json").read_text())
@@ -202,7 +205,7 @@ def test_a_run_appears_whole_or_not_at_all(dataset, tmp_path, monkeypatch):
         there.append((tmp_path / "run").exists())
         start(out, *rest)
 
-    monkeypatch.setattr(run_folder, "start", watched)
+    monkeypatch.setattr(nbv, "start", watched)
     own = tiny.write_prior(tmp_path / "prior")
     started(dataset, tmp_path / "run", own, budget=1)
     assert there == [False]
@@ -213,7 +216,7 @@ SETTINGS = {
     "budget": (-1, "settings.budget: Input should be greater than or equal to 0"),
     "seeds": ("four", "settings.seeds: Input should be a valid integer"),
     "speed": (1, "settings.speed: Extra inputs are not permitted"),
-    "prior_std": ({"colour": 1.0}, "settings.prior_std: must have a number for each of colour, scale, rotation, opacity"),
+    "prior_std": ({"color": 1.0}, "settings.prior_std: must be a number for each of colour, scale, rotation, opacity"),
 }
 
 
@@ -237,17 +240,57 @@ def test_scales_of_lambda_are_finite(dataset, tmp_path, values):
         started(dataset, tmp_path / "run", tiny.write_prior(tmp_path / "prior"), **values)
 
 
-def test_settings_of_the_fit_are_read_back_as_they_were(tmp_path):
-    from mgs.active.fitting import TrainSettings
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--estimator", "block"], "--estimator block: gives no diagonal, or is unknown; choose one of exact, hutchinson"),
+        (["--estimator", "guess"], "--estimator guess: gives no diagonal, or is unknown"),
+        (["--optimiser", "hope"], "--optimiser hope: unknown; choose one of adam"),
+        (["--lam", "0"], "--lam 0.0: Input should be greater than 0"),
+        (["--rate", "colour"], "--rate colour: expected KIND=NUMBER, as in --rate colour=0.01"),
+        (["--rate", "colour=-1"], "--rates-colour -1.0: Input should be greater than or equal to 0"),
+        (["--rate", "hue=1"], "--rates {'hue': 1.0}: must be a number for each of colour, scale, rotation, opacity"),
+        (["--prior-std", "scale=inf"], "--prior-std-scale inf: Input should be a finite number"),
+        (["--passes", "0"], "--passes 0: Input should be greater than or equal to 1"),
+    ],
+)
+def test_bad_options_are_one_line(dataset, prior, tmp_path, capsys, options, message):
+    out = tmp_path / "run"
+    assert message in refused(capsys, ["nbv", dataset, "--prior", prior, "--budget", "1", "--out", out, *options])
+    assert not out.exists()
 
-    assert asdict(read_train_settings(tmp_path, train_settings(6, 2))) == asdict(TrainSettings(passes=6, seed=2))
+
+def test_options_of_the_criterion_and_the_fit_reach_the_run(dataset, prior, tmp_path):
+    """The paper's Eq. 7: squared gradients of one scalar loss per image, one lambda."""
+    options = "--estimator loss-gradient --lam 1e-6 --budget 1 --seeds 3 --passes 2"
+    options += " --rate colour=0.1 --rate opacity=0 --prior-std scale=2"
+    with pytest.raises(SystemExit) as stop:
+        main(["nbv", str(dataset), "--prior", str(prior), "--out", str(tmp_path / "run"), *options.split()])
+    assert stop.value.code == 0
+    state = run_folder.read_checkpoint(tmp_path / "run")
+    settings = run_folder.read_settings(tmp_path / "run")
+    assert settings.train.rates == {"colour": 0.1, "scale": 0.02, "rotation": 0.01, "opacity": 0}
+    assert settings.prior_std == {"colour": 1.0, "scale": 2.0, "rotation": 0.5, "opacity": 2.0}
+    np.testing.assert_array_equal(state.gaussians.logit_opacities[0], state.gaussians.logit_opacities)
+    cameras = [load_dataset(dataset).frames[i].camera for i in state.taken]
+    paper = sum(fisher(state.gaussians, camera, "loss-gradient").astype(np.float64) for camera in cameras)
+    np.testing.assert_array_equal(state.H, paper)
+    exact = sum(fisher(state.gaussians, camera).astype(np.float64) for camera in cameras)
+    assert np.abs(state.H - exact).max() > 0.5 * exact.max()
+
+
+def test_settings_of_the_fit_are_read_as_older_runs_wrote_them():
+    older = {"passes": 6, "tolerance": 0.01, "rates": [0.1, 0.2, 0.3, 0.4], "decay": 0.1, "seed": 2}
+    found = TrainSettings(**older)
+    assert found.rates == {"colour": 0.1, "scale": 0.2, "rotation": 0.3, "opacity": 0.4}
+    assert TrainSettings(**found.model_dump()) == found
 
 
 def test_the_documented_policy_of_ones_own(dataset, tmp_path, monkeypatch):
     """The program in docs/nbv.md, its command caught: the policy is started, run, and read back where nobody registered it."""
-    monkeypatch.setattr(criteria, "CRITERIA", dict(criteria.CRITERIA))
+    monkeypatch.setitem(criteria.CRITERIA, "least-known", None)  # so that it is gone again at the end
     commands: list[list[str]] = []
-    monkeypatch.setattr("mgs.cli.app.main", commands.append)
+    monkeypatch.setattr("mgs.cli.app.main", lambda given: commands.append(given))
     page = (Path(__file__).parent.parent / "docs/nbv.md").read_text()
     exec(page.split("```python\n")[1].split("```")[0], {})
     name = commands[0][commands[0].index("--policy") + 1]
@@ -255,10 +298,11 @@ def test_the_documented_policy_of_ones_own(dataset, tmp_path, monkeypatch):
 
     loaded, scores = load_dataset(dataset), []
     own = criteria.CRITERIA[name]
-    monkeypatch.setitem(criteria.CRITERIA, name, lambda *given: scores.append(own(*given)) or scores[-1])
+    counted = criteria.Criterion(lambda *given: scores.append(own.score(*given)) or scores[-1])
+    monkeypatch.setitem(criteria.CRITERIA, name, counted)
     state = loop.run(tmp_path / "run", run_folder.read_settings(tmp_path / "run"), loaded, tiny.stations(), tiny.silent)
     assert len(scores) == len(loaded) - 4
-    assert state.steps[-1]["gain"] == max(scores) > 0
+    assert state.steps[-1]["score"] == max(scores) > 0
 
     monkeypatch.undo()
     assert load_run(tmp_path / "run")[3] == name

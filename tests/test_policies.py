@@ -29,31 +29,31 @@ def test_d_optimal_is_the_exact_log_determinant_difference(F, H):
 
 @given(information, information, st.sampled_from(sorted(criteria.CRITERIA)))
 def test_no_view_loses_information(F, H, name):
-    assert criteria.CRITERIA[name](F, H, LAM) >= 0
+    assert criteria.CRITERIA[name].score(F, H, LAM) >= 0
 
 
 @given(information, st.sampled_from(sorted(criteria.CRITERIA)))
 def test_a_view_that_sees_nothing_gains_nothing(H, name):
-    assert criteria.CRITERIA[name](np.zeros_like(H), H, LAM) == 0
+    assert criteria.CRITERIA[name].score(np.zeros_like(H), H, LAM) == 0
 
 
 @given(information, information, information, st.sampled_from(sorted(criteria.CRITERIA)))
 def test_seeing_more_is_never_worse(F, more, H, name):
-    score = criteria.CRITERIA[name]
+    score = criteria.CRITERIA[name].score
     assert score(F + more, H, LAM) >= score(F, H, LAM) * (1 - 1e-12)
 
 
 @given(information, information, information, st.sampled_from(["d-optimal", "t-optimal", "fisherrf"]))
 def test_returns_diminish(F, H, seen, name):
     """Submodularity: with the model held fixed, a view is worth less once others have been taken."""
-    score = criteria.CRITERIA[name]
+    score = criteria.CRITERIA[name].score
     assert score(F, H + seen, LAM) <= score(F, H, LAM) * (1 + 1e-12)
 
 
 @given(information, information, scales, st.sampled_from(["d-optimal", "fisherrf", "coverage"]))
 def test_units_do_not_matter_when_lambda_carries_them(F, H, unit, name):
     """theta -> unit * theta divides J by unit; lam = (sigma / tau)^2 follows, so the gain must not change."""
-    score = criteria.CRITERIA[name]
+    score = criteria.CRITERIA[name].score
     # Powers of two: exact in floating point, so the threshold of `coverage` cannot flip by rounding.
     unit = 2.0 ** np.round(np.log2(unit))
     assert score(F / unit**2, H / unit**2, LAM / unit**2) == pytest.approx(score(F, H, LAM), rel=1e-9)

@@ -66,7 +66,9 @@ def test_run_folder(runs):
 def drawn(monkeypatch):
     """{file name: figure} of every figure that is saved."""
     found, save = {}, plotting.save_figure
-    monkeypatch.setattr(plotting, "save_figure", lambda figure, path: (found.update({path.name: figure}), save(figure, path)))
+    monkeypatch.setattr(
+        "mgs.report.figures.save_figure", lambda figure, path: (found.update({path.name: figure}), save(figure, path))
+    )
     return found
 
 

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from mgs.active.fitting import TrainSettings, fit
+from mgs.active.fitting import fit
+from mgs.active.settings import TrainSettings
 from mgs.active.stopping import LOSS_FLOOR, StopReason, stop_reason
 from mgs.bench.core import surface_camera, surface_gaussians
 from mgs.camera import Camera, look_at
@@ -54,7 +55,7 @@ def test_fit_lowers_the_loss_a_hundredfold_and_reports_it(truth, cameras, target
 
 def test_one_step_is_adam_on_the_gradient_of_the_summed_squared_error(truth, cameras, targets):
     """The first Adam step moves each parameter by its rate times g / (|g| + epsilon): against finite differences."""
-    from mgs.active.fitting import EPSILON
+    from mgs.active.optimisers import ADAM_EPSILON
 
     start = grey(truth)
     found = fit(start, cameras[:1], targets[:1], TrainSettings(passes=1, rates=(0.02, 0.0, 0.0, 0.0)))
@@ -69,7 +70,7 @@ def test_one_step_is_adam_on_the_gradient_of_the_summed_squared_error(truth, cam
         up[i, 0, 0] += 0.05
         down[i, 0, 0] -= 0.05
         g = (half_sum(up) - half_sum(down)) / 0.1
-        assert step[i, 0] == pytest.approx(-0.02 * g / (abs(g) + EPSILON), rel=1e-2)
+        assert step[i, 0] == pytest.approx(-0.02 * g / (abs(g) + ADAM_EPSILON), rel=1e-2)
 
 
 def test_what_no_image_shows_stays_where_the_prior_put_it(truth, cameras, targets):
@@ -100,7 +101,7 @@ def test_stops_when_passes_no_longer_help(truth, cameras, targets):
 
 def faster(factor: float, **values) -> TrainSettings:
     """Learning rates that many times too high."""
-    return TrainSettings(rates=tuple(factor * rate for rate in TrainSettings().rates), **values)
+    return TrainSettings(rates={kind: factor * rate for kind, rate in TrainSettings().rates.items()}, **values)
 
 
 def test_a_fit_whose_loss_rises_has_diverged(truth, cameras, targets):

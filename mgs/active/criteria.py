@@ -1,14 +1,9 @@
-"""Next-best-view policies: pure NumPy scores, each a row of a table. The loop that uses them is `mgs.active.loop`.
+"""Criteria: what a view is worth, from Fisher information alone. Pure NumPy functions, each a row of a table.
 
-Two kinds, because they look at different things:
-
-- a *criterion* scores one candidate from Fisher information alone, `(F [N,P], H [N,P], lam [P]) -> float`;
-- a *pose policy* scores all candidates from camera positions alone, `(candidates [C,3], taken [T,3], centre [3], rng)
-  -> scores [C]`, metres.
-
-Neither ever sees a candidate's image. The largest score wins; a tie goes to the camera farthest from those taken (a rule of
-our own, the same for all: the paper names none, and coverage ties at every step once it has saturated). A policy of your own is
-one more row (docs/nbv.md).
+The loop of `mgs.active.loop` scores every candidate with the criterion that a run names, and takes the one with the largest
+score; a tie goes to the camera farthest from those taken (a rule of our own, the same for all policies: the paper names none,
+and coverage ties at every step once it has saturated). Policies that look at poses instead of information are in
+`mgs.active.pose_policies`. Neither kind ever sees a candidate's image. A criterion of your own is one more row (docs/nbv.md).
 
 Notation, after the paper's Eq. 7 and POp-GS: H [N,P] is the diagonal of J^T J summed over the training set, F [N,P] that of
 one candidate, lam [P] the regularisation (`regularisation`); l = N P is the number of parameters.
@@ -17,13 +12,16 @@ one candidate, lam [P] the regularisation (`regularisation`); l = N P is the num
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
 
-Criterion = Callable[[Array, Array, Array], float]
+Score = Callable[[Array, Array, Array], float]
+"""(F [N,P], H [N,P], lam [P]) -> score of one candidate."""
 
 PIXEL_NOISE = 0.02
 """sigma_e, standard deviation of a pixel's residual, linear RGB (34 dB): the scale at which one pixel's evidence counts as one.
@@ -102,11 +100,20 @@ def coverage_greedy(F: Array, H: Array, lam: Array) -> float:
     return float((observed(H + F, lam) & ~observed(H, lam)).sum())
 
 
+@dataclass(frozen=True)
+class Criterion:
+    """A score, and the Gaussians at which its F and H are measured: as fitted so far, or as the prior gave them, before any
+    training (then by exact Fisher information, whatever the estimator of the run)."""
+
+    score: Score
+    at: Literal["fitted", "prior"] = "fitted"
+
+
 CRITERIA: dict[str, Criterion] = {
-    "d-optimal": d_optimal,
-    "coverage": coverage_greedy,
-    "t-optimal": t_optimal,
-    "a-optimal": a_optimal,
-    "e-optimal": e_optimal,
-    "fisherrf": fisherrf,
+    "d-optimal": Criterion(d_optimal),
+    "coverage": Criterion(coverage_greedy, at="prior"),
+    "t-optimal": Criterion(t_optimal),
+    "a-optimal": Criterion(a_optimal),
+    "e-optimal": Criterion(e_optimal),
+    "fisherrf": Criterion(fisherrf),
 }

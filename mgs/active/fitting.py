@@ -14,6 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mgs.active.optimisers import OPTIMISERS
+from mgs.active.settings import TrainSettings
 from mgs.active.stopping import StopReason, stop_reason
 from mgs.camera import Camera
 from mgs.errors import InputError
@@ -24,22 +26,6 @@ from mgs.splat.blocks import BlockLists
 from mgs.splat.projection import camera_array, project
 from mgs.splat.recording import frozen
 from mgs.splat.rendering import composite
-
-
-@dataclass(frozen=True)
-class TrainSettings:
-    """Learning rates are Adam's, per step, in each parameter's own unit; they fall by `decay` over `passes`."""
-
-    passes: int = 40
-    """Most passes over the images."""
-    tolerance: float = 0.01
-    """Converged when a pass lowers the loss by less than this share, twice in a row, and does not raise it by more
-    (`mgs.active.stopping.stop_reason`)."""
-    rates: tuple[float, float, float, float] = (0.02, 0.02, 0.01, 0.05)
-    """For sh, log_scales, quats, logit_opacities."""
-    decay: float = 0.1
-    """Last rate over first."""
-    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -61,14 +47,17 @@ class Fit:
 
 
 def _baked(
-    gaussians: Gaussians, moments: Any, camera: Any, packed: Any, lists: BlockLists, target: Any, size: Any, *_: Any
-) -> tuple[int, ...]:
-    return len(lists.splat), len(lists.block), len(target), *gaussians.sh.shape, *size
-
-
-EPSILON = 1e-3
-"""Adam's epsilon, (pixel value)^2 per unit of the parameter: a gradient of the summed squared error below it is noise, and a
-parameter that no image sees stays where the prior put it instead of walking full steps."""
+    optimiser: str,
+    gaussians: Gaussians,
+    buffers: Any,
+    camera: Any,
+    packed: Any,
+    lists: BlockLists,
+    target: Any,
+    size: Any,
+    *_: Any,
+) -> tuple[Any, ...]:
+    return optimiser, len(lists.splat), len(lists.block), len(target), *gaussians.sh.shape, *size
 
 
 @frozen(lambda gaussians, camera: gaussians.sh.shape)
@@ -78,8 +67,9 @@ def _project(gaussians: Gaussians, camera: Any) -> Any:
 
 @frozen(_baked)
 def _step(
+    optimiser: str,
     gaussians: Gaussians,
-    moments: list[list[Any]],
+    buffers: list[list[Any]],
     camera: Any,
     packed: Any,
     lists: BlockLists,
@@ -88,10 +78,10 @@ def _step(
     rates: list[Any],
     t: Any,
 ) -> tuple[Gaussians, list[list[Any]], Any]:
-    """One Adam step (Kingma & Ba 2015, beta 0.9 and 0.999) on one image. Returns parameters, moments, mean squared error.
+    """One step of the optimiser on one image. Returns parameters, buffers, mean squared error before the step.
 
-    packed: the Gaussians' splats, packed for the lists; size: (width, height); t: UInt32, step number from 1; target: Float
-    [H*W*3].
+    buffers, rates: for each of LEARNED; packed: the Gaussians' splats, packed for the lists; size: (width, height); t: UInt32,
+    step number from 1; target: Float [H*W*3].
     """
     values = [dr.copy(getattr(gaussians, name)) for name in LEARNED]
     dr.enable_grad(values)
@@ -100,16 +90,11 @@ def _step(
     error = rgb.array - target
     loss = dr.mean(dr.square(error))
     dr.backward(0.5 * dr.sum(dr.square(error)))
-    new_values, new_moments = [], []
-    step = mi.Float(t)
-    unbias1, unbias2 = 1 - dr.power(mi.Float(0.9), step), 1 - dr.power(mi.Float(0.999), step)
-    for value, (m, v), rate in zip(values, moments, rates, strict=True):
-        gradient = dr.grad(value)
-        m, v = dr.lerp(gradient, m, 0.9), dr.lerp(dr.square(gradient), v, 0.999)
-        update = (m.array / unbias1) / (dr.sqrt(v.array / unbias2) + EPSILON) * rate
-        new_values.append(mi.TensorXf(dr.detach(value).array - update, value.shape))
-        new_moments.append([m, v])
-    return Gaussians(gaussians.means, **dict(zip(LEARNED, new_values, strict=True))), new_moments, dr.detach(loss)
+    step, moved, kept = mi.Float(t), {}, []
+    for name, value, kept_before, rate in zip(LEARNED, values, buffers, rates, strict=True):
+        moved[name], after = OPTIMISERS[optimiser].step(dr.detach(value), dr.grad(value), kept_before, rate, step)
+        kept.append(after)
+    return Gaussians(gaussians.means, **moved), kept, dr.detach(loss)
 
 
 def fit(
@@ -122,23 +107,27 @@ def fit(
 ) -> Fit:
     """Fit appearance (not means) to images: cameras and targets [H,W,3] linear RGB, rock on black.
 
-    Starts with fresh optimiser moments, so the result depends on its arguments alone, bitwise. on_pass(done, most) reports.
-    Stops as `mgs.active.stopping.stop_reason` says. Raises InputError where a parameter of the Gaussians given is not finite.
+    Starts with fresh buffers of the optimiser, so the result depends on its arguments alone, bitwise. on_pass(done, most)
+    reports. Stops as `mgs.active.stopping.stop_reason` says. Raises InputError where a parameter of the Gaussians given is not
+    finite, or the optimiser is unknown.
     """
     settings, cache = settings or TrainSettings(), cache or ListCache()
+    if settings.optimiser not in OPTIMISERS:
+        raise InputError(f"optimiser {settings.optimiser!r} is unknown; choose one of {', '.join(OPTIMISERS)}")
     model = as_drjit(gaussians)
     images = [
         _Image(camera, camera_array(camera), mi.Float(np.ascontiguousarray(target, np.float32).ravel()))
         for camera, target in zip(cameras, targets, strict=True)
     ]
-    moments = [[dr.zeros(mi.TensorXf, getattr(model, n).shape) for _ in range(2)] for n in LEARNED]
+    count = OPTIMISERS[settings.optimiser].buffers
+    buffers = [[dr.zeros(mi.TensorXf, getattr(model, name).shape) for _ in range(count)] for name in LEARNED]
     rng = generator(settings.seed, "train/order")
     losses, kept, stop = [_loss(model, images, cache)], model, StopReason.PASS_LIMIT
     for done in range(settings.passes):
         fall = settings.decay ** (done / max(settings.passes - 1, 1))
-        rates = [dr.opaque(mi.Float, rate * fall) for rate in settings.rates]
+        rates = [dr.opaque(mi.Float, rate * fall) for rate in settings.rates.values()]
         order = [images[i] for i in rng.permutation(len(images))]
-        model, moments, loss = _pass(model, moments, order, rates, done * len(images), cache)
+        model, buffers, loss = _pass(settings.optimiser, model, buffers, order, rates, done * len(images), cache)
         if loss <= min(losses[1:], default=np.inf):  # never of a loss that is not a number
             kept = model
         losses.append(loss)
@@ -169,9 +158,9 @@ def _loss(model: Gaussians, images: list[_Image], cache: ListCache) -> float:
 
 
 def _pass(
-    model: Gaussians, moments: list[list[Any]], images: list[_Image], rates: list[Any], t: int, cache: ListCache
+    optimiser: str, model: Gaussians, buffers: list[list[Any]], images: list[_Image], rates: list[Any], t: int, cache: ListCache
 ) -> tuple[Gaussians, list[list[Any]], float]:
-    """One step on each image, in order, after t steps. Returns parameters, moments and the mean of the steps' losses.
+    """One step on each image, in order, after t steps. Returns parameters, buffers and the mean of the steps' losses.
 
     The loss is NaN where a parameter is no longer finite: such a model cannot be rendered.
     """
@@ -182,11 +171,11 @@ def _pass(
         try:
             lists, packed = cache.get(image.camera, splats)
         except InputError:
-            return model, moments, float("nan")
+            return model, buffers, float("nan")
         size = (image.camera.width, image.camera.height)
-        model, moments, loss = _step(
-            model, moments, image.array, packed, lists, image.pixels, size, rates, dr.opaque(mi.UInt32, t)
+        model, buffers, loss = _step(
+            optimiser, model, buffers, image.array, packed, lists, image.pixels, size, rates, dr.opaque(mi.UInt32, t)
         )
         losses.append(loss)
     finite = dr.all([dr.all(dr.isfinite(getattr(model, name).array)) for name in LEARNED])
-    return model, moments, float(np.mean([float(loss[0]) for loss in losses])) if finite[0] else float("nan")
+    return model, buffers, float(np.mean([float(loss[0]) for loss in losses])) if finite[0] else float("nan")

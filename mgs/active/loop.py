@@ -48,12 +48,16 @@ class Fit(Protocol):
 
 @dataclass(frozen=True)
 class Stations:
-    """The stations the loop calls; NumPy in and out, deterministic.
+    """What the loop calls; NumPy in and out, deterministic. `mgs.active.stations` has the real ones, tests have stand-ins.
 
-    centre: [3] the rock, metres; groups: columns of the Fisher information by kind of parameter;
-    initial(seed frames) -> Gaussians; fit(gaussians, cameras, targets, rate, on_pass) -> Fit, rate scaling the learning rates;
-    fisher(gaussians, camera) -> [N,P]; measure(gaussians, taken frame indices) -> entries for steps.jsonl; prior: hash of what
-    `initial` starts from (`mgs.active.inputs.prior_digest`).
+    centre: [3] the rock, metres.
+    groups: columns of the Fisher information by kind of parameter (`mgs.splat.groups`).
+    initial(seed frames) -> Gaussians before any training.
+    fit(gaussians, cameras, targets, rate, on_pass) -> Fit; rate multiplies all learning rates.
+    fisher(gaussians, camera) -> information of one view [N,P], by the estimator of the run.
+    measure(gaussians, taken frame indices) -> entries for steps.jsonl.
+    exact(gaussians, camera) -> exact information of one view [N,P], for what the views see of the surface; None: as `fisher`.
+    prior: hash of what `initial` starts from (`mgs.active.inputs.prior_digest`).
     """
 
     centre: np.ndarray
@@ -62,6 +66,7 @@ class Stations:
     fit: Callable[[Gaussians, list[Camera], list[np.ndarray], float, Callable[[int, int], None]], Fit]
     fisher: Callable[[Gaussians, Camera], np.ndarray]
     measure: Callable[[Gaussians, list[int]], dict[str, float]]
+    exact: Callable[[Gaussians, Camera], np.ndarray] | None = None
     prior: str = ""
 
 
@@ -136,7 +141,9 @@ class _Loop:
         self.out, self.settings, self.frames, self.stations, self.progress = out, settings, dataset.frames, stations, progress
         self.cameras = [frame.camera for frame in dataset.frames]
         self.positions = np.array([camera.position for camera in self.cameras])
-        self.lam = criteria.regularisation(stations.groups, settings.pixel_noise, settings.prior_std)
+        self.prior_lam = criteria.regularisation(stations.groups, settings.pixel_noise, settings.prior_std)
+        self.lam = self.prior_lam if settings.lam is None else np.full_like(self.prior_lam, settings.lam)
+        self.exact = stations.exact or stations.fisher
         self.images: dict[int, np.ndarray] = {}
         cameras = {frame.name: inputs.camera_digest(frame.camera) for frame in self.frames}
         self.made_from = {"prior": stations.prior, "cameras": cameras}
@@ -146,7 +153,14 @@ class _Loop:
     def first(self) -> State:
         """Step 0: the seeds."""
         names = [self.frames[i].name for i in self.seeds]
-        choice = {"frame": None, "name": None, "seeds": self.seeds, "seed_names": names, "gain": None, "information_gain": None}
+        choice = {
+            "frame": None,
+            "name": None,
+            "seeds": self.seeds,
+            "seed_names": names,
+            "score": None,
+            "information_gain": None,
+        }
         nothing = np.zeros((len(self.start), len(self.lam)))
         return self.learn(State(self.start, nothing, nothing, [], []), self.seeds, choice, _Stopwatch())
 
@@ -154,31 +168,39 @@ class _Loop:
         """One step: choose a pose, capture its image, learn."""
         watch = _Stopwatch()
         with watch("score"):
-            frame, gain = self.choose(state)
+            frame, score = self.choose(state)
             F = self.stations.fisher(state.gaussians, self.cameras[frame])
             information_gain = criteria.d_optimal(F, state.H, self.lam)
-        choice = {"frame": frame, "name": self.frames[frame].name, "gain": gain, "information_gain": information_gain}
+        choice = {"frame": frame, "name": self.frames[frame].name, "score": score, "information_gain": information_gain}
         return self.learn(state, [frame], choice, watch)
 
-    def choose(self, state: State) -> tuple[int, float | None]:
-        """Frame with the largest score among those not taken, and its gain: poses only, one candidate in memory at a time."""
+    def choose(self, state: State) -> tuple[int, float]:
+        """Frame of the largest score among those not taken, and that score. Looks at poses, never at candidates' images."""
         policy = self.settings.policy
         left = [i for i in range(len(self.frames)) if i not in state.taken]
         poses = self.positions[left], self.positions[state.taken], self.stations.centre
         rng = generator(self.settings.seed, f"{policy}/{len(state.steps)}")
         if policy in criteria.CRITERIA:
-            model, H = (self.start, state.surface) if policy == "coverage" else (state.gaussians, state.H)
-            scores: np.ndarray = np.empty(len(left))
-            for done, i in enumerate(left):
-                self.progress("scoring candidates", done, len(left))
-                scores[done] = criteria.CRITERIA[policy](self.stations.fisher(model, self.cameras[i]), H, self.lam)
+            scores = self.score(state, criteria.CRITERIA[policy], left)
         else:
             scores = pose_policies.POSE_POLICIES[policy](*poses, rng)
         farthest = pose_policies.farthest_pose(*poses, rng)
         best = max(range(len(left)), key=lambda k: (scores[k], farthest[k]))
         if np.isnan(scores).any() or np.isinf(scores[best]):
             raise InputError(f"policy {policy}: gave a score that is NaN or infinite; correct the policy (docs/nbv.md)")
-        return left[best], None if policy == "random" else float(scores[best])
+        return left[best], float(scores[best])
+
+    def score(self, state: State, criterion: criteria.Criterion, left: list[int]) -> np.ndarray:
+        """The criterion's score of each frame in `left`; the information of one candidate is in memory at a time."""
+        if criterion.at == "prior":
+            fisher, model, H, lam = self.exact, self.start, state.surface, self.prior_lam
+        else:
+            fisher, model, H, lam = self.stations.fisher, state.gaussians, state.H, self.lam
+        scores: np.ndarray = np.empty(len(left))
+        for done, i in enumerate(left):
+            self.progress("scoring candidates", done, len(left))
+            scores[done] = criterion.score(fisher(model, self.cameras[i]), H, lam)
+        return scores
 
     def learn(self, state: State, new: list[int], choice: dict[str, Any], watch: _Stopwatch) -> State:
         """Read the new images, fit to convergence on all so far, sum their information at the new model."""
@@ -199,7 +221,7 @@ class _Loop:
             for done, camera in enumerate(cameras):
                 self.progress("information of the training set", done, len(cameras))
                 H += self.stations.fisher(fit.gaussians, camera)
-            surface = state.surface + sum(self.stations.fisher(self.start, self.cameras[i]) for i in new)
+            surface = state.surface + sum(self.exact(self.start, self.cameras[i]) for i in new)
         kinds = ("image", "mask") if step else ("image", "mask", "depth")  # depth gives the seeds' colours to the surface
         files = {self.frames[i].name: inputs.frame_digests(self.frames[i], kinds) for i in new}
         made_from = {**self.made_from, "files": state.inputs.get("files", {}) | files}
@@ -207,7 +229,7 @@ class _Loop:
             "step": step,
             **choice,
             "images": len(taken),
-            "coverage": criteria.coverage(surface, self.lam),
+            "coverage": criteria.coverage(surface, self.prior_lam),
             "iterations": int(fit.iterations),
             "loss": float(fit.loss),
             "stop_reason": str(fit.stop_reason),

@@ -6,10 +6,10 @@
 - `gaussians.ply`: the model, once the budget is spent.
 
 A line of `steps.jsonl` holds: `step` (0 = the seeds), `frame` and `name` of the chosen view (null at step 0, which has `seeds`
-and `seed_names` instead), `images` (how many the model has now), `gain` (the policy's own score; null for random),
-`information_gain` (Eq. 7 of the chosen view, whatever the policy), `coverage` (Eq. 9 of all images), `iterations`, `loss` and
-`stop_reason` of the fit, `seconds` per stage, and, where the step was evaluated, mean PSNR in dB over all views (`psnr`;
-`psnr_mask` in the rock mask) and over those never trained on (`held_out_psnr`, `held_out_psnr_mask`).
+and `seed_names` instead), `images` (how many the model has now), `score` (the policy's own number; of random, the draw),
+`information_gain` (Eq. 7 of the chosen view by the run's estimator, whatever the policy), `coverage` (Eq. 9 of all images),
+`iterations`, `loss` and `stop_reason` of the fit, `seconds` per stage, and, where the step was evaluated, mean PSNR in dB over
+all views (`psnr`; `psnr_mask` in the rock mask) and over those never trained on (`held_out_psnr`, `held_out_psnr_mask`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import numpy as np
 
 from mgs.active import pose_policies
 from mgs.active.settings import NbvSettings, validated
-from mgs.data.dataset import Dataset
+from mgs.data.dataset import Dataset, load_dataset
 from mgs.errors import InputError
 from mgs.files import atomic_path, read_json, write_json
 from mgs.gaussians import Gaussians
@@ -46,10 +46,20 @@ class State:
 
 
 def check_settings(settings: NbvSettings, frames: int) -> None:
-    """Raises InputError where the policy is unknown, or the dataset has too few frames for the seeds and the budget."""
+    """Raises InputError where the policy, the estimator or the optimiser is unknown, or the dataset has too few frames for the
+    seeds and the budget."""
+    from mgs.active.optimisers import OPTIMISERS  # these two need Dr.Jit, which reading a run does not
+    from mgs.splat import ESTIMATORS
+
+    diagonal = [name for name in ESTIMATORS if name != "block"]
     if settings.policy not in pose_policies.policy_names():
         known = ", ".join(pose_policies.policy_names())
         raise InputError(f"--policy {settings.policy}: unknown; choose one of {known}, or register your own (docs/nbv.md)")
+    if settings.estimator not in diagonal:
+        known = ", ".join(diagonal)
+        raise InputError(f"--estimator {settings.estimator}: gives no diagonal, or is unknown; choose one of {known}")
+    if settings.train.optimiser not in OPTIMISERS:
+        raise InputError(f"--optimiser {settings.train.optimiser}: unknown; choose one of {', '.join(OPTIMISERS)}")
     if frames < settings.seeds:
         raise InputError(f"{settings.dataset}: has {frames} frames, fewer than {settings.seeds} seeds; lower --seeds")
     left = frames - settings.seeds
@@ -122,13 +132,10 @@ def load_run(run: Path) -> tuple[Gaussians, Dataset, list[str], str]:
 
     Raises InputError where the run is missing, it has no finished step, or its dataset has changed.
     """
-    from mgs.active import run_folder
-    from mgs.data.dataset import load_dataset
-
-    settings = run_folder.read_settings(run)
-    state = run_folder.read_checkpoint(run)
+    settings = read_settings(run)
+    state = read_checkpoint(run)
     if state is None:
         raise InputError(f"{run}: has no finished step yet; continue it with `mgs nbv --resume {run}`")
     dataset = load_dataset(settings.dataset)
-    run_folder.check_same_frames(run, dataset)
+    check_same_frames(run, dataset)
     return state.gaussians, dataset, [dataset.frames[i].name for i in state.taken], settings.policy

@@ -1,7 +1,8 @@
-"""Settings of a run: validated once, frozen, and written whole beside the results."""
+"""Settings of a run: validated once, frozen, and written whole beside the results. Needs neither Mitsuba nor Dr.Jit."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -9,6 +10,43 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from mgs.active.criteria import PIXEL_NOISE, PRIOR_STD
 from mgs.errors import InputError
+
+RATES = {"colour": 0.02, "scale": 0.02, "rotation": 0.01, "opacity": 0.05}
+"""Learning rates of the optimiser, per step, in each kind of parameter's own unit: colour coefficient, log-scale, quaternion,
+opacity logit. Chosen constants."""
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+def _complete(given: Any, defaults: Mapping[str, float]) -> Any:
+    """A number for each kind of parameter: those given, the others as in `defaults`. A list is what older runs wrote."""
+    if isinstance(given, list | tuple) and len(given) == len(defaults):
+        given = dict(zip(defaults, given, strict=True))
+    if not isinstance(given, Mapping) or not given.keys() <= defaults.keys():
+        raise ValueError(f"must be a number for each of {', '.join(defaults)}")
+    return {**defaults, **given}
+
+
+class TrainSettings(BaseModel):
+    """How a fit is done: `mgs.active.fitting.fit`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    optimiser: str = "adam"
+    """A row of `mgs.active.optimisers.OPTIMISERS`."""
+    passes: Annotated[int, Field(ge=1)] = 40
+    """Most passes over the images."""
+    tolerance: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.01
+    """Converged when a pass lowers the loss by less than this share, twice in a row, and does not raise it by more
+    (`mgs.active.stopping.stop_reason`)."""
+    rates: dict[str, Annotated[float, Field(ge=0, allow_inf_nan=False)]] = RATES
+    """Learning rate of each kind of parameter; kinds left out take those of RATES. A rate of 0 leaves a kind as it is."""
+    decay: Positive = 0.1
+    """The rates fall by this factor over `passes`."""
+    seed: Annotated[int, Field(ge=0)] = 0
+    """Root of the order in which a pass takes the images."""
+
+    _every_kind = field_validator("rates", mode="before")(lambda given: _complete(given, RATES))
 
 
 class NbvSettings(BaseModel):
@@ -19,31 +57,31 @@ class NbvSettings(BaseModel):
     dataset: Path
     prior: Path
     policy: str = "d-optimal"
-    """A row of `mgs.active.criteria`, looked up when the loop starts: a finished run is read without it."""
+    """A row of `mgs.active.criteria.CRITERIA` or `mgs.active.pose_policies.POSE_POLICIES`, looked up when the loop starts: a
+    finished run is read without it."""
+    estimator: str = "exact"
+    """A row of `mgs.splat.ESTIMATORS` that gives [N,P]: how the Fisher information that criteria see is computed."""
     budget: Annotated[int, Field(ge=0)] = 50
     """Views chosen beyond the seeds."""
     seeds: Annotated[int, Field(ge=1)] = 4
     """Views at evenly spaced azimuths that start the model."""
     seed: Annotated[int, Field(ge=0)] = 0
     """Root of every random draw."""
-    pixel_noise: Annotated[float, Field(gt=0, allow_inf_nan=False)] = PIXEL_NOISE
+    lam: Positive | None = None
+    """One lambda for all parameters, as in the paper; None: (pixel_noise / prior_std)^2 of each kind of parameter."""
+    pixel_noise: Positive = PIXEL_NOISE
     """sigma_e in lambda = (sigma_e / tau)^2, linear RGB; `mgs.active.criteria.regularisation`."""
-    prior_std: dict[str, Annotated[float, Field(gt=0, allow_inf_nan=False)]] = PRIOR_STD
-    """tau of each kind of parameter: those of `mgs.active.criteria.PRIOR_STD`."""
+    prior_std: dict[str, Positive] = PRIOR_STD
+    """tau of each kind of parameter; kinds left out take those of `mgs.active.criteria.PRIOR_STD`."""
     evaluate_every: Annotated[int, Field(ge=0)] = 0
     """Measure PSNR on all views after every so many steps; 0 = only at the end. Never feeds back into the choice."""
-    warm_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.3
+    warm_rate: Positive = 0.3
     """Learning rates of the fits after the first, over those of the first: they start from a model that has converged on all
     but one image, so less is left to move. A chosen constant."""
-    train: dict[str, Any] = {}
-    """Fields of `mgs.active.fitting.TrainSettings`; those left out take its defaults."""
+    train: TrainSettings = TrainSettings()
+    """How each fit is done."""
 
-    @field_validator("prior_std")
-    @classmethod
-    def _every_kind(cls, given: dict[str, float]) -> dict[str, float]:
-        if given.keys() != PRIOR_STD.keys():
-            raise ValueError(f"must have a number for each of {', '.join(PRIOR_STD)}, and no other")
-        return given
+    _every_kind = field_validator("prior_std", mode="before")(lambda given: _complete(given, PRIOR_STD))
 
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -60,5 +98,5 @@ def validated(model: type[Model], values: dict[str, Any], file: Path | None = No
         if file is not None:
             key = ".".join(["settings", *parts])
             raise InputError(f"{file}: {key}: {message}; correct it, or start the run anew") from None
-        option = "--" + "-".join(parts).replace("_", "-")
+        option = "--" + "-".join(part for part in parts if part != "train").replace("_", "-")
         raise InputError(f"{option} {first['input']}: {message}") from None

@@ -1,16 +1,16 @@
-"""The real stations of the loop, put together in one place. Needs the variant to be set (`mgs.runtime.start`)."""
+"""The real stations of the loop, put together in one place."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
-from mgs.active.fitting import Fit, TrainSettings, fit
+from mgs.active.fitting import Fit, fit
 from mgs.active.inputs import prior_digest
 from mgs.active.loop import Stations
+from mgs.active.settings import NbvSettings
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import Dataset
@@ -21,15 +21,14 @@ from mgs.prior.initial import initial_gaussians
 from mgs.splat import ListCache, fisher, groups, render
 
 
-def real_stations(dataset: Dataset, prior: Prior, settings: TrainSettings) -> Stations:
+def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stations:
     """Stations on the splat core, starting from the prior; the rock is at the prior's centre of mass."""
-    cache = ListCache()
+    cache, train = ListCache(), settings.train
 
     def run_fit(
         gaussians: Gaussians, cameras: list[Camera], targets: list[np.ndarray], rate: float, on_pass: Callable[[int, int], None]
     ) -> Fit:
-        first, second, third, fourth = settings.rates
-        scaled = replace(settings, rates=(rate * first, rate * second, rate * third, rate * fourth))
+        scaled = train.model_copy(update={"rates": {kind: rate * value for kind, value in train.rates.items()}})
         return fit(gaussians, cameras, targets, scaled, on_pass, cache)
 
     return Stations(
@@ -37,7 +36,8 @@ def real_stations(dataset: Dataset, prior: Prior, settings: TrainSettings) -> St
         groups=groups(0),
         initial=lambda frames: initial_gaussians(prior, frames)[0],
         fit=run_fit,
-        fisher=lambda gaussians, camera: fisher(gaussians, camera, cache=cache),
+        fisher=lambda gaussians, camera: fisher(gaussians, camera, settings.estimator, cache=cache),
+        exact=lambda gaussians, camera: fisher(gaussians, camera, cache=cache),
         measure=psnr_measure(dataset, cache),
         prior=prior_digest(prior),
     )

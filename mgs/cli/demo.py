@@ -29,7 +29,7 @@ def demo(
 
     from mgs import runtime
     from mgs.cli.diagnose import diagnose
-    from mgs.cli.nbv import run_folder, start_run
+    from mgs.cli.nbv import resume_and_print, start_and_print
     from mgs.cli.printing import print_table
     from mgs.cli.prior import prior
     from mgs.cli.synth_orbit import synth_orbit
@@ -58,10 +58,9 @@ def demo(
     for policy, run in zip(POLICIES, runs, strict=True):
         heading(f"3/5 next best views: {policy}, 4 seeds and {BUDGET} views")
         if not (run / "config.json").is_file():
-            start_run(
-                dataset, run, folder, None, {"policy": policy, "budget": BUDGET, "seed": seed, "evaluate_every": 1}, console
-            )
-        run_folder(run, console, pictures=True)
+            settings = {"policy": policy, "budget": BUDGET, "seed": seed, "evaluate_every": 1}
+            start_and_print(dataset, run, console, prior=folder, **settings)
+        resume_and_print(run, console, pictures=True)
     heading("4/5 what the views told about each Gaussian")
     diagnose(runs[0])
     heading("5/5 the report")

@@ -7,17 +7,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mgs.active.criteria import PIXEL_NOISE
+from mgs.active.criteria import PIXEL_NOISE, PRIOR_STD
 from mgs.active.pose_policies import policy_names
+from mgs.active.settings import RATES
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from mgs.active.fitting import TrainSettings
     from mgs.active.run_folder import State
 
 DIGITS = {"psnr": 2, "ssim": 4, "psnr_mask": 2, "ssim_mask": 4}
 """Decimals of the qualities that are printed."""
+
+
+def _numbers(defaults: dict[str, float]) -> str:
+    return ", ".join(f"{kind}={value:g}" for kind, value in defaults.items())
 
 
 def nbv(
@@ -34,9 +38,25 @@ def nbv(
     ] = None,
     seeds: Annotated[int, typer.Option(help="Views at evenly spaced azimuths that start the model.")] = 4,
     seed: Annotated[int, typer.Option(min=0, help="Root of every random draw.")] = 0,
+    estimator: Annotated[
+        str, typer.Option(help="How Fisher information is computed: exact, hutchinson, or loss-gradient (the paper's).")
+    ] = "exact",
+    lam: Annotated[
+        float | None,
+        typer.Option(help="One lambda for all parameters, as in the paper; default: (pixel noise / prior std)^2."),
+    ] = None,
     pixel_noise: Annotated[
         float, typer.Option(help="Residual of a pixel, linear RGB: sets lambda of every criterion.")
     ] = PIXEL_NOISE,
+    prior_std: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KIND=NUMBER", help=f"Prior standard deviation of a kind of parameter [{_numbers(PRIOR_STD)}]."),
+    ] = None,
+    optimiser: Annotated[str, typer.Option(help="Optimiser of the fit.")] = "adam",
+    rate: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KIND=NUMBER", help=f"Learning rate of a kind of parameter [{_numbers(RATES)}]; 0: not learned."),
+    ] = None,
     passes: Annotated[int | None, typer.Option(help="Most passes over the images of one fit.")] = None,
     evaluate_every: Annotated[int, typer.Option(help="Measure PSNR on all views every so many steps; 0: only at the end.")] = 0,
     resume: Annotated[
@@ -50,129 +70,62 @@ def nbv(
     """
     from rich.console import Console
 
-    from mgs import runtime
     from mgs.errors import InputError
 
-    runtime.start()
     console = Console(highlight=False)
     if resume is not None:
         if dataset is not None or out is not None:
             raise InputError("nbv: --resume RUN continues RUN as it was started; leave DATASET and --out out")
-        run_folder(resume, console)
+        resume_and_print(resume, console)
         return
     if dataset is None or out is None:
         raise InputError("nbv: give a DATASET and --out RUN, or --resume RUN")
-    values = {
-        "policy": policy, "seeds": seeds, "seed": seed, "pixel_noise": pixel_noise, "evaluate_every": evaluate_every,
+    train: dict[str, Any] = {"optimiser": optimiser, "rates": pairs("--rate", rate)}
+    if passes is not None:
+        train["passes"] = passes
+    settings: dict[str, Any] = {
+        "policy": policy, "seeds": seeds, "seed": seed, "estimator": estimator, "lam": lam, "pixel_noise": pixel_noise,
+        "prior_std": pairs("--prior-std", prior_std), "evaluate_every": evaluate_every, "train": train,
     }  # fmt: skip
     if budget is not None:
-        values["budget"] = budget
-    start_run(dataset, out, prior, gaussians, values, console, passes)
-    run_folder(out, console)
+        settings["budget"] = budget
+    start_and_print(dataset, out, console, prior=prior, gaussians=gaussians, **settings)
+    resume_and_print(out, console)
 
 
-def train_settings(passes: int | None, seed: int) -> dict[str, Any]:
-    """Every setting of the fit, resolved; `mgs.active.fitting.fit` derives its draws by name from the run's root seed.
-
-    Raises InputError for fewer than one pass.
-    """
-    from dataclasses import asdict
-
-    from mgs.active.fitting import TrainSettings
+def pairs(option: str, given: list[str] | None) -> dict[str, float]:
+    """`KIND=NUMBER` options as a table. Raises InputError for one that is not of this form."""
     from mgs.errors import InputError
 
-    if passes is not None and passes < 1:
-        raise InputError(f"--passes {passes}: a fit needs at least one pass; raise it")
-    return asdict(TrainSettings(seed=seed) if passes is None else TrainSettings(seed=seed, passes=passes))
+    table = {}
+    for text in given or []:
+        kind, _, number = text.partition("=")
+        try:
+            table[kind] = float(number)
+        except ValueError:
+            raise InputError(f"{option} {text}: expected KIND=NUMBER, as in {option} colour=0.01") from None
+    return table
 
 
-def read_train_settings(out: Path, values: dict[str, Any]) -> TrainSettings:
-    """Settings of the fit from `train` of a run's config.json. Raises InputError for one that is unknown or wrong."""
-    from dataclasses import asdict
+def start_and_print(dataset: Path, out: Path, console: Console, **settings: Any) -> None:
+    """`mgs.active.nbv.start_run` under a spinner; says which prior it found."""
+    from mgs.active.nbv import start_run
 
-    from pydantic import ConfigDict, ValidationError
-    from pydantic.dataclasses import dataclass
-
-    from mgs.active.fitting import TrainSettings
-    from mgs.errors import InputError
-
-    checked: Any = dataclass(TrainSettings, frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))
-    try:
-        return TrainSettings(**asdict(checked(**values)))
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in ("train", *first["loc"]))
-        raise InputError(f"{out / 'config.json'}: {key}: {first['msg']}; correct it, or start the run anew") from None
+    with console.status("starting") as status:
+        found = start_run(dataset, out, progress=lambda stage, done, total: status.update(stage), **settings)
+    if settings.get("prior") is None and found.prior.parent == dataset.resolve():
+        console.print(f"prior: {found.prior}", soft_wrap=True)
 
 
-def start_run(
-    dataset: Path,
-    out: Path,
-    prior: Path | None,
-    gaussians: int | None,
-    values: dict[str, Any],
-    console: Console,
-    passes: int | None = None,
-) -> None:
-    """Check everything, find or build the prior, write config.json with every setting resolved.
-
-    values: fields of `mgs.active.settings.NbvSettings`. Leaves no folder behind where it fails.
-    """
-    from mgs.active.run_folder import check_settings, start
-    from mgs.active.settings import NbvSettings, validated
-    from mgs.data.dataset import load_dataset
-    from mgs.errors import InputError
-    from mgs.files import atomic_folder
-    from mgs.prior.build import build_prior, load_prior, save_prior
-    from mgs.prior.settings import PriorSettings
-
-    if prior is not None and gaussians is not None:
-        raise InputError("nbv: --gaussians is for a prior that is built here; leave it out, or leave out --prior")
-    if prior is None and gaussians is None and (dataset / "prior/prior.json").is_file():
-        prior = dataset / "prior"
-        console.print(f"prior: {prior}", soft_wrap=True)
-    where = prior or out / "prior"
-    given = validated(NbvSettings, {"dataset": dataset.resolve(), "prior": where.resolve(), **values})
-    frames = load_dataset(dataset)
-    resolved: dict[str, Any] = {"train": train_settings(passes, given.seed)}
-    if "budget" not in values:
-        resolved["budget"] = min(given.budget, max(0, len(frames) - given.seeds))
-    settings = given.model_copy(update=resolved)
-    check_settings(settings, len(frames))
-    if prior is not None:
-        load_prior(prior)
-    with atomic_folder(out) as unfinished:
-        if prior is None:
-            with console.status("building the prior") as status:
-                built, _ = build_prior(
-                    frames,
-                    PriorSettings(gaussians=gaussians, seed=settings.seed),
-                    on_stage=lambda stage: status.update(f"prior: {stage}"),
-                )
-            save_prior(unfinished / "prior", built)
-        start(unfinished, settings, frames)
-
-
-def run_folder(out: Path, console: Console, pictures: bool = False) -> None:
+def resume_and_print(out: Path, console: Console, pictures: bool = False) -> None:
     """Run or resume the loop in a run folder, evaluate (with pictures where asked), print the table."""
-    from mgs.active import loop, run_folder
-    from mgs.data.dataset import load_dataset
-    from mgs.errors import InputError
-    from mgs.prior.build import load_prior
-
-    settings = run_folder.read_settings(out)
-    if not settings.prior.is_dir():
-        raise InputError(f"{out / 'config.json'}: prior {settings.prior} is not there; if it was moved, correct `prior` there")
-    train = read_train_settings(out, settings.train)
-    dataset = load_dataset(settings.dataset)
-    run_folder.check_same_frames(out, dataset)
-    prior = load_prior(settings.prior)
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from mgs.active.stations import real_stations
+    from mgs.active.nbv import resume_nbv
+    from mgs.active.run_folder import read_settings
     from mgs.report.evaluation import evaluate_run
 
-    stations = real_stations(dataset, prior, train)
+    settings = read_settings(out)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -189,7 +142,7 @@ def run_folder(out: Path, console: Console, pictures: bool = False) -> None:
         def on_step(state: State) -> None:
             bar.update(whole, completed=len(state.taken))
 
-        state = loop.run(out, settings, dataset, stations, progress, on_step, say=lambda text: bar.print(text, soft_wrap=True))
+        state = resume_nbv(out, on_step=on_step, progress=progress, say=lambda text: bar.print(text, soft_wrap=True))
         metrics = evaluate_run(out, pictures=pictures, progress=lambda done, total: progress("evaluating", done, total))
     print_run(out, state, metrics, console)
 
@@ -198,11 +151,12 @@ def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console
     """The steps as a table, then the quality of the model."""
     from rich.table import Table
 
-    table = Table("step", "image", "gain", "coverage", "iterations", "loss", "stopped", "seconds", box=None)
+    table = Table("step", "image", "score", "coverage", "iterations", "loss", "stopped", "seconds", box=None)
     for line in state.steps:
-        gain = "" if line["gain"] is None else f"{line['gain']:.4g}"
+        number = line.get("score", line.get("gain"))  # as older runs called it
+        score = "" if number is None else f"{number:.4g}"
         table.add_row(
-            str(line["step"]), line["name"] or " ".join(line["seed_names"]), gain, f"{100 * line['coverage']:.2f} %",
+            str(line["step"]), line["name"] or " ".join(line["seed_names"]), score, f"{100 * line['coverage']:.2f} %",
             str(line["iterations"]), f"{line['loss']:.3g}", line["stop_reason"], f"{sum(line['seconds'].values()):.1f}",
         )  # fmt: skip
     console.print(table)

@@ -1,0 +1,32 @@
+# The public names of mgs: `mgs/__init__.py` reads them from here, and so do type checkers.
+
+from .active.nbv import resume_nbv as resume_nbv
+from .active.nbv import run_nbv as run_nbv
+from .active.run_folder import State as State
+from .camera import Camera as Camera
+from .camera import look_at as look_at
+from .data.dataset import Dataset as Dataset
+from .data.dataset import Frame as Frame
+from .data.dataset import load_cameras as load_cameras
+from .data.dataset import load_dataset as load_dataset
+from .errors import InputError as InputError
+from .gaussians import Gaussians as Gaussians
+from .prior.build import Prior as Prior
+from .prior.build import build_prior as build_prior
+from .prior.build import load_prior as load_prior
+from .prior.build import prior_from_mesh as prior_from_mesh
+from .prior.build import save_prior as save_prior
+from .prior.initial import initial_gaussians as initial_gaussians
+from .prior.settings import PriorSettings as PriorSettings
+from .report.evaluation import evaluate as evaluate
+from .report.evaluation import evaluate_run as evaluate_run
+from .report.writing import write_report as write_report
+from .splat import ListCache as ListCache
+from .splat import as_drjit as as_drjit
+from .splat import fisher as fisher
+from .splat import render as render
+from .splat_ply import read_ply as read_ply
+from .splat_ply import write_ply as write_ply
+from .synth.rendering import synthesise as synthesise
+
+__version__: str

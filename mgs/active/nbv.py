@@ -1,0 +1,107 @@
+"""The whole of `mgs nbv` for programs: start a run, run it, resume it. Prints nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from mgs.active import loop
+from mgs.active.run_folder import State, check_same_frames, check_settings, read_settings, start
+from mgs.active.settings import NbvSettings, validated
+from mgs.active.stations import real_stations
+from mgs.data.dataset import load_dataset
+from mgs.errors import InputError
+from mgs.files import atomic_folder
+from mgs.prior.build import build_prior, load_prior, save_prior
+from mgs.prior.settings import PriorSettings
+
+
+def _silent(*_: Any) -> None:
+    """What is called where nobody listens."""
+
+
+def run_nbv(
+    dataset: str | Path,
+    out: str | Path,
+    *,
+    prior: str | Path | None = None,
+    gaussians: int | None = None,
+    on_step: Callable[[State], None] = _silent,
+    progress: Callable[[str, int, int], None] = _silent,
+    say: Callable[[str], None] = _silent,
+    **settings: Any,
+) -> State:
+    """Choose views one by one, as the paper does: `start_run`, then `resume_nbv`.
+
+    dataset: a dataset folder. out: the run's folder, new. prior, gaussians, settings: see `start_run`.
+    on_step(state): called after every step that is finished and on disk; state.steps[-1] is its line of steps.jsonl.
+    progress(stage, done, total): called while a step is worked on. say(text): called with what a person should know.
+    Returns the last state: gaussians, H, taken (frame indices in the order of their choice), steps.
+    Raises InputError as `start_run` and `resume_nbv`.
+    """
+    start_run(dataset, out, prior=prior, gaussians=gaussians, progress=progress, **settings)
+    return resume_nbv(out, on_step=on_step, progress=progress, say=say)
+
+
+def start_run(
+    dataset: str | Path,
+    out: str | Path,
+    *,
+    prior: str | Path | None = None,
+    gaussians: int | None = None,
+    progress: Callable[[str, int, int], None] = _silent,
+    **settings: Any,
+) -> NbvSettings:
+    """Check everything, find or build the prior, and write the run's config.json with every setting resolved.
+
+    prior: folder of a prior; without it DATASET/prior where there is one, otherwise a prior is built inside the run, of this
+    many `gaussians` (or, without a number, one per pixel's footprint on the rock). settings: fields of
+    `mgs.active.settings.NbvSettings`; the budget is 50 views, or all candidates where they are fewer.
+    Leaves no folder behind where it fails. Raises InputError where the output folder is not empty, a setting is wrong, the
+    dataset is too small for it, or the dataset or the prior is missing or damaged.
+    """
+    dataset, out = Path(dataset), Path(out)
+    if prior is not None and gaussians is not None:
+        raise InputError("nbv: --gaussians is for a prior that is built here; leave it out, or leave out --prior")
+    if prior is None and gaussians is None and (dataset / "prior/prior.json").is_file():
+        prior = dataset / "prior"
+    where = out / "prior" if prior is None else Path(prior)
+    given = validated(NbvSettings, {"dataset": dataset.resolve(), "prior": where.resolve(), **settings})
+    frames = load_dataset(dataset)
+    resolved: dict[str, Any] = {"train": given.train.model_copy(update={"seed": given.seed})}
+    if "budget" not in settings:
+        resolved["budget"] = min(given.budget, max(0, len(frames) - given.seeds))
+    complete = given.model_copy(update=resolved)
+    check_settings(complete, len(frames))
+    if prior is not None:
+        load_prior(prior)
+    with atomic_folder(out) as unfinished:
+        if prior is None:
+            asked = PriorSettings(gaussians=gaussians, seed=complete.seed)
+            built, _ = build_prior(frames, asked, on_stage=lambda stage: progress(f"prior: {stage}", 0, 1))
+            save_prior(unfinished / "prior", built)
+        start(unfinished, complete, frames)
+    return complete
+
+
+def resume_nbv(
+    out: str | Path,
+    *,
+    on_step: Callable[[State], None] = _silent,
+    progress: Callable[[str, int, int], None] = _silent,
+    say: Callable[[str], None] = _silent,
+) -> State:
+    """Run the loop in a run's folder from where it stands to the end of its budget; a finished run is only read.
+
+    Callbacks and result as `run_nbv`. Raises InputError where the folder holds no run, its dataset or prior is missing or has
+    changed, another process works on it, or a fit diverged (the steps before it are kept).
+    """
+    out = Path(out)
+    settings = read_settings(out)
+    if not settings.prior.is_dir():
+        raise InputError(f"{out / 'config.json'}: prior {settings.prior} is not there; if it was moved, correct `prior` there")
+    dataset = load_dataset(settings.dataset)
+    check_same_frames(out, dataset)
+    stations = real_stations(dataset, load_prior(settings.prior), settings)
+    return loop.run(out, settings, dataset, stations, progress, on_step, say)

@@ -1,0 +1,75 @@
+"""The public names of `mgs`: there, lazy, typed; and the whole way from Python without a console."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+
+import mgs
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.mark.parametrize("name", mgs.__all__)
+def test_a_public_name_is_there_and_documented(name):
+    value = getattr(mgs, name)
+    assert value.__module__.startswith("mgs.")
+    assert value.__doc__
+    assert name in dir(mgs)
+
+
+def test_what_is_no_public_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="module 'mgs' has no attribute 'rendr'"):
+        _ = mgs.rendr
+
+
+def test_importing_loads_nothing_and_leaves_the_variant_alone():
+    program = "import sys, mgs; assert not {'mitsuba', 'drjit', 'numpy'} & set(sys.modules); mgs.render; import mitsuba as mi"
+    subprocess.run([sys.executable, "-c", f"{program}; assert mi.variant() is None"], check=True, timeout=60)
+
+
+def test_no_module_hides_behind_a_function_of_its_name():
+    """`from mgs.splat import render` gave a function, `import mgs.splat.render` a module."""
+    for folder in {path.parent for path in (ROOT / "mgs").rglob("*.py")}:
+        package = ".".join(folder.relative_to(ROOT).parts)
+        module = __import__(package, fromlist=["_"])
+        for path in folder.glob("*.py"):
+            if path.stem != "__init__" and path.stem != "__main__":
+                found = getattr(module, path.stem, None)
+                assert found is None or found.__class__.__name__ == "module", f"{package}.{path.stem}"
+
+
+def test_type_checkers_see_the_names(tmp_path):
+    (tmp_path / "program.py").write_text("import mgs\n\nreveal_type(mgs.render)\nreveal_type(mgs.Camera.position)\nmgs.rendr\n")
+    command = [sys.executable, "-m", "mypy", "--follow-imports=silent", "--no-incremental", str(tmp_path / "program.py")]
+    said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300).stdout
+    assert "gaussians: mgs.gaussians.Gaussians, camera: mgs.camera.Camera" in said
+    assert 'Module has no attribute "rendr"' in said
+    assert (ROOT / "mgs/py.typed").is_file()
+
+
+def test_the_whole_way_from_python(dataset, prior, tmp_path, capsys):
+    """Nothing is printed, the callbacks are told, and the state is what the folder holds."""
+    steps, stages = [], set()
+    state = mgs.run_nbv(
+        dataset, tmp_path / "run", prior=prior, budget=2, seeds=3, policy="farthest", train={"passes": 2},
+        on_step=lambda state: steps.append(len(state.taken)), progress=lambda stage, done, total: stages.add(stage),
+    )  # fmt: skip
+    assert capsys.readouterr() == ("", "")
+    assert steps == [3, 4, 5]
+    assert {"fitting", "information of the training set"} <= stages
+    assert mgs.read_ply(tmp_path / "run/gaussians.ply") == state.gaussians
+    again = mgs.resume_nbv(tmp_path / "run")
+    assert again.gaussians == state.gaussians
+    assert again.taken == state.taken
+    frames = mgs.load_dataset(dataset).frames
+    metrics = mgs.evaluate(state.gaussians, frames, [frames[i].name for i in state.taken])
+    assert metrics["images"] == 5
+    information = mgs.fisher(state.gaussians, frames[0].camera)
+    assert information.shape == (tiny.POINTS, 11)
+    assert isinstance(information, np.ndarray)
+    with pytest.raises(mgs.InputError, match="not empty"):
+        mgs.run_nbv(dataset, tmp_path / "run", prior=prior)
