@@ -169,13 +169,15 @@ def test_resuming_a_finished_run_shows_it_again(run, capsys):
     assert "views never trained on" in capsys.readouterr().out
 
 
-def test_compare_policies_and_report(dataset, run, tmp_path):
+def test_compare_policies_and_report(dataset, run, tmp_path, capsys):
     from mgs.report.writing import write_report
 
     other = dataset.parent / "random"
     command("nbv", dataset, "--out", other, "--prior", run / "prior", "--policy", "random", *OPTIONS[2:])
+    capsys.readouterr()
     for folder in (run, other):
-        command("eval", folder)
+        command("eval", folder)  # `mgs nbv` has measured the model, and drawn nothing
+        assert f"kept {folder}/metrics.json, measured before" in capsys.readouterr().out
     command("diagnose", run, "--views", "kf_0001")
     written = write_report(tmp_path / "report", [run, other])
     assert {"orbit.png", "gain.png", "coverage.png", "comparison.png", "table.md"} <= {path.name for path in written}

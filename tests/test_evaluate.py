@@ -5,14 +5,18 @@ import math
 
 import numpy as np
 import pytest
+import tiny
 from PIL import Image
+from refusals import listing
 from synthetic import orbit_cameras, write_dataset
 
 from mgs.colour import srgb_from_linear
 from mgs.errors import InputError
+from mgs.files import write_json
 from mgs.gaussians import Gaussians, sh_from_rgb
+from mgs.images import write_png
 from mgs.metrics import PSNR_LIMIT, psnr, ssim
-from mgs.report.evaluation import evaluate, read_comparison, write_comparison
+from mgs.report.evaluation import evaluate, evaluate_run, read_comparison, write_comparison
 
 
 @pytest.fixture
@@ -149,3 +153,77 @@ def test_ssim_of_a_frame_leaves_out_its_border_and_ssim_of_a_mask_does_not():
     wrong[0, 0] = 1 - wrong[0, 0]
     assert ssim(truth, wrong) == pytest.approx(1, abs=1e-6)
     assert ssim(truth, wrong, np.ones((40, 40), bool)) < 1 - 1e-4
+
+
+@pytest.fixture
+def work(monkeypatch):
+    """How many views were measured, and how many drawn, since last asked."""
+    calls = []
+    for name in ("compare", "write_comparison"):
+        function = getattr(evaluation, name)
+        monkeypatch.setattr(evaluation, name, lambda *given, f=function, n=name: calls.append(n) or f(*given))
+
+    def done():
+        counts = calls.count("compare"), calls.count("write_comparison")
+        calls.clear()
+        return counts
+
+    return done
+
+
+def test_what_is_known_of_a_model_is_not_measured_again(dataset, prior, tmp_path, work):
+    run, said = tiny.write_run(tmp_path / "run", dataset, prior), []
+
+    def again(**options):
+        return evaluate_run(run, say=said.append, **options)
+
+    first = again(pictures=False)
+    assert work() == (12, 0)
+    assert said.pop() == f"wrote {run}/metrics.json"
+    assert again(pictures=False) == first
+    assert work() == (0, 0)
+    assert said.pop() == f"kept {run}/metrics.json, measured before on this very model and dataset"
+    drawn = again()
+    assert drawn == first | {"pictures": True} == json.loads((run / "metrics.json").read_text())
+    assert work() == (0, 12)
+    assert said.pop().endswith(f"dataset; wrote {run}/renders")
+    pictures = listing(run / "renders")
+    assert again() == again(pictures=False) == drawn
+    assert work() == (0, 0)
+    assert said.pop(0).endswith(f"dataset, and {run}/renders")
+    (run / "renders/kf_0003.png").unlink()
+    again()
+    assert work() == (0, 12)
+    (run / "metrics.json").unlink()
+    assert again() == drawn
+    assert work() == (12, 12)
+    assert listing(run / "renders") == pictures
+
+
+def brighten(path):
+    with np.load(path) as data:
+        arrays = dict(data)
+    np.savez(path, **arrays | {"sh": arrays["sh"] + np.float32(0.1)})
+
+
+@pytest.mark.parametrize(
+    ("what", "change"),
+    [
+        ("model", lambda run, dataset: brighten(run / "checkpoint.npz")),
+        ("image", lambda run, dataset: write_png(dataset / "images/kf_0003.png", np.ones((tiny.HEIGHT, tiny.WIDTH, 3)))),
+        ("mask", lambda run, dataset: write_png(dataset / "masks/kf_0003.png", np.ones((tiny.HEIGHT, tiny.WIDTH), bool))),
+        ("older version", lambda run, dataset: write_json(run / "metrics.json", {"images": 3})),
+        ("damaged", lambda run, dataset: (run / "metrics.json").write_text("{")),
+    ],
+)
+def test_what_has_changed_is_measured_again(dataset, prior, tmp_path, work, what, change):
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    before = evaluate_run(run)
+    change(run, dataset)
+    work()
+    after = evaluate_run(run, pictures=False)
+    assert work() == (12, 0)
+    assert (after["all"] == before["all"]) == (what in ("older version", "damaged"))
+    assert after["pictures"] is False  # those that are there may be of another model
+    evaluate_run(run)
+    assert work() == (0, 12)

@@ -7,21 +7,17 @@ import math
 import signal
 import subprocess
 import sys
-from contextlib import nullcontext
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tiny
-from PIL import Image
 
 from mgs.active import criteria, loop, pose_policies, run_folder
 from mgs.active.stopping import StopReason
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
-from mgs.gaussians import Gaussians
-from mgs.images import write_exr
 from mgs.splat_ply import read_ply
 
 
@@ -273,155 +269,12 @@ def test_resuming_a_finished_run_changes_nothing(dataset, tmp_path):
     assert (tmp_path / "run/steps.jsonl").read_bytes() == before
 
 
-def retouch(path: Path) -> None:
-    """Change an image a little."""
-    with Image.open(path) as picture:
-        pixels = np.array(picture)
-    pixels[tiny.HEIGHT // 2, tiny.WIDTH // 2] ^= 1
-    Image.fromarray(pixels).save(path)
-
-
-def nudge(root: Path, name: str, **values) -> None:
-    """Change the record of a frame in transforms.json; x: its position, metres."""
-    data = json.loads((root / "transforms.json").read_text())
-    record = next(record for record in data["frames"] if name in record["file_path"])
-    record["transform_matrix"][0][3] += values.pop("x", 0)
-    record.update(values)
-    (root / "transforms.json").write_text(json.dumps(data))
-
-
-SPOILT = {
-    "image": (lambda root: retouch(root / "images/kf_0004.png"), r"images/kf_0004\.png has changed since .*run took it"),
-    "mask": (lambda root: retouch(root / "masks/kf_0008.png"), r"masks/kf_0008\.png has changed"),
-    "depth": (
-        lambda root: write_exr(root / "depth/kf_0000.exr", {"Z": np.zeros((tiny.HEIGHT, tiny.WIDTH), np.float32)}),
-        r"depth/kf_0000\.exr has changed",
-    ),
-    "no mask": (
-        lambda root: nudge(root, "kf_0000", mask_path=None),
-        r"transforms\.json: the mask of frame kf_0000 has changed",
-    ),
-    "pose": (
-        lambda root: nudge(root, "kf_0005", x=1e-6),
-        r"transforms\.json: the pose or the intrinsics of frame kf_0005 have",
-    ),
-    "intrinsics": (lambda root: nudge(root, "kf_0005", fl_x=16.1), "the intrinsics of frame kf_0005 have changed"),
-}
-"""What may change between a run and its resumption, and how it is named. Of 12 frames on a circle 0, 4 and 8 are the seeds."""
-
-
-@pytest.fixture
-def half_done(tmp_path):
-    """A dataset of its own and a run of three steps of six."""
-    root = tiny.write_dataset(tmp_path / "dataset")
-    settings = tiny.start(tmp_path / "run", load_dataset(root))
-    loop.run(tmp_path / "run", settings.model_copy(update={"budget": 2}), load_dataset(root), tiny.stations(), tiny.silent)
-    return root, tmp_path / "run"
-
-
-def resume(root: Path, out: Path, **parts) -> tuple[run_folder.State, list[str]]:
-    """The last state of a resumed run, and what was said on the way."""
-    said: list[str] = []
-    stations = tiny.stations(**parts)
-    return loop.run(out, run_folder.read_settings(out), load_dataset(root), stations, tiny.silent, say=said.append), said
-
-
-@pytest.mark.parametrize("what", SPOILT)
-def test_a_run_does_not_go_on_from_changed_inputs(half_done, what):
-    root, out = half_done
-    spoil, named = SPOILT[what]
-    spoil(root)
-    before = lines(out)
-    with pytest.raises(InputError, match=named):
-        resume(root, out)
-    assert lines(out) == before
-
-
-def test_a_run_goes_on_where_what_it_has_not_taken_changed(half_done):
-    """Only the pose of a candidate is an input until it is taken: its pixels may still change. Not those of others."""
-    root, out = half_done
-    taken = run_folder.read_checkpoint(out).taken
-    for i in set(range(tiny.FRAMES)) - set(taken):
-        retouch(root / f"images/kf_{i:04d}.png")
-    for i in set(taken) - {0, 4, 8}:
-        (root / f"depth/kf_{i:04d}.exr").write_bytes(b"never read")
-    moved = root.rename(root.parent / "elsewhere")
-    config = json.loads((out / "config.json").read_text())
-    config["settings"]["dataset"] = str(moved)
-    (out / "config.json").write_text(json.dumps(config))
-    state, said = resume(moved, out)
-    assert len(state.steps) == 6
-    assert not said
-
-
-def without_record(out: Path) -> None:
-    """Make the checkpoint one of a version that kept no record of its inputs."""
-    with np.load(out / "checkpoint.npz") as data:
-        arrays = dict(data)
-    record = json.loads(str(arrays["json"]))
-    del record["inputs"]
-    arrays["json"] = np.array(json.dumps(record))
-    np.savez(out / "checkpoint.npz", **arrays)
-
-
-def test_a_run_of_a_version_without_records_goes_on_with_a_warning(half_done):
-    root, out = half_done
-    without_record(out)
-    state, said = resume(root, out)
-    assert len(state.steps) == 6
-    assert len(said) == 1
-    assert "kept no record of its inputs" in said[0]
-    without_record(out)
-    assert resume(root, out)[1] == []  # nothing is left to be mixed
-
-
-def strict(text: str) -> dict:
-    """JSON as other programs read it: without NaN and infinities."""
-    return json.loads(text, parse_constant=pytest.fail)
-
-
-def test_numbers_of_older_runs_that_are_none_are_null(half_done):
-    """A line could hold NaN where all held-out masks were empty."""
-    root, out = half_done
-    with np.load(out / "checkpoint.npz") as data:
-        arrays = dict(data)
-    record = json.loads(str(arrays["json"]))
-    record["steps"][1]["held_out_psnr_mask"] = math.nan
-    arrays["json"] = np.array(json.dumps(record))
-    np.savez(out / "checkpoint.npz", **arrays)
-    state, _ = resume(root, out)
-    written = [strict(line) for line in (out / "steps.jsonl").read_text().splitlines()]
-    assert written == state.steps
-    assert written[1]["held_out_psnr_mask"] is None
-
-
 @pytest.mark.parametrize("score", [math.nan, math.inf])
 def test_a_policy_that_gives_no_number_is_named(dataset, tmp_path, monkeypatch, score):
     monkeypatch.setitem(criteria.CRITERIA, "mine", criteria.Criterion(lambda F, H, lam: score))
     with pytest.raises(InputError, match="policy mine: gave a score that is NaN or infinite"):
         run(tmp_path / "run", dataset, policy="mine")
     assert len(lines(tmp_path / "run")) == 1
-
-
-@pytest.mark.parametrize("recorded", [True, False])
-@pytest.mark.parametrize("count", [tiny.POINTS, tiny.POINTS - 1])
-def test_a_run_does_not_go_on_from_another_prior(half_done, recorded, count):
-    """Of as many Gaussians it was mixed in; of another number it ended in a traceback."""
-    root, out = half_done
-
-    def initial(frames):
-        g = tiny.initial(frames)
-        fewer = (getattr(g, field.name)[:count] for field in fields(g))
-        return replace(Gaussians(*fewer), means=g.means[:count] + np.float32(0.01))
-
-    if not recorded:
-        without_record(out)
-    with pytest.raises(
-        InputError, match=r"dataset: is not the prior that .*run was started on; restore it, or start a new run"
-    ):
-        resume(root, out, initial=initial)
-    with pytest.raises(InputError, match=r"is not the prior") if recorded else nullcontext():
-        resume(root, out, prior="another spacing")
 
 
 def test_damaged_or_missing_runs_are_told_apart(dataset, tmp_path):

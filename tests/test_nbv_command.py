@@ -112,6 +112,25 @@ def test_a_quality_that_could_not_be_measured_is_a_dash(dataset, tmp_path):
     assert "all views (2): PSNR 30.12 dB, SSIM 0.9500; inside the rock mask PSNR – dB, SSIM –" in console.export_text()
 
 
+@pytest.mark.parametrize("name", ["kf_{}", "DJI_20231105103211_000{}_W_some_flight", "frame {} of the [second] flight"])
+@pytest.mark.parametrize("width", [80, 200])
+def test_names_and_numbers_are_readable_at_80_columns(tmp_path, name, width):
+    line = {
+        "step": 0, "name": None, "seed_names": [name.format(i) for i in range(4)], "gain": None, "coverage": 1.0,
+        "iterations": 1120, "loss": 2.34e-4, "stop_reason": "pass-limit", "seconds": {"fit": 123.4},
+    }  # fmt: skip
+    steps = [line, line | {"step": 1, "name": name.format(5), "gain": 1.234e-05}]
+    console = Console(record=True, width=width)
+    metrics = {"all": {"count": 0}, "held_out": {"count": 0}}
+    print_run(tmp_path, nbv.State(tiny.initial([]), np.zeros(0), np.zeros(0), [0], steps), metrics, console)
+    shown = console.export_text().splitlines()[:-1]
+    assert max(len(text) for text in shown) <= width
+    for i in (0, 1, 2, 3, 5):
+        assert sum(name.format(i) in text for text in shown) == 1
+    for number in ("1.234e-05", "100.00 %", "1120", "0.000234", "pass-limit", "123.4"):
+        assert any(number in text for text in shown)
+
+
 @pytest.mark.parametrize("made", ["dataset", "coverage"])
 def test_demo_does_not_show_another_seeds_results(tmp_path, capsys, made):
     root = tiny.write_dataset(tmp_path / "demo/dataset")

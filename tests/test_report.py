@@ -4,10 +4,13 @@ import io
 import json
 import re
 import shutil
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import tiny
+from matplotlib import rc_context
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 from rich.console import Console
 
@@ -169,6 +172,14 @@ def test_runs_that_cannot_be_compared(runs, tmp_path):
     assert not (tmp_path / "report").exists()
 
 
+def test_pictures_of_an_earlier_model_are_not_shown(runs, tmp_path):
+    """A run that went on was measured without pictures: those that are there are of fewer images than the caption says."""
+    run = shutil.copytree(runs[0], tmp_path / "run")
+    write_json(run / "metrics.json", json.loads((run / "metrics.json").read_text()) | {"pictures": False})
+    with pytest.raises(InputError, match="no picture of this model; draw it with `mgs eval"):
+        writing.write_report(tmp_path / "report", [run])
+
+
 def test_missing_and_damaged_files(runs, tmp_path):
     with pytest.raises(InputError, match=r"config\.json: no such file"):
         tables.read_run(tmp_path)
@@ -274,6 +285,41 @@ def test_comparison_is_cropped_to_the_rock():
     assert plotting.crop(np.zeros((4, 4), bool)) == (slice(None), slice(None))
 
 
+@pytest.mark.parametrize("labels", [["d-optimal"], ["random (a folder of a long name)"], ["random (a)", "random (b)", "mine"]])
+@pytest.mark.parametrize("title", ["kf_0001", "DJI_20231105103211_0004_W_some_flight_over_some_rock_with_a_long_name"])
+def test_no_word_of_a_comparison_is_cut_off_or_written_over(tmp_path, monkeypatch, labels, title):
+    drawn = []
+    monkeypatch.setattr(figures, "save_figure", lambda figure, path: drawn.append(figure))
+    truth = np.zeros((60, 80, 3))
+    truth[10:50, 20:60] = 0.5
+    captions = dict.fromkeys(labels, "100 images, trained on; 30.09 dB, SSIM 0.9301")
+    renders = dict.fromkeys(labels, truth + 0.1)
+    figures.comparison_figure(tmp_path / "a.png", truth, renders, title=title, captions=captions)
+    figure = drawn[0]
+    with rc_context(plotting.STYLE):
+        FigureCanvasAgg(figure).draw()
+    texts = [text for axis in figure.axes for text in (axis.title, *axis.texts)] + [figure.axes[-1].xaxis.label]
+    boxes = [text.get_window_extent() for text in texts if text.get_text()]
+    assert len(boxes) == 3 + len(labels)
+    for box in boxes:
+        assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
+        assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1
+    titles = [axis.title.get_window_extent() for axis in figure.axes if axis.title.get_text()]
+    assert len(titles) == 1 + len(labels)
+    assert all(a.x1 < b.x0 for a, b in pairwise(titles))
+
+
+def test_titles_of_an_orbit_are_not_written_over(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(figures, "save_figure", lambda figure, path: drawn.append(figure))
+    choices = {f"random (a folder of a long name {i})": ([0], [1]) for i in range(2)}
+    figures.orbit_figure(tmp_path / "a.png", np.eye(3), None, choices)
+    with rc_context(plotting.STYLE):
+        FigureCanvasAgg(drawn[0]).draw()
+    a, b = (axis.title.get_window_extent() for axis in drawn[0].axes[:2])
+    assert 0 <= a.x0 < a.x1 < b.x0 < b.x1 <= drawn[0].bbox.x1
+
+
 @pytest.mark.parametrize(
     "labels",
     [list(POLICY_STYLE), ["mine", "d-optimal", "yours"], ["random (a)", "random (b)"], [f"mine-{i}" for i in range(15)]],
@@ -289,10 +335,13 @@ def test_a_policy_keeps_its_style_whatever_it_is_compared_with():
     assert (ours["color"], ours["marker"]) == POLICY_STYLE["random"]
 
 
-def test_a_long_name_cuts_no_number():
+@pytest.mark.parametrize("name", ["random (a [second] run in a folder with a long name)", "random" * 20, "d-optimal"])
+def test_a_long_name_cuts_no_number_and_is_not_cut(name):
     console = Console(width=80, record=True, file=io.StringIO())
-    row = ["my-own-very-long-policy", "12", "30.09", "0.9426", "29.56", "0.9362", "27.54", "0.7538", "100.00"]
-    printing.print_table(console, [row])
+    row = [name, "12", "30.09", "0.9426", "29.56", "0.9362", "27.54", "0.7538", "100.00"]
+    printing.print_table(console, [row, ["random", *row[1:]]])
     text = console.export_text()
-    assert all(number in text for number in row[1:])
+    assert all(text.count(number) == 2 for number in row[2:])
     assert "…" not in text
+    assert any(name in line for line in text.splitlines())
+    assert max(len(line) for line in text.splitlines() if name not in line) <= 80

@@ -14,6 +14,7 @@ def evaluate(
 ) -> None:
     """Measure PSNR and SSIM on all views and on the views never trained on; write RUN/metrics.json and renders next to truth.
 
+    What is there already of this very model and dataset is kept, and not measured or drawn again.
     Full frame: the rock on black. Inside the mask: the pixels of the rock only.
     """
     from rich.console import Console
@@ -25,8 +26,14 @@ def evaluate(
     from mgs.report.tables import table_rows
 
     runtime.start()
+    said: list[str] = []
     with Progress(transient=True) as bar:
         task = bar.add_task("rendering and comparing", total=None)
-        evaluate_run(run, pictures=pictures, progress=lambda done, total: bar.update(task, completed=done, total=total))
+        evaluate_run(
+            run,
+            pictures=pictures,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            say=said.append,
+        )
     print_table(Console(), table_rows([run]))
-    typer.echo(f"wrote {run / 'metrics.json'}" + (f" and {run / 'renders'}" if pictures else ""))
+    typer.echo("\n".join(said))

@@ -148,18 +148,33 @@ def resume_and_print(out: Path, console: Console, pictures: bool = False) -> Non
 
 
 def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console) -> None:
-    """The steps as a table, then the quality of the model."""
-    from rich.table import Table
+    """The steps as a table, then the quality of the model. Names too long for the console have a table of their own."""
+    from rich.table import Column, Table
+    from rich.text import Text
 
-    table = Table("step", "image", "score", "coverage", "iterations", "loss", "stopped", "seconds", box=None)
+    columns = ("step", "image", "score", "coverage", "iterations", "loss", "stopped", "seconds")
+    rows = []
     for line in state.steps:
+        names = [line["name"]] if line["name"] else line["seed_names"]
         number = line.get("score", line.get("gain"))  # as older runs called it
         score = "" if number is None else f"{number:.4g}"
-        table.add_row(
-            str(line["step"]), line["name"] or " ".join(line["seed_names"]), score, f"{100 * line['coverage']:.2f} %",
+        rows.append((
+            str(line["step"]), "\n".join(names), score, f"{100 * line['coverage']:.2f} %",
             str(line["iterations"]), f"{line['loss']:.3g}", line["stop_reason"], f"{sum(line['seconds'].values()):.1f}",
-        )  # fmt: skip
-    console.print(table)
+        ))  # fmt: skip
+
+    def table(*shown: int) -> Table:
+        made = Table(*(Column(columns[i], no_wrap=i != 1, overflow="fold") for i in shown), box=None)
+        for row in rows:
+            made.add_row(*(Text(row[i]) for i in shown))
+        return made
+
+    whole = table(*range(len(columns)))
+    if console.measure(whole, options=console.options.update(max_width=1 << 16)).maximum <= console.width:
+        console.print(whole)
+    else:
+        console.print(table(0, *range(2, len(columns))))
+        console.print(table(0, 1))
     for name, label in (("all", "all views"), ("held_out", "views never trained on")):
         mean = metrics[name]
         if mean["count"]:

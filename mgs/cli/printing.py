@@ -10,24 +10,32 @@ if TYPE_CHECKING:
 
 
 def print_table(console: Console, rows: Sequence[Sequence[str]]) -> None:
-    """Print the table to a terminal of 80 columns."""
+    """Print the table, for 80 columns; names that do not fit beside the numbers stand below, by the number of their row."""
     from rich import box
     from rich.table import Table
+    from rich.text import Text
 
-    short = [
-        "policy",
-        "images",
-        *(f"{name}\n{views}" for views in ("all", "new", "rock") for name in ("PSNR", "SSIM")),
-        "cover",
-    ]
-    table = Table(
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-        caption="dB and %; new: views never trained on; rock: those, inside its mask",
-    )
-    for i, heading in enumerate(short):
-        # only the name may be broken: a number that is cut is wrong
-        table.add_column(heading, justify="right" if i else "left", no_wrap=bool(i), overflow="fold")
-    for row in rows:
-        table.add_row(*row)
-    console.print(table)
+    short = ["images", *(f"{name}\n{views}" for views in ("all", "new", "rock") for name in ("PSNR", "SSIM")), "cover"]
+    names = [row[0] for row in rows]
+
+    def table(heading: str, first: Sequence[str]) -> Table:
+        made = Table(
+            box=box.SIMPLE_HEAD,
+            pad_edge=False,
+            caption="dB and %; new: views never trained on; rock: those, inside its mask",
+        )
+        made.add_column(heading, no_wrap=True)
+        for heading in short:
+            made.add_column(heading, justify="right", no_wrap=True)
+        for name, row in zip(first, rows, strict=True):
+            made.add_row(Text(name), *row[1:])
+        return made
+
+    whole = table("policy", names)
+    if console.measure(whole, options=console.options.update(max_width=1 << 16)).maximum <= console.width:
+        console.print(whole)
+        return
+    numbers = [str(number) for number in range(1, len(rows) + 1)]
+    console.print(table("run", numbers))
+    for number, name in zip(numbers, names, strict=True):
+        console.print(Text(f"{number}: {name}"), soft_wrap=True)

@@ -6,22 +6,26 @@ Both compare sRGB display values in [0,1] with `Frame.masked_rgb()`: the rock on
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mgs.active.run_folder import load_run
+from mgs.active.inputs import array_digest, camera_digest, frame_digests
+from mgs.active.run_folder import load_run, read_settings
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
-from mgs.data.dataset import Frame
+from mgs.data.dataset import Dataset, Frame
 from mgs.errors import InputError
-from mgs.files import atomic_path, locked, write_json
+from mgs.files import atomic_path, locked, read_json, write_json
 from mgs.gaussians import Gaussians
 from mgs.images import read_png
 from mgs.metrics import METRICS, compare
+from mgs.provenance import versions
 
 Renderer = Callable[[Gaussians, Camera], np.ndarray]
 """(gaussians, camera) -> linear RGB [H,W,3]."""
@@ -117,15 +121,65 @@ def read_comparison(path: str | Path, camera: Camera) -> tuple[np.ndarray, np.nd
     return pixels[-height:, :width], pixels[-height:, width : 2 * width]
 
 
-def evaluate_run(run: str | Path, *, pictures: bool = True, progress: Progress | None = None) -> dict[str, Any]:
+def evaluate_run(
+    run: str | Path,
+    *,
+    pictures: bool = True,
+    progress: Progress | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> dict[str, Any]:
     """`evaluate` of a run of `mgs nbv` on its dataset; writes RUN/metrics.json, and RUN/renders/*.png where `pictures`.
 
-    Raises InputError as `load_run`, and where another process works on the run.
+    What is there of this very model, dataset and version of mgs is kept: nothing is measured or drawn twice. say is told what
+    was written and what was kept. Raises InputError as `load_run`, and where another process works on the run.
     """
     run = Path(run)
-    gaussians, dataset, trained, policy = load_run(run)
-    folder = run / "renders" if pictures else None
+    file, folder = run / "metrics.json", run / "renders"
+    read_settings(run)  # a folder that is no run is not locked
     with locked(run):
-        metrics = {"policy": policy} | evaluate(gaussians, dataset.frames, trained, pictures=folder, progress=progress)
-        write_json(run / "metrics.json", metrics)
-    return metrics
+        gaussians, dataset, trained, policy = load_run(run)
+        subject = _subject(gaussians, dataset, trained)
+        metrics = _measured_before(file, subject)
+        if metrics is None:
+            found = evaluate(gaussians, dataset.frames, trained, pictures=folder if pictures else None, progress=progress)
+            metrics = {"policy": policy, "of": subject, "pictures": pictures} | found
+            write_json(file, metrics)
+            say(f"wrote {file}" + (f" and {folder}" if pictures else ""))
+            return metrics
+        kept = f"kept {file}, measured before on this very model and dataset"
+        drawn = metrics["pictures"] and all((folder / f"{frame.name}.png").is_file() for frame in dataset.frames)
+        if pictures and not drawn:
+            decibels = [view["psnr"] for view in metrics["views"]]
+            _draw(gaussians, dataset.frames, decibels, folder, progress)
+            metrics = metrics | {"pictures": True}
+            write_json(file, metrics)
+            say(f"{kept}; wrote {folder}")
+        else:
+            say(kept + (f", and {folder}" if pictures else ""))
+        return metrics
+
+
+def _subject(gaussians: Gaussians, dataset: Dataset, trained: list[str]) -> str:
+    """Hash of all that the metrics of a run depend on: the model, the dataset's cameras, images and masks, and the versions."""
+    frames = [[frame.name, camera_digest(frame.camera), frame_digests(frame, ("image", "mask"))] for frame in dataset.frames]
+    text = json.dumps([array_digest(asdict(gaussians).values()), frames, trained, versions()])
+    return array_digest([np.frombuffer(text.encode(), np.uint8)])
+
+
+def _measured_before(file: Path, subject: str) -> dict[str, Any] | None:
+    """The contents of metrics.json, where it is there and of this subject."""
+    try:
+        metrics = read_json(file)
+    except InputError:
+        return None
+    return metrics if isinstance(metrics, dict) and metrics.get("of") == subject else None
+
+
+def _draw(
+    gaussians: Gaussians, frames: Sequence[Frame], decibels: Sequence[float], folder: Path, progress: Progress | None
+) -> None:
+    """The pictures of `evaluate` alone, of frames whose PSNR is known."""
+    for done, (frame, value) in enumerate(zip(frames, decibels, strict=True)):
+        if progress:
+            progress(done, len(frames))
+        write_comparison(folder / f"{frame.name}.png", frame.masked_rgb(), render_rgb(gaussians, frame.camera), value)

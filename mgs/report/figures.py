@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain, cycle
 from pathlib import Path
@@ -69,7 +70,7 @@ def orbit_figure(
         norm = Normalize(1, max(last, 2))
         for axis, (policy, (seeds, chosen)) in zip(axes, choices.items(), strict=True):
             _orbit_panel(axis, positions, surface, list(seeds), list(chosen), norm)
-            axis.set(title=f"{policy}: {len(seeds)} seeds, {len(chosen)} chosen", xlabel="$x$ (m)")
+            axis.set(title=_in_lines(f"{policy}: {len(seeds)} seeds, {len(chosen)} chosen"), xlabel="$x$ (m)")
         axes[0].set_ylabel("$y$ (m)")
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
         bar = figure.colorbar(ScalarMappable(norm, "viridis"), ax=list(axes), shrink=0.8, pad=0.01)
@@ -187,14 +188,21 @@ def comparison_figure(
         figure = new_figure(2.7 * columns, 2.7 * aspect * 2 + 0.9, dpi=150)
         axes = figure.subplots(2, columns)
         axes[0, 0].imshow(shown, interpolation="nearest")
-        axes[0, 0].set_title(f"truth\n{title}")
+        axes[0, 0].set_title(f"truth\n{_in_lines(title)}")
         for column, (policy, image) in enumerate(images.items(), 1):
             axes[0, column].imshow(image, interpolation="nearest")
-            axes[0, column].set_title(policy + (f"\n{captions[policy]}" if captions and policy in captions else ""))
+            caption = f"\n{_in_lines(captions[policy])}" if captions and policy in captions else ""
+            axes[0, column].set_title(_in_lines(policy) + caption)
             map_ = axes[1, column].imshow(differences[policy], cmap="magma", vmin=0, vmax=limit, interpolation="nearest")
         for axis in axes.flat:
             axis.set_axis_off()
         axes[1, 0].text(0.97, 0.5, "absolute\ndifference", ha="right", va="center", transform=axes[1, 0].transAxes)
         bar = figure.colorbar(map_, ax=list(axes[1, 1:]), orientation="horizontal", shrink=0.6, pad=0.02, aspect=40)
-        bar.set_label("mean absolute difference of the sRGB channels, in [0, 1]")
+        label = "mean absolute difference of the sRGB channels, in [0, 1]"
+        bar.set_label(label if columns > 2 else _in_lines(label))
         save_figure(figure, path)
+
+
+def _in_lines(text: str, width: int = 34) -> str:
+    """Text in lines of at most that many characters: what fits above one column of a figure."""
+    return "\n".join(textwrap.wrap(text, width))

@@ -40,8 +40,9 @@ def write_report(out: str | Path, folders: Sequence[str | Path]) -> list[Path]:
     frame = frames[unseen_view(list(runs.values()), len(frames))]
     pictures = {label: run.folder / "renders" / f"{frame.name}.png" for label, run in runs.items()}
     for label, picture in pictures.items():
-        if not picture.is_file():
-            raise InputError(f"{picture}: no such picture; draw it with `mgs eval {runs[label].folder}`")
+        stale = (runs[label].metrics or {}).get("pictures") is False  # of an earlier model; older runs do not say
+        if stale or not picture.is_file():
+            raise InputError(f"{picture}: no picture of this model; draw it with `mgs eval {runs[label].folder}`")
     captions = {label: _caption(run, frame.name) for label, run in runs.items()}
     pairs = {label: read_comparison(picture, frame.camera) for label, picture in pictures.items()}
 
