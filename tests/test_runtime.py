@@ -120,7 +120,7 @@ def test_the_users_variant_stays(program, printed):
     prepare = """
 import numpy as np, mitsuba as mi
 from mgs import runtime
-from mgs.conventions import Camera
+from mgs.camera import Camera
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.splat import fisher, render
