@@ -1,7 +1,8 @@
-"""Pinhole cameras and the frames they are given in.
+"""Pinhole cameras, and the coordinate systems used everywhere in mgs.
 
-World: metres, +Z up. Camera: OpenCV (x right, y down, z forward), pixel centres at +0.5. Depth: z-depth in metres, 0 = no
-return.
+World: metres, +Z up. Camera: OpenCV axes (x right, y down, z forward). Pixels: (u, v) counted from the image's corner, so that
+the centre of the first pixel is (0.5, 0.5). Depth: z-depth in metres, which is measured along the camera's z axis and not along
+the ray; 0 means that the pixel has no depth ("no return").
 """
 
 from __future__ import annotations
@@ -14,23 +15,24 @@ from numpy.typing import ArrayLike, NDArray
 from mgs.errors import InputError
 
 MAX_PIXELS = 2**27
-"""Largest image of a camera: what is larger is a slip of the keyboard, and would end in a lack of memory."""
+"""Most pixels of a camera's image. More are probably a typing error, and the memory would not suffice to draw them."""
 
 MAX_SIDE = 2**20
-"""Largest width and height of an image, pixels: beyond it float32 cannot tell neighbouring pixel centres well, and a strip a
-pixel wide, drawn in whole blocks, has far more than MAX_PIXELS."""
+"""Largest width and largest height of an image, pixels. Beyond it float32 does not resolve pixel centres well. Besides, the
+renderer draws whole blocks of pixels: an image that is very long and one pixel wide would take far more than MAX_PIXELS."""
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+"""OpenGL's camera axes are x right, y up, z backward: two of OpenCV's are turned round."""
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera. Two are equal where all their numbers are.
+    """A pinhole camera. Two cameras are equal if all their numbers are.
 
-    K: [3,3] float64, pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]. width, height: pixels.
-    world_to_camera: [4,4] float64, rigid, OpenCV axes, metres.
-    Raises InputError where K or the pose is not finite, K has skew or a non-positive focal length, the image has no pixel,
-    parts of pixels, more than MAX_PIXELS or a side beyond MAX_SIDE, or the pose is not rigid.
+    K: [3,3] float64, the intrinsics in pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]. width, height: of the image, pixels.
+    world_to_camera: [4,4] float64, rigid transform in metres; the camera has OpenCV axes.
+    Raises InputError if K or the pose is not finite, K has skew or a focal length that is not positive, the width or height is
+    not a whole number of at least 1, the image exceeds MAX_PIXELS or MAX_SIDE, or the pose is not rigid.
     """
 
     K: NDArray[np.float64]
@@ -43,7 +45,7 @@ class Camera:
         pose = np.asarray(self.world_to_camera, np.float64)
         if int(self.width) != self.width or int(self.height) != self.height:
             raise InputError(f"camera: image size {self.width}x{self.height} must be whole pixels")
-        object.__setattr__(self, "width", int(self.width))  # NumPy's integers are no sizes to Dr.Jit
+        object.__setattr__(self, "width", int(self.width))  # Dr.Jit does not accept NumPy's integers as sizes
         object.__setattr__(self, "height", int(self.height))
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "world_to_camera", pose)
@@ -65,18 +67,15 @@ class Camera:
         if not rigid or not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-9):
             raise InputError("camera: the pose is singular or not rigid; its rotation must be orthonormal")
 
-    def _key(self) -> tuple[object, ...]:
-        return self.K.tobytes(), self.width, self.height, self.world_to_camera.tobytes()
-
     def __eq__(self, other: object) -> bool:
-        return self._key() == other._key() if isinstance(other, Camera) else NotImplemented
+        return self.key == other.key if isinstance(other, Camera) else NotImplemented
 
     def __hash__(self) -> int:
-        return hash(self._key())
+        return hash(self.key)
 
     @property
     def camera_to_world(self) -> NDArray[np.float64]:
-        """[4,4] OpenCV camera-to-world."""
+        """Inverse of world_to_camera [4,4]: a rigid transform in metres; the camera has OpenCV axes."""
         R, t = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = R.T, -R.T @ t
@@ -84,16 +83,16 @@ class Camera:
 
     @property
     def position(self) -> NDArray[np.float64]:
-        """[3] camera centre in the world, metres."""
+        """Centre of the camera in the world [3], metres."""
         return self.camera_to_world[:3, 3]
 
     @property
     def key(self) -> bytes:
-        """K, pose and image size as bytes: equal where all of these are, so it names the view in caches and seeds."""
+        """K, pose and image size as bytes. It is what caches and seeds know a view by."""
         return self.K.tobytes() + self.world_to_camera.tobytes() + f"{self.width}x{self.height}".encode()
 
     def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """World points [N,3] -> (pixels [N,2], z-depth [N]); pixels are meaningless where z <= 0."""
+        """World points [N,3], metres -> (pixels [N,2], z-depth [N], metres). Ignore pixels where z-depth is not positive."""
         p = np.asarray(points, np.float64) @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
         z = p[:, 2]
         safe = np.where(z > 0, z, 1.0)
@@ -102,7 +101,7 @@ class Camera:
         return np.stack([u, v], 1), z
 
     def unproject(self, depth: ArrayLike) -> NDArray[np.float64]:
-        """z-depth image [H,W], metres -> world points [H,W,3]; meaningless where depth is 0."""
+        """Depth image [H,W] -> world points [H,W,3] at the pixel centres; both in metres. Where the depth is 0, ignore them."""
         depth = np.asarray(depth, np.float64)
         v, u = np.mgrid[: self.height, : self.width] + 0.5
         x = (u - self.K[0, 2]) / self.K[0, 0] * depth
@@ -110,9 +109,21 @@ class Camera:
         pose = self.camera_to_world
         return np.stack([x, y, depth], -1) @ pose[:3, :3].T + pose[:3, 3]
 
+    def resized(self, width: int) -> Camera:
+        """The same view in an image of this width, pixels; the height follows, rounded to a whole number of at least 1.
+
+        Raises InputError if the image becomes too large.
+        """
+        height = max(1, round(self.height * width / self.width))
+        scale = np.diag([width / self.width, height / self.height, 1.0])
+        return Camera(scale @ self.K, width, height, self.world_to_camera)
+
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:
-    """OpenCV world_to_camera [4,4] of a camera at `eye` that looks at `target` with world `up` (metres)."""
+    """world_to_camera [4,4] of a camera at `eye` [3] that looks at `target` [3], metres, with the direction `up` [3] upwards.
+
+    Where the camera looks along `up`, +Y takes its place. Raises InputError if eye and target are the same point.
+    """
     eye = np.asarray(eye, np.float64)
     forward: NDArray[np.float64] = np.asarray(target, np.float64) - eye
     norm = np.linalg.norm(forward)
@@ -130,10 +141,13 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
 
 
 def opencv_from_opengl(camera_to_world: ArrayLike) -> NDArray[np.float64]:
-    """nerfstudio's OpenGL camera-to-world [4,4] -> our OpenCV world_to_camera [4,4]."""
+    """nerfstudio's camera-to-world [4,4] (OpenGL axes) -> our world_to_camera [4,4] (OpenCV axes).
+
+    Raises numpy.linalg.LinAlgError if the matrix is singular.
+    """
     return np.asarray(np.linalg.inv(np.asarray(camera_to_world, np.float64) @ _OPENGL_FROM_OPENCV), np.float64)
 
 
 def opengl_from_opencv(world_to_camera: ArrayLike) -> NDArray[np.float64]:
-    """Our OpenCV world_to_camera [4,4] -> nerfstudio's OpenGL camera-to-world [4,4]."""
+    """Our world_to_camera [4,4] (OpenCV axes) -> nerfstudio's camera-to-world [4,4] (OpenGL axes)."""
     return np.asarray(np.linalg.inv(np.asarray(world_to_camera, np.float64)) @ _OPENGL_FROM_OPENCV, np.float64)

@@ -1,4 +1,4 @@
-"""The one error a user can cause and mend."""
+"""The error that stands for bad input: what the user can cause, and can mend."""
 
 
 class InputError(ValueError):

@@ -1,4 +1,8 @@
-"""Files: nothing is ever half-written. Outputs go to a temporary name beside the target and are renamed."""
+"""Reading and writing files and folders so that nothing is ever half-written.
+
+Output goes to a temporary name in the same folder and is renamed when it is complete. A process that is killed meanwhile leaves
+the temporary file behind, but never an incomplete file under the real name.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +22,10 @@ from mgs.errors import InputError
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path` (same suffix); rename it on success, delete it on failure.
+    """Context manager that gives a temporary path beside `path`, with the same suffix, for the block to write to.
 
-    Raises InputError where it cannot be written: no permission, a file in place of a folder, a full disk.
+    After the block it is renamed to `path`; if the block fails it is deleted. Folders that are missing above it are made.
+    Raises InputError if it cannot be written: no permission, a file where a folder is needed, a full disk.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
@@ -36,11 +41,15 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def _not_writable(path: Path, error: OSError) -> InputError:
+    """The InputError for a path that cannot be written, out of what the operating system said."""
     return InputError(f"{path}: cannot be written ({error.strerror or error}); choose a place you may write to, with room")
 
 
 def check_writable(path: str | Path) -> Path:
-    """The path, where a file or folder could be made there. Makes nothing. Raises InputError where it could not."""
+    """Check that a file or folder could be written at `path`, and return it as a Path. Nothing is made.
+
+    Commands call it before long work. Raises InputError if it could not be written.
+    """
     path = Path(path)
     try:
         there = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
@@ -52,7 +61,10 @@ def check_writable(path: str | Path) -> Path:
 
 @contextmanager
 def reading(path: Path, what: str = "file") -> Iterator[None]:
-    """While `path` is read, errors of the file system become one line: InputError, no such `what`, or why it cannot be read."""
+    """Context manager around the reading of `path`: an OSError in its block becomes an InputError of one line.
+
+    The line says that there is no such `what`, or why it cannot be read.
+    """
     try:
         yield
     except FileNotFoundError:
@@ -62,7 +74,7 @@ def reading(path: Path, what: str = "file") -> Iterator[None]:
 
 
 def copy_file(source: Path, path: Path) -> None:
-    """Copy a file, atomically. Raises InputError where the source cannot be read or the copy cannot be written."""
+    """Copy a file; the copy appears complete. Raises InputError if the source cannot be read or the copy cannot be written."""
     with reading(source):
         data = source.read_bytes()
     with atomic_path(path) as temporary:
@@ -70,30 +82,37 @@ def copy_file(source: Path, path: Path) -> None:
 
 
 def fingerprint(path: str | Path) -> dict[str, str]:
-    """Name and SHA-256 of a file, to tell later whether it is still the same."""
+    """Name (without folders) and SHA-256 hash of a file, by which it can be recognised later. Raises OSError."""
     return {"name": Path(path).name, "sha256": hashlib.sha256(Path(path).read_bytes()).hexdigest()}
 
 
 def write_json(path: str | Path, data: Any) -> None:
-    """Write JSON (indented, UTF-8), atomically. Raises ValueError for NaN and infinities, which JSON has not: use None."""
+    """Write data as JSON, indented, in UTF-8; the file appears complete.
+
+    Raises ValueError for NaN and infinities, for which JSON has no notation (write None instead), and InputError as
+    `atomic_path`.
+    """
     text = json.dumps(data, indent=2, allow_nan=False)
     with atomic_path(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
 def read_json(path: str | Path) -> Any:
-    """Read JSON. Raises InputError where the file is missing, not a file that can be read, or not JSON."""
+    """Contents of a JSON file. Raises InputError if it is missing, cannot be read or is not valid JSON."""
     path = Path(path)
     with reading(path):
         data = path.read_bytes()
     try:
-        return json.loads(data.decode("utf-8-sig"))  # some tools put a byte-order mark in front
-    except (ValueError, RecursionError) as error:  # also of numbers or nestings that Python refuses
+        return json.loads(data.decode("utf-8-sig"))  # some tools begin a file with a byte-order mark
+    except (ValueError, RecursionError) as error:  # RecursionError: nested too deeply for Python
         raise InputError(f"{path}: not valid JSON ({error}); the file is damaged, write it again") from None
 
 
 def check_new_folder(path: str | Path) -> Path:
-    """The path, where an output folder could be made there; makes nothing. Raises InputError as `new_folder`."""
+    """Check that `new_folder(path)` would work, and return the path as a Path. Nothing is made.
+
+    Raises InputError if `path` is a file, is a folder that is not empty, or could not be written.
+    """
     path = check_writable(path)
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file, not a folder; choose another output folder")
@@ -103,7 +122,8 @@ def check_new_folder(path: str | Path) -> Path:
 
 
 def new_folder(path: str | Path) -> Path:
-    """Create an output folder. Raises InputError where it is a file, is not empty, or cannot be written."""
+    """Make an output folder, and the folders above it; an empty one that exists is used. Raises InputError as
+    `check_new_folder`."""
     path = check_new_folder(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -114,7 +134,11 @@ def new_folder(path: str | Path) -> Path:
 
 @contextmanager
 def folder_or_nothing(path: str | Path) -> Iterator[Path]:
-    """Yield a new folder; where the block fails, all is as it was: no folder, no parents, or the empty one there was."""
+    """Context manager that makes a new folder for its block. If the block fails, everything is again as before.
+
+    That means: the folder and the parents that were made for it are removed, or, if there was an empty folder, it is emptied.
+    Raises InputError as `new_folder`.
+    """
     path = check_new_folder(path)
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     new_folder(path)
@@ -134,9 +158,9 @@ def folder_or_nothing(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary folder beside `path`, which becomes `path` at the end: a kill leaves no half of it.
+    """Context manager that gives a temporary folder beside `path` for its block to fill; after the block it becomes `path`.
 
-    Raises InputError as `new_folder`.
+    So a folder named `path` is always complete, even if the process is killed. Raises InputError as `new_folder`.
     """
     path = check_new_folder(path).resolve()
     with folder_or_nothing(path.with_name(f".{path.name}.{os.getpid()}.part")) as temporary:
@@ -149,10 +173,11 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def locked(folder: str | Path) -> Iterator[None]:
-    """Keep every other process that asks for this lock out of a folder while the block runs.
+    """Context manager: while its block runs, no other process gets the lock of the same folder.
 
-    Raises InputError where another one has it (names its id), or the folder cannot be written. The lock is the kernel's, on the
-    file FOLDER/.lock: it ends with the process, however that ends, so a file that a killed process left locks nothing.
+    Raises InputError, naming the process, if another one holds the lock, and if the folder cannot be written. The lock is kept
+    by the operating system, on the file FOLDER/.lock. It ends when the process ends, also when that is killed: a file .lock
+    that is left over locks nothing.
     """
     path = Path(folder) / ".lock"
     try:
@@ -168,8 +193,8 @@ def locked(folder: str | Path) -> Iterator[None]:
 
 
 def _lock(path: Path) -> TextIO:
-    """The file, locked and with this process's id in it. Raises InputError where another process has it."""
-    while True:
+    """Open and lock the file, and write this process's id into it. Raises InputError if another process has locked it."""
+    while True:  # until the file that is locked is the one that stands under this name
         with ExitStack() as closed_on_failure:
             file = closed_on_failure.enter_context(open(path, "a+", encoding="ascii"))
             try:
@@ -181,7 +206,7 @@ def _lock(path: Path) -> TextIO:
                 ours = os.path.samestat(os.fstat(file.fileno()), os.stat(path))
             except FileNotFoundError:
                 ours = False
-            if ours:  # not a file that its last owner removed after we opened it
+            if ours:  # the process that had the lock before may have removed the file after we opened it
                 file.truncate(0)
                 print(os.getpid(), end="", file=file, flush=True)
                 closed_on_failure.pop_all()

@@ -1,6 +1,7 @@
-"""The Gaussians: parameters and activations.
+"""The Gaussians of a model: their parameters, and what these mean.
 
-`Gaussians` is a plain dataclass, so Dr.Jit can carry it as a PyTree; on disk and between stations its fields are NumPy arrays.
+`Gaussians` is a plain dataclass, which Dr.Jit can take apart by its fields (a PyTree). Its fields are NumPy arrays everywhere
+but inside `mgs.splat`, where they are Dr.Jit tensors.
 """
 
 from __future__ import annotations
@@ -15,26 +16,34 @@ from mgs.colour import SH_C0
 from mgs.errors import InputError
 
 MAX_SH_DEGREE = 3
+"""Highest degree of spherical harmonics, as in 3DGS."""
 
 MAX_GAUSSIANS = 2**25
-"""Most Gaussians of a model: with 48 colour coefficients each, every place in a kernel's buffers is below 2^31."""
+"""Most Gaussians of a model. Kernels address their buffers with 32-bit indices: 48 colour coefficients of each Gaussian stay
+below 2^31."""
 
 SH_MAX = 1e6
-"""Largest colour coefficient, linear RGB, of either sign: with it, gradients and Fisher information, which are of the order of
-colours squared and summed over pixels, stay far within float32. The sun itself is 1e5 times as bright as what it lights."""
+"""Largest magnitude of a colour coefficient, linear RGB. Gradients and Fisher information grow with the square of colours,
+summed over pixels; up to this limit they stay far within the range of float32. It is beyond any real colour: the sun is about
+1e5 times as bright as a surface that it lights."""
 
 LEARNED = ("sh", "log_scales", "quats", "logit_opacities")
-"""Learned parameters, in the order of their columns in the Fisher information: 3K colour, 3, 4, 1. Means are frozen."""
+"""Names of the learned parameters, in the order of their columns in the Fisher information. They have 3K (K colour coefficients
+for each of r, g, b), 3, 4 and 1 columns. The means are not learned."""
 
 
 @dataclass(eq=False)
 class Gaussians:
-    """N Gaussians with appearance; float32 NumPy arrays (or Dr.Jit tensors of the same shapes inside `mgs.splat`).
+    """N Gaussians; float32 NumPy arrays, or inside `mgs.splat` Dr.Jit tensors of the same shapes.
 
-    `gaussians[10:20]`, `gaussians[mask]` and `gaussians[indices]` are Gaussians again. Two are equal where every number is.
+    means: [N,3] centres in the world, metres.
+    log_scales: [N,3] natural logarithm of the standard deviations along the three local axes, metres.
+    quats: [N,4] quaternions w x y z of any norm, from the local axes to the world's.
+    logit_opacities: [N] opacity o as its logit, ln(o / (1 - o)).
+    sh: [N,K,3] colour, linear RGB, as K = (d+1)^2 coefficients of spherical harmonics of a degree d from 0 to 3, in the order
+    and with the signs of 3DGS: rgb = max(0, 0.5 + sum over k of Y_k(direction) sh_k), with the direction from the camera.
 
-    means [N,3] world, metres; log_scales [N,3] ln metres; quats [N,4] wxyz, any norm; logit_opacities [N];
-    sh [N,(d+1)^2,3] spherical-harmonic colour of degree d in 0..3, linear RGB, rgb = 0.5 + sum_k Y_k(direction) sh_k.
+    `gaussians[10:20]`, `gaussians[mask]` and `gaussians[indices]` are Gaussians again. Two are equal if all numbers are.
     """
 
     means: Any
@@ -47,7 +56,7 @@ class Gaussians:
         return int(self.means.shape[0])
 
     def __getitem__(self, index: Any) -> Gaussians:
-        """Some of them, in this order: a slice, a mask [N], indices [M], or one index (M = 1)."""
+        """The Gaussians that are chosen by a slice, a mask [N] or indices [M] (in the order of these), or by one index."""
         chosen = [index] if isinstance(index, int | np.integer) else index
         return Gaussians(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
@@ -61,22 +70,24 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
     @property
     def rgb(self) -> np.ndarray:
-        """View-independent part of the colour, linear RGB [N,3], clamped at 0."""
+        """The part of the colour that is the same from all sides, linear RGB [N,3], at least 0."""
         return np.maximum(0.5 + SH_C0 * self.sh[:, 0, :], 0.0)
 
     @property
     def opacities(self) -> np.ndarray:
-        """[N] in [0,1]: the sigmoid of the logits, 0 or 1 where float32 has nothing nearer."""
+        """Opacities [N] in [0,1]: the sigmoid of the logits. Of very large logits it is rounded to exactly 0 or 1."""
         return expit(self.logit_opacities.astype(np.float64)).astype(np.float32)
 
     def check(self) -> Gaussians:
-        """Shapes and values of NumPy fields; returns self.
+        """Check the shapes and the values, of NumPy fields only. Returns the Gaussians themselves.
 
-        Raises InputError naming the parameter and the first Gaussian that is NaN, infinite or has a colour beyond SH_MAX.
+        Raises InputError as `check_shapes`, and if a number is NaN or infinite or a colour coefficient exceeds SH_MAX; the
+        message names the parameter and the first such Gaussian.
         """
         self.check_shapes()
         for field in fields(self):
@@ -89,8 +100,7 @@ class Gaussians:
         return self
 
     def check_shapes(self) -> None:
-        """Raises InputError where the shape of a parameter (NumPy or Dr.Jit) does not fit that of the means, or there are more
-        than MAX_GAUSSIANS."""
+        """Raises InputError if the shapes (NumPy or Dr.Jit) are not those of N Gaussians, or N exceeds MAX_GAUSSIANS."""
         n = len(self)
         if n > MAX_GAUSSIANS:
             raise InputError(f"gaussians: {n:,} are more than {MAX_GAUSSIANS:,}, the most that kernels index; take fewer")
@@ -104,5 +114,5 @@ class Gaussians:
 
 
 def sh_from_rgb(rgb: np.ndarray) -> np.ndarray:
-    """Linear RGB [N,3] -> degree-0 coefficients [N,1,3]."""
+    """Colours [N,3], linear RGB -> the spherical harmonics of degree 0 [N,1,3] that have these colours from all sides."""
     return ((np.asarray(rgb, np.float32) - 0.5) / SH_C0)[:, None, :].astype(np.float32)

@@ -1,4 +1,4 @@
-"""Images on disk: PNG and JPEG in sRGB, OpenEXR in linear numbers."""
+"""Images on disk: PNG and JPEG hold sRGB, OpenEXR holds linear colour, depth and other numbers."""
 
 from __future__ import annotations
 
@@ -13,22 +13,27 @@ from mgs.errors import InputError
 from mgs.files import atomic_path, reading
 
 PNG_BIT_DEPTH = 24
-"""Where a PNG holds its number of bits per sample: in the header, the first chunk (PNG specification, section 11.2.1)."""
+"""Index of the byte of a PNG file that says how many bits a sample has (PNG specification, section 11.2.1)."""
 
 EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
-"""Pillow's names of pixels that it converts to 8-bit RGBA without loss: grey, palette and RGB, with and without alpha."""
+"""Pillow's names for the kinds of pixels that it converts to 8-bit RGBA without loss: grey, palette and RGB, with and without
+alpha."""
 
 LUMA = np.array([0.299, 0.587, 0.114])
 """Weights of R, G and B in grey (ITU-R BT.601)."""
 
 PNG_LEVEL = 1
-"""zlib's level, of 9. Against Pillow's 6: a render takes 62 instead of 236 ms (0.56 Mpixel) and as many bytes, a smooth photo
-413 instead of 644 ms (3 Mpixel) and 7 % more, a mask 9 instead of 14 ms and 16 instead of 5 kB."""
+"""Level of zlib's compression, 1 to 9. Compared with Pillow's own level, 6, a render of 0.56 Mpixel is written in 62 instead of
+236 ms and is as large, a smooth photo of 3 Mpixel is written in 413 instead of 644 ms and is 7 % larger, and a mask is written
+in 9 instead of 14 ms and has 16 instead of 5 kB."""
 
 
 def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> None:
-    """Write an 8-bit PNG: linear RGB [H,W,3] (converted to sRGB), display values with linear=False, or, as they are, a bool
-    mask [H,W] or uint8 sRGB [H,W,3]."""
+    """Write an 8-bit PNG; the file appears complete. What `image` holds is told by its type:
+
+    bool [H,W]: a mask, written as black and white. uint8 [H,W,3]: sRGB, written as it is. Float [H,W,3]: linear RGB, converted
+    to sRGB, or with linear=False values that are sRGB in [0,1] already. Raises InputError as `mgs.files.atomic_path`.
+    """
     from PIL import Image
 
     if image.dtype == bool:
@@ -43,7 +48,7 @@ def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> No
 
 
 def _open_image(path: Path) -> tuple[Any, bytes]:
-    """A decoded Pillow image and its file's bytes. Raises InputError where it is missing, cannot be read, or is damaged."""
+    """The decoded Pillow image, and the bytes of its file. Raises InputError if it is missing, cannot be read or is damaged."""
     from PIL import Image, UnidentifiedImageError
 
     with reading(path, "image"):
@@ -59,9 +64,9 @@ def _open_image(path: Path) -> tuple[Any, bytes]:
 
 
 def read_values(path: str | Path) -> np.ndarray:
-    """An image of one channel, such as depth, as it is: [H,W] uint8 or uint16 (TIFF: int32 or float32 too).
+    """The numbers of an image of one channel, such as depth, unchanged: [H,W] uint8 or uint16, of a TIFF also int32 or float32.
 
-    Raises InputError where it is missing, cannot be read, is damaged, or has other channels.
+    Raises InputError if it is missing, cannot be read, is damaged, or does not have one channel.
     """
     path = Path(path)
     image, _ = _open_image(path)
@@ -71,11 +76,11 @@ def read_values(path: str | Path) -> np.ndarray:
 
 
 def read_rgba(path: str | Path) -> np.ndarray:
-    """PNG, JPEG or another image -> [H,W,4], sRGB and straight alpha (full where it has none).
+    """A PNG, JPEG or other image -> [H,W,4]: sRGB, and alpha that is not multiplied into the colours.
 
-    uint16 for a PNG of 16 bits per sample, uint8 for all others: full is 65535 or 255.
-    Raises InputError where it is missing, cannot be read, is damaged, or is neither grey nor RGB (no CMYK: what its numbers
-    look like is known to its colour profile alone).
+    uint16 for a PNG of 16 bits per sample (largest value 65535), uint8 for all others (255). An image without alpha is opaque:
+    its alpha has the largest value. Raises InputError if the file is missing, cannot be read, is damaged, or is neither grey
+    nor RGB. CMYK is refused because only the colour profile of such a file tells what its numbers look like.
     """
     import cv2
 
@@ -85,11 +90,11 @@ def read_rgba(path: str | Path) -> np.ndarray:
     if image.mode not in EIGHT_BIT_MODES and bits < 16:
         raise InputError(f"{path}: pixels of kind {image.mode} are not supported; convert it to grey or RGB of 8 or 16 bits")
     if bits in (2, 4, 16) and image.mode in ("L", "I", "I;16") and "transparency" in image.info:
-        # Pillow and OpenCV both get these wrong; at 1 and 8 bits Pillow is right.
+        # A PNG may name one grey value that is transparent. At these bit depths Pillow and OpenCV both read it wrongly.
         raise InputError(f"{path}: a grey of {bits} bits that stands for transparent is not supported; convert it to RGBA")
     if bits < 16:
         return np.asarray(image.convert("RGBA"))
-    # Pillow keeps only the upper 8 bits of 16-bit colour.
+    # OpenCV reads these, because Pillow keeps only the upper 8 bits of 16-bit colour.
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.uint16:
         raise InputError(f"{path}: not a readable 16-bit PNG; the file is damaged, write it again")
@@ -98,19 +103,22 @@ def read_rgba(path: str | Path) -> np.ndarray:
 
 
 def read_png(path: str | Path) -> np.ndarray:
-    """sRGB image of 8 or 16 bits -> linear RGB float32 [H,W,3], alpha ignored. Raises InputError as `read_rgba`."""
+    """An sRGB image of 8 or 16 bits -> linear RGB float32 [H,W,3]; alpha is ignored. Raises InputError as `read_rgba`."""
     rgba = read_rgba(path)
     return linear_from_srgb(rgba[..., :3].astype(np.float32) / np.iinfo(rgba.dtype).max)
 
 
 def read_mask(path: str | Path) -> np.ndarray:
-    """Mask image -> bool [H,W] (at least half white is inside, alpha ignored). Raises InputError as `read_rgba`."""
+    """A mask image -> bool [H,W], True where it is at least half white; alpha is ignored. Raises InputError as `read_rgba`."""
     rgba = read_rgba(path)
     return rgba[..., :3] @ LUMA >= 0.5 * np.iinfo(rgba.dtype).max
 
 
 def write_exr(path: str | Path, channels: dict[str, np.ndarray]) -> None:
-    """Write a float32 OpenEXR with one named channel per [H,W] array (linear)."""
+    """Write an OpenEXR file with a float32 channel for each named array [H,W]; the file appears complete.
+
+    Raises InputError if it cannot be written.
+    """
     import OpenEXR
 
     data = {name: np.ascontiguousarray(array, np.float32) for name, array in channels.items()}
@@ -118,16 +126,16 @@ def write_exr(path: str | Path, channels: dict[str, np.ndarray]) -> None:
     with atomic_path(path) as temporary, OpenEXR.File(header, data) as file:
         try:
             file.write(str(temporary))
-        except RuntimeError as error:  # how OpenEXR says that the disk is full
+        except RuntimeError as error:  # OpenEXR raises this if the disk is full
             raise InputError(f"{path}: cannot be written ({error}); choose a place you may write to, with room") from None
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:
-    """OpenEXR -> {channel: float32 [H,W]}. Raises InputError where it is missing, cannot be read, or is damaged."""
+    """The channels of an OpenEXR file, {name: float32 [H,W]}. Raises InputError if it is missing, unreadable or damaged."""
     import OpenEXR
 
     path = Path(path)
-    with reading(path, "EXR file"), path.open("rb") as opened:  # of a file that it cannot open OpenEXR does not say why
+    with reading(path, "EXR file"), path.open("rb") as opened:  # OpenEXR itself would not say why it cannot open a file
         opened.read(1)
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:

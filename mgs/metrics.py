@@ -1,4 +1,4 @@
-"""PSNR and SSIM of display values (sRGB in [0,1]), over the whole frame and inside the rock mask."""
+"""Image quality: PSNR and SSIM, over the whole frame and inside the rock's mask. Both compare sRGB values in [0,1]."""
 
 from __future__ import annotations
 
@@ -10,22 +10,26 @@ from mgs.colour import srgb_from_linear
 from mgs.errors import InputError
 
 PSNR_LIMIT = 100.0
-"""dB, reported where two images are equal (8-bit images cannot tell more than 59 dB apart)."""
+"""Largest PSNR that is reported, dB: equal images, whose PSNR is infinite, have this one. For comparison: rounding to 8 bits is
+an error of 59 dB."""
 
 SSIM_SIGMA = 1.5
-"""Pixels, of SSIM's Gaussian window (11 x 11), from Wang et al. 2004."""
+"""Standard deviation of the Gaussian window of SSIM, pixels (Wang et al. 2004)."""
 
 SSIM_WINDOW = 11
+"""Width and height of that window, pixels (Wang et al. 2004)."""
 
 METRICS = ("psnr", "ssim", "psnr_mask", "ssim_mask")
+"""Names of the four numbers that `compare` gives, as in metrics.json. PSNR is in dB; `_mask`: inside the rock's mask only."""
 
 
 def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio, dB, of display values [H,W,3] in [0,1]; over the pixels of `mask` [H,W] where given.
+    """Peak signal-to-noise ratio of two images, dB: -10 log10 of the mean squared error over pixels and channels.
 
-    At most PSNR_LIMIT; NaN where the mask is empty. Raises InputError where the shapes differ.
+    a, b: [H,W,3] sRGB in [0,1]; mask: [H,W] bool, if given only its pixels count. At most PSNR_LIMIT, and NaN if the mask is
+    empty. Raises InputError if the shapes differ.
     """
-    _same_shape(a, b)
+    _check_same_shape(a, b)
     squares = (np.asarray(a, np.float64) - b) ** 2
     if mask is not None:
         squares = squares[mask]
@@ -36,14 +40,15 @@ def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
 
 
 def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Structural similarity (Wang et al. 2004) of display values [H,W,3] in [0,1], mean over channels.
+    """Structural similarity of two images (Wang et al. 2004, computed by scikit-image), mean over pixels and channels.
 
-    With a mask [H,W]: the SSIM map averaged over the mask; NaN where that is empty. Raises InputError where the shapes differ
-    or the images are smaller than the window.
+    a, b: [H,W,3] sRGB in [0,1]. Without a mask the mean leaves out the image's border, where the window does not fit; with a
+    mask, [H,W] bool, it is over all pixels of the mask, and NaN if that is empty. Raises InputError if the shapes differ or the
+    images are smaller than the window.
     """
     from skimage.metrics import structural_similarity
 
-    _same_shape(a, b)
+    _check_same_shape(a, b)
     if min(a.shape[:2]) < SSIM_WINDOW:
         raise InputError(f"SSIM needs images of at least {SSIM_WINDOW}x{SSIM_WINDOW} pixels, not {a.shape[1]}x{a.shape[0]}")
     mean, similarity = structural_similarity(
@@ -61,12 +66,15 @@ def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     return float(similarity[mask].mean()) if mask.any() else math.nan
 
 
-def _same_shape(a: np.ndarray, b: np.ndarray) -> None:
+def _check_same_shape(a: np.ndarray, b: np.ndarray) -> None:
     if a.shape != b.shape:
         raise InputError(f"images of {a.shape} and {b.shape} cannot be compared; render at the size of the dataset")
 
 
 def compare(truth: np.ndarray, rendered: np.ndarray, mask: np.ndarray) -> dict[str, float]:
-    """The four METRICS of one view: linear RGB [H,W,3] twice, rock mask [H,W]."""
+    """The four METRICS of one view. truth, rendered: [H,W,3] linear RGB; mask: [H,W] bool, the rock.
+
+    Raises InputError as `psnr` and `ssim`.
+    """
     a, b = srgb_from_linear(truth), srgb_from_linear(rendered)
     return {"psnr": psnr(a, b), "ssim": ssim(a, b), "psnr_mask": psnr(a, b, mask), "ssim_mask": ssim(a, b, mask)}

@@ -1,4 +1,4 @@
-"""What every figure shares: one style, one way to make a figure and to write it."""
+"""What all figures share: their style, how a figure is made, and how it is written."""
 
 from __future__ import annotations
 
@@ -28,25 +28,30 @@ STYLE = {
     "lines.linewidth": 1.5,
     "lines.markersize": 4,
 }
+"""Settings for `matplotlib.rc_context`."""
 
 DPI = 200
+"""Pixels per inch of a figure."""
 
 
 def new_figure(width: float, height: float, dpi: int = DPI) -> Figure:
-    """An empty figure, width and height in inches."""
+    """An empty figure of this width and height, inches. It needs no display."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), dpi=dpi, layout="constrained")
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:
-    """Write a figure as PNG, atomically."""
+    """Write a figure as a PNG; the file appears complete. Raises InputError as `mgs.files.atomic_path`."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png")
 
 
 def crop(mask: np.ndarray, margin: float = 0.06) -> tuple[slice, slice]:
-    """Rows and columns around a mask [H,W], with a margin as a share of the image; the whole image where the mask is empty."""
+    """The rows and columns of an image that hold its mask [H,W] with a margin around it; all of them if the mask is empty.
+
+    margin: a share of the image's height and width.
+    """
     rows, columns = np.nonzero(mask)
     if len(rows) == 0:
         return slice(None), slice(None)

@@ -1,4 +1,4 @@
-"""What a result depends on, written beside it: the command, the versions."""
+"""What results depend on and files of results therefore record: the command and the versions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mgs import __version__
 
 
 def versions() -> dict[str, str]:
-    """What a result depends on: versions of mgs, Python and the libraries that compute it."""
+    """Versions of mgs, of Python and of the libraries that compute results; "unknown" for one that is not installed."""
     found = {"mgs": __version__, "python": platform.python_version()}
     for package in ("mitsuba", "drjit", "numpy"):
         try:
@@ -23,5 +23,5 @@ def versions() -> dict[str, str]:
 
 
 def command_line() -> str:
-    """What the user typed: the program's name without its folder, and the arguments."""
+    """The command line of this process as the user typed it: the program's name without its folder, and the arguments."""
     return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])

@@ -1,4 +1,7 @@
-"""Where the data files of the package lie: inside an installed wheel, or at the root of a checkout."""
+"""Data files that come with mgs: the folders `scenes` and `plugins`.
+
+In an installed wheel they lie inside the package, in a checkout beside it.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def resource_folder(name: str) -> Path:
-    """The folder `scenes` or `plugins`. Raises InputError where the installation lacks it."""
+    """Path of the folder `scenes` or `plugins`. Raises InputError if the installation lacks it."""
     for root in (_PACKAGE, _PACKAGE.parent):
         if (root / name).is_dir():
             return root / name
@@ -18,7 +21,10 @@ def resource_folder(name: str) -> Path:
 
 
 def scene_path(scene: str | Path) -> Path:
-    """A scene's TOML file, by path or by the name of one that comes with mgs. Raises InputError where there is none."""
+    """Path of a scene's TOML file. scene: such a path, or the name of a scene that comes with mgs, as in "boulder".
+
+    Raises InputError if there is no such file or name.
+    """
     if Path(scene).suffix == ".toml":
         if not Path(scene).is_file():
             raise InputError(f"{scene}: no such scene file")

@@ -1,8 +1,10 @@
-"""Start Dr.Jit: find a libLLVM that works before any kernel runs, then set the variant, unless one is set.
+"""Start Dr.Jit and Mitsuba: find a libLLVM that works, then set Mitsuba's variant unless one is set already.
 
-Everything in mgs that computes with Dr.Jit calls `start` first. Dr.Jit loads a libLLVM of the system. Older ones than 19
-abort the process in the middle of a kernel ("Cannot select: fminimum"), so the version is asked for first: loading a library
-and calling LLVMGetVersion cannot abort. Needs nothing but the standard library until `start`: the set-up uses it before
+Everything in mgs that computes with Dr.Jit calls `start` first. Dr.Jit compiles its kernels with a libLLVM of the system. With
+a version older than 19 the process ends in the middle of a kernel ("Cannot select: fminimum"), and there is no exception to
+catch. So the version is looked at before any kernel runs: loading a library and calling its LLVMGetVersion is harmless.
+
+Except for `start` and what comes after it, this module needs only Python's standard library: tools/setup.sh uses it before
 anything is installed.
 """
 
@@ -20,17 +22,21 @@ from pathlib import Path
 from mgs.errors import InputError
 
 VARIANT = "llvm_ad_rgb"
+"""The variant that `start` sets: compiled by LLVM, with automatic differentiation, in RGB and single precision."""
+
 MIN_LLVM = 19
-"""LLVM 14 and 15 cannot lower float minimum and maximum; 19 and 22 are known to work."""
+"""Least major version of libLLVM. 14 and 15 cannot compile the minimum and maximum of floats; 19 and 22 are known to work."""
 
 LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
+"""Environment variable from which Dr.Jit takes the path of libLLVM."""
+
 _DRJIT_FOLDERS = ("/usr/lib/x86_64-linux-gnu", "/usr/lib/aarch64-linux-gnu", "/usr/lib/wsl/lib")
 _GOOD = f"version {MIN_LLVM} or newer (`apt-get install libllvm{MIN_LLVM}` or `conda install -c conda-forge libllvm{MIN_LLVM}`)"
 
 
 @dataclass(frozen=True)
 class Libllvm:
-    """A libLLVM that loads: what to give to dlopen, and its (major, minor, patch)."""
+    """A libLLVM that can be loaded. path: a path, or a name that the system's loader finds; version: (major, minor, patch)."""
 
     path: str
     version: tuple[int, int, int]
@@ -40,7 +46,10 @@ class Libllvm:
 
 
 def load_libllvm(path: str) -> Libllvm:
-    """Load a library and ask for its version. Raises InputError (no remedy in it) where it does not load or is no libLLVM."""
+    """Load a library and ask it for its version. Raises InputError if it does not load or is not libLLVM.
+
+    The message does not say how to mend it: `find_libllvm` adds that.
+    """
     try:
         library = ctypes.CDLL(path)
     except OSError as error:
@@ -58,10 +67,11 @@ def load_libllvm(path: str) -> Libllvm:
 
 
 def find_libllvm() -> Libllvm:
-    """The libLLVM to use: Dr.Jit's own choice where it is new enough, otherwise the newest good one on the system.
+    """The libLLVM to use: the one that Dr.Jit would choose if it is new enough, otherwise the newest other one on the system.
 
-    Dr.Jit's order: DRJIT_LIBLLVM_PATH, `libLLVM.so`, the highest version in the library folder. A path that the user has
-    set is honoured, even with an error. Raises InputError where there is no libLLVM, or none of version 19 or newer.
+    Dr.Jit tries, in this order: the path in DRJIT_LIBLLVM_PATH, `libLLVM.so` by name, the highest version in the system's
+    folder of libraries. If DRJIT_LIBLLVM_PATH is set, only that one is looked at, because the user chose it.
+    Raises InputError if there is no libLLVM of version 19 or newer.
     """
     explicit = os.environ.get(LIBRARY_VARIABLE)
     candidates = [explicit] if explicit else _candidates()
@@ -81,7 +91,7 @@ def find_libllvm() -> Libllvm:
 
 
 def _candidates() -> list[str]:
-    """Libraries in the order in which Dr.Jit and then we would try them, each file once."""
+    """Paths of libraries to try, each file once: first in Dr.Jit's order, then those in folders where Dr.Jit does not look."""
     usual = _installed(_DRJIT_FOLDERS, "libLLVM*.so.*")
     prefixes = {sys.prefix, os.environ.get("CONDA_PREFIX", sys.prefix)}
     more = [f"{prefix}/lib" for prefix in sorted(prefixes)] + [
@@ -101,7 +111,10 @@ def _candidates() -> list[str]:
 
 
 def _installed(folders: tuple[str, ...], pattern: str) -> list[str]:
-    """Files that match in the folders, highest version first (numbers compared as numbers, as Dr.Jit does), links resolved."""
+    """Paths of the files in the folders that match the pattern, highest version first, with symbolic links resolved.
+
+    As in Dr.Jit, numbers within names are compared as numbers: 19 comes before 9.
+    """
     paths = [path for folder in folders for path in glob.glob(f"{folder}/{pattern}")]
 
     def version(path: str) -> list[tuple[int, int, str]]:
@@ -111,11 +124,11 @@ def _installed(folders: tuple[str, ...], pattern: str) -> list[str]:
 
 
 def start() -> None:
-    """Make sure that a Mitsuba variant is set which mgs can compute with; what is set already stays.
+    """Make sure that Mitsuba has a variant that mgs can compute with. One that is set already stays; otherwise sets VARIANT.
 
-    Where none is set, sets `llvm_ad_rgb` on a libLLVM that works. Calling it again costs nothing.
-    Raises InputError where the variant that is set is not differentiable RGB (`scalar_rgb`, `llvm_ad_spectral`, ...), where no
-    libLLVM of version 19 or newer is found, or where Dr.Jit cannot use this processor with it.
+    Calling it again costs nothing. Raises InputError if the variant that is set is not differentiable RGB in single precision
+    (`scalar_rgb` and `llvm_ad_spectral` are not), if no libLLVM of version 19 or newer is found, or if Dr.Jit cannot use this
+    processor with it.
     """
     if "mitsuba" not in sys.modules:
         _choose_libllvm()
@@ -133,18 +146,18 @@ def start() -> None:
 
 
 _checked: set[str] = set()
-"""Variants that have been looked at in this process."""
+"""Names of the variants that `start` has found good in this process."""
 
 
 def _choose_libllvm() -> None:
-    """Let Dr.Jit load a libLLVM that works. Raises InputError as `find_libllvm`."""
+    """Point Dr.Jit, by its environment variable, to a libLLVM that works. Raises InputError as `find_libllvm`."""
     library = find_libllvm()
     if "/" in library.path:
         os.environ[LIBRARY_VARIABLE] = library.path
 
 
 def _check_libllvm() -> None:
-    """Raises InputError where Dr.Jit has loaded no libLLVM, or an old one."""
+    """Raises InputError if Dr.Jit has loaded no libLLVM, or one that is too old."""
     import drjit as dr
 
     used = dr.detail.llvm_version()
@@ -159,7 +172,7 @@ def _check_libllvm() -> None:
 
 
 def _check_variant() -> None:
-    """Raises InputError where the variant that is set cannot run the kernels of mgs."""
+    """Raises InputError if the variant that is set cannot run the kernels of mgs."""
     import drjit as dr
     import mitsuba as mi
 
@@ -173,7 +186,8 @@ def _check_variant() -> None:
 
 
 def processor() -> dict[str, str | int]:
-    """What kernels run on, after `start`: processor name as LLVM knows it, SIMD width in float32 lanes, threads of Dr.Jit."""
+    """What kernels run on; call `start` before. "cpu": LLVM's name of the processor; "simd_width": number of float32 lanes;
+    "threads": of Dr.Jit. The first two are "unknown" if Dr.Jit does not tell."""
     import drjit as dr
 
     core = ctypes.CDLL(str(Path(str(dr.__file__)).with_name("libdrjit-core.so")))
@@ -186,7 +200,7 @@ def processor() -> dict[str, str | int]:
 
 
 def check_kernel() -> None:
-    """Run the smallest kernel that old LLVMs cannot compile. Raises InputError where its result is wrong."""
+    """Run a small kernel of the kind that old versions of LLVM cannot compile. Raises InputError if its result is wrong."""
     import drjit as dr
     import mitsuba as mi
 

@@ -1,4 +1,10 @@
-"""Gaussians on disk: the 3DGS PLY layout, written and read, and the compressed one of SuperSplat and PlayCanvas, read."""
+"""Gaussians on disk, as PLY files. The layout of 3DGS is written and read; the compressed one of SuperSplat and PlayCanvas is
+only read.
+
+The layout of 3DGS has one vertex per Gaussian: x y z; nx ny nz (zero); f_dc_0..2, the coefficients of degree 0; f_rest_*, those
+of higher degrees, all of red, then all of green, then all of blue; opacity (its logit); scale_0..2 (natural logarithms);
+rot_0..3 (quaternion w x y z).
+"""
 
 from __future__ import annotations
 
@@ -17,22 +23,24 @@ from mgs.files import atomic_path, reading
 from mgs.gaussians import Gaussians
 
 LINEAR_COMMENT = "mgs: colours are linear RGB"
-"""Header comment of our PLY files. The layout itself has no field for it, and other tools train in display space (sRGB)."""
+"""A comment in the header of the PLY files that mgs writes, because the layout itself cannot say what its colours are. Most
+other tools train on sRGB values as they are, so the colours in their files must be blended as sRGB."""
 
 CHUNK = 256
-"""Splats that share one row of the element `chunk` of a compressed PLY."""
+"""Number of consecutive splats of a compressed PLY that share one row of its element `chunk`."""
 
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+"""Properties of a splat in a compressed PLY: one 32-bit word each."""
 
 VECTOR_BITS = ((21, 11), (11, 10), (0, 11))
-"""Lowest bit and number of bits of x, y and z in a packed position or scale."""
+"""Where x, y and z lie in the word of a packed position or scale: the lowest bit, and the number of bits."""
 
 TO_ASCII = bytes(byte if byte < 128 else ord("?") for byte in range(256))
-"""Translation of bytes that leaves no others than ASCII."""
+"""Table for `bytes.translate` that replaces every byte that is not ASCII by a question mark."""
 
 
 def _ply_names(coefficients: int) -> list[str]:
-    """Property names of the 3DGS layout for a number of SH coefficients per channel."""
+    """Names of the properties of the 3DGS layout, in their order. coefficients: spherical harmonics per colour channel, K."""
     rest = 3 * (coefficients - 1)
     return (
         ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -42,7 +50,11 @@ def _ply_names(coefficients: int) -> list[str]:
 
 
 def write_ply(path: str | Path, gaussians: Gaussians) -> None:
-    """Write a binary 3DGS PLY (opens in any splat viewer); f_rest is channel-major, colours stay linear RGB."""
+    """Write Gaussians (NumPy fields) as a binary PLY in the layout of 3DGS; the file appears complete.
+
+    It opens in any splat viewer. The colours stay linear RGB, which viewers that expect sRGB show too dark.
+    Raises InputError as `mgs.files.atomic_path`.
+    """
     g, n = gaussians, len(gaussians)
     names = _ply_names(g.sh.shape[1])
     rest = np.transpose(g.sh[:, 1:, :], (0, 2, 1)).reshape(n, -1)
@@ -57,7 +69,8 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
 
 
 def ply_colour_space(path: str | Path) -> str:
-    """The space in which a readable 3DGS PLY's colours are blended: "linear" for our files, "srgb" for other tools'."""
+    """The space in which the colours of a PLY are to be blended: "linear" for files of mgs (by their LINEAR_COMMENT), otherwise
+    "srgb". Raises OSError if the file cannot be read."""
     with Path(path).open("rb") as file:
         for line in file:
             if line.strip() == f"comment {LINEAR_COMMENT}".encode():
@@ -68,9 +81,11 @@ def ply_colour_space(path: str | Path) -> str:
 
 
 def read_ply(path: str | Path) -> Gaussians:
-    """Read any standard 3DGS PLY (binary or ascii, SH degree 0 to 3), by property name, or a compressed one.
+    """Read a PLY in the layout of 3DGS (binary or ASCII, spherical harmonics of degree 0 to 3), or a compressed one.
 
-    Raises InputError where the file is missing, is not a PLY, lacks a property, or holds NaN or infinite values.
+    Properties are found by their names, so their order does not matter, nor do other properties. Colours are taken as they are:
+    see `ply_colour_space`. Raises InputError if the file is missing, is not a PLY, lacks a property, or holds values that
+    `Gaussians.check` refuses.
     """
     path = Path(path)
     ply = _parse(path)
@@ -89,7 +104,7 @@ def read_ply(path: str | Path) -> Gaussians:
 
 
 def _parse(path: Path) -> PlyData:
-    """The elements of a PLY file. Raises InputError where it cannot be read or is damaged."""
+    """The elements of a PLY file. Raises InputError if it cannot be read or is damaged."""
     try:
         with reading(path, "file; give a 3DGS PLY"):
             return _parse_any_comment(path)
@@ -100,19 +115,19 @@ def _parse(path: Path) -> PlyData:
 
 
 def _parse_any_comment(path: Path) -> PlyData:
-    """As PlyData.read, which refuses a header with comments that are not ASCII."""
+    """PlyData.read, but also of files with comments that are not ASCII, which it refuses."""
     try:
         return PlyData.read(str(path))
     except UnicodeDecodeError:
         header, mark, body = path.read_bytes().partition(b"end_header")
-    with NamedTemporaryFile(suffix=".ply") as copy:  # plyfile is slow on what is no file on disk
+    with NamedTemporaryFile(suffix=".ply") as copy:  # plyfile is slow where it does not read from disk
         copy.write(header.translate(TO_ASCII) + mark + body)
         copy.flush()
         return PlyData.read(copy.name)
 
 
 def _from_columns(path: Path, columns: Mapping[str, np.ndarray], n: int) -> Gaussians:
-    """The Gaussians of the 3DGS layout's properties, each [n]. Raises InputError where one is missing or a list."""
+    """Gaussians from the properties of the 3DGS layout, an array [n] each. Raises InputError if one is missing or is a list."""
     rest = sum(re.fullmatch("f_rest_[0-9]+", name) is not None for name in columns)
     coefficients = 1 + rest // 3
     if rest % 3 or coefficients not in (1, 4, 9, 16):
@@ -125,7 +140,7 @@ def _from_columns(path: Path, columns: Mapping[str, np.ndarray], n: int) -> Gaus
         raise InputError(f"{path}: not a 3DGS PLY, property {lists[0]!r} is a list; export it with a splatting tool")
 
     def stack(*names: str) -> np.ndarray:
-        with np.errstate(over="ignore"):  # becomes infinite, which is refused by the caller
+        with np.errstate(over="ignore"):  # an overflow gives infinity, which the caller refuses
             return np.stack([np.asarray(columns[name], np.float32) for name in names], 1)
 
     sh = stack("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :]
@@ -142,11 +157,12 @@ def _from_columns(path: Path, columns: Mapping[str, np.ndarray], n: int) -> Gaus
 
 
 def _decompress(path: Path, ply: PlyData) -> dict[str, np.ndarray]:
-    """The 3DGS layout's properties, each [N], of a compressed PLY.
+    """The properties of the 3DGS layout, an array [n] each, from a compressed PLY.
 
-    Its layout is that of PlayCanvas' splat-transform (`.compressed.ply`): four 32-bit words per splat, whose fields are shares
-    of the range that each chunk of 256 splats has in the element `chunk`. Older files have no ranges of colour: 0 to 1.
-    Raises InputError where elements or properties are missing, of another type, or do not fit one another.
+    Such files are written by PlayCanvas' splat-transform (`.compressed.ply`). A splat has four 32-bit words (PACKED). A number
+    in them is a fraction, 0 to 1, of the way from the least to the largest value that the number has within its chunk of 256
+    splats; these two are in the element `chunk`. Older files do not have them for colours, whose range is then 0 to 1.
+    Raises InputError if an element or a property is missing, is of another type, or the elements' sizes do not fit together.
     """
     vertices, n = ply["vertex"].data, len(ply["vertex"].data)
     chunks = ply["chunk"].data if "chunk" in ply else np.empty(0, [])
@@ -175,7 +191,8 @@ def _decompress(path: Path, ply: PlyData) -> dict[str, np.ndarray]:
     for i, channel in enumerate("rgb"):
         value = share("packed_color", 24 - 8 * i, 8)
         columns[f"f_dc_{i}"] = ((within(channel, value) if coloured else value) - 0.5) / SH_C0
-    # The ends stand for half a step of opacities; a quarter of one inside, their logits are finite.
+    # Opacities are stored in steps of 1/255. Those stored as 0 and 1 would have infinite logits, so they are moved inside by a
+    # quarter of a step: the middle of the half step of opacities that were rounded to them.
     columns["opacity"] = logit(np.clip(share("packed_color", 0, 8), 0.25 / 255, 1 - 0.25 / 255))
     three = np.stack([np.sqrt(2) * (share("packed_rotation", lowest, 10) - 0.5) for lowest in (20, 10, 0)], 1)
     columns |= {f"rot_{i}": column for i, column in enumerate(_unit_quats(vertices["packed_rotation"] >> 30, three).T)}
@@ -183,14 +200,18 @@ def _decompress(path: Path, ply: PlyData) -> dict[str, np.ndarray]:
 
 
 def _unit_quats(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Unit quaternions [N,4], wxyz, of the index of their largest component [N] (which is positive) and the others [N,3]."""
+    """Unit quaternions wxyz [N,4] from the index of the largest component [N], which is positive, and the other three [N,3]."""
     place = np.arange(4)
     quats = np.take_along_axis(others, np.minimum(place - (place > largest[:, None]), 2), 1)
     return np.where(place == largest[:, None], np.sqrt(np.maximum(1 - (others**2).sum(1), 0))[:, None], quats)
 
 
 def _decompress_sh(path: Path, ply: PlyData, n: int) -> dict[str, np.ndarray]:
-    """f_rest of a compressed PLY. A byte is a step of 1/32 from -4 to 4 and stands for its middle, 0 and 255 for the ends."""
+    """The properties f_rest_* of a compressed PLY, an array [n] each; none if it has only colours of degree 0.
+
+    They are bytes, which divide the range -4 to 4 into 256 steps. A byte stands for the middle of its step; 0 and 255 stand for
+    -4 and 4. Raises InputError if the element `sh` is not n rows of bytes.
+    """
     if "sh" not in ply:
         return {}
     table = ply["sh"].data
