@@ -16,6 +16,7 @@ from mgs.files import write_json
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_png
 from mgs.metrics import PSNR_LIMIT, psnr, ssim
+from mgs.report import evaluation
 from mgs.report.evaluation import evaluate, evaluate_run, read_comparison, write_comparison
 
 
