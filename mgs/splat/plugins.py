@@ -1,7 +1,7 @@
 """Makes the plugins of mgs known to Mitsuba, when imported: `import mgs.splat.plugins`.
 
 A plugin class belongs to a Mitsuba variant, so the files in `plugins/` are run for the variant that is set and again for every
-one that is set later: the import may come before or after `mi.set_variant`.
+one that is set later: the import may come before or after the variant is set.
 """
 
 from __future__ import annotations
