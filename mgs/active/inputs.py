@@ -44,7 +44,7 @@ def file_digest(path: Path) -> str:
 
 def prior_digest(prior: Prior) -> str:
     """Hash of what a run takes from a prior: points, normals, spacing and depth tolerance."""
-    return array_digest([prior.points, prior.normals, np.array([prior.spacing, prior.depth_tolerance])])
+    return array_digest([prior.points, prior.normals, np.array([prior.spacing, prior.depth_tolerance, prior.backed])])
 
 
 def camera_digest(camera: Camera) -> str:

@@ -57,6 +57,7 @@ class Stations:
     fisher(gaussians, camera) -> information of one view [N,P], by the estimator of the run.
     measure(gaussians, taken frame indices) -> entries for steps.jsonl.
     exact(gaussians, camera) -> exact information of one view [N,P], for what the views see of the surface; None: as `fisher`.
+    on_surface: how many of the Gaussians, the first, lie on the surface, so are what coverage is a share of; None: all.
     prior: hash of what `initial` starts from (`mgs.active.inputs.prior_digest`).
     """
 
@@ -67,6 +68,7 @@ class Stations:
     fisher: Callable[[Gaussians, Camera], np.ndarray]
     measure: Callable[[Gaussians, list[int]], dict[str, float]]
     exact: Callable[[Gaussians, Camera], np.ndarray] | None = None
+    on_surface: int | None = None
     prior: str = ""
 
 
@@ -143,7 +145,6 @@ class _Loop:
         self.positions = np.array([camera.position for camera in self.cameras])
         self.prior_lam = criteria.regularisation(stations.groups, settings.pixel_noise, settings.prior_std)
         self.lam = self.prior_lam if settings.lam is None else np.full_like(self.prior_lam, settings.lam)
-        self.exact = stations.exact or stations.fisher
         self.images: dict[int, np.ndarray] = {}
         cameras = {frame.name: inputs.camera_digest(frame.camera) for frame in self.frames}
         self.made_from = {"prior": stations.prior, "cameras": cameras}
@@ -162,7 +163,8 @@ class _Loop:
             "information_gain": None,
         }
         nothing = np.zeros((len(self.start), len(self.lam)))
-        return self.learn(State(self.start, nothing, nothing, [], []), self.seeds, choice, _Stopwatch())
+        on_surface = nothing[: self.stations.on_surface]
+        return self.learn(State(self.start, nothing, on_surface, [], []), self.seeds, choice, _Stopwatch())
 
     def next(self, state: State) -> State:
         """One step: choose a pose, capture its image, learn."""
@@ -192,15 +194,20 @@ class _Loop:
 
     def score(self, state: State, criterion: criteria.Criterion, left: list[int]) -> np.ndarray:
         """The criterion's score of each frame in `left`; the information of one candidate is in memory at a time."""
-        if criterion.at == "prior":
-            fisher, model, H, lam = self.exact, self.start, state.surface, self.prior_lam
-        else:
-            fisher, model, H, lam = self.stations.fisher, state.gaussians, state.H, self.lam
         scores: np.ndarray = np.empty(len(left))
         for done, i in enumerate(left):
             self.progress("scoring candidates", done, len(left))
-            scores[done] = criterion.score(fisher(model, self.cameras[i]), H, lam)
+            if criterion.at == "prior":
+                scores[done] = criterion.score(self.surface_information(i), state.surface, self.prior_lam)
+            else:
+                F = self.stations.fisher(state.gaussians, self.cameras[i])
+                scores[done] = criterion.score(F, state.H, self.lam)
         return scores
+
+    def surface_information(self, frame: int) -> np.ndarray:
+        """What a frame's pose sees of the surface: exact information about the Gaussians on it before any training."""
+        fisher = self.stations.exact or self.stations.fisher
+        return fisher(self.start, self.cameras[frame])[: self.stations.on_surface]
 
     def learn(self, state: State, new: list[int], choice: dict[str, Any], watch: _Stopwatch) -> State:
         """Read the new images, fit to convergence on all so far, sum their information at the new model."""
@@ -221,7 +228,7 @@ class _Loop:
             for done, camera in enumerate(cameras):
                 self.progress("information of the training set", done, len(cameras))
                 H += self.stations.fisher(fit.gaussians, camera)
-            surface = state.surface + sum(self.exact(self.start, self.cameras[i]) for i in new)
+            surface = state.surface + sum(self.surface_information(i) for i in new)
         kinds = ("image", "mask") if step else ("image", "mask", "depth")  # depth gives the seeds' colours to the surface
         files = {self.frames[i].name: inputs.frame_digests(self.frames[i], kinds) for i in new}
         made_from = {**self.made_from, "files": state.inputs.get("files", {}) | files}

@@ -34,7 +34,7 @@ from mgs.provenance import versions
 @dataclass
 class State:
     """What is known after a step: the model, frames taken in order, all lines, and the information of the training set, H [N,P]
-    at that model and surface [N,P] at the prior's Gaussians before training (what the views see of the surface); inputs: what
+    at that model and surface [S,P] at the S Gaussians on the prior's surface before training (what the views see of the surface); inputs: what
     it was made from, a record of `mgs.active.inputs`, empty in runs of versions that kept none."""
 
     gaussians: Gaussians

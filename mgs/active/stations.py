@@ -39,6 +39,7 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
         fisher=lambda gaussians, camera: fisher(gaussians, camera, settings.estimator, cache=cache),
         exact=lambda gaussians, camera: fisher(gaussians, camera, cache=cache),
         measure=psnr_measure(dataset, cache),
+        on_surface=len(prior.points),
         prior=prior_digest(prior),
     )
 

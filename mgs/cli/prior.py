@@ -14,7 +14,7 @@ SEEDS = 4
 def prior(
     dataset: Annotated[Path, typer.Argument(help="Folder with transforms.json and depth images.")],
     out: Annotated[Path | None, typer.Option(help="Folder to write; default DATASET/prior.")] = None,
-    gaussians: Annotated[int | None, typer.Option(help="Exact number N of surface samples.")] = None,
+    gaussians: Annotated[int | None, typer.Option(help="Exact number of Gaussians, on the surface and behind it.")] = None,
     spacing: Annotated[
         float | None, typer.Option(help="Distance between samples, metres; default a pixel's footprint.")
     ] = None,
@@ -22,6 +22,10 @@ def prior(
         Path | None,
         typer.Option(help="Sample this mesh (world coordinates, metres; a GLB is turned from +Y up) instead of building one."),
     ] = None,
+    backing: Annotated[
+        float,
+        typer.Option(help="Gaussians behind the surface per sample on it, which keep it opaque; 0: none, as in the paper."),
+    ] = 0.5,
     poisson_depth: Annotated[int | None, typer.Option(help="Poisson octree depth; default from the cloud's density.")] = None,
     prior_noise: Annotated[float, typer.Option(help="Spoil the rock's points on purpose: standard deviation, metres.")] = 0.0,
     holes: Annotated[float, typer.Option(help="Spoil them by round holes: share of the points to remove.")] = 0.0,
@@ -46,7 +50,7 @@ def prior(
     console = Console()
     frames = load_dataset(dataset)
     folder = check_new_folder(out if out is not None else dataset / "prior")  # known before the work
-    settings = PriorSettings(gaussians, spacing, poisson_depth, prior_noise, holes, seed)
+    settings = PriorSettings(gaussians, spacing, poisson_depth, prior_noise, holes, seed, backing)
     with console.status("reading") as status:
         if mesh is not None:
             if mesh.suffix.lower() in GLTF:
@@ -80,6 +84,7 @@ def _table(numbers: dict[str, Any]) -> Any:
     part = "" if "mesh" in numbers else f" sampled (what some frame saw), of {numbers['mesh_area']:.4f} m²"
     table.add_row("area, A", f"{area:.4f} m²{part}")
     table.add_row("samples, N = A / spacing²", f"{n:,} = {area:.4f} / {spacing:.6f}²")
+    table.add_row("Gaussians", f"{n + numbers['backed']:,}: a sample each, and {numbers['backed']:,} behind the surface")
     mean, least = (numbers[key] / spacing for key in ("nearest_neighbour_mean", "nearest_neighbour_min"))
     table.add_row("nearest neighbour over spacing", f"mean {mean:.2f}, least {least:.2f}")
     table.add_row(f"samples that {SEEDS} evenly spaced frames see", f"{numbers['seen_by_seeds']:.1%}; the rest starts grey")

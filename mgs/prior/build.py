@@ -18,16 +18,21 @@ from mgs.errors import InputError
 from mgs.files import atomic_path, new_folder, read_json, write_json
 from mgs.prior.segmentation import Rock, find_rock
 from mgs.prior.settings import PriorSettings, _check
-from mgs.prior.surface import poisson_mesh, sample_surface
+from mgs.prior.surface import poisson_mesh, sample_surface, spread_first
 from mgs.prior.truth import error_to_truth
 from mgs.seeds import derive_seed
 
 
 @dataclass(frozen=True)
 class Prior:
-    """mesh: what was sampled; points [N,3] world, metres; normals [N,3] unit; spacing: sqrt(area / N), metres;
+    """The surface of a rock, and samples of it.
+
+    mesh: what was sampled. points [N,3] world, metres; normals [N,3] unit. spacing: sqrt(area / N), metres.
     depth_tolerance: metres a depth may differ from the prior and still be the same surface (the largest of three rms residuals
-    of the cloud, a voxel, and two standard deviations of the depth images); numbers: what prior.json holds."""
+    of the cloud, a voxel, and two standard deviations of the depth images).
+    numbers: what prior.json holds.
+    backed: the first so many points, which are spread evenly, have a Gaussian behind them too (`mgs.prior.initial`).
+    """
 
     mesh: Mesh
     points: np.ndarray
@@ -35,6 +40,7 @@ class Prior:
     spacing: float
     depth_tolerance: float
     numbers: dict[str, Any]
+    backed: int = 0
 
 
 def build_prior(dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None] | None = None) -> tuple[Prior, Rock]:
@@ -54,9 +60,7 @@ def build_prior(dataset: Dataset, settings: PriorSettings, on_stage: Callable[[s
     tolerance = max(3 * residual, cloud.voxel, 2 * cloud.noise)
     tell("surface samples")
     mesh = _seen_by(mesh, dataset.frames, tolerance)
-    spacing = settings.spacing or (None if settings.gaussians else cloud.voxel)
-    seed = derive_seed(settings.seed, "prior/samples")
-    points, normals, spacing = sample_surface(mesh, seed, count=settings.gaussians, spacing=spacing)
+    points, normals, spacing, backed = _samples(mesh, settings, cloud.voxel)
     numbers = {
         "frames": len(dataset.frames),
         "pixels": cloud.pixels,
@@ -72,23 +76,39 @@ def build_prior(dataset: Dataset, settings: PriorSettings, on_stage: Callable[[s
         "poisson_depth": depth,
         "fit_rms": residual,
         "depth_tolerance": tolerance,
-        **_sample_numbers(mesh, points, spacing),
+        **_sample_numbers(mesh, points, spacing, backed),
         "settings": asdict(settings),
     }
     truth = dataset.root / "rock.glb"
     if truth.is_file() and any(frame.depth_path for frame in dataset.frames):
         tell("distance to the true rock")
         numbers["truth"] = error_to_truth(points, spacing, mesh, truth, dataset.frames, rock, settings.seed)
-    return Prior(mesh, points, normals, spacing, tolerance, numbers), rock
+    return Prior(mesh, points, normals, spacing, tolerance, numbers, backed), rock
 
 
-def _sample_numbers(mesh: Mesh, points: np.ndarray, spacing: float) -> dict[str, Any]:
+def _samples(mesh: Mesh, settings: PriorSettings, pixel: float) -> tuple[np.ndarray, np.ndarray, float, int]:
+    """(points [N,3], unit normals [N,3], spacing in metres, how many of the first are backed) of a surface.
+
+    pixel: the spacing where the settings name neither number nor spacing, metres. Raises InputError as `sample_surface`.
+    """
+    count, share = settings.gaussians, settings.backing
+    if count is not None:
+        count -= round(count * share / (1 + share))
+    seed = derive_seed(settings.seed, "prior/samples")
+    points, normals, spacing = sample_surface(mesh, seed, count=count, spacing=settings.spacing or pixel)
+    backed = round(share * len(points)) if settings.gaussians is None else settings.gaussians - len(points)
+    order = spread_first(points, backed, spacing)
+    return points[order], normals[order], spacing, backed
+
+
+def _sample_numbers(mesh: Mesh, points: np.ndarray, spacing: float, backed: int) -> dict[str, Any]:
     nearest = cKDTree(points).query(points, 2)[0][:, 1]
     return {
         "mesh_faces": len(mesh.faces),
         "mesh_area": float(mesh.areas.sum()),
         "sampled_area": float(mesh.areas[mesh.seen].sum()),
         "n": len(points),
+        "backed": backed,
         "spacing": spacing,
         "nearest_neighbour_mean": float(nearest.mean()),
         "nearest_neighbour_min": float(nearest.min()),
@@ -112,11 +132,15 @@ def prior_from_mesh(path: str | Path, settings: PriorSettings) -> Prior:
     mesh = read_mesh(path)
     if settings.gaussians is None and settings.spacing is None:
         raise InputError(f"{path}: a given mesh says nothing of how finely to sample it; give --gaussians or --spacing")
-    seed = derive_seed(settings.seed, "prior/samples")
-    points, normals, spacing = sample_surface(mesh, seed, count=settings.gaussians, spacing=settings.spacing)
-    done = {"gaussians": settings.gaussians, "spacing": settings.spacing, "seed": settings.seed}
-    numbers = {"mesh": str(path), "depth_tolerance": spacing, **_sample_numbers(mesh, points, spacing), "settings": done}
-    return Prior(mesh, points, normals, spacing, spacing, numbers)
+    points, normals, spacing, backed = _samples(mesh, settings, 0.0)
+    done = {key: value for key, value in asdict(settings).items() if key in ("gaussians", "spacing", "seed", "backing")}
+    numbers = {
+        "mesh": str(path),
+        "depth_tolerance": spacing,
+        **_sample_numbers(mesh, points, spacing, backed),
+        "settings": done,
+    }
+    return Prior(mesh, points, normals, spacing, spacing, numbers, backed)
 
 
 def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:
@@ -165,10 +189,13 @@ def load_prior(folder: str | Path) -> Prior:
         data = PlyData.read(str(path))["vertex"].data
         columns = np.stack([np.asarray(data[name], np.float64) for name in ("x", "y", "z", "nx", "ny", "nz")], 1)
         spacing, tolerance = float(numbers["spacing"]), float(numbers["depth_tolerance"])
+        backed = int(numbers.get("backed", 0))  # older priors have no backing
     except (PlyParseError, KeyError, ValueError, TypeError, UnicodeDecodeError) as error:
         raise InputError(f"{folder}: not a readable prior ({error}); make it again with `mgs prior`") from None
     if not np.isfinite(columns).all() or len(columns) < 2:
         raise InputError(f"{path}: has NaN values, or fewer than two points; make the prior again with `mgs prior`")
     if not (0 < spacing < np.inf and 0 < tolerance < np.inf):
         raise InputError(f"{folder / 'prior.json'}: spacing and depth_tolerance must be positive metres; make the prior again")
-    return Prior(read_mesh(folder / "mesh.ply"), columns[:, :3], columns[:, 3:], spacing, tolerance, numbers)
+    if not 0 <= backed <= len(columns):
+        raise InputError(f"{folder / 'prior.json'}: backed must be a number of the points; make the prior again")
+    return Prior(read_mesh(folder / "mesh.ply"), columns[:, :3], columns[:, 3:], spacing, tolerance, numbers, backed)

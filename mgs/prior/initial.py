@@ -1,12 +1,21 @@
-"""The prior and the seed frames -> initial Gaussians (paper, section III-A)."""
+"""The prior and the seed frames -> initial Gaussians (paper, section III-A), with a backing that keeps the rock opaque.
+
+Nothing in an image asks for an opaque surface: where only a layer of Gaussians on the surface is fitted, as in the paper, light
+patches turn see-through, and what shines through is the far side of the rock, from every camera another part of it. A mesh prior
+knows more: behind the surface the rock is solid. So every second Gaussian on the surface has an opaque one a spacing behind it,
+larger, so that they close; both are fitted like any other. What shines through the surface then ends on the rock's own colour, a
+spacing deep. benchmarks/backing.py measures it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import map_coordinates
+from scipy.special import logit
 
 from mgs.camera import Camera
 from mgs.data.dataset import Frame
@@ -29,17 +38,28 @@ INITIAL_OPACITY = 0.9
 THICKNESS = 0.1
 """Standard deviation along the normal over the spacing: flat on the surface, yet thick enough to stay well conditioned."""
 
+BACKING_DEPTH = 1.0
+"""How far behind the surface a backing Gaussian lies, over the spacing of the surface's."""
+
+BACKING_SCALE = (0.8, 0.8, 0.2)
+"""Standard deviations of a backing Gaussian along the surface and along the normal, over the spacing of the backing's own: more
+overlap than on the surface, since gaps are what it is there to prevent."""
+
+BACKING_OPACITY = 0.99
+
 GREY = 0.5
 """Linear RGB of a Gaussian that no seed frame sees: zero spherical harmonics."""
 
 
 def initial_gaussians(prior: Prior, seed_frames: Sequence[Frame]) -> tuple[Gaussians, np.ndarray]:
-    """One flat Gaussian per sample of the prior; colours averaged over the seed frames that see it, grey where none does.
+    """One flat Gaussian per sample of the prior, then one behind each of its backed samples, of the same colour.
+
+    Colours are averages over the seed frames that see the sample, and grey where none does.
 
     A frame sees a point that is inside its rock mask, faces it, and agrees with its depth image within `prior.depth_tolerance`
     and the slope of the surface in its pixel. For a frame without depth it is the depth of the prior's mesh: that needs the
     variant to be set (`mgs.runtime.start`).
-    Returns (Gaussians of SH degree 0, seen [N] bool). Raises InputError where a seed frame cannot be read.
+    Returns (N + backed Gaussians of SH degree 0, which samples a seed frame sees [N] bool). Raises InputError where a seed frame cannot be read.
     """
     n = len(prior.points)
     total, count = np.zeros((n, 3)), np.zeros(n)
@@ -55,14 +75,32 @@ def initial_gaussians(prior: Prior, seed_frames: Sequence[Frame]) -> tuple[Gauss
     seen = count > 0
     rgb = np.where(seen[:, None], total / np.maximum(count, 1)[:, None], GREY)
     scales = np.log(prior.spacing * np.array([IN_PLANE_SCALE, IN_PLANE_SCALE, THICKNESS]))
-    gaussians = Gaussians(
+    surface = Gaussians(
         means=prior.points.astype(np.float32),
         log_scales=np.tile(scales, (n, 1)).astype(np.float32),
         quats=quat_from_normals(prior.normals).astype(np.float32),
-        logit_opacities=np.full(n, np.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)), np.float32),
+        logit_opacities=np.full(n, logit(INITIAL_OPACITY), np.float32),
         sh=sh_from_rgb(rgb),
     )
-    return gaussians, seen
+    return _with_backing(surface, prior), seen
+
+
+def _with_backing(surface: Gaussians, prior: Prior) -> Gaussians:
+    """The surface's Gaussians, then those behind its first `prior.backed`."""
+    count = prior.backed
+    if count == 0:
+        return surface
+    over = surface[:count]
+    behind = prior.points[:count] - BACKING_DEPTH * prior.spacing * prior.normals[:count]
+    scales = np.log(prior.spacing * np.sqrt(len(surface) / count) * np.array(BACKING_SCALE))
+    backing = Gaussians(
+        means=behind.astype(np.float32),
+        log_scales=np.tile(scales, (count, 1)).astype(np.float32),
+        quats=over.quats,
+        logit_opacities=np.full(count, logit(BACKING_OPACITY), np.float32),
+        sh=over.sh,
+    )
+    return Gaussians(*(np.concatenate([getattr(g, field.name) for g in (surface, backing)]) for field in fields(Gaussians)))
 
 
 def _depth_of_mesh(prior: Prior) -> Callable[[Camera], np.ndarray]:

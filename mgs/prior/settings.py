@@ -11,9 +11,15 @@ from mgs.errors import InputError
 
 @dataclass(frozen=True)
 class PriorSettings:
-    """gaussians: exactly N samples, or spacing: metres between them (both None: one per voxel of the cloud, a pixel's
-    footprint on the rock); poisson_depth: octree depth, None = cells of 1.5 voxels; noise: metres, and holes: share of the
-    rock's points, by which the cloud is spoilt on purpose (see `degrade`); seed: root seed."""
+    """What to build.
+
+    gaussians: how many Gaussians in all, exactly; or spacing: metres between samples of the surface. Both None: a sample per
+    voxel of the cloud, which is a pixel's footprint on the rock.
+    backing: Gaussians behind the surface per sample on it (`mgs.prior.initial`); 0 puts all on the surface, as the paper does.
+    poisson_depth: octree depth, None = cells of 1.5 voxels.
+    noise: metres, and holes: share of the rock's points, by which the cloud is spoilt on purpose (see `degrade`).
+    seed: root seed.
+    """
 
     gaussians: int | None = None
     spacing: float | None = None
@@ -21,6 +27,7 @@ class PriorSettings:
     noise: float = 0.0
     holes: float = 0.0
     seed: int = 0
+    backing: float = 0.5
 
 
 def _check(settings: PriorSettings) -> None:
@@ -32,5 +39,7 @@ def _check(settings: PriorSettings) -> None:
         raise InputError("prior: --gaussians and --spacing fix the same number; give one of them")
     if not 0 <= settings.noise < np.inf:
         raise InputError(f"prior: noise {settings.noise} m must be 0 or more; correct --prior-noise")
+    if not 0 <= settings.backing <= 1:
+        raise InputError(f"prior: backing {settings.backing} is a number of Gaussians per sample, 0 to 1; correct --backing")
     if not 0 <= settings.holes <= 0.9:
         raise InputError(f"prior: holes {settings.holes} is a share of the rock's points, 0 to 0.9; correct --holes")

@@ -106,6 +106,15 @@ def sample_surface(
     return points[keep], normals / np.linalg.norm(normals, axis=1, keepdims=True), spacing
 
 
+def spread_first(points: np.ndarray, count: int, spacing: float) -> np.ndarray:
+    """An order of evenly spread points [N,3], `spacing` metres apart, in which the first `count` are evenly spread by themselves.
+
+    Returns indices [N].
+    """
+    first = _blue_noise(points, count, spacing * np.sqrt(len(points) / count)) if count else np.zeros(0, int)
+    return np.concatenate([first, np.setdiff1d(np.arange(len(points)), first)])
+
+
 def _count(samples: float) -> int:
     """The number of samples, rounded. Raises InputError where it is below 2, or takes more memory than the machine has."""
     needed, there = Decimal(samples) * SAMPLE_BYTES, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")

@@ -48,7 +48,9 @@ def gaussian_scalars(H: np.ndarray, surface: np.ndarray, lam: np.ndarray, groups
     scalars = {f"fisher.{name}": H[:, columns].sum(axis=1, dtype=np.float64) for name, columns in groups.items()}
     scalars["information"] = 0.5 * np.log1p(H / lam).sum(axis=1)
     scalars["uncertainty"] = (lam / (H + lam)).mean(axis=1)
-    scalars["unobserved"] = (~criteria.observed(surface, lam)).astype(np.float64)
+    unseen = ~criteria.observed(surface, lam)
+    scalars["unobserved"] = np.zeros(len(H))
+    scalars["unobserved"][: len(unseen)] = unseen
     return scalars
 
 
