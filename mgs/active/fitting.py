@@ -60,7 +60,7 @@ class Fit:
     stop_reason: StopReason
 
 
-def _baked(
+def _recorded_sizes(
     gaussians: Gaussians, moments: Any, camera: Any, packed: Any, lists: BlockLists, target: Any, size: Any, *_: Any
 ) -> tuple[int, ...]:
     return len(lists.splat), len(lists.block), len(target), *gaussians.sh.shape, *size
@@ -76,7 +76,7 @@ def _project(gaussians: Gaussians, camera: Any) -> Any:
     return project(gaussians, camera)
 
 
-@frozen(_baked)
+@frozen(_recorded_sizes)
 def _step(
     gaussians: Gaussians,
     moments: list[list[Any]],

@@ -1,7 +1,8 @@
 """Gaussian splatting on Dr.Jit: render, differentiate, and measure information.
 
-`render` draws Gaussians and is differentiable by `dr.backward`; `fisher` gives the information that a view carries about each
-Gaussian; a `ListCache` kept between calls makes both faster for cameras seen before. Set a Mitsuba variant before calling them.
+`render` draws Gaussians, and Dr.Jit can differentiate it. `fisher` gives the information that a view carries about each
+Gaussian. A `ListCache` kept between calls makes both faster for cameras seen before. Call `mgs.runtime.start`
+before importing this package: it looks for a libLLVM that works, which has no effect once Mitsuba is imported.
 `import mgs.splat.plugins` registers the Mitsuba integrator `mgs_splat` (plugins/mgs_splat.py), which draws the same images.
 """
 
