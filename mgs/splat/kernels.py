@@ -1,11 +1,11 @@
-"""The kernels: forward (the image), adjoint (gradients), fisher (sums for the Fisher information).
+"""The kernels: forward (the image), jvp (its tangents), adjoint (gradients), fisher (sums for the Fisher information).
 
 `walking.py` has what they share and says how a lane draws its block of pixels. The adjoint and Fisher kernels need, for each
 splat at each pixel, the colour S composited behind it. They do not walk back to front for it: they draw the image front to back
 once more and subtract, S = C - (colour so far), where C is the finished pixel. The same instructions then take the same
 decisions (thresholds, finished pixels) as the forward kernel did, and nothing about them has to be stored.
 
-Every kernel stores the sums of a (splat, block) pair in that pair's own slot, and a second, small kernel adds the slots of each
+These two store their sums for a (splat, block) pair in that pair's own slot, and a second, small kernel adds the slots of each
 splat. There are no atomic additions, so that reruns are bitwise equal with any number of threads. Symbols: docs/notation.md.
 """
 
@@ -27,12 +27,14 @@ from mgs.splat.walking import (
     Row,
     blend,
     lanes,
+    pack_parts,
     pair_slots,
     recorded_sizes,
     store_sums,
     sums_by_place,
     unpack,
     walk,
+    without_denormals,
 )
 
 LN2 = 0.6931471805599453
@@ -65,12 +67,70 @@ def forward(lists: BlockLists, packed: Any) -> tuple[Any, Any]:
     would have kept only its last few bits.
     """
     pixels = _pixel_sums(lists, packed, *lanes(lists), lambda splat: [*splat.colour, mi.Float(1), splat.depth])
+    return _store_pixels(lists, [[*rgba, z] for _, *rgba, z in pixels])
+
+
+def _store_pixels(lists: BlockLists, pixels: list[list[Any]]) -> tuple[Any, Any]:
+    """Write red, green, blue, alpha and depth of each pixel of the lanes' blocks, as `forward` returns them."""
     rgba, depth = (dr.empty(mi.Float, len(lists.block) * PIXELS * size) for size in (4, 1))
-    for pixel, (_, *colour, z) in enumerate(pixels):
-        place = lists.block * PIXELS + pixel
-        dr.scatter(rgba, mi.Vector4f(*colour), place, mode=dr.ReduceMode.NoConflicts)
-        dr.scatter(depth, z, place, mode=dr.ReduceMode.NoConflicts)
+    for pixel, (*colour, z) in enumerate(pixels):
+        index = lists.block * PIXELS + pixel
+        dr.scatter(rgba, mi.Vector4f(*colour), index, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter(depth, z, index, mode=dr.ReduceMode.NoConflicts)
     return rgba, depth
+
+
+def pack_tangents(tangents: Splats, splats: Splats, place: Any) -> Any:
+    """The tangents of each splat side by side in memory, at the splat's `place`: Float [12 N], evaluated.
+
+    tangents: how fast each field of the splats changes (`_rest` fields are not read); splats: the fields themselves.
+    By the chain rule through xi and eta, ln alpha of a pixel changes by a polynomial in them, whose six coefficients depend on
+    the splat alone. Packed are those on (1, xi, eta, xi^2), (xi eta, eta^2), and the tangents of depth and of the colour.
+    Letters p, k, e: see docs/notation.md.
+    """
+    k, p, e = splats.shear, splats.white_x, splats.white_y
+    one = LN2 * tangents.log2_opacity
+    xi = 2 * LN2 * p * (tangents.mean_x - k * tangents.mean_y)
+    eta = 2 * LN2 * e * tangents.mean_y
+    xi_xi, xi_eta, eta_eta = -2 * LN2 / p * tangents.white_x, 2 * LN2 * p / e * tangents.shear, -2 * LN2 / e * tangents.white_y
+    return pack_parts([[one, xi, eta, xi_xi], [xi_eta, eta_eta, tangents.depth, 0], [*tangents.colour, 0]], place)
+
+
+@frozen(recorded_sizes)
+def jvp(lists: BlockLists, packed: Any, packed_tangents: Any) -> tuple[Any, Any]:
+    """How the output of `forward` changes as the splats change along their tangents (`pack_tangents`), in the same layout.
+
+    This is the product J v of the Jacobian of `forward` and the tangents v, in one pass front to back (forward-mode
+    differentiation): beside the transmittance T of each pixel its tangent dT is carried along. With alpha' the tangent of a
+    splat's alpha, dw = alpha' T + alpha dT is the tangent of its weight w, dT of the next splat is dT - dw, and the colour
+    changes by c dw + w dc. As dT = -(sum of dw so far), which is minus the tangent of the pixel's alpha, it is not kept apart.
+    Where alpha is clamped at ALPHA_MAX or the splat is not drawn, alpha' is 0.
+    """
+    lane, T = lanes(lists)
+    pixels = [[t, *(dr.zeros(mi.Float, len(lists.block)) for _ in range(5))] for t in T]
+
+    def visit(i: Any, splat: Splats, rows: list[Row], pixels: Any) -> Any:
+        place = dr.gather(mi.UInt32, lists.splat, i)
+        (one, by_xi, by_eta, xi_xi), (xi_eta, eta_eta, d_depth, _), (*d_colour, _) = (
+            dr.gather(mi.Vector4f, packed_tangents, place * 3 + part) for part in range(3)
+        )
+        numbers, tangents = [*splat.colour, splat.depth], [*d_colour, d_depth]
+        new, alive = [], mi.Bool(False)
+        for j, row in enumerate(rows):
+            constant, linear = dr.fma(dr.fma(eta_eta, row.eta, by_eta), row.eta, one), dr.fma(xi_eta, row.eta, by_xi)
+            for x, (raw, xi) in enumerate(zip(row.raw_alpha, row.xi, strict=True)):
+                transmittance, d_alpha_so_far, *sums = pixels[j * BLOCK_X + x]
+                alpha, w, after, room = blend(raw, transmittance)
+                d_log_alpha = dr.fma(dr.fma(xi_xi, xi, linear), xi, constant)
+                d_alpha = dr.select(raw <= ALPHA_MAX, alpha * d_log_alpha, 0)
+                dw = dr.fma(d_alpha, transmittance, -alpha * d_alpha_so_far)
+                sums = [dr.fma(n, dw, dr.fma(w, dn, s)) for n, dn, s in zip(numbers, tangents, sums, strict=True)]
+                new.append([after, d_alpha_so_far + dw, *sums])
+                alive |= room
+        return new, alive
+
+    pixels = walk(lists, packed, lane, pixels, visit)
+    return _store_pixels(lists, [[without_denormals(x) for x in (*rgb, alpha, z)] for _, alpha, *rgb, z in pixels])
 
 
 def _slopes(colours: list[Any], behind: list[Any], alpha: Any, w: Any, after: Any, free: Any) -> list[Any]:

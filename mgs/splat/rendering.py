@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -160,8 +161,17 @@ class _Rasterise(dr.CustomOp):
     def eval(self, splats: Splats, packed: Any, lists: BlockLists, places: Any, means: bool) -> Any:
         self.splats, self.packed, self.lists, self.places, self.means = splats, packed, lists, places, means
         self.out = kernels.forward(lists, packed)
-        pixel = dr.gather(mi.Vector4f, self.out[0], places, mode=dr.ReduceMode.NoConflicts)
-        return *pixel, dr.gather(mi.Float, self.out[1], places, mode=dr.ReduceMode.NoConflicts)
+        return self._in_order(self.out)
+
+    def _in_order(self, out: tuple[Any, Any]) -> Any:
+        """The output of a kernel, block by block, as five arrays of pixels row by row."""
+        rgba, depth = out
+        pixel = dr.gather(mi.Vector4f, rgba, self.places, mode=dr.ReduceMode.NoConflicts)
+        return *pixel, dr.gather(mi.Float, depth, self.places, mode=dr.ReduceMode.NoConflicts)
+
+    def forward(self) -> None:
+        tangents = kernels.pack_tangents(self.grad_in("splats"), self.splats, self.lists.place)
+        self.set_grad_out(self._in_order(kernels.jvp(self.lists, self.packed, tangents)))
 
     def backward(self) -> None:
         *d_pixel, d_weighted = self.grad_out()
@@ -199,13 +209,14 @@ def splats_and_lists(gaussians: Gaussians, camera: Camera, cache: ListCache | No
 def render(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.0), cache: ListCache | None = None) -> Image:
     """Render Gaussians by EWA splatting (Kerbl et al. 2023, with the constants of `mgs.splat.constants`).
 
-    gaussians: NumPy fields, or Dr.Jit TensorXf fields, any of which may have gradients enabled: `dr.backward` then reaches
-    log_scales, quats, logit_opacities, sh and, where enabled, means. Not differentiated: the camera, the thresholds
-    (alpha < 1/255, transmittance), the depth order; forward-mode derivatives are not available.
-    background: linear RGB. cache: keep one between calls so that a camera seen again reuses its block lists. Records its own
-    kernels, so it cannot be called inside another `dr.freeze`.
-    Raises InputError where a parameter is NaN or infinite, or a colour beyond SH_MAX (names the parameter and the first
-    Gaussian); likewise for a number of the background (a Dr.Jit colour is not looked at); and for a view of too many pairs
+    gaussians: NumPy fields, or Dr.Jit TensorXf fields, any of which may have gradients enabled. Derivatives by them are those
+    of Dr.Jit, in reverse mode (`dr.backward`) and in forward mode (`dr.forward`; `jvp` is a short way to it). Not
+    differentiated: the camera, the thresholds (alpha < 1/255, transmittance, ALPHA_MAX) and the depth order.
+    background: linear RGB, one number or three, or a Dr.Jit colour, which may have gradients enabled. cache: keep one between
+    calls so that a camera seen again reuses its block lists. `render` records its own kernels, so it cannot be called inside
+    another `dr.freeze`.
+    Raises InputError where a parameter is NaN or infinite or a colour beyond SH_MAX, naming the parameter and the first
+    Gaussian; where a number of the background is (a Dr.Jit colour is not looked at); and for a view of too many pairs
     (`mgs.splat.blocks.MAX_PAIRS`).
     """
     runtime.start()
@@ -215,6 +226,53 @@ def render(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.
         return _empty(camera, colour)
     splats, lists, packed = splats_and_lists(as_drjit(gaussians), camera, cache)
     return composite(splats, packed, lists, camera.width, camera.height, colour)
+
+
+def jvp(
+    gaussians: Gaussians,
+    tangents: Mapping[str, Any],
+    camera: Camera,
+    background: Any = (0.0, 0.0, 0.0),
+    cache: ListCache | None = None,
+) -> Image:
+    """How the image changes as the Gaussians change along `tangents`: the product J v, in one pass (forward-mode derivative).
+
+    J is the Jacobian of `render`, with what it does not differentiate; v are the tangents. gaussians, camera, background,
+    cache: as in `render`; gradients that are enabled on them play no part.
+    tangents: by name of a parameter ("means", "log_scales", "quats", "logit_opacities", "sh") an array of the parameter's
+    shape, NumPy or Dr.Jit, in its unit per unit of some t. Parameters that are not named do not change.
+    Returns the derivatives by t of rgb [H,W,3], alpha [H,W] and depth [H,W], TensorXf.
+    Raises InputError where `render` does, and for a tangent of an unknown name, of a wrong shape or that is not finite.
+    """
+    model = as_drjit(gaussians)
+    given = {name: _checked_tangent(model, name, tangent) for name, tangent in tangents.items()}
+    with dr.resume_grad():
+        watched = Gaussians(**{f.name: dr.copy(dr.detach(getattr(model, f.name))) for f in fields(model)})
+        for name, tangent in given.items():
+            dr.enable_grad(getattr(watched, name))
+            dr.set_grad(getattr(watched, name), tangent)
+        image = render(watched, camera, dr.detach(as_colour(background)), cache)
+        dr.forward_to(image, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)  # none where nothing is given to change
+        return dr.grad(image)
+
+
+def _checked_tangent(gaussians: Gaussians, name: str, tangent: Any) -> Any:
+    """The tangent of a parameter as a detached TensorXf. Raises InputError, see `jvp`."""
+    names = [f.name for f in fields(gaussians)]
+    if name not in names:
+        raise InputError(f"tangents: {name!r} is no parameter; choose from {', '.join(names)}")
+    shape = tuple(getattr(gaussians, name).shape)
+    try:
+        with np.errstate(over="ignore"):
+            values = np.asarray(dr.detach(tangent), np.float32)
+    except (TypeError, ValueError):
+        raise InputError(f"tangents: {name} must be numbers of the parameter's shape, {shape}") from None
+    if values.shape != shape:
+        raise InputError(f"tangents: {name} has shape {values.shape}, expected {shape}, that of the parameter")
+    if not np.isfinite(values).all():
+        first = np.argwhere(~np.isfinite(values))[0][0]
+        raise InputError(f"tangents: {name} is NaN or infinite, first at Gaussian {first}; remove or repair it")
+    return mi.TensorXf(values)
 
 
 def _empty(camera: Camera, background: Any) -> Image:
@@ -233,5 +291,6 @@ def composite(splats: Splats, packed: Any, lists: BlockLists, width: int, height
     r, g, b, alpha, weighted = dr.custom(_Rasterise, splats, packed, lists, places, dr.grad_enabled(splats.mean_x))
     rgb = mi.Color3f(r, g, b) + (1 - alpha) * background
     expected = dr.select(alpha > 0, weighted / dr.select(alpha > 0, alpha, 1), 0)
+    alpha = alpha + 0  # a variable that nothing else depends on: forward-mode AD clears the others when it is done
     shape = (height, width)
     return Image(mi.TensorXf(dr.ravel(rgb), (*shape, 3)), mi.TensorXf(alpha, shape), mi.TensorXf(expected, shape))

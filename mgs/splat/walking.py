@@ -30,6 +30,11 @@ DENORMAL = 1e-24
 It lies so far above the smallest normal float (1e-38) that a denormal product can change no sum that is kept."""
 
 
+def without_denormals(x: Any) -> Any:
+    """x, or 0 where its size is at most DENORMAL."""
+    return dr.select(dr.abs(x) > DENORMAL, x, 0)
+
+
 def recorded_sizes(lists: BlockLists, *others: Any) -> tuple[int, ...]:
     """What a recorded kernel holds as constants (see `frozen`): the lengths of its lists, and its arguments that are flags."""
     return len(lists.splat), len(lists.slot_start), len(lists.block), *(x for x in others if isinstance(x, bool))
@@ -237,7 +242,7 @@ def sums_by_place(lists: BlockLists, slots: Any, count: int, real: Any) -> Any:
         return i + 1, total + mi.Vector4d(dr.gather(mi.Vector4f, slots, i * packets + packet))
 
     _, total = dr.while_loop((start, mi.Vector4d(0)), lambda i, total: i < end, body)
-    total = [dr.select(dr.abs(x) > DENORMAL, x, 0) for x in total]
+    total = [without_denormals(x) for x in total]
     return dr.ravel((mi.Vector4f if real is mi.Float else mi.Vector4d)(*total))
 
 
