@@ -18,7 +18,7 @@ from mgs.cli.app import main
 from mgs.files import read_json
 from mgs.splat import fisher, render
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y
-from mgs.splat.kernels import PIXELS
+from mgs.splat.walking import PIXELS
 
 
 def points(most: int = 1_000_000) -> list[dict]:

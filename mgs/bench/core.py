@@ -22,8 +22,8 @@ from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
 from mgs.rotation import quat_from_normals
 from mgs.seeds import derive_seed, generator
 from mgs.splat import ListCache, as_drjit, fisher, render
-from mgs.splat.kernels import PIXELS
 from mgs.splat.projection import camera_array, project
+from mgs.splat.walking import PIXELS
 
 TARGETS = {
     "forward_warm_speedup": ("at least", 60.0),
