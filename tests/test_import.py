@@ -125,7 +125,7 @@ def test_colmap_export_and_import(dataset: Dataset, tmp_path: Path, binary: bool
 def test_a_prior_from_sparse_points(dataset: Dataset, tmp_path: Path) -> None:
     _write_colmap(dataset, tmp_path / "colmap", True)
     copy = _import(tmp_path / "colmap", tmp_path / "copy")
-    prior, rock = build_prior(copy, PriorSettings(gaussians=800))
+    prior, rock = build_prior(copy, PriorSettings(gaussians=800, backing=0))
     on_rock = np.sqrt((((prior.points - synthetic.CENTRE) / synthetic.AXES) ** 2).sum(1))
     assert np.median(np.abs(on_rock - 1)) < 0.02
     assert len(rock.points) > 2000
@@ -271,7 +271,7 @@ def test_masks_by_projecting_a_mesh_or_from_files(dataset: Dataset, tmp_path: Pa
 
 
 def test_a_prior_of_a_given_mesh(dataset: Dataset, tmp_path: Path) -> None:
-    options = ["prior", str(dataset.root), "--mesh", str(dataset.root / "rock.glb"), "--gaussians", "300"]
+    options = ["prior", str(dataset.root), "--mesh", str(dataset.root / "rock.glb"), "--gaussians", "300", "--backing", "0"]
     with pytest.raises(SystemExit) as exit_:
         main([*options, "--out", str(tmp_path / "prior")])
     assert exit_.value.code == 0
@@ -374,4 +374,4 @@ def test_an_empty_mask_in_every_frame_is_one_line(dataset: Dataset) -> None:
     write_png(empty, np.zeros((48, 64), bool))
     blind = Dataset(dataset.root, tuple(replace(frame, mask_path=empty) for frame in dataset.frames))
     with pytest.raises(InputError, match="rock mask"):
-        build_prior(blind, PriorSettings(gaussians=100))
+        build_prior(blind, PriorSettings(gaussians=100, backing=0))

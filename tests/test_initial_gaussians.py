@@ -27,7 +27,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 @pytest.fixture(scope="module")
 def prior(dataset: Dataset) -> Prior:
-    return build_prior(dataset, PriorSettings(gaussians=2000))[0]
+    return build_prior(dataset, PriorSettings(gaussians=2000, backing=0))[0]
 
 
 def test_shapes_scales_and_rotations(prior: Prior, dataset: Dataset) -> None:

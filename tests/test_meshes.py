@@ -96,7 +96,12 @@ def test_the_record_of_a_given_mesh_says_what_was_done(dataset: Dataset, capsys:
     with pytest.raises(SystemExit) as exit_:
         main(["prior", str(dataset.root), "--mesh", str(dataset.root / "rock.glb"), "--gaussians", "100", "--seed", "3"])
     assert exit_.value.code == 0
-    assert load_prior(dataset.root / "prior").numbers["settings"] == {"gaussians": 100, "spacing": None, "seed": 3}
+    assert load_prior(dataset.root / "prior").numbers["settings"] == {
+        "gaussians": 100,
+        "spacing": None,
+        "seed": 3,
+        "backing": 0.5,
+    }
     assert "some frame saw" not in capsys.readouterr().out
 
 
@@ -143,7 +148,9 @@ def _spoilt(how: str) -> trimesh.Trimesh:
 def test_a_mesh_that_can_be_mended_gives_the_same_prior(tmp_path: Path, how: str) -> None:
     synthetic.rock_mesh().export(tmp_path / "rock.ply")
     _spoilt(how).export(tmp_path / "spoilt.ply")
-    right, found = (prior_from_mesh(tmp_path / f"{name}.ply", PriorSettings(gaussians=200)) for name in ("rock", "spoilt"))
+    right, found = (
+        prior_from_mesh(tmp_path / f"{name}.ply", PriorSettings(gaussians=200, backing=0)) for name in ("rock", "spoilt")
+    )
     assert len(found.mesh.vertices) == len(right.mesh.vertices) or how.endswith("shared")
     assert len(found.mesh.faces) == len(right.mesh.faces)
     assert found.spacing == pytest.approx(right.spacing)
@@ -173,5 +180,5 @@ def test_a_mesh_with_holes_is_sampled(tmp_path: Path, dataset: Dataset) -> None:
     mesh = synthetic.rock_mesh()
     mesh.update_faces(np.random.default_rng(0).random(len(mesh.faces)) > 0.2)
     mesh.export(tmp_path / "holes.ply")
-    prior = prior_from_mesh(tmp_path / "holes.ply", PriorSettings(gaussians=200))
+    prior = prior_from_mesh(tmp_path / "holes.ply", PriorSettings(gaussians=200, backing=0))
     assert len(prior.points) == 200

@@ -38,7 +38,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 @pytest.fixture(scope="module")
 def built(dataset: Dataset):
-    return build_prior(dataset, PriorSettings(gaussians=1500))
+    return build_prior(dataset, PriorSettings(gaussians=1500, backing=0))
 
 
 def _ball(centre=(0.0, 0.0, 0.5), radius=0.5) -> Mesh:
@@ -249,7 +249,7 @@ def test_error_to_truth_of_a_dataset_of_an_older_mgs(built, dataset: Dataset, tm
 
 def test_prior_round_trip_and_determinism(built, dataset: Dataset, tmp_path: Path) -> None:
     prior = built[0]
-    again, _ = build_prior(dataset, PriorSettings(gaussians=1500))
+    again, _ = build_prior(dataset, PriorSettings(gaussians=1500, backing=0))
     assert np.array_equal(prior.points, again.points)
     assert prior.numbers == again.numbers
     loaded = load_prior(save_prior(tmp_path / "prior", prior))
@@ -414,7 +414,7 @@ def test_a_dataset_is_loaded_before_anything_is_written(tmp_path: Path) -> None:
 
 def test_error_grows_with_noise_holes_and_a_coarse_poisson(built, dataset: Dataset) -> None:
     def error(**options) -> dict[str, float]:
-        return build_prior(dataset, PriorSettings(gaussians=1500, **options))[0].numbers["truth"]
+        return build_prior(dataset, PriorSettings(gaussians=1500, backing=0, **options))[0].numbers["truth"]
 
     exact = built[0].numbers["truth"]
     assert exact["chamfer"] < error(noise=0.01)["chamfer"] < error(noise=0.04)["chamfer"]

@@ -33,9 +33,13 @@ from mgs.provenance import versions
 
 @dataclass
 class State:
-    """What is known after a step: the model, frames taken in order, all lines, and the information of the training set, H [N,P]
-    at that model and surface [S,P] at the S Gaussians on the prior's surface before training (what the views see of the surface); inputs: what
-    it was made from, a record of `mgs.active.inputs`, empty in runs of versions that kept none."""
+    """What is known after a step.
+
+    gaussians: the fitted model. H [N,P]: information of the training set at that model. surface [S,P]: its information about the
+    S Gaussians on the prior's surface as they were before training, which is what the views see of the surface. taken: frame
+    indices in the order in which they were taken. steps: all lines of steps.jsonl. inputs: what the run was made from, a record
+    of `mgs.active.inputs`, empty in runs of versions that kept none.
+    """
 
     gaussians: Gaussians
     H: np.ndarray

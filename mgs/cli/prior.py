@@ -24,7 +24,7 @@ def prior(
     ] = None,
     backing: Annotated[
         float,
-        typer.Option(help="Gaussians behind the surface per sample on it, which keep it opaque; 0: none, as in the paper."),
+        typer.Option(help="Gaussians behind the surface per sample on it, to keep it opaque; 0: none, as in the paper."),
     ] = 0.5,
     poisson_depth: Annotated[int | None, typer.Option(help="Poisson octree depth; default from the cloud's density.")] = None,
     prior_noise: Annotated[float, typer.Option(help="Spoil the rock's points on purpose: standard deviation, metres.")] = 0.0,
