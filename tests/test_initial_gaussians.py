@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_erosion
+from scipy.spatial import cKDTree
 from scipy.special import spence
 
 sys.path.insert(0, str(Path(__file__).parent))
 import synthetic
 
+from mgs.active.inputs import prior_digest
 from mgs.data.dataset import Dataset
-from mgs.prior.build import Prior, build_prior
+from mgs.errors import InputError
+from mgs.gaussians import Gaussians
+from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.initial import GREY, IN_PLANE_SCALE, INITIAL_OPACITY, THICKNESS, initial_gaussians
 from mgs.prior.settings import PriorSettings
 from mgs.rotation import rotmat_from_quat
+from mgs.splat import render
 
 
 @pytest.fixture(scope="module")
@@ -104,3 +111,41 @@ def test_no_seed_frames_is_all_grey(prior: Prior) -> None:
     gaussians, seen = initial_gaussians(prior, [])
     assert not seen.any()
     assert np.allclose(gaussians.rgb, GREY, atol=1e-6)
+
+
+def test_behind_the_surface_lies_an_opaque_backing(dataset: Dataset) -> None:
+    """A third of the Gaussians, spread evenly, a spacing inside, of the colour above them: opaque without the rest."""
+    prior = build_prior(dataset, PriorSettings(gaussians=1200))[0]
+    gaussians, seen = initial_gaussians(prior, dataset.frames)
+    assert (len(gaussians), len(prior.points), len(seen), prior.backed) == (1200, 800, 800, 400)
+    surface, backing, over = gaussians[:800], gaussians[800:], slice(0, 400)
+    inward = np.einsum("nk,nk->n", surface.means[over] - backing.means, prior.normals[over])
+    np.testing.assert_allclose(inward, prior.spacing, rtol=1e-3)
+    np.testing.assert_array_equal(backing.sh, surface.sh[over])
+    apart = [cKDTree(points).query(points, 2)[0][:, 1] for points in (prior.points, prior.points[over])]
+    assert apart[1].min() > 1.1 * apart[0].mean()  # a subset at random would have neighbours as near as all have
+
+    faded = replace(surface, logit_opacities=np.full(800, -3, np.float32))
+    for frame in dataset.frames[:3]:
+        inner = binary_erosion(frame.mask(), iterations=3)
+        alpha, hidden = (np.asarray(render(g, frame.camera).alpha)[inner] for g in (faded, joined(faded, backing)))
+        assert alpha.mean() < 0.6
+        assert hidden.min() > 0.9
+
+
+def joined(a: Gaussians, b: Gaussians) -> Gaussians:
+    return Gaussians(*(np.concatenate([getattr(a, name), getattr(b, name)]) for name in vars(a)))
+
+
+def test_the_backing_survives_the_file_and_is_part_of_what_a_run_goes_on_from(dataset: Dataset, tmp_path: Path) -> None:
+    prior = build_prior(dataset, PriorSettings(gaussians=300))[0]
+    loaded = load_prior(save_prior(tmp_path / "prior", prior))
+    assert loaded.backed == prior.backed == 100
+    assert len(initial_gaussians(loaded, dataset.frames[:2])[0]) == 300
+    assert prior_digest(replace(loaded, backed=99)) != prior_digest(loaded)
+    numbers = json.loads((tmp_path / "prior/prior.json").read_text())
+    (tmp_path / "prior/prior.json").write_text(json.dumps(numbers | {"backed": 1000}))
+    with pytest.raises(InputError, match="backed must be a number of the points"):
+        load_prior(tmp_path / "prior")
+    with pytest.raises(InputError, match=r"backing 1.5 is a number of Gaussians per sample, 0 to 1; correct --backing"):
+        build_prior(dataset, PriorSettings(gaussians=300, backing=1.5))

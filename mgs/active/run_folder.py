@@ -35,10 +35,10 @@ from mgs.provenance import versions
 class State:
     """What is known after a step.
 
-    gaussians: the fitted model. H [N,P]: information of the training set at that model. surface [S,P]: its information about the
-    S Gaussians on the prior's surface as they were before training, which is what the views see of the surface. taken: frame
-    indices in the order in which they were taken. steps: all lines of steps.jsonl. inputs: what the run was made from, a record
-    of `mgs.active.inputs`, empty in runs of versions that kept none.
+    gaussians: the fitted model. H [N,P]: information of the training set at that model. surface [S,P]: its information about
+    the S Gaussians on the prior's surface as they were before training, which is what the views see of the surface. taken:
+    frame indices in the order in which they were taken. steps: all lines of steps.jsonl. inputs: what the run was made from, a
+    record of `mgs.active.inputs`, empty in runs of versions that kept none.
     """
 
     gaussians: Gaussians

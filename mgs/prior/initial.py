@@ -1,10 +1,10 @@
 """The prior and the seed frames -> initial Gaussians (paper, section III-A), with a backing that keeps the rock opaque.
 
-Nothing in an image asks for an opaque surface: where only a layer of Gaussians on the surface is fitted, as in the paper, light
-patches turn see-through, and what shines through is the far side of the rock, from every camera another part of it. A mesh prior
-knows more: behind the surface the rock is solid. So every second Gaussian on the surface has an opaque one a spacing behind it,
-larger, so that they close; both are fitted like any other. What shines through the surface then ends on the rock's own colour, a
-spacing deep. benchmarks/backing.py measures it.
+Nothing in an image asks for an opaque surface. Where only a layer of Gaussians on the surface is fitted, as in the paper,
+bright patches turn see-through, and what shines through is the far side of the rock, another part of it from every camera. But a
+mesh prior knows that the rock is solid behind its surface. So every second Gaussian on the surface has an opaque one a spacing
+behind it, larger, so that together they close; all are fitted alike. What shines through the surface then ends on the rock's own
+colour, one spacing deep. benchmarks/backing.py measures it.
 """
 
 from __future__ import annotations
@@ -59,7 +59,8 @@ def initial_gaussians(prior: Prior, seed_frames: Sequence[Frame]) -> tuple[Gauss
     A frame sees a point that is inside its rock mask, faces it, and agrees with its depth image within `prior.depth_tolerance`
     and the slope of the surface in its pixel. For a frame without depth it is the depth of the prior's mesh: that needs the
     variant to be set (`mgs.runtime.start`).
-    Returns (N + backed Gaussians of SH degree 0, which samples a seed frame sees [N] bool). Raises InputError where a seed frame cannot be read.
+    Returns (N + backed Gaussians of SH degree 0, which samples a seed frame sees [N] bool). Raises InputError where a seed
+    frame cannot be read.
     """
     n = len(prior.points)
     total, count = np.zeros((n, 3)), np.zeros(n)

@@ -107,9 +107,9 @@ def sample_surface(
 
 
 def spread_first(points: np.ndarray, count: int, spacing: float) -> np.ndarray:
-    """An order of evenly spread points [N,3], `spacing` metres apart, in which the first `count` are evenly spread by themselves.
+    """An order of points in which the first `count` are evenly spread by themselves: indices [N].
 
-    Returns indices [N].
+    points [N,3]: evenly spread, `spacing` metres apart.
     """
     first = _blue_noise(points, count, spacing * np.sqrt(len(points) / count)) if count else np.zeros(0, int)
     return np.concatenate([first, np.setdiff1d(np.arange(len(points)), first)])
