@@ -1,10 +1,10 @@
 """The prior and the seed frames -> initial Gaussians (paper, section III-A), with a backing that keeps the rock opaque.
 
 Nothing in an image asks for an opaque surface. Where only a layer of Gaussians on the surface is fitted, as in the paper,
-bright patches turn see-through, and what shines through is the far side of the rock, another part of it from every camera. But a
-mesh prior knows that the rock is solid behind its surface. So every second Gaussian on the surface has an opaque one a spacing
-behind it, larger, so that together they close; all are fitted alike. What shines through the surface then ends on the rock's own
-colour, one spacing deep. benchmarks/backing.py measures it.
+bright patches turn see-through, and what shines through is the far side of the rock, another part of it from every camera.
+But a mesh prior knows that the rock is solid behind its surface. So every second Gaussian on the surface has an opaque one a
+spacing behind it, larger, so that together they close; all are fitted alike. What shines through the surface then ends on the
+rock's own colour, one spacing deep. benchmarks/backing.py measures it.
 """
 
 from __future__ import annotations
