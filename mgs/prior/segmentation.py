@@ -19,7 +19,7 @@ from collections.abc import Callable
 from mgs.data.dataset import Dataset
 from mgs.prior.settings import PriorSettings
 from mgs.seeds import derive_seed, generator
-from mgs.survey.fusion import FILTERED_SHARE, Cloud, _voxel_means, focus, fuse_frames, sparse_cloud
+from mgs.survey.fusion import FILTERED_SHARE, Cloud, focus, fuse_frames, sparse_cloud, voxel_means
 
 PLANE_TOLERANCE = 0.02
 """RANSAC inlier distance as a share of the camera distance: larger than the grain of a floor, smaller than a rock."""
@@ -115,7 +115,7 @@ def rock_cluster(points: np.ndarray, voxel: float, target: np.ndarray, root: str
     thin, cell = points, voxel
     while len(thin) > CLUSTER_POINTS:
         cell *= 1.25
-        thin = _voxel_means(points, cell)[0]
+        thin = voxel_means(points, cell)[0]
     if len(thin) <= CLUSTER_NEIGHBOURS:
         raise InputError(f"{root}: no rock in the cloud ({len(points)} points above the ground plane); aim the cameras at one")
     eps = 2 * float(np.median(cKDTree(thin).query(thin, CLUSTER_NEIGHBOURS + 1)[0][:, -1]))
