@@ -238,10 +238,10 @@ def test_error_to_truth_of_a_dataset_of_an_older_mgs(built, dataset: Dataset, tm
     """Its rock.glb is +Z up and without the mark of today's."""
     from mgs.prior.truth import error_to_truth
 
-    prior, stages = built
+    prior, rock = built
     synthetic.rock_mesh().export(tmp_path / "rock.glb")
     old, new = (
-        error_to_truth(prior.points, prior.spacing, stages.mesh, root / "rock.glb", dataset.frames, stages.rock, 0)
+        error_to_truth(prior.points, prior.spacing, prior.mesh, root / "rock.glb", dataset.frames, rock, 0)
         for root in (tmp_path, dataset.root)
     )
     assert old == new
