@@ -20,8 +20,8 @@ def bench(
     kind: Annotated[
         Kind,
         typer.Argument(
-            help="splat: beside Mitsuba's own integrator, volprim_rf_basic. scaling: as the number of Gaussians, pixels and "
-            "threads grows."
+            help="splat: compared with Mitsuba's own integrator, volprim_rf_basic. scaling: as the numbers of Gaussians, "
+            "pixels and threads grow."
         ),
     ],
     json: Annotated[Path | None, typer.Option(help="Write everything that is measured to this file.")] = None,
@@ -33,7 +33,7 @@ def bench(
 ) -> None:
     """Time rendering, gradients and Fisher information on Gaussians of a rock in an image of 640x480 pixels.
 
-    Let nothing else run on the machine meanwhile. The file also holds the command line, the machine and the versions.
+    Let nothing else run on the machine meanwhile. The JSON file also holds the command line, the machine and the versions.
     """
     from rich.console import Console
 

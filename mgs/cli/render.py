@@ -25,7 +25,7 @@ def render(
     out: Annotated[Path, typer.Option(help="Folder to write, new or empty.")],
     width: Annotated[
         int | None,
-        typer.Option(min=1, help="Width of the images, pixels; the height follows. Default: as of the cameras."),
+        typer.Option(min=1, help="Width of the images, pixels; the height follows. Default: the cameras' own."),
     ] = None,
     colour_space: Annotated[
         ColourSpace,
