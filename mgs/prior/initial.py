@@ -43,8 +43,9 @@ def initial_gaussians(prior: Prior, seed_frames: Sequence[Frame]) -> tuple[Gauss
     A frame sees a sample that lies inside its rock mask, whose normal points towards the camera, and whose depth agrees with
     the depth image, up to `prior.depth_tolerance` and the slope of the surface within a pixel. For a frame without depth image
     the depth of the prior's mesh is used, which needs Mitsuba's variant to be set (`mgs.runtime.start`). A sample that no frame
-    sees is grey. Returns (Gaussians of degree 0, seen [N] bool: which samples some frame sees). Raises InputError if a file of
-    a frame cannot be read.
+    sees is grey.
+    Returns (Gaussians of degree 0, seen [N] bool: which samples some frame sees).
+    Raises InputError if a file of a frame cannot be read.
     """
     n = len(prior.points)
     total, count = np.zeros((n, 3)), np.zeros(n)

@@ -31,12 +31,15 @@ def error_to_truth(
 
     points: [N,3] the prior's samples; spacing: theirs, metres; mesh: the prior's; truth: file of the true rock; frames: of the
     dataset, with depth; segmented: the cloud that the mesh was built from; seed: root of the random points.
-    Returns these numbers; the first two are named as in Knapitsch et al. 2017:
-    accuracy: mean distance from the prior's samples to the true surface;
-    completeness: mean distance from the true surface, as far as some frame sees it, to the prior's mesh;
-    chamfer: the mean of these two; hausdorff: the largest distance in either direction;
-    visible_within_2_spacing: share of the true surface that some frame sees which is within two spacings of the mesh;
-    visible_share: share of the true surface above the ground that some frame sees.
+    Returns these numbers, of which the first two are named as in Knapitsch et al. 2017:
+
+    - accuracy: mean distance from the prior's samples to the true surface.
+    - completeness: mean distance from the true surface, as far as some frame sees it, to the prior's mesh.
+    - chamfer: the mean of these two.
+    - hausdorff: the largest distance in either direction.
+    - visible_within_2_spacing: share of the true surface that some frame sees which is within two spacings of the mesh.
+    - visible_share: share of the true surface above the ground that some frame sees.
+
     Raises InputError if the rock's file or a depth image cannot be read, or no frame sees the rock.
     """
     import trimesh
@@ -49,10 +52,10 @@ def error_to_truth(
     tolerance = max(spacing / 2, 2 * segmented.cloud.noise)
     seen = np.zeros(len(surface), bool)
     for frame in frames:
-        # Both sides of a face count: in some files of scanned rocks the normals point inwards.
+        # Both sides of a face count, because the faces of a scanned rock may be wound either way.
         seen |= visible(surface, normals, frame.camera, frame.depth(), tolerance, two_sided=True)
     if not seen.any():
-        raise InputError(f"{truth}: no frame sees the true rock; it does not belong to this dataset (or is in another frame)")
+        raise InputError(f"{truth}: no frame sees the true rock; it is another dataset's, or in another coordinate system")
     there = distances_to_mesh(points, true.vertices, true.faces)
     back = distances_to_mesh(surface[seen], mesh.vertices, mesh.faces)
     return {

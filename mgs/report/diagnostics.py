@@ -1,7 +1,8 @@
 """Maps of what the training views of a run say about its model, and where: for views (EXR, PNG) and for Gaussians (PLY).
 
-H [N,P] is the diagonal of the Fisher information, summed over the training views. lam [P] is the information that the prior has
-of each parameter (`mgs.active.criteria.regularisation`). From these, every Gaussian has the following numbers, its *scalars*:
+H [N,P] is the diagonal of the Fisher information, summed over the training views. lam [P] is the information of the prior
+about each parameter (`mgs.active.criteria.regularisation`). From these, every Gaussian has the following numbers, its
+*scalars*:
 
 - `fisher.colour`, `fisher.scale`, `fisher.rotation`, `fisher.opacity`: the sum of H over its parameters of that kind, in
   (pixel value / parameter)^2.

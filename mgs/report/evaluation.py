@@ -56,11 +56,13 @@ def evaluate(
     folder; if given, `write_comparison` writes NAME.png of every frame into it. progress: told the number of frames done.
 
     Returns what metrics.json holds, without its policy:
-    images: how many frames the model was trained on;
-    all, held_out: means over all frames and over those held out: "count", the number of frames, and each of
-    `mgs.metrics.METRICS`, None if there is no frame to average; views: for each frame its "name", "trained" (bool) and its
-    METRICS, None where the rock's mask is empty. Raises InputError if a file of a frame cannot be read or a picture cannot be
-    written.
+
+    - images: how many frames the model was trained on.
+    - all, held_out: over all frames, and over those held out, the number of frames ("count") and the mean of each of
+      `mgs.metrics.METRICS`, None if no frame has it.
+    - views: for each frame its "name", "trained" (bool) and its METRICS, None where the rock's mask is empty.
+
+    Raises InputError if a file of a frame cannot be read or a picture cannot be written.
     """
     trained = set(trained)
     views: list[dict[str, Any]] = []

@@ -25,7 +25,8 @@ STAGES = {
     "registered": "registered, before loop closure",
     "optimised": "after loop closure",
 }
-"""The three estimates of the trajectory that a `Survey` holds, each better than the one before: field -> what to call it."""
+"""The three estimates of the trajectory that a `Survey` holds, in the order in which they are made: field -> what to call
+it."""
 
 
 @dataclass(frozen=True)

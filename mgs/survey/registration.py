@@ -31,8 +31,9 @@ NEIGHBOURS = 40
 
 EDGE = 5
 """Pixels are left out whose neighbourhood of EDGE x EDGE pixels spans two surfaces (`mgs.survey.fusion.usable_depth`). On
-silhouettes the sensor reports points between the two surfaces. They move with the camera instead of standing still in the
-world, so they pull every measured motion towards zero: with them, the error of a step was twenty times larger."""
+silhouettes the sensor reports points that lie on neither of them ("flying pixels"). These move with the camera instead of
+standing still in the world, so they pull every measured motion towards zero: with them, the error of a step was twenty times
+larger."""
 
 RANGE = 1.6
 """Depths are left out that are larger than this many times the lower quartile of the frame's depths: with the depth, the noise
