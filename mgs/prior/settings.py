@@ -1,4 +1,4 @@
-"""What a prior is asked to be."""
+"""Settings of a prior."""
 
 from __future__ import annotations
 
@@ -11,14 +11,18 @@ from mgs.errors import InputError
 
 @dataclass(frozen=True)
 class PriorSettings:
-    """What to build.
+    """What a prior is asked to be.
 
-    gaussians: how many Gaussians in all, exactly; or spacing: metres between samples of the surface. Both None: a sample per
-    voxel of the cloud, which is a pixel's footprint on the rock.
-    backing: Gaussians behind the surface per sample on it (`mgs.prior.initial`); 0 puts all on the surface, as the paper does.
-    poisson_depth: octree depth, None = cells of 1.5 voxels.
-    noise: metres, and holes: share of the rock's points, by which the cloud is spoilt on purpose (see `degrade`).
-    seed: root seed.
+    gaussians: number of Gaussians, on the surface and behind it. spacing: distance between samples on the surface in metres,
+    instead of a number. With neither, the spacing is the edge of the cloud's voxels, about the size of a pixel on the rock.
+    backing: Gaussians behind the surface for each sample on it (`mgs.prior.initial`). With 0 all lie on it, as in the paper.
+    poisson_depth: depth of the octree of the Poisson reconstruction; None chooses it such that its finest cells have an edge of
+    1.5 voxels or less.
+    noise (metres), holes (share of points): by how much the rock's points are made worse on purpose, to study the effect
+    (`mgs.prior.segmentation.degrade`).
+    seed: root of every random draw.
+    Raises InputError if the number is below 2, the spacing is not positive, both are given, or backing, noise or holes are out
+    of range.
     """
 
     gaussians: int | None = None
@@ -29,17 +33,16 @@ class PriorSettings:
     seed: int = 0
     backing: float = 0.5
 
-
-def _check(settings: PriorSettings) -> None:
-    if settings.gaussians is not None and settings.gaussians < 2:
-        raise InputError(f"prior: {settings.gaussians} Gaussians are too few for a model; ask for more with --gaussians")
-    if settings.spacing is not None and not settings.spacing > 0:
-        raise InputError(f"prior: spacing {settings.spacing} m must be positive; correct --spacing")
-    if settings.gaussians is not None and settings.spacing is not None:
-        raise InputError("prior: --gaussians and --spacing fix the same number; give one of them")
-    if not 0 <= settings.noise < np.inf:
-        raise InputError(f"prior: noise {settings.noise} m must be 0 or more; correct --prior-noise")
-    if not 0 <= settings.backing <= 1:
-        raise InputError(f"prior: backing {settings.backing} is a number of Gaussians per sample, 0 to 1; correct --backing")
-    if not 0 <= settings.holes <= 0.9:
-        raise InputError(f"prior: holes {settings.holes} is a share of the rock's points, 0 to 0.9; correct --holes")
+    def __post_init__(self) -> None:
+        if self.gaussians is not None and self.gaussians < 2:
+            raise InputError(f"prior: {self.gaussians} Gaussians are too few for a model; ask for more with --gaussians")
+        if self.spacing is not None and not self.spacing > 0:
+            raise InputError(f"prior: spacing {self.spacing} m must be positive; correct --spacing")
+        if self.gaussians is not None and self.spacing is not None:
+            raise InputError("prior: --gaussians and --spacing fix the same number; give one of them")
+        if not 0 <= self.noise < np.inf:
+            raise InputError(f"prior: noise {self.noise} m must be 0 or more; correct --prior-noise")
+        if not 0 <= self.holes <= 0.9:
+            raise InputError(f"prior: holes {self.holes} is a share of the rock's points, 0 to 0.9; correct --holes")
+        if not 0 <= self.backing <= 1:
+            raise InputError(f"prior: backing {self.backing} is a number of Gaussians per sample, 0 to 1; correct --backing")
