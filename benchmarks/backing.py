@@ -1,8 +1,9 @@
 """What the backing is worth: `python benchmarks/backing.py DATASET PREFIX` writes PREFIX.json and PREFIX.png.
 
-Fits models of several sizes, with and without Gaussians behind the surface, to 12 views spread evenly in azimuth, and measures
-on the other views: PSNR inside the rock (pixels at least two from its silhouette), and the shares of those pixels whose expected
-depth is more than 5 cm or more than 3 spacings too deep, or whose opacity is below 0.9. The dataset needs exact depth.
+Fits models of several sizes, with and without Gaussians behind the surface, to 12 views spread evenly in azimuth, and
+measures on the other views: PSNR inside the rock (pixels at least two from its silhouette), and the shares of those pixels
+whose expected depth is more than 5 cm or more than 3 spacings too deep, or whose opacity is below 0.9. The dataset needs
+exact depth.
 """
 
 from __future__ import annotations
