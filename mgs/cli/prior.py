@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from mgs.data.dataset import Dataset, Frame
+    from mgs.prior.build import Prior
 
 SEEDS = 4
 """Number of seed frames in the paper, and of those for which the share of samples that they see is printed."""
@@ -43,11 +47,9 @@ def prior(
     The steps: fuse the depth images into a cloud, find the ground plane and the rock above it, reconstruct the rock's surface
     (Poisson), spread samples evenly over what some frame saw of it. Writes mesh.ply, points.ply, prior.json and prior.png.
     """
-    import numpy as np
     from rich.console import Console
 
     from mgs import runtime
-    from mgs.active.pose_policies import seed_views
     from mgs.data.dataset import load_dataset
     from mgs.data.meshes import GLTF
     from mgs.files import atomic_folder, check_new_folder
@@ -68,8 +70,7 @@ def prior(
         else:
             result, segmented = build_prior(loaded, settings, lambda stage: status.update(f"prior: {stage}"))
         status.update("prior: what four seed frames see")
-        positions = np.stack([frame.camera.position for frame in loaded.frames])
-        seeds = [loaded.frames[k] for k in seed_views(positions, result.points.mean(0), min(SEEDS, len(loaded)))]
+        seeds = _seed_frames(loaded, result)
         if not all(frame.depth_path for frame in seeds):
             runtime.start()  # to cast rays at the mesh in place of depth images
         result = with_share_seen(result, seeds)
@@ -79,6 +80,16 @@ def prior(
             draw_prior(unfinished / "prior.png", result, segmented)
     console.print(_table(result.numbers))
     console.print(f"wrote {folder}: mesh.ply, points.ply, prior.json, prior.png")
+
+
+def _seed_frames(dataset: Dataset, prior: Prior) -> list[Frame]:
+    """The frames that `mgs nbv` would take as its SEEDS seeds, or all frames if there are fewer."""
+    import numpy as np
+
+    from mgs.active.pose_policies import seed_views
+
+    positions = np.stack([frame.camera.position for frame in dataset.frames])
+    return [dataset.frames[k] for k in seed_views(positions, prior.points.mean(0), min(SEEDS, len(dataset)))]
 
 
 def _table(numbers: dict[str, Any]) -> Any:
