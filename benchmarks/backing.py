@@ -96,7 +96,9 @@ def draw(path: Path, records: Sequence[dict[str, Any]]) -> None:
                 name = "all on the surface" if backing == 0 else "a third behind it"
                 values = [scale * r[key] for r in shown]
                 axis.plot([r["gaussians"] for r in shown], values, color=colour, marker=marker, label=name)
-            axis.set(xscale="log", xlabel="Gaussians, all", ylabel=label)
+            axis.set(xscale="log", xlabel="Gaussians, on the surface and behind it", ylabel=label)
+            axis.set_xticks(SIZES, labels=[f"{size:,}" for size in SIZES])
+            axis.minorticks_off()
             axis.set_ylim(bottom=0 if scale == 100 else None)
             axis.legend()
         save_figure(figure, path)

@@ -180,6 +180,27 @@ def depth_error(data: dict[str, Any]) -> str:
     return markdown(heading, [[name, *(f"{100 * share:.1f} %" for share in row)] for name, row in data["shares"].items()])
 
 
+def backing(data: dict[str, Any]) -> str:
+    """Held-out quality and see-through of fits with and without Gaussians behind the surface."""
+    found = {(row["gaussians"], row["passes"], row["backing"]): row for row in data["records"]}
+    rows = []
+    for n, passes in dict.fromkeys((n, passes) for n, passes, _ in found):
+        without, with_ = found[n, passes, 0.0], found[n, passes, 0.5]
+        cells = [f"{row['psnr_inside']:.2f} dB" for row in (without, with_)]
+        cells += [f"{100 * row[key]:.1f} %" for key in ("too_deep", "see_through") for row in (without, with_)]
+        rows.append([f"{n:,}, {passes} passes", *cells])
+    heading = [
+        "Gaussians",
+        "PSNR, all on the surface",
+        "a third behind",
+        "too deep",
+        "a third behind",
+        "see-through",
+        "a third behind",
+    ]
+    return markdown(heading, rows) + made_by(data)
+
+
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "demo": ("demo", demo),
     "demo-report": ("demo", demo_report),
@@ -192,6 +213,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "render-settings": ("render_settings", render_settings),
     "lambda-ranking": ("lambda_ranking", lambda_ranking),
     "depth-error": ("depth_error", depth_error),
+    "backing": ("backing", backing),
 }
 """By name: the file in docs/benchmarks, without `.json`, and what makes the table of its contents."""
 
