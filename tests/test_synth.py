@@ -108,7 +108,7 @@ def test_same_seed_same_bytes_and_resume_and_pose_noise(dataset, tmp_path):
 
 def test_output_folder_that_is_not_empty(dataset, tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
-        patched.setattr("mgs.synth.make_rock", None)  # what is in the way is known before the rock is made
+        patched.setattr("mgs.synth.rendering.make_rock", None)  # what is in the way is known before the rock is made
         with pytest.raises(InputError, match="not empty"):
             synthesise(dataset.root, SCENE, TINY, seed=3)
     (tmp_path / "config.json").write_text("{}")
@@ -173,7 +173,7 @@ def test_rock_that_does_not_fit_the_frame(tmp_path):
 
 
 def test_without_the_denoiser_more_samples_and_a_note(tmp_path, monkeypatch):
-    monkeypatch.setattr("mgs.synth.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("mgs.synth.rendering.importlib.util.find_spec", lambda name: None)
     notes = []
     small = Preset(width=32, height=24, frames=1, spp=1)
     dataset = synthesise(tmp_path / "plain", SCENE, small, say=notes.append)
