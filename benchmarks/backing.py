@@ -18,6 +18,7 @@ from scipy.ndimage import binary_erosion
 
 from mgs import runtime
 from mgs.active.fitting import fit
+from mgs.active.loop import target_of
 from mgs.active.pose_policies import seed_views
 from mgs.active.settings import TrainSettings
 from mgs.colour import srgb_from_linear
@@ -48,7 +49,7 @@ def measure(gaussians: Gaussians, frames: Sequence[Frame], spacing: float) -> di
     for frame in frames:
         image, depth = render(gaussians, frame.camera, cache=cache), frame.depth()
         inside = binary_erosion(frame.mask(), iterations=2)
-        truth, rendered = srgb_from_linear(frame.masked_rgb()), srgb_from_linear(np.asarray(image.rgb))
+        truth, rendered = srgb_from_linear(frame.target()[0][..., :3]), srgb_from_linear(np.asarray(image.rgb))
         decibels.append(psnr(rendered, truth, inside))
         behind, alpha = (np.asarray(image.depth) - depth)[inside], np.asarray(image.alpha)[inside]
         pixels.append(np.stack([behind > DEEP, behind > 3 * spacing, alpha < OPAQUE], 1))
@@ -71,7 +72,7 @@ def study(root: Path) -> list[dict[str, Any]]:
         chosen = [frames[i] for i in taken]
         start = initial_gaussians(prior, chosen)[0]
         train = TrainSettings(passes=passes, tolerance=0.0)
-        cameras, targets = [frame.camera for frame in chosen], [frame.masked_rgb() for frame in chosen]
+        cameras, targets = [frame.camera for frame in chosen], [target_of(frame) for frame in chosen]
         fitted = fit(start, cameras, targets, train, cache=cache).gaussians
         held_out = [frame for i, frame in enumerate(frames) if i not in taken]
         found = measure(fitted, held_out, prior.spacing)

@@ -19,8 +19,9 @@ SSIM_SIGMA = 1.5
 SSIM_WINDOW = 11
 """Width and height of that window, pixels (Wang et al. 2004)."""
 
-METRICS = ("psnr", "ssim", "psnr_mask", "ssim_mask")
-"""Names of the four numbers that `compare` gives, as in metrics.json. PSNR is in dB; `_mask`: inside the rock's mask only."""
+METRICS = ("psnr", "ssim", "psnr_mask", "ssim_mask", "psnr_inside")
+"""Names of the numbers that `compare` gives, as in metrics.json. PSNR is in dB. They are over the whole image; with `_mask`,
+over the rock's mask; with `_inside`, over the pixels that the rock covers wholly, so without its outline."""
 
 
 def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
@@ -71,10 +72,18 @@ def _check_same_shape(a: np.ndarray, b: np.ndarray) -> None:
         raise InputError(f"images of {a.shape} and {b.shape} cannot be compared; render at the size of the dataset")
 
 
-def compare(truth: np.ndarray, rendered: np.ndarray, mask: np.ndarray) -> dict[str, float]:
-    """The four METRICS of one view. truth, rendered: [H,W,3] linear RGB; mask: [H,W] bool, the rock.
+def compare(truth: np.ndarray, rendered: np.ndarray, mask: np.ndarray, weight: np.ndarray) -> dict[str, float]:
+    """The METRICS of one view, over the pixels whose truth is known.
 
-    Raises InputError as `psnr` and `ssim`.
+    truth: [H,W,4], linear RGB premultiplied by alpha, and alpha; rendered: [H,W,3] linear RGB; mask: [H,W] bool, the rock;
+    weight: [H,W], 0 where the truth is not known (`mgs.data.dataset.Frame.target`). Raises InputError as `psnr` and `ssim`.
     """
-    a, b = srgb_from_linear(truth), srgb_from_linear(rendered)
-    return {"psnr": psnr(a, b), "ssim": ssim(a, b), "psnr_mask": psnr(a, b, mask), "ssim_mask": ssim(a, b, mask)}
+    a, b, known = srgb_from_linear(truth[..., :3]), srgb_from_linear(rendered), weight > 0
+    whole = None if known.all() else known
+    return {
+        "psnr": psnr(a, b, whole),
+        "ssim": ssim(a, b, whole),
+        "psnr_mask": psnr(a, b, mask & known),
+        "ssim_mask": ssim(a, b, mask & known),
+        "psnr_inside": psnr(a, b, (truth[..., 3] >= 1) & known),
+    }

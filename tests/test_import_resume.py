@@ -21,10 +21,10 @@ from mgs.images import write_png
 
 STRUCK = """
 import os, sys
-from mgs.data import importers as imports
+from mgs.data import importers
 from mgs.cli.app import main
 
-write, calls = imports.write_png, []
+write, calls = importers.write_png, []
 
 def strike(path, *arguments, **options):
     calls.append(path.parent.name)
@@ -32,7 +32,7 @@ def strike(path, *arguments, **options):
         os.kill(os.getpid(), {blow})
     write(path, *arguments, **options)
 
-imports.write_png = strike
+importers.write_png = strike
 main()
 """
 """The program, which sends itself a signal when it has written three images, and all of the fourth frame but its image."""

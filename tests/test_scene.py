@@ -15,6 +15,7 @@ from mgs.seeds import generator
 from mgs.synth import arena
 from mgs.synth.arena import make_ground, make_stones
 from mgs.synth.rock import make_rock
+from mgs.synth.rock_layer import RockLayer, continued, lattice, render_layers, with_coverage
 from mgs.synth.scene import Scene, sensor_dict
 from mgs.synth.scene_file import Arena, Rock, SceneFile, load_scene_file
 
@@ -57,13 +58,110 @@ def test_texture_lies_on_the_rock_as_in_the_mesh(monkeypatch):
     rock = make_rock(Rock(detail=0.04), generator(0, "rock"))
     camera = Camera(K * [[2], [2], [1]], 128, 96, look_at([3, 1, 1.5], [0, 0, 0.6]))
     scene = Scene(SceneFile(arena=Arena(stones=0)), rock, camera, seed=0)
-    albedo = np.array(mi.render(scene.scene, integrator=scene.guides, spp=16, seed=0))[..., :3]
+    albedo = render_layers(scene.scene, scene.guides, spp=16, seed=0)[0][..., 3:6]
     depth, mask = scene.cast(camera)
     points = camera.unproject(depth)[mask]
     nearest = cKDTree(rock.vertices).query(points)[1]
     expected = linear_from_srgb(rock.visual.to_color().vertex_colors[nearest, :3] / 255)
     assert np.corrcoef(albedo[mask].mean(-1), expected.mean(-1))[0, 1] > 0.7
     assert albedo[mask].mean(0) == pytest.approx(expected.mean(0), rel=0.05)
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """A red ball of radius 0.7 around (0.1, 0, 0.5) on grey ground, and a camera."""
+    rock = trimesh.creation.icosphere(5, 0.7)
+    rock.apply_translation([0.1, 0, 0.5])
+    rock.visual = trimesh.visual.ColorVisuals(rock, vertex_colors=np.tile([255, 0, 0, 255], (len(rock.vertices), 1)))
+    camera = Camera(K, 64, 48, look_at([3, 0, 1.5], [0, 0, 0.6]))
+    return Scene(SceneFile(arena=Arena(colour=(0.3, 0.3, 0.3), stones=0)), rock, camera, seed=0), camera
+
+
+def test_the_image_is_that_of_the_inner_integrator_and_the_rock_a_part_of_it(ball):
+    scene, _ = ball
+    for integrator, spp in ((scene.path, 5), (scene.guides, 8)):
+        image, rock, share = render_layers(scene.scene, integrator, spp, seed=4)
+        alone = np.array(mi.render(scene.scene, integrator=integrator.inner, spp=spp, seed=4))
+        np.testing.assert_array_equal(image[..., -alone.shape[-1] :], alone)
+        np.testing.assert_array_equal(rock[share == 1], image[share == 1])
+        assert not rock[share == 0].any()
+        assert (share == 1).sum() > 100
+        assert set(np.unique(np.round(share * spp, 4))) == set(range(spp + 1))
+
+
+def test_light_of_rock_and_of_all_else_adds_up_to_the_image(ball):
+    """The layer of the ground, lit in the same scene by the same random numbers, is the rest of the image."""
+    scene, _ = ball
+    image, rock, _ = render_layers(scene.scene, scene.path, 8, seed=1)
+    ground = next(shape for shape in scene.scene.shapes() if shape.id() == "ground")
+    _, rest, share = render_layers(scene.scene, RockLayer(scene.path.inner, ground), 8, seed=1)
+    no_sky = share + render_layers(scene.scene, scene.path, 8, seed=1)[2] == 1
+    assert no_sky.sum() > 1000
+    np.testing.assert_allclose((rock + rest)[no_sky], image[no_sky], rtol=1e-5, atol=1e-7)
+
+
+def test_coverage_is_the_area_that_the_outline_cuts_off(ball):
+    """A ball's outline is an ellipse, whose area in each pixel is known from 100 x 100 points."""
+    scene, camera = ball
+    depth, mask = scene.cast(camera)
+    alpha = scene.coverage(camera, mask, mask.astype(np.float32))
+    offset = (np.arange(100) + 0.5) / 100
+    v, u = np.mgrid[:48, :64]
+    expected = np.zeros((48, 64))
+    centre = np.array([0.1, 0, 0.5]) - camera.position
+    for dv in offset:
+        for du in offset:
+            local = np.stack([(u + du - K[0, 2]) / K[0, 0], (v + dv - K[1, 2]) / K[1, 1], np.ones_like(u, float)], -1)
+            rays = local @ camera.world_to_camera[:3, :3]
+            along = rays @ centre
+            expected += along**2 > (rays**2).sum(-1) * (centre @ centre - 0.7**2)
+    rim = (expected > 0) & (expected < 1e4)
+    # The ground hides the ball's foot; there the outline is another.
+    upper = np.arange(48)[:, None] < camera.project(np.array([[0.1, 0, 0.5]]))[0][0, 1]
+    assert (rim & upper).sum() > 50
+    assert np.abs(alpha - expected / 1e4)[upper & (alpha < 1) | rim & upper].max() < 0.03
+    np.testing.assert_array_equal(np.round(alpha * 255), alpha * 255)
+    assert (alpha[mask] > 0).all()
+    assert (alpha[~mask] < 1).all()
+    np.testing.assert_array_equal(scene.coverage(camera, np.zeros_like(mask), np.zeros(mask.shape, np.float32)), 0)
+    assert (depth[mask] > 0).all()
+
+
+def test_lattice_is_even_and_has_the_centre():
+    points = lattice(255)
+    np.testing.assert_array_equal(points[127], 0.5)
+    assert points.min() >= 0
+    assert points.max() < 1
+    for direction in np.random.default_rng(0).standard_normal((50, 2)):
+        # A straight edge through the centre of the pixel cuts off one half.
+        assert np.mean((points - 0.5) @ direction > 0) == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_rock_of_one_colour_keeps_it():
+    """Whatever share of the samples met it, its light is its colour times the coverage; and its continuation is its colour."""
+    colour, coverage = np.array([0.1, 0.2, 0.4], np.float32), np.zeros((6, 7), np.float32)
+    coverage[1:5, 2:6], coverage[0, 2:6] = 1, 0.25
+    share = np.random.default_rng(0).binomial(4, coverage).astype(np.float32) / 4
+    assert (share[0, 2:6] == 0).any()
+    expected = coverage[..., None] * colour
+    np.testing.assert_allclose(with_coverage(share[..., None] * colour, share, coverage), expected, atol=1e-6)
+    np.testing.assert_allclose(continued(expected, coverage), np.broadcast_to(colour, expected.shape), atol=1e-5)
+
+
+def test_the_rock_alone_is_the_image_inside_and_its_own_colour_at_the_rim(ball):
+    """Against many samples: the denoised layer at its rim is far nearer to the truth than image times mask."""
+    scene, camera = ball
+    rendered = scene.render(camera, 8, 0, denoise=True)
+    truth = np.mean([scene.render(camera, 64, 10 + i, denoise=False).rock for i in range(4)], axis=0)
+    rgb, alpha = rendered.rock[..., :3], rendered.rock[..., 3]
+    rim = (alpha > 0) & (alpha < 1)
+    error = np.sqrt(((rgb - truth[..., :3])[rim] ** 2).mean())
+    by_mask = np.sqrt(((rendered.rgb * rendered.mask[..., None] - truth[..., :3])[rim] ** 2).mean())
+    assert error < 0.4 * by_mask
+    assert not rgb[alpha == 0].any()
+    np.testing.assert_array_equal(rgb[alpha == 1], rendered.rgb[alpha == 1])
+    green = rgb[rim][:, 1].sum() / rgb[rim][:, 0].sum()
+    assert green == pytest.approx(truth[rim][:, 1].sum() / truth[rim][:, 0].sum(), abs=0.02)  # no grey of the ground
 
 
 @pytest.mark.parametrize(

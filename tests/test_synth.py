@@ -7,10 +7,12 @@ import json
 import numpy as np
 import pytest
 import trimesh
+from refusals import listing
 from scipy.spatial import cKDTree
 
 from mgs.camera import opencv_from_opengl
 from mgs.cli.app import main
+from mgs.data.check import check_dataset
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import locked, read_json
@@ -18,7 +20,7 @@ from mgs.resources import resource_folder
 from mgs.rotation import WORLD_FROM_GLTF
 from mgs.seeds import generator
 from mgs.synth import arena
-from mgs.synth.rendering import ROCK_EXPOSURE, PoseNoise, Preset, rock_cameras, synthesise
+from mgs.synth.rendering import ROCK_EXPOSURE, PoseNoise, Preset, dome_cameras, rock_cameras, synthesise
 from mgs.synth.rock import make_rock
 from mgs.synth.scene_file import ORBITS, Arena, Orbit, Rock, SceneFile, load_scene_file
 
@@ -67,6 +69,70 @@ def test_rock_is_in_frame_and_fills_it(dataset):
         assert columns.max() < frame.camera.width - 1
 
 
+def test_the_rock_alone_agrees_with_image_and_mask(dataset):
+    """Inside it is the image, outside it is empty, and at the rim its alpha is between; the mask is where a centre shows it."""
+    for frame in dataset.frames:
+        rgba, weight = frame.target()
+        alpha, mask = rgba[..., 3], frame.mask()
+        assert weight.all()
+        assert (alpha[mask] > 0).all()
+        assert (alpha[~mask] < 1).all()
+        assert 40 < ((alpha > 0) & (alpha < 1)).sum() < 400
+        np.testing.assert_array_equal(rgba[alpha == 1, :3], frame.rgb()[alpha == 1])
+        assert not rgba[alpha == 0].any()
+        np.testing.assert_array_equal(frame.masked_rgb(), rgba[..., :3])
+
+
+def test_test_views_are_a_dataset_of_their_own_and_change_nothing_else(dataset, tmp_path):
+    """Interrupted among the test views, and completed by the same command."""
+
+    class Stop(Exception):
+        pass
+
+    def stop(done, total):
+        assert total == 9
+        if done == 7:
+            raise Stop
+
+    with pytest.raises(Stop):
+        synthesise(tmp_path / "again", SCENE, TINY, seed=3, test_views=4, progress=stop)
+    assert not (tmp_path / "again/test/transforms.json").exists()
+    written = {path: path.stat().st_mtime_ns for path in (tmp_path / "again").rglob("*_0*.*")}
+    assert len(written) == 4 * 7
+    with pytest.raises(InputError, match="other settings"):
+        synthesise(tmp_path / "again", SCENE, TINY, seed=3, test_views=5)
+    again = synthesise(tmp_path / "again", SCENE, TINY, seed=3, test_views=4)
+    assert {path: path.stat().st_mtime_ns for path in written} == written
+    here, there = listing(again.root), listing(dataset.root)
+    assert all(here[name] == content for name, content in there.items() if name != "config.json")
+    assert all(name.startswith("test") for name in here.keys() - there.keys())
+
+    views = again.test_views()
+    assert dataset.test_views() is None
+    assert [frame.name for frame in views.frames] == ["tv_0000", "tv_0001", "tv_0002", "tv_0003"]
+    assert not [problem for problem in check_dataset(views).problems if "tv_" in problem]
+    noisy = synthesise(tmp_path / "noisy", SCENE, TINY, seed=3, test_views=4, pose_noise=PoseNoise(0.01, 0.1)).test_views()
+    for a, b in zip(views.frames, noisy.frames, strict=True):
+        assert a.camera == b.camera  # what models are judged by is exact
+        assert a.rock_path.read_bytes() == b.rock_path.read_bytes()
+
+
+def test_the_dome_of_test_views_has_the_orbits_radius_and_shows_the_whole_rock():
+    settings = SceneFile(orbit=Orbit(kind="circle", radius=5, altitude=1))
+    rock = make_rock(SCENE.rock, generator(0, "rock"))
+    cameras = dome_cameras(settings, Preset(640, 480, 3, 1), rock, 60)
+    out = np.array([camera.position for camera in cameras]) - [0, 0, rock.bounds[1, 2] / 2]
+    np.testing.assert_allclose(np.linalg.norm(out, axis=1), 5)
+    elevation = np.sort(np.degrees(np.arcsin(out[:, 2] / 5)))
+    assert 5 < elevation[0] < 6
+    assert 70 < elevation[-1] < 75
+    assert dome_cameras(settings, TINY, rock, 0) == []
+    near = SCENE.model_copy(update={"orbit": Orbit(kind="circle", radius=1.8, altitude=6)})
+    assert len(rock_cameras(near, TINY, rock)) == 5
+    with pytest.raises(InputError, match="not wholly in test view"):
+        dome_cameras(near, TINY, rock, 10)
+
+
 def test_poses_on_disk_are_the_orbit(dataset):
     positions = np.array([frame.camera.position for frame in load_dataset(dataset.root).frames])
     np.testing.assert_allclose(np.hypot(positions[:, 0], positions[:, 1]), 4.0, atol=1e-9)
@@ -100,6 +166,7 @@ def test_same_seed_same_bytes_and_resume_and_pose_noise(dataset, tmp_path):
     for a, b in zip(dataset.frames, again.frames, strict=True):
         assert a.image_path.read_bytes() == b.image_path.read_bytes()
         assert a.mask_path.read_bytes() == b.mask_path.read_bytes()
+        assert a.rock_path.read_bytes() == b.rock_path.read_bytes()
         np.testing.assert_array_equal(a.depth(), b.depth())
         assert 0 < np.linalg.norm(a.camera.position - b.camera.position) < 0.06
         np.testing.assert_allclose(opencv_from_opengl(truth[b.name]), a.camera.world_to_camera, atol=1e-12)
@@ -227,5 +294,6 @@ def test_every_scene_frames_its_rock_on_every_orbit(scene):
     for kind in ORBITS:
         flown = settings.model_copy(update={"orbit": settings.orbit.model_copy(update={"kind": kind})})
         cameras = rock_cameras(flown, Preset(640, 480, 36, 1), rock)
+        dome_cameras(flown, Preset(640, 480, 36, 1), rock, 60)  # would refuse a view without the whole rock
         heights = [np.ptp(camera.project(rock.vertices[rock.vertices[:, 2] > 0])[0][:, 1]) / 480 for camera in cameras]
         assert 0.35 < np.mean(heights) < 0.75

@@ -103,7 +103,7 @@ def fit(gaussians: Gaussians, cameras: list[Camera], targets: list[np.ndarray], 
         pixels, _ = camera.project(gaussians.means)
         u, v = np.clip(pixels.astype(int), 0, [WIDTH - 1, HEIGHT - 1]).T
         facing = _facing(gaussians, camera)
-        total += facing[:, None] * target[v, u]
+        total += facing[:, None] * target[v, u, :3]
         weight += facing
     rgb = 0.5 * gaussians.rgb + 0.5 * total / weight[:, None]
     g = gaussians

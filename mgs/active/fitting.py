@@ -54,6 +54,7 @@ def _recorded_sizes(
     packed: Any,
     lists: BlockLists,
     target: Any,
+    weight: Any,
     size: Any,
     *_: Any,
 ) -> tuple[Any, ...]:
@@ -74,6 +75,7 @@ def _step(
     packed: Any,
     lists: BlockLists,
     target: Any,
+    weight: Any,
     size: Any,
     rates: list[Any],
     t: Any,
@@ -81,13 +83,13 @@ def _step(
     """One step of the optimiser on one image. Returns parameters, buffers, mean squared error before the step.
 
     buffers, rates: for each of LEARNED; packed: the Gaussians' splats, packed for the lists; size: (width, height); t: UInt32,
-    step number from 1; target: Float [H*W*3].
+    step number from 1; target, weight: Float [H*W*3].
     """
     values = [dr.copy(getattr(gaussians, name)) for name in LEARNED]
     dr.enable_grad(values)
     watched = Gaussians(gaussians.means, **dict(zip(LEARNED, values, strict=True)))
     rgb = composite(project(watched, camera), packed, lists, *size).rgb
-    error = rgb.array - target
+    error = (rgb.array - target) * weight
     loss = dr.mean(dr.square(error))
     dr.backward(0.5 * dr.sum(dr.square(error)))
     step, moved, kept = mi.Float(t), {}, []
@@ -105,8 +107,10 @@ def fit(
     on_pass: Callable[[int, int], None] | None = None,
     cache: ListCache | None = None,
 ) -> Fit:
-    """Fit appearance (not means) to images: cameras and targets [H,W,3] linear RGB, rock on black.
+    """Fit appearance (not means) to images.
 
+    cameras, and a target of each: [H,W,3] linear RGB, the rock in front of black; or [H,W,4], in which the last channel is the
+    weight of the pixel, 1 where its colour is known and 0 where it is not (`mgs.data.dataset.Frame.target`).
     Starts with fresh buffers of the optimiser, so the result depends on its arguments alone, bitwise. on_pass(done, most)
     reports. Stops as `mgs.active.stopping.stop_reason` says. Raises InputError where a parameter of the Gaussians given is not
     finite, or the optimiser is unknown.
@@ -115,10 +119,7 @@ def fit(
     if settings.optimiser not in OPTIMISERS:
         raise InputError(f"optimiser {settings.optimiser!r} is unknown; choose one of {', '.join(OPTIMISERS)}")
     model = as_drjit(gaussians)
-    images = [
-        _Image(camera, camera_array(camera), mi.Float(np.ascontiguousarray(target, np.float32).ravel()))
-        for camera, target in zip(cameras, targets, strict=True)
-    ]
+    images = [_image(camera, np.asarray(target, np.float32)) for camera, target in zip(cameras, targets, strict=True)]
     count = OPTIMISERS[settings.optimiser].buffers
     buffers = [[dr.zeros(mi.TensorXf, getattr(model, name).shape) for _ in range(count)] for name in LEARNED]
     rng = generator(settings.seed, "train/order")
@@ -144,16 +145,27 @@ def fit(
 
 @dataclass(frozen=True)
 class _Image:
-    """An image to fit to: its camera, the same for the kernels, and its pixels, mi.Float [H*W*3]."""
+    """An image to fit to: its camera, the same for the kernels, its pixels and their weights, mi.Float [H*W*3]."""
 
     camera: Camera
     array: Any
     pixels: Any
+    weights: Any
+
+
+def _image(camera: Camera, target: np.ndarray) -> _Image:
+    """target: as `fit` takes it."""
+    rgb = target[..., :3]
+    weights = np.broadcast_to(target[..., 3:] if target.shape[-1] == 4 else np.ones((), np.float32), rgb.shape)
+    return _Image(camera, camera_array(camera), *(mi.Float(np.ascontiguousarray(a).ravel()) for a in (rgb, weights)))
 
 
 def _loss(model: Gaussians, images: list[_Image], cache: ListCache) -> float:
     """Mean squared error of one model over the images."""
-    errors = [dr.mean(dr.square(render(model, image.camera, cache=cache).rgb.array - image.pixels)) for image in images]
+    errors = []
+    for image in images:
+        rgb = render(model, image.camera, cache=cache).rgb.array
+        errors.append(dr.mean(dr.square((rgb - image.pixels) * image.weights)))
     return float(np.mean([float(error[0]) for error in errors]))
 
 
@@ -174,8 +186,9 @@ def _pass(
             return model, buffers, float("nan")
         size = (image.camera.width, image.camera.height)
         model, buffers, loss = _step(
-            optimiser, model, buffers, image.array, packed, lists, image.pixels, size, rates, dr.opaque(mi.UInt32, t)
-        )
+            optimiser, model, buffers, image.array, packed, lists, image.pixels, image.weights, size, rates,
+            dr.opaque(mi.UInt32, t),
+        )  # fmt: skip
         losses.append(loss)
     finite = dr.all([dr.all(dr.isfinite(getattr(model, name).array)) for name in LEARNED])
     return model, buffers, float(np.mean([float(loss[0]) for loss in losses])) if finite[0] else float("nan")

@@ -53,7 +53,7 @@ class Stations:
     centre: [3] the rock, metres.
     groups: columns of the Fisher information by kind of parameter (`mgs.splat.groups`).
     initial(seed frames) -> Gaussians before any training.
-    fit(gaussians, cameras, targets, rate, on_pass) -> Fit; rate multiplies all learning rates.
+    fit(gaussians, cameras, targets, rate, on_pass) -> Fit; targets as `mgs.active.fitting.fit`, rate multiplies all rates.
     fisher(gaussians, camera) -> information of one view [N,P], by the estimator of the run.
     measure(gaussians, taken frame indices) -> entries for steps.jsonl.
     exact(gaussians, camera) -> exact information of one view [N,P], for what the views see of the surface; None: as `fisher`.
@@ -216,7 +216,7 @@ class _Loop:
         with watch("capture"):
             for i in taken:
                 if i not in self.images:
-                    self.images[i] = _target(self.frames[i])
+                    self.images[i] = target_of(self.frames[i])
         with watch("fit"):
             targets = [self.images[i] for i in taken]
             rate = self.settings.warm_rate if step else 1.0
@@ -229,7 +229,9 @@ class _Loop:
                 self.progress("information of the training set", done, len(cameras))
                 H += self.stations.fisher(fit.gaussians, camera)
             surface = state.surface + sum(self.surface_information(i) for i in new)
-        kinds = ("image", "mask") if step else ("image", "mask", "depth")  # depth gives the seeds' colours to the surface
+        kinds = (
+            ("image", "mask", "rock") if step else ("image", "mask", "rock", "depth")
+        )  # depth gives the seeds' colours to the surface
         files = {self.frames[i].name: inputs.frame_digests(self.frames[i], kinds) for i in new}
         made_from = {**self.made_from, "files": state.inputs.get("files", {}) | files}
         line = {
@@ -248,11 +250,15 @@ class _Loop:
         return State(fit.gaussians, H, surface, taken, [*state.steps, line], made_from)
 
 
-def _target(frame: Frame) -> np.ndarray:
-    """`Frame.masked_rgb`. Raises InputError where the mask is empty: a fit to black would hide the rock."""
+def target_of(frame: Frame) -> np.ndarray:
+    """What a frame is fitted to: [H,W,4], the colour and the weight of `Frame.target`.
+
+    Raises InputError where the mask is empty: a fit to black would hide the rock.
+    """
     if not frame.mask().any():
         raise InputError(f"{frame.mask_path}: the rock mask of frame {frame.name} is empty; correct it, or remove the frame")
-    return frame.masked_rgb()
+    rgba, weight = frame.target()
+    return np.dstack([rgba[..., :3], weight])
 
 
 def _diverged(out: Path, step: int, losses: Sequence[float]) -> str:

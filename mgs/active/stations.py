@@ -51,16 +51,16 @@ def psnr_measure(dataset: Dataset, cache: ListCache) -> Callable[[Gaussians, lis
     """
 
     @functools.cache
-    def truth(index: int) -> tuple[np.ndarray, np.ndarray]:
-        frame = dataset.frames[index]
-        return srgb_from_linear(frame.masked_rgb()), frame.mask()
+    def truth(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        rgba, weight = dataset.frames[index].target()
+        return srgb_from_linear(rgba[..., :3]), weight > 0, dataset.frames[index].mask() & (weight > 0)
 
     def measure(gaussians: Gaussians, taken: list[int]) -> dict[str, float]:
         values = np.empty((len(dataset), 2))
         for i, frame in enumerate(dataset.frames):
-            image, mask = truth(i)
+            image, known, rock = truth(i)
             rendered = srgb_from_linear(np.asarray(render(gaussians, frame.camera, cache=cache).rgb))
-            values[i] = psnr(rendered, image), psnr(rendered, image, mask)
+            values[i] = psnr(rendered, image, known), psnr(rendered, image, rock)
         return _means(values, "") | _means(np.delete(values, taken, axis=0), "held_out_")
 
     return measure

@@ -29,14 +29,18 @@ def synth_orbit(
     spp: Annotated[int | None, typer.Option(min=1, help="Samples per pixel. Default: the preset's.")] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Number of frames. Default: the preset's.")] = None,
     size: Annotated[str | None, typer.Option(help="Image size WIDTHxHEIGHT, pixels. Default: the preset's.")] = None,
+    test_views: Annotated[
+        int, typer.Option(min=0, help="Number of views on a dome around the rock, to judge models by; written to OUT/test.")
+    ] = 0,
     pose_noise: Annotated[float, typer.Option(min=0, help="Noise on the positions in transforms.json, metres per axis.")] = 0.0,
     rotation_noise: Annotated[float, typer.Option(min=0, help="Noise on the rotations there, degrees per axis.")] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="Root seed: the same seed gives the same dataset, bit for bit.")] = 0,
 ) -> None:
     """Render a dataset with Mitsuba: an orbit around a rock, with photoreal images, depth, rock masks and exact poses.
 
-    Writes transforms.json (as nerfstudio has it), images/, depth/, masks/, the true rock as rock.glb, config.json and
-    contact_sheet.png. An interrupted run goes on where it stopped when the same command is given again.
+    Writes transforms.json (as nerfstudio has it), images/, depth/, masks/, rock/ (images of the rock alone, with alpha), the
+    true rock as rock.glb, config.json and contact_sheet.png. An interrupted run goes on where it stopped when the same command
+    is given again.
     """
     from rich.console import Console
     from rich.progress import Progress
@@ -62,13 +66,14 @@ def synth_orbit(
     noise = PoseNoise(pose_noise, rotation_noise) if pose_noise or rotation_noise else None
     console = Console()
     with Progress(console=console) as bar:
-        task = bar.add_task(f"{chosen.frames} frames, {chosen.width}x{chosen.height}", total=chosen.frames)
-        dataset = synthesise(
+        views = f"{chosen.frames} frames" + (f" and {test_views} test views" if test_views else "")
+        task = bar.add_task(f"{views}, {chosen.width}x{chosen.height}", total=chosen.frames + test_views)
+        synthesise(
             out, settings, chosen, seed, mesh, noise,
             progress=lambda done, total: bar.update(task, completed=done), say=console.print,
-            mesh_up=mesh_up and mesh_up.value,
+            mesh_up=mesh_up and mesh_up.value, test_views=test_views,
         )  # fmt: skip
-    console.print(f"{out}: {len(dataset)} frames; look at {out / 'contact_sheet.png'}")
+    console.print(f"{out}: {views}; look at {out / 'contact_sheet.png'}")
 
 
 def _parse_size(size: str | None) -> dict[str, int | None]:

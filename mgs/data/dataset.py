@@ -1,4 +1,4 @@
-"""A dataset folder in nerfstudio style: transforms.json, images/, depth/, masks/."""
+"""A dataset folder in nerfstudio style: transforms.json, images/, depth/, masks/, rock/."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mgs.camera import Camera, opencv_from_opengl, opengl_from_opencv
+from mgs.data.rock_image import boundary, read_rock_image
 from mgs.errors import InputError
 from mgs.files import check_new_folder, check_writable, locked, read_json, write_json
 from mgs.images import read_exr, read_mask, read_png
@@ -25,6 +26,12 @@ DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "is_fisheye")
 FRAME_INTERVAL = 0.5
 """Seconds between keyframes (paper, section IV-A)."""
 
+TEST_FOLDER = "test"
+"""Folder of a dataset that holds its test views, a dataset of its own."""
+
+FILES = {"image_path": "file_path", "depth_path": "depth_file_path", "mask_path": "mask_path", "rock_path": "rock_file_path"}
+"""The keys of transforms.json under which the paths of a `Frame` are written."""
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -36,6 +43,7 @@ class Frame:
     image_path: Path
     depth_path: Path | None = None
     mask_path: Path | None = None
+    rock_path: Path | None = None
 
     def rgb(self) -> np.ndarray:
         """Linear RGB float32 [H,W,3]. Raises InputError where it is missing, damaged or of another size."""
@@ -50,14 +58,38 @@ class Frame:
         return np.nan_to_num(self._sized(self.depth_path, depth), nan=0.0, posinf=0.0, neginf=0.0)
 
     def mask(self) -> np.ndarray:
-        """Rock mask bool [H,W]; all true where the frame has none. Raises InputError as `rgb`."""
-        if self.mask_path is None:
-            return np.ones((self.camera.height, self.camera.width), bool)
-        return self._sized(self.mask_path, read_mask(self.mask_path))
+        """Which pixels count as rock, bool [H,W].
+
+        In the images of `mgs synth-orbit` these are the pixels whose centre shows the rock. Without a mask file, they are the
+        pixels with an alpha of at least 0.5 in the rock's image; without that too, all of them. Raises InputError as `rgb`.
+        """
+        if self.mask_path is not None:
+            return self._sized(self.mask_path, read_mask(self.mask_path))
+        if self.rock_path is not None:
+            return self.target()[0][..., 3] >= 0.5
+        return np.ones((self.camera.height, self.camera.width), bool)
+
+    def target(self) -> tuple[np.ndarray, np.ndarray]:
+        """What a model of the rock alone is fitted to and compared with: (rgba, weight).
+
+        rgba: float32 [H,W,4], linear RGB premultiplied by alpha, and alpha, the share of the pixel that the rock covers.
+        weight: float32 [H,W], 1 for the pixels whose rgba is known and 0 for the others.
+
+        A frame with an image of the rock has a weight of 1 everywhere. A frame with a mask alone says of each pixel that it is
+        rock or that it is not: alpha is 1 or 0 and colour outside the mask is 0. That is wrong in the pixels that the outline
+        of the rock crosses, so the `mgs.data.rock_image.boundary` of the mask has a weight of 0. A frame without either shows
+        nothing but rock: alpha and weight are 1 everywhere. Raises InputError as `rgb`.
+        """
+        if self.rock_path is not None:
+            rgba = self._sized(self.rock_path, read_rock_image(self.rock_path))
+            return rgba, np.ones(rgba.shape[:2], np.float32)
+        mask = self.mask()
+        rgba = np.dstack([self.rgb(), np.ones(mask.shape, np.float32)]) * mask[..., None]
+        return rgba, (~boundary(mask)).astype(np.float32)
 
     def masked_rgb(self) -> np.ndarray:
-        """Linear RGB float32 [H,W,3] of the rock alone, black elsewhere: the training and evaluation target."""
-        return self.rgb() * self.mask()[..., None]
+        """The colour of `target`: linear RGB float32 [H,W,3] of the rock alone in front of black."""
+        return self.target()[0][..., :3]
 
     def _sized(self, path: Path, pixels: np.ndarray) -> np.ndarray:
         expected = (self.camera.height, self.camera.width)
@@ -76,6 +108,14 @@ class Dataset:
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    def test_views(self) -> Dataset | None:
+        """The dataset in the folder `test` of this one: views to judge a model by, which no model is trained on.
+
+        None where there is none. Raises InputError as `load_dataset`.
+        """
+        folder = self.root / TEST_FOLDER
+        return load_dataset(folder) if (folder / "transforms.json").is_file() else None
 
 
 def load_dataset(root: str | Path) -> Dataset:
@@ -117,7 +157,7 @@ def read_records(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     for index, record in enumerate(records):
         if not isinstance(record, dict) or not record.get("file_path") or "transform_matrix" not in record:
             raise InputError(f"{path}: frame {index} lacks file_path or transform_matrix; add it")
-        for key in ("file_path", "depth_file_path", "mask_path"):
+        for key in FILES.values():
             value = record.get(key) or ""
             if not isinstance(value, str) or not value.isprintable():
                 raise InputError(f"{path}: frame {index} has a {key} that is no text or cannot be a path; correct it")
@@ -167,10 +207,8 @@ def _frame(root: Path, path: Path, data: dict[str, Any], index: int, record: dic
             raise InputError(f"{where}: {key} {record[key]} does not exist in {root}; restore it or remove the frame")
         return target
 
-    image = file("file_path")
-    assert image is not None
-    name = Path(record["file_path"]).stem
-    return Frame(name, camera, timestamp, image, file("depth_file_path"), file("mask_path"))
+    paths: dict[str, Any] = {field: file(key) for field, key in FILES.items()}
+    return Frame(Path(record["file_path"]).stem, camera, timestamp, **paths)
 
 
 def _intrinsics(camera: Camera) -> dict[str, float]:
@@ -185,11 +223,8 @@ def write_transforms(root: str | Path, frames: list[Frame] | tuple[Frame, ...]) 
     header = {"camera_model": "OPENCV", **_intrinsics(frames[0].camera)}
     records = []
     for frame in frames:
-        record: dict[str, Any] = {"file_path": frame.image_path.relative_to(root).as_posix()}
-        if frame.depth_path is not None:
-            record["depth_file_path"] = frame.depth_path.relative_to(root).as_posix()
-        if frame.mask_path is not None:
-            record["mask_path"] = frame.mask_path.relative_to(root).as_posix()
+        paths = {key: getattr(frame, field) for field, key in FILES.items()}
+        record: dict[str, Any] = {key: path.relative_to(root).as_posix() for key, path in paths.items() if path is not None}
         record["transform_matrix"] = opengl_from_opencv(frame.camera.world_to_camera).tolist()
         record["timestamp"] = frame.timestamp
         own = _intrinsics(frame.camera)

@@ -1,6 +1,6 @@
 """How good a model is: PSNR and SSIM of its renders against the images of a dataset, and pictures of both side by side.
 
-The truth is `Frame.masked_rgb`: the rock on black, which is what the model was trained on. Both numbers compare sRGB values in
+The truth is `Frame.target`: the rock in front of black, which is what the model was trained on. Both numbers compare sRGB values in
 [0,1]. Over the full frame they flatter, because any model gets the black right; those inside the mask are over the rock's
 pixels only (`mgs.metrics`).
 """
@@ -73,11 +73,11 @@ def evaluate(
     for done, frame in enumerate(frames):
         if progress:
             progress(done, len(frames))
-        truth, rendered = frame.masked_rgb(), renderer(gaussians, frame.camera)
-        measured = compare(truth, rendered, frame.mask())
+        (truth, weight), rendered = frame.target(), renderer(gaussians, frame.camera)
+        measured = compare(truth, rendered, frame.mask(), weight)
         views.append({"name": frame.name, "trained": frame.name in trained} | measured)
         if pictures is not None:
-            write_comparison(pictures / f"{frame.name}.png", truth, rendered, measured["psnr"])
+            write_comparison(pictures / f"{frame.name}.png", truth[..., :3], rendered, measured["psnr"])
     if progress:
         progress(len(frames), len(frames))
     return {
@@ -175,7 +175,9 @@ def evaluate_run(
 
 def _subject(gaussians: Gaussians, dataset: Dataset, trained: list[str]) -> str:
     """Hash of all that the metrics of a run depend on: the model, the dataset's cameras, images and masks, and the versions."""
-    frames = [[frame.name, camera_digest(frame.camera), frame_digests(frame, ("image", "mask"))] for frame in dataset.frames]
+    frames = [
+        [frame.name, camera_digest(frame.camera), frame_digests(frame, ("image", "mask", "rock"))] for frame in dataset.frames
+    ]
     text = json.dumps([array_digest(asdict(gaussians).values()), frames, trained, versions()])
     return array_digest([np.frombuffer(text.encode(), np.uint8)])
 

@@ -14,8 +14,9 @@ import trimesh
 from PIL import Image
 
 from mgs.camera import Camera, opengl_from_opencv
-from mgs.data.dataset import FRAME_INTERVAL, Dataset, Frame, load_dataset, resumes, write_transforms
+from mgs.data.dataset import FRAME_INTERVAL, TEST_FOLDER, Dataset, Frame, load_dataset, resumes, write_transforms
 from mgs.data.meshes import GLTF, to_glb
+from mgs.data.rock_image import write_rock_image
 from mgs.errors import InputError
 from mgs.files import atomic_path, check_new_folder, check_writable, fingerprint, locked, new_folder, write_json
 from mgs.images import write_exr, write_png
@@ -24,10 +25,14 @@ from mgs.seeds import derive_seed, generator
 from mgs.synth.orbit import orbit_cameras, perturb
 from mgs.synth.rock import load_rock, make_rock, up_axis
 from mgs.synth.scene import Scene
-from mgs.synth.scene_file import SceneFile
+from mgs.synth.scene_file import Orbit, SceneFile
 
 NOISY_FACTOR = 8
 """Samples are multiplied by this where pyoidn is not installed."""
+
+DOME_ELEVATIONS = (5.0, 75.0)
+"""Lowest and highest elevation of test views, seen from the rock's middle, degrees: the lowest look over the stones on the
+ground, the highest down on the rock."""
 
 ROCK_EXPOSURE = 0.2
 """Mean linear value of the rock's pixels over the orbit: the exposure is metered once on the rock, as a photographer does."""
@@ -67,11 +72,14 @@ def synthesise(
     progress: Callable[[int, int], None] = lambda done, total: None,
     say: Callable[[str], None] = lambda message: None,
     mesh_up: str | None = None,
+    test_views: int = 0,
 ) -> Dataset:
-    """Render the dataset `out`: images, depth, masks, rock.glb, config.json, contact_sheet.png, transforms.json (last).
+    """Render the dataset `out`: images, depth, masks, rock, rock.glb, config.json, contact_sheet.png, transforms.json (last).
 
-    With `pose_noise` transforms.json holds noisy poses, and true_poses.json the cameras that took the images.
+    With `pose_noise`, transforms.json holds noisy poses, and true_poses.json the cameras that took the images.
     mesh: a file in place of the procedural rock; mesh_up: its up axis, "y" or "z", by default as `mgs.synth.rock.up_axis`.
+    test_views: number of views of `dome_cameras` that are rendered into the folder `test` of the dataset, with exact poses
+    (`Dataset.test_views`). The files of the orbit are the same with and without them.
     A folder that an interrupted run of the same settings left is completed; the result is the same as in one run.
     Raises InputError: output folder not empty, not writable or worked on by another process, bad mesh, rock not wholly in every
     frame, or nowhere in sight.
@@ -87,9 +95,10 @@ def synthesise(
         extents = " x ".join(f"{x:.2f}" for x in rock.extents)
         say(f"{mesh}: {_said_up(mesh, mesh_up)}; scaled {scale:.4g} times to the scene's rock size, now {extents} m")
     cameras = rock_cameras(settings, preset, rock)
-    frames = _frames(out, cameras)
+    frames = _frames(out, cameras, "kf")
+    tests = _frames(out / TEST_FOLDER, dome_cameras(settings, preset, rock, test_views), "tv")
     denoise = importlib.util.find_spec("pyoidn") is not None
-    resolved = _resolved(settings, preset, seed, mesh, mesh_up, denoise, pose_noise)
+    resolved = _resolved(settings, preset, seed, mesh, mesh_up, denoise, pose_noise, test_views)
     goes_on = resumes(out, "config.json", resolved)
     glb = to_glb(rock)  # before the scene adds its attributes to the mesh
     scene = Scene(settings, rock, cameras[0], seed)
@@ -105,7 +114,7 @@ def synthesise(
             temporary.write_bytes(glb)
 
         prepared = time.perf_counter()
-        seconds = _render_frames(scene, frames, exposure, spp, seed, denoise, progress)
+        seconds = _render_frames(scene, [*frames, *tests], exposure, spp, seed, denoise, progress)
         write_contact_sheet(out / "contact_sheet.png", frames)
         timings = {
             "prepare_s": round(prepared - started, 2),
@@ -114,6 +123,8 @@ def synthesise(
         }
         record = {"mesh_scale": scale, "exposure": exposure, "samples_per_pixel": spp, "versions": versions()}
         write_json(out / "config.json", resolved | record | {"timings": timings})
+        if tests:
+            write_transforms(out / TEST_FOLDER, tests)
         write_transforms(out, frames if pose_noise is None else _told(out, frames, pose_noise, seed))
         return load_dataset(out)
 
@@ -138,6 +149,7 @@ def _resolved(
     mesh_up: str | None,
     denoise: bool,
     pose_noise: PoseNoise | None,
+    test_views: int,
 ) -> dict[str, Any]:
     """All that decides the dataset: what a run that goes on must agree with."""
     return {
@@ -147,6 +159,7 @@ def _resolved(
         "mesh": None if mesh is None else fingerprint(mesh) | {"up": mesh_up or up_axis(mesh)},
         "denoise": denoise,
         "pose_noise": None if pose_noise is None else asdict(pose_noise),
+        "test_views": test_views,
     }
 
 
@@ -176,8 +189,10 @@ def _render_frames(
             rendered = scene.render(frame.camera, spp, derive_seed(seed, frame.name), denoise)
             assert frame.depth_path
             assert frame.mask_path
+            assert frame.rock_path
             write_exr(frame.depth_path, {"Z": rendered.depth})
             write_png(frame.mask_path, rendered.mask)
+            write_rock_image(frame.rock_path, rendered.rock * [exposure, exposure, exposure, 1])
             write_png(frame.image_path, rendered.rgb * exposure)
             seconds.append(time.perf_counter() - begun)
         progress(index + 1, len(frames))
@@ -189,12 +204,26 @@ def rock_cameras(settings: SceneFile, preset: Preset, rock: trimesh.Trimesh) -> 
 
     Raises InputError where the rock is not wholly inside a frame.
     """
+    return _aimed(settings.orbit, settings, preset, preset.frames, rock, "frame")
+
+
+def dome_cameras(settings: SceneFile, preset: Preset, rock: trimesh.Trimesh, count: int) -> list[Camera]:
+    """Cameras spread evenly over a dome around the rock, of DOME_ELEVATIONS and the radius of the scene's orbit.
+
+    They have the orbit's field of view and aim, and raise InputError as `rock_cameras`.
+    """
+    dome = settings.orbit.model_copy(update={"kind": "hemisphere", "elevations": DOME_ELEVATIONS})
+    return _aimed(dome, settings, preset, count, rock, "test view")
+
+
+def _aimed(orbit: Orbit, settings: SceneFile, preset: Preset, count: int, rock: trimesh.Trimesh, what: str) -> list[Camera]:
+    """Cameras of an orbit as `rock_cameras`; what: how a camera is called where the rock is not wholly inside its frame."""
     target = np.array([0, 0, rock.bounds[1, 2] / 2])
-    cameras = orbit_cameras(settings.orbit, preset.frames, target, settings.camera.fov, preset.width, preset.height)
+    cameras = orbit_cameras(orbit, count, target, settings.camera.fov, preset.width, preset.height)
     for index, camera in enumerate(cameras):
         pixels, z = camera.project(rock.vertices[rock.vertices[:, 2] > 0])
         if (z <= 0).any() or (pixels < 1).any() or (pixels > np.array([preset.width, preset.height]) - 1).any():
-            raise InputError(f"scene: the rock is not wholly in frame {index}; raise orbit.radius or camera.fov")
+            raise InputError(f"scene: the rock is not wholly in {what} {index}; raise orbit.radius or camera.fov")
     return cameras
 
 
@@ -212,18 +241,19 @@ def write_contact_sheet(path: str | Path, frames: list[Frame]) -> None:
         sheet.save(temporary)
 
 
-def _frames(out: Path, cameras: list[Camera]) -> list[Frame]:
+def _frames(out: Path, cameras: list[Camera], prefix: str) -> list[Frame]:
     return [
         Frame(
-            name := f"kf_{i:04d}", camera, FRAME_INTERVAL * i,
-            out / f"images/{name}.png", out / f"depth/{name}.exr", out / f"masks/{name}.png",
+            name := f"{prefix}_{i:04d}", camera, FRAME_INTERVAL * i,
+            out / f"images/{name}.png", out / f"depth/{name}.exr", out / f"masks/{name}.png", out / f"rock/{name}.png",
         )
         for i, camera in enumerate(cameras)
     ]  # fmt: skip
 
 
 def _is_done(frame: Frame) -> bool:
-    return all(path is not None and path.is_file() for path in (frame.image_path, frame.depth_path, frame.mask_path))
+    paths = frame.image_path, frame.depth_path, frame.mask_path, frame.rock_path
+    return all(path is not None and path.is_file() for path in paths)
 
 
 def _meter(scene: Scene, cameras: list[Camera], seed: int, spp: int, denoise: bool, say: Callable[[str], None]) -> float:

@@ -1,4 +1,7 @@
-"""The Mitsuba scene: rock, ground, sun and sky, and one camera that moves. It is loaded once; only the sensor changes."""
+"""The Mitsuba scene: rock, ground, sun and sky, and one camera that moves. It is loaded once; only the sensor changes.
+
+The variant must be set before this module is imported (`mgs.runtime.start`).
+"""
 
 from __future__ import annotations
 
@@ -12,8 +15,10 @@ import trimesh
 
 from mgs.camera import Camera
 from mgs.colour import linear_from_srgb
+from mgs.data.rock_image import boundary
 from mgs.seeds import generator
 from mgs.synth.arena import make_ground, make_stones, regolith
+from mgs.synth.rock_layer import RockLayer, continued, lattice, render_layers, with_coverage
 from mgs.synth.scene_file import SceneFile, Sky
 
 MAX_DEPTH = 4
@@ -23,18 +28,28 @@ GUIDES_PER_SAMPLE = 2
 """Samples of the denoiser's guides for each sample of light. Guides are cheap and, nearly free of noise, can be declared clean:
 the denoiser then keeps the texture they show."""
 
+MARGIN = 16
+"""Pixels around the rock that are given to the denoiser with it."""
+
+COVERAGE_RAYS = 255
+"""Rays that tell which share of a pixel the rock covers, so that each share is a value of an 8-bit image. Odd, because one of
+them goes through the centre."""
+
 _MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Mitsuba's camera frame is x to the image's left, y up, z forward."""
 
 
 @dataclass(frozen=True)
 class Rendered:
-    """One frame. rgb [H,W,3] linear radiance, exposure not applied; depth [H,W] z-depth, metres, 0 = sky; mask [H,W] bool.
+    """One frame. Radiance is linear RGB; the exposure is not applied.
 
-    Depth and mask are taken along the rays through the pixel centres; rgb is averaged over the pixel.
+    rgb: [H,W,3], mean over the pixel. rock: [H,W,4], the same for the rock alone, premultiplied by alpha, and alpha, the share
+    of the pixel that the rock covers. depth: [H,W] z-depth, metres, 0 = sky. mask: bool [H,W], whether the rock is seen. Depth
+    and mask are taken along the rays through the pixel centres.
     """
 
     rgb: np.ndarray
+    rock: np.ndarray
     depth: np.ndarray
     mask: np.ndarray
 
@@ -53,40 +68,87 @@ class Scene:
         if stones is not None:
             colour = {"type": "mesh_attribute", "name": "vertex_color"}
             shapes["stones"] = _mesh("stones", stones, {"type": "diffuse", "reflectance": colour})
-        path = {"type": "path", "max_depth": MAX_DEPTH}
-        self.guides = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
-        self.scene = mi.load_dict(
-            {"type": "scene", "integrator": path, "sky": _sunsky(settings.sky), "sensor": sensor_dict(camera), **shapes}
-        )
+        self.scene = mi.load_dict({"type": "scene", "sky": _sunsky(settings.sky), "sensor": sensor_dict(camera), **shapes})
         self.params = mi.traverse(self.scene)
         self.params.keep(["sensor.to_world"])
         self.rock = next(shape for shape in self.scene.shapes() if shape.id() == "rock")
+        self.path = RockLayer(mi.load_dict({"type": "path", "max_depth": MAX_DEPTH}), self.rock)
+        self.guides = RockLayer(mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}), self.rock)
 
     def render(self, camera: Camera, spp: int, seed: int, denoise: bool) -> Rendered:
-        """Path-trace one frame with `spp` samples per pixel; with `denoise`, Open Image Denoise guided by albedo and normal."""
+        """Path-trace one frame with `spp` samples per pixel; with `denoise`, Open Image Denoise guided by albedo and normal.
+
+        Where the rock covers a pixel wholly, its layer is the image itself. At its outline, the layer is denoised apart.
+        """
         self.params["sensor.to_world"] = mi.Transform4f(_to_world(camera))
         self.params.update()
-        rgb = np.array(mi.render(self.scene, spp=spp, seed=seed))
-        if denoise:
-            import pyoidn
-
-            guides = np.array(mi.render(self.scene, integrator=self.guides, spp=GUIDES_PER_SAMPLE * spp, seed=seed))
-            albedo, normal = np.clip(guides[..., :3], 0, 1), np.clip(guides[..., 3:], -1, 1)
-            rgb = pyoidn.denoise(rgb, albedo=albedo, normal=normal, hdr=True, clean_aux=True)
+        rgb, rock, share = render_layers(self.scene, self.path, spp, seed)
         depth, mask = self.cast(camera)
-        return Rendered(rgb, depth, mask)
+        alpha = self.coverage(camera, mask, share)
+        rock = with_coverage(rock, share, alpha)
+        if denoise:
+            guides, rock_guides, share = render_layers(self.scene, self.guides, GUIDES_PER_SAMPLE * spp, seed)
+            rgb = _denoise(rgb, guides)
+            if alpha.any():
+                box = _around(alpha > 0)  # the denoiser takes as long for black pixels as for others
+                noisy = continued(rock[box], alpha[box])
+                clean = _denoise(noisy, continued(with_coverage(rock_guides, share, alpha)[box], alpha[box]))
+                rock[box] = np.maximum(rock[box] + clean - noisy, 0)
+        inside, outside = alpha[..., None] == 1, alpha[..., None] == 0
+        rock = np.where(inside, rgb, np.where(outside, 0, rock))
+        return Rendered(rgb, np.dstack([rock, alpha]), depth, mask)
 
     def cast(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """z-depth [H,W] (metres, 0 = sky) and rock mask [H,W] along the rays through the pixel centres."""
-        origin = camera.position
-        rays = (camera.unproject(np.ones((camera.height, camera.width))) - origin).reshape(-1, 3)
-        length = np.linalg.norm(rays, axis=1)
-        directions = mi.Vector3f((rays / length[:, None]).T.astype(np.float32))
-        hit = self.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(*origin.tolist()), directions))
-        z = np.where(hit.is_valid().numpy(), hit.t.numpy() / length, 0)
-        mask = (hit.shape == mi.ShapePtr(self.rock)).numpy()
+        rays = camera.unproject(np.ones((camera.height, camera.width))) - camera.position
         size = (camera.height, camera.width)
-        return z.reshape(size).astype(np.float32), mask.reshape(size)
+        z, mask = self._first_hits(camera, rays.reshape(-1, 3))
+        return z.reshape(size), mask.reshape(size)
+
+    def coverage(self, camera: Camera, mask: np.ndarray, share: np.ndarray) -> np.ndarray:
+        """The share of each pixel's area that the rock covers, float32 [H,W].
+
+        mask: bool [H,W], whether the pixel's centre shows the rock. share: [H,W], the share of a few random rays that meet it.
+        Through pixels at the outline of the mask, and where mask and share differ, COVERAGE_RAYS evenly spaced rays are cast;
+        elsewhere the coverage is 1 or 0, as the mask is.
+        """
+        alpha = mask.astype(np.float32)
+        rows, columns = np.nonzero(boundary(mask) | (share != mask))
+        if not len(rows):
+            return alpha
+        u, v = (pixel[:, None] + offset for pixel, offset in zip((columns, rows), lattice(COVERAGE_RAYS).T, strict=True))
+        K = camera.K
+        local = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1).reshape(-1, 3)
+        on_rock = self._first_hits(camera, local @ camera.world_to_camera[:3, :3])[1].reshape(len(rows), -1)
+        on_rock[:, COVERAGE_RAYS // 2] = mask[rows, columns]  # the ray through the centre: coverage and mask never contradict
+        alpha[rows, columns] = on_rock.mean(1)
+        return alpha
+
+    def _first_hits(self, camera: Camera, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of what rays from the camera meet first: z-depth, float32 [N], metres, 0 = sky; and whether it is the rock, bool [N].
+
+        rays: [N,3] in world axes, of z-depth 1.
+        """
+        length = np.linalg.norm(rays, axis=1)
+        origin, directions = mi.Point3f(*camera.position.tolist()), mi.Vector3f((rays / length[:, None]).T.astype(np.float32))
+        dr.make_opaque(origin)  # a number known to the compiler would make a kernel of its own for every camera
+        hit = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, directions))
+        dr.eval(hit)  # else each array that is read below would trace the rays again
+        z = np.where(hit.is_valid().numpy(), hit.t.numpy() / length, 0)
+        return z.astype(np.float32), (hit.shape == mi.ShapePtr(self.rock)).numpy()
+
+
+def _around(mask: np.ndarray) -> tuple[slice, ...]:
+    """Rows and columns of the smallest box around the true pixels of a mask [H,W], and MARGIN beyond; there is a true pixel."""
+    return tuple(slice(max(place.min() - MARGIN, 0), place.max() + 1 + MARGIN) for place in np.nonzero(mask))
+
+
+def _denoise(rgb: np.ndarray, guides: np.ndarray) -> np.ndarray:
+    """Open Image Denoise of rgb [H,W,3]; the guides [H,W,9] are RGB, which is not used, albedo and normal."""
+    import pyoidn
+
+    albedo, normal = np.clip(guides[..., 3:6], 0, 1), np.clip(guides[..., 6:], -1, 1)
+    return pyoidn.denoise(np.ascontiguousarray(rgb), albedo=albedo, normal=normal, hdr=True, clean_aux=True)
 
 
 def sensor_dict(camera: Camera) -> dict[str, Any]:
