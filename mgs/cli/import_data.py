@@ -20,7 +20,8 @@ def import_data(
 ) -> None:
     """Bring your own data: cameras and images (depth and masks, if any) to a dataset folder, lens distortion undone.
 
-    Masks come from --masks, from --mesh, from the source's own mask files or from the images' alpha, in this order. Without
+    Masks come from --masks, from --mesh, from the source's own mask files or from the images' alpha, in this order. Where alpha
+    has values between empty and full, it is kept, in images of the rock alone (rock/). Without
     depth, the prior comes from `mgs prior OUT --mesh MESH`, or from COLMAP's sparse points. An interrupted import goes on where
     it stopped when the same command is given again.
     """
@@ -51,8 +52,10 @@ def import_data(
         )
     if found.missing:
         notes.print(f"mgs: {found.missing} of {found.missing + len(found.shots)} listed images do not exist; skipped them")
-    masked, deep = (sum(bool(getattr(frame, key)) for frame in result.frames) for key in ("mask_path", "depth_path"))
+    keys = ("mask_path", "rock_path", "depth_path")
+    masked, layered, deep = (sum(bool(getattr(frame, key)) for frame in result.frames) for key in keys)
     undone = sum(shot.distortion.any() for shot in found.shots)
     console.print(
-        f"{found.kind}: {len(result)} frames, {masked} with mask, {deep} with depth, {undone} undistorted; wrote {out}"
+        f"{found.kind}: {len(result)} frames, {masked} with mask, {layered} with alpha, {deep} with depth, "
+        f"{undone} undistorted; wrote {out}"
     )
