@@ -301,6 +301,10 @@ SPOILT = {
         lambda root: nudge(root, "kf_0000", mask_path=None),
         r"transforms\.json: the mask of frame kf_0000 has changed",
     ),
+    "rock": (
+        lambda root: nudge(root, "kf_0004", rock_file_path="images/kf_0000.png"),
+        r"images/kf_0000\.png has changed",
+    ),
     "pose": (
         lambda root: nudge(root, "kf_0005", x=1e-6),
         r"transforms\.json: the pose or the intrinsics of frame kf_0005 have",

@@ -54,7 +54,7 @@ def camera_digest(camera: Camera) -> str:
 
 
 def frame_digests(frame: Frame, kinds: Iterable[str]) -> dict[str, str | None]:
-    """Hashes of the files of a frame, of those kinds: `image`, `mask`, `depth`; None of one that it has not.
+    """Hashes of the files of a frame, of those kinds: `image`, `mask`, `depth`, `rock`; None of one that it has not.
 
     Raises InputError as `file_digest`.
     """
@@ -62,7 +62,7 @@ def frame_digests(frame: Frame, kinds: Iterable[str]) -> dict[str, str | None]:
 
 
 def _path(frame: Frame, kind: str) -> Path | None:
-    return {"image": frame.image_path, "mask": frame.mask_path, "depth": frame.depth_path}[kind]
+    return {"image": frame.image_path, "mask": frame.mask_path, "depth": frame.depth_path, "rock": frame.rock_path}[kind]
 
 
 def check_unchanged(out: Path, record: dict[str, Any], prior: str, prior_path: Path, dataset: Dataset) -> None:

@@ -200,7 +200,7 @@ class _Loop:
                 self.progress("information of the training set", done, len(cameras))
                 H += self.stations.fisher(fit.gaussians, camera)
             surface = state.surface + sum(self.stations.fisher(self.start, self.cameras[i]) for i in new)
-        kinds = ("image", "mask") if step else ("image", "mask", "depth")  # depth gives the seeds' colours to the surface
+        kinds = ["image", "mask", "rock"] + ["depth"] * (not step)  # depth gives the seeds' colours to the surface
         files = {self.frames[i].name: inputs.frame_digests(self.frames[i], kinds) for i in new}
         made_from = {**self.made_from, "files": state.inputs.get("files", {}) | files}
         line = {

@@ -282,19 +282,22 @@ def survey_numbers(dataset: Dataset, survey: Survey, settings: SurveySettings) -
 
 
 def write_survey(out: Path, dataset: Dataset, survey: Survey) -> Dataset:
-    """Write the survey as a dataset folder: estimated poses, measured depth, the images and masks, the true rock if known."""
+    """Write the survey as a dataset folder: estimated poses, measured depth, all else as flown."""
     frames = []
     for frame, pose, depth in zip(dataset.frames, survey.optimised, survey.depths, strict=True):
         estimated = replace(frame.camera, world_to_camera=np.linalg.inv(pose))
         # Frames have names of their own; their files may share one, in different folders.
         image = out / "images" / f"{frame.name}{frame.image_path.suffix}"
         mask = frame.mask_path and out / "masks" / f"{frame.name}{frame.mask_path.suffix}"
+        rock = frame.rock_path and out / "rock" / f"{frame.name}{frame.rock_path.suffix}"
         measured = out / "depth" / f"{frame.name}.exr"
         copy_file(frame.image_path, image)
         if mask and frame.mask_path:
             copy_file(frame.mask_path, mask)
+        if rock and frame.rock_path:
+            copy_file(frame.rock_path, rock)
         write_exr(measured, {"Z": depth})
-        frames.append(Frame(frame.name, estimated, frame.timestamp, image, measured, mask))
+        frames.append(Frame(frame.name, estimated, frame.timestamp, image, measured, mask, rock))
     truth = dataset.root / "rock.glb"
     if truth.is_file():
         copy_file(truth, out / "rock.glb")
