@@ -7,10 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from mgs.camera import Camera, look_at, opencv_from_opengl
+from mgs.colour import linear_from_srgb
 from mgs.data.check import check_dataset
 from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
+from mgs.data.rock_image import boundary, write_rock_image
 from mgs.errors import InputError
 from mgs.images import write_exr, write_png
 from mgs.synth.orbit import intrinsics
@@ -93,6 +96,71 @@ def test_frames_come_in_order_of_time_and_may_have_their_own_intrinsics(folder):
     assert frames[0].camera.K[0, 0] == K[0, 0]
 
 
+def _with_rock_images(folder):
+    """The dataset with an image of the rock alone for every frame: alpha of multiples of 1/255 that agrees with the mask."""
+    frames = []
+    for i, frame in enumerate(load_dataset(folder).frames):
+        rng, mask = np.random.default_rng(i), frame.mask()
+        alpha = np.where(mask, 1.0, 0.0)
+        rim = boundary(mask)
+        alpha[rim] = rng.integers(1, 255, rim.sum()) / 255
+        rgb = linear_from_srgb(rng.integers(0, 256, (H, W, 3)) / 255) * alpha[..., None]
+        frame = replace(frame, rock_path=folder / f"rock/{frame.name}.png")
+        write_rock_image(frame.rock_path, np.dstack([rgb, alpha]))
+        frames.append((frame, np.dstack([rgb, alpha])))
+    write_transforms(folder, [frame for frame, _ in frames])
+    return frames
+
+
+def test_the_target_is_the_rock_premultiplied(folder):
+    """What was written comes back: alpha exactly, colour to the step of 8 bits; the file is sRGB with straight alpha."""
+    written = _with_rock_images(folder)
+    for frame, (_, expected) in zip(load_dataset(folder).frames, written, strict=True):
+        rgba, weight = frame.target()
+        np.testing.assert_allclose(rgba, expected, atol=1e-6)
+        assert rgba.dtype == weight.dtype == np.float32
+        np.testing.assert_array_equal(weight, 1)
+        np.testing.assert_array_equal(frame.masked_rgb(), rgba[..., :3])
+        with Image.open(frame.rock_path) as image:
+            assert image.mode == "RGBA"
+            straight = np.asarray(image) / 255
+        covered = straight[..., 3] > 0
+        colour = rgba[covered, :3] / rgba[covered, 3:]
+        np.testing.assert_allclose(linear_from_srgb(straight[covered, :3]), colour, rtol=1e-5)
+        without_mask = replace(frame, mask_path=None)
+        np.testing.assert_array_equal(without_mask.mask(), rgba[..., 3] >= 0.5)
+
+
+def test_the_target_of_a_mask_has_no_weight_along_its_outline(folder):
+    frame = load_dataset(folder).frames[0]
+    mask, (rgba, weight) = frame.mask(), frame.target()
+    np.testing.assert_array_equal(rgba, np.dstack([frame.rgb() * mask[..., None], mask]))
+    padded = np.pad(mask, 1, mode="edge")
+    neighbours = [padded[1:-1, :-2], padded[1:-1, 2:], padded[:-2, 1:-1], padded[2:, 1:-1]]
+    differs = np.any([neighbour != mask for neighbour in neighbours], axis=0)
+    assert 40 < differs.sum() < 150
+    np.testing.assert_array_equal(weight, np.where(differs, 0, 1))
+    np.testing.assert_array_equal(frame.masked_rgb(), rgba[..., :3])
+    rgba, weight = replace(frame, mask_path=None).target()
+    np.testing.assert_array_equal(rgba, np.dstack([frame.rgb(), np.ones((H, W))]))
+    np.testing.assert_array_equal(weight, 1)
+
+
+def test_a_mask_that_reaches_the_edge_of_the_image_has_no_outline_there():
+    mask = np.zeros((5, 6), bool)
+    mask[:, 3:] = True
+    np.testing.assert_array_equal(boundary(mask), [[False, False, True, True, False, False]] * 5)
+
+
+def test_test_views_are_a_dataset_in_the_folder_test(folder):
+    assert load_dataset(folder).test_views() is None
+    _write(folder / "test", count=3)
+    views = load_dataset(folder).test_views()
+    assert len(views) == 3
+    assert views.frames[0].image_path == folder / "test/images/kf_0000.png"
+    assert len(load_dataset(folder)) == 6
+
+
 def _set_pose(value):
     return lambda data: data["frames"][2].update(transform_matrix=value)
 
@@ -114,6 +182,8 @@ NAN = np.full((4, 4), np.nan).tolist()
         (_set_pose("left"), "frame 2"),
         (lambda d: d["frames"][1].pop("transform_matrix"), "frame 1 lacks"),
         (lambda d: d["frames"][1].update(file_path="images/none.png"), "does not exist"),
+        (lambda d: d["frames"][1].update(rock_file_path="rock/none.png"), "rock_file_path rock/none.png does not exist"),
+        (lambda d: d["frames"][1].update(rock_file_path=["a"]), "frame 1 has a rock_file_path that is no text"),
     ],
 )
 def test_bad_transforms(folder, change, message):
@@ -185,3 +255,23 @@ def test_check_lists_every_problem(folder):
     problems = "\n".join(check_dataset(load_dataset(folder)).problems)
     for expected in ("not a readable image", "mask is empty", "most of the mask has no depth", "same pose as kf_0003"):
         assert expected in problems
+
+
+def test_check_compares_rock_images_with_masks(folder):
+    frames = [frame for frame, _ in _with_rock_images(folder)]
+    assert check_dataset(load_dataset(folder)).problems == []
+    for frame, change in ((frames[1], -1), (frames[2], 1)):
+        rgba, _ = frame.target()
+        row, column = np.argwhere(rgba[..., 3] == (change < 0))[7]
+        rgba[row, column] += change
+        write_rock_image(frame.rock_path, rgba)
+    write_rock_image(frames[3].rock_path, np.ones((H, W + 1, 4)))
+    frames[4].rock_path.write_bytes(b"")
+    problems = check_dataset(load_dataset(folder)).problems
+    assert [problem.split("/")[-1] for problem in problems] == [
+        "kf_0001.png: contradicts the mask in 1 pixels; make both from the same source",
+        "kf_0002.png: contradicts the mask in 1 pixels; make both from the same source",
+        f"kf_0003.png: is {W + 1}x{H}, but transforms.json says {W}x{H}; correct either",
+        "kf_0004.png: not a readable image; give a PNG or JPEG, or write it again if it is damaged",
+    ]
+    assert [str(frame.rock_path) in problem for frame, problem in zip(frames[1:5], problems, strict=True)] == [True] * 4

@@ -15,7 +15,7 @@ from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_png
-from mgs.metrics import PSNR_LIMIT, psnr, ssim
+from mgs.metrics import METRICS, PSNR_LIMIT, psnr, ssim
 from mgs.report import evaluation
 from mgs.report.evaluation import evaluate, evaluate_run, read_comparison, write_comparison
 
@@ -108,11 +108,14 @@ def test_evaluate(tmp_path):
     assert (result["images"], result["all"]["count"], result["held_out"]["count"]) == (1, 4, 3)
     truth = srgb_from_linear(dataset.frames[2].masked_rgb())
     flat = srgb_from_linear(np.full_like(truth, 0.2))
-    mask = dataset.frames[2].mask()
+    mask, known = dataset.frames[2].mask(), dataset.frames[2].target()[1] > 0
     assert 0 < mask.mean() < 1
-    assert result["views"][2]["psnr"] == pytest.approx(psnr(truth, flat))
-    assert result["views"][2]["ssim_mask"] == pytest.approx(ssim(truth, flat, mask))
-    for name in ("psnr", "ssim", "psnr_mask", "ssim_mask"):
+    assert 0.9 < known.mean() < 1  # all but the outline of a mask without an image of the rock
+    assert result["views"][2]["psnr"] == pytest.approx(psnr(truth, flat, known))
+    assert result["views"][2]["ssim"] == pytest.approx(ssim(truth, flat, known))
+    assert result["views"][2]["ssim_mask"] == pytest.approx(ssim(truth, flat, mask & known))
+    assert result["views"][2]["psnr_inside"] == pytest.approx(psnr(truth, flat, mask & known))
+    for name in METRICS:
         values = [view[name] for view in result["views"]]
         assert result["all"][name] == pytest.approx(np.mean(values))
         assert result["held_out"][name] == pytest.approx(np.mean([values[i] for i in (0, 2, 3)]))
@@ -127,7 +130,7 @@ def test_evaluate_a_perfect_model_and_nothing_held_out(tmp_path):
     result = evaluate(grey(), dataset.frames, ["kf_0000", "kf_0001"], renderer=lambda g, camera: truths[id(camera)])
     assert result["all"]["psnr"] == result["all"]["psnr_mask"] == PSNR_LIMIT
     assert result["all"]["ssim"] == pytest.approx(1)
-    assert result["held_out"] == {"count": 0, "psnr": None, "ssim": None, "psnr_mask": None, "ssim_mask": None}
+    assert result["held_out"] == {"count": 0} | dict.fromkeys(METRICS)
 
 
 def test_comparison_picture(tmp_path):

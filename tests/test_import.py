@@ -22,6 +22,8 @@ import synthetic
 
 from mgs.camera import Camera, look_at, opengl_from_opencv
 from mgs.cli.app import main
+from mgs.colour import linear_from_srgb, srgb_from_linear
+from mgs.data.check import check_dataset
 from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
 from mgs.data.importers import import_source, read_source, undistorter
 from mgs.files import read_json, write_json
@@ -129,6 +131,83 @@ def test_a_prior_from_sparse_points(dataset: Dataset, tmp_path: Path) -> None:
     on_rock = np.sqrt((((prior.points - synthetic.CENTRE) / synthetic.AXES) ** 2).sum(1))
     assert np.median(np.abs(on_rock - 1)) < 0.02
     assert len(rock.rock_points) > 2000
+
+
+def _soft(mask: np.ndarray, full: int) -> np.ndarray:
+    """A mask as an alpha with a soft edge, 0 to `full`."""
+    return np.round(cv2.GaussianBlur(mask.astype(np.float64), (5, 5), 1) * full).astype(np.uint8 if full == 255 else np.uint16)
+
+
+def _with_alpha(dataset: Dataset, kind: str) -> list[np.ndarray]:
+    """Give the images of a dataset a soft alpha and take its masks away; returns the pixels."""
+    data, images = read_json(dataset.root / "transforms.json"), []
+    for frame, record in zip(dataset.frames, data["frames"], strict=True):
+        del record["mask_path"]
+        full = 65535 if kind == "16 bit" else 255
+        rgb = cv2.imread(str(frame.image_path)).astype(np.uint16)[..., ::-1] * (full // 255)
+        alpha = _soft(frame.mask(), full) if kind != "binary" else frame.mask() * np.uint8(255)
+        pixels = np.dstack([rgb.astype(alpha.dtype), alpha])
+        cv2.imwrite(str(frame.image_path), pixels[..., [2, 1, 0, 3]])
+        images.append(pixels)
+    write_json(dataset.root / "transforms.json", data)
+    return images
+
+
+@pytest.mark.parametrize("kind", ["8 bit", "16 bit"])
+def test_a_soft_alpha_becomes_images_of_the_rock_alone(dataset: Dataset, tmp_path: Path, kind: str) -> None:
+    images = _with_alpha(dataset, kind)
+    copy = _import(dataset.root, tmp_path / "copy")
+    assert not [problem for problem in check_dataset(copy).problems if "contradicts" in problem]
+    for frame, pixels in zip(copy.frames, images, strict=True):
+        straight = pixels / np.iinfo(pixels.dtype).max
+        rgba, weight = frame.target()
+        assert np.abs(rgba[..., 3] - straight[..., 3]).max() <= 0.5 / 255 + 1e-6
+        assert np.abs(rgba[..., :3] - linear_from_srgb(straight[..., :3]) * straight[..., 3:]).max() < 6e-3
+        assert weight.all()
+        assert np.array_equal(frame.mask(), straight[..., 3] >= 0.5)
+        assert np.abs(frame.rgb() - linear_from_srgb(straight[..., :3])).max() < 5e-3  # as it was, whatever alpha says
+    again = _import(copy.root, tmp_path / "again")
+    for one, other in zip(copy.frames, again.frames, strict=True):
+        assert one.rock_path is not None
+        assert other.rock_path is not None
+        assert one.rock_path.read_bytes() == other.rock_path.read_bytes()
+
+
+@pytest.mark.parametrize("case", ["binary", "masks", "mesh", "mask files"])
+def test_without_a_soft_alpha_that_gives_the_mask_there_are_no_images_of_the_rock(
+    dataset: Dataset, tmp_path: Path, case: str
+) -> None:
+    _with_alpha(dataset, "binary" if case == "binary" else "8 bit")
+    options = {"masks": {"masks": dataset.root / "masks"}, "mesh": {"mesh": dataset.root / "rock.glb"}}.get(case, {})
+    if case == "mask files":
+        data = read_json(dataset.root / "transforms.json")
+        for frame, record in zip(dataset.frames, data["frames"], strict=True):
+            record["mask_path"] = f"masks/{frame.name}.png"
+        write_json(dataset.root / "transforms.json", data)
+    copy = _import(dataset.root, tmp_path / "copy", **options)
+    for frame, original in zip(copy.frames, dataset.frames, strict=True):
+        assert frame.rock_path is None
+        assert case == "mesh" or np.array_equal(frame.mask(), original.mask())
+    assert not (copy.root / "rock").exists()
+
+
+def test_a_soft_alpha_is_undistorted_without_a_fringe(dataset: Dataset, tmp_path: Path) -> None:
+    """A grey rock over transparent black: resampled straight, its rim would turn dark; premultiplied, it stays grey."""
+    data = read_json(dataset.root / "transforms.json") | dict(zip(("k1", "k2"), DISTORTION, strict=False))
+    for frame, record in zip(dataset.frames, data["frames"], strict=True):
+        del record["mask_path"]
+        alpha = _soft(frame.mask(), 255)
+        grey = np.where(alpha > 0, np.uint8(128), np.uint8(0))
+        cv2.imwrite(str(frame.image_path), np.dstack([grey, grey, grey, alpha]))
+    write_json(dataset.root / "transforms.json", data)
+    copy = _import(dataset.root, tmp_path / "copy")
+    assert not [problem for problem in check_dataset(copy).problems if "contradicts" in problem]
+    for frame in copy.frames:
+        rgba = frame.target()[0]
+        rim = (rgba[..., 3] > 0.02) & (rgba[..., 3] < 0.98)
+        assert rim.sum() > 50
+        straight = srgb_from_linear(rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-9))[rim] * 255
+        assert np.abs(straight - 128).max() < 1
 
 
 def test_nerf_synthetic_with_alpha(dataset: Dataset, tmp_path: Path) -> None:
@@ -340,6 +419,7 @@ BAD: dict[str, tuple[Callable[[Path], Path], list[str], str]] = {
     "no depth file": (lambda root: _edit(root, _first("depth_file_path", "depth/none.exr")), [], "no such EXR"),
     "image path a number": (lambda root: _edit(root, _first("file_path", 5)), [], "frame 0"),
     "image path empty": (lambda root: _edit(root, _first("file_path", "")), [], "frame 0"),
+    "no rock file": (lambda root: _edit(root, _first("rock_file_path", "rock/none.png")), [], "no such image"),
     "mask path a list": (lambda root: _edit(root, _first("mask_path", ["a"])), [], "frame 0"),
     "nan time": (lambda root: _edit(root, _first("timestamp", float("nan"))), [], "frame 0"),
     "time of words": (lambda root: _edit(root, _first("timestamp", "noon")), [], "frame 0"),

@@ -40,6 +40,10 @@ def nudge(root: Path, name: str, **values) -> None:
 SPOILT = {
     "image": (lambda root: retouch(root / "images/kf_0004.png"), r"images/kf_0004\.png has changed since .*run took it"),
     "mask": (lambda root: retouch(root / "masks/kf_0008.png"), r"masks/kf_0008\.png has changed"),
+    "rock": (
+        lambda root: nudge(root, "kf_0004", rock_file_path="images/kf_0000.png"),
+        r"images/kf_0000\.png has changed",
+    ),
     "depth": (
         lambda root: write_exr(root / "depth/kf_0000.exr", {"Z": np.zeros((tiny.HEIGHT, tiny.WIDTH), np.float32)}),
         r"depth/kf_0000\.exr has changed",

@@ -17,6 +17,7 @@ import synthetic
 from mgs.camera import Camera, look_at
 from mgs.cli.app import main
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
+from mgs.data.rock_image import write_rock_image
 from mgs.files import read_json, write_json
 from mgs.images import write_exr
 from mgs.prior.build import build_prior
@@ -258,14 +259,21 @@ def test_files_of_one_name_in_different_folders_stay_apart(tmp_path: Path) -> No
     for frame in dataset.frames:
         assert frame.mask_path is not None
         (tmp_path / "data/frames" / frame.name).mkdir(parents=True)
+        rock = np.dstack([frame.masked_rgb(), frame.mask()]) / 2
+        write_rock_image(tmp_path / "data/frames" / frame.name / "rock.png", rock)
         frame.mask_path.rename(tmp_path / "data/frames" / frame.name / "mask.png")
-    frames = [replace(frame, mask_path=tmp_path / "data/frames" / frame.name / "mask.png") for frame in dataset.frames]
+    folders = {frame.name: tmp_path / "data/frames" / frame.name for frame in dataset.frames}
+    frames = [
+        replace(frame, mask_path=folders[frame.name] / "mask.png", rock_path=folders[frame.name] / "rock.png")
+        for frame in dataset.frames
+    ]
     write_transforms(dataset.root, frames)
     dataset = load_dataset(dataset.root)
     result = write_survey(tmp_path / "survey", dataset, fly(dataset, SurveySettings(exact_poses=True)))
     for surveyed, flown in zip(result.frames, dataset.frames, strict=True):
         assert np.array_equal(surveyed.mask(), flown.mask())
         assert np.array_equal(surveyed.rgb(), flown.rgb())
+        assert np.array_equal(surveyed.target()[0], flown.target()[0])
 
 
 def test_command_writes_a_dataset_with_its_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -229,9 +229,7 @@ class _Loop:
                 self.progress("information of the training set", done, len(cameras))
                 H += self.stations.fisher(fit.gaussians, camera)
             surface = state.surface + sum(self.surface_information(i) for i in new)
-        kinds = (
-            ("image", "mask", "rock") if step else ("image", "mask", "rock", "depth")
-        )  # depth gives the seeds' colours to the surface
+        kinds = ["image", "mask", "rock"] + ["depth"] * (not step)  # depth gives the seeds' colours to the surface
         files = {self.frames[i].name: inputs.frame_digests(self.frames[i], kinds) for i in new}
         made_from = {**self.made_from, "files": state.inputs.get("files", {}) | files}
         line = {

@@ -22,8 +22,9 @@ def import_data(
     """Make a dataset of your own data: cameras and images, and depth and masks if there are any. Lens distortion is undone.
 
     Masks are taken from --masks, --mesh, the source's own mask files or the images' alpha: the first of these that there is.
-    For data without depth, `mgs prior OUT` builds the prior from COLMAP's points, or takes your mesh with --mesh. An
-    interrupted import goes on where it stopped when the same command is given again.
+    Where alpha has values between empty and full, it is kept, in images of the rock alone (rock/). For data without depth,
+    `mgs prior OUT` builds the prior from COLMAP's points, or takes your mesh with --mesh. An interrupted import goes on where
+    it stopped when the same command is given again.
     """
     from rich.console import Console
     from rich.progress import Progress
@@ -52,8 +53,10 @@ def import_data(
         )
     if found.missing:
         notes.print(f"mgs: {found.missing} of {found.missing + len(found.shots)} listed images do not exist; skipped them")
-    masked, deep = (sum(bool(getattr(frame, key)) for frame in result.frames) for key in ("mask_path", "depth_path"))
+    keys = ("mask_path", "rock_path", "depth_path")
+    masked, layered, deep = (sum(bool(getattr(frame, key)) for frame in result.frames) for key in keys)
     undone = sum(shot.distortion.any() for shot in found.shots)
     console.print(
-        f"{found.kind}: {len(result)} frames, {masked} with mask, {deep} with depth, {undone} undistorted; wrote {out}"
+        f"{found.kind}: {len(result)} frames, {masked} with mask, {layered} with alpha, {deep} with depth, "
+        f"{undone} undistorted; wrote {out}"
     )

@@ -42,6 +42,8 @@ def check_dataset(dataset: Dataset, progress: Callable[[int, int], None] = lambd
             shares.append(mask.mean())
             if not mask.any():
                 problems.append(f"frame {frame.name}: the mask is empty; aim the camera at the rock or remove the frame")
+            if frame.rock_path is not None and (contrary := _contrary(frame.target()[0][..., 3], mask)):
+                problems.append(f"{frame.rock_path}: contradicts the mask in {contrary} pixels; make both from the same source")
             pose = frame.camera.world_to_camera.round(9).tobytes()
             if poses.setdefault(pose, frame.name) != frame.name:
                 problems.append(f"frame {frame.name}: has the same pose as {poses[pose]}; remove one of them")
@@ -70,6 +72,14 @@ def check_dataset(dataset: Dataset, progress: Callable[[int, int], None] = lambd
         )
     low, high = (min(r[0] for r in ranges), max(r[1] for r in ranges)) if ranges else (0.0, 0.0)
     return Check(problems, float(np.mean(shares)) if shares else 0.0, (float(low), float(high)), through)
+
+
+def _contrary(alpha: np.ndarray, mask: np.ndarray) -> int:
+    """Number of pixels that a mask [H,W] calls rock where alpha [H,W] says that there is none of it, or the other way round.
+
+    A mask says what is seen in the centre of a pixel, so any alpha between 0 and 1 agrees with it.
+    """
+    return int((mask & (alpha == 0) | ~mask & (alpha == 1)).sum())
 
 
 def seen_through(frame: Frame, depth: np.ndarray, mask: np.ndarray, other: Frame, other_depth: np.ndarray) -> float:

@@ -17,6 +17,7 @@ import numpy as np
 from mgs.camera import Camera, opencv_from_opengl
 from mgs.data.dataset import FRAME_INTERVAL, PINHOLES, Dataset, Frame, load_dataset, read_records, resumes, write_transforms
 from mgs.data.meshes import read_mesh, write_points
+from mgs.data.rock_image import premultiplied, write_rock_image
 from mgs.errors import InputError
 from mgs.files import copy_file, fingerprint, locked, new_folder, write_json
 from mgs.images import read_exr, read_mask, read_rgba, read_values, write_exr, write_png
@@ -53,6 +54,7 @@ class Shot:
     depth: Path | None = None
     depth_unit: float = 1.0
     mask: Path | None = None
+    rock: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -114,11 +116,12 @@ def _read_transforms(path: Path) -> Source:
         if image is None:
             missing += 1
             continue
-        depth, mask = (path.parent / record[key] if record.get(key) else None for key in ("depth_file_path", "mask_path"))
+        keys = ("depth_file_path", "mask_path", "rock_file_path")
+        depth, mask, rock = (path.parent / record[key] if record.get(key) else None for key in keys)
         camera, distortion = _transforms_camera(path, index, {**data, **record}, image)
         time = _number(path, f"timestamp of frame {index}", record.get("timestamp", FRAME_INTERVAL * index))
         unit = 1.0 if depth is None or depth.suffix.lower() == ".exr" else scale
-        shots.append(Shot(_frame_name(record["file_path"]), camera, distortion, time, image, depth, unit, mask))
+        shots.append(Shot(_frame_name(record["file_path"]), camera, distortion, time, image, depth, unit, mask, rock))
     kind = "NeRF-synthetic" if "camera_angle_x" in data and "fl_x" not in data else "nerfstudio"
     return Source(kind, shots, missing)
 
@@ -223,16 +226,18 @@ def import_source(
     import.json, which says what is imported, is written first and transforms.json last; a finished frame is not read again
     unless its files have changed since, and the result is the same, bit for bit, as in one go.
     Masks come from, in this order: files of `masks` with the image's stem, the pixels whose centre shows the `mesh` (world
-    coordinates; needs the variant to be set, `mgs.runtime.start`), the source's own mask files, the images' alpha. Distorted
-    images, depth and masks are undistorted to a pinhole camera that holds valid pixels only.
+    coordinates; needs the variant to be set, `mgs.runtime.start`), the source's own mask files, the images' alpha.
+    Images of the rock alone come from the source's own images of it, or from an alpha that gives the mask and has values
+    between empty and full; with `masks` or `mesh` there are none.
+    Distorted images, depth and masks are undistorted to a pinhole camera that holds valid pixels only.
     Raises InputError where a file is missing, damaged or of another size than the camera, where `out` holds anything else or
     another process works on it, or as `read_mesh`; the frames before are kept.
     """
     shots, project = source.shots, None
     if masks is not None:
-        shots = [replace(shot, mask=_mask_file(masks, shot)) for shot in shots]
+        shots = [replace(shot, mask=_mask_file(masks, shot), rock=None) for shot in shots]
     elif mesh is not None:
-        shots, project = [replace(shot, mask=None) for shot in shots], mesh_silhouette(mesh)
+        shots, project = [replace(shot, mask=None, rock=None) for shot in shots], mesh_silhouette(mesh)
     by_mesh = None if project is None or mesh is None else fingerprint(mesh)
     asked = {"kind": source.kind, "frames": len(shots), "sha256_of_frames": _digest(shots), "mesh": by_mesh}
     frames = []
@@ -268,7 +273,7 @@ def _digest(shots: list[Shot]) -> str:
     known = [
         (shot.name, shot.camera.K.tolist(), shot.camera.width, shot.camera.height, shot.camera.world_to_camera.tolist(),
          shot.distortion.tolist(), shot.timestamp, shot.depth_unit,
-         [None if path is None else str(path.resolve()) for path in (shot.image, shot.depth, shot.mask)])
+         [None if path is None else str(path.resolve()) for path in (shot.image, shot.depth, shot.mask, shot.rock)])
         for shot in shots
     ]  # fmt: skip
     return hashlib.sha256(json.dumps(known).encode()).hexdigest()
@@ -280,19 +285,12 @@ def _import_shot(shot: Shot, out: Path, project: Callable[[Camera], np.ndarray] 
     begin is called between reading and writing: a source that cannot be read leaves nothing behind.
     """
     camera, undo = undistorter(shot.camera, shot.distortion)
-    image, mask_path = out / "images" / f"{shot.name}.png", out / "masks" / f"{shot.name}.png"
+    image, mask_path, rock_path = (out / folder / f"{shot.name}.png" for folder in ("images", "masks", "rock"))
     depth_path = None if shot.depth is None else out / "depth" / f"{shot.name}.exr"
-    made_of = [path.stat().st_mtime_ns for path in (shot.image, shot.depth, shot.mask) if path is not None and path.is_file()]
-    if not image.is_file() or image.stat().st_mtime_ns < max(made_of):
+    sources = (path for path in (shot.image, shot.depth, shot.mask, shot.rock) if path is not None and path.is_file())
+    if not image.is_file() or image.stat().st_mtime_ns < max(path.stat().st_mtime_ns for path in sources):
         rgba = _sized(shot.image, read_rgba(shot.image), shot.camera)
-        full = np.iinfo(rgba.dtype).max
-        mask = None
-        if project is not None:
-            mask = project(camera)
-        elif shot.mask is not None:
-            mask = undo(_sized(shot.mask, read_mask(shot.mask), shot.camera).astype(np.uint8) * 255, True) >= 128
-        elif rgba[..., 3].min() < full:
-            mask = undo(rgba[..., 3], True) > full // 2
+        mask, rock = (project(camera), None) if project is not None else _mask_and_rock(shot, rgba, undo)
         depth = None if shot.depth is None else _sized(shot.depth, _read_depth(shot.depth, shot.depth_unit), shot.camera)
         begin()
         if depth_path is not None and depth is not None:
@@ -300,12 +298,35 @@ def _import_shot(shot: Shot, out: Path, project: Callable[[Camera], np.ndarray] 
         mask_path.unlink(missing_ok=True)
         if mask is not None:
             write_png(mask_path, mask)
+        rock_path.unlink(missing_ok=True)
+        if rock is not None:
+            write_rock_image(rock_path, rock)
         if _is_plain_png(shot.image) and not shot.distortion.any():
             copy_file(shot.image, image)
         else:
-            pixels = undo(rgba[..., :3], True)
+            full, pixels = np.iinfo(rgba.dtype).max, undo(rgba[..., :3], True)
             write_png(image, pixels if full == 255 else pixels / full, linear=False)
-    return Frame(shot.name, camera, shot.timestamp, image, depth_path, mask_path if mask_path.is_file() else None)
+    mask_file, rock_file = (path if path.is_file() else None for path in (mask_path, rock_path))
+    return Frame(shot.name, camera, shot.timestamp, image, depth_path, mask_file, rock_file)
+
+
+def _mask_and_rock(
+    shot: Shot, rgba: np.ndarray, undo: Callable[[np.ndarray, bool], np.ndarray]
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """The mask and the image of the rock alone that a source gives, undistorted; None for each that it does not give.
+
+    rgba [H,W,4]: the pixels of the shot's image. The mask is bool [H,W]; the rock is premultiplied by alpha, float32 [H,W,4].
+    """
+    given = None if shot.rock is None else _sized(shot.rock, read_rgba(shot.rock), shot.camera)
+    layer = rgba if given is None else given
+    full = np.iinfo(layer.dtype).max
+    alpha = layer[..., 3]
+    if given is None and shot.mask is None and ((alpha > 0) & (alpha < full)).any():
+        given = rgba
+    rock = None if given is None else undo(premultiplied(given.astype(np.float32) / full), True)
+    if shot.mask is not None:
+        return undo(_sized(shot.mask, read_mask(shot.mask), shot.camera).astype(np.uint8) * 255, True) >= 128, rock
+    return undo(alpha, True) > full // 2 if alpha.min() < full else None, rock
 
 
 def _is_plain_png(path: Path) -> bool:

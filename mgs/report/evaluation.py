@@ -1,8 +1,8 @@
 """How good a model is: PSNR and SSIM of its renders against the images of a dataset, and pictures of both side by side.
 
-The truth is `Frame.target`: the rock in front of black, which is what the model was trained on. Both numbers compare sRGB values in
-[0,1]. Over the full frame they flatter, because any model gets the black right; those inside the mask are over the rock's
-pixels only (`mgs.metrics`).
+The truth is `Frame.target`: the rock in front of black, which is what the model was trained on. Both numbers compare sRGB
+values in [0,1]. Over the full frame they flatter, because any model gets the black right; those inside the mask are over the
+rock's pixels only (`mgs.metrics`).
 """
 
 from __future__ import annotations

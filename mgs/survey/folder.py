@@ -35,7 +35,7 @@ def save_survey(out: Path, dataset: Dataset, survey: Survey, settings: SurveySet
 def write_survey(out: Path, dataset: Dataset, survey: Survey) -> Dataset:
     """Write a survey of a dataset as another dataset, into the folder `out`, and load it.
 
-    It has the images and masks of the dataset surveyed, the depth images that were measured, the poses that were estimated, and
+    It has the images (the rock's too) and masks of the dataset surveyed, the depth images that were measured, the poses that were estimated, and
     the true rock (rock.glb) if there is one. Raises InputError if a file cannot be read or written.
     """
     frames = []
@@ -44,12 +44,15 @@ def write_survey(out: Path, dataset: Dataset, survey: Survey) -> Dataset:
         # Files are named after their frame: only frames are sure to have different names.
         image = out / "images" / f"{frame.name}{frame.image_path.suffix}"
         mask = frame.mask_path and out / "masks" / f"{frame.name}{frame.mask_path.suffix}"
+        rock = frame.rock_path and out / "rock" / f"{frame.name}{frame.rock_path.suffix}"
         measured = out / "depth" / f"{frame.name}.exr"
         copy_file(frame.image_path, image)
         if mask and frame.mask_path:
             copy_file(frame.mask_path, mask)
+        if rock and frame.rock_path:
+            copy_file(frame.rock_path, rock)
         write_exr(measured, {"Z": depth})
-        frames.append(Frame(frame.name, estimated, frame.timestamp, image, measured, mask))
+        frames.append(Frame(frame.name, estimated, frame.timestamp, image, measured, mask, rock))
     truth = dataset.root / "rock.glb"
     if truth.is_file():
         copy_file(truth, out / "rock.glb")
