@@ -35,8 +35,9 @@ def save_survey(out: Path, dataset: Dataset, survey: Survey, settings: SurveySet
 def write_survey(out: Path, dataset: Dataset, survey: Survey) -> Dataset:
     """Write a survey of a dataset as another dataset, into the folder `out`, and load it.
 
-    It has the images (the rock's too) and masks of the dataset surveyed, the depth images that were measured, the poses that were estimated, and
-    the true rock (rock.glb) if there is one. Raises InputError if a file cannot be read or written.
+    It has the images (the rock's too) and masks of the dataset surveyed, the depth images that were measured, the poses
+    that were estimated, and the true rock (rock.glb) if there is one. Raises InputError if a file cannot be read or
+    written.
     """
     frames = []
     for frame, pose, depth in zip(dataset.frames, survey.optimised, survey.depths, strict=True):
