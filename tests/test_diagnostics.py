@@ -28,7 +28,7 @@ def test_scalars_follow_their_formulas():
     H[2] = 0
     surface = np.ones((5, 11))
     surface[4] = 1e-5
-    scalars = diagnostics.gaussian_scalars(H, surface, lam, groups(0))
+    scalars = diagnostics.gaussian_scalars(H, surface, lam, lam, groups(0))
     np.testing.assert_allclose(scalars["fisher.scale"], H[:, 3] + H[:, 4] + H[:, 5])
     np.testing.assert_allclose(scalars["fisher.opacity"], H[:, 10])
     assert scalars["information"][2] == 0

@@ -265,11 +265,12 @@ def test_scales_of_lambda_are_finite(dataset, tmp_path, values):
         (["--estimator", "block"], "--estimator block: gives no diagonal, or is unknown; choose one of exact, hutchinson"),
         (["--estimator", "guess"], "--estimator guess: gives no diagonal, or is unknown"),
         (["--optimiser", "hope"], "--optimiser hope: unknown; choose one of adam"),
-        (["--lam", "0"], "--lam 0.0: Input should be greater than 0"),
+        (["--lam", "0"], "--lam 0.0: Input should be greater than or equal to"),
         (["--rate", "colour"], "--rate colour: expected KIND=NUMBER, as in --rate colour=0.01"),
-        (["--rate", "colour=-1"], "--rates-colour -1.0: Input should be greater than or equal to 0"),
-        (["--rate", "hue=1"], "--rates {'hue': 1.0}: must be a number for each of colour, scale, rotation, opacity"),
-        (["--prior-std", "scale=inf"], "--prior-std-scale inf: Input should be a finite number"),
+        (["--rate", "colour=-1"], "--rate colour=-1.0: Input should be greater than or equal to 0"),
+        (["--rate", "hue=1"], "--rate {'hue': 1.0}: must be a number for each of colour, scale, rotation, opacity"),
+        (["--prior-std", "scale=inf"], "--prior-std scale=inf: Input should be a finite number"),
+        (["--pixel-noise", "1e-200"], "--pixel-noise 1e-200: Input should be greater than or equal to 0.000001"),
         (["--passes", "0"], "--passes 0: Input should be greater than or equal to 1"),
     ],
 )
@@ -277,6 +278,22 @@ def test_bad_options_are_one_line(dataset, prior, tmp_path, capsys, options, mes
     out = tmp_path / "run"
     assert message in refused(capsys, ["nbv", dataset, "--prior", prior, "--budget", "1", "--out", out, *options])
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"optimizer": "adam"}, "setting optimizer = 'adam': Extra inputs are not permitted"),
+        ({"train": {"tolerance": -1}}, "setting train.tolerance = -1: Input should be greater than or equal to 0"),
+    ],
+)
+def test_settings_without_an_option_are_named_by_their_key(dataset, prior, tmp_path, values, message):
+    with pytest.raises(InputError, match=message):
+        started(dataset, tmp_path / "run", prior, budget=1, **values)
+
+
+def test_a_seed_of_the_fit_is_kept(dataset, prior, tmp_path):
+    assert started(dataset, tmp_path / "run", prior, budget=1, seed=3, train={"seed": 7})[0]["train"]["seed"] == 7
 
 
 def test_options_of_the_criterion_and_the_fit_reach_the_run(dataset, prior, tmp_path):

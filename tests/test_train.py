@@ -10,6 +10,7 @@ from mgs.active.settings import TrainSettings
 from mgs.active.stopping import LOSS_FLOOR, StopReason, stop_reason
 from mgs.bench.core import surface_camera, surface_gaussians
 from mgs.camera import Camera, look_at
+from mgs.errors import InputError
 from mgs.gaussians import LEARNED, Gaussians
 from mgs.splat import ListCache, fisher, render
 
@@ -172,3 +173,9 @@ def test_why_a_fit_stops(losses, limit, expected):
 
 def test_without_tolerance_nothing_converges():
     assert stop_reason([1, 0.5, 0.5, 0.5], 0.0, 40) is None
+
+
+def test_what_is_refused_for_another_reason_than_its_numbers_is_no_divergence(truth, cameras, targets, monkeypatch):
+    monkeypatch.setattr("mgs.splat.blocks.MAX_PAIRS", 4)
+    with pytest.raises(InputError, match="pairs"):
+        fit(grey(truth), cameras, targets, TrainSettings(passes=1))

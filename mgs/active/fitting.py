@@ -183,6 +183,8 @@ def _pass(
         try:
             lists, packed = cache.get(image.camera, splats)
         except InputError:
+            if _is_finite(model):  # refused for another reason, such as too many pairs
+                raise
             return model, buffers, float("nan")
         size = (image.camera.width, image.camera.height)
         model, buffers, loss = _step(
@@ -190,5 +192,9 @@ def _pass(
             dr.opaque(mi.UInt32, t),
         )  # fmt: skip
         losses.append(loss)
-    finite = dr.all([dr.all(dr.isfinite(getattr(model, name).array)) for name in LEARNED])
-    return model, buffers, float(np.mean([float(loss[0]) for loss in losses])) if finite[0] else float("nan")
+    return model, buffers, float(np.mean([float(loss[0]) for loss in losses])) if _is_finite(model) else float("nan")
+
+
+def _is_finite(model: Gaussians) -> bool:
+    """Whether all learned parameters are finite."""
+    return bool(dr.all([dr.all(dr.isfinite(getattr(model, name).array)) for name in LEARNED])[0])

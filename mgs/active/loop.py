@@ -144,7 +144,7 @@ class _Loop:
         self.cameras = [frame.camera for frame in dataset.frames]
         self.positions = np.array([camera.position for camera in self.cameras])
         self.prior_lam = criteria.regularisation(stations.groups, settings.pixel_noise, settings.prior_std)
-        self.lam = self.prior_lam if settings.lam is None else np.full_like(self.prior_lam, settings.lam)
+        self.lam = settings.regularisation(stations.groups)
         self.images: dict[int, np.ndarray] = {}
         cameras = {frame.name: inputs.camera_digest(frame.camera) for frame in self.frames}
         self.made_from = {"prior": stations.prior, "cameras": cameras}

@@ -69,7 +69,8 @@ def start_run(
     where = out / "prior" if prior is None else Path(prior)
     given = validated(NbvSettings, {"dataset": dataset.resolve(), "prior": where.resolve(), **settings})
     frames = load_dataset(dataset)
-    resolved: dict[str, Any] = {"train": given.train.model_copy(update={"seed": given.seed})}
+    own_seed = "seed" in given.train.model_fields_set
+    resolved: dict[str, Any] = {"train": given.train if own_seed else given.train.model_copy(update={"seed": given.seed})}
     if "budget" not in settings:
         resolved["budget"] = min(given.budget, max(0, len(frames) - given.seeds))
     complete = given.model_copy(update=resolved)
@@ -92,7 +93,7 @@ def resume_nbv(
     progress: Callable[[str, int, int], None] = _silent,
     say: Callable[[str], None] = _silent,
 ) -> State:
-    """Run the loop in a run's folder from where it stands to the end of its budget; a finished run is only read.
+    """Run the loop in a run's folder from where it stands to the end of its budget. A finished run gives the same files again.
 
     Callbacks and result as `run_nbv`. Raises InputError where the folder holds no run, its dataset or prior is missing or has
     changed, another process works on it, or a fit diverged (the steps before it are kept).

@@ -6,9 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from mgs.active.criteria import PIXEL_NOISE, PRIOR_STD
+from mgs.active.criteria import PIXEL_NOISE, PRIOR_STD, regularisation
 from mgs.errors import InputError
 
 RATES = {"colour": 0.02, "scale": 0.02, "rotation": 0.01, "opacity": 0.05}
@@ -16,6 +18,9 @@ RATES = {"colour": 0.02, "scale": 0.02, "rotation": 0.01, "opacity": 0.05}
 opacity logit. Chosen constants."""
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+Scale = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
+"""A scale of lambda = (pixel noise / prior std)^2, bounded so that lambda is far from what overflows or vanishes in float64."""
 
 
 def _complete(given: Any, defaults: Mapping[str, float]) -> Any:
@@ -67,11 +72,11 @@ class NbvSettings(BaseModel):
     """Views at evenly spaced azimuths that start the model."""
     seed: Annotated[int, Field(ge=0)] = 0
     """Root of every random draw."""
-    lam: Positive | None = None
+    lam: Annotated[float, Field(ge=1e-30, le=1e30, allow_inf_nan=False)] | None = None
     """One lambda for all parameters, as in the paper; None: (pixel_noise / prior_std)^2 of each kind of parameter."""
-    pixel_noise: Positive = PIXEL_NOISE
+    pixel_noise: Scale = PIXEL_NOISE
     """sigma_e in lambda = (sigma_e / tau)^2, linear RGB; `mgs.active.criteria.regularisation`."""
-    prior_std: dict[str, Positive] = PRIOR_STD
+    prior_std: dict[str, Scale] = PRIOR_STD
     """tau of each kind of parameter; kinds left out take those of `mgs.active.criteria.PRIOR_STD`."""
     evaluate_every: Annotated[int, Field(ge=0)] = 0
     """Measure PSNR on all views after every so many steps; 0 = only at the end. Never feeds back into the choice."""
@@ -83,8 +88,18 @@ class NbvSettings(BaseModel):
 
     _every_kind = field_validator("prior_std", mode="before")(lambda given: _complete(given, PRIOR_STD))
 
+    def regularisation(self, groups: dict[str, slice]) -> NDArray[np.float64]:
+        """lambda of every column of the Fisher information, [P]: what the criteria of this run see."""
+        by_kind = regularisation(groups, self.pixel_noise, self.prior_std)
+        return by_kind if self.lam is None else np.full_like(by_kind, self.lam)
+
 
 Model = TypeVar("Model", bound=BaseModel)
+
+OPTIONS = (
+    "policy", "estimator", "budget", "seeds", "seed", "lam", "pixel_noise", "evaluate_every", "optimiser", "passes",
+)  # fmt: skip
+"""Settings that `mgs nbv` has an option for, of the same name."""
 
 
 def validated(model: type[Model], values: dict[str, Any], file: Path | None = None) -> Model:
@@ -98,5 +113,15 @@ def validated(model: type[Model], values: dict[str, Any], file: Path | None = No
         if file is not None:
             key = ".".join(["settings", *parts])
             raise InputError(f"{file}: {key}: {message}; correct it, or start the run anew") from None
-        option = "--" + "-".join(part for part in parts if part != "train").replace("_", "-")
-        raise InputError(f"{option} {first['input']}: {message}") from None
+        raise InputError(f"{_named(parts, first['input'])}: {message}") from None
+
+
+def _named(parts: list[str], value: Any) -> str:
+    """How a wrong setting is called: as it is given to `mgs nbv`, or by its key where that has no option for it."""
+    key, *kind = [part for part in parts if part != "train"]
+    option = {"rates": "--rate", "prior_std": "--prior-std", **{name: f"--{name.replace('_', '-')}" for name in OPTIONS}}.get(
+        key
+    )
+    if option is None:
+        return f"setting {'.'.join(parts)} = {value!r}"
+    return f"{option} {kind[0]}={value}" if kind else f"{option} {value}"

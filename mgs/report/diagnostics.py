@@ -45,17 +45,20 @@ DECADES = 4
 """Largest range of the logarithmic colour scales, in powers of ten."""
 
 
-def gaussian_scalars(H: np.ndarray, surface: np.ndarray, lam: np.ndarray, groups: dict[str, slice]) -> dict[str, np.ndarray]:
+def gaussian_scalars(
+    H: np.ndarray, surface: np.ndarray, lam: np.ndarray, prior_lam: np.ndarray, groups: dict[str, slice]
+) -> dict[str, np.ndarray]:
     """The scalars that the module's docstring lists, name -> [N].
 
-    H: [N,P] information of the training views about the fitted model; surface: [N,P] the same about the Gaussians before
-    training (both as in `mgs.active.run_folder.State`). lam: [P] information of the prior. groups: columns of each kind of
-    parameter (`mgs.splat.groups`).
+    H: [N,P] information of the training views about the fitted model, by the estimator of the run; surface: [S,P] their exact
+    information about the Gaussians on the surface before training (both as in `mgs.active.run_folder.State`). lam: [P] the
+    lambda that the run's criteria see; prior_lam: [P] information of the prior, which coverage is judged by. groups: columns of
+    each kind of parameter (`mgs.splat.groups`).
     """
     scalars = {f"fisher.{name}": H[:, columns].sum(axis=1, dtype=np.float64) for name, columns in groups.items()}
     scalars["information"] = 0.5 * np.log1p(H / lam).sum(axis=1)
     scalars["uncertainty"] = (lam / (H + lam)).mean(axis=1)
-    unseen = ~criteria.observed(surface, lam)
+    unseen = ~criteria.observed(surface, prior_lam)
     scalars["unobserved"] = np.zeros(len(H))
     scalars["unobserved"][: len(unseen)] = unseen
     return scalars
@@ -214,8 +217,8 @@ def diagnose_run(
     settings, state = run_folder.read_settings(run), run_folder.read_checkpoint(run)
     assert state is not None
     columns = groups(gaussians.sh_degree)
-    lam = criteria.regularisation(columns, settings.pixel_noise, settings.prior_std)
-    scalars = gaussian_scalars(state.H, state.surface, lam, columns)
+    prior_lam = criteria.regularisation(columns, settings.pixel_noise, settings.prior_std)
+    scalars = gaussian_scalars(state.H, state.surface, settings.regularisation(columns), prior_lam, columns)
     out = run / "diagnostics"
     write_information_ply(out / "information.ply", gaussians, scalars)
     written = [out / "information.ply"]
@@ -225,6 +228,8 @@ def diagnose_run(
         maps = view_maps(gaussians, frame.camera, scalars)
         write_exr(out / f"{frame.name}.exr", maps)
         seen = "trained on" if frame.name in trained else "never trained on"
+        if settings.estimator != "exact":  # then the maps are not in the units that their panels name
+            seen += f"; by {settings.estimator}"
         write_preview(out / f"{frame.name}.png", maps, f"{frame.name}, {seen}")
         written += [out / f"{frame.name}.exr", out / f"{frame.name}.png"]
     if progress:
