@@ -20,7 +20,9 @@ class Axis(StrEnum):
 def synth_orbit(
     out: Annotated[Path, typer.Argument(help="Folder for the dataset; new, or one that an interrupted run left.")],
     scene: Annotated[str, typer.Option(help="A scene of mgs (boulder, ...) or the path of a .toml file.")] = "boulder",
-    orbit: Annotated[str | None, typer.Option(help="circle, rings, spiral or hemisphere, in place of the scene's.")] = None,
+    orbit: Annotated[
+        str | None, typer.Option(help="Kind of orbit in place of the scene's: circle, rings, spiral or hemisphere.")
+    ] = None,
     mesh: Annotated[Path | None, typer.Option(help="A real rock (textured GLB, OBJ or PLY), scaled to the scene.")] = None,
     mesh_up: Annotated[
         Axis | None, typer.Option(help="Up axis of --mesh. Default: y for GLB (its rule) and OBJ, z for PLY and others.")
@@ -30,10 +32,11 @@ def synth_orbit(
     frames: Annotated[int | None, typer.Option(min=1, help="Number of frames, in place of the preset's.")] = None,
     size: Annotated[str | None, typer.Option(help="Image size WIDTHxHEIGHT, in place of the preset's.")] = None,
     test_views: Annotated[
-        int, typer.Option(min=0, help="Views from all over a dome around the rock, to judge models by; written to OUT/test.")
+        int,
+        typer.Option(min=0, help="Number of views of a dome around the rock, to judge models by; in OUT/test."),
     ] = 0,
-    pose_noise: Annotated[float, typer.Option(min=0, help="Error of the poses in transforms.json, metres per axis.")] = 0.0,
-    rotation_noise: Annotated[float, typer.Option(min=0, help="The same for the rotations, degrees per axis.")] = 0.0,
+    pose_noise: Annotated[float, typer.Option(min=0, help="Standard deviation of errors in the written positions, m.")] = 0.0,
+    rotation_noise: Annotated[float, typer.Option(min=0, help="The same for their rotations, degrees.")] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="Root seed: the same seed gives the same dataset, bit for bit.")] = 0,
 ) -> None:
     """Render an RGB-D orbit around a rock with Mitsuba: photoreal images, z-depth, rock masks, exact poses.
