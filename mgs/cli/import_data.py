@@ -1,4 +1,4 @@
-"""`mgs import`: nerfstudio, NeRF-synthetic and COLMAP data to a dataset."""
+"""`mgs import`: make a dataset of nerfstudio, NeRF-synthetic or COLMAP data."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import typer
 
 
 def import_data(
-    source: Annotated[Path, typer.Argument(help="transforms.json, or a folder with one, or with a COLMAP model (sparse/0).")],
+    source: Annotated[Path, typer.Argument(help="A transforms.json, a folder with one, or a folder with a COLMAP model.")],
     out: Annotated[Path, typer.Option(help="Folder to write; new, or one that an interrupted import left.")],
-    images: Annotated[Path | None, typer.Option(help="COLMAP's images; default SOURCE/images.")] = None,
-    masks: Annotated[Path | None, typer.Option(help="Rock masks, named as the images; white is rock.")] = None,
+    images: Annotated[Path | None, typer.Option(help="Folder of COLMAP's images; by default SOURCE/images.")] = None,
+    masks: Annotated[Path | None, typer.Option(help="Folder of masks, named as the images; white is rock.")] = None,
     mesh: Annotated[
         Path | None, typer.Option(help="Masks by projecting this mesh (world coordinates; a GLB is turned from +Y up).")
     ] = None,
     split: Annotated[str, typer.Option(help="Split of NeRF-synthetic data: train, val or test.")] = "train",
 ) -> None:
-    """Bring your own data: cameras and images (depth and masks, if any) to a dataset folder, lens distortion undone.
+    """Bring your own data: make a dataset of cameras and images, and of depth and masks if there are any.
 
-    Masks come from --masks, from --mesh, from the source's own mask files or from the images' alpha, in this order. Where alpha
-    has values between empty and full, it is kept, in images of the rock alone (rock/). Without
+    Lens distortion is undone. Masks come from the first of these that there is: --masks, --mesh, the source's own mask files,
+    the images' alpha. An alpha with values between empty and full is kept too, in images of the rock alone (rock/). Without
     depth, the prior comes from `mgs prior OUT --mesh MESH`, or from COLMAP's sparse points. An interrupted import goes on where
     it stopped when the same command is given again.
     """
@@ -40,7 +40,7 @@ def import_data(
         console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
     found = read_source(source, images, split)
     if mesh is not None:
-        runtime.start()  # to cast rays at it
+        runtime.start()  # rays are cast at the mesh
     with Progress(console=console, transient=True) as progress:
         bar = progress.add_task("importing")
         result = import_source(

@@ -11,7 +11,7 @@ import typer
 
 
 class Axis(StrEnum):
-    """An up axis."""
+    """An axis that may point up."""
 
     y = "y"
     z = "z"
@@ -39,7 +39,7 @@ def synth_orbit(
     rotation_noise: Annotated[float, typer.Option(min=0, help="The same for their rotations, degrees.")] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="Root seed: the same seed gives the same dataset, bit for bit.")] = 0,
 ) -> None:
-    """Render an RGB-D orbit around a rock with Mitsuba: photoreal images, z-depth, rock masks, exact poses.
+    """Render an RGB-D orbit around a rock with Mitsuba: photoreal images with z-depth, masks of the rock and exact poses.
 
     Writes transforms.json (nerfstudio conventions), images/, depth/, masks/, rock/ (images of the rock alone, with alpha), the
     true rock as rock.glb, config.json and contact_sheet.png. An interrupted run goes on where it stopped when the same command
