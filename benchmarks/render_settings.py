@@ -2,8 +2,9 @@
 
     python benchmarks/render_settings.py docs/benchmarks
 
-Two views of the default scene (sunlit and shaded), 640x480. Writes render_settings.json and render_settings.png; with
---plot-only, draws the figure again from the JSON.
+Two views of the default scene (sunlit and shaded), 640x480. At the rock's outline (the pixels that it covers in part) the
+picture of the rock alone is compared, in front of black, and so is the image times the binary mask. Writes render_settings.json
+and render_settings.png; with --plot-only, draws the figure again from the JSON.
 """
 
 from __future__ import annotations
@@ -42,34 +43,44 @@ def measure() -> dict:
     cameras = rock_cameras(settings, Preset(*SIZE, 32, 1), rock)
     scene = Scene(settings, rock, cameras[0], 0)
 
-    def reference(index: int) -> tuple[np.ndarray, np.ndarray]:
+    def reference(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         parts = [scene.render(cameras[index], 64, 1000 + i, denoise=False) for i in range(REFERENCE_SPP // 64)]
-        return np.mean([part.rgb for part in parts], axis=0), parts[0].mask
+        return np.mean([part.rgb for part in parts], axis=0), np.mean([part.rock for part in parts], axis=0), parts[0].mask
 
     truth = {index: reference(index) for index in VIEWS}
-    exposure = ROCK_EXPOSURE / np.mean([rgb[mask].mean() for rgb, mask in truth.values()])
+    exposure = ROCK_EXPOSURE / np.mean([rgb[mask].mean() for rgb, _, mask in truth.values()])
+
+    def shown(rgb: np.ndarray) -> np.ndarray:
+        return srgb_from_linear(rgb * exposure)
+
     rows = []
     for denoise in (False, True):
         for spp in SPP:
             scene.render(cameras[0], spp, 0, denoise)
-            seconds, cpu, full, inside = [], [], [], []
-            for index, (rgb, mask) in truth.items():
+            seconds, cpu, found = [], [], []
+            for index, (rgb, rock, mask) in truth.items():
                 begun, cpu_begun = time.perf_counter(), time.process_time()
-                image = srgb_from_linear(scene.render(cameras[index], spp, 7, denoise).rgb * exposure)
+                rendered = scene.render(cameras[index], spp, 7, denoise)
                 seconds.append(time.perf_counter() - begun)
                 cpu.append(time.process_time() - cpu_begun)
-                expected = srgb_from_linear(rgb * exposure)
-                full.append(psnr(image, expected))
-                inside.append(psnr(image[mask], expected[mask]))
+                image, expected, alone = shown(rendered.rgb), shown(rgb), shown(rock[..., :3])
+                outline = (rock[..., 3] > 0) & (rock[..., 3] < 1)
+                found.append(
+                    {
+                        "psnr": psnr(image, expected),
+                        "psnr_rock": psnr(image, expected, mask),
+                        "psnr_outline": psnr(shown(rendered.rock[..., :3]), alone, outline),
+                        "psnr_outline_image_times_mask": psnr(image * mask[..., None], alone, outline),
+                    }
+                )
             rows.append(
                 {
                     "spp": spp,
                     "denoise": denoise,
                     "seconds": round(float(np.median(seconds)), 3),
                     "cpu_seconds": round(float(np.median(cpu)), 3),
-                    "psnr": round(float(np.mean(full)), 2),
-                    "psnr_rock": round(float(np.mean(inside)), 2),
                 }
+                | {key: round(float(np.mean([view[key] for view in found])), 2) for key in found[0]}
             )
             print(rows[-1], flush=True)
     return {

@@ -1,4 +1,4 @@
-"""The pictures of docs/data.md: one strip of frames per scene, from datasets in a folder, and the four orbits.
+"""The pictures of docs/data.md: a strip of frames per scene, from datasets in a folder, the outline of a rock, the four orbits.
 
 for s in boulder contact-binary strata low-sun pebbles; do mgs synth-orbit out/$s --scene $s --frames 8; done
 python benchmarks/scene_gallery.py out docs/images
@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 
+from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset
 from mgs.synth.orbit import orbit_positions
 from mgs.synth.scene_file import ORBITS, load_scene_file
@@ -31,6 +32,23 @@ def strip(folder: Path, columns: int = 4) -> Image.Image:
         with Image.open(frame.image_path) as image:
             picture.paste(image.convert("RGB").resize((WIDTH, height), Image.Resampling.LANCZOS), (i * WIDTH, 0))
     return picture
+
+
+def draw_outline(folder: Path, size: int = 56, zoom: int = 5) -> Image.Image:
+    """The left edge of the rock in the first frame: image times mask, and the rock alone, each in front of black and white."""
+    frame = load_dataset(folder).frames[0]
+    (rgba, _), mask = frame.target(), frame.mask()
+    column = np.flatnonzero(mask.any(0))[0]
+    row = np.flatnonzero(mask[:, column])[0]
+    window = slice(row - size // 2, row + size // 2), slice(column - 8, column - 8 + size)
+    parts = [
+        layer[..., :3] + (1 - layer[..., 3:]) * backdrop
+        for backdrop in (0, 1)
+        for layer in (np.dstack([frame.rgb() * mask[..., None], mask]), rgba)
+    ]
+    row_of_parts = np.hstack([srgb_from_linear(part[window]) for part in parts])
+    picture = Image.fromarray(np.round(row_of_parts * 255).astype(np.uint8))
+    return picture.resize((picture.width * zoom, picture.height * zoom), Image.Resampling.NEAREST)
 
 
 def draw_orbits(path: Path, frames: int = 60) -> None:
@@ -56,4 +74,6 @@ if __name__ == "__main__":
     arguments.out.mkdir(parents=True, exist_ok=True)
     for dataset in sorted(path.parent for path in arguments.datasets.glob("*/transforms.json")):
         strip(dataset).save(arguments.out / f"scene_{dataset.name}.png", optimize=True)
+        if dataset.name == "boulder":
+            draw_outline(dataset).save(arguments.out / "outline.png", optimize=True)
     draw_orbits(arguments.out / "orbits.png")

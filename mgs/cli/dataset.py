@@ -1,4 +1,4 @@
-"""`mgs dataset check`: find out what is wrong with a dataset."""
+"""`mgs dataset check`: read a dataset and say what is wrong with it."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ class Action(StrEnum):
 
 
 def dataset(
-    action: Annotated[Action, typer.Argument(help="check: read every file; compare depth, masks and poses between frames.")],
+    action: Annotated[Action, typer.Argument(help="check: read every file, and compare depth, masks and poses.")],
     path: Annotated[Path, typer.Argument(help="Folder of the dataset.")],
 ) -> None:
-    """Check a dataset: can every file be read, has it the right size, is no mask empty, do neighbouring frames agree?
+    """Check that every file of a dataset can be read and has the right size, and that colour, depth, masks and poses agree.
 
-    Prints every problem and how to mend it. The exit code is 2 if there are problems.
+    Prints every problem and its cure. The exit code is 2 where there is one. Test views are a dataset of their own: give
+    DATASET/test.
     """
     from rich.console import Console
     from rich.progress import Progress

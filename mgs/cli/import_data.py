@@ -41,7 +41,7 @@ def import_data(
         console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
     found = read_source(source, images, split)
     if mesh is not None:
-        runtime.start()  # to cast rays at it
+        runtime.start()  # rays are cast at the mesh
     with Progress(console=console, transient=True) as progress:
         bar = progress.add_task("importing")
         result = import_source(

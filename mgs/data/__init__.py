@@ -1,1 +1,1 @@
-"""Datasets on disk: read, checked, imported."""
+"""Datasets on disk: reading, checking and importing them; meshes; and which points a camera sees."""

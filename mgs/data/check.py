@@ -1,4 +1,4 @@
-"""Check a dataset: every file readable, and colour, depth, masks and poses consistent with one another."""
+"""Checks of a dataset: that every file can be read, and that colour, depth, masks and poses agree with one another."""
 
 from __future__ import annotations
 
@@ -11,17 +11,22 @@ from mgs.data.dataset import Dataset, Frame
 from mgs.errors import InputError
 
 TOLERANCE = 0.02
-"""A point is seen through where another frame's depth there is greater by more than this share."""
+"""A point of the rock counts as seen through by a frame whose depth in that place is greater than the point's own by more than
+this share of it."""
 
 MAX_SEEN_THROUGH = 0.08
-"""Largest share of points seen through (median over neighbouring frames). Sound datasets have 0.01 to 0.03, from
-silhouettes; depth 10 % too large has 0.1 to 0.2 (measured on a sphere)."""
+"""Largest share of points that may be seen through (median over pairs of neighbouring frames). Measured on a sphere: 0.01 to
+0.03 in sound datasets, because of the pixels at the outline, and 0.1 to 0.2 where all depths are 10 % too large."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """What a check found. problems: one line each, naming frame and cure. seen_through: median over neighbouring frames
-    of the share of one's rock that lies where the next sees empty space; NaN without depth."""
+    """What a check found.
+
+    problems: one line each, which names the frame or file and the cure. mask_share: mean share of the pixels that are rock.
+    depth_range: smallest and largest depth of the rock, metres; zeros without depth. seen_through: median of the function
+    `seen_through` over pairs of neighbouring frames; NaN without depth.
+    """
 
     problems: list[str]
     mask_share: float
@@ -30,7 +35,10 @@ class Check:
 
 
 def check_dataset(dataset: Dataset, progress: Callable[[int, int], None] = lambda done, total: None) -> Check:
-    """Read every pixel of a dataset and collect what is wrong with it, rather than stop at the first problem."""
+    """Read every pixel of a dataset and list all that is wrong with it.
+
+    progress: called as progress(frames done, all frames).
+    """
     problems: list[str] = []
     shares, ranges, shares_through = [], [], []
     poses: dict[bytes, str] = {}
@@ -75,18 +83,20 @@ def check_dataset(dataset: Dataset, progress: Callable[[int, int], None] = lambd
 
 
 def _contrary(alpha: np.ndarray, mask: np.ndarray) -> int:
-    """Number of pixels that a mask [H,W] calls rock where alpha [H,W] says that there is none of it, or the other way round.
+    """Number of pixels in which a mask [H,W] and an alpha [H,W] contradict each other.
 
-    A mask says what is seen in the centre of a pixel, so any alpha between 0 and 1 agrees with it.
+    The mask says whether the rock is seen in the centre of the pixel. So it is contradicted by an alpha of 0 where it is true,
+    and by an alpha of 1 where it is false; any alpha between agrees with both.
     """
     return int((mask & (alpha == 0) | ~mask & (alpha == 1)).sum())
 
 
 def seen_through(frame: Frame, depth: np.ndarray, mask: np.ndarray, other: Frame, other_depth: np.ndarray) -> float:
-    """Share of the rock's points of `frame` that lie in space which `other` sees to be empty; NaN where none is in view.
+    """The share of the rock's points in `frame` that `other` contradicts, because it sees something behind them in their place.
 
-    Occlusion cannot cause it, so it is near 0 for consistent frames however far apart. depth, other_depth: [H,W] z-depth,
-    metres; mask: [H,W] bool.
+    Something in front of a point may hide it from `other`, but nothing lets it see through the point; so this share is near 0
+    where poses and depths are right, however far apart the two frames are. NaN where no point is in view of `other`.
+    depth, other_depth: [H,W] z-depth, metres; mask: [H,W] bool, the rock in `frame`.
     """
     points = frame.camera.unproject(depth)[mask & (depth > 0)]
     pixels, z = other.camera.project(points)

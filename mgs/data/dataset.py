@@ -17,7 +17,7 @@ from mgs.files import check_new_folder, check_writable, locked, read_json, write
 from mgs.images import read_exr, read_mask, read_png
 
 PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
-"""Camera models of transforms.json that are a pinhole once their distortion is zero."""
+"""Camera models of transforms.json that are a pinhole where their distortion is zero."""
 
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
@@ -35,7 +35,7 @@ FILES = {"image_path": "file_path", "depth_path": "depth_file_path", "mask_path"
 
 @dataclass(frozen=True)
 class Frame:
-    """One keyframe: a camera, its time in seconds, and where its pixels lie."""
+    """One keyframe: its camera, its time in seconds, and the files of its images."""
 
     name: str
     camera: Camera
@@ -119,9 +119,10 @@ class Dataset:
 
 
 def load_dataset(root: str | Path) -> Dataset:
-    """Read transforms.json and check that every file it names exists; pixels are read when asked for.
+    """Read transforms.json and check that every file it names exists. Images are read later, by the methods of `Frame`.
 
-    Raises InputError: missing folder or file, no intrinsics, distorted images, NaN or singular pose, no frames, a frame twice.
+    Raises InputError where the folder or a file is missing, intrinsics are missing, images are distorted, a pose is not finite
+    or singular, there are no frames, or two frames have the same name.
     """
     root = Path(root)
     path = root / "transforms.json"
@@ -130,15 +131,15 @@ def load_dataset(root: str | Path) -> Dataset:
     data, records = read_records(path)
     frames = [_frame(root, path, data, i, record) for i, record in enumerate(records)]
     for name, count in Counter(frame.name for frame in frames).items():
-        if count > 1:  # a name is what runs and pictures know a frame by
+        if count > 1:  # runs and pictures refer to a frame by its name
             raise InputError(f"{path}: lists {count} frames named {name}; remove or rename all but one")
     return Dataset(root, tuple(sorted(frames, key=lambda frame: (frame.timestamp, frame.name))))
 
 
 def load_cameras(path: str | Path) -> list[tuple[str, Camera]]:
-    """(file_path, camera) of every frame of a transforms.json (or of the folder that holds one), in the file's order.
+    """The (file_path, camera) of every frame of a transforms.json, in the file's order. path: the file, or its folder.
 
-    The files that the frames name need not exist. Raises InputError as `load_dataset`, but for those files.
+    The files that the frames name need not exist. For all else, InputError is raised as by `load_dataset`.
     """
     path = Path(path) / "transforms.json" if Path(path).is_dir() else Path(path)
     data, records = read_records(path)
@@ -146,9 +147,10 @@ def load_cameras(path: str | Path) -> list[tuple[str, Camera]]:
 
 
 def read_records(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The contents of a transforms.json, and its frames: each names its image and has a transform_matrix of some kind.
+    """The contents of a transforms.json, and its list of frames; each is sure to have a file_path and a transform_matrix.
 
-    Raises InputError where the file is missing or damaged, lists no frames, or a path is none.
+    What the matrix holds is not checked. Raises InputError where the file is missing or damaged, lists no frames, or has a
+    value that cannot be a path where a path must be.
     """
     data = read_json(path)
     records = data.get("frames") if isinstance(data, dict) else None
@@ -217,8 +219,11 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
 
 
 def write_transforms(root: str | Path, frames: list[Frame] | tuple[Frame, ...]) -> None:
-    """Write transforms.json; paths are relative to `root`. The first frame's intrinsics are the file's, those of frames that
-    differ are their own. Written last: it is what makes a folder a dataset."""
+    """Write transforms.json into the folder `root`; the paths in it are relative to that folder.
+
+    The intrinsics of the first frame are written once, for the whole file; a frame with other intrinsics has its own. Write
+    this file after all others: a folder that has it counts as a finished dataset.
+    """
     root = Path(root)
     header = {"camera_model": "OPENCV", **_intrinsics(frames[0].camera)}
     records = []
@@ -234,10 +239,11 @@ def write_transforms(root: str | Path, frames: list[Frame] | tuple[Frame, ...]) 
 
 
 def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:
-    """Whether `out` holds an unfinished dataset (no transforms.json yet) whose JSON file `record` agrees with what is `asked`.
+    """Whether `out` holds an unfinished dataset that is to be continued; False where `out` is empty or does not exist.
 
-    Removes what a process that was killed while it wrote left behind. Raises InputError where `out` holds anything else, where
-    another process works on it, or where it cannot be written.
+    An unfinished dataset has no transforms.json yet, but the JSON file `record`, which must agree with `asked` in every key of
+    it. Temporary files that a killed process left are removed. Raises InputError where `out` holds anything else, where another
+    process works on it, or where it cannot be written.
     """
     check_writable(out)
     begun = out / record
@@ -251,7 +257,7 @@ def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:
             for left in out.rglob(".*.part*"):
                 left.unlink()
         return True
-    for left in out.glob(f".{begun.stem}.*.part{begun.suffix}"):  # all that there is where the record was being written
+    for left in out.glob(f".{begun.stem}.*.part{begun.suffix}"):  # of a process that was killed while it wrote the record
         left.unlink()
     check_new_folder(out)
     return False

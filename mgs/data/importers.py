@@ -1,4 +1,4 @@
-"""Other people's data -> a dataset folder: nerfstudio, NeRF-synthetic and COLMAP, with lens distortion undone."""
+"""Imports of nerfstudio, NeRF-synthetic and COLMAP data into a dataset folder, with lens distortion undone."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ from mgs.files import copy_file, fingerprint, locked, new_folder, write_json
 from mgs.images import read_exr, read_mask, read_rgba, read_values, write_exr, write_png
 
 RECORD = "import.json"
-"""What was asked for, written before the first frame: an import that goes on must agree with it."""
+"""File in the output folder that says what is imported. It is written before the first frame, and an interrupted import is
+continued only where it asks for the same."""
 
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 """Coefficients of the OPENCV camera model, in OpenCV's order."""
@@ -39,12 +40,16 @@ COLMAP_MODELS: dict[str, tuple[str, ...]] = {
     "OPENCV": ("k1", "k2", "p1", "p2"),
     "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-"""Distortion coefficients of COLMAP's camera models, in its order after focal lengths and principal point."""
+"""Distortion coefficients of each of COLMAP's camera models, in the order in which they follow focal lengths and principal
+point in COLMAP's list of parameters."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One frame of a foreign data set: its camera before undistortion, distortion in OpenCV's order, and its files."""
+    """One frame of the data to import: its camera, with the distortion not yet undone, and its files.
+
+    distortion: coefficients in OpenCV's order. timestamp: seconds. depth_unit: metres per step of a depth image in PNG.
+    """
 
     name: str
     camera: Camera
@@ -59,7 +64,8 @@ class Shot:
 
 @dataclass(frozen=True)
 class Source:
-    """What was found: its format, the shots whose image exists, how many do not, and sparse points (points, views)."""
+    """The data to import: its format, the shots whose image exists, the number of those whose image does not, and COLMAP's
+    points [N,3] with the mean unit direction [N,3] from each to the cameras that saw it."""
 
     kind: str
     shots: list[Shot]
@@ -68,10 +74,13 @@ class Source:
 
 
 def read_source(source: str | Path, images: Path | None = None, split: str = "train") -> Source:
-    """Recognise and read a data set: a folder or a transforms*.json, or a folder with a COLMAP model (or sparse/0 in it).
+    """Recognise the format of a source, and read its cameras and the names of its files.
 
-    images: COLMAP's image folder (by default `images` beside the model). split: of NeRF-synthetic data.
-    Raises InputError: nothing recognised, no frame whose image exists, a frame listed twice, an unsupported camera model.
+    source: a transforms.json or the folder that holds one; a folder with the transforms_SPLIT.json of NeRF-synthetic data; or a
+    folder with a COLMAP model, in itself, in sparse/ or in sparse/0/. images: COLMAP's image folder, by default SOURCE/images.
+    split: train, val or test of NeRF-synthetic data.
+    Raises InputError where no format is recognised, none of the images exists, a frame is listed twice, or a camera model is
+    not supported.
     """
     source = Path(source)
     if not source.exists():
@@ -104,7 +113,7 @@ def _frame_name(path: str) -> str:
 
 
 def _read_transforms(path: Path) -> Source:
-    """nerfstudio's transforms.json, or NeRF-synthetic's (camera_angle_x, image names without suffix)."""
+    """Read a transforms.json of nerfstudio, or of NeRF-synthetic, which has camera_angle_x and image names without a suffix."""
     data, records = read_records(path)
     model = data.get("camera_model", "OPENCV")
     if model not in PINHOLES:
@@ -221,17 +230,19 @@ def import_source(
     mesh: Path | None = None,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Dataset:
-    """Write a source as a dataset into the folder `out`, new or empty, or with what an interrupted import of the same left.
+    """Write a source as a dataset into the folder `out`: a new or empty one, or one that an interrupted import of it left.
 
-    import.json, which says what is imported, is written first and transforms.json last; a finished frame is not read again
-    unless its files have changed since, and the result is the same, bit for bit, as in one go.
-    Masks come from, in this order: files of `masks` with the image's stem, the pixels whose centre shows the `mesh` (world
-    coordinates; needs the variant to be set, `mgs.runtime.start`), the source's own mask files, the images' alpha.
-    Images of the rock alone come from the source's own images of it, or from an alpha that gives the mask and has values
-    between empty and full; with `masks` or `mesh` there are none.
-    Distorted images, depth and masks are undistorted to a pinhole camera that holds valid pixels only.
-    Raises InputError where a file is missing, damaged or of another size than the camera, where `out` holds anything else or
-    another process works on it, or as `read_mesh`; the frames before are kept.
+    Masks come from the first of these that there is: files in the folder `masks` that are named as the images; the pixels whose
+    centre shows the `mesh` (world coordinates; the variant must be set, `mgs.runtime.start`); the source's own mask files; the
+    images' alpha. Images of the rock alone come from the source's own images of it, or from an alpha that gives the mask and
+    has values between empty and full. With `masks` or `mesh` there are none.
+    Distorted images, depth and masks are undistorted to a pinhole camera in which every pixel is valid.
+
+    import.json, which says what is imported, is written first, and transforms.json last. When an interrupted import is
+    continued, a finished frame is made again only if its files have changed since. The result is the same, bit for bit, as that
+    of an import in one go. on_frame: called as on_frame(frames done, all frames).
+    Raises InputError as `read_mesh`, and where a file is missing, damaged or of another size than its camera, where `out` holds
+    anything else, or where another process works on it. The frames that were finished before are kept.
     """
     shots, project = source.shots, None
     if masks is not None:
@@ -269,7 +280,7 @@ def _mask_file(masks: Path, shot: Shot) -> Path:
 
 
 def _digest(shots: list[Shot]) -> str:
-    """SHA-256 of all that is known of the shots before their files are read."""
+    """SHA-256 of the shots: names, cameras, times and paths of files, but not what the files hold."""
     known = [
         (shot.name, shot.camera.K.tolist(), shot.camera.width, shot.camera.height, shot.camera.world_to_camera.tolist(),
          shot.distortion.tolist(), shot.timestamp, shot.depth_unit,
@@ -280,9 +291,10 @@ def _digest(shots: list[Shot]) -> str:
 
 
 def _import_shot(shot: Shot, out: Path, project: Callable[[Camera], np.ndarray] | None, begin: Callable[[], None]) -> Frame:
-    """Write the files of a frame, its image last, unless they are there and no older than what they are made of.
+    """Write the files of a frame, the image last. Nothing is done where the image exists and is no older than its sources.
 
-    begin is called between reading and writing: a source that cannot be read leaves nothing behind.
+    project: the mask by `mesh_silhouette`, or None. begin: called after all is read and before anything is written, to make the
+    output folder; so a source that cannot be read leaves no folder behind.
     """
     camera, undo = undistorter(shot.camera, shot.distortion)
     image, mask_path, rock_path = (out / folder / f"{shot.name}.png" for folder in ("images", "masks", "rock"))
@@ -313,9 +325,11 @@ def _import_shot(shot: Shot, out: Path, project: Callable[[Camera], np.ndarray] 
 def _mask_and_rock(
     shot: Shot, rgba: np.ndarray, undo: Callable[[np.ndarray, bool], np.ndarray]
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """The mask and the image of the rock alone that a source gives, undistorted; None for each that it does not give.
+    """The mask and the image of the rock alone that the source itself gives, undistorted; None for what it does not give.
 
-    rgba [H,W,4]: the pixels of the shot's image. The mask is bool [H,W]; the rock is premultiplied by alpha, float32 [H,W,4].
+    rgba [H,W,4]: the pixels of the shot's image. undo: as `undistorter` gives it. The mask is bool [H,W]; the image of the rock
+    is linear RGB premultiplied by alpha, and alpha, float32 [H,W,4]. Premultiplied light is what undistortion resamples:
+    straight colours would mix with those of empty pixels, and leave a rim.
     """
     given = None if shot.rock is None else _sized(shot.rock, read_rgba(shot.rock), shot.camera)
     layer = rgba if given is None else given
@@ -353,11 +367,12 @@ def _read_depth(path: Path, unit: float) -> np.ndarray:
 
 
 def undistorter(camera: Camera, distortion: np.ndarray) -> tuple[Camera, Callable[[np.ndarray, bool], np.ndarray]]:
-    """The pinhole camera inside a distorted one, and a function (pixels, smooth) that resamples an image to it (OpenCV).
+    """A pinhole camera that sees no more than a distorted one, and a function that resamples images of the latter to it.
 
-    distortion: k1 k2 p1 p2 k3 (k4 k5 k6), OpenCV's rational model. smooth: bilinear, otherwise nearest (depth). OpenCV puts
-    pixel centres at integers, we at +0.5; the shift is made here. Without distortion nothing is resampled.
-    Raises InputError where no valid pixel is left.
+    distortion: k1 k2 p1 p2 k3 (k4 k5 k6) of OpenCV's rational model. The function is called as undo(pixels, smooth) with pixels
+    [H,W] or [H,W,C]; it interpolates linearly where smooth is true, and takes the nearest pixel, as depth needs it, where it is
+    false. Without distortion it returns the pixels as they are. OpenCV's pixel centres are whole numbers, and ours are at +0.5;
+    the difference is taken into account here. Raises InputError where no valid pixel is left.
     """
     import cv2
 
@@ -381,8 +396,11 @@ def undistorter(camera: Camera, distortion: np.ndarray) -> tuple[Camera, Callabl
 
 
 def mesh_silhouette(path: Path) -> Callable[[Camera], np.ndarray]:
-    """A function of a camera: bool [H,W], the pixels whose centre shows the mesh. Raises InputError as `read_mesh`."""
-    from mgs.data.raycast import mesh_depth  # only here: it wants the variant to be set
+    """A function that gives the mask of a mesh in a camera: bool [H,W], the pixels whose centre shows it.
+
+    Raises InputError as `read_mesh`.
+    """
+    from mgs.data.raycast import mesh_depth  # not at the top: imports without a mesh do not set the variant that it needs
 
     depth = mesh_depth(read_mesh(path))
     return lambda camera: depth(camera) > 0

@@ -32,15 +32,18 @@ def write_points(path: str | Path, points: np.ndarray, normals: np.ndarray) -> N
 GLTF = (".glb", ".gltf")
 
 GLTF_UP = "+Y"
-"""What our GLB files hold in the extras of their mesh under `up`."""
+"""Value of `up` in the extras of the mesh in GLB files that `to_glb` makes."""
 
 FURTHEST = 1e15
-"""Largest coordinate of a mesh, metres: squares of areas beyond it leave float32."""
+"""Largest coordinate of a mesh, metres. Areas are squared, and with larger coordinates these squares would not fit float32."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """vertices [V,3] world, metres; faces [F,3]; seen [F] bool: faces that the survey saw, so those that samples cover."""
+    """A triangle mesh: vertices [V,3] world, metres; faces [F,3], indices of their vertices; seen [F] bool.
+
+    `seen` marks the faces that a survey saw. Only these are sampled: a reconstruction also closes holes that nobody has seen.
+    """
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -53,7 +56,7 @@ class Mesh:
 
     @property
     def vertex_normals(self) -> np.ndarray:
-        """[V,3] unit, area-weighted over the seen faces (zero at vertices of none)."""
+        """[V,3] unit normals: the mean over the seen faces around a vertex, weighted by area; zero where there is none."""
         cross = _crosses(self.vertices, self.faces) * self.seen[:, None]
         normals = np.zeros_like(self.vertices)
         for k in range(3):
@@ -63,16 +66,16 @@ class Mesh:
 
 
 def _crosses(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[F,3] along the normal of each face, twice its area long."""
+    """[F,3] vectors along the normals of the faces; the length of each is twice the area of its face."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return np.cross(b - a, c - a)
 
 
 def load_mesh(path: str | Path) -> trimesh.Trimesh:
-    """A triangle mesh (GLB, OBJ, PLY ...) as it is in its file, with its texture.
+    """Read a triangle mesh (GLB, OBJ, PLY ...) with its texture, in the axes and units of its file.
 
-    Raises InputError where it is missing or unreadable, has no faces or no area, holds NaN or infinite vertices, or has faces
-    of vertices that are not there.
+    Raises InputError where the file is missing or unreadable, where the mesh has no faces or no area, and where a vertex is
+    NaN, infinite or beyond FURTHEST, or a face names a vertex that does not exist.
     """
     import trimesh
 
@@ -84,7 +87,7 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
         parts = list(mesh.graph.nodes_geometry) if isinstance(mesh, trimesh.Scene) else []
         if len(parts) == 1:
             transform, name = mesh.graph[parts[0]]
-            mesh = mesh.geometry[name].apply_transform(transform)  # keeps the file's normals, which force="mesh" loses
+            mesh = mesh.geometry[name].apply_transform(transform)  # force="mesh" below would lose the file's normals
         else:
             mesh = trimesh.load(path, force="mesh", process=False)
     except Exception as error:  # trimesh's readers raise many types; each means a damaged or unknown file.
@@ -109,23 +112,27 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """A triangle mesh in world coordinates, metres, as one clean surface; all of it counts as seen.
+    """Read a triangle mesh in world coordinates, metres, and make it one clean surface; all of it counts as seen.
 
-    glTF and GLB are +Y up, as their format has it, and are turned; other formats have no rule, and are taken as they are.
-    Left out: faces without area, faces that are there twice (whichever way round), vertices of no face. Faces wound against
-    their neighbours are turned, and then all of them where the mesh is inside out. Raises InputError as `load_mesh`.
+    glTF and GLB files are +Y up by their format, and are turned to +Z up; other formats have no rule, and are taken as they
+    are. Faces without area, repeated faces and vertices without a face are left out. A face whose corners run the other way
+    round than those of its neighbours is turned over, and so are all faces where the mesh is inside out. Raises InputError as
+    `load_mesh`.
     """
     return _in_world(load_mesh(path), Path(path).suffix.lower() in GLTF)
 
 
 def read_rock(path: str | Path) -> Mesh:
-    """The true rock of a dataset, `rock.glb`, as `read_mesh`. One without the mark of `to_glb` is of an older mgs: +Z up."""
+    """Read the true rock of a dataset, `rock.glb`, as `read_mesh` does.
+
+    A file without the mark of `to_glb` was written by an older version of mgs, and is +Z up.
+    """
     mesh = load_mesh(path)
     return _in_world(mesh, mesh.metadata.get("up") == GLTF_UP)
 
 
 def to_glb(mesh: trimesh.Trimesh) -> bytes:
-    """A GLB file of a mesh in world coordinates, with its normals and texture: turned to +Y up, and marked so."""
+    """The bytes of a GLB file of a mesh in world coordinates, with normals and texture, turned to +Y up and marked GLTF_UP."""
     turned: Any = mesh.copy(include_cache=True)  # the cache holds the vertex normals
     turned.apply_transform(WORLD_FROM_GLTF.T)
     turned.metadata["up"] = GLTF_UP
@@ -133,12 +140,12 @@ def to_glb(mesh: trimesh.Trimesh) -> bytes:
 
 
 def _in_world(mesh: trimesh.Trimesh, y_up: bool) -> Mesh:
-    """A mesh in world coordinates, cleaned as `read_mesh` says; y_up: it is +Y up."""
+    """A mesh in world coordinates, cleaned as `read_mesh` says; y_up: whether the given mesh is +Y up."""
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     if y_up:
         vertices = vertices @ WORLD_FROM_GLTF[:3, :3].T
     faces = faces[np.linalg.norm(_crosses(vertices, faces), axis=1) > 0]
-    place = np.unique(vertices + 0.0, axis=0, return_inverse=True)[1].ravel()  # one number for vertices at one place; -0 is 0
+    place = np.unique(vertices + 0.0, axis=0, return_inverse=True)[1].ravel()  # equal for vertices at one place; + 0.0: no -0
     first = np.unique(np.sort(place[faces], axis=1), axis=0, return_index=True)[1]
     faces = faces[np.sort(first)]
     faces = np.where(_wound_against(place[faces])[:, None], faces[:, ::-1], faces)
@@ -150,11 +157,13 @@ def _in_world(mesh: trimesh.Trimesh, y_up: bool) -> Mesh:
 
 
 def _wound_against(faces: np.ndarray) -> np.ndarray:
-    """[F] bool: which faces [F,3] to turn so that neighbours are wound alike; in each connected piece, the fewer.
+    """Which of the faces [F,3] to turn over so that neighbours are wound alike, bool [F]; of each connected piece, the fewer.
 
-    Neighbours share an edge that no third face has, and are wound alike where they run along it in opposite directions. In a
-    graph with two nodes for each face, one for either winding, the windings that go together are connected. A piece that has
-    only one side (a Moebius strip) is left as it is.
+    A face is wound clockwise or counter-clockwise: the order of its corners. Neighbours are two faces that share an edge which
+    no third face has. They are wound alike where their corners follow that edge in opposite directions.
+    Method: a graph has two nodes for each face, f for "keep" and F + f for "turn over". An edge of the graph joins two nodes of
+    neighbours that go together. The connected components then say what goes with what. A piece that has only one side (a
+    Moebius strip) cannot be wound alike, and is left as it is.
     """
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     forward = edges[:, 0] < edges[:, 1]

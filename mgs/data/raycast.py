@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 
 def mesh_depth(mesh: Mesh) -> Callable[[Camera], np.ndarray]:
-    """A function of a camera that gives the z-depth of the mesh, float32 [H,W], metres, 0 where a ray meets no face.
+    """A function that gives the z-depth of the mesh in a camera: float32 [H,W], metres, 0 where no face is met.
 
-    One ray per pixel, through its centre, whatever the mesh and however near it is; both sides of a face are met.
+    One ray is cast through the centre of each pixel; it meets a face from either side.
     """
-    centre = mesh.vertices.mean(0)  # float32 resolves most near the origin
+    centre = mesh.vertices.mean(0)  # rays are cast in coordinates around it: float32 is finest near the origin
     shape = mi.Mesh("mesh", len(mesh.vertices), len(mesh.faces))
     params = mi.traverse(shape)
     params["vertex_positions"] = mi.Float((mesh.vertices - centre).astype(np.float32).ravel())
@@ -31,7 +31,7 @@ def mesh_depth(mesh: Mesh) -> Callable[[Camera], np.ndarray]:
     def depth(camera: Camera) -> np.ndarray:
         rays = mi.Matrix3f(camera.camera_to_world[:3, :3] @ np.linalg.inv(camera.K))
         origin = mi.Point3f(*(camera.position - centre).tolist())
-        dr.make_opaque(rays, origin)  # else every camera compiles a kernel of its own
+        dr.make_opaque(rays, origin)  # a number that the compiler knows would cost a new kernel for every camera
         pixel = dr.arange(mi.UInt32, camera.width * camera.height)
         row = pixel // camera.width
         column = pixel - row * camera.width

@@ -1,4 +1,4 @@
-"""Which surface points a camera sees: depth test and mask."""
+"""Which points of a surface a camera sees, by its depth image and its mask."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from mgs.camera import Camera
 from mgs.data.dataset import Frame
 
 GRAZING = 0.2
-"""Cosine between normal and view below which the slope no longer widens the tolerance."""
+"""Cosine of the angle between normal and view. The tolerance grows with the slope of the surface only down to this cosine."""
 
 
 def visible(
@@ -20,10 +20,11 @@ def visible(
     *,
     two_sided: bool = False,
 ) -> np.ndarray:
-    """[N] bool: inside the frame, facing the camera (or two_sided), and at the depth that its pixel shows.
+    """Which points are seen, bool [N]: they are inside the frame, face the camera, and have the depth that their pixel shows.
 
-    points [N,3] world, metres; normals [N,3] unit; depth [H,W] z-depth, metres, 0 = no return; tolerance: metres. A slanted
-    surface changes depth within its pixel, so the tolerance grows by one pixel footprint times the slope.
+    points [N,3] world, metres; normals [N,3] unit; depth [H,W] z-depth, metres, 0 = no return; tolerance: largest difference of
+    depth, metres; two_sided: points that face away count too. The depth of a slanted surface changes within a pixel, so the
+    tolerance is widened by the size of a pixel on the surface times the slope.
     """
     pixels, z = camera.project(points)
     view = camera.position - points
@@ -40,7 +41,10 @@ def visible(
 
 
 def in_mask(points: np.ndarray, frame: Frame) -> np.ndarray:
-    """[N] bool: the pixel of each point [N,3] (clamped to the frame) is inside the frame's rock mask."""
+    """Whether each point [N,3], world, metres, falls on a pixel of the rock's mask, bool [N].
+
+    A point outside the frame is given the nearest pixel at its edge.
+    """
     pixels, _ = frame.camera.project(points)
     column = np.clip(np.floor(pixels[:, 0]), 0, frame.camera.width - 1).astype(int)
     row = np.clip(np.floor(pixels[:, 1]), 0, frame.camera.height - 1).astype(int)

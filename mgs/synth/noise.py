@@ -1,4 +1,4 @@
-"""Band-limited noise: the one texture primitive that rocks, regolith and albedo are made of."""
+"""Band-limited noise: the shape and the colours of rocks and ground are all made of it."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ LATTICE = 96
 """Samples along one side of the periodic noise volume."""
 
 PERIOD = 16
-"""Noise periods (wavelengths of the finest detail) along one side of the volume."""
+"""Side of the noise volume in units of the shortest wavelength of its noise."""
 
 
 class Noise:
-    """A seeded scalar field in space: Gaussian white noise of one octave (wavelengths 1 to 2), zero mean, unit variance.
+    """A random scalar field in space: Gaussian noise with zero mean and unit variance, of one octave, wavelengths 1 to 2.
 
-    The octave is cut out in Fourier space (as wavelet noise does; Cook and DeRose 2005), so octaves add without beating,
-    and is looked up trilinearly in a periodic volume.
+    It is white noise in a periodic volume, of which all other frequencies are removed in Fourier space. Sums of octaves of
+    different scale then share no frequencies (the idea of wavelet noise, Cook and DeRose 2005). Values between the samples of
+    the volume are interpolated linearly.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
@@ -29,9 +30,9 @@ class Noise:
         self.volume = (volume / volume.std()).astype(np.float32)
 
     def octave(self, points: np.ndarray, wavelength: float) -> np.ndarray:
-        """Noise at points [..., 3] with features of about `wavelength` (same unit) -> float32 [...].
+        """Noise at points [..., 3], float32 [...]; `wavelength` is the shortest wavelength, in the unit of the points.
 
-        Each call looks through a new random rotation and offset, so octaves and layers are independent.
+        Every call turns and shifts the points at random before it looks them up, so the results of calls are independent.
         """
         rotation = np.linalg.qr(self.rng.standard_normal((3, 3)))[0]
         offset = self.rng.uniform(0, LATTICE, 3).astype(np.float32)
@@ -39,18 +40,19 @@ class Noise:
         return map_coordinates(self.volume, np.moveaxis(coordinates, -1, 0), order=1, mode="grid-wrap", prefilter=False)
 
     def fractal(self, points: np.ndarray, wavelength: float, octaves: int, gain: float = 0.5) -> np.ndarray:
-        """Sum of `octaves` octaves, each of half the wavelength and `gain` times the amplitude of the one before."""
+        """Sum of so many calls of `octave`, each of half the wavelength and `gain` times the amplitude of the one before."""
         return sum((gain**i * self.octave(points, wavelength / 2**i) for i in range(octaves)), np.zeros(points.shape[:-1]))
 
     def ridged(self, points: np.ndarray, wavelength: float, octaves: int, gain: float = 0.5) -> np.ndarray:
-        """As `fractal`, of 1 - |noise|: sharp crests, zero mean (roughly)."""
+        """The same sum as `fractal`, of 0.8 - |noise| in place of noise: it has sharp crests, and a mean of about zero."""
         octave = (gain**i * (0.8 - np.abs(self.octave(points, wavelength / 2**i))) for i in range(octaves))
         return sum(octave, np.zeros(points.shape[:-1]))
 
     def fracture(self, points: np.ndarray, wavelength: float) -> np.ndarray:
-        """Piecewise linear field at points [N,3], about -1 to 1: Voronoi cells of a `wavelength`, each a tilted plane.
+        """A field [N], about -1 to 1, that is linear within each of many cells: flat faces and narrow edges, as of broken rock.
 
-        Flat faces, narrow edges and ledges, as broken rock has (cells: Worley 1996).
+        points [N,3]; wavelength: mean distance of the cells, in the unit of the points. The cells are those of a Voronoi
+        diagram of random centres (Worley 1996), and each has a random slope.
         """
         low, high = points.min(0) - wavelength, points.max(0) + wavelength
         centres = self.rng.uniform(low, high, (int(np.prod((high - low) / wavelength)) + 4, 3))
@@ -62,9 +64,9 @@ class Noise:
 
 
 def tile(size: int, exponent: float, rng: np.random.Generator, shortest: float = 2) -> np.ndarray:
-    """A periodic image [size,size] of Gaussian noise, zero mean, unit variance, amplitude falling as frequency^-exponent.
+    """A periodic image [size,size], float32, of Gaussian noise with zero mean and unit variance.
 
-    Nothing is finer than `shortest` pixels.
+    Its amplitude is proportional to frequency^-exponent, and zero for wavelengths below `shortest` pixels.
     """
     k = np.fft.fftfreq(size)
     frequency = np.hypot(k[:, None], k[None, : size // 2 + 1])

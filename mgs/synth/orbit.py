@@ -1,4 +1,4 @@
-"""Camera trajectories around a rock that stands at the origin. Every camera looks at the target."""
+"""Cameras that fly around a rock at the origin and look at one target, its middle."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ def intrinsics(fov: float, width: int, height: int) -> np.ndarray:
 
 
 def orbit_positions(settings: Orbit, frames: int, target: np.ndarray) -> np.ndarray:
-    """Camera centres [frames,3], world metres, in the order they are flown, starting at azimuth 0 (+x), counter-clockwise.
+    """Camera centres [frames,3], world, metres, in the order of flight: counter-clockwise, from azimuth 0, which is +x.
 
-    circle: fixed radius and altitude (the paper's orbit). rings: `turns` circles at rising elevation. spiral: `turns` turns
-    of rising elevation. hemisphere: even over the dome (Fibonacci lattice), sorted by azimuth.
+    settings.kind is one of: circle, of fixed radius and altitude, as in the paper; rings, `turns` circles at rising elevations;
+    spiral, `turns` turns with rising elevation; hemisphere, positions spread evenly between the two elevations (Fibonacci
+    lattice), sorted by azimuth. target [3]: the point that all look at, world, metres.
     """
     step = np.arange(frames)
     if settings.kind == "circle":
@@ -45,15 +46,15 @@ def orbit_positions(settings: Orbit, frames: int, target: np.ndarray) -> np.ndar
 
 
 def orbit_cameras(settings: Orbit, frames: int, target: np.ndarray, fov: float, width: int, height: int) -> list[Camera]:
-    """The cameras of an orbit; `target` [3] is the point they look at, world metres."""
+    """The cameras of an orbit. target [3]: the point that all look at, world, metres; fov: horizontal, degrees."""
     K = intrinsics(fov, width, height)
     return [Camera(K, width, height, look_at(eye, target)) for eye in orbit_positions(settings, frames, target)]
 
 
 def perturb(cameras: list[Camera], position: float, rotation: float, rng: np.random.Generator) -> list[Camera]:
-    """What a reconstruction is told in place of the true poses: independent Gaussian errors of each camera.
+    """The cameras with an independent Gaussian error in each pose.
 
-    position: standard deviation along each axis, metres. rotation: about each axis, degrees.
+    position: standard deviation along each axis, metres; rotation: standard deviation about each axis, degrees.
     """
     noisy = []
     for camera in cameras:

@@ -28,7 +28,7 @@ from mgs.synth.scene import Scene
 from mgs.synth.scene_file import Orbit, SceneFile
 
 NOISY_FACTOR = 8
-"""Samples are multiplied by this where pyoidn is not installed."""
+"""Factor on the samples per pixel where pyoidn, the denoiser, is not installed."""
 
 DOME_ELEVATIONS = (5.0, 75.0)
 """Lowest and highest elevation of test views, seen from the rock's middle, degrees: the lowest look over the stones on the
@@ -53,7 +53,7 @@ class Preset:
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """Standard deviations of the poses that the reconstruction is told: metres and degrees, per axis."""
+    """Standard deviations, along and about each axis, of the errors of the poses in transforms.json: metres and degrees."""
 
     position: float = 0.0
     rotation: float = 0.0
@@ -74,26 +74,23 @@ def synthesise(
     mesh_up: str | None = None,
     test_views: int = 0,
 ) -> Dataset:
-    """Render the dataset `out`: images, depth, masks, rock, rock.glb, config.json, contact_sheet.png, transforms.json (last).
+    """Render a scene as a dataset into the folder `out`; what it holds is listed in docs/data.md.
 
-    With `pose_noise`, transforms.json holds noisy poses, and true_poses.json the cameras that took the images.
-    mesh: a file in place of the procedural rock; mesh_up: its up axis, "y" or "z", by default as `mgs.synth.rock.up_axis`.
-    test_views: number of views of `dome_cameras` that are rendered into the folder `test` of the dataset, with exact poses
-    (`Dataset.test_views`). The files of the orbit are the same with and without them.
-    A folder that an interrupted run of the same settings left is completed; the result is the same as in one run.
-    Raises InputError: output folder not empty, not writable or worked on by another process, bad mesh, rock not wholly in every
-    frame, or nowhere in sight.
+    seed: root seed of the rock, the ground and the rendering. mesh: a file in place of the procedural rock; mesh_up: its up
+    axis, "y" or "z", by default that of `mgs.synth.rock.up_axis`. With `pose_noise`, transforms.json holds noisy poses, and
+    true_poses.json those of the cameras that took the images. test_views: number of views of `dome_cameras` that are rendered
+    into the folder `test` of the dataset (`Dataset.test_views`); their poses are exact, and the orbit is the same with and
+    without them. progress: called as progress(views done, all views); say: called with lines for the user.
+
+    A folder that an interrupted run of the same settings left is completed, and ends with the same files as after one run.
+    Raises InputError where the output folder is not empty, cannot be written or is in use by another process, where the mesh is
+    bad, or where the rock is not wholly in every view or cannot be seen.
     """
     started, out = time.perf_counter(), Path(out)
     check_writable(out)
     if (out / "transforms.json").exists() or not (out / "config.json").exists():
         check_new_folder(out)  # before the rock is made, which takes seconds
-    if mesh is None:
-        rock, scale = make_rock(settings.rock, generator(seed, "rock")), 1.0
-    else:
-        rock, scale = load_rock(mesh, settings.rock, mesh_up)
-        extents = " x ".join(f"{x:.2f}" for x in rock.extents)
-        say(f"{mesh}: {_said_up(mesh, mesh_up)}; scaled {scale:.4g} times to the scene's rock size, now {extents} m")
+    rock, scale = _rock(settings, seed, mesh, mesh_up, say)
     cameras = rock_cameras(settings, preset, rock)
     frames = _frames(out, cameras, "kf")
     tests = _frames(out / TEST_FOLDER, dome_cameras(settings, preset, rock, test_views), "tv")
@@ -116,21 +113,28 @@ def synthesise(
         prepared = time.perf_counter()
         seconds = _render_frames(scene, [*frames, *tests], exposure, spp, seed, denoise, progress)
         write_contact_sheet(out / "contact_sheet.png", frames)
-        timings = {
-            "prepare_s": round(prepared - started, 2),
-            "frame_s": round(float(np.median(seconds)), 3) if seconds else None,
-            "total_s": round(time.perf_counter() - started, 2),
-        }
         record = {"mesh_scale": scale, "exposure": exposure, "samples_per_pixel": spp, "versions": versions()}
-        write_json(out / "config.json", resolved | record | {"timings": timings})
+        write_json(out / "config.json", resolved | record | {"timings": _timings(started, prepared, seconds)})
         if tests:
             write_transforms(out / TEST_FOLDER, tests)
         write_transforms(out, frames if pose_noise is None else _told(out, frames, pose_noise, seed))
         return load_dataset(out)
 
 
+def _rock(
+    settings: SceneFile, seed: int, mesh: str | Path | None, mesh_up: str | None, say: Callable[[str], None]
+) -> tuple[trimesh.Trimesh, float]:
+    """The procedural rock, or that of the file `mesh`, standing in the ground, and the scale that was applied to it."""
+    if mesh is None:
+        return make_rock(settings.rock, generator(seed, "rock")), 1.0
+    rock, scale = load_rock(mesh, settings.rock, mesh_up)
+    extents = " x ".join(f"{x:.2f}" for x in rock.extents)
+    say(f"{mesh}: {_said_up(mesh, mesh_up)}; scaled {scale:.4g} times to the scene's rock size, now {extents} m")
+    return rock, scale
+
+
 def _said_up(mesh: str | Path, given: str | None) -> str:
-    """In words: which axis of a mesh file is taken as up, and why."""
+    """A phrase that says which axis of a mesh file is taken as up, and why."""
     if given:
         return f"+{given.upper()} is up, as told"
     up = up_axis(mesh)
@@ -151,7 +155,7 @@ def _resolved(
     pose_noise: PoseNoise | None,
     test_views: int,
 ) -> dict[str, Any]:
-    """All that decides the dataset: what a run that goes on must agree with."""
+    """All that decides what the dataset holds. An interrupted run is continued only where it is the same."""
     return {
         "scene": settings.model_dump(mode="json"),
         "preset": asdict(preset),
@@ -163,8 +167,17 @@ def _resolved(
     }
 
 
+def _timings(started: float, prepared: float, frames: list[float]) -> dict[str, float | None]:
+    """Seconds until the first frame was begun, median of a frame, and seconds in all; for config.json."""
+    return {
+        "prepare_s": round(prepared - started, 2),
+        "frame_s": round(float(np.median(frames)), 3) if frames else None,
+        "total_s": round(time.perf_counter() - started, 2),
+    }
+
+
 def _told(out: Path, frames: list[Frame], pose_noise: PoseNoise, seed: int) -> list[Frame]:
-    """The frames with noisy poses; writes true_poses.json."""
+    """The frames with noisy poses, as they are told to whoever reads the dataset; writes the true ones to true_poses.json."""
     cameras = [frame.camera for frame in frames]
     told = perturb(cameras, pose_noise.position, pose_noise.rotation, generator(seed, "pose noise"))
     truth = {frame.name: opengl_from_opencv(frame.camera.world_to_camera).tolist() for frame in frames}
@@ -181,7 +194,7 @@ def _render_frames(
     denoise: bool,
     progress: Callable[[int, int], None],
 ) -> list[float]:
-    """Render and write the frames that are not on disk yet; returns the seconds that each took."""
+    """Render and write the frames whose files do not all exist yet; returns the seconds that each took."""
     seconds = []
     for index, frame in enumerate(frames):
         if not _is_done(frame):
@@ -200,24 +213,24 @@ def _render_frames(
 
 
 def rock_cameras(settings: SceneFile, preset: Preset, rock: trimesh.Trimesh) -> list[Camera]:
-    """The orbit's cameras, aimed at the middle of the rock above the ground.
+    """The cameras of the scene's orbit, aimed at the middle of that part of the rock which is above the ground.
 
-    Raises InputError where the rock is not wholly inside a frame.
+    Raises InputError where that part is not wholly inside a frame.
     """
     return _aimed(settings.orbit, settings, preset, preset.frames, rock, "frame")
 
 
 def dome_cameras(settings: SceneFile, preset: Preset, rock: trimesh.Trimesh, count: int) -> list[Camera]:
-    """Cameras spread evenly over a dome around the rock, of DOME_ELEVATIONS and the radius of the scene's orbit.
+    """Cameras for test views: spread evenly over a dome around the rock, at the radius of the scene's orbit.
 
-    They have the orbit's field of view and aim, and raise InputError as `rock_cameras`.
+    The dome covers all azimuths and the elevations of DOME_ELEVATIONS. Raises InputError as `rock_cameras`.
     """
     dome = settings.orbit.model_copy(update={"kind": "hemisphere", "elevations": DOME_ELEVATIONS})
     return _aimed(dome, settings, preset, count, rock, "test view")
 
 
 def _aimed(orbit: Orbit, settings: SceneFile, preset: Preset, count: int, rock: trimesh.Trimesh, what: str) -> list[Camera]:
-    """Cameras of an orbit as `rock_cameras`; what: how a camera is called where the rock is not wholly inside its frame."""
+    """The cameras of an orbit, aimed and checked as `rock_cameras` says; what: the word for one of them in the error."""
     target = np.array([0, 0, rock.bounds[1, 2] / 2])
     cameras = orbit_cameras(orbit, count, target, settings.camera.fov, preset.width, preset.height)
     for index, camera in enumerate(cameras):
@@ -228,7 +241,7 @@ def _aimed(orbit: Orbit, settings: SceneFile, preset: Preset, count: int, rock: 
 
 
 def write_contact_sheet(path: str | Path, frames: list[Frame]) -> None:
-    """Up to 32 evenly chosen frames, eight side by side, as PNG."""
+    """Write up to 32 of the frames, evenly chosen, as small pictures in one PNG, eight in a row."""
     columns, width = 8, 160
     chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, min(32, len(frames))).astype(int))]
     height = round(width * frames[0].camera.height / frames[0].camera.width)
@@ -242,6 +255,7 @@ def write_contact_sheet(path: str | Path, frames: list[Frame]) -> None:
 
 
 def _frames(out: Path, cameras: list[Camera], prefix: str) -> list[Frame]:
+    """Frames named prefix_0000, prefix_0001 and so on, with the files that will hold them in the folder `out`."""
     return [
         Frame(
             name := f"{prefix}_{i:04d}", camera, FRAME_INTERVAL * i,
@@ -252,6 +266,7 @@ def _frames(out: Path, cameras: list[Camera], prefix: str) -> list[Frame]:
 
 
 def _is_done(frame: Frame) -> bool:
+    """Whether all files of a frame exist; none exists in part (`mgs.files.atomic_path`)."""
     paths = frame.image_path, frame.depth_path, frame.mask_path, frame.rock_path
     return all(path is not None and path.is_file() for path in paths)
 

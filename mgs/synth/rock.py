@@ -1,4 +1,4 @@
-"""Rocks: procedural ones from a seed, or any textured mesh; both as a textured triangle mesh standing on the ground z = 0."""
+"""Rocks as textured triangle meshes that stand in the ground z = 0: procedural ones from a seed, or any mesh from a file."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from mgs.synth.noise import Noise
 from mgs.synth.scene_file import Rock
 
 MAX_GRID = 10**8
-"""Points of the grid that a rock is cut from: more would take tens of gigabytes."""
+"""Largest number of points of the grid on which a rock's body is computed: more would take tens of gigabytes."""
 
 CELL = 6
-"""Texels along one side of an atlas cell; a cell holds two triangles."""
+"""Texels along one side of a cell of the texture; two triangles share a cell."""
 
 
 def make_rock(settings: Rock, rng: np.random.Generator) -> trimesh.Trimesh:
-    """A weathered rock: cut ellipsoids -> marching cubes at `detail` -> displacement -> baked albedo texture.
+    """A weathered procedural rock: ellipsoids cut by planes, meshed by marching cubes, displaced, and painted with an albedo.
 
     Returns a mesh in world coordinates (metres, +Z up), partly below z = 0, with UVs and an sRGB base-colour texture.
     Raises InputError where `detail` is too coarse or too fine for the rock.
@@ -36,7 +36,7 @@ def make_rock(settings: Rock, rng: np.random.Generator) -> trimesh.Trimesh:
 
 
 def rock_shape(settings: Rock, noise: Noise) -> tuple[trimesh.Trimesh, np.ndarray]:
-    """The rock's geometry alone, standing on the ground, and the displacement [V], metres, that shaped each vertex."""
+    """The rock's geometry without texture, standing in the ground, and the displacement [V], metres, of each vertex."""
     mesh = _body(settings, noise).subdivide()
     height = _relief(mesh, settings, noise)
     mesh.vertices += height[:, None] * mesh.vertex_normals
@@ -44,15 +44,18 @@ def rock_shape(settings: Rock, noise: Noise) -> tuple[trimesh.Trimesh, np.ndarra
 
 
 def up_axis(path: str | Path) -> str:
-    """The up axis of a mesh file, "y" or "z", where nobody says: glTF and GLB have a rule, +Y. OBJ, PLY and others have none;
-    most OBJ files are +Y up, the others are taken to be as our world is, +Z."""
+    """The axis of a mesh file that is taken as up where the user does not name it, "y" or "z".
+
+    glTF and GLB are +Y up by their format. Other formats have no rule: OBJ is taken as +Y up, because most of its files are,
+    and all others as +Z up, as our world is.
+    """
     return "y" if Path(path).suffix.lower() in (*GLTF, ".obj") else "z"
 
 
 def load_rock(path: str | Path, settings: Rock, up: str | None = None) -> tuple[trimesh.Trimesh, float]:
-    """Any GLB, OBJ or PLY as the rock: scaled to `settings.size` and stood on the ground; keeps its texture.
+    """Read a mesh file as the rock, with its texture, scale it to `settings.size` and stand it in the ground.
 
-    up: "y" or "z", the file's up axis; by default as `up_axis`. Returns the mesh, +Z up, and the scale that was applied.
+    up: the file's up axis, "y" or "z", by default that of `up_axis`. Returns the mesh, +Z up, and the scale that was applied.
     Raises InputError as `load_mesh`, and where all vertices are one point.
     """
     mesh = load_mesh(path)
@@ -65,7 +68,7 @@ def load_rock(path: str | Path, settings: Rock, up: str | None = None) -> tuple[
 
 
 def _stand(mesh: trimesh.Trimesh, settings: Rock) -> trimesh.Trimesh:
-    """Scale to the settings' size, centre over the origin, and sink the share `buried` of the height into the ground."""
+    """Scale a mesh to the settings' size, centre it over the origin, and bury the share `buried` of its height."""
     mesh.apply_scale(settings.size / mesh.extents.max())
     low, high = mesh.bounds
     middle = (low + high) / 2
@@ -74,7 +77,7 @@ def _stand(mesh: trimesh.Trimesh, settings: Rock) -> trimesh.Trimesh:
 
 
 def _body(settings: Rock, noise: Noise) -> trimesh.Trimesh:
-    """Smooth union of ellipsoids, each cut by random planes; size 1, centred."""
+    """Ellipsoids, each cut by random planes, joined smoothly and meshed; scaled to the settings' size."""
     low = np.min([np.subtract(lobe.centre, lobe.radii) for lobe in settings.lobes], axis=0)
     high = np.max([np.add(lobe.centre, lobe.radii) for lobe in settings.lobes], axis=0)
     extent = float((high - low).max())
@@ -105,13 +108,13 @@ def _body(settings: Rock, noise: Noise) -> trimesh.Trimesh:
 
 
 def _smooth_max(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
-    """Maximum with the crease rounded over `width` (polynomial smooth maximum)."""
+    """The maximum of a and b, rounded off where they differ by less than `width` (polynomial smooth maximum)."""
     h = np.clip(0.5 + 0.5 * (a - b) / width, 0, 1)
     return b + (a - b) * h + width * h * (1 - h)
 
 
 def _relief(mesh: trimesh.Trimesh, settings: Rock, noise: Noise) -> np.ndarray:
-    """Displacement along the normals [V], metres: ridged relief, rough and smooth patches, pits, cracks, strata."""
+    """Displacement of each vertex along its normal [V], metres: ridges, rough and smooth patches, pits, cracks, strata."""
     p = np.asarray(mesh.vertices, np.float32)
     size, amplitude = settings.size, settings.relief * settings.size
     warped = p + 0.06 * size * np.stack([noise.fractal(p, 0.4 * size, 2) for _ in range(3)], -1).astype(np.float32)
@@ -131,14 +134,15 @@ def _relief(mesh: trimesh.Trimesh, settings: Rock, noise: Noise) -> np.ndarray:
 
 
 def _bake(mesh: trimesh.Trimesh, height: np.ndarray, settings: Rock, noise: Noise) -> trimesh.Trimesh:
-    """Give every pair of triangles its own cell of a texture atlas, and evaluate the albedo at every texel.
+    """The mesh with a texture of its albedo, in which every two triangles have a square cell of their own.
 
-    Needs no unwrapping, so it works for any shape and never stretches.
+    The albedo is a function of position, so it is evaluated at every texel. Because each triangle has its own place, no surface
+    needs to be unwrapped: this works for any shape, and stretches nothing. Returns a mesh whose faces share no vertices.
     """
     n_faces = len(mesh.faces)
     cells = np.arange((n_faces + 1) // 2)
     across = int(np.ceil(np.sqrt(len(cells))))
-    # A cell's texels: the first triangle lies at its origin, the second is the first turned by half a turn.
+    # The first triangle of a cell has its right angle at the cell's origin; the second is the first, turned by 180 degrees.
     j, i = (a.ravel() for a in np.mgrid[:CELL, :CELL])
     turned = i + j > CELL - 1
     u, v = (np.where(turned, CELL - 1 - a, a) / (CELL - 2) for a in (i, j))
@@ -159,7 +163,7 @@ def _bake(mesh: trimesh.Trimesh, height: np.ndarray, settings: Rock, noise: Nois
     corners = np.stack([first, CELL - 1 - first])[np.arange(n_faces) % 2] + 0.5
     cell = np.arange(n_faces) // 2
     uv = (corners + CELL * np.stack([cell % across, cell // across], -1)[:, None]) / (across * CELL)
-    uv[..., 1] = 1 - uv[..., 1]  # trimesh, as OBJ, counts v upwards from the last row
+    uv[..., 1] = 1 - uv[..., 1]  # in trimesh, as in OBJ files, v points upwards from the image's last row
     image = Image.fromarray(np.round(255 * srgb_from_linear(texture)).astype(np.uint8))
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=0.9)
     return trimesh.Trimesh(
@@ -172,7 +176,10 @@ def _bake(mesh: trimesh.Trimesh, height: np.ndarray, settings: Rock, noise: Nois
 
 
 def _albedo(p: np.ndarray, normal: np.ndarray, height: np.ndarray, settings: Rock, noise: Noise) -> np.ndarray:
-    """Linear RGB [..., 3] at points [..., 3], metres: two minerals, grains, dark hollows and dust on top."""
+    """Albedo, linear RGB [..., 3], at points p [..., 3], metres: two minerals, grains, dark hollows, and dust on what faces up.
+
+    normal [..., 3]: unit; height [...]: displacement of `_relief`, metres.
+    """
     size = settings.size
     light, dark, dust = (np.asarray(c, np.float32) for c in (*settings.colours, settings.dust))
     patches = noise.fractal(p, 0.5 * size, 4, 0.6)
@@ -193,6 +200,6 @@ def _albedo(p: np.ndarray, normal: np.ndarray, height: np.ndarray, settings: Roc
 
 
 def _smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
-    """0 below `low`, 1 above `high`, cubic between (falls where low > high)."""
+    """0 at x = low and before, 1 at x = high and beyond, and a cubic curve between; low may be greater than high."""
     t = np.clip((x - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)

@@ -22,18 +22,19 @@ from mgs.synth.rock_layer import RockLayer, continued, lattice, render_layers, w
 from mgs.synth.scene_file import SceneFile, Sky
 
 MAX_DEPTH = 4
-"""Path length: direct light and two bounces; light between rock and ground matters in the shade."""
+"""Longest light path, in Mitsuba's count: direct light and two bounces. In the shade, light that rock and ground throw on each
+other matters."""
 
 GUIDES_PER_SAMPLE = 2
-"""Samples of the denoiser's guides for each sample of light. Guides are cheap and, nearly free of noise, can be declared clean:
-the denoiser then keeps the texture they show."""
+"""Samples of the denoiser's guides (albedo and normals) for each sample of light. Guides are cheap; with so many samples they
+are nearly free of noise and may be declared clean, and then the denoiser keeps the texture that they show."""
 
 MARGIN = 16
-"""Pixels around the rock that are given to the denoiser with it."""
+"""Pixels around the rock's bounding box that the denoiser of the rock alone sees too."""
 
 COVERAGE_RAYS = 255
-"""Rays that tell which share of a pixel the rock covers, so that each share is a value of an 8-bit image. Odd, because one of
-them goes through the centre."""
+"""Rays through a pixel that measure which share of it the rock covers. Shares of 255 are exact in an 8-bit image, and the
+number is odd, so that one of the rays goes through the centre."""
 
 _MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Mitsuba's camera frame is x to the image's left, y up, z forward."""
@@ -55,7 +56,7 @@ class Rendered:
 
 
 class Scene:
-    """A rock on its arena under sun and sky, seen through cameras of one size and one K."""
+    """A rock on its arena under sun and sky. All cameras that see it must have the size and the K of the one given first."""
 
     def __init__(self, settings: SceneFile, rock: trimesh.Trimesh, camera: Camera, seed: int) -> None:
         ground = make_ground(settings.arena, rock, generator(seed, "ground"))
@@ -76,9 +77,10 @@ class Scene:
         self.guides = RockLayer(mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}), self.rock)
 
     def render(self, camera: Camera, spp: int, seed: int, denoise: bool) -> Rendered:
-        """Path-trace one frame with `spp` samples per pixel; with `denoise`, Open Image Denoise guided by albedo and normal.
+        """Path-trace one frame with `spp` samples per pixel; with `denoise`, Open Image Denoise takes out the noise.
 
-        Where the rock covers a pixel wholly, its layer is the image itself. At its outline, the layer is denoised apart.
+        In pixels that the rock covers wholly, the picture of the rock alone is the image itself. At the outline it is denoised
+        on its own, with albedo and normals of the rock alone to guide the denoiser.
         """
         self.params["sensor.to_world"] = mi.Transform4f(_to_world(camera))
         self.params.update()
@@ -99,7 +101,7 @@ class Scene:
         return Rendered(rgb, np.dstack([rock, alpha]), depth, mask)
 
     def cast(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """z-depth [H,W] (metres, 0 = sky) and rock mask [H,W] along the rays through the pixel centres."""
+        """z-depth, float32 [H,W], metres, 0 = sky, and the rock's mask, bool [H,W], of rays through the pixel centres."""
         rays = camera.unproject(np.ones((camera.height, camera.width))) - camera.position
         size = (camera.height, camera.width)
         z, mask = self._first_hits(camera, rays.reshape(-1, 3))
@@ -125,26 +127,26 @@ class Scene:
         return alpha
 
     def _first_hits(self, camera: Camera, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of what rays from the camera meet first: z-depth, float32 [N], metres, 0 = sky; and whether it is the rock, bool [N].
+        """z-depth of what rays from the camera meet first, float32 [N], metres, 0 = sky; and whether it is the rock, bool [N].
 
-        rays: [N,3] in world axes, of z-depth 1.
+        rays [N,3]: directions in world axes, each as long as reaches a z-depth of 1.
         """
         length = np.linalg.norm(rays, axis=1)
         origin, directions = mi.Point3f(*camera.position.tolist()), mi.Vector3f((rays / length[:, None]).T.astype(np.float32))
-        dr.make_opaque(origin)  # a number known to the compiler would make a kernel of its own for every camera
+        dr.make_opaque(origin)  # a number that the compiler knows would cost a new kernel for every camera
         hit = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, directions))
-        dr.eval(hit)  # else each array that is read below would trace the rays again
+        dr.eval(hit)  # otherwise each array that is read below would trace the rays again
         z = np.where(hit.is_valid().numpy(), hit.t.numpy() / length, 0)
         return z.astype(np.float32), (hit.shape == mi.ShapePtr(self.rock)).numpy()
 
 
 def _around(mask: np.ndarray) -> tuple[slice, ...]:
-    """Rows and columns of the smallest box around the true pixels of a mask [H,W], and MARGIN beyond; there is a true pixel."""
+    """Rows and columns of the bounding box of the true pixels of a mask [H,W], widened by MARGIN; at least one must be true."""
     return tuple(slice(max(place.min() - MARGIN, 0), place.max() + 1 + MARGIN) for place in np.nonzero(mask))
 
 
 def _denoise(rgb: np.ndarray, guides: np.ndarray) -> np.ndarray:
-    """Open Image Denoise of rgb [H,W,3]; the guides [H,W,9] are RGB, which is not used, albedo and normal."""
+    """rgb [H,W,3] after Open Image Denoise. guides [H,W,9]: RGB, which is not used, albedo and normal."""
     import pyoidn
 
     albedo, normal = np.clip(guides[..., 3:6], 0, 1), np.clip(guides[..., 6:], -1, 1)
@@ -152,7 +154,7 @@ def _denoise(rgb: np.ndarray, guides: np.ndarray) -> np.ndarray:
 
 
 def sensor_dict(camera: Camera) -> dict[str, Any]:
-    """A Mitsuba perspective sensor that is `camera`, with a box filter (sharp pixels, independent of their neighbours)."""
+    """The camera as a Mitsuba perspective sensor. Its box filter makes a pixel the mean over its own area, and no more."""
     K, w, h = camera.K, camera.width, camera.height
     film = {"type": "hdrfilm", "width": w, "height": h, "pixel_format": "rgb", "rfilter": {"type": "box"}}
     return {
@@ -169,6 +171,7 @@ def sensor_dict(camera: Camera) -> dict[str, Any]:
 
 
 def _to_world(camera: Camera) -> np.ndarray:
+    """The camera's pose [4,4] as Mitsuba's sensors have it."""
     return camera.camera_to_world @ _MITSUBA_FROM_OPENCV
 
 
@@ -184,7 +187,7 @@ def _bitmap(linear: np.ndarray) -> dict[str, Any]:
 
 
 def _rock_bsdf(rock: trimesh.Trimesh, plain: tuple[float, float, float]) -> dict[str, Any]:
-    """A rough dielectric-coated diffuser that keeps the mesh's texture, else its vertex colours, else one `plain` colour."""
+    """A rough, slightly glossy material; its colour is the mesh's texture, or else its vertex colours, or else `plain`."""
     visual: Any = rock.visual
     image = getattr(visual, "material", None) and _texture_image(visual.material)
     if image is not None and visual.uv is not None:
@@ -204,7 +207,7 @@ def _texture_image(material: Any) -> Any:
 
 
 def _mesh(name: str, mesh: trimesh.Trimesh, bsdf: dict[str, Any]) -> Any:
-    """trimesh -> mi.Mesh with normals, UVs (v turned to Mitsuba's, downwards) and vertex attributes."""
+    """A trimesh mesh as a mi.Mesh, with normals, UVs and vertex attributes. In Mitsuba v points down, in trimesh up."""
     uv = getattr(mesh.visual, "uv", None)
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict({"type": "twosided", "material": bsdf})

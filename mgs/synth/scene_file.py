@@ -30,7 +30,7 @@ class _Strict(BaseModel):
 
 
 class Lobe(_Strict):
-    """One ellipsoid of the rock's body, before it is cut and weathered; unitless, scaled with the rock."""
+    """One ellipsoid of the rock's body, before it is cut and weathered, in any unit: the whole rock is scaled to its size."""
 
     centre: tuple[float, float, float] = (0, 0, 0)
     radii: tuple[Positive, Positive, Positive] = (1, 1, 1)
@@ -97,7 +97,7 @@ class Lens(_Strict):
 
 
 class Orbit(_Strict):
-    """Where the keyframes are taken from; every camera looks at the middle of the rock."""
+    """Positions of the cameras; every camera looks at the middle of the rock."""
 
     kind: OrbitKind = "circle"
     radius: Positive = 4.0
@@ -111,7 +111,7 @@ class Orbit(_Strict):
 
 
 class Sensor(_Strict):
-    """What a survey of the scene is flown with (`mgs survey`); the images of `mgs synth-orbit` are exact."""
+    """Errors of the sensors that `mgs survey` flies with; `mgs synth-orbit` has none."""
 
     noise: Annotated[float, Field(ge=0)] = 1.0
     """Factor on the depth camera's noise (`mgs.survey.depth_sensor`)."""
@@ -150,17 +150,20 @@ def load_scene_file(scene: str | Path) -> SceneFile:
 
 
 def _keys_beside(where: tuple[int | str, ...]) -> list[str]:
-    """The keys that a scene file may have in the section of the key `where`, a path such as ("rock", "lobes", 0, "radius")."""
+    """The keys that may stand in a scene file beside the key at `where`, a path such as ("rock", "lobes", 0, "radius")."""
     section: Any = SceneFile
     for part in where[:-1]:
-        if isinstance(part, str):  # not the place in a list
+        if isinstance(part, str):  # a number is an index into a list, whose entries are all of one kind
             kind = section.model_fields[part].annotation
             section = next(iter(get_args(kind)), kind)
     return list(section.model_fields)
 
 
 def sensor_of(dataset: Path) -> Sensor:
-    """The sensor of the scene that a dataset was rendered from; the default where the dataset does not say."""
+    """The sensor settings of the scene that a dataset was rendered from; the default where it has no config.json.
+
+    Raises InputError where config.json is damaged.
+    """
     path = dataset / "config.json"
     recorded = read_json(path) if path.is_file() else {}
     try:
