@@ -224,9 +224,9 @@ def import_source(
     """Write a source as a dataset into the folder `out`, new or empty, or with what an interrupted import of the same left.
 
     import.json, which says what is imported, is written first and transforms.json last; a finished frame is not read again
-    unless its files have changed since, and the result is the same, bit for bit, as in one go.
+    unless one of its files has a newer modification time, and the result is the same, bit for bit, as in one go.
     Masks come from, in this order: files of `masks` with the image's stem, the pixels whose centre shows the `mesh` (world
-    coordinates; needs the variant to be set, `mgs.runtime.start`), the source's own mask files, the images' alpha.
+    coordinates), the source's own mask files, the images' alpha.
     Images of the rock alone come from the source's own images of it, or from an alpha that gives the mask and has values
     between empty and full; with `masks` or `mesh` there are none.
     Distorted images, depth and masks are undistorted to a pinhole camera that holds valid pixels only.
@@ -263,6 +263,8 @@ def import_source(
 
 def _mask_file(masks: Path, shot: Shot) -> Path:
     path = _find(masks, shot.image.stem) or _find(masks, shot.name)
+    if not masks.is_dir():
+        raise InputError(f"{masks}: no such folder; give the folder of the masks")
     if path is None:
         raise InputError(f"{masks}: no mask for image {shot.image.name}; name masks as their images")
     return path
@@ -381,8 +383,11 @@ def undistorter(camera: Camera, distortion: np.ndarray) -> tuple[Camera, Callabl
 
 
 def mesh_silhouette(path: Path) -> Callable[[Camera], np.ndarray]:
-    """A function of a camera: bool [H,W], the pixels whose centre shows the mesh. Raises InputError as `read_mesh`."""
-    from mgs.data.raycast import mesh_depth  # only here: it wants the variant to be set
+    """A function of a camera: bool [H,W], the pixels whose centre shows the mesh.
+
+    Raises InputError as `read_mesh` and `mesh_depth`.
+    """
+    from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
     depth = mesh_depth(read_mesh(path))
     return lambda camera: depth(camera) > 0

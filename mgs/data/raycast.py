@@ -1,4 +1,4 @@
-"""Depth images of a mesh, by rays through the pixel centres. Needs the variant to be set (`mgs.runtime.start`)."""
+"""Depth images of a mesh, by rays through the pixel centres."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mgs import runtime
 from mgs.camera import Camera
 
 if TYPE_CHECKING:
@@ -19,7 +20,9 @@ def mesh_depth(mesh: Mesh) -> Callable[[Camera], np.ndarray]:
     """A function of a camera that gives the z-depth of the mesh, float32 [H,W], metres, 0 where a ray meets no face.
 
     One ray per pixel, through its centre, whatever the mesh and however near it is; both sides of a face are met.
+    Raises InputError where no variant can be started (`mgs.runtime.start`).
     """
+    runtime.start()
     centre = mesh.vertices.mean(0)  # float32 resolves most near the origin
     shape = mi.Mesh("mesh", len(mesh.vertices), len(mesh.faces))
     params = mi.traverse(shape)
