@@ -41,9 +41,13 @@ class Camera:
     world_to_camera: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        K = np.asarray(self.K, np.float64)
-        pose = np.asarray(self.world_to_camera, np.float64)
-        if int(self.width) != self.width or int(self.height) != self.height:
+        K = np.asarray(self.K, np.float64) + 0.0  # makes 0.0 of -0.0: `key` compares bytes
+        pose = np.asarray(self.world_to_camera, np.float64) + 0.0
+        try:
+            whole = int(self.width) == self.width and int(self.height) == self.height
+        except (ValueError, OverflowError):  # of NaN and of infinity
+            whole = False
+        if not whole:
             raise InputError(f"camera: image size {self.width}x{self.height} must be whole pixels")
         object.__setattr__(self, "width", int(self.width))  # Dr.Jit does not accept NumPy's integers as sizes
         object.__setattr__(self, "height", int(self.height))

@@ -202,6 +202,20 @@ def test_a_camera_has_no_skew(entry):
         Camera(skewed, W, H, np.eye(4))
 
 
+@pytest.mark.parametrize("side", [float("nan"), float("inf"), np.float32("nan"), 12.5])
+def test_a_camera_has_whole_pixels(side):
+    for size in ((side, H), (W, side)):
+        with pytest.raises(InputError, match="must be whole pixels"):
+            Camera(K, *size, np.eye(4))
+
+
+def test_cameras_that_differ_in_the_sign_of_zero_are_equal():
+    signed_K, signed_pose = (np.where(matrix == 0, -0.0, matrix) for matrix in (K, np.eye(4)))
+    plain, signed = Camera(K, W, H, np.eye(4)), Camera(signed_K, W, H, signed_pose)
+    assert plain == signed
+    assert hash(plain) == hash(signed)
+
+
 def test_bad_files(folder, tmp_path):
     with pytest.raises(InputError, match="no such dataset folder"):
         load_dataset(tmp_path / "nowhere")

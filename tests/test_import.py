@@ -428,7 +428,8 @@ BAD: dict[str, tuple[Callable[[Path], Path], list[str], str]] = {
     "no images": (_no_images, [], "none of the 8 images"),
     "truncated image": (_truncated_image, [], "not a readable image"),
     "truncated colmap": (lambda root: _colmap(root, _truncate), [], "not a readable COLMAP model"),
-    "no mask": (lambda root: synthetic.write_dataset(root).root, ["--masks", "images/none"], "no mask for image"),
+    "no mask": (lambda root: synthetic.write_dataset(root).root, ["--masks", "."], "no mask for image"),
+    "no mask folder": (lambda root: synthetic.write_dataset(root).root, ["--masks", "none"], "none: no such folder"),
     "no mesh": (lambda root: synthetic.write_dataset(root).root, ["--mesh", "none.glb"], "no such mesh"),
     "both masks": (lambda root: synthetic.write_dataset(root).root, ["--mesh", "a.glb", "--masks", "b"], "give one of them"),
 }
@@ -445,6 +446,20 @@ def test_bad_input_is_one_line_and_leaves_nothing(case: str, tmp_path: Path, cap
     assert message in error
     assert "\n" not in error
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", ["import", "prior"])
+def test_a_mesh_is_said_to_be_turned_only_where_it_could_be_read(
+    dataset: Dataset, tmp_path: Path, command: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "broken.glb").write_text("this is no mesh")
+    options = ["--gaussians", "300"] if command == "prior" else []
+    said = {}
+    for mesh in (tmp_path / "broken.glb", dataset.root / "rock.glb"):
+        with pytest.raises(SystemExit):
+            main([command, str(dataset.root), "--out", str(tmp_path / "out"), "--mesh", str(mesh), *options])
+        said[mesh.stem] = "turned from +Y up" in capfd.readouterr().out.replace("\n", " ")
+    assert said == {"broken": False, "rock": True}
 
 
 def test_an_empty_mask_in_every_frame_is_one_line(dataset: Dataset) -> None:

@@ -130,3 +130,36 @@ def test_bad_meshes(tmp_path, name, write, message):
     with pytest.raises(InputError, match=message) as error:
         load_rock(tmp_path / name, Rock())
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "options"), [("glb", {"include_normals": True}), ("obj", {"include_normals": True}), ("ply", {})]
+)
+def test_a_rock_whose_faces_are_there_twice_has_normals(tmp_path, suffix, options):
+    """Faces and their reverse share vertices, where their normals cancel; the file may hold what is left of them."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    doubled = np.concatenate([ball.faces, ball.faces[:, ::-1], [[0, 0, 1]]])
+    trimesh.Trimesh(ball.vertices, doubled, process=False).export(tmp_path / f"rock.{suffix}", **options)
+    rock, _ = load_rock(tmp_path / f"rock.{suffix}", Rock(), "z")
+    assert len(rock.faces) == len(ball.faces)
+    np.testing.assert_allclose(np.linalg.norm(rock.vertex_normals, axis=1), 1, atol=1e-6)
+    outward = rock.vertices - rock.bounds.mean(0)
+    cosines = np.einsum("vk,vk->v", rock.vertex_normals, outward / np.linalg.norm(outward, axis=1, keepdims=True))
+    assert cosines.min() > 0.99
+
+
+def test_leaving_out_a_face_keeps_the_normals_and_uv_of_the_file(tmp_path):
+    rock = make_rock(COARSE, generator(0, "rock"))
+    (tmp_path / "rock.glb").write_bytes(to_glb(rock))
+    spoilt = rock.copy(include_cache=True)
+    normals = spoilt.vertex_normals
+    spoilt.faces = np.concatenate([rock.faces, rock.faces[:1], [[0, 0, 1]]])
+    spoilt.vertex_normals = normals
+    (tmp_path / "spoilt.glb").write_bytes(to_glb(spoilt))
+    good, mended = (load_rock(tmp_path / f"{name}.glb", COARSE)[0] for name in ("rock", "spoilt"))
+    np.testing.assert_array_equal(mended.vertices, good.vertices)
+    np.testing.assert_array_equal(mended.faces, good.faces)
+    np.testing.assert_array_equal(mended.visual.uv, good.visual.uv)
+    assert set(good.faces[0]) == {0, 1, 2}  # of no other face
+    np.testing.assert_array_equal(mended.vertex_normals[3:], good.vertex_normals[3:])
+    assert not np.array_equal(good.vertex_normals[3:6], np.tile(good.face_normals[1], (3, 1)))  # new ones would differ

@@ -108,6 +108,8 @@ def test_start_raises_instead_of_aborting():
         ("render(one, camera); print(mi.variant())", "llvm_ad_rgb"),
         ("mi.set_variant('scalar_rgb')\ntry: runtime.start()\nexcept InputError as e: print(mi.variant(), e)", SCALAR),
         ("mi.set_variant('scalar_rgb')\ntry: render(one, camera)\nexcept InputError as e: print(mi.variant(), e)", SCALAR),
+        ("mesh_depth(mesh)(camera); print(mi.variant())", "llvm_ad_rgb"),
+        ("mi.set_variant('scalar_rgb')\ntry: mesh_depth(mesh)\nexcept InputError as e: print(mi.variant(), e)", SCALAR),
         ("mi.set_variant('scalar_rgb')\ntry: fisher(one, camera)\nexcept InputError as e: print(mi.variant(), e)", SCALAR),
         (
             "mi.set_variant('llvm_ad_spectral')\ntry: runtime.start()\nexcept InputError as e: print(e)",
@@ -121,11 +123,14 @@ def test_the_users_variant_stays(program, printed):
 import numpy as np, mitsuba as mi
 from mgs import runtime
 from mgs.camera import Camera
+from mgs.data.meshes import Mesh
+from mgs.data.raycast import mesh_depth
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.splat import fisher, render
 one = Gaussians(*(np.ones(shape, np.float32) for shape in ((1, 3), (1, 3), (1, 4), 1, (1, 1, 3))))
 camera = Camera(np.diag([20.0, 20.0, 1.0]), 16, 12, np.eye(4))
+mesh = Mesh(np.eye(3) + [0, 0, 2], np.array([[0, 1, 2]]), np.ones(1, bool))
 """
     done = subprocess.run([sys.executable, "-c", prepare + program], capture_output=True, text=True, timeout=120)
     assert printed in done.stdout, done.stderr

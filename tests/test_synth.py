@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from mgs.resources import resource_folder
 from mgs.rotation import WORLD_FROM_GLTF
 from mgs.seeds import generator
 from mgs.synth import arena
-from mgs.synth.rendering import ROCK_EXPOSURE, PoseNoise, Preset, dome_cameras, rock_cameras, synthesise
+from mgs.synth.rendering import ROCK_EXPOSURE, PoseNoise, Preset, _meter, dome_cameras, rock_cameras, synthesise
 from mgs.synth.rock import make_rock
 from mgs.synth.scene_file import ORBITS, Arena, Orbit, Rock, SceneFile, load_scene_file
 
@@ -297,3 +298,10 @@ def test_every_scene_frames_its_rock_on_every_orbit(scene):
         dome_cameras(flown, Preset(640, 480, 36, 1), rock, 60)  # would refuse a view without the whole rock
         heights = [np.ptp(camera.project(rock.vertices[rock.vertices[:, 2] > 0])[0][:, 1]) / 480 for camera in cameras]
         assert 0.35 < np.mean(heights) < 0.75
+
+
+def test_a_rock_that_renders_as_nan_is_refused():
+    image = SimpleNamespace(rgb=np.full((2, 2, 3), np.nan, np.float32), mask=np.ones((2, 2), bool), depth=np.ones((2, 2)))
+    scene = SimpleNamespace(render=lambda *_, **__: image)
+    with pytest.raises(InputError, match="NaN or infinite in frame 0; repair its mesh"):
+        _meter(scene, [None] * 4, 0, 1, False, print)

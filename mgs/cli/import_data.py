@@ -29,7 +29,6 @@ def import_data(
     from rich.console import Console
     from rich.progress import Progress
 
-    from mgs import runtime
     from mgs.data.importers import import_source, read_source
     from mgs.data.meshes import GLTF
     from mgs.errors import InputError
@@ -37,11 +36,12 @@ def import_data(
     console, notes = Console(), Console(stderr=True)
     if masks is not None and mesh is not None:
         raise InputError("import: --masks and --mesh both say where masks come from; give one of them")
-    if mesh is not None and mesh.suffix.lower() in GLTF:
-        console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
     found = read_source(source, images, split)
+<<<<<<< HEAD
     if mesh is not None:
         runtime.start()  # rays are cast at the mesh
+=======
+>>>>>>> wt-aud1
     with Progress(console=console, transient=True) as progress:
         bar = progress.add_task("importing")
         result = import_source(
@@ -51,6 +51,8 @@ def import_data(
             mesh=mesh,
             on_frame=lambda done, total: progress.update(bar, completed=done, total=total),
         )
+    if mesh is not None and mesh.suffix.lower() in GLTF:
+        console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
     if found.missing:
         notes.print(f"mgs: {found.missing} of {found.missing + len(found.shots)} listed images do not exist; skipped them")
     keys = ("mask_path", "rock_path", "depth_path")

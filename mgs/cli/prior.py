@@ -49,7 +49,6 @@ def prior(
     """
     from rich.console import Console
 
-    from mgs import runtime
     from mgs.data.dataset import load_dataset
     from mgs.data.meshes import GLTF
     from mgs.files import atomic_folder, check_new_folder
@@ -64,16 +63,13 @@ def prior(
     settings = PriorSettings(gaussians, spacing, poisson_depth, prior_noise, holes, seed, backing)
     with console.status("reading") as status:
         if mesh is not None:
+            result, segmented = prior_from_mesh(mesh, settings), None
             if mesh.suffix.lower() in GLTF:
                 console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
-            result, segmented = prior_from_mesh(mesh, settings), None
         else:
             result, segmented = build_prior(loaded, settings, lambda stage: status.update(f"prior: {stage}"))
         status.update("prior: what four seed frames see")
-        seeds = _seed_frames(loaded, result)
-        if not all(frame.depth_path for frame in seeds):
-            runtime.start()  # to cast rays at the mesh in place of depth images
-        result = with_share_seen(result, seeds)
+        result = with_share_seen(result, _seed_frames(loaded, result))
         status.update("prior: picture")
         with atomic_folder(folder) as unfinished:
             save_prior(unfinished, result)

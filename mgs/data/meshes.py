@@ -144,16 +144,34 @@ def _in_world(mesh: trimesh.Trimesh, y_up: bool) -> Mesh:
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     if y_up:
         vertices = vertices @ WORLD_FROM_GLTF[:3, :3].T
+<<<<<<< HEAD
     faces = faces[np.linalg.norm(_crosses(vertices, faces), axis=1) > 0]
     place = np.unique(vertices + 0.0, axis=0, return_inverse=True)[1].ravel()  # equal for vertices at one place; + 0.0: no -0
     first = np.unique(np.sort(place[faces], axis=1), axis=0, return_index=True)[1]
     faces = faces[np.sort(first)]
+=======
+    faces = faces[distinct_faces(vertices, faces)]
+    place = _places(vertices)
+>>>>>>> wt-aud1
     faces = np.where(_wound_against(place[faces])[:, None], faces[:, ::-1], faces)
     used, corners = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[used], corners.reshape(faces.shape)
     a, b, c = (vertices[faces[:, k]] - vertices.mean(0) for k in range(3))
     inside_out = np.einsum("fk,fk->f", a, np.cross(b, c)).sum() < 0  # six times the signed volume
     return Mesh(vertices, faces[:, ::-1] if inside_out else faces, np.ones(len(faces), bool))
+
+
+def distinct_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Which faces [F,3] to keep: indices, ascending, of those with an area, and of faces at the same three places, whichever
+    way round, only the first. vertices: [V,3]."""
+    kept = np.flatnonzero(np.linalg.norm(_crosses(vertices, faces), axis=1) > 0)
+    corners = np.sort(_places(vertices)[faces[kept]], axis=1)
+    return kept[np.sort(np.unique(corners, axis=0, return_index=True)[1])]
+
+
+def _places(vertices: np.ndarray) -> np.ndarray:
+    """[V] a number for each vertex; vertices at the same place have the same number. 0.0 and -0.0 are the same coordinate."""
+    return np.unique(vertices + 0.0, axis=0, return_inverse=True)[1].ravel()
 
 
 def _wound_against(faces: np.ndarray) -> np.ndarray:

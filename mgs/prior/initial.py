@@ -60,10 +60,10 @@ def initial_gaussians(prior: Prior, seed_frames: Sequence[Frame]) -> tuple[Gauss
 
     A frame sees a sample that lies inside its rock mask, whose normal points towards the camera, and whose depth agrees with
     the depth image, up to `prior.depth_tolerance` and the slope of the surface within a pixel. For a frame without depth image
-    the depth of the prior's mesh is used, which needs Mitsuba's variant to be set (`mgs.runtime.start`). A sample that no frame
+    the depth of the prior's mesh is used. A sample that no frame
     sees is grey.
     Returns (N + backed Gaussians of degree 0, seen [N] bool: which samples some frame sees).
-    Raises InputError if a file of a frame cannot be read.
+    Raises InputError if a file of a frame cannot be read, and as `mesh_depth` where a frame has no depth image.
     """
     n = len(prior.points)
     total, count = np.zeros((n, 3)), np.zeros(n)
@@ -117,7 +117,7 @@ def _depth_of_mesh(prior: Prior) -> Callable[[Camera], np.ndarray]:
 def with_share_seen(prior: Prior, seed_frames: Sequence[Frame]) -> Prior:
     """The prior with one more of its `numbers`, seen_by_seeds: the share of its samples that some of the seed frames see.
 
-    The others would start grey. Needs and raises what `initial_gaussians` does.
+    The others would start grey. Raises InputError as `initial_gaussians`.
     """
     seen = initial_gaussians(prior, seed_frames)[1]
     return replace(prior, numbers=prior.numbers | {"seen_by_seeds": float(seen.mean())})

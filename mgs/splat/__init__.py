@@ -4,9 +4,8 @@
 change in a given way. `fisher` gives the information that a view carries about each Gaussian. A `ListCache` kept between calls
 makes all three faster for cameras seen before.
 
-Call `mgs.runtime.start` before importing this package: it looks for a libLLVM that works, which has no effect once Mitsuba is
-imported. `import mgs.splat.plugins` registers the Mitsuba integrator `mgs_splat` (plugins/mgs_splat.py), which draws the same
-images.
+`render`, `jvp` and `fisher` start Dr.Jit themselves (`mgs.runtime.start`): importing this package needs nothing before it.
+`import mgs.splat.plugins` registers the Mitsuba integrator `mgs_splat` (plugins/mgs_splat.py), which draws the same images.
 """
 
 from mgs.splat.information import ESTIMATORS, fisher, groups

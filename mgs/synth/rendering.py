@@ -274,7 +274,8 @@ def _is_done(frame: Frame) -> bool:
 def _meter(scene: Scene, cameras: list[Camera], seed: int, spp: int, denoise: bool, say: Callable[[str], None]) -> float:
     """One exposure for the whole orbit, from four evenly spaced cameras: that of the rock, or less, and said, where that would
     clip more than MAX_CLIPPED. How much less is seen in the four rendered as the frames will be: the noise of few samples
-    makes too many pixels bright. Raises InputError where a camera does not see the rock.
+    makes too many pixels bright. Raises InputError where a camera does not see the rock, or the rock's
+    brightness is not finite.
     """
     chosen = np.unique(np.linspace(0, len(cameras), 4, endpoint=False).astype(int))
     means, values = [], []
@@ -283,6 +284,8 @@ def _meter(scene: Scene, cameras: list[Camera], seed: int, spp: int, denoise: bo
         if not rendered.mask.any():
             raise InputError(f"scene: the rock is hidden in frame {index}; raise orbit.altitude, or lower rock.buried")
         means.append(float(rendered.rgb[rendered.mask].mean()))
+        if not np.isfinite(means[-1]):
+            raise InputError(f"scene: the rock has pixels that are NaN or infinite in frame {index}; repair its mesh")
         values.append(rendered.rgb.max(-1)[rendered.depth > 0])
     wanted = ROCK_EXPOSURE / float(np.mean(means))
     if np.quantile(np.concatenate(values), 1 - MAX_CLIPPED) * wanted <= 1:

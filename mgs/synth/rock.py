@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from skimage.measure import marching_cubes
 
 from mgs.colour import srgb_from_linear
-from mgs.data.meshes import GLTF, load_mesh
+from mgs.data.meshes import GLTF, distinct_faces, load_mesh
 from mgs.errors import InputError
 from mgs.rotation import WORLD_FROM_GLTF
 from mgs.synth.noise import Noise
@@ -55,16 +55,37 @@ def up_axis(path: str | Path) -> str:
 def load_rock(path: str | Path, settings: Rock, up: str | None = None) -> tuple[trimesh.Trimesh, float]:
     """Read a mesh file as the rock, with its texture, scale it to `settings.size` and stand it in the ground.
 
+<<<<<<< HEAD
     up: the file's up axis, "y" or "z", by default that of `up_axis`. Returns the mesh, +Z up, and the scale that was applied.
+=======
+    Faces without area and faces that are there twice (whichever way round) are left out: the normals of two opposite faces
+    cancel, and a vertex without a normal has no shading.
+    up: "y" or "z", the file's up axis; by default as `up_axis`. Returns the mesh, +Z up, and the scale that was applied.
+>>>>>>> wt-aud1
     Raises InputError as `load_mesh`, and where all vertices are one point.
     """
     mesh = load_mesh(path)
+    _leave_out_bad_faces(mesh)
     if mesh.extents.max() == 0:
         raise InputError(f"{path}: all vertices are one point; repair the mesh")
     if (up or up_axis(path)) == "y":
         mesh.apply_transform(WORLD_FROM_GLTF)
     scale = settings.size / float(mesh.extents.max())
     return _stand(mesh, settings), scale
+
+
+def _leave_out_bad_faces(mesh: trimesh.Trimesh) -> None:
+    """Leave out, in place, the faces that are not `distinct_faces`, and then the vertices of no face. A mesh without such faces
+    is not touched. The vertices of a face that is left out get new normals: two opposite faces may have spoilt those they had.
+    All other vertices keep the file's normals."""
+    kept = distinct_faces(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
+    if len(kept) == len(mesh.faces):
+        return
+    normals, spoilt = mesh.vertex_normals.copy(), np.unique(np.delete(mesh.faces, kept, axis=0))
+    mesh.update_faces(kept)
+    normals[spoilt] = mesh.vertex_normals[spoilt]
+    mesh.vertex_normals = normals  # type: ignore[method-assign]  # mypy does not see that it is a property
+    mesh.remove_unreferenced_vertices()
 
 
 def _stand(mesh: trimesh.Trimesh, settings: Rock) -> trimesh.Trimesh:
