@@ -37,11 +37,6 @@ def import_data(
     if masks is not None and mesh is not None:
         raise InputError("import: --masks and --mesh both say where masks come from; give one of them")
     found = read_source(source, images, split)
-<<<<<<< HEAD
-    if mesh is not None:
-        runtime.start()  # rays are cast at the mesh
-=======
->>>>>>> wt-aud1
     with Progress(console=console, transient=True) as progress:
         bar = progress.add_task("importing")
         result = import_source(

@@ -232,29 +232,17 @@ def import_source(
 ) -> Dataset:
     """Write a source as a dataset into the folder `out`: a new or empty one, or one that an interrupted import of it left.
 
-<<<<<<< HEAD
     Masks come from the first of these that there is: files in the folder `masks` that are named as the images; the pixels whose
-    centre shows the `mesh` (world coordinates; the variant must be set, `mgs.runtime.start`); the source's own mask files; the
+    centre shows the `mesh` (world coordinates); the source's own mask files; the
     images' alpha. Images of the rock alone come from the source's own images of it, or from an alpha that gives the mask and
     has values between empty and full. With `masks` or `mesh` there are none.
     Distorted images, depth and masks are undistorted to a pinhole camera in which every pixel is valid.
 
     import.json, which says what is imported, is written first, and transforms.json last. When an interrupted import is
-    continued, a finished frame is made again only if its files have changed since. The result is the same, bit for bit, as that
+    continued, a finished frame is made again only if one of its files has a newer modification time. The result is the same, bit for bit, as that
     of an import in one go. on_frame: called as on_frame(frames done, all frames).
     Raises InputError as `read_mesh`, and where a file is missing, damaged or of another size than its camera, where `out` holds
     anything else, or where another process works on it. The frames that were finished before are kept.
-=======
-    import.json, which says what is imported, is written first and transforms.json last; a finished frame is not read again
-    unless one of its files has a newer modification time, and the result is the same, bit for bit, as in one go.
-    Masks come from, in this order: files of `masks` with the image's stem, the pixels whose centre shows the `mesh` (world
-    coordinates), the source's own mask files, the images' alpha.
-    Images of the rock alone come from the source's own images of it, or from an alpha that gives the mask and has values
-    between empty and full; with `masks` or `mesh` there are none.
-    Distorted images, depth and masks are undistorted to a pinhole camera that holds valid pixels only.
-    Raises InputError where a file is missing, damaged or of another size than the camera, where `out` holds anything else or
-    another process works on it, or as `read_mesh`; the frames before are kept.
->>>>>>> wt-aud1
     """
     shots, project = source.shots, None
     if masks is not None:
@@ -410,19 +398,11 @@ def undistorter(camera: Camera, distortion: np.ndarray) -> tuple[Camera, Callabl
 
 
 def mesh_silhouette(path: Path) -> Callable[[Camera], np.ndarray]:
-<<<<<<< HEAD
-    """A function that gives the mask of a mesh in a camera: bool [H,W], the pixels whose centre shows it.
-
-    Raises InputError as `read_mesh`.
-    """
-    from mgs.data.raycast import mesh_depth  # not at the top: imports without a mesh do not set the variant that it needs
-=======
     """A function of a camera: bool [H,W], the pixels whose centre shows the mesh.
 
     Raises InputError as `read_mesh` and `mesh_depth`.
     """
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
->>>>>>> wt-aud1
 
     depth = mesh_depth(read_mesh(path))
     return lambda camera: depth(camera) > 0

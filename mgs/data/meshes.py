@@ -144,15 +144,8 @@ def _in_world(mesh: trimesh.Trimesh, y_up: bool) -> Mesh:
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     if y_up:
         vertices = vertices @ WORLD_FROM_GLTF[:3, :3].T
-<<<<<<< HEAD
-    faces = faces[np.linalg.norm(_crosses(vertices, faces), axis=1) > 0]
-    place = np.unique(vertices + 0.0, axis=0, return_inverse=True)[1].ravel()  # equal for vertices at one place; + 0.0: no -0
-    first = np.unique(np.sort(place[faces], axis=1), axis=0, return_index=True)[1]
-    faces = faces[np.sort(first)]
-=======
     faces = faces[distinct_faces(vertices, faces)]
     place = _places(vertices)
->>>>>>> wt-aud1
     faces = np.where(_wound_against(place[faces])[:, None], faces[:, ::-1], faces)
     used, corners = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[used], corners.reshape(faces.shape)

@@ -19,17 +19,11 @@ if TYPE_CHECKING:
 def mesh_depth(mesh: Mesh) -> Callable[[Camera], np.ndarray]:
     """A function that gives the z-depth of the mesh in a camera: float32 [H,W], metres, 0 where no face is met.
 
-<<<<<<< HEAD
     One ray is cast through the centre of each pixel; it meets a face from either side.
-    """
-    centre = mesh.vertices.mean(0)  # rays are cast in coordinates around it: float32 is finest near the origin
-=======
-    One ray per pixel, through its centre, whatever the mesh and however near it is; both sides of a face are met.
     Raises InputError where no variant can be started (`mgs.runtime.start`).
     """
     runtime.start()
-    centre = mesh.vertices.mean(0)  # float32 resolves most near the origin
->>>>>>> wt-aud1
+    centre = mesh.vertices.mean(0)  # rays are cast in coordinates around it: float32 is finest near the origin
     shape = mi.Mesh("mesh", len(mesh.vertices), len(mesh.faces))
     params = mi.traverse(shape)
     params["vertex_positions"] = mi.Float((mesh.vertices - centre).astype(np.float32).ravel())

@@ -55,13 +55,9 @@ def up_axis(path: str | Path) -> str:
 def load_rock(path: str | Path, settings: Rock, up: str | None = None) -> tuple[trimesh.Trimesh, float]:
     """Read a mesh file as the rock, with its texture, scale it to `settings.size` and stand it in the ground.
 
-<<<<<<< HEAD
-    up: the file's up axis, "y" or "z", by default that of `up_axis`. Returns the mesh, +Z up, and the scale that was applied.
-=======
     Faces without area and faces that are there twice (whichever way round) are left out: the normals of two opposite faces
     cancel, and a vertex without a normal has no shading.
     up: "y" or "z", the file's up axis; by default as `up_axis`. Returns the mesh, +Z up, and the scale that was applied.
->>>>>>> wt-aud1
     Raises InputError as `load_mesh`, and where all vertices are one point.
     """
     mesh = load_mesh(path)
