@@ -239,8 +239,8 @@ def import_source(
     Distorted images, depth and masks are undistorted to a pinhole camera in which every pixel is valid.
 
     import.json, which says what is imported, is written first, and transforms.json last. When an interrupted import is
-    continued, a finished frame is made again only if one of its files has a newer modification time. The result is the same, bit for bit, as that
-    of an import in one go. on_frame: called as on_frame(frames done, all frames).
+    continued, a finished frame is made again only if one of its files has a newer modification time. The result is the
+    same, bit for bit, as that of an import in one go. on_frame: called as on_frame(frames done, all frames).
     Raises InputError as `read_mesh`, and where a file is missing, damaged or of another size than its camera, where `out` holds
     anything else, or where another process works on it. The frames that were finished before are kept.
     """
