@@ -1,4 +1,4 @@
-"""Render an orbit around a rock into a dataset folder. Needs the variant to be set (`mgs.runtime.start`)."""
+"""Render an orbit around a rock into a dataset folder."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+from mgs import runtime
 from mgs.camera import Camera, opengl_from_opencv
 from mgs.data.dataset import FRAME_INTERVAL, Dataset, Frame, load_dataset, resumes, write_transforms
 from mgs.data.meshes import GLTF, to_glb
@@ -24,7 +25,7 @@ from mgs.seeds import derive_seed, generator
 from mgs.synth.orbit import orbit_cameras, perturb
 from mgs.synth.rock import load_rock, make_rock, up_axis
 from mgs.synth.scene import Scene
-from mgs.synth.scene_file import SceneFile
+from mgs.synth.scene_file import SceneFile, load_scene_file
 
 NOISY_FACTOR = 8
 """Samples are multiplied by this where pyoidn is not installed."""
@@ -57,10 +58,17 @@ class PoseNoise:
 PRESETS = {"quick": Preset(320, 240, 32, 8), "paper": Preset(640, 480, 100, 16)}
 
 
+def preset_named(name: str) -> Preset:
+    """A row of PRESETS. Raises InputError where there is none of this name."""
+    if name not in PRESETS:
+        raise InputError(f"preset {name!r}: unknown; choose one of {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
 def synthesise(
     out: str | Path,
-    settings: SceneFile,
-    preset: Preset,
+    scene: SceneFile | str | Path = "boulder",
+    preset: Preset | str = "quick",
     seed: int = 0,
     mesh: str | Path | None = None,
     pose_noise: PoseNoise | None = None,
@@ -70,13 +78,18 @@ def synthesise(
 ) -> Dataset:
     """Render the dataset `out`: images, depth, masks, rock.glb, config.json, contact_sheet.png, transforms.json (last).
 
-    With `pose_noise` transforms.json holds noisy poses, and true_poses.json the cameras that took the images.
-    mesh: a file in place of the procedural rock; mesh_up: its up axis, "y" or "z", by default as `mgs.synth.rock.up_axis`.
+    scene: the name of a scene of mgs ("boulder"), the path of a TOML file, or a scene that was loaded. preset: "quick",
+    "paper", or a `Preset` of your own. mesh: a file in place of the procedural rock; mesh_up: its up axis, "y" or "z", by
+    default as `mgs.synth.rock.up_axis`. pose_noise: with it transforms.json holds noisy poses, and true_poses.json the cameras
+    that took the images.
     A folder that an interrupted run of the same settings left is completed; the result is the same as in one run.
-    Raises InputError: output folder not empty, not writable or worked on by another process, bad mesh, rock not wholly in every
-    frame, or nowhere in sight.
+    Raises InputError: unknown scene or preset, output folder not empty, not writable or worked on by another process, bad mesh,
+    rock not wholly in every frame, or nowhere in sight.
     """
+    runtime.start()
     started, out = time.perf_counter(), Path(out)
+    settings = scene if isinstance(scene, SceneFile) else load_scene_file(scene)
+    preset = preset_named(preset) if isinstance(preset, str) else preset
     check_writable(out)
     if (out / "transforms.json").exists() or not (out / "config.json").exists():
         check_new_folder(out)  # before the rock is made, which takes seconds
@@ -92,11 +105,11 @@ def synthesise(
     resolved = _resolved(settings, preset, seed, mesh, mesh_up, denoise, pose_noise)
     goes_on = resumes(out, "config.json", resolved)
     glb = to_glb(rock)  # before the scene adds its attributes to the mesh
-    scene = Scene(settings, rock, cameras[0], seed)
+    world = Scene(settings, rock, cameras[0], seed)
     spp = preset.spp * (1 if denoise else NOISY_FACTOR)
     if not denoise:
         say(f"pyoidn is not installed: {spp} samples per pixel in place of denoising; `pip install pyoidn` is faster")
-    exposure = _meter(scene, cameras, seed, spp, denoise, say)
+    exposure = _meter(world, cameras, seed, spp, denoise, say)
     if not goes_on:
         new_folder(out)
         write_json(out / "config.json", resolved)
@@ -105,7 +118,7 @@ def synthesise(
             temporary.write_bytes(glb)
 
         prepared = time.perf_counter()
-        seconds = _render_frames(scene, frames, exposure, spp, seed, denoise, progress)
+        seconds = _render_frames(world, frames, exposure, spp, seed, denoise, progress)
         write_contact_sheet(out / "contact_sheet.png", frames)
         timings = {
             "prepare_s": round(prepared - started, 2),
