@@ -83,3 +83,37 @@ def write_dataset(
         (root / "rock.glb").write_bytes(to_glb(rock_mesh(*rocks[0])))
     write_transforms(root, frames)
     return load_dataset(root)
+
+
+def write_colmap(dataset: Dataset, root: Path, binary: bool) -> None:
+    """Export to COLMAP with pycolmap: one camera, and points on the rock and the ground, tracked where seen."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    first = dataset.frames[0].camera
+    K = first.K
+    lens = pycolmap.Camera(
+        model="PINHOLE", width=first.width, height=first.height, params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], camera_id=1
+    )
+    model.add_camera_with_trivial_rig(lens)
+    rng = np.random.default_rng(0)
+    sphere = rng.standard_normal((6000, 3))
+    rock = CENTRE + AXES * sphere / np.linalg.norm(sphere, axis=1, keepdims=True)
+    ground = np.column_stack([rng.uniform(-2, 2, (9000, 2)), np.zeros(9000)])
+    outside = (((ground - CENTRE) / AXES) ** 2).sum(1) > 1
+    points = np.concatenate([rock[rock[:, 2] > 0], ground[outside]])
+    for k, frame in enumerate(dataset.frames, 1):
+        pose = pycolmap.Rigid3d(frame.camera.world_to_camera[:3])
+        pixels = frame.camera.project(points)[0]
+        image = pycolmap.Image(name=frame.image_path.name, keypoints=pixels, camera_id=1, image_id=k)
+        model.add_image_with_trivial_frame(image, pose)
+    normals = np.where(points[:, 2:] > 0, (points - CENTRE) / AXES**2, [0, 0, 1])
+    facing = np.stack([((frame.camera.position - points) * normals).sum(1) > 0 for frame in dataset.frames])
+    for i, point in enumerate(points):
+        track = pycolmap.Track()
+        for k in np.flatnonzero(facing[:, i]):
+            track.add_element(int(k) + 1, i)
+        model.add_point3D(point, track, np.zeros(3, np.uint8))
+    (root / "sparse/0").mkdir(parents=True)
+    (model.write_binary if binary else model.write_text)(root / "sparse/0")
+    (root / "images").symlink_to(dataset.root / "images")

@@ -11,7 +11,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pycolmap
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -84,48 +83,16 @@ def test_any_camera_and_any_pixels_survive_export_and_import(data: st.DataObject
         assert one.timestamp == other.timestamp
 
 
-def _write_colmap(dataset: Dataset, root: Path, binary: bool) -> None:
-    """Export to COLMAP with pycolmap: one camera, and points on the rock and the ground, tracked where seen."""
-    model = pycolmap.Reconstruction()
-    first = dataset.frames[0].camera
-    K = first.K
-    lens = pycolmap.Camera(
-        model="PINHOLE", width=first.width, height=first.height, params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], camera_id=1
-    )
-    model.add_camera_with_trivial_rig(lens)
-    rng = np.random.default_rng(0)
-    sphere = rng.standard_normal((6000, 3))
-    rock = synthetic.CENTRE + synthetic.AXES * sphere / np.linalg.norm(sphere, axis=1, keepdims=True)
-    ground = np.column_stack([rng.uniform(-2, 2, (9000, 2)), np.zeros(9000)])
-    outside = (((ground - synthetic.CENTRE) / synthetic.AXES) ** 2).sum(1) > 1
-    points = np.concatenate([rock[rock[:, 2] > 0], ground[outside]])
-    for k, frame in enumerate(dataset.frames, 1):
-        pose = pycolmap.Rigid3d(frame.camera.world_to_camera[:3])
-        pixels = frame.camera.project(points)[0]
-        image = pycolmap.Image(name=frame.image_path.name, keypoints=pixels, camera_id=1, image_id=k)
-        model.add_image_with_trivial_frame(image, pose)
-    normals = np.where(points[:, 2:] > 0, (points - synthetic.CENTRE) / synthetic.AXES**2, [0, 0, 1])
-    facing = np.stack([((frame.camera.position - points) * normals).sum(1) > 0 for frame in dataset.frames])
-    for i, point in enumerate(points):
-        track = pycolmap.Track()
-        for k in np.flatnonzero(facing[:, i]):
-            track.add_element(int(k) + 1, i)
-        model.add_point3D(point, track, np.zeros(3, np.uint8))
-    (root / "sparse/0").mkdir(parents=True)
-    (model.write_binary if binary else model.write_text)(root / "sparse/0")
-    (root / "images").symlink_to(dataset.root / "images")
-
-
 @pytest.mark.parametrize("binary", [True, False])
 def test_colmap_export_and_import(dataset: Dataset, tmp_path: Path, binary: bool) -> None:
-    _write_colmap(dataset, tmp_path / "colmap", binary)
+    synthetic.write_colmap(dataset, tmp_path / "colmap", binary)
     copy = _import(tmp_path / "colmap", tmp_path / "copy")
     _same_cameras(dataset, copy)
     assert all(np.array_equal(a.rgb(), b.rgb()) for a, b in zip(dataset.frames, copy.frames, strict=True))
 
 
 def test_a_prior_from_sparse_points(dataset: Dataset, tmp_path: Path) -> None:
-    _write_colmap(dataset, tmp_path / "colmap", True)
+    synthetic.write_colmap(dataset, tmp_path / "colmap", True)
     copy = _import(tmp_path / "colmap", tmp_path / "copy")
     prior, rock = build_prior(copy, PriorSettings(gaussians=800, backing=0))
     on_rock = np.sqrt((((prior.points - synthetic.CENTRE) / synthetic.AXES) ** 2).sum(1))
@@ -370,7 +337,7 @@ def _edit(root: Path, change: Callable[[dict[str, Any]], None]) -> Path:
 
 
 def _colmap(root: Path, damage: Callable[[Path], None]) -> Path:
-    _write_colmap(synthetic.write_dataset(root / "data"), root / "colmap", True)
+    synthetic.write_colmap(synthetic.write_dataset(root / "data"), root / "colmap", True)
     damage(root / "colmap/sparse/0")
     return root / "colmap"
 

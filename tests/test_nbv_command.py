@@ -13,7 +13,7 @@ import tiny
 from refusals import refused
 from rich.console import Console
 
-from mgs.active import criteria, loop, nbv, run_folder
+from mgs.active import criteria, loop, nbv, pose_policies, run_folder
 from mgs.active.run_folder import load_run
 from mgs.active.settings import TrainSettings
 from mgs.cli.app import main
@@ -323,13 +323,12 @@ def test_settings_of_the_fit_are_read_as_older_runs_wrote_them():
 
 
 def test_the_documented_policy_of_ones_own(dataset, tmp_path, monkeypatch):
-    """The program in docs/nbv.md, its command caught: the policy is started, run, and read back where nobody registered it."""
-    monkeypatch.setitem(criteria.CRITERIA, "least-known", None)  # so that it is gone again at the end
-    commands: list[list[str]] = []
-    monkeypatch.setattr("mgs.cli.app.main", lambda given: commands.append(given))
-    page = (Path(__file__).parent.parent / "docs/nbv.md").read_text()
-    exec(page.split("```python\n")[1].split("```")[0], {})
-    name = commands[0][commands[0].index("--policy") + 1]
+    """The criterion in docs/howto/policy.md is started, run, and read back where nobody registered it."""
+    name = "least-known"
+    monkeypatch.setitem(criteria.CRITERIA, name, None)  # so that it is gone again at the end
+    monkeypatch.setitem(pose_policies.POSE_POLICIES, "highest", None)
+    page = (Path(__file__).parent.parent / "docs/howto/policy.md").read_text()
+    exec(page.split('```python title="my_mgs.py"\n')[1].split("```")[0], {})
     started(dataset, tmp_path / "run", tiny.write_prior(tmp_path / "prior"), policy=name, budget=1)
 
     loaded, scores = load_dataset(dataset), []

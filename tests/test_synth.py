@@ -184,6 +184,14 @@ def test_output_folder_that_is_not_empty(dataset, tmp_path, monkeypatch):
         synthesise(tmp_path, SCENE, TINY, seed=3)
 
 
+def test_scenes_and_presets_are_known_by_name(tmp_path):
+    with pytest.raises(InputError, match=r"scene 'bolder': unknown; choose one of boulder"):
+        synthesise(tmp_path / "out", "bolder", TINY)
+    with pytest.raises(InputError, match=r"preset 'fast': unknown; choose one of quick, paper"):
+        synthesise(tmp_path / "out", "boulder", "fast")
+    assert not (tmp_path / "out").exists()
+
+
 def test_another_mesh_of_the_same_name_is_not_gone_on_with(tmp_path):
     class Stop(Exception):
         pass

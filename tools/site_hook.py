@@ -1,7 +1,7 @@
-"""What `mkdocs build` needs beyond mkdocs.yml: pages of files that lie outside docs/.
+"""What `mkdocs build` needs beyond mkdocs.yml: pages of files that lie outside docs/, and the commands with their options.
 
 The changelog becomes a page. A link from a page of docs/ to a source file (`../mgs/active/criteria.py`), which is right on
-GitHub, becomes a link to a page that shows the file.
+GitHub, becomes a link to a page that shows the file. The mark `<!-- commands -->` becomes what `mgs COMMAND --help` says.
 """
 
 from __future__ import annotations
@@ -9,12 +9,17 @@ from __future__ import annotations
 import posixpath
 import re
 from pathlib import Path
+from typing import Any
 
+import typer
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files, InclusionLevel
 from mkdocs.structure.pages import Page
 
+from mgs.cli.app import app
+
 ROOT = Path(__file__).parent.parent
+COMMANDS = "<!-- commands -->"
 LINK = re.compile(r"\]\((?P<path>\.\./[^)#\s]+)(?P<rest>[^)]*)\)")
 LANGUAGES = {".py": "python", ".toml": "toml"}
 
@@ -43,8 +48,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Point links to files outside docs/ to their pages. What has no page is left as it is, and `--strict` refuses it."""
+    """Point links to files outside docs/ to their pages. What has no page is left as it is, and `--strict` refuses it.
+
+    Write the commands in the place of their mark.
+    """
     folder = posixpath.dirname(page.file.src_uri)
+    if COMMANDS in markdown:
+        markdown = markdown.replace(COMMANDS, command_reference())
 
     def moved(match: re.Match[str]) -> str:
         uri = source_page(target(match["path"], folder))
@@ -58,3 +68,23 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 def source_page(path: str) -> str:
     """Where in the site the page of a source file lies."""
     return f"source/{path}.md"
+
+
+def command_reference() -> str:
+    """Every command of `mgs`: a heading, what it does, and a table of its arguments and options."""
+    parts = []
+    for name, command in vars(typer.main.get_command(app))["commands"].items():
+        parts.append(f"## mgs {name}\n\n{command.help}\n")
+        if command.params:
+            rows = "".join(_row(parameter) for parameter in command.params)
+            parts.append(f"| argument or option | meaning | default |\n| --- | --- | --- |\n{rows}")
+    return "\n".join(parts)
+
+
+def _row(parameter: Any) -> str:
+    """A row of the table of a command. A default that is None is told with the meaning, where there is something to tell."""
+    names = [name if name.startswith("-") else name.upper() for name in (*parameter.opts, *parameter.secondary_opts)]
+    written = ", ".join(f"`{name} {parameter.metavar}`" if parameter.metavar else f"`{name}`" for name in names)
+    default = getattr(parameter.default, "value", parameter.default)
+    shown = "required" if parameter.required else "" if default is None else f"`{default}`"
+    return f"| {written} | {parameter.help.replace('|', chr(92) + '|')} | {shown} |\n"

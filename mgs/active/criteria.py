@@ -3,7 +3,8 @@
 The loop of `mgs.active.loop` scores every candidate with the criterion that a run names, and takes the one with the largest
 score; a tie goes to the camera farthest from those taken (a rule of our own, the same for all policies: the paper names none,
 and coverage ties at every step once it has saturated). Policies that look at poses instead of information are in
-`mgs.active.pose_policies`. Neither kind ever sees a candidate's image. A criterion of your own is one more row (docs/nbv.md).
+`mgs.active.pose_policies`. Neither kind ever sees a candidate's image. A criterion of your own is one more row: see
+docs/howto/policy.md.
 
 Notation, after the paper's Eq. 7 and POp-GS: H [N,P] is the diagonal of J^T J summed over the training set, F [N,P] that of
 one candidate, lam [P] the regularisation (`regularisation`); l = N P is the number of parameters.
@@ -117,3 +118,4 @@ CRITERIA: dict[str, Criterion] = {
     "e-optimal": Criterion(e_optimal),
     "fisherrf": Criterion(fisherrf),
 }
+"""Policies that look at information, by name. A program may add its own (docs/howto/policy.md)."""

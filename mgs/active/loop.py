@@ -189,7 +189,7 @@ class _Loop:
         farthest = pose_policies.farthest_pose(*poses, rng)
         best = max(range(len(left)), key=lambda k: (scores[k], farthest[k]))
         if np.isnan(scores).any() or np.isinf(scores[best]):
-            raise InputError(f"policy {policy}: gave a score that is NaN or infinite; correct the policy (docs/nbv.md)")
+            raise InputError(f"policy {policy}: gave a score that is NaN or infinite; correct it (docs/howto/policy.md)")
         return left[best], float(scores[best])
 
     def score(self, state: State, criterion: criteria.Criterion, left: list[int]) -> np.ndarray:

@@ -41,3 +41,4 @@ def adam(value: Any, gradient: Any, buffers: list[Any], rate: Any, t: Any) -> tu
 
 
 OPTIMISERS: dict[str, Optimiser] = {"adam": Optimiser(2, adam)}
+"""Optimisers of the fit, by name (`mgs nbv --optimiser`). A program may add its own."""

@@ -53,6 +53,7 @@ POSE_POLICIES: dict[str, PosePolicy] = {
     "uniform": uniform_azimuth,
     "farthest": farthest_pose,
 }
+"""Policies that look at poses, by name. A program may add its own (docs/howto/policy.md)."""
 
 
 def policy_names() -> list[str]:

@@ -58,7 +58,7 @@ def check_settings(settings: NbvSettings, frames: int) -> None:
     diagonal = [name for name in ESTIMATORS if name != "block"]
     if settings.policy not in pose_policies.policy_names():
         known = ", ".join(pose_policies.policy_names())
-        raise InputError(f"--policy {settings.policy}: unknown; choose one of {known}, or register your own (docs/nbv.md)")
+        raise InputError(f"--policy {settings.policy}: unknown; choose one of {known}, or add your own (docs/howto/policy.md)")
     if settings.estimator not in diagonal:
         known = ", ".join(diagonal)
         raise InputError(f"--estimator {settings.estimator}: gives no diagonal, or is unknown; choose one of {known}")

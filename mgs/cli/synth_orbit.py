@@ -50,19 +50,17 @@ def synth_orbit(
     from mgs.synth.scene_file import ORBITS, load_scene_file
 
     runtime.start()
-    from mgs.synth.rendering import PRESETS, PoseNoise, synthesise
+    from mgs.synth.rendering import PoseNoise, preset_named, synthesise
 
     settings = load_scene_file(scene)
     if orbit is not None:
         if orbit not in ORBITS:
             raise InputError(f"orbit {orbit!r}: unknown; choose one of {', '.join(ORBITS)}")
         settings = settings.model_copy(update={"orbit": settings.orbit.model_copy(update={"kind": orbit})})
-    if preset not in PRESETS:
-        raise InputError(f"preset {preset!r}: unknown; choose one of {', '.join(PRESETS)}")
     if mesh_up is not None and mesh is None:
         raise InputError("--mesh-up: says how a mesh stands, but there is none; give --mesh too")
     given = {"spp": spp, "frames": frames, **_parse_size(size)}
-    chosen = replace(PRESETS[preset], **{key: value for key, value in given.items() if value is not None})
+    chosen = replace(preset_named(preset), **{key: value for key, value in given.items() if value is not None})
     noise = PoseNoise(pose_noise, rotation_noise) if pose_noise or rotation_noise else None
     console = Console()
     with Progress(console=console) as bar:

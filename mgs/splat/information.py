@@ -252,3 +252,5 @@ ESTIMATORS: dict[str, Callable[..., np.ndarray]] = {
     "hutchinson": hutchinson,
     "loss-gradient": loss_gradient,
 }
+"""What `fisher` calls, by name: (gaussians with Dr.Jit fields, camera, background, cache, **options) -> NumPy [N,P], or [N,P,P]
+for `block`. A program may add its own (docs/howto/estimator.md)."""

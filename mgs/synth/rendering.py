@@ -1,4 +1,4 @@
-"""Render an orbit around a rock into a dataset folder. Needs the variant to be set (`mgs.runtime.start`)."""
+"""Render an orbit around a rock into a dataset folder."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+from mgs import runtime
 from mgs.camera import Camera, opengl_from_opencv
 from mgs.data.dataset import FRAME_INTERVAL, TEST_FOLDER, Dataset, Frame, load_dataset, resumes, write_transforms
 from mgs.data.meshes import GLTF, to_glb
@@ -25,7 +26,7 @@ from mgs.seeds import derive_seed, generator
 from mgs.synth.orbit import orbit_cameras, perturb
 from mgs.synth.rock import load_rock, make_rock, up_axis
 from mgs.synth.scene import Scene
-from mgs.synth.scene_file import Orbit, SceneFile
+from mgs.synth.scene_file import Orbit, SceneFile, load_scene_file
 
 NOISY_FACTOR = 8
 """Factor on the samples per pixel where pyoidn, the denoiser, is not installed."""
@@ -62,10 +63,17 @@ class PoseNoise:
 PRESETS = {"quick": Preset(320, 240, 32, 8), "paper": Preset(640, 480, 100, 16)}
 
 
+def preset_named(name: str) -> Preset:
+    """A row of PRESETS. Raises InputError where there is none of this name."""
+    if name not in PRESETS:
+        raise InputError(f"preset {name!r}: unknown; choose one of {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
 def synthesise(
     out: str | Path,
-    settings: SceneFile,
-    preset: Preset,
+    scene: SceneFile | str | Path = "boulder",
+    preset: Preset | str = "quick",
     seed: int = 0,
     mesh: str | Path | None = None,
     pose_noise: PoseNoise | None = None,
@@ -76,17 +84,22 @@ def synthesise(
 ) -> Dataset:
     """Render a scene as a dataset into the folder `out`; what it holds is listed in docs/data.md.
 
-    seed: root seed of the rock, the ground and the rendering. mesh: a file in place of the procedural rock; mesh_up: its up
-    axis, "y" or "z", by default that of `mgs.synth.rock.up_axis`. With `pose_noise`, transforms.json holds noisy poses, and
-    true_poses.json those of the cameras that took the images. test_views: number of views of `dome_cameras` that are rendered
-    into the folder `test` of the dataset (`Dataset.test_views`); their poses are exact, and the orbit is the same with and
-    without them. progress: called as progress(views done, all views); say: called with lines for the user.
+    scene: the name of a scene of mgs ("boulder"), the path of a TOML file, or a scene that was loaded. preset: "quick",
+    "paper", or a `Preset` of your own. seed: root seed of the rock, the ground and the rendering. mesh: a file in place
+    of the procedural rock; mesh_up: its up axis, "y" or "z", by default that of `mgs.synth.rock.up_axis`. With
+    `pose_noise`, transforms.json holds noisy poses, and true_poses.json those of the cameras that took the images.
+    test_views: number of views of `dome_cameras` that are rendered into the folder `test` of the dataset
+    (`Dataset.test_views`); their poses are exact, and the orbit is the same with and without them. progress: called as
+    progress(views done, all views); say: called with lines for the user.
 
     A folder that an interrupted run of the same settings left is completed, and ends with the same files as after one run.
-    Raises InputError where the output folder is not empty, cannot be written or is in use by another process, where the mesh is
-    bad, or where the rock is not wholly in every view or cannot be seen.
+    Raises InputError where the scene or the preset is unknown, where the output folder is not empty, cannot be written or is in
+    use by another process, where the mesh is bad, or where the rock is not wholly in every view or cannot be seen.
     """
+    runtime.start()
     started, out = time.perf_counter(), Path(out)
+    settings = scene if isinstance(scene, SceneFile) else load_scene_file(scene)
+    preset = preset_named(preset) if isinstance(preset, str) else preset
     check_writable(out)
     if (out / "transforms.json").exists() or not (out / "config.json").exists():
         check_new_folder(out)  # before the rock is made, which takes seconds
@@ -98,11 +111,11 @@ def synthesise(
     resolved = _resolved(settings, preset, seed, mesh, mesh_up, denoise, pose_noise, test_views)
     goes_on = resumes(out, "config.json", resolved)
     glb = to_glb(rock)  # before the scene adds its attributes to the mesh
-    scene = Scene(settings, rock, cameras[0], seed)
+    world = Scene(settings, rock, cameras[0], seed)
     spp = preset.spp * (1 if denoise else NOISY_FACTOR)
     if not denoise:
         say(f"pyoidn is not installed: {spp} samples per pixel in place of denoising; `pip install pyoidn` is faster")
-    exposure = _meter(scene, cameras, seed, spp, denoise, say)
+    exposure = _meter(world, cameras, seed, spp, denoise, say)
     if not goes_on:
         new_folder(out)
         write_json(out / "config.json", resolved)
@@ -111,7 +124,7 @@ def synthesise(
             temporary.write_bytes(glb)
 
         prepared = time.perf_counter()
-        seconds = _render_frames(scene, [*frames, *tests], exposure, spp, seed, denoise, progress)
+        seconds = _render_frames(world, [*frames, *tests], exposure, spp, seed, denoise, progress)
         write_contact_sheet(out / "contact_sheet.png", frames)
         record = {"mesh_scale": scale, "exposure": exposure, "samples_per_pixel": spp, "versions": versions()}
         write_json(out / "config.json", resolved | record | {"timings": _timings(started, prepared, seconds)})

@@ -18,7 +18,6 @@ from mgs.colour import linear_from_srgb
 from mgs.data.rock_image import boundary
 from mgs.seeds import generator
 from mgs.synth.arena import make_ground, make_stones, regolith
-from mgs.synth.rock_layer import RockLayer, continued, lattice, render_layers, with_coverage
 from mgs.synth.scene_file import SceneFile, Sky
 
 MAX_DEPTH = 4
@@ -59,6 +58,8 @@ class Scene:
     """A rock on its arena under sun and sky. All cameras that see it must have the size and the K of the one given first."""
 
     def __init__(self, settings: SceneFile, rock: trimesh.Trimesh, camera: Camera, seed: int) -> None:
+        from mgs.synth.rock_layer import RockLayer  # not at the top: its class belongs to the variant that is set by now
+
         ground = make_ground(settings.arena, rock, generator(seed, "ground"))
         stones = make_stones(settings.arena, rock, ground, generator(seed, "stones"))
         shapes = {"rock": _mesh("rock", rock, _rock_bsdf(rock, settings.rock.colours[0]))}
@@ -82,6 +83,8 @@ class Scene:
         In pixels that the rock covers wholly, the picture of the rock alone is the image itself. At the outline it is denoised
         on its own, with albedo and normals of the rock alone to guide the denoiser.
         """
+        from mgs.synth.rock_layer import continued, render_layers, with_coverage
+
         self.params["sensor.to_world"] = mi.Transform4f(_to_world(camera))
         self.params.update()
         rgb, rock, share = render_layers(self.scene, self.path, spp, seed)
@@ -114,6 +117,8 @@ class Scene:
         Through pixels at the outline of the mask, and where mask and share differ, COVERAGE_RAYS evenly spaced rays are cast;
         elsewhere the coverage is 1 or 0, as the mask is.
         """
+        from mgs.synth.rock_layer import lattice
+
         alpha = mask.astype(np.float32)
         rows, columns = np.nonzero(boundary(mask) | (share != mask))
         if not len(rows):
