@@ -38,7 +38,8 @@ def premultiplied(rgba: np.ndarray) -> np.ndarray:
 
 
 def boundary(mask: np.ndarray) -> np.ndarray:
-    """The pixels on either side of a mask's outline, bool [H,W]: those with another value than the pixel above, below, left or
-    right of them. This is the dilation of the mask by a 3x3 cross, without its erosion; the edge of the image is no outline.
+    """The pixels on either side of a mask's outline, bool [H,W]: the dilation of the mask by a 3x3 cross, without its erosion.
+
+    They are the pixels that differ from the one above, below, left or right of them. The edge of the image is no outline.
     """
     return binary_dilation(mask) ^ binary_erosion(mask, border_value=1)

@@ -1,4 +1,4 @@
-"""The rock alone, of the same rendering as the whole image: its light, and the share of each pixel that it covers.
+"""The picture of the rock alone, from the same rendering as the whole image.
 
 The variant must be set before this module is imported (`mgs.runtime.start`): an integrator is a class of the variant.
 """
@@ -14,7 +14,6 @@ from scipy.ndimage import gaussian_filter, uniform_filter
 
 SHARE_MIN = 1e-6
 """Divisor in place of a smaller share of samples, which can only be 0: a pixel has far fewer than a million samples."""
-
 
 CONTINUATION = 4.0
 """Standard deviation, pixels, of the Gaussian weights with which the rock's values are averaged to continue them beyond its
@@ -60,8 +59,9 @@ def with_coverage(values: np.ndarray, share: np.ndarray, coverage: np.ndarray) -
     """Channels of the rock alone as if exactly the share `coverage` of the samples had met the rock, float32 [H,W,C].
 
     values [H,W,C] and share [H,W]: as `render_layers` gives them; coverage [H,W]: the share of the pixel that the rock covers.
-    A pixel at the rock's outline has few random samples, so that their share differs from the coverage; this takes that noise
-    out and keeps the mean value of those samples that met the rock. Where none did, it is the mean in the 3x3 pixels around.
+    Of a few random samples in a pixel at the rock's outline, more or fewer may meet the rock than the coverage says. The result
+    is without this noise: it is the mean over the samples that did meet the rock, times the coverage. Where none of a pixel's
+    samples did, the mean is that of the 3x3 pixels around it.
     """
     own = values / np.maximum(share, SHARE_MIN)[..., None]
     around = uniform_filter(values, (3, 3, 1)) / np.maximum(uniform_filter(share, 3), SHARE_MIN)[..., None]
