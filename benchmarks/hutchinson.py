@@ -15,7 +15,8 @@ from mgs import runtime
 
 runtime.start()
 
-from mgs.bench.core import exponent, surface_camera, surface_gaussians  # noqa: E402
+from mgs.bench.core import surface_camera, surface_gaussians  # noqa: E402
+from mgs.bench.growth import exponent  # noqa: E402
 from mgs.files import write_json  # noqa: E402
 from mgs.plotting import STYLE, new_figure, save_figure  # noqa: E402
 from mgs.provenance import command_line, versions  # noqa: E402

@@ -29,6 +29,7 @@ from mgs.provenance import command_line, versions  # noqa: E402
 from mgs.splat import as_drjit, blocks, kernels  # noqa: E402
 from mgs.splat.projection import camera_array, project  # noqa: E402
 from mgs.splat.rendering import as_colour  # noqa: E402
+from mgs.splat.walking import pack  # noqa: E402
 
 TILES = (1, 2, 4, 8, 16, 32, 64, 128)
 """Blocks across and down; 128 is the whole image."""
@@ -57,12 +58,12 @@ def main(prefix: str, n: int = 100_000) -> None:
     dr.eval(splats)
     black, chosen, settings = as_colour(0.0), blocks.TILE, {}
     for blocks.TILE in TILES:
-        settings[blocks.TILE] = blocks.build(splats, blocks.depth_order(splats.z), camera.width, camera.height, 0.0)
+        settings[blocks.TILE] = blocks.build(splats, blocks.depth_order(splats.depth), camera.width, camera.height, 0.0)
     blocks.TILE = chosen
     settings["splats anywhere"] = anywhere(settings[TILES[-1]])
     prepared = {}
     for name, lists in settings.items():
-        packed = kernels.pack(splats, lists.place)
+        packed = pack(splats, lists.place)
         prepared[name] = lists, packed, kernels.forward(lists, packed)
     operations = {
         "forward": lambda lists, packed, out: kernels.forward(lists, packed),

@@ -24,6 +24,7 @@ from .report.writing import write_report as write_report
 from .splat import ListCache as ListCache
 from .splat import as_drjit as as_drjit
 from .splat import fisher as fisher
+from .splat import jvp as jvp
 from .splat import render as render
 from .splat_ply import read_ply as read_ply
 from .splat_ply import write_ply as write_ply

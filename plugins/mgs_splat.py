@@ -10,7 +10,7 @@ append the expected z-depth in metres as an AOV (default false). The image is li
 about alpha (`pixel_format` rgb or rgba). Shapes, emitters, the sampler and the film's reconstruction filter play no part: a
 pixel is the value at its centre.
 
-Reverse-mode gradients reach every parameter on which they are enabled. Not differentiated: the sensor. No forward mode.
+Derivatives, in reverse and in forward mode, reach every parameter on which they are enabled. Not differentiated: the sensor.
 """
 
 from __future__ import annotations
@@ -86,8 +86,9 @@ class MgsSplat(mi.CppADIntegrator):
             dr.traverse(dr.ADMode.Backward)
 
     def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
-        """Raises InputError: compositing has a hand-written adjoint and no forward-mode derivative."""
-        raise InputError("mgs_splat: has no forward-mode derivatives; use dr.backward")
+        """How the image changes along the gradients set on the parameters, TensorXf [H,W,C]."""
+        with dr.resume_grad():
+            return dr.forward_to(self.render(scene, sensor), flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
 
     def _channels(self, image: Any, film: Any) -> Any:
         """What an image block of this film holds: R G B, A where the film asks for it, filter weight, AOVs. [H,W,C]."""

@@ -13,12 +13,13 @@ from PIL import Image
 from refusals import refused
 
 from mgs.bench import chart, core
-from mgs.bench.chart import OPERATIONS, fitted, linear_growth, scaling_exponents, scaling_figure
+from mgs.bench.chart import scaling_figure
+from mgs.bench.growth import OPERATIONS, fitted, linear_growth, scaling_exponents
 from mgs.cli.app import main
 from mgs.files import read_json
 from mgs.splat import fisher, render
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y
-from mgs.splat.kernels import PIXELS
+from mgs.splat.walking import PIXELS
 
 
 def points(most: int = 1_000_000) -> list[dict]:

@@ -95,7 +95,7 @@ def test_a_prior_from_sparse_points(dataset: Dataset, tmp_path: Path) -> None:
     prior, rock = build_prior(copy, PriorSettings(gaussians=800))
     on_rock = np.sqrt((((prior.points - synthetic.CENTRE) / synthetic.AXES) ** 2).sum(1))
     assert np.median(np.abs(on_rock - 1)) < 0.02
-    assert len(rock.points) > 2000
+    assert len(rock.rock_points) > 2000
 
 
 def test_nerf_synthetic_with_alpha(dataset: Dataset, tmp_path: Path) -> None:

@@ -161,3 +161,11 @@ def test_help_and_version(capsys, arguments, said):
         main(arguments)
     assert stop.value.code == 0
     assert said in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_paragraph_of_a_help_text_is_one_line_in_a_wide_terminal(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "400")
+    with pytest.raises(SystemExit):
+        main(["diagnose", "--help"])
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "Writes into RUN/diagnostics" in line]
+    assert "coloured by its information." in line

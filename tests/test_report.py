@@ -25,6 +25,7 @@ from mgs.files import write_json
 from mgs.report import figures, tables, writing
 from mgs.report.evaluation import evaluate
 from mgs.report.figures import POLICY_STYLE
+from mgs.report.runs import evaluated_runs, read_run
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +59,7 @@ def runs(tmp_path_factory):
 
 
 def test_run_folder(runs):
-    run = tables.read_run(runs[0])
+    run = read_run(runs[0])
     assert run.policy == "d-optimal"
     assert len(run.seeds) == 3
     assert len(set(run.seeds + run.chosen)) == 8
@@ -69,9 +70,7 @@ def test_run_folder(runs):
 def drawn(monkeypatch):
     """{file name: figure} of every figure that is saved."""
     found, save = {}, plotting.save_figure
-    monkeypatch.setattr(
-        "mgs.report.figures.save_figure", lambda figure, path: (found.update({path.name: figure}), save(figure, path))
-    )
+    monkeypatch.setattr(figures, "save_figure", lambda figure, path: (found.update({path.name: figure}), save(figure, path)))
     return found
 
 
@@ -100,7 +99,7 @@ def test_report_writes_every_figure(runs, tmp_path, drawn):
     assert {path.name for path in (tmp_path / "report").iterdir()} == {path.name for path in written}
     assert json.loads((tmp_path / "report/table.json").read_text()) == tables.table_numbers(runs)
 
-    read = {run.policy: run for run in map(tables.read_run, runs)}
+    read = {run.policy: run for run in map(read_run, runs)}
     steps = {policy: run.steps for policy, run in read.items()}
     gains = {policy: [(s["step"], s["information_gain"]) for s in lines[1:]] for policy, lines in steps.items()}
     assert curves(drawn["gain.png"].axes[0]) == gains
@@ -120,7 +119,7 @@ def test_report_writes_every_figure(runs, tmp_path, drawn):
 
 
 def test_unseen_view(runs):
-    read = [tables.read_run(folder) for folder in runs]
+    read = [read_run(folder) for folder in runs]
     index = writing.unseen_view(read, tiny.FRAMES)
     counts = [sum(i in run.seeds + run.chosen for run in read) for i in range(tiny.FRAMES)]
     assert counts[index] == min(counts)
@@ -149,9 +148,9 @@ def test_table(runs):
 
 def test_runs_of_one_policy_are_told_apart_by_their_folders(runs, tmp_path):
     other = shutil.copytree(runs[1], tmp_path / "again")
-    assert list(tables.evaluated_runs([*runs, other])) == ["d-optimal", "random (random)", "random (again)"]
+    assert list(evaluated_runs([*runs, other])) == ["d-optimal", "random (random)", "random (again)"]
     with pytest.raises(InputError, match="same policy and folder name"):
-        tables.evaluated_runs([runs[1], runs[1]])
+        evaluated_runs([runs[1], runs[1]])
 
 
 def test_runs_that_cannot_be_compared(runs, tmp_path):
@@ -182,16 +181,16 @@ def test_pictures_of_an_earlier_model_are_not_shown(runs, tmp_path):
 
 def test_missing_and_damaged_files(runs, tmp_path):
     with pytest.raises(InputError, match=r"config\.json: no such file"):
-        tables.read_run(tmp_path)
+        read_run(tmp_path)
     (tmp_path / "config.json").write_text((runs[0] / "config.json").read_text())
     with pytest.raises(InputError, match=r"steps\.jsonl: no such file; .*--resume"):
-        tables.read_run(tmp_path)
+        read_run(tmp_path)
     for damaged, cause in {"": "no JSON", "{": "no JSON", "{}\n": "seeds: Field required"}.items():
         (tmp_path / "steps.jsonl").write_text(damaged)
         with pytest.raises(
             InputError, match=rf"steps\.jsonl: line 1 is damaged \({cause}\); write the file anew with `mgs nbv --r"
         ):
-            tables.read_run(tmp_path)
+            read_run(tmp_path)
     (tmp_path / "steps.jsonl").write_text((runs[0] / "steps.jsonl").read_text())
     with pytest.raises(InputError, match="mgs eval"):
         tables.table_numbers([tmp_path])
@@ -223,7 +222,7 @@ def test_a_damaged_config(runs, tmp_path, change, named):
     change(config)
     write_json(run / "config.json", config)
     with pytest.raises(InputError, match=rf"config\.json: {named}.*start the run anew"):
-        tables.read_run(run)
+        read_run(run)
 
 
 def test_an_unfinished_run(runs, tmp_path):

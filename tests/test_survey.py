@@ -31,18 +31,10 @@ from mgs.survey.depth_sensor import (
     noisy_depth,
     normals_from_depth,
 )
-from mgs.survey.registration import (
-    Edge,
-    SurveySettings,
-    chain,
-    drifting_odometry,
-    fly,
-    loop_candidates,
-    optimise,
-    survey_numbers,
-    trajectory_error,
-    write_survey,
-)
+from mgs.survey.flight import SurveySettings, fly, survey_numbers, trajectory_error
+from mgs.survey.folder import write_survey
+from mgs.survey.odometry import chain, drifting_odometry
+from mgs.survey.registration import Edge, loop_candidates, optimise
 
 ROCKS = [
     (np.array(centre), np.array(axes))

@@ -199,7 +199,7 @@ def test_rock_that_does_not_fit_the_frame(tmp_path):
 
 
 def test_without_the_denoiser_more_samples_and_a_note(tmp_path, monkeypatch):
-    monkeypatch.setattr("mgs.synth.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("mgs.synth.rendering.importlib.util.find_spec", lambda name: None)
     notes = []
     small = Preset(width=32, height=24, frames=1, spp=1)
     dataset = synthesise(tmp_path / "plain", SCENE, small, say=notes.append)

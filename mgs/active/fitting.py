@@ -46,7 +46,7 @@ class Fit:
     stop_reason: StopReason
 
 
-def _baked(
+def _recorded_sizes(
     optimiser: str,
     gaussians: Gaussians,
     buffers: Any,
@@ -65,7 +65,7 @@ def _project(gaussians: Gaussians, camera: Any) -> Any:
     return project(gaussians, camera)
 
 
-@frozen(_baked)
+@frozen(_recorded_sizes)
 def _step(
     optimiser: str,
     gaussians: Gaussians,

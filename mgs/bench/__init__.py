@@ -1,1 +1,1 @@
-"""Timings of the splat core."""
+"""Timings of the splatting kernels on this machine."""

@@ -1,6 +1,7 @@
-"""Timings of the splat core: against Mitsuba's own splatting integrator in one process, and its growth; medians.
+"""Timings of the splatting kernels: beside Mitsuba's own splatting integrator, and as the work grows. All times are medians.
 
-Kernels are compiled and memory is touched before anything is timed. Ratios travel between machines; seconds do not.
+Kernels are compiled, and memory is allocated, before anything is timed. Ratios of times are about the same on other machines;
+times are not.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
 from mgs.rotation import quat_from_normals
 from mgs.seeds import derive_seed, generator
 from mgs.splat import ListCache, as_drjit, fisher, render
-from mgs.splat.kernels import PIXELS
 from mgs.splat.projection import camera_array, project
+from mgs.splat.walking import PIXELS
 
 TARGETS = {
     "forward_warm_speedup": ("at least", 60.0),
@@ -33,19 +34,24 @@ TARGETS = {
     "block_fisher_over_gradient": ("at most", 2.5),
     "tiny_forward_ms": ("at most", 5.0),
 }
-"""What this project asks of itself; `mgs bench splat` prints each beside what was measured."""
+"""What this project asks of itself, by the names in "figures" of `bench_splat`: `mgs bench splat` prints them beside what was
+measured. *_speedup: time of Mitsuba's integrator over ours; *_over_gradient: time of the Fisher information over that of image
+and gradient; tiny_forward_ms: milliseconds."""
 
 WARM_UP = 2
-"""Calls before those that are timed: they compile kernels and touch memory."""
+"""Number of calls before those that are timed: they compile kernels and allocate memory."""
 
 FORWARD_FLOPS, FISHER_FLOPS = 21, 73
-"""Floating-point operations of a render and of an exact Fisher pass per pixel of a (splat, block) pair, counted in the LLVM IR
-of their kernels (an FMA is two)."""
+"""Floating-point operations of a render and of an exact Fisher pass, for each pixel of each (splat, block) pair, counted in the
+LLVM code of their kernels. A fused multiply-add (FMA) counts as two."""
 
 
 def surface_gaussians(n: int, seed: int = 0) -> Gaussians:
-    """n flat Gaussians spread over the surface of the default rock: standard deviations of 0.8, 0.8 and 0.2 spacings, opacity
-    0.73 (logit 1), random colours; the parameters for which `TARGETS` were set."""
+    """n flat Gaussians at random points on the surface of the default rock.
+
+    Their standard deviations are 0.8, 0.8 and 0.2 spacings (the square root of area / n), their opacity is 0.73 (logit 1),
+    their colours are random. These are the Gaussians for which the TARGETS were set.
+    """
     import trimesh
 
     from mgs.synth.noise import Noise
@@ -65,7 +71,8 @@ def surface_gaussians(n: int, seed: int = 0) -> Gaussians:
 
 
 def surface_camera(gaussians: Gaussians, width: int, height: int) -> Camera:
-    """A camera 25 degrees above the horizon, three radii away, with the focal length at which the Gaussians just fit."""
+    """A camera with an image of width x height pixels, 25 degrees above the horizon and three radii away from the Gaussians,
+    which fill its image."""
     low, high = gaussians.means.min(axis=0), gaussians.means.max(axis=0)
     centre, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
     pose = look_at(centre + 3 * radius * np.array([np.cos(0.44), 0.0, np.sin(0.44)]), centre)
@@ -75,8 +82,11 @@ def surface_camera(gaussians: Gaussians, width: int, height: int) -> Camera:
 
 
 def turned_cameras(camera: Camera, gaussians: Gaussians, count: int) -> list[Camera]:
-    """The camera carried around the vertical axis through the Gaussians' middle, in `count` even steps short of a full turn:
-    the same intrinsics, distance and elevation, so similar numbers of (splat, block) pairs (within 6 % at N = 100,000)."""
+    """`count` other cameras: the camera turned about the vertical axis through the middle of the Gaussians, in even steps.
+
+    Intrinsics, distance and elevation stay the same, so that the number of (splat, block) pairs is similar (within 6 % for
+    100,000 Gaussians).
+    """
     to_centre = np.eye(4)
     to_centre[:3, 3] = -(gaussians.means.min(axis=0) + gaussians.means.max(axis=0)) / 2
     cameras = []
@@ -89,7 +99,8 @@ def turned_cameras(camera: Camera, gaussians: Gaussians, count: int) -> list[Cam
 
 
 def median_seconds(call: Callable[[], Any], repeats: int) -> float:
-    """Median wall-clock seconds of evaluated calls, after WARM_UP that are not counted."""
+    """Median of the wall-clock seconds of `repeats` calls, after WARM_UP calls that do not count. What a call returns is
+    evaluated by Dr.Jit within its time."""
     seconds = []
     for i in range(repeats + WARM_UP):
         start = time.perf_counter()
@@ -101,7 +112,10 @@ def median_seconds(call: Callable[[], Any], repeats: int) -> float:
 
 
 def gradient(gaussians: Gaussians, camera: Camera, weights: Any, cache: ListCache | None) -> list[Any]:
-    """Render, and the gradient of a weighted sum of the image with respect to all learned parameters."""
+    """Render, then differentiate: gradients of a weighted sum of the image with respect to each of LEARNED.
+
+    weights: TensorXf [H,W,3]; cache: as `mgs.splat.render`.
+    """
     dr.enable_grad([getattr(gaussians, name) for name in LEARNED])
     loss = dr.sum(render(gaussians, camera, cache=cache).rgb * weights, axis=None)
     dr.backward(loss)
@@ -111,10 +125,12 @@ def gradient(gaussians: Gaussians, camera: Camera, weights: Any, cache: ListCach
 
 
 def time_core(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
-    """Seconds of each operation on these Gaussians, with the camera's (splat, block) pairs and list memory in bytes.
+    """Seconds of each operation on these Gaussians (NumPy fields).
 
-    forward_cold: a view never seen before, every call another of `turned_cameras`, block lists built. All else: this camera
-    again, its lists kept from the call before.
+    forward_cold: render a view that was never seen before, another one in each call, so that its block lists must be built. The
+    other operations see the same camera again, whose lists are kept: forward_warm, render; gradient_warm, `gradient`;
+    fisher_exact and fisher_block, `mgs.splat.fisher` with these estimators. Also pairs: the number of (splat, block) pairs of
+    the camera; list_bytes: memory of its lists, bytes.
     """
     device, cache = as_drjit(gaussians), ListCache()
     new_views = iter(turned_cameras(camera, gaussians, repeats + WARM_UP))
@@ -133,7 +149,8 @@ def time_core(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, f
 
 
 def time_volprim(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
-    """The peer: Mitsuba's `volprim_rf_basic` on the same Gaussians, forward, and forward with gradients."""
+    """Seconds of Mitsuba's own integrator for such Gaussians, `volprim_rf_basic`: volprim_forward, an image; volprim_gradient,
+    an image and the gradients of its sum."""
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     forward = camera.world_to_camera[2, :3]
     scene = mi.load_dict(
@@ -177,7 +194,8 @@ def time_volprim(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str
 
 
 def peak_flops() -> float:
-    """Floating-point operations per second of this machine, measured: 8 independent chains per lane of FMAs in registers."""
+    """Floating-point operations per second that this machine reaches, measured: FMAs on registers, in 8 independent chains for
+    each SIMD lane."""
     n, rounds = 1 << 16, 256
     scale = dr.opaque(mi.Float, 0.999)
 
@@ -194,7 +212,12 @@ def peak_flops() -> float:
 
 
 def bench_splat(n: int, width: int, height: int, repeats: int, report: Callable[[str], None]) -> dict[str, Any]:
-    """The whole table of `mgs bench splat`: seconds, ratios, throughput, memory."""
+    """Measure what `mgs bench splat` prints and writes: n Gaussians in an image of width x height pixels.
+
+    report(what) is called before each measurement. Returns "scene"; "seconds" of each operation; "figures", those of TARGETS;
+    "pairs" (splat, block); "pixel_splat_pairs_per_second"; "peak_gflops_measured" and "share_of_peak" that the kernels reach;
+    "list_megabytes" of a camera's block lists; "peak_memory_megabytes" of the process before Mitsuba's integrator is loaded.
+    """
     gaussians = surface_gaussians(n)
     camera = surface_camera(gaussians, width, height)
     report("splatting")
@@ -237,8 +260,13 @@ def bench_splat(n: int, width: int, height: int, repeats: int, report: Callable[
 
 
 def bench_scaling(repeats: int, report: Callable[[str], None], most: int = 1_000_000) -> list[dict[str, Any]]:
-    """Time and memory against N at 640x480, image size at N = 100,000, both together (640x480 at 100,000), and threads; one
-    record per point. Where both grow together, a splat keeps its number of pairs, so nothing grows but that of pairs."""
+    """Measure `scaling_point` along four sweeps; returns a record for each point. most: largest number N of Gaussians.
+
+    gaussians: N grows, at 640x480. pixels: the image grows, at N = 100,000. both: N and the number of pixels grow together,
+    with 640x480 at 100,000; a Gaussian then keeps its number of pairs, and only the number of all (splat, block) pairs grows.
+    threads: one, and all. A record holds "sweep", "n", "pixels", "threads" and what `scaling_point` returns. report(what) is
+    called before each point.
+    """
     threads = dr.thread_count()
     numbers = [n for n in (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000) if n <= most]
     points = [("gaussians", n, 640, 480, threads) for n in numbers]
@@ -255,7 +283,8 @@ def bench_scaling(repeats: int, report: Callable[[str], None], most: int = 1_000
 
 
 def scaling_point(n: int, width: int, height: int, threads: int, repeats: int) -> dict[str, float]:
-    """`time_core` with this many threads, and the most memory that Dr.Jit has held in this process, bytes."""
+    """What `time_core` returns, with this many threads, and peak_bytes: the most memory that Dr.Jit has held in this
+    process."""
     dr.set_thread_count(threads)
     gaussians = surface_gaussians(n)
     seconds = time_core(gaussians, surface_camera(gaussians, width, height), repeats)
@@ -263,12 +292,8 @@ def scaling_point(n: int, width: int, height: int, threads: int, repeats: int) -
 
 
 def in_new_process(call: Callable[..., Any], *arguments: Any) -> Any:
-    """What the call returns, run in a process of its own: no memory, recorded kernel or view of an earlier one."""
+    """Call a function in a new process and return its result, so that nothing is left over from earlier calls: no memory, no
+    recorded kernel, no block list. The function and the arguments must be picklable."""
     spawn = multiprocessing.get_context("spawn")  # Dr.Jit's threads do not survive a fork
     with ProcessPoolExecutor(1, spawn, initializer=runtime.start) as pool:
         return pool.submit(call, *arguments).result()
-
-
-def exponent(x: list[float], y: list[float]) -> float:
-    """Slope of log y against log x by least squares: the growth y ~ x^slope."""
-    return float(np.polyfit(np.log(x), np.log(y), 1)[0])

@@ -1,1 +1,1 @@
-"""The command line: it parses and prints."""
+"""The command line: it reads options, calls the rooms, and prints what came out."""

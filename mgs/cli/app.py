@@ -1,9 +1,14 @@
-"""The `mgs` command. One file per command in this room; heavy imports stay inside the commands."""
+"""The program `mgs`: its commands, and how they end.
+
+Beside this file there is one for each command. Commands import what they need when they are called, so that `mgs --help` does
+not wait for Mitsuba.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from inspect import cleandoc
 from typing import Annotated
 
 import typer
@@ -25,7 +30,7 @@ from mgs.cli.synth_orbit import synth_orbit
 from mgs.errors import InputError
 
 INTERRUPTED = 130
-"""Exit code after Ctrl-C: 128 + SIGINT."""
+"""Exit code after Ctrl-C: by convention 128 plus the number of the signal, SIGINT."""
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "doctor": doctor,
@@ -42,6 +47,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "bench": bench,
 }
+"""All commands, in about the order in which they are used."""
 
 _AGAIN = "run the same command again to continue"
 GOES_ON = {
@@ -50,17 +56,22 @@ GOES_ON = {
     "demo": _AGAIN,
     "nbv": "`mgs nbv --resume RUN` continues a run whose folder is there",
 }
-"""What a person is told after Ctrl-C, by command. The others start anew: they write at the end, or write the same again."""
-"""Every command of the `mgs` program, in the order of the pipeline."""
+"""What is printed after Ctrl-C, for the commands that can go on where they stopped. The others start anew."""
 
 app = typer.Typer(name="mgs", add_completion=False, pretty_exceptions_enable=False)
 
 
+def _help(docstring: str | None) -> str:
+    """A docstring with each paragraph in one line, so that the help screen breaks lines at the width of the terminal only."""
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in cleandoc(docstring or "").split("\n\n"))
+
+
 for name, command in COMMANDS.items():
-    app.command(name)(command)
+    app.command(name, help=_help(command.__doc__))(command)
 
 
 def _print_version(wanted: bool) -> None:
+    """What the option --version does."""
     if wanted:
         typer.echo(f"mgs {__version__}")
         raise typer.Exit
@@ -76,8 +87,11 @@ def _program(
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run a command and end the process: bad input and wrong options are one line and exit code 2, an interruption is one
-    line and exit code 130. Raises SystemExit, always."""
+    """Run a command and end the process. arguments: those of the command line, by default the process's own.
+
+    Bad input and wrong options print one line, with exit code 2; an interruption prints one line, with exit code 130. Always
+    raises SystemExit, but for errors of the program itself, which pass through.
+    """
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
         code = app(arguments or ["--help"], prog_name="mgs", standalone_mode=False)
@@ -91,19 +105,20 @@ def main(arguments: list[str] | None = None) -> None:
         if not _from_interrupt(error):
             raise
         code = INTERRUPTED
-    if code == INTERRUPTED:  # typer has turned Ctrl-C into this, without a word
+    if code == INTERRUPTED:  # typer turns Ctrl-C into this exit code and prints nothing
         hint = GOES_ON.get(arguments[0]) if arguments else None
         raise _stop(f"interrupted; {hint}" if hint else "interrupted", INTERRUPTED)
     raise SystemExit(code or 0)
 
 
 def _from_interrupt(error: BaseException | None) -> bool:
-    """Whether Ctrl-C is behind an exception: Dr.Jit raises one of its own where it is hit inside its calls."""
+    """Whether Ctrl-C is the cause of an exception. If it comes during a call of Dr.Jit, that raises an exception of its own."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
 
 
 def _stop(message: str, code: int) -> SystemExit:
+    """Print one line to the standard error, and return the exception that ends the process with this exit code."""
     print(f"mgs: {message}", file=sys.stderr)
     return SystemExit(code)

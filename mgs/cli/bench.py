@@ -1,4 +1,4 @@
-"""`mgs bench`: timings on this machine, as ratios against a peer in the same run."""
+"""`mgs bench`: time the splatting kernels on this machine."""
 
 from __future__ import annotations
 
@@ -18,63 +18,66 @@ class Kind(StrEnum):
 
 def bench(
     kind: Annotated[
-        Kind, typer.Argument(help="splat: against Mitsuba's volprim_rf_basic; scaling: against N, pixels, threads.")
+        Kind,
+        typer.Argument(
+            help="splat: compared with Mitsuba's own integrator, volprim_rf_basic. scaling: as the numbers of Gaussians, "
+            "pixels and threads grow."
+        ),
     ],
-    json: Annotated[Path | None, typer.Option(help="Write everything measured to this file.")] = None,
-    chart: Annotated[Path | None, typer.Option(help="scaling only: write the log-log charts to this PNG.")] = None,
+    json: Annotated[Path | None, typer.Option(help="Write everything that is measured to this file.")] = None,
+    chart: Annotated[Path | None, typer.Option(help="scaling only: draw the chart to this PNG.")] = None,
     gaussians: Annotated[
-        int | None, typer.Option(min=1000, help="splat: how many [100000]; scaling: the most [1000000].")
+        int | None, typer.Option(min=1000, help="splat: number of Gaussians [100000]; scaling: the largest number [1000000].")
     ] = None,
-    repeats: Annotated[int, typer.Option(min=3, help="Runs that each median is of.")] = 9,
+    repeats: Annotated[int, typer.Option(min=3, help="Number of calls of each operation; their median counts.")] = 9,
 ) -> None:
-    """Time the splat core on 100,000 Gaussians of a rock at 640x480 (splat), or its growth up to a million (scaling).
+    """Time rendering, gradients and Fisher information on Gaussians of a rock in an image of 640x480 pixels.
 
-    Nothing else should run on the machine meanwhile. The command line, machine and versions are written beside the numbers.
+    Let nothing else run on the machine meanwhile. The JSON file also holds the command line, the machine and the versions.
     """
     from rich.console import Console
 
     from mgs import runtime
     from mgs.errors import InputError
     from mgs.files import check_writable, write_json
-    from mgs.provenance import versions
+    from mgs.provenance import command_line, versions
 
     if kind is Kind.scaling and gaussians is not None and gaussians < 3000:
         raise InputError(f"--gaussians {gaussians}: scaling fits the growth with N, from 1000 up; give at least 3000")
     for target in (json, chart):
-        if target is not None:  # known before the minutes of measuring
+        if target is not None:  # before minutes of measuring, not after them
             check_writable(target)
             if target.is_dir():
                 raise InputError(f"{target}: is a folder; name a file to write")
     runtime.start()
+    from mgs.bench.chart import scaling_figure
     from mgs.bench.core import bench_scaling, bench_splat
-    from mgs.provenance import command_line
+    from mgs.bench.growth import growth
 
     console = Console()
-    report = lambda what: console.print(f"timing {what}", style="dim")  # noqa: E731  (a spinner's thread would be timed too)
+
+    def report(what: str) -> None:
+        console.print(f"timing {what}", style="dim")  # a line and no spinner, whose thread would be timed too
+
+    result: dict[str, Any]
     if kind is Kind.splat:
-        result: dict[str, Any] = bench_splat(gaussians or 100_000, 640, 480, repeats, report)
-    else:
-        result = {"repeats": repeats, "points": bench_scaling(repeats, report, gaussians or 1_000_000)}
-    result |= {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
-    if kind is Kind.splat:
+        result = bench_splat(gaussians or 100_000, 640, 480, repeats, report)
         _print_splat(console, result)
     else:
-        from mgs.bench.chart import fitted, linear_growth, scaling_exponents, scaling_figure
-
-        result["exponents"] = scaling_exponents(result["points"])
-        result["linear_growth"] = linear_growth(result["points"])
-        result["exponents_from_n"] = fitted(result["points"])[0]["n"]
+        points = bench_scaling(repeats, report, gaussians or 1_000_000)
+        result = {"repeats": repeats, "points": points} | growth(points)
         _print_scaling(console, result)
         if chart:
-            scaling_figure(chart, result["points"])
+            scaling_figure(chart, points)
             console.print(f"wrote {chart}")
+    result |= {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
     if json:
         write_json(json, result)
         console.print(f"wrote {json}")
 
 
 def _print_scaling(console: Any, result: dict[str, Any]) -> None:
-    """Exponents: a row for each quantity, a column for what it grows with; and time as a sum of what grows linearly."""
+    """Print the exponents, a row for each quantity and a column for each thing that grows, and the linear fits of time."""
     from rich.table import Table
 
     rows = result["exponents"]
@@ -90,7 +93,7 @@ def _print_scaling(console: Any, result: dict[str, Any]) -> None:
 
 
 def _print_splat(console: Any, result: dict[str, Any]) -> None:
-    """Seconds, then each figure beside its target."""
+    """Print the time of each operation, then each figure beside what is asked for."""
     from rich.table import Table
 
     from mgs.bench.core import TARGETS

@@ -1,4 +1,4 @@
-"""`mgs dataset check`: validate what is on disk."""
+"""`mgs dataset check`: find out what is wrong with a dataset."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ class Action(StrEnum):
 
 
 def dataset(
-    action: Annotated[Action, typer.Argument(help="check: read everything, and compare depth, masks and poses.")],
+    action: Annotated[Action, typer.Argument(help="check: read every file; compare depth, masks and poses between frames.")],
     path: Annotated[Path, typer.Argument(help="Folder of the dataset.")],
 ) -> None:
-    """Validate a dataset: every file readable and of its size, no empty mask, neighbouring frames in agreement.
+    """Check a dataset: can every file be read, has it the right size, is no mask empty, do neighbouring frames agree?
 
-    Prints every problem with its cure; the exit code is 2 where there is one.
+    Prints every problem and how to mend it. The exit code is 2 if there are problems.
     """
     from rich.console import Console
     from rich.progress import Progress

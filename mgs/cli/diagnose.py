@@ -1,4 +1,4 @@
-"""`mgs diagnose`: maps of what a run knows and what it does not."""
+"""`mgs diagnose`: maps of what the training views of a run say about its model."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ import typer
 def diagnose(
     run: Annotated[Path, typer.Argument(help="Folder that `mgs nbv` wrote.")],
     views: Annotated[
-        str | None, typer.Option(help="Frames by name, as in kf_0003,kf_0010; a few held-out ones by default.")
+        str | None,
+        typer.Option(help="Names of frames to draw, as in kf_0003,kf_0010. Default: a few that were not trained on."),
     ] = None,
 ) -> None:
-    """Map the Fisher information and the posterior uncertainty of a run, per view and per Gaussian.
+    """Draw maps of the Fisher information and the uncertainty that a run has about its model, for views and for Gaussians.
 
-    Writes RUN/diagnostics: one multi-channel EXR per view (R G B A Z, fisher.colour, fisher.scale, fisher.rotation,
-    fisher.opacity, information, uncertainty, unobserved), a PNG preview of each, and information.ply, coloured by information.
+    Writes into RUN/diagnostics: for each view an EXR with the channels R G B A Z, fisher.colour, fisher.scale, fisher.rotation,
+    fisher.opacity, information, uncertainty and unobserved, and a PNG that shows them; and information.ply, a point for each
+    Gaussian, coloured by its information.
     """
     from rich.progress import Progress
 

@@ -1,4 +1,4 @@
-"""`mgs doctor`: what this machine has, what is wrong, and how to mend it."""
+"""`mgs doctor`: what mgs finds on this machine, what is wrong with it, and how to mend it."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ import typer
 from mgs.errors import InputError
 
 _PACKAGES = ("mgs", "mitsuba", "drjit", "numpy", "pyoidn", "pymeshlab")
+"""Packages whose versions are printed. Only pyoidn may be missing."""
 
 
 def doctor() -> None:
-    """Print versions, the libLLVM in use, processor and memory; say what is wrong and how to mend it.
+    """Print versions, the libLLVM that is used, processor and memory; say what is wrong and how to mend it.
 
-    Exit code 0 where all is well, 2 where something stops mgs from working.
+    The exit code is 0 if all is well, and 2 if something prevents mgs from working.
     """
     from rich.console import Console
     from rich.table import Table
@@ -37,7 +38,7 @@ def doctor() -> None:
 
 
 def _software() -> list[tuple[str, str, str]]:
-    """(name, value, what is wrong or "") of Python and the packages."""
+    """Python and the packages: (name, value, what is wrong with it or "") of each."""
     rows = [("python", platform.python_version(), "")]
     for package in _PACKAGES:
         try:
@@ -47,17 +48,17 @@ def _software() -> list[tuple[str, str, str]]:
             absent = "absent: images are rendered with more samples instead of being denoised"
             problem = f"the package {package} is missing; install mgs again (`make setup`, or `pip install .`)"
             rows.append((package, absent if optional else "missing", "" if optional else problem))
-    try:  # its wheel wants libGL of the system, though nothing is drawn with it
+    try:  # pymeshlab needs the system's libGL to load, although mgs draws nothing with it
         import pymeshlab  # noqa: F401
     except ModuleNotFoundError:
-        pass  # told above
+        pass  # reported above
     except ImportError as error:
         rows.append(("pymeshlab", "does not load", f"pymeshlab: {error}; install libGL (`apt-get install libgl1 libopengl0`)"))
     return rows
 
 
 def _machine() -> list[tuple[str, str, str]]:
-    """(name, value, what is wrong or "") of libLLVM, processor and memory."""
+    """Processor, memory and libLLVM: (name, value, what is wrong with it or "") of each."""
     from mgs import runtime
 
     page, gib = os.sysconf("SC_PAGE_SIZE"), 1024**3
@@ -80,7 +81,7 @@ def _machine() -> list[tuple[str, str, str]]:
 
 
 def _resources() -> list[tuple[str, str, str]]:
-    """(name, value, what is wrong or "") of the folders that come with the package."""
+    """The folders of data files that come with mgs: (name, value, what is wrong with it or "") of each."""
     from mgs.resources import resource_folder
 
     rows = []

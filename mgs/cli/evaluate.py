@@ -1,4 +1,4 @@
-"""`mgs eval`: PSNR and SSIM of a run, and its renders next to the truth."""
+"""`mgs eval`: PSNR and SSIM of the model of a run, and its renders beside the truth."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ import typer
 
 def evaluate(
     run: Annotated[Path, typer.Argument(help="Folder that `mgs nbv` wrote.")],
-    pictures: Annotated[bool, typer.Option(help="Write truth | render | |difference| of every view to RUN/renders.")] = True,
+    pictures: Annotated[
+        bool, typer.Option(help="Write truth, render and difference of every view, side by side, to RUN/renders.")
+    ] = True,
 ) -> None:
-    """Measure PSNR and SSIM on all views and on the views never trained on; write RUN/metrics.json and renders next to truth.
+    """Measure PSNR and SSIM on all views and on the views never trained on; write RUN/metrics.json, and renders beside truth.
 
     What is there already of this very model and dataset is kept, and not measured or drawn again.
-    Full frame: the rock on black. Inside the mask: the pixels of the rock only.
+    The truth is the rock on black. Numbers are over the full frame, and over the pixels of the rock only.
     """
     from rich.console import Console
     from rich.progress import Progress

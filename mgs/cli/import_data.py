@@ -1,4 +1,4 @@
-"""`mgs import`: nerfstudio, NeRF-synthetic and COLMAP data to a dataset."""
+"""`mgs import`: make a dataset of data in the formats of nerfstudio, NeRF-synthetic and COLMAP."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ import typer
 
 
 def import_data(
-    source: Annotated[Path, typer.Argument(help="transforms.json, or a folder with one, or with a COLMAP model (sparse/0).")],
-    out: Annotated[Path, typer.Option(help="Folder to write; new, or one that an interrupted import left.")],
-    images: Annotated[Path | None, typer.Option(help="COLMAP's images; default SOURCE/images.")] = None,
-    masks: Annotated[Path | None, typer.Option(help="Rock masks, named as the images; white is rock.")] = None,
+    source: Annotated[Path, typer.Argument(help="A transforms.json, or a folder with one or with a COLMAP model (sparse/0).")],
+    out: Annotated[Path, typer.Option(help="Folder to write: new, empty, or left by an interrupted import.")],
+    images: Annotated[Path | None, typer.Option(help="Folder of COLMAP's images. Default: SOURCE/images.")] = None,
+    masks: Annotated[Path | None, typer.Option(help="Folder of rock masks, named like the images; white is rock.")] = None,
     mesh: Annotated[
-        Path | None, typer.Option(help="Masks by projecting this mesh (world coordinates; a GLB is turned from +Y up).")
+        Path | None,
+        typer.Option(help="Make masks by projecting this mesh of the rock. World coordinates; a GLB is turned from +Y up."),
     ] = None,
-    split: Annotated[str, typer.Option(help="Split of NeRF-synthetic data: train, val or test.")] = "train",
+    split: Annotated[str, typer.Option(help="Which split of NeRF-synthetic data to import: train, val or test.")] = "train",
 ) -> None:
-    """Bring your own data: cameras and images (depth and masks, if any) to a dataset folder, lens distortion undone.
+    """Make a dataset of your own data: cameras and images, and depth and masks if there are any. Lens distortion is undone.
 
-    Masks come from --masks, from --mesh, from the source's own mask files or from the images' alpha, in this order. Without
-    depth, the prior comes from `mgs prior OUT --mesh MESH`, or from COLMAP's sparse points. An interrupted import goes on where
-    it stopped when the same command is given again.
+    Masks are taken from --masks, --mesh, the source's own mask files or the images' alpha: the first of these that there is.
+    For data without depth, `mgs prior OUT` builds the prior from COLMAP's points, or takes your mesh with --mesh. An
+    interrupted import goes on where it stopped when the same command is given again.
     """
     from rich.console import Console
     from rich.progress import Progress

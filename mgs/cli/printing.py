@@ -1,4 +1,4 @@
-"""What several commands print."""
+"""Things that several commands print."""
 
 from __future__ import annotations
 

@@ -1,76 +1,95 @@
-"""`mgs prior`: RGB-D frames to a mesh prior."""
+"""`mgs prior`: from the depth images of a dataset to a mesh of the rock, and samples of its surface."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+if TYPE_CHECKING:
+    from mgs.data.dataset import Dataset, Frame
+    from mgs.prior.build import Prior
+
 SEEDS = 4
-"""Seed frames of the paper."""
+"""Number of seed frames in the paper, and of those for which the share of samples that they see is printed."""
 
 
 def prior(
-    dataset: Annotated[Path, typer.Argument(help="Folder with transforms.json and depth images.")],
-    out: Annotated[Path | None, typer.Option(help="Folder to write; default DATASET/prior.")] = None,
-    gaussians: Annotated[int | None, typer.Option(help="Exact number N of surface samples.")] = None,
+    dataset: Annotated[Path, typer.Argument(help="Dataset folder (transforms.json) with depth images.")],
+    out: Annotated[Path | None, typer.Option(help="Folder to write, new or empty. Default: DATASET/prior.")] = None,
+    gaussians: Annotated[int | None, typer.Option(help="Number N of samples on the surface, one for each Gaussian.")] = None,
     spacing: Annotated[
-        float | None, typer.Option(help="Distance between samples, metres; default a pixel's footprint.")
+        float | None,
+        typer.Option(help="Distance between samples, metres, instead of N. Default: about the size of a pixel on the rock."),
     ] = None,
     mesh: Annotated[
         Path | None,
-        typer.Option(help="Sample this mesh (world coordinates, metres; a GLB is turned from +Y up) instead of building one."),
+        typer.Option(help="Sample this mesh instead of building one. World coordinates, metres; a GLB is turned from +Y up."),
     ] = None,
-    poisson_depth: Annotated[int | None, typer.Option(help="Poisson octree depth; default from the cloud's density.")] = None,
-    prior_noise: Annotated[float, typer.Option(help="Spoil the rock's points on purpose: standard deviation, metres.")] = 0.0,
-    holes: Annotated[float, typer.Option(help="Spoil them by round holes: share of the points to remove.")] = 0.0,
-    seed: Annotated[int, typer.Option(min=0, help="Root seed.")] = 0,
+    poisson_depth: Annotated[
+        int | None, typer.Option(help="Octree depth of the Poisson surface, 3 to 12. Default: by the density of the cloud.")
+    ] = None,
+    prior_noise: Annotated[
+        float, typer.Option(help="Make the rock's points worse on purpose: noise of this standard deviation, metres.")
+    ] = 0.0,
+    holes: Annotated[
+        float, typer.Option(help="Make them worse on purpose: cut round holes until this share of the points is removed.")
+    ] = 0.0,
+    seed: Annotated[int, typer.Option(min=0, help="Root seed: the same seed gives the same prior.")] = 0,
 ) -> None:
-    """Depth images to a rock's mesh and N samples on it: plane removal, clustering, Poisson surface, blue noise."""
-    from dataclasses import replace
+    """Build a mesh of the rock from depth images, and sample N points on it.
 
-    import numpy as np
+    The steps: fuse the depth images into a cloud, find the ground plane and the rock above it, reconstruct the rock's surface
+    (Poisson), spread samples evenly over what some frame saw of it. Writes mesh.ply, points.ply, prior.json and prior.png.
+    """
     from rich.console import Console
 
     from mgs import runtime
-    from mgs.active.pose_policies import seed_views
     from mgs.data.dataset import load_dataset
     from mgs.data.meshes import GLTF
     from mgs.files import atomic_folder, check_new_folder
     from mgs.prior.build import build_prior, prior_from_mesh, save_prior
     from mgs.prior.figure import draw_prior
-    from mgs.prior.initial import initial_gaussians
+    from mgs.prior.initial import with_share_seen
     from mgs.prior.settings import PriorSettings
 
     console = Console()
-    frames = load_dataset(dataset)
-    folder = check_new_folder(out if out is not None else dataset / "prior")  # known before the work
+    loaded = load_dataset(dataset)
+    folder = check_new_folder(out if out is not None else dataset / "prior")  # before the work, not after it
     settings = PriorSettings(gaussians, spacing, poisson_depth, prior_noise, holes, seed)
     with console.status("reading") as status:
         if mesh is not None:
             if mesh.suffix.lower() in GLTF:
                 console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
-            result, rock = prior_from_mesh(mesh, settings), None
+            result, segmented = prior_from_mesh(mesh, settings), None
         else:
-            result, rock = build_prior(frames, settings, lambda stage: status.update(f"prior: {stage}"))
+            result, segmented = build_prior(loaded, settings, lambda stage: status.update(f"prior: {stage}"))
         status.update("prior: what four seed frames see")
-        positions = np.stack([frame.camera.position for frame in frames.frames])
-        seeds = seed_views(positions, result.points.mean(0), min(SEEDS, len(frames)))
-        if not all(frames.frames[k].depth_path for k in seeds):
-            runtime.start()
-        seen = initial_gaussians(result, [frames.frames[k] for k in seeds])[1]
-        result = replace(result, numbers=result.numbers | {"seen_by_seeds": float(seen.mean())})
+        seeds = _seed_frames(loaded, result)
+        if not all(frame.depth_path for frame in seeds):
+            runtime.start()  # to cast rays at the mesh in place of depth images
+        result = with_share_seen(result, seeds)
         status.update("prior: picture")
         with atomic_folder(folder) as unfinished:
             save_prior(unfinished, result)
-            draw_prior(unfinished / "prior.png", result, rock)
+            draw_prior(unfinished / "prior.png", result, segmented)
     console.print(_table(result.numbers))
     console.print(f"wrote {folder}: mesh.ply, points.ply, prior.json, prior.png")
 
 
+def _seed_frames(dataset: Dataset, prior: Prior) -> list[Frame]:
+    """The frames that `mgs nbv` would take as its SEEDS seeds, or all frames if there are fewer."""
+    import numpy as np
+
+    from mgs.active.pose_policies import seed_views
+
+    positions = np.stack([frame.camera.position for frame in dataset.frames])
+    return [dataset.frames[k] for k in seed_views(positions, prior.points.mean(0), min(SEEDS, len(dataset)))]
+
+
 def _table(numbers: dict[str, Any]) -> Any:
-    """The numbers a person wants."""
+    """The table that is printed, from the numbers of prior.json."""
     from rich.table import Table
 
     n, spacing, area = numbers["n"], numbers["spacing"], numbers["sampled_area"]
@@ -96,6 +115,7 @@ def _table(numbers: dict[str, Any]) -> Any:
 
 
 def _add_cloud_rows(table: Any, numbers: dict[str, Any]) -> None:
+    """The rows of a mesh that was built from a cloud."""
     table.add_row("depth pixels in the cloud", f"{numbers['pixels']:,}")
     table.add_row("noise of a depth pixel", f"{1e3 * numbers['depth_noise']:.2f} mm")
     table.add_row("points of the fused cloud", f"{numbers['points']:,} on a {1e3 * numbers['voxel']:.2f} mm grid")

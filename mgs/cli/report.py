@@ -1,4 +1,4 @@
-"""`mgs report`: figures and a table that compare runs."""
+"""`mgs report`: compare runs by figures and a table."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import typer
 
 
 def report(
-    runs: Annotated[list[Path], typer.Argument(help="Folders of runs on one dataset, each measured with `mgs eval`.")],
+    runs: Annotated[list[Path], typer.Argument(help="Run folders, all of one dataset, each measured by `mgs eval`.")],
     out: Annotated[
-        Path, typer.Option(help="Folder for the figures and the table; files of an earlier report are replaced.")
+        Path, typer.Option(help="Folder for the figures and the table. Files of an earlier report are replaced.")
     ] = Path("report"),
 ) -> None:
-    """Compare runs: orbit, information gain, coverage, PSNR against images, one held-out view, and the table.
+    """Compare runs: draw the orbit, information gain, coverage, PSNR against images and one held-out view, and make a table.
 
-    Draws from the files of the runs alone.
+    Everything is taken from the files of the runs; nothing is computed anew.
     """
     from rich.console import Console
 
@@ -25,7 +25,7 @@ def report(
     from mgs.report.tables import table_rows
     from mgs.report.writing import write_report
 
-    check_writable(out / "table.md")  # known before the figures are drawn
+    check_writable(out / "table.md")  # before the figures are drawn, not after it
     written = write_report(out, runs)
     print_table(Console(), table_rows(runs))
     for path in written:

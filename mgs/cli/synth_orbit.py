@@ -1,4 +1,4 @@
-"""`mgs synth-orbit`: render an RGB-D orbit around a rock."""
+"""`mgs synth-orbit`: render a dataset, an orbit around a rock."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ import typer
 
 
 class Axis(StrEnum):
-    """An up axis."""
+    """The axis of a mesh that points upwards."""
 
     y = "y"
     z = "z"
 
 
 def synth_orbit(
-    out: Annotated[Path, typer.Argument(help="Folder for the dataset; new, or one that an interrupted run left.")],
-    scene: Annotated[str, typer.Option(help="A scene of mgs (boulder, ...) or the path of a .toml file.")] = "boulder",
-    orbit: Annotated[str | None, typer.Option(help="circle, rings, spiral or hemisphere, in place of the scene's.")] = None,
-    mesh: Annotated[Path | None, typer.Option(help="A real rock (textured GLB, OBJ or PLY), scaled to the scene.")] = None,
+    out: Annotated[Path, typer.Argument(help="Folder to write: new, empty, or left by an interrupted run.")],
+    scene: Annotated[str, typer.Option(help="Name of a scene that comes with mgs, or path of a .toml file.")] = "boulder",
+    orbit: Annotated[str | None, typer.Option(help="circle, rings, spiral or hemisphere. Default: the scene's.")] = None,
+    mesh: Annotated[Path | None, typer.Option(help="A real rock: textured GLB, OBJ or PLY, scaled to the scene.")] = None,
     mesh_up: Annotated[
-        Axis | None, typer.Option(help="Up axis of --mesh. Default: y for GLB (its rule) and OBJ, z for PLY and others.")
+        Axis | None, typer.Option(help="Axis of --mesh that points up. Default: y for GLB (its rule) and OBJ, z for others.")
     ] = None,
-    preset: Annotated[str, typer.Option(help="quick: 320x240, 32 frames. paper: 640x480, 100 frames.")] = "quick",
-    spp: Annotated[int | None, typer.Option(min=1, help="Samples per pixel, in place of the preset's.")] = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="Number of frames, in place of the preset's.")] = None,
-    size: Annotated[str | None, typer.Option(help="Image size WIDTHxHEIGHT, in place of the preset's.")] = None,
-    pose_noise: Annotated[float, typer.Option(min=0, help="Error of the poses in transforms.json, metres per axis.")] = 0.0,
-    rotation_noise: Annotated[float, typer.Option(min=0, help="The same for the rotations, degrees per axis.")] = 0.0,
+    preset: Annotated[str, typer.Option(help="quick: 32 frames of 320x240. paper: 100 frames of 640x480.")] = "quick",
+    spp: Annotated[int | None, typer.Option(min=1, help="Samples per pixel. Default: the preset's.")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Number of frames. Default: the preset's.")] = None,
+    size: Annotated[str | None, typer.Option(help="Image size WIDTHxHEIGHT, pixels. Default: the preset's.")] = None,
+    pose_noise: Annotated[float, typer.Option(min=0, help="Noise on the positions in transforms.json, metres per axis.")] = 0.0,
+    rotation_noise: Annotated[float, typer.Option(min=0, help="Noise on the rotations there, degrees per axis.")] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="Root seed: the same seed gives the same dataset, bit for bit.")] = 0,
 ) -> None:
-    """Render an RGB-D orbit around a rock with Mitsuba: photoreal images, z-depth, rock masks, exact poses.
+    """Render a dataset with Mitsuba: an orbit around a rock, with photoreal images, depth, rock masks and exact poses.
 
-    Writes transforms.json (nerfstudio conventions), images/, depth/, masks/, the true rock as rock.glb, config.json and
+    Writes transforms.json (as nerfstudio has it), images/, depth/, masks/, the true rock as rock.glb, config.json and
     contact_sheet.png. An interrupted run goes on where it stopped when the same command is given again.
     """
     from rich.console import Console
@@ -70,6 +70,7 @@ def synth_orbit(
 
 
 def _parse_size(size: str | None) -> dict[str, int | None]:
+    """Width and height of an option like 320x240, {} if it was not given. Raises InputError for anything else."""
     import re
 
     from mgs.camera import MAX_PIXELS

@@ -1,4 +1,7 @@
-"""The mesh prior: survey cloud -> plane removal -> rock cluster -> Poisson mesh -> surface samples (paper, section III-A)."""
+"""The mesh prior (paper, section III-A): built from a dataset or from a given mesh, written to a folder and read back.
+
+Building it goes from the cloud of a dataset to ground plane, rock, Poisson mesh, and samples of the mesh's surface.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +19,8 @@ from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh, write_points
 from mgs.data.visibility import in_mask, visible
 from mgs.errors import InputError
 from mgs.files import atomic_path, new_folder, read_json, write_json
-from mgs.prior.segmentation import Rock, find_rock
-from mgs.prior.settings import PriorSettings, _check
+from mgs.prior.segmentation import SegmentedCloud, segment_dataset
+from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import poisson_mesh, sample_surface
 from mgs.prior.truth import error_to_truth
 from mgs.seeds import derive_seed
@@ -25,9 +28,15 @@ from mgs.seeds import derive_seed
 
 @dataclass(frozen=True)
 class Prior:
-    """mesh: what was sampled; points [N,3] world, metres; normals [N,3] unit; spacing: sqrt(area / N), metres;
-    depth_tolerance: metres a depth may differ from the prior and still be the same surface (the largest of three rms residuals
-    of the cloud, a voxel, and two standard deviations of the depth images); numbers: what prior.json holds."""
+    """A mesh of the rock, and N samples of its surface.
+
+    mesh: the mesh; its faces that count as seen were sampled. points: [N,3] samples in the world, metres. normals: [N,3] unit.
+    spacing: sqrt(sampled area / N), metres: about the distance between neighbouring samples.
+    depth_tolerance: by how much a depth image may differ from the prior and still show the same surface, metres. It is the
+    largest of three rms distances of the cloud from the mesh, a voxel, and two standard deviations of the depth images; for a
+    given mesh, the spacing.
+    numbers: what prior.json holds.
+    """
 
     mesh: Mesh
     points: np.ndarray
@@ -37,20 +46,22 @@ class Prior:
     numbers: dict[str, Any]
 
 
-def build_prior(dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None] | None = None) -> tuple[Prior, Rock]:
-    """Build the prior of a dataset of RGB-D frames, or of its imported sparse points where frames have no depth, from its rock.
+def build_prior(
+    dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None] | None = None
+) -> tuple[Prior, SegmentedCloud]:
+    """Build the prior of a dataset from its depth images, or if it has none from COLMAP's points that `mgs import` kept.
 
-    on_stage is told the name of each stage as it starts.
-    Raises InputError: no depth, no ground plane, no rock (empty cluster), two equal rocks, no closed surface, N below 2.
+    on_stage(name) is called as each stage starts. Returns the prior, and the cloud that its mesh was built from.
+    Raises InputError as `segment_dataset` (no depth, no ground plane, no rock, two equal rocks), `poisson_mesh` (no closed
+    surface) and `sample_surface` (too few or too many samples), or if no frame sees the mesh.
     """
-    _check(settings)
     tell = on_stage or (lambda stage: None)
-    rock = find_rock(dataset, settings, tell)
-    cloud = rock.cloud
+    segmented = segment_dataset(dataset, settings, tell)
+    cloud = segmented.cloud
     tell("Poisson mesh")
     cell = max(cloud.voxel, settings.noise)
-    mesh, depth = poisson_mesh(rock.points, rock.normals, cell, rock.plane, settings.poisson_depth)
-    residual = float(np.sqrt(np.mean(distances_to_mesh(rock.points, mesh.vertices, mesh.faces) ** 2)))
+    mesh, depth = poisson_mesh(segmented.rock_points, segmented.rock_normals, cell, segmented.plane, settings.poisson_depth)
+    residual = float(np.sqrt(np.mean(distances_to_mesh(segmented.rock_points, mesh.vertices, mesh.faces) ** 2)))
     tolerance = max(3 * residual, cloud.voxel, 2 * cloud.noise)
     tell("surface samples")
     mesh = _seen_by(mesh, dataset.frames, tolerance)
@@ -63,12 +74,12 @@ def build_prior(dataset: Dataset, settings: PriorSettings, on_stage: Callable[[s
         "points": len(cloud.points),
         "voxel": cloud.voxel,
         "depth_noise": cloud.noise,
-        "plane_inliers": int(rock.ground.sum()),
-        "plane_sigma": rock.plane.sigma,
-        "plane_tolerance": rock.plane.tolerance,
-        "eps": rock.eps,
-        "clusters": rock.clusters,
-        "cluster_size": len(rock.points),
+        "plane_inliers": int(segmented.ground.sum()),
+        "plane_sigma": segmented.plane.sigma,
+        "plane_tolerance": segmented.plane.tolerance,
+        "eps": segmented.eps,
+        "clusters": segmented.clusters,
+        "cluster_size": len(segmented.rock_points),
         "poisson_depth": depth,
         "fit_rms": residual,
         "depth_tolerance": tolerance,
@@ -78,11 +89,12 @@ def build_prior(dataset: Dataset, settings: PriorSettings, on_stage: Callable[[s
     truth = dataset.root / "rock.glb"
     if truth.is_file() and any(frame.depth_path for frame in dataset.frames):
         tell("distance to the true rock")
-        numbers["truth"] = error_to_truth(points, spacing, mesh, truth, dataset.frames, rock, settings.seed)
-    return Prior(mesh, points, normals, spacing, tolerance, numbers), rock
+        numbers["truth"] = error_to_truth(points, spacing, mesh, truth, dataset.frames, segmented, settings.seed)
+    return Prior(mesh, points, normals, spacing, tolerance, numbers), segmented
 
 
 def _sample_numbers(mesh: Mesh, points: np.ndarray, spacing: float) -> dict[str, Any]:
+    """What prior.json holds of the mesh and of its samples [N,3]; areas in square metres, distances in metres."""
     nearest = cKDTree(points).query(points, 2)[0][:, 1]
     return {
         "mesh_faces": len(mesh.faces),
@@ -96,11 +108,11 @@ def _sample_numbers(mesh: Mesh, points: np.ndarray, spacing: float) -> dict[str,
 
 
 def prior_from_mesh(path: str | Path, settings: PriorSettings) -> Prior:
-    """The prior of a given mesh in world coordinates, metres: it is only sampled.
+    """The prior of a given mesh in world coordinates, metres, all of whose surface is sampled.
 
-    Raises InputError as `read_mesh`, and for settings of a cloud and of Poisson's surface: there is neither.
+    Raises InputError as `read_mesh` and `sample_surface`, if neither the number of samples nor their spacing is given, and for
+    the settings that only a mesh built from a cloud has: noise, holes and poisson_depth.
     """
-    _check(settings)
     built = {
         "--prior-noise": settings.noise > 0,
         "--holes": settings.holes > 0,
@@ -120,10 +132,11 @@ def prior_from_mesh(path: str | Path, settings: PriorSettings) -> Prior:
 
 
 def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:
-    """The mesh with `seen` narrowed to faces with a corner that some frame sees inside its rock mask.
+    """The mesh, of which only those faces still count as seen that have a corner some frame sees inside its rock mask.
 
-    What no frame sees is buried, bridges a gap that frames look through, or lies where no view could ever use it: Gaussians
-    there are wasted, or show where they should not. Without depth nothing is narrowed.
+    What no frame sees is buried in the ground, or closes a gap that frames look through, or cannot be seen from any candidate
+    view. Gaussians there would be of no use, or would show where they should not. tolerance: depth_tolerance of the prior,
+    metres. If no frame has depth, the mesh is returned as it is. Raises InputError if no frame sees any of the mesh.
     """
     frames = [frame for frame in frames if frame.depth_path is not None]
     if not frames:
@@ -138,7 +151,10 @@ def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:
 
 
 def save_prior(out: str | Path, prior: Prior) -> Path:
-    """Write mesh.ply, points.ply (x y z nx ny nz) and prior.json into a new folder. Raises InputError if it is not empty."""
+    """Write a prior into a new folder: mesh.ply, points.ply (x y z nx ny nz) and prior.json. Returns the folder.
+
+    Raises InputError if the folder is not empty or cannot be written.
+    """
     import trimesh
 
     out = new_folder(out)
@@ -150,9 +166,10 @@ def save_prior(out: str | Path, prior: Prior) -> Path:
 
 
 def load_prior(folder: str | Path) -> Prior:
-    """Read a folder that `save_prior` wrote. Raises InputError where a file is missing, damaged or holds NaN.
+    """Read a prior from a folder that `save_prior` wrote.
 
-    All of the mesh counts as seen: its file does not say what was sampled.
+    All of its mesh counts as seen, because the file does not say which part was sampled. Raises InputError if the folder or a
+    file is missing, or a file is damaged or holds NaN.
     """
     folder = Path(folder)
     if not folder.is_dir():

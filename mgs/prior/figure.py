@@ -1,4 +1,7 @@
-"""One picture of the prior: cloud, ground plane, rock cluster, mesh, samples, all seen from the same side."""
+"""The picture of a prior, prior.png: cloud, ground plane, rock cluster, mesh and samples, all seen from the same side.
+
+"Picture coordinates" are right, up, and towards the viewer, in metres.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +12,24 @@ import numpy as np
 from mgs.data.meshes import Mesh
 from mgs.plotting import STYLE, new_figure, save_figure
 from mgs.prior.build import Prior
-from mgs.prior.segmentation import Rock
+from mgs.prior.segmentation import SegmentedCloud
 
 MAX_DOTS = 60_000
-"""Points drawn per panel; more do not show."""
+"""Most points that are drawn in a panel; with more, the picture looks the same."""
 
 LIGHT = np.array([-0.5, 0.4, 0.77])
-"""Direction to the light in the picture's frame (right, up, towards the viewer)."""
+"""Direction to the light in picture coordinates, about a unit vector."""
 
 
-def draw_prior(path: str | Path, prior: Prior, rock: Rock | None) -> None:
-    """Write the figure as a PNG, atomically; rock: what the mesh was built from, None where it was given."""
+def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None) -> None:
+    """Write the picture of a prior as a PNG; the file appears complete.
+
+    segmented: the cloud that the mesh was built from, None if the mesh was given: then the panels of the cloud are left out.
+    Raises InputError if it cannot be written.
+    """
     import matplotlib
 
-    up = np.array([0.0, 0.0, 1.0]) if rock is None else rock.plane.normal
+    up = np.array([0.0, 0.0, 1.0]) if segmented is None else segmented.plane.normal
     frame = _oblique(up)
     body = prior.mesh.vertices
     centre = (body.min(0) + body.max(0)) / 2
@@ -34,10 +41,10 @@ def draw_prior(path: str | Path, prior: Prior, rock: Rock | None) -> None:
     towards = (prior.normals @ frame.T)[:, 2] > 0
     samples = f"samples: N = {len(prior.points):,} = area / spacing²\nspacing {1e3 * prior.spacing:.2f} mm"
     with matplotlib.rc_context(STYLE | {"axes.spines.top": True, "axes.spines.right": True}):
-        figure = new_figure(17 if rock is not None else 7, 4.2, dpi=100)
-        axes = figure.subplots(1, 5 if rock is not None else 2)
-        if rock is not None:
-            _cloud_panels(axes[:3], rock, frame, centre, reach)
+        figure = new_figure(17 if segmented is not None else 7, 4.2, dpi=100)
+        axes = figure.subplots(1, 5 if segmented is not None else 2)
+        if segmented is not None:
+            _cloud_panels(axes[:3], segmented, frame, centre, reach)
         _shaded_mesh(axes[-2], prior.mesh, frame, centre, reach)
         axes[-2].set_title(f"mesh, {prior.numbers['mesh_area']:.2f} m²{error}{unseen}")
         _dots(axes[-1], ((prior.points - centre) @ frame.T)[towards], shade[towards], None, reach, None)
@@ -45,14 +52,18 @@ def draw_prior(path: str | Path, prior: Prior, rock: Rock | None) -> None:
         save_figure(figure, path)
 
 
-def _cloud_panels(axes, rock: Rock, frame: np.ndarray, centre: np.ndarray, reach: float) -> None:
-    """The cloud, its plane inliers and the rock's points."""
-    cloud, height, ground = rock.cloud.points, rock.plane.height(rock.cloud.points), rock.ground
+def _cloud_panels(axes, segmented: SegmentedCloud, frame: np.ndarray, centre: np.ndarray, reach: float) -> None:
+    """Three panels: the cloud, its points on the ground plane, and the rock's points.
+
+    frame: as `_oblique`; centre: [3] of the picture in the world; reach: half the width of the rock in the picture; metres.
+    """
+    cloud, rock, ground = segmented.cloud.points, segmented.rock_points, segmented.ground
+    height = segmented.plane.height(cloud)
     near = np.linalg.norm(cloud - centre, axis=1) < 4 * reach
     panels = [
         (f"cloud: {len(cloud):,} points\ncoloured by height", cloud[near], height[near], "viridis", 2.2),
         (f"ground plane: {int(ground.sum()):,} inliers (tan)\nthe rest in blue", cloud[near], (~ground[near]) * 1.0, None, 2.2),
-        (f"rock cluster: {len(rock.points):,} points", rock.points, rock.plane.height(rock.points), "viridis", 1.0),
+        (f"rock cluster: {len(rock):,} points", rock, segmented.plane.height(rock), "viridis", 1.0),
     ]
     for axis, (title, points, value, colours, zoom) in zip(axes, panels, strict=True):
         tint = np.where(value[:, None] > 0.5, [0.15, 0.35, 0.75], [0.85, 0.76, 0.6]) if colours is None else value
@@ -61,7 +72,10 @@ def _cloud_panels(axes, rock: Rock, frame: np.ndarray, centre: np.ndarray, reach
 
 
 def _oblique(up: np.ndarray) -> np.ndarray:
-    """[3,3] rows right, up, towards the viewer: from 30 degrees above the ground, at an arbitrary fixed azimuth."""
+    """The axes of picture coordinates in the world, rows [3,3], of a viewer 30 degrees above a ground whose normal is `up` [3].
+
+    The azimuth of the viewer is arbitrary, but always the same.
+    """
     side = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
     ahead = np.cross(side, up)
@@ -73,7 +87,11 @@ def _oblique(up: np.ndarray) -> np.ndarray:
 
 
 def _dots(axis, points: np.ndarray, colour: np.ndarray, colours: str | None, reach: float, size: float | None) -> None:
-    """Scatter points [N,3] (picture frame), nearest drawn last; size in points^2, by default from their number."""
+    """Draw points [N,3], in picture coordinates, those nearest to the viewer last.
+
+    colour: values [N] for the colour map `colours`, or RGB [N,3]; reach: half the width of the panel, metres; size: of a dot,
+    in square typographic points, None to choose it by the number of points.
+    """
     if len(points) > MAX_DOTS:
         chosen = np.random.default_rng(0).choice(len(points), MAX_DOTS, replace=False)
         points, colour = points[chosen], colour[chosen]
@@ -84,7 +102,10 @@ def _dots(axis, points: np.ndarray, colour: np.ndarray, colours: str | None, rea
 
 
 def _shaded_mesh(axis, mesh: Mesh, frame: np.ndarray, centre: np.ndarray, reach: float) -> None:
-    """Faces towards the viewer, painted far to near with Lambert shading."""
+    """Draw the faces of a mesh that face the viewer, with Lambert shading, from the farthest to the nearest.
+
+    frame, centre, reach: as in `_cloud_panels`. Faces that do not count as seen are blue.
+    """
     from matplotlib.collections import PolyCollection
 
     corners = ((mesh.vertices - centre) @ frame.T)[mesh.faces]

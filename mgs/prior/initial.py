@@ -1,8 +1,9 @@
-"""The prior and the seed frames -> initial Gaussians (paper, section III-A)."""
+"""The Gaussians that a fit starts from: from the prior and the seed frames (paper, section III-A)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,28 +19,33 @@ if TYPE_CHECKING:
     from mgs.prior.build import Prior
 
 IN_PLANE_SCALE = 0.65
-"""Standard deviation along the surface over the spacing, and
-INITIAL_OPACITY: with Gaussians of standard deviation s, opacity o and one per spacing^2, light crosses one layer face on with a
-mean log-transmittance of -2 pi (s / spacing)^2 Li2(o) (the integral of ln(1 - o exp(-r^2 / 2 s^2)) over the plane). 0.65 and
-0.9 give -3.45: 3 % shines through (less in an image, where the renderer widens each Gaussian by EPS2D), so the far side is
-hidden from the first render, while the derivative of opacity by its logit, o (1 - o) = 0.09, does not vanish as at 0.99."""
+"""Standard deviation of a Gaussian along the surface, over the spacing of the samples."""
 
 INITIAL_OPACITY = 0.9
+"""Opacity of a Gaussian. IN_PLANE_SCALE and INITIAL_OPACITY are chosen together, such that the far side of the rock is hidden
+from the first render on. Let Gaussians of standard deviation s and opacity o lie on a plane, one per spacing^2. The logarithm
+of the transmittance of a ray across the plane is on average the integral over the plane of ln(1 - o exp(-r^2 / (2 s^2))) /
+spacing^2, which is -2 pi (s / spacing)^2 Li2(o), with the dilogarithm Li2. For 0.65 and 0.9 that is -3.45: 3 % of the light
+passes. In an image it is less, because the renderer widens each Gaussian by EPS2D. An opacity of 0.99 would hide more, but
+there the derivative of the opacity by its logit, o (1 - o), is almost zero; at 0.9 it is 0.09."""
 
 THICKNESS = 0.1
-"""Standard deviation along the normal over the spacing: flat on the surface, yet thick enough to stay well conditioned."""
+"""Standard deviation of a Gaussian across the surface, over the spacing. It is flat, but thick enough for its projection to be
+numerically well conditioned."""
 
 GREY = 0.5
-"""Linear RGB of a Gaussian that no seed frame sees: zero spherical harmonics."""
+"""Colour of a Gaussian that no seed frame sees, linear RGB in every channel: all its spherical harmonics are zero."""
 
 
 def initial_gaussians(prior: Prior, seed_frames: Sequence[Frame]) -> tuple[Gaussians, np.ndarray]:
-    """One flat Gaussian per sample of the prior; colours averaged over the seed frames that see it, grey where none does.
+    """One flat Gaussian for each of the N samples of a prior, with a colour averaged over the seed frames that see the sample.
 
-    A frame sees a point that is inside its rock mask, faces it, and agrees with its depth image within `prior.depth_tolerance`
-    and the slope of the surface in its pixel. For a frame without depth it is the depth of the prior's mesh: that needs the
-    variant to be set (`mgs.runtime.start`).
-    Returns (Gaussians of SH degree 0, seen [N] bool). Raises InputError where a seed frame cannot be read.
+    A frame sees a sample that lies inside its rock mask, whose normal points towards the camera, and whose depth agrees with
+    the depth image, up to `prior.depth_tolerance` and the slope of the surface within a pixel. For a frame without depth image
+    the depth of the prior's mesh is used, which needs Mitsuba's variant to be set (`mgs.runtime.start`). A sample that no frame
+    sees is grey.
+    Returns (Gaussians of degree 0, seen [N] bool: which samples some frame sees).
+    Raises InputError if a file of a frame cannot be read.
     """
     n = len(prior.points)
     total, count = np.zeros((n, 3)), np.zeros(n)
@@ -66,6 +72,16 @@ def initial_gaussians(prior: Prior, seed_frames: Sequence[Frame]) -> tuple[Gauss
 
 
 def _depth_of_mesh(prior: Prior) -> Callable[[Camera], np.ndarray]:
-    from mgs.data.raycast import mesh_depth  # only here: it wants the variant to be set
+    """A function that gives the depth image [H,W], metres, of the prior's mesh in a camera."""
+    from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
     return mesh_depth(prior.mesh)
+
+
+def with_share_seen(prior: Prior, seed_frames: Sequence[Frame]) -> Prior:
+    """The prior with one more of its `numbers`, seen_by_seeds: the share of its samples that some of the seed frames see.
+
+    The others would start grey. Needs and raises what `initial_gaussians` does.
+    """
+    seen = initial_gaussians(prior, seed_frames)[1]
+    return replace(prior, numbers=prior.numbers | {"seen_by_seeds": float(seen.mean())})

@@ -1,49 +1,60 @@
-"""The cloud -> ground plane (RANSAC) -> the rock's points (DBSCAN)."""
+"""Segmentation: the fused cloud -> the ground plane (RANSAC) and the points of the rock above it (DBSCAN), with normals."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mgs.data.dataset import Frame
+from mgs.data.dataset import Dataset, Frame
 from mgs.errors import InputError
-
-if TYPE_CHECKING:
-    pass
-from collections.abc import Callable
-
-from mgs.data.dataset import Dataset
 from mgs.prior.settings import PriorSettings
 from mgs.seeds import derive_seed, generator
-from mgs.survey.fusion import FILTERED_SHARE, Cloud, _voxel_means, focus, fuse_frames, sparse_cloud
+from mgs.survey.depth_sensor import SIGMA_FROM_MAD
+from mgs.survey.fusion import FILTERED_SHARE, Cloud, focus, fuse_frames, sparse_cloud, voxel_means
 
 PLANE_TOLERANCE = 0.02
-"""RANSAC inlier distance as a share of the camera distance: larger than the grain of a floor, smaller than a rock."""
+"""Largest distance of an inlier of RANSAC from the plane, as a share of the cameras' distance: larger than the grain of a
+floor, smaller than a rock."""
 
 PLANE_REACH = 0.5
-"""The plane is refined on its inliers within this many camera distances of the focus: real ground undulates."""
+"""The plane is refined on its inliers within this distance of the focus, as a multiple of the cameras' distance. Real ground is
+not flat, and only the ground near the rock matters."""
 
 PLANE_MIN_SHARE = 0.2
-"""With fewer inliers than this share of the cloud, there is no dominant plane."""
+"""Least share of the cloud that must lie on the plane for it to count as the ground."""
 
 CLUSTER_POINTS = 20_000
-"""DBSCAN runs on a cloud thinned to at most this many points; its labels are then passed to the full cloud."""
+"""DBSCAN sees a cloud that is averaged on a coarser grid to at most this many points; each point of the full cloud then takes
+the label of the nearest one."""
 
 CLUSTER_NEIGHBOURS = 8
-"""DBSCAN min_samples, and the neighbour whose median distance sets eps."""
+"""DBSCAN's min_samples. Its eps is twice the median distance of points to the neighbour of this number."""
 
 EQUAL_SIZE = 0.8
-"""Clusters of at least this share of the largest's points count as equally large; then nearness to the focus decides."""
+"""Clusters with at least this share of the points of the largest one count as equally large. Among those, the one nearest to
+the focus is the rock."""
+
+NEARER = 1.25
+"""Two equally large clusters are told apart only if one is this many times as far from the focus as the other."""
+
+NORMAL_NEIGHBOURS = (16, 128)
+"""Number of neighbours that the plane for a normal is fitted to: the least, in a cloud without noise, and the most."""
+
+FLOOR_UPRIGHT = 0.9
+"""A cosine of the angle between a point's normal and the ground's. Points of the rock's cluster that are nearer to the ground
+than two plane tolerances, and whose cosine is larger, are taken for ground that rises at the foot of the rock."""
 
 
 @dataclass(frozen=True)
 class Plane:
-    """Points x with normal . x = offset; normal [3] unit, towards the cameras. sigma: robust spread of the inliers, metres;
-    tolerance: points nearer than this to the plane, or below it, belong to the ground."""
+    """The ground plane: all points x with normal . x = offset, in metres.
+
+    normal: [3] unit, on the side of the cameras. sigma: standard deviation of the inliers' distances (robust), metres.
+    tolerance: points less than this above the plane, or below it, belong to the ground; metres.
+    """
 
     normal: np.ndarray
     offset: float
@@ -51,30 +62,35 @@ class Plane:
     tolerance: float
 
     def height(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance [N] of points [N,3] above the plane, metres."""
+        """Distance of points [N,3] from the plane [N], metres; negative below it."""
         return points @ self.normal - self.offset
 
 
 class _PlaneModel:
-    """Least-squares plane in the interface of skimage.measure.ransac."""
+    """A plane, with the methods that skimage.measure.ransac wants of a model."""
 
     def __init__(self, normal: np.ndarray, offset: float) -> None:
         self.normal, self.offset = normal, offset
 
     @classmethod
     def from_estimate(cls, points: np.ndarray) -> _PlaneModel:
+        """The plane that fits points [N,3] best in the least-squares sense."""
         centre = points.mean(0)
         normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
         return cls(normal, float(normal @ centre))
 
     def residuals(self, points: np.ndarray) -> np.ndarray:
+        """Signed distances [N] of points [N,3]."""
         return points @ self.normal - self.offset
 
 
 def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
-    """The dominant plane by RANSAC (Fischler and Bolles 1981, scikit-image) on 10,000 points, refined on all its inliers.
+    """The plane that holds most points of a cloud, by RANSAC (Fischler and Bolles 1981, scikit-image).
 
-    Raises InputError where no plane holds a fifth of the cloud.
+    RANSAC sees at most 10,000 points, drawn by the seed. The plane is then fitted to all its inliers near what the cameras of
+    `frames` look at, three times; each time the limit for inliers shrinks to three of their standard deviations, but not below
+    two voxels.
+    Raises InputError if the plane holds less than a fifth of the cloud, or none of the cloud near the focus.
     """
     from skimage.measure import ransac
 
@@ -94,7 +110,7 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
         core = np.abs(residual) < tolerance
         if core.sum() < 3:
             raise InputError("cloud: no ground around what the cameras look at; show ground, or give --mesh")
-        sigma = 1.4826 * float(np.median(np.abs(residual[core] - np.median(residual[core]))))
+        sigma = SIGMA_FROM_MAD * float(np.median(np.abs(residual[core] - np.median(residual[core]))))
         tolerance = min(tolerance, max(3 * sigma, 2 * cloud.voxel))
         model = _PlaneModel.from_estimate(around[core & (np.abs(residual) < tolerance)])
     cameras = np.stack([frame.camera.position for frame in frames])
@@ -102,34 +118,35 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
     return Plane(sign * model.normal, sign * model.offset, sigma, tolerance)
 
 
-def rock_cluster(points: np.ndarray, voxel: float, target: np.ndarray, root: str = "cloud") -> tuple[np.ndarray, float, int]:
-    """The rock among the points above ground [N,3] (metres), by DBSCAN (Ester et al. 1996, scikit-learn).
+def rock_cluster(points: np.ndarray, voxel: float, target: np.ndarray, name: str = "cloud") -> tuple[np.ndarray, float, int]:
+    """Which of the points above the ground [N,3] belong to the rock, by DBSCAN (Ester et al. 1996, scikit-learn).
 
-    eps is twice the median distance to the 8th neighbour. The cluster with the most points is the rock; among clusters of
-    nearly that size, the one nearest to `target` [3], the point the cameras look at.
-    Returns (inside [N] bool, eps in metres, number of clusters).
-    Raises InputError where there is no cluster, or where two clusters are equally large and equally near.
+    voxel: distance between neighbouring points; target: [3] what the cameras look at; all in metres. name: what messages call
+    the cloud. The cluster with the most points is the rock; if others are nearly as large (EQUAL_SIZE), the one of these that
+    is nearest to the target.
+    Returns (inside [N] bool, DBSCAN's eps in metres, number of clusters).
+    Raises InputError if there is no cluster, or if two clusters are equally large and about equally near.
     """
     from sklearn.cluster import DBSCAN
 
     thin, cell = points, voxel
     while len(thin) > CLUSTER_POINTS:
         cell *= 1.25
-        thin = _voxel_means(points, cell)[0]
+        thin = voxel_means(points, cell)[0]
     if len(thin) <= CLUSTER_NEIGHBOURS:
-        raise InputError(f"{root}: no rock in the cloud ({len(points)} points above the ground plane); aim the cameras at one")
+        raise InputError(f"{name}: no rock in the cloud ({len(points)} points above the ground plane); aim the cameras at one")
     eps = 2 * float(np.median(cKDTree(thin).query(thin, CLUSTER_NEIGHBOURS + 1)[0][:, -1]))
     labels = DBSCAN(eps=eps, min_samples=CLUSTER_NEIGHBOURS).fit_predict(thin)
     count = int(labels.max()) + 1
     if count == 0:
-        raise InputError(f"{root}: no rock in the cloud (only scattered points above the ground plane); aim the cameras at one")
+        raise InputError(f"{name}: no rock in the cloud (only scattered points above the ground plane); aim the cameras at one")
     sizes = np.bincount(labels[labels >= 0])
     large = np.flatnonzero(sizes >= EQUAL_SIZE * sizes.max())
     away = np.array([np.linalg.norm(thin[labels == k].mean(0) - target) for k in large])
     order = np.argsort(away, kind="stable")
-    if len(large) > 1 and away[order[1]] < 1.25 * away[order[0]]:
+    if len(large) > 1 and away[order[1]] < NEARER * away[order[0]]:
         raise InputError(
-            f"{root}: clusters of {sizes[large[order[0]]]} and {sizes[large[order[1]]]} points are equally large and equally "
+            f"{name}: clusters of {sizes[large[order[0]]]} and {sizes[large[order[1]]]} points are equally large and equally "
             "near to what the cameras look at; aim them at one rock"
         )
     rock = int(large[order[0]])
@@ -139,9 +156,10 @@ def rock_cluster(points: np.ndarray, voxel: float, target: np.ndarray, root: str
 
 
 def degrade(points: np.ndarray, noise: float, holes: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Spoil a rock's points [N,3] on purpose: Gaussian noise of standard deviation `noise` (metres) on every coordinate, and
-    round holes of a tenth of the rock's extent until the share `holes` of the points is gone.
+    """Make the points of a rock [N,3] worse on purpose: add noise, and cut holes into them.
 
+    noise: standard deviation of the Gaussian noise added to each coordinate, metres. holes: share of the points to remove, in
+    balls around random points with a radius of a tenth of the rock's extent, until this share is reached.
     Returns (points [N,3], kept [N] bool).
     """
     kept = np.ones(len(points), bool)
@@ -152,14 +170,11 @@ def degrade(points: np.ndarray, noise: float, holes: float, rng: np.random.Gener
     return points + noise * rng.standard_normal(points.shape), kept
 
 
-NORMAL_NEIGHBOURS = (16, 128)
-"""Points of the local plane fit of a normal: without noise, and at most."""
-
-
 def estimate_normals(points: np.ndarray, views: np.ndarray, roughness: float = 0.0) -> np.ndarray:
-    """Unit normals [N,3] by plane fits to neighbours (Hoppe et al. 1992), turned towards the cameras (views [N,3]).
+    """Unit normals [N,3] of points [N,3]: of the plane through each point's neighbours (Hoppe et al. 1992).
 
-    roughness: noise over the distance of neighbouring points; the number of neighbours, 16, grows with it.
+    They are turned towards the cameras: views [N,3] are directions to these. roughness: noise of the points over the distance
+    between neighbouring points; the more, the more neighbours are taken.
     """
     least, most = NORMAL_NEIGHBOURS
     count = min(int(least * (1 + 2 * roughness)), most, len(points))
@@ -169,27 +184,32 @@ def estimate_normals(points: np.ndarray, views: np.ndarray, roughness: float = 0
     return normals * np.where(np.einsum("nk,nk->n", normals, views) < 0, -1.0, 1.0)[:, None]
 
 
-FLOOR_UPRIGHT = 0.9
-"""A cluster point within two plane tolerances of the ground whose normal is this upright (cosine) is a swell of the ground at
-the foot of the rock, not rock."""
-
-
 @dataclass(frozen=True)
-class Rock:
-    """From the cloud to the rock: ground [P] bool, points of the cloud on the plane; points [M,3], the rock's cluster, and
-    normals [M,3]; eps: metres, and clusters: how many DBSCAN found."""
+class SegmentedCloud:
+    """A cloud of P points, divided into ground, rock and the rest.
+
+    cloud: the fused cloud; plane: its ground plane; ground: [P] bool, which points lie on the plane.
+    rock_points, rock_normals: [M,3] the rock's points, metres, and their unit normals, as the mesh is built from them:
+    degraded, if that was asked for, and without the ground at the rock's foot.
+    eps (metres), clusters: DBSCAN's parameter, and how many clusters it found.
+    """
 
     cloud: Cloud
     plane: Plane
     ground: np.ndarray
-    points: np.ndarray
-    normals: np.ndarray
+    rock_points: np.ndarray
+    rock_normals: np.ndarray
     eps: float
     clusters: int
 
 
-def find_rock(dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None]) -> Rock:
-    """Cloud, ground plane, rock cluster and its normals (spoilt as `settings` say). Raises InputError as `build_prior`."""
+def segment_dataset(dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None]) -> SegmentedCloud:
+    """Fuse the cloud of a dataset and find the ground and the rock in it.
+
+    The cloud is that of the depth images; if no frame has one, the points of COLMAP that `mgs import` kept (sparse.ply).
+    on_stage(name) is called as each stage starts. Raises InputError if the dataset has neither, a file cannot be read, or as
+    `fuse_frames`, `ground_plane` and `rock_cluster`.
+    """
     on_stage("cloud")
     sparse = dataset.root / "sparse.ply"
     if sparse.is_file() and not any(frame.depth_path for frame in dataset.frames):
@@ -207,4 +227,4 @@ def find_rock(dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str
     points, views = points[kept], views[kept]
     normals = estimate_normals(points, views, (FILTERED_SHARE * cloud.noise + settings.noise) / cloud.voxel)
     floor = (plane.height(points) < 2 * plane.tolerance) & (normals @ plane.normal > FLOOR_UPRIGHT)
-    return Rock(cloud, plane, ground, points[~floor], normals[~floor], eps, clusters)
+    return SegmentedCloud(cloud, plane, ground, points[~floor], normals[~floor], eps, clusters)

@@ -1,4 +1,4 @@
-"""What a prior is asked to be."""
+"""Settings of a prior."""
 
 from __future__ import annotations
 
@@ -11,9 +11,17 @@ from mgs.errors import InputError
 
 @dataclass(frozen=True)
 class PriorSettings:
-    """gaussians: exactly N samples, or spacing: metres between them (both None: one per voxel of the cloud, a pixel's
-    footprint on the rock); poisson_depth: octree depth, None = cells of 1.5 voxels; noise: metres, and holes: share of the
-    rock's points, by which the cloud is spoilt on purpose (see `degrade`); seed: root seed."""
+    """What a prior is asked to be.
+
+    gaussians: number N of samples on the surface. spacing: distance between them in metres, instead of N. With neither, the
+    spacing is the edge of the cloud's voxels, about the size of a pixel on the rock.
+    poisson_depth: depth of the octree of the Poisson reconstruction; None chooses it such that its finest cells have an edge of
+    1.5 voxels or less.
+    noise (metres), holes (share of points): by how much the rock's points are made worse on purpose, to study the effect
+    (`mgs.prior.segmentation.degrade`).
+    seed: root of every random draw.
+    Raises InputError if N is below 2, the spacing is not positive, both are given, or noise or holes are out of range.
+    """
 
     gaussians: int | None = None
     spacing: float | None = None
@@ -22,15 +30,14 @@ class PriorSettings:
     holes: float = 0.0
     seed: int = 0
 
-
-def _check(settings: PriorSettings) -> None:
-    if settings.gaussians is not None and settings.gaussians < 2:
-        raise InputError(f"prior: {settings.gaussians} Gaussians are too few for a model; ask for more with --gaussians")
-    if settings.spacing is not None and not settings.spacing > 0:
-        raise InputError(f"prior: spacing {settings.spacing} m must be positive; correct --spacing")
-    if settings.gaussians is not None and settings.spacing is not None:
-        raise InputError("prior: --gaussians and --spacing fix the same number; give one of them")
-    if not 0 <= settings.noise < np.inf:
-        raise InputError(f"prior: noise {settings.noise} m must be 0 or more; correct --prior-noise")
-    if not 0 <= settings.holes <= 0.9:
-        raise InputError(f"prior: holes {settings.holes} is a share of the rock's points, 0 to 0.9; correct --holes")
+    def __post_init__(self) -> None:
+        if self.gaussians is not None and self.gaussians < 2:
+            raise InputError(f"prior: {self.gaussians} Gaussians are too few for a model; ask for more with --gaussians")
+        if self.spacing is not None and not self.spacing > 0:
+            raise InputError(f"prior: spacing {self.spacing} m must be positive; correct --spacing")
+        if self.gaussians is not None and self.spacing is not None:
+            raise InputError("prior: --gaussians and --spacing fix the same number; give one of them")
+        if not 0 <= self.noise < np.inf:
+            raise InputError(f"prior: noise {self.noise} m must be 0 or more; correct --prior-noise")
+        if not 0 <= self.holes <= 0.9:
+            raise InputError(f"prior: holes {self.holes} is a share of the rock's points, 0 to 0.9; correct --holes")

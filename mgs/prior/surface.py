@@ -1,44 +1,46 @@
-"""The rock's points -> watertight Poisson mesh -> blue-noise surface samples."""
+"""The surface: the rock's points -> a watertight mesh (Poisson reconstruction) -> evenly spread samples (blue noise)."""
 
 from __future__ import annotations
 
 import os
 from decimal import Decimal
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from mgs.data.meshes import Mesh
 from mgs.errors import InputError
 from mgs.prior.segmentation import Plane
 
-if TYPE_CHECKING:
-    pass
-from mgs.data.meshes import Mesh, _crosses
-
 POISSON_SCALE = 2.0
-"""Edge of Poisson's cube over the extent of the points: at pymeshlab's 1.1 the bulge below the open underside leaves the cube
-and the surface is not closed."""
+"""Edge of the cube that Poisson reconstruction works in, over the extent of the points. Below the open underside of the points
+the surface bulges out; with pymeshlab's own value, 1.1, it leaves the cube there and is not closed."""
 
 POISSON_CELL = 1.5
-"""Edge of Poisson's finest cell over the cloud's voxel: finer cells fit noise and cost time (halving it gained nothing)."""
+"""Largest edge of the finest cells of the reconstruction, over the cloud's voxel. Finer cells fit noise and take longer; half
+the edge gained nothing."""
 
 POISSON_DEPTHS = (5, 10)
-"""Least and largest octree depth chosen automatically; a caller may ask for 3 to 12 (beyond, pymeshlab crashes)."""
+"""Least and largest depth of the octree that is chosen automatically. A caller may ask for 3 to 12; beyond, pymeshlab
+crashes."""
 
 OVERSAMPLING = 5
-"""Random candidates per blue-noise sample."""
+"""Number of random candidates for each sample."""
 
 SAMPLE_BYTES = 3400
-"""Memory that sampling takes per sample, most of it for pairs of candidates (measured: 3.3 to 3.5 kB from 10^5 to 10^6)."""
+"""Memory that sampling takes for each sample, bytes, most of it for pairs of candidates (measured: 3.3 to 3.5 kB for 10^5 to
+10^6 samples)."""
 
 
 def poisson_mesh(points: np.ndarray, normals: np.ndarray, voxel: float, plane: Plane, depth: int | None) -> tuple[Mesh, int]:
-    """Screened Poisson surface (Kazhdan and Hoppe 2013, pymeshlab) cut flat at the ground plane (manifold3d).
+    """A watertight mesh of the rock: its screened Poisson surface, cut flat at the ground plane.
 
-    Poisson closes the unseen underside with a bulge that no data supports; the cut replaces it by a flat cap on the ground, so
-    that the mesh stays watertight; the cap counts as not seen. depth: octree depth; by default cells of at most 1.5 voxels.
-    Returns (mesh, octree depth). Raises InputError where Poisson gives no closed surface above the ground.
+    points, normals: [M,3] of the rock, metres and unit vectors; voxel: distance between neighbouring points, metres; depth: of
+    the octree, None to choose it such that its finest cells have an edge of at most 1.5 voxels.
+    Poisson reconstruction closes the underside, where there are no points, with a bulge that no data supports. The cut replaces
+    the bulge by a flat base on the ground, which does not count as seen.
+    Returns (mesh, depth of the octree). Raises InputError if the depth is not within 3 to 12, or there is no closed surface
+    above the ground. Sources: Kazhdan and Hoppe 2013, by pymeshlab; the cut by manifold3d.
     """
     import manifold3d
     import pymeshlab
@@ -71,21 +73,23 @@ def poisson_mesh(points: np.ndarray, normals: np.ndarray, voxel: float, plane: P
 def sample_surface(
     mesh: Mesh, seed: int, *, count: int | None = None, spacing: float | None = None
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Blue-noise samples of the seen surface: exactly N = A / spacing^2 of them (rounded), A its area.
+    """Samples of the part of a mesh that counts as seen, with about the same distance between all neighbours (blue noise).
 
-    Give count N or spacing (metres). A greedy Poisson-disk subset of 5 N uniform candidates, with the largest radius that
-    keeps N of them; the few too many with the nearest neighbours are dropped.
-    Returns (points [N,3], unit normals [N,3], spacing in metres). Raises InputError for fewer than two samples, for more than
-    memory holds, and where float32, in which Gaussians are kept, does not tell neighbours apart.
+    Give either count N, or spacing in metres: then N is the area divided by spacing^2, rounded. From 5 N random candidates,
+    points are taken one after the other unless they are nearer than a radius to one taken before (Poisson disks). The radius is
+    the largest that leaves at least N; of the few too many, those nearest to a neighbour are dropped.
+    Returns (points [N,3], unit normals [N,3], spacing in metres: the square root of area / N).
+    Raises InputError for fewer than two samples, for more than the memory holds, and if float32, in which Gaussians are kept,
+    cannot tell neighbouring samples apart at their distance from the origin.
     """
     areas = np.where(mesh.seen, mesh.areas, 0.0)
     area = float(areas.sum())
     if count is None:
         assert spacing is not None
         square = spacing * spacing
-        count = _count(area / square if square > 0 else np.inf)
+        count = _checked_count(area / square if square > 0 else np.inf)
     else:
-        count = _count(count)
+        count = _checked_count(count)
     spacing = float(np.sqrt(area / count))
     furthest = float(np.abs(mesh.vertices[mesh.faces[mesh.seen]]).max())
     if furthest * np.finfo(np.float32).eps > spacing / 10:
@@ -101,13 +105,15 @@ def sample_surface(
     points = np.einsum("nk,nki->ni", weights, mesh.vertices[mesh.faces[face]])
     keep = _blue_noise(points, count, spacing)
     normals = np.einsum("nk,nki->ni", weights[keep], mesh.vertex_normals[mesh.faces[face[keep]]])
-    flat = np.linalg.norm(normals, axis=1) < 1e-6  # normals of the corners cancel (a fold): the face's own
-    normals[flat] = _crosses(mesh.vertices, mesh.faces[face[keep[flat]]])
+    # At a fold the normals of a face's corners may cancel; the face's own normal takes their place.
+    flat = np.linalg.norm(normals, axis=1) < 1e-6
+    corners = mesh.vertices[mesh.faces[face[keep[flat]]]]
+    normals[flat] = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return points[keep], normals / np.linalg.norm(normals, axis=1, keepdims=True), spacing
 
 
-def _count(samples: float) -> int:
-    """The number of samples, rounded. Raises InputError where it is below 2, or takes more memory than the machine has."""
+def _checked_count(samples: float) -> int:
+    """A number of samples, rounded. Raises InputError if it is below 2, or would take more memory than the machine has."""
     needed, there = Decimal(samples) * SAMPLE_BYTES, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if needed > there:
         raise InputError(
@@ -121,7 +127,10 @@ def _count(samples: float) -> int:
 
 
 def _blue_noise(points: np.ndarray, count: int, spacing: float) -> np.ndarray:
-    """Indices [count] of a Poisson-disk subset of random points [N,3]."""
+    """Choose `count` of the random points [N,3] in the way that `sample_surface` describes; returns their indices [count].
+
+    About the largest possible radius is found by bisection; it is less than the spacing, metres.
+    """
     pairs = cKDTree(points).query_pairs(0.95 * spacing, output_type="ndarray")
     distance = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     low, high = 0.0, 0.95 * spacing
@@ -140,7 +149,11 @@ def _blue_noise(points: np.ndarray, count: int, spacing: float) -> np.ndarray:
 
 
 def _independent(pairs: np.ndarray, n: int) -> np.ndarray:
-    """The greedy (first come, first kept) subset of 0..n-1 in which no pair of `pairs` [P,2] is together."""
+    """Take 0, 1, ... n-1 in this order, leaving out each that forms one of the `pairs` [P,2] with one taken before.
+
+    Returns those taken. They are found in a few vectorised rounds. In each, a number is taken if no smaller one that is still
+    undecided forms a pair with it, and the partners of all numbers taken are left out.
+    """
     low, high = pairs.min(1), pairs.max(1)
     undecided, kept = np.ones(n, bool), np.zeros(n, bool)
     while undecided.any():

@@ -1,4 +1,4 @@
-"""How far a prior is from the true rock, where that is known."""
+"""How far a prior is from the true rock, for datasets that hold the true rock (rock.glb)."""
 
 from __future__ import annotations
 
@@ -11,37 +11,51 @@ from mgs.data.dataset import Frame
 from mgs.data.meshes import Mesh, distances_to_mesh, read_rock
 from mgs.data.visibility import visible
 from mgs.errors import InputError
-from mgs.prior.segmentation import Rock
+from mgs.prior.segmentation import SegmentedCloud
 from mgs.seeds import derive_seed
 
 TRUTH_SAMPLES = 50_000
-"""Samples of the true rock that its errors are measured on."""
+"""Number of random points on the true rock whose distance to the prior is measured."""
 
 
 def error_to_truth(
-    points: np.ndarray, spacing: float, mesh: Mesh, truth: Path, frames: Sequence[Frame], rock: Rock, seed: int
+    points: np.ndarray,
+    spacing: float,
+    mesh: Mesh,
+    truth: Path,
+    frames: Sequence[Frame],
+    segmented: SegmentedCloud,
+    seed: int,
 ) -> dict[str, float]:
-    """How far the prior is from the true rock, metres (Knapitsch et al. 2017 name accuracy and completeness).
+    """How far a prior is from the true rock, metres.
 
-    accuracy: mean distance of the prior's samples to the true surface; completeness: mean distance of the true surface that
-    some frame sees to the prior's mesh; chamfer: their mean; hausdorff: the largest distance either way;
-    visible_within_2_spacing: share of that visible surface within two spacings of the mesh; visible_share: share of the true
-    surface above the ground that some frame sees.
+    points: [N,3] the prior's samples; spacing: theirs, metres; mesh: the prior's; truth: file of the true rock; frames: of the
+    dataset, with depth; segmented: the cloud that the mesh was built from; seed: root of the random points.
+    Returns these numbers, of which the first two are named as in Knapitsch et al. 2017:
+
+    - accuracy: mean distance from the prior's samples to the true surface.
+    - completeness: mean distance from the true surface, as far as some frame sees it, to the prior's mesh.
+    - chamfer: the mean of these two.
+    - hausdorff: the largest distance in either direction.
+    - visible_within_2_spacing: share of the true surface that some frame sees which is within two spacings of the mesh.
+    - visible_share: share of the true surface above the ground that some frame sees.
+
+    Raises InputError if the rock's file or a depth image cannot be read, or no frame sees the rock.
     """
     import trimesh
 
     known = read_rock(truth)
     true = trimesh.Trimesh(known.vertices, known.faces, process=False)
     surface, face = trimesh.sample.sample_surface(true, TRUTH_SAMPLES, seed=derive_seed(seed, "prior/truth"))
-    exposed = rock.plane.height(np.asarray(surface)) > 0
+    exposed = segmented.plane.height(np.asarray(surface)) > 0
     surface, normals = np.asarray(surface)[exposed], true.face_normals[face[exposed]]
-    tolerance = max(spacing / 2, 2 * rock.cloud.noise)
+    tolerance = max(spacing / 2, 2 * segmented.cloud.noise)
     seen = np.zeros(len(surface), bool)
     for frame in frames:
-        # Two-sided: scanned rocks come with either winding.
+        # Both sides of a face count, because the faces of a scanned rock may be wound either way.
         seen |= visible(surface, normals, frame.camera, frame.depth(), tolerance, two_sided=True)
     if not seen.any():
-        raise InputError(f"{truth}: no frame sees the true rock; it does not belong to this dataset (or is in another frame)")
+        raise InputError(f"{truth}: no frame sees the true rock; it is another dataset's, or in another coordinate system")
     there = distances_to_mesh(points, true.vertices, true.faces)
     back = distances_to_mesh(surface[seen], mesh.vertices, mesh.faces)
     return {

@@ -1,15 +1,21 @@
-"""What a run knows, and where: maps of information and uncertainty per view (EXR, PNG) and per Gaussian (PLY).
+"""Maps of what the training views of a run say about its model, and where: for views (EXR, PNG) and for Gaussians (PLY).
 
-With H [N,P] the diagonal Fisher information of the training set and lam [P] the information of the prior
-(`mgs.active.criteria`), a Gaussian has
+H [N,P] is the diagonal of the Fisher information, summed over the training views. lam [P] is the information of the prior
+about each parameter (`mgs.active.criteria.regularisation`). From these, every Gaussian has the following numbers, its
+*scalars*:
 
-- `fisher.colour|scale|rotation|opacity`: the sum of H over the parameters of that kind, in (pixel value / parameter)^2;
-- `information`: 1/2 sum_k log(1 + H_k / lam_k), nats: what the training images say about it, all kinds in one unit;
-- `uncertainty`: mean_k lam_k / (H_k + lam_k): the share of the prior's variance that is left, 1 = nothing known, 0 = all known;
-- `unobserved`: 1 where no training view sees its place on the surface, as in the coverage of a run: by the information about
-  its colour before training (`mgs.active.criteria.observed`), because training hides some Gaussians behind others.
+- `fisher.colour`, `fisher.scale`, `fisher.rotation`, `fisher.opacity`: the sum of H over its parameters of that kind, in
+  (pixel value / parameter)^2.
+- `information`: 1/2 sum_k log(1 + H_k / lam_k) over its parameters k, in nats: what the training views say about it. All kinds
+  of parameters have the same unit here.
+- `uncertainty`: the mean over its parameters of lam_k / (H_k + lam_k): the variance that is left over the variance of the
+  prior. 1 means that nothing is known, 0 that everything is.
+- `unobserved`: 1 if no training view sees its place on the surface, otherwise 0, by the same rule as the coverage of a run
+  (`mgs.active.criteria.observed`). The rule looks at the information about the colours of the Gaussians before training,
+  because training hides some Gaussians behind others.
 
-A pixel of a map is the mean over the Gaussians it shows, with their blending weights: sum w v / sum w; 0 where it shows none.
+A map of a scalar v shows in each pixel the mean over the Gaussians that the pixel shows, with their blending weights w:
+sum w v / sum w; 0 in pixels that show none.
 """
 
 from __future__ import annotations
@@ -20,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from mgs.active import criteria
+from mgs.active import criteria, run_folder
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import Frame
@@ -30,20 +36,21 @@ from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_exr
 
 VIEWS = 3
-"""How many views are drawn where none are named."""
+"""Number of views that are drawn if none are named."""
 
 VISIBLE = 0.5
-"""Opacity from which a pixel of a preview shows the model; below it is drawn as background."""
+"""Least opacity at which a pixel of a preview is drawn; with less it counts as background."""
 
 DECADES = 4
-"""Range of the logarithmic colour scales, powers of ten below the largest value shown."""
+"""Largest range of the logarithmic colour scales, in powers of ten."""
 
 
 def gaussian_scalars(H: np.ndarray, surface: np.ndarray, lam: np.ndarray, groups: dict[str, slice]) -> dict[str, np.ndarray]:
-    """The scalars of the module's docstring, [N] each.
+    """The scalars that the module's docstring lists, name -> [N].
 
-    H, surface: [N,P] information of the training set at the fitted model, and at the Gaussians before training
-    (`mgs.active.run_folder.State`); lam: [P]; groups: columns of each kind of parameter.
+    H: [N,P] information of the training views about the fitted model; surface: [N,P] the same about the Gaussians before
+    training (both as in `mgs.active.run_folder.State`). lam: [P] information of the prior. groups: columns of each kind of
+    parameter (`mgs.splat.groups`).
     """
     scalars = {f"fisher.{name}": H[:, columns].sum(axis=1, dtype=np.float64) for name, columns in groups.items()}
     scalars["information"] = 0.5 * np.log1p(H / lam).sum(axis=1)
@@ -53,10 +60,11 @@ def gaussian_scalars(H: np.ndarray, surface: np.ndarray, lam: np.ndarray, groups
 
 
 def view_maps(gaussians: Gaussians, camera: Camera, scalars: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """One view as float32 [H,W] channels: R G B (linear, on black), A, Z (metres), and a map of each scalar [N].
+    """The channels of one view, name -> float32 [H,W]: R G B (linear colour on black), A (opacity), Z (expected z-depth,
+    metres) and a map of each scalar.
 
-    The scalars are drawn as colours, three at a time. `unobserved` is 1 where most of the weight belongs to unobserved
-    Gaussians, otherwise 0.
+    scalars: name -> [N]. They are drawn in place of the colours of the Gaussians, three at a time. The map of `unobserved` is 1
+    where unobserved Gaussians have more than half of the weight, otherwise 0.
     """
     from mgs.splat import ListCache, render
 
@@ -67,7 +75,7 @@ def view_maps(gaussians: Gaussians, camera: Camera, scalars: dict[str, np.ndarra
     names, shown = list(scalars), np.where(alpha > 0, alpha, 1.0)
     for first in range(0, len(names), 3):
         three = names[first : first + 3]
-        # As shares of the largest value: colours of about 1 keep the precision of float32.
+        # Divided by the largest value: float32 keeps its precision with colours of about 1, whatever the unit of the scalar.
         largest = [max(float(scalars[name].max(initial=0)), 1e-30) for name in three]
         values = np.zeros((len(gaussians), 3))
         for i, name in enumerate(three):
@@ -83,9 +91,10 @@ def view_maps(gaussians: Gaussians, camera: Camera, scalars: dict[str, np.ndarra
 
 
 def write_information_ply(path: str | Path, gaussians: Gaussians, scalars: dict[str, np.ndarray]) -> None:
-    """Write x y z, red green blue (viridis of the information, 0 to its largest) and every scalar, one vertex a Gaussian.
+    """Write a PLY with a vertex for each Gaussian: x y z, red green blue, and every scalar; the file appears complete.
 
-    Opens in MeshLab and CloudCompare; dots in names become underscores.
+    The colours show the information, from 0 to its largest value (colour map viridis). Dots in names become underscores. It
+    opens in MeshLab and CloudCompare. scalars: name -> [N]. Raises InputError if the file cannot be written.
     """
     import matplotlib
     from plyfile import PlyData, PlyElement
@@ -115,11 +124,14 @@ PANELS = {
     "information": ("information gained (nats)", "viridis"),
     "uncertainty": ("posterior / prior variance", "cividis"),
 }
-"""Channel -> title and colour map of its panel in a preview; all perceptually uniform."""
+"""Panels of a preview: channel -> title and colour map. The colour maps are perceptually uniform."""
 
 
 def write_preview(path: str | Path, maps: dict[str, np.ndarray], title: str) -> None:
-    """Write the channels of one view as a sheet of nine panels with colour bars, cropped to the model."""
+    """Write the preview of one view as a PNG: its render and the PANELS with colour bars, cropped to the model.
+
+    maps: as `view_maps` gives them, of all scalars; title: of the render. Raises InputError if the file cannot be written.
+    """
     import matplotlib
 
     from mgs.plotting import STYLE, crop, new_figure, save_figure
@@ -145,14 +157,15 @@ def write_preview(path: str | Path, maps: dict[str, np.ndarray], title: str) -> 
 
 
 def _on_grey(name: str) -> Any:
-    """A colour map with what is masked in light grey."""
+    """The colour map of this name, with light grey for masked pixels."""
     import matplotlib
 
     return matplotlib.colormaps[name].with_extremes(bad="#e8e8e8")
 
 
 def _norm(channel: str, values: np.ma.MaskedArray) -> Any:
-    """Logarithmic for Fisher information (it spans decades), 0 to 1 for shares, the data's range otherwise."""
+    """The scale of a channel's colours: logarithmic for Fisher information, which spans many powers of ten; from 0 to 1 for the
+    uncertainty and for `unobserved`; otherwise from the least to about the largest of the values [H,W] that are not masked."""
     from matplotlib.colors import LogNorm, Normalize
 
     data = values.compressed()
@@ -166,9 +179,10 @@ def _norm(channel: str, values: np.ma.MaskedArray) -> Any:
 
 
 def choose_views(frames: Sequence[Frame], trained: Sequence[str], wanted: Sequence[str] | None) -> list[Frame]:
-    """The frames named in `wanted`, or VIEWS evenly spread ones that were never trained on (of all, where there are none).
+    """The frames to draw: those named in `wanted`, or, without it, VIEWS frames spread evenly over those not trained on.
 
-    Raises InputError for a name that no frame has.
+    trained: names of the frames that were trained on; if these are all, the choice is among all frames. Raises InputError for a
+    name that no frame has.
     """
     if wanted:
         by_name = {frame.name: frame for frame in frames}
@@ -184,16 +198,16 @@ def choose_views(frames: Sequence[Frame], trained: Sequence[str], wanted: Sequen
 def diagnose_run(
     run: str | Path, wanted: Sequence[str] | None = None, progress: Callable[[int, int], None] | None = None
 ) -> list[Path]:
-    """Write RUN/diagnostics: VIEW.exr and VIEW.png for each view, and information.ply; returns the files.
+    """Write the folder RUN/diagnostics: information.ply, and NAME.exr and NAME.png for each view. Returns the paths of the
+    files.
 
-    Raises InputError where the run is missing or has no step yet, or a view is unknown.
+    wanted: names of frames, see `choose_views`; progress: called as progress(views done, views in all). Raises InputError as
+    `mgs.active.run_folder.load_run` (no run, no finished step, a dataset that has changed), and for an unknown view.
     """
-    from mgs.active import run_folder
-    from mgs.active.run_folder import load_run
     from mgs.splat import groups
 
     run = Path(run)
-    gaussians, dataset, trained, _ = load_run(run)
+    gaussians, dataset, trained, _ = run_folder.load_run(run)
     frames = choose_views(dataset.frames, trained, wanted)
     settings, state = run_folder.read_settings(run), run_folder.read_checkpoint(run)
     assert state is not None

@@ -1,7 +1,8 @@
-"""PSNR and SSIM of a model against the images of a dataset, and renders next to the truth.
+"""How good a model is: PSNR and SSIM of its renders against the images of a dataset, and pictures of both side by side.
 
-Both compare sRGB display values in [0,1] with `Frame.masked_rgb()`: the rock on black, which is what the model was trained on.
-"Full frame" includes that black, which any model gets right, so it flatters; "inside the mask" is over the rock's pixels only.
+The truth is `Frame.masked_rgb`: the rock on black, which is what the model was trained on. Both numbers compare sRGB values in
+[0,1]. Over the full frame they flatter, because any model gets the black right; those inside the mask are over the rock's
+pixels only (`mgs.metrics`).
 """
 
 from __future__ import annotations
@@ -28,16 +29,17 @@ from mgs.metrics import METRICS, compare
 from mgs.provenance import versions
 
 Renderer = Callable[[Gaussians, Camera], np.ndarray]
-"""(gaussians, camera) -> linear RGB [H,W,3]."""
+"""A function that draws a model: (gaussians, camera) -> linear RGB [H,W,3]."""
 
 Progress = Callable[[int, int], None]
+"""A function that is told how the work goes on: (frames done, frames in all)."""
 
 DIFFERENCE_GAIN = 4
-"""How much the pictures of differences are brightened."""
+"""Factor by which differences are brightened in the pictures."""
 
 
 def render_rgb(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """Linear RGB [H,W,3] of the model on black."""
+    """The model on black, linear RGB [H,W,3]."""
     from mgs.splat import render
 
     return np.asarray(render(gaussians, camera).rgb)
@@ -52,11 +54,19 @@ def evaluate(
     pictures: Path | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """METRICS of the model on every frame; means over all views and over the views whose name is not in `trained`.
+    """Compare a model with every frame of a dataset.
 
-    Returns {"images": how many were trained on, "all": means, "held_out": means, "views": [one dict a view]}; means come with
-    a "count", and are None where there is nothing to average. Writes truth | render | difference as PNG into the folder
-    `pictures` where given. progress: called as progress(done, total).
+    trained: names of the frames that the model was trained on; the others are held out. renderer: draws the model. pictures: a
+    folder; if given, `write_comparison` writes NAME.png of every frame into it. progress: told the number of frames done.
+
+    Returns what metrics.json holds, without its policy:
+
+    - images: how many frames the model was trained on.
+    - all, held_out: over all frames, and over those held out, the number of frames ("count") and the mean of each of
+      `mgs.metrics.METRICS`, None if no frame has it.
+    - views: for each frame its "name", "trained" (bool) and its METRICS, None where the rock's mask is empty.
+
+    Raises InputError if a file of a frame cannot be read or a picture cannot be written.
     """
     trained = set(trained)
     views: list[dict[str, Any]] = []
@@ -79,7 +89,7 @@ def evaluate(
 
 
 def _means(views: list[dict[str, Any]]) -> dict[str, Any]:
-    """Mean of each metric over the views that have it."""
+    """Number of views, and the mean of each of METRICS over those views that have it; None if there is no such view."""
     means: dict[str, Any] = {"count": len(views)}
     for name in METRICS:
         values = [view[name] for view in views if not math.isnan(view[name])]
@@ -88,12 +98,16 @@ def _means(views: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _without_nan(view: dict[str, Any]) -> dict[str, Any]:
-    """JSON knows no NaN."""
+    """A view's numbers with None in place of NaN, for which JSON has no notation."""
     return {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in view.items()}
 
 
 def write_comparison(path: str | Path, truth: np.ndarray, rendered: np.ndarray, decibels: float) -> None:
-    """Write truth | render | brightened |difference| as one PNG, captions in a strip above. Linear RGB [H,W,3] twice."""
+    """Write one PNG with three panels side by side: truth, render, and their absolute difference, brightened.
+
+    truth, rendered: [H,W,3] linear RGB; decibels: the PSNR, for the caption. The captions stand in a strip above the panels.
+    Raises InputError if the file cannot be written.
+    """
     from PIL import Image, ImageDraw, ImageFont
 
     a, b = srgb_from_linear(truth), srgb_from_linear(rendered)
@@ -111,9 +125,9 @@ def write_comparison(path: str | Path, truth: np.ndarray, rendered: np.ndarray, 
 
 
 def read_comparison(path: str | Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """(truth, render), linear RGB [H,W,3], out of a picture by `write_comparison`; to 8 bits.
+    """Truth and render, linear RGB [H,W,3] each, out of a picture that `write_comparison` wrote. They were rounded to 8 bits.
 
-    Raises InputError where the picture is missing, damaged or not of this camera's size.
+    camera: of the view. Raises InputError if the picture is missing, damaged or not of this camera's size.
     """
     pixels, (height, width) = read_png(path), (camera.height, camera.width)
     if pixels.shape[0] <= height or pixels.shape[1] != 3 * width:

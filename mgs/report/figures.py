@@ -1,4 +1,8 @@
-"""Figures of runs: one function a figure; each takes plain data and writes one PNG. `mgs.report.writing` feeds them."""
+"""Figures that compare runs: each function takes plain data and writes one PNG. `mgs.report.writing` calls them.
+
+"Label" is what a run is called in a report: its policy, and its folder if several runs have the same policy. Every function
+raises InputError if its file cannot be written.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mgs.colour import srgb_from_linear
+from mgs.plotting import STYLE, crop, new_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-from mgs.plotting import STYLE, crop, new_figure, save_figure
 
 POLICY_STYLE = {
     "d-optimal": ("#0072B2", "o"),
@@ -27,14 +31,16 @@ POLICY_STYLE = {
     "fisherrf": ("#7f7f7f", "p"),
     "e-optimal": ("#8c510a", "*"),
 }
-"""Colour (Okabe and Ito's colour-blind-safe set, grey and brown) and marker of a policy, the same in every figure."""
+"""Colour and marker of each policy, the same in every figure. The colours are those of Okabe and Ito, which colour-blind people
+can tell apart, and grey and brown."""
 
 
 def line_styles(labels: Iterable[str]) -> list[dict[str, Any]]:
-    """Colour, marker and label of each line; a label starts with the policy.
+    """How to draw the line of each label: keywords for matplotlib's `plot`.
 
-    The first line of a policy in POLICY_STYLE has its style. A second one, and a policy of the user's own, takes the next
-    that no line has, from the end of the table; where they run out they repeat, dashed.
+    The first line of a policy in POLICY_STYLE has the policy's colour and marker. A second line of the same policy, and one of
+    a policy of the user's own, takes colour and marker of a policy that has no line, from the end of the table. When none are
+    left, they are used again, for dashed lines.
     """
     labels = list(labels)
     first = {label.split(" ")[0]: label for label in reversed(labels)}
@@ -54,10 +60,10 @@ def orbit_figure(
     surface: np.ndarray | None,
     choices: Mapping[str, tuple[Sequence[int], Sequence[int]]],
 ) -> None:
-    """The orbit from above: every pose, the seeds, the chosen views coloured and numbered in their order; a panel a policy.
+    """The orbit from above, in one panel for each run: all poses, the seeds, and the chosen views, numbered in their order.
 
-    positions: [C,3] camera centres, metres. surface: [N,3] points of the rock or None. choices: policy -> (seeds, chosen), as
-    indices into positions.
+    positions: [C,3] camera centres, metres. surface: [N,3] points of the rock, metres, or None to leave it out. choices: label
+    -> (indices of the seeds, indices of the chosen views in their order), into positions.
     """
     import matplotlib
     from matplotlib.cm import ScalarMappable
@@ -81,7 +87,7 @@ def orbit_figure(
 def _orbit_panel(
     axis: Axes, positions: np.ndarray, surface: np.ndarray | None, seeds: list[int], chosen: list[int], norm: Any
 ) -> None:
-    """One policy from above."""
+    """The panel of one run in `orbit_figure`. norm: scale of the colours by which the order of the choices is shown."""
     xy = np.asarray(positions)[:, :2]
     centre = xy.mean(axis=0) if surface is None else np.asarray(surface)[:, :2].mean(axis=0)
     if surface is not None:
@@ -104,7 +110,10 @@ def _orbit_panel(
 
 
 def gain_figure(path: str | Path, gains: Mapping[str, Sequence[float]]) -> None:
-    """Information gain (Eq. 7) of the selected view at each active step, a line a policy (the paper's Fig. 2)."""
+    """Information gain (the paper's Eq. 7) of the view that each step selected, one line for each run (the paper's Fig. 2).
+
+    gains: label -> gain of each step after the seeds.
+    """
     import matplotlib
 
     with matplotlib.rc_context(STYLE):
@@ -120,9 +129,10 @@ def gain_figure(path: str | Path, gains: Mapping[str, Sequence[float]]) -> None:
 
 
 def coverage_figure(path: str | Path, coverage: Mapping[str, tuple[Sequence[int], Sequence[float]]]) -> None:
-    """Surface coverage after each image, and what each image added (the paper's Fig. 3).
+    """Surface coverage after each step, and what each step added to it, one line for each run (the paper's Fig. 3).
 
-    coverage: policy -> (images in the training set, share of Gaussians observed in [0,1]); the first entry is the seeds.
+    coverage: label -> (number of images in the training set, share of the surface observed, 0 to 1), after the seeds and then
+    after each step.
     """
     import matplotlib
 
@@ -143,7 +153,10 @@ def coverage_figure(path: str | Path, coverage: Mapping[str, tuple[Sequence[int]
 
 
 def psnr_figure(path: str | Path, panels: Mapping[str, Mapping[str, tuple[Sequence[int], Sequence[float]]]]) -> None:
-    """PSNR against the number of images, a line a policy. panels: what is measured -> policy -> (images, dB)."""
+    """PSNR against the number of images, one line for each run, in one panel for each thing that is measured.
+
+    panels: what is measured -> label -> (numbers of images, PSNR in dB).
+    """
     import matplotlib
 
     with matplotlib.rc_context(STYLE):
@@ -159,6 +172,7 @@ def psnr_figure(path: str | Path, panels: Mapping[str, Mapping[str, tuple[Sequen
 
 
 def _whole_steps(axis: Axes) -> None:
+    """Put the ticks of the x axis at whole numbers."""
     from matplotlib.ticker import MaxNLocator
 
     axis.xaxis.set_major_locator(MaxNLocator(integer=True))

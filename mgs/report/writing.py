@@ -1,42 +1,34 @@
-"""The report: every figure and the table of runs on one dataset, from their files alone."""
+"""The report that compares runs on one dataset: all figures and the table, drawn from the files of the runs alone."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mgs.errors import InputError
 from mgs.files import atomic_path, write_json
+from mgs.report.evaluation import read_comparison
 from mgs.report.figures import comparison_figure, coverage_figure, gain_figure, orbit_figure, psnr_figure
-
-if TYPE_CHECKING:
-    pass
-from mgs.report.tables import Run, check_finished, evaluated_runs, markdown_table, read_run, table_numbers, table_rows
+from mgs.report.runs import Run, check_finished, dataset_of, evaluated_runs, read_run
+from mgs.report.tables import markdown_table, table_numbers, table_rows
+from mgs.splat_ply import read_ply
 
 
 def write_report(out: str | Path, folders: Sequence[str | Path]) -> list[Path]:
-    """Every figure and the table of runs on one dataset, into the folder `out`; returns the files written.
+    """Write all figures and the table of runs into the folder `out`, and return the paths of the files.
 
-    orbit.png, gain.png, coverage.png, comparison.png (a view that the fewest runs were trained on), psnr.png (where runs were
-    evaluated on the way), table.md, table.json (`table_numbers`). Raises InputError as `evaluated_runs`, where a run is
-    unfinished, and where the pictures of `mgs eval` are missing.
+    folders: the run folders. The files: orbit.png, gain.png, coverage.png, comparison.png (of a view that the fewest runs were
+    trained on), psnr.png (only if all runs were evaluated after some of their steps), table.md and table.json
+    (`table_numbers`). Files of an earlier report are replaced. Raises InputError as `evaluated_runs` and `dataset_of`, if a run
+    is unfinished, or if a picture of `mgs eval` is missing or damaged; then nothing is written.
     """
-    from mgs.active.run_folder import check_same_frames, read_settings
-    from mgs.data.dataset import load_dataset
-    from mgs.report.evaluation import read_comparison
-    from mgs.splat_ply import read_ply
-
     for folder in folders:
         check_finished(read_run(folder))
     out, runs = Path(out), evaluated_runs(folders)
     first = next(iter(runs.values()))
-    dataset = load_dataset(read_settings(first.folder).dataset)
-    for run in runs.values():
-        check_same_frames(run.folder, dataset)
-    frames = dataset.frames
+    frames = dataset_of(list(runs.values())).frames
     frame = frames[unseen_view(list(runs.values()), len(frames))]
     pictures = {label: run.folder / "renders" / f"{frame.name}.png" for label, run in runs.items()}
     for label, picture in pictures.items():
@@ -73,14 +65,16 @@ def write_report(out: str | Path, folders: Sequence[str | Path]) -> list[Path]:
 
 
 def unseen_view(runs: Sequence[Run], frames: int) -> int:
-    """A frame that the fewest runs were trained on; of those, the one in the middle."""
+    """Index of a frame that the fewest runs were trained on; of several such frames, the middle one. frames: how many there
+    are."""
     counts = [sum(index in run.seeds + run.chosen for run in runs) for index in range(frames)]
     fewest = [index for index in range(frames) if counts[index] == min(counts)]
     return fewest[len(fewest) // 2]
 
 
 def _caption(run: Run, name: str) -> str:
-    """PSNR and SSIM of one view, and how many images the model had. Raises InputError where the view was not evaluated."""
+    """What stands above a render of the view `name`: number of images, PSNR, SSIM. Raises InputError if it was not
+    evaluated."""
     view = next((view for view in (run.metrics or {})["views"] if view["name"] == name), None)
     if view is None:
         raise InputError(f"{run.folder}: was not evaluated on {name}; measure it with `mgs eval {run.folder}`")

@@ -1,12 +1,16 @@
 """Gaussian splatting on Dr.Jit: render, differentiate, and measure information.
 
-`render` draws Gaussians and is differentiable by `dr.backward`; `fisher` gives the information that a view carries about each
-Gaussian; a `ListCache` kept between calls makes both faster for cameras seen before. Set a Mitsuba variant before calling them.
-`import mgs.splat.plugins` registers the Mitsuba integrator `mgs_splat` (plugins/mgs_splat.py), which draws the same images.
+`render` draws Gaussians, and Dr.Jit can differentiate it in both directions. `jvp` says how an image changes as the Gaussians
+change in a given way. `fisher` gives the information that a view carries about each Gaussian. A `ListCache` kept between calls
+makes all three faster for cameras seen before.
+
+Call `mgs.runtime.start` before importing this package: it looks for a libLLVM that works, which has no effect once Mitsuba is
+imported. `import mgs.splat.plugins` registers the Mitsuba integrator `mgs_splat` (plugins/mgs_splat.py), which draws the same
+images.
 """
 
 from mgs.splat.information import ESTIMATORS, fisher, groups
 from mgs.splat.mitsuba_sensor import camera_from_sensor
-from mgs.splat.rendering import Image, ListCache, as_drjit, render
+from mgs.splat.rendering import Image, ListCache, as_drjit, jvp, render
 
-__all__ = ["ESTIMATORS", "Image", "ListCache", "as_drjit", "camera_from_sensor", "fisher", "groups", "render"]
+__all__ = ["ESTIMATORS", "Image", "ListCache", "as_drjit", "camera_from_sensor", "fisher", "groups", "jvp", "render"]

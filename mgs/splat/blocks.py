@@ -1,8 +1,14 @@
 """Block lists: for every block of pixels, the splats that touch it, front to back.
 
-A block is what one SIMD lane owns. Lists are built with a margin around every footprint and stay valid while each footprint
-stays inside its margin (`outgrown`), as neighbour lists with a skin do in molecular dynamics. That works because the means,
-and with them centres and depth order, are frozen.
+A block is a rectangle of BLOCK_X x BLOCK_Y pixels; the kernels give each block to one lane of a SIMD register (see
+`mgs.splat.walking`). A splat that touches five blocks is in five lists: it makes five (splat, block) *pairs*.
+
+Lists can be built with a margin around every footprint. They then stay valid as long as each footprint stays inside its margin
+(`outgrown`), like the neighbour lists with a skin of molecular dynamics. That works because the means are frozen, so that the
+centres of the splats and their depth order stay the same in each camera.
+
+Splats of neighbouring blocks should lie near one another in memory. So blocks are grouped into square *tiles*, and the splats
+are stored tile by tile; where a splat lies is called its *place*.
 """
 
 from __future__ import annotations
@@ -17,21 +23,22 @@ from mgs.errors import InputError
 from mgs.splat.projection import Splats
 
 BLOCK_X, BLOCK_Y = 8, 4
-"""Pixels of one lane. With AVX-512, 8x2 and 4x4 were no faster forward, and slower for gradients: more pairs to store."""
+"""Width and height of a block, pixels. With AVX-512, 8x2 and 4x4 drew no faster, and took longer for gradients, as they make
+more pairs whose sums must be stored."""
 
 TILE = 16
-"""Blocks across and down a tile, which is walked before the next, so that its splats (64 bytes each) and their sums stay in a
-core's cache; `benchmarks/tiles.py` chose it."""
+"""Blocks across and down a tile. Lanes work through one tile before the next, so that its splats (64 bytes each) and their sums
+stay in a core's cache; `benchmarks/tiles.py` measures what that is worth, and this size was the best."""
 
 LOG2_INV_ALPHA_MIN = 7.994353436858858
-"""log2(255): a footprint ends where xi^2 + eta^2 = log2_opacity + log2(255)."""
+"""log2(255), that is -log2(ALPHA_MIN): a footprint ends where xi^2 + eta^2 = log2_opacity + log2(255)."""
 
 SLACK = 1e-2
-"""Bits added to a footprint's level so that rounding never drops a pixel at its rim."""
+"""Added to the level of a footprint that is listed (see `Footprints`), so that rounding never drops a pixel at its rim."""
 
 MAX_PAIRS = 1 << 26
-"""Most (splat, block) pairs of a view, and most rows of blocks in the lists' making. With it, every place in the kernels'
-buffers, the 24 sums of a pair too, is below 2^31; so it may be lowered, but not raised."""
+"""Most (splat, block) pairs of a view, and most (splat, row of blocks) pairs, which are made on the way to them. With it every
+index into the kernels' buffers, with 24 sums per pair, is below 2^31: it may be lowered, but not raised."""
 
 PAIR_BYTES = 128
 """Peak memory of a view for each of its pairs: measured 28 for an image, 58 for exact Fisher information, 123 for blocks."""
@@ -39,26 +46,35 @@ PAIR_BYTES = 128
 
 @dataclass
 class Footprints:
-    """Centres and depths of the splats as the lists were built, whitening and level q of their footprints (inflated; q <= 0:
-    not drawn). Float [N] each."""
+    """The ellipses for which lists were built, Float [N] each. Fields as in `Splats`, grown by the margin.
 
-    u: Any
-    v: Any
-    z: Any
-    k: Any
-    p: Any
-    e: Any
-    q: Any
+    level: the value of xi^2 + eta^2 at the rim of the ellipse, margin and SLACK included; not positive where the splat is in no
+    list.
+    """
+
+    mean_x: Any
+    mean_y: Any
+    depth: Any
+    shear: Any
+    white_x: Any
+    white_y: Any
+    level: Any
 
 
 @dataclass
 class BlockLists:
-    """Pairs (splat, block), sorted by block (tile by tile), in each block by depth; M counts some unused room at the end.
+    """The lists of all blocks, as M (splat, block) pairs sorted by block, tile by tile, and within a block by depth.
 
-    Splats lie in memory by tile, block, depth, and are known by that place: place: UInt32 [N] is where each one lies.
-    splat, slot: UInt32 [M]; a pair's slot is its place in the order where the pairs of one splat are contiguous, and
-    slot_start, slot_end: UInt32 [N] are the slots of the splat at each place. block: UInt32 [L] of each lane, by tile, in it
-    the longest list first, and start, end: UInt32 [L] its range of pairs. width, height: UInt32, pixels; blocks_x: UInt32.
+    Each splat has a place, its position in memory: splats are stored by the tile of their centre, then block, then depth.
+    Each pair has a slot, which is where kernels store their sums for it. The slots of one splat follow one another.
+
+    place: UInt32 [N], the place of each Gaussian's splat.
+    splat: UInt32 [M], the place of the pair's splat; slot: UInt32 [M], the pair's slot. The last are unused (see `_room`).
+    slot_start, slot_end: UInt32 [N], the range of slots of the splat at each place.
+    block: UInt32 [L], the block of each lane, counted row by row through the image. Lanes go tile by tile, and in a tile the
+    block with the longest list comes first. start, end: UInt32 [L], the range of the lane's pairs.
+    width, height: pixels, and blocks_x: blocks across the image; UInt32 [1].
+    footprints: what the lists were built for.
     """
 
     place: Any
@@ -81,70 +97,76 @@ class BlockLists:
 
 
 def level(splats: Splats) -> Any:
-    """q [N]: the value of xi^2 + eta^2 at the rim where alpha = ALPHA_MIN; not positive where nothing is drawn."""
+    """Float [N]: the value of xi^2 + eta^2 at the rim where alpha = ALPHA_MIN; not positive where nothing is drawn."""
     return dr.select(splats.visible, splats.log2_opacity + LOG2_INV_ALPHA_MIN, -1)
 
 
 def inflate(splats: Splats, margin: float) -> Footprints:
-    """Footprints grown by `margin` (a share of their size; 0: exact)."""
-    q = level(splats)
+    """The splats' footprints, larger by `margin`, a share of their size (0: exact), and more opaque by `margin` bits."""
+    exact = level(splats)
     growth = 1 / (1 + margin)
     return Footprints(
-        splats.u,
-        splats.v,
-        splats.z,
-        splats.k,
-        splats.p * growth,
-        splats.e * growth,
-        dr.select(q > -margin, q + margin + SLACK, -1),
+        mean_x=splats.mean_x,
+        mean_y=splats.mean_y,
+        depth=splats.depth,
+        shear=splats.shear,
+        white_x=splats.white_x * growth,
+        white_y=splats.white_y * growth,
+        level=dr.select(exact > -margin, exact + margin + SLACK, -1),
     )
 
 
 def outgrown(built: Footprints, splats: Splats) -> Any:
-    """Mask [N]: the splat moved (or left the view), or its footprint is not wholly inside the one its lists were built with.
+    """Mask [N] of splats for which lists are no longer valid: the centre or depth changed, the splat left or entered the view,
+    or its footprint is not wholly inside the one that its lists were built for.
 
-    In the whitened coordinates of the built ellipse, the present one is {x: x^T S^T S x <= 1}; it is inside the unit disc
-    exactly where the smaller eigenvalue of S^T S is at least 1.
+    The test for "inside": let x be the whitened coordinates of the built ellipse, scaled so that it is the unit disc, and S the
+    matrix [s00 s01; 0 s11] that maps them to those of the present ellipse, scaled alike. In x the present ellipse is then
+    {x: |S x| <= 1}, and it lies in the unit disc exactly where the smaller eigenvalue of S^T S = [a b; b c] is at least 1.
     """
-    q = level(splats)
-    ratio = dr.sqrt(dr.maximum(built.q, 0) / dr.maximum(q, 1e-6))
-    s00 = ratio * splats.p / built.p
-    s01 = ratio * splats.p * (built.k - splats.k) / built.e
-    s11 = ratio * splats.e / built.e
+    now = level(splats)
+    ratio = dr.sqrt(dr.maximum(built.level, 0) / dr.maximum(now, 1e-6))
+    s00 = ratio * splats.white_x / built.white_x
+    s01 = ratio * splats.white_x * (built.shear - splats.shear) / built.white_y
+    s11 = ratio * splats.white_y / built.white_y
     a, b, c = s00 * s00, s00 * s01, s01 * s01 + s11 * s11
     half = 0.5 * (a + c)
     spread = dr.sqrt(0.25 * (a - c) * (a - c) + b * b)
     smallest = s00 * s00 * (s11 * s11) / (half + spread)
-    moved = (built.u != splats.u) | (built.v != splats.v) | (built.z != splats.z)
-    return (moved & ((q > 0) | (built.q > 0))) | ((q > 0) & ~(smallest >= 1))
+    moved = (built.mean_x != splats.mean_x) | (built.mean_y != splats.mean_y) | (built.depth != splats.depth)
+    return (moved & ((now > 0) | (built.level > 0))) | ((now > 0) & ~(smallest >= 1))
 
 
 def depth_order(depth: Any) -> Any:
-    """UInt32 [N]: indices front to back, ties by index (a radix sort of the float bits; depths are positive)."""
+    """UInt32 [N]: indices of the splats front to back, equal depths by index; depth: Float [N], positive.
+
+    A stable radix sort of the bits of the floats, which for positive numbers have the same order as their values.
+    """
     bits = dr.reinterpret_array(mi.UInt32, depth)
     order = dr.detail.block_mkperm(bits & 0xFFFF, len(depth), 1 << 16)
     return _sorted(order, dr.gather(mi.UInt32, bits, order) >> 16, 1 << 16)
 
 
 def build(splats: Splats, order: Any, width: int, height: int, margin: float) -> BlockLists:
-    """Block lists of detached splats, given their depth order. Exact ellipse-block overlap, not bounding boxes.
+    """Block lists of detached splats; order: UInt32 [N] from `depth_order`; width, height: pixels; margin: see `inflate`.
 
+    Whether a splat touches a block is decided by its ellipse, not by a bounding box.
     Raises InputError for more than MAX_PAIRS pairs, before memory is taken for them.
     """
     blocks_x, blocks_y = -(-width // BLOCK_X), -(-height // BLOCK_Y)
-    foot, place = inflate(splats, margin), _places(splats, order, blocks_x, blocks_y)
+    foot, place = inflate(splats, margin), _memory_places(splats, order, blocks_x, blocks_y)
     splat, number, slot_start, slot_end = _pairs(splats, foot, place, blocks_x, blocks_y)
-    numbers = _by_tile(dr.arange(mi.UInt32, blocks_x * blocks_y), blocks_x)
+    numbers = _tile_number(dr.arange(mi.UInt32, blocks_x * blocks_y), blocks_x)
     if len(splat) == 0:  # Dr.Jit has no operations on arrays of length 0
         slot, start, end = mi.UInt32(), dr.zeros(mi.UInt32, len(numbers)), dr.zeros(mi.UInt32, len(numbers))
     else:
         slot = _front_to_back(slot_start, slot_end, dr.gather(mi.UInt32, place, order), len(splat))
-        slot = _sorted(slot, dr.gather(mi.UInt32, number, slot), _numbers(blocks_x, blocks_y))
+        slot = _sorted(slot, dr.gather(mi.UInt32, number, slot), _tile_numbers(blocks_x, blocks_y))
         splat, number = dr.gather(mi.UInt32, splat, slot), dr.gather(mi.UInt32, number, slot)
         dr.eval(splat, number)
-        start, end = (dr.gather(mi.UInt32, a, numbers) for a in _ranges(number, _numbers(blocks_x, blocks_y)))
-    room = _rounded(len(splat))
-    lane = _lane_order(end - start, numbers, _numbers(blocks_x, blocks_y))
+        start, end = (dr.gather(mi.UInt32, a, numbers) for a in _key_ranges(number, _tile_numbers(blocks_x, blocks_y)))
+    room = _room(len(splat))
+    lane = _lanes_by_tile(end - start, numbers, _tile_numbers(blocks_x, blocks_y))
     lists = BlockLists(
         place=place,
         splat=_padded(splat, room),
@@ -163,78 +185,95 @@ def build(splats: Splats, order: Any, width: int, height: int, margin: float) ->
     return lists
 
 
-def _by_tile(block: Any, blocks_x: int) -> Any:
-    """UInt32: the number of a block (UInt32, row by row) when they are counted tile by tile, each of TILE x TILE blocks."""
+def _tile_number(block: Any, blocks_x: int) -> Any:
+    """UInt32: the number of a block when blocks are counted tile by tile, from its number when they are counted row by row.
+
+    A tile at the edge of the image is counted as if it were whole, TILE x TILE blocks, so some numbers belong to no block.
+    """
     bx, by = block % blocks_x, block // blocks_x
     tile = (by // TILE) * -(-blocks_x // TILE) + bx // TILE
     return (tile * TILE + by % TILE) * TILE + bx % TILE
 
 
-def _numbers(blocks_x: int, blocks_y: int) -> int:
-    """How many numbers `_by_tile` gives; tiles are counted whole."""
+def _tile_numbers(blocks_x: int, blocks_y: int) -> int:
+    """How many numbers there are in the count of `_tile_number`."""
     return -(-blocks_x // TILE) * -(-blocks_y // TILE) * TILE * TILE
 
 
 def _sorted(values: Any, keys: Any, count: int) -> Any:
-    """UInt32 values, stably sorted by keys below `count`. Evaluated, as all that are read next in a random order: a random read
-    whose place awaits another one stalls, and takes longer than two kernels."""
+    """UInt32 values, stably sorted by their keys, which are below `count`; evaluated.
+
+    Evaluated, since the values serve as addresses next: within one kernel a read at a random address that must wait for
+    another such read takes longer than two kernels do.
+    """
     values = dr.gather(mi.UInt32, values, dr.detail.block_mkperm(keys, len(values), count))
     dr.eval(values)
     return values
 
 
-def _places(splats: Splats, order: Any, blocks_x: int, blocks_y: int) -> Any:
-    """UInt32 [N]: where each splat lies: by the tile of its centre (the nearest, outside the image), then block, then depth."""
+def _memory_places(splats: Splats, order: Any, blocks_x: int, blocks_y: int) -> Any:
+    """UInt32 [N], the place of each splat: they are stored by the tile of their centre, then its block, then depth.
+
+    A centre outside the image counts to the nearest block.
+    """
 
     def block(pixel: Any, size: int, count: int) -> Any:
         return mi.UInt32(dr.select(splats.visible, dr.clip(pixel / size, 0, count - 1), 0))
 
-    number = _by_tile(block(splats.v, BLOCK_Y, blocks_y) * blocks_x + block(splats.u, BLOCK_X, blocks_x), blocks_x)
+    number = _tile_number(
+        block(splats.mean_y, BLOCK_Y, blocks_y) * blocks_x + block(splats.mean_x, BLOCK_X, blocks_x), blocks_x
+    )
     dr.eval(number)
-    at = _sorted(order, dr.gather(mi.UInt32, number, order), _numbers(blocks_x, blocks_y))
+    at = _sorted(order, dr.gather(mi.UInt32, number, order), _tile_numbers(blocks_x, blocks_y))
     place = dr.empty(mi.UInt32, len(at))
     dr.scatter(place, dr.arange(mi.UInt32, len(at)), at, mode=dr.ReduceMode.NoConflicts)
     dr.eval(place)
     return place
 
 
-def _lane_order(length: Any, number: Any, numbers: int) -> Any:
-    """UInt32 [L]: blocks by tile, in it the longest list first, so that the lanes of one SIMD packet end together, given the
-    length of each block's list and its number by tile."""
+def _lanes_by_tile(length: Any, number: Any, numbers: int) -> Any:
+    """UInt32 [L]: the blocks in the order of lanes, tile by tile, and in a tile the longest list first.
+
+    The lanes of one SIMD register then have lists of similar lengths and end together. length: of each block's list; number:
+    `_tile_number` of each block; numbers: how many of these there are.
+    """
     longest = _sorted(dr.arange(mi.UInt32, len(length)), 4095 - dr.minimum(length, 4095), 4096)
     return _sorted(longest, dr.gather(mi.UInt32, number, longest) // (TILE * TILE), numbers // (TILE * TILE))
 
 
 def _pairs(splats: Splats, foot: Footprints, place: Any, blocks_x: int, blocks_y: int) -> tuple[Any, ...]:
-    """Place of the splat, and number by tile of the block, of every pair, in the order of slots: splats as they lie in memory,
-    the blocks of each row by row; first and end of the slots of the splat at each place [N]. Empty where no splat is drawn.
+    """All (splat, block) pairs, in the order of their slots: by the splat's place, then by block, row by row.
 
-    First the rows of blocks that a footprint reaches, then the blocks of each row: work grows with the pairs that are kept,
-    where a bounding box would list the whole square around a slanted needle.
+    Returns the place of each pair's splat [M], the `_tile_number` of its block [M], and the first slot and the end of the
+    slots of the splat at each place [N], UInt32. The first two are empty where no splat is drawn.
+
+    First come the (splat, row of blocks) pairs, then the blocks of each row. So the work grows with the pairs that are kept; a
+    bounding box around a slanted needle would first list a whole square of blocks.
     """
-    n = len(splats.u)
-    half = dr.sqrt(dr.maximum(foot.q, 0)) * dr.rcp(foot.e)
-    low = dr.clip(dr.ceil((splats.v - half + 0.5) / BLOCK_Y) - 1, 0, blocks_y)
-    high = dr.clip(dr.floor((splats.v + half - 0.5) / BLOCK_Y) + 1, 0, blocks_y)
-    rows, shapes = dr.select(foot.q > 0, dr.maximum(high - low, 0), 0), dr.empty(mi.Float, 8 * n)
-    dr.scatter(shapes, mi.Vector4f(splats.u, splats.v, foot.k, foot.p), 2 * place, mode=dr.ReduceMode.NoConflicts)
-    dr.scatter(shapes, mi.Vector4f(foot.e, foot.q, low, rows), 2 * place + 1, mode=dr.ReduceMode.NoConflicts)
+    n = len(splats.mean_x)
+    half = dr.sqrt(dr.maximum(foot.level, 0)) * dr.rcp(foot.white_y)
+    low = dr.clip(dr.ceil((splats.mean_y - half + 0.5) / BLOCK_Y) - 1, 0, blocks_y)
+    high = dr.clip(dr.floor((splats.mean_y + half - 0.5) / BLOCK_Y) + 1, 0, blocks_y)
+    rows, shapes = dr.select(foot.level > 0, dr.maximum(high - low, 0), 0), dr.empty(mi.Float, 8 * n)
+    ellipse = mi.Vector4f(foot.mean_x, foot.mean_y, foot.shear, foot.white_x), mi.Vector4f(foot.white_y, foot.level, low, rows)
+    for i, part in enumerate(ellipse):
+        dr.scatter(shapes, part, 2 * place + i, mode=dr.ReduceMode.NoConflicts)
     dr.eval(foot, shapes)
 
     rows = mi.UInt32(dr.gather(mi.Float, shapes, 8 * dr.arange(mi.UInt32, n) + 7))
     first_row = dr.prefix_sum(rows)
-    row_splat = _runs(first_row, _total(rows, blocks_y, "rows of blocks"))
+    row_splat = _run_numbers(first_row, _total(rows, blocks_y, "rows of blocks"))
     block, columns = mi.UInt32(), mi.UInt32()
     if len(row_splat) > 0:
         offset = dr.arange(mi.UInt32, len(row_splat)) - dr.gather(mi.UInt32, first_row, row_splat)
-        block, columns = _columns(shapes, row_splat, offset, blocks_x)
+        block, columns = _blocks_of_row(shapes, row_splat, offset, blocks_x)
         dr.eval(row_splat, block, columns)
     count = _total(columns, blocks_x, "blocks")
     if count == 0:
         return mi.UInt32(), mi.UInt32(), dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n)
     first = dr.prefix_sum(columns)
-    row, end = _runs(first, count), first + columns
-    number = _by_tile(dr.gather(mi.UInt32, block - first, row) + dr.arange(mi.UInt32, count), blocks_x)
+    row, end = _run_numbers(first, count), first + columns
+    number = _tile_number(dr.gather(mi.UInt32, block - first, row) + dr.arange(mi.UInt32, count), blocks_x)
     slot_start = dr.gather(mi.UInt32, first, first_row, rows > 0)
     slot_end = dr.gather(mi.UInt32, end, first_row + rows - 1, rows > 0)
     pairs = dr.gather(mi.UInt32, row_splat, row), number, slot_start, slot_end
@@ -243,7 +282,7 @@ def _pairs(splats: Splats, foot: Footprints, place: Any, blocks_x: int, blocks_y
 
 
 def _total(counts: Any, most: int, what: str) -> int:
-    """Sum of UInt32 counts of at most `most` each, in 64 bits where 32 might wrap. Raises InputError beyond MAX_PAIRS."""
+    """Sum of UInt32 counts, each at most `most`; in 64 bits where 32 might not hold it. Raises InputError beyond MAX_PAIRS."""
     if len(counts) == 0:
         return 0
     total = int(dr.sum(counts if len(counts) * most < 1 << 32 else mi.UInt64(counts))[0])
@@ -257,32 +296,41 @@ def _total(counts: Any, most: int, what: str) -> int:
 
 
 def _front_to_back(slot_start: Any, slot_end: Any, by_depth: Any, count: int) -> Any:
-    """UInt32 [count]: the slots of the splat at each of these places, in their order."""
+    """UInt32 [count]: all slots, those of the nearest splat first; by_depth: UInt32 [N], places of the splats front to back."""
     dr.eval(by_depth)
     start, end = dr.gather(mi.UInt32, slot_start, by_depth), dr.gather(mi.UInt32, slot_end, by_depth)
     dr.eval(start, end)
     first = dr.prefix_sum(end - start)
-    rank = _runs(first, count)
+    rank = _run_numbers(first, count)
     slots = dr.gather(mi.UInt32, start - first, rank) + dr.arange(mi.UInt32, count)
     dr.eval(slots)
     return slots
 
 
-def _runs(start: Any, count: int) -> Any:
-    """UInt32 [count]: the run that each place belongs to, given the first places of runs (UInt32, growing; some are empty)."""
+def _run_numbers(start: Any, count: int) -> Any:
+    """UInt32 [count]: for each of `count` numbers cut into runs, which run it belongs to.
+
+    start: UInt32, where each run begins, never decreasing; where two begin at one number, the first of them is empty.
+    """
     if count == 0:
         return mi.UInt32()
-    begun, inside = dr.zeros(mi.UInt32, count), start < dr.opaque(mi.UInt32, count)  # a literal would compile anew
+    begun, inside = (
+        dr.zeros(mi.UInt32, count),
+        start < dr.opaque(mi.UInt32, count),
+    )  # a Python number would be compiled into the kernel
     dr.scatter_add(begun, mi.UInt32(1), start, inside, mode=dr.ReduceMode.Direct)
     return dr.cumsum(begun) - 1
 
 
-def _columns(shapes: Any, splat: Any, offset: Any, blocks_x: int) -> tuple[Any, Any]:
-    """The blocks of one row that a footprint's ellipse reaches within the row's pixel centres: the first, and how many.
+def _blocks_of_row(shapes: Any, splat: Any, offset: Any, blocks_x: int) -> tuple[Any, Any]:
+    """The blocks that a footprint's ellipse reaches in one row of blocks: number of the first (row by row), and how many.
 
-    The right rim x = k y + sqrt(q - e^2 y^2) / p is concave in y, so over the row's band it is largest at its own maximum,
-    clipped to the band; likewise the left rim. shapes: (u, v, k, p), (e, q, low, rows) of each splat, where low is its first
-    row; the row is low + offset.
+    shapes: two packets for the splat at each place, (mean_x, mean_y, shear, white_x) and (white_y, level, first row, unused);
+    splat: UInt32, its place; offset: UInt32, the row counted from the splat's first row.
+
+    The ellipse counts between the centres of the row's first and last pixels. At height y from the splat's centre its right
+    rim is x = k y + sqrt(q - e^2 y^2) / p, with the letters of docs/notation.md. That is concave in y, so in this band it is
+    largest at its own maximum, or at the end of the band nearest to that. The left rim is its mirror image.
     """
     u, v, k, p = dr.gather(mi.Vector4f, shapes, 2 * splat)
     e, q, first_row, _ = dr.gather(mi.Vector4f, shapes, 2 * splat + 1)
@@ -309,14 +357,15 @@ def _padded(values: Any, size: int) -> Any:
     return padded
 
 
-def _rounded(pairs: int) -> int:
-    """Room for this many pairs, rounded up by at most an eighth: few distinct sizes, so recorded kernels are reused."""
+def _room(pairs: int) -> int:
+    """Length of the lists of this many pairs, rounded up by at most an eighth, so that few lengths occur: a kernel is recorded
+    anew for each."""
     step = max(1024, 1 << max(pairs.bit_length() - 4, 0))
     return -(-max(pairs, 1) // step) * step
 
 
-def _ranges(key: Any, buckets: int) -> tuple[Any, Any]:
-    """(start, end) [buckets] of each bucket in the sorted keys."""
+def _key_ranges(key: Any, buckets: int) -> tuple[Any, Any]:
+    """Start and end, UInt32 [buckets] each, of the keys equal to 0, 1, 2, ... in sorted keys (0 and 0 where there are none)."""
     start, end = dr.zeros(mi.UInt32, buckets), dr.zeros(mi.UInt32, buckets)
     m = len(key)
     place, last = dr.arange(mi.UInt32, m), dr.opaque(mi.UInt32, m - 1)

@@ -1,8 +1,10 @@
-"""Fisher information of one view, per Gaussian: a registry of estimators, each a small function.
+"""Fisher information that one view carries about each Gaussian, by one of several estimators (`ESTIMATORS`).
 
-The pixel model is h(theta) -> rgb image with unit noise, so the information is H = J^T J over pixels and channels.
-Columns of a Gaussian's P = 3K + 8 parameters: spherical harmonics (coefficient-major, channel-minor; colour itself for degree
-0 up to the factor SH_C0^2), log-scales 3, quaternion 4, opacity logit 1. Means are frozen and have no columns.
+A pixel is taken as the rendered value plus noise of variance 1. The information is then J^T J, where J is the Jacobian of the
+rgb image, all pixels and channels, with respect to the parameters.
+
+The P = 3K + 8 columns of a Gaussian: 3K spherical-harmonic coefficients (coefficient by coefficient, r g b in each), 3
+log-scales, 4 of the quaternion, 1 opacity logit. The means are frozen and have no columns. Symbols: docs/notation.md.
 """
 
 from __future__ import annotations
@@ -22,12 +24,13 @@ from mgs.seeds import derive_seed
 from mgs.splat import kernels
 from mgs.splat.constants import LOG_SCALE_RANGE
 from mgs.splat.kernels import LN2
-from mgs.splat.projection import axes2d, camera_array, columns, project64, sh_basis, turns, whitening
+from mgs.splat.projection import axes2d, camera_array, is_rotation, project64, rows_as_vectors, sh_basis, whitening
 from mgs.splat.rendering import ListCache, as_colour, as_drjit, render, splats_and_lists
+from mgs.splat.walking import pack, sums_by_splat
 
 
 def groups(sh_degree: int) -> dict[str, slice]:
-    """Columns of each parameter group for colours of the given degree."""
+    """Columns of each group of parameters ("colour", "scale", "rotation", "opacity"), for colours of this SH degree."""
     k = 3 * (sh_degree + 1) ** 2
     return {"colour": slice(0, k), "scale": slice(k, k + 3), "rotation": slice(k + 3, k + 7), "opacity": slice(k + 7, k + 8)}
 
@@ -40,11 +43,13 @@ def fisher(
     cache: ListCache | None = None,
     **options: Any,
 ) -> np.ndarray:
-    """Fisher information that one view carries about each Gaussian: float32 [N,P], or [N,P,P] for `block`; rows are padded.
+    """Fisher information that one view carries about each Gaussian: float32 [N,P], or [N,P,P] for the estimator `block`.
 
-    The camera's image is not needed: information depends on the pose and the model alone. Estimators: see `ESTIMATORS`;
-    options: `probes` and `seed` of `hutchinson`; the others have none.
-    Raises InputError for an unknown estimator, as `render` does, and for blocks of 2^31 numbers or more.
+    Entries are in (linear RGB / unit of the parameter)^2. The camera's image is not needed: the information depends on the
+    model and the pose alone. The array may be a view of a larger one (its rows are padded in memory).
+    gaussians, background, cache: as in `render`. estimator: a name in `ESTIMATORS`. options: `probes` and `seed` of
+    `hutchinson`; the others have none.
+    Raises InputError for an unknown estimator, where `render` does, and for blocks of 2^31 numbers or more.
     """
     if estimator not in ESTIMATORS:
         raise InputError(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
@@ -52,7 +57,7 @@ def fisher(
     n, size = len(gaussians), groups(gaussians.sh_degree)["opacity"].stop
     if n == 0:
         return np.zeros((0, size, size) if estimator == "block" else (0, size), np.float32)
-    if estimator == "block" and n * (size * size + 3) >= 1 << 31:  # written in packets of four
+    if estimator == "block" and n * (size * size + 3) >= 1 << 31:  # each row is written in packets of four numbers
         raise InputError(
             f"fisher: blocks of {n:,} Gaussians of SH degree {gaussians.sh_degree} would take {n * size * size / 2**28:.1f} "
             "GiB, and 8 are the most; take fewer Gaussians, a lower degree, or the estimator `exact`"
@@ -62,8 +67,12 @@ def fisher(
 
 @dataclass
 class Geometry:
-    """What turns the kernel's sums into parameters: for each of the 8 geometric columns (3 log-scales, 4 quaternion, 1 logit)
-    the derivative of ln alpha as coefficients on (xi^2, xi eta, eta^2, 1); and the colour basis [K]."""
+    """How pixels depend on a Gaussian's parameters, up to what differs from pixel to pixel; Dr.Jit arrays [N].
+
+    shape: for the 3 log-scales and the 4 numbers of the quaternion, the derivative of ln alpha, as its three coefficients on
+    (xi^2, xi eta, eta^2). logit: the derivative of ln alpha by the opacity logit, 1 - opacity. basis: the K values of the
+    spherical harmonics. positive: for r, g, b 1, or 0 where the colour is clamped at 0 and has no derivative.
+    """
 
     shape: list[tuple[Any, Any, Any]]
     logit: Any
@@ -72,14 +81,19 @@ class Geometry:
 
 
 def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
-    """Closed-form derivatives of the footprint, in whitened coordinates, where all of them are of order one.
+    """The derivatives of the footprint in closed form, in whitened coordinates x = (xi, eta), in which they are of order one.
 
-    With a_i the i-th semi-axis of the Gaussian in whitened pixels and b_i = a_i / s_i, ln alpha changes with log-scale i by
-    4 ln2^2 (a_i.x)^2 and with a rotation about local axis k by 4 ln2^2 (s_i^2 - s_j^2)(b_i.x)(b_j.x), (i, j, k) cyclic; a
-    quaternion q of norm n turns the local frame by (2/n) Im(conj(q/n) dq).
+    With s_i the standard deviation along local axis i and b_i the image of that axis in whitened pixels per metre, ln alpha
+    changes with log-scale i by 4 ln2^2 s_i^2 (b_i.x)^2, and with a rotation about local axis k by
+    4 ln2^2 (s_i^2 - s_j^2) (b_i.x) (b_j.x), where (i, j, k) is (0, 1, 2) or a cyclic shift of it. A change dq of a quaternion q
+    of norm n rotates the local axes by (2/n) Im(conj(q/n) dq).
+    gaussians: TensorXf fields; camera: `camera_array`; splats: their projection.
     """
-    mean, quats = mi.Vector3d(columns(gaussians.means, mi.Vector3f)), mi.Vector4d(columns(gaussians.quats, mi.Vector4f))
-    log_scales = mi.Vector3d(columns(gaussians.log_scales, mi.Vector3f))
+    mean, quats = (
+        mi.Vector3d(rows_as_vectors(gaussians.means, mi.Vector3f)),
+        mi.Vector4d(rows_as_vectors(gaussians.quats, mi.Vector4f)),
+    )
+    log_scales = mi.Vector3d(rows_as_vectors(gaussians.log_scales, mi.Vector3f))
     _, unit, _ = axes2d(mean, quats, camera)
     scales = dr.exp(dr.clip(log_scales, *LOG_SCALE_RANGE))
     k, p, e = whitening([a * s for a, s in zip(unit, scales, strict=True)])
@@ -95,29 +109,30 @@ def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
     turn = []
     for i, j in ((1, 2), (2, 0), (0, 1)):
         turn.append(product((scales[i] - scales[j]) * (scales[i] + scales[j]), i, j))
-    w, x, y, z = quats * dr.select(turns(quats), 2 / dr.squared_norm(quats), 0)
+    w, x, y, z = quats * dr.select(is_rotation(quats), 2 / dr.squared_norm(quats), 0)
     X, Y, Z = turn
     by_quat = [-x * X - y * Y - z * Z, w * X - z * Y + y * Z, z * X + w * Y - x * Z, -y * X + x * Y + w * Z]
     transparency = dr.rcp(1 + dr.exp(mi.Float64(gaussians.logit_opacities.array)))
     basis = sh_basis(mean, camera, gaussians.sh.shape[1])
-    positive = [dr.select(c > 0, mi.Float(1), 0) for c in (splats.r, splats.g, splats.b)]
+    positive = [dr.select(c > 0, mi.Float(1), 0) for c in (splats.red, splats.green, splats.blue)]
     return Geometry([tuple(m) for m in (*by_scale, *by_quat)], transparency, basis, positive)
 
 
 def _sums(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None, block: bool) -> tuple[Any, Geometry]:
+    """The sums of `kernels.fisher`, arrays [N], and the geometry that turns them into entries of the information."""
     device = camera_array(camera)
     splats, lists, packed = splats_and_lists(gaussians, camera, cache)
     if block:
         exact = project64(gaussians, device)
         dr.eval(exact)
-        packed = kernels.pack(exact, lists.place)
+        packed = pack(exact, lists.place)
     placed = kernels.fisher(lists, packed, dr.detach(as_colour(background)), block)
-    sums = kernels.by_splat(lists, placed, kernels.FISHER_SUMS[block])
+    sums = sums_by_splat(lists, placed, kernels.FISHER_SUMS[block])
     return sums, geometry(gaussians, device, splats)
 
 
 def _quadratic(m: tuple[Any, Any, Any], n: tuple[Any, Any, Any], q: list[Any]) -> Any:
-    """sum (m . f)(n . f) from the five fourth-order moments q of f = (xi^2, xi eta, eta^2)."""
+    """Sum over pixels of |s|^2 (m . phi)(n . phi), phi = (xi^2, xi eta, eta^2), from the five fourth-order moments q."""
     return (
         m[0] * n[0] * q[0]
         + (m[0] * n[1] + m[1] * n[0]) * q[1]
@@ -128,7 +143,7 @@ def _quadratic(m: tuple[Any, Any, Any], n: tuple[Any, Any, Any], q: list[Any]) -
 
 
 def exact(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None) -> np.ndarray:
-    """diag(J^T J), exactly, for all parameters in one pass: seven sums per splat (design: one backward pass, no Jacobian)."""
+    """The diagonal of J^T J, exactly, for all parameters, in one pass over the image: seven sums per splat, and no Jacobian."""
     (w2, s2, *quartic), g = _sums(gaussians, camera, background, cache, block=False)
     columns_ = [w2 * basis * basis * positive for basis in g.basis for positive in g.positive]
     columns_ += [dr.maximum(_quadratic(m, m, quartic), 0) for m in g.shape]
@@ -137,9 +152,9 @@ def exact(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCach
 
 
 def block(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None) -> np.ndarray:
-    """The exact [N,P,P] diagonal blocks of J^T J: 22 sums per splat."""
+    """The diagonal blocks of J^T J, [N,P,P], exactly, in one pass over the image: 22 sums per splat."""
     (w2, s2, *rest), g = _sums(gaussians, camera, background, cache, block=True)
-    dr.eval(g)  # several kernels may write the blocks
+    dr.eval(g)  # once, as several kernels may write the blocks
     quartic, quadratic, cross = rest[:5], rest[5:8], [rest[8 + 4 * c : 12 + 4 * c] for c in range(3)]
     colour = [(basis, c) for basis in g.basis for c in range(3)]
     k = len(colour)
@@ -167,7 +182,7 @@ def block(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCach
 def _gradient(
     gaussians: Gaussians, image_gradient: Any, camera: Camera, background: Any, cache: ListCache | None
 ) -> np.ndarray:
-    """J^T z by Dr.Jit's own AD: [N,P]. image_gradient(rgb) -> TensorXf [H,W,3]."""
+    """J^T z of an image z, [N,P], by `dr.backward`. image_gradient(rgb) must return z, TensorXf [H,W,3]."""
     with dr.resume_grad():
         learned = {name: dr.copy(dr.detach(getattr(gaussians, name))) for name in LEARNED}
         dr.enable_grad(list(learned.values()))
@@ -180,9 +195,9 @@ def _gradient(
 def hutchinson(
     gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None, probes: int = 8, seed: int = 0
 ) -> np.ndarray:
-    """Mean of (J^T z)^2 over `probes` images z of independent +-1, whose expectation is diag(J^T J) (Hutchinson 1990).
+    """Mean of (J^T z)^2 over `probes` images z of independent +1 and -1. Its expectation is diag(J^T J) (Hutchinson 1990).
 
-    Each camera has probes of its own, drawn from `seed` and the camera: with the same ones in every view the errors of
+    Each camera has probes of its own, drawn from `seed` and the camera. With the same ones in every view the errors of
     neighbouring views would be alike, and would add up in a sum over views. Raises InputError for less than one probe.
     """
     if int(probes) != probes or probes < 1:
@@ -198,23 +213,28 @@ def hutchinson(
 
 
 def loss_gradient(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None) -> np.ndarray:
-    """The paper's Eq. 7 to the letter: squared gradient of one scalar "dummy photometric loss" per image.
+    """The paper's Eq. 7 as it is written: the squared gradient of one scalar "dummy photometric loss" per image.
 
-    The paper names no loss; here it is the mean squared error against mid-grey 0.5, L = mean (rgb - 0.5)^2. This is not
-    diag(J^T J): gradients of different pixels cancel before they are squared.
+    The paper does not say which loss. Here it is the mean squared error against mid-grey, L = mean (rgb - 0.5)^2. The result is
+    not diag(J^T J), since gradients of different pixels cancel before they are squared.
     """
     return _gradient(gaussians, lambda rgb: (rgb - 0.5) * (2 / len(rgb.array)), camera, background, cache) ** 2
 
 
 SMALLEST = 1.2e-38
-"""Smallest normal float32: threads differ in how they flush what is smaller, and nothing else differs between reruns."""
+"""Smallest normal float32. Entries smaller than this become 0: threads differ in how they flush denormals, and nothing else
+would differ between reruns."""
 
 PACKETS = 32
-"""Packets of four columns that one kernel writes: LLVM takes minutes over a kernel with all 56 x 56 of SH degree 3."""
+"""How many packets of four columns one kernel writes. LLVM takes minutes to compile a kernel that writes all 56 x 56 columns of
+blocks of SH degree 3."""
 
 
 def _interleaved(columns_: dict[int, Any], size: int, n: int) -> np.ndarray:
-    """Dr.Jit arrays [N] by column -> NumPy float32 [N, size], 0 in columns not given. Written four columns at a time."""
+    """NumPy float32 [N, size] from its columns, Dr.Jit arrays [N] by index; columns not given are 0.
+
+    A kernel writes four columns at a time, so rows are padded to a multiple of four; the result is a view without the padding.
+    """
     packets = -(-size // 4)
     flat, row = dr.empty(mi.Float, n * packets * 4), dr.arange(mi.UInt32, n) * packets
     for packet in range(packets):

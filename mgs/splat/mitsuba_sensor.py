@@ -11,15 +11,16 @@ from mgs.camera import Camera
 from mgs.errors import InputError
 
 _MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""Mitsuba's camera frame is x to the image's left, y up, z forward."""
+"""Mitsuba's camera looks along z with x to the image's left and y up, OpenCV's with x to the right and y down."""
 
 
 def camera_from_sensor(sensor: Any) -> Camera:
-    """The pinhole camera of a Mitsuba `perspective` sensor: its crop window is the image.
+    """The pinhole camera of a Mitsuba `perspective` sensor. The image is the sensor's crop window.
 
-    Whatever the fov axis, Mitsuba keeps the horizontal field of view of the whole film, and pixels are square. The principal
-    point (0.5 - ppo) is in whole films. Near and far clip and the shutter are not used (see `mgs.splat.constants.NEAR`).
-    Raises InputError for any other sensor, or a pose that is not rigid.
+    `x_fov` is the horizontal field of view of the whole film, whatever the sensor's fov axis; pixels are square. The principal
+    point is 0.5 minus the sensor's offset, as a share of the whole film. Near clip, far clip and shutter are ignored (the near
+    plane is `mgs.splat.constants.NEAR`).
+    Raises InputError for any other sensor, and for a pose that is not rigid.
     """
     params = mi.traverse(sensor)
     if "x_fov" not in params or sensor.needs_aperture_sample():
@@ -41,5 +42,5 @@ def camera_from_sensor(sensor: Any) -> Camera:
 
 
 def _number(value: Any) -> float:
-    """A Mitsuba Float of one entry."""
+    """The value of a Mitsuba Float that has one entry."""
     return float(np.asarray(value, np.float64).ravel()[0])

@@ -1,7 +1,7 @@
-"""Makes the plugins of mgs known to Mitsuba, when imported: `import mgs.splat.plugins`.
+"""Importing this module makes the Mitsuba plugins of mgs known to Mitsuba: `import mgs.splat.plugins`.
 
-A plugin class belongs to a Mitsuba variant, so the files in `plugins/` are run for the variant that is set and again for every
-one that is set later: the import may come before or after `mi.set_variant`.
+A plugin class belongs to one Mitsuba variant. So the files in `plugins/` are run for the variant that is set now, and again for
+every variant that is set later; the import may come before or after the variant is set.
 """
 
 from __future__ import annotations

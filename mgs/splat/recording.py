@@ -1,4 +1,4 @@
-"""Record a kernel once per set of sizes and replay it: tracing costs more than a small image does."""
+"""Record a kernel once per set of sizes and replay it afterwards: tracing it anew takes longer than drawing a small image."""
 
 from __future__ import annotations
 
@@ -11,24 +11,28 @@ from typing import Any
 import drjit as dr
 
 _one_at_a_time = threading.RLock()
-"""Held during a recording or replay: Dr.Jit 1.5 hangs or fails where two threads record, and the collector is the process's."""
+"""Held during every recording and replay. Dr.Jit 1.5 hangs or fails where two threads record at once; and the garbage
+collector, which must rest meanwhile, is one for the whole process."""
 
 
-def frozen(baked: Callable[..., tuple[int, ...]]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorate with `dr.freeze`; baked(*arguments) are the lengths and plain numbers that a recording bakes in.
+def frozen(sizes: Callable[..., tuple[int, ...]]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Decorator: `dr.freeze`, which records the kernels of a function's first call and replays them in later calls.
 
-    They are compared as one string: of a small number that also stands elsewhere among the inputs or the function's globals
-    `dr.freeze` notes only that it was seen before, not which it is, and replays what was recorded for another (Dr.Jit 1.5).
-    Python's cycle collector waits meanwhile: a Mitsuba scene that it frees during a recording ends the process
+    sizes(*arguments) must return the lengths of arrays and the plain numbers that a recording holds as constants; a call with
+    other sizes is recorded anew. They are handed to Dr.Jit as one string. As numbers they would not be safe: where a small
+    number also occurs elsewhere among the inputs or the function's globals, `dr.freeze` (Dr.Jit 1.5) only compares that it
+    occurs again, not its value, and replays a recording of other sizes.
+
+    Python's garbage collector is off during the call: if it frees a Mitsuba scene while Dr.Jit records, the process ends
     ("enqueue_host_func(): this function cannot be recorded", Dr.Jit 1.5).
 
-    Threads: all decorated functions together run one at a time, so threads may draw at once, each with a `ListCache` of its
-    own, and the collector is as it was once none runs. Not guarded: a `ListCache` or a gradient that threads share, and
-    another thread that switches the collector itself.
+    Threads: all decorated functions together run one at a time. So threads may draw at once if each has a `ListCache` of its
+    own, and afterwards the collector is on again if it was before. Not protected: a `ListCache` or a gradient that threads
+    share, and a thread that switches the collector on or off by itself.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        recorded = dr.freeze(function, state_fn=lambda *a, **k: repr(baked(*a, **k)), limit=64, warn_after=1 << 30)
+        recorded = dr.freeze(function, state_fn=lambda *a, **k: repr(sizes(*a, **k)), limit=64, warn_after=1 << 30)
 
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> Any:

@@ -1,8 +1,8 @@
-"""The oracle: O(N x pixels) float64 NumPy, the kernels' names and constants, nothing clever.
+"""The oracle: the same model in plain float64 NumPy, every Gaussian on every pixel, with the kernels' names and constants.
 
-What is drawn and derived here has a fast twin in Dr.Jit and a test that compares the two; `margins` says in which pixels
-float32 may decide otherwise than float64, so that they must not be compared. Derivatives are written independently of the
-kernels (dense per-pixel Jacobians of alpha compositing) and are themselves tested against central differences.
+Each function has a fast twin in Dr.Jit and a test that compares the two. In some pixels float32 may decide otherwise than
+float64, for example whether an alpha is above a threshold; `margins` finds them, so that tests leave them out. Derivatives are
+written independently of the kernels, as dense Jacobians of alpha compositing, and are tested against central differences.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from mgs.splat.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, FRUSTUM_MARGIN, LOG
 
 @dataclass
 class Projected:
-    """means2d [N,2] px; cov2d [N,2,2] px^2 with EPS2D; depths [N] m; opacities [N]; colours [N,3]; visible [N] bool;
-    T [N,2,3] px/m: the EWA map from world offsets to pixels."""
+    """means2d [N,2] px; cov2d [N,2,2] px^2, EPS2D included; depths [N] m, 1 where not visible; opacities [N] in [0,1];
+    colours [N,3] linear RGB; visible [N] bool, in front of the near plane."""
 
     means2d: np.ndarray
     cov2d: np.ndarray
@@ -29,7 +29,6 @@ class Projected:
     opacities: np.ndarray
     colours: np.ndarray
     visible: np.ndarray
-    T: np.ndarray
 
 
 def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
@@ -62,7 +61,10 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
 
 
 def project(gaussians: Gaussians, camera: Camera) -> Projected:
-    """EWA projection (Zwicker et al. 2002; 3DGS), float64."""
+    """EWA projection (Zwicker et al. 2002) as 3DGS uses it (Kerbl et al. 2023), float64.
+
+    J is the Jacobian of the projection at each mean, T = J R the map from metres around it to pixels, [N,2,3] each.
+    """
     means = np.asarray(gaussians.means, np.float64)
     R, t = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
@@ -84,25 +86,26 @@ def project(gaussians: Gaussians, camera: Camera) -> Projected:
     raw = 0.5 + np.einsum("nk,nkc->nc", sh_basis(directions, gaussians.sh_degree), sh)
     opacities = expit(np.asarray(gaussians.logit_opacities, np.float64))
     means2d = np.stack([fx * x / z + cx, fy * y / z + cy], 1)
-    return Projected(means2d, cov2d, z, opacities, np.maximum(raw, 0), visible, T)
+    return Projected(means2d, cov2d, z, opacities, np.maximum(raw, 0), visible)
 
 
 def _half_square(d: np.ndarray, cov: np.ndarray) -> np.ndarray:
-    """1/2 d^T cov^-1 d of each row of d [P,2]: the negative exponent of a Gaussian."""
+    """1/2 d^T cov^-1 d for each row d of [P,2]: minus the exponent of a Gaussian of covariance cov [2,2]."""
     return 0.5 * ((d @ np.linalg.inv(cov)) * d).sum(1)
 
 
 def composite(projected: Projected, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Front-to-back alpha compositing, per pixel and splat.
+    """Front-to-back alpha compositing, for every pixel and splat; P = H*W pixels, row by row, and M visible Gaussians.
 
-    Returns order [M] (visible Gaussians by depth, ties by index), alpha [P,M] after thresholds (0 where skipped or behind
-    the stop), T [P,M] transmittance in front of each splat, clipped [P,M] where ALPHA_MAX holds. P = H*W, row-major.
+    Returns order [M], indices of the visible Gaussians by depth, equal depths by index; alpha [P,M] after all thresholds (0
+    where a splat is not drawn); T [P,M], the transmittance in front of each splat; clipped [P,M], mask where alpha would be
+    above ALPHA_MAX.
     """
     index = np.flatnonzero(projected.visible)
     order = index[np.argsort(projected.depths[index].astype(np.float32), kind="stable")]
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
     pixels = np.stack([u.ravel(), v.ravel()], 1)
-    alpha = np.zeros((len(order), len(pixels))).T  # written a splat at a time
+    alpha = np.zeros((len(order), len(pixels))).T  # transposed, as one splat is written at a time
     transmittance = np.zeros_like(alpha)
     clipped = np.zeros_like(alpha, bool)
     T = np.ones(len(pixels))
@@ -130,10 +133,11 @@ def render(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -> 
 
 
 def margins(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """[H,W]: by which relative error in alpha a pixel's decisions could change, at least; infinite where nothing is near.
+    """[H,W]: the smallest relative error of the alphas with which some decision at the pixel could come out differently.
 
-    Decisions: alpha < ALPHA_MIN, alpha > ALPHA_MAX (its derivative jumps), the stop at TRANSMITTANCE_MIN (the error of T adds
-    up as sum alpha / (1 - alpha)) and the depth order of two splats drawn in the same pixel (equal to float32 rounding).
+    Decisions are: whether alpha is below ALPHA_MIN; whether it is above ALPHA_MAX, where its derivative jumps; whether the
+    pixel is finished (a relative error of the alphas makes one of T that is sum alpha / (1 - alpha) times as large); and
+    which of two splats drawn in the pixel is in front (0 where float32 may round their depths to the same number).
     """
     p = project(gaussians, camera)
     order, alpha, _, _ = composite(p, camera)
@@ -158,7 +162,7 @@ def margins(gaussians: Gaussians, camera: Camera) -> np.ndarray:
 
 
 def _projection_jacobian(gaussians: Gaussians, camera: Camera, step: float = 1e-5) -> np.ndarray:
-    """d(cov2d)/d(log-scale 3, quaternion 4) of each Gaussian -> [N,7,2,2], by central differences of `project` in float64."""
+    """Derivatives of cov2d by the 3 log-scales and 4 numbers of the quaternion, [N,7,2,2]: central differences of `project`."""
     columns = []
     for name, size in (("log_scales", 3), ("quats", 4)):
         for k in range(size):
@@ -172,7 +176,7 @@ def _projection_jacobian(gaussians: Gaussians, camera: Camera, step: float = 1e-
 
 
 def jacobian(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -> np.ndarray:
-    """Dense Jacobian of the rgb image, [H*W, 3, N, 3K+8], columns as `mgs.gaussians.LEARNED`. Brute force: toy scenes only."""
+    """Dense Jacobian of the rgb image, [H*W, 3, N, 3K+8], columns as in `mgs.gaussians.LEARNED`. For toy scenes only."""
     projected = project(gaussians, camera)
     order, alpha, T, clipped = composite(projected, camera)
     weights = alpha * T
@@ -189,7 +193,7 @@ def jacobian(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -
     derivatives = _projection_jacobian(gaussians, camera)
     J = np.zeros((len(pixels), 3, n, 3 * K + 8))
     for i, j in enumerate(order):
-        drawn = np.flatnonzero(alpha[:, i])  # elsewhere no parameter of it changes anything
+        drawn = np.flatnonzero(alpha[:, i])  # on other pixels the splat changes nothing
         for c in np.flatnonzero(projected.colours[j] > 0):
             J[drawn, c, j, c : 3 * K : 3] = weights[drawn, i, None] * basis[j]
         D = projected.colours[j] * T[drawn, i, None] - behind[drawn, i] / (1 - alpha[drawn, i, None])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -16,15 +17,17 @@ from mgs.errors import InputError
 from mgs.gaussians import SH_MAX, Gaussians
 from mgs.splat import blocks, kernels
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, BlockLists
-from mgs.splat.kernels import PIXELS
 from mgs.splat.projection import Splats, camera_array, project
+from mgs.splat.walking import PIXELS, pack, sums_by_splat
 
 MARGIN = 0.15
-"""Growth of a footprint, as a share of its size (and bits of its opacity), that lists allow for once their camera's first,
-exact lists were outgrown: a model that is only looked at pays for no margin, one in training seldom rebuilds."""
+"""How much a footprint may grow before its lists must be rebuilt: a share of its size, and bits of its opacity.
+
+The first lists of a camera have no margin: a model that is only looked at pays for none. The margin comes with the lists that
+replace them, since then the model is being trained."""
 
 CACHE_BYTES = 1 << 30
-"""Default memory budget of a `ListCache`, bytes: 100 cameras of 100,000 Gaussians at 640x480."""
+"""Default memory budget of a `ListCache`, bytes: enough for 100 cameras of 100,000 Gaussians at 640x480."""
 
 
 @dataclass
@@ -40,27 +43,30 @@ class Image:
 
 
 REMEMBERED = 1 << 16
-"""Most cameras whose last use a `ListCache` remembers, a few hundred bytes each."""
+"""For how many cameras a `ListCache` remembers when they were used last, at a few hundred bytes each."""
 
 
 class ListCache:
-    """Block lists per camera, within a budget in bytes. One camera's lists are kept even where they alone exceed it.
+    """Block lists per camera, kept between calls of `render` and `fisher` within a budget in bytes.
 
-    Views are mostly gone through again and again, in one order (scoring) or a new one each time (fitting). What was used
-    longest ago is then needed soonest, so giving it up for every newcomer (LRU) may never find anything. Here a camera takes
-    the place of the one used longest ago only if it was itself used less than half as long ago; otherwise its lists serve
-    once and are dropped. So as many stay as there is room for, and other cameras take over within three rounds.
+    The lists of one camera are kept even where they alone exceed the budget.
 
-    Lists serve as long as they are exact for the splats: same centres and depths, no footprint outside the margin it was
-    built with. Otherwise they are rebuilt, so a stale list can never change an image.
+    Lists that no longer fit the Gaussians are found out and rebuilt at every use (see `mgs.splat.blocks.outgrown`), so keeping
+    them never changes an image.
+
+    What is kept: cameras are mostly gone through again and again, in one order (to score views) or in a new order each time (to
+    fit). The camera used longest ago is then often the one needed next, and a cache that always drops that one (LRU) may never
+    find what it is asked for. Here a new camera takes its place only if it was itself used less than half as long ago.
+    Otherwise the new lists are used once and dropped. So as many cameras stay as there is room for, and where the caller turns
+    to other cameras, these take over within three rounds.
     """
 
     def __init__(self, budget: int = CACHE_BYTES) -> None:
         self.budget = budget
         self.builds = 0
-        self._lists: OrderedDict[bytes, BlockLists] = OrderedDict()  # used longest ago first
-        self._used: dict[bytes, int] = {}  # when each camera was used last, held or not, by _clock
-        self._clock = 0  # uses of all cameras
+        self._lists: OrderedDict[bytes, BlockLists] = OrderedDict()  # the one used longest ago first
+        self._used: dict[bytes, int] = {}  # value of _clock at each camera's last use, its lists held or not
+        self._clock = 0  # counts the uses of all cameras
 
     @property
     def nbytes(self) -> int:
@@ -68,7 +74,7 @@ class ListCache:
         return sum(lists.nbytes for lists in self._lists.values())
 
     def get(self, camera: Camera, splats: Splats) -> tuple[BlockLists, Any]:
-        """Lists for detached splats seen by the camera, and the splats packed at the places of these lists.
+        """Lists for detached splats seen by the camera, from the cache or new, and the splats packed for them (`walking.pack`).
 
         Raises InputError where a parameter is not finite, a colour beyond SH_MAX, or the view has too many pairs.
         """
@@ -76,19 +82,19 @@ class ListCache:
         lists = self._lists.get(key)
         margin = 0.0 if lists is None else MARGIN
         dr.eval(splats)
-        if lists is not None and len(lists.place) != len(splats.u):
+        if lists is not None and len(lists.place) != len(splats.mean_x):
             lists = None
         if lists is not None:
             stale = dr.select(splats.finite, mi.UInt32(blocks.outgrown(lists.footprints, splats)), 2)
             dr.schedule(stale)
-            packed = kernels.pack(splats, lists.place)
+            packed = pack(splats, lists.place)
             worst = int(dr.max(stale)[0])
             _raise_unless_finite(worst < 2)
             lists = None if worst else lists
         if lists is None:
             _raise_unless_finite(dr.all(splats.finite))
-            lists = blocks.build(splats, blocks.depth_order(splats.z), camera.width, camera.height, margin)
-            packed = kernels.pack(splats, lists.place)
+            lists = blocks.build(splats, blocks.depth_order(splats.depth), camera.width, camera.height, margin)
+            packed = pack(splats, lists.place)
             self.builds += 1
             self._keep(key, lists)
         self._clock += 1
@@ -98,7 +104,7 @@ class ListCache:
         return lists, packed
 
     def _keep(self, key: bytes, lists: BlockLists) -> None:
-        """Hold new lists, and keep the budget: drop those used longest ago, or these."""
+        """Hold new lists; then keep the budget, by dropping those used longest ago or the new ones (see the class)."""
         self._lists[key] = lists
         while len(self._lists) > 1 and self.nbytes > self.budget:
             oldest = next(other for other in self._lists if other != key)
@@ -112,9 +118,10 @@ class ListCache:
 
 
 def as_colour(background: Any) -> Any:
-    """Linear RGB as Color3f: one number or three, or a Dr.Jit colour, which is kept with its gradient.
+    """A background as Color3f, linear RGB: from one number, from three, or from a Dr.Jit colour, which keeps its gradient.
 
-    The numbers are opaque: literals would compile the kernel anew for every colour. Raises InputError for anything else.
+    Numbers go to Dr.Jit through `dr.opaque`; otherwise they would be compiled into the kernel, one kernel for each colour.
+    Raises InputError for anything else, and for numbers that are not finite or beyond SH_MAX.
     """
     if dr.is_jit_v(background):
         return mi.Color3f(background)
@@ -133,9 +140,10 @@ def _raise_unless_finite(finite: Any) -> None:
 
 
 def as_drjit(gaussians: Gaussians) -> Gaussians:
-    """The same Gaussians with TensorXf fields; fields that are Dr.Jit already are kept, gradients included.
+    """The same Gaussians with TensorXf fields. Fields that are Dr.Jit arrays already are kept, with their gradients.
 
-    Raises InputError where shapes do not fit each other: a kernel would read beyond the end; and as `mgs.runtime.start`.
+    Raises InputError where the shapes of the fields do not fit each other, with which a kernel would read beyond the end of an
+    array; and where no variant can be started (`mgs.runtime.start`).
     """
     runtime.start()
     gaussians.check_shapes()
@@ -144,14 +152,26 @@ def as_drjit(gaussians: Gaussians) -> Gaussians:
 
 
 class _Rasterise(dr.CustomOp):
-    """Splats -> r, g, b, alpha and weighted depth, Float [H*W] each, with the hand-written adjoint: compositing is no sum that
-    AD could replay. places: see `_places`."""
+    """Compositing as an operation of Dr.Jit's AD: splats -> red, green, blue, alpha, depth times alpha, Float [H*W] each.
+
+    Its derivative is written by hand: Dr.Jit's own would have to store the state of every pixel before every splat.
+    packed, lists: of these splats; places: from `_block_major`; means: whether mean_x and mean_y have gradients.
+    """
 
     def eval(self, splats: Splats, packed: Any, lists: BlockLists, places: Any, means: bool) -> Any:
         self.splats, self.packed, self.lists, self.places, self.means = splats, packed, lists, places, means
         self.out = kernels.forward(lists, packed)
-        pixel = dr.gather(mi.Vector4f, self.out[0], places, mode=dr.ReduceMode.NoConflicts)
-        return *pixel, dr.gather(mi.Float, self.out[1], places, mode=dr.ReduceMode.NoConflicts)
+        return self._in_order(self.out)
+
+    def _in_order(self, out: tuple[Any, Any]) -> Any:
+        """The output of a kernel, block by block, as five arrays of pixels row by row."""
+        rgba, depth = out
+        pixel = dr.gather(mi.Vector4f, rgba, self.places, mode=dr.ReduceMode.NoConflicts)
+        return *pixel, dr.gather(mi.Float, depth, self.places, mode=dr.ReduceMode.NoConflicts)
+
+    def forward(self) -> None:
+        tangents = kernels.pack_tangents(self.grad_in("splats"), self.splats, self.lists.place)
+        self.set_grad_out(self._in_order(kernels.jvp(self.lists, self.packed, tangents)))
 
     def backward(self) -> None:
         *d_pixel, d_weighted = self.grad_out()
@@ -160,12 +180,12 @@ class _Rasterise(dr.CustomOp):
         dr.scatter(d_rgba, mi.Vector4f(*d_pixel), self.places, mode=dr.ReduceMode.NoConflicts)
         dr.scatter(d_depth, d_weighted, self.places, mode=dr.ReduceMode.NoConflicts)
         placed = kernels.adjoint(self.lists, self.packed, self.out, (d_rgba, d_depth), self.means)
-        sums = kernels.by_splat(self.lists, placed, kernels.ADJOINT_SUMS[self.means])
+        sums = sums_by_splat(self.lists, placed, kernels.ADJOINT_SUMS[self.means])
         self.set_grad_in("splats", kernels.splat_gradient(sums, self.splats))
 
 
-def _places(width: int, height: int) -> Any:
-    """UInt32 [H*W]: where each pixel of an image lies in block-major order."""
+def _block_major(width: int, height: int) -> Any:
+    """UInt32 [H*W]: index of each pixel, taken row by row, in the output of the kernels, which is block by block."""
     index = dr.arange(mi.UInt32, width * height)
     x, y = index % width, index // width
     block = (y // BLOCK_Y) * (-(-width // BLOCK_X)) + x // BLOCK_X
@@ -173,9 +193,10 @@ def _places(width: int, height: int) -> Any:
 
 
 def splats_and_lists(gaussians: Gaussians, camera: Camera, cache: ListCache | None) -> tuple[Splats, BlockLists, Any]:
-    """Project Gaussians with Dr.Jit fields, find their block lists and pack them at the places of these lists.
+    """Project Gaussians with Dr.Jit fields. Returns the splats, with gradients, their block lists, and the splats packed.
 
-    Raises InputError where a parameter is not finite, or a colour beyond SH_MAX.
+    Raises InputError where a parameter is not finite or a colour beyond SH_MAX, naming the parameter and the Gaussian; and
+    where the view has too many pairs.
     """
     splats = project(gaussians, camera_array(camera))
     try:
@@ -188,13 +209,14 @@ def splats_and_lists(gaussians: Gaussians, camera: Camera, cache: ListCache | No
 def render(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.0), cache: ListCache | None = None) -> Image:
     """Render Gaussians by EWA splatting (Kerbl et al. 2023, with the constants of `mgs.splat.constants`).
 
-    gaussians: NumPy fields, or Dr.Jit TensorXf fields, any of which may have gradients enabled: `dr.backward` then reaches
-    log_scales, quats, logit_opacities, sh and, where enabled, means. Not differentiated: the camera, the thresholds
-    (alpha < 1/255, transmittance), the depth order; forward-mode derivatives are not available.
-    background: linear RGB. cache: keep one between calls so that a camera seen again reuses its block lists. Records its own
-    kernels, so it cannot be called inside another `dr.freeze`.
-    Raises InputError where a parameter is NaN or infinite, or a colour beyond SH_MAX (names the parameter and the first
-    Gaussian); likewise for a number of the background (a Dr.Jit colour is not looked at); and for a view of too many pairs
+    gaussians: NumPy fields, or Dr.Jit TensorXf fields, any of which may have gradients enabled. Derivatives by them are those
+    of Dr.Jit, in reverse mode (`dr.backward`) and in forward mode (`dr.forward`; `jvp` is a short way to it). Not
+    differentiated: the camera, the thresholds (alpha < 1/255, transmittance, ALPHA_MAX) and the depth order.
+    background: linear RGB, one number or three, or a Dr.Jit colour, which may have gradients enabled. cache: keep one between
+    calls so that a camera seen again reuses its block lists. `render` records its own kernels, so it cannot be called inside
+    another `dr.freeze`.
+    Raises InputError where a parameter is NaN or infinite or a colour beyond SH_MAX, naming the parameter and the first
+    Gaussian; where a number of the background is (a Dr.Jit colour is not looked at); and for a view of too many pairs
     (`mgs.splat.blocks.MAX_PAIRS`).
     """
     runtime.start()
@@ -206,18 +228,69 @@ def render(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.
     return composite(splats, packed, lists, camera.width, camera.height, colour)
 
 
+def jvp(
+    gaussians: Gaussians,
+    tangents: Mapping[str, Any],
+    camera: Camera,
+    background: Any = (0.0, 0.0, 0.0),
+    cache: ListCache | None = None,
+) -> Image:
+    """How the image changes as the Gaussians change along `tangents`: the product J v, in one pass (forward-mode derivative).
+
+    J is the Jacobian of `render`, with what it does not differentiate; v are the tangents. gaussians, camera, background,
+    cache: as in `render`; gradients that are enabled on them play no part.
+    tangents: by name of a parameter ("means", "log_scales", "quats", "logit_opacities", "sh") an array of the parameter's
+    shape, NumPy or Dr.Jit, in its unit per unit of some t. Parameters that are not named do not change.
+    Returns the derivatives by t of rgb [H,W,3], alpha [H,W] and depth [H,W], TensorXf.
+    Raises InputError where `render` does, and for a tangent of an unknown name, of a wrong shape or that is not finite.
+    """
+    model = as_drjit(gaussians)
+    given = {name: _checked_tangent(model, name, tangent) for name, tangent in tangents.items()}
+    with dr.resume_grad():
+        watched = Gaussians(**{f.name: dr.copy(dr.detach(getattr(model, f.name))) for f in fields(model)})
+        for name, tangent in given.items():
+            dr.enable_grad(getattr(watched, name))
+            dr.set_grad(getattr(watched, name), tangent)
+        image = render(watched, camera, dr.detach(as_colour(background)), cache)
+        dr.forward_to(image, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)  # none where nothing is given to change
+        return dr.grad(image)
+
+
+def _checked_tangent(gaussians: Gaussians, name: str, tangent: Any) -> Any:
+    """The tangent of a parameter as a detached TensorXf. Raises InputError, see `jvp`."""
+    names = [f.name for f in fields(gaussians)]
+    if name not in names:
+        raise InputError(f"tangents: {name!r} is no parameter; choose from {', '.join(names)}")
+    shape = tuple(getattr(gaussians, name).shape)
+    try:
+        with np.errstate(over="ignore"):
+            values = np.asarray(dr.detach(tangent), np.float32)
+    except (TypeError, ValueError):
+        raise InputError(f"tangents: {name} must be numbers of the parameter's shape, {shape}") from None
+    if values.shape != shape:
+        raise InputError(f"tangents: {name} has shape {values.shape}, expected {shape}, that of the parameter")
+    if not np.isfinite(values).all():
+        first = np.argwhere(~np.isfinite(values))[0][0]
+        raise InputError(f"tangents: {name} is NaN or infinite, first at Gaussian {first}; remove or repair it")
+    return mi.TensorXf(values)
+
+
 def _empty(camera: Camera, background: Any) -> Image:
-    """What a camera sees of no Gaussians."""
+    """The image of a model without Gaussians: the background. (Dr.Jit has no operations on arrays of length 0.)"""
     shape = (camera.height, camera.width)
     rgb = background + dr.zeros(mi.Color3f, camera.height * camera.width)
     return Image(mi.TensorXf(dr.ravel(rgb), (*shape, 3)), dr.zeros(mi.TensorXf, shape), dr.zeros(mi.TensorXf, shape))
 
 
 def composite(splats: Splats, packed: Any, lists: BlockLists, width: int, height: int, background: Any = 0.0) -> Image:
-    """Composite projected splats, packed for their block lists, over a Color3f; differentiable in the splats' numbers."""
-    places = _places(width, height)
-    r, g, b, alpha, weighted = dr.custom(_Rasterise, splats, packed, lists, places, dr.grad_enabled(splats.u))
+    """The image of projected splats over a background (Color3f), differentiable in the splats' fields and the background.
+
+    packed: the splats' numbers from `walking.pack`; lists: their block lists; width, height: pixels.
+    """
+    places = _block_major(width, height)
+    r, g, b, alpha, weighted = dr.custom(_Rasterise, splats, packed, lists, places, dr.grad_enabled(splats.mean_x))
     rgb = mi.Color3f(r, g, b) + (1 - alpha) * background
     expected = dr.select(alpha > 0, weighted / dr.select(alpha > 0, alpha, 1), 0)
+    alpha = alpha + 0  # a variable that nothing else depends on: forward-mode AD clears the others when it is done
     shape = (height, width)
     return Image(mi.TensorXf(dr.ravel(rgb), (*shape, 3)), mi.TensorXf(alpha, shape), mi.TensorXf(expected, shape))

@@ -1,1 +1,1 @@
-"""A flight with a noisy depth camera and drifting odometry, registered into one cloud."""
+"""The survey: a flight with a noisy depth camera and drifting odometry; its frames are registered and fused into a cloud."""

@@ -1,9 +1,13 @@
-"""A noisy RGB-D camera, and the filter that a survey puts behind it.
+"""A depth camera with the noise of a real one, and the filter that the survey applies to what it measures.
 
-The parameters are those published for the Kinect (structured light, 640x480); lengths in metres, angles in radians.
-Nguyen, Izadi and Lovell, "Modeling Kinect sensor noise for improved 3D reconstruction and tracking", 3DIMPVT 2012:
-axial and lateral noise. Khoshelham and Elberink, "Accuracy and resolution of Kinect depth data", Sensors 12(2), 2012:
-quantisation. Drop-outs at grazing angles have no published curve: a ramp, our choice.
+The numbers are those published for the Kinect (structured light, images of 640x480):
+
+- axial noise (along the camera's axis) and lateral noise (across it): Nguyen, Izadi and Lovell, "Modeling Kinect sensor noise
+  for improved 3D reconstruction and tracking", 3DIMPVT 2012;
+- quantisation: Khoshelham and Elberink, "Accuracy and resolution of Kinect depth data", Sensors 12(2), 2012;
+- returns that are lost on grazing surfaces: there is no published curve; ours rises linearly with the angle.
+
+Depth images are [H,W] z-depth in metres, 0 = no return.
 """
 
 from __future__ import annotations
@@ -13,22 +17,35 @@ import numpy as np
 from mgs.camera import Camera
 
 AXIAL_FLOOR, AXIAL_GROWTH, AXIAL_START = 0.0012, 0.0019, 0.4
-"""Axial standard deviation: AXIAL_FLOOR + AXIAL_GROWTH (z - AXIAL_START)^2 metres (Nguyen et al., eq. 3): 26 mm at 4 m."""
+"""Axial noise has the standard deviation AXIAL_FLOOR + AXIAL_GROWTH (z - AXIAL_START)^2 at the depth z, all in metres (Nguyen
+et al., eq. 3): 26 mm at 4 m."""
 
 LATERAL_FLOOR, LATERAL_GROWTH = 0.8, 0.035
-"""Lateral standard deviation: LATERAL_FLOOR + LATERAL_GROWTH theta / (pi/2 - theta) pixels of a 640-wide image (eq. 1)."""
-
-QUANTUM = 2.85e-3
-"""Depth step over z^2, per metre (Khoshelham and Elberink, section 4.2: 2.85e-5 in centimetres): 46 mm at 4 m."""
-
-DROP_OUT = (np.radians(65.0), np.radians(85.0))
-"""Angle between view and normal at which returns begin to be lost, and at which all are lost (our choice)."""
+"""Lateral noise has the standard deviation LATERAL_FLOOR + LATERAL_GROWTH theta / (pi/2 - theta), in pixels of an image that is
+REFERENCE_WIDTH wide, where theta is the angle between the view and the surface's normal (Nguyen et al., eq. 1)."""
 
 REFERENCE_WIDTH = 640
+"""Width in pixels of the images that the lateral noise was measured on."""
+
+QUANTUM = 2.85e-3
+"""Depth z is measured in steps of QUANTUM z^2, metres (Khoshelham and Elberink, section 4.2: 2.85e-5 in centimetres): 46 mm at
+4 m."""
+
+DROP_OUT = (np.radians(65.0), np.radians(85.0))
+"""Angles between the view and the surface's normal, radians: at the first one returns begin to be lost, from the second one on
+all are lost. Between them the share of lost returns rises linearly. Chosen constants."""
+
+SIGMA_FROM_MAD = 1.4826
+"""Standard deviation of a normal distribution divided by its median absolute deviation. Estimates of noise use the median,
+which a few outliers do not change."""
 
 
 def normals_from_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """Unit normals [H,W,3], world, towards the camera, from differences over 2 pixels; zero where depth is missing."""
+    """Unit normals [H,W,3] of the surface in a depth image [H,W], in the world, turned towards the camera.
+
+    They are computed from the differences between the right and left, and the lower and upper neighbours of a pixel. A pixel
+    that lacks depth or one of these neighbours has the normal zero.
+    """
     points = camera.unproject(depth)
     padded = np.pad(points, ((1, 1), (1, 1), (0, 0)), mode="edge")
     valid = np.pad(depth > 0, 1)
@@ -43,11 +60,12 @@ def normals_from_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def noisy_depth(depth: np.ndarray, camera: Camera, rng: np.random.Generator, scale: float = 1.0) -> np.ndarray:
-    """What the sensor measures for a true z-depth [H,W], metres (0 = no return).
+    """What the sensor measures [H,W] where the true depth image is `depth` [H,W]; metres, 0 = no return.
 
-    scale multiplies every standard deviation and the quantisation step, and narrows the drop-out ramp towards 90 degrees;
-    0 returns the true depth. Order: lateral shift, axial noise, quantisation, drop-outs. Silhouettes and
-    the rim of the image, which have no normal, count as grazing.
+    In this order: each pixel shows the depth of a pixel nearby (lateral noise), axial noise is added, the depth is rounded to
+    its steps, and returns are lost. Silhouettes and the rim of the image, which have no normal, count as grazing surfaces.
+    scale: factor on every standard deviation and on the steps. Below 1 it also moves both angles of DROP_OUT towards 90
+    degrees; at 0 the true depth is returned.
     """
     if scale <= 0:
         return depth.copy()
@@ -56,7 +74,7 @@ def noisy_depth(depth: np.ndarray, camera: Camera, rng: np.random.Generator, sca
     view = camera.position - camera.unproject(depth)
     cosine = np.einsum("hwk,hwk->hw", normals, view) / np.maximum(np.linalg.norm(view, axis=-1), 1e-9)
     angle = np.arccos(np.clip(cosine, 0, 1))
-    finite = np.minimum(angle, np.radians(85.0))
+    finite = np.minimum(angle, np.radians(85.0))  # at 90 degrees the lateral noise would be infinite
     lateral = scale * (LATERAL_FLOOR + LATERAL_GROWTH * finite / (np.pi / 2 - finite)) * w / REFERENCE_WIDTH
     rows, columns = np.mgrid[:h, :w]
     rows = np.clip(np.round(rows + lateral * rng.standard_normal((h, w))), 0, h - 1).astype(int)
@@ -72,19 +90,22 @@ def noisy_depth(depth: np.ndarray, camera: Camera, rng: np.random.Generator, sca
 
 
 def depth_noise(depth: np.ndarray) -> float:
-    """Standard deviation of a depth image [H,W] from its second differences (robust; a smooth surface contributes little).
+    """Estimate the standard deviation of the noise in a depth image [H,W], metres.
 
-    Metres; 0 where fewer than a hundred pixels have neighbours.
+    It is measured on the second differences of neighbours within a row, to which a smooth surface contributes little. 0 if
+    fewer than a hundred pixels have both neighbours.
     """
     whole = (depth[:, :-2] > 0) & (depth[:, 1:-1] > 0) & (depth[:, 2:] > 0)
     second = (depth[:, :-2] - 2 * depth[:, 1:-1] + depth[:, 2:])[whole]
-    return 1.4826 * float(np.median(np.abs(second))) / np.sqrt(6) if len(second) >= 100 else 0.0
+    # The second difference of independent noise has 1 + 4 + 1 = 6 times its variance.
+    return SIGMA_FROM_MAD * float(np.median(np.abs(second))) / np.sqrt(6) if len(second) >= 100 else 0.0
 
 
 def filter_depth(depth: np.ndarray, sigma: float) -> np.ndarray:
-    """Bilateral filter (Tomasi and Manduchi 1998, OpenCV; the first step of KinectFusion) over 7x7 pixels.
+    """Smooth a depth image [H,W], metres, by a bilateral filter over 7x7 pixels: noise is averaged, edges stay sharp.
 
-    depth [H,W] metres, 0 = no return and stays so; sigma: its noise, metres; 0 returns it as it is.
+    Pixels without return stay so. sigma: standard deviation of the noise, metres; at 0 the image is returned as it is.
+    Source: Tomasi and Manduchi 1998, by OpenCV; the first step of KinectFusion (Newcombe et al. 2011).
     """
     import cv2
 

@@ -1,4 +1,4 @@
-"""One picture of the survey: trajectories from above, error per frame, depth before and after the sensor, fused cloud."""
+"""The picture of a survey, survey.png: trajectories from above, position error of each frame, depth error, fused cloud."""
 
 from __future__ import annotations
 
@@ -9,20 +9,18 @@ import numpy as np
 
 from mgs.data.dataset import Dataset
 from mgs.plotting import STYLE, new_figure, save_figure
+from mgs.survey.flight import STAGES, Survey
 from mgs.survey.fusion import Cloud
-from mgs.survey.registration import Survey
 
 COLOURS = {"odometry": "#d1495b", "registered": "#edae49", "optimised": "#00798c"}
-
-LABELS = {
-    "odometry": "odometry alone",
-    "registered": "registered, before loop closure",
-    "optimised": "after loop closure",
-}
+"""Colour of each of the STAGES."""
 
 
 def draw_survey(path: str | Path, dataset: Dataset, survey: Survey, cloud: Cloud, numbers: dict[str, Any]) -> None:
-    """Write the figure as a PNG, atomically."""
+    """Write the picture of a survey of this dataset as a PNG; the file appears complete.
+
+    cloud: fused from the survey; numbers: from `mgs.survey.flight.survey_numbers`. Raises InputError if it cannot be written.
+    """
     import matplotlib
 
     around = survey.truth[:, :3, 3].mean(0)
@@ -42,9 +40,10 @@ def draw_survey(path: str | Path, dataset: Dataset, survey: Survey, cloud: Cloud
 
 
 def _trajectories(axis, survey: Survey) -> None:
+    """The true flight and its estimates from above, and the frames that closed loops."""
     axis.plot(*survey.truth[:, :2, 3].T, color="0.6", lw=5, label="truth", solid_capstyle="round")
     for name, colour in COLOURS.items():
-        axis.plot(*getattr(survey, name)[:, :2, 3].T, ".-", color=colour, lw=1.2, ms=4, label=LABELS[name])
+        axis.plot(*getattr(survey, name)[:, :2, 3].T, ".-", color=colour, lw=1.2, ms=4, label=STAGES[name])
     for k, loop in enumerate(survey.loops):
         ends = survey.optimised[[loop.i, loop.j], :2, 3]
         axis.plot(*ends.T, color="k", lw=1.5, label="loop closures" if k == 0 else None)
@@ -54,6 +53,7 @@ def _trajectories(axis, survey: Survey) -> None:
 
 
 def _errors(axis, survey: Survey, numbers: dict[str, Any]) -> None:
+    """Position error of every frame but the first, whose pose is known, on a logarithmic axis."""
     for name, colour in COLOURS.items():
         offset = np.linalg.norm(getattr(survey, name)[:, :3, 3] - survey.truth[:, :3, 3], axis=1)
         rms = numbers["error"][name]["ate_rms"]
@@ -61,7 +61,7 @@ def _errors(axis, survey: Survey, numbers: dict[str, Any]) -> None:
             np.arange(1, len(offset)),
             1e3 * np.maximum(offset[1:], 1e-4),
             color=colour,
-            label=f"{LABELS[name]}: rms {1e3 * rms:.0f} mm",
+            label=f"{STAGES[name]}: rms {1e3 * rms:.0f} mm",
         )
     axis.set(title="position error against truth", xlabel="frame", ylabel="mm")
     axis.margins(y=0.25)
@@ -69,6 +69,7 @@ def _errors(axis, survey: Survey, numbers: dict[str, Any]) -> None:
 
 
 def _depth_error(axis, dataset: Dataset, survey: Survey, numbers: dict[str, Any]) -> None:
+    """Measured minus true depth of the first frame, as an image."""
     measured, true = survey.depths[0], dataset.frames[0].depth()
     error = np.where((measured > 0) & (true > 0), 1e3 * (measured - true), np.nan)
     limit = max(3e3 * numbers["depth_error_on_rock"], 1.0)

@@ -1,4 +1,4 @@
-"""RGB-D frames -> one world cloud, averaged on a grid."""
+"""Depth images -> one cloud of points in the world, averaged on a grid; and what the cameras of a dataset look at."""
 
 from __future__ import annotations
 
@@ -15,25 +15,33 @@ from mgs.data.dataset import Frame
 from mgs.errors import InputError
 from mgs.survey.depth_sensor import depth_noise, filter_depth
 
-MAX_PIXELS = 6_000_000
-"""Pixels that enter the cloud; more are thinned by a stride (100 frames at 640x480 still see each voxel ten times)."""
+MAX_FUSED_PIXELS = 6_000_000
+"""About how many pixels are fused at most. If there are more, only every second, third ... row and column of each image is
+used. Of 100 frames of 640x480, each voxel is then still seen ten times."""
 
 EDGE_JUMP = 0.05
-"""A pixel whose 3x3 neighbourhood spans more than this share of its depth is a silhouette or a grazing view: its depth mixes
-surfaces, so it is left out."""
+"""Largest difference between the depths in the neighbourhood of a pixel, as a share of the pixel's own depth. Pixels beyond it
+are left out: they lie on a silhouette, where a depth may be a mixture of two surfaces, or the camera sees the surface at a
+grazing angle."""
 
 REACH = 1.0
-"""The cloud ends this many camera distances from the focus: far ground is not the ground under the rock."""
+"""Radius of the cloud around the focus, as a multiple of the cameras' distance from it. Points farther away are left out,
+because the ground there says nothing of the ground under the rock."""
 
 FILTERED_SHARE = 0.5
-"""Noise left by the bilateral filter, as a share of what entered, with a margin (measured: 0.27)."""
+"""Noise that the bilateral filter leaves, as a share of the noise before. It was measured to be 0.27; this leaves a margin."""
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """A fused cloud: points [N,3] world, metres; views [N,3] unit, mean direction from each point to the cameras that saw it;
-    voxel: edge of the fusion grid, metres, so also the distance of neighbouring points; noise: standard deviation of the
-    depths before they were filtered and averaged, metres; pixels: how many depths were fused."""
+    """A fused cloud of N points.
+
+    points: [N,3] in the world, metres.
+    views: [N,3] unit vectors, the mean direction from each point to the cameras that saw it.
+    voxel: edge of a cell of the grid on which points were averaged, metres: about the distance between neighbouring points.
+    noise: standard deviation of the measured depths, before they were filtered and averaged, metres.
+    pixels: how many depths were fused.
+    """
 
     points: np.ndarray
     views: np.ndarray
@@ -44,14 +52,15 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Focus:
-    """What the cameras look at: point [3] world, metres; distance: of the median camera from it, metres."""
+    """What the cameras look at. point: [3] in the world, metres; distance: the median of the cameras' distances from it,
+    metres."""
 
     point: np.ndarray
     distance: float
 
 
 def focus(frames: Sequence[Frame]) -> Focus:
-    """The point nearest to all optical axes (least squares), and how far the cameras are from it."""
+    """The point nearest to the optical axes of all cameras, in the least-squares sense, and how far the cameras are from it."""
     A, b = np.zeros((3, 3)), np.zeros(3)
     for frame in frames:
         axis = frame.camera.world_to_camera[2, :3]
@@ -62,28 +71,32 @@ def focus(frames: Sequence[Frame]) -> Focus:
 
 
 def usable_depth(depth: np.ndarray, size: int = 3) -> np.ndarray:
-    """Depth [H,W] with silhouettes and grazing pixels set to 0 (see EDGE_JUMP); size: edge of the neighbourhood, pixels.
+    """A depth image [H,W], metres, with pixels on silhouettes and at grazing angles set to 0 (see EDGE_JUMP).
 
-    A neighbour without return counts as a silhouette: returns are lost where the view grazes, and what is left there is the
-    worst (with such pixels kept, a survey's registration drifted twice as far).
+    size: width and height of the neighbourhood that is looked at, pixels. A pixel with a neighbour that has no return is set to
+    0 too: returns are lost at grazing angles, and those that are left there are the worst. With such pixels kept, the
+    registration of a survey drifted twice as far.
     """
     jump = maximum_filter(depth, size) - minimum_filter(depth, size)
     return np.where(jump <= EDGE_JUMP * depth, depth, 0.0)
 
 
 def fuse_frames(frames: Sequence[Frame]) -> Cloud:
-    """Fuse RGB-D frames into one world cloud, averaged on a grid of one pixel footprint, or coarser where the depth is noisy.
+    """Fuse the depth images of frames into one cloud.
 
-    Noisy depth images (see `depth_noise`) pass the bilateral filter first.
-    Raises InputError where frames have no depth, or no pixel has a return.
+    The points of all images are averaged on a grid, whose cells are as large as a pixel appears on the rock, or larger if the
+    depths are noisy. If the noise (`depth_noise`) is more than a quarter of a cell, the images are smoothed first by
+    `filter_depth`.
+    Raises InputError if a frame has no depth image or cannot be read, or no depth can be used.
     """
     depths = [frame.depth() for frame in frames]
     returns = [depth[depth > 0] for depth in depths]
     total = sum(map(len, returns))
     if total == 0:
         raise InputError("cloud: no depth image has a return (all pixels are 0); check the depth files or their unit (metres)")
-    stride = max(1, int(np.ceil(np.sqrt(total / MAX_PIXELS))))
-    # The lower quartile of depth: the rock stands in front of the ground that fills most of a frame.
+    stride = max(1, int(np.ceil(np.sqrt(total / MAX_FUSED_PIXELS))))
+    # The lower quartile of the depths is about that of the rock, which stands in front of the ground that fills most of a
+    # frame.
     near = [np.quantile(z, 0.25) / frame.camera.K[0, 0] for frame, z in zip(frames, returns, strict=True) if len(z)]
     noise = float(np.median([depth_noise(depth) for depth in depths]))
     voxel = max(float(np.median(near)), FILTERED_SHARE * noise)
@@ -99,7 +112,7 @@ def fuse_frames(frames: Sequence[Frame]) -> Cloud:
         view = frame.camera.position - p
         points.append(p)
         views.append(view / np.linalg.norm(view, axis=1, keepdims=True))
-    p, index = _voxel_means(np.concatenate(points), voxel)
+    p, index = voxel_means(np.concatenate(points), voxel)
     if len(p) == 0:
         raise InputError("cloud: no usable depth near what the cameras look at; check the depth files and poses")
     view = _group_means(np.concatenate(views), index, len(p))
@@ -108,7 +121,11 @@ def fuse_frames(frames: Sequence[Frame]) -> Cloud:
 
 
 def sparse_cloud(path: Path) -> Cloud:
-    """The cloud of an import's sparse.ply (x y z, nx ny nz direction to the cameras). Raises InputError if damaged."""
+    """The cloud in a file sparse.ply, which `mgs import` makes of COLMAP's triangulated points.
+
+    Its properties are x y z in the world, and nx ny nz, the direction to the cameras that saw the point. Raises InputError if
+    the file is damaged, holds NaN or has fewer than two points.
+    """
     try:
         data = PlyData.read(str(path))["vertex"].data
         columns = np.stack([np.asarray(data[name], np.float64) for name in ("x", "y", "z", "nx", "ny", "nz")], 1)
@@ -116,19 +133,22 @@ def sparse_cloud(path: Path) -> Cloud:
         raise InputError(f"{path}: not a readable cloud ({error}); import the data again") from None
     if len(columns) < 2 or not np.isfinite(columns).all():
         raise InputError(f"{path}: has NaN values, or fewer than two points; import the data again")
-    # Randomly scattered points are half as far from their nearest neighbour as a grid of the same density.
+    # The nearest neighbour of a point in a random cloud is half as far away as in a regular grid of the same density.
     spacing = 2 * float(np.median(cKDTree(columns[:, :3]).query(columns[:, :3], 2)[0][:, 1]))
     return Cloud(columns[:, :3], columns[:, 3:], spacing, 0.0, len(columns))
 
 
 def _group_means(values: np.ndarray, index: np.ndarray, groups: int) -> np.ndarray:
-    """Mean of values [N,3] by group index [N] -> [groups,3]."""
+    """Means [groups,3] of values [N,3] over the groups that `index` [N] assigns them to, 0 to groups - 1."""
     count = np.bincount(index, minlength=groups)
     return np.stack([np.bincount(index, values[:, k], groups) for k in range(3)], 1) / count[:, None]
 
 
-def _voxel_means(points: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean point of each occupied voxel [M,3], and the voxel of each point [N]."""
+def voxel_means(points: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
+    """Average points [N,3] on a grid with cells of edge `voxel`, metres.
+
+    Returns the mean point of each cell that has points [M,3], and for each point the index of its cell among these [N].
+    """
     if len(points) == 0:
         return points, np.zeros(0, int)
     cells = np.floor((points - points.min(0)) / voxel).astype(np.int64)

@@ -116,7 +116,7 @@ class Sensor(_Strict):
     noise: Annotated[float, Field(ge=0)] = 1.0
     """Factor on the depth camera's noise (`mgs.survey.depth_sensor`)."""
     drift: Annotated[float, Field(ge=0)] = 1.0
-    """Factor on the odometry's drift (`mgs.survey.registration`)."""
+    """Factor on the odometry's drift (`mgs.survey.odometry`)."""
 
 
 class SceneFile(_Strict):

@@ -16,6 +16,7 @@ from mgs.splat import ListCache, as_drjit, blocks, fisher, kernels, reference, r
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, TILE, build, depth_order, inflate, outgrown
 from mgs.splat.projection import camera_array, project
 from mgs.splat.rendering import MARGIN
+from mgs.splat.walking import PIXELS, packet_count
 
 from .scenes import PARAMETERS, changed, make_camera, make_gaussians, place
 
@@ -28,7 +29,7 @@ def projected(gaussians, camera):
 
 def lists_of(gaussians, camera, margin=MARGIN):
     splats = projected(gaussians, camera)
-    return build(splats, depth_order(splats.z), camera.width, camera.height, margin), splats
+    return build(splats, depth_order(splats.depth), camera.width, camera.height, margin), splats
 
 
 def pairs_of(lists) -> set[tuple[int, int]]:
@@ -65,7 +66,7 @@ def test_lists_are_in_depth_order_and_slots_of_a_splat_contiguous():
     splat, slot, start, end = (np.asarray(a) for a in (lists.splat, lists.slot, lists.start, lists.end))
     by_place = np.argsort(np.asarray(lists.place))
     assert sorted(by_place) == list(range(60)), "every splat has a place of its own"
-    z, used = np.asarray(splats.z)[by_place], int((end - start).sum())
+    z, used = np.asarray(splats.depth)[by_place], int((end - start).sum())
     for s, e in zip(start, end, strict=True):
         assert (np.diff(z[splat[s:e]]) >= 0).all()
     assert sorted(slot[:used]) == list(range(used))
@@ -75,11 +76,13 @@ def test_lists_are_in_depth_order_and_slots_of_a_splat_contiguous():
 
 
 def test_memory_and_lanes_go_by_tile():
-    """Splats lie by the tile of their centre, then block, then depth; lanes go by tile, in it the longest list first."""
+    """Splats are stored by the tile of their centre, then block, then depth; lanes go by tile, longest list first in each."""
     camera, g = make_camera((300, 200), focal=300.0), make_gaussians(500, 9, log_scales=(-5.0, -3.0))
     lists, splats = lists_of(g, camera)
     across = -(-camera.width // BLOCK_X)
-    u, v, z = (np.asarray(a, np.float64)[np.argsort(np.asarray(lists.place))] for a in (splats.u, splats.v, splats.z))
+    u, v, z = (
+        np.asarray(a, np.float64)[np.argsort(np.asarray(lists.place))] for a in (splats.mean_x, splats.mean_y, splats.depth)
+    )
     bx, by = np.clip(u // BLOCK_X, 0, across - 1), np.clip(v // BLOCK_Y, 0, camera.height // BLOCK_Y - 1)
     tile = by // TILE * -(-across // TILE) + bx // TILE
     assert len(set(tile)) > 4
@@ -104,10 +107,11 @@ def test_a_new_camera_compiles_nothing():
 
 
 def test_kernels_are_recorded_once_whether_lists_are_new_kept_or_rebuilt(monkeypatch):
-    """A recording also fixes which of its inputs are the same array, as the splats and the footprints of new lists may be."""
+    """A recording also depends on which of its inputs are one and the same array, as the splats and the footprints of new lists
+    may be, and those of kept lists are not. No kernel must be recorded twice for that."""
     camera, g, cache, recorded = make_camera((46, 31)), make_gaussians(37, 3), ListCache(), []
-    walk = kernels._walk
-    monkeypatch.setattr(kernels, "_walk", lambda *arguments: recorded.append(1) or walk(*arguments))
+    walk = kernels.walk
+    monkeypatch.setattr(kernels, "walk", lambda *arguments: recorded.append(1) or walk(*arguments))
     for growth, builds in ((0, 1), (0, 1), (0.05, 2), (0.05, 2), (0.4, 3)):
         drawn = as_drjit(changed(g, log_scales=g.log_scales + np.float32(growth)))
         dr.enable_grad(drawn.log_scales)
@@ -139,14 +143,14 @@ def test_not_outgrown_means_inside():
     )
     old, new = inflate(projected(base, camera), MARGIN), projected(moved, camera)
     stale = np.asarray(outgrown(old, new))
-    drawn = np.asarray(inflate(new, 0).q) > 0
+    drawn = np.asarray(inflate(new, 0).level) > 0
     assert 0.2 < stale[drawn].mean() < 0.8
-    k, p, e, q = (np.asarray(a, np.float64)[None] for a in (new.k, new.p, new.e, new.log2_opacity))
+    k, p, e, q = (np.asarray(a, np.float64)[None] for a in (new.shear, new.white_x, new.white_y, new.log2_opacity))
     angle = np.linspace(0, 2 * np.pi, 64)[:, None]
     rim = np.sqrt(np.maximum(q + np.log2(255), 0))
     y = rim * np.sin(angle) / e
     x = rim * np.cos(angle) / p + k * y
-    k, p, e, q = (np.asarray(a, np.float64)[None] for a in (old.k, old.p, old.e, old.q))
+    k, p, e, q = (np.asarray(a, np.float64)[None] for a in (old.shear, old.white_x, old.white_y, old.level))
     inside = ((p * (x - k * y)) ** 2 + (e * y) ** 2 <= q).all(0)
     assert inside[drawn & ~stale].all()
     assert (inside & stale & drawn).mean() < 0.25, "rebuilds for nothing"
@@ -317,13 +321,13 @@ def test_a_view_has_a_bounded_number_of_pairs(monkeypatch):
 def test_places_in_buffers_stay_below_31_bits():
     """Of the most pairs, the most Gaussians and the largest images."""
     most = max(kernels.ADJOINT_SUMS[True], kernels.FISHER_SUMS[True])
-    assert blocks._rounded(blocks.MAX_PAIRS) * 4 * kernels._packets(most) < 1 << 31
-    assert MAX_GAUSSIANS * max(3 * 16, 4 * kernels._packets(most)) < 1 << 31
+    assert blocks._room(blocks.MAX_PAIRS) * 4 * packet_count(most) < 1 << 31
+    assert MAX_GAUSSIANS * max(3 * 16, 4 * packet_count(most)) < 1 << 31
     for width in (1, 9, MAX_PIXELS // MAX_SIDE, 12_345, MAX_SIDE):
         height = min(MAX_SIDE, MAX_PIXELS // width)
         blocks_x, blocks_y = -(-width // BLOCK_X), -(-height // BLOCK_Y)
-        assert blocks_x * blocks_y * kernels.PIXELS * 4 < 1 << 31
-        assert blocks._numbers(blocks_x, blocks_y) < 1 << 31
+        assert blocks_x * blocks_y * PIXELS * 4 < 1 << 31
+        assert blocks._tile_numbers(blocks_x, blocks_y) < 1 << 31
 
 
 def test_what_is_too_large_for_the_kernels_is_refused_at_once():
@@ -344,7 +348,7 @@ def test_what_is_too_large_for_the_kernels_is_refused_at_once():
 
 @pytest.mark.parametrize("tile", [1, 3, 1000])
 def test_the_size_of_tiles_changes_no_bit(tile, monkeypatch):
-    """Tiles are an order of memory and of work: images, gradients and Fisher information know nothing of them."""
+    """Tiles decide in which order splats are stored and blocks drawn: no image, gradient or information may depend on them."""
     camera, g = make_camera((150, 70), focal=150.0), make_gaussians(80, 7, log_scales=(-5.0, -1.5))
 
     def everything():

@@ -112,7 +112,7 @@ import mitsuba as mi
 from mgs.splat import kernels, render
 from splat.scenes import make_camera, make_gaussians
 
-scenes, walk = [mi.load_dict({"type": "scene", "ball": {"type": "sphere"}})], kernels._walk
+scenes, walk = [mi.load_dict({"type": "scene", "ball": {"type": "sphere"}})], kernels.walk
 
 def littering(*arguments):
     cycle = [scenes.pop()]
@@ -122,7 +122,7 @@ def littering(*arguments):
     return walk(*arguments)
 
 gc.set_threshold(10)
-kernels._walk = littering
+kernels.walk = littering
 render(make_gaussians(20, 0), make_camera())
 print("drawn")
 """
@@ -143,7 +143,7 @@ import numpy as np
 from mgs.splat import fisher, kernels, render
 from splat.scenes import make_camera, make_gaussians
 
-collecting, walk = [], kernels._walk
+collecting, walk = [], kernels.walk
 
 def watched(*arguments):
     result = walk(*arguments)
@@ -155,7 +155,7 @@ def draw(i):
     gaussians, camera = make_gaussians(20 + 9 * i, i), make_camera((40 + i, 30))
     return np.asarray(render(gaussians, camera).rgb).tobytes() + fisher(gaussians, camera).tobytes()
 
-kernels._walk = watched
+kernels.walk = watched
 with ThreadPoolExecutor(4) as pool:
     at_once = list(pool.map(draw, range(8)))
 assert len(collecting) == 24 and not any(collecting), collecting

@@ -61,7 +61,8 @@ def test_exact_and_block_against_brute_force(degree):
 
 
 def test_recorded_kernels_know_numbers_of_gaussians_from_other_numbers():
-    """One kernel after the other for N = 8, 10, 7, 22 and 32: numbers that also stand in the kernels, for other things."""
+    """Scenes of 8, 10, 7, 22, 32 and 4 Gaussians in turn. The kernels contain these numbers for other reasons (sums, pixels),
+    and a recording once took one for the other."""
     camera = make_camera()
     for n in (8, 10, 7, 22, 32, 4):
         g = calm(lambda seed, n=n: make_gaussians(n, seed, log_scales=(-4.0, -1.0)), camera, n)
@@ -78,14 +79,14 @@ def test_recorded_kernels_know_numbers_of_gaussians_from_other_numbers():
 
 @pytest.mark.parametrize("degree", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_blocks_of_one_gaussian(degree):
-    """Its kernels are the hardest on the compiler, all places are constants: 20 s for degree 3."""
+    """With one Gaussian all addresses are constants, which is hardest on the compiler: it takes 20 s for degree 3."""
     camera = make_camera()
     g = calm(lambda seed: make_gaussians(1, seed, degree, spread=0.1, log_scales=(-2, -1), logits=(1, 2)), camera, 3)
     assert_close(fisher(g, camera, "block", BACKGROUND), reference.fisher_block(g, camera, BACKGROUND), f"one, degree {degree}")
 
 
 def test_images_of_several_tiles():
-    """Splats and lanes go by tiles of 128x64 pixels; across their borders everything is as within."""
+    """Memory and lanes are ordered by tiles of 128x64 pixels; this image has four, and borders between them must not matter."""
     camera = make_camera((150, 70), focal=150.0)
     g = calm(lambda seed: make_gaussians(30, seed, log_scales=(-4.0, -1.0)), camera, 3)
     expected = reference.fisher_block(g, camera, BACKGROUND)

@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mgs.splat.kernels import exp2
+from mgs.splat.walking import exp2
 
 
 @pytest.mark.parametrize(("real", "bound"), [("Float", 1e-7), ("Float64", 3e-9)])

@@ -1,4 +1,4 @@
-"""Lists are padded to round sizes; both ends of the range of padding once crashed."""
+"""Lists are padded with zeros to a round length; an empty list, and one that needs no padding, once crashed."""
 
 import drjit as dr
 import mitsuba as mi

@@ -1,0 +1,258 @@
+"""What all kernels share: how one SIMD lane draws the splats of its block of pixels, and how sums reach the splats.
+
+The image is cut into blocks of BLOCK_X x BLOCK_Y pixels. Each block has one lane of a SIMD register to itself; it reads the
+block's list of splats front to back and draws every one on all pixels of the block. A splat is so read once for 32 pixels,
+and their contributions to it are added up before they are stored once: on a CPU splatting spends its time on reads and writes
+at scattered addresses, not on arithmetic.
+
+The Python loops over a block's pixels run while Dr.Jit traces the kernel, so they become straight code; no Python runs over
+Gaussians or over the image. Symbols are those of docs/notation.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mgs.splat.blocks import BLOCK_X, BLOCK_Y, BlockLists
+from mgs.splat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from mgs.splat.projection import Splats
+
+PIXELS = BLOCK_X * BLOCK_Y
+"""Pixels of a block."""
+
+DENORMAL = 1e-24
+"""Sums smaller than this become 0: threads differ in how they flush denormals, and nothing else would differ between reruns.
+It lies so far above the smallest normal float (1e-38) that a denormal product can change no sum that is kept."""
+
+
+def without_denormals(x: Any) -> Any:
+    """x, or 0 where its size is at most DENORMAL."""
+    return dr.select(dr.abs(x) > DENORMAL, x, 0)
+
+
+def recorded_sizes(lists: BlockLists, *others: Any) -> tuple[int, ...]:
+    """What a recorded kernel holds as constants (see `frozen`): the lengths of its lists, and its arguments that are flags."""
+    return len(lists.splat), len(lists.slot_start), len(lists.block), *(x for x in others if isinstance(x, bool))
+
+
+def pack(s: Splats, place: Any) -> Any:
+    """The numbers of each splat side by side in memory, at the splat's `place` (UInt32 [N], see `BlockLists.place`).
+
+    The splats must be detached. Splats from `project` become Float [16 N], so one splat fills one cache line:
+    (mean_x, mean_y, shear, white_x), (white_y, log2_opacity, depth, mean_x_rest), (red, green, blue, mean_y_rest),
+    (shear_rest, 0, 0, 0). Splats from `project64` become Float64 [12 N], the same without the rests.
+    """
+    parts = [[s.mean_x, s.mean_y, s.shear, s.white_x]]
+    if s.mean_x_rest is None:
+        parts += [[s.white_y, s.log2_opacity, s.depth, 0], [*s.colour, 0]]
+    else:
+        parts += [[s.white_y, s.log2_opacity, s.depth, s.mean_x_rest], [*s.colour, s.mean_y_rest], [s.shear_rest, 0, 0, 0]]
+    return pack_parts(parts, place)
+
+
+def pack_parts(parts: list[list[Any]], place: Any) -> Any:
+    """Write lists of four arrays [N] each to one evaluated array: the numbers at `place` lie side by side, part after part."""
+    real, vector = (mi.Float, mi.Vector4f) if type(parts[0][0]) is mi.Float else (mi.Float64, mi.Vector4d)
+    packed = dr.empty(real, 4 * len(parts) * len(place))
+    for i, part in enumerate(parts):
+        dr.scatter(packed, vector(*part), place * len(parts) + i, mode=dr.ReduceMode.NoConflicts)
+    dr.eval(packed)
+    return packed
+
+
+def unpack(packed: Any, place: Any) -> Splats:
+    """The splats that `pack` put at the places (UInt32). mean_x, mean_y, shear are Float64, rests added; others as packed."""
+    if type(packed) is mi.Float64:
+        (mean_x, mean_y, shear, white_x), (white_y, log2_opacity, depth, _), (*colour, _) = (
+            dr.gather(mi.Vector4d, packed, place * 3 + i) for i in range(3)
+        )
+    else:
+        (mean_x, mean_y, shear, white_x), (white_y, log2_opacity, depth, x_rest), (*colour, y_rest), (shear_rest, *_) = (
+            dr.gather(mi.Vector4f, packed, place * 4 + i) for i in range(4)
+        )
+        mean_x, mean_y = mi.Float64(mean_x) + mi.Float64(x_rest), mi.Float64(mean_y) + mi.Float64(y_rest)
+        shear = mi.Float64(shear) + mi.Float64(shear_rest)
+    return Splats(mean_x, mean_y, shear, white_x, white_y, log2_opacity, depth, *colour)
+
+
+@dataclass
+class Lane:
+    """What a lane works on. left, top: centre of its block's first pixel, px, Float [L]; start, end: UInt32 [L], the range of
+    its pairs in `BlockLists.splat`."""
+
+    left: Any
+    top: Any
+    start: Any
+    end: Any
+
+
+def lanes(lists: BlockLists) -> tuple[Lane, list[Any]]:
+    """The lanes, and the transmittance with which each of their 32 pixels starts: 1, or 0 (finished) outside the image."""
+    x, y = (lists.block % lists.blocks_x) * BLOCK_X, (lists.block // lists.blocks_x) * BLOCK_Y
+    T = [
+        dr.select((x + i < lists.width) & (y + j < lists.height), mi.Float(1), mi.Float(0))
+        for j in range(BLOCK_Y)
+        for i in range(BLOCK_X)
+    ]
+    return Lane(mi.Float(x) + 0.5, mi.Float(y) + 0.5, lists.start, lists.end), T
+
+
+@dataclass
+class Row:
+    """One row of a block's pixels under one splat. eta of the row; xi and raw_alpha, before any threshold, of each pixel."""
+
+    eta: Any
+    xi: list[Any]
+    raw_alpha: list[Any]
+
+
+EXP2 = (1.0, 0.69314720574, 0.24022646891, 0.05550328776, 0.00961848896, 0.00133999314, 0.00015345812)
+"""Coefficients of a polynomial for 2^x on [-1/2, 1/2], x^0 first; relative error 3e-9, and 0 at x = 0 (Remez exchange)."""
+
+
+def exp2(x: Any) -> Any:
+    """2^x of a Float or Float64 up to 120, and 2^-120 for every x below -120. Relative error 3e-9, of a Float 8e-8.
+
+    It takes half the instructions of dr.exp2, which also handles infinity and zero. Nothing here needs these: an alpha of
+    2^-120 is not drawn, and nor is a smaller one.
+    """
+    integer, bits = (mi.Int64, 52) if type(x) is mi.Float64 else (mi.Int32, 23)
+    x = dr.select(x > -120, x, -120)
+    whole = dr.round(x)
+    part = x - whole
+    value = type(x)(EXP2[-1])
+    for coefficient in EXP2[-2::-1]:
+        value = dr.fma(value, part, coefficient)
+    return dr.reinterpret_array(type(x), dr.reinterpret_array(integer, value) + (integer(whole) << bits))
+
+
+CENTRE = BLOCK_X // 2
+"""Column of a block at which `block_rows` computes alpha with `exp2`; it goes on from there to both sides."""
+
+
+def block_rows(lane: Lane, s: Splats) -> list[Row]:
+    """xi, eta and alpha = 2^(log2_opacity - xi^2 - eta^2) of one splat on all pixels of a lane's block.
+
+    Along a row the exponent is quadratic in x. So the ratio of neighbouring alphas changes by a constant factor from pixel to
+    pixel, and alphas follow from one another by multiplication: three exp2 for a row of eight pixels, for rounding errors
+    four times as large.
+
+    Going outwards from the row's centre, nothing underflows that is drawn: EPS2D keeps white_x below 1.6, so where a pixel of
+    the row is drawn, alpha at the centre is at least 2^-100. It can be smaller in blocks that the splat no longer reaches, as
+    it shrank after its lists were built. There `exp2` returns too much, 2^-120, so the ratios are set to 2^-120
+    too, and all alphas of the row stay far below the threshold.
+
+    The offset of the block's first pixel from the splat is computed in double: far along a slanted needle, xi is a small
+    difference of large numbers.
+    """
+    real = type(s.white_x)
+    dx, dy = mi.Float64(lane.left) - s.mean_x, mi.Float64(lane.top) - s.mean_y
+    corner, down = real(mi.Float64(s.white_x) * (dx - s.shear * dy)), real(dy)
+    slant, bend = s.white_x * real(s.shear), exp2(-2 * s.white_x * s.white_x)  # bend: the constant factor of the ratios
+    rows = []
+    for j in range(BLOCK_Y):
+        eta = s.white_y * (down + j)
+        first = dr.fma(-slant, real(j), corner)
+        xi = [dr.fma(s.white_x, real(i), first) for i in range(BLOCK_X)]
+        row = dr.fma(-eta, eta, s.log2_opacity)
+        middle = xi[CENTRE]
+        power = dr.fma(-middle, middle, row)
+        raw = [exp2(power)] * BLOCK_X
+        for columns, sign in ((range(CENTRE + 1, BLOCK_X), -1), (range(CENTRE - 1, -1, -1), 1)):
+            step = s.white_x * dr.fma(real(2 * sign), middle, -s.white_x)
+            ratio = exp2(dr.select(power > -120, step, -120))
+            for i in columns:
+                raw[i] = raw[i + sign] * ratio
+                ratio = ratio * bend
+        rows.append(Row(eta, xi, raw))
+    return rows
+
+
+def blend(raw: Any, T: Any) -> tuple[Any, Any, Any, Any]:
+    """Draw one splat on one pixel. raw: its alpha before thresholds; T: the transmittance in front of it.
+
+    Returns alpha (0 where the splat is not drawn), the weight w = alpha T, the transmittance behind the splat, and the mask of
+    pixels that are not finished. A finished pixel keeps its transmittance with a minus sign: every later splat then leaves
+    less than TRANSMITTANCE_MIN, so none is drawn, and the pixel's alpha is still known.
+
+    Thresholds are comparisons and selects. dr.minimum and dr.maximum must propagate NaN, which takes five instructions.
+    """
+    alpha = dr.select(raw >= ALPHA_MIN, dr.select(raw <= ALPHA_MAX, raw, ALPHA_MAX), 0)
+    after = dr.fma(-alpha, T, T)
+    room = after > TRANSMITTANCE_MIN
+    alpha = dr.select(room, alpha, 0)
+    return alpha, alpha * T, dr.select(room, after, -dr.abs(T)), room
+
+
+def walk(lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], visit: Callable[..., Any]) -> list[list[Any]]:
+    """Go through each lane's list front to back, until it ends or all pixels of the block are finished.
+
+    pixels: what each of the 32 pixels carries along, in lists. visit(pair, splat, rows, pixels) -> (pixels, alive) draws one
+    splat; pair: UInt32, its number in the lists; alive: mask of lanes with a pixel that is not finished. Returns the pixels'
+    state at the end.
+
+    The numbers of one pixel stay together in the list, since the compiler keeps that order: it finishes each pixel before the
+    next one needs registers.
+    """
+
+    def body(i: Any, pixels: Any, alive: Any) -> Any:
+        splat = unpack(packed, dr.gather(mi.UInt32, lists.splat, i))
+        pixels, alive = visit(i, splat, block_rows(lane, splat), pixels)
+        return i + 1, pixels, (i + 1 < lane.end) & alive
+
+    start = mi.UInt32(lane.start)
+    _, pixels, _ = dr.while_loop((start, pixels, start < lane.end), lambda i, pixels, alive: alive, body)
+    return pixels
+
+
+def pair_slots(lists: BlockLists, count: int) -> Any:
+    """Zeros, Float: for every (splat, block) pair room for `count` sums, rounded up to whole packets of four."""
+    return dr.zeros(mi.Float, len(lists.splat) * 4 * packet_count(count))
+
+
+def packet_count(count: int) -> int:
+    """How many packets of four hold `count` numbers."""
+    return -(-count // 4)
+
+
+def store_sums(slots: Any, sums: list[Any], slot: Any) -> None:
+    """Write a pair's sums to its own slot (UInt32). No other lane writes there, so no atomic operations are needed."""
+    padded, packets = sums + [mi.Float(0)] * (-len(sums) % 4), packet_count(len(sums))
+    for i in range(packets):
+        dr.scatter(slots, mi.Vector4f(*padded[4 * i : 4 * i + 4]), slot * packets + i, mode=dr.ReduceMode.NoConflicts)
+
+
+def sums_by_place(lists: BlockLists, slots: Any, count: int, real: Any) -> Any:
+    """Add the slots of each splat, which follow one another, in this order and in double: so reruns are bitwise equal.
+
+    Returns [N * packets * 4] of the type `real` (Float or Float64), by the splats' places in memory.
+    """
+    dr.eval(slots)
+    packets = packet_count(count)
+    lane = dr.arange(mi.UInt32, len(lists.place) * packets)
+    place, packet = lane // packets, lane % packets
+    start, end = (dr.gather(mi.UInt32, a, place) for a in (lists.slot_start, lists.slot_end))
+
+    def body(i: Any, total: Any) -> Any:
+        return i + 1, total + mi.Vector4d(dr.gather(mi.Vector4f, slots, i * packets + packet))
+
+    _, total = dr.while_loop((start, mi.Vector4d(0)), lambda i, total: i < end, body)
+    total = [without_denormals(x) for x in total]
+    return dr.ravel((mi.Vector4f if real is mi.Float else mi.Vector4d)(*total))
+
+
+def sums_by_splat(lists: BlockLists, placed: Any, count: int) -> list[Any]:
+    """The result of `sums_by_place` as `count` arrays [N], in the order of the Gaussians.
+
+    They are evaluated here, because what follows would otherwise wait for these reads at random addresses within one kernel;
+    two kernels take less time.
+    """
+    packets, vector = packet_count(count), mi.Vector4f if type(placed) is mi.Float else mi.Vector4d
+    sums = [x for i in range(packets) for x in dr.gather(vector, placed, lists.place * packets + i)][:count]
+    dr.eval(sums)
+    return sums

@@ -1,0 +1,155 @@
+"""The survey: a flight along the dataset's orbit with a noisy depth camera and drifting odometry.
+
+The measured depth images are registered to each other, which gives a consistent trajectory. The pose of the first frame is
+taken as known; all other poses are estimated. Poses are [4,4] camera-to-world, metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from mgs.data.dataset import Dataset
+from mgs.errors import InputError
+from mgs.seeds import generator
+from mgs.survey.depth_sensor import SIGMA_FROM_MAD, noisy_depth
+from mgs.survey.fusion import focus
+from mgs.survey.odometry import agrees, chain, drifting_odometry
+from mgs.survey.registration import CLOSURE_OVERLAP, GRID, Edge, loop_candidates, optimise, register, registration_cloud
+
+STAGES = {
+    "odometry": "odometry alone",
+    "registered": "registered, before loop closure",
+    "optimised": "after loop closure",
+}
+"""The three estimates of the trajectory that a `Survey` holds, in the order in which they are made: field -> what to call
+it."""
+
+
+@dataclass(frozen=True)
+class SurveySettings:
+    """What a survey is flown with.
+
+    sensor: factor on the noise of the depth camera, 0 measures exact depth; drift: factor on the errors of odometry;
+    exact_poses: no odometry and no registration, the poses are those flown; seed: root of every random draw.
+    Raises InputError if a factor is negative or not finite.
+    """
+
+    sensor: float = 1.0
+    drift: float = 1.0
+    exact_poses: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.sensor < np.inf and 0 <= self.drift < np.inf):
+            raise InputError("survey: --sensor-noise and --drift are factors of 0 or more; correct them")
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a flight of F frames gave.
+
+    truth: [F,4,4] poses as flown. odometry, registered, optimised: [F,4,4] poses as estimated, by the STAGES.
+    depths: F depth images [H,W] as measured, metres, 0 = no return.
+    edges: the F - 1 registrations of consecutive frames. loops: the loop closures that were accepted.
+    """
+
+    truth: np.ndarray
+    odometry: np.ndarray
+    registered: np.ndarray
+    optimised: np.ndarray
+    depths: list[np.ndarray]
+    edges: list[Edge]
+    loops: list[Edge]
+
+
+def fly(dataset: Dataset, settings: SurveySettings, on_stage: Callable[[str, int, int], None] | None = None) -> Survey:
+    """Survey a dataset that has depth images. on_stage(name, done, total) is called as the work goes on.
+
+    Raises InputError if there are fewer than three frames, one has no depth image or too few returns to be registered.
+    """
+    tell = on_stage or (lambda stage, done, total: None)
+    frames = dataset.frames
+    if len(frames) < 3:
+        raise InputError(f"{dataset.root}: {len(frames)} frames are too few for a survey; at least 3 are needed")
+    depths = []
+    for k, frame in enumerate(frames):
+        tell("depth", k, len(frames))
+        depths.append(
+            noisy_depth(frame.depth(), frame.camera, generator(settings.seed, f"survey/{frame.name}"), settings.sensor)
+        )
+    truth = np.stack([frame.camera.camera_to_world for frame in frames])
+    if settings.exact_poses:
+        return Survey(truth, truth, truth, truth, depths, [], [])
+    steps = drifting_odometry(truth, settings.drift, generator(settings.seed, "survey/odometry"))
+    odometry = chain(truth[0], steps)
+    grid = GRID * focus(frames).distance
+    clouds = [registration_cloud(frame, depth, grid) for frame, depth in zip(frames, depths, strict=True)]
+    edges = []
+    for k in range(len(frames) - 1):
+        tell("registration", k, len(frames) - 1)
+        edge = register(clouds, k, k + 1, steps[k], grid, (1.0,))
+        # A result far from odometry's has slid along a smooth surface, or failed.
+        trusted = agrees(edge.relative, steps[k], settings.drift, grid)
+        edges.append(edge if trusted else replace(edge, relative=steps[k], registered=False))
+    registered = chain(truth[0], np.stack([edge.relative for edge in edges]))
+    loops = []
+    candidates = loop_candidates(registered)
+    for k, (i, j) in enumerate(candidates):
+        tell("loop closure", k, len(candidates))
+        edge = register(clouds, i, j, np.linalg.inv(registered[i]) @ registered[j], grid, (4.0, 2.0, 1.0))
+        if edge.overlap >= CLOSURE_OVERLAP:
+            loops.append(edge)
+    optimised = optimise(registered, steps, edges, loops, settings.drift, grid)
+    return Survey(truth, odometry, registered, optimised, depths, edges, loops)
+
+
+def trajectory_error(poses: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    """Absolute trajectory error (Sturm et al. 2012) of poses [F,4,4] against the true ones [F,4,4], which share the first pose.
+
+    ate_rms, ate_max: root mean square and largest distance of the positions, metres; rotation_rms: root mean square angle,
+    degrees; aligned_rms: as ate_rms, after the rigid motion that brings the two trajectories closest (Umeyama 1991).
+    """
+    offset = np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1)
+    turn = np.einsum("fki,fkj->fij", poses[:, :3, :3], truth[:, :3, :3])
+    angle = np.degrees(np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1)))
+    a, b = poses[:, :3, 3] - poses[:, :3, 3].mean(0), truth[:, :3, 3] - truth[:, :3, 3].mean(0)
+    u, _, vt = np.linalg.svd(a.T @ b)
+    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    aligned = np.linalg.norm(a @ rotation - b, axis=1)
+    return {
+        "ate_rms": float(np.sqrt(np.mean(offset**2))),
+        "ate_max": float(offset.max()),
+        "rotation_rms": float(np.sqrt(np.mean(angle**2))),
+        "aligned_rms": float(np.sqrt(np.mean(aligned**2))),
+    }
+
+
+def survey_numbers(dataset: Dataset, survey: Survey, settings: SurveySettings) -> dict[str, Any]:
+    """What survey.json holds of a survey of this dataset, lengths in metres.
+
+    path_length: way flown; depth_error_on_rock: robust standard deviation of the measured depth's error within the rock's
+    masks; returns_lost: share of the pixels with true depth that have no measured one; steps_by_odometry: number of steps where
+    registration failed; registration_overlap: of every step; loops: [i, j, overlap] each; error: `trajectory_error` of each of
+    the STAGES.
+    """
+    error = [
+        (measured - frame.depth())[(measured > 0) & frame.mask()]
+        for frame, measured in zip(dataset.frames, survey.depths, strict=True)
+    ]
+    returns = sum(int((depth > 0).sum()) for depth in survey.depths)
+    possible = sum(int((frame.depth() > 0).sum()) for frame in dataset.frames)
+    return {
+        "frames": len(dataset.frames),
+        "settings": asdict(settings),
+        "path_length": float(np.linalg.norm(np.diff(survey.truth[:, :3, 3], axis=0), axis=1).sum()),
+        "depth_error_on_rock": SIGMA_FROM_MAD * float(np.median(np.abs(np.concatenate(error)))),
+        "returns_lost": 1 - returns / max(possible, 1),
+        "steps_by_odometry": sum(not edge.registered for edge in survey.edges),
+        "registration_overlap": [edge.overlap for edge in survey.edges],
+        "loops": [[edge.i, edge.j, edge.overlap] for edge in survey.loops],
+        "error": {name: trajectory_error(getattr(survey, name), survey.truth) for name in STAGES},
+    }
