@@ -31,6 +31,9 @@ LEARNED = ("sh", "log_scales", "quats", "logit_opacities")
 """Names of the learned parameters, in the order of their columns in the Fisher information. They have 3K (K colour coefficients
 for each of r, g, b), 3, 4 and 1 columns. The means are not learned."""
 
+KINDS = ("colour", "scale", "rotation", "opacity")
+"""What the LEARNED parameters are called in settings and in columns of the information, in the same order."""
+
 
 @dataclass(eq=False)
 class Gaussians:

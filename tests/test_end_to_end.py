@@ -26,7 +26,7 @@ from mgs.cli.app import main
 
 fit, fits = stations.fit, []
 
-def struck(gaussians, cameras, targets, settings, on_pass, cache):
+def struck(gaussians, cameras, targets, settings, on_pass, *rest):
     fits.append(len(cameras))
 
     def blow(done, most):
@@ -34,7 +34,7 @@ def struck(gaussians, cameras, targets, settings, on_pass, cache):
         if len(fits) == 3:
             os.kill(os.getpid(), {blow})
 
-    return fit(gaussians, cameras, targets, settings, blow, cache)
+    return fit(gaussians, cameras, targets, settings, blow, *rest)
 
 stations.fit = struck
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts what runs in the background deaf to it

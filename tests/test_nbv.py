@@ -230,8 +230,8 @@ def test_interrupted_by_the_keyboard_then_resumed(dataset, tmp_path, uninterrupt
     ("broken", "named"), [(0, "the fit to the seeds"), (1, "the fit of step 1 .*step 0 is kept"), (3, "steps 0 to 2 are kept")]
 )
 def test_a_fit_that_diverges_ends_the_run_which_can_go_on(dataset, tmp_path, uninterrupted, broken, named):
-    def fit(gaussians, cameras, *rest):
-        found = tiny.fit(gaussians, cameras, *rest)
+    def fit(gaussians, start, cameras, *rest):
+        found = tiny.fit(gaussians, start, cameras, *rest)
         if len(cameras) < 3 + broken:
             return found
         found.gaussians.sh[:] = np.nan

@@ -75,9 +75,9 @@ def test_a_frame_without_rock_is_refused_before_it_is_fitted_to(dataset, tmp_pat
     blacken(dataset, *frames)
     fits = []
 
-    def fit(gaussians, cameras, *rest):
+    def fit(gaussians, start, cameras, *rest):
         fits.append(len(cameras))
-        return tiny.fit(gaussians, cameras, *rest)
+        return tiny.fit(gaussians, start, cameras, *rest)
 
     loaded = load_dataset(dataset)
     settings = tiny.start(tmp_path / "run", loaded, policy="farthest")

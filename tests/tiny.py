@@ -95,7 +95,7 @@ def fisher(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     return (_facing(gaussians, camera) ** 2 * brightness)[:, None].astype(np.float32) * np.linspace(1, 2, 11, dtype=np.float32)
 
 
-def fit(gaussians: Gaussians, cameras: list[Camera], targets: list[np.ndarray], rate: float, on_pass) -> Fit:
+def fit(gaussians: Gaussians, start: Gaussians, cameras: list[Camera], targets: list[np.ndarray], rate: float, on_pass) -> Fit:
     """Each point's colour moves half way to the mean of its pixels."""
     on_pass(0, 1)
     total, weight = np.zeros((POINTS, 3)), np.full(POINTS, 1e-6)

@@ -53,7 +53,8 @@ class Stations:
     centre: [3] the rock, metres.
     groups: columns of the Fisher information by kind of parameter (`mgs.splat.groups`).
     initial(seed frames) -> Gaussians before any training.
-    fit(gaussians, cameras, targets, rate, on_pass) -> Fit; targets as `mgs.active.fitting.fit`, rate multiplies all rates.
+    fit(gaussians, start, cameras, targets, rate, on_pass) -> Fit; start, the Gaussians before any training, and targets as in
+    `mgs.active.fitting.fit`; rate multiplies all rates.
     fisher(gaussians, camera) -> information of one view [N,P], by the estimator of the run.
     measure(gaussians, taken frame indices) -> entries for steps.jsonl.
     exact(gaussians, camera) -> exact information of one view [N,P], for what the views see of the surface; None: as `fisher`.
@@ -64,7 +65,7 @@ class Stations:
     centre: np.ndarray
     groups: dict[str, slice]
     initial: Callable[[list[Frame]], Gaussians]
-    fit: Callable[[Gaussians, list[Camera], list[np.ndarray], float, Callable[[int, int], None]], Fit]
+    fit: Callable[[Gaussians, Gaussians, list[Camera], list[np.ndarray], float, Callable[[int, int], None]], Fit]
     fisher: Callable[[Gaussians, Camera], np.ndarray]
     measure: Callable[[Gaussians, list[int]], dict[str, float]]
     exact: Callable[[Gaussians, Camera], np.ndarray] | None = None
@@ -220,7 +221,8 @@ class _Loop:
         with watch("fit"):
             targets = [self.images[i] for i in taken]
             rate = self.settings.warm_rate if step else 1.0
-            fit = self.stations.fit(state.gaussians, cameras, targets, rate, partial(self.progress, "fitting"))
+            on_pass = partial(self.progress, "fitting")
+            fit = self.stations.fit(state.gaussians, self.start, cameras, targets, rate, on_pass)
         if fit.stop_reason == StopReason.DIVERGED:
             raise InputError(_diverged(self.out, step, fit.losses))
         with watch("information"):

@@ -23,13 +23,20 @@ from mgs.splat import ListCache, fisher, groups, render
 
 def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stations:
     """Stations on the splat core, starting from the prior; the rock is at the prior's centre of mass."""
-    cache, train = ListCache(), settings.train
+    cache, train, lam = ListCache(), settings.train, settings.regularisation(groups(0))
+
+    by_kind = {kind: float(lam[columns][0]) for kind, columns in groups(0).items()}
 
     def run_fit(
-        gaussians: Gaussians, cameras: list[Camera], targets: list[np.ndarray], rate: float, on_pass: Callable[[int, int], None]
+        gaussians: Gaussians,
+        start: Gaussians,
+        cameras: list[Camera],
+        targets: list[np.ndarray],
+        rate: float,
+        on_pass: Callable[[int, int], None],
     ) -> Fit:
         scaled = train.model_copy(update={"rates": {kind: rate * value for kind, value in train.rates.items()}})
-        return fit(gaussians, cameras, targets, scaled, on_pass, cache)
+        return fit(gaussians, cameras, targets, scaled, on_pass, cache, start, by_kind)
 
     return Stations(
         centre=prior.points.mean(axis=0),
