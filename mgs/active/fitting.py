@@ -1,15 +1,7 @@
 """Learn the appearance of frozen Gaussians from posed images: the most probable parameters, given the images and the prior.
 
-A pixel is the rendered value plus noise of standard deviation sigma, and each parameter lies around its start with a standard
-deviation tau. The negative logarithm of the posterior is then, up to a constant and times sigma^2, the objective
-
-    Phi = 1/2 sum over images, pixels and channels of (rendered - target)^2  +  1/2 sum over parameters of lam (theta - start)^2
-
-with lam = (sigma / tau)^2 (`mgs.active.criteria.regularisation`). Its curvature, J^T J + lam, is the matrix whose diagonal the
-criteria use: the model that is fitted and the one whose information is measured are the same. With lam = 0 it is maximum
-likelihood, the paper's Eq. 2 up to a constant.
-
-One optimiser step draws one image; a pass draws all of them once, in an order of its own.
+What is lowered is the objective of `mgs.active.objective`. One optimiser step draws one image; a pass draws all of them once,
+in an order of its own.
 """
 
 from __future__ import annotations
@@ -22,17 +14,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mgs.active.objective import Objective, Prior, objective, watched
 from mgs.active.optimisers import OPTIMISERS
 from mgs.active.settings import TrainSettings
 from mgs.active.stopping import StopReason, stop_reason
 from mgs.camera import Camera
 from mgs.colour import SH_C0
 from mgs.errors import InputError
-from mgs.gaussians import KINDS, LEARNED, Gaussians
+from mgs.gaussians import LEARNED, Gaussians
 from mgs.seeds import generator
-from mgs.splat import ListCache, as_drjit, render
+from mgs.splat import ListCache, as_drjit
 from mgs.splat.blocks import BlockLists
-from mgs.splat.projection import camera_array, project
+from mgs.splat.projection import project
 from mgs.splat.recording import frozen
 from mgs.splat.rendering import composite
 
@@ -54,16 +47,6 @@ class Fit:
     passes: int
     iterations: int
     stop_reason: StopReason
-
-
-@dataclass
-class _Prior:
-    """What holds the parameters near their start: for each of LEARNED its lam, Float. share: 1 / number of images, Float, the
-    part of the prior that goes with one image."""
-
-    start: Gaussians
-    lam: dict[str, Any]
-    share: Any
 
 
 COLOUR_MIN = 1e-4
@@ -95,11 +78,6 @@ def _recorded_sizes(
     return optimiser, len(lists.splat), len(lists.block), len(target), *gaussians.sh.shape, *size
 
 
-@frozen(lambda gaussians, camera: gaussians.sh.shape)
-def _project(gaussians: Gaussians, camera: Any) -> Any:
-    return project(gaussians, camera)
-
-
 @frozen(_recorded_sizes)
 def _step(
     optimiser: str,
@@ -113,22 +91,21 @@ def _step(
     size: Any,
     rates: list[Any],
     t: Any,
-    prior: _Prior,
+    prior: Prior,
 ) -> tuple[Gaussians, list[list[Any]], Any]:
     """One step of the optimiser on one image and its share of the prior. Returns parameters, buffers, loss before the step.
 
     buffers, rates: for each of LEARNED; packed: the Gaussians' splats, packed for the lists; size: (width, height); t: UInt32,
     step number from 1; target, weight: Float [H*W*3].
     """
-    values = [dr.copy(getattr(gaussians, name)) for name in LEARNED]
-    dr.enable_grad(values)
-    watched = Gaussians(gaussians.means, **dict(zip(LEARNED, values, strict=True)))
-    rgb = composite(project(watched, camera), packed, lists, *size).rgb
+    copy = watched(gaussians)
+    rgb = composite(project(copy, camera), packed, lists, *size).rgb
     error = (rgb.array - target) * weight
     loss = dr.mean(dr.square(error))
     dr.backward(0.5 * dr.sum(dr.square(error)))
     step, moved, kept = mi.Float(t), {}, []
-    for name, value, kept_before, rate in zip(LEARNED, values, buffers, rates, strict=True):
+    for name, kept_before, rate in zip(LEARNED, buffers, rates, strict=True):
+        value = getattr(copy, name)
         away = dr.detach(value) - getattr(prior.start, name)
         pull = prior.lam[name] * prior.share
         gradient = dr.grad(value) + mi.TensorXf(pull * away.array, away.shape)
@@ -148,7 +125,7 @@ def fit(
     start: Gaussians | None = None,
     lam: Mapping[str, float] | None = None,
 ) -> Fit:
-    """Fit appearance (not means) to images: lower the objective Phi of this module's docstring.
+    """Fit appearance (not means) to images: lower Phi (`mgs.active.objective`).
 
     cameras, and a target of each: [H,W,3] linear RGB, the rock in front of black; or [H,W,4], in which the last channel is the
     weight of the pixel, 1 where its colour is known and 0 where it is not (`mgs.data.dataset.Frame.target`).
@@ -158,21 +135,20 @@ def fit(
     reports. Stops as `mgs.active.stopping.stop_reason` says. Raises InputError where a parameter of the Gaussians given is not
     finite, the optimiser is unknown, or `start` is of another shape.
     """
-    settings, cache = settings or TrainSettings(), cache or ListCache()
+    settings = settings or TrainSettings()
     if settings.optimiser not in OPTIMISERS:
         raise InputError(f"optimiser {settings.optimiser!r} is unknown; choose one of {', '.join(OPTIMISERS)}")
     model = as_drjit(gaussians)
-    images = [_image(camera, np.asarray(target, np.float32)) for camera, target in zip(cameras, targets, strict=True)]
+    goal = objective(gaussians, cameras, targets, start, lam, cache)
     count = OPTIMISERS[settings.optimiser].buffers
     buffers = [[dr.zeros(mi.TensorXf, getattr(model, name).shape) for _ in range(count)] for name in LEARNED]
-    prior = _prior(gaussians if start is None else start, lam or {}, model, len(images))
     rng = generator(settings.seed, "train/order")
-    losses, kept, stop = [_loss(model, images, prior, cache)], model, StopReason.PASS_LIMIT
+    losses, kept, stop = [goal.loss(model)], model, StopReason.PASS_LIMIT
     for done in range(settings.passes):
         fall = settings.decay ** (done / max(settings.passes - 1, 1))
         rates = [dr.opaque(mi.Float, rate * fall) for rate in settings.rates.values()]
-        order = [images[i] for i in rng.permutation(len(images))]
-        model, buffers, loss = _pass(settings.optimiser, model, buffers, order, rates, done * len(images), prior, cache)
+        order = rng.permutation(len(goal.photos))
+        model, buffers, loss = _pass(goal, settings.optimiser, model, buffers, order, rates, done * len(order))
         if loss <= min(losses[1:], default=np.inf):  # never of a loss that is not a number
             kept = model
         losses.append(loss)
@@ -184,78 +160,28 @@ def fit(
     passes = len(losses) - 1
     numpy = Gaussians(*(np.asarray(getattr(kept, f.name)) for f in fields(kept)))
     finite = [loss for loss in losses[1:] if np.isfinite(loss)]
-    return Fit(numpy, min(finite, default=losses[0]), tuple(losses), passes, passes * len(images), stop)
-
-
-@dataclass(frozen=True)
-class _Image:
-    """An image to fit to: its camera, the same for the kernels, its pixels and their weights, mi.Float [H*W*3]."""
-
-    camera: Camera
-    array: Any
-    pixels: Any
-    weights: Any
-
-
-def _image(camera: Camera, target: np.ndarray) -> _Image:
-    """target: as `fit` takes it."""
-    rgb = target[..., :3]
-    weights = np.broadcast_to(target[..., 3:] if target.shape[-1] == 4 else np.ones((), np.float32), rgb.shape)
-    return _Image(camera, camera_array(camera), *(mi.Float(np.ascontiguousarray(a).ravel()) for a in (rgb, weights)))
-
-
-def _prior(start: Gaussians, lam: Mapping[str, float], model: Gaussians, images: int) -> _Prior:
-    """The prior of `fit`. Raises InputError where its start does not fit the model."""
-    # A copy: Dr.Jit uses NumPy's memory in place, and a recorded step takes parameters and start for the same array for ever
-    # if they were in the same memory when it was recorded (Dr.Jit 1.5).
-    start = as_drjit(Gaussians(*(np.array(getattr(start, f.name), np.float32) for f in fields(start))))
-    if start.sh.shape != model.sh.shape:
-        raise InputError(f"start: has colours of shape {start.sh.shape}, expected {model.sh.shape}, that of the Gaussians")
-    by_name = dict(zip(LEARNED, KINDS, strict=True))
-    values = {name: dr.opaque(mi.Float, float(lam.get(kind, 0.0))) for name, kind in by_name.items()}
-    return _Prior(start, values, dr.opaque(mi.Float, 1 / images))
-
-
-def _loss(model: Gaussians, images: list[_Image], prior: _Prior, cache: ListCache) -> float:
-    """The loss of one model (see `Fit`): the mean over the images of mean squared error and share of the prior."""
-    away = [getattr(model, name).array - getattr(prior.start, name).array for name in LEARNED]
-    pulls = zip(away, prior.lam.values(), strict=True)
-    penalty = sum(lam * prior.share * dr.sum(dr.square(distance)) for distance, lam in pulls)
-    errors = []
-    for image in images:
-        rgb = render(model, image.camera, cache=cache).rgb.array
-        errors.append(dr.mean(dr.square((rgb - image.pixels) * image.weights)) + penalty / len(image.pixels))
-    return float(np.mean([float(error[0]) for error in errors]))
+    return Fit(numpy, min(finite, default=losses[0]), tuple(losses), passes, passes * len(goal.photos), stop)
 
 
 def _pass(
-    optimiser: str,
-    model: Gaussians,
-    buffers: list[list[Any]],
-    images: list[_Image],
-    rates: list[Any],
-    t: int,
-    prior: _Prior,
-    cache: ListCache,
+    goal: Objective, optimiser: str, model: Gaussians, buffers: list[list[Any]], order: np.ndarray, rates: list[Any], t: int
 ) -> tuple[Gaussians, list[list[Any]], float]:
     """One step on each image, in order, after t steps. Returns parameters, buffers and the mean of the steps' losses.
 
     The loss is NaN where a parameter is no longer finite: such a model cannot be rendered.
     """
     losses = []
-    for image in images:
+    for photo in (goal.photos[i] for i in order):
         t += 1
-        splats = _project(model, image.array)
         try:
-            lists, packed = cache.get(image.camera, splats)
+            lists, packed = goal.lists(model, photo)
         except InputError:
             if _is_finite(model):  # refused for another reason, such as too many pairs
                 raise
             return model, buffers, float("nan")
-        size = (image.camera.width, image.camera.height)
         model, buffers, loss = _step(
-            optimiser, model, buffers, image.array, packed, lists, image.pixels, image.weights, size, rates,
-            dr.opaque(mi.UInt32, t), prior,
+            optimiser, model, buffers, photo.array, packed, lists, photo.pixels, photo.weights, photo.size, rates,
+            dr.opaque(mi.UInt32, t), goal.prior,
         )  # fmt: skip
         losses.append(loss)
     return model, buffers, float(np.mean([float(loss[0]) for loss in losses])) if _is_finite(model) else float("nan")

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from mgs.active.criteria import PIXEL_NOISE, PRIOR_STD, regularisation
 from mgs.errors import InputError
 
-RATES = {"colour": 0.02, "scale": 0.02, "rotation": 0.01, "opacity": 0.05}
+RATES = {"colour": 0.04, "scale": 0.08, "rotation": 0.04, "opacity": 0.2}
 """Learning rates of the optimiser, per step, in each kind of parameter's own unit: colour coefficient, log-scale, quaternion,
 opacity logit. Chosen constants."""
 

@@ -1,0 +1,142 @@
+"""Does the choice of views depend on how long one fits? `python benchmarks/ranking.py PREFIX DATASET...`
+
+From each of four states of a dataset (4 views spread evenly in azimuth; 4, 6 and 8 random ones) the model is fitted for 10 to
+1,500 passes, and every other view is scored by each criterion that looks at the fitted model. Compared with the ranking after
+the longest fit: Kendall's tau; and regret, the share of the longest fit's best score that is lost if the shorter fit chooses.
+
+Writes PREFIX.json, and PREFIX.png. States that are in PREFIX.json already are not computed again.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import kendalltau
+
+from mgs import runtime
+from mgs.active.criteria import CRITERIA, regularisation
+from mgs.active.fitting import fit
+from mgs.active.loop import target_of
+from mgs.active.pose_policies import seed_views
+from mgs.active.settings import TrainSettings
+from mgs.data.dataset import Dataset, load_dataset
+from mgs.files import write_json
+from mgs.gaussians import Gaussians
+from mgs.plotting import STYLE, new_figure, save_figure
+from mgs.prior.build import build_prior
+from mgs.prior.initial import initial_gaussians
+from mgs.prior.settings import PriorSettings
+from mgs.provenance import command_line, versions
+from mgs.seeds import generator
+from mgs.splat import ListCache, fisher, groups
+
+STATES = {"4 even": 4, "4 random": 4, "6 random": 6, "8 random": 8}
+PASSES = (10, 20, 40, 80, 150, 400, 1500)
+GAUSSIANS = 10_000
+FITTED = [name for name, criterion in CRITERIA.items() if criterion.at == "fitted" and name != "e-optimal"]
+"""Criteria compared. e-optimal is 0 while any parameter stays unobserved, so it ranks nothing here."""
+
+
+def views_of(state: str, positions: np.ndarray, centre: np.ndarray) -> list[int]:
+    """Frames of a state."""
+    count = STATES[state]
+    if state.endswith("even"):
+        return seed_views(positions, centre, count)
+    return sorted(generator(0, f"ranking/{state}").choice(len(positions), count, replace=False).tolist())
+
+
+def scores(model: Gaussians, taken: list[int], dataset: Dataset, lam: np.ndarray, cache: ListCache) -> dict[str, list[float]]:
+    """The score of each view that is not taken, by each criterion of FITTED."""
+    cameras = [frame.camera for frame in dataset.frames]
+    H = np.sum([fisher(model, cameras[i], cache=cache) for i in taken], axis=0, dtype=np.float64)
+    found: dict[str, list[float]] = {name: [] for name in FITTED}
+    for i in (i for i in range(len(cameras)) if i not in taken):
+        F = fisher(model, cameras[i], cache=cache)
+        for name in FITTED:
+            found[name].append(CRITERIA[name].score(F, H, lam))
+    return found
+
+
+def study(root: Path, state: str) -> list[dict[str, Any]]:
+    """One record per number of passes: loss and scores."""
+    dataset, cache, lam = load_dataset(root), ListCache(), regularisation(groups(0))
+    prior, _ = build_prior(dataset, PriorSettings(gaussians=GAUSSIANS))
+    positions = np.array([frame.camera.position for frame in dataset.frames])
+    taken = views_of(state, positions, prior.points.mean(0))
+    frames = [dataset.frames[i] for i in taken]
+    start, by_kind = initial_gaussians(prior, frames)[0], {kind: float(lam[c][0]) for kind, c in groups(0).items()}
+    cameras, targets = [frame.camera for frame in frames], [target_of(frame) for frame in frames]
+    records = []
+    for passes in PASSES:
+        found = fit(start, cameras, targets, TrainSettings(passes=passes, tolerance=0.0), cache=cache, start=start, lam=by_kind)
+        values = scores(found.gaussians, taken, dataset, lam, cache)
+        record = {"dataset": root.name, "state": state, "views": taken, "passes": passes, "loss": found.loss, "scores": values}
+        records.append(record)
+        print(root.name, state, passes, f"loss {found.loss:.4g}", flush=True)
+    return records
+
+
+def compared(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Kendall's tau and regret of each record against the longest fit of its state, by criterion."""
+    found = []
+    for record in records:
+        longest = max(
+            (r for r in records if (r["dataset"], r["state"]) == (record["dataset"], record["state"])),
+            key=lambda r: r["passes"],
+        )
+        for name in FITTED:
+            mine, end = np.array(record["scores"][name]), np.array(longest["scores"][name])
+            row = {key: record[key] for key in ("dataset", "state", "passes")} | {"criterion": name}
+            row |= {"tau": float(kendalltau(mine, end).statistic), "regret": float(1 - end[mine.argmax()] / end.max())}
+            found.append(row)
+    return found
+
+
+def draw(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Tau and regret against passes: the mean over states as a line, each state as a dot."""
+    import matplotlib
+
+    colours = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(7.2, 3.1)
+        axes = figure.subplots(1, 2)
+        for name, colour in zip(FITTED, colours, strict=False):
+            for axis, key, scale in zip(axes, ("tau", "regret"), (1, 100), strict=True):
+                values = {p: [scale * r[key] for r in rows if (r["criterion"], r["passes"]) == (name, p)] for p in PASSES[:-1]}
+                axis.plot(list(values), [np.mean(v) for v in values.values()], color=colour, label=name)
+                for passes, dots in values.items():
+                    axis.plot([passes] * len(dots), dots, ".", color=colour, alpha=0.4, markersize=4)
+        axes[0].set(ylabel=f"Kendall's tau with {PASSES[-1]:,} passes")
+        axes[1].set(ylabel="regret (%)")
+        for axis in axes:
+            axis.set(xscale="log", xlabel="passes of the fit")
+        axes[0].legend()
+        save_figure(figure, path)
+
+
+def main(prefix: Path, roots: list[Path]) -> None:
+    """Compute what is missing, write after every state, draw."""
+    runtime.start()
+    path = prefix.with_suffix(".json")
+    records = json.loads(path.read_text())["records"] if path.is_file() else []
+    for state in STATES:
+        for root in roots:
+            if not any((r["dataset"], r["state"]) == (root.name, state) for r in records):
+                records += study(root, state)
+                made = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
+                write_json(path, made | {"rows": compared(records), "records": records})
+    rows = compared(records)
+    for passes in PASSES:
+        for name in FITTED:
+            of = [r for r in rows if (r["criterion"], r["passes"]) == (name, passes)]
+            tau, regret = (np.mean([r[key] for r in of]) for key in ("tau", "regret"))
+            print(f"{passes:5} {name:12} tau {tau:.3f} regret {regret:.2%}")
+    draw(prefix.with_suffix(".png"), rows)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), [Path(root) for root in sys.argv[2:]])

@@ -1,0 +1,231 @@
+"""What a fit lowers: the negative logarithm of the posterior of the Gaussians' appearance, its gradient and its curvature.
+
+A pixel is the rendered value plus noise of standard deviation sigma, and each parameter lies around its start with a standard
+deviation tau. The negative logarithm of the posterior is then, up to a constant and times sigma^2, the objective
+
+    Phi = 1/2 sum over images, pixels and channels of (rendered - target)^2  +  1/2 sum over parameters of lam (theta - start)^2
+
+with lam = (sigma / tau)^2 (`mgs.active.criteria.regularisation`). Its curvature, J^T J + lam with the Jacobian J of all images,
+is the matrix whose diagonal the criteria use: the model that is fitted and the one whose information is measured are the same.
+With lam = 0 it is maximum likelihood, the paper's Eq. 2 up to a constant.
+
+The curvature is never stored (10,000 Gaussians have 110,000 parameters): its product with a vector takes one derivative in
+forward mode and one in reverse mode for each image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mgs.camera import Camera
+from mgs.errors import InputError
+from mgs.gaussians import KINDS, LEARNED, Gaussians
+from mgs.splat import ListCache, as_drjit, fisher, groups, render
+from mgs.splat.blocks import BlockLists
+from mgs.splat.projection import camera_array, project
+from mgs.splat.recording import frozen
+from mgs.splat.rendering import composite
+
+Vector = list[Any]
+"""A number for every learned parameter: a TensorXf for each of LEARNED, of its shape."""
+
+
+@dataclass(frozen=True)
+class Photo:
+    """An image to fit to: its camera, the same for the kernels, its pixels and their weights, mi.Float [H*W*3]."""
+
+    camera: Camera
+    array: Any
+    pixels: Any
+    weights: Any
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, pixels."""
+        return self.camera.width, self.camera.height
+
+
+@dataclass
+class Prior:
+    """What holds the parameters near their start: for each of LEARNED its lam, Float. share: 1 / number of images, Float, the
+    part of the prior that goes with one image."""
+
+    start: Gaussians
+    lam: dict[str, Any]
+    share: Any
+
+
+@dataclass(frozen=True)
+class Objective:
+    """Phi of this module's docstring, for some images. Models are Gaussians with TensorXf fields."""
+
+    photos: list[Photo]
+    prior: Prior
+    cache: ListCache
+
+    def loss(self, model: Gaussians) -> float:
+        """2 Phi over the number of pixel values: the mean squared error of the images plus the prior's part."""
+        penalty = sum(lam * self.prior.share * dr.sum(dr.square(d.array)) for d, lam in self._pulls(model))
+        errors = []
+        for photo in self.photos:
+            rgb = render(model, photo.camera, cache=self.cache).rgb.array
+            errors.append(dr.mean(dr.square((rgb - photo.pixels) * photo.weights)) + penalty / len(photo.pixels))
+        return float(np.mean([float(error[0]) for error in errors]))
+
+    def phi(self, model: Gaussians) -> float:
+        """Phi itself, (pixel value)^2."""
+        return 0.5 * sum(len(photo.pixels) for photo in self.photos) * self.loss(model)
+
+    def gradient(self, model: Gaussians) -> Vector:
+        """The derivative of Phi by the parameters."""
+        total = [mi.TensorXf(lam * d.array, d.shape) for d, lam in self._pulls(model)]
+        for photo in self.photos:
+            lists, packed = self.lists(model, photo)
+            parts = _image_gradient(model, photo.array, packed, lists, photo.pixels, photo.weights, photo.size)
+            total = [a + b for a, b in zip(total, parts, strict=True)]
+            dr.eval(total)
+        return total
+
+    def curvature_times(self, model: Gaussians, vector: Vector) -> Vector:
+        """(J^T J + lam) times a vector."""
+        total = [mi.TensorXf(lam * v.array, v.shape) for v, lam in zip(vector, self.prior.lam.values(), strict=True)]
+        for photo in self.photos:
+            lists, packed = self.lists(model, photo)
+            parts = _image_curvature(model, vector, photo.array, packed, lists, photo.weights, photo.size)
+            total = [a + b for a, b in zip(total, parts, strict=True)]
+            dr.eval(total)
+        return total
+
+    def lists(self, model: Gaussians, photo: Photo) -> tuple[BlockLists, Any]:
+        """Block lists of one image and the splats packed for them. Raises InputError as `ListCache.get`."""
+        return self.cache.get(photo.camera, _project(model, photo.array))
+
+    def _pulls(self, model: Gaussians) -> list[tuple[Any, Any]]:
+        """For each of LEARNED how far it is from its start, and its lam."""
+        return [(getattr(model, name) - getattr(self.prior.start, name), lam) for name, lam in self.prior.lam.items()]
+
+
+def objective(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    targets: Sequence[np.ndarray],
+    start: Gaussians | None = None,
+    lam: Mapping[str, float] | None = None,
+    cache: ListCache | None = None,
+) -> Objective:
+    """The objective of `mgs.active.fitting.fit`, from the same arguments. Raises InputError where the start does not fit."""
+    photos = [_photo(camera, np.asarray(target, np.float32)) for camera, target in zip(cameras, targets, strict=True)]
+    start = gaussians if start is None else start
+    if start.sh.shape != gaussians.sh.shape:
+        raise InputError(f"start: has colours of shape {start.sh.shape}, expected {gaussians.sh.shape}, that of the Gaussians")
+    # A copy: Dr.Jit uses NumPy's memory in place, and a recorded step takes parameters and start for the same array for ever
+    # if they were in the same memory when it was recorded (Dr.Jit 1.5).
+    start = as_drjit(Gaussians(*(np.array(getattr(start, f.name), np.float32) for f in fields(start))))
+    by_name = dict(zip(LEARNED, KINDS, strict=True))
+    values = {name: dr.opaque(mi.Float, float((lam or {}).get(kind, 0.0))) for name, kind in by_name.items()}
+    return Objective(photos, Prior(start, values, dr.opaque(mi.Float, 1 / max(len(photos), 1))), cache or ListCache())
+
+
+def _photo(camera: Camera, target: np.ndarray) -> Photo:
+    """target: as `fit` takes it."""
+    rgb = target[..., :3]
+    weights = np.broadcast_to(target[..., 3:] if target.shape[-1] == 4 else np.ones((), np.float32), rgb.shape)
+    return Photo(camera, camera_array(camera), *(mi.Float(np.ascontiguousarray(a).ravel()) for a in (rgb, weights)))
+
+
+def newton_decrease(found: Objective, model: Gaussians, iterations: int) -> list[float]:
+    """By how much Phi would fall at most if the images were linear in the parameters: 1/2 g^T (J^T J + lam)^-1 g, after each
+    iteration of conjugate gradients with the diagonal of the matrix as preconditioner.
+
+    The numbers grow from iteration to iteration, towards the limit. The full J^T J is needed: its diagonal ignores that
+    neighbouring splats can do each other's work, and so takes them for better determined than they are. lam must not be 0.
+    """
+    gradient = found.gradient(model)
+    inverse = [dr.rcp(d.array) for d in _diagonal(found, model)]
+    x = [dr.zeros(mi.TensorXf, g.shape) for g in gradient]
+    residual = [-g for g in gradient]
+    z = [mi.TensorXf(i * r.array, r.shape) for i, r in zip(inverse, residual, strict=True)]
+    direction, rz, decreases = z, _dot(residual, z), []
+    for _ in range(iterations):
+        product = found.curvature_times(model, direction)
+        step = rz / _dot(direction, product)
+        x, residual = _plus(x, step, direction), _plus(residual, -step, product)
+        z = [mi.TensorXf(i * r.array, r.shape) for i, r in zip(inverse, residual, strict=True)]
+        before, rz = rz, _dot(residual, z)
+        direction = _plus(z, rz / before, direction)
+        dr.eval(x, residual, direction)
+        decreases.append(-0.5 * _dot(gradient, x))
+    return decreases
+
+
+def _diagonal(found: Objective, model: Gaussians) -> Vector:
+    """The diagonal of J^T J + lam, with the weights of pixels taken as 1."""
+    H = np.stack([fisher(model, photo.camera, cache=found.cache) for photo in found.photos]).sum(0, dtype=np.float64)
+    columns = groups(model.sh_degree).values()
+    lam = found.prior.lam.values()
+    return [
+        mi.TensorXf(np.ascontiguousarray(H[:, c] + float(k[0]), np.float32).reshape(getattr(model, name).shape))
+        for name, c, k in zip(LEARNED, columns, lam, strict=True)
+    ]
+
+
+def _dot(a: Vector, b: Vector) -> float:
+    """Sum of products, in double precision."""
+    sums = [dr.sum(mi.Float64(x.array) * mi.Float64(y.array)) for x, y in zip(a, b, strict=True)]
+    return sum(float(s[0]) for s in sums)
+
+
+def _plus(a: Vector, factor: float, b: Vector) -> Vector:
+    """a + factor b."""
+    scale = dr.opaque(mi.Float, factor)
+    return [mi.TensorXf(dr.fma(scale, y.array, x.array), x.shape) for x, y in zip(a, b, strict=True)]
+
+
+def watched(model: Gaussians) -> Gaussians:
+    """A copy of the model whose learned parameters have gradients enabled, for use inside a recorded function."""
+    values = [dr.copy(dr.detach(getattr(model, name))) for name in LEARNED]
+    dr.enable_grad(values)
+    return Gaussians(model.means, **dict(zip(LEARNED, values, strict=True)))
+
+
+def _sizes(model: Gaussians, packed: Any, lists: BlockLists, size: Any) -> tuple[Any, ...]:
+    return len(lists.splat), len(lists.block), *model.sh.shape, *size
+
+
+@frozen(lambda model, camera: model.sh.shape)
+def _project(model: Gaussians, camera: Any) -> Any:
+    return project(model, camera)
+
+
+@frozen(lambda model, camera, packed, lists, target, weight, size: _sizes(model, packed, lists, size))
+def _image_gradient(
+    model: Gaussians, camera: Any, packed: Any, lists: BlockLists, target: Any, weight: Any, size: Any
+) -> Vector:
+    """The derivative of half the summed squared error of one image."""
+    copy = watched(model)
+    rgb = composite(project(copy, camera), packed, lists, *size).rgb
+    dr.backward(0.5 * dr.sum(dr.square((rgb.array - target) * weight)))
+    return [dr.grad(getattr(copy, name)) for name in LEARNED]
+
+
+@frozen(lambda model, vector, camera, packed, lists, weight, size: _sizes(model, packed, lists, size))
+def _image_curvature(
+    model: Gaussians, vector: Vector, camera: Any, packed: Any, lists: BlockLists, weight: Any, size: Any
+) -> Vector:
+    """J^T J times a vector, for one image: forward mode gives J v, reverse mode J^T of that."""
+    copy = watched(model)
+    for name, tangent in zip(LEARNED, vector, strict=True):
+        dr.set_grad(getattr(copy, name), tangent)
+    rgb = composite(project(copy, camera), packed, lists, *size).rgb
+    dr.forward_to(rgb)
+    along = dr.detach(dr.grad(rgb).array) * dr.square(weight)
+    copy = watched(model)
+    rgb = composite(project(copy, camera), packed, lists, *size).rgb
+    dr.backward(dr.sum(rgb.array * along))
+    return [dr.grad(getattr(copy, name)) for name in LEARNED]
