@@ -22,7 +22,7 @@ from markdown_it import MarkdownIt
 import mgs
 from mgs.active import loop
 from mgs.active.criteria import PIXEL_NOISE
-from mgs.active.pose_policies import policy_names
+from mgs.active.policies import policy_names
 from mgs.active.stopping import StopReason
 from mgs.cli.app import app
 from mgs.colour import SH_C0

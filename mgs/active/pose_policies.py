@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from mgs.active.criteria import CRITERIA, Array
+from mgs.active.criteria import Array
 
 PosePolicy = Callable[[Array, Array, Array, np.random.Generator], Array]
 
@@ -54,11 +54,6 @@ POSE_POLICIES: dict[str, PosePolicy] = {
     "farthest": farthest_pose,
 }
 """Policies that look at poses, by name. A program may add its own (docs/howto/policy.md)."""
-
-
-def policy_names() -> list[str]:
-    """Every policy that `mgs nbv --policy` accepts: the rows of both tables, as they are now."""
-    return [*CRITERIA, *POSE_POLICIES]
 
 
 def seed_views(positions: Array, centre: Array, count: int) -> list[int]:

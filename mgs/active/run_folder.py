@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from mgs.active import pose_policies
+from mgs.active.policies import policy_named
 from mgs.active.settings import NbvSettings, validated
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.errors import InputError
@@ -57,9 +57,7 @@ def check_settings(settings: NbvSettings, frames: int) -> None:
     from mgs.splat import ESTIMATORS
 
     diagonal = [name for name in ESTIMATORS if name != "block"]
-    if settings.policy not in pose_policies.policy_names():
-        known = ", ".join(pose_policies.policy_names())
-        raise InputError(f"--policy {settings.policy}: unknown; choose one of {known}, or add your own (docs/howto/policy.md)")
+    policy_named(settings.policy)
     if settings.estimator not in diagonal:
         known = ", ".join(diagonal)
         raise InputError(f"--estimator {settings.estimator}: gives no diagonal, or is unknown; choose one of {known}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mgs.active.criteria import PIXEL_NOISE, PRIOR_STD
-from mgs.active.pose_policies import policy_names
+from mgs.active.policies import policy_names
 from mgs.active.settings import RATES
 
 if TYPE_CHECKING:
