@@ -55,6 +55,7 @@ class Stations:
     initial(seed frames) -> Gaussians before any training.
     fit(gaussians, cameras, targets, rate, on_pass) -> Fit; targets as `mgs.active.fitting.fit`, rate multiplies all rates.
     fisher(gaussians, camera) -> information of one view [N,P], by the estimator of the run.
+    estimate(gaussians, camera, estimator) -> information of one view by a row of `mgs.splat.ESTIMATORS`.
     measure(gaussians, taken frame indices) -> entries for steps.jsonl.
     exact(gaussians, camera) -> exact information of one view [N,P], for what the views see of the surface; None: as `fisher`.
     on_surface: how many of the Gaussians, the first, lie on the surface, so are what coverage is a share of; None: all.
@@ -66,6 +67,7 @@ class Stations:
     initial: Callable[[list[Frame]], Gaussians]
     fit: Callable[[Gaussians, list[Camera], list[np.ndarray], float, Callable[[int, int], None]], Fit]
     fisher: Callable[[Gaussians, Camera], np.ndarray]
+    estimate: Callable[[Gaussians, Camera, str], np.ndarray]
     measure: Callable[[Gaussians, list[int]], dict[str, float]]
     exact: Callable[[Gaussians, Camera], np.ndarray] | None = None
     on_surface: int | None = None
@@ -208,6 +210,7 @@ class _Loop:
             prior_lam=self.prior_lam,
             information=lambda view: self.stations.fisher(state.gaussians, self.cameras[told(view)]),
             surface_information=lambda view: self.surface_information(self.cameras[told(view)]),
+            estimate=lambda view, estimator: self.stations.estimate(state.gaussians, self.cameras[told(view)], estimator),
             seen=lambda view: self.seen(told(view)),
             dome=self.dome,
         )

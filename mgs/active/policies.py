@@ -13,10 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mgs.active.criteria import CRITERIA, Array, Criterion
+from mgs.active.criteria import CRITERIA, Array, Criterion, block_log_determinant, d_optimal
+from mgs.active.criteria import i_optimal as i_optimality
 from mgs.active.directional import Views, gains
 from mgs.active.pose_policies import POSE_POLICIES
 from mgs.errors import InputError
+
+PAPER_LAM = 1e-6
+"""The one lambda of the policy `paper`: that of POp-GS, since the paper does not say which it used."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,7 @@ class Outlook:
     H, lam: [M,P] information of the views taken about the model fitted so far, and [P] lambda, of the run.
     points: [N,3] the Gaussians on the prior's surface, before training. surface_H, prior_lam: the same as H and lam for these.
     information(view), surface_information(view): what one view adds to H, and to surface_H.
+    estimate(view, estimator): the information of one view about the fitted model, by any row of `mgs.splat.ESTIMATORS`.
     seen(view): [N] squared blending weights of the surface in one view (`mgs.active.directional.squared_weights`).
     dome(): a dome of poses around the rock, and what they see of the surface.
     """
@@ -44,6 +49,7 @@ class Outlook:
     prior_lam: Array
     information: Callable[[int], Array]
     surface_information: Callable[[int], Array]
+    estimate: Callable[[int, str], Array]
     seen: Callable[[int], Array]
     dome: Callable[[], Views]
 
@@ -78,7 +84,38 @@ def directional_i(outlook: Outlook) -> Array:
     return gains(outlook.points, lam, 3, 0.1, views(outlook.visited), views(outlook.left), outlook.dome())
 
 
+def i_optimal(outlook: Outlook) -> Array:
+    """I-optimality over all poses of the dataset, taken or not (`mgs.active.criteria.i_optimal`)."""
+    others = [i for i in range(len(outlook.positions)) if i not in outlook.visited]
+    mean = (outlook.H + sum(outlook.information(i) for i in others)) / len(outlook.positions)
+    return np.array([i_optimality(outlook.information(i), outlook.H, outlook.lam, mean) for i in outlook.left])
+
+
+def block_d(outlook: Outlook) -> Array:
+    """Eq. 7 for the exact 11x11 blocks (`mgs.active.criteria.block_log_determinant`), whatever the estimator of the run."""
+    H = _sum(outlook, "block")
+    before, lam = block_log_determinant(H, outlook.lam), outlook.lam
+    return np.array([block_log_determinant(H + outlook.estimate(i, "block"), lam) - before for i in outlook.left])
+
+
+def paper(outlook: Outlook) -> Array:
+    """The paper's method to the letter: Eq. 7 on squared gradients of one scalar loss per image, with one lambda (PAPER_LAM).
+
+    The paper names neither the loss nor the lambda. The loss is that of the estimator `loss-gradient`, for the views taken too.
+    """
+    H, lam = _sum(outlook, "loss-gradient"), np.full_like(outlook.lam, PAPER_LAM)
+    return np.array([d_optimal(outlook.estimate(i, "loss-gradient"), H, lam) for i in outlook.left])
+
+
+def _sum(outlook: Outlook, estimator: str) -> NDArray[np.float64]:
+    """Information of the views taken, by an estimator, summed."""
+    return np.sum([outlook.estimate(i, estimator) for i in outlook.visited], axis=0, dtype=np.float64)
+
+
 OUTLOOK_POLICIES: dict[str, Policy] = {
+    "i-optimal": i_optimal,
+    "block-d": block_d,
+    "paper": paper,
     "directional-d": directional_d,
     "directional-i": directional_i,
 }

@@ -37,6 +37,7 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
         initial=lambda frames: initial_gaussians(prior, frames)[0],
         fit=run_fit,
         fisher=lambda gaussians, camera: fisher(gaussians, camera, settings.estimator, cache=cache),
+        estimate=lambda gaussians, camera, estimator: fisher(gaussians, camera, estimator, cache=cache),
         exact=lambda gaussians, camera: fisher(gaussians, camera, cache=cache),
         measure=psnr_measure(dataset, cache),
         on_surface=len(prior.points),
