@@ -1,4 +1,4 @@
-"""Image quality: PSNR and SSIM, over the whole frame and inside the rock's mask. Both compare sRGB values in [0,1]."""
+"""How good a rendered view is: as an image (PSNR and SSIM, of sRGB values in [0,1]), and as a surface (alpha and depth)."""
 
 from __future__ import annotations
 
@@ -22,6 +22,16 @@ SSIM_WINDOW = 11
 METRICS = ("psnr", "ssim", "psnr_mask", "ssim_mask", "psnr_inside")
 """Names of the numbers that `compare` gives, as in metrics.json. PSNR is in dB. They are over the whole image; with `_mask`,
 over the rock's mask; with `_inside`, over the pixels that the rock covers wholly, so without its outline."""
+
+SPACINGS = (1, 3, 10)
+"""How far behind the true surface a pixel must be drawn to count as too deep, in spacings of the prior's samples. One spacing
+is about what the Gaussians resolve; at ten, the pixel shows another part of the rock."""
+
+OPAQUE = 0.9
+"""A pixel wholly on the rock counts as see-through where the model's alpha is below this."""
+
+SURFACE_METRICS = ("alpha_mae", "depth_error", *(f"too_deep_{k}" for k in SPACINGS), "see_through")
+"""Names of the numbers that `compare_surface` gives, as in metrics.json. `depth_error` is in metres, the others are shares."""
 
 
 def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
@@ -87,3 +97,47 @@ def compare(truth: np.ndarray, rendered: np.ndarray, mask: np.ndarray, weight: n
         "ssim_mask": ssim(a, b, mask & known),
         "psnr_inside": psnr(a, b, (truth[..., 3] >= 1) & known),
     }
+
+
+def compare_surface(
+    truth: np.ndarray,
+    alpha: np.ndarray,
+    depth: np.ndarray,
+    mask: np.ndarray,
+    weight: np.ndarray,
+    *,
+    fractional: bool,
+    true_depth: np.ndarray | None = None,
+    spacing: float | None = None,
+) -> dict[str, float]:
+    """Those of the SURFACE_METRICS of one view for which the data has a truth; NaN where it has no pixel to measure.
+
+    truth, mask, weight: as in `compare`; alpha, depth: [H,W] of the render, its expected z-depth in metres. fractional: whether
+    the truth's alpha is a share of each pixel, and not only a mask; true_depth: [H,W] metres, 0 where unknown; spacing: of the
+    prior's samples, metres.
+
+    - alpha_mae: mean absolute error of alpha over the pixels whose truth is known; only where `fractional`.
+    - depth_error: median absolute error of depth inside the mask, metres; only with a true depth. A pixel where nothing is
+      drawn counts as infinitely deep; NaN where the median is infinite.
+    - too_deep_1, too_deep_3, too_deep_10: share of the same pixels that are deeper than the truth by more than so many
+      spacings; only with a true depth and a spacing.
+    - see_through: share of the pixels that the rock covers wholly whose alpha is below OPAQUE.
+    """
+    known = weight > 0
+    inside = (truth[..., 3] >= 1) & known
+    found = {"see_through": _mean(alpha[inside] < OPAQUE)}
+    if fractional:
+        found["alpha_mae"] = _mean(np.abs(alpha.astype(np.float64) - truth[..., 3])[known])
+    if true_depth is not None:
+        rock = mask & known & (true_depth > 0)
+        behind = np.where(alpha > 0, depth.astype(np.float64) - true_depth, np.inf)[rock]
+        median = float(np.median(np.abs(behind))) if behind.size else math.nan
+        found["depth_error"] = median if math.isfinite(median) else math.nan
+        if spacing is not None:
+            found |= {f"too_deep_{k}": _mean(behind > k * spacing) for k in SPACINGS}
+    return {name: found[name] for name in SURFACE_METRICS if name in found}
+
+
+def _mean(values: np.ndarray) -> float:
+    """Mean of any number of values, NaN of none."""
+    return float(values.mean()) if values.size else math.nan

@@ -22,7 +22,7 @@ from markdown_it import MarkdownIt
 import mgs
 from mgs.active import loop
 from mgs.active.criteria import PIXEL_NOISE
-from mgs.active.pose_policies import policy_names
+from mgs.active.policies import policy_names
 from mgs.active.stopping import StopReason
 from mgs.cli.app import app
 from mgs.colour import SH_C0
@@ -274,7 +274,7 @@ def test_the_tables_of_the_loop_are_those_of_the_code(dataset, tmp_path):
     keys = {key for row in rows(page, "| key of `steps.jsonl`") for key in re.findall(r"`(\w+)`", row[0])}
     loaded = load_dataset(dataset)
     settings = tiny.start(tmp_path / "run", loaded, budget=1, evaluate_every=1)
-    qualities = dict.fromkeys(("psnr", "psnr_mask", "held_out_psnr", "held_out_psnr_mask"), 1.0)
+    qualities = {f"{views}{name}": 1.0 for views in ("", "held_out_", "test_") for name in ("psnr", "psnr_mask")}
     stations = tiny.stations(measure=lambda gaussians, taken: qualities)
     state = loop.run(tmp_path / "run", settings, loaded, stations, tiny.silent)
     assert keys == set(state.steps[1]) == set(state.steps[0]) - {"seeds", "seed_names"}

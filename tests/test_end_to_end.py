@@ -192,11 +192,18 @@ def test_demo_shows_the_table_and_the_pictures_and_can_be_given_again(tmp_path, 
     out = tmp_path / "demo"
     dataset = synthetic.write_dataset(out / "dataset", synthetic.orbit_cameras(13, 48, 36))
     write_contact_sheet(out / "dataset/contact_sheet.png", dataset.frames)
+    synthetic.write_dataset(out / "dataset/test", synthetic.orbit_cameras(2, 48, 36))
     for name, value in {"cli.demo.GAUSSIANS": 200, "cli.demo.BUDGET": 2, "report.diagnostics.VIEWS": 1}.items():
         monkeypatch.setattr(f"mgs.{name}", value)
     command("demo", out)
     shown = capsys.readouterr().out
     assert all(policy in shown for policy in ("d-optimal", "coverage", "random"))
+    assert shown.count("test views (2): PSNR") == 3
+    table = json.loads((out / "report/table.json").read_text())
+    for row in table:
+        line = next(line for line in shown.splitlines() if line.split()[:1] == [row["policy"]])
+        assert line.split()[2:4] == [f"{row['test.psnr']:.2f}", f"{row['test.ssim']:.4f}"]
+        assert row["test.psnr"] == pytest.approx(steps(out / row["policy"])[-1]["test_psnr"], abs=1e-4)
     pictures = [Path(line.strip()) for line in shown.splitlines() if line.startswith("  ") and "demo/" in line]
     assert len(pictures) >= 7
     assert all(picture.is_file() for picture in pictures)

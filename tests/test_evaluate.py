@@ -6,6 +6,8 @@ import math
 import numpy as np
 import pytest
 import tiny
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 from refusals import listing
 from synthetic import orbit_cameras, write_dataset
@@ -14,8 +16,8 @@ from mgs.colour import srgb_from_linear
 from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.gaussians import Gaussians, sh_from_rgb
-from mgs.images import write_png
-from mgs.metrics import METRICS, PSNR_LIMIT, psnr, ssim
+from mgs.images import write_exr, write_png
+from mgs.metrics import METRICS, OPAQUE, PSNR_LIMIT, SPACINGS, SURFACE_METRICS, compare_surface, psnr, ssim
 from mgs.report import evaluation
 from mgs.report.evaluation import evaluate, evaluate_run, read_comparison, write_comparison
 
@@ -92,7 +94,8 @@ def test_evaluate(tmp_path):
     dataset = write_dataset(tmp_path / "data", orbit_cameras(4))
 
     def renderer(gaussians, camera):
-        return np.full((camera.height, camera.width, 3), 0.2, np.float32)
+        shape = (camera.height, camera.width)
+        return np.full((*shape, 3), 0.2, np.float32), np.ones(shape, np.float32), np.ones(shape, np.float32)
 
     calls = []
     result = evaluate(
@@ -124,13 +127,103 @@ def test_evaluate(tmp_path):
     assert len(list((tmp_path / "renders").iterdir())) == 4
 
 
+def random_view(rng, shape=(6, 5)):
+    """Truth [H,W,4] with alphas of 0, 1 and between, weight, mask, true depth with holes, and a render's alpha and depth."""
+    alpha = rng.choice([0.0, 0.3, 1.0], shape)
+    truth = np.dstack([np.zeros((*shape, 3)), alpha])
+    weight, mask = rng.choice([0.0, 1.0], shape, p=[0.2, 0.8]), alpha > 0.2
+    true_depth = np.where(mask, rng.choice([0.0, 2.0], shape, p=[0.2, 0.8]), 0)
+    drawn = rng.choice([0.0, 0.8, 0.95, 1.0], shape)
+    return truth, weight, mask, true_depth, drawn, np.where(drawn > 0, rng.normal(2, 0.5, shape), 0)
+
+
+@given(seed=st.integers(0, 10_000), spacing=st.floats(0.01, 0.5))
+def test_surface_metrics_follow_their_definitions(seed, spacing):
+    """Against sums over single pixels."""
+    truth, weight, mask, true_depth, alpha, depth = random_view(np.random.default_rng(seed))
+    found = compare_surface(truth, alpha, depth, mask, weight, fractional=True, true_depth=true_depth, spacing=spacing)
+    assert tuple(found) == SURFACE_METRICS
+    errors, see_through, behind = [], [], []
+    for at in np.ndindex(mask.shape):
+        if weight[at] == 0:
+            continue
+        errors.append(abs(alpha[at] - truth[at][3]))
+        if truth[at][3] == 1:
+            see_through.append(alpha[at] < OPAQUE)
+        if mask[at] and true_depth[at] > 0:
+            behind.append(depth[at] - true_depth[at] if alpha[at] > 0 else math.inf)
+    assert found["alpha_mae"] == pytest.approx(np.mean(errors))
+    assert found["see_through"] == pytest.approx(np.mean(see_through) if see_through else math.nan, nan_ok=True)
+    for k in SPACINGS:
+        expected = np.mean([b > k * spacing for b in behind]) if behind else math.nan
+        assert found[f"too_deep_{k}"] == pytest.approx(expected, nan_ok=True)
+    median = np.median(np.abs(behind)) if behind else math.nan
+    assert found["depth_error"] == pytest.approx(median if median < math.inf else math.nan, nan_ok=True)
+
+
+def test_a_surface_is_measured_as_far_as_the_truth_is_known():
+    truth, weight, mask, true_depth, alpha, depth = random_view(np.random.default_rng(0), (40, 30))
+
+    def names(**options):
+        return set(compare_surface(truth, alpha, depth, mask, weight, **options))
+
+    assert names(fractional=False) == {"see_through"}
+    assert names(fractional=True) == {"see_through", "alpha_mae"}
+    assert names(fractional=False, spacing=0.1) == {"see_through"}
+    assert names(fractional=False, true_depth=true_depth) == {"see_through", "depth_error"}
+    assert names(fractional=True, true_depth=true_depth, spacing=0.1) == set(SURFACE_METRICS)
+
+
+def test_where_nothing_is_drawn_the_model_is_infinitely_deep():
+    truth, mask, nothing = np.ones((2, 2, 4)), np.ones((2, 2), bool), np.zeros((2, 2))
+    found = compare_surface(
+        truth, nothing, nothing, mask, np.ones((2, 2)), fractional=True, true_depth=np.full((2, 2), 3.0), spacing=0.1
+    )
+    assert math.isnan(found.pop("depth_error"))
+    assert set(found.values()) == {1.0}
+
+
+def test_test_views_are_measured_and_drawn_apart(tmp_path):
+    """They may have the names of frames that the model was trained on."""
+    dataset = write_dataset(tmp_path / "data", orbit_cameras(4))
+    tests = write_dataset(tmp_path / "data/test", orbit_cameras(3, 40, 30))
+    assert dataset.test_views().frames == tests.frames
+
+    def renderer(gaussians, camera):
+        shape = (camera.height, camera.width)
+        return np.full((*shape, 3), 0.2, np.float32), np.ones(shape, np.float32), np.ones(shape, np.float32)
+
+    def measured(frames, test_frames=(), pictures=None):
+        return evaluate(grey(), frames, ["kf_0001"], test_frames=test_frames, renderer=renderer, pictures=pictures)
+
+    result, without, alone = (
+        measured(dataset.frames, tests.frames, tmp_path / "out"),
+        measured(dataset.frames),
+        measured(tests.frames),
+    )
+    assert {key: result[key] for key in without} == without
+    assert result["test"] == alone["all"]
+    assert result["test"]["count"] == 3
+    assert result["test_views"] == [view | {"trained": False} for view in alone["views"]]
+    assert {path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.png")} == {
+        *(f"kf_000{i}.png" for i in range(4)),
+        *(f"test/kf_000{i}.png" for i in range(3)),
+    }
+
+
 def test_evaluate_a_perfect_model_and_nothing_held_out(tmp_path):
     dataset = write_dataset(tmp_path, orbit_cameras(2))
-    truths = {id(frame.camera): frame.masked_rgb() for frame in dataset.frames}
-    result = evaluate(grey(), dataset.frames, ["kf_0000", "kf_0001"], renderer=lambda g, camera: truths[id(camera)])
+    truths = {id(frame.camera): (frame.masked_rgb(), 1.0 * frame.mask(), frame.depth()) for frame in dataset.frames}
+    result = evaluate(
+        grey(), dataset.frames, ["kf_0000", "kf_0001"], spacing=1e-9, renderer=lambda g, camera: truths[id(camera)]
+    )
     assert result["all"]["psnr"] == result["all"]["psnr_mask"] == PSNR_LIMIT
     assert result["all"]["ssim"] == pytest.approx(1)
-    assert result["held_out"] == {"count": 0} | dict.fromkeys(METRICS)
+    surface = [name for name in SURFACE_METRICS if name != "alpha_mae"]  # a mask does not say which share of a pixel is rock
+    assert [result["all"][name] for name in surface] == [0] * len(surface)
+    assert result["held_out"] == {"count": 0} | dict.fromkeys([*METRICS, *surface])
+    assert "test" not in result
+    assert "test_views" not in result
 
 
 def test_comparison_picture(tmp_path):
@@ -183,7 +276,11 @@ def test_what_is_known_of_a_model_is_not_measured_again(dataset, prior, tmp_path
 
     first = again(pictures=False)
     assert work() == (12, 0)
-    assert said.pop() == f"wrote {run}/metrics.json"
+    assert said.pop(0) == f"wrote {run}/metrics.json"
+    assert said.pop(0) == f"{dataset}: has no images of the rock alone, so the error of alpha is left out"
+    assert said == []
+    assert {"depth_error", "too_deep_3", "see_through"} < set(first["all"])
+    assert "alpha_mae" not in first["all"]
     assert again(pictures=False) == first
     assert work() == (0, 0)
     assert said.pop() == f"kept {run}/metrics.json, measured before on this very model and dataset"
@@ -216,6 +313,8 @@ def brighten(path):
         ("model", lambda run, dataset: brighten(run / "checkpoint.npz")),
         ("image", lambda run, dataset: write_png(dataset / "images/kf_0003.png", np.ones((tiny.HEIGHT, tiny.WIDTH, 3)))),
         ("mask", lambda run, dataset: write_png(dataset / "masks/kf_0003.png", np.ones((tiny.HEIGHT, tiny.WIDTH), bool))),
+        ("depth", lambda run, dataset: write_exr(dataset / "depth/kf_0003.exr", {"Z": np.ones((12, 16), np.float32)})),
+        ("spacing", lambda run, dataset: write_json(run.parent / "prior/prior.json", {"spacing": 0.01})),
         ("older version", lambda run, dataset: write_json(run / "metrics.json", {"images": 3})),
         ("damaged", lambda run, dataset: (run / "metrics.json").write_text("{")),
     ],
@@ -231,3 +330,43 @@ def test_what_has_changed_is_measured_again(dataset, prior, tmp_path, work, what
     assert after["pictures"] is False  # those that are there may be of another model
     evaluate_run(run)
     assert work() == (0, 12)
+
+
+def test_a_run_is_measured_on_the_test_views_of_its_dataset(dataset, prior, tmp_path, work):
+    run, said = tiny.write_run(tmp_path / "run", dataset, prior), []
+    before = evaluate_run(run)
+    tiny.write_dataset(dataset / "test", frames=3)
+    work()
+    after = evaluate_run(run, say=said.append)
+    assert work() == (15, 15)
+    assert after == json.loads((run / "metrics.json").read_text())
+    assert (after["test"]["count"], len(after["test_views"])) == (3, 3)
+    assert {key: after[key] for key in ("all", "held_out", "views")} == {
+        key: before[key] for key in ("all", "held_out", "views")
+    }
+    assert evaluate_run(run) == after
+    assert work() == (0, 0)
+    (run / "renders/test/kf_0002.png").unlink()
+    assert evaluate_run(run) == after
+    assert work() == (0, 15)
+    (dataset / "test/images/kf_0002.png").unlink()
+    with pytest.raises(InputError, match=r"images/kf_0002\.png does not exist in .*test"):
+        evaluate_run(run)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "said"),
+    [(None, "is not there"), ({"spacing": "wide"}, InputError), ({"spacing": -1}, InputError), ([], InputError)],
+)
+def test_without_the_priors_spacing_nothing_is_called_too_deep(dataset, prior, tmp_path, numbers, said):
+    run, lines = tiny.write_run(tmp_path / "run", dataset, prior), []
+    if numbers is None:
+        prior.rename(tmp_path / "elsewhere")
+        found = evaluate_run(run, pictures=False, say=lines.append)["all"]
+        assert "depth_error" in found
+        assert not [name for name in found if name.startswith("too_deep")]
+        assert lines[-1] == f"{prior}: is not there, so the shares that are too deep, in its spacings, are left out"
+        return
+    write_json(prior / "prior.json", numbers)
+    with pytest.raises(said, match=r"prior\.json: spacing must be positive metres"):
+        evaluate_run(run)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import tiny
 
-from mgs.active import criteria, loop, pose_policies, run_folder
+from mgs.active import criteria, loop, policies, run_folder
 from mgs.active.stopping import StopReason
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
@@ -39,7 +39,7 @@ def timeless(steps: list[dict]) -> list[dict]:
     return [{key: value for key, value in step.items() if key != "seconds"} for step in steps]
 
 
-@pytest.mark.parametrize("policy", pose_policies.policy_names())
+@pytest.mark.parametrize("policy", policies.policy_names())
 def test_run_writes_what_it_did(dataset, tmp_path, policy):
     state = run(tmp_path / "run", dataset, policy=policy)
     steps = lines(tmp_path / "run")

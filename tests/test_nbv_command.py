@@ -102,6 +102,10 @@ def test_a_mean_over_no_view_is_left_out(dataset, tmp_path):
     assert list(measure(model, list(range(12)))) == ["psnr", "psnr_mask"]
     blacken(dataset, 0, 4, 8)
     assert list(psnr_measure(loaded, ListCache())(model, [0, 4, 8])) == ["psnr", "held_out_psnr"]
+    tiny.write_dataset(dataset / "test", frames=3)
+    tested = psnr_measure(loaded, ListCache())(model, [0, 4, 8])
+    assert list(tested) == ["psnr", "held_out_psnr", "test_psnr", "test_psnr_mask"]
+    assert tested["test_psnr"] == psnr_measure(load_dataset(dataset / "test"), ListCache())(model, [])["psnr"]
 
 
 def test_a_quality_that_could_not_be_measured_is_a_dash(dataset, tmp_path):
@@ -109,7 +113,11 @@ def test_a_quality_that_could_not_be_measured_is_a_dash(dataset, tmp_path):
     views = {"count": 2, "psnr": 30.123, "ssim": 0.95, "psnr_mask": None, "ssim_mask": None}
     console = Console(record=True, width=500)
     print_run(tmp_path, state, {"all": views, "held_out": {"count": 0}}, console)
-    assert "all views (2): PSNR 30.12 dB, SSIM 0.9500; inside the rock mask PSNR – dB, SSIM –" in console.export_text()
+    text = "(2): PSNR 30.12 dB, SSIM 0.9500; inside the rock mask PSNR – dB, SSIM –"
+    assert f"all views {text}" in console.export_text(clear=False)
+    assert "test views" not in console.export_text()
+    print_run(tmp_path, state, {"all": views, "held_out": {"count": 0}, "test": views}, console)
+    assert f"test views {text}\nall views {text}" in console.export_text()
 
 
 @pytest.mark.parametrize("name", ["kf_{}", "DJI_20231105103211_000{}_W_some_flight", "frame {} of the [second] flight"])

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mgs.active import criteria, pose_policies
+from mgs.active import criteria, policies, pose_policies
 from mgs.seeds import generator
 
 GROUPS = {"colour": slice(0, 3), "scale": slice(3, 6), "rotation": slice(6, 10), "opacity": slice(10, 11)}
@@ -104,6 +104,79 @@ def test_t_optimal_is_the_difference_the_paper_writes():
     rng = np.random.default_rng(1)
     F, H = rng.random((N, 11)), rng.random((N, 11))
     assert criteria.t_optimal(F, H, LAM) == pytest.approx((1 / (H + LAM) - 1 / (H + F + LAM)).mean())
+
+
+@given(information, information, information)
+def test_i_optimal_is_the_fall_of_a_predicted_variance(F, H, weight):
+    """Never negative; with equal weights the fall of the mean variance; a view is worth less once it was taken."""
+    found = criteria.i_optimal(F, H, LAM, weight)
+    assert found == pytest.approx((weight * (1 / (H + LAM) - 1 / (H + F + LAM))).mean(), rel=1e-6, abs=1e-6)
+    assert 0 <= criteria.i_optimal(F, H + F, LAM, weight) <= found
+    assert criteria.i_optimal(F, H, LAM, np.ones_like(H)) == criteria.t_optimal(F, H, LAM)
+
+
+@given(information, information)
+def test_blocks_without_correlations_are_a_diagonal(F, H):
+    F_blocks, H_blocks = (values[:, :, None] * np.eye(11) for values in (F, H))
+    gain = criteria.block_log_determinant(H_blocks + F_blocks, LAM) - criteria.block_log_determinant(H_blocks, LAM)
+    assert gain == pytest.approx(criteria.d_optimal(F, H, LAM), rel=1e-6, abs=1e-9)
+
+
+@given(arrays(np.float64, (2, N, 14, 11), elements=st.floats(-10, 10)))
+def test_blocks_are_the_log_determinant_of_the_posterior(jacobians):
+    """H_j = J_j^T J_j of a few rows; the gain is never negative. A diagonal, which knows no correlation, says more."""
+    F, H = (np.einsum("nrk,nrl->nkl", J, J) for J in jacobians)
+    expected = np.linalg.slogdet(H + np.diag(LAM))[1].mean() / 11 - np.log(LAM).mean()
+    assert criteria.block_log_determinant(H, LAM) == pytest.approx(expected, rel=1e-6, abs=1e-6)
+    assert criteria.block_log_determinant(H + F, LAM) >= criteria.block_log_determinant(H, LAM) - 1e-9
+    diagonal = np.einsum("nkk->nk", H)
+    assert criteria.block_log_determinant(H, LAM) <= criteria.d_optimal(diagonal, np.zeros_like(diagonal), LAM) + 1e-9
+
+
+def test_rounding_below_zero_counts_as_no_information():
+    assert criteria.block_log_determinant(-1e-6 * np.eye(11)[None], LAM) == 0
+
+
+def test_angle_spreads_over_a_dome():
+    """A pole, four on the horizon, one close by at the same angle as another: distance plays no part."""
+    taken = np.array([[2.0, 0, 0]])
+    candidates = np.array([[0, 0, 9.0], [-0.5, 0, 0], [4, 0.1, 0], [0, 2, 0]]) + CENTRE
+    found = pose_policies.smallest_angle(candidates, taken, CENTRE, np.random.default_rng(0))
+    assert found == pytest.approx([np.pi / 2, np.pi, np.arctan(0.1 / 4), np.pi / 2], abs=1e-6)
+    moved = np.array([3.0, 4.0, 5.0])
+    again = pose_policies.smallest_angle(candidates + moved, taken + moved, CENTRE + moved, np.random.default_rng(0))
+    assert again == pytest.approx(found, abs=1e-6)
+
+
+def outlook_of(models, H, **given):
+    """An outlook on three candidates, 1, 2 and 3, after one view, 0."""
+    nothing = np.zeros((0, 11))
+    parts = {
+        "positions": CIRCLE[:4], "left": [1, 2, 3], "visited": [0], "centre": CENTRE, "rng": np.random.default_rng(0),
+        "H": H, "lam": LAM, "points": np.zeros((0, 3)), "surface_H": nothing, "prior_lam": LAM,
+        "information": lambda view: models["exact"][view], "surface_information": lambda view: nothing,
+        "estimate": lambda view, estimator: models[estimator][view], "seen": lambda view: np.zeros(0), "dome": lambda: None,
+    }  # fmt: skip
+    return policies.Outlook(**(parts | given))
+
+
+def test_what_the_outlook_policies_ask_for():
+    """Each by its own estimator for the views taken, too; the pool of `i-optimal` is all poses, also those out of reach."""
+    rng = np.random.default_rng(0)
+    models = {name: rng.random((4, N, 11)) * scale for name, scale in (("exact", 1), ("loss-gradient", 1e-9))}
+    J = rng.normal(size=(4, N, 14, 11))
+    models["block"] = np.einsum("vnrk,vnrl->vnkl", J, J)
+    outlook = outlook_of(models, models["exact"][0])
+    H = models["exact"][0]
+    expected = [criteria.i_optimal(models["exact"][i], H, LAM, models["exact"].mean(0)) for i in (1, 2, 3)]
+    assert policies.policy_named("i-optimal")(outlook) == pytest.approx(expected)
+    assert policies.policy_named("i-optimal")(outlook_of(models, H, left=[2])) == pytest.approx(expected[1:2])
+    taken = criteria.block_log_determinant(models["block"][0], LAM)
+    expected = [criteria.block_log_determinant(models["block"][0] + models["block"][i], LAM) - taken for i in (1, 2, 3)]
+    assert policies.policy_named("block-d")(outlook) == pytest.approx(expected)
+    gradients, lam = models["loss-gradient"], np.full(11, 1e-6)
+    expected = [criteria.d_optimal(gradients[i], gradients[0], lam) for i in (1, 2, 3)]
+    assert policies.policy_named("paper")(outlook) == pytest.approx(expected)
 
 
 def test_random_differs_between_rounds_and_repeats_between_runs():

@@ -28,11 +28,30 @@ from mgs.report.figures import POLICY_STYLE
 from mgs.report.runs import evaluated_runs, read_run
 
 
+def flat(camera, grey):
+    """An opaque grey wall."""
+    shape = camera.height, camera.width
+    return np.full((*shape, 3), grey, np.float32), np.ones(shape), np.ones(shape)
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """Two runs of the real loop on stand-in stations, evaluated with a renderer of one grey."""
-    root = tmp_path_factory.mktemp("report")
+    return write_runs(tmp_path_factory.mktemp("report"))
+
+
+@pytest.fixture(scope="module")
+def tested(tmp_path_factory):
+    """The same, on a dataset with three test views."""
+    root = tmp_path_factory.mktemp("tested")
+    tiny.write_dataset(root / "data/test", frames=3)
+    return write_runs(root)
+
+
+def write_runs(root):
     dataset = load_dataset(tiny.write_dataset(root / "data"))
+    tests = dataset.test_views()
+    sets = ("", "test_") if tests else ("",)
     folders = []
     for policy in ("d-optimal", "random"):
         out = root / policy
@@ -41,7 +60,11 @@ def runs(tmp_path_factory):
             out,
             settings,
             dataset,
-            tiny.stations(measure=lambda gaussians, taken: {"psnr": len(taken), "psnr_mask": 2 * len(taken)}),
+            tiny.stations(
+                measure=lambda gaussians, taken: {
+                    f"{views}psnr{mask}": len(taken) * (1 + len(views + mask)) for views in sets for mask in ("", "_mask")
+                }
+            ),
             tiny.silent,
         )
         gaussians, _, trained, _ = load_run(out)
@@ -50,7 +73,8 @@ def runs(tmp_path_factory):
             gaussians,
             dataset.frames,
             trained,
-            renderer=lambda g, camera, grey=grey: np.full((camera.height, camera.width, 3), grey, np.float32),
+            test_frames=tests.frames if tests else (),
+            renderer=lambda g, camera, grey=grey: flat(camera, grey),
             pictures=out / "renders",
         )
         write_json(out / "metrics.json", {"policy": policy} | metrics)
@@ -125,25 +149,67 @@ def test_unseen_view(runs):
     assert counts[index] == min(counts)
 
 
-def test_table(runs):
-    rows = tables.table_rows(runs)
+@pytest.mark.parametrize("sets", [["all", "held_out"], ["test", "all", "held_out"]])
+def test_table(request, sets):
+    runs = request.getfixturevalue("tested" if "test" in sets else "runs")
+    rows = tables.table_numbers(runs)
     metrics = json.loads((runs[1] / "metrics.json").read_text())
-    row = dict(zip(tables.COLUMNS, rows[1], strict=True))
+    means = {f"{views}.{name}": value for views in sets for name, value in metrics[views].items()}
+    last = json.loads((runs[1] / "steps.jsonl").read_text().splitlines()[-1])
+    assert rows[1] == means | {"policy": "random", "images": 8, "coverage": 100 * last["coverage"]}
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in tables.markdown_table(rows).splitlines()]
+    assert len(lines) == 4
+    row = dict(zip(lines[0], lines[3], strict=True))
     assert row["policy"] == "random"
     assert row["images"] == "8"
-    assert row["all.psnr"] == f"{metrics['all']['psnr']:.2f}"
-    assert row["held_out.ssim_mask"] == f"{metrics['held_out']['ssim_mask']:.4f}"
-    numbers = tables.table_numbers(runs)[1]
-    means = {f"{views}.{name}": value for views in ("all", "held_out") for name, value in metrics[views].items()}
-    last = json.loads((runs[1] / "steps.jsonl").read_text().splitlines()[-1])
-    assert numbers == means | {"policy": "random", "images": 8, "coverage": 100 * last["coverage"]}
-    lines = tables.markdown_table(rows).splitlines()
-    assert len(lines) == 4
-    assert {line.count("|") for line in lines} == {len(tables.COLUMNS) + 1}
+    assert row["PSNR, all (dB)"] == f"{metrics['all']['psnr']:.2f}"
+    assert row["SSIM, held out, rock only"] == f"{metrics['held_out']['ssim_mask']:.4f}"
+    assert len(row) == 9 + 4 * ("test" in sets)
+    if "test" in sets:
+        assert lines[0][2] == "PSNR, test views (dB)"
+        assert lines[3][2] == f"{metrics['test']['psnr']:.2f}"
     console = Console(width=80, file=io.StringIO())
     printing.print_table(console, rows)
-    for value in row.values():
-        assert value in console.file.getvalue()
+    printed = console.file.getvalue()
+    assert max(map(len, printed.splitlines())) <= 80
+    for key in printing.SHOWN["test" in sets]:
+        assert tables.table_cell(key, rows[1][key]) in printed
+
+
+def test_the_views_that_were_not_measured_have_a_dash(runs, tested):
+    rows = [*tables.table_numbers(runs), *tables.table_numbers(tested)]
+    lines = tables.markdown_table(rows).splitlines()
+    assert len({line.count("|") for line in lines}) == 1
+    assert lines[2].count("–") == 4
+    assert lines[4].count("–") == 0
+
+
+def test_a_report_shows_test_views_where_there_are_some(tested, tmp_path, drawn):
+    writing.write_report(tmp_path / "report", tested)
+    lines = {run.policy: run.steps for run in map(read_run, tested)}
+    axes = drawn["psnr.png"].axes
+    assert [axis.get_ylabel() for axis in axes] == ["PSNR, test views (dB)", "PSNR, test views, rock only (dB)"]
+    for axis, key in zip(axes, ("test_psnr", "test_psnr_mask"), strict=True):
+        assert curves(axis) == {policy: [(s["images"], s[key]) for s in steps] for policy, steps in lines.items()}
+    metrics = json.loads((tested[0] / "metrics.json").read_text())
+    shown = {axis.get_title().split("\n")[0]: axis for axis in drawn["comparison.png"].axes if axis.images}
+    assert shown["truth"].get_title() == "truth\nkf_0001"
+    assert f"{metrics['test_views'][1]['psnr']:.2f} dB" in shown["d-optimal"].get_title()
+    assert "trained" not in shown["d-optimal"].get_title()
+
+
+def test_a_run_that_was_not_measured_on_the_test_views_is_compared_on_the_others(tested, tmp_path, drawn):
+    run = shutil.copytree(tested[1], tmp_path / "random")
+    metrics = json.loads((run / "metrics.json").read_text())
+    write_json(run / "metrics.json", {key: value for key, value in metrics.items() if not key.startswith("test")})
+    lines = [json.loads(line) for line in (run / "steps.jsonl").read_text().splitlines()]
+    kept = [{key: value for key, value in line.items() if not key.startswith("test")} for line in lines]
+    (run / "steps.jsonl").write_text("".join(json.dumps(line) + "\n" for line in kept))
+    writing.write_report(tmp_path / "report", [tested[0], run])
+    assert drawn["psnr.png"].axes[0].get_ylabel() == "PSNR, all views (dB)"
+    read = [read_run(folder) for folder in (tested[0], run)]
+    shown = f"kf_{writing.unseen_view(read, tiny.FRAMES):04d}"
+    assert drawn["comparison.png"].axes[0].get_title() == f"truth\n{shown}"
 
 
 def test_runs_of_one_policy_are_told_apart_by_their_folders(runs, tmp_path):
@@ -337,10 +403,11 @@ def test_a_policy_keeps_its_style_whatever_it_is_compared_with():
 @pytest.mark.parametrize("name", ["random (a [second] run in a folder with a long name)", "random" * 20, "d-optimal"])
 def test_a_long_name_cuts_no_number_and_is_not_cut(name):
     console = Console(width=80, record=True, file=io.StringIO())
-    row = [name, "12", "30.09", "0.9426", "29.56", "0.9362", "27.54", "0.7538", "100.00"]
-    printing.print_table(console, [row, ["random", *row[1:]]])
+    values = dict(zip(printing.SHOWN[False], (30.09, 0.9426, 29.56, 0.9362, 27.54, 0.7538), strict=True))
+    row = {"images": 12, "coverage": 100.0} | values
+    printing.print_table(console, [{"policy": name} | row, {"policy": "random"} | row])
     text = console.export_text()
-    assert all(text.count(number) == 2 for number in row[2:])
+    assert all(text.count(tables.table_cell(key, value)) == 2 for key, value in row.items() if key != "images")
     assert "…" not in text
     assert any(name in line for line in text.splitlines())
     assert max(len(line) for line in text.splitlines() if name not in line) <= 80

@@ -96,6 +96,25 @@ def fisherrf(F: Array, H: Array, lam: Array) -> float:
     return float((F / (H + lam)).mean(dtype=np.float64))
 
 
+def i_optimal(F: Array, H: Array, lam: Array, weight: Array) -> float:
+    """1/l sum weight [1/(H+lam) - 1/(H+F+lam)], the decrease of the variance predicted for a set of views, per parameter.
+
+    weight: [N,P] mean information of those views, so how much their pixels depend on each parameter (diagonal, linearised).
+    With a weight of 1 it is `t_optimal`.
+    """
+    return float((weight * F / ((H + lam) * (H + F + lam))).mean(dtype=np.float64))
+
+
+def block_log_determinant(H: Array, lam: Array) -> float:
+    """1/l sum over the Gaussians of log det(I + Lambda^-1/2 H Lambda^-1/2), Lambda = diag(lam): what the images say about them.
+
+    H: [N,P,P] blocks of J^T J, so correlations between the parameters of one Gaussian count, those between Gaussians do not.
+    The difference of two such values is Eq. 7 for blocks. Eigenvalues that rounding has made negative count as 0.
+    """
+    whitened = np.asarray(H, np.float64) / np.sqrt(np.multiply.outer(lam, lam))
+    return float(np.log1p(np.maximum(np.linalg.eigvalsh(whitened), 0)).mean())
+
+
 def coverage_greedy(F: Array, H: Array, lam: Array) -> float:
     """Number of Gaussians newly `observed`."""
     return float((observed(H + F, lam) & ~observed(H, lam)).sum())

@@ -9,13 +9,13 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from mgs.active import criteria, inputs, pose_policies
+from mgs.active import criteria, directional, inputs, policies, pose_policies
 from mgs.active.run_folder import State, check_settings, read_checkpoint, write_checkpoint, write_steps
 from mgs.active.settings import NbvSettings
 from mgs.active.stopping import StopReason
@@ -56,6 +56,7 @@ class Stations:
     fit(gaussians, start, cameras, targets, rate, on_pass) -> Fit; start, the Gaussians before any training, and targets as in
     `mgs.active.fitting.fit`; rate multiplies all rates.
     fisher(gaussians, camera) -> information of one view [N,P], by the estimator of the run.
+    estimate(gaussians, camera, estimator) -> information of one view by a row of `mgs.splat.ESTIMATORS`.
     measure(gaussians, taken frame indices) -> entries for steps.jsonl.
     exact(gaussians, camera) -> exact information of one view [N,P], for what the views see of the surface; None: as `fisher`.
     on_surface: how many of the Gaussians, the first, lie on the surface, so are what coverage is a share of; None: all.
@@ -67,6 +68,7 @@ class Stations:
     initial: Callable[[list[Frame]], Gaussians]
     fit: Callable[[Gaussians, Gaussians, list[Camera], list[np.ndarray], float, Callable[[int, int], None]], Fit]
     fisher: Callable[[Gaussians, Camera], np.ndarray]
+    estimate: Callable[[Gaussians, Camera, str], np.ndarray]
     measure: Callable[[Gaussians, list[int]], dict[str, float]]
     exact: Callable[[Gaussians, Camera], np.ndarray] | None = None
     on_surface: int | None = None
@@ -151,6 +153,7 @@ class _Loop:
         self.made_from = {"prior": stations.prior, "cameras": cameras}
         self.seeds = pose_policies.seed_views(self.positions, stations.centre, settings.seeds)
         self.start = stations.initial([self.frames[i] for i in self.seeds])
+        self.seen, self.dome = cache(self._seen), cache(self._dome)  # they depend on poses and surface alone
 
     def first(self) -> State:
         """Step 0: the seeds."""
@@ -180,35 +183,53 @@ class _Loop:
     def choose(self, state: State) -> tuple[int, float]:
         """Frame of the largest score among those not taken, and that score. Looks at poses, never at candidates' images."""
         policy = self.settings.policy
-        left = [i for i in range(len(self.frames)) if i not in state.taken]
-        poses = self.positions[left], self.positions[state.taken], self.stations.centre
-        rng = generator(self.settings.seed, f"{policy}/{len(state.steps)}")
-        if policy in criteria.CRITERIA:
-            scores = self.score(state, criteria.CRITERIA[policy], left)
-        else:
-            scores = pose_policies.POSE_POLICIES[policy](*poses, rng)
-        farthest = pose_policies.farthest_pose(*poses, rng)
-        best = max(range(len(left)), key=lambda k: (scores[k], farthest[k]))
+        outlook = self.outlook(state, [i for i in range(len(self.frames)) if i not in state.taken])
+        scores = policies.policy_named(policy)(outlook)
+        farthest = pose_policies.farthest_pose(outlook.candidates, outlook.taken, outlook.centre, outlook.rng)
+        best = max(range(len(outlook.left)), key=lambda k: (scores[k], farthest[k]))
         if np.isnan(scores).any() or np.isinf(scores[best]):
             raise InputError(f"policy {policy}: gave a score that is NaN or infinite; correct it (docs/howto/policy.md)")
-        return left[best], float(scores[best])
+        return outlook.left[best], float(scores[best])
 
-    def score(self, state: State, criterion: criteria.Criterion, left: list[int]) -> np.ndarray:
-        """The criterion's score of each frame in `left`; the information of one candidate is in memory at a time."""
-        scores: np.ndarray = np.empty(len(left))
-        for done, i in enumerate(left):
-            self.progress("scoring candidates", done, len(left))
-            if criterion.at == "prior":
-                scores[done] = criterion.score(self.surface_information(i), state.surface, self.prior_lam)
-            else:
-                F = self.stations.fisher(state.gaussians, self.cameras[i])
-                scores[done] = criterion.score(F, state.H, self.lam)
-        return scores
+    def outlook(self, state: State, left: list[int]) -> policies.Outlook:
+        """What the policy is told when it chooses among the frames in `left`."""
 
-    def surface_information(self, frame: int) -> np.ndarray:
-        """What a frame's pose sees of the surface: exact information about the Gaussians on it before any training."""
+        def told(view: int) -> int:
+            self.progress("scoring candidates", left.index(view) if view in left else 0, len(left))
+            return view
+
+        return policies.Outlook(
+            positions=self.positions,
+            left=left,
+            visited=state.taken,
+            centre=self.stations.centre,
+            rng=generator(self.settings.seed, f"{self.settings.policy}/{len(state.steps)}"),
+            H=state.H,
+            lam=self.lam,
+            points=self.start.means[: self.stations.on_surface],
+            surface_H=state.surface,
+            prior_lam=self.prior_lam,
+            information=lambda view: self.stations.fisher(state.gaussians, self.cameras[told(view)]),
+            surface_information=lambda view: self.surface_information(self.cameras[told(view)]),
+            estimate=lambda view, estimator: self.stations.estimate(state.gaussians, self.cameras[told(view)], estimator),
+            seen=lambda view: self.seen(told(view)),
+            dome=self.dome,
+        )
+
+    def surface_information(self, camera: Camera) -> np.ndarray:
+        """What a pose sees of the surface: exact information about the Gaussians on it before any training."""
         fisher = self.stations.exact or self.stations.fisher
-        return fisher(self.start, self.cameras[frame])[: self.stations.on_surface]
+        return fisher(self.start, camera)[: self.stations.on_surface]
+
+    def _seen(self, frame: int) -> np.ndarray:
+        """Squared blending weights [N] of the Gaussians on the surface in a frame's view."""
+        return directional.squared_weights(self.surface_information(self.cameras[frame]))
+
+    def _dome(self) -> directional.Views:
+        """A dome of poses around the rock, and what they see of the surface."""
+        cameras = directional.dome_cameras(self.cameras[0], self.positions, self.stations.centre)
+        seen = [directional.squared_weights(self.surface_information(camera)) for camera in cameras]
+        return directional.Views(np.array([camera.position for camera in cameras]), np.stack(seen))
 
     def learn(self, state: State, new: list[int], choice: dict[str, Any], watch: _Stopwatch) -> State:
         """Read the new images, fit to convergence on all so far, sum their information at the new model."""
@@ -230,7 +251,7 @@ class _Loop:
             for done, camera in enumerate(cameras):
                 self.progress("information of the training set", done, len(cameras))
                 H += self.stations.fisher(fit.gaussians, camera)
-            surface = state.surface + sum(self.surface_information(i) for i in new)
+            surface = state.surface + sum(self.surface_information(self.cameras[i]) for i in new)
         kinds = ["image", "mask", "rock"] + ["depth"] * (not step)  # depth gives the seeds' colours to the surface
         files = {self.frames[i].name: inputs.frame_digests(self.frames[i], kinds) for i in new}
         made_from = {**self.made_from, "files": state.inputs.get("files", {}) | files}

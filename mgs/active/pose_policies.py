@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from mgs.active.criteria import CRITERIA, Array
+from mgs.active.criteria import Array
 
 PosePolicy = Callable[[Array, Array, Array, np.random.Generator], Array]
 
@@ -43,6 +43,12 @@ def farthest_pose(candidates: Array, taken: Array, centre: Array, rng: np.random
     return _rounded(distance.min(axis=1))
 
 
+def smallest_angle(candidates: Array, taken: Array, centre: Array, rng: np.random.Generator) -> Array:
+    """Angle to the nearest camera already taken, as seen from `centre`, radians: spreads the views over the whole dome."""
+    ours, theirs = (offset / np.linalg.norm(offset, axis=1, keepdims=True) for offset in (candidates - centre, taken - centre))
+    return _rounded(np.arccos(np.clip(ours @ theirs.T, -1, 1)).min(axis=1))
+
+
 def _rounded(scores: Array) -> Array:
     """Equal distances differ in the last bits; without them a tie is a tie (the loop takes the farthest, seeds the first)."""
     return np.round(scores, 9)
@@ -52,13 +58,9 @@ POSE_POLICIES: dict[str, PosePolicy] = {
     "random": random_order,
     "uniform": uniform_azimuth,
     "farthest": farthest_pose,
+    "angle": smallest_angle,
 }
 """Policies that look at poses, by name. A program may add its own (docs/howto/policy.md)."""
-
-
-def policy_names() -> list[str]:
-    """Every policy that `mgs nbv --policy` accepts: the rows of both tables, as they are now."""
-    return [*CRITERIA, *POSE_POLICIES]
 
 
 def seed_views(positions: Array, centre: Array, count: int) -> list[int]:

@@ -9,7 +9,8 @@ A line of `steps.jsonl` holds: `step` (0 = the seeds), `frame` and `name` of the
 and `seed_names` instead), `images` (how many the model has now), `score` (the policy's own number; of random, the draw),
 `information_gain` (Eq. 7 of the chosen view by the run's estimator, whatever the policy), `coverage` (Eq. 9 of all images),
 `iterations`, `loss` and `stop_reason` of the fit, `seconds` per stage, and, where the step was evaluated, mean PSNR in dB over
-all views (`psnr`; `psnr_mask` in the rock mask) and over those never trained on (`held_out_psnr`, `held_out_psnr_mask`).
+all views (`psnr`; `psnr_mask` in the rock mask), over those never trained on (`held_out_psnr`, `held_out_psnr_mask`), and over
+the test views of the dataset where it has some (`test_psnr`, `test_psnr_mask`).
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from mgs.active import pose_policies
+from mgs.active.policies import policy_named
 from mgs.active.settings import NbvSettings, validated
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.errors import InputError
@@ -56,9 +57,7 @@ def check_settings(settings: NbvSettings, frames: int) -> None:
     from mgs.splat import ESTIMATORS
 
     diagonal = [name for name in ESTIMATORS if name != "block"]
-    if settings.policy not in pose_policies.policy_names():
-        known = ", ".join(pose_policies.policy_names())
-        raise InputError(f"--policy {settings.policy}: unknown; choose one of {known}, or add your own (docs/howto/policy.md)")
+    policy_named(settings.policy)
     if settings.estimator not in diagonal:
         known = ", ".join(diagonal)
         raise InputError(f"--estimator {settings.estimator}: gives no diagonal, or is unknown; choose one of {known}")

@@ -44,6 +44,7 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
         initial=lambda frames: initial_gaussians(prior, frames)[0],
         fit=run_fit,
         fisher=lambda gaussians, camera: fisher(gaussians, camera, settings.estimator, cache=cache),
+        estimate=lambda gaussians, camera, estimator: fisher(gaussians, camera, estimator, cache=cache),
         exact=lambda gaussians, camera: fisher(gaussians, camera, cache=cache),
         measure=psnr_measure(dataset, cache),
         on_surface=len(prior.points),
@@ -53,22 +54,27 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
 
 def psnr_measure(dataset: Dataset, cache: ListCache) -> Callable[[Gaussians, list[int]], dict[str, float]]:
     """measure(gaussians, frames taken) -> mean PSNR, dB: `psnr` and `psnr_mask` (inside the rock mask) over all views,
-    `held_out_psnr` and `held_out_psnr_mask` over those never trained on. As `mgs.report.evaluation`, without its SSIM, which
-    costs more. A mean over no view (all masks empty, none held out) is left out.
+    `held_out_psnr` and `held_out_psnr_mask` over those never trained on, `test_psnr` and `test_psnr_mask` over the test views
+    where the dataset has some. As `mgs.report.evaluation`, without its other metrics, which cost more. A mean over no view (all
+    masks empty, none held out) is left out. Raises InputError as `Dataset.test_views`.
     """
+    tests = dataset.test_views()
+    frames = [*dataset.frames, *(tests.frames if tests else ())]
 
     @functools.cache
     def truth(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        rgba, weight = dataset.frames[index].target()
-        return srgb_from_linear(rgba[..., :3]), weight > 0, dataset.frames[index].mask() & (weight > 0)
+        rgba, weight = frames[index].target()
+        return srgb_from_linear(rgba[..., :3]), weight > 0, frames[index].mask() & (weight > 0)
 
     def measure(gaussians: Gaussians, taken: list[int]) -> dict[str, float]:
-        values = np.empty((len(dataset), 2))
-        for i, frame in enumerate(dataset.frames):
+        values = np.empty((len(frames), 2))
+        for i, frame in enumerate(frames):
             image, known, rock = truth(i)
             rendered = srgb_from_linear(np.asarray(render(gaussians, frame.camera, cache=cache).rgb))
             values[i] = psnr(rendered, image, known), psnr(rendered, image, rock)
-        return _means(values, "") | _means(np.delete(values, taken, axis=0), "held_out_")
+        views, test_views = values[: len(dataset)], values[len(dataset) :]
+        held_out = np.delete(views, taken, axis=0)
+        return _means(views, "") | _means(held_out, "held_out_") | _means(test_views, "test_")
 
     return measure
 

@@ -12,6 +12,10 @@ POLICIES = ("d-optimal", "coverage", "random")
 GAUSSIANS = 10_000
 """About one Gaussian per pixel of the rock at 320x240."""
 
+TEST_VIEWS = 12
+"""Views on a dome around the rock, on which the policies are judged: enough to see it from all sides, and not many to
+render beside the 32 of the orbit."""
+
 BUDGET = 8
 """Views beyond the four seeds, the same for every policy."""
 
@@ -34,7 +38,7 @@ def demo(
     from mgs.cli.prior import prior
     from mgs.cli.synth_orbit import synth_orbit
     from mgs.files import check_new_folder, check_writable
-    from mgs.report.tables import table_rows
+    from mgs.report.tables import table_numbers
     from mgs.report.writing import write_report
 
     runtime.start()
@@ -49,9 +53,9 @@ def demo(
     def heading(text: str) -> None:
         console.rule(f"{text}   [dim]{time.monotonic() - started:.0f} s", align="left")
 
-    heading("1/5 a photoreal orbit: 32 frames with depth and masks")
+    heading(f"1/5 a photoreal orbit: 32 frames with depth and masks, and {TEST_VIEWS} test views")
     if not (dataset / "transforms.json").is_file():
-        synth_orbit(dataset, seed=seed)
+        synth_orbit(dataset, seed=seed, test_views=TEST_VIEWS)
     heading(f"2/5 the prior: {GAUSSIANS:,} points on the rock's mesh")
     if not (folder / "prior.json").is_file():
         prior(dataset, out=folder, gaussians=GAUSSIANS, seed=seed)
@@ -65,7 +69,7 @@ def demo(
     diagnose(runs[0])
     heading("5/5 the report")
     written = write_report(report, runs)
-    print_table(console, table_rows(runs))
+    print_table(console, table_numbers(runs))
     console.print(f"done in {time.monotonic() - started:.0f} s; look at:")
     for picture in (dataset / "contact_sheet.png", folder / "prior.png", *written):
         console.print(f"  {picture}", soft_wrap=True)

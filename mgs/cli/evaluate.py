@@ -1,4 +1,4 @@
-"""`mgs eval`: PSNR and SSIM of the model of a run, and its renders beside the truth."""
+"""`mgs eval`: how good the model of a run is, and its renders beside the truth."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ def evaluate(
         bool, typer.Option(help="Write truth, render and difference of every view, side by side, to RUN/renders.")
     ] = True,
 ) -> None:
-    """Measure PSNR and SSIM on all views and on the views never trained on; write RUN/metrics.json, and renders beside truth.
+    """Measure the model on the test views, on all views, and on the views never trained on; write RUN/metrics.json, and renders
+    beside truth.
 
     What is there already of this very model and dataset is kept, and not measured or drawn again.
-    The truth is the rock on black. Numbers are over the full frame, and over the pixels of the rock only.
+    The truth is the rock on black. PSNR and SSIM are over the full frame, and over the pixels of the rock only. metrics.json
+    also has the errors of alpha and depth, where the dataset has their truth.
     """
     from rich.console import Console
     from rich.progress import Progress
@@ -25,7 +27,7 @@ def evaluate(
     from mgs import runtime
     from mgs.cli.printing import print_table
     from mgs.report.evaluation import evaluate_run
-    from mgs.report.tables import table_rows
+    from mgs.report.tables import table_numbers
 
     runtime.start()
     said: list[str] = []
@@ -37,5 +39,5 @@ def evaluate(
             progress=lambda done, total: bar.update(task, completed=done, total=total),
             say=said.append,
         )
-    print_table(Console(), table_rows([run]))
+    print_table(Console(), table_numbers([run]))
     typer.echo("\n".join(said))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mgs.active.criteria import PIXEL_NOISE, PRIOR_STD
-from mgs.active.pose_policies import policy_names
+from mgs.active.policies import policy_names
 from mgs.active.settings import RATES
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def nbv(
         typer.Option(metavar="KIND=NUMBER", help=f"Learning rate of a kind of parameter [{_numbers(RATES)}]; 0: not learned."),
     ] = None,
     passes: Annotated[int | None, typer.Option(help="Most passes over the images of one fit.")] = None,
-    evaluate_every: Annotated[int, typer.Option(help="Measure PSNR on all views every so many steps; 0: only at the end.")] = 0,
+    evaluate_every: Annotated[int, typer.Option(help="Measure PSNR every so many steps; 0: only at the end.")] = 0,
     resume: Annotated[
         Path | None, typer.Option(help="Continue this run; every other setting comes from its config.json.")
     ] = None,
@@ -175,8 +175,8 @@ def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console
     else:
         console.print(table(0, *range(2, len(columns))))
         console.print(table(0, 1))
-    for name, label in (("all", "all views"), ("held_out", "views never trained on")):
-        mean = metrics[name]
+    for name, label in (("test", "test views"), ("all", "all views"), ("held_out", "views never trained on")):
+        mean = metrics.get(name, {"count": 0})
         if mean["count"]:
             shown = {key: "–" if mean[key] is None else f"{mean[key]:.{digits}f}" for key, digits in DIGITS.items()}
             console.print(

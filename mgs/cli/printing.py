@@ -2,33 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 
-def print_table(console: Console, rows: Sequence[Sequence[str]]) -> None:
-    """Print the table, for 80 columns; names that do not fit beside the numbers stand below, by the number of their row."""
+GROUPS = {"test": "test", "all": "all", "held_out": "new"}
+"""What a set of views is called in the headings of the printed table."""
+
+SHOWN = {
+    True: ("test.psnr", "test.ssim", "test.psnr_mask", "all.psnr", "held_out.psnr", "held_out.psnr_mask"),
+    False: ("all.psnr", "all.ssim", "held_out.psnr", "held_out.ssim", "held_out.psnr_mask", "held_out.ssim_mask"),
+}
+"""Columns of the printed table with and without test views: as many as fit into a line of 80 characters."""
+
+
+def print_table(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print the rows of `mgs.report.tables.table_numbers` as a table, for 80 columns.
+
+    Names that do not fit beside the numbers stand below, by the number of their row.
+    """
     from rich import box
     from rich.table import Table
     from rich.text import Text
 
-    short = ["images", *(f"{name}\n{views}" for views in ("all", "new", "rock") for name in ("PSNR", "SSIM")), "cover"]
-    names = [row[0] for row in rows]
+    from mgs.report.tables import table_cell
+
+    tested = any("test.psnr" in row for row in rows)
+    keys = ("images", *SHOWN[tested], "coverage")
+    names = [row["policy"] for row in rows]
 
     def table(heading: str, first: Sequence[str]) -> Table:
-        made = Table(
-            box=box.SIMPLE_HEAD,
-            pad_edge=False,
-            caption="dB and %; new: views never trained on; rock: those, inside its mask",
-        )
+        caption = "dB and %; new: views never trained on; rock: inside its mask"
+        made = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption=caption)
         made.add_column(heading, no_wrap=True)
-        for heading in short:
-            made.add_column(heading, justify="right", no_wrap=True)
+        for key in keys:
+            made.add_column(_heading(key), justify="right", no_wrap=True)
         for name, row in zip(first, rows, strict=True):
-            made.add_row(Text(name), *row[1:])
+            made.add_row(Text(name), *(table_cell(key, row.get(key)) for key in keys))
         return made
 
     whole = table("policy", names)
@@ -39,3 +52,12 @@ def print_table(console: Console, rows: Sequence[Sequence[str]]) -> None:
     console.print(table("run", numbers))
     for number, name in zip(numbers, names, strict=True):
         console.print(Text(f"{number}: {name}"), soft_wrap=True)
+
+
+def _heading(key: str) -> str:
+    """A column's heading: the metric, and below it the set of views, and `rock` where the metric is inside its mask."""
+    views, _, metric = key.partition(".")
+    if not metric:
+        return {"coverage": "cover"}.get(key, key)
+    name, _, mask = metric.partition("_")
+    return f"{name.upper()}\n{GROUPS[views]}" + ("\nrock" if mask else "")

@@ -1,8 +1,11 @@
-"""How good a model is: PSNR and SSIM of its renders against the images of a dataset, and pictures of both side by side.
+"""How good a model is: its renders against the images of a dataset, in numbers (`mgs.metrics`) and in pictures.
 
-The truth is `Frame.target`: the rock in front of black, which is what the model was trained on. Both numbers compare sRGB
+The truth is `Frame.target`: the rock in front of black, which is what the model was trained on. PSNR and SSIM compare sRGB
 values in [0,1]. Over the full frame they flatter, because any model gets the black right; those inside the mask are over the
-rock's pixels only (`mgs.metrics`).
+rock's pixels only.
+
+Views come in three sets: all views of the dataset; of these, the views held out, which the model was never trained on; and the
+dataset's test views (`Dataset.test_views`), which are the same for every model and which no model is trained on.
 """
 
 from __future__ import annotations
@@ -20,16 +23,16 @@ from mgs.active.inputs import array_digest, camera_digest, frame_digests
 from mgs.active.run_folder import load_run, read_settings
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
-from mgs.data.dataset import Dataset, Frame
+from mgs.data.dataset import TEST_FOLDER, Dataset, Frame
 from mgs.errors import InputError
 from mgs.files import atomic_path, locked, read_json, write_json
 from mgs.gaussians import Gaussians
 from mgs.images import read_png
-from mgs.metrics import METRICS, compare
+from mgs.metrics import METRICS, SURFACE_METRICS, compare, compare_surface
 from mgs.provenance import versions
 
-Renderer = Callable[[Gaussians, Camera], np.ndarray]
-"""A function that draws a model: (gaussians, camera) -> linear RGB [H,W,3]."""
+Renderer = Callable[[Gaussians, Camera], tuple[np.ndarray, np.ndarray, np.ndarray]]
+"""A function that draws a model: (gaussians, camera) -> linear RGB [H,W,3], alpha [H,W], expected z-depth [H,W] in metres."""
 
 Progress = Callable[[int, int], None]
 """A function that is told how the work goes on: (frames done, frames in all)."""
@@ -38,11 +41,12 @@ DIFFERENCE_GAIN = 4
 """Factor by which differences are brightened in the pictures."""
 
 
-def render_rgb(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """The model on black, linear RGB [H,W,3]."""
+def render_view(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The model on black: linear RGB [H,W,3], alpha [H,W], expected z-depth [H,W] in metres."""
     from mgs.splat import render
 
-    return np.asarray(render(gaussians, camera).rgb)
+    image = render(gaussians, camera)
+    return np.asarray(image.rgb), np.asarray(image.alpha), np.asarray(image.depth)
 
 
 def evaluate(
@@ -50,49 +54,69 @@ def evaluate(
     frames: Sequence[Frame],
     trained: Iterable[str],
     *,
-    renderer: Renderer = render_rgb,
+    test_frames: Sequence[Frame] = (),
+    spacing: float | None = None,
+    renderer: Renderer = render_view,
     pictures: Path | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Compare a model with every frame of a dataset.
+    """Compare a model with every frame of a dataset, and with every test view where there are some.
 
-    trained: names of the frames that the model was trained on; the others are held out. renderer: draws the model. pictures: a
-    folder; if given, `write_comparison` writes NAME.png of every frame into it. progress: told the number of frames done.
+    trained: names of the frames that the model was trained on; the others are held out. test_frames: the test views, on which
+    it was not trained. spacing: of the prior's samples, metres; without it the shares that are too deep are left out. renderer:
+    draws the model. pictures: a folder; if given, `write_comparison` writes NAME.png of every frame into it, and test/NAME.png
+    of every test view. progress: told the number of views done.
 
     Returns what metrics.json holds, without its policy:
 
     - images: how many frames the model was trained on.
-    - all, held_out: over all frames, and over those held out, the number of frames ("count") and the mean of each of
-      `mgs.metrics.METRICS`, None if no frame has it.
-    - views: for each frame its "name", "trained" (bool) and its METRICS, None where the rock's mask is empty.
+    - test (only where there are test views), all, held_out: over the test views, over all frames, and over those held out, the
+      number of views ("count") and the mean of each of `mgs.metrics.METRICS`, and of each of `mgs.metrics.SURFACE_METRICS` that
+      the data has a truth for; None if no view has it.
+    - views, and with test views test_views: for each view its "name", "trained" (bool) and its metrics, None where there is no
+      pixel to measure, as where the rock's mask is empty.
 
     Raises InputError if a file of a frame cannot be read or a picture cannot be written.
     """
-    trained = set(trained)
-    views: list[dict[str, Any]] = []
-    for done, frame in enumerate(frames):
+    trained, views, tests = set(trained), list[dict[str, Any]](), list[dict[str, Any]]()
+    work = [(views, frame, pictures) for frame in frames]
+    work += [(tests, frame, pictures and pictures / TEST_FOLDER) for frame in test_frames]
+    for done, (found, frame, folder) in enumerate(work):
         if progress:
-            progress(done, len(frames))
-        (truth, weight), rendered = frame.target(), renderer(gaussians, frame.camera)
-        measured = compare(truth, rendered, frame.mask(), weight)
-        views.append({"name": frame.name, "trained": frame.name in trained} | measured)
-        if pictures is not None:
-            write_comparison(pictures / f"{frame.name}.png", truth[..., :3], rendered, measured["psnr"])
+            progress(done, len(work))
+        measured = _measured(frame, renderer(gaussians, frame.camera), spacing, folder)
+        found.append({"name": frame.name, "trained": found is views and frame.name in trained} | measured)
     if progress:
-        progress(len(frames), len(frames))
-    return {
-        "images": len(trained),
-        "all": _means(views),
-        "held_out": _means([view for view in views if not view["trained"]]),
-        "views": [_without_nan(view) for view in views],
-    }
+        progress(len(work), len(work))
+    held_out = [view for view in views if not view["trained"]]
+    result: dict[str, Any] = {"images": len(trained)} | ({"test": _means(tests, tests)} if tests else {})
+    result |= {"all": _means(views, views), "held_out": _means(held_out, views)}
+    result["views"] = [_without_nan(view) for view in views]
+    return result | ({"test_views": [_without_nan(view) for view in tests]} if tests else {})
 
 
-def _means(views: list[dict[str, Any]]) -> dict[str, Any]:
-    """Number of views, and the mean of each of METRICS over those views that have it; None if there is no such view."""
+def _measured(
+    frame: Frame, rendered: tuple[np.ndarray, np.ndarray, np.ndarray], spacing: float | None, folder: Path | None
+) -> dict[str, float]:
+    """The METRICS of one view, and those of the SURFACE_METRICS that it has a truth for. Its picture goes into the folder."""
+    (truth, weight), mask, (rgb, alpha, depth) = frame.target(), frame.mask(), rendered
+    found = compare(truth, rgb, mask, weight) | compare_surface(
+        truth, alpha, depth, mask, weight,
+        fractional=frame.rock_path is not None, true_depth=frame.depth() if frame.depth_path else None, spacing=spacing,
+    )  # fmt: skip
+    if folder is not None:
+        write_comparison(folder / f"{frame.name}.png", truth[..., :3], rgb, found["psnr"])
+    return found
+
+
+def _means(views: list[dict[str, Any]], whole: list[dict[str, Any]]) -> dict[str, Any]:
+    """Number of views, and the mean of each metric over those views that have it; None if there is no such view.
+
+    whole: the set that the views are from. Of the SURFACE_METRICS, those are left out that none of it has a truth for.
+    """
     means: dict[str, Any] = {"count": len(views)}
-    for name in METRICS:
-        values = [view[name] for view in views if not math.isnan(view[name])]
+    for name in (*METRICS, *(name for name in SURFACE_METRICS if any(name in view for view in whole))):
+        values = [view[name] for view in views if not math.isnan(view.get(name, math.nan))]
         means[name] = sum(values) / len(values) if values else None
     return means
 
@@ -142,29 +166,38 @@ def evaluate_run(
     progress: Progress | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
-    """`evaluate` of a run of `mgs nbv` on its dataset; writes RUN/metrics.json, and RUN/renders/*.png where `pictures`.
+    """`evaluate` of a run of `mgs nbv` on its dataset and its test views; writes RUN/metrics.json, and RUN/renders where
+    `pictures`: NAME.png of every view, test/NAME.png of every test view.
 
     What is there of this very model, dataset and version of mgs is kept: nothing is measured or drawn twice. say is told what
-    was written and what was kept. Raises InputError as `load_run`, and where another process works on the run.
+    was written and what was kept, and which metrics are left out because the dataset has no truth for them. Raises InputError
+    as `load_run`, where the test views cannot be read, and where another process works on the run.
     """
     run = Path(run)
     file, folder = run / "metrics.json", run / "renders"
-    read_settings(run)  # a folder that is no run is not locked
+    prior = read_settings(run).prior  # read before the lock: a folder that is no run is not locked
     with locked(run):
         gaussians, dataset, trained, policy = load_run(run)
-        subject = _subject(gaussians, dataset, trained)
+        tests, spacing = _test_frames(dataset), _spacing(prior)
+        subject = _subject(gaussians, [*dataset.frames, *tests], trained, spacing)
         metrics = _measured_before(file, subject)
         if metrics is None:
-            found = evaluate(gaussians, dataset.frames, trained, pictures=folder if pictures else None, progress=progress)
+            found = evaluate(
+                gaussians, dataset.frames, trained,
+                test_frames=tests, spacing=spacing, pictures=folder if pictures else None, progress=progress,
+            )  # fmt: skip
             metrics = {"policy": policy, "of": subject, "pictures": pictures} | found
             write_json(file, metrics)
             say(f"wrote {file}" + (f" and {folder}" if pictures else ""))
+            for reason in _left_out(dataset, prior, spacing):
+                say(reason)
             return metrics
         kept = f"kept {file}, measured before on this very model and dataset"
-        drawn = metrics["pictures"] and all((folder / f"{frame.name}.png").is_file() for frame in dataset.frames)
-        if pictures and not drawn:
-            decibels = [view["psnr"] for view in metrics["views"]]
-            _draw(gaussians, dataset.frames, decibels, folder, progress)
+        paths = [folder / f"{frame.name}.png" for frame in dataset.frames]
+        paths += [folder / TEST_FOLDER / f"{frame.name}.png" for frame in tests]
+        if pictures and not (metrics["pictures"] and all(path.is_file() for path in paths)):
+            decibels = [view["psnr"] for view in [*metrics["views"], *metrics.get("test_views", [])]]
+            _draw(gaussians, [*dataset.frames, *tests], paths, decibels, progress)
             metrics = metrics | {"pictures": True}
             write_json(file, metrics)
             say(f"{kept}; wrote {folder}")
@@ -173,12 +206,43 @@ def evaluate_run(
         return metrics
 
 
-def _subject(gaussians: Gaussians, dataset: Dataset, trained: list[str]) -> str:
-    """Hash of all that the metrics of a run depend on: the model, the dataset's cameras, images and masks, and the versions."""
-    frames = [
-        [frame.name, camera_digest(frame.camera), frame_digests(frame, ("image", "mask", "rock"))] for frame in dataset.frames
-    ]
-    text = json.dumps([array_digest(asdict(gaussians).values()), frames, trained, versions()])
+def _test_frames(dataset: Dataset) -> tuple[Frame, ...]:
+    """The test views of a dataset, none where it has none. Raises InputError as `Dataset.test_views`."""
+    tests = dataset.test_views()
+    return () if tests is None else tests.frames
+
+
+def _spacing(prior: Path) -> float | None:
+    """Spacing of the prior's samples, metres, None where the folder of the prior is not there. Raises InputError if its file is
+    damaged."""
+    file = prior / "prior.json"
+    if not file.is_file():
+        return None
+    numbers = read_json(file)
+    spacing = numbers.get("spacing") if isinstance(numbers, dict) else None
+    if not isinstance(spacing, float | int) or not 0 < spacing < math.inf:
+        raise InputError(f"{file}: spacing must be positive metres; make the prior again with `mgs prior`")
+    return float(spacing)
+
+
+def _left_out(dataset: Dataset, prior: Path, spacing: float | None) -> list[str]:
+    """Why some of the SURFACE_METRICS are not measured, in a line each."""
+    reasons = []
+    if not any(frame.rock_path for frame in dataset.frames):
+        reasons.append(f"{dataset.root}: has no images of the rock alone, so the error of alpha is left out")
+    if not any(frame.depth_path for frame in dataset.frames):
+        reasons.append(f"{dataset.root}: has no depth images, so the errors of depth are left out")
+    elif spacing is None:
+        reasons.append(f"{prior}: is not there, so the shares that are too deep, in its spacings, are left out")
+    return reasons
+
+
+def _subject(gaussians: Gaussians, frames: Sequence[Frame], trained: list[str], spacing: float | None) -> str:
+    """Hash of all that the metrics of a run depend on: the model, the cameras and files of all views, the prior's spacing, and
+    the versions."""
+    kinds = ("image", "mask", "rock", "depth")
+    views = [[frame.name, camera_digest(frame.camera), frame_digests(frame, kinds)] for frame in frames]
+    text = json.dumps([array_digest(asdict(gaussians).values()), views, trained, spacing, versions()])
     return array_digest([np.frombuffer(text.encode(), np.uint8)])
 
 
@@ -192,10 +256,10 @@ def _measured_before(file: Path, subject: str) -> dict[str, Any] | None:
 
 
 def _draw(
-    gaussians: Gaussians, frames: Sequence[Frame], decibels: Sequence[float], folder: Path, progress: Progress | None
+    gaussians: Gaussians, frames: Sequence[Frame], paths: Sequence[Path], decibels: Sequence[float], progress: Progress | None
 ) -> None:
-    """The pictures of `evaluate` alone, of frames whose PSNR is known."""
-    for done, (frame, value) in enumerate(zip(frames, decibels, strict=True)):
+    """The pictures of `evaluate` alone, of views whose PSNR is known."""
+    for done, (frame, path, value) in enumerate(zip(frames, paths, decibels, strict=True)):
         if progress:
             progress(done, len(frames))
-        write_comparison(folder / f"{frame.name}.png", frame.masked_rgb(), render_rgb(gaussians, frame.camera), value)
+        write_comparison(path, frame.masked_rgb(), render_view(gaussians, frame.camera)[0], value)

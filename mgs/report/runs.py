@@ -59,6 +59,8 @@ class _Metrics(BaseModel):
     all: dict[str, float | None]
     held_out: dict[str, float | None]
     views: list[_View]
+    test: dict[str, float | None] = {}
+    test_views: list[_View] = []
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,10 @@ from mgs.report.runs import evaluated_runs
 COLUMNS = {
     "policy": "policy",
     "images": "images",
+    "test.psnr": "PSNR, test views (dB)",
+    "test.ssim": "SSIM, test views",
+    "test.psnr_mask": "PSNR, test views, rock only (dB)",
+    "test.ssim_mask": "SSIM, test views, rock only",
     "all.psnr": "PSNR, all (dB)",
     "all.ssim": "SSIM, all",
     "held_out.psnr": "PSNR, held out (dB)",
@@ -19,28 +23,30 @@ COLUMNS = {
     "held_out.ssim_mask": "SSIM, held out, rock only",
     "coverage": "coverage (%)",
 }
-"""Columns of the table: the key of the number in a row of `table_numbers` -> the heading."""
+"""Columns of the table: the key of the number in a row of `table_numbers` -> the heading. Those of the test views stand first,
+because they are the same for every run; where no run was measured on test views, they are left out (`table_columns`)."""
 
 
 def table_numbers(folders: Sequence[str | Path]) -> list[dict[str, Any]]:
     """One row for each run, as numbers.
 
     policy: the run's label (`evaluated_runs`); images: how many the model was trained on; coverage: of the surface, per cent;
-    all.NAME and held_out.NAME: the means in metrics.json, PSNR in dB, None if there is no view to average.
-    Raises InputError as `evaluated_runs`.
+    test.NAME (where the dataset has test views), all.NAME and held_out.NAME: the means in metrics.json, PSNR in dB, None if
+    there is no view to average. Raises InputError as `evaluated_runs`.
     """
     rows = []
     for label, run in evaluated_runs(folders).items():
         metrics = run.metrics or {}
         row = {"policy": label, "images": metrics["images"]}
-        row |= {f"{views}.{name}": metrics[views][name] for views in ("all", "held_out") for name in metrics[views]}
+        sets = [views for views in ("test", "all", "held_out") if views in metrics]
+        row |= {f"{views}.{name}": metrics[views][name] for views in sets for name in metrics[views]}
         rows.append(row | {"coverage": 100 * run.steps[-1]["coverage"]})
     return rows
 
 
-def table_rows(folders: Sequence[str | Path]) -> list[list[str]]:
-    """One row of text for each run, with the cells in the order of COLUMNS. Raises InputError as `evaluated_runs`."""
-    return [[table_cell(column, row.get(column)) for column in COLUMNS] for row in table_numbers(folders)]
+def table_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The keys of COLUMNS, in order, without those of the test views where no row of `table_numbers` has them."""
+    return [key for key in COLUMNS if not key.startswith("test.") or any(key in row for row in rows)]
 
 
 def table_cell(column: str, value: Any) -> str:
@@ -50,7 +56,9 @@ def table_cell(column: str, value: Any) -> str:
     return f"{value:.4f}" if "ssim" in column else f"{value:.2f}" if isinstance(value, float) else str(value)
 
 
-def markdown_table(rows: Sequence[Sequence[str]]) -> str:
-    """The rows of `table_rows` as a Markdown table, with the numbers aligned to the right."""
-    heading = "| " + " | ".join(COLUMNS.values()) + " |\n|" + " --- |" + " ---: |" * (len(COLUMNS) - 1) + "\n"
-    return heading + "".join("| " + " | ".join(row) + " |\n" for row in rows)
+def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The rows of `table_numbers` as a Markdown table, with the numbers aligned to the right."""
+    columns = table_columns(rows)
+    lines = [[COLUMNS[key] for key in columns], ["---", *["---:"] * (len(columns) - 1)]]
+    lines += [[table_cell(key, row.get(key)) for key in columns] for row in rows]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)

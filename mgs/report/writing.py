@@ -2,43 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from mgs.data.dataset import TEST_FOLDER, Dataset, Frame
 from mgs.errors import InputError
 from mgs.files import atomic_path, write_json
 from mgs.report.evaluation import read_comparison
 from mgs.report.figures import comparison_figure, coverage_figure, gain_figure, orbit_figure, psnr_figure
 from mgs.report.runs import Run, check_finished, dataset_of, evaluated_runs, read_run
-from mgs.report.tables import markdown_table, table_numbers, table_rows
+from mgs.report.tables import markdown_table, table_numbers
 from mgs.splat_ply import read_ply
 
 
 def write_report(out: str | Path, folders: Sequence[str | Path]) -> list[Path]:
     """Write all figures and the table of runs into the folder `out`, and return the paths of the files.
 
-    folders: the run folders. The files: orbit.png, gain.png, coverage.png, comparison.png (of a view that the fewest runs were
-    trained on), psnr.png (only if all runs were evaluated after some of their steps), table.md and table.json
-    (`table_numbers`). Files of an earlier report are replaced. Raises InputError as `evaluated_runs` and `dataset_of`, if a run
-    is unfinished, or if a picture of `mgs eval` is missing or damaged; then nothing is written.
+    folders: the run folders. The files: orbit.png, gain.png, coverage.png, comparison.png (of a test view, or where there are
+    none, of a view that the fewest runs were trained on), psnr.png (only if all runs were evaluated after some of their steps;
+    over the test views, or where there are none, over all views), table.md and table.json (`table_numbers`).
+    Files of an earlier report are replaced. Raises InputError as `evaluated_runs` and `dataset_of`, if a run is unfinished, or
+    if a picture of `mgs eval` is missing or damaged; then nothing is written.
     """
     for folder in folders:
         check_finished(read_run(folder))
     out, runs = Path(out), evaluated_runs(folders)
     first = next(iter(runs.values()))
-    frames = dataset_of(list(runs.values())).frames
-    frame = frames[unseen_view(list(runs.values()), len(frames))]
-    pictures = {label: run.folder / "renders" / f"{frame.name}.png" for label, run in runs.items()}
+    dataset = dataset_of(list(runs.values()))
+    frame, views = shown_view(list(runs.values()), dataset)
+    within = Path("renders", TEST_FOLDER) if views == "test_views" else Path("renders")
+    pictures = {label: run.folder / within / f"{frame.name}.png" for label, run in runs.items()}
     for label, picture in pictures.items():
         stale = (runs[label].metrics or {}).get("pictures") is False  # of an earlier model; older runs do not say
         if stale or not picture.is_file():
             raise InputError(f"{picture}: no picture of this model; draw it with `mgs eval {runs[label].folder}`")
-    captions = {label: _caption(run, frame.name) for label, run in runs.items()}
+    captions = {label: _caption(run, views, frame.name) for label, run in runs.items()}
     pairs = {label: read_comparison(picture, frame.camera) for label, picture in pictures.items()}
 
-    positions = np.array([frame.camera.position for frame in frames])
+    positions = np.array([frame.camera.position for frame in dataset.frames])
     choices = {label: (run.seeds, run.chosen) for label, run in runs.items()}
     orbit_figure(out / "orbit.png", positions, read_ply(first.folder / "gaussians.ply").means, choices)
     gain_figure(out / "gain.png", {label: [s["information_gain"] for s in run.steps[1:]] for label, run in runs.items()})
@@ -50,18 +53,43 @@ def write_report(out: str | Path, folders: Sequence[str | Path]) -> list[Path]:
     comparison_figure(out / "comparison.png", truth, renders, title=frame.name, captions=captions)
     written = [out / f"{name}.png" for name in ("orbit", "gain", "coverage", "comparison")]
 
-    measured = {label: [s for s in run.steps if {"psnr", "psnr_mask"} <= s.keys()] for label, run in runs.items()}
-    if all(measured.values()):
-        panels = {
-            what: {label: ([s["images"] for s in steps], [s[key] for s in steps]) for label, steps in measured.items()}
-            for what, key in (("all views", "psnr"), ("all views, rock only", "psnr_mask"))
-        }
+    panels = _psnr_panels(runs)
+    if panels:
         psnr_figure(out / "psnr.png", panels)
         written.append(out / "psnr.png")
+    numbers = table_numbers(folders)
     with atomic_path(out / "table.md") as temporary:
-        temporary.write_text(markdown_table(table_rows(folders)), encoding="utf-8")
-    write_json(out / "table.json", table_numbers(folders))
+        temporary.write_text(markdown_table(numbers), encoding="utf-8")
+    write_json(out / "table.json", numbers)
     return [*written, out / "table.md", out / "table.json"]
+
+
+def shown_view(runs: Sequence[Run], dataset: Dataset) -> tuple[Frame, str]:
+    """The view that the comparison shows, and the key of metrics.json that has its numbers: "test_views" or "views".
+
+    It is the middle one of the test views where all runs were measured on them, otherwise a view that the fewest runs were
+    trained on (`unseen_view`). Raises InputError as `Dataset.test_views`.
+    """
+    tests = dataset.test_views()
+    if tests is not None and all((run.metrics or {}).get("test_views") for run in runs):
+        return tests.frames[len(tests) // 2], "test_views"
+    return dataset.frames[unseen_view(runs, len(dataset))], "views"
+
+
+def _psnr_panels(runs: Mapping[str, Run]) -> dict[str, dict[str, tuple[list[int], list[float]]]]:
+    """What `psnr_figure` draws: PSNR over the test views, or, where a run was never measured on them, over all views.
+
+    Nothing where a run was never measured on these either.
+    """
+    for prefix, views in (("test_", "test views"), ("", "all views")):
+        keys = {views: f"{prefix}psnr", f"{views}, rock only": f"{prefix}psnr_mask"}
+        measured = {label: [s for s in run.steps if set(keys.values()) <= s.keys()] for label, run in runs.items()}
+        if all(measured.values()):
+            return {
+                what: {label: ([s["images"] for s in steps], [s[key] for s in steps]) for label, steps in measured.items()}
+                for what, key in keys.items()
+            }
+    return {}
 
 
 def unseen_view(runs: Sequence[Run], frames: int) -> int:
@@ -72,10 +100,10 @@ def unseen_view(runs: Sequence[Run], frames: int) -> int:
     return fewest[len(fewest) // 2]
 
 
-def _caption(run: Run, name: str) -> str:
-    """What stands above a render of the view `name`: number of images, PSNR, SSIM. Raises InputError if it was not
-    evaluated."""
-    view = next((view for view in (run.metrics or {})["views"] if view["name"] == name), None)
+def _caption(run: Run, views: str, name: str) -> str:
+    """What stands above a render of the view `name`: number of images, PSNR, SSIM. views: key of metrics.json that lists it.
+    Raises InputError if it was not evaluated."""
+    view = next((view for view in (run.metrics or {})[views] if view["name"] == name), None)
     if view is None:
         raise InputError(f"{run.folder}: was not evaluated on {name}; measure it with `mgs eval {run.folder}`")
     seen = ", trained on" if view["trained"] else ""

@@ -1,0 +1,152 @@
+"""Every policy by its name, and what a policy is told: a function of the `Outlook`, which gives each candidate a score.
+
+There are three tables, by what their functions look at: `mgs.active.criteria.CRITERIA` at information,
+`mgs.active.pose_policies.POSE_POLICIES` at poses, and OUTLOOK_POLICIES here at whatever an Outlook has. None is ever shown a
+candidate's image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mgs.active.criteria import CRITERIA, Array, Criterion, block_log_determinant, d_optimal
+from mgs.active.criteria import i_optimal as i_optimality
+from mgs.active.directional import Views, gains
+from mgs.active.pose_policies import POSE_POLICIES
+from mgs.errors import InputError
+
+PAPER_LAM = 1e-6
+"""The one lambda of the policy `paper`: that of POp-GS, since the paper does not say which it used."""
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """What is known when a view is chosen. Views are meant by the index of their frame.
+
+    positions: [V,3] camera centres of all frames, metres. left: the candidates. visited: the views taken, in their order.
+    centre: [3] the middle of the rock. rng: new in each step, drawn from the run's seed.
+    H, lam: [M,P] information of the views taken about the model fitted so far, and [P] lambda, of the run.
+    points: [N,3] the Gaussians on the prior's surface, before training. surface_H, prior_lam: the same as H and lam for these.
+    information(view), surface_information(view): what one view adds to H, and to surface_H.
+    estimate(view, estimator): the information of one view about the fitted model, by any row of `mgs.splat.ESTIMATORS`.
+    seen(view): [N] squared blending weights of the surface in one view (`mgs.active.directional.squared_weights`).
+    dome(): a dome of poses around the rock, and what they see of the surface.
+    """
+
+    positions: Array
+    left: list[int]
+    visited: list[int]
+    centre: Array
+    rng: np.random.Generator
+    H: Array
+    lam: Array
+    points: Array
+    surface_H: Array
+    prior_lam: Array
+    information: Callable[[int], Array]
+    surface_information: Callable[[int], Array]
+    estimate: Callable[[int, str], Array]
+    seen: Callable[[int], Array]
+    dome: Callable[[], Views]
+
+    @property
+    def candidates(self) -> Array:
+        """[C,3] positions of the candidates, metres."""
+        return self.positions[self.left]
+
+    @property
+    def taken(self) -> Array:
+        """[T,3] positions of the views taken, in the order in which they were taken, metres."""
+        return self.positions[self.visited]
+
+    def views(self, frames: list[int]) -> Views:
+        """Poses of some frames, and what they see of the surface."""
+        return Views(self.positions[frames], np.stack([self.seen(i) for i in frames]))
+
+
+Policy = Callable[[Outlook], Array]
+"""(outlook) -> score of each candidate [C], in the order of `left`."""
+
+
+def directional_d(outlook: Outlook) -> Array:
+    """Directional D-optimality, nats, with colours of SH degree 2 and tau 0.3 (`mgs.active.directional`)."""
+    lam, views = float(outlook.prior_lam[0]), outlook.views
+    return gains(outlook.points, lam, 2, 0.3, views(outlook.visited), views(outlook.left))
+
+
+def directional_i(outlook: Outlook) -> Array:
+    """Directional I-optimality over a dome, with colours of SH degree 3 and tau 0.1 (`mgs.active.directional`)."""
+    lam, views = float(outlook.prior_lam[0]), outlook.views
+    return gains(outlook.points, lam, 3, 0.1, views(outlook.visited), views(outlook.left), outlook.dome())
+
+
+def i_optimal(outlook: Outlook) -> Array:
+    """I-optimality over all poses of the dataset, taken or not (`mgs.active.criteria.i_optimal`)."""
+    others = [i for i in range(len(outlook.positions)) if i not in outlook.visited]
+    mean = (outlook.H + sum(outlook.information(i) for i in others)) / len(outlook.positions)
+    return np.array([i_optimality(outlook.information(i), outlook.H, outlook.lam, mean) for i in outlook.left])
+
+
+def block_d(outlook: Outlook) -> Array:
+    """Eq. 7 for the exact 11x11 blocks (`mgs.active.criteria.block_log_determinant`), whatever the estimator of the run."""
+    H = _sum(outlook, "block")
+    before, lam = block_log_determinant(H, outlook.lam), outlook.lam
+    return np.array([block_log_determinant(H + outlook.estimate(i, "block"), lam) - before for i in outlook.left])
+
+
+def paper(outlook: Outlook) -> Array:
+    """The paper's method to the letter: Eq. 7 on squared gradients of one scalar loss per image, with one lambda (PAPER_LAM).
+
+    The paper names neither the loss nor the lambda. The loss is that of the estimator `loss-gradient`, for the views taken too.
+    """
+    H, lam = _sum(outlook, "loss-gradient"), np.full_like(outlook.lam, PAPER_LAM)
+    return np.array([d_optimal(outlook.estimate(i, "loss-gradient"), H, lam) for i in outlook.left])
+
+
+def _sum(outlook: Outlook, estimator: str) -> NDArray[np.float64]:
+    """Information of the views taken, by an estimator, summed."""
+    return np.sum([outlook.estimate(i, estimator) for i in outlook.visited], axis=0, dtype=np.float64)
+
+
+OUTLOOK_POLICIES: dict[str, Policy] = {
+    "i-optimal": i_optimal,
+    "block-d": block_d,
+    "paper": paper,
+    "directional-d": directional_d,
+    "directional-i": directional_i,
+}
+"""Policies that are told all that there is, by name. A program may add its own (docs/howto/policy.md)."""
+
+
+def policy_names() -> list[str]:
+    """Every name that `mgs nbv --policy` accepts: the rows of the three tables, as they are now."""
+    return [*CRITERIA, *OUTLOOK_POLICIES, *POSE_POLICIES]
+
+
+def policy_named(name: str) -> Policy:
+    """The policy of that name, as a function of an Outlook. Raises InputError where there is none."""
+    if name in CRITERIA:
+        return _of_criterion(CRITERIA[name])
+    if name in POSE_POLICIES:
+        row = POSE_POLICIES[name]
+        return lambda outlook: row(outlook.candidates, outlook.taken, outlook.centre, outlook.rng)
+    if name in OUTLOOK_POLICIES:
+        return OUTLOOK_POLICIES[name]
+    known = ", ".join(policy_names())
+    raise InputError(f"--policy {name}: unknown; choose one of {known}, or add your own (docs/howto/policy.md)")
+
+
+def _of_criterion(criterion: Criterion) -> Policy:
+    """A criterion as a policy; the information of one candidate is in memory at a time."""
+
+    def scores(outlook: Outlook) -> NDArray[np.float64]:
+        at_prior = criterion.at == "prior"
+        look, H = (outlook.surface_information, outlook.surface_H) if at_prior else (outlook.information, outlook.H)
+        lam = outlook.prior_lam if at_prior else outlook.lam
+        return np.array([criterion.score(look(i), H, lam) for i in outlook.left])
+
+    return scores

@@ -1,0 +1,179 @@
+"""Directional D- and I-optimality against their definitions, with full inverses and determinants; and what makes them gains."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import tiny
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mgs.active import criteria, directional, loop
+from mgs.active.directional import Views, gains
+from mgs.colour import SH_C0
+from mgs.data.dataset import load_dataset
+from mgs.splat import reference
+
+N, LAM = 4, (0.02 / 1.0) ** 2
+
+
+def random_views(rng, count):
+    """Poses around the origin, some of which see nothing of some Gaussians."""
+    seen = rng.choice([0.0, 1.0], (count, N)) * 10 ** rng.uniform(-4, 2, (count, N))
+    return Views(rng.normal(size=(count, 3)) * 3 + [0, 0, 4], seen)
+
+
+def scene(seed, taken=3, candidates=4, dome=5):
+    """Points of a rock, views taken, candidates, a dome."""
+    rng = np.random.default_rng(seed)
+    return 0.5 * rng.normal(size=(N, 3)), *(random_views(rng, count) for count in (taken, candidates, dome))
+
+
+def together(a, b):
+    return Views(np.concatenate([a.positions, b.positions]), np.concatenate([a.seen, b.seen]))
+
+
+seeds, degrees, taus = st.integers(0, 10_000), st.integers(0, 3), st.sampled_from([0.03, 0.1, 0.3, 1.0])
+
+
+def posterior(points, views, degree, tau):
+    """[N,K,K] the inverse of Lambda + sum W y y^T, one view and one Gaussian at a time."""
+    found = []
+    for j, point in enumerate(points):
+        total = np.diag(directional.precision(degree, tau, LAM))
+        for position, seen in zip(views.positions, views.seen, strict=True):
+            direction = (point - position) / np.linalg.norm(point - position)
+            y = reference.sh_basis(direction[None], degree)[0]
+            total = total + seen[j] * np.outer(y, y)
+        found.append(np.linalg.inv(total))
+    return np.array(found)
+
+
+@given(seeds, degrees, taus)
+def test_a_rank_one_update_gives_what_full_inverses_give(seed, degree, tau):
+    """D: the fall of log det S, times three channels, halved. I: the fall of the variance summed over the dome."""
+    points, taken, candidates, dome = scene(seed)
+    before = posterior(points, taken, degree, tau)
+    predicted = directional.information(points, dome, degree)
+    d, i = gains(points, LAM, degree, tau, taken, candidates), gains(points, LAM, degree, tau, taken, candidates, dome)
+    for c in range(len(candidates.positions)):
+        one = Views(candidates.positions[[c]], candidates.seen[[c]])
+        after = posterior(points, together(taken, one), degree, tau)
+        expected = 1.5 * (np.linalg.slogdet(before)[1] - np.linalg.slogdet(after)[1]).sum()
+        assert d[c] == pytest.approx(expected, rel=1e-6, abs=1e-8)
+        fall, whole = (np.einsum("nkl,nlk->", predicted, S) for S in (before - after, before))
+        assert i[c] == pytest.approx(fall, rel=1e-6, abs=1e-9 * whole)
+
+
+@given(seeds, degrees, taus)
+def test_no_view_loses_and_one_that_sees_nothing_gains_nothing(seed, degree, tau):
+    points, taken, candidates, dome = scene(seed)
+    candidates.seen[0] = 0
+    for views in (None, dome):
+        found = gains(points, LAM, degree, tau, taken, candidates, views)
+        assert (found >= 0).all()
+        assert found[0] == 0
+
+
+@given(seeds, degrees, taus, st.floats(1, 100))
+def test_seeing_more_is_never_worse(seed, degree, tau, factor):
+    points, taken, candidates, dome = scene(seed)
+    more = Views(candidates.positions, candidates.seen * factor)
+    for views in (None, dome):
+        less, best = (gains(points, LAM, degree, tau, taken, c, views) for c in (candidates, more))
+        assert (best >= less * (1 - 1e-9)).all()
+
+
+@given(seeds, degrees, taus)
+def test_the_returns_of_d_diminish(seed, degree, tau):
+    """Submodularity, with the squared weights held fixed: so greedy is within 1 - 1/e of the best choice."""
+    points, taken, candidates, others = scene(seed)
+    alone = gains(points, LAM, degree, tau, taken, candidates)
+    later = gains(points, LAM, degree, tau, together(taken, others), candidates)
+    assert (later <= alone * (1 + 1e-7) + 1e-9).all()
+
+
+@given(seeds, taus)
+def test_degree_zero_is_the_colour_part_of_d_optimality(seed, tau):
+    """In nats: half the sum, over the three channels, of Eq. 7 with the exact information about colour."""
+    points, taken, candidates, _ = scene(seed)
+
+    def colour(seen):
+        return np.repeat(SH_C0**2 * seen[:, None], 3, axis=1)
+
+    H = colour(taken.seen.sum(0))
+    expected = [0.5 * H.size * criteria.d_optimal(colour(seen), H, np.full(3, LAM)) for seen in candidates.seen]
+    assert gains(points, LAM, 0, tau, taken, candidates) == pytest.approx(expected, rel=1e-9)
+
+
+def test_gaussians_in_parts_add_up(monkeypatch):
+    points, taken, candidates, dome = scene(0)
+    whole = [gains(points, LAM, 2, 0.3, taken, candidates, views) for views in (None, dome)]
+    monkeypatch.setattr(directional, "CHUNK", 3)
+    parts = [gains(points, LAM, 2, 0.3, taken, candidates, views) for views in (None, dome)]
+    np.testing.assert_allclose(parts, whole, rtol=1e-12)
+
+
+def test_a_view_from_a_new_side_is_worth_more():
+    """Of two views that see the same of one Gaussian, that from elsewhere; with degree 0 they are equal."""
+    seen = np.ones((2, 1))
+    taken, candidates = Views(np.array([[3.0, 0, 0]]), seen[:1]), Views(np.array([[3.0, 0.3, 0], [0, 3, 0]]), seen)
+    near, far = gains(np.zeros((1, 3)), LAM, 2, 0.3, taken, candidates)
+    assert far > 2 * near
+    assert np.ptp(gains(np.zeros((1, 3)), LAM, 0, 0.3, taken, candidates)) < 1e-12
+
+
+def test_squared_weights_are_those_of_the_renderer():
+    """Against the reference: squared derivatives by a colour coefficient add up to SH_C0^2 sum w^2, but where it is clamped."""
+    model, camera = tiny.initial([]), tiny.orbit(1)[0]
+    weights = directional.squared_weights(reference.fisher(model, camera))
+    derivatives = reference.jacobian(model, camera).reshape(tiny.HEIGHT * tiny.WIDTH, 3, tiny.POINTS, 11)[:, 0, :, 0]
+    assert weights.max() > 0.1
+    np.testing.assert_allclose(weights, ((derivatives / SH_C0) ** 2).sum(0), rtol=1e-5)
+    model.sh[:, 0, :2] = -10
+    np.testing.assert_allclose(directional.squared_weights(reference.fisher(model, camera)), weights, rtol=1e-5)
+
+
+def test_the_dome_stands_around_the_rock():
+    cameras, centre = tiny.orbit(), np.array([0.5, 0, 0])
+    positions = np.array([camera.position for camera in cameras])
+    dome = directional.dome_cameras(cameras[0], positions, centre)
+    offset = np.array([camera.position for camera in dome]) - centre
+    radius = np.linalg.norm(offset, axis=1)
+    np.testing.assert_allclose(radius, np.median(np.linalg.norm(positions - centre, axis=1)))
+    assert (offset[:, 2] >= 0).all()
+    assert np.abs(offset[:, :2].mean(0)).max() < 0.1 * radius[0]
+    for camera in dome:
+        pixel, _ = camera.project(centre[None])
+        np.testing.assert_allclose(pixel[0], [tiny.WIDTH / 2, tiny.HEIGHT / 2], atol=1e-9)
+
+
+@pytest.mark.parametrize("policy", ["directional-d", "directional-i"])
+def test_a_flight_is_planned_without_looking_at_any_fit(dataset, tmp_path, policy):
+    """A run whose model is black after every fit takes the same views; the scores are those of the surface alone."""
+
+    def forgetful(*arguments):
+        fit = tiny.fit(*arguments)
+        fit.gaussians.sh[:] = -100
+        return fit
+
+    loaded, states = load_dataset(dataset), []
+    for name, fit in (("run", tiny.fit), ("forgetful", forgetful)):
+        settings = tiny.start(tmp_path / name, loaded, policy=policy, budget=3)
+        states.append(loop.run(tmp_path / name, settings, loaded, tiny.stations(fit=fit), tiny.silent))
+    assert states[0].taken == states[1].taken
+    assert [step["score"] for step in states[0].steps] == [step["score"] for step in states[1].steps]
+    start, cameras = tiny.initial([]), tiny.orbit()
+
+    def views(cameras):
+        seen = [directional.squared_weights(tiny.fisher(start, camera)) for camera in cameras]
+        return Views(np.array([camera.position for camera in cameras]), np.stack(seen))
+
+    seeds, first = states[0].taken[:3], states[0].taken[3]
+    left = [i for i in range(tiny.FRAMES) if i not in seeds]
+    dome = views(directional.dome_cameras(cameras[0], views(cameras).positions, np.zeros(3)))
+    degree, tau, around = {"directional-d": (2, 0.3, None), "directional-i": (3, 0.1, dome)}[policy]
+    pools = (views([cameras[i] for i in chosen]) for chosen in (seeds, left))
+    expected = gains(start.means, criteria.regularisation(tiny.GROUPS)[0], degree, tau, *pools, around)
+    assert states[0].steps[1]["score"] == pytest.approx(expected.max())
+    assert expected[left.index(first)] == pytest.approx(expected.max())
