@@ -272,7 +272,7 @@ def test_scales_of_lambda_are_finite(dataset, tmp_path, values):
     [
         (["--estimator", "block"], "--estimator block: gives no diagonal, or is unknown; choose one of exact, hutchinson"),
         (["--estimator", "guess"], "--estimator guess: gives no diagonal, or is unknown"),
-        (["--optimiser", "hope"], "--optimiser hope: unknown; choose one of adam"),
+        (["--optimiser", "hope"], "--optimiser hope: unknown; choose one of natural, adam"),
         (["--lam", "0"], "--lam 0.0: Input should be greater than or equal to"),
         (["--rate", "colour"], "--rate colour: expected KIND=NUMBER, as in --rate colour=0.01"),
         (["--rate", "colour=-1"], "--rate colour=-1.0: Input should be greater than or equal to 0"),
@@ -313,7 +313,7 @@ def test_options_of_the_criterion_and_the_fit_reach_the_run(dataset, prior, tmp_
     assert stop.value.code == 0
     state = run_folder.read_checkpoint(tmp_path / "run")
     settings = run_folder.read_settings(tmp_path / "run")
-    assert settings.train.rates == {"colour": 0.1, "scale": 0.02, "rotation": 0.01, "opacity": 0}
+    assert settings.train.rates == {"colour": 0.1, "scale": 0.04, "rotation": 0.02, "opacity": 0}
     assert settings.prior_std == {"colour": 1.0, "scale": 2.0, "rotation": 0.5, "opacity": 2.0}
     np.testing.assert_array_equal(state.gaussians.logit_opacities[0], state.gaussians.logit_opacities)
     cameras = [load_dataset(dataset).frames[i].camera for i in state.taken]

@@ -83,8 +83,9 @@ def test_the_newton_decrease_grows_to_that_of_a_dense_solve(case):
     g = J.T @ (weight * residual) + lam * away
     A = (J.T * weight) @ J + np.diag(lam)
     expected = 0.5 * g @ np.linalg.solve(A, g)
-    found = newton_decrease(goal, model, 80)
-    assert (np.diff(found) > -1e-4 * expected).all()
+    found = newton_decrease(goal, model, 40)
+    assert (np.diff(found[:8]) > 0).all()
+    assert (np.diff(found) > -5e-3 * expected).all()  # single precision loses the conjugacy in the end
     assert found[-1] == pytest.approx(expected, rel=0.01)
     assert found[0] < 0.9 * expected  # it takes more than one iteration: the parameters are correlated
 
@@ -98,7 +99,7 @@ def test_a_start_in_the_memory_of_the_model_is_kept_apart(case):
     camera = goal.photos[0].camera
     model = surface_gaussians(50)
     target = np.zeros((20, 24, 4), np.float32)  # of weight 0: the prior alone moves the parameters
-    settings = TrainSettings(passes=1, rates=(0.01, 0, 0, 0))
+    settings = TrainSettings(optimiser="adam", passes=1, rates=(0.01, 0, 0, 0))
     fit(model, [camera], [target], settings, start=model, lam={"colour": 1.0})
     other = Gaussians(model.means, model.log_scales, model.quats, model.logit_opacities, model.sh - 0.2)
     moved = fit(model, [camera], [target], settings, start=other, lam={"colour": 1.0}).gaussians

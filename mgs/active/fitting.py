@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from mgs.active.objective import Objective, Prior, objective, watched
-from mgs.active.optimisers import OPTIMISERS
+from mgs.active.optimisers import INFORMATION_PASSES, OPTIMISERS
 from mgs.active.settings import TrainSettings
 from mgs.active.stopping import StopReason, stop_reason
 from mgs.camera import Camera
@@ -92,11 +92,12 @@ def _step(
     rates: list[Any],
     t: Any,
     prior: Prior,
+    information: list[Any],
 ) -> tuple[Gaussians, list[list[Any]], Any]:
     """One step of the optimiser on one image and its share of the prior. Returns parameters, buffers, loss before the step.
 
     buffers, rates: for each of LEARNED; packed: the Gaussians' splats, packed for the lists; size: (width, height); t: UInt32,
-    step number from 1; target, weight: Float [H*W*3].
+    step number from 1; target, weight: Float [H*W*3]; information: see `mgs.active.optimisers.Optimiser`.
     """
     copy = watched(gaussians)
     rgb = composite(project(copy, camera), packed, lists, *size).rgb
@@ -104,13 +105,13 @@ def _step(
     loss = dr.mean(dr.square(error))
     dr.backward(0.5 * dr.sum(dr.square(error)))
     step, moved, kept = mi.Float(t), {}, []
-    for name, kept_before, rate in zip(LEARNED, buffers, rates, strict=True):
+    for name, kept_before, rate, known in zip(LEARNED, buffers, rates, information, strict=True):
         value = getattr(copy, name)
         away = dr.detach(value) - getattr(prior.start, name)
         pull = prior.lam[name] * prior.share
         gradient = dr.grad(value) + mi.TensorXf(pull * away.array, away.shape)
         loss += dr.sum(dr.square(away.array)) * pull / len(target)
-        moved[name], after = OPTIMISERS[optimiser].step(dr.detach(value), gradient, kept_before, rate, step)
+        moved[name], after = OPTIMISERS[optimiser].step(dr.detach(value), gradient, known, kept_before, rate, step)
         kept.append(after)
     return _in_bounds(Gaussians(gaussians.means, **moved)), kept, dr.detach(loss)
 
@@ -140,15 +141,18 @@ def fit(
         raise InputError(f"optimiser {settings.optimiser!r} is unknown; choose one of {', '.join(OPTIMISERS)}")
     model = as_drjit(gaussians)
     goal = objective(gaussians, cameras, targets, start, lam, cache)
-    count = OPTIMISERS[settings.optimiser].buffers
-    buffers = [[dr.zeros(mi.TensorXf, getattr(model, name).shape) for _ in range(count)] for name in LEARNED]
+    optimiser = OPTIMISERS[settings.optimiser]
+    buffers = [[dr.zeros(mi.TensorXf, getattr(model, name).shape) for _ in range(optimiser.buffers)] for name in LEARNED]
+    information: list[Any] = [None] * len(LEARNED)
     rng = generator(settings.seed, "train/order")
     losses, kept, stop = [goal.loss(model)], model, StopReason.PASS_LIMIT
     for done in range(settings.passes):
         fall = settings.decay ** (done / max(settings.passes - 1, 1))
         rates = [dr.opaque(mi.Float, rate * fall) for rate in settings.rates.values()]
+        if optimiser.uses_information and done % INFORMATION_PASSES == 0:
+            information = [mi.TensorXf(d.array / len(goal.photos), d.shape) for d in goal.diagonal(model)]
         order = rng.permutation(len(goal.photos))
-        model, buffers, loss = _pass(goal, settings.optimiser, model, buffers, order, rates, done * len(order))
+        model, buffers, loss = _pass(goal, settings.optimiser, model, buffers, information, order, rates, done * len(order))
         if loss <= min(losses[1:], default=np.inf):  # never of a loss that is not a number
             kept = model
         losses.append(loss)
@@ -164,7 +168,14 @@ def fit(
 
 
 def _pass(
-    goal: Objective, optimiser: str, model: Gaussians, buffers: list[list[Any]], order: np.ndarray, rates: list[Any], t: int
+    goal: Objective,
+    optimiser: str,
+    model: Gaussians,
+    buffers: list[list[Any]],
+    information: list[Any],
+    order: np.ndarray,
+    rates: list[Any],
+    t: int,
 ) -> tuple[Gaussians, list[list[Any]], float]:
     """One step on each image, in order, after t steps. Returns parameters, buffers and the mean of the steps' losses.
 
@@ -181,7 +192,7 @@ def _pass(
             return model, buffers, float("nan")
         model, buffers, loss = _step(
             optimiser, model, buffers, photo.array, packed, lists, photo.pixels, photo.weights, photo.size, rates,
-            dr.opaque(mi.UInt32, t), goal.prior,
+            dr.opaque(mi.UInt32, t), goal.prior, information,
         )  # fmt: skip
         losses.append(loss)
     return model, buffers, float(np.mean([float(loss[0]) for loss in losses])) if _is_finite(model) else float("nan")

@@ -102,6 +102,16 @@ class Objective:
             dr.eval(total)
         return total
 
+    def diagonal(self, model: Gaussians) -> Vector:
+        """The diagonal of J^T J + lam, by exact Fisher information; weights of pixels are taken as 1."""
+        total = [mi.TensorXf(lam + dr.zeros(mi.Float, d.array.shape[0]), d.shape) for d, lam in self._pulls(model)]
+        for photo in self.photos:
+            information = fisher(model, photo.camera, cache=self.cache)
+            columns = zip(total, groups(model.sh_degree).values(), strict=True)
+            total = [t + mi.TensorXf(np.ascontiguousarray(information[:, c]).reshape(t.shape)) for t, c in columns]
+            dr.eval(total)
+        return total
+
     def lists(self, model: Gaussians, photo: Photo) -> tuple[BlockLists, Any]:
         """Block lists of one image and the splats packed for them. Raises InputError as `ListCache.get`."""
         return self.cache.get(photo.camera, _project(model, photo.array))
@@ -147,7 +157,7 @@ def newton_decrease(found: Objective, model: Gaussians, iterations: int) -> list
     neighbouring splats can do each other's work, and so takes them for better determined than they are. lam must not be 0.
     """
     gradient = found.gradient(model)
-    inverse = [dr.rcp(d.array) for d in _diagonal(found, model)]
+    inverse = [dr.rcp(d.array) for d in found.diagonal(model)]
     x = [dr.zeros(mi.TensorXf, g.shape) for g in gradient]
     residual = [-g for g in gradient]
     z = [mi.TensorXf(i * r.array, r.shape) for i, r in zip(inverse, residual, strict=True)]
@@ -162,17 +172,6 @@ def newton_decrease(found: Objective, model: Gaussians, iterations: int) -> list
         dr.eval(x, residual, direction)
         decreases.append(-0.5 * _dot(gradient, x))
     return decreases
-
-
-def _diagonal(found: Objective, model: Gaussians) -> Vector:
-    """The diagonal of J^T J + lam, with the weights of pixels taken as 1."""
-    H = np.stack([fisher(model, photo.camera, cache=found.cache) for photo in found.photos]).sum(0, dtype=np.float64)
-    columns = groups(model.sh_degree).values()
-    lam = found.prior.lam.values()
-    return [
-        mi.TensorXf(np.ascontiguousarray(H[:, c] + float(k[0]), np.float32).reshape(getattr(model, name).shape))
-        for name, c, k in zip(LEARNED, columns, lam, strict=True)
-    ]
 
 
 def _dot(a: Vector, b: Vector) -> float:

@@ -13,9 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from mgs.active.criteria import PIXEL_NOISE, PRIOR_STD, regularisation
 from mgs.errors import InputError
 
-RATES = {"colour": 0.04, "scale": 0.08, "rotation": 0.04, "opacity": 0.2}
-"""Learning rates of the optimiser, per step, in each kind of parameter's own unit: colour coefficient, log-scale, quaternion,
-opacity logit. Chosen constants."""
+RATES = {"colour": 0.02, "scale": 0.04, "rotation": 0.02, "opacity": 0.1}
+"""Learning rates of the optimiser, the longest step or about it, in each kind of parameter's own unit: colour coefficient,
+log-scale, quaternion, opacity logit. Chosen constants (docs/fit.md)."""
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -37,7 +37,7 @@ class TrainSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    optimiser: str = "adam"
+    optimiser: str = "natural"
     """A row of `mgs.active.optimisers.OPTIMISERS`."""
     passes: Annotated[int, Field(ge=1)] = 40
     """Most passes over the images."""

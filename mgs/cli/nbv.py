@@ -52,7 +52,7 @@ def nbv(
         list[str] | None,
         typer.Option(metavar="KIND=NUMBER", help=f"Prior standard deviation of a kind of parameter [{_numbers(PRIOR_STD)}]."),
     ] = None,
-    optimiser: Annotated[str, typer.Option(help="Optimiser of the fit.")] = "adam",
+    optimiser: Annotated[str, typer.Option(help="Optimiser of the fit: natural or adam.")] = "natural",
     rate: Annotated[
         list[str] | None,
         typer.Option(metavar="KIND=NUMBER", help=f"Learning rate of a kind of parameter [{_numbers(RATES)}]; 0: not learned."),

@@ -1,0 +1,134 @@
+"""How linear is an image in the parameters? `python benchmarks/linearity.py DATASET PREFIX` writes PREFIX.json and PREFIX.png.
+
+The Fisher information stands for the posterior as far as the image h is linear in the parameters theta over the posterior's
+width (paper, section III-C). Measured is the departure |h(theta + delta) - h(theta) - J delta| / |J delta| over views that were
+not fitted, with J delta from one forward-mode derivative, for moves delta of two kinds:
+
+- draws from the diagonal posterior, N(0, sigma^2 / (H + lam)), of all parameters and of one kind at a time, times a factor;
+- the move that one added view really causes when the fit goes on with it.
+
+Models: fitted to four views spread evenly in azimuth for few and for many passes.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs import runtime
+from mgs.active.criteria import PIXEL_NOISE, regularisation
+from mgs.active.fitting import fit
+from mgs.active.loop import target_of
+from mgs.active.pose_policies import seed_views
+from mgs.active.settings import RATES, NbvSettings, TrainSettings
+from mgs.camera import Camera
+from mgs.data.dataset import load_dataset
+from mgs.files import write_json
+from mgs.gaussians import KINDS, LEARNED, Gaussians
+from mgs.plotting import STYLE, new_figure, save_figure
+from mgs.prior.build import build_prior
+from mgs.prior.initial import initial_gaussians
+from mgs.prior.settings import PriorSettings
+from mgs.provenance import command_line, versions
+from mgs.seeds import generator
+from mgs.splat import ListCache, fisher, groups, jvp, render
+
+PASSES = (40, 400)
+FACTORS = (0.03, 0.1, 0.3, 1.0)
+GAUSSIANS = 10_000
+JUDGED = 4
+"""Views on which the departure is measured."""
+
+
+def departure(
+    model: Gaussians, move: dict[str, np.ndarray], cameras: Sequence[Camera], cache: ListCache
+) -> tuple[float, float]:
+    """|h(theta + delta) - h(theta) - J delta| / |J delta| over the images of the cameras together; and the root mean square
+    change |J delta| of a pixel value."""
+    moved = replace(model, **{name: (getattr(model, name) + d).astype(np.float32) for name, d in move.items()})
+    # The change that was really made, after rounding.
+    delta = {name: getattr(moved, name) - getattr(model, name) for name in move}
+    away, along, count = 0.0, 0.0, 0
+    for camera in cameras:
+        h0, h1 = (np.asarray(render(g, camera, cache=cache).rgb, np.float64) for g in (model, moved))
+        linear = np.asarray(jvp(model, delta, camera, cache=cache).rgb, np.float64)
+        away, along, count = away + ((h1 - h0 - linear) ** 2).sum(), along + (linear**2).sum(), count + linear.size
+    return float(np.sqrt(away / along)), float(np.sqrt(along / count))
+
+
+def study(root: Path) -> list[dict[str, Any]]:
+    """One record per model and move."""
+    dataset, cache, lam = load_dataset(root), ListCache(), regularisation(groups(0))
+    by_kind = {kind: float(lam[c][0]) for kind, c in groups(0).items()}
+    prior, _ = build_prior(dataset, PriorSettings(gaussians=GAUSSIANS))
+    cameras = [frame.camera for frame in dataset.frames]
+    positions = np.array([camera.position for camera in cameras])
+    taken = seed_views(positions, prior.points.mean(0), 4)
+    left = [i for i in range(len(cameras)) if i not in taken]
+    judged = [cameras[i] for i in left[:: len(left) // JUDGED][:JUDGED]]
+    start = initial_gaussians(prior, [dataset.frames[i] for i in taken])[0]
+
+    def fitted(model: Gaussians, views: list[int], passes: int, rate: float = 1.0) -> Gaussians:
+        train = TrainSettings(passes=passes, tolerance=0.0, rates={kind: rate * value for kind, value in RATES.items()})
+        targets = [target_of(dataset.frames[i]) for i in views]
+        return fit(model, [cameras[i] for i in views], targets, train, cache=cache, start=start, lam=by_kind).gaussians
+
+    records = []
+    for passes in PASSES:
+        model = fitted(start, taken, passes)
+        H = np.sum([fisher(model, cameras[i], cache=cache) for i in taken], axis=0, dtype=np.float64)
+        draw = generator(0, "linearity").standard_normal(H.shape) * PIXEL_NOISE / np.sqrt(H + lam)
+        columns = dict(zip(LEARNED, groups(0).values(), strict=True))
+        whole = {name: draw[:, c].reshape(getattr(model, name).shape) for name, c in columns.items()}
+        moves = {"all": whole} | {kind: {name: whole[name]} for kind, name in zip(KINDS, LEARNED, strict=True)}
+        for factor in FACTORS:
+            for name, move in moves.items():
+                ratio, size = departure(model, {k: factor * v for k, v in move.items()}, judged, cache)
+                records.append({"passes": passes, "move": f"draw, {name}", "factor": factor, "departure": ratio, "rms": size})
+                print(records[-1], flush=True)
+        for added in left[2::7][:3]:
+            after = fitted(model, [*taken, added], passes, NbvSettings.model_fields["warm_rate"].default)
+            move = {name: getattr(after, name) - getattr(model, name) for name in LEARNED}
+            ratio, size = departure(model, move, judged, cache)
+            records.append({"passes": passes, "move": "one added view", "factor": 1.0, "departure": ratio, "rms": size})
+            print(records[-1], flush=True)
+    return records
+
+
+def draw(path: Path, records: list[dict[str, Any]]) -> None:
+    """Departure against the size of the move, by kind of parameter."""
+    import matplotlib
+
+    colours = dict(zip(("all", *KINDS), ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7"), strict=True))
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(7.2, 3.1)
+        for axis, passes in zip(figure.subplots(1, 2, sharey=True), PASSES, strict=True):
+            for kind, colour in colours.items():
+                rows = [r for r in records if (r["passes"], r["move"]) == (passes, f"draw, {kind}")]
+                axis.plot([r["factor"] for r in rows], [r["departure"] for r in rows], "o-", color=colour, label=kind)
+            real = [r["departure"] for r in records if (r["passes"], r["move"]) == (passes, "one added view")]
+            axis.plot([1.0] * len(real), real, "x", color="#000000", label="one added view")
+            axis.set(xscale="log", yscale="log", xlabel="size of the draw (posterior standard deviations)")
+            axis.set_title(f"after {passes} passes")
+            axis.axhline(1, color="#888888", linewidth=0.8)
+        figure.axes[0].set(ylabel="departure from linear")
+        figure.axes[0].legend()
+        save_figure(figure, path)
+
+
+def main(root: Path, prefix: Path) -> None:
+    """Measure, write, draw."""
+    runtime.start()
+    records = study(root)
+    made = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
+    write_json(prefix.with_suffix(".json"), made | {"records": records})
+    draw(prefix.with_suffix(".png"), records)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
