@@ -38,7 +38,7 @@ from mgs.provenance import command_line, versions
 from mgs.seeds import generator
 from mgs.splat import ListCache, fisher, groups, jvp, render
 
-PASSES = (40, 400)
+PASSES = (20, 400)
 FACTORS = (0.03, 0.1, 0.3, 1.0)
 GAUSSIANS = 10_000
 JUDGED = 4

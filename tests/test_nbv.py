@@ -50,7 +50,7 @@ def test_run_writes_what_it_did(dataset, tmp_path, policy):
     assert [step["name"] for step in steps[1:]] == [dataset.frames[i].name for i in state.taken[3:]]
     assert len(set(state.taken)) == len(state.taken)
     assert [step["images"] for step in steps] == list(range(3, 9))
-    assert all(step["stop_reason"] == "converged" and step["iterations"] == 7 for step in steps)
+    assert all(step["stop_reason"] == "settled" and step["iterations"] == 7 for step in steps)
     assert {"capture", "fit", "information"} <= set(steps[1]["seconds"])
     assert "psnr" not in steps[1]
     config = json.loads((tmp_path / "run/config.json").read_text())

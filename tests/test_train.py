@@ -120,7 +120,7 @@ def test_fit_repeats_bitwise_and_owes_nothing_to_a_used_cache(truth, cameras, ta
 
 def test_stops_when_passes_no_longer_help(truth, cameras, targets):
     found = fit(grey(truth), cameras, targets, TrainSettings(passes=50, rates=(1e-4,) * 4))
-    assert found.stop_reason == "converged"
+    assert found.stop_reason == "settled"
     assert found.passes < 50
 
 
@@ -167,9 +167,9 @@ LONG = [2 * 0.9**k for k in range(6)]
     ("losses", "limit", "expected"),
     [
         ([1, 0.5, 0.4, 0.3], 40, None),
-        ([1, 0.5, 0.499, 0.498], 40, StopReason.CONVERGED),
-        ([1, 0.5, 0.499, 0.498], 3, StopReason.CONVERGED),
-        ([1, 0.5, 0.499, 0.4993], 40, StopReason.CONVERGED),  # a rise within the tolerance is no fall, and no divergence
+        ([1, 0.5, 0.499, 0.498], 40, StopReason.SETTLED),
+        ([1, 0.5, 0.499, 0.498], 3, StopReason.SETTLED),
+        ([1, 0.5, 0.499, 0.4993], 40, StopReason.SETTLED),  # a rise within the tolerance is no fall, and no divergence
         ([1, 0.5, 0.499], 40, None),  # twice in a row
         ([1, 0.5, 0.499], 2, StopReason.PASS_LIMIT),
         ([1, 0.5, 0.49, 0.4895], 40, None),
@@ -188,7 +188,7 @@ LONG = [2 * 0.9**k for k in range(6)]
         ([1, 0.1, 3, 4, 5, 6, 7], 40, StopReason.DIVERGED),
         ([1, 0.5, math.nan], 40, StopReason.DIVERGED),
         ([1, math.inf], 40, StopReason.DIVERGED),
-        ([0, *[LOSS_FLOOR] * 3], 40, StopReason.CONVERGED),  # started from the solution
+        ([0, *[LOSS_FLOOR] * 3], 40, StopReason.SETTLED),  # started from the solution
     ],
 )
 def test_why_a_fit_stops(losses, limit, expected):

@@ -64,7 +64,7 @@ class Fit:
     loss: float
     iterations: int
     losses: tuple[float, ...] = ()
-    stop_reason: StopReason = StopReason.CONVERGED
+    stop_reason: StopReason = StopReason.SETTLED
 
 
 def _normals() -> np.ndarray:

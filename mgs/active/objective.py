@@ -15,7 +15,7 @@ forward mode and one in reverse mode for each image.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -149,7 +149,9 @@ def _photo(camera: Camera, target: np.ndarray) -> Photo:
     return Photo(camera, camera_array(camera), *(mi.Float(np.ascontiguousarray(a).ravel()) for a in (rgb, weights)))
 
 
-def newton_decrease(found: Objective, model: Gaussians, iterations: int) -> list[float]:
+def newton_decrease(
+    found: Objective, model: Gaussians, iterations: int, progress: Callable[[int, int], None] = lambda done, most: None
+) -> list[float]:
     """By how much Phi would fall at most if the images were linear in the parameters: 1/2 g^T (J^T J + lam)^-1 g, after each
     iteration of conjugate gradients with the diagonal of the matrix as preconditioner.
 
@@ -162,7 +164,8 @@ def newton_decrease(found: Objective, model: Gaussians, iterations: int) -> list
     residual = [-g for g in gradient]
     z = [mi.TensorXf(i * r.array, r.shape) for i, r in zip(inverse, residual, strict=True)]
     direction, rz, decreases = z, _dot(residual, z), []
-    for _ in range(iterations):
+    for done in range(iterations):
+        progress(done, iterations)
         product = found.curvature_times(model, direction)
         step = rz / _dot(direction, product)
         x, residual = _plus(x, step, direction), _plus(residual, -step, product)

@@ -39,10 +39,10 @@ class TrainSettings(BaseModel):
 
     optimiser: str = "natural"
     """A row of `mgs.active.optimisers.OPTIMISERS`."""
-    passes: Annotated[int, Field(ge=1)] = 40
+    passes: Annotated[int, Field(ge=1)] = 20
     """Most passes over the images."""
     tolerance: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.01
-    """Converged when a pass lowers the loss by less than this share, twice in a row, and does not raise it by more
+    """Settled when a pass lowers the loss by less than this share, twice in a row, and does not raise it by more
     (`mgs.active.stopping.stop_reason`)."""
     rates: dict[str, Annotated[float, Field(ge=0, allow_inf_nan=False)]] = RATES
     """Learning rate of each kind of parameter; kinds left out take those of RATES. A rate of 0 leaves a kind as it is."""
@@ -81,7 +81,7 @@ class NbvSettings(BaseModel):
     evaluate_every: Annotated[int, Field(ge=0)] = 0
     """Measure PSNR on all views after every so many steps; 0 = only at the end. Never feeds back into the choice."""
     warm_rate: Positive = 0.3
-    """Learning rates of the fits after the first, over those of the first: they start from a model that has converged on all
+    """Learning rates of the fits after the first, over those of the first: they start from a model that was fitted to all
     but one image, so less is left to move. A chosen constant."""
     train: TrainSettings = TrainSettings()
     """How each fit is done."""

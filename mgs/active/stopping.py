@@ -8,7 +8,7 @@ from enum import StrEnum
 
 DIVERGED_FACTOR = 1.5
 """A fit has diverged when its loss was above this many times the loss it started from, for DIVERGED_PASSES passes in a row.
-Chosen constants: Adam's first steps are as long as its rates, whatever the gradient, so a fit that starts from a converged
+Chosen constants: Adam's first steps are as long as its rates, whatever the gradient, so a fit that starts from a fitted
 model rises first (on the demo's: 1.04 times at the usual rates, above 1.5 for one pass at ten times those), then falls."""
 
 DIVERGED_PASSES = 5
@@ -18,9 +18,10 @@ LOSS_FLOOR = (1 / 255) ** 2 / 12
 
 
 class StopReason(StrEnum):
-    """Why a fit stopped: `stop_reason` in steps.jsonl, where older runs have `iteration-limit` for the pass limit."""
+    """Why a fit stopped: `stop_reason` in steps.jsonl. Older runs have `converged` for settled, and `iteration-limit` for the
+    pass limit."""
 
-    CONVERGED = "converged"
+    SETTLED = "settled"
     PASS_LIMIT = "pass-limit"
     DIVERGED = "diverged"
 
@@ -32,9 +33,10 @@ def stop_reason(losses: Sequence[float], tolerance: float, limit: int) -> StopRe
 
     Diverged: the last loss is not finite; or the last DIVERGED_PASSES (all, where the limit is lower) are above DIVERGED_FACTOR
     times the start; or the limit, of DIVERGED_PASSES or more, was reached and no pass came within the tolerance of the start.
-    Converged: two passes in a row lower the loss of the pass before by less than the tolerance, and neither is more than the
+    Settled: two passes in a row lower the loss of the pass before by less than the tolerance, and neither is more than the
     tolerance above the lowest loss until then. So a rise within the tolerance is the noise of a loss that falls no more; a
-    larger one, or small ones that add up to more, are not.
+    larger one, or small ones that add up to more, are not. How far away the minimum is, it does not say: that is what
+    `mgs.active.convergence` is for.
     """
     passes, start = len(losses) - 1, max(losses[0], LOSS_FLOOR)
     if not math.isfinite(losses[-1]):
@@ -43,7 +45,7 @@ def stop_reason(losses: Sequence[float], tolerance: float, limit: int) -> StopRe
     if passes >= window and min(losses[-window:]) > DIVERGED_FACTOR * start:
         return StopReason.DIVERGED
     if passes >= 3 and all(_settled(losses, k, tolerance) for k in (passes - 1, passes)):
-        return StopReason.CONVERGED
+        return StopReason.SETTLED
     if passes < limit:
         return None
     risen = limit >= DIVERGED_PASSES and min(losses[1:]) > (1 + tolerance) * start

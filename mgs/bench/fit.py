@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import kendalltau
 
+from mgs.active.convergence import CG_ITERATIONS
 from mgs.active.criteria import d_optimal, regularisation
 from mgs.active.fitting import Fit, fit
 from mgs.active.loop import target_of
@@ -36,7 +37,6 @@ STATES = (("even", 4), ("random", 4), ("random", 6), ("random", 8))
 """States from which candidates are ranked: views spread evenly in azimuth, or drawn, and their number."""
 LONGER = 10
 """How many times as many passes the fit has that stands for the end."""
-CG_ITERATIONS = 20
 
 OLD_RATES = {"colour": 0.02, "scale": 0.02, "rotation": 0.01, "opacity": 0.05}
 """Rates of the fit that times are compared with, Adam for OLD_PASSES passes: those of the first version of mgs."""

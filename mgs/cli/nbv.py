@@ -183,4 +183,14 @@ def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console
                 f"{label} ({mean['count']}): PSNR {shown['psnr']} dB, SSIM {shown['ssim']}; "
                 f"inside the rock mask PSNR {shown['psnr_mask']} dB, SSIM {shown['ssim_mask']}"
             )
+    if "fit" in metrics:
+        console.print(fit_line(metrics["fit"], state.steps[-1]["stop_reason"]))
     console.print(f"wrote {out}", soft_wrap=True)
+
+
+def fit_line(fit: dict[str, Any], stop_reason: str) -> str:
+    """What to say of the last fit: whether it has converged, or how far from its end it stopped."""
+    share = f"{100 * fit['predicted_decrease']:.2g} %"
+    if fit["converged"]:
+        return f"last fit: converged; its objective could fall by {share} yet, as predicted from its curvature"
+    return f"last fit: stopped early ({stop_reason}); its objective could fall by {share} yet, as predicted from its curvature"

@@ -21,6 +21,7 @@ import numpy as np
 
 from mgs.active.inputs import array_digest, camera_digest, frame_digests
 from mgs.active.run_folder import load_run, read_settings
+from mgs.active.settings import NbvSettings
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import TEST_FOLDER, Dataset, Frame
@@ -29,6 +30,7 @@ from mgs.files import atomic_path, locked, read_json, write_json
 from mgs.gaussians import Gaussians
 from mgs.images import read_png
 from mgs.metrics import METRICS, SURFACE_METRICS, compare, compare_surface
+from mgs.prior.build import load_prior
 from mgs.provenance import versions
 
 Renderer = Callable[[Gaussians, Camera], tuple[np.ndarray, np.ndarray, np.ndarray]]
@@ -175,7 +177,8 @@ def evaluate_run(
     """
     run = Path(run)
     file, folder = run / "metrics.json", run / "renders"
-    prior = read_settings(run).prior  # read before the lock: a folder that is no run is not locked
+    settings = read_settings(run)  # read before the lock: a folder that is no run is not locked
+    prior = settings.prior
     with locked(run):
         gaussians, dataset, trained, policy = load_run(run)
         tests, spacing = _test_frames(dataset), _spacing(prior)
@@ -186,7 +189,8 @@ def evaluate_run(
                 gaussians, dataset.frames, trained,
                 test_frames=tests, spacing=spacing, pictures=folder if pictures else None, progress=progress,
             )  # fmt: skip
-            metrics = {"policy": policy, "of": subject, "pictures": pictures} | found
+            fit = _fit(gaussians, dataset, trained, settings, progress, say)
+            metrics = {"policy": policy, "of": subject, "pictures": pictures} | fit | found
             write_json(file, metrics)
             say(f"wrote {file}" + (f" and {folder}" if pictures else ""))
             for reason in _left_out(dataset, prior, spacing):
@@ -210,6 +214,27 @@ def _test_frames(dataset: Dataset) -> tuple[Frame, ...]:
     """The test views of a dataset, none where it has none. Raises InputError as `Dataset.test_views`."""
     tests = dataset.test_views()
     return () if tests is None else tests.frames
+
+
+def _fit(
+    gaussians: Gaussians,
+    dataset: Dataset,
+    trained: list[str],
+    settings: NbvSettings,
+    progress: Progress | None,
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    """How far the last fit is from its end, as the entry "fit". It is left out, and why is said, where the prior that the fit
+    started from is not there or no longer fits."""
+    from mgs.active.convergence import remaining_decrease
+
+    by_name = {frame.name: frame for frame in dataset.frames}
+    frames, report = [by_name[name] for name in trained], progress or (lambda done, most: None)
+    try:
+        return {"fit": remaining_decrease(gaussians, settings, load_prior(settings.prior), frames, report)}
+    except InputError as error:
+        say(f"{error}; so it is left out how far the fit is from its end")
+        return {}
 
 
 def _spacing(prior: Path) -> float | None:

@@ -1,0 +1,49 @@
+"""How near its end the fit of a run stopped: a prediction of how much lower the objective could still get.
+
+A fit is stopped long before the minimum: the images held out are as good by then, and the ranking of candidates changes little
+(docs/fit.md). What a loss does from pass to pass says nothing about how far away the minimum is. The Newton decrease does: half
+of g^T (J^T J + lam)^-1 g, exact where images are linear in the parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from mgs.active.loop import target_of
+from mgs.active.objective import newton_decrease, objective
+from mgs.active.settings import NbvSettings
+from mgs.data.dataset import Frame
+from mgs.gaussians import Gaussians
+from mgs.prior.build import Prior
+from mgs.prior.initial import initial_gaussians
+from mgs.splat import as_drjit, groups
+
+CG_ITERATIONS = 20
+"""Iterations of conjugate gradients; `mgs bench fit` compares what they predict with what a longer fit finds."""
+
+CONVERGED_SHARE = 0.02
+"""A fit has converged if the objective is predicted to fall by at most this share of itself."""
+
+
+def remaining_decrease(
+    gaussians: Gaussians,
+    settings: NbvSettings,
+    prior: Prior,
+    frames: Sequence[Frame],
+    progress: Callable[[int, int], None] = lambda done, most: None,
+) -> dict[str, Any]:
+    """The objective of the last fit of a run, and by how much it is predicted to fall yet.
+
+    gaussians: the fitted model; frames: those taken, in their order, so the seeds first.
+    Returns "phi" (`mgs.active.objective`, squared pixel values); "predicted_decrease", the Newton decrease after CG_ITERATIONS,
+    a share of phi; and "converged", whether that is at most CONVERGED_SHARE. Raises InputError where a frame cannot be read.
+    """
+    start = initial_gaussians(prior, frames[: settings.seeds])[0]
+    lam = settings.regularisation(groups(0))
+    by_kind = {kind: float(lam[columns][0]) for kind, columns in groups(0).items()}
+    cameras, targets = [frame.camera for frame in frames], [target_of(frame) for frame in frames]
+    goal, model = objective(gaussians, cameras, targets, start, by_kind), as_drjit(gaussians)
+    phi = goal.phi(model)
+    share = newton_decrease(goal, model, CG_ITERATIONS, progress)[-1] / max(phi, 1e-30)
+    return {"phi": phi, "predicted_decrease": share, "converged": bool(share <= CONVERGED_SHARE)}
