@@ -93,11 +93,11 @@ def fisher(
     n, size = len(gaussians), list(groups(gaussians.sh_degree, means).values())[-1].stop
     if not 0 <= alpha_weight <= ALPHA_WEIGHT_MAX:
         raise InputError(f"fisher: alpha_weight {alpha_weight} must be from 0 to {ALPHA_WEIGHT_MAX:.0e}")
-    if estimator in EXACT:
+    if MEANS[means] or alpha_weight:
+        if estimator not in EXACT:
+            raise InputError(f"fisher: the estimator {estimator!r} knows neither means nor alpha; use {' or '.join(EXACT)}")
         unit = _unit_normals(n, normals) if means == "normal" else None
-        options = {"means": means, "normals": unit, "alpha_weight": alpha_weight, **options}
-    elif MEANS[means] or alpha_weight:
-        raise InputError(f"fisher: the estimator {estimator!r} knows neither means nor alpha; choose one of {', '.join(EXACT)}")
+        options |= {"means": means, "normals": unit, "alpha_weight": alpha_weight}
     if n == 0:
         return np.zeros((0, size, size) if estimator == "block" else (0, size), np.float32)
     if estimator == "block" and n * (size * size + 3) >= 1 << 31:  # each row is written in packets of four numbers

@@ -219,7 +219,7 @@ def test_extreme_scenes_give_finite_information(name):
         ({"alpha_weight": 1e13}, "fisher: alpha_weight 1e[+]?13|alpha_weight 10000000000000.0 must be"),
         (
             {"estimator": "hutchinson", "means": "free"},
-            "fisher: the estimator 'hutchinson' knows neither means nor alpha; choose",
+            "fisher: the estimator 'hutchinson' knows neither means nor alpha; use exact or block",
         ),
         (
             {"estimator": "loss-gradient", "alpha_weight": 1},
