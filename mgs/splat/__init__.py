@@ -8,8 +8,8 @@ makes all three faster for cameras seen before.
 `import mgs.splat.plugins` registers the Mitsuba integrator `mgs_splat` (plugins/mgs_splat.py), which draws the same images.
 """
 
-from mgs.splat.information import ESTIMATORS, fisher, groups
+from mgs.splat.information import ESTIMATORS, MEANS, fisher, groups
 from mgs.splat.mitsuba_sensor import camera_from_sensor
 from mgs.splat.rendering import Image, ListCache, as_drjit, jvp, render
 
-__all__ = ["ESTIMATORS", "Image", "ListCache", "as_drjit", "camera_from_sensor", "fisher", "groups", "jvp", "render"]
+__all__ = ["ESTIMATORS", "MEANS", "Image", "ListCache", "as_drjit", "camera_from_sensor", "fisher", "groups", "jvp", "render"]

@@ -38,10 +38,12 @@ SLACK = 1e-2
 
 MAX_PAIRS = 1 << 26
 """Most (splat, block) pairs of a view, and most (splat, row of blocks) pairs, which are made on the way to them. With it every
-index into the kernels' buffers, with 24 sums per pair, is below 2^31: it may be lowered, but not raised."""
+index into the kernels' buffers, with 24 sums per pair, is below 2^31: it may be lowered, but not raised. Fisher information
+with means has up to 36 and checks its own."""
 
 PAIR_BYTES = 128
-"""Peak memory of a view for each of its pairs: measured 28 for an image, 58 for exact Fisher information, 123 for blocks."""
+"""Peak memory of a view for each of its pairs: measured 28 for an image, 58 for exact Fisher information, 123 for blocks. With
+means their sums take 32 and 48 more (exact information with means and an SH degree above 0 has as many sums as blocks)."""
 
 
 @dataclass

@@ -4,13 +4,13 @@ A pixel is taken as the rendered value plus noise of variance 1. The information
 rgb image, all pixels and channels, with respect to the parameters.
 
 The P = 3K + 8 columns of a Gaussian: 3K spherical-harmonic coefficients (coefficient by coefficient, r g b in each), 3
-log-scales, 4 of the quaternion, 1 opacity logit. The means are frozen and have no columns. Symbols: docs/notation.md.
+log-scales, 4 of the quaternion, 1 opacity logit. The means are frozen and have no columns, unless asked for (`MEANS`): then 1
+or 3 more follow. Symbols: docs/notation.md.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -22,17 +22,44 @@ from mgs.errors import InputError
 from mgs.gaussians import LEARNED, Gaussians
 from mgs.seeds import derive_seed
 from mgs.splat import kernels
-from mgs.splat.constants import LOG_SCALE_RANGE
-from mgs.splat.kernels import LN2
-from mgs.splat.projection import axes2d, camera_array, is_rotation, project64, rows_as_vectors, sh_basis, whitening
+from mgs.splat.derivatives import (
+    ByMean,
+    Geometry,
+    Moments,
+    along_normals,
+    by_means,
+    geometry,
+    mean_product,
+    means_product,
+    product_sum,
+    weighted_sum,
+)
+from mgs.splat.projection import camera_array, project64
 from mgs.splat.rendering import ListCache, as_colour, as_drjit, render, splats_and_lists
-from mgs.splat.walking import pack, sums_by_splat
+from mgs.splat.walking import pack, packet_count, sums_by_splat
+
+MEANS = {"frozen": 0, "normal": 1, "free": 3}
+"""What the means may do, and the number of their columns: stay; move along a given normal of each Gaussian (the offset, in
+metres); move freely (x, y, z in the world, metres)."""
+
+ALPHA_WEIGHT_MAX = 1e12
+"""(linear RGB)^2. Largest (sigma_rgb / sigma_alpha)^2: beyond it, sums over pixels might leave float32."""
+
+MAX_SUMS = 1 << 31
+"""Most sums of all (splat, block) pairs of a view, since kernels index them with 31 bits."""
+
+EXACT = ("exact", "block")
+"""The estimators that know the means and alpha."""
 
 
-def groups(sh_degree: int) -> dict[str, slice]:
-    """Columns of each group of parameters ("colour", "scale", "rotation", "opacity"), for colours of this SH degree."""
-    k = 3 * (sh_degree + 1) ** 2
-    return {"colour": slice(0, k), "scale": slice(k, k + 3), "rotation": slice(k + 3, k + 7), "opacity": slice(k + 7, k + 8)}
+def groups(sh_degree: int, means: str = "frozen") -> dict[str, slice]:
+    """Columns of each group of parameters, for colours of this SH degree: "colour", "scale", "rotation", "opacity", and "mean"
+    if these are not frozen. Raises InputError if `means` is not a name in `MEANS`."""
+    if means not in MEANS:
+        raise InputError(f"means {means!r} is unknown; choose one of {', '.join(MEANS)}")
+    sizes = {"colour": 3 * (sh_degree + 1) ** 2, "scale": 3, "rotation": 4, "opacity": 1, "mean": MEANS[means]}
+    ends = np.cumsum(list(sizes.values())).tolist()
+    return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True) if size}
 
 
 def fisher(
@@ -41,6 +68,9 @@ def fisher(
     estimator: str = "exact",
     background: Any = (0.0, 0.0, 0.0),
     cache: ListCache | None = None,
+    means: str = "frozen",
+    normals: Any = None,
+    alpha_weight: float = 0.0,
     **options: Any,
 ) -> np.ndarray:
     """Fisher information that one view carries about each Gaussian: float32 [N,P], or [N,P,P] for the estimator `block`.
@@ -49,12 +79,25 @@ def fisher(
     model and the pose alone. The array may be a view of a larger one (its rows are padded in memory).
     gaussians, background, cache: as in `render`. estimator: a name in `ESTIMATORS`. options: `probes` and `seed` of
     `hutchinson`; the others have none.
-    Raises InputError for an unknown estimator, where `render` does, and for blocks of 2^31 numbers or more.
+    means: a name in `MEANS`; `groups` says which columns are whose. normals: [N,3], world, of any length but 0, the directions
+    in which `means="normal"` moves them; read only then. They are given, not taken from the Gaussians' own axes, since those
+    turn as the model is fitted, and information summed over views must be about one and the same direction.
+    alpha_weight: the ratio of noise variances (sigma_rgb / sigma_alpha)^2, up to 1e12, with which a pixel's alpha is observed
+    beside its colour; 0: it is not.
+    Raises InputError for an unknown estimator, where `render` does, for blocks of 2^31 numbers or more, for unusable means,
+    normals or alpha_weight, which only the estimators `exact` and `block` know, and with means for too many pairs (`MAX_SUMS`).
     """
     if estimator not in ESTIMATORS:
         raise InputError(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
     gaussians.check_shapes()
-    n, size = len(gaussians), groups(gaussians.sh_degree)["opacity"].stop
+    n, size = len(gaussians), list(groups(gaussians.sh_degree, means).values())[-1].stop
+    if not 0 <= alpha_weight <= ALPHA_WEIGHT_MAX:
+        raise InputError(f"fisher: alpha_weight {alpha_weight} must be from 0 to {ALPHA_WEIGHT_MAX:.0e}")
+    if MEANS[means] or alpha_weight:
+        if estimator not in EXACT:
+            raise InputError(f"fisher: the estimator {estimator!r} knows neither means nor alpha; use {' or '.join(EXACT)}")
+        unit = _unit_normals(n, normals) if means == "normal" else None
+        options |= {"means": means, "normals": unit, "alpha_weight": alpha_weight}
     if n == 0:
         return np.zeros((0, size, size) if estimator == "block" else (0, size), np.float32)
     if estimator == "block" and n * (size * size + 3) >= 1 << 31:  # each row is written in packets of four numbers
@@ -65,97 +108,100 @@ def fisher(
     return ESTIMATORS[estimator](as_drjit(gaussians), camera, background, cache, **options)
 
 
-@dataclass
-class Geometry:
-    """How pixels depend on a Gaussian's parameters, up to what differs from pixel to pixel; Dr.Jit arrays [N].
+def _unit_normals(n: int, normals: Any) -> np.ndarray:
+    """Normals, float64 [N,3], of length 1. Raises InputError where they are missing or unusable."""
+    if normals is None:
+        raise InputError("fisher: means='normal' needs normals [N,3], the direction in which each mean may move")
+    values = np.asarray(normals, np.float64)
+    if values.shape != (n, 3):
+        raise InputError(f"fisher: normals have shape {values.shape}, expected {(n, 3)}")
+    length = np.linalg.norm(values, axis=1, keepdims=True)
+    bad = ~(np.isfinite(length) & (length > 0))
+    if bad.any():
+        raise InputError(f"fisher: a normal is zero, NaN or infinite, first at Gaussian {np.argmax(bad)}; repair it")
+    return values / length
 
-    shape: for the 3 log-scales and the 4 numbers of the quaternion, the derivative of ln alpha, as its three coefficients on
-    (xi^2, xi eta, eta^2). logit: the derivative of ln alpha by the opacity logit, 1 - opacity. basis: the K values of the
-    spherical harmonics. positive: for r, g, b 1, or 0 where the colour is clamped at 0 and has no derivative.
+
+def _sums(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Any,
+    cache: ListCache | None,
+    block: bool,
+    means: str,
+    normals: np.ndarray | None,
+    alpha_weight: float,
+) -> tuple[Moments, Geometry, list[ByMean]]:
+    """The sums of `kernels.fisher`, and the derivatives that turn them into entries of the information, those by means apart.
+
+    means, normals, alpha_weight: as in `exact`.
     """
-
-    shape: list[tuple[Any, Any, Any]]
-    logit: Any
-    basis: list[Any]
-    positive: list[Any]
-
-
-def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
-    """The derivatives of the footprint in closed form, in whitened coordinates x = (xi, eta), in which they are of order one.
-
-    With s_i the standard deviation along local axis i and b_i the image of that axis in whitened pixels per metre, ln alpha
-    changes with log-scale i by 4 ln2^2 s_i^2 (b_i.x)^2, and with a rotation about local axis k by
-    4 ln2^2 (s_i^2 - s_j^2) (b_i.x) (b_j.x), where (i, j, k) is (0, 1, 2) or a cyclic shift of it. A change dq of a quaternion q
-    of norm n rotates the local axes by (2/n) Im(conj(q/n) dq).
-    gaussians: TensorXf fields; camera: `camera_array`; splats: their projection.
-    """
-    mean, quats = (
-        mi.Vector3d(rows_as_vectors(gaussians.means, mi.Vector3f)),
-        mi.Vector4d(rows_as_vectors(gaussians.quats, mi.Vector4f)),
-    )
-    log_scales = mi.Vector3d(rows_as_vectors(gaussians.log_scales, mi.Vector3f))
-    _, unit, _ = axes2d(mean, quats, camera)
-    scales = dr.exp(dr.clip(log_scales, *LOG_SCALE_RANGE))
-    k, p, e = whitening([a * s for a, s in zip(unit, scales, strict=True)])
-    b = [mi.Vector2d(p * (t.x - k * t.y), e * t.y) for t in unit]
-
-    def product(s: Any, i: int, j: int) -> Any:
-        x, y = b[i], b[j]
-        f = 4 * LN2 * LN2 * s
-        return mi.Vector3d(f * x.x * y.x, f * (x.x * y.y + x.y * y.x), f * x.y * y.y)
-
-    free = [(s > LOG_SCALE_RANGE[0]) & (s < LOG_SCALE_RANGE[1]) for s in log_scales]
-    by_scale = [dr.select(free[i], product(scales[i] * scales[i], i, i), 0) for i in range(3)]
-    turn = []
-    for i, j in ((1, 2), (2, 0), (0, 1)):
-        turn.append(product((scales[i] - scales[j]) * (scales[i] + scales[j]), i, j))
-    w, x, y, z = quats * dr.select(is_rotation(quats), 2 / dr.squared_norm(quats), 0)
-    X, Y, Z = turn
-    by_quat = [-x * X - y * Y - z * Z, w * X - z * Y + y * Z, z * X + w * Y - x * Z, -y * X + x * Y + w * Z]
-    transparency = dr.rcp(1 + dr.exp(mi.Float64(gaussians.logit_opacities.array)))
-    basis = sh_basis(mean, camera, gaussians.sh.shape[1])
-    positive = [dr.select(c > 0, mi.Float(1), 0) for c in (splats.red, splats.green, splats.blue)]
-    return Geometry([tuple(m) for m in (*by_scale, *by_quat)], transparency, basis, positive)
-
-
-def _sums(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None, block: bool) -> tuple[Any, Geometry]:
-    """The sums of `kernels.fisher`, arrays [N], and the geometry that turns them into entries of the information."""
     device = camera_array(camera)
     splats, lists, packed = splats_and_lists(gaussians, camera, cache)
+    moving = means != "frozen"
+    cross = block or (moving and gaussians.sh_degree > 0)  # as a mean moves, SH of higher degree change colour, too
+    count = kernels.fisher_sums(cross, moving)
+    room = 4 * packet_count(count)
+    if len(lists.splat) * room >= MAX_SUMS:
+        raise InputError(
+            f"view: {len(lists.splat):,} pairs of a Gaussian and a block of pixels are too many for Fisher information with "
+            f"means, which takes fewer than {MAX_SUMS // room:,}; take fewer or smaller Gaussians, or a smaller image"
+        )
     if block:
         exact = project64(gaussians, device)
         dr.eval(exact)
         packed = pack(exact, lists.place)
-    placed = kernels.fisher(lists, packed, dr.detach(as_colour(background)), block)
-    sums = sums_by_splat(lists, placed, kernels.FISHER_SUMS[block])
-    return sums, geometry(gaussians, device, splats)
-
-
-def _quadratic(m: tuple[Any, Any, Any], n: tuple[Any, Any, Any], q: list[Any]) -> Any:
-    """Sum over pixels of |s|^2 (m . phi)(n . phi), phi = (xi^2, xi eta, eta^2), from the five fourth-order moments q."""
-    return (
-        m[0] * n[0] * q[0]
-        + (m[0] * n[1] + m[1] * n[0]) * q[1]
-        + (m[0] * n[2] + m[2] * n[0] + m[1] * n[1]) * q[2]
-        + (m[1] * n[2] + m[2] * n[1]) * q[3]
-        + m[2] * n[2] * q[4]
+    weight = dr.opaque(mi.Float, alpha_weight) if alpha_weight else None
+    placed = kernels.fisher(lists, packed, dr.detach(as_colour(background)), cross, moving, weight)
+    w2, *sums = sums_by_splat(lists, placed, count)
+    squared, mixed = kernels.fisher_moments(cross, moving)
+    channels = [sums[len(squared) + c * len(mixed) :] for c in range(3)] if cross else []
+    moments = Moments(
+        w2, dict(zip(squared, sums, strict=False)), [dict(zip(mixed, channel, strict=False)) for channel in channels]
     )
+    by_mean = by_means(gaussians, device) if moving else []
+    if normals is not None:
+        by_mean = [along_normals(by_mean, normals)]
+    return moments, geometry(gaussians, device, splats), by_mean
 
 
-def exact(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None) -> np.ndarray:
-    """The diagonal of J^T J, exactly, for all parameters, in one pass over the image: seven sums per splat, and no Jacobian."""
-    (w2, s2, *quartic), g = _sums(gaussians, camera, background, cache, block=False)
-    columns_ = [w2 * basis * basis * positive for basis in g.basis for positive in g.positive]
-    columns_ += [dr.maximum(_quadratic(m, m, quartic), 0) for m in g.shape]
-    columns_.append(g.logit * g.logit * s2)
+def exact(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Any,
+    cache: ListCache | None,
+    means: str = "frozen",
+    normals: np.ndarray | None = None,
+    alpha_weight: float = 0.0,
+) -> np.ndarray:
+    """The diagonal of J^T J, exactly, for all parameters, in one pass over the image: seven sums per splat, and no Jacobian.
+
+    With means it takes 16 sums, or 34 for an SH degree above 0, of which colours depend on the mean. means, alpha_weight: as in
+    `fisher`. normals: float64 [N,3] of length 1 for means="normal", else None.
+    """
+    sums, g, by_mean = _sums(gaussians, camera, background, cache, False, means, normals, alpha_weight)
+    columns_ = [sums.w2 * basis * basis * positive for basis in g.basis for positive in g.positive]
+    columns_ += [dr.maximum(product_sum(m, m, sums.squared), 0) for m in g.shape]
+    columns_.append(g.logit * g.logit * sums.squared[0, 0])
+    columns_ += [dr.maximum(means_product(mean, mean, sums), 0) for mean in by_mean]
     return _interleaved(dict(enumerate(columns_)), len(columns_), len(gaussians))
 
 
-def block(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None) -> np.ndarray:
-    """The diagonal blocks of J^T J, [N,P,P], exactly, in one pass over the image: 22 sums per splat."""
-    (w2, s2, *rest), g = _sums(gaussians, camera, background, cache, block=True)
-    dr.eval(g)  # once, as several kernels may write the blocks
-    quartic, quadratic, cross = rest[:5], rest[5:8], [rest[8 + 4 * c : 12 + 4 * c] for c in range(3)]
+def block(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Any,
+    cache: ListCache | None,
+    means: str = "frozen",
+    normals: np.ndarray | None = None,
+    alpha_weight: float = 0.0,
+) -> np.ndarray:
+    """The diagonal blocks of J^T J, [N,P,P], exactly, in one pass over the image: 22 sums per splat, with means 34.
+
+    means, normals, alpha_weight: as in `exact`.
+    """
+    sums, g, by_mean = _sums(gaussians, camera, background, cache, True, means, normals, alpha_weight)
+    dr.eval(g, by_mean)  # once, as several kernels may write the blocks
     colour = [(basis, c) for basis in g.basis for c in range(3)]
     k = len(colour)
     upper: dict[tuple[int, int], Any] = {}
@@ -163,17 +209,25 @@ def block(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCach
         scaled = basis_i * g.positive[c]
         for j, (basis_j, d) in enumerate(colour[: i + 1]):
             if c == d:
-                upper[j, i] = w2 * scaled * basis_j
-        ws, *wsf = cross[c]
+                upper[j, i] = sums.w2 * scaled * basis_j
         for j, m in enumerate(g.shape):
-            upper[i, k + j] = scaled * sum(a * b for a, b in zip(m, wsf, strict=True))
-        upper[i, k + 7] = scaled * ws * g.logit
+            upper[i, k + j] = scaled * weighted_sum(m, sums.mixed[c])
+        upper[i, k + 7] = scaled * sums.mixed[c][0, 0] * g.logit
+        for j, mean in enumerate(by_mean):
+            by_colour = [sums.w2 * mean.colour[c]] if mean.colour else []
+            upper[i, k + 8 + j] = scaled * sum(by_colour, weighted_sum(mean.log_alpha, sums.mixed[c]))
     for i, m in enumerate(g.shape):
         for j in range(i, 7):
-            upper[k + i, k + j] = _quadratic(m, g.shape[j], quartic)
-        upper[k + i, k + 7] = g.logit * sum(a * b for a, b in zip(m, quadratic, strict=True))
-    upper[k + 7, k + 7] = g.logit * g.logit * s2
-    size = k + 8
+            upper[k + i, k + j] = product_sum(m, g.shape[j], sums.squared)
+        upper[k + i, k + 7] = g.logit * weighted_sum(m, sums.squared)
+    upper[k + 7, k + 7] = g.logit * g.logit * sums.squared[0, 0]
+    for j, mean in enumerate(by_mean):
+        for i, m in enumerate(g.shape):
+            upper[k + i, k + 8 + j] = mean_product(mean, m, sums)
+        upper[k + 7, k + 8 + j] = mean_product(mean, {(0, 0): g.logit}, sums)
+        for i, other in enumerate(by_mean[: j + 1]):
+            upper[k + 8 + i, k + 8 + j] = means_product(other, mean, sums)
+    size = k + 8 + len(by_mean)
     both = {i * size + j: value for (i, j), value in upper.items()} | {j * size + i: value for (i, j), value in upper.items()}
     flat = _interleaved(both, size * size, len(gaussians))
     return flat.reshape(-1, size, size)

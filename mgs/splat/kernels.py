@@ -80,19 +80,33 @@ def _store_pixels(lists: BlockLists, pixels: list[list[Any]]) -> tuple[Any, Any]
     return rgba, depth
 
 
-def pack_tangents(tangents: Splats, splats: Splats, place: Any) -> Any:
-    """The tangents of each splat side by side in memory, at the splat's `place`: Float [12 N], evaluated.
+POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+"""The powers (a, b) of the monomials xi^a eta^b up to second order. The derivative of ln alpha of a pixel by any parameter is a
+polynomial of these."""
 
-    tangents: how fast each field of the splats changes (`_rest` fields are not read); splats: the fields themselves.
-    By the chain rule through xi and eta, ln alpha of a pixel changes by a polynomial in them, whose six coefficients depend on
-    the splat alone. Packed are those on (1, xi, eta, xi^2), (xi eta, eta^2), and the tangents of depth and of the colour.
-    Letters p, k, e: see docs/notation.md.
+
+def log_alpha_tangent(tangents: Splats, splats: Splats) -> dict[tuple[int, int], Any]:
+    """How fast ln alpha of a pixel changes as the splats change along `tangents`: the coefficients of its `POWERS`, arrays [N].
+
+    By the chain rule through xi and eta. Where alpha is clamped, it does not change at all. Letters p, k, e: see
+    docs/notation.md.
     """
     k, p, e = splats.shear, splats.white_x, splats.white_y
     one = LN2 * tangents.log2_opacity
     xi = 2 * LN2 * p * (tangents.mean_x - k * tangents.mean_y)
     eta = 2 * LN2 * e * tangents.mean_y
     xi_xi, xi_eta, eta_eta = -2 * LN2 / p * tangents.white_x, 2 * LN2 * p / e * tangents.shear, -2 * LN2 / e * tangents.white_y
+    return dict(zip(POWERS, (one, xi, eta, xi_xi, xi_eta, eta_eta), strict=True))
+
+
+def pack_tangents(tangents: Splats, splats: Splats, place: Any) -> Any:
+    """The tangents of each splat side by side in memory, at the splat's `place`: Float [12 N], evaluated.
+
+    tangents: how fast each field of the splats changes (`_rest` fields are not read); splats: the fields themselves.
+    Packed are the coefficients of `log_alpha_tangent`, on (1, xi, eta, xi^2), (xi eta, eta^2), and the tangents of depth and of
+    the colour.
+    """
+    one, xi, eta, xi_xi, xi_eta, eta_eta = log_alpha_tangent(tangents, splats).values()
     return pack_parts([[one, xi, eta, xi_xi], [xi_eta, eta_eta, tangents.depth, 0], [*tangents.colour, 0]], place)
 
 
@@ -133,11 +147,13 @@ def jvp(lists: BlockLists, packed: Any, packed_tangents: Any) -> tuple[Any, Any]
     return _store_pixels(lists, [[without_denormals(x) for x in (*rgb, alpha, z)] for _, alpha, *rgb, z in pixels])
 
 
-def _slopes(colours: list[Any], behind: list[Any], alpha: Any, w: Any, after: Any, free: Any) -> list[Any]:
+def _slopes(colours: list[Any], behind: list[Any], alpha: Any, w: Any, after: Any, free: Any, last: Any = None) -> list[Any]:
     """s_c = D_c alpha, the derivative of each channel of a pixel by ln alpha of one splat, as Float.
 
     colours: the splat's, c; behind: the colour S composited behind it; w, after: weight and transmittance from `blend`.
     free: mask of pixels where the splat is drawn and its alpha not clamped at ALPHA_MAX; elsewhere the derivative is 0.
+    last: T_end, the transmittance of the finished pixel, times any factor. If given, T_end alpha / (1 - alpha) is appended: the
+    derivative of the pixel's own alpha, 1 - T_end, times the factor.
 
     In double precision it is computed as alpha / (1 - alpha) times the difference c T (1 - alpha) - S: only this difference
     can cancel, so the rest may be single. In single precision 1 - alpha has few digits left in opaque pixels, so it is
@@ -145,9 +161,11 @@ def _slopes(colours: list[Any], behind: list[Any], alpha: Any, w: Any, after: An
     """
     if type(alpha) is mi.Float64:
         odds = dr.select(free, mi.Float(w) / mi.Float(after), 0)
-        return [odds * mi.Float(dr.fma(c, after, -s)) for c, s in zip(colours, behind, strict=True)]
-    held, lost = dr.select(free, w, 0), dr.select(free, alpha / (1 - alpha), 0)
-    return [dr.fma(c, held, -s * lost) for c, s in zip(colours, behind, strict=True)]
+        slopes = [odds * mi.Float(dr.fma(c, after, -s)) for c, s in zip(colours, behind, strict=True)]
+    else:
+        held, odds = dr.select(free, w, 0), dr.select(free, alpha / (1 - alpha), 0)
+        slopes = [dr.fma(c, held, -s * odds) for c, s in zip(colours, behind, strict=True)]
+    return slopes if last is None else [*slopes, odds * last]
 
 
 ADJOINT_SUMS = {False: 8, True: 10}
@@ -225,19 +243,44 @@ def splat_gradient(sums: list[Any], splats: Splats) -> Splats:
     )
 
 
-FISHER_SUMS = {False: 7, True: 22}
-"""Number of sums per splat of `fisher`, by whether blocks are asked for: those of the exact diagonal, of the exact blocks."""
+def fisher_moments(cross: bool, means: bool) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+    """The powers (a, b) of the monomials xi^a eta^b that `fisher` sums: weighted with |s|^2, and with w s_c for each channel c.
+
+    cross: whether products of two parameters, one of them of the colour, are needed. means: whether derivatives by the means
+    are. Only these contain xi and eta to the first power.
+    """
+    squared, mixed = [0, 4], [0, 2] if cross else []
+    if cross or means:
+        squared.append(2)
+    if means:
+        squared += [1, 3]
+        mixed += [1] if cross else []
+    return tuple([(order - b, b) for order in orders for b in range(order + 1)] for orders in (squared, mixed))  # type: ignore
+
+
+def fisher_sums(cross: bool, means: bool) -> int:
+    """Number of sums per splat of `fisher`: 7 for the exact diagonal and 22 for blocks; with means 16, and 34 with `cross`."""
+    squared, mixed = fisher_moments(cross, means)
+    return 1 + len(squared) + 3 * len(mixed)
+
+
+def _monomial(in_xi: list[Any], power: tuple[int, int], eta: Any, eta2: Any) -> Any:
+    """The moment xi^a eta^b of one row of pixels, from its moments in xi; eta2 is eta^2."""
+    a, b = power
+    moment = in_xi[a]
+    for factor in [eta2] * (b // 2) + [eta] * (b % 2):
+        moment = moment * factor
+    return moment
 
 
 @frozen(recorded_sizes)
-def fisher(lists: BlockLists, packed: Any, background: Any, block: bool) -> Any:
+def fisher(lists: BlockLists, packed: Any, background: Any, cross: bool, means: bool = False, alpha_weight: Any = None) -> Any:
     """What `mgs.splat.information` needs for the Fisher information: sums over pixels, to be read through `sums_by_splat`.
 
-    With phi = (xi^2, xi eta, eta^2), s_c = D_c alpha the derivative of channel c by ln alpha, and |s|^2 the sum of s_c^2 over
-    channels, they are
-    w^2, |s|^2, and |s|^2 times xi^4, xi^3 eta, xi^2 eta^2, xi eta^3, eta^4: seven, for the exact diagonal;
-    with block=True also |s|^2 phi (3) and for each channel w s_c (1) and w s_c phi (3): 22, for the exact blocks.
-    background: Color3f, linear RGB.
+    With s_c = D_c alpha the derivative of channel c by ln alpha, and |s|^2 the sum of s_c^2 over channels, they are
+    w^2, and |s|^2 and, if `cross`, w s_r, w s_g and w s_b times the monomials of `fisher_moments`.
+    background: Color3f, linear RGB. alpha_weight: None, or a Float [1]: alpha then counts as a fourth channel of the pixel and
+    adds alpha_weight s_alpha^2 to |s|^2, with s_alpha = T_end alpha / (1 - alpha).
 
     Entries of blocks off the diagonal are sums that cancel. So for blocks give splats packed in double (`project64`): pixels
     are then computed in double, and only the sums over the pixels of one block are in single precision.
@@ -247,23 +290,29 @@ def fisher(lists: BlockLists, packed: Any, background: Any, block: bool) -> Any:
     T = [real(t) for t in T]
     pixels = _pixel_sums(lists, packed, lane, T, lambda splat: splat.colour)
     behind = [[dr.fma(dr.abs(t), real(b), c) for c, b in zip(rgb, background, strict=True)] for t, *rgb in pixels]
+    last = [None] * PIXELS
+    if alpha_weight is not None:
+        last = [mi.Float(dr.abs(t)) * dr.sqrt(alpha_weight) for t, *_ in pixels]
+        dr.schedule(last)
     dr.eval(behind)
-    count = FISHER_SUMS[block]
+    squared, mixed = fisher_moments(cross, means)
+    count = fisher_sums(cross, means)
     slots = pair_slots(lists, count)
 
     def visit(i: Any, splat: Splats, rows: list[Row], pixels: Any) -> Any:
         new, alive = [], mi.Bool(False)
-        sums = [mi.Float(0)] * 22
+        sums = [mi.Float(0)] * count
         for j, row in enumerate(rows):
             m = [mi.Float(0)] * 5
-            cross = [[mi.Float(0)] * 3 for _ in range(3)]
+            cross_m = [[mi.Float(0)] * 3 for _ in range(3)]
             for x, (raw, xi) in enumerate(zip(row.raw_alpha, row.xi, strict=True)):
-                transmittance, *behind = pixels[j * BLOCK_X + x]
+                pixel = j * BLOCK_X + x
+                transmittance, *behind = pixels[pixel]
                 alpha, w, after, room = blend(raw, transmittance)
                 behind = [dr.fma(-c, w, s) for c, s in zip(splat.colour, behind, strict=True)]
                 new.append([after, *behind])
                 alive |= room
-                slopes = _slopes(splat.colour, behind, alpha, w, after, room & (raw <= ALPHA_MAX))
+                slopes = _slopes(splat.colour, behind, alpha, w, after, room & (raw <= ALPHA_MAX), last[pixel])
                 w, xi = mi.Float(w), mi.Float(xi)
                 sums[0] = dr.fma(w, w, sums[0])
                 square = sum(s * s for s in slopes)
@@ -271,20 +320,16 @@ def fisher(lists: BlockLists, packed: Any, background: Any, block: bool) -> Any:
                 m[0], m[1], m[2] = m[0] + square, dr.fma(square, xi, m[1]), dr.fma(square, xi2, m[2])
                 power = square * xi2
                 m[3], m[4] = dr.fma(power, xi, m[3]), dr.fma(power, xi2, m[4])
-                if block:
-                    for c, s in enumerate(slopes):
-                        ws = w * s
-                        a = cross[c]
-                        cross[c] = [a[0] + ws, dr.fma(ws, xi, a[1]), dr.fma(ws, xi2, a[2])]
+                for c, s in enumerate(slopes[:3] if cross else []):
+                    ws = w * s
+                    a = cross_m[c]
+                    cross_m[c] = [a[0] + ws, dr.fma(ws, xi, a[1]), dr.fma(ws, xi2, a[2])]
             eta = mi.Float(row.eta)
             eta2 = eta * eta
-            moments = [m[0], m[4], m[3] * eta, m[2] * eta2, m[1] * eta2 * eta, m[0] * eta2 * eta2]
-            if block:
-                moments += [m[2], m[1] * eta, m[0] * eta2]
-                for a in cross:
-                    moments += [a[0], a[2], a[1] * eta, a[0] * eta2]
-            sums[1 : 1 + len(moments)] = [a + b for a, b in zip(sums[1:], moments, strict=False)]
-        store_sums(slots, sums[:count], dr.gather(mi.UInt32, lists.slot, i))
+            moments = [_monomial(m, power, eta, eta2) for power in squared]
+            moments += [_monomial(a, power, eta, eta2) for a in cross_m for power in mixed]
+            sums[1:] = [a + b for a, b in zip(sums[1:], moments, strict=True)]
+        store_sums(slots, sums, dr.gather(mi.UInt32, lists.slot, i))
         return new, alive
 
     walk(lists, packed, lane, [[t, *c] for t, c in zip(T, behind, strict=True)], visit)

@@ -8,6 +8,7 @@ written independently of the kernels, as dense Jacobians of alpha compositing, a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.special import expit
@@ -161,58 +162,92 @@ def margins(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     return least.reshape(camera.height, camera.width)
 
 
-def _projection_jacobian(gaussians: Gaussians, camera: Camera, step: float = 1e-5) -> np.ndarray:
-    """Derivatives of cov2d by the 3 log-scales and 4 numbers of the quaternion, [N,7,2,2]: central differences of `project`."""
-    columns = []
-    for name, size in (("log_scales", 3), ("quats", 4)):
-        for k in range(size):
-            ends = []
-            for sign in (+1, -1):
-                moved = Gaussians(*(np.array(getattr(gaussians, f), np.float64) for f in vars(gaussians)))
-                getattr(moved, name)[:, k] += sign * step
-                ends.append(project(moved, camera).cov2d)
-            columns.append((ends[0] - ends[1]) / (2 * step))
-    return np.stack(columns, 1)
+def _moved(gaussians: Gaussians, name: str, step: np.ndarray) -> Gaussians:
+    """A float64 copy with `step` added to one parameter of every Gaussian."""
+    values = {field: np.array(value, np.float64) for field, value in vars(gaussians).items()}
+    return Gaussians(**{**values, name: values[name] + step})
 
 
-def jacobian(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -> np.ndarray:
-    """Dense Jacobian of the rgb image, [H*W, 3, N, 3K+8], columns as in `mgs.gaussians.LEARNED`. For toy scenes only."""
+def _projection_jacobian(
+    gaussians: Gaussians, camera: Camera, directions: np.ndarray, step: float = 1e-5
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Derivatives by the 3 log-scales, the 4 numbers of the quaternion, and the means along `directions` [N,m,3] (metres).
+
+    Of means2d [N,7+m,2], cov2d [N,7+m,2,2] and colours [N,7+m,3]: central differences of `project`.
+    """
+    moves = [("log_scales", row) for row in np.eye(3)] + [("quats", row) for row in np.eye(4)]
+    moves += [("means", direction) for direction in directions.transpose(1, 0, 2)]
+    derivatives = []
+    for name, direction in moves:
+        up, down = (project(_moved(gaussians, name, sign * step * direction), camera) for sign in (+1, -1))
+        derivatives.append([(a - b) / (2 * step) for a, b in zip(_differentiated(up), _differentiated(down), strict=True)])
+    means2d, cov2d, colours = (np.stack(columns, 1) for columns in zip(*derivatives, strict=True))
+    return means2d, cov2d, colours
+
+
+def _differentiated(projected: Projected) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return projected.means2d, projected.cov2d, projected.colours
+
+
+def mean_directions(n: int, means: str = "frozen", normals: np.ndarray | None = None) -> np.ndarray:
+    """The directions [N,m,3] that the columns of the means stand for; means, normals: as in `mgs.splat.fisher`."""
+    if means == "normal":
+        unit = np.asarray(normals, np.float64)
+        return (unit / np.linalg.norm(unit, axis=1, keepdims=True))[:, None, :]
+    return np.tile(np.eye(3)[: {"frozen": 0, "free": 3}[means]], (n, 1, 1))
+
+
+def jacobian(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Any = (0.0, 0.0, 0.0),
+    means: str = "frozen",
+    normals: np.ndarray | None = None,
+    alpha_weight: float = 0.0,
+) -> np.ndarray:
+    """Dense Jacobian of the rgb image, [H*W, 3, N, P]. For toy scenes only.
+
+    The P = 3K + 8 columns are those of `mgs.gaussians.LEARNED`, and 1 or 3 of the means follow unless they are frozen.
+    means, normals, alpha_weight: as in `mgs.splat.fisher`. With an alpha_weight above 0 there are four channels, the last one
+    alpha times its square root. It is composited as a colour is that all Gaussians share, over a background of 0.
+    """
     projected = project(gaussians, camera)
     order, alpha, T, clipped = composite(projected, camera)
     weights = alpha * T
-    n, degree = len(gaussians), gaussians.sh_degree
-    K = (degree + 1) ** 2
+    n, K = len(gaussians), (gaussians.sh_degree + 1) ** 2
     directions = np.asarray(gaussians.means, np.float64) - camera.position
     directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
-    basis = sh_basis(directions, degree)
-    contribution = weights[:, :, None] * projected.colours[order]
-    image = contribution.sum(1) + (1 - weights.sum(1))[:, None] * np.asarray(background, np.float64)
+    basis = sh_basis(directions, gaussians.sh_degree)
+    extra = int(alpha_weight > 0)
+    colours = np.concatenate([projected.colours, np.full((n, extra), np.sqrt(alpha_weight))], 1)
+    contribution = weights[:, :, None] * colours[order]
+    image = contribution.sum(1) + (1 - weights.sum(1))[:, None] * np.append(background, np.zeros(extra))
     behind = image[:, None, :] - np.cumsum(contribution, 1)
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
     pixels = np.stack([u.ravel(), v.ravel()], 1)
-    derivatives = _projection_jacobian(gaussians, camera)
-    J = np.zeros((len(pixels), 3, n, 3 * K + 8))
+    d_means2d, d_cov2d, d_colours = _projection_jacobian(gaussians, camera, mean_directions(n, means, normals))
+    J = np.zeros((len(pixels), 3 + extra, n, 3 * K + 1 + d_cov2d.shape[1]))
     for i, j in enumerate(order):
         drawn = np.flatnonzero(alpha[:, i])  # on other pixels the splat changes nothing
         for c in np.flatnonzero(projected.colours[j] > 0):
             J[drawn, c, j, c : 3 * K : 3] = weights[drawn, i, None] * basis[j]
-        D = projected.colours[j] * T[drawn, i, None] - behind[drawn, i] / (1 - alpha[drawn, i, None])
+        D = colours[j] * T[drawn, i, None] - behind[drawn, i] / (1 - alpha[drawn, i, None])
         dalpha = np.where(clipped[drawn, i], 0.0, alpha[drawn, i])
         e = (pixels[drawn] - projected.means2d[j]) @ np.linalg.inv(projected.cov2d[j])
-        dlog = np.stack(
-            [*(((e @ dcov) * e).sum(1) / 2 for dcov in derivatives[j]), np.full(len(e), 1 - projected.opacities[j])], 1
-        )
-        J[drawn, :, j, 3 * K :] = D[:, :, None] * (dalpha[:, None] * dlog)[:, None, :]
+        dlog = [e @ d_mean + ((e @ d_cov) * e).sum(1) / 2 for d_mean, d_cov in zip(d_means2d[j], d_cov2d[j], strict=True)]
+        dlog.insert(7, np.full(len(e), 1 - projected.opacities[j]))
+        J[drawn, :, j, 3 * K :] = D[:, :, None] * (dalpha[:, None] * np.stack(dlog, 1))[:, None, :]
+        J[drawn, :3, j, 3 * K + 8 :] += weights[drawn, i, None, None] * d_colours[j, 7:].T
     return J
 
 
-def fisher(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -> np.ndarray:
-    """diag(J^T J) over pixels and channels, [N, 3K+8]."""
-    return (jacobian(gaussians, camera, background) ** 2).sum((0, 1))
+def fisher(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.0), **options: Any) -> np.ndarray:
+    """diag(J^T J) over pixels and channels, [N,P]; options: those of `jacobian`."""
+    return (jacobian(gaussians, camera, background, **options) ** 2).sum((0, 1))
 
 
-def fisher_block(gaussians: Gaussians, camera: Camera, background=(0.0, 0.0, 0.0)) -> np.ndarray:
-    """The [N, 3K+8, 3K+8] diagonal blocks of J^T J."""
-    J = jacobian(gaussians, camera, background)
+def fisher_block(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.0), **options: Any) -> np.ndarray:
+    """The [N,P,P] diagonal blocks of J^T J; options: those of `jacobian`."""
+    J = jacobian(gaussians, camera, background, **options)
     rows = J.reshape(J.shape[0] * J.shape[1], *J.shape[2:])
     return np.matmul(rows.transpose(1, 2, 0), rows.transpose(1, 0, 2))

@@ -320,9 +320,9 @@ def test_a_view_has_a_bounded_number_of_pairs(monkeypatch):
 
 def test_places_in_buffers_stay_below_31_bits():
     """Of the most pairs, the most Gaussians and the largest images."""
-    most = max(kernels.ADJOINT_SUMS[True], kernels.FISHER_SUMS[True])
+    most = max(kernels.ADJOINT_SUMS[True], kernels.fisher_sums(True, False))  # with means it is checked apart
     assert blocks._room(blocks.MAX_PAIRS) * 4 * packet_count(most) < 1 << 31
-    assert MAX_GAUSSIANS * max(3 * 16, 4 * packet_count(most)) < 1 << 31
+    assert MAX_GAUSSIANS * max(3 * 16, 4 * packet_count(kernels.fisher_sums(True, True))) < 1 << 31
     for width in (1, 9, MAX_PIXELS // MAX_SIDE, 12_345, MAX_SIDE):
         height = min(MAX_SIDE, MAX_PIXELS // width)
         blocks_x, blocks_y = -(-width // BLOCK_X), -(-height // BLOCK_Y)

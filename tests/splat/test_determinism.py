@@ -37,6 +37,10 @@ def results(threads: int | None = None, degree: int = 1) -> dict[str, bytes]:
         cache = ListCache()
         for estimator in ("exact", "block", "loss-gradient"):
             out[estimator] = fisher(gaussians, camera, estimator, BACKGROUND, cache)
+        for estimator in ("exact", "block"):
+            out[f"{estimator}, means and alpha"] = fisher(
+                gaussians, camera, estimator, BACKGROUND, cache, means="free", alpha_weight=0.3
+            )
         assert all(np.isfinite(a).all() and np.any(a) for a in out.values())
         return {name: a.tobytes() for name, a in out.items()}
     finally:

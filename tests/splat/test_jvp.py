@@ -102,6 +102,20 @@ def test_tangents_and_gradients_are_of_one_jacobian(seed, degree, scale, stretch
     assert abs(forward - reverse) <= 1e-6 * size
 
 
+@pytest.mark.parametrize("eye", [(2.0, 0.4, 1.1), (-1.5, 1.0, 0.3), (0.1, 0.2, 2.5)])
+@pytest.mark.parametrize("degree", [0, 2])
+def test_means_have_one_jacobian_too(degree, eye):
+    """<u, J v> = <J^T u, v> where the means alone change, from several cameras."""
+    camera, gaussians = make_camera(eye=eye), make_gaussians(30, 5, degree, log_scales=(-4.0, -1.5))
+    v, u = random_tangents(gaussians, degree, ["means"]), image_weights(camera, degree)
+    Jv, JTu = images(jvp(gaussians, v, camera, BACKGROUND)), gradients(gaussians, camera, u, ("means",))
+    forward = sum(float((Jv[name] * u[name]).sum(dtype=np.float64)) for name in OUTPUTS)
+    reverse = float((JTu["means"] * v["means"]).sum(dtype=np.float64))
+    sizes = [np.sqrt(sum((image[name].astype(np.float64) ** 2).sum() for name in OUTPUTS)) for image in (Jv, u)]
+    assert sizes[0] > 1
+    assert abs(forward - reverse) <= 1e-6 * sizes[0] * sizes[1]
+
+
 def test_forward_mode_of_drjit_through_render():
     """`dr.forward` from a number t that moves parameters and background gives `jvp`, and what the background adds to it."""
     gaussians, camera, _ = case(1)

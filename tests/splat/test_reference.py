@@ -7,7 +7,7 @@ from mgs.colour import SH_C0
 from mgs.gaussians import Gaussians
 from mgs.rotation import rotmat_from_quat
 from mgs.splat import reference
-from mgs.splat.constants import EPS2D
+from mgs.splat.constants import EPS2D, FRUSTUM_MARGIN
 
 from .scenes import calm, double, make_camera, make_gaussians, place
 
@@ -74,27 +74,29 @@ def test_background_shows_where_alpha_is_not():
     np.testing.assert_allclose(over["rgb"] - black["rgb"], (1 - black["alpha"])[..., None] * BACKGROUND, atol=1e-12)
 
 
-def central(gaussians: Gaussians, camera, j: int, name: str, index, step=1e-6) -> np.ndarray:
-    """d rgb / d one number of Gaussian j, [H*W,3]."""
+def central(gaussians: Gaussians, camera, j: int, name: str, index, direction=1.0, step=1e-6) -> np.ndarray:
+    """d (r, g, b, alpha) / d one number of Gaussian j, or several that change together along a direction: [H*W,4]."""
     ends = []
     for sign in (+1, -1):
         moved = double(gaussians)
-        getattr(moved, name)[(j, *index)] += sign * step
-        ends.append(reference.render(moved, camera, BACKGROUND)["rgb"].reshape(-1, 3))
+        getattr(moved, name)[(j, *index)] += sign * step * direction
+        image = reference.render(moved, camera, BACKGROUND)
+        ends.append(np.concatenate([image["rgb"], image["alpha"][..., None]], 2).reshape(-1, 4))
     return (ends[0] - ends[1]) / (2 * step)
+
+
+def opaque_in_the_middle(seed: int, degree: int = 0) -> Gaussians:
+    """Six Gaussians, one of them wide with an opacity of 1."""
+    g = make_gaussians(6, seed, degree, log_scales=(-3.5, -1.0))
+    g.means[5], g.log_scales[5], g.logit_opacities[5] = 0, 0.5, 20
+    return g
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_jacobian_against_central_differences(degree):
     """Every column of every Gaussian, background included; colours clamped at 0 and alphas clamped at ALPHA_MAX among them."""
-
-    def make(seed):
-        g = make_gaussians(6, seed, degree, log_scales=(-3.5, -1.0))
-        g.means[5], g.log_scales[5], g.logit_opacities[5] = 0, 0.5, 20
-        return g
-
     camera = make_camera((21, 14), focal=24)
-    g = calm(make, camera, 7)
+    g = calm(lambda seed: opaque_in_the_middle(seed, degree), camera, 7)
     projected = reference.project(g, camera)
     assert (projected.colours == 0).any()
     assert reference.composite(projected, camera)[3].any(), "no alpha above ALPHA_MAX, though one opacity is 1"
@@ -105,7 +107,40 @@ def test_jacobian_against_central_differences(degree):
     assert J.shape == (21 * 14, 3, 6, len(columns))
     for j in range(len(g)):
         for column, (name, index) in enumerate(columns):
-            expected = central(g, camera, j, name, index)
+            expected = central(g, camera, j, name, index)[:, :3]
+            error = np.abs(J[:, :, j, column] - expected).max()
+            assert error < 2e-8 * max(1.0, np.abs(expected).max() / 1e-2), (name, index, j, error)
+
+
+@pytest.mark.parametrize("centre", [None, (25.5, 3.0)])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_columns_of_means_and_rows_of_alpha_against_central_differences(degree, centre):
+    """All that the image does as means move: centre, footprint, colour. The second camera looks past most of them, at some from
+    beyond its margin, where the projection's Jacobian no longer follows the mean."""
+    camera, weight = make_camera((21, 14), focal=24, centre=centre), 0.3
+    g = calm(lambda seed: opaque_in_the_middle(seed, degree), camera, 11)
+    if centre:
+        drawn = reference.composite(reference.project(g, camera), camera)
+        beyond = camera.project(g.means[drawn[0][drawn[1].any(0)]])[0][:, 0] > 21 * (1 + FRUSTUM_MARGIN / 2)
+        assert beyond.any()
+    normals = np.random.default_rng(degree).normal(size=(6, 3))
+    frozen, free, normal = (
+        reference.jacobian(g, camera, BACKGROUND, means=means, normals=normals, alpha_weight=weight)
+        for means in ("frozen", "free", "normal")
+    )
+    P = 3 * (degree + 1) ** 2 + 8
+    assert [J.shape[1:] for J in (frozen, free, normal)] == [(4, 6, P), (4, 6, P + 3), (4, 6, P + 1)]
+    np.testing.assert_array_equal(free[..., :P], frozen)
+    np.testing.assert_array_equal(normal[..., :P], frozen)
+    np.testing.assert_array_equal(frozen[:, :3], reference.jacobian(g, camera, BACKGROUND))
+    assert np.abs(free[..., P:]).max() > 0.1
+    for j in range(6):
+        unit = normals[j] / np.linalg.norm(normals[j])
+        columns = [(free, P + i, "means", (i,), 1.0) for i in range(3)] + [(normal, P, "means", (), unit)]
+        columns += [(frozen, P - 8 + i, "log_scales", (i,), 1.0) for i in range(3)]
+        columns += [(frozen, P - 1, "logit_opacities", (), 1.0), (frozen, 0, "sh", (0, 0), 1.0)]
+        for J, column, name, index, direction in columns:
+            expected = central(g, camera, j, name, index, direction) * (1, 1, 1, np.sqrt(weight))
             error = np.abs(J[:, :, j, column] - expected).max()
             assert error < 2e-8 * max(1.0, np.abs(expected).max() / 1e-2), (name, index, j, error)
 
