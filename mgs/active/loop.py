@@ -113,7 +113,7 @@ def run(
         state = read_checkpoint(out)
         if state is not None:
             check_inputs(out, state, settings, dataset, stations.prior, say)
-        loop = _Loop(out, settings, dataset, stations, progress)
+        loop = Loop(out, settings, dataset, stations, progress)
         if state is not None and not np.array_equal(state.gaussians.means, loop.start.means):
             raise InputError(inputs.changed_prior(out, settings.prior))
         if state is None:
@@ -140,7 +140,7 @@ def check_inputs(
         say(f"{out}: was started by a version that kept no record of its inputs; it goes on with the files as they are now")
 
 
-class _Loop:
+class Loop:
     """What stays the same from step to step; each method is a function of the state."""
 
     def __init__(self, out: Path, settings: NbvSettings, dataset: Dataset, stations: Stations, progress: Progress) -> None:
