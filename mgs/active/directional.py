@@ -41,8 +41,9 @@ DOME = 48
 DOME_ELEVATIONS = (0.0, 85.0)
 """Lowest and highest elevation of the dome, degrees: all of the sky, so no knowledge of where a model will be judged from."""
 
-CHUNK = 4096
-"""How many Gaussians are worked on at once, which bounds the memory: about 100 MB with 100 views and degree 3."""
+CHUNK = 1024
+"""How many Gaussians are worked on at once, which bounds the memory: with 100 candidates and degree 3, an array of all their
+coefficients takes 13 MB."""
 
 
 class Views(NamedTuple):
