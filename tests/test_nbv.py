@@ -99,7 +99,8 @@ def test_a_tie_goes_to_the_farthest_camera(dataset, tmp_path):
     assert sorted(state.taken) == [0, 3, 6, 9]
 
 
-def test_candidate_images_are_never_read_before_they_are_chosen(dataset, tmp_path, monkeypatch):
+@pytest.mark.parametrize("policy", policies.policy_names())
+def test_candidate_images_are_never_read_before_they_are_chosen(dataset, tmp_path, monkeypatch, policy):
     """Every image that is opened is logged; at each choice the opened ones must be exactly those taken."""
     import mgs.active.inputs
     import mgs.data.dataset
@@ -115,14 +116,14 @@ def test_candidate_images_are_never_read_before_they_are_chosen(dataset, tmp_pat
         function = getattr(module, name)
         monkeypatch.setattr(module, name, lambda path, f=function: opened.add(Path(path).stem) or f(path))
     at_choice = []
-    choose = loop._Loop.choose
+    choose = loop.Loop.choose
 
     def watched(self, state):
         at_choice.append((set(opened), {dataset.frames[i].name for i in state.taken}))
         return choose(self, state)
 
-    monkeypatch.setattr(loop._Loop, "choose", watched)
-    state = run(tmp_path / "run", dataset)
+    monkeypatch.setattr(loop.Loop, "choose", watched)
+    state = run(tmp_path / "run", dataset, policy=policy)
     assert len(at_choice) == 5
     assert all(seen == taken for seen, taken in at_choice)
     assert opened == {dataset.frames[i].name for i in state.taken}

@@ -57,8 +57,13 @@ def demo(rows: list[dict[str, Any]]) -> str:
         "held_out.psnr_mask": "held out, rock",
         "coverage": "coverage (%)",
     }
-    shown = [key for key in headings if key in rows[0]]
-    return markdown([headings[key] for key in shown], [[table_cell(key, row[key]) for key in shown] for row in rows])
+    return _shown(headings, rows)
+
+
+def _shown(headings: dict[str, str], rows: list[dict[str, Any]]) -> str:
+    """The columns of the reports' rows that have a heading; of a dataset without test views, none of these."""
+    keys = [key for key in headings if key in rows[0]]
+    return markdown([headings[key] for key in keys], [[table_cell(key, row[key]) for key in keys] for row in rows])
 
 
 def demo_report(rows: list[dict[str, Any]]) -> str:
@@ -70,13 +75,15 @@ def policies(rows: list[dict[str, Any]]) -> str:
     """More policies on the demo's dataset, compared inside the rock's mask too."""
     headings = {
         "policy": "policy",
+        "test.psnr": "test views",
+        "test.psnr_mask": "test views, rock only",
         "all.psnr": "all views",
         "all.psnr_mask": "all, rock only",
         "held_out.psnr": "held out",
         "held_out.psnr_mask": "held out, rock only",
         "held_out.ssim_mask": "SSIM, held out, rock only",
     }
-    return markdown(list(headings.values()), [[table_cell(key, row[key]) for key in headings] for row in rows])
+    return _shown(headings, rows)
 
 
 def splat(data: dict[str, Any]) -> str:

@@ -41,8 +41,9 @@ DOME = 48
 DOME_ELEVATIONS = (0.0, 85.0)
 """Lowest and highest elevation of the dome, degrees: all of the sky, so no knowledge of where a model will be judged from."""
 
-CHUNK = 4096
-"""How many Gaussians are worked on at once, which bounds the memory: about 100 MB with 100 views and degree 3."""
+CHUNK = 1024
+"""How many Gaussians are worked on at once, which bounds the memory: with 100 candidates and degree 3, an array of all their
+coefficients takes 13 MB."""
 
 
 class Views(NamedTuple):
@@ -76,13 +77,16 @@ def dome_cameras(like: Camera, positions: Array, centre: Array) -> list[Camera]:
     return [Camera(like.K, like.width, like.height, look_at(eye, centre)) for eye in orbit_positions(settings, DOME, centre)]
 
 
-def basis(points: Array, positions: Array, degree: int) -> NDArray[np.float64]:
-    """[N,V,K] spherical harmonics of the directions from camera centres [V,3] to points [N,3]."""
+def basis(points: Array, views: Views, degree: int) -> NDArray[np.float64]:
+    """[N,V,K] spherical harmonics of the directions from the cameras to points [N,3], metres; 0 where the view does not see the
+    point, which is most of them and would cost most of the time."""
     from mgs.splat.reference import sh_basis  # imported here because mgs.splat loads Dr.Jit
 
-    offset = np.asarray(points, np.float64)[:, None] - np.asarray(positions, np.float64)
-    unit = offset / np.linalg.norm(offset, axis=2, keepdims=True)
-    return np.asarray(sh_basis(unit.reshape(-1, 3), degree)).reshape(*offset.shape[:2], -1)
+    point, view = np.nonzero(views.seen.T)
+    offset = np.asarray(points, np.float64)[point] - np.asarray(views.positions, np.float64)[view]
+    y = np.zeros((len(points), len(views.positions), (degree + 1) ** 2))
+    y[point, view] = sh_basis(offset / np.linalg.norm(offset, axis=1, keepdims=True), degree)
+    return y
 
 
 def precision(degree: int, tau: float, lam: float) -> NDArray[np.float64]:
@@ -92,7 +96,7 @@ def precision(degree: int, tau: float, lam: float) -> NDArray[np.float64]:
 
 def information(points: Array, views: Views, degree: int) -> NDArray[np.float64]:
     """[N,K,K] sum over the views of W y y^T. points: [N,3] metres."""
-    y = basis(points, views.positions, degree) * np.sqrt(views.seen.T.astype(np.float64))[..., None]
+    y = basis(points, views, degree) * np.sqrt(views.seen.T.astype(np.float64))[..., None]
     return np.asarray(y.transpose(0, 2, 1) @ y)
 
 
@@ -116,7 +120,7 @@ def _gains(
 ) -> NDArray[np.float64]:
     """`gains` of some of the Gaussians. prior: [K,K]."""
     S = np.linalg.inv(prior + information(points, taken, degree))
-    y, W = basis(points, candidates.positions, degree), candidates.seen.T.astype(np.float64)
+    y, W = basis(points, candidates, degree), candidates.seen.T.astype(np.float64)
     moved = y @ S
     explained = W * (moved * y).sum(2)
     if dome is None:

@@ -1,7 +1,8 @@
 """What a run was made from, as hashes: a resumed run goes on from the same, or not at all.
 
 A record holds `prior`: the hash of the prior; `cameras`: of the pose and the intrinsics of every frame, by its name; `files`:
-of the files of each frame taken, by its name and their kind. Files of frames that were not taken are never opened.
+of the files of each frame taken, by its name and their kind; `policy`: of the file of a policy of the user's own, if it is one.
+Files of frames that were not taken are never opened.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mgs.active import policy_file
 from mgs.camera import Camera
 from mgs.data.dataset import Dataset, Frame
 from mgs.errors import InputError
@@ -78,6 +80,17 @@ def check_unchanged(out: Path, record: dict[str, Any], prior: str, prior_path: P
             if digest != known[kind]:
                 file = _path(frame, kind) or f"{dataset.root / 'transforms.json'}: the {kind} of frame {frame.name}"
                 raise InputError(f"{file} has changed since {out} took it; restore it, or start a new run")
+
+
+def policy_record(policy: str) -> dict[str, str]:
+    """The hash of a policy's file, as an entry of a record; nothing for a policy that is in no file."""
+    return {"policy": file_digest(policy_file.file_of(policy))} if policy_file.in_file(policy) else {}
+
+
+def check_same_policy(out: Path, record: dict[str, Any], policy: str) -> None:
+    """Raises InputError where the file of the policy is another than that of the record."""
+    if record.get("policy") != policy_record(policy).get("policy"):
+        raise InputError(f"policy {policy}: its file has changed since {out} was started; restore it, or start a new run")
 
 
 def changed_prior(out: Path, prior: Path) -> str:

@@ -15,7 +15,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from mgs.active import criteria, directional, inputs, policies, pose_policies
+from mgs.active import criteria, directional, inputs, policies, policy_file, pose_policies
+from mgs.active.outlook import Outlook
 from mgs.active.run_folder import State, check_settings, read_checkpoint, write_checkpoint, write_steps
 from mgs.active.settings import NbvSettings
 from mgs.active.stopping import StopReason
@@ -113,7 +114,7 @@ def run(
         state = read_checkpoint(out)
         if state is not None:
             check_inputs(out, state, settings, dataset, stations.prior, say)
-        loop = _Loop(out, settings, dataset, stations, progress)
+        loop = Loop(out, settings, dataset, stations, progress)
         if state is not None and not np.array_equal(state.gaussians.means, loop.start.means):
             raise InputError(inputs.changed_prior(out, settings.prior))
         if state is None:
@@ -135,11 +136,12 @@ def check_inputs(
     """Raises InputError where the run cannot go on from what it was made from; says so where that was never recorded."""
     if state.inputs:
         inputs.check_unchanged(out, state.inputs, prior, settings.prior, dataset)
+        inputs.check_same_policy(out, state.inputs, settings.policy)
     elif len(state.steps) <= settings.budget:
         say(f"{out}: was started by a version that kept no record of its inputs; it goes on with the files as they are now")
 
 
-class _Loop:
+class Loop:
     """What stays the same from step to step; each method is a function of the state."""
 
     def __init__(self, out: Path, settings: NbvSettings, dataset: Dataset, stations: Stations, progress: Progress) -> None:
@@ -150,9 +152,10 @@ class _Loop:
         self.lam = settings.regularisation(stations.groups)
         self.images: dict[int, np.ndarray] = {}
         cameras = {frame.name: inputs.camera_digest(frame.camera) for frame in self.frames}
-        self.made_from = {"prior": stations.prior, "cameras": cameras}
+        self.made_from = {"prior": stations.prior, "cameras": cameras, **inputs.policy_record(settings.policy)}
         self.seeds = pose_policies.seed_views(self.positions, stations.centre, settings.seeds)
         self.start = stations.initial([self.frames[i] for i in self.seeds])
+        self.policy = policies.policy_named(settings.policy)
         self.seen, self.dome = cache(self._seen), cache(self._dome)  # they depend on poses and surface alone
 
     def first(self) -> State:
@@ -181,29 +184,39 @@ class _Loop:
         return self.learn(state, [frame], choice, watch)
 
     def choose(self, state: State) -> tuple[int, float]:
-        """Frame of the largest score among those not taken, and that score. Looks at poses, never at candidates' images."""
-        policy = self.settings.policy
-        outlook = self.outlook(state, [i for i in range(len(self.frames)) if i not in state.taken])
-        scores = policies.policy_named(policy)(outlook)
+        """Frame of the largest score among those in reach, and that score. Looks at poses, never at candidates' images."""
+        outlook = self.outlook(state, self.reachable(state))
+        scores = np.asarray(self.policy(outlook), np.float64)
         farthest = pose_policies.farthest_pose(outlook.candidates, outlook.taken, outlook.centre, outlook.rng)
+        where = f"policy {self.settings.policy}: gave"
+        if scores.shape != (len(outlook.left),):
+            raise InputError(f"{where} scores of shape {scores.shape} to {len(outlook.left)} candidates; give each one number")
         best = max(range(len(outlook.left)), key=lambda k: (scores[k], farthest[k]))
         if np.isnan(scores).any() or np.isinf(scores[best]):
-            raise InputError(f"policy {policy}: gave a score that is NaN or infinite; correct it (docs/howto/policy.md)")
+            raise InputError(f"{where} a score that is NaN or infinite; correct it (docs/howto/policy.md)")
         return outlook.left[best], float(scores[best])
 
-    def outlook(self, state: State, left: list[int]) -> policies.Outlook:
+    def reachable(self, state: State) -> list[int]:
+        """Frames not taken; with the setting `nearest`, so many of them that are nearest to the view taken last."""
+        left = [i for i in range(len(self.frames)) if i not in state.taken]
+        if self.settings.nearest is None:
+            return left
+        near = pose_policies.nearest_poses(self.positions[left], self.positions[state.taken[-1]], self.settings.nearest)
+        return [left[k] for k in near]
+
+    def outlook(self, state: State, left: list[int]) -> Outlook:
         """What the policy is told when it chooses among the frames in `left`."""
 
         def told(view: int) -> int:
             self.progress("scoring candidates", left.index(view) if view in left else 0, len(left))
             return view
 
-        return policies.Outlook(
+        return Outlook(
             positions=self.positions,
             left=left,
             visited=state.taken,
             centre=self.stations.centre,
-            rng=generator(self.settings.seed, f"{self.settings.policy}/{len(state.steps)}"),
+            rng=generator(self.settings.seed, f"{policy_file.label(self.settings.policy)}/{len(state.steps)}"),
             H=state.H,
             lam=self.lam,
             points=self.start.means[: self.stations.on_surface],

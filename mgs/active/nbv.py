@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mgs.active import loop
+from mgs.active.policy_file import absolute
 from mgs.active.run_folder import State, check_same_frames, check_settings, read_settings, start
 from mgs.active.settings import NbvSettings, validated
 from mgs.active.stations import real_stations
@@ -70,7 +71,8 @@ def start_run(
     given = validated(NbvSettings, {"dataset": dataset.resolve(), "prior": where.resolve(), **settings})
     frames = load_dataset(dataset)
     own_seed = "seed" in given.train.model_fields_set
-    resolved: dict[str, Any] = {"train": given.train if own_seed else given.train.model_copy(update={"seed": given.seed})}
+    resolved: dict[str, Any] = {"policy": absolute(given.policy)}
+    resolved |= {"train": given.train if own_seed else given.train.model_copy(update={"seed": given.seed})}
     if "budget" not in settings:
         resolved["budget"] = min(given.budget, max(0, len(frames) - given.seeds))
     complete = given.model_copy(update=resolved)

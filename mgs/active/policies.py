@@ -1,75 +1,25 @@
-"""Every policy by its name, and what a policy is told: a function of the `Outlook`, which gives each candidate a score.
+"""Every policy by its name, as a function of the `mgs.active.outlook.Outlook` that gives each candidate a score.
 
 There are three tables, by what their functions look at: `mgs.active.criteria.CRITERIA` at information,
-`mgs.active.pose_policies.POSE_POLICIES` at poses, and OUTLOOK_POLICIES here at whatever an Outlook has. None is ever shown a
-candidate's image.
+`mgs.active.pose_policies.POSE_POLICIES` at poses, and OUTLOOK_POLICIES here at whatever an Outlook has. A name like
+FILE.py:FUNCTION is a policy in a file of the user's own (`mgs.active.policy_file`).
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mgs.active.criteria import CRITERIA, Array, Criterion, block_log_determinant, d_optimal
 from mgs.active.criteria import i_optimal as i_optimality
-from mgs.active.directional import Views, gains
+from mgs.active.directional import gains
+from mgs.active.outlook import Outlook, Policy
+from mgs.active.policy_file import in_file, load
 from mgs.active.pose_policies import POSE_POLICIES
 from mgs.errors import InputError
 
 PAPER_LAM = 1e-6
 """The one lambda of the policy `paper`: that of POp-GS, since the paper does not say which it used."""
-
-
-@dataclass(frozen=True)
-class Outlook:
-    """What is known when a view is chosen. Views are meant by the index of their frame.
-
-    positions: [V,3] camera centres of all frames, metres. left: the candidates. visited: the views taken, in their order.
-    centre: [3] the middle of the rock. rng: new in each step, drawn from the run's seed.
-    H, lam: [M,P] information of the views taken about the model fitted so far, and [P] lambda, of the run.
-    points: [N,3] the Gaussians on the prior's surface, before training. surface_H, prior_lam: the same as H and lam for these.
-    information(view), surface_information(view): what one view adds to H, and to surface_H.
-    estimate(view, estimator): the information of one view about the fitted model, by any row of `mgs.splat.ESTIMATORS`.
-    seen(view): [N] squared blending weights of the surface in one view (`mgs.active.directional.squared_weights`).
-    dome(): a dome of poses around the rock, and what they see of the surface.
-    """
-
-    positions: Array
-    left: list[int]
-    visited: list[int]
-    centre: Array
-    rng: np.random.Generator
-    H: Array
-    lam: Array
-    points: Array
-    surface_H: Array
-    prior_lam: Array
-    information: Callable[[int], Array]
-    surface_information: Callable[[int], Array]
-    estimate: Callable[[int, str], Array]
-    seen: Callable[[int], Array]
-    dome: Callable[[], Views]
-
-    @property
-    def candidates(self) -> Array:
-        """[C,3] positions of the candidates, metres."""
-        return self.positions[self.left]
-
-    @property
-    def taken(self) -> Array:
-        """[T,3] positions of the views taken, in the order in which they were taken, metres."""
-        return self.positions[self.visited]
-
-    def views(self, frames: list[int]) -> Views:
-        """Poses of some frames, and what they see of the surface."""
-        return Views(self.positions[frames], np.stack([self.seen(i) for i in frames]))
-
-
-Policy = Callable[[Outlook], Array]
-"""(outlook) -> score of each candidate [C], in the order of `left`."""
 
 
 def directional_d(outlook: Outlook) -> Array:
@@ -128,7 +78,9 @@ def policy_names() -> list[str]:
 
 
 def policy_named(name: str) -> Policy:
-    """The policy of that name, as a function of an Outlook. Raises InputError where there is none."""
+    """The policy of that name, as a function of an Outlook. Raises InputError if there is none, and as `policy_file.load`."""
+    if in_file(name):
+        return load(name)
     if name in CRITERIA:
         return _of_criterion(CRITERIA[name])
     if name in POSE_POLICIES:

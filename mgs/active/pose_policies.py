@@ -63,6 +63,12 @@ POSE_POLICIES: dict[str, PosePolicy] = {
 """Policies that look at poses, by name. A program may add its own (docs/howto/policy.md)."""
 
 
+def nearest_poses(positions: Array, here: Array, count: int) -> list[int]:
+    """Indices of the `count` positions [C,3] nearest to `here` [3], in their order; all of them where they are fewer."""
+    distance = _rounded(np.linalg.norm(positions - here, axis=1))
+    return sorted(int(k) for k in np.argsort(distance, kind="stable")[:count])
+
+
 def seed_views(positions: Array, centre: Array, count: int) -> list[int]:
     """Frames nearest to `count` evenly spaced azimuths (0, 360/count, ...), each frame once; in that order.
 

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from mgs.active.policies import policy_named
+from mgs.active.policy_file import label
 from mgs.active.settings import NbvSettings, validated
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.errors import InputError
@@ -141,4 +142,4 @@ def load_run(run: Path) -> tuple[Gaussians, Dataset, list[str], str]:
         raise InputError(f"{run}: has no finished step yet; continue it with `mgs nbv --resume {run}`")
     dataset = load_dataset(settings.dataset)
     check_same_frames(run, dataset)
-    return state.gaussians, dataset, [dataset.frames[i].name for i in state.taken], settings.policy
+    return state.gaussians, dataset, [dataset.frames[i].name for i in state.taken], label(settings.policy)

@@ -62,8 +62,10 @@ class NbvSettings(BaseModel):
     dataset: Path
     prior: Path
     policy: str = "d-optimal"
-    """A row of `mgs.active.criteria.CRITERIA` or `mgs.active.pose_policies.POSE_POLICIES`, looked up when the loop starts: a
-    finished run is read without it."""
+    """A name of `mgs.active.policies.policy_names`, or FILE.py:FUNCTION; looked up when the loop starts: a finished run is read
+    without it."""
+    nearest: Annotated[int, Field(ge=1)] | None = None
+    """The next view is one of so many that are nearest to the view taken last (at first, to the last seed); None: any view."""
     estimator: str = "exact"
     """A row of `mgs.splat.ESTIMATORS` that gives [N,P]: how the Fisher information that criteria see is computed."""
     budget: Annotated[int, Field(ge=0)] = 50
@@ -97,7 +99,7 @@ class NbvSettings(BaseModel):
 Model = TypeVar("Model", bound=BaseModel)
 
 OPTIONS = (
-    "policy", "estimator", "budget", "seeds", "seed", "lam", "pixel_noise", "evaluate_every", "optimiser", "passes",
+    "policy", "nearest", "estimator", "budget", "seeds", "seed", "lam", "pixel_noise", "evaluate_every", "optimiser", "passes",
 )  # fmt: skip
 """Settings that `mgs nbv` has an option for, of the same name."""
 

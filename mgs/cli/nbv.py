@@ -32,7 +32,12 @@ def nbv(
         typer.Option(help="Folder of `mgs prior`; default DATASET/prior, or built inside the run where there is none."),
     ] = None,
     gaussians: Annotated[int | None, typer.Option(help="Build a prior of this many Gaussians inside the run.")] = None,
-    policy: Annotated[str, typer.Option(help=f"One of {', '.join(policy_names())}.")] = "d-optimal",
+    policy: Annotated[
+        str, typer.Option(help=f"One of {', '.join(policy_names())}; or FILE.py:FUNCTION, a function of your own.")
+    ] = "d-optimal",
+    nearest: Annotated[
+        int | None, typer.Option(help="Move only to one of so many views that are nearest to the last one. Default: to any.")
+    ] = None,
     budget: Annotated[
         int | None, typer.Option(help="Views chosen beyond the seeds; default 50, or all candidates where they are fewer.")
     ] = None,
@@ -84,8 +89,9 @@ def nbv(
     if passes is not None:
         train["passes"] = passes
     settings: dict[str, Any] = {
-        "policy": policy, "seeds": seeds, "seed": seed, "estimator": estimator, "lam": lam, "pixel_noise": pixel_noise,
-        "prior_std": pairs("--prior-std", prior_std), "evaluate_every": evaluate_every, "train": train,
+        "policy": policy, "nearest": nearest, "seeds": seeds, "seed": seed, "estimator": estimator, "lam": lam,
+        "pixel_noise": pixel_noise, "prior_std": pairs("--prior-std", prior_std), "evaluate_every": evaluate_every,
+        "train": train,
     }  # fmt: skip
     if budget is not None:
         settings["budget"] = budget

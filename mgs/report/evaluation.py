@@ -171,8 +171,8 @@ def evaluate_run(
     """`evaluate` of a run of `mgs nbv` on its dataset and its test views; writes RUN/metrics.json, and RUN/renders where
     `pictures`: NAME.png of every view, test/NAME.png of every test view.
 
-    What is there of this very model, dataset and version of mgs is kept: nothing is measured or drawn twice. say is told what
-    was written and what was kept, and which metrics are left out because the dataset has no truth for them. Raises InputError
+    What is there of this very model, dataset and version of mgs is kept: nothing is measured or drawn twice. say is told
+    which metrics are left out because there is no truth for them, then what was written and what was kept. Raises InputError
     as `load_run`, where the test views cannot be read, and where another process works on the run.
     """
     run = Path(run)
@@ -183,6 +183,8 @@ def evaluate_run(
         gaussians, dataset, trained, policy = load_run(run)
         tests, spacing = _test_frames(dataset), _spacing(prior)
         subject = _subject(gaussians, [*dataset.frames, *tests], trained, spacing)
+        for reason in _left_out(dataset, prior, spacing):
+            say(reason)
         metrics = _measured_before(file, subject)
         if metrics is None:
             found = evaluate(
@@ -193,8 +195,6 @@ def evaluate_run(
             metrics = {"policy": policy, "of": subject, "pictures": pictures} | fit | found
             write_json(file, metrics)
             say(f"wrote {file}" + (f" and {folder}" if pictures else ""))
-            for reason in _left_out(dataset, prior, spacing):
-                say(reason)
             return metrics
         kept = f"kept {file}, measured before on this very model and dataset"
         paths = [folder / f"{frame.name}.png" for frame in dataset.frames]

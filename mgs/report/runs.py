@@ -10,6 +10,7 @@ from typing import Any
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from mgs.active.policy_file import label
 from mgs.active.run_folder import check_same_frames, read_settings
 from mgs.active.settings import validated
 from mgs.data.dataset import Dataset, load_dataset
@@ -106,7 +107,7 @@ def read_run(folder: str | Path) -> Run:
         TypeAdapter(_Metrics | None).validate_python(metrics)
     except ValidationError:
         raise InputError(f"{path}: is damaged; measure the run again with `mgs eval {folder}`") from None
-    return Run(folder, settings.policy, steps, metrics, config["settings"])
+    return Run(folder, label(settings.policy), steps, metrics, config["settings"])
 
 
 def _read_steps(folder: Path) -> list[dict[str, Any]]:
