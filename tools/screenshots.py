@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import signal
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -44,6 +46,27 @@ def report(browser: Any, demo: Path, folder: Path) -> None:
     save(both, "report_html.png")
 
 
+def viewer(browser: Any, demo: Path, folder: Path) -> None:
+    """The viewer of a run: a camera selected, with the colours of the model and with its uncertainty."""
+    command = [sys.executable, "-m", "mgs", "view", str(demo / "d-optimal"), "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        address = process.stdout.readline().split()[1]
+        tab = browser.new_context(viewport={"width": 1100, "height": 760}).new_page()
+        tab.goto(address)
+        tab.get_by_label("View", exact=True).first.click()
+        tab.get_by_role("option", name="kf_0028", exact=True).click()
+        for x in range(420, 520, 20):  # turns, so that the notice about software rendering has time to go, too
+            tab.mouse.move(x, 500)
+            tab.mouse.down()
+        tab.mouse.up()
+        tab.locator("button[class*=CloseButton]").first.click()
+        tab.wait_for_timeout(5000)
+        tab.screenshot(path=folder / "view.png")
+        process.send_signal(signal.SIGINT)
+    save(Image.open(folder / "view.png"), "view.png")
+
+
 def main(demo: Path) -> None:
     """Make all screenshots from the folder of the demo."""
     from playwright.sync_api import sync_playwright
@@ -51,6 +74,7 @@ def main(demo: Path) -> None:
     with sync_playwright() as driver, tempfile.TemporaryDirectory() as folder:
         browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=ARGUMENTS)
         report(browser, demo, Path(folder))
+        viewer(browser, demo, Path(folder))
         browser.close()
 
 
