@@ -192,6 +192,28 @@ def test_what_is_not_there_is_left_out(runs, tmp_path):
     assert "PSNR, held out" not in parsed.text
 
 
+def test_test_views_are_compared_and_their_metrics_shown(runs, tmp_path):
+    """Those of the dataset's folder `test`, under names that cannot be mistaken for those of its own views."""
+    run = shutil.copytree(runs[0], tmp_path / "run")
+    config = json.loads((run / "config.json").read_text())
+    shutil.copytree(config["settings"]["dataset"], tmp_path / "data")
+    tiny.write_dataset(tmp_path / "data/test", frames=3)
+    config["settings"]["dataset"] = str(tmp_path / "data")
+    (run / "config.json").write_text(json.dumps(config))
+    metrics = json.loads((run / "metrics.json").read_text())
+    view = {"name": "kf_0001", "trained": False, "psnr": 12.345, "psnr_mask": 10.5, "ssim": 0.5}
+    (run / "metrics.json").write_text(json.dumps(metrics | {"test": {"count": 1, "psnr": 12.345}, "test_views": [view]}))
+    write_page(tmp_path / "page.html", [run])
+    parsed = Parsed((tmp_path / "page.html").read_text())
+    data = json.loads(parsed.data)
+    tests = {view["view"]: view["sides"] for view in data["compared"] if view["view"].startswith("test/")}
+    assert list(tests) == ["test/kf_0000", "test/kf_0001", "test/kf_0002"]
+    assert tests["test/kf_0001"][1]["label"] == "d-optimal, 12.35 dB"
+    assert tests["test/kf_0000"][1]["label"] == "d-optimal"
+    assert "test views, PSNR (dB) 12.35" in parsed.text
+    assert "test/kf_0001" in data["plots"][-1]["data"][1]["x"]
+
+
 def test_the_command(runs, tmp_path, capsys):
     from mgs.cli.app import main
 
@@ -202,6 +224,7 @@ def test_the_command(runs, tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
     (tmp_path / "file").write_text("")
     assert "cannot be written" in refused(capsys, ["report", runs[0], "--html", tmp_path / "file/page.html"], tmp_path)
+    assert "is a folder" in refused(capsys, ["report", runs[0], "--html", tmp_path], tmp_path)
     assert "no such file" in refused(capsys, ["report", tmp_path, "--html", tmp_path / "x.html"], tmp_path)
 
 

@@ -29,10 +29,11 @@ def report(
     The page of --html is made of what is there, also of an unfinished run: for its pictures, the model that the run folder
     holds is drawn.
     """
+    from mgs.errors import InputError
     from mgs.files import check_writable
 
-    if html is not None:
-        check_writable(html)
+    if html is not None and check_writable(html).is_dir():
+        raise InputError(f"--html {html}: is a folder; name a file to write")
     if out is not None or html is None:
         _write_figures(runs, out or Path("report"))
     if html is not None:

@@ -16,7 +16,7 @@ from mgs.active.run_folder import read_settings
 from mgs.data.dataset import Dataset, Frame
 from mgs.files import atomic_path
 from mgs.report.evaluation import render_rgb
-from mgs.report.page_facts import Shown, cell, links, measured, read_shown, setting_rows, summary_rows
+from mgs.report.page_facts import Shown, cell, links, measured, measured_views, read_shown, setting_rows, summary_rows
 from mgs.report.page_pictures import (
     ERROR_COLOURS,
     UNCERTAINTY_COLOURS,
@@ -180,7 +180,7 @@ def _pictures(one: Shown, frame: Frame, images: int) -> list[dict[str, str]]:
 
 def _quality(one: Shown, view: str) -> str:
     """PSNR of a view as part of a caption; empty where it was not measured."""
-    found = next((v for v in (one.metrics or {}).get("views", []) if v["name"] == view), None)
+    found = next((v for v in measured_views(one) if v["name"] == view), None)
     decibels = None if found is None else found.get("psnr")
     return "" if decibels is None else f", {decibels:.2f} dB"
 
@@ -221,7 +221,7 @@ def _plots(shown: Sequence[Shown]) -> list[dict[str, Any]]:
     wanted += [(f"{metric_name(key)} after each step", curves(key), metric_name(key), False) for key in keys]
     wanted.append(("Loss at the end of each fit", curves("loss"), "mean squared error", True))
     plots = [line_plot(title, found, "images", y, zero) for title, found, y, zero in wanted if found]
-    views = {one.label: one.metrics["views"] for one in shown if one.metrics is not None}
+    views = {one.label: measured_views(one) for one in shown if one.metrics is not None}
     if views:
         plots.append(views_plot("psnr_mask", views) if _all_have("psnr_mask", views) else views_plot("psnr", views))
     return plots

@@ -106,6 +106,12 @@ def measured(step: Mapping[str, Any]) -> dict[str, float]:
     return {" ".join(path): float(value) for path, value in _flat(rest).items() if value is not None}
 
 
+def measured_views(one: Shown) -> list[dict[str, Any]]:
+    """What metrics.json holds of each view: those of the dataset, then its test views, whose names here begin with `test/`."""
+    metrics = one.metrics or {}
+    return [*metrics.get("views", []), *(view | {"name": f"test/{view['name']}"} for view in metrics.get("test_views", []))]
+
+
 def _flat(values: Mapping[str, Any], path: tuple[str, ...] = ()) -> dict[tuple[str, ...], Any]:
     """The numbers in nested dictionaries, by their path of keys; None, which stands for a mean of nothing, included."""
     found: dict[tuple[str, ...], Any] = {}

@@ -35,8 +35,11 @@ METRIC_NAMES = {
     "psnr_inside": "PSNR, without the outline (dB)",
     "held_out_psnr": "PSNR, held out (dB)",
     "held_out_psnr_mask": "PSNR, held out, rock only (dB)",
+    "test_psnr": "PSNR, test views (dB)",
+    "test_psnr_mask": "PSNR, test views, rock only (dB)",
+    "depth_error": "depth error (m)",
 }
-"""Headings of the metrics that mgs has long measured. Any other number is called by its key."""
+"""Headings of metrics whose key says too little. Any other number is called by its key."""
 
 
 def metric_name(key: str) -> str:
