@@ -12,10 +12,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mgs.active.run_folder import read_settings
 from mgs.data.dataset import Dataset, Frame
 from mgs.files import atomic_path
-from mgs.report.evaluation import render_rgb
 from mgs.report.page_facts import Shown, cell, links, measured, measured_views, read_shown, setting_rows, summary_rows
 from mgs.report.page_pictures import (
     ERROR_COLOURS,
@@ -81,6 +82,8 @@ def draw_pictures(
     These frames are up to COMPARED that the fewest runs were trained on, spread evenly, and as many test views of the dataset,
     whose names begin with `test/`. Raises InputError if a file of a frame cannot be read.
     """
+    from mgs.splat import render
+
     modelled = [one for one in shown if one.model is not None]
     if not modelled:
         return Album((slice(None), slice(None)), WIDEST), []
@@ -102,7 +105,7 @@ def draw_pictures(
         draw_taken(album, one.label, one.model, one.frames, (settings.pixel_noise, settings.prior_std), drawn)
         for frame in views:
             if f"render/{frame.name}/{one.label}" not in album.pictures:
-                draw_render(album, f"{frame.name}/{one.label}", frame, render_rgb(one.model, frame.camera))
+                draw_render(album, f"{frame.name}/{one.label}", frame, np.asarray(render(one.model, frame.camera).rgb))
             drawn()
     for frame in views:
         if f"truth/{frame.name}" not in album.pictures:
