@@ -20,6 +20,7 @@ from .prior.initial import initial_gaussians as initial_gaussians
 from .prior.settings import PriorSettings as PriorSettings
 from .report.evaluation import evaluate as evaluate
 from .report.evaluation import evaluate_run as evaluate_run
+from .report.page import write_page as write_page
 from .report.writing import write_report as write_report
 from .splat import ListCache as ListCache
 from .splat import as_drjit as as_drjit

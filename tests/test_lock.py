@@ -11,7 +11,10 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 GROUPS = PROJECT["dependency-groups"]
-WANTED = PROJECT["project"]["dependencies"] + GROUPS["dev"] + GROUPS["docs"] + PROJECT["build-system"]["requires"]
+EXTRAS = PROJECT["project"]["optional-dependencies"]
+WANTED = (
+    PROJECT["project"]["dependencies"] + EXTRAS["view"] + GROUPS["dev"] + GROUPS["docs"] + PROJECT["build-system"]["requires"]
+)
 LINES = [line for line in (ROOT / "requirements.lock").read_text().splitlines() if not line.startswith("#")]
 
 

@@ -27,6 +27,7 @@ from mgs.cli.render import render
 from mgs.cli.report import report
 from mgs.cli.survey import survey
 from mgs.cli.synth_orbit import synth_orbit
+from mgs.cli.view import view
 from mgs.errors import InputError
 
 INTERRUPTED = 130
@@ -43,6 +44,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "eval": evaluate,
     "diagnose": diagnose,
     "report": report,
+    "view": view,
     "render": render,
     "demo": demo,
     "bench": bench,

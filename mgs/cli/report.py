@@ -1,4 +1,4 @@
-"""`mgs report`: compare runs by figures and a table."""
+"""`mgs report`: compare runs by figures and a table, or by one HTML page."""
 
 from __future__ import annotations
 
@@ -9,17 +9,41 @@ import typer
 
 
 def report(
-    runs: Annotated[list[Path], typer.Argument(help="Run folders, all of one dataset, each measured by `mgs eval`.")],
+    runs: Annotated[list[Path], typer.Argument(help="Run folders, all of one dataset.")],
     out: Annotated[
-        Path, typer.Option(help="Folder for the figures and the table. Files of an earlier report are replaced.")
-    ] = Path("report"),
+        Path | None,
+        typer.Option(
+            help="Folder for the figures and the table. Files of an earlier report are replaced.",
+            show_default="report; with --html none",
+        ),
+    ] = None,
+    html: Annotated[
+        Path | None,
+        typer.Option("--html", help="One page with everything, interactive; it opens from the disk and loads nothing."),
+    ] = None,
 ) -> None:
     """Compare runs: draw the orbit, information gain, coverage, PSNR against images and one test view, and make a table.
 
     Where the dataset has no test views, a view is drawn that the fewest runs were trained on, and PSNR is over all views.
 
-    Everything is taken from the files of the runs; nothing is computed anew.
+    The figures are taken from the files of runs that are finished and measured by `mgs eval`; nothing is computed anew.
+
+    The page of --html is made of what is there, also of an unfinished run: for its pictures, the model that the run folder
+    holds is drawn.
     """
+    from mgs.errors import InputError
+    from mgs.files import check_writable
+
+    if html is not None and check_writable(html).is_dir():
+        raise InputError(f"--html {html}: is a folder; name a file to write")
+    if out is not None or html is None:
+        _write_figures(runs, out or Path("report"))
+    if html is not None:
+        _write_page(runs, html)
+
+
+def _write_figures(runs: list[Path], out: Path) -> None:
+    """Write the figures and the table, and print the table."""
     from rich.console import Console
 
     from mgs.cli.printing import print_table
@@ -32,3 +56,17 @@ def report(
     print_table(Console(), table_numbers(runs))
     for path in written:
         typer.echo(f"wrote {path}")
+
+
+def _write_page(runs: list[Path], html: Path) -> None:
+    """Write the page, with a progress bar, and print its size."""
+    from rich.progress import Progress
+
+    from mgs import runtime
+    from mgs.report.page import write_page
+
+    runtime.start()
+    with Progress(transient=True) as bar:
+        task = bar.add_task("drawing", total=None)
+        size = write_page(html, runs, progress=lambda done, total: bar.update(task, completed=done, total=total))
+    typer.echo(f"wrote {html} ({size / 1e6:.1f} MB)")

@@ -143,11 +143,10 @@ def check_finished(run: Run) -> None:
         raise InputError(f"{run.folder}: has all {planned} views, but no gaussians.ply; write it with {resume}, then report")
 
 
-def evaluated_runs(folders: Sequence[str | Path]) -> dict[str, Run]:
+def labelled_runs(folders: Sequence[str | Path]) -> dict[str, Run]:
     """Read runs that are to be compared, by label: the policy, with the folder's name if several runs have the same policy.
 
-    Raises InputError as `read_run`, if a run was not evaluated since its last step, if two runs have the same policy and folder
-    name, or if the runs are on different datasets.
+    Raises InputError as `read_run`, if two runs have the same policy and folder name, or if the runs are on different datasets.
     """
     runs = [read_run(folder) for folder in folders]
     policies = [run.policy for run in runs]
@@ -157,10 +156,17 @@ def evaluated_runs(folders: Sequence[str | Path]) -> dict[str, Run]:
     if len(labelled) < len(runs):
         raise InputError("report: two of the runs have the same policy and folder name; give each run once, or rename a folder")
     for run in runs:
-        if run.metrics is None or run.metrics["images"] != len(run.seeds + run.chosen):
-            raise InputError(f"{run.folder}: was not evaluated since its last step; measure it with `mgs eval {run.folder}`")
         if run.settings["dataset"] != runs[0].settings["dataset"]:
             raise InputError(f"{run.folder}: is a run on another dataset than {runs[0].folder}; compare runs on one dataset")
+    return labelled
+
+
+def evaluated_runs(folders: Sequence[str | Path]) -> dict[str, Run]:
+    """`labelled_runs`, all of which were evaluated. Raises InputError as that, or if a run was not since its last step."""
+    labelled = labelled_runs(folders)
+    for run in labelled.values():
+        if run.metrics is None or run.metrics["images"] != len(run.seeds + run.chosen):
+            raise InputError(f"{run.folder}: was not evaluated since its last step; measure it with `mgs eval {run.folder}`")
     return labelled
 
 

@@ -1,0 +1,348 @@
+"""The viewer: a local web server (viser) that shows a subject, and draws the kernel's own image where a camera rests.
+
+viser calls back from threads of its own. These only note what is wanted; everything is computed in `Viewer.tick`, which the
+thread that made the viewer calls again and again, because Mitsuba's variant belongs to a thread.
+"""
+
+from __future__ import annotations
+
+import math
+import socket
+import time
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.camera import Camera
+from mgs.colour import srgb_from_linear
+from mgs.errors import InputError
+from mgs.report.page_plots import FRUSTUM
+from mgs.rotation import rotmat_from_quat
+from mgs.view import layers
+from mgs.view.subject import View, read_subject
+
+REST = 0.2
+"""Seconds without a movement after which a camera rests."""
+
+FOLLOW = 1.0
+"""Seconds between two looks at the run folder."""
+
+PIXELS = 1e6
+"""Most pixels of an image of the kernel. In a larger window it is enlarged."""
+
+PREVIEW = 480
+"""Width of the image that a click on a camera shows, pixels."""
+
+COLOURS = {"seed": (213, 94, 0), "chosen": (0, 158, 115), "candidate": (130, 130, 130)}
+"""Of cameras, by their role; sRGB."""
+
+SELECTED = (255, 220, 60)
+"""Colour of the camera that was clicked."""
+
+BLACK = np.zeros((2, 2, 3), np.uint8)
+"""The background where there is no image of the kernel."""
+
+
+def check_address(host: str, port: int) -> None:
+    """Raises InputError if no server can listen there: the port is taken or not allowed, or the host is not this machine."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InputError(
+            f"--host {host} --port {port}: cannot be served there ({reason}); choose another port or host"
+        ) from None
+
+
+@dataclass
+class _Client:
+    """A browser window: its handle, its own copy of the Gaussians, when its camera last moved, and what was drawn for it."""
+
+    handle: Any
+    splats: Any
+    moved: float
+    drawn: tuple[float, int] | None = None
+    layer: str = ""
+    covered: bool = False
+
+
+class Viewer:
+    """Serves a run folder or a PLY, until `close`. `tick` has to be called again and again.
+
+    follow: look every FOLLOW seconds for a new step of the run. Raises InputError as `read_subject` and `check_address`, and if
+    viser is not installed.
+    """
+
+    def __init__(self, path: str | Path, host: str = "127.0.0.1", port: int = 8080, follow: bool = False) -> None:
+        self.path, self.follow = Path(path), follow
+        self.stamp = self._stamp()
+        self.subject = read_subject(path, follow)
+        try:
+            import viser
+        except ImportError:
+            raise InputError("mgs view: needs viser, which is not installed; `pip install 'mgs[view]'`") from None
+        check_address(host, port)
+        with redirect_stdout(StringIO()):  # viser greets, and names every window; the command says what is needed
+            self.server = viser.ViserServer(host, port, label="mgs", verbose=False)
+        self.host, self.port = host, self.server.get_port()
+        if port not in (0, self.port):  # taken since the check: viser then goes on to the next
+            self.close()
+            raise InputError(f"--port {port}: is in use; choose another one")
+        self.clients: dict[int, _Client] = {}
+        self.frusta: dict[str, Any] = {}
+        self.selected: str | None = None
+        self.version = 0
+        self.next_look = time.monotonic() + FOLLOW
+        self._scene()
+        self._controls()
+        self._show_views()
+        self.server.on_client_connect(self._connected)
+        self.server.on_client_disconnect(self._disconnected)
+
+    def close(self) -> None:
+        """End the server."""
+        with redirect_stdout(StringIO()):
+            self.server.stop()
+
+    def tick(self) -> None:
+        """Do what is due now: read a new step, draw for the cameras that rest."""
+        now = time.monotonic()
+        if self.follow and now >= self.next_look:
+            self.next_look = now + FOLLOW
+            stamp = self._stamp()
+            if stamp != self.stamp:
+                self.stamp, self.subject = stamp, read_subject(self.path, self.follow)
+                self._renew()
+        for client in list(self.clients.values()):
+            due = client.drawn != (client.moved, self.version) and now >= client.moved + REST
+            if due and self.subject.gaussians is not None:
+                self._draw(client)
+
+    def _stamp(self) -> list[int]:
+        """Changes when a step is committed, and when the run was measured."""
+        files = [self.path / name for name in ("checkpoint.npz", "metrics.json")]
+        return [file.stat().st_mtime_ns if file.is_file() else 0 for file in files]
+
+    def _scene(self) -> None:
+        """Backdrop, light, first camera, mesh."""
+        server, subject = self.server, self.subject
+        server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        server.scene.set_up_direction("+z")
+        server.scene.configure_environment_map(None)
+        server.scene.world_axes.visible = False
+        server.scene.set_background_image(BLACK)
+        centre, size = self._extent()
+        server.initial_camera.look_at = centre
+        direction = np.array([1.0, -1.0, 0.8]) * 2 * size
+        if subject.views:  # as from the first camera, but from above and behind the cameras, so that they are seen too
+            eye = subject.views[0].frame.camera.position
+            direction = 1.6 * (eye - centre) + np.array([0, 0, np.linalg.norm(eye - centre)])
+            server.initial_camera.fov = _vertical_fov(subject.views[0].frame.camera)
+        server.initial_camera.position = centre + direction
+        if subject.mesh is not None:
+            mesh = subject.mesh
+            self.mesh = server.scene.add_mesh_simple(
+                "/mesh", mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), color=(150, 160, 175), visible=False
+            )
+
+    def _extent(self) -> tuple[np.ndarray, float]:
+        """Middle of the subject, metres, and its size: the radius that holds 95 % of the Gaussians, or the mesh."""
+        subject = self.subject
+        points = subject.gaussians.means if subject.gaussians is not None else None
+        if points is None or len(points) == 0:
+            eyes = np.array([view.frame.camera.position for view in subject.views] or [np.zeros(3)])
+            points = subject.mesh.vertices if subject.mesh is not None else eyes
+        centre = np.median(points, axis=0).astype(np.float64)
+        return centre, max(float(np.quantile(np.linalg.norm(points - centre, axis=1), 0.95)), 1e-6)
+
+    def _controls(self) -> None:
+        """The panel."""
+        gui = self.server.gui
+        self.title = gui.add_markdown("")
+        self.layer: Any = gui.add_dropdown(
+            "Layer", layers.layers(self.subject), hint="What is drawn: by the kernel, and by the browser"
+        )
+        self.legend = gui.add_markdown("")
+        self.exact = gui.add_checkbox("Exact at rest", True, hint="The kernel's own image while the camera rests")
+        self.gaussians = gui.add_checkbox("Gaussians", True)
+        for control in (self.layer, self.exact, self.gaussians):
+            control.on_update(lambda _: self._again())
+        if self.subject.mesh is not None:
+            show_mesh = gui.add_checkbox("Mesh of the prior", False)
+            show_mesh.on_update(lambda _: setattr(self.mesh, "visible", show_mesh.value))
+        if not self.subject.views:
+            return
+        self.group = self.server.scene.add_frame("/cameras", show_axes=False)
+        self.cameras = gui.add_checkbox("Cameras", True, hint="Orange: seeds; green: chosen; grey: candidates")
+        self.cameras.on_update(lambda _: setattr(self.group, "visible", self.cameras.value))
+        self.view: Any = gui.add_dropdown("View", [view.frame.name for view in self.subject.views], hint="Or click a camera")
+        self.view.on_update(lambda _: self.select(self.view.value))
+        look = gui.add_button("Look from there")
+        look.on_click(lambda event: self._look(event.client))
+        self.facts = gui.add_markdown("Click a camera to see its image.")
+        self.image = gui.add_image(np.zeros((3, 4, 3), np.uint8), format="jpeg", visible=False)
+
+    def _again(self) -> None:
+        """Have everything drawn anew."""
+        self.version += 1
+
+    def _renew(self) -> None:
+        """Show a new step."""
+        for client in list(self.clients.values()):
+            splats, client.splats = client.splats, None
+            if splats is not None:
+                splats.remove()
+        chosen = self.layer.value
+        self.layer.options = layers.layers(self.subject)
+        self.layer.value = chosen
+        self._show_views()
+        self._again()
+
+    def _show_views(self) -> None:
+        """Title, cameras and the way between them."""
+        subject, scene = self.subject, self.server.scene
+        self.title.content = f"**{subject.title}**"
+        if not subject.views:
+            return
+        centre, _ = self._extent()
+        eyes = np.array([view.frame.camera.position for view in subject.views])
+        size = FRUSTUM * float(np.linalg.norm(eyes - centre, axis=1).mean())
+        for view in subject.views:
+            self._show_camera(view, size)
+        way = [view.frame.camera.position for view in subject.taken if view.role == "chosen"]
+        if len(way) > 1:
+            segments = np.stack([way[:-1], way[1:]], axis=1).astype(np.float32)
+            scene.add_line_segments("/cameras/way", segments, colors=COLOURS["chosen"], thickness=0.01 * size)
+
+    def _show_camera(self, view: View, size: float) -> None:
+        """A camera as a pyramid that can be clicked, and the step of a chosen one beside it."""
+        from viser.transforms import SO3
+
+        camera, name = view.frame.camera, view.frame.name
+        pose = camera.camera_to_world
+        colour = SELECTED if name == self.selected else COLOURS[view.role]
+        handle = self.server.scene.add_camera_frustum(
+            f"/cameras/views/{name}", _vertical_fov(camera), camera.width / camera.height,
+            scale=(0.3 if view.role == "candidate" else 0.6) * size, thickness=0.015 * size, color=colour,
+            wxyz=SO3.from_matrix(pose[:3, :3]).wxyz, position=pose[:3, 3],
+        )  # fmt: skip
+        handle.on_click(lambda _: self._clicked(name))
+        self.frusta[name] = handle
+        if view.role == "chosen":
+            self.server.scene.add_label(f"/cameras/views/{name}/step", str(view.step))
+
+    def _clicked(self, name: str) -> None:
+        """A camera was clicked."""
+        if self.view.value == name:
+            self.select(name)
+        else:
+            self.view.value = name  # which selects it
+
+    def select(self, name: str) -> None:
+        """Show the image of a view and what is known about it; where the image cannot be read, why."""
+        by_name = {view.frame.name: view for view in self.subject.views}
+        if self.selected in self.frusta:
+            self.frusta[self.selected].color = COLOURS[by_name[self.selected].role]
+        self.selected, view = name, by_name[name]
+        self.frusta[name].color = SELECTED
+        role = f"chosen at step {view.step}" if view.role == "chosen" else view.role
+        self.facts.content = "\n".join([f"**{name}**: {role}", "", *(f"- {key}: {value}" for key, value in view.facts)])
+        try:
+            image = np.round(srgb_from_linear(view.frame.rgb()) * 255).astype(np.uint8)
+        except InputError as error:
+            self.image.visible = False
+            self.facts.content += f"\n\n{error}"
+            return
+        every = max(1, image.shape[1] // PREVIEW)
+        self.image.image = np.ascontiguousarray(image[::every, ::every])
+        self.image.visible = True
+
+    def _look(self, handle: Any) -> None:
+        """Put a browser's camera where the selected view's is."""
+        view = next((view for view in self.subject.views if view.frame.name == self.selected), None)
+        if view is None or handle is None:
+            return
+        from viser.transforms import SO3
+
+        camera = view.frame.camera
+        pose, centre = camera.camera_to_world, self._extent()[0]
+        with handle.atomic():
+            handle.camera.wxyz = SO3.from_matrix(pose[:3, :3]).wxyz
+            handle.camera.position = pose[:3, 3]
+            handle.camera.look_at = pose[:3, 3] + pose[:3, 2] * float(np.linalg.norm(centre - pose[:3, 3]))
+            handle.camera.fov = _vertical_fov(camera)
+
+    def _connected(self, handle: Any) -> None:
+        """A browser window was opened."""
+        client = _Client(handle, None, time.monotonic())
+        self.clients[handle.client_id] = client
+
+        @handle.camera.on_update
+        def _moved(_: Any) -> None:
+            client.moved = time.monotonic()
+            if client.covered:
+                self._uncover(client)
+
+    def _disconnected(self, handle: Any) -> None:
+        """A browser window was closed."""
+        self.clients.pop(handle.client_id, None)
+
+    def _uncover(self, client: _Client) -> None:
+        """Show what the browser draws itself."""
+        client.covered = False
+        client.handle.scene.set_background_image(BLACK)
+        if client.splats is not None:
+            client.splats.visible = bool(self.gaussians.value)
+
+    def _draw(self, client: _Client) -> None:
+        """Draw the layer for a browser whose camera rests: its Gaussians, and the kernel's image in their place."""
+        asked, layer, subject = (client.moved, self.version), self.layer.value, self.subject
+        g = subject.gaussians
+        assert g is not None
+        if client.splats is None:
+            client.splats = client.handle.scene.add_gaussian_splats(
+                "/gaussians", g.means, layers.covariances(subject), layers.gaussian_colours(subject, layer) / 255,
+                g.opacities[:, None], visible=False,
+            )  # fmt: skip
+        elif layer != client.layer:
+            client.splats.rgbs = layers.gaussian_colours(subject, layer) / 255
+        client.layer = layer
+        camera = window_camera(client.handle.camera)
+        if self.exact.value and self.gaussians.value and camera is not None:
+            image, depth, ends = layers.kernel_image(subject, camera, layer)
+            self.legend.content = layers.legend(layer, ends)
+            if asked[0] == client.moved:
+                client.splats.visible, client.covered = False, True
+                client.handle.scene.set_background_image(image, format="png", depth=depth)
+        else:
+            ends = layers.scale(subject, layer) if layer in subject.scalars else (math.nan, math.nan)
+            self.legend.content = layers.legend(layer, ends) if layer != "depth" else "Depth is drawn by the kernel, at rest."
+            self._uncover(client)
+        client.drawn = asked
+
+
+def window_camera(camera: Any) -> Camera | None:
+    """The camera of a browser window (viser's CameraHandle) as ours, with at most PIXELS; None where the window has no size."""
+    width, height = camera.image_width, camera.image_height
+    if width < 1 or height < 1:
+        return None
+    shrink = min(1.0, math.sqrt(PIXELS / (width * height)))
+    width, height = max(1, round(width * shrink)), max(1, round(height * shrink))
+    focal = height / 2 / math.tan(camera.fov / 2)
+    pose = np.eye(4)
+    pose[:3, :3] = rotmat_from_quat(camera.wxyz).T
+    pose[:3, 3] = -pose[:3, :3] @ np.asarray(camera.position, np.float64)
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return Camera(K, width, height, pose)
+
+
+def _vertical_fov(camera: Camera) -> float:
+    """Vertical field of view of a camera, radians, as if its principal point were in the middle."""
+    return 2 * math.atan(camera.height / 2 / camera.K[1, 1])

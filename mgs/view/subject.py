@@ -1,0 +1,129 @@
+"""What the viewer shows, read from a run folder or from a PLY: Gaussians and their scalars, cameras, the mesh of the prior."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.active import criteria, run_folder
+from mgs.active.settings import NbvSettings
+from mgs.data.dataset import Frame, load_dataset
+from mgs.data.meshes import Mesh, read_mesh
+from mgs.errors import InputError
+from mgs.files import read_json
+from mgs.gaussians import Gaussians
+from mgs.report.diagnostics import gaussian_scalars
+from mgs.report.page_facts import cell, measured
+from mgs.report.page_plots import metric_name
+from mgs.splat_ply import ply_colour_space, read_ply
+
+SCALARS = ("information", "uncertainty", "unobserved")
+"""Those of `mgs.report.diagnostics` that the viewer shows."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera of the dataset. role: "seed", "chosen" or "candidate"; step: at which it was chosen, 0 for seeds, None for
+    candidates; facts: (name, value) of what is known about it."""
+
+    frame: Frame
+    role: str
+    step: int | None
+    facts: list[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """gaussians: the model; None where a run has no finished step yet. space: "linear" or "srgb", in which its colours are
+    blended. scalars: name -> [N], of SCALARS; none for a PLY. views: of the dataset, in its order; none for a PLY."""
+
+    title: str
+    gaussians: Gaussians | None
+    space: str = "linear"
+    scalars: dict[str, np.ndarray] = field(default_factory=dict)
+    views: list[View] = field(default_factory=list)
+    mesh: Mesh | None = None
+
+    @property
+    def taken(self) -> list[View]:
+        """The seeds, then the chosen views in their order."""
+        return sorted((view for view in self.views if view.step is not None), key=lambda view: view.step or 0)
+
+
+def read_subject(path: str | Path, follow: bool = False) -> Subject:
+    """Read a run folder or a PLY of Gaussians. follow: a run without a finished step is shown without a model.
+
+    Raises InputError if there is neither, if a file is damaged or the dataset has changed, and, unless `follow`, if the run has
+    no finished step.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _read_run(path, follow)
+    if follow:
+        raise InputError(f"{path}: --follow needs the folder of a run")
+    if not path.is_file():
+        raise InputError(f"{path}: no such run folder or PLY file")
+    return Subject(path.name, read_ply(path), ply_colour_space(path))
+
+
+def _read_run(run: Path, follow: bool) -> Subject:
+    """`read_subject` of a run folder."""
+    settings = run_folder.read_settings(run)
+    if not follow:
+        run_folder.load_run(run)  # raises where there is no finished step
+    dataset, state = load_dataset(settings.dataset), run_folder.read_checkpoint(run)
+    run_folder.check_same_frames(run, dataset)
+    mesh_path = settings.prior / "mesh.ply"
+    mesh = read_mesh(mesh_path) if mesh_path.is_file() else None
+    name = run.resolve().name
+    if state is None:
+        waiting = [View(frame, "candidate", None, []) for frame in dataset.frames]
+        return Subject(f"{name}: no finished step yet", None, views=waiting, mesh=mesh)
+    views = _views(dataset.frames, state, _psnr(run, len(state.taken)))
+    planned = settings.seeds + settings.budget
+    title = f"{name}: {settings.policy}, {len(state.taken)} of {planned} views, {len(state.gaussians):,} Gaussians"
+    return Subject(title, state.gaussians, "linear", _scalars(settings, state), views, mesh)
+
+
+def _scalars(settings: NbvSettings, state: run_folder.State) -> dict[str, np.ndarray]:
+    """SCALARS of the model of a run, as `mgs diagnose` has them."""
+    from mgs.splat import groups
+
+    columns = groups(state.gaussians.sh_degree)
+    prior_lam = criteria.regularisation(columns, settings.pixel_noise, settings.prior_std)
+    found = gaussian_scalars(state.H, state.surface, settings.regularisation(columns), prior_lam, columns)
+    return {name: found[name] for name in SCALARS}
+
+
+def _psnr(run: Path, images: int) -> dict[str, float]:
+    """PSNR of each view by its name, where the run was measured since its last step."""
+    metrics: Any = read_json(run / "metrics.json") if (run / "metrics.json").is_file() else None
+    if not isinstance(metrics, dict) or metrics.get("images") != images:
+        return {}
+    return {view["name"]: view["psnr"] for view in metrics.get("views", []) if view.get("psnr") is not None}
+
+
+def _views(frames: tuple[Frame, ...], state: run_folder.State, psnr: dict[str, float]) -> list[View]:
+    """The cameras of the dataset, with what the run's state says about each."""
+    seeds = state.steps[0]["seeds"]
+    steps = {line["frame"]: line for line in state.steps[1:]}
+    views = []
+    for index, frame in enumerate(frames):
+        facts = [("PSNR of the model here", f"{psnr[frame.name]:.2f} dB")] if frame.name in psnr else []
+        if index in seeds:
+            views.append(View(frame, "seed", 0, facts))
+        elif index in steps:
+            line = steps[index]
+            facts += [
+                ("information gain", f"{line['information_gain']:.4g}"),
+                ("images then", str(line["images"])),
+                ("surface coverage then", f"{100 * line['coverage']:.2f} %"),
+                *((f"{metric_name(key)}, then", cell(key, value)) for key, value in measured(line).items()),
+            ]
+            views.append(View(frame, "chosen", line["step"], facts))
+        else:
+            views.append(View(frame, "candidate", None, facts))
+    return views

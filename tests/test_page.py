@@ -1,0 +1,288 @@
+"""The report page: what stands in it, from runs that are finished, unfinished, unmeasured; and in a real browser."""
+
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from urllib.parse import unquote
+
+import numpy as np
+import pytest
+import tiny
+from browser import chromium, opened
+from refusals import refused
+
+from mgs.active import loop
+from mgs.active.run_folder import read_checkpoint, read_settings
+from mgs.camera import Camera
+from mgs.data.dataset import load_dataset
+from mgs.report import page_pictures
+from mgs.report.evaluation import evaluate_run
+from mgs.report.page import write_page
+from mgs.report.page_plots import corners_at
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Two runs on stand-in stations: one finished and measured, one stopped two steps before its end."""
+    root = tmp_path_factory.mktemp("a <b> & c")  # what a page must escape, in an address and in text
+    dataset = load_dataset(tiny.write_dataset(root / "data"))
+    for policy, budget in (("d-optimal", 3), ("random", 1)):
+        settings = tiny.start(root / policy, dataset, policy=policy, budget=3, evaluate_every=1)
+        stations = tiny.stations(measure=lambda gaussians, taken: {"psnr": float(len(taken)), "test": {"lpips": 0.25}})
+        loop.run(root / policy, settings.model_copy(update={"budget": budget}), dataset, stations, tiny.silent)
+    evaluate_run(root / "d-optimal", pictures=False)
+    (root / "d-optimal/diagnostics").mkdir()
+    (root / "d-optimal/diagnostics/kf_0001.exr").write_bytes(b"")
+    return [root / "d-optimal", root / "random"]
+
+
+@pytest.fixture(scope="module")
+def page(runs):
+    path = runs[0].parent / "pages/page.html"
+    size = write_page(path, runs)
+    assert size == path.stat().st_size
+    return path
+
+
+class Parsed(HTMLParser):
+    """Links, addresses that are loaded, text outside of scripts, and the data of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.links, self.loaded, self.said, self.inside, self.data = [], [], [], [], ""
+        self.feed(text)
+        self.text = " ".join(" ".join(self.said).split())
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.inside.append((tag, values.get("id")))
+        self.links += [values["href"]] if tag == "a" else []
+        self.loaded += [values["src"]] if values.get("src") else [values["href"]] if tag == "link" else []
+
+    def handle_endtag(self, tag):
+        while self.inside and self.inside.pop()[0] != tag:
+            pass
+
+    def handle_data(self, data):
+        tag, name = self.inside[-1] if self.inside else ("", None)
+        if name == "data":
+            self.data += data
+        elif tag not in ("script", "style"):
+            self.said.append(data)
+
+
+def test_the_page_says_what_the_files_say(page, runs):
+    parsed = Parsed(page.read_text())
+    data, metrics = json.loads(parsed.data), json.loads((runs[0] / "metrics.json").read_text())
+    assert parsed.loaded == ["data:,"]
+    for group in ("all", "held_out"):
+        assert f"{metrics[group]['psnr']:.2f}" in parsed.text
+    assert "2 of" not in parsed.text.split("random")[0]
+    assert "Unfinished: 4 of 6 views are taken" in parsed.text
+    assert "Not measured: `mgs eval" in parsed.text
+    steps = [json.loads(line) for line in (runs[0] / "steps.jsonl").read_text().splitlines()]
+    plots = {plot["title"]: plot["data"] for plot in data["plots"]}
+    gain, both = plots["Information gain of each chosen view (the paper's Fig. 2)"]
+    assert gain["y"] == [step["information_gain"] for step in steps[1:]]
+    assert len(both["y"]) == 1
+    assert plots["Surface coverage (Fig. 3)"][0]["y"] == [100 * step["coverage"] for step in steps]
+    assert plots["test lpips after each step"][1]["y"] == [0.25, 0.25]  # a metric of which the page was told nothing
+    views = data["runs"][0]["views"]
+    taken = [*steps[0]["seed_names"], *(step["name"] for step in steps[1:])]
+    assert [view["name"] for view in views] == taken
+    psnr = {view["name"]: f"{view['psnr']:.2f} dB" for view in metrics["views"]}
+    assert [view["pictures"][1]["caption"] for view in views] == [f"render, {psnr[name]}" for name in taken]
+    assert {key for view in views for key in dict(view["facts"])} >= {"information gain", "surface coverage", "PSNR (dB)"}
+    for one in data["runs"]:
+        for view in one["views"]:
+            for picture in view["pictures"]:
+                assert picture["alt"]
+                assert data["pictures"][picture["name"]].startswith("data:image/webp;base64,")
+    trained = {view["name"] for one in data["runs"] for view in one["views"]}
+    assert not trained & {view["view"] for view in data["compared"]}
+
+
+def test_links_lead_to_the_files(page, runs):
+    links = Parsed(page.read_text()).links
+    assert all((page.parent / unquote(link)).is_file() for link in links)
+    assert {link.rsplit("/", 1)[-1] for link in links} >= {"gaussians.ply", "kf_0001.exr", "config.json", "metrics.json"}
+    assert sum(link.endswith("gaussians.ply") for link in links) == 2
+
+
+def test_the_page_is_the_same_every_time_and_names_are_escaped(page, runs, tmp_path):
+    again = page.parent / "again.html"
+    write_page(again, runs)
+    assert again.read_bytes() == page.read_bytes()
+    again.unlink()
+    other = runs[0].parent / "<b onclick=alert(1)>"
+    shutil.copytree(runs[0], other)
+    write_page(tmp_path / "p.html", [runs[0], other])
+    shutil.rmtree(other)
+    assert "<b onclick" not in (tmp_path / "p.html").read_text()
+    assert "&lt;b onclick" in (tmp_path / "p.html").read_text()
+
+
+def test_uncertainty_falls_with_every_view(runs, monkeypatch):
+    """The maps before and after a view are those of the exact information of the views until then, as written out here."""
+    from mgs.active.criteria import regularisation
+    from mgs.splat import fisher, groups
+
+    run, shown = runs[0], {}
+    monkeypatch.setattr(page_pictures.Album, "add_uncertainty", lambda self, name, values, alpha: shown.update({name: values}))
+    state, dataset = read_checkpoint(run), load_dataset(read_settings(run).dataset)
+    frames = [dataset.frames[i] for i in state.taken]
+    album = page_pictures.new_album(frames, 10)
+    settings = read_settings(run)
+    noise = settings.pixel_noise, settings.prior_std
+    page_pictures.draw_taken(album, "a", state.gaussians, frames, noise, lambda: None)
+    lam = regularisation(groups(0), *noise)
+    H = np.zeros((tiny.POINTS, 11))
+    for frame in frames:
+        before = shown[f"before/{frame.name}/a"]
+        H += fisher(state.gaussians, frame.camera)
+        after = shown[f"after/{frame.name}/a"]
+        assert before.max() <= 1 + 1e-5
+        assert (after <= before + 1e-6).all()
+    seen = after > 0
+    least = (lam / (H + lam)).mean(axis=1).min()
+    assert after[seen].min() >= least - 1e-5
+    np.testing.assert_array_equal(shown[f"before/{frames[0].name}/a"] > 0.99, shown[f"before/{frames[0].name}/a"] > 0)
+
+
+def test_pictures_stay_within_their_share(monkeypatch, runs):
+    dataset = load_dataset(read_settings(runs[0]).dataset)
+    album = page_pictures.new_album(dataset.frames, 1)
+    rows, columns = album.window
+    mask = np.logical_or.reduce([frame.mask() for frame in dataset.frames])
+    assert mask[rows, columns].sum() == mask.sum()
+    monkeypatch.setattr(page_pictures, "PIXELS", 1000)
+    small = page_pictures.new_album(dataset.frames, 50)
+    assert small.width**2 * mask[rows, columns].shape[0] / mask[rows, columns].shape[1] <= 1000 / 50
+    small.add_colours("a", np.ones((tiny.HEIGHT, tiny.WIDTH, 3), np.float32))
+    assert small.pictures["a"].startswith("data:image/webp")
+
+
+def test_corners_of_a_camera_project_to_those_of_its_image():
+    camera: Camera = tiny.orbit()[1]
+    pixels, depth = camera.project(corners_at(camera, 0.5))
+    np.testing.assert_allclose(pixels, [[0, 0], [16, 0], [16, 12], [0, 12]], atol=1e-9)
+    np.testing.assert_allclose(depth, 0.5)
+
+
+def test_what_is_not_there_is_left_out(runs, tmp_path):
+    """No model and no metrics of it: no pictures, no numbers, and a note for each."""
+    run = shutil.copytree(runs[0], tmp_path / "run")
+    (run / "checkpoint.npz").unlink()
+    metrics = json.loads((run / "metrics.json").read_text())
+    (run / "metrics.json").write_text(json.dumps(metrics | {"images": 5}))
+    write_page(tmp_path / "with.html", [run])
+    data = json.loads(Parsed((tmp_path / "with.html").read_text()).data)
+    assert data["pictures"]
+    assert not any("psnr" in key for view in data["runs"][0]["views"] for key in view["pictures"][1]["caption"].split())
+    (run / "gaussians.ply").unlink()
+    write_page(tmp_path / "without.html", [run])
+    parsed = Parsed((tmp_path / "without.html").read_text())
+    data = json.loads(parsed.data)
+    assert data["pictures"] == {}
+    assert data["compared"] == []
+    assert "metrics.json is of 5 images, the model of 6" in parsed.text
+    assert "holds no model" in parsed.text
+    assert f"{metrics['held_out']['psnr']:.4f}" not in parsed.text
+    assert "PSNR, held out" not in parsed.text
+
+
+def test_test_views_are_compared_and_their_metrics_shown(runs, tmp_path):
+    """Those of the dataset's folder `test`, under names that cannot be mistaken for those of its own views."""
+    run = shutil.copytree(runs[0], tmp_path / "run")
+    config = json.loads((run / "config.json").read_text())
+    shutil.copytree(config["settings"]["dataset"], tmp_path / "data")
+    tiny.write_dataset(tmp_path / "data/test", frames=3)
+    config["settings"]["dataset"] = str(tmp_path / "data")
+    (run / "config.json").write_text(json.dumps(config))
+    metrics = json.loads((run / "metrics.json").read_text())
+    view = {"name": "kf_0001", "trained": False, "psnr": 12.345, "psnr_mask": 10.5, "ssim": 0.5}
+    (run / "metrics.json").write_text(json.dumps(metrics | {"test": {"count": 1, "psnr": 12.345}, "test_views": [view]}))
+    write_page(tmp_path / "page.html", [run])
+    parsed = Parsed((tmp_path / "page.html").read_text())
+    data = json.loads(parsed.data)
+    tests = {view["view"]: view["sides"] for view in data["compared"] if view["view"].startswith("test/")}
+    assert list(tests) == ["test/kf_0000", "test/kf_0001", "test/kf_0002"]
+    assert tests["test/kf_0001"][1]["label"] == "d-optimal, 12.35 dB"
+    assert tests["test/kf_0000"][1]["label"] == "d-optimal"
+    assert "test views, PSNR (dB) 12.35" in parsed.text
+    assert "test/kf_0001" in data["plots"][-1]["data"][1]["x"]
+
+
+def test_the_command(runs, tmp_path, capsys):
+    from mgs.cli.app import main
+
+    with pytest.raises(SystemExit) as stop:
+        main(["report", str(runs[1]), "--html", str(tmp_path / "page.html")])
+    assert stop.value.code == 0
+    assert re.search(r"wrote .*page\.html \(\d+\.\d MB\)", capsys.readouterr().out.replace("\n", ""))
+    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
+    (tmp_path / "file").write_text("")
+    assert "cannot be written" in refused(capsys, ["report", runs[0], "--html", tmp_path / "file/page.html"], tmp_path)
+    assert "is a folder" in refused(capsys, ["report", runs[0], "--html", tmp_path], tmp_path)
+    assert "no such file" in refused(capsys, ["report", tmp_path, "--html", tmp_path / "x.html"], tmp_path)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as found:
+        yield found
+
+
+@pytest.mark.parametrize(("width", "height", "scheme"), [(1280, 900, "light"), (390, 844, "dark")])
+def test_the_page_in_a_browser(browser, page, width, height, scheme):
+    """Loads without a network and without errors, fits the width, draws its plots, and its controls do what they say."""
+    with opened(browser, page.as_uri(), width, height, scheme) as (tab, wrong):
+        assert tab.evaluate("document.documentElement.scrollWidth") <= width
+        background = tab.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert (background == "rgb(255, 255, 255)") == (scheme == "light")
+        for name in ("plot-0", "time-0", "orbit-0"):
+            tab.locator(f"#{name}").scroll_into_view_if_needed()
+            tab.wait_for_selector(f"#{name} .main-svg", state="attached")
+        tab.wait_for_selector("#orbit-0 canvas")
+
+        def shown():
+            return tab.locator("#pictures img").evaluate_all("all => all.map(i => [i.alt, i.naturalWidth, i.complete])")
+
+        def fact(name):
+            return tab.locator(f"#facts dt:text-is('{name}') + dd").inner_text()
+
+        assert len(shown()) == 5
+        assert fact("taken as") == "seed 1 of 3"
+        tab.locator("#step").focus()
+        for _ in range(3):
+            tab.keyboard.press("ArrowRight")
+        assert fact("taken as") == "step 1"
+        tab.wait_for_function("[...document.querySelectorAll('#pictures img')].every(i => i.complete && i.naturalWidth)")
+        assert all(fact("view") in alt for alt, *_ in shown())
+        marked = tab.evaluate("document.getElementById('orbit-0').data.at(-1).x[0]")
+        assert marked == pytest.approx(tab.evaluate("data.runs[0].views[3].eye[0]"))
+        tab.locator("#run").select_option("1")
+        assert tab.locator("#orbit-1").is_visible()
+        assert not tab.locator("#orbit-0").is_visible()
+
+        divider = tab.locator("#divider")
+        divider.scroll_into_view_if_needed()
+        box = divider.bounding_box()
+        tab.mouse.click(box["x"] + 0.25 * box["width"], box["y"] + 0.5 * box["height"])
+        at = float(tab.evaluate("getComputedStyle(document.getElementById('divider')).getPropertyValue('--at')").strip("%"))
+        assert at == pytest.approx(25, abs=3)
+        before = tab.locator("#compare-b").get_attribute("src")
+        tab.locator("#compare-right").select_option("2")
+        assert tab.locator("#compare-b").get_attribute("src") != before
+        assert "random" in tab.locator("#compare-b").get_attribute("alt")
+
+        tab.locator("#theme").click()
+        assert tab.evaluate("getComputedStyle(document.body).backgroundColor") != background
+        assert wrong == []
+
+
+def test_no_picture_or_plot_is_without_words(browser, page):
+    with opened(browser, page.as_uri(), 800, 600) as (tab, _):
+        assert tab.locator("img:not([alt]), img[alt='']").count() == 0
+        assert tab.locator(".plot:not([aria-label])").count() == 0

@@ -1,0 +1,298 @@
+"""The viewer: what it reads and draws, what it refuses, and the whole of it in a real browser."""
+
+import io
+import re
+import socket
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import tiny
+from browser import chromium, opened
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from refusals import refused
+from scipy.spatial.transform import Rotation
+
+from mgs.active import loop
+from mgs.active.run_folder import read_settings
+from mgs.camera import Camera, look_at
+from mgs.colour import srgb_from_linear
+from mgs.data.dataset import load_dataset
+from mgs.gaussians import Gaussians
+from mgs.report.evaluation import evaluate_run
+from mgs.splat import render
+from mgs.splat_ply import write_ply
+from mgs.view import layers
+from mgs.view.server import Viewer, check_address, window_camera
+from mgs.view.subject import read_subject
+
+
+def steps(run, budget):
+    """Let a run on stand-in stations go on to this many chosen views."""
+    settings = read_settings(run)
+    dataset = load_dataset(settings.dataset)
+    loop.run(run, settings.model_copy(update={"budget": budget}), dataset, tiny.stations(), tiny.silent)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of three seeds and two of four views, measured; and a PLY of its model."""
+    root = tmp_path_factory.mktemp("view")
+    dataset = load_dataset(tiny.write_dataset(root / "data"))
+    prior = tiny.write_prior(root / "prior")
+    tiny.start(root / "run", dataset, budget=4, prior=prior)
+    steps(root / "run", 2)
+    evaluate_run(root / "run", pictures=False)
+    return root / "run"
+
+
+def test_a_run_is_read(run):
+    subject = read_subject(run)
+    assert subject.title == f"run: d-optimal, 5 of 7 views, {tiny.POINTS} Gaussians"
+    assert [view.role for view in subject.taken] == ["seed"] * 3 + ["chosen"] * 2
+    assert [view.step for view in subject.taken] == [0, 0, 0, 1, 2]
+    assert len(subject.views) == tiny.FRAMES
+    assert subject.mesh is not None
+    assert layers.layers(subject) == ["colour", "alpha", "depth", "information", "uncertainty", "unobserved"]
+    facts = dict(subject.taken[-1].facts)
+    assert facts["images then"] == "5"
+    assert facts["PSNR of the model here"].endswith(" dB")
+    assert "PSNR of the model here" in dict(next(v for v in subject.views if v.role == "candidate").facts)
+
+
+@pytest.mark.parametrize("space", ["linear", "srgb"])
+def test_a_ply_is_read(run, tmp_path, space):
+    path = tmp_path / "gaussians.ply"
+    write_ply(path, read_subject(run).gaussians)
+    if space == "srgb":  # another tool's file does not say that its colours are linear
+        path.write_bytes(re.sub(rb"comment [^\n]*\n", b"", path.read_bytes()))
+    subject = read_subject(path)
+    assert (subject.space, subject.views, subject.mesh) == (space, [], None)
+    assert layers.layers(subject) == ["colour", "alpha", "depth"]
+    expected = srgb_from_linear(subject.gaussians.rgb) if space == "linear" else np.clip(subject.gaussians.rgb, 0, 1)
+    np.testing.assert_allclose(layers.gaussian_colours(subject, "colour"), 255 * expected, atol=0.51)
+
+
+def test_what_the_kernel_draws(run):
+    """Every layer against the renderer, or against the scalars of the Gaussians by another way."""
+    subject, camera = read_subject(run), tiny.orbit()[1].resized(64)
+    image = render(subject.gaussians, camera)
+    rgb, alpha, depth = (np.asarray(x) for x in (image.rgb, image.alpha, image.depth))
+    seen = alpha >= 0.5
+    assert 0.05 < seen.mean() < 0.95
+    drawn = {layer: layers.kernel_image(subject, camera, layer) for layer in layers.layers(subject)}
+    np.testing.assert_allclose(drawn["colour"][0], 255 * srgb_from_linear(rgb), atol=0.51)
+    np.testing.assert_allclose(drawn["alpha"][0], 255 * alpha[..., None].repeat(3, 2), atol=0.51)
+    for layer, (picture, z, (low, high)) in drawn.items():
+        assert picture.dtype == np.uint8
+        np.testing.assert_allclose(z, np.where(seen, depth, layers.FAR), rtol=1e-6)
+        assert layers.legend(layer, (low, high))
+        if layer not in ("colour", "alpha"):
+            assert (picture[~seen] == 0).all()
+    low, high = drawn["depth"][2]
+    assert (low, high) == pytest.approx((depth[seen].min(), depth[seen].max()))
+    informed = subject.scalars["information"]
+    assert drawn["information"][2] == (0, pytest.approx(np.quantile(informed, 0.999)))
+
+
+def test_covariances_have_the_scales_and_the_axes(run):
+    subject = read_subject(run)
+    g = subject.gaussians
+    values, vectors = np.linalg.eigh(layers.covariances(subject).astype(np.float64))
+    np.testing.assert_allclose(values, np.sort(np.exp(2 * g.log_scales.astype(np.float64)), axis=1), rtol=1e-4)
+    assert vectors.shape == (len(g), 3, 3)
+    flat = Gaussians(g.means, g.log_scales - np.array([0, 0, 3]), g.quats, g.logit_opacities, g.sh)
+    _, vectors = np.linalg.eigh(layers.covariances(SimpleNamespace(gaussians=flat)).astype(np.float64))
+    normals = g.means / np.linalg.norm(g.means, axis=1, keepdims=True)  # the stand-in's discs lie on a sphere
+    np.testing.assert_allclose(np.abs((vectors[:, :, 0] * normals).sum(1)), 1, atol=1e-4)
+
+
+POINTS = st.tuples(*[st.floats(-5, 5)] * 3)
+SIDES = st.integers(1, 5000)
+
+
+@given(POINTS, POINTS, st.floats(0.3, 2), SIDES, SIDES)
+def test_the_camera_of_a_window(eye, target, fov, width, height):
+    """What it looks at is in the middle of the image, and what lies at the rim of its field of view at the rim."""
+    if np.linalg.norm(np.subtract(eye, target)) < 0.1:
+        return
+    pose = np.linalg.inv(look_at(eye, target))
+    wxyz = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
+    handle = SimpleNamespace(image_width=width, image_height=height, fov=fov, wxyz=wxyz, position=np.array(eye))
+    camera = window_camera(handle)
+    assert camera.width * camera.height <= 1e6 + camera.width + camera.height
+    (pixel,), (z,) = camera.project([target])
+    np.testing.assert_allclose(pixel, [camera.width / 2, camera.height / 2], atol=1e-3 * camera.height)
+    top = pose[:3, 3] + z * (pose[:3, 2] - np.tan(fov / 2) * pose[:3, 1])
+    np.testing.assert_allclose(camera.project([top])[0][0], [camera.width / 2, 0], atol=1e-3 * camera.height)
+    assert window_camera(SimpleNamespace(image_width=0, image_height=5)) is None
+
+
+def test_refusals(capsys, run, dataset, prior, tmp_path, monkeypatch):
+    assert "no such run folder or PLY file" in refused(capsys, ["view", tmp_path / "none.ply"])
+    assert "holds no run" in refused(capsys, ["view", tmp_path])
+    assert "--port" in refused(capsys, ["view", run, "--port", 70000])
+    assert "--port" in refused(capsys, ["view", run, "--port", "many"])
+    (tmp_path / "file.ply").write_text("no PLY")
+    assert "file.ply" in refused(capsys, ["view", tmp_path / "file.ply"])
+    assert "--follow needs the folder of a run" in refused(capsys, ["view", tmp_path / "file.ply", "--follow"])
+    assert "cannot be served there" in refused(capsys, ["view", run, "--host", "192.0.2.1"])  # of an example network, not ours
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        assert "in use" in refused(capsys, ["view", run, "--port", taken.getsockname()[1]])
+    tiny.start(tmp_path / "begun", load_dataset(dataset), prior=prior)
+    assert "no finished step yet" in refused(capsys, ["view", tmp_path / "begun"])
+    assert read_subject(tmp_path / "begun", follow=True).gaussians is None
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert "pip install 'mgs[view]'" in refused(capsys, ["view", run])
+    check_address("127.0.0.1", 0)
+
+
+@contextmanager
+def viewing(*arguments):
+    """`mgs view ARGUMENTS` in a process of its own; gives its address. Ctrl-C must end it in peace."""
+    command = [sys.executable, "-m", "mgs", "view", *map(str, arguments), "--port", "0"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        line, warned = process.stdout.readline(), False
+        if "everyone who reaches this address" in line:
+            line, warned = process.stdout.readline(), True
+        found = re.search(r"open (http://\S+) in a browser", line)
+        assert found, line + process.stderr.read()
+        assert warned == ("--host" in arguments)
+        yield found[1]
+        process.send_signal(2)
+        said = process.communicate(timeout=20)
+        assert (process.returncode, said) == (0, ("", ""))
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_a_run_is_followed_from_its_beginning(dataset, prior, tmp_path):
+    pytest.importorskip("viser", reason="viser is not installed (pip install 'mgs[view]')")
+    tiny.start(tmp_path / "run", load_dataset(dataset), prior=prior, budget=2)
+    viewer = Viewer(tmp_path / "run", port=0, follow=True)
+    try:
+        viewer.tick()
+        assert viewer.title.content == "**run: no finished step yet**"
+        assert viewer.layer.options == ("colour", "alpha", "depth")
+        steps(tmp_path / "run", 1)
+        viewer.next_look = 0.0
+        viewer.tick()
+        assert "4 of 5 views" in viewer.title.content
+        assert "uncertainty" in viewer.layer.options
+        assert len(viewer.frusta) == tiny.FRAMES
+        viewer.select("kf_0000")
+        assert "seed" in viewer.facts.content
+        viewer.subject.views[0].frame.image_path.unlink()
+        viewer.select("kf_0000")
+        assert "no such image" in viewer.facts.content
+        assert not viewer.image.visible
+    finally:
+        viewer.close()
+
+
+KNOWN = "THREE.BufferGeometry.computeBoundingSphere(): Computed radius is NaN"
+"""viser's mesh for Gaussians has corners of two coordinates, of which three.js complains once."""
+
+WIDTH, HEIGHT = 1000, 640
+
+
+def start_camera(subject) -> Camera:
+    """The camera of a new window, as docs and code describe it, written out again."""
+    first = subject.views[0].frame.camera
+    centre = np.median(subject.gaussians.means, axis=0).astype(float)
+    offset = first.position - centre
+    focal = HEIGHT * first.K[1, 1] / first.height
+    K = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
+    return Camera(K, WIDTH, HEIGHT, look_at(centre + 1.6 * offset + [0, 0, np.linalg.norm(offset)], centre))
+
+
+def screenshot(tab) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB")).astype(int)
+
+
+def screen_becomes(tab, wanted, seconds=60.0) -> np.ndarray:
+    """A screenshot for which `wanted` is true; the last one if there is none until the time is up."""
+    until = time.monotonic() + seconds
+    while not wanted(picture := screenshot(tab)) and time.monotonic() < until:
+        tab.wait_for_timeout(300)
+    return picture
+
+
+def choose(tab, label, option):
+    tab.get_by_label(label, exact=True).first.click()
+    tab.get_by_role("option", name=option, exact=True).click()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    pytest.importorskip("viser", reason="viser is not installed (pip install 'mgs[view]')")
+    with chromium() as found:
+        yield found
+
+
+def test_the_viewer_in_a_browser(browser, run):
+    """The screen shows the kernel's image of each layer, a click on a camera shows its frame, and a new step appears."""
+    subject = read_subject(run)
+    camera = start_camera(subject)
+    centre = camera.project(subject.gaussians.means)[0].mean(0)
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    inside = (np.abs(u - centre[0]) < 60) & (np.abs(v - centre[1]) < 60)  # where nothing else is drawn
+
+    def off(picture):
+        return np.abs(picture - expected)[inside].mean()
+
+    with viewing(run, "--follow") as address, opened(browser, address, WIDTH, HEIGHT) as (tab, wrong):
+        tab.get_by_text(subject.title).wait_for()
+        tab.get_by_label("Cameras", exact=True).first.uncheck(force=True)
+        for layer in ("alpha", "uncertainty", "colour"):
+            choose(tab, "Layer", layer)
+            expected = layers.kernel_image(subject, camera, layer)[0].astype(int)
+            assert expected[inside].std() > 2
+            assert off(screen_becomes(tab, lambda picture: off(picture) < 1)) < 1, layer
+        tab.get_by_label("Exact at rest", exact=True).first.uncheck(force=True)
+        black = np.abs(expected)[inside].mean()
+        own = off(screen_becomes(tab, lambda picture: 1 < off(picture) < 0.4 * black))
+        assert 1 < own < 0.4 * black  # near, but by another renderer
+
+        tab.get_by_label("Cameras", exact=True).first.check(force=True)
+        chosen = next(view for view in subject.taken if view.role == "chosen")
+        free = [
+            (view, x, y)
+            for view in subject.views
+            for (x, y), z in [[values[0] for values in camera.project([view.frame.camera.position])]]
+            if z > 0 and 30 < x < 600 and 250 < y < HEIGHT - 30  # neither under the panel nor under the notice of viser
+        ]
+        clicked, x, y = free[-1]
+        tab.wait_for_timeout(1500)
+        tab.mouse.click(x, y)
+        tab.get_by_text(f"{clicked.frame.name}:").wait_for()
+        image = tab.locator("img").last
+        assert image.evaluate("i => [i.naturalWidth, i.naturalHeight]") == [tiny.WIDTH, tiny.HEIGHT]
+        shown = np.asarray(Image.open(io.BytesIO(image.screenshot())).convert("RGB")).astype(float)
+        frame = 255 * srgb_from_linear(clicked.frame.rgb())
+        np.testing.assert_allclose(shown.mean((0, 1)), frame.mean((0, 1)), atol=6)
+        choose(tab, "View", chosen.frame.name)
+        tab.get_by_text("chosen at step 1").wait_for()
+        tab.get_by_text("surface coverage then").wait_for()
+
+        steps(run, 3)
+        tab.get_by_text("6 of 7 views").wait_for(timeout=10_000)
+        assert [text for text in wrong if KNOWN not in text] == []
+
+
+def test_a_ply_in_a_browser_at_phone_width(browser, run, tmp_path):
+    write_ply(tmp_path / "splats.ply", read_subject(run).gaussians)
+    with viewing(tmp_path / "splats.ply", "--host", "0.0.0.0") as address, opened(browser, address, 390, 760) as (tab, wrong):
+        tab.get_by_text("splats.ply").wait_for()
+        assert screen_becomes(tab, lambda picture: picture[:300].std() > 5)[:300].std() > 5
+        assert [text for text in wrong if KNOWN not in text] == []
