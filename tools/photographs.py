@@ -130,7 +130,7 @@ class Photograph:
         turn = self.frame.camera.world_to_camera[:3, :3] @ self.camera.world_to_camera[:3, :3].T
         source = rays @ turn.T @ (self.frame.camera.K - HALF).T
         place = (source[:, :2] / source[:, 2:]).astype(np.float32).reshape(*u.shape, 2)
-        return cv2.remap(image, place, None, method, borderMode=cv2.BORDER_REPLICATE)
+        return cv2.remap(image, place[..., 0], place[..., 1], method, borderMode=cv2.BORDER_REPLICATE)
 
 
 def photograph(frame: Frame, rng: np.random.Generator) -> Photograph:

@@ -39,3 +39,16 @@ def print_table(console: Console, rows: Sequence[Sequence[str]]) -> None:
     console.print(table("run", numbers))
     for number, name in zip(numbers, names, strict=True):
         console.print(Text(f"{number}: {name}"), soft_wrap=True)
+
+
+def parse_up(text: str) -> tuple[float, float, float] | None:
+    """The unit vector of an option like 0,0,1; None for auto. Raises InputError for anything else."""
+    from mgs.data.up import unit_up
+    from mgs.errors import InputError
+
+    if text == "auto":
+        return None
+    try:
+        return unit_up([float(part) for part in text.split(",")])
+    except (ValueError, InputError):
+        raise InputError(f"--up {text!r}: expected auto, or three numbers X,Y,Z that are not all zero, as in 0,0,1") from None
