@@ -21,6 +21,7 @@ from mgs.active.settings import NbvSettings
 from mgs.active.stopping import StopReason
 from mgs.camera import Camera
 from mgs.data.dataset import Dataset, Frame
+from mgs.data.up import PLUS_Z, Up, upright
 from mgs.errors import InputError
 from mgs.files import locked
 from mgs.gaussians import Gaussians
@@ -58,6 +59,7 @@ class Stations:
     measure(gaussians, taken frame indices) -> entries for steps.jsonl.
     exact(gaussians, camera) -> exact information of one view [N,P], for what the views see of the surface; None: as `fisher`.
     on_surface: how many of the Gaussians, the first, lie on the surface, so are what coverage is a share of; None: all.
+    up: unit vector that points upwards in the world: azimuths are angles about it.
     prior: hash of what `initial` starts from (`mgs.active.inputs.prior_digest`).
     """
 
@@ -69,6 +71,7 @@ class Stations:
     measure: Callable[[Gaussians, list[int]], dict[str, float]]
     exact: Callable[[Gaussians, Camera], np.ndarray] | None = None
     on_surface: int | None = None
+    up: Up = PLUS_Z
     prior: str = ""
 
 
@@ -142,13 +145,15 @@ class _Loop:
     def __init__(self, out: Path, settings: NbvSettings, dataset: Dataset, stations: Stations, progress: Progress) -> None:
         self.out, self.settings, self.frames, self.stations, self.progress = out, settings, dataset.frames, stations, progress
         self.cameras = [frame.camera for frame in dataset.frames]
-        self.positions = np.array([camera.position for camera in self.cameras])
+        turn = upright(stations.up)  # policies measure azimuths about +Z
+        self.positions = np.array([camera.position for camera in self.cameras]) @ turn.T
+        self.centre = turn @ stations.centre
         self.prior_lam = criteria.regularisation(stations.groups, settings.pixel_noise, settings.prior_std)
         self.lam = settings.regularisation(stations.groups)
         self.images: dict[int, np.ndarray] = {}
         cameras = {frame.name: inputs.camera_digest(frame.camera) for frame in self.frames}
         self.made_from = {"prior": stations.prior, "cameras": cameras}
-        self.seeds = pose_policies.seed_views(self.positions, stations.centre, settings.seeds)
+        self.seeds = pose_policies.seed_views(self.positions, self.centre, settings.seeds)
         self.start = stations.initial([self.frames[i] for i in self.seeds])
 
     def first(self) -> State:
@@ -180,7 +185,7 @@ class _Loop:
         """Frame of the largest score among those not taken, and that score. Looks at poses, never at candidates' images."""
         policy = self.settings.policy
         left = [i for i in range(len(self.frames)) if i not in state.taken]
-        poses = self.positions[left], self.positions[state.taken], self.stations.centre
+        poses = self.positions[left], self.positions[state.taken], self.centre
         rng = generator(self.settings.seed, f"{policy}/{len(state.steps)}")
         if policy in criteria.CRITERIA:
             scores = self.score(state, criteria.CRITERIA[policy], left)
