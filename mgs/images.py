@@ -15,6 +15,9 @@ from mgs.files import atomic_path, reading
 PNG_BIT_DEPTH = 24
 """Index of the byte of a PNG file that says how many bits a sample has (PNG specification, section 11.2.1)."""
 
+ORIENTATION = 0x0112
+"""Number of the EXIF tag that says how a camera was held (EXIF 2.3, section 4.6.4)."""
+
 EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
 """Pillow's names for the kinds of pixels that it converts to 8-bit RGBA without loss: grey, palette and RGB, with and without
 alpha."""
@@ -61,6 +64,14 @@ def _open_image(path: Path) -> tuple[Any, bytes]:
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: not a readable image ({error}); the file is damaged, write it again") from None
     return image, data
+
+
+def exif_orientation(path: str | Path) -> int:
+    """The orientation that EXIF gives an image, 1 (as it is) to 8; 1 where it gives none. From 5 on, width and height change
+    places. Raises InputError as `read_rgba`."""
+    image, _ = _open_image(Path(path))
+    found = image.getexif().get(ORIENTATION, 1)
+    return found if found in range(1, 9) else 1
 
 
 def read_values(path: str | Path) -> np.ndarray:

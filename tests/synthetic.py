@@ -35,6 +35,11 @@ def albedo(points: np.ndarray) -> np.ndarray:
     return 0.5 + 0.4 * np.sin(np.stack([4 * points[..., 0], 3 * points[..., 1] + 1, 5 * points[..., 2] + 2], -1))
 
 
+def level(points: np.ndarray) -> np.ndarray:
+    """Which ellipsoid of the rock's shape each point [N,3] lies on, less 1: 0 on the rock's surface, negative inside."""
+    return np.sqrt((((points - CENTRE) / AXES) ** 2).sum(1)) - 1
+
+
 def cast(camera: Camera, rocks: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Exact z-depth [H,W] (0 = sky), rock mask [H,W] and world points [H,W,3] of ellipsoids (centre, axes) on z = 0."""
     directions = camera.unproject(np.ones((camera.height, camera.width))) - camera.position

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -283,7 +284,9 @@ def _twins(root: Path) -> Path:
 
 
 def _no_depth(root: Path) -> Path:
-    return synthetic.write_dataset(root, depth=False).root
+    dataset = synthetic.write_dataset(root, depth=False)
+    write_transforms(root, [replace(frame, mask_path=None) for frame in dataset.frames])
+    return root
 
 
 def _no_return(root: Path) -> Path:
@@ -337,11 +340,10 @@ def _plain(root: Path) -> Path:
     [
         (_flat, [], "no rock in the cloud"),
         (_twins, [], "equally large and equally near"),
-        (_no_depth, [], "depth_file_path"),
+        (_no_depth, [], "has no depth images and no points (sparse.ply) and no masks; import data with depth, or"),
         (_no_return, [], "no depth image has a return"),
         (_truncated_depth, [], "kf_0003.exr: not a readable EXR"),
         (_small_depth, [], "is 10x10"),
-        (_one_frame, [], "no closed surface"),
         (_occupied, [], "not empty"),
         (_faceless_truth, [], "no faces"),
         (_plain, ["--gaussians", "0"], "0 Gaussians are too few"),
@@ -370,6 +372,17 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert "\n" not in error
     assert not (root / "prior/mesh.ply").exists()
     assert make is _occupied or not (root / "prior").exists()
+
+
+def test_one_frame_with_depth_gives_what_it_saw(tmp_path: Path) -> None:
+    """Its cloud is open on the far side: Poisson closes it, and only what the frame saw is sampled."""
+    dataset = load_dataset(_one_frame(tmp_path / "data"))
+    prior, _ = build_prior(dataset, PriorSettings(gaussians=200, backing=0))
+    assert trimesh.Trimesh(prior.mesh.vertices, prior.mesh.faces).is_watertight
+    away = dataset.frames[0].camera.position - prior.points
+    facing = np.einsum("nk,nk->n", prior.normals, away) / np.linalg.norm(away, axis=1)
+    assert facing.min() > -0.2  # a face counts as seen where one of its corners is
+    assert np.quantile(np.abs(synthetic.level(prior.points)), 0.95) < 0.1
 
 
 @pytest.mark.parametrize(

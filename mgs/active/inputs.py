@@ -17,6 +17,7 @@ import numpy as np
 from mgs.active import policy_file
 from mgs.camera import Camera
 from mgs.data.dataset import Dataset, Frame
+from mgs.data.up import PLUS_Z
 from mgs.errors import InputError
 
 if TYPE_CHECKING:
@@ -45,8 +46,9 @@ def file_digest(path: Path) -> str:
 
 
 def prior_digest(prior: Prior) -> str:
-    """Hash of what a run takes from a prior: points, normals, spacing and depth tolerance."""
-    return array_digest([prior.points, prior.normals, np.array([prior.spacing, prior.depth_tolerance, prior.backed])])
+    """Hash of what a run takes from a prior: points, normals, spacing and depth tolerance; which way is up, where not +Z."""
+    up = [np.array(prior.up)] if prior.up != PLUS_Z else []
+    return array_digest([prior.points, prior.normals, np.array([prior.spacing, prior.depth_tolerance, prior.backed]), *up])
 
 
 def camera_digest(camera: Camera) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -22,6 +22,7 @@ from mgs.active.settings import NbvSettings
 from mgs.active.stopping import StopReason
 from mgs.camera import Camera
 from mgs.data.dataset import Dataset, Frame
+from mgs.data.up import PLUS_Z, Up, upright
 from mgs.errors import InputError
 from mgs.files import locked
 from mgs.gaussians import Gaussians
@@ -61,6 +62,7 @@ class Stations:
     measure(gaussians, taken frame indices) -> entries for steps.jsonl.
     exact(gaussians, camera) -> exact information of one view [N,P], for what the views see of the surface; None: as `fisher`.
     on_surface: how many of the Gaussians, the first, lie on the surface, so are what coverage is a share of; None: all.
+    up: unit vector that points upwards in the world: azimuths are angles about it.
     prior: hash of what `initial` starts from (`mgs.active.inputs.prior_digest`).
     """
 
@@ -73,6 +75,7 @@ class Stations:
     measure: Callable[[Gaussians, list[int]], dict[str, float]]
     exact: Callable[[Gaussians, Camera], np.ndarray] | None = None
     on_surface: int | None = None
+    up: Up = PLUS_Z
     prior: str = ""
 
 
@@ -147,13 +150,15 @@ class Loop:
     def __init__(self, out: Path, settings: NbvSettings, dataset: Dataset, stations: Stations, progress: Progress) -> None:
         self.out, self.settings, self.frames, self.stations, self.progress = out, settings, dataset.frames, stations, progress
         self.cameras = [frame.camera for frame in dataset.frames]
-        self.positions = np.array([camera.position for camera in self.cameras])
+        self.turn = upright(stations.up)  # policies are told of a world in which +Z points upwards
+        self.positions = np.array([camera.position for camera in self.cameras]) @ self.turn.T
+        self.centre = self.turn @ stations.centre
         self.prior_lam = criteria.regularisation(stations.groups, settings.pixel_noise, settings.prior_std)
         self.lam = settings.regularisation(stations.groups)
         self.images: dict[int, np.ndarray] = {}
         cameras = {frame.name: inputs.camera_digest(frame.camera) for frame in self.frames}
         self.made_from = {"prior": stations.prior, "cameras": cameras, **inputs.policy_record(settings.policy)}
-        self.seeds = pose_policies.seed_views(self.positions, stations.centre, settings.seeds)
+        self.seeds = pose_policies.seed_views(self.positions, self.centre, settings.seeds)
         self.start = stations.initial([self.frames[i] for i in self.seeds])
         self.policy = policies.policy_named(settings.policy)
         self.seen, self.dome = cache(self._seen), cache(self._dome)  # they depend on poses and surface alone
@@ -215,11 +220,11 @@ class Loop:
             positions=self.positions,
             left=left,
             visited=state.taken,
-            centre=self.stations.centre,
+            centre=self.centre,
             rng=generator(self.settings.seed, f"{policy_file.label(self.settings.policy)}/{len(state.steps)}"),
             H=state.H,
             lam=self.lam,
-            points=self.start.means[: self.stations.on_surface],
+            points=self.start.means[: self.stations.on_surface] @ self.turn.T,
             surface_H=state.surface,
             prior_lam=self.prior_lam,
             information=lambda view: self.stations.fisher(state.gaussians, self.cameras[told(view)]),
@@ -240,9 +245,12 @@ class Loop:
 
     def _dome(self) -> directional.Views:
         """A dome of poses around the rock, and what they see of the surface."""
-        cameras = directional.dome_cameras(self.cameras[0], self.positions, self.stations.centre)
+        upright_cameras = directional.dome_cameras(self.cameras[0], self.positions, self.centre)
+        to_upright = np.eye(4)
+        to_upright[:3, :3] = self.turn
+        cameras = [replace(camera, world_to_camera=camera.world_to_camera @ to_upright) for camera in upright_cameras]
         seen = [directional.squared_weights(self.surface_information(camera)) for camera in cameras]
-        return directional.Views(np.array([camera.position for camera in cameras]), np.stack(seen))
+        return directional.Views(np.array([camera.position for camera in upright_cameras]), np.stack(seen))
 
     def learn(self, state: State, new: list[int], choice: dict[str, Any], watch: _Stopwatch) -> State:
         """Read the new images, fit to convergence on all so far, sum their information at the new model."""

@@ -48,6 +48,7 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
         exact=lambda gaussians, camera: fisher(gaussians, camera, cache=cache),
         measure=psnr_measure(dataset, cache),
         on_surface=len(prior.points),
+        up=prior.up,
         prior=prior_digest(prior),
     )
 

@@ -7,6 +7,9 @@ from typing import Annotated
 
 import typer
 
+MANY_PIXELS = 2_000_000
+"""Images with more pixels than this are worth a word on --downscale."""
+
 
 def import_data(
     source: Annotated[Path, typer.Argument(help="A transforms.json, or a folder with one or with a COLMAP model (sparse/0).")],
@@ -17,18 +20,28 @@ def import_data(
         Path | None,
         typer.Option(help="Make masks by projecting this mesh of the rock. World coordinates; a GLB is turned from +Y up."),
     ] = None,
+    downscale: Annotated[
+        int, typer.Option(min=1, help="Make blocks of so many pixels each way into one, as 4 for photographs of 12 megapixels.")
+    ] = 1,
+    up: Annotated[
+        str, typer.Option(help="Which way is up: X,Y,Z in the source's world, or auto: as the cameras were held.")
+    ] = "auto",
+    unit: Annotated[
+        float | None, typer.Option(help="Metres in the source's unit of length. Default: unknown, unless there is depth.")
+    ] = None,
     split: Annotated[str, typer.Option(help="Which split of NeRF-synthetic data to import: train, val or test.")] = "train",
 ) -> None:
     """Make a dataset of your own data: cameras and images, and depth and masks if there are any. Lens distortion is undone.
 
     Masks are taken from --masks, --mesh, the source's own mask files or the images' alpha: the first of these that there is.
-    Where alpha has values between empty and full, it is kept, in images of the rock alone (rock/). For data without depth,
-    `mgs prior OUT` builds the prior from COLMAP's points, or takes your mesh with --mesh. An interrupted import goes on where
-    it stopped when the same command is given again.
+    Where alpha has values between empty and full, it is kept, in images of the rock alone (rock/). Points that came with the
+    cameras are kept for `mgs prior`, in sparse.ply. An interrupted import goes on where it stopped when the same command is
+    given again.
     """
     from rich.console import Console
     from rich.progress import Progress
 
+    from mgs.cli.printing import parse_up
     from mgs.data.importers import import_source, read_source
     from mgs.data.meshes import GLTF
     from mgs.errors import InputError
@@ -37,6 +50,9 @@ def import_data(
     if masks is not None and mesh is not None:
         raise InputError("import: --masks and --mesh both say where masks come from; give one of them")
     found = read_source(source, images, split)
+    found = found if unit is None else found.in_metres(unit)
+    given = parse_up(up)
+    upward, reason = found.up_or_estimate() if given is None else (given, "as --up says")
     with Progress(console=console, transient=True) as progress:
         bar = progress.add_task("importing")
         result = import_source(
@@ -44,6 +60,8 @@ def import_data(
             out,
             masks=masks,
             mesh=mesh,
+            downscale=downscale,
+            up=upward,
             on_frame=lambda done, total: progress.update(bar, completed=done, total=total),
         )
     if mesh is not None and mesh.suffix.lower() in GLTF:
@@ -53,6 +71,12 @@ def import_data(
     keys = ("mask_path", "rock_path", "depth_path")
     masked, layered, deep = (sum(bool(getattr(frame, key)) for frame in result.frames) for key in keys)
     undone = sum(shot.distortion.any() for shot in found.shots)
+    axis = ", ".join(f"{value:.4g}" for value in upward)
+    lengths = "metres" if result.unit == "m" else f"in {result.unit}s (no --unit was given)"
+    console.print(f"up is ({axis}): {reason}; lengths are {lengths}")
+    camera = result.frames[0].camera
+    if camera.width * camera.height > MANY_PIXELS:
+        notes.print(f"mgs: images of {camera.width}x{camera.height} take long to fit; --downscale 2 or more makes them smaller")
     console.print(
         f"{found.kind}: {len(result)} frames, {masked} with mask, {layered} with alpha, {deep} with depth, "
         f"{undone} undistorted; wrote {out}"

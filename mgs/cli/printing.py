@@ -61,3 +61,16 @@ def _heading(key: str) -> str:
         return {"coverage": "cover"}.get(key, key)
     name, _, mask = metric.partition("_")
     return f"{name.upper()}\n{GROUPS[views]}" + ("\nrock" if mask else "")
+
+
+def parse_up(text: str) -> tuple[float, float, float] | None:
+    """The unit vector of an option like 0,0,1; None for auto. Raises InputError for anything else."""
+    from mgs.data.up import unit_up
+    from mgs.errors import InputError
+
+    if text == "auto":
+        return None
+    try:
+        return unit_up([float(part) for part in text.split(",")])
+    except (ValueError, InputError):
+        raise InputError(f"--up {text!r}: expected auto, or three numbers X,Y,Z that are not all zero, as in 0,0,1") from None

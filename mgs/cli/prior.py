@@ -1,7 +1,8 @@
-"""`mgs prior`: from the depth images of a dataset to a mesh of the rock, and samples of its surface."""
+"""`mgs prior`: from depth images, points, masks or a mesh to a mesh of the rock, and samples of its surface."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,14 +15,35 @@ if TYPE_CHECKING:
 SEEDS = 4
 """Number of seed frames in the paper, and of those for which the share of samples that they see is printed."""
 
+WHY = {
+    "depth": ": the dataset has depth images",
+    "points": ": the dataset has points (sparse.ply) and no depth",
+    "hull": ": the dataset has masks, and neither depth nor points",
+}
+"""What is said of a source that nobody asked for."""
+
 
 def prior(
-    dataset: Annotated[Path, typer.Argument(help="Dataset folder (transforms.json) with depth images.")],
+    dataset: Annotated[Path, typer.Argument(help="Dataset folder (transforms.json).")],
     out: Annotated[Path | None, typer.Option(help="Folder to write, new or empty. Default: DATASET/prior.")] = None,
     gaussians: Annotated[int | None, typer.Option(help="Number of Gaussians, on the surface and behind it.")] = None,
     spacing: Annotated[
         float | None,
         typer.Option(help="Distance between samples, metres, instead of N. Default: about the size of a pixel on the rock."),
+    ] = None,
+    source: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            help="depth, mesh, points or hull (of the masks). Default: the first of depth, points, hull that there is.",
+        ),
+    ] = None,
+    points: Annotated[
+        Path | None, typer.Option(help="Build it of the points in this PLY file. World coordinates of the dataset.")
+    ] = None,
+    up: Annotated[
+        str | None,
+        typer.Option(help="Which way is up: X,Y,Z, or auto: the ground plane's normal. Default: as the dataset says."),
     ] = None,
     mesh: Annotated[
         Path | None,
@@ -42,32 +64,52 @@ def prior(
     ] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="Root seed: the same seed gives the same prior.")] = 0,
 ) -> None:
-    """Build a mesh of the rock from depth images, and sample N points on it.
+    """Build a mesh of the rock, and sample N points on it.
 
-    The steps: fuse the depth images into a cloud, find the ground plane and the rock above it, reconstruct the rock's surface
-    (Poisson), spread samples evenly over what some frame saw of it. Writes mesh.ply, points.ply, prior.json and prior.png.
+    From depth images: fuse them into a cloud, find the ground plane and the rock above it, reconstruct the rock's surface
+    (Poisson). From points that came with the cameras: the same, of those inside the masks or above the ground. From a hull: the
+    largest body that fits into all masks. Then spread samples evenly over what some frame saw. Writes mesh.ply, points.ply,
+    prior.json and prior.png.
     """
+    import numpy as np
     from rich.console import Console
 
+    from mgs.cli.printing import parse_up
     from mgs.data.dataset import load_dataset
     from mgs.data.meshes import GLTF
+    from mgs.errors import InputError
     from mgs.files import atomic_folder, check_new_folder
     from mgs.prior.build import build_prior, prior_from_mesh, save_prior
-    from mgs.prior.figure import draw_prior
+    from mgs.prior.figure import draw_prior, draw_refused
     from mgs.prior.initial import with_share_seen
+    from mgs.prior.photographs import source_of
+    from mgs.prior.segmentation import NoSurface
     from mgs.prior.settings import PriorSettings
 
     console = Console()
+    axis = None if up is None else parse_up(up)
+    if mesh is not None and (source not in (None, "mesh") or points is not None):
+        raise InputError("prior: --mesh gives the surface, and --from or --points build one; give one of them")
     loaded = load_dataset(dataset)
     folder = check_new_folder(out if out is not None else dataset / "prior")  # before the work, not after it
     settings = PriorSettings(gaussians, spacing, poisson_depth, prior_noise, holes, seed, backing)
     with console.status("reading") as status:
         if mesh is not None:
-            result, segmented = prior_from_mesh(mesh, settings), None
+            result, segmented = prior_from_mesh(mesh, settings, axis or loaded.up, loaded.unit), None
             if mesh.suffix.lower() in GLTF:
                 console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
         else:
-            result, segmented = build_prior(loaded, settings, lambda stage: status.update(f"prior: {stage}"))
+            upward: Any = "auto" if up == "auto" else axis
+            chosen = source_of(loaded, source, points)
+            console.print(f"prior from {chosen}" + ("" if source or points else WHY[chosen]))
+            try:
+                result, segmented = build_prior(
+                    loaded, settings, lambda stage: status.update(f"prior: {stage}"), source=chosen, points=points, up=upward
+                )
+            except NoSurface as refused:
+                picture = folder.with_name(f"{folder.name}-refused.png")
+                draw_refused(picture, refused.points, refused.kept, np.array(loaded.up))
+                raise InputError(f"{refused} (the points: {picture})") from None
         status.update("prior: what four seed frames see")
         result = with_share_seen(result, _seed_frames(loaded, result))
         status.update("prior: picture")
@@ -83,29 +125,44 @@ def _seed_frames(dataset: Dataset, prior: Prior) -> list[Frame]:
     import numpy as np
 
     from mgs.active.pose_policies import seed_views
+    from mgs.data.up import upright
 
-    positions = np.stack([frame.camera.position for frame in dataset.frames])
-    return [dataset.frames[k] for k in seed_views(positions, prior.points.mean(0), min(SEEDS, len(dataset)))]
+    turn = upright(prior.up)
+    positions = np.stack([frame.camera.position for frame in dataset.frames]) @ turn.T
+    return [dataset.frames[k] for k in seed_views(positions, turn @ prior.points.mean(0), min(SEEDS, len(dataset)))]
 
 
 def _table(numbers: dict[str, Any]) -> Any:
     """The table that is printed, from the numbers of prior.json."""
     from rich.table import Table
 
-    n, spacing, area = numbers["n"], numbers["spacing"], numbers["sampled_area"]
+    metres = numbers["unit"] == "m"
+    n, spacing, area, unit = numbers["n"], numbers["spacing"], numbers["sampled_area"], "m" if metres else "unit"
     table = Table("station", "number", title="Mesh prior")
+
+    def length(value: float) -> str:
+        return f"{1e3 * value:.2f} mm" if metres else f"{value:.4g} unit"
+
     if "points" in numbers:
-        _add_cloud_rows(table, numbers)
-    part = "" if "mesh" in numbers else f" sampled (what some frame saw), of {numbers['mesh_area']:.4f} m²"
-    table.add_row("area, A", f"{area:.4f} m²{part}")
+        _add_cloud_rows(table, numbers, length)
+    if "hull_cell" in numbers:
+        table.add_row(
+            "visual hull", f"cells of {length(numbers['hull_cell'])}, fills {numbers['hull_fills_masks']:.1%} of the masks"
+        )
+    if "poisson_depth" in numbers:
+        table.add_row("mesh (Poisson)", f"{numbers['mesh_faces']:,} faces, octree depth {numbers['poisson_depth']}, watertight")
+        table.add_row("cloud to mesh, rms", length(numbers["fit_rms"]))
+    part = "" if "mesh" in numbers else f" sampled (what some frame saw), of {numbers['mesh_area']:.4f} {unit}²"
+    table.add_row("area, A", f"{area:.4f} {unit}²{part}")
     table.add_row("samples, N = A / spacing²", f"{n:,} = {area:.4f} / {spacing:.6f}²")
     table.add_row("Gaussians", f"{n + numbers['backed']:,}: a sample each, and {numbers['backed']:,} behind the surface")
     mean, least = (numbers[key] / spacing for key in ("nearest_neighbour_mean", "nearest_neighbour_min"))
     table.add_row("nearest neighbour over spacing", f"mean {mean:.2f}, least {least:.2f}")
     table.add_row(f"samples that {SEEDS} evenly spaced frames see", f"{numbers['seen_by_seeds']:.1%}; the rest starts grey")
+    table.add_row("up", _up(numbers))
     truth = numbers.get("truth")
     if truth is None:
-        table.add_row("distance to the true rock", "not measured: a given mesh, no depth, or no rock.glb in the dataset")
+        table.add_row("distance to the true rock", "not measured: needs depth, and rock.glb in the dataset")
         return table
     table.add_section()
     for name in ("accuracy", "completeness", "chamfer", "hausdorff"):
@@ -115,19 +172,31 @@ def _table(numbers: dict[str, Any]) -> Any:
     return table
 
 
-def _add_cloud_rows(table: Any, numbers: dict[str, Any]) -> None:
+def _up(numbers: dict[str, Any]) -> str:
+    """Which way is up, and how far the ground plane's normal is from it where there is a plane."""
+    from mgs.data.up import angle_between, unit_up
+
+    up = unit_up(numbers["up"])
+    text = f"({', '.join(f'{value:.3g}' for value in up)})"
+    if "plane_normal" not in numbers:
+        return text
+    return f"{text}; the ground plane's normal is {angle_between(up, unit_up(numbers['plane_normal'])):.1f}° from it"
+
+
+def _add_cloud_rows(table: Any, numbers: dict[str, Any], length: Callable[[float], str]) -> None:
     """The rows of a mesh that was built from a cloud."""
-    table.add_row("depth pixels in the cloud", f"{numbers['pixels']:,}")
-    table.add_row("noise of a depth pixel", f"{1e3 * numbers['depth_noise']:.2f} mm")
-    table.add_row("points of the fused cloud", f"{numbers['points']:,} on a {1e3 * numbers['voxel']:.2f} mm grid")
-    table.add_row(
-        "ground plane inliers (RANSAC)",
-        f"{numbers['plane_inliers']:,} within {1e3 * numbers['plane_tolerance']:.1f} mm "
-        f"(sigma {1e3 * numbers['plane_sigma']:.2f} mm)",
-    )
-    table.add_row(
-        "rock cluster (DBSCAN)",
-        f"{numbers['cluster_size']:,} points, one of {numbers['clusters']} clusters, eps {1e3 * numbers['eps']:.1f} mm",
-    )
-    table.add_row("mesh (Poisson)", f"{numbers['mesh_faces']:,} faces, octree depth {numbers['poisson_depth']}, watertight")
-    table.add_row("cloud to mesh, rms", f"{1e3 * numbers['fit_rms']:.2f} mm")
+    if "pixels" in numbers:
+        table.add_row("depth pixels in the cloud", f"{numbers['pixels']:,}")
+        table.add_row("noise of a depth pixel", length(numbers["depth_noise"]))
+        table.add_row("points of the fused cloud", f"{numbers['points']:,} on a {length(numbers['voxel'])} grid")
+    else:
+        table.add_row("points", f"{numbers['points']:,}, {numbers['points_kept']:,} of them well triangulated")
+    if "plane_normal" in numbers:
+        within = f"within {length(numbers['plane_tolerance'])} (sigma {length(numbers['plane_sigma'])})"
+        table.add_row("ground plane inliers (RANSAC)", f"{numbers['plane_inliers']:,} {within}")
+    if "eps" in numbers:
+        found = f"one of {numbers['clusters']} clusters, eps {length(numbers['eps'])}"
+        table.add_row("rock cluster (DBSCAN)", f"{numbers['cluster_size']:,} points, {found}")
+    elif "points_kept" in numbers:
+        chosen = f"one of {numbers['clusters']} clusters (HDBSCAN)" if numbers["clusters"] else "inside the masks"
+        table.add_row("points of the rock", f"{numbers['cluster_size']:,} {chosen}, {length(numbers['cloud_spacing'])} apart")

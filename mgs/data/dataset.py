@@ -12,6 +12,7 @@ import numpy as np
 
 from mgs.camera import Camera, opencv_from_opengl, opengl_from_opencv
 from mgs.data.rock_image import boundary, read_rock_image
+from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.errors import InputError
 from mgs.files import check_new_folder, check_writable, locked, read_json, write_json
 from mgs.images import read_exr, read_mask, read_png
@@ -101,10 +102,15 @@ class Frame:
 
 @dataclass(frozen=True)
 class Dataset:
-    """A folder of keyframes in order of time."""
+    """A folder of keyframes in order of time.
+
+    up: unit vector that points upwards in the world. unit: what a length of 1 is called, "m", or "unit" where nobody knows.
+    """
 
     root: Path
     frames: tuple[Frame, ...]
+    up: Up = PLUS_Z
+    unit: str = "m"
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -133,7 +139,8 @@ def load_dataset(root: str | Path) -> Dataset:
     for name, count in Counter(frame.name for frame in frames).items():
         if count > 1:  # runs and pictures refer to a frame by its name
             raise InputError(f"{path}: lists {count} frames named {name}; remove or rename all but one")
-    return Dataset(root, tuple(sorted(frames, key=lambda frame: (frame.timestamp, frame.name))))
+    ordered = tuple(sorted(frames, key=lambda frame: (frame.timestamp, frame.name)))
+    return Dataset(root, ordered, unit_up(data["up"]) if data.get("up") else PLUS_Z, str(data.get("unit") or "m"))
 
 
 def load_cameras(path: str | Path) -> list[tuple[str, Camera]]:
@@ -218,14 +225,15 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
     return {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": camera.width, "h": camera.height}
 
 
-def write_transforms(root: str | Path, frames: list[Frame] | tuple[Frame, ...]) -> None:
-    """Write transforms.json into the folder `root`; the paths in it are relative to that folder.
+def write_transforms(root: str | Path, frames: list[Frame] | tuple[Frame, ...], up: Up = PLUS_Z, unit: str = "m") -> None:
+    """Write transforms.json into the folder `root`; the paths in it are relative to that folder. up, unit: as `Dataset`.
 
     The intrinsics of the first frame are written once, for the whole file; a frame with other intrinsics has its own. Write
     this file after all others: a folder that has it counts as a finished dataset.
     """
     root = Path(root)
-    header = {"camera_model": "OPENCV", **_intrinsics(frames[0].camera)}
+    header: dict[str, Any] = {"camera_model": "OPENCV", **_intrinsics(frames[0].camera)}
+    world = {"up": list(up), "unit": unit} if (up, unit) != (PLUS_Z, "m") else {}  # what is left out is +Z and metres
     records = []
     for frame in frames:
         paths = {key: getattr(frame, field) for field, key in FILES.items()}
@@ -235,7 +243,7 @@ def write_transforms(root: str | Path, frames: list[Frame] | tuple[Frame, ...]) 
         own = _intrinsics(frame.camera)
         record |= {key: value for key, value in own.items() if value != header[key]}
         records.append(record)
-    write_json(root / "transforms.json", header | {"frames": records})
+    write_json(root / "transforms.json", header | world | {"frames": records})
 
 
 def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 from collections import Counter
@@ -15,9 +14,13 @@ from typing import Any
 import numpy as np
 
 from mgs.camera import Camera, opencv_from_opengl
+from mgs.data.clouds import SparseCloud, read_cloud, write_cloud
+from mgs.data.colmap import is_model, read_model
 from mgs.data.dataset import FRAME_INTERVAL, PINHOLES, Dataset, Frame, load_dataset, read_records, resumes, write_transforms
-from mgs.data.meshes import read_mesh, write_points
+from mgs.data.lens import Undo, fit_to_camera, shrunk, undistorter
+from mgs.data.meshes import read_mesh
 from mgs.data.rock_image import premultiplied, write_rock_image
+from mgs.data.up import PLUS_Z, Up, angle_between, unit_up, up_of_cameras
 from mgs.errors import InputError
 from mgs.files import copy_file, fingerprint, locked, new_folder, write_json
 from mgs.images import read_exr, read_mask, read_rgba, read_values, write_exr, write_png
@@ -29,19 +32,11 @@ continued only where it asks for the same."""
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 """Coefficients of the OPENCV camera model, in OpenCV's order."""
 
+LEVELLED = 10.0
+"""A transforms.json whose cameras have their common up vector within this angle of +Z, degrees, was made with +Z up."""
+
 SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 """NeRF-synthetic names images without a suffix."""
-
-COLMAP_MODELS: dict[str, tuple[str, ...]] = {
-    "SIMPLE_PINHOLE": (),
-    "PINHOLE": (),
-    "SIMPLE_RADIAL": ("k1",),
-    "RADIAL": ("k1", "k2"),
-    "OPENCV": ("k1", "k2", "p1", "p2"),
-    "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-}
-"""Distortion coefficients of each of COLMAP's camera models, in the order in which they follow focal lengths and principal
-point in COLMAP's list of parameters."""
 
 
 @dataclass(frozen=True)
@@ -64,13 +59,41 @@ class Shot:
 
 @dataclass(frozen=True)
 class Source:
-    """The data to import: its format, the shots whose image exists, the number of those whose image does not, and COLMAP's
-    points [N,3] with the mean unit direction [N,3] from each to the cameras that saw it."""
+    """The data to import: its format, the shots whose image exists, the number of those whose image does not, and the points
+    that were triangulated with the cameras. up: which way is up, unit: "m" or "unit", what a length of 1 is; None where the
+    source does not say."""
 
     kind: str
     shots: list[Shot]
     missing: int
-    sparse: tuple[np.ndarray, np.ndarray] | None = None
+    sparse: SparseCloud | None = None
+    up: Up | None = None
+    unit: str | None = None
+
+    def in_metres(self, unit: float) -> Source:
+        """The same data, whose unit of length is so many metres: cameras and points are scaled, depth is metres already.
+
+        Raises InputError if that is not positive and finite.
+        """
+        if not 0 < unit < np.inf:
+            raise InputError(f"import: --unit {unit} must be a positive number of metres; correct it")
+        shots = [replace(shot, camera=_scaled(shot.camera, unit)) for shot in self.shots]
+        return replace(self, shots=shots, sparse=self.sparse and self.sparse.scaled(unit), unit="m")
+
+    def up_or_estimate(self) -> tuple[Up, str]:
+        """Which way is up, and how that is known: as the source says, or as the cameras were held (`up_of_cameras`).
+
+        NeRF-synthetic data are +Z up, and so is a transforms.json whose cameras agree to 10 degrees. Raises InputError as
+        `up_of_cameras`.
+        """
+        if self.up is not None:
+            return self.up, "as the source says"
+        if self.kind == "NeRF-synthetic":
+            return PLUS_Z, "the rule of NeRF-synthetic data"
+        found = up_of_cameras([shot.camera for shot in self.shots])
+        if self.kind == "nerfstudio" and angle_between(found, PLUS_Z) < LEVELLED:
+            return PLUS_Z, f"the cameras' common up vector is within {LEVELLED:.0f} degrees of it"
+        return found, "the cameras' common up vector"
 
 
 def read_source(source: str | Path, images: Path | None = None, split: str = "train") -> Source:
@@ -90,7 +113,7 @@ def read_source(source: str | Path, images: Path | None = None, split: str = "tr
     elif (source / f"transforms_{split}.json").is_file():
         result = _read_transforms(source / f"transforms_{split}.json")
     else:
-        model = next((folder for folder in (source / "sparse/0", source / "sparse", source) if _is_colmap(folder)), None)
+        model = next((folder for folder in (source / "sparse/0", source / "sparse", source) if is_model(folder)), None)
         if model is None:
             raise InputError(f"{source}: holds no transforms.json, transforms_{split}.json or COLMAP model; check the folder")
         result = _read_colmap(model, images if images is not None else source / "images")
@@ -100,6 +123,12 @@ def read_source(source: str | Path, images: Path | None = None, split: str = "tr
     if repeated:
         raise InputError(f"{source}: lists {repeated[0]} more than once; remove the duplicate frames")
     return result
+
+
+def _scaled(camera: Camera, factor: float) -> Camera:
+    pose = camera.world_to_camera.copy()
+    pose[:3, 3] *= factor
+    return Camera(camera.K, camera.width, camera.height, pose)
 
 
 def _find(folder: Path, name: str) -> Path | None:
@@ -132,7 +161,11 @@ def _read_transforms(path: Path) -> Source:
         unit = 1.0 if depth is None or depth.suffix.lower() == ".exr" else scale
         shots.append(Shot(_frame_name(record["file_path"]), camera, distortion, time, image, depth, unit, mask, rock))
     kind = "NeRF-synthetic" if "camera_angle_x" in data and "fl_x" not in data else "nerfstudio"
-    return Source(kind, shots, missing)
+    cloud = path.parent / str(data["ply_file_path"]) if data.get("ply_file_path") else None
+    sparse = read_cloud(cloud) if cloud is not None and cloud.is_file() else None
+    up = unit_up(data["up"]) if data.get("up") else None
+    length = str(data.get("unit") or "") or ("m" if any(shot.depth for shot in shots) else None)
+    return Source(kind, shots, missing, sparse, up, length)
 
 
 def _number(path: Path, what: str, value: Any) -> float:
@@ -171,55 +204,15 @@ def _transforms_camera(path: Path, index: int, record: dict[str, Any], image: Pa
         raise InputError(f"{where}: {error}; correct the pose") from None
 
 
-def _is_colmap(folder: Path) -> bool:
-    return all((folder / f"{name}.bin").is_file() for name in ("cameras", "images", "points3D")) or all(
-        (folder / f"{name}.txt").is_file() for name in ("cameras", "images", "points3D")
-    )
-
-
 def _read_colmap(model: Path, images: Path) -> Source:
-    """A COLMAP sparse model, text or binary (pycolmap)."""
-    import pycolmap
-
-    try:
-        reconstruction = pycolmap.Reconstruction(model)
-    except Exception as error:  # pycolmap raises many types; each means a damaged model.
-        reason = " ".join(str(error).split())[:120]
-        raise InputError(f"{model}: not a readable COLMAP model ({reason}); export it again") from None
+    listed, cloud = read_model(model)
     shots, missing = [], 0
-    for index, image in enumerate(sorted(reconstruction.images.values(), key=lambda image: image.name)):
-        path = images / image.name
-        if not path.is_file():
+    for index, (name, camera, distortion) in enumerate(listed):
+        if (images / name).is_file():
+            shots.append(Shot(_frame_name(name), camera, distortion, FRAME_INTERVAL * index, images / name))
+        else:
             missing += 1
-            continue
-        lens = image.camera
-        keys = COLMAP_MODELS.get(lens.model_name)
-        if keys is None:
-            raise InputError(f"{model}: camera model {lens.model_name} is not supported; run COLMAP's image_undistorter first")
-        pose = np.eye(4)
-        pose[:3] = image.cam_from_world().matrix()
-        camera = Camera(lens.calibration_matrix(), lens.width, lens.height, pose)
-        values = dict(zip(keys, lens.params[len(lens.params) - len(keys) :], strict=True))
-        order = (*DISTORTION_KEYS, "k4", "k5", "k6")
-        distortion = np.array([values.get(key, 0.0) for key in order])
-        shots.append(Shot(_frame_name(image.name), camera, distortion, FRAME_INTERVAL * index, path))
-    return Source("COLMAP", shots, missing, _sparse_points(reconstruction))
-
-
-def _sparse_points(reconstruction: Any) -> tuple[np.ndarray, np.ndarray] | None:
-    """Triangulated points [N,3] and the mean unit direction [N,3] to the cameras that saw each."""
-    centres = {image.image_id: image.projection_center() for image in reconstruction.images.values()}
-    points, views = [], []
-    for point in reconstruction.points3D.values():
-        seen = {element.image_id for element in point.track.elements}
-        if seen:
-            rays = np.stack([centres[image] for image in seen]) - point.xyz
-            points.append(point.xyz)
-            views.append((rays / np.linalg.norm(rays, axis=1, keepdims=True)).mean(0))
-    if not points:
-        return None
-    directions = np.stack(views)
-    return np.stack(points), directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
+    return Source("COLMAP", shots, missing, cloud)
 
 
 def import_source(
@@ -228,6 +221,8 @@ def import_source(
     *,
     masks: Path | None = None,
     mesh: Path | None = None,
+    downscale: int = 1,
+    up: Up = PLUS_Z,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Dataset:
     """Write a source as a dataset into the folder `out`: a new or empty one, or one that an interrupted import of it left.
@@ -236,7 +231,8 @@ def import_source(
     centre shows the `mesh` (world coordinates); the source's own mask files; the
     images' alpha. Images of the rock alone come from the source's own images of it, or from an alpha that gives the mask and
     has values between empty and full. With `masks` or `mesh` there are none.
-    Distorted images, depth and masks are undistorted to a pinhole camera in which every pixel is valid.
+    Distorted images, depth and masks are undistorted to a pinhole camera in which every pixel is valid; then blocks of
+    `downscale` x `downscale` pixels become one. up: what transforms.json says is up. One frame is in memory at a time.
 
     import.json, which says what is imported, is written first, and transforms.json last. When an interrupted import is
     continued, a finished frame is made again only if one of its files has a newer modification time. The result is the
@@ -251,6 +247,7 @@ def import_source(
         shots, project = [replace(shot, mask=None, rock=None) for shot in shots], mesh_silhouette(mesh)
     by_mesh = None if project is None or mesh is None else fingerprint(mesh)
     asked = {"kind": source.kind, "frames": len(shots), "sha256_of_frames": _digest(shots), "mesh": by_mesh}
+    asked |= {"downscale": downscale} if downscale != 1 else {}
     frames = []
     with ExitStack() as lock:
         if resumes(out, RECORD, asked):
@@ -265,10 +262,10 @@ def import_source(
         for k, shot in enumerate(shots):
             if on_frame:
                 on_frame(k, len(shots))
-            frames.append(_import_shot(shot, out, project, begin))
+            frames.append(_import_shot(shot, out, project, downscale, begin))
         if source.sparse is not None:
-            write_points(out / "sparse.ply", *source.sparse)
-        write_transforms(out, frames)
+            write_cloud(out / "sparse.ply", source.sparse)
+        write_transforms(out, frames, up, source.unit or "unit")
     return load_dataset(out)
 
 
@@ -292,20 +289,22 @@ def _digest(shots: list[Shot]) -> str:
     return hashlib.sha256(json.dumps(known).encode()).hexdigest()
 
 
-def _import_shot(shot: Shot, out: Path, project: Callable[[Camera], np.ndarray] | None, begin: Callable[[], None]) -> Frame:
+def _import_shot(
+    shot: Shot, out: Path, project: Callable[[Camera], np.ndarray] | None, downscale: int, begin: Callable[[], None]
+) -> Frame:
     """Write the files of a frame, the image last. Nothing is done where the image exists and is no older than its sources.
 
     project: the mask by `mesh_silhouette`, or None. begin: called after all is read and before anything is written, to make the
     output folder; so a source that cannot be read leaves no folder behind.
     """
-    camera, undo = undistorter(shot.camera, shot.distortion)
+    camera, undo = shrunk(*undistorter(shot.camera, shot.distortion), downscale)
     image, mask_path, rock_path = (out / folder / f"{shot.name}.png" for folder in ("images", "masks", "rock"))
     depth_path = None if shot.depth is None else out / "depth" / f"{shot.name}.exr"
     sources = (path for path in (shot.image, shot.depth, shot.mask, shot.rock) if path is not None and path.is_file())
     if not image.is_file() or image.stat().st_mtime_ns < max(path.stat().st_mtime_ns for path in sources):
-        rgba = _sized(shot.image, read_rgba(shot.image), shot.camera)
+        rgba = fit_to_camera(shot.image, read_rgba(shot.image), shot.camera)
         mask, rock = (project(camera), None) if project is not None else _mask_and_rock(shot, rgba, undo)
-        depth = None if shot.depth is None else _sized(shot.depth, _read_depth(shot.depth, shot.depth_unit), shot.camera)
+        depth = None if shot.depth is None else fit_to_camera(shot.depth, _read_depth(shot.depth, shot.depth_unit), shot.camera)
         begin()
         if depth_path is not None and depth is not None:
             write_exr(depth_path, {"Z": undo(depth, False)})
@@ -315,7 +314,7 @@ def _import_shot(shot: Shot, out: Path, project: Callable[[Camera], np.ndarray] 
         rock_path.unlink(missing_ok=True)
         if rock is not None:
             write_rock_image(rock_path, rock)
-        if _is_plain_png(shot.image) and not shot.distortion.any():
+        if _is_plain_png(shot.image, camera) and not shot.distortion.any():
             copy_file(shot.image, image)
         else:
             full, pixels = np.iinfo(rgba.dtype).max, undo(rgba[..., :3], True)
@@ -324,16 +323,14 @@ def _import_shot(shot: Shot, out: Path, project: Callable[[Camera], np.ndarray] 
     return Frame(shot.name, camera, shot.timestamp, image, depth_path, mask_file, rock_file)
 
 
-def _mask_and_rock(
-    shot: Shot, rgba: np.ndarray, undo: Callable[[np.ndarray, bool], np.ndarray]
-) -> tuple[np.ndarray | None, np.ndarray | None]:
+def _mask_and_rock(shot: Shot, rgba: np.ndarray, undo: Undo) -> tuple[np.ndarray | None, np.ndarray | None]:
     """The mask and the image of the rock alone that the source itself gives, undistorted; None for what it does not give.
 
     rgba [H,W,4]: the pixels of the shot's image. undo: as `undistorter` gives it. The mask is bool [H,W]; the image of the rock
     is linear RGB premultiplied by alpha, and alpha, float32 [H,W,4]. Premultiplied light is what undistortion resamples:
     straight colours would mix with those of empty pixels, and leave a rim.
     """
-    given = None if shot.rock is None else _sized(shot.rock, read_rgba(shot.rock), shot.camera)
+    given = None if shot.rock is None else fit_to_camera(shot.rock, read_rgba(shot.rock), shot.camera)
     layer = rgba if given is None else given
     full = np.iinfo(layer.dtype).max
     alpha = layer[..., 3]
@@ -341,23 +338,16 @@ def _mask_and_rock(
         given = rgba
     rock = None if given is None else undo(premultiplied(given.astype(np.float32) / full), True)
     if shot.mask is not None:
-        return undo(_sized(shot.mask, read_mask(shot.mask), shot.camera).astype(np.uint8) * 255, True) >= 128, rock
+        return undo(fit_to_camera(shot.mask, read_mask(shot.mask), shot.camera).astype(np.uint8) * 255, True) >= 128, rock
     return undo(alpha, True) > full // 2 if alpha.min() < full else None, rock
 
 
-def _is_plain_png(path: Path) -> bool:
-    """Whether a file is what `write_png` would write: a PNG of colour type 2 (RGB) with 8 bits per channel."""
+def _is_plain_png(path: Path, camera: Camera) -> bool:
+    """Whether a file is what `write_png` would write: a PNG of the camera's size and of colour type 2 (RGB), 8 bits each."""
     with path.open("rb") as file:
         header = file.read(26)
-    return header[:8] == b"\x89PNG\r\n\x1a\n" and header[24:] == b"\x08\x02"
-
-
-def _sized(path: Path, pixels: np.ndarray, camera: Camera) -> np.ndarray:
-    if pixels.shape[:2] != (camera.height, camera.width):
-        found = f"{pixels.shape[1]}x{pixels.shape[0]}"
-        expected = f"{camera.width}x{camera.height}"
-        raise InputError(f"{path}: is {found}, but its camera is {expected}; resize it or correct w and h")
-    return pixels
+    size = camera.width.to_bytes(4, "big") + camera.height.to_bytes(4, "big")
+    return header[:8] == b"\x89PNG\r\n\x1a\n" and header[16:] == size + b"\x08\x02"
 
 
 def _read_depth(path: Path, unit: float) -> np.ndarray:
@@ -366,35 +356,6 @@ def _read_depth(path: Path, unit: float) -> np.ndarray:
         channels = read_exr(path)
         return channels.get("Z", next(iter(channels.values())))
     return read_values(path).astype(np.float32) * unit
-
-
-def undistorter(camera: Camera, distortion: np.ndarray) -> tuple[Camera, Callable[[np.ndarray, bool], np.ndarray]]:
-    """A pinhole camera that sees no more than a distorted one, and a function that resamples images of the latter to it.
-
-    distortion: k1 k2 p1 p2 k3 (k4 k5 k6) of OpenCV's rational model. The function is called as undo(pixels, smooth) with pixels
-    [H,W] or [H,W,C]; it interpolates linearly where smooth is true, and takes the nearest pixel, as depth needs it, where it is
-    false. Without distortion it returns the pixels as they are. OpenCV's pixel centres are whole numbers, and ours are at +0.5;
-    the difference is taken into account here. Raises InputError where no valid pixel is left.
-    """
-    import cv2
-
-    if not distortion.any():
-        return camera, lambda pixels, smooth: pixels
-    shift = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    size = (camera.width, camera.height)
-    K, _ = cv2.getOptimalNewCameraMatrix(camera.K - shift, distortion, size, alpha=0.0)
-    if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise InputError("import: the distortion leaves no valid pixel; check k1 k2 p1 p2 and the focal length")
-
-    @functools.cache
-    def maps() -> tuple[np.ndarray, np.ndarray]:
-        return cv2.initUndistortRectifyMap(camera.K - shift, distortion, None, K, size, cv2.CV_32FC1)
-
-    def undo(pixels: np.ndarray, smooth: bool) -> np.ndarray:
-        method = cv2.INTER_LINEAR if smooth else cv2.INTER_NEAREST
-        return cv2.remap(np.ascontiguousarray(pixels), *maps(), method, borderMode=cv2.BORDER_REPLICATE)
-
-    return Camera(K + shift, camera.width, camera.height, camera.world_to_camera), undo
 
 
 def mesh_silhouette(path: Path) -> Callable[[Camera], np.ndarray]:

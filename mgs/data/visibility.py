@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from mgs.camera import Camera
 from mgs.data.dataset import Frame
@@ -38,6 +41,29 @@ def visible(
     steep = np.maximum(np.abs(cosine), GRAZING)
     slack = tolerance + z / camera.K[0, 0] * np.sqrt(np.maximum(1 - steep**2, 0)) / steep
     return seen & (shown > 0) & (np.abs(z - shown) < slack)
+
+
+def has_masks(frames: Sequence[Frame]) -> bool:
+    """Whether frames say which of their pixels are the object: all have a file of a mask, or of the rock alone."""
+    return all(frame.mask_path is not None or frame.rock_path is not None for frame in frames)
+
+
+def mask_share(points: np.ndarray, frames: Sequence[Frame], slack: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """In how many masks each point [N,3] falls, over the frames that have it in their image, and the number of these frames:
+    ([N] 0 to 1, [N]).
+
+    A point of the object falls into the mask of every frame, whether it is hidden or not, because a mask is the outline of the
+    whole object. slack: pixels by which masks are widened, for the errors of points and poses.
+    """
+    inside, count = np.zeros(len(points)), np.zeros(len(points), int)
+    for frame in frames:
+        pixels, z = frame.camera.project(points)
+        here = (z > 0) & (pixels >= 0).all(1) & (pixels < [frame.camera.width, frame.camera.height]).all(1)
+        column, row = pixels[here].astype(int).T
+        mask = binary_dilation(frame.mask(), iterations=slack) if slack else frame.mask()
+        inside[here] += mask[row, column]
+        count += here
+    return inside / np.maximum(count, 1), count
 
 
 def in_mask(points: np.ndarray, frame: Frame) -> np.ndarray:

@@ -1,6 +1,7 @@
 """The mesh prior (paper, section III-A): built from a dataset or from a given mesh, written to a folder and read back.
 
-Building it goes from the cloud of a dataset to ground plane, rock, Poisson mesh, and samples of the mesh's surface.
+Building it goes from the cloud of a dataset to ground plane, rock, Poisson mesh, and samples of the mesh's surface. Without
+depth, `mgs.prior.photographs` builds the mesh, of triangulated points or of masks.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from plyfile import PlyData, PlyParseError
@@ -16,10 +17,12 @@ from scipy.spatial import cKDTree
 
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh, write_points
+from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.data.visibility import in_mask, visible
 from mgs.errors import InputError
 from mgs.files import atomic_path, new_folder, read_json, write_json
-from mgs.prior.segmentation import SegmentedCloud, segment_dataset
+from mgs.prior.photographs import Surface, source_of, surface_of
+from mgs.prior.segmentation import Plane, SegmentedCloud, segment_dataset
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import poisson_mesh, sample_surface, spread_first
 from mgs.prior.truth import error_to_truth
@@ -37,7 +40,7 @@ class Prior:
     given mesh, the spacing.
     numbers: what prior.json holds.
     backed: the first so many points, which are spread evenly by themselves, have a Gaussian behind them too
-    (`mgs.prior.initial`).
+    (`mgs.prior.initial`). up: unit vector that points upwards in the world.
     """
 
     mesh: Mesh
@@ -47,51 +50,101 @@ class Prior:
     depth_tolerance: float
     numbers: dict[str, Any]
     backed: int = 0
+    up: Up = PLUS_Z
 
 
 def build_prior(
-    dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None] | None = None
-) -> tuple[Prior, SegmentedCloud]:
-    """Build the prior of a dataset from its depth images, or if it has none from COLMAP's points that `mgs import` kept.
+    dataset: Dataset,
+    settings: PriorSettings,
+    on_stage: Callable[[str], None] | None = None,
+    *,
+    source: str | None = None,
+    points: Path | None = None,
+    up: Up | Literal["auto"] | None = None,
+) -> tuple[Prior, SegmentedCloud | None]:
+    """Build the prior of a dataset from its depth images, from triangulated points, or from its masks.
 
-    on_stage(name) is called as each stage starts. Returns the prior, and the cloud that its mesh was built from.
-    Raises InputError as `segment_dataset` (no depth, no ground plane, no rock, two equal rocks), `poisson_mesh` (no closed
-    surface) and `sample_surface` (too few or too many samples), or if no frame sees the mesh.
+    on_stage(name) is called as each stage starts. source: "depth", "points" or "hull"; None: the first of these that the
+    dataset has. points: a PLY file of points, in place of the dataset's. up: which way is up; "auto": the normal of the
+    ground plane where one was found; None, or no such plane: as the dataset says.
+    Returns the prior, and the cloud that its mesh was built from, None for a hull.
+    Raises InputError as `source_of`, `surface_of` and `segment_dataset` (nothing to build it from, too few photographs, no
+    rock, two equal rocks), `poisson_mesh` (no closed surface) and `sample_surface` (too few or too many samples), or if no
+    frame sees the mesh; and NoSurface, which has the cloud, where points give no surface.
     """
     tell = on_stage or (lambda stage: None)
+    chosen = source_of(dataset, source, points)
+    surface = _of_depth(dataset, settings, tell) if chosen == "depth" else surface_of(dataset, chosen, settings, tell, points)
+    mesh, segmented, cell = surface.mesh, surface.segmented, surface.cell
+    tell("surface samples")
+    residual, noise = 0.0, 0.0
+    if segmented is not None:
+        residual = float(np.sqrt(np.mean(distances_to_mesh(segmented.rock_points, mesh.vertices, mesh.faces) ** 2)))
+        noise = segmented.cloud.noise
+    tolerance = max(3 * residual, cell, 2 * noise)
+    mesh = _seen_by(mesh, dataset.frames, tolerance)
+    pixel = cell if chosen == "depth" else _pixel(dataset.frames, mesh.vertices.mean(0))
+    samples, normals, spacing, backed = _samples(mesh, settings, pixel)
+    plane = None if segmented is None else segmented.plane
+    ground_up = None if plane is None else unit_up(plane.normal)
+    upward = (ground_up if up == "auto" else up) or dataset.up
+    numbers = {
+        "from": chosen,
+        "frames": len(dataset.frames),
+        **surface.numbers,
+        **({} if segmented is None or plane is None else _plane_numbers(plane, segmented.ground)),
+        "fit_rms": residual,
+        "depth_tolerance": tolerance,
+        **_sample_numbers(mesh, samples, spacing, backed),
+        **_world_numbers(upward, dataset.unit),
+        "settings": asdict(settings),
+    }
+    truth = dataset.root / "rock.glb"
+    if truth.is_file() and chosen == "depth" and segmented is not None:
+        tell("distance to the true rock")
+        numbers["truth"] = error_to_truth(samples, spacing, mesh, truth, dataset.frames, segmented, settings.seed)
+    return Prior(mesh, samples, normals, spacing, tolerance, numbers, backed, upward), segmented
+
+
+def _of_depth(dataset: Dataset, settings: PriorSettings, tell: Callable[[str], None]) -> Surface:
+    """The surface by the source "depth"."""
     segmented = segment_dataset(dataset, settings, tell)
-    cloud = segmented.cloud
+    cloud, plane = segmented.cloud, segmented.plane
+    assert plane is not None
     tell("Poisson mesh")
     cell = max(cloud.voxel, settings.noise)
-    mesh, depth = poisson_mesh(segmented.rock_points, segmented.rock_normals, cell, segmented.plane, settings.poisson_depth)
-    residual = float(np.sqrt(np.mean(distances_to_mesh(segmented.rock_points, mesh.vertices, mesh.faces) ** 2)))
-    tolerance = max(3 * residual, cloud.voxel, 2 * cloud.noise)
-    tell("surface samples")
-    mesh = _seen_by(mesh, dataset.frames, tolerance)
-    points, normals, spacing, backed = _samples(mesh, settings, cloud.voxel)
+    mesh, depth = poisson_mesh(segmented.rock_points, segmented.rock_normals, cell, plane, settings.poisson_depth)
     numbers = {
-        "frames": len(dataset.frames),
         "pixels": cloud.pixels,
         "points": len(cloud.points),
         "voxel": cloud.voxel,
         "depth_noise": cloud.noise,
-        "plane_inliers": int(segmented.ground.sum()),
-        "plane_sigma": segmented.plane.sigma,
-        "plane_tolerance": segmented.plane.tolerance,
         "eps": segmented.eps,
         "clusters": segmented.clusters,
         "cluster_size": len(segmented.rock_points),
         "poisson_depth": depth,
-        "fit_rms": residual,
-        "depth_tolerance": tolerance,
-        **_sample_numbers(mesh, points, spacing, backed),
-        "settings": asdict(settings),
     }
-    truth = dataset.root / "rock.glb"
-    if truth.is_file() and any(frame.depth_path for frame in dataset.frames):
-        tell("distance to the true rock")
-        numbers["truth"] = error_to_truth(points, spacing, mesh, truth, dataset.frames, segmented, settings.seed)
-    return Prior(mesh, points, normals, spacing, tolerance, numbers, backed), segmented
+    return Surface(mesh, cloud.voxel, segmented, numbers)
+
+
+def _plane_numbers(plane: Plane, ground: np.ndarray) -> dict[str, Any]:
+    """What prior.json holds of the ground plane; ground: [P] bool, the points on it."""
+    return {
+        "plane_inliers": int(ground.sum()),
+        "plane_sigma": plane.sigma,
+        "plane_tolerance": plane.tolerance,
+        "plane_normal": plane.normal.tolist(),
+    }
+
+
+def _world_numbers(up: Up, unit: str) -> dict[str, Any]:
+    """What prior.json holds of the world: which way is up, and what a length of 1 is."""
+    return {"up": list(up), "unit": unit}
+
+
+def _pixel(frames: Sequence[Frame], point: np.ndarray) -> float:
+    """The median size of a pixel of the frames at a point [3], in units of the world."""
+    return float(np.median([np.linalg.norm(f.camera.position - point) / f.camera.K[0, 0] for f in frames]))
 
 
 def _samples(mesh: Mesh, settings: PriorSettings, pixel: float) -> tuple[np.ndarray, np.ndarray, float, int]:
@@ -124,8 +177,8 @@ def _sample_numbers(mesh: Mesh, points: np.ndarray, spacing: float, backed: int)
     }
 
 
-def prior_from_mesh(path: str | Path, settings: PriorSettings) -> Prior:
-    """The prior of a given mesh in world coordinates, metres, all of whose surface is sampled.
+def prior_from_mesh(path: str | Path, settings: PriorSettings, up: Up = PLUS_Z, unit: str = "m") -> Prior:
+    """The prior of a given mesh in world coordinates, all of whose surface is sampled. up, unit: of the dataset it is for.
 
     Raises InputError as `read_mesh` and `sample_surface`, if neither the number of samples nor their spacing is given, and for
     the settings that only a mesh built from a cloud has: noise, holes and poisson_depth.
@@ -144,12 +197,14 @@ def prior_from_mesh(path: str | Path, settings: PriorSettings) -> Prior:
     points, normals, spacing, backed = _samples(mesh, settings, 0.0)
     done = {key: value for key, value in asdict(settings).items() if key in ("gaussians", "spacing", "seed", "backing")}
     numbers = {
+        "from": "mesh",
         "mesh": str(path),
         "depth_tolerance": spacing,
         **_sample_numbers(mesh, points, spacing, backed),
+        **_world_numbers(up, unit),
         "settings": done,
     }
-    return Prior(mesh, points, normals, spacing, spacing, numbers, backed)
+    return Prior(mesh, points, normals, spacing, spacing, numbers, backed, up)
 
 
 def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:
@@ -157,14 +212,17 @@ def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:
 
     What no frame sees is buried in the ground, or closes a gap that frames look through, or cannot be seen from any candidate
     view. Gaussians there would be of no use, or would show where they should not. tolerance: depth_tolerance of the prior,
-    metres. If no frame has depth, the mesh is returned as it is. Raises InputError if no frame sees any of the mesh.
+    metres. If no frame has depth, the depth of the mesh itself says what hides what. Raises InputError if no frame sees any of
+    the mesh.
     """
-    frames = [frame for frame in frames if frame.depth_path is not None]
-    if not frames:
-        return mesh
+    from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
+
+    with_depth = [frame for frame in frames if frame.depth_path is not None]
+    of_mesh = None if with_depth else mesh_depth(mesh)
     seen, normals = np.zeros(len(mesh.vertices), bool), mesh.vertex_normals
-    for frame in frames:
-        seen |= visible(mesh.vertices, normals, frame.camera, frame.depth(), tolerance) & in_mask(mesh.vertices, frame)
+    for frame in with_depth or frames:
+        depth = of_mesh(frame.camera) if of_mesh else frame.depth()
+        seen |= visible(mesh.vertices, normals, frame.camera, depth, tolerance) & in_mask(mesh.vertices, frame)
     narrowed = mesh.seen & seen[mesh.faces].any(1)
     if not narrowed.any():
         raise InputError("prior: no frame sees the mesh in its rock mask; check masks and poses")
@@ -204,6 +262,7 @@ def load_prior(folder: str | Path) -> Prior:
         columns = np.stack([np.asarray(data[name], np.float64) for name in ("x", "y", "z", "nx", "ny", "nz")], 1)
         spacing, tolerance = float(numbers["spacing"]), float(numbers["depth_tolerance"])
         backed = int(numbers.get("backed", 0))  # older priors have no backing
+        up = unit_up(numbers["up"]) if "up" in numbers else PLUS_Z
     except (PlyParseError, KeyError, ValueError, TypeError, UnicodeDecodeError) as error:
         raise InputError(f"{folder}: not a readable prior ({error}); make it again with `mgs prior`") from None
     if not np.isfinite(columns).all() or len(columns) < 2:
@@ -212,4 +271,4 @@ def load_prior(folder: str | Path) -> Prior:
         raise InputError(f"{folder / 'prior.json'}: spacing and depth_tolerance must be positive metres; make the prior again")
     if not 0 <= backed <= len(columns):
         raise InputError(f"{folder / 'prior.json'}: backed must be a number of the points; make the prior again")
-    return Prior(read_mesh(folder / "mesh.ply"), columns[:, :3], columns[:, 3:], spacing, tolerance, numbers, backed)
+    return Prior(read_mesh(folder / "mesh.ply"), columns[:, :3], columns[:, 3:], spacing, tolerance, numbers, backed, up)

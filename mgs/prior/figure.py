@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from mgs.data.meshes import Mesh
 from mgs.plotting import STYLE, new_figure, save_figure
@@ -29,8 +30,8 @@ def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None)
     """
     import matplotlib
 
-    up = np.array([0.0, 0.0, 1.0]) if segmented is None else segmented.plane.normal
-    frame = _oblique(up)
+    plane = None if segmented is None else segmented.plane
+    frame = _oblique(np.array(prior.up) if plane is None else plane.normal)
     body = prior.mesh.vertices
     centre = (body.min(0) + body.max(0)) / 2
     reach = 0.5 * float(np.linalg.norm(np.ptp(body, axis=0)))
@@ -39,31 +40,56 @@ def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None)
     unseen = "" if prior.mesh.seen.all() else "\nblue: seen by no frame, not sampled"
     shade = np.clip(0.25 + 0.75 * (prior.normals @ frame.T) @ LIGHT, 0.05, 1)[:, None] * [0.95, 0.85, 0.7]
     towards = (prior.normals @ frame.T)[:, 2] > 0
-    samples = f"samples: N = {len(prior.points):,} = area / spacing²\nspacing {1e3 * prior.spacing:.2f} mm"
+    metres = prior.numbers.get("unit", "m") == "m"
+    spacing = f"{1e3 * prior.spacing:.2f} mm" if metres else f"{prior.spacing:.3g} units"
+    samples = f"samples: N = {len(prior.points):,} = area / spacing²\nspacing {spacing}"
     with matplotlib.rc_context(STYLE | {"axes.spines.top": True, "axes.spines.right": True}):
         figure = new_figure(17 if segmented is not None else 7, 4.2, dpi=100)
         axes = figure.subplots(1, 5 if segmented is not None else 2)
         if segmented is not None:
-            _cloud_panels(axes[:3], segmented, frame, centre, reach)
+            _cloud_panels(axes[:3], segmented, np.array(prior.up), frame, centre, reach)
         _shaded_mesh(axes[-2], prior.mesh, frame, centre, reach)
-        axes[-2].set_title(f"mesh, {prior.numbers['mesh_area']:.2f} m²{error}{unseen}")
+        axes[-2].set_title(f"mesh, {prior.numbers['mesh_area']:.2f} {'m' if metres else 'unit'}²{error}{unseen}")
         _dots(axes[-1], ((prior.points - centre) @ frame.T)[towards], shade[towards], None, reach, None)
         axes[-1].set_title(samples)
         save_figure(figure, path)
 
 
-def _cloud_panels(axes, segmented: SegmentedCloud, frame: np.ndarray, centre: np.ndarray, reach: float) -> None:
-    """Three panels: the cloud, its points on the ground plane, and the rock's points.
+def draw_refused(path: str | Path, points: np.ndarray, kept: np.ndarray, up: np.ndarray) -> None:
+    """Write the picture of a cloud [P,3] that gives no surface, from the side and from above, as a PNG; blue: the points `kept`
+    [P] that were taken for the object. up: [3] unit. Raises InputError if it cannot be written."""
+    import matplotlib
 
-    frame: as `_oblique`; centre: [3] of the picture in the world; reach: half the width of the rock in the picture; metres.
+    middle = np.median(points[kept] if kept.any() else points, axis=0)
+    reach = 1.5 * float(np.quantile(np.linalg.norm((points[kept] if kept.any() else points) - middle, axis=1), 0.95))
+    tint = np.where(kept[:, None], [0.15, 0.35, 0.75], [0.85, 0.76, 0.6])
+    side = _oblique(up)[0]
+    above = np.stack([side, np.cross(up, side), up])
+    with matplotlib.rc_context(STYLE | {"axes.spines.top": True, "axes.spines.right": True}):
+        figure = new_figure(7, 4.2, dpi=100)
+        for axis, frame, name in zip(
+            figure.subplots(1, 2), (_oblique(up), above), ("from the side", "from above"), strict=True
+        ):
+            _dots(axis, (points - middle) @ frame.T, tint, None, 2 * reach, 1.5)
+            axis.set_title(f"{name}: {len(points):,} points,\n{int(kept.sum()):,} taken for the object (blue)")
+        save_figure(figure, path)
+
+
+def _cloud_panels(axes, segmented: SegmentedCloud, up: np.ndarray, frame: np.ndarray, centre: np.ndarray, reach: float) -> None:
+    """Three panels: the cloud, its points on the ground plane (or, without one, all that are not the rock's), and the rock's.
+
+    up: [3] unit, for the heights where there is no plane. frame: as `_oblique`; centre: [3] of the picture in the world; reach:
+    half the width of the rock in the picture; metres.
     """
     cloud, rock, ground = segmented.cloud.points, segmented.rock_points, segmented.ground
-    height = segmented.plane.height(cloud)
+    height = cloud @ up - np.min(rock @ up) if segmented.plane is None else segmented.plane.height(cloud)
+    other = ground if segmented.plane is not None else cKDTree(rock).query(cloud)[0] > 0
+    named = f"ground plane: {int(ground.sum()):,} inliers" if segmented.plane is not None else "not the object's"
     near = np.linalg.norm(cloud - centre, axis=1) < 4 * reach
     panels = [
         (f"cloud: {len(cloud):,} points\ncoloured by height", cloud[near], height[near], "viridis", 2.2),
-        (f"ground plane: {int(ground.sum()):,} inliers (tan)\nthe rest in blue", cloud[near], (~ground[near]) * 1.0, None, 2.2),
-        (f"rock cluster: {len(rock):,} points", rock, segmented.plane.height(rock), "viridis", 1.0),
+        (f"{named} (tan)\nthe rest in blue", cloud[near], (~other[near]) * 1.0, None, 2.2),
+        (f"rock cluster: {len(rock):,} points", rock, rock @ up, "viridis", 1.0),
     ]
     for axis, (title, points, value, colours, zoom) in zip(axes, panels, strict=True):
         tint = np.where(value[:, None] > 0.5, [0.15, 0.35, 0.75], [0.85, 0.76, 0.6]) if colours is None else value

@@ -9,11 +9,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mgs.data.dataset import Dataset, Frame
+from mgs.data.visibility import has_masks, mask_share
 from mgs.errors import InputError
 from mgs.prior.settings import PriorSettings
 from mgs.seeds import derive_seed, generator
 from mgs.survey.depth_sensor import SIGMA_FROM_MAD
-from mgs.survey.fusion import FILTERED_SHARE, Cloud, focus, fuse_frames, sparse_cloud, voxel_means
+from mgs.survey.fusion import FILTERED_SHARE, Cloud, focus, fuse_frames, voxel_means
 
 PLANE_TOLERANCE = 0.02
 """Largest distance of an inlier of RANSAC from the plane, as a share of the cameras' distance: larger than the grain of a
@@ -64,6 +65,14 @@ class Plane:
     def height(self, points: np.ndarray) -> np.ndarray:
         """Distance of points [N,3] from the plane [N], metres; negative below it."""
         return points @ self.normal - self.offset
+
+
+class NoSurface(InputError):
+    """No surface can be built of a cloud. points: [P,3] of it; kept: [P] bool, those that were taken for the object."""
+
+    def __init__(self, message: str, points: np.ndarray, kept: np.ndarray) -> None:
+        super().__init__(message)
+        self.points, self.kept = points, kept
 
 
 class _PlaneModel:
@@ -118,12 +127,18 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
     return Plane(sign * model.normal, sign * model.offset, sigma, tolerance)
 
 
-def rock_cluster(points: np.ndarray, voxel: float, target: np.ndarray, name: str = "cloud") -> tuple[np.ndarray, float, int]:
+def rock_cluster(
+    points: np.ndarray,
+    voxel: float,
+    target: np.ndarray,
+    name: str = "cloud",
+    weight: Callable[[np.ndarray], np.ndarray] = lambda points: np.ones(len(points)),
+) -> tuple[np.ndarray, float, int]:
     """Which of the points above the ground [N,3] belong to the rock, by DBSCAN (Ester et al. 1996, scikit-learn).
 
     voxel: distance between neighbouring points; target: [3] what the cameras look at; all in metres. name: what messages call
-    the cloud. The cluster with the most points is the rock; if others are nearly as large (EQUAL_SIZE), the one of these that
-    is nearest to the target.
+    the cloud. weight: a function of points [N,3] that gives what each counts [N]. The cluster that counts most is the rock; if
+    others are nearly as large (EQUAL_SIZE), the one of these that is nearest to the target.
     Returns (inside [N] bool, DBSCAN's eps in metres, number of clusters).
     Raises InputError if there is no cluster, or if two clusters are equally large and about equally near.
     """
@@ -140,14 +155,15 @@ def rock_cluster(points: np.ndarray, voxel: float, target: np.ndarray, name: str
     count = int(labels.max()) + 1
     if count == 0:
         raise InputError(f"{name}: no rock in the cloud (only scattered points above the ground plane); aim the cameras at one")
-    sizes = np.bincount(labels[labels >= 0])
+    sizes = np.bincount(labels[labels >= 0], weight(thin)[labels >= 0])
     large = np.flatnonzero(sizes >= EQUAL_SIZE * sizes.max())
     away = np.array([np.linalg.norm(thin[labels == k].mean(0) - target) for k in large])
     order = np.argsort(away, kind="stable")
     if len(large) > 1 and away[order[1]] < NEARER * away[order[0]]:
+        first, second = ((labels == large[k]).sum() for k in order[:2])
         raise InputError(
-            f"{name}: clusters of {sizes[large[order[0]]]} and {sizes[large[order[1]]]} points are equally large and equally "
-            "near to what the cameras look at; aim them at one rock"
+            f"{name}: clusters of {first} and {second} points are equally large and equally near to what the cameras look at; "
+            "aim them at one rock"
         )
     rock = int(large[order[0]])
     distance, nearest = cKDTree(thin).query(points, distance_upper_bound=eps)
@@ -188,14 +204,15 @@ def estimate_normals(points: np.ndarray, views: np.ndarray, roughness: float = 0
 class SegmentedCloud:
     """A cloud of P points, divided into ground, rock and the rest.
 
-    cloud: the fused cloud; plane: its ground plane; ground: [P] bool, which points lie on the plane.
+    cloud: the fused cloud; plane: its ground plane, None where it was not needed or there is none; ground: [P] bool, which
+    points lie on the plane.
     rock_points, rock_normals: [M,3] the rock's points, metres, and their unit normals, as the mesh is built from them:
     degraded, if that was asked for, and without the ground at the rock's foot.
     eps (metres), clusters: DBSCAN's parameter, and how many clusters it found.
     """
 
     cloud: Cloud
-    plane: Plane
+    plane: Plane | None
     ground: np.ndarray
     rock_points: np.ndarray
     rock_normals: np.ndarray
@@ -204,24 +221,23 @@ class SegmentedCloud:
 
 
 def segment_dataset(dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None]) -> SegmentedCloud:
-    """Fuse the cloud of a dataset and find the ground and the rock in it.
+    """Fuse the depth images of a dataset into a cloud, and find the ground and the rock in it.
 
-    The cloud is that of the depth images; if no frame has one, the points of COLMAP that `mgs import` kept (sparse.ply).
-    on_stage(name) is called as each stage starts. Raises InputError if the dataset has neither, a file cannot be read, or as
-    `fuse_frames`, `ground_plane` and `rock_cluster`.
+    on_stage(name) is called as each stage starts. Raises InputError as `fuse_frames`, `ground_plane` and `rock_cluster`.
     """
     on_stage("cloud")
-    sparse = dataset.root / "sparse.ply"
-    if sparse.is_file() and not any(frame.depth_path for frame in dataset.frames):
-        cloud = sparse_cloud(sparse)
-    else:
-        cloud = fuse_frames(dataset.frames)
+    cloud = fuse_frames(dataset.frames)
     on_stage("ground plane")
     plane = ground_plane(cloud, dataset.frames, derive_seed(settings.seed, "prior/plane"))
     ground = np.abs(plane.height(cloud.points)) <= plane.tolerance
     above = plane.height(cloud.points) > plane.tolerance
     on_stage("rock cluster")
-    inside, eps, clusters = rock_cluster(cloud.points[above], cloud.voxel, focus(dataset.frames).point, str(dataset.root))
+    target = focus(dataset.frames).point
+
+    def weight(points: np.ndarray) -> np.ndarray:  # a low rise of the ground may have more points than a rock
+        return plane.height(points) * (mask_share(points, dataset.frames)[0] if has_masks(dataset.frames) else 1)
+
+    inside, eps, clusters = rock_cluster(cloud.points[above], cloud.voxel, target, str(dataset.root), weight)
     points, views = cloud.points[above][inside], cloud.views[above][inside]
     points, kept = degrade(points, settings.noise, settings.holes, generator(settings.seed, "prior/degrade"))
     points, views = points[kept], views[kept]

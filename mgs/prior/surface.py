@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from decimal import Decimal
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -42,6 +44,54 @@ def poisson_mesh(points: np.ndarray, normals: np.ndarray, voxel: float, plane: P
     Returns (mesh, depth of the octree). Raises InputError if the depth is not within 3 to 12, or there is no closed surface
     above the ground. Sources: Kazhdan and Hoppe 2013, by pymeshlab; the cut by manifold3d.
     """
+    solid, depth = _closed_solid(points, normals, voxel, depth, plane)
+    solid = max(solid.trim_by_plane(plane.normal, plane.offset).decompose(), key=lambda part: part.volume(), default=None)
+    if solid is None or solid.is_empty():
+        raise InputError(f"prior: Poisson at depth {depth} gives nothing above the ground; give more frames, or --from hull")
+    mesh = _from_solid(solid)
+    base = (np.abs(plane.height(mesh.vertices)) < 1e-6 * np.ptp(mesh.vertices, axis=0).max())[mesh.faces].all(1)
+    return replace(mesh, seen=~base), depth
+
+
+def closed_poisson(points: np.ndarray, normals: np.ndarray, voxel: float, depth: int | None) -> tuple[Mesh, int]:
+    """The largest piece of the watertight screened Poisson surface of points all around an object.
+
+    Arguments, result and errors as `poisson_mesh`, without the plane and the cut."""
+    solid, depth = _closed_solid(points, normals, voxel, depth, None)
+    return _from_solid(max(solid.decompose(), key=lambda part: part.volume())), depth
+
+
+def intersection(a: Mesh, b: Mesh) -> Mesh:
+    """The largest piece of what two watertight meshes have in common (manifold3d). Raises InputError if that is nothing."""
+    pieces = (_to_solid(a.vertices, a.faces) ^ _to_solid(b.vertices, b.faces)).decompose()
+    if not pieces:
+        raise InputError("prior: the points and the hull of the masks have nothing in common; poses, points or masks are wrong")
+    return _from_solid(max(pieces, key=lambda part: part.volume()))
+
+
+def _to_solid(vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """A solid of manifold3d; its status says whether the mesh is closed."""
+    import manifold3d
+
+    # It takes only arrays that it could write to, so they are copied.
+    return manifold3d.Manifold(manifold3d.Mesh64(np.array(vertices, np.float64), np.array(faces, np.uint64)))
+
+
+def _from_solid(solid: Any) -> Mesh:
+    cut = solid.to_mesh64()
+    vertices, faces = np.asarray(cut.vert_properties)[:, :3], np.asarray(cut.tri_verts).astype(np.int64)
+    return Mesh(vertices, faces, np.ones(len(faces), bool))
+
+
+def _closed_solid(
+    points: np.ndarray, normals: np.ndarray, voxel: float, depth: int | None, plane: Plane | None
+) -> tuple[Any, int]:
+    """The Poisson surface as a solid of manifold3d, and the depth of the octree.
+
+    Under an open cloud the surface may leave the cube. Then larger cubes are tried, at last with the points mirrored in the
+    ground plane too, which closes any surface that stands on it; the cells keep their size. Raises InputError if the depth is
+    not within 3 to 12, or none of that gives a closed surface.
+    """
     import manifold3d
     import pymeshlab
 
@@ -50,24 +100,28 @@ def poisson_mesh(points: np.ndarray, normals: np.ndarray, voxel: float, plane: P
     if depth is None:
         cells = POISSON_SCALE * float(np.ptp(points, axis=0).max()) / (POISSON_CELL * voxel)
         depth = int(np.clip(np.ceil(np.log2(cells)), *POISSON_DEPTHS))
-    meshes = pymeshlab.MeshSet()
-    meshes.add_mesh(pymeshlab.Mesh(points, v_normals_matrix=normals))
-    meshes.generate_surface_reconstruction_screened_poisson(depth=depth, scale=POISSON_SCALE, threads=1)
-    surface = meshes.current_mesh()
-    vertices, faces = surface.vertex_matrix(), surface.face_matrix()
-    failure = InputError(f"prior: Poisson at depth {depth} gives no closed surface; try another --poisson-depth or more frames")
-    if len(faces) == 0:
-        raise failure
-    solid = manifold3d.Manifold(manifold3d.Mesh64(vertices, faces.astype(np.uint64)))
-    if solid.status() != manifold3d.Error.NoError:
-        raise failure
-    solid = max(solid.trim_by_plane(plane.normal, plane.offset).decompose(), key=lambda part: part.volume(), default=None)
-    if solid is None or solid.is_empty():
-        raise failure
-    cut = solid.to_mesh64()
-    vertices, faces = np.asarray(cut.vert_properties)[:, :3], np.asarray(cut.tri_verts).astype(np.int64)
-    base = (np.abs(plane.height(vertices)) < 1e-6 * np.ptp(vertices, axis=0).max())[faces].all(1)
-    return Mesh(vertices, faces, ~base), depth
+    both = points, normals
+    if plane is not None:
+        image = (
+            points - 2 * plane.height(points)[:, None] * plane.normal,
+            normals - 2 * (normals @ plane.normal)[:, None] * plane.normal,
+        )
+        both = np.concatenate([points, image[0]]), np.concatenate([normals, image[1]])
+    for scale, finer, (p, n) in [(1, 0, (points, normals)), (2, 1, (points, normals)), (1, 0, both), (2, 1, both)]:
+        meshes = pymeshlab.MeshSet()
+        meshes.add_mesh(pymeshlab.Mesh(p, v_normals_matrix=n))
+        meshes.generate_surface_reconstruction_screened_poisson(
+            depth=min(depth + finer, 12), scale=scale * POISSON_SCALE, threads=1
+        )
+        surface = meshes.current_mesh()
+        vertices, faces = surface.vertex_matrix(), surface.face_matrix()
+        if len(faces):
+            solid = _to_solid(vertices, faces)
+            if solid.status() == manifold3d.Error.NoError and not solid.is_empty():
+                return solid, depth
+    raise InputError(
+        f"prior: Poisson at depth {depth} gives no closed surface; try another --poisson-depth, more frames, or --from hull"
+    )
 
 
 def sample_surface(

@@ -47,7 +47,7 @@ def error_to_truth(
     known = read_rock(truth)
     true = trimesh.Trimesh(known.vertices, known.faces, process=False)
     surface, face = trimesh.sample.sample_surface(true, TRUTH_SAMPLES, seed=derive_seed(seed, "prior/truth"))
-    exposed = segmented.plane.height(np.asarray(surface)) > 0
+    exposed = np.ones(len(surface), bool) if segmented.plane is None else segmented.plane.height(np.asarray(surface)) > 0
     surface, normals = np.asarray(surface)[exposed], true.face_normals[face[exposed]]
     tolerance = max(spacing / 2, 2 * segmented.cloud.noise)
     seen = np.zeros(len(surface), bool)

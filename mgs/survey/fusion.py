@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyParseError
 from scipy.ndimage import maximum_filter, minimum_filter
-from scipy.spatial import cKDTree
 
 from mgs.data.dataset import Frame
 from mgs.errors import InputError
@@ -118,24 +115,6 @@ def fuse_frames(frames: Sequence[Frame]) -> Cloud:
     view = _group_means(np.concatenate(views), index, len(p))
     norm = np.linalg.norm(view, axis=1, keepdims=True)
     return Cloud(p, view / np.where(norm > 0, norm, 1.0), voxel, noise, len(index))
-
-
-def sparse_cloud(path: Path) -> Cloud:
-    """The cloud in a file sparse.ply, which `mgs import` makes of COLMAP's triangulated points.
-
-    Its properties are x y z in the world, and nx ny nz, the direction to the cameras that saw the point. Raises InputError if
-    the file is damaged, holds NaN or has fewer than two points.
-    """
-    try:
-        data = PlyData.read(str(path))["vertex"].data
-        columns = np.stack([np.asarray(data[name], np.float64) for name in ("x", "y", "z", "nx", "ny", "nz")], 1)
-    except (PlyParseError, KeyError, ValueError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a readable cloud ({error}); import the data again") from None
-    if len(columns) < 2 or not np.isfinite(columns).all():
-        raise InputError(f"{path}: has NaN values, or fewer than two points; import the data again")
-    # The nearest neighbour of a point in a random cloud is half as far away as in a regular grid of the same density.
-    spacing = 2 * float(np.median(cKDTree(columns[:, :3]).query(columns[:, :3], 2)[0][:, 1]))
-    return Cloud(columns[:, :3], columns[:, 3:], spacing, 0.0, len(columns))
 
 
 def _group_means(values: np.ndarray, index: np.ndarray, groups: int) -> np.ndarray:

@@ -1,0 +1,203 @@
+"""The visual hull: the largest body that fits into the masks of all frames (Laurentini 1994), by space carving on a grid.
+
+A point of space has a value for each frame: how far its projection lies inside the mask's outline, in pixels, times the size
+of a pixel at the point. The least of these values is positive inside the hull, negative outside, and about the distance to
+the hull's surface near it; marching cubes find the surface between the nodes of the grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, gaussian_filter, label
+
+from mgs.camera import Camera
+from mgs.data.dataset import Frame
+from mgs.data.meshes import Mesh
+from mgs.errors import InputError
+
+COARSE = 48
+"""Cells along an edge of the first grid. It is refined near the surface only, REFINEMENTS times, by two each time."""
+
+REFINEMENTS = 2
+
+NEAR_SURFACE = 3.0
+"""Nodes of a refined grid whose interpolated value is less than this many of its cells are computed anew. The others are too
+far from the surface to change it."""
+
+ROW = 4096
+"""Points are handed to OpenCV in rows of this length."""
+
+MARGIN = 1.3
+"""Half edge of the grid over the largest radius of the object that a mask shows."""
+
+LEAST_VIEWS = 3
+"""A point that fewer frames have in their image is outside: nothing says that it belongs to the object."""
+
+AGREEMENT = 0.8
+"""Least median share of a mask that the hull must fill. Where masks and poses fit, it is above 0.95."""
+
+
+@dataclass(frozen=True)
+class Hull:
+    """A visual hull. mesh: its surface, closed, in the world; cell: edge of the finest grid cells, in units of the world;
+    agreement: for each frame the share of its mask that the hull fills."""
+
+    mesh: Mesh
+    cell: float
+    agreement: np.ndarray
+
+
+def visual_hull(frames: Sequence[Frame], tell: Callable[[str], None] = lambda stage: None) -> Hull:
+    """The visual hull of the masks of frames, smoothed by no more than half a cell.
+
+    Raises InputError if all masks are empty or full, if the masks share no point of space, or if the hull fills too little of
+    the masks because poses and masks do not fit; the message names frames.
+    """
+    from skimage.measure import marching_cubes
+
+    tell("visual hull")
+    views = [_View(frame.camera, _signed_distance(frame.mask())) for frame in frames]
+    lo, edge = _bounds(frames)
+    cells = COARSE
+    field, carved = _first_grid(views, lo, edge)
+    if field.max() <= 0:
+        kept = np.unravel_index(np.argmin(carved), carved.shape)
+        point = (lo + edge / cells * np.array(kept))[None]
+        against = [frame.name for frame, view in zip(frames, views, strict=True) if view(point)[0] <= 0]
+        raise InputError(
+            f"prior: the masks share no point of space (at best {len(against)} of {len(frames)} frames, such as {against[0]}, "
+            "are against it); poses and masks do not fit, or the object moved; correct or remove frames"
+        )
+    for _ in range(REFINEMENTS):
+        field, cells = _refined(field), 2 * cells
+        near = np.argwhere(np.abs(field) < NEAR_SURFACE * edge / cells)
+        field[tuple(near.T)] = _inside(views, lo + edge / cells * near, NEAR_SURFACE * edge / cells)
+    cell = edge / cells
+    smooth = np.clip(gaussian_filter(field, 1.0), field - cell / 2, field + cell / 2)
+    solid = np.pad(_largest(smooth), 1, constant_values=-cell)
+    vertices, faces, _, _ = marching_cubes(solid, 0.0, gradient_direction="ascent")
+    vertices = lo + cell * (vertices.astype(np.float64) - 1)
+    mesh = Mesh(vertices, faces.astype(np.int64), np.ones(len(faces), bool))
+    return Hull(mesh, cell, _checked_agreement(frames, mesh))
+
+
+@dataclass(frozen=True)
+class _View:
+    """A frame to carve with. distance: [H,W] pixels from the mask's outline, positive inside."""
+
+    camera: Camera
+    distance: np.ndarray
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """How far inside the silhouette points [N,3] are, in units of the world; +inf where they are not in the image."""
+        import cv2
+
+        pixels, z = self.camera.project(points)
+        inside = (z > 0) & (pixels > 0).all(1) & (pixels < [self.camera.width, self.camera.height]).all(1)
+        padded = np.zeros((-(-len(points) // ROW) * ROW, 2), np.float32)
+        padded[: len(points)] = np.where(inside[:, None], pixels - 0.5, 0)
+        at = padded.reshape(-1, ROW, 2)  # OpenCV takes images of up to 32,767 rows
+        found = [
+            cv2.remap(self.distance, part, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+            for part in np.array_split(at, -(-len(at) // ROW))
+        ]
+        value = np.concatenate(found).ravel()[: len(points)] * (z / self.camera.K[0, 0])
+        return np.where(inside, value, np.inf)
+
+
+def _signed_distance(mask: np.ndarray) -> np.ndarray:
+    """Distance [H,W] of pixel centres from the outline of a mask, pixels, positive inside, float32."""
+    inside = distance_transform_edt(mask) - 0.5 if not mask.all() else np.full(mask.shape, float(max(mask.shape)))
+    outside = distance_transform_edt(~mask) - 0.5 if mask.any() else np.full(mask.shape, float(max(mask.shape)))
+    return np.where(mask, inside, -outside).astype(np.float32)
+
+
+def _bounds(frames: Sequence[Frame]) -> tuple[np.ndarray, float]:
+    """(lowest corner [3], edge) of the cube to carve in: around the point nearest to the rays through the masks' centres.
+
+    Frames with an empty mask, and with one that fills the image, say nothing of it. Raises InputError if all are such.
+    """
+    A, b, cones = np.zeros((3, 3)), np.zeros(3), []
+    for frame in frames:
+        mask = frame.mask()
+        if not mask.any() or mask.all():
+            continue
+        rows, columns = np.nonzero(mask)
+        pixels = np.stack([columns, rows], 1) + 0.5
+        middle, K = (pixels.min(0) + pixels.max(0)) / 2, frame.camera.K
+        ray = frame.camera.world_to_camera[:3, :3].T @ np.linalg.solve(K, [*middle, 1])
+        ray /= np.linalg.norm(ray)
+        across = np.eye(3) - np.outer(ray, ray)
+        A, b = A + across, b + across @ frame.camera.position
+        cones.append((frame.camera, np.linalg.norm(pixels - middle, axis=1).max() / K[0, 0]))
+    if not cones:
+        raise InputError("prior: every mask is empty or fills its image; give masks that are white on the object only")
+    centre = np.linalg.lstsq(A, b, rcond=1e-9)[0]
+    half = MARGIN * max(np.linalg.norm(camera.position - centre) * tangent for camera, tangent in cones)
+    return centre - half, float(2 * half)
+
+
+def _inside(views: Sequence[_View], points: np.ndarray, reach: float) -> np.ndarray:
+    """The least value of points [N,3] over the views, cut to +-reach, float32 [N]; -reach where fewer than LEAST_VIEWS have
+    the point in their image."""
+    least, count = np.full(len(points), np.inf), np.zeros(len(points), int)
+    left = np.arange(len(points))
+    for view in views:
+        value = view(points[left])
+        count[left] += np.isfinite(value)
+        least[left] = np.minimum(least[left], value)
+        left = left[least[left] > -reach]  # what is carved away deeper than this is far from the surface
+    carved = least <= -reach
+    return np.where(carved | (count < min(LEAST_VIEWS, len(views))), -reach, np.minimum(least, reach)).astype(np.float32)
+
+
+def _first_grid(views: Sequence[_View], lo: np.ndarray, edge: float) -> tuple[np.ndarray, np.ndarray]:
+    """The values of the nodes of the coarse grid, and how many views carve each away, [n,n,n] with n = COARSE + 1."""
+    nodes = np.stack(np.meshgrid(*[np.arange(COARSE + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    points = lo + edge / COARSE * nodes
+    carved = np.zeros(len(points), int)
+    for view in views:
+        carved += view(points) <= 0
+    shape = (COARSE + 1,) * 3
+    return _inside(views, points, 2 * NEAR_SURFACE * edge / COARSE).reshape(shape), carved.reshape(shape)
+
+
+def _refined(field: np.ndarray) -> np.ndarray:
+    """The field on a grid with twice as many cells, interpolated linearly."""
+    fine = field
+    for axis in range(3):
+        front = np.moveaxis(fine, axis, 0)
+        between = np.empty((2 * len(front) - 1, *front.shape[1:]), np.float32)
+        between[::2], between[1::2] = front, (front[1:] + front[:-1]) / 2
+        fine = np.moveaxis(between, 0, axis)
+    return np.ascontiguousarray(fine)
+
+
+def _largest(field: np.ndarray) -> np.ndarray:
+    """The field, negative outside of the largest connected piece in which it is positive."""
+    pieces, _ = label(field > 0)
+    sizes = np.bincount(pieces.ravel())
+    sizes[0] = 0
+    return np.where((pieces == sizes.argmax()) | (field <= 0), field, -np.abs(field))
+
+
+def _checked_agreement(frames: Sequence[Frame], mesh: Mesh) -> np.ndarray:
+    """For each frame the share of its mask that the mesh fills. Raises InputError where the median is below AGREEMENT."""
+    from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
+
+    depth = mesh_depth(mesh)
+    filled = []
+    for frame in frames:
+        mask = frame.mask()
+        filled.append((depth(frame.camera)[mask] > 0).mean() if mask.any() else np.nan)
+    agreement = np.array(filled)
+    if not np.nanmedian(agreement) >= AGREEMENT:
+        worst = frames[int(np.nanargmin(agreement))].name
+        raise InputError(
+            f"prior: the masks carve away most of the object (the hull fills {np.nanmedian(agreement):.0%} of a mask, "
+            f"{np.nanmin(agreement):.0%} in frame {worst}); poses and masks do not fit, correct or remove frames"
+        )
+    return agreement
