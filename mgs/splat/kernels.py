@@ -147,6 +147,17 @@ def jvp(lists: BlockLists, packed: Any, packed_tangents: Any) -> tuple[Any, Any]
     return _store_pixels(lists, [[without_denormals(x) for x in (*rgb, alpha, z)] for _, alpha, *rgb, z in pixels])
 
 
+def _begin_pixel() -> None:
+    """Tell Dr.Jit that the operations of another pixel begin (that a new scope does). It changes no result.
+
+    Within one scope Dr.Jit writes operations in the order in which the loop's results need them: first the alphas and
+    transmittances of all 32 pixels, and at the end what is summed from them. What lies between leaves the registers for the
+    stack. With a scope for each pixel, the Fisher kernel finishes one before the next, and takes a tenth less CPU time for the
+    exact diagonal (measured with AVX-512). The forward and adjoint kernels gained nothing from it.
+    """
+    dr.detail.new_scope(dr.backend_v(mi.Float))
+
+
 def _slopes(colours: list[Any], behind: list[Any], alpha: Any, w: Any, after: Any, free: Any, last: Any = None) -> list[Any]:
     """s_c = D_c alpha, the derivative of each channel of a pixel by ln alpha of one splat, as Float.
 
@@ -163,9 +174,9 @@ def _slopes(colours: list[Any], behind: list[Any], alpha: Any, w: Any, after: An
         odds = dr.select(free, mi.Float(w) / mi.Float(after), 0)
         slopes = [odds * mi.Float(dr.fma(c, after, -s)) for c, s in zip(colours, behind, strict=True)]
     else:
-        held, odds = dr.select(free, w, 0), dr.select(free, alpha / (1 - alpha), 0)
-        slopes = [dr.fma(c, held, -s * odds) for c, s in zip(colours, behind, strict=True)]
-    return slopes if last is None else [*slopes, odds * last]
+        odds = alpha / (1 - alpha)
+        slopes = [dr.select(free, dr.fma(c, w, -s * odds), 0) for c, s in zip(colours, behind, strict=True)]
+    return slopes if last is None else [*slopes, dr.select(free, odds * last, 0)]
 
 
 ADJOINT_SUMS = {False: 8, True: 10}
@@ -290,11 +301,8 @@ def fisher(lists: BlockLists, packed: Any, background: Any, cross: bool, means: 
     T = [real(t) for t in T]
     pixels = _pixel_sums(lists, packed, lane, T, lambda splat: splat.colour)
     behind = [[dr.fma(dr.abs(t), real(b), c) for c, b in zip(rgb, background, strict=True)] for t, *rgb in pixels]
-    last = [None] * PIXELS
-    if alpha_weight is not None:
-        last = [mi.Float(dr.abs(t)) * dr.sqrt(alpha_weight) for t, *_ in pixels]
-        dr.schedule(last)
-    dr.eval(behind)
+    last = [None if alpha_weight is None else mi.Float(dr.abs(t)) * dr.sqrt(alpha_weight) for t, *_ in pixels]
+    dr.eval(behind, last)
     squared, mixed = fisher_moments(cross, means)
     count = fisher_sums(cross, means)
     slots = pair_slots(lists, count)
@@ -307,6 +315,7 @@ def fisher(lists: BlockLists, packed: Any, background: Any, cross: bool, means: 
             cross_m = [[mi.Float(0)] * 3 for _ in range(3)]
             for x, (raw, xi) in enumerate(zip(row.raw_alpha, row.xi, strict=True)):
                 pixel = j * BLOCK_X + x
+                _begin_pixel()
                 transmittance, *behind = pixels[pixel]
                 alpha, w, after, room = blend(raw, transmittance)
                 behind = [dr.fma(-c, w, s) for c, s in zip(splat.colour, behind, strict=True)]
