@@ -163,27 +163,27 @@ def newton_decrease(
     x = [dr.zeros(mi.TensorXf, g.shape) for g in gradient]
     residual = [-g for g in gradient]
     z = [mi.TensorXf(i * r.array, r.shape) for i, r in zip(inverse, residual, strict=True)]
-    direction, rz, decreases = z, _dot(residual, z), []
+    direction, rz, decreases = z, dot(residual, z), []
     for done in range(iterations):
         progress(done, iterations)
         product = found.curvature_times(model, direction)
-        step = rz / _dot(direction, product)
-        x, residual = _plus(x, step, direction), _plus(residual, -step, product)
+        step = rz / dot(direction, product)
+        x, residual = plus(x, step, direction), plus(residual, -step, product)
         z = [mi.TensorXf(i * r.array, r.shape) for i, r in zip(inverse, residual, strict=True)]
-        before, rz = rz, _dot(residual, z)
-        direction = _plus(z, rz / before, direction)
+        before, rz = rz, dot(residual, z)
+        direction = plus(z, rz / before, direction)
         dr.eval(x, residual, direction)
-        decreases.append(-0.5 * _dot(gradient, x))
+        decreases.append(-0.5 * dot(gradient, x))
     return decreases
 
 
-def _dot(a: Vector, b: Vector) -> float:
+def dot(a: Vector, b: Vector) -> float:
     """Sum of products, in double precision."""
     sums = [dr.sum(mi.Float64(x.array) * mi.Float64(y.array)) for x, y in zip(a, b, strict=True)]
     return sum(float(s[0]) for s in sums)
 
 
-def _plus(a: Vector, factor: float, b: Vector) -> Vector:
+def plus(a: Vector, factor: float, b: Vector) -> Vector:
     """a + factor b."""
     scale = dr.opaque(mi.Float, factor)
     return [mi.TensorXf(dr.fma(scale, y.array, x.array), x.shape) for x, y in zip(a, b, strict=True)]

@@ -15,7 +15,7 @@ from mgs.active.directional import Views
 class Outlook:
     """What is known when a view is chosen: nothing of it from a candidate's image. Views are meant by the index of their frame.
 
-    positions: [V,3] camera centres of all frames, metres; like `centre` and `points`, in coordinates in which +Z points upwards.
+    positions: [V,3] camera centres of all frames, metres; like `centre` and `points`, in coordinates in which +Z is up.
     left: the candidates. visited: the views taken, in their order.
     centre: [3] the middle of the rock. rng: new in each step, drawn from the run's seed.
     H, lam: [M,P] information of the views taken about the model fitted so far, and [P] lambda, of the run.
