@@ -75,7 +75,7 @@ def test_means_of_other_scenes_and_cameras(n, style, size, eye, means):
     degree=st.integers(0, 1),
     scale=st.floats(-5, -0.5),
     stretch=st.floats(0.1, 6),
-    logit=st.floats(-2, 20),
+    logit=st.floats(-2, 10),
     azimuth=st.floats(0, 6.28),
     height=st.floats(-2, 2),
     means=st.sampled_from(MOVING),
