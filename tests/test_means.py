@@ -230,7 +230,8 @@ def test_policies_choose_with_learned_means(files, tmp_path, policy):
     ("given", "message"),
     [
         (["--means", "loose"], "--means loose: Input should be 'frozen', 'normal' or 'free'"),
-        (["--means", "free", "--estimator", "hutchinson"], "--means free: the estimator hutchinson knows nothing of means"),
+        (["--means", "free", "--estimator", "hutchinson"], "--means free: --estimator hutchinson knows nothing of means"),
+        (["--means", "free", "--policy", "paper"], "--means free: --policy paper knows nothing of means"),
         (["--means", "normal", "--prior-std", "mean=0"], "--prior-std mean=0.0: Input should be greater than or equal to"),
     ],
 )

@@ -53,8 +53,8 @@ class State:
 
 
 def check_settings(settings: NbvSettings, frames: int) -> None:
-    """Raises InputError where the policy, the estimator or the optimiser is unknown, the estimator knows nothing of means that
-    are learned, or the dataset has too few frames for the seeds and the budget."""
+    """Raises InputError where the policy, the estimator or the optimiser is unknown, estimator or policy knows nothing of means
+    that are learned, or the dataset has too few frames for the seeds and the budget."""
     from mgs.active.optimisers import OPTIMISERS  # these two need Dr.Jit, which reading a run does not
     from mgs.splat import ESTIMATORS
 
@@ -63,9 +63,10 @@ def check_settings(settings: NbvSettings, frames: int) -> None:
     if settings.estimator not in diagonal:
         known = ", ".join(diagonal)
         raise InputError(f"--estimator {settings.estimator}: gives no diagonal, or is unknown; choose one of {known}")
-    if settings.train.means != "frozen" and settings.estimator != "exact":
-        means = settings.train.means
-        raise InputError(f"--means {means}: the estimator {settings.estimator} knows nothing of means; use --estimator exact")
+    blind = [f"--estimator {settings.estimator}"] if settings.estimator != "exact" else []
+    blind += ["--policy paper"] if settings.policy == "paper" else []
+    if settings.train.means != "frozen" and blind:
+        raise InputError(f"--means {settings.train.means}: {blind[0]} knows nothing of means; leave out either")
     if settings.train.optimiser not in OPTIMISERS:
         raise InputError(f"--optimiser {settings.train.optimiser}: unknown; choose one of {', '.join(OPTIMISERS)}")
     if frames < settings.seeds:
