@@ -91,7 +91,9 @@ class Bench:
         cameras = [self.dataset.frames[i].camera for i in taken]
         targets = [target_of(self.dataset.frames[i]) for i in taken]
         fit = self._stations(self.settings.train.seed + order).fit
-        gaussians = fit(self.state.gaussians, cameras, targets, self.settings.warm_rate, lambda done, most: None).gaussians
+        start = self.stations.initial([self.dataset.frames[i] for i in self.state.taken[: self.settings.seeds]])
+        rate = self.settings.warm_rate
+        gaussians = fit(self.state.gaussians, start, cameras, targets, rate, lambda done, most: None).gaussians
         return float(self.stations.measure(gaussians, taken)[self.metric])
 
 

@@ -4,10 +4,13 @@ import shutil
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from mgs import runtime
 
 runtime.start()
+settings.register_profile("mgs", deadline=None)  # no test is timed: the machine may be busy, and a first call loads libraries
+settings.load_profile("mgs")
 
 import tiny  # noqa: E402
 

@@ -285,6 +285,20 @@ def test_the_viewer_in_a_browser(browser, run):
         tab.get_by_text("chosen at step 1").wait_for()
         tab.get_by_text("surface coverage then").wait_for()
 
+        tab.get_by_text("Look from there").click()
+        there = chosen.frame.camera.resized(round(chosen.frame.camera.width * HEIGHT / chosen.frame.camera.height))
+        narrow = layers.kernel_image(subject, there, "colour")[0].astype(int)
+        rows, columns = slice(260, 460), slice(WIDTH // 2 - 100, WIDTH // 2 + 50)
+        shift = (WIDTH - there.width) // 2
+        expected_there = narrow[rows, columns.start - shift : columns.stop - shift]
+        tab.get_by_label("Exact at rest", exact=True).first.check(force=True)
+        tab.get_by_label("Cameras", exact=True).first.uncheck(force=True)
+
+        def off_there(picture):
+            return np.abs(picture[rows, columns] - expected_there).mean()
+
+        assert off_there(screen_becomes(tab, lambda picture: off_there(picture) < 3)) < 3
+
         steps(run, 3)
         tab.get_by_text("6 of 7 views").wait_for(timeout=10_000)
         assert [text for text in wrong if KNOWN not in text] == []

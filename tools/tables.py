@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from mgs.bench.core import TARGETS
+from mgs.bench.fit import TARGETS as FIT_TARGETS
 from mgs.report.tables import markdown_table, table_cell
 
 ROOT = Path(__file__).parent.parent
@@ -223,7 +224,75 @@ def backing(data: dict[str, Any]) -> str:
     return markdown(heading, rows) + made_by(data)
 
 
+def fit(data: dict[str, Any]) -> str:
+    """What a fit comes to, beside what is asked for."""
+    rows = []
+    for name, (bound, target) in FIT_TARGETS.items():
+        value = data["figures"][name]
+        rows.append(
+            [name.replace("_", " "), f"{value:.3g}" if math.isfinite(value) else "not reached", f"{bound} {target:.3g}"]
+        )
+    return markdown(["figure", "measured", "asked for"], rows) + made_by(data)
+
+
+def optimisers(data: dict[str, Any]) -> str:
+    """Objective and PSNR of each optimiser after about so much work."""
+    records, works = data["records"], (5, 10, 20, 40, 80, 160, 400)
+    rows = []
+    for start in ("cold", "warm"):
+        for row in dict.fromkeys(r["row"] for r in records):
+            shown = [r for r in records if (r["start"], r["row"]) == (start, row)]
+            cells = []
+            for work in works:  # a point within a quarter of this work
+                near = [r for r in shown if abs(math.log(r["passes"] / work)) < math.log(1.25)]
+                cells.append(f"{near[-1]['phi']:.0f} / {near[-1]['psnr_inside']:.2f}" if near else "")
+            rows.append([f"{start}: {row}", *cells])
+    return markdown(["start, optimiser", *(f"{work} passes" for work in works)], rows) + made_by(data)
+
+
+def ranking(data: dict[str, Any]) -> str:
+    """Agreement of rankings after short fits with those after the longest, mean over the states."""
+    rows, passes = [], sorted({r["passes"] for r in data["rows"]})[:-1]
+    for criterion in dict.fromkeys(r["criterion"] for r in data["rows"]):
+        cells = []
+        for count in passes:
+            of = [r for r in data["rows"] if (r["criterion"], r["passes"]) == (criterion, count)]
+            tau, regret = (sum(r[key] for r in of) / len(of) for key in ("tau", "regret"))
+            cells.append(f"{tau:.2f} / {100 * regret:.1f} %")
+        rows.append([criterion, *cells])
+    return markdown(["criterion", *(f"{count} passes" for count in passes)], rows) + made_by(data)
+
+
+def linearity(data: dict[str, Any]) -> str:
+    """Departure from linear of moves of several sizes; of added views the mean."""
+    records = data["records"]
+    factors = sorted({r["factor"] for r in records})
+    rows = []
+    for passes in dict.fromkeys(r["passes"] for r in records):
+        for move in dict.fromkeys(r["move"] for r in records):
+            cells = []
+            for factor in factors:
+                of = [r["departure"] for r in records if (r["passes"], r["move"], r["factor"]) == (passes, move, factor)]
+                cells.append(f"{sum(of) / len(of):.2g}" if of else "")
+            rows.append([f"{move}, after {passes} passes", *cells])
+    return markdown(["move", *(f"times {factor:g}" for factor in factors)], rows) + made_by(data)
+
+
+def residual(data: dict[str, Any]) -> str:
+    """Quality against the weights of pixels in the fit."""
+    rows = [
+        [f"{r['power']:g}, {r['background']}", *(f"{r[key]:.2f}" for key in ("psnr", "psnr_mask", "psnr_inside"))]
+        for r in data["records"]
+    ]
+    return markdown(["power, background", "full frame", "mask", "inside"], rows) + made_by(data)
+
+
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "fit": ("fit", fit),
+    "optimisers": ("optimisers", optimisers),
+    "ranking": ("ranking", ranking),
+    "linearity": ("linearity", linearity),
+    "residual": ("residual", residual),
     "demo": ("demo", demo),
     "demo-report": ("demo", demo_report),
     "policies": ("policies", policies),

@@ -43,6 +43,9 @@ COLOURS = {"seed": (213, 94, 0), "chosen": (0, 158, 115), "candidate": (130, 130
 SELECTED = (255, 220, 60)
 """Colour of the camera that was clicked."""
 
+LINE = 1.5
+"""Thickness of lines, pixels of the screen."""
+
 BLACK = np.zeros((2, 2, 3), np.uint8)
 """The background where there is no image of the kernel."""
 
@@ -219,7 +222,9 @@ class Viewer:
         way = [view.frame.camera.position for view in subject.taken if view.role == "chosen"]
         if len(way) > 1:
             segments = np.stack([way[:-1], way[1:]], axis=1).astype(np.float32)
-            scene.add_line_segments("/cameras/way", segments, colors=COLOURS["chosen"], thickness=0.01 * size)
+            scene.add_line_segments(
+                "/cameras/way", segments, colors=COLOURS["chosen"], thickness=LINE, thickness_units="screen"
+            )
 
     def _show_camera(self, view: View, size: float) -> None:
         """A camera as a pyramid that can be clicked, and the step of a chosen one beside it."""
@@ -230,7 +235,7 @@ class Viewer:
         colour = SELECTED if name == self.selected else COLOURS[view.role]
         handle = self.server.scene.add_camera_frustum(
             f"/cameras/views/{name}", _vertical_fov(camera), camera.width / camera.height,
-            scale=(0.3 if view.role == "candidate" else 0.6) * size, thickness=0.015 * size, color=colour,
+            scale=(0.3 if view.role == "candidate" else 0.6) * size, thickness=LINE, thickness_units="screen", color=colour,
             wxyz=SO3.from_matrix(pose[:3, :3]).wxyz, position=pose[:3, 3],
         )  # fmt: skip
         handle.on_click(lambda _: self._clicked(name))
@@ -266,9 +271,11 @@ class Viewer:
 
     def _look(self, handle: Any) -> None:
         """Put a browser's camera where the selected view's is."""
-        view = next((view for view in self.subject.views if view.frame.name == self.selected), None)
-        if view is None or handle is None:
+        if handle is None:  # the window was closed meanwhile
             return
+        if self.selected != self.view.value:
+            self.select(self.view.value)
+        view = next(view for view in self.subject.views if view.frame.name == self.selected)
         from viser.transforms import SO3
 
         camera = view.frame.camera

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mgs.active import criteria, run_folder
+from mgs.active.policy_file import label
 from mgs.active.settings import NbvSettings
 from mgs.data.dataset import Frame, load_dataset
 from mgs.data.meshes import Mesh, read_mesh
@@ -84,7 +85,7 @@ def _read_run(run: Path, follow: bool) -> Subject:
         return Subject(f"{name}: no finished step yet", None, views=waiting, mesh=mesh)
     views = _views(dataset.frames, state, _psnr(run, len(state.taken)))
     planned = settings.seeds + settings.budget
-    title = f"{name}: {settings.policy}, {len(state.taken)} of {planned} views, {len(state.gaussians):,} Gaussians"
+    title = f"{name}: {label(settings.policy)}, {len(state.taken)} of {planned} views, {len(state.gaussians):,} Gaussians"
     return Subject(title, state.gaussians, "linear", _scalars(settings, state), views, mesh)
 
 
