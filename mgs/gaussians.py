@@ -28,11 +28,19 @@ summed over pixels; up to this limit they stay far within the range of float32. 
 1e5 times as bright as a surface that it lights."""
 
 LEARNED = ("sh", "log_scales", "quats", "logit_opacities")
-"""Names of the learned parameters, in the order of their columns in the Fisher information. They have 3K (K colour coefficients
-for each of r, g, b), 3, 4 and 1 columns. The means are not learned."""
+"""Names of the parameters that are always learned, in the order of their columns in the Fisher information. They have 3K (K
+colour coefficients for each of r, g, b), 3, 4 and 1 columns. The means are learned only where that is asked for (`learned`)."""
 
 KINDS = ("colour", "scale", "rotation", "opacity")
 """What the LEARNED parameters are called in settings and in columns of the information, in the same order."""
+
+
+def learned(means: str = "frozen") -> dict[str, str]:
+    """{name of a learned parameter: what it is called in settings and columns}, in the order of the columns.
+
+    means: a name in `mgs.splat.MEANS`; unless it is "frozen", the means are learned too and come last, called "mean".
+    """
+    return dict(zip(LEARNED, KINDS, strict=True)) | ({} if means == "frozen" else {"means": "mean"})
 
 
 @dataclass(eq=False)

@@ -1,4 +1,5 @@
-"""The objective of the fit: value, gradient, curvature and predicted decrease against the float64 oracle."""
+"""The objective of the fit, with frozen and with learned means: value, gradient, curvature and predicted decrease against the
+float64 oracle."""
 
 import numpy as np
 import pytest
@@ -6,19 +7,21 @@ import pytest
 from mgs.active.objective import newton_decrease, objective
 from mgs.bench.core import surface_camera, surface_gaussians
 from mgs.camera import Camera, look_at
-from mgs.gaussians import KINDS, LEARNED, Gaussians
+from mgs.errors import InputError
+from mgs.gaussians import Gaussians, learned
 from mgs.splat import as_drjit, reference
 
 N = 60
-LAM = {"colour": 0.02, "scale": 0.05, "rotation": 0.1, "opacity": 0.01}
+LAM = {"colour": 0.02, "scale": 0.05, "rotation": 0.1, "opacity": 0.01, "mean": 30.0}
 
 
-@pytest.fixture(scope="module")
-def case():
+@pytest.fixture(scope="module", params=["frozen", "normal", "free"])
+def case(request):
     """Objective, model, and from the oracle: Jacobian [M,P], residual [M], weights [M], lam [P] and distance to the start [P].
 
-    Parameters are ordered as they are in LEARNED, one array after the other.
+    Parameters are ordered as `learned` has them, one array after the other.
     """
+    means = request.param
     start = surface_gaussians(N)
     start.log_scales += 0.9
     rng = np.random.default_rng(5)
@@ -29,6 +32,10 @@ def case():
             for a in (start.log_scales, start.quats, start.logit_opacities, start.sh)
         ),
     )
+    normals = rng.standard_normal((N, 3))
+    directions = reference.mean_directions(N, means, normals)
+    offsets = 0.02 * rng.standard_normal(directions.shape[:2])
+    model.means = (start.means + (offsets[..., None] * directions).sum(1)).astype(np.float32)
     first = surface_camera(start, 24, 20)
     distance = np.linalg.norm(first.position)
     cameras = [
@@ -37,17 +44,18 @@ def case():
     truths = [rng.uniform(0, 1, (20, 24, 3)).astype(np.float32) for _ in cameras]
     weights = [(rng.uniform(size=(20, 24, 1)) > 0.2).astype(np.float32) for _ in cameras]
     targets = [np.dstack([t, w]) for t, w in zip(truths, weights, strict=True)]
-    goal = objective(model, cameras, targets, start, LAM)
-    columns = np.split(np.arange(11), (3, 6, 10))
+    goal = objective(model, cameras, targets, start, LAM, means=means, normals=normals)
+    columns = np.split(np.arange(11 + directions.shape[1]), (3, 6, 10, 11))
     rows = []
     for camera in cameras:
-        J = reference.jacobian(model, camera)
+        J = reference.jacobian(model, camera, means=means, normals=normals)
         rows.append(np.concatenate([J[..., c].reshape(20 * 24 * 3, -1) for c in columns], 1))
     images = [reference.render(model, camera)["rgb"] for camera in cameras]
     residual = np.concatenate([(i - t).ravel() for i, t in zip(images, truths, strict=True)])
     weight = np.concatenate([np.broadcast_to(w, t.shape).ravel() for w, t in zip(weights, truths, strict=True)])
-    lam = np.concatenate([np.full(getattr(model, n).size, LAM[k]) for n, k in zip(LEARNED, KINDS, strict=True)])
-    away = np.concatenate([(getattr(model, n) - getattr(start, n)).ravel() for n in LEARNED]).astype(np.float64)
+    changes = [(getattr(model, name) - getattr(start, name)).ravel() for name in learned()] + [offsets.ravel()]
+    lam = np.concatenate([np.full(change.size, LAM[kind]) for change, kind in zip(changes, LAM, strict=True)])
+    away = np.concatenate(changes).astype(np.float64)
     return goal, as_drjit(model), np.concatenate(rows), residual, weight, lam, away
 
 
@@ -70,12 +78,17 @@ def test_the_gradient_is_that_of_the_oracle(case):
 def test_the_curvature_is_jtj_plus_lam_of_the_oracle(case):
     goal, model, J, _, weight, lam, _ = case
     rng = np.random.default_rng(1)
-    sizes = [getattr(model, name).shape for name in LEARNED]
-    parts = [rng.standard_normal(shape).astype(np.float32) for shape in sizes]
+    parts = [rng.standard_normal(away.shape).astype(np.float32) for away, _ in goal.pulls(model)]
     v = flat(parts)
     expected = J.T @ (weight * (J @ v)) + lam * v
     found = flat(goal.curvature_times(model, [type(model.means)(part) for part in parts]))
     assert np.allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_the_diagonal_is_that_of_jtj_plus_lam(case):
+    goal, model, J, _, _, lam, _ = case
+    expected = (J**2).sum(0) + lam
+    assert np.allclose(flat(goal.diagonal(model)), expected, rtol=1e-3, atol=1e-5 * expected.max())
 
 
 def test_the_newton_decrease_grows_to_that_of_a_dense_solve(case):
@@ -104,3 +117,17 @@ def test_a_start_in_the_memory_of_the_model_is_kept_apart(case):
     other = Gaussians(model.means, model.log_scales, model.quats, model.logit_opacities, model.sh - 0.2)
     moved = fit(model, [camera], [target], settings, start=other, lam={"colour": 1.0}).gaussians
     assert np.allclose(moved.sh - model.sh, -0.01, rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("means", "normals", "message"),
+    [
+        ("loose", None, "means 'loose' is unknown; choose one of frozen, normal, free"),
+        ("normal", None, "needs normals"),
+        ("normal", np.zeros((50, 3)), "a normal is zero"),
+        ("normal", np.ones((49, 3)), "normals have shape"),
+    ],
+)
+def test_unusable_means_are_refused(means, normals, message):
+    with pytest.raises(InputError, match=message):
+        objective(surface_gaussians(50), [], [], means=means, normals=normals)

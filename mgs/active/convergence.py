@@ -16,7 +16,7 @@ from mgs.active.settings import NbvSettings
 from mgs.data.dataset import Frame
 from mgs.gaussians import Gaussians
 from mgs.prior.build import Prior
-from mgs.prior.initial import initial_gaussians
+from mgs.prior.initial import initial_gaussians, initial_normals
 from mgs.splat import as_drjit, groups
 
 CG_ITERATIONS = 20
@@ -40,10 +40,12 @@ def remaining_decrease(
     a share of phi; and "converged", whether that is at most CONVERGED_SHARE. Raises InputError where a frame cannot be read.
     """
     start = initial_gaussians(prior, frames[: settings.seeds])[0]
-    lam = settings.regularisation(groups(0))
-    by_kind = {kind: float(lam[columns][0]) for kind, columns in groups(0).items()}
+    means, kinds = settings.train.means, groups(0, settings.train.means)
+    lam = settings.regularisation(kinds)
+    by_kind = {kind: float(lam[columns][0]) for kind, columns in kinds.items()}
     cameras, targets = [frame.camera for frame in frames], [target_of(frame) for frame in frames]
-    goal, model = objective(gaussians, cameras, targets, start, by_kind), as_drjit(gaussians)
+    goal = objective(gaussians, cameras, targets, start, by_kind, None, means, initial_normals(prior))
+    model = as_drjit(gaussians)
     phi = goal.phi(model)
     share = newton_decrease(goal, model, CG_ITERATIONS, progress)[-1] / max(phi, 1e-30)
     return {"phi": phi, "predicted_decrease": share, "converged": bool(share <= CONVERGED_SHARE)}

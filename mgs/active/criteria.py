@@ -33,6 +33,10 @@ PRIOR_STD = {"colour": 1.0, "scale": 0.5, "rotation": 0.5, "opacity": 2.0}
 colour 1 SH unit (0.28 linear RGB: albedo and shading of a rock), scale 0.5 (a factor 1.65), quaternion 0.5 (about 60
 degrees), opacity logit 2 (0.12 to 0.88 about one half)."""
 
+MEAN_STD = 0.5
+"""tau of means that are learned, over the spacing of the prior's samples: a surface that is off by more than that between its
+samples is another surface. A chosen constant. `mgs nbv` multiplies it by the spacing, so that `prior_std` is in metres."""
+
 
 def regularisation(
     groups: dict[str, slice], pixel_noise: float = PIXEL_NOISE, prior_std: Mapping[str, float] = PRIOR_STD
@@ -42,7 +46,7 @@ def regularisation(
     J^T J has units (pixel value / parameter)^2, which differ between parameters, so one number cannot serve all of them.
     With a prior theta ~ N(theta_0, tau^2) the posterior precision is H / sigma_e^2 + 1 / tau^2 = (H + lam) / sigma_e^2, so this
     lam makes Eq. 7 equal 2/l times the mutual information of the parameters and the new image (diagonal, linearised), in
-    nats. groups: columns of each kind of parameter, from `mgs.splat.groups`.
+    nats. groups: columns of each kind of parameter, from `mgs.splat.groups`; prior_std: a number for each of these kinds.
     """
     lam = np.empty(max(columns.stop for columns in groups.values()))
     for name, columns in groups.items():

@@ -1,4 +1,4 @@
-"""Learn the appearance of frozen Gaussians from posed images: the most probable parameters, given the images and the prior.
+"""Fit Gaussians to posed images: the most probable parameters, given the images and the prior. Means stay frozen by default.
 
 What is lowered is the objective of `mgs.active.objective`. One optimiser step draws one image; a pass draws all of them once,
 in an order of its own.
@@ -7,7 +7,7 @@ in an order of its own.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import drjit as dr
@@ -21,7 +21,7 @@ from mgs.active.stopping import StopReason, stop_reason
 from mgs.camera import Camera
 from mgs.colour import SH_C0
 from mgs.errors import InputError
-from mgs.gaussians import LEARNED, Gaussians
+from mgs.gaussians import Gaussians, learned
 from mgs.seeds import generator
 from mgs.splat import ListCache, as_drjit
 from mgs.splat.blocks import BlockLists
@@ -60,7 +60,7 @@ def _in_bounds(model: Gaussians) -> Gaussians:
     if model.sh.shape[1] > 1:
         return model
     sh = mi.TensorXf(dr.maximum(model.sh.array, (COLOUR_MIN - 0.5) / SH_C0), model.sh.shape)
-    return Gaussians(model.means, model.log_scales, model.quats, model.logit_opacities, sh)
+    return replace(model, sh=sh)
 
 
 def _recorded_sizes(
@@ -73,9 +73,12 @@ def _recorded_sizes(
     target: Any,
     weight: Any,
     size: Any,
-    *_: Any,
+    rates: Any,
+    t: Any,
+    prior: Prior,
+    information: Any,
 ) -> tuple[Any, ...]:
-    return optimiser, len(lists.splat), len(lists.block), len(target), *gaussians.sh.shape, *size
+    return optimiser, prior.means, len(lists.splat), len(lists.block), len(target), *gaussians.sh.shape, *size
 
 
 @frozen(_recorded_sizes)
@@ -96,24 +99,26 @@ def _step(
 ) -> tuple[Gaussians, list[list[Any]], Any]:
     """One step of the optimiser on one image and its share of the prior. Returns parameters, buffers, loss before the step.
 
-    buffers, rates: for each of LEARNED; packed: the Gaussians' splats, packed for the lists; size: (width, height); t: UInt32,
-    step number from 1; target, weight: Float [H*W*3]; information: see `mgs.active.optimisers.Optimiser`.
+    buffers, rates: for each of the learned arrays; packed: the Gaussians' splats, packed for the lists; size: (width, height);
+    t: UInt32, step number from 1; target, weight: Float [H*W*3]; information: see `mgs.active.optimisers.Optimiser`.
     """
-    copy = watched(gaussians)
+    copy = watched(gaussians, prior)
     rgb = composite(project(copy, camera), packed, lists, *size).rgb
     error = (rgb.array - target) * weight
     loss = dr.mean(dr.square(error))
     dr.backward(0.5 * dr.sum(dr.square(error)))
     step, moved, kept = mi.Float(t), {}, []
-    for name, kept_before, rate, known in zip(LEARNED, buffers, rates, information, strict=True):
-        value = getattr(copy, name)
-        away = dr.detach(value) - getattr(prior.start, name)
+    for name, kept_before, rate, known in zip(prior.lam, buffers, rates, information, strict=True):
+        value, slope = dr.detach(getattr(copy, name)), dr.grad(getattr(copy, name))
+        away = prior.along(name, value - getattr(prior.start, name))
         pull = prior.lam[name] * prior.share
-        gradient = dr.grad(value) + mi.TensorXf(pull * away.array, away.shape)
+        gradient = prior.along(name, slope) + mi.TensorXf(pull * away.array, away.shape)
         loss += dr.sum(dr.square(away.array)) * pull / len(target)
-        moved[name], after = OPTIMISERS[optimiser].step(dr.detach(value), gradient, known, kept_before, rate, step)
+        is_offset = away.shape != value.shape  # learned in the place of a mean
+        found, after = OPTIMISERS[optimiser].step(away if is_offset else value, gradient, known, kept_before, rate, step)
+        moved[name] = value + prior.across(name, found - away) if is_offset else found
         kept.append(after)
-    return _in_bounds(Gaussians(gaussians.means, **moved)), kept, dr.detach(loss)
+    return _in_bounds(replace(gaussians, **moved)), kept, dr.detach(loss)
 
 
 def fit(
@@ -125,30 +130,36 @@ def fit(
     cache: ListCache | None = None,
     start: Gaussians | None = None,
     lam: Mapping[str, float] | None = None,
+    normals: np.ndarray | None = None,
 ) -> Fit:
-    """Fit appearance (not means) to images: lower Phi (`mgs.active.objective`).
+    """Fit Gaussians to images: lower Phi (`mgs.active.objective`). Their means stay unless `settings.means` says otherwise.
 
     cameras, and a target of each: [H,W,3] linear RGB, the rock in front of black; or [H,W,4], in which the last channel is the
     weight of the pixel, 1 where its colour is known and 0 where it is not (`mgs.data.dataset.Frame.target`).
     start: where the prior holds the parameters; the Gaussians given, by default. lam: the prior's information about each kind
-    of parameter (`mgs.gaussians.KINDS`), (pixel value / unit of the parameter)^2; by default there is none.
+    of parameter (`mgs.gaussians.learned`), (pixel value / unit of the parameter)^2; by default there is none. normals: [N,3],
+    of any length but 0, the directions of means that move along them; read only then.
     Starts with fresh buffers of the optimiser, so the result depends on its arguments alone, bitwise. on_pass(done, most)
     reports. Stops as `mgs.active.stopping.stop_reason` says. Raises InputError where a parameter of the Gaussians given is not
-    finite, the optimiser is unknown, or `start` is of another shape.
+    finite, the optimiser is unknown, `start` is of another shape, or means are to move without normals or without a rate.
     """
     settings = settings or TrainSettings()
     if settings.optimiser not in OPTIMISERS:
         raise InputError(f"optimiser {settings.optimiser!r} is unknown; choose one of {', '.join(OPTIMISERS)}")
+    kinds = learned(settings.means).values()
+    if missing := [kind for kind in kinds if kind not in settings.rates]:
+        raise InputError(f"train.rates: has no rate of {missing[0]}, which is learned; give one, metres")
     model = as_drjit(gaussians)
-    goal = objective(gaussians, cameras, targets, start, lam, cache)
+    goal = objective(gaussians, cameras, targets, start, lam, cache, settings.means, normals)
     optimiser = OPTIMISERS[settings.optimiser]
-    buffers = [[dr.zeros(mi.TensorXf, getattr(model, name).shape) for _ in range(optimiser.buffers)] for name in LEARNED]
-    information: list[Any] = [None] * len(LEARNED)
+    shapes = [away.shape for away, _ in goal.pulls(model)]
+    buffers = [[dr.zeros(mi.TensorXf, shape) for _ in range(optimiser.buffers)] for shape in shapes]
+    information: list[Any] = [None] * len(shapes)
     rng = generator(settings.seed, "train/order")
     losses, kept, stop = [goal.loss(model)], model, StopReason.PASS_LIMIT
     for done in range(settings.passes):
         fall = settings.decay ** (done / max(settings.passes - 1, 1))
-        rates = [dr.opaque(mi.Float, rate * fall) for rate in settings.rates.values()]
+        rates = [dr.opaque(mi.Float, settings.rates[kind] * fall) for kind in kinds]
         if optimiser.uses_information and done % INFORMATION_PASSES == 0:
             information = [mi.TensorXf(d.array / len(goal.photos), d.shape) for d in goal.diagonal(model)]
         order = rng.permutation(len(goal.photos))
@@ -199,5 +210,5 @@ def _pass(
 
 
 def _is_finite(model: Gaussians) -> bool:
-    """Whether all learned parameters are finite."""
-    return bool(dr.all([dr.all(dr.isfinite(getattr(model, name).array)) for name in LEARNED])[0])
+    """Whether all parameters are finite."""
+    return bool(dr.all([dr.all(dr.isfinite(getattr(model, f.name).array)) for f in fields(model)])[0])

@@ -60,7 +60,8 @@ class Stations:
     fisher(gaussians, camera) -> information of one view [N,P], by the estimator of the run.
     estimate(gaussians, camera, estimator) -> information of one view by a row of `mgs.splat.ESTIMATORS`.
     measure(gaussians, taken frame indices) -> entries for steps.jsonl.
-    exact(gaussians, camera) -> exact information of one view [N,P], for what the views see of the surface; None: as `fisher`.
+    exact(gaussians, camera) -> exact information of one view [N,P], for what the views see of the surface, with or without
+    columns of means; None: as `fisher`.
     on_surface: how many of the Gaussians, the first, lie on the surface, so are what coverage is a share of; None: all.
     up: unit vector that points upwards in the world: azimuths are angles about it.
     prior: hash of what `initial` starts from (`mgs.active.inputs.prior_digest`).
@@ -118,8 +119,8 @@ def run(
         if state is not None:
             check_inputs(out, state, settings, dataset, stations.prior, say)
         loop = Loop(out, settings, dataset, stations, progress)
-        if state is not None and not np.array_equal(state.gaussians.means, loop.start.means):
-            raise InputError(inputs.changed_prior(out, settings.prior))
+        if state is not None:
+            loop.check(state)
         if state is None:
             state = loop.first()
             write_checkpoint(out, state)
@@ -153,7 +154,8 @@ class Loop:
         self.turn = upright(stations.up)  # policies are told of a world in which +Z points upwards
         self.positions = np.array([camera.position for camera in self.cameras]) @ self.turn.T
         self.centre = self.turn @ stations.centre
-        self.prior_lam = criteria.regularisation(stations.groups, settings.pixel_noise, settings.prior_std)
+        appearance = {kind: columns for kind, columns in stations.groups.items() if kind != "mean"}
+        self.prior_lam = criteria.regularisation(appearance, settings.pixel_noise, settings.prior_std)
         self.lam = settings.regularisation(stations.groups)
         self.images: dict[int, np.ndarray] = {}
         cameras = {frame.name: inputs.camera_digest(frame.camera) for frame in self.frames}
@@ -162,6 +164,15 @@ class Loop:
         self.start = stations.initial([self.frames[i] for i in self.seeds])
         self.policy = policies.policy_named(settings.policy)
         self.seen, self.dome = cache(self._seen), cache(self._dome)  # they depend on poses and surface alone
+
+    def check(self, state: State) -> None:
+        """Raises InputError where a state is not of this run: where its means, which a fit leaves alone, are not the prior's;
+        or, since learned means tell nothing, where it has other parameters than this run learns."""
+        if state.H.shape[1] != len(self.lam):
+            where = f"{self.out / 'config.json'}: settings.train.means"
+            raise InputError(f"{where} has changed since {self.out} was started; restore it, or start a new run")
+        if self.settings.train.means == "frozen" and not np.array_equal(state.gaussians.means, self.start.means):
+            raise InputError(inputs.changed_prior(self.out, self.settings.prior))
 
     def first(self) -> State:
         """Step 0: the seeds."""
@@ -175,7 +186,7 @@ class Loop:
             "information_gain": None,
         }
         nothing = np.zeros((len(self.start), len(self.lam)))
-        on_surface = nothing[: self.stations.on_surface]
+        on_surface = nothing[: self.stations.on_surface, : len(self.prior_lam)]
         return self.learn(State(self.start, nothing, on_surface, [], []), self.seeds, choice, _Stopwatch())
 
     def next(self, state: State) -> State:
@@ -235,9 +246,9 @@ class Loop:
         )
 
     def surface_information(self, camera: Camera) -> np.ndarray:
-        """What a pose sees of the surface: exact information about the Gaussians on it before any training."""
+        """What a pose sees of the surface: exact information about how the Gaussians on it look before any training."""
         fisher = self.stations.exact or self.stations.fisher
-        return fisher(self.start, camera)[: self.stations.on_surface]
+        return fisher(self.start, camera)[: self.stations.on_surface, : len(self.prior_lam)]
 
     def _seen(self, frame: int) -> np.ndarray:
         """Squared blending weights [N] of the Gaussians on the surface in a frame's view."""

@@ -77,13 +77,13 @@ def start_run(
         resolved["budget"] = min(given.budget, max(0, len(frames) - given.seeds))
     complete = given.model_copy(update=resolved)
     check_settings(complete, len(frames))
-    if prior is not None:
-        load_prior(prior)
+    found = None if prior is None else load_prior(prior)
     with atomic_folder(out) as unfinished:
-        if prior is None:
+        if found is None:
             asked = PriorSettings(gaussians=gaussians, seed=complete.seed)
-            built, _ = build_prior(frames, asked, on_stage=lambda stage: progress(f"prior: {stage}", 0, 1))
-            save_prior(unfinished / "prior", built)
+            found, _ = build_prior(frames, asked, on_stage=lambda stage: progress(f"prior: {stage}", 0, 1))
+            save_prior(unfinished / "prior", found)
+        complete = complete.with_spacing(found.spacing)
         start(unfinished, complete, frames)
     return complete
 

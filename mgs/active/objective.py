@@ -1,4 +1,4 @@
-"""What a fit lowers: the negative logarithm of the posterior of the Gaussians' appearance, its gradient and its curvature.
+"""What a fit lowers: the negative logarithm of the posterior of the Gaussians' parameters, its gradient and its curvature.
 
 A pixel is the rendered value plus noise of standard deviation sigma, and each parameter lies around its start with a standard
 deviation tau. The negative logarithm of the posterior is then, up to a constant and times sigma^2, the objective
@@ -9,6 +9,10 @@ with lam = (sigma / tau)^2 (`mgs.active.criteria.regularisation`). Its curvature
 is the matrix whose diagonal the criteria use: the model that is fitted and the one whose information is measured are the same.
 With lam = 0 it is maximum likelihood, the paper's Eq. 2 up to a constant.
 
+The means are frozen by default, as in the paper. Where they are "free", all three coordinates are parameters like the others.
+Where they move along the "normal", the parameter is one offset per Gaussian, metres: how far its mean lies from its start,
+along a given normal.
+
 The curvature is never stored (10,000 Gaussians have 110,000 parameters): its product with a vector takes one derivative in
 forward mode and one in reverse mode for each image.
 """
@@ -16,7 +20,7 @@ forward mode and one in reverse mode for each image.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import drjit as dr
@@ -25,15 +29,17 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.errors import InputError
-from mgs.gaussians import KINDS, LEARNED, Gaussians
+from mgs.gaussians import Gaussians, learned
 from mgs.splat import ListCache, as_drjit, fisher, groups, render
 from mgs.splat.blocks import BlockLists
-from mgs.splat.projection import camera_array, project
+from mgs.splat.information import unit_normals
+from mgs.splat.projection import camera_array, project, rows_as_vectors
 from mgs.splat.recording import frozen
 from mgs.splat.rendering import composite
 
 Vector = list[Any]
-"""A number for every learned parameter: a TensorXf for each of LEARNED, of its shape."""
+"""A number for every learned parameter: a TensorXf for each array of `mgs.gaussians.learned`, of its shape; for means that move
+along their normals the shape is [N]."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +59,35 @@ class Photo:
 
 @dataclass
 class Prior:
-    """What holds the parameters near their start: for each of LEARNED its lam, Float. share: 1 / number of images, Float, the
-    part of the prior that goes with one image."""
+    """What holds the parameters near their start: for each of the learned arrays its lam, Float. share: 1 / number of images,
+    Float, the part of the prior that goes with one image. normals: where means move along them, TensorXf [N,3].
+    """
 
     start: Gaussians
     lam: dict[str, Any]
     share: Any
+    normals: Any = None
+
+    @property
+    def means(self) -> str:
+        """A name in `mgs.splat.MEANS`."""
+        if "means" not in self.lam:
+            return "frozen"
+        return "free" if self.normals is None else "normal"
+
+    def along(self, name: str, vectors: Any) -> Any:
+        """Changes of a parameter, or derivatives by it, as those of what is learned of it: for means that move along their
+        normals the part along these, [N,3] -> [N]; for everything else the same again."""
+        if name != "means" or self.normals is None:
+            return vectors
+        product = dr.dot(rows_as_vectors(vectors, mi.Vector3f), rows_as_vectors(self.normals, mi.Vector3f))
+        return mi.TensorXf(product, vectors.shape[:1])
+
+    def across(self, name: str, changes: Any) -> Any:
+        """The way back: changes of what is learned as changes of the parameter itself, for offsets [N] -> [N,3]."""
+        if name != "means" or self.normals is None:
+            return changes
+        return mi.TensorXf(dr.ravel(rows_as_vectors(self.normals, mi.Vector3f) * changes.array), self.normals.shape)
 
 
 @dataclass(frozen=True)
@@ -71,7 +100,7 @@ class Objective:
 
     def loss(self, model: Gaussians) -> float:
         """2 Phi over the number of pixel values: the mean squared error of the images plus the prior's part."""
-        penalty = sum(lam * self.prior.share * dr.sum(dr.square(d.array)) for d, lam in self._pulls(model))
+        penalty = sum(lam * self.prior.share * dr.sum(dr.square(d.array)) for d, lam in self.pulls(model))
         errors = []
         for photo in self.photos:
             rgb = render(model, photo.camera, cache=self.cache).rgb.array
@@ -84,10 +113,10 @@ class Objective:
 
     def gradient(self, model: Gaussians) -> Vector:
         """The derivative of Phi by the parameters."""
-        total = [mi.TensorXf(lam * d.array, d.shape) for d, lam in self._pulls(model)]
+        total = [mi.TensorXf(lam * d.array, d.shape) for d, lam in self.pulls(model)]
         for photo in self.photos:
             lists, packed = self.lists(model, photo)
-            parts = _image_gradient(model, photo.array, packed, lists, photo.pixels, photo.weights, photo.size)
+            parts = _image_gradient(model, self.prior, photo.array, packed, lists, photo.pixels, photo.weights, photo.size)
             total = [a + b for a, b in zip(total, parts, strict=True)]
             dr.eval(total)
         return total
@@ -97,17 +126,19 @@ class Objective:
         total = [mi.TensorXf(lam * v.array, v.shape) for v, lam in zip(vector, self.prior.lam.values(), strict=True)]
         for photo in self.photos:
             lists, packed = self.lists(model, photo)
-            parts = _image_curvature(model, vector, photo.array, packed, lists, photo.weights, photo.size)
+            parts = _image_curvature(model, self.prior, vector, photo.array, packed, lists, photo.weights, photo.size)
             total = [a + b for a, b in zip(total, parts, strict=True)]
             dr.eval(total)
         return total
 
     def diagonal(self, model: Gaussians) -> Vector:
         """The diagonal of J^T J + lam, by exact Fisher information; weights of pixels are taken as 1."""
-        total = [mi.TensorXf(lam + dr.zeros(mi.Float, d.array.shape[0]), d.shape) for d, lam in self._pulls(model)]
+        total = [mi.TensorXf(lam + dr.zeros(mi.Float, d.array.shape[0]), d.shape) for d, lam in self.pulls(model)]
+        means = self.prior.means
+        normals = np.asarray(self.prior.normals) if means == "normal" else None
         for photo in self.photos:
-            information = fisher(model, photo.camera, cache=self.cache)
-            columns = zip(total, groups(model.sh_degree).values(), strict=True)
+            information = fisher(model, photo.camera, cache=self.cache, means=means, normals=normals)
+            columns = zip(total, groups(model.sh_degree, means).values(), strict=True)
             total = [t + mi.TensorXf(np.ascontiguousarray(information[:, c]).reshape(t.shape)) for t, c in columns]
             dr.eval(total)
         return total
@@ -116,9 +147,10 @@ class Objective:
         """Block lists of one image and the splats packed for them. Raises InputError as `ListCache.get`."""
         return self.cache.get(photo.camera, _project(model, photo.array))
 
-    def _pulls(self, model: Gaussians) -> list[tuple[Any, Any]]:
-        """For each of LEARNED how far it is from its start, and its lam."""
-        return [(getattr(model, name) - getattr(self.prior.start, name), lam) for name, lam in self.prior.lam.items()]
+    def pulls(self, model: Gaussians) -> list[tuple[Any, Any]]:
+        """For each of the learned arrays how far it is from its start, and its lam."""
+        prior = self.prior
+        return [(prior.along(n, getattr(model, n) - getattr(prior.start, n)), lam) for n, lam in prior.lam.items()]
 
 
 def objective(
@@ -128,8 +160,15 @@ def objective(
     start: Gaussians | None = None,
     lam: Mapping[str, float] | None = None,
     cache: ListCache | None = None,
+    means: str = "frozen",
+    normals: np.ndarray | None = None,
 ) -> Objective:
-    """The objective of `mgs.active.fitting.fit`, from the same arguments. Raises InputError where the start does not fit."""
+    """The objective of `mgs.active.fitting.fit`, from the same arguments; means: the setting of that name.
+
+    Raises InputError where the start or the normals do not fit the Gaussians, or `means` is not a name in `mgs.splat.MEANS`.
+    """
+    groups(gaussians.sh_degree, means)  # raises where the name is unknown
+    unit = unit_normals(len(gaussians), normals) if means == "normal" else None
     photos = [_photo(camera, np.asarray(target, np.float32)) for camera, target in zip(cameras, targets, strict=True)]
     start = gaussians if start is None else start
     if start.sh.shape != gaussians.sh.shape:
@@ -137,9 +176,10 @@ def objective(
     # A copy: Dr.Jit uses NumPy's memory in place, and a recorded step takes parameters and start for the same array for ever
     # if they were in the same memory when it was recorded (Dr.Jit 1.5).
     start = as_drjit(Gaussians(*(np.array(getattr(start, f.name), np.float32) for f in fields(start))))
-    by_name = dict(zip(LEARNED, KINDS, strict=True))
-    values = {name: dr.opaque(mi.Float, float((lam or {}).get(kind, 0.0))) for name, kind in by_name.items()}
-    return Objective(photos, Prior(start, values, dr.opaque(mi.Float, 1 / max(len(photos), 1))), cache or ListCache())
+    values = {name: dr.opaque(mi.Float, float((lam or {}).get(kind, 0.0))) for name, kind in learned(means).items()}
+    directions = None if unit is None else mi.TensorXf(unit.astype(np.float32))
+    prior = Prior(start, values, dr.opaque(mi.Float, 1 / max(len(photos), 1)), directions)
+    return Objective(photos, prior, cache or ListCache())
 
 
 def _photo(camera: Camera, target: np.ndarray) -> Photo:
@@ -189,15 +229,15 @@ def plus(a: Vector, factor: float, b: Vector) -> Vector:
     return [mi.TensorXf(dr.fma(scale, y.array, x.array), x.shape) for x, y in zip(a, b, strict=True)]
 
 
-def watched(model: Gaussians) -> Gaussians:
+def watched(model: Gaussians, prior: Prior) -> Gaussians:
     """A copy of the model whose learned parameters have gradients enabled, for use inside a recorded function."""
-    values = [dr.copy(dr.detach(getattr(model, name))) for name in LEARNED]
-    dr.enable_grad(values)
-    return Gaussians(model.means, **dict(zip(LEARNED, values, strict=True)))
+    values = {name: dr.copy(dr.detach(getattr(model, name))) for name in prior.lam}
+    dr.enable_grad(list(values.values()))
+    return replace(model, **values)
 
 
-def _sizes(model: Gaussians, packed: Any, lists: BlockLists, size: Any) -> tuple[Any, ...]:
-    return len(lists.splat), len(lists.block), *model.sh.shape, *size
+def _sizes(model: Gaussians, prior: Prior, lists: BlockLists, size: Any) -> tuple[Any, ...]:
+    return prior.means, len(lists.splat), len(lists.block), *model.sh.shape, *size
 
 
 @frozen(lambda model, camera: model.sh.shape)
@@ -205,29 +245,34 @@ def _project(model: Gaussians, camera: Any) -> Any:
     return project(model, camera)
 
 
-@frozen(lambda model, camera, packed, lists, target, weight, size: _sizes(model, packed, lists, size))
+@frozen(lambda model, prior, camera, packed, lists, target, weight, size: _sizes(model, prior, lists, size))
 def _image_gradient(
-    model: Gaussians, camera: Any, packed: Any, lists: BlockLists, target: Any, weight: Any, size: Any
+    model: Gaussians, prior: Prior, camera: Any, packed: Any, lists: BlockLists, target: Any, weight: Any, size: Any
 ) -> Vector:
     """The derivative of half the summed squared error of one image."""
-    copy = watched(model)
+    copy = watched(model, prior)
     rgb = composite(project(copy, camera), packed, lists, *size).rgb
     dr.backward(0.5 * dr.sum(dr.square((rgb.array - target) * weight)))
-    return [dr.grad(getattr(copy, name)) for name in LEARNED]
+    return _gradients(copy, prior)
 
 
-@frozen(lambda model, vector, camera, packed, lists, weight, size: _sizes(model, packed, lists, size))
+@frozen(lambda model, prior, vector, camera, packed, lists, weight, size: _sizes(model, prior, lists, size))
 def _image_curvature(
-    model: Gaussians, vector: Vector, camera: Any, packed: Any, lists: BlockLists, weight: Any, size: Any
+    model: Gaussians, prior: Prior, vector: Vector, camera: Any, packed: Any, lists: BlockLists, weight: Any, size: Any
 ) -> Vector:
     """J^T J times a vector, for one image: forward mode gives J v, reverse mode J^T of that."""
-    copy = watched(model)
-    for name, tangent in zip(LEARNED, vector, strict=True):
-        dr.set_grad(getattr(copy, name), tangent)
+    copy = watched(model, prior)
+    for name, tangent in zip(prior.lam, vector, strict=True):
+        dr.set_grad(getattr(copy, name), prior.across(name, tangent))
     rgb = composite(project(copy, camera), packed, lists, *size).rgb
     dr.forward_to(rgb)
     along = dr.detach(dr.grad(rgb).array) * dr.square(weight)
-    copy = watched(model)
+    copy = watched(model, prior)
     rgb = composite(project(copy, camera), packed, lists, *size).rgb
     dr.backward(dr.sum(rgb.array * along))
-    return [dr.grad(getattr(copy, name)) for name in LEARNED]
+    return _gradients(copy, prior)
+
+
+def _gradients(copy: Gaussians, prior: Prior) -> Vector:
+    """The gradients that were found for a `watched` copy, by what is learned."""
+    return [prior.along(name, dr.grad(getattr(copy, name))) for name in prior.lam]

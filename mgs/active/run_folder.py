@@ -38,7 +38,8 @@ class State:
     """What is known after a step.
 
     gaussians: the fitted model. H [N,P]: information of the training set at that model. surface [S,P]: its information about
-    the S Gaussians on the prior's surface as they were before training, which is what the views see of the surface. taken:
+    the S Gaussians on the prior's surface as they were before training, which is what the views see of the surface; of learned
+    means, H has columns and surface has none. taken:
     frame indices in the order in which they were taken. steps: all lines of steps.jsonl. inputs: what the run was made from, a
     record of `mgs.active.inputs`, empty in runs of versions that kept none.
     """
@@ -52,8 +53,8 @@ class State:
 
 
 def check_settings(settings: NbvSettings, frames: int) -> None:
-    """Raises InputError where the policy, the estimator or the optimiser is unknown, or the dataset has too few frames for the
-    seeds and the budget."""
+    """Raises InputError where the policy, the estimator or the optimiser is unknown, estimator or policy knows nothing of means
+    that are learned, or the dataset has too few frames for the seeds and the budget."""
     from mgs.active.optimisers import OPTIMISERS  # these two need Dr.Jit, which reading a run does not
     from mgs.splat import ESTIMATORS
 
@@ -62,6 +63,10 @@ def check_settings(settings: NbvSettings, frames: int) -> None:
     if settings.estimator not in diagonal:
         known = ", ".join(diagonal)
         raise InputError(f"--estimator {settings.estimator}: gives no diagonal, or is unknown; choose one of {known}")
+    blind = [f"--estimator {settings.estimator}"] if settings.estimator != "exact" else []
+    blind += ["--policy paper"] if settings.policy == "paper" else []
+    if settings.train.means != "frozen" and blind:
+        raise InputError(f"--means {settings.train.means}: {blind[0]} knows nothing of means; leave out either")
     if settings.train.optimiser not in OPTIMISERS:
         raise InputError(f"--optimiser {settings.train.optimiser}: unknown; choose one of {', '.join(OPTIMISERS)}")
     if frames < settings.seeds:

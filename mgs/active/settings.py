@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from mgs.active.criteria import PIXEL_NOISE, PRIOR_STD, regularisation
+from mgs.active.criteria import MEAN_STD, PIXEL_NOISE, PRIOR_STD, regularisation
 from mgs.errors import InputError
 
 RATES = {"colour": 0.02, "scale": 0.04, "rotation": 0.02, "opacity": 0.1}
 """Learning rates of the optimiser, the longest step or about it, in each kind of parameter's own unit: colour coefficient,
 log-scale, quaternion, opacity logit. Chosen constants (docs/fit.md)."""
+
+MEAN_RATE = 0.02
+"""The same for means that are learned, over the spacing of the prior's samples. With larger steps more Gaussians are pushed
+behind others, where no image sees them. A chosen constant."""
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -24,11 +28,13 @@ Scale = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
 
 
 def _complete(given: Any, defaults: Mapping[str, float]) -> Any:
-    """A number for each kind of parameter: those given, the others as in `defaults`. A list is what older runs wrote."""
+    """A number for each kind of parameter: those given, the others as in `defaults`. A list is what older runs wrote.
+
+    A number for "mean" may be given too; it has no default, because its unit is the metre and scenes differ in size."""
     if isinstance(given, list | tuple) and len(given) == len(defaults):
         given = dict(zip(defaults, given, strict=True))
-    if not isinstance(given, Mapping) or not given.keys() <= defaults.keys():
-        raise ValueError(f"must be a number for each of {', '.join(defaults)}")
+    if not isinstance(given, Mapping) or not given.keys() <= {*defaults, "mean"}:
+        raise ValueError(f"must be a number for each of {', '.join(defaults)}; for mean, too, where means are learned")
     return {**defaults, **given}
 
 
@@ -37,6 +43,8 @@ class TrainSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    means: Literal["frozen", "normal", "free"] = "frozen"
+    """What the means may do: stay, as in the paper; move along the prior's normals; move freely (`mgs.splat.MEANS`)."""
     optimiser: str = "natural"
     """A row of `mgs.active.optimisers.OPTIMISERS`."""
     passes: Annotated[int, Field(ge=1)] = 20
@@ -45,7 +53,8 @@ class TrainSettings(BaseModel):
     """Settled when a pass lowers the loss by less than this share, twice in a row, and does not raise it by more
     (`mgs.active.stopping.stop_reason`)."""
     rates: dict[str, Annotated[float, Field(ge=0, allow_inf_nan=False)]] = RATES
-    """Learning rate of each kind of parameter; kinds left out take those of RATES. A rate of 0 leaves a kind as it is."""
+    """Learning rate of each kind of parameter; kinds left out take those of RATES. A rate of 0 leaves a kind as it is. That of
+    `mean`, metres, is read only where means are learned, and must be there then; `mgs nbv` sets it (`with_spacing`)."""
     decay: Positive = 0.1
     """The rates fall by this factor over `passes`."""
     seed: Annotated[int, Field(ge=0)] = 0
@@ -79,7 +88,8 @@ class NbvSettings(BaseModel):
     pixel_noise: Scale = PIXEL_NOISE
     """sigma_e in lambda = (sigma_e / tau)^2, linear RGB; `mgs.active.criteria.regularisation`."""
     prior_std: dict[str, Scale] = PRIOR_STD
-    """tau of each kind of parameter; kinds left out take those of `mgs.active.criteria.PRIOR_STD`."""
+    """tau of each kind of parameter; kinds left out take those of `mgs.active.criteria.PRIOR_STD`. That of `mean`, metres, is
+    read only where means are learned, and must be there then; `mgs nbv` sets it (`with_spacing`)."""
     evaluate_every: Annotated[int, Field(ge=0)] = 0
     """Measure PSNR on all views after every so many steps; 0 = only at the end. Never feeds back into the choice."""
     warm_rate: Positive = 0.3
@@ -91,15 +101,29 @@ class NbvSettings(BaseModel):
     _every_kind = field_validator("prior_std", mode="before")(lambda given: _complete(given, PRIOR_STD))
 
     def regularisation(self, groups: dict[str, slice]) -> NDArray[np.float64]:
-        """lambda of every column of the Fisher information, [P]: what the criteria of this run see."""
+        """lambda of every column of the Fisher information, [P]: what the criteria of this run see. groups: their kinds.
+
+        Raises InputError where there is no tau of one of these kinds.
+        """
+        if missing := [kind for kind in groups if kind not in self.prior_std]:
+            raise InputError(f"prior_std: has no number for {missing[0]}, which is learned; give one, metres")
         by_kind = regularisation(groups, self.pixel_noise, self.prior_std)
         return by_kind if self.lam is None else np.full_like(by_kind, self.lam)
+
+    def with_spacing(self, spacing: float) -> NbvSettings:
+        """The settings for a prior whose samples are so far apart, metres: where means are learned, with a tau and a rate of
+        theirs, unless these are given already."""
+        if self.train.means == "frozen":
+            return self
+        train = self.train.model_copy(update={"rates": {"mean": MEAN_RATE * spacing} | self.train.rates})
+        return self.model_copy(update={"train": train, "prior_std": {"mean": MEAN_STD * spacing} | self.prior_std})
 
 
 Model = TypeVar("Model", bound=BaseModel)
 
 OPTIONS = (
-    "policy", "nearest", "estimator", "budget", "seeds", "seed", "lam", "pixel_noise", "evaluate_every", "optimiser", "passes",
+    "policy", "nearest", "estimator", "budget", "seeds", "seed", "lam", "pixel_noise", "evaluate_every", "means", "optimiser",
+    "passes",
 )  # fmt: skip
 """Settings that `mgs nbv` has an option for, of the same name."""
 

@@ -17,15 +17,15 @@ from mgs.data.dataset import Dataset
 from mgs.gaussians import Gaussians
 from mgs.metrics import psnr
 from mgs.prior.build import Prior
-from mgs.prior.initial import initial_gaussians
+from mgs.prior.initial import initial_gaussians, initial_normals
 from mgs.splat import ListCache, fisher, groups, render
 
 
 def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stations:
     """Stations on the splat core, starting from the prior; the rock is at the prior's centre of mass."""
-    cache, train, lam = ListCache(), settings.train, settings.regularisation(groups(0))
-
-    by_kind = {kind: float(lam[columns][0]) for kind, columns in groups(0).items()}
+    cache, train, columns = ListCache(), settings.train, groups(0, settings.train.means)
+    lam, normals = settings.regularisation(columns), initial_normals(prior)
+    by_kind = {kind: float(lam[of_kind][0]) for kind, of_kind in columns.items()}
 
     def run_fit(
         gaussians: Gaussians,
@@ -36,15 +36,18 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
         on_pass: Callable[[int, int], None],
     ) -> Fit:
         scaled = train.model_copy(update={"rates": {kind: rate * value for kind, value in train.rates.items()}})
-        return fit(gaussians, cameras, targets, scaled, on_pass, cache, start, by_kind)
+        return fit(gaussians, cameras, targets, scaled, on_pass, cache, start, by_kind, normals)
+
+    def information(gaussians: Gaussians, camera: Camera, estimator: str) -> np.ndarray:
+        return fisher(gaussians, camera, estimator, cache=cache, means=train.means, normals=normals)
 
     return Stations(
         centre=prior.points.mean(axis=0),
-        groups=groups(0),
+        groups=columns,
         initial=lambda frames: initial_gaussians(prior, frames)[0],
         fit=run_fit,
-        fisher=lambda gaussians, camera: fisher(gaussians, camera, settings.estimator, cache=cache),
-        estimate=lambda gaussians, camera, estimator: fisher(gaussians, camera, estimator, cache=cache),
+        fisher=lambda gaussians, camera: information(gaussians, camera, settings.estimator),
+        estimate=information,
         exact=lambda gaussians, camera: fisher(gaussians, camera, cache=cache),
         measure=psnr_measure(dataset, cache),
         on_surface=len(prior.points),

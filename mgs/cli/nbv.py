@@ -57,6 +57,9 @@ def nbv(
         list[str] | None,
         typer.Option(metavar="KIND=NUMBER", help=f"Prior standard deviation of a kind of parameter [{_numbers(PRIOR_STD)}]."),
     ] = None,
+    means: Annotated[
+        str, typer.Option(help="What the means may do: frozen (stay), normal (move along the prior's normals), or free.")
+    ] = "frozen",
     optimiser: Annotated[str, typer.Option(help="Optimiser of the fit: natural or adam.")] = "natural",
     rate: Annotated[
         list[str] | None,
@@ -85,7 +88,7 @@ def nbv(
         return
     if dataset is None or out is None:
         raise InputError("nbv: give a DATASET and --out RUN, or --resume RUN")
-    train: dict[str, Any] = {"optimiser": optimiser, "rates": pairs("--rate", rate)}
+    train: dict[str, Any] = {"means": means, "optimiser": optimiser, "rates": pairs("--rate", rate)}
     if passes is not None:
         train["passes"] = passes
     settings: dict[str, Any] = {

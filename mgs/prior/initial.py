@@ -89,6 +89,12 @@ def initial_gaussians(prior: Prior, seed_frames: Sequence[Frame]) -> tuple[Gauss
     return _with_backing(surface, prior), seen
 
 
+def initial_normals(prior: Prior) -> np.ndarray:
+    """The normal of each of the Gaussians of `initial_gaussians`, [N + backed,3], unit: of its sample, or of the sample that it
+    stands behind."""
+    return np.concatenate([prior.normals, prior.normals[: prior.backed]])
+
+
 def _with_backing(surface: Gaussians, prior: Prior) -> Gaussians:
     """The surface's Gaussians, then those behind its first `prior.backed`."""
     count = prior.backed

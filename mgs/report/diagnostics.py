@@ -4,8 +4,8 @@ H [N,P] is the diagonal of the Fisher information, summed over the training view
 about each parameter (`mgs.active.criteria.regularisation`). From these, every Gaussian has the following numbers, its
 *scalars*:
 
-- `fisher.colour`, `fisher.scale`, `fisher.rotation`, `fisher.opacity`: the sum of H over its parameters of that kind, in
-  (pixel value / parameter)^2.
+- `fisher.colour`, `fisher.scale`, `fisher.rotation`, `fisher.opacity`, and `fisher.mean` where the run learns the means: the
+  sum of H over its parameters of that kind, in (pixel value / parameter)^2. The preview has no panel of the last.
 - `information`: 1/2 sum_k log(1 + H_k / lam_k) over its parameters k, in nats: what the training views say about it. All kinds
   of parameters have the same unit here.
 - `uncertainty`: the mean over its parameters of lam_k / (H_k + lam_k): the variance that is left over the variance of the
@@ -221,8 +221,8 @@ def diagnose_run(
     frames = choose_views(dataset.frames, trained, wanted)
     settings, state = run_folder.read_settings(run), run_folder.read_checkpoint(run)
     assert state is not None
-    columns = groups(gaussians.sh_degree)
-    prior_lam = criteria.regularisation(columns, settings.pixel_noise, settings.prior_std)
+    columns = groups(gaussians.sh_degree, settings.train.means)
+    prior_lam = criteria.regularisation(groups(gaussians.sh_degree), settings.pixel_noise, settings.prior_std)
     scalars = gaussian_scalars(state.H, state.surface, settings.regularisation(columns), prior_lam, columns)
     out = run / "diagnostics"
     write_information_ply(out / "information.ply", gaussians, scalars)

@@ -96,7 +96,7 @@ def fisher(
     if MEANS[means] or alpha_weight:
         if estimator not in EXACT:
             raise InputError(f"fisher: the estimator {estimator!r} knows neither means nor alpha; use {' or '.join(EXACT)}")
-        unit = _unit_normals(n, normals) if means == "normal" else None
+        unit = unit_normals(n, normals) if means == "normal" else None
         options |= {"means": means, "normals": unit, "alpha_weight": alpha_weight}
     if n == 0:
         return np.zeros((0, size, size) if estimator == "block" else (0, size), np.float32)
@@ -108,7 +108,7 @@ def fisher(
     return ESTIMATORS[estimator](as_drjit(gaussians), camera, background, cache, **options)
 
 
-def _unit_normals(n: int, normals: Any) -> np.ndarray:
+def unit_normals(n: int, normals: Any) -> np.ndarray:
     """Normals, float64 [N,3], of length 1. Raises InputError where they are missing or unusable."""
     if normals is None:
         raise InputError("fisher: means='normal' needs normals [N,3], the direction in which each mean may move")

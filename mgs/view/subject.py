@@ -93,8 +93,8 @@ def _scalars(settings: NbvSettings, state: run_folder.State) -> dict[str, np.nda
     """SCALARS of the model of a run, as `mgs diagnose` has them."""
     from mgs.splat import groups
 
-    columns = groups(state.gaussians.sh_degree)
-    prior_lam = criteria.regularisation(columns, settings.pixel_noise, settings.prior_std)
+    columns = groups(state.gaussians.sh_degree, settings.train.means)
+    prior_lam = criteria.regularisation(groups(state.gaussians.sh_degree), settings.pixel_noise, settings.prior_std)
     found = gaussian_scalars(state.H, state.surface, settings.regularisation(columns), prior_lam, columns)
     return {name: found[name] for name in SCALARS}
 
