@@ -95,6 +95,8 @@ class _View:
         """How far inside the silhouette points [N,3] are, in units of the world; +inf where they are not in the image."""
         import cv2
 
+        if len(points) == 0:
+            return np.zeros(0)
         pixels, z = self.camera.project(points)
         inside = (z > 0) & (pixels > 0).all(1) & (pixels < [self.camera.width, self.camera.height]).all(1)
         padded = np.zeros((-(-len(points) // ROW) * ROW, 2), np.float32)
