@@ -427,6 +427,11 @@ def _few(root: Path, data: Callable[[str], Path]) -> list[str | Path]:
     return []
 
 
+def _alpha(root: Path, data: Callable[[str], Path]) -> list[str | Path]:
+    import_source(read_source(data("nerf-synthetic")), root)
+    return []
+
+
 def _apart(root: Path, data: Callable[[str], Path]) -> list[str | Path]:
     """Every camera looks away from what the others look at."""
     dataset = import_source(read_source(data("nerf-synthetic")), root)
@@ -491,6 +496,7 @@ REFUSED: dict[str, tuple[Callable[[Path, Callable[[str], Path]], list[Any]], lis
     "no such source": (_nothing, ["--from", "dreams"], "choose one of depth, mesh, points, hull"),
     "mesh without mesh": (_nothing, ["--from", "mesh"], "give --mesh MESH"),
     "mesh and hull": (_both, [], "give one of them"),
+    "noise on a hull": (_alpha, ["--prior-noise", "0.1"], "--prior-noise shape a mesh that is built of a cloud, but a hull"),
     "no such cloud": (_no_object, ["--points", "none.ply"], "none.ply: no such point cloud"),
     "up of words": (_few, ["--up", "skyward"], "--up 'skyward': expected auto, or three numbers"),
     "up of zeros": (_few, ["--up", "0,0,0"], "--up '0,0,0': expected auto, or three numbers"),

@@ -18,9 +18,9 @@ from mgs.data.clouds import SparseCloud, views_of
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.visibility import has_masks, mask_share
 from mgs.errors import InputError
-from mgs.prior.segmentation import NoSurface, Plane, SegmentedCloud, estimate_normals, ground_plane
+from mgs.prior.segmentation import NoSurface, Plane, SegmentedCloud, degrade, estimate_normals, ground_plane
 from mgs.prior.settings import PriorSettings
-from mgs.seeds import derive_seed
+from mgs.seeds import derive_seed, generator
 from mgs.survey.depth_sensor import SIGMA_FROM_MAD
 from mgs.survey.fusion import REACH, Cloud, focus
 
@@ -147,8 +147,9 @@ def segment_points(
         kept[kept] = on_surface(points[kept])
     if kept.sum() < LEAST_POINTS:
         raise NoSurface(f"{dataset.root}: only {kept.sum()} of {len(sparse.points)} points lie {where}", points, kept)
-    rock = points[kept]
-    return SegmentedCloud(cloud, plane, ground, rock, estimate_normals(rock, views[kept]), 0.0, clusters)
+    rock, left = degrade(points[kept], settings.noise, settings.holes, generator(settings.seed, "prior/degrade"))
+    normals = estimate_normals(rock[left], views[kept][left], settings.noise / cloud.voxel)
+    return SegmentedCloud(cloud, plane, ground, rock[left], normals, 0.0, clusters)
 
 
 def _plane_or_none(cloud: Cloud, frames: Sequence[Frame], settings: PriorSettings) -> Plane | None:
