@@ -144,6 +144,17 @@ def test_a_finer_grid_gives_the_same_hull(tmp_path: Path, monkeypatch: pytest.Mo
     assert distances_to_mesh(coarse.mesh.vertices, fine.mesh.vertices, fine.mesh.faces).max() < coarse.cell
 
 
+def test_large_masks_are_carved_with_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset = floating(tmp_path / "d", lattice(16))
+    whole = visual_hull(dataset.frames)
+    monkeypatch.setattr(hull, "MOST_PIXELS", 96 * 72 // 4)
+    views = [hull._view(frame) for frame in dataset.frames]
+    assert {view.distance.shape for view in views} == {(36, 48)}
+    blocks = visual_hull(dataset.frames)
+    pixel = 3.0 / 90
+    assert distances_to_mesh(blocks.mesh.vertices, whole.mesh.vertices, whole.mesh.faces).max() < 1.5 * pixel
+
+
 def test_a_frame_whose_mask_does_not_fit_is_named(tmp_path: Path) -> None:
     dataset = floating(tmp_path / "d", lattice(12))
     wrong = np.zeros((72, 96), bool)
