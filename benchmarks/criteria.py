@@ -60,14 +60,9 @@ class Bench:
         self.metric = f"test_{METRIC}" if self.dataset.test_views() else METRIC
         self.left = [i for i in range(len(self.dataset)) if i not in state.taken]
         self.model = array_digest(asdict(state.gaussians).values())
-        self.stations = self._stations(self.settings.train.seed)
-
-    def _stations(self, seed: int) -> Any:
-        """The loop's stations; seed: of the order in which fits take the images."""
         from mgs.active.stations import real_stations
 
-        train = self.settings.train.model_copy(update={"seed": seed})
-        return real_stations(self.dataset, self.prior, self.settings.model_copy(update={"train": train}))
+        self.stations = real_stations(self.dataset, self.prior, self.settings)
 
     def scores(self, policies: Sequence[str]) -> dict[str, list[float]]:
         """The scores of the candidates, by policy, and how far they are from the views taken, by which ties are decided."""
@@ -90,10 +85,10 @@ class Bench:
         taken = [*self.state.taken, candidate]
         cameras = [self.dataset.frames[i].camera for i in taken]
         targets = [target_of(self.dataset.frames[i]) for i in taken]
-        fit = self._stations(self.settings.train.seed + order).fit
+        fit = self.stations.fit
         start = self.stations.initial([self.dataset.frames[i] for i in self.state.taken[: self.settings.seeds]])
-        rate = self.settings.warm_rate
-        gaussians = fit(self.state.gaussians, start, cameras, targets, rate, lambda done, most: None).gaussians
+        train = self.settings.train_at(1).model_copy(update={"seed": self.settings.train.seed + order})
+        gaussians = fit(self.state.gaussians, start, cameras, targets, train, lambda done, most: None).gaussians
         return float(self.stations.measure(gaussians, taken)[self.metric])
 
 

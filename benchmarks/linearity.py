@@ -25,7 +25,7 @@ from mgs.active.criteria import PIXEL_NOISE, regularisation
 from mgs.active.fitting import fit
 from mgs.active.loop import target_of
 from mgs.active.pose_policies import seed_views
-from mgs.active.settings import RATES, NbvSettings, TrainSettings
+from mgs.active.settings import TrainSettings
 from mgs.camera import Camera
 from mgs.data.dataset import load_dataset
 from mgs.files import write_json
@@ -73,8 +73,8 @@ def study(root: Path) -> list[dict[str, Any]]:
     judged = [cameras[i] for i in left[:: len(left) // JUDGED][:JUDGED]]
     start = initial_gaussians(prior, [dataset.frames[i] for i in taken])[0]
 
-    def fitted(model: Gaussians, views: list[int], passes: int, rate: float = 1.0) -> Gaussians:
-        train = TrainSettings(passes=passes, tolerance=0.0, rates={kind: rate * value for kind, value in RATES.items()})
+    def fitted(model: Gaussians, views: list[int], passes: int) -> Gaussians:
+        train = TrainSettings(passes=passes, tolerance=0.0)
         targets = [target_of(dataset.frames[i]) for i in views]
         return fit(model, [cameras[i] for i in views], targets, train, cache=cache, start=start, lam=by_kind).gaussians
 
@@ -92,7 +92,7 @@ def study(root: Path) -> list[dict[str, Any]]:
                 records.append({"passes": passes, "move": f"draw, {name}", "factor": factor, "departure": ratio, "rms": size})
                 print(records[-1], flush=True)
         for added in left[2::7][:3]:
-            after = fitted(model, [*taken, added], passes, NbvSettings.model_fields["warm_rate"].default)
+            after = fitted(model, [*taken, added], passes)
             move = {name: getattr(after, name) - getattr(model, name) for name in LEARNED}
             ratio, size = departure(model, move, judged, cache)
             records.append({"passes": passes, "move": "one added view", "factor": 1.0, "departure": ratio, "rms": size})

@@ -27,7 +27,7 @@ from mgs.active.loop import target_of
 from mgs.active.objective import Objective, dot, objective, plus
 from mgs.active.optimisers import INFORMATION_PASSES, OPTIMISERS
 from mgs.active.pose_policies import seed_views
-from mgs.active.settings import RATES, NbvSettings, TrainSettings
+from mgs.active.settings import RATES, TrainSettings
 from mgs.data.dataset import load_dataset
 from mgs.files import write_json
 from mgs.gaussians import LEARNED, Gaussians
@@ -130,14 +130,13 @@ def study(case: _Case) -> list[dict[str, Any]]:
         records.append({"start": begin, "row": row, "passes": work, "seconds": seconds, "phi": phi, "psnr_inside": decibels})
         print(records[-1], flush=True)
 
-    warm_rate = NbvSettings.model_fields["warm_rate"].default
     before = case.fitted(case.start, case.taken, "natural", RATES, TrainSettings().passes)
-    for begin, model, views, scale in (("cold", case.start, case.taken, 1.0), ("warm", before, case.added, warm_rate)):
+    for begin, model, views in (("cold", case.start, case.taken), ("warm", before, case.added)):
         goal = case.objective(views)
         for row, (optimiser, rates, lengths) in ROWS.items():
             for passes in lengths:
                 began = time.perf_counter()
-                found = case.fitted(model, views, optimiser, {kind: scale * rate for kind, rate in rates.items()}, passes)
+                found = case.fitted(model, views, optimiser, rates, passes)
                 seconds = time.perf_counter() - began
                 extra = -(-passes // INFORMATION_PASSES) if OPTIMISERS[optimiser].uses_information else 0
                 record(begin, row, passes + extra, seconds, goal, found)

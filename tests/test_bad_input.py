@@ -135,9 +135,9 @@ PIXELS: dict[str, tuple[Change, str]] = {
 
 SURVEYS: dict[str, tuple[Change, str]] = {
     "truncated depth": (truncate("depth/kf_0005.exr"), "kf_0005.exr"),
-    "no depth in transforms.json": (
-        edit_transforms(lambda data: [frame.pop("depth_file_path") for frame in data["frames"]]),
-        "depth_file_path",
+    "neither depth nor masks in transforms.json": (
+        edit_transforms(lambda data: [frame.pop(key) for frame in data["frames"] for key in ("depth_file_path", "mask_path")]),
+        "has no depth images and no points (sparse.ply) and no masks",
     ),
     "no return in any pixel": (every_depth(lambda path: np.zeros((tiny.HEIGHT, tiny.WIDTH))), "return"),
     "NaN in every pixel": (every_depth(lambda path: np.full((tiny.HEIGHT, tiny.WIDTH), np.nan)), "return"),

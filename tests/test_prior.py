@@ -93,6 +93,31 @@ def test_largest_cluster_wins() -> None:
     assert 0.05 < eps < 0.5
 
 
+def test_what_stands_up_is_the_rock_not_a_long_low_rise_of_the_ground() -> None:
+    rng = np.random.default_rng(6)
+    rise, rock = rng.uniform([3, 0, 0.02], [5, 2, 0.05], (6000, 3)), rng.uniform([0, 0, 0.02], [0.6, 0.6, 0.5], (2500, 3))
+    inside, _, _ = rock_cluster(np.concatenate([rise, rock]), 0.05, np.zeros(3), weight=lambda points: points[:, 2])
+    assert inside[6000:].mean() > 0.99
+    assert not inside[:6000].any()
+
+
+def test_a_wide_low_sheet_over_the_ground_is_closed() -> None:
+    """Its Poisson surface alone leaves the cube at the open underside."""
+    from mgs.prior.segmentation import Plane
+    from mgs.prior.surface import poisson_mesh
+
+    xy = np.random.default_rng(7).uniform(-1, 1, (20_000, 2))
+    height = 0.02 + 0.04 * np.cos(np.pi / 2 * xy[:, 0]) * np.cos(np.pi / 2 * xy[:, 1])
+    slope = -0.04 * np.pi / 2 * np.sin(np.pi / 2 * xy) * np.cos(np.pi / 2 * xy[:, ::-1])
+    normals = np.column_stack([-slope, np.ones(len(xy))])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = np.column_stack([xy, height])
+    mesh, _ = poisson_mesh(points, normals, 0.02, Plane(Z, 0.0, 0.001, 0.002), None)
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces).is_watertight
+    inner = np.abs(xy).max(1) < 0.8
+    assert distances_to_mesh(points[inner], mesh.vertices, mesh.faces).max() < 0.01
+
+
 def test_of_two_equal_clusters_the_one_looked_at_wins_and_a_tie_is_an_error() -> None:
     blob = np.random.default_rng(4).uniform(-0.5, 0.5, (2000, 3))
     both = np.concatenate([blob - 2 * X, blob + 2 * X])

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from mgs.active import loop, run_folder
-from mgs.active.settings import NbvSettings
+from mgs.active.settings import NbvSettings, TrainSettings
 from mgs.active.stopping import StopReason
 from mgs.camera import Camera, look_at
 from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
@@ -101,7 +101,9 @@ def estimate(gaussians: Gaussians, camera: Camera, estimator: str) -> np.ndarray
     return F[:, None] * np.eye(11, dtype=np.float32) if estimator == "block" else F
 
 
-def fit(gaussians: Gaussians, start: Gaussians, cameras: list[Camera], targets: list[np.ndarray], rate: float, on_pass) -> Fit:
+def fit(
+    gaussians: Gaussians, start: Gaussians, cameras: list[Camera], targets: list[np.ndarray], train: TrainSettings, on_pass
+) -> Fit:
     """Each point's colour moves half way to the mean of its pixels."""
     on_pass(0, 1)
     total, weight = np.zeros((POINTS, 3)), np.full(POINTS, 1e-6)

@@ -203,6 +203,25 @@ def depth_error(data: dict[str, Any]) -> str:
     return markdown(heading, [[name, *(f"{100 * share:.1f} %" for share in row)] for name, row in data["shares"].items()])
 
 
+def own_data(data: dict[str, Any]) -> str:
+    """Held-out quality from strangers' data, and what is lost against the exact prior."""
+    rows = []
+    for row in data["records"]:
+        cells = [f"{row[key]:.2f} ({row[loss]:+.2f})" for key, loss in (("psnr", "loss"), ("psnr_rock", "loss_rock"))]
+        overlaps = (row.get(key) for key in ("masks_overlap_unrefined", "masks_overlap"))
+        overlap = ", ".join("" if value is None else f"{value:.3f}" for value in overlaps).strip(", ")
+        cells += [f"{1e3 * row['accuracy']:.0f} mm", overlap]
+        rows.append([f"{row['kind']}: {row['from']}, masks {row['masks']}", *cells])
+    heading = [
+        "data, prior from",
+        "all pixels, dB",
+        "inside the rock, dB",
+        "accuracy",
+        "overlap of made masks, before and after",
+    ]
+    return markdown(heading, rows) + made_by(data)
+
+
 def backing(data: dict[str, Any]) -> str:
     """Held-out quality and see-through of fits with and without Gaussians behind the surface."""
     found = {(row["gaussians"], row["passes"], row["backing"]): row for row in data["records"]}
@@ -306,6 +325,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "lambda-ranking": ("lambda_ranking", lambda_ranking),
     "depth-error": ("depth_error", depth_error),
     "backing": ("backing", backing),
+    "own-data": ("own_data", own_data),
 }
 """By name: the file in docs/benchmarks, without `.json`, and what makes the table of its contents."""
 

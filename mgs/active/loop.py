@@ -18,7 +18,7 @@ import numpy as np
 from mgs.active import criteria, directional, inputs, policies, policy_file, pose_policies
 from mgs.active.outlook import Outlook
 from mgs.active.run_folder import State, check_settings, read_checkpoint, write_checkpoint, write_steps
-from mgs.active.settings import NbvSettings
+from mgs.active.settings import NbvSettings, TrainSettings
 from mgs.active.stopping import StopReason
 from mgs.camera import Camera
 from mgs.data.dataset import Dataset, Frame
@@ -55,8 +55,8 @@ class Stations:
     centre: [3] the rock, metres.
     groups: columns of the Fisher information by kind of parameter (`mgs.splat.groups`).
     initial(seed frames) -> Gaussians before any training.
-    fit(gaussians, start, cameras, targets, rate, on_pass) -> Fit; start, the Gaussians before any training, and targets as in
-    `mgs.active.fitting.fit`; rate multiplies all rates.
+    fit(gaussians, start, cameras, targets, train, on_pass) -> Fit; start: the Gaussians before any training; targets, and train,
+    the settings, as in `mgs.active.fitting.fit`.
     fisher(gaussians, camera) -> information of one view [N,P], by the estimator of the run.
     estimate(gaussians, camera, estimator) -> information of one view by a row of `mgs.splat.ESTIMATORS`.
     measure(gaussians, taken frame indices) -> entries for steps.jsonl.
@@ -70,7 +70,7 @@ class Stations:
     centre: np.ndarray
     groups: dict[str, slice]
     initial: Callable[[list[Frame]], Gaussians]
-    fit: Callable[[Gaussians, Gaussians, list[Camera], list[np.ndarray], float, Callable[[int, int], None]], Fit]
+    fit: Callable[[Gaussians, Gaussians, list[Camera], list[np.ndarray], TrainSettings, Callable[[int, int], None]], Fit]
     fisher: Callable[[Gaussians, Camera], np.ndarray]
     estimate: Callable[[Gaussians, Camera, str], np.ndarray]
     measure: Callable[[Gaussians, list[int]], dict[str, float]]
@@ -273,9 +273,8 @@ class Loop:
                     self.images[i] = target_of(self.frames[i])
         with watch("fit"):
             targets = [self.images[i] for i in taken]
-            rate = self.settings.warm_rate if step else 1.0
             on_pass = partial(self.progress, "fitting")
-            fit = self.stations.fit(state.gaussians, self.start, cameras, targets, rate, on_pass)
+            fit = self.stations.fit(state.gaussians, self.start, cameras, targets, self.settings.train_at(step), on_pass)
         if fit.stop_reason == StopReason.DIVERGED:
             raise InputError(_diverged(self.out, step, fit.losses))
         with watch("information"):

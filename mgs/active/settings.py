@@ -92,13 +92,22 @@ class NbvSettings(BaseModel):
     read only where means are learned, and must be there then; `mgs nbv` sets it (`with_spacing`)."""
     evaluate_every: Annotated[int, Field(ge=0)] = 0
     """Measure PSNR on all views after every so many steps; 0 = only at the end. Never feeds back into the choice."""
-    warm_rate: Positive = 0.3
-    """Learning rates of the fits after the first, over those of the first: they start from a model that was fitted to all
-    but one image, so less is left to move. A chosen constant."""
+    warm_passes: Annotated[int, Field(ge=1)] = 10
+    """Most passes of the fits after the first, if `train.passes` is not less: they start from a model that was fitted to all
+    images but one. A chosen constant (docs/fit.md)."""
+    warm_rate: Positive = 1.0
+    """Learning rates of the fits after the first, over those of the first."""
     train: TrainSettings = TrainSettings()
     """How each fit is done."""
 
     _every_kind = field_validator("prior_std", mode="before")(lambda given: _complete(given, PRIOR_STD))
+
+    def train_at(self, step: int) -> TrainSettings:
+        """How the fit of a step is done: that of the seeds, step 0, as `train` says, the others with what is warm."""
+        if step == 0:
+            return self.train
+        rates = {kind: self.warm_rate * rate for kind, rate in self.train.rates.items()}
+        return self.train.model_copy(update={"rates": rates, "passes": min(self.warm_passes, self.train.passes)})
 
     def regularisation(self, groups: dict[str, slice]) -> NDArray[np.float64]:
         """lambda of every column of the Fisher information, [P]: what the criteria of this run see. groups: their kinds.

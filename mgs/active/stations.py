@@ -10,7 +10,7 @@ import numpy as np
 from mgs.active.fitting import Fit, fit
 from mgs.active.inputs import prior_digest
 from mgs.active.loop import Stations
-from mgs.active.settings import NbvSettings
+from mgs.active.settings import NbvSettings, TrainSettings
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import Dataset
@@ -23,7 +23,8 @@ from mgs.splat import ListCache, fisher, groups, render
 
 def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stations:
     """Stations on the splat core, starting from the prior; the rock is at the prior's centre of mass."""
-    cache, train, columns = ListCache(), settings.train, groups(0, settings.train.means)
+    cache, means = ListCache(), settings.train.means
+    columns = groups(0, means)
     lam, normals = settings.regularisation(columns), initial_normals(prior)
     by_kind = {kind: float(lam[of_kind][0]) for kind, of_kind in columns.items()}
 
@@ -32,14 +33,13 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
         start: Gaussians,
         cameras: list[Camera],
         targets: list[np.ndarray],
-        rate: float,
+        train: TrainSettings,
         on_pass: Callable[[int, int], None],
     ) -> Fit:
-        scaled = train.model_copy(update={"rates": {kind: rate * value for kind, value in train.rates.items()}})
-        return fit(gaussians, cameras, targets, scaled, on_pass, cache, start, by_kind, normals)
+        return fit(gaussians, cameras, targets, train, on_pass, cache, start, by_kind, normals)
 
     def information(gaussians: Gaussians, camera: Camera, estimator: str) -> np.ndarray:
-        return fisher(gaussians, camera, estimator, cache=cache, means=train.means, normals=normals)
+        return fisher(gaussians, camera, estimator, cache=cache, means=means, normals=normals)
 
     return Stations(
         centre=prior.points.mean(axis=0),

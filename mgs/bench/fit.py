@@ -21,7 +21,7 @@ from mgs.active.fitting import Fit, fit
 from mgs.active.loop import target_of
 from mgs.active.objective import Objective, newton_decrease, objective
 from mgs.active.pose_policies import seed_views
-from mgs.active.settings import NbvSettings, TrainSettings
+from mgs.active.settings import TrainSettings
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.gaussians import Gaussians
 from mgs.prior.build import Prior, build_prior
@@ -103,8 +103,8 @@ def bench_fit(root: Path, report: Callable[[str], None]) -> dict[str, Any]:
     report("the end of the fit: predicted and found")
     end = _end_of_fit(case, stopped)
     report(f"passes to the objective of {OLD_PASSES} passes at the first version's rates")
-    cold = passes_to(case, case.start, 1.0)
-    warm = passes_to(_one_more(case), stopped.gaussians, NbvSettings.model_fields["warm_rate"].default)
+    cold = passes_to(case, case.start)
+    warm = passes_to(_one_more(case), stopped.gaussians)
     report(f"ranking of candidates from {len(STATES)} states")
     ranking = [_ranking(_case(dataset, small, how, count)) for how, count in STATES]
     figures = {
@@ -165,23 +165,22 @@ def _end_of_fit(case: _Case, stopped: Fit) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def passes_to(case: _Case, model: Gaussians, rate: float) -> dict[str, Any]:
+def passes_to(case: _Case, model: Gaussians) -> dict[str, Any]:
     """How many passes a fit needs to reach the objective that the first version's rates reach in OLD_PASSES passes.
 
-    rate: multiplies the rates of both. Returns that objective, the fewest of TRIED_PASSES that reach it (infinite where none
-    does), and for every fit its passes, objective and seconds.
+    Returns that objective, the fewest of TRIED_PASSES that reach it (infinite where none does), and for every fit its passes,
+    objective and seconds.
     """
 
-    def timed(rates: dict[str, float], passes: int) -> dict[str, Any]:
-        train = TrainSettings(passes=passes, tolerance=0.0, rates={kind: rate * value for kind, value in rates.items()})
+    def timed(train: TrainSettings) -> dict[str, Any]:
         began = time.perf_counter()
         found = case.fit(model, case.taken, train)
-        return {"passes": passes, "seconds": time.perf_counter() - began, "phi": case.phi(found.gaussians)}
+        return {"passes": train.passes, "seconds": time.perf_counter() - began, "phi": case.phi(found.gaussians)}
 
-    old = timed(OLD_RATES, OLD_PASSES)
+    old = timed(TrainSettings(optimiser="adam", passes=OLD_PASSES, tolerance=0.0, rates=OLD_RATES))
     tried: list[dict[str, Any]] = []
     for passes in TRIED_PASSES:
-        tried.append(timed(TrainSettings().rates, passes))
+        tried.append(timed(TrainSettings(passes=passes, tolerance=0.0)))
         if tried[-1]["phi"] <= old["phi"]:
             break
     reached = tried[-1]["phi"] <= old["phi"]

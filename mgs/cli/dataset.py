@@ -1,4 +1,4 @@
-"""`mgs dataset check`: read a dataset and say what is wrong with it."""
+"""`mgs dataset`: say what is wrong with a dataset, or make masks for one that has none."""
 
 from __future__ import annotations
 
@@ -8,22 +8,63 @@ from typing import Annotated
 
 import typer
 
+UNCERTAINTY = 2.0
+"""By how much a prior may be wrong, over its depth tolerance, where masks are made of it. benchmarks/own_data.py measures what
+the refinement gains."""
+
 
 class Action(StrEnum):
     """What to do with a dataset."""
 
     check = "check"
+    masks = "masks"
 
 
 def dataset(
-    action: Annotated[Action, typer.Argument(help="check: read every file, and compare depth, masks and poses.")],
+    action: Annotated[
+        Action, typer.Argument(help="check: read every file, and compare depth, masks and poses. masks: see below.")
+    ],
     path: Annotated[Path, typer.Argument(help="Folder of the dataset.")],
+    prior: Annotated[Path | None, typer.Option(help="masks: the prior to project. Default: DATASET/prior.")] = None,
+    refine: Annotated[bool, typer.Option(help="masks: move outlines to where colours change, near the prior's.")] = True,
 ) -> None:
     """Check that every file of a dataset can be read and has the right size, and that colour, depth, masks and poses agree.
 
     Prints every problem and its cure. The exit code is 2 where there is one. Test views are a dataset of their own: give
     DATASET/test.
+
+    `mgs dataset masks DATASET` makes masks for a dataset that has none: it projects the prior into every image, moves the
+    outlines to where colours change, writes masks/, and masks.png for a person to look at.
     """
+    if action == Action.masks:
+        _make_masks(path, path / "prior" if prior is None else prior, refine)
+    else:
+        _check(path)
+
+
+def _make_masks(path: Path, prior: Path, refine: bool) -> None:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from mgs.data.dataset import load_dataset
+    from mgs.data.masks import SHEET, make_masks
+    from mgs.prior.build import load_prior
+
+    loaded, known = load_dataset(path), load_prior(prior)
+    console = Console()
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task("masks", total=len(loaded))
+        made = make_masks(
+            loaded,
+            known.mesh,
+            UNCERTAINTY * known.depth_tolerance,
+            refine=refine,
+            progress=lambda done, total: bar.update(task, completed=done),
+        )
+    console.print(f"{path}: {len(made)} masks of {prior}; look at {path / SHEET} before you use them")
+
+
+def _check(path: Path) -> None:
     from rich.console import Console
     from rich.progress import Progress
 

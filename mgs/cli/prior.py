@@ -9,8 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    from rich.status import Status
+
     from mgs.data.dataset import Dataset, Frame
     from mgs.prior.build import Prior
+    from mgs.prior.segmentation import SegmentedCloud
+    from mgs.prior.settings import PriorSettings
 
 SEEDS = 4
 """Number of seed frames in the paper, and of those for which the share of samples that they see is printed."""
@@ -71,7 +75,6 @@ def prior(
     largest body that fits into all masks. Then spread samples evenly over what some frame saw. Writes mesh.ply, points.ply,
     prior.json and prior.png.
     """
-    import numpy as np
     from rich.console import Console
 
     from mgs.cli.printing import parse_up
@@ -79,11 +82,10 @@ def prior(
     from mgs.data.meshes import GLTF
     from mgs.errors import InputError
     from mgs.files import atomic_folder, check_new_folder
-    from mgs.prior.build import build_prior, prior_from_mesh, save_prior
-    from mgs.prior.figure import draw_prior, draw_refused
+    from mgs.prior.build import prior_from_mesh, save_prior
+    from mgs.prior.figure import draw_prior
     from mgs.prior.initial import with_share_seen
     from mgs.prior.photographs import source_of
-    from mgs.prior.segmentation import NoSurface
     from mgs.prior.settings import PriorSettings
 
     console = Console()
@@ -102,14 +104,7 @@ def prior(
             upward: Any = "auto" if up == "auto" else axis
             chosen = source_of(loaded, source, points)
             console.print(f"prior from {chosen}" + ("" if source or points else WHY[chosen]))
-            try:
-                result, segmented = build_prior(
-                    loaded, settings, lambda stage: status.update(f"prior: {stage}"), source=chosen, points=points, up=upward
-                )
-            except NoSurface as refused:
-                picture = folder.with_name(f"{folder.name}-refused.png")
-                draw_refused(picture, refused.points, refused.kept, np.array(loaded.up))
-                raise InputError(f"{refused} (the points: {picture})") from None
+            result, segmented = _built(loaded, settings, folder, status, source=chosen, points=points, up=upward)
         status.update("prior: what four seed frames see")
         result = with_share_seen(result, _seed_frames(loaded, result))
         status.update("prior: picture")
@@ -118,6 +113,25 @@ def prior(
             draw_prior(unfinished / "prior.png", result, segmented)
     console.print(_table(result.numbers))
     console.print(f"wrote {folder}: mesh.ply, points.ply, prior.json, prior.png")
+
+
+def _built(
+    dataset: Dataset, settings: PriorSettings, folder: Path, status: Status, **options: Any
+) -> tuple[Prior, SegmentedCloud | None]:
+    """`build_prior` with its stages shown; a refused cloud is drawn beside `folder`, and the picture is named in the error."""
+    import numpy as np
+
+    from mgs.errors import InputError
+    from mgs.prior.build import build_prior
+    from mgs.prior.figure import draw_refused
+    from mgs.prior.segmentation import NoSurface
+
+    try:
+        return build_prior(dataset, settings, lambda stage: status.update(f"prior: {stage}"), **options)
+    except NoSurface as refused:
+        picture = folder.with_name(f"{folder.name}-refused.png")
+        draw_refused(picture, refused.points, refused.kept, np.array(dataset.up))
+        raise InputError(f"{refused} (the points: {picture})") from None
 
 
 def _seed_frames(dataset: Dataset, prior: Prior) -> list[Frame]:

@@ -183,14 +183,7 @@ def prior_from_mesh(path: str | Path, settings: PriorSettings, up: Up = PLUS_Z, 
     Raises InputError as `read_mesh` and `sample_surface`, if neither the number of samples nor their spacing is given, and for
     the settings that only a mesh built from a cloud has: noise, holes and poisson_depth.
     """
-    built = {
-        "--prior-noise": settings.noise > 0,
-        "--holes": settings.holes > 0,
-        "--poisson-depth": settings.poisson_depth is not None,
-    }
-    given = " and ".join(option for option, is_given in built.items() if is_given)
-    if given:
-        raise InputError(f"prior: {given} shape a mesh that is built here, but --mesh gives one; leave out either")
+    settings.refuse_shaping("--mesh gives one")
     mesh = read_mesh(path)
     if settings.gaussians is None and settings.spacing is None:
         raise InputError(f"{path}: a given mesh says nothing of how finely to sample it; give --gaussians or --spacing")

@@ -15,6 +15,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, label
 
 from mgs.camera import Camera
 from mgs.data.dataset import Frame
+from mgs.data.lens import shrunk
 from mgs.data.meshes import Mesh
 from mgs.errors import InputError
 
@@ -29,6 +30,9 @@ far from the surface to change it."""
 
 ROW = 4096
 """Points are handed to OpenCV in rows of this length."""
+
+MOST_PIXELS = 1_000_000
+"""Of a mask to carve with: 4 MB of memory each. Outlines are then finer than the grid still."""
 
 MARGIN = 1.3
 """Half edge of the grid over the largest radius of the object that a mask shows."""
@@ -59,7 +63,7 @@ def visual_hull(frames: Sequence[Frame], tell: Callable[[str], None] = lambda st
     from skimage.measure import marching_cubes
 
     tell("visual hull")
-    views = [_View(frame.camera, _signed_distance(frame.mask())) for frame in frames]
+    views = [_view(frame) for frame in frames]
     lo, edge = _bounds(frames)
     cells = COARSE
     field, carved = _first_grid(views, lo, edge)
@@ -95,6 +99,8 @@ class _View:
         """How far inside the silhouette points [N,3] are, in units of the world; +inf where they are not in the image."""
         import cv2
 
+        if len(points) == 0:
+            return np.zeros(0)
         pixels, z = self.camera.project(points)
         inside = (z > 0) & (pixels > 0).all(1) & (pixels < [self.camera.width, self.camera.height]).all(1)
         padded = np.zeros((-(-len(points) // ROW) * ROW, 2), np.float32)
@@ -106,6 +112,13 @@ class _View:
         ]
         value = np.concatenate(found).ravel()[: len(points)] * (z / self.camera.K[0, 0])
         return np.where(inside, value, np.inf)
+
+
+def _view(frame: Frame) -> _View:
+    """The view of a frame. All are kept in memory, so a mask of more than MOST_PIXELS is made smaller."""
+    stride = int(np.ceil(np.sqrt(frame.camera.width * frame.camera.height / MOST_PIXELS)))
+    camera, smaller = shrunk(frame.camera, lambda pixels, smooth: pixels, stride)
+    return _View(camera, _signed_distance(smaller(frame.mask().astype(np.uint8) * 255, True) >= 128))
 
 
 def _signed_distance(mask: np.ndarray) -> np.ndarray:

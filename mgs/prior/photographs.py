@@ -116,6 +116,7 @@ def surface_of(
     """
     check_photographs(dataset.frames)
     if source == "hull":
+        settings.refuse_shaping("a hull is carved from masks")
         carved = visual_hull(dataset.frames, tell)
         return Surface(carved.mesh, carved.cell, None, _hull_numbers(carved))
     cloud = read_cloud(points or dataset.root / CLOUD)

@@ -18,9 +18,9 @@ from mgs.data.clouds import SparseCloud, views_of
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.visibility import has_masks, mask_share
 from mgs.errors import InputError
-from mgs.prior.segmentation import NoSurface, Plane, SegmentedCloud, estimate_normals, ground_plane
+from mgs.prior.segmentation import NoSurface, Plane, SegmentedCloud, degrade, estimate_normals, ground_plane
 from mgs.prior.settings import PriorSettings
-from mgs.seeds import derive_seed
+from mgs.seeds import derive_seed, generator
 from mgs.survey.depth_sensor import SIGMA_FROM_MAD
 from mgs.survey.fusion import REACH, Cloud, focus
 
@@ -48,6 +48,10 @@ CLUSTER_SAMPLES = 10
 JOINED = 4.0
 """Clusters with points nearer to each other than this many distances between neighbouring points are one: texture that comes
 and goes makes several of one object."""
+
+PLANE_VOXEL = 0.25
+"""What the ground plane takes for the voxel of a cloud, over the distance between its points: points of a fused cloud are as
+far from the plane as their voxels are large, triangulated ones are better than they are dense."""
 
 NEIGHBOURS = 16
 """Neighbours that a point is compared with to see whether it lies off the surface."""
@@ -92,7 +96,9 @@ def on_surface(points: np.ndarray) -> np.ndarray:
 
 def main_cluster(points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, int]:
     """Which points [N,3] belong to the cluster of the largest total weight [N], by HDBSCAN (Campello et al. 2013,
-    scikit-learn), and how many clusters there are. All points, and 0, where no part is denser than another."""
+    scikit-learn), and how many clusters there are. All points, and 0, where no part is denser than another.
+
+    Points that HDBSCAN gives to no cluster, because few are around them, belong to the one that they are next to."""
     from sklearn.cluster import HDBSCAN
 
     least = max(CLUSTER_SAMPLES, int(CLUSTER_SHARE * len(points)))
@@ -108,7 +114,9 @@ def main_cluster(points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, in
     pieces, piece = connected_components(touching, directed=False)
     joined = np.where(labels >= 0, piece[labels], -1)
     total = np.bincount(joined[joined >= 0], weight[joined >= 0], pieces)
-    return joined == total.argmax(), int(pieces)
+    chosen = joined == total.argmax()
+    near = cKDTree(points[chosen]).query(points)[0] < JOINED * spacing_of(points)
+    return chosen | (near & (joined < 0)), int(pieces)
 
 
 def segment_points(
@@ -139,15 +147,17 @@ def segment_points(
         kept[kept] = on_surface(points[kept])
     if kept.sum() < LEAST_POINTS:
         raise NoSurface(f"{dataset.root}: only {kept.sum()} of {len(sparse.points)} points lie {where}", points, kept)
-    rock = points[kept]
-    return SegmentedCloud(cloud, plane, ground, rock, estimate_normals(rock, views[kept]), 0.0, clusters)
+    rock, left = degrade(points[kept], settings.noise, settings.holes, generator(settings.seed, "prior/degrade"))
+    normals = estimate_normals(rock[left], views[kept][left], settings.noise / cloud.voxel)
+    return SegmentedCloud(cloud, plane, ground, rock[left], normals, 0.0, clusters)
 
 
 def _plane_or_none(cloud: Cloud, frames: Sequence[Frame], settings: PriorSettings) -> Plane | None:
     """The ground plane, where a fifth of the points near what the cameras look at lie on one that all cameras are above."""
     target = focus(frames)
     near = np.linalg.norm(cloud.points - target.point, axis=1) < REACH * target.distance
-    part = Cloud(cloud.points[near], cloud.views[near], cloud.voxel, cloud.noise, cloud.pixels)
+    fine = PLANE_VOXEL * cloud.voxel
+    part = Cloud(cloud.points[near], cloud.views[near], fine, cloud.noise, cloud.pixels)
     try:
         plane = ground_plane(part, frames, derive_seed(settings.seed, "prior/plane"))
     except InputError:

@@ -33,6 +33,19 @@ class PriorSettings:
     seed: int = 0
     backing: float = 0.5
 
+    def refuse_shaping(self, why: str) -> None:
+        """Raises InputError where noise, holes or a Poisson depth are asked for, which shape a mesh that is built of a cloud.
+
+        why: the end of the message, what the surface is made of instead.
+        """
+        options = {
+            "--prior-noise": self.noise > 0,
+            "--holes": self.holes > 0,
+            "--poisson-depth": self.poisson_depth is not None,
+        }
+        if given := " and ".join(option for option, is_given in options.items() if is_given):
+            raise InputError(f"prior: {given} shape a mesh that is built of a cloud, but {why}; leave out either")
+
     def __post_init__(self) -> None:
         if self.gaussians is not None and self.gaussians < 2:
             raise InputError(f"prior: {self.gaussians} Gaussians are too few for a model; ask for more with --gaussians")
