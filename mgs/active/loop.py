@@ -55,8 +55,8 @@ class Stations:
     centre: [3] the rock, metres.
     groups: columns of the Fisher information by kind of parameter (`mgs.splat.groups`).
     initial(seed frames) -> Gaussians before any training.
-    fit(gaussians, start, cameras, targets, train, on_pass) -> Fit; start: the Gaussians before any training; targets, and train,
-    the settings, as in `mgs.active.fitting.fit`.
+    fit(gaussians, start, cameras, targets, train, on_pass) -> Fit; start: the Gaussians before any training; targets and train
+    (the settings) as in `mgs.active.fitting.fit`.
     fisher(gaussians, camera) -> information of one view [N,P], by the estimator of the run.
     estimate(gaussians, camera, estimator) -> information of one view by a row of `mgs.splat.ESTIMATORS`.
     measure(gaussians, taken frame indices) -> entries for steps.jsonl.
