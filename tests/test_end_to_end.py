@@ -199,7 +199,7 @@ def test_demo_shows_the_table_and_the_pictures_and_can_be_given_again(tmp_path, 
     command("demo", out)
     shown = capsys.readouterr().out
     assert all(policy in shown for policy in POLICIES)
-    assert shown.count("test views (2): PSNR") == 3
+    assert shown.count("test views (2): PSNR") == len(POLICIES)
     table = json.loads((out / "report/table.json").read_text())
     for row in table:
         line = next(line for line in shown.splitlines() if line.split()[:1] == [row["policy"]])
@@ -209,6 +209,6 @@ def test_demo_shows_the_table_and_the_pictures_and_can_be_given_again(tmp_path, 
     assert len(pictures) >= 7
     assert all(picture.is_file() for picture in pictures)
     kept = {path: path.read_bytes() for path in out.glob("*/steps.jsonl")}
-    assert len(kept) == 3
+    assert len(kept) == len(POLICIES)
     command("demo", out)
     assert {path: path.read_bytes() for path in out.glob("*/steps.jsonl")} == kept

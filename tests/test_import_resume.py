@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import signal
 import subprocess
 import sys
@@ -65,7 +66,9 @@ def test_struck_in_the_middle_and_given_again(many: list[str], tmp_path: Path, b
     """A real process, a real signal; then the same folder, bit for bit, and no finished frame read again."""
     out = tmp_path / "out"
     program = [sys.executable, "-c", STRUCK.format(blow=int(blow)), "import", *many, "--out", str(out)]
-    process = subprocess.run(program, capture_output=True, text=True)
+    # A shell starts what runs in the background deaf to SIGINT.
+    hearing = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.run(program, capture_output=True, text=True, preexec_fn=hearing)
     assert process.returncode == code, process.stderr
     said = "mgs: interrupted; run the same command again to continue\n"
     assert process.stderr.endswith(said) if blow == signal.SIGINT else "mgs:" not in process.stderr

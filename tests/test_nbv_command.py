@@ -139,13 +139,13 @@ def test_names_and_numbers_are_readable_at_80_columns(tmp_path, name, width):
         assert any(number in text for text in shown)
 
 
-@pytest.mark.parametrize("made", ["dataset", "coverage"])
+@pytest.mark.parametrize("made", ["dataset", "random"])
 def test_demo_does_not_show_another_seeds_results(tmp_path, capsys, made):
     root = tiny.write_dataset(tmp_path / "demo/dataset")
     if made == "dataset":
         write_json(root / "config.json", {"seed": 3})
     else:
-        tiny.start(tmp_path / "demo/coverage", load_dataset(root), seed=3)
+        tiny.start(tmp_path / "demo/random", load_dataset(root), seed=3)
     with pytest.raises(SystemExit) as stop:
         main(["demo", str(tmp_path / "demo"), "--seed", "1"])
     assert stop.value.code == 2

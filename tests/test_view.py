@@ -1,7 +1,9 @@
 """The viewer: what it reads and draws, what it refuses, and the whole of it in a real browser."""
 
+import functools
 import io
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -159,7 +161,9 @@ def test_refusals(capsys, run, dataset, prior, tmp_path, monkeypatch):
 def viewing(*arguments):
     """`mgs view ARGUMENTS` in a process of its own; gives its address. Ctrl-C must end it in peace."""
     command = [sys.executable, "-m", "mgs", "view", *map(str, arguments), "--port", "0"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # A shell starts what runs in the background deaf to SIGINT, which is what ends the viewer.
+    hearing = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hearing)
     try:
         line, warned = process.stdout.readline(), False
         if "everyone who reaches this address" in line:

@@ -161,7 +161,7 @@ def fit(
         fall = settings.decay ** (done / max(settings.passes - 1, 1))
         rates = [dr.opaque(mi.Float, settings.rates[kind] * fall) for kind in kinds]
         if optimiser.uses_information and done % INFORMATION_PASSES == 0:
-            information = [mi.TensorXf(d.array / len(goal.photos), d.shape) for d in goal.diagonal(model)]
+            information = goal.largest_diagonal(model)
         order = rng.permutation(len(goal.photos))
         model, buffers, loss = _pass(goal, settings.optimiser, model, buffers, information, order, rates, done * len(order))
         if loss <= min(losses[1:], default=np.inf):  # never of a loss that is not a number

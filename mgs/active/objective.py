@@ -134,14 +134,28 @@ class Objective:
     def diagonal(self, model: Gaussians) -> Vector:
         """The diagonal of J^T J + lam, by exact Fisher information; weights of pixels are taken as 1."""
         total = [mi.TensorXf(lam + dr.zeros(mi.Float, d.array.shape[0]), d.shape) for d, lam in self.pulls(model)]
-        means = self.prior.means
-        normals = np.asarray(self.prior.normals) if means == "normal" else None
         for photo in self.photos:
-            information = fisher(model, photo.camera, cache=self.cache, means=means, normals=normals)
-            columns = zip(total, groups(model.sh_degree, means).values(), strict=True)
-            total = [t + mi.TensorXf(np.ascontiguousarray(information[:, c]).reshape(t.shape)) for t, c in columns]
+            total = [t + part for t, part in zip(total, self._information(model, photo), strict=True)]
             dr.eval(total)
         return total
+
+    def largest_diagonal(self, model: Gaussians) -> Vector:
+        """The largest entry of any one image's diagonal, with that image's share of lam: what bounds a step on one image."""
+        least = [(d, lam * self.prior.share) for d, lam in self.pulls(model)]
+        largest = [dr.zeros(mi.TensorXf, d.shape) for d, _ in least]
+        for photo in self.photos:
+            parts = self._information(model, photo)
+            largest = [mi.TensorXf(dr.maximum(a.array, b.array), a.shape) for a, b in zip(largest, parts, strict=True)]
+            dr.eval(largest)
+        return [mi.TensorXf(a.array + lam, a.shape) for a, (_, lam) in zip(largest, least, strict=True)]
+
+    def _information(self, model: Gaussians, photo: Photo) -> Vector:
+        """The exact Fisher information of one image."""
+        means = self.prior.means
+        normals = np.asarray(self.prior.normals) if means == "normal" else None
+        found = fisher(model, photo.camera, cache=self.cache, means=means, normals=normals)
+        columns = zip(self.pulls(model), groups(model.sh_degree, means).values(), strict=True)
+        return [mi.TensorXf(np.ascontiguousarray(found[:, c]).reshape(d.shape)) for (d, _), c in columns]
 
     def lists(self, model: Gaussians, photo: Photo) -> tuple[BlockLists, Any]:
         """Block lists of one image and the splats packed for them. Raises InputError as `ListCache.get`."""

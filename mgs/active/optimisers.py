@@ -41,8 +41,8 @@ class Optimiser:
     step(value, gradient, information, buffers, rate, t) -> (new value, new buffers), all Dr.Jit TensorXf of one shape but
     rate, a Float, and t, a Float that counts steps from 1. It is recorded once and replayed, so it must be made of Dr.Jit
     operations alone.
-    uses_information: whether `information` is given, the diagonal of J^T J + lam of all images over their number, measured
-    again every INFORMATION_PASSES passes; it is None otherwise.
+    uses_information: whether `information` is given, the largest entry of any one image's diagonal of J^T J, with that image's
+    share of lam, measured again every INFORMATION_PASSES passes; it is None otherwise.
     """
 
     buffers: int
@@ -63,7 +63,11 @@ def adam(value: Any, gradient: Any, information: Any, buffers: list[Any], rate: 
 def natural(value: Any, gradient: Any, information: Any, buffers: list[Any], rate: Any, t: Any) -> tuple[Any, list[Any]]:
     """Natural gradient with the exact diagonal of the Fisher information as its metric (Amari 1998), momentum, and steps of at
     most the rate, beyond which images are not linear in the parameters. Where information is plenty, steps are short of that
-    and shrink as the gradient does; where there is none, the prior's lam keeps them finite."""
+    and shrink as the gradient does; where there is none, the prior's lam keeps them finite.
+
+    A step is made for one image, so its metric is the information of the image that says most about the parameter. The mean
+    over the images would be too little for a parameter that few of them see: its steps would overshoot by their number, and
+    longer fits to many images diverge."""
     m = dr.lerp(gradient, buffers[0], NATURAL_BETA)
     curvature = NATURAL_OVERLAP * dr.maximum(information.array, LEAST_INFORMATION)
     update = dr.clip(m.array / curvature, -rate, rate)

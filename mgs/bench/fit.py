@@ -41,7 +41,7 @@ LONGER = 10
 OLD_RATES = {"colour": 0.02, "scale": 0.02, "rotation": 0.01, "opacity": 0.05}
 """Rates of the fit that times are compared with, Adam for OLD_PASSES passes: those of the first version of mgs."""
 OLD_PASSES = 400
-TRIED_PASSES = (40, 60, 90, 130, 200)
+TRIED_PASSES = (40, 130)
 """Lengths of a fit that are tried, until one reaches the objective of the fit that times are compared with."""
 
 TARGETS = {

@@ -35,7 +35,7 @@ def print_table(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
     names = [row["policy"] for row in rows]
 
     def table(heading: str, first: Sequence[str]) -> Table:
-        caption = "dB and %; new: views never trained on; rock: inside its mask"
+        caption = "n: images; dB and %; new: views never trained on; rock: inside its mask"
         made = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption=caption)
         made.add_column(heading, no_wrap=True)
         for key in keys:
@@ -58,7 +58,7 @@ def _heading(key: str) -> str:
     """A column's heading: the metric, and below it the set of views, and `rock` where the metric is inside its mask."""
     views, _, metric = key.partition(".")
     if not metric:
-        return {"coverage": "cover"}.get(key, key)
+        return {"coverage": "cover", "images": "n"}.get(key, key)  # short, so that the table fits 80 columns
     name, _, mask = metric.partition("_")
     return f"{name.upper()}\n{GROUPS[views]}" + ("\nrock" if mask else "")
 
