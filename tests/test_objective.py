@@ -91,6 +91,13 @@ def test_the_diagonal_is_that_of_jtj_plus_lam(case):
     assert np.allclose(flat(goal.diagonal(model)), expected, rtol=1e-3, atol=1e-5 * expected.max())
 
 
+def test_the_largest_diagonal_is_that_of_one_image(case):
+    goal, model, J, _, _, lam, _ = case
+    each = (J.reshape(2, -1, J.shape[1]) ** 2).sum(1)  # two images
+    expected = each.max(0) + lam / 2
+    assert np.allclose(flat(goal.largest_diagonal(model)), expected, rtol=1e-3, atol=1e-5 * expected.max())
+
+
 def test_the_newton_decrease_grows_to_that_of_a_dense_solve(case):
     goal, model, J, residual, weight, lam, away = case
     g = J.T @ (weight * residual) + lam * away
