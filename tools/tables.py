@@ -242,21 +242,6 @@ def backing(data: dict[str, Any]) -> str:
     return markdown(heading, rows) + made_by(data)
 
 
-def optimisers(data: dict[str, Any]) -> str:
-    """Objective and PSNR of each optimiser after about so much work."""
-    records, works = data["records"], (5, 10, 20, 40, 80)
-    rows = []
-    for start in ("cold", "warm"):
-        for row in dict.fromkeys(r["row"] for r in records):
-            shown = [r for r in records if (r["start"], r["row"]) == (start, row)]
-            cells = []
-            for work in works:  # a point within a quarter of this work
-                near = [r for r in shown if abs(math.log(r["passes"] / work)) < math.log(1.25)]
-                cells.append(f"{near[-1]['phi']:.0f} / {near[-1]['psnr_inside']:.2f}" if near else "")
-            rows.append([f"{start}: {row}", *cells])
-    return markdown(["start, optimiser", *(f"{work} passes" for work in works)], rows) + made_by(data)
-
-
 def ranking(data: dict[str, Any]) -> str:
     """Agreement of rankings after short fits with those after the longest, mean over the states."""
     rows, passes = [], sorted({r["passes"] for r in data["rows"]})[:-1]
@@ -295,7 +280,6 @@ def residual(data: dict[str, Any]) -> str:
 
 
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
-    "optimisers": ("optimisers", optimisers),
     "ranking": ("ranking", ranking),
     "linearity": ("linearity", linearity),
     "residual": ("residual", residual),
