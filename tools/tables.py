@@ -4,8 +4,7 @@
     python tools/tables.py --check    # exit code 1 where one is not what its numbers say
 
 A table stands between `<!-- table: NAME -->` and `<!-- end of table -->`; NAME is a key of `TABLES`. Most of the JSON files say
-which command wrote them; demo.json is demo/report/table.json after `make demo`, and policies.json is table.json of `mgs report`
-on the five runs of docs/nbv.md.
+which command wrote them; demo.json and policies.json are demo/report/table.json after `make demo`.
 """
 
 from __future__ import annotations
