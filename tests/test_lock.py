@@ -2,10 +2,12 @@
 
 import re
 import tomllib
+from importlib.metadata import PackageNotFoundError, metadata
 from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parent.parent
@@ -30,3 +32,14 @@ def test_what_the_package_asks_for_is_locked(wanted):
     version = locked.get(canonicalize_name(requirement.name))
     assert version is not None, f"{requirement.name} is not in requirements.lock; run `make lock`"
     assert requirement.specifier.contains(version), f"{requirement.name} {version}; run `make lock`"
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_what_is_locked_installs_on_the_lowest_python(line):
+    """The first version of the oldest Python that the package supports: distributions ship early ones (Debian 12: 3.11.2)."""
+    lowest = PROJECT["project"]["requires-python"].removeprefix(">=") + ".0"
+    try:
+        found = metadata(line.split("==")[0])
+    except PackageNotFoundError:
+        pytest.skip("not installed here")
+    assert lowest in SpecifierSet(found["Requires-Python"] or ""), f"{line} needs Python {found['Requires-Python']}"

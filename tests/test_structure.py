@@ -17,7 +17,7 @@ PACKAGE = "mgs"
 ROOMS = (
     "errors", "seeds", "runtime", "resources", "provenance", "colour", "rotation", "camera", "gaussians", "files", "images",
     "splat_ply", "metrics", "plotting",
-    "data", "synth", "survey", "prior", "splat", "active", "report", "view", "bench", "cli", "__main__",
+    "data", "synth", "survey", "prior", "splat", "active", "report", "view", "bench", "study", "cli", "__main__",
 )  # fmt: skip
 """All rooms, lowest first: each may import from those before it, and from none after it."""
 

@@ -28,10 +28,11 @@ PIXEL_NOISE = 0.02
 """sigma_e, standard deviation of a pixel's residual, linear RGB (34 dB): the scale at which one pixel's evidence counts as one.
 A chosen constant."""
 
-PRIOR_STD = {"colour": 1.0, "scale": 0.5, "rotation": 0.5, "opacity": 2.0}
+PRIOR_STD = {"colour": 0.25, "scale": 0.125, "rotation": 0.125, "opacity": 0.5}
 """tau: how far each parameter may plausibly lie from its start before any image is seen, in the parameter's own unit:
-colour 1 SH unit (0.28 linear RGB: albedo and shading of a rock), scale 0.5 (a factor 1.65), quaternion 0.5 (about 60
-degrees), opacity logit 2 (0.12 to 0.88 about one half)."""
+colour 0.25 SH units (0.07 linear RGB), scale 0.125 (13 %), quaternion 0.125 (about 14 degrees), opacity logit 0.5. Chosen
+from docs/fit.md: the start is already the prior's surface in its mean colours, and a wider tau lets Gaussians grow into
+needles that stand out of the rock."""
 
 MEAN_STD = 0.5
 """tau of means that are learned, over the spacing of the prior's samples: a surface that is off by more than that between its
