@@ -8,8 +8,9 @@ import pytest
 import synthetic
 from matplotlib.image import imread
 
-from mgs.active.criteria import PIXEL_NOISE
+from mgs.active.criteria import PIXEL_NOISE, PRIOR_STD
 from mgs.active.nbv import run_nbv
+from mgs.active.run_folder import read_checkpoint
 from mgs.camera import Camera, look_at
 from mgs.cli.app import main
 from mgs.data.meshes import Mesh
@@ -17,6 +18,7 @@ from mgs.errors import InputError
 from mgs.prior.build import build_prior
 from mgs.prior.resolution import PIXELS_PER_SAMPLE, resolution
 from mgs.prior.settings import PriorSettings
+from mgs.report.evaluation import evaluate_run
 from mgs.splat_ply import read_ply
 from mgs.study import parsimony
 from mgs.study.sweep import Cell
@@ -59,7 +61,7 @@ def test_only_cameras_count_that_see_the_face():
     assert resolution(mesh, [camera_above(2.0), camera_above(0.5, x=50)]) == alone  # beside the image
     near = resolution(mesh, [camera_above(2.0), camera_above(0.2, focal=400)])  # sees the middle alone
     assert alone.samples < near.samples < resolution(mesh, [camera_above(0.2, focal=400, size=4000)]).samples
-    with pytest.raises(InputError, match="--gaussians N"):
+    with pytest.raises(InputError, match="give --gaussians N"):
         resolution(mesh, [camera_above(-2.0)])
 
 
@@ -200,6 +202,13 @@ def test_an_unknown_preset_is_one_line(tmp_path, capsys):
 def test_a_run_is_pruned_beside_its_model(data, tmp_path, capsys):
     run = tmp_path / "run"
     run_nbv(data.root, run, gaussians=400, budget=1, policy="uniform")
+    informed = evaluate_run(run, pictures=False)["informed"]
+    assert {kind: number["of"] for kind, number in informed.items()} == {
+        "colour": 1200, "scale": 1200, "rotation": 1600, "opacity": 400
+    }  # fmt: skip
+    H = read_checkpoint(run).H
+    assert informed["colour"]["informed"] == (H[:, :3] > (PIXEL_NOISE / PRIOR_STD["colour"]) ** 2).sum()
+    assert 0 < informed["colour"]["informed"] < 1200
     whole = (run / "gaussians.ply").read_bytes()
     with pytest.raises(SystemExit) as exit_:
         main(["prune", str(run)])
