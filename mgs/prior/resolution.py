@@ -16,9 +16,10 @@ from mgs.camera import Camera
 from mgs.data.meshes import Mesh
 from mgs.errors import InputError
 
-PIXELS_PER_SAMPLE = 2.0
-"""Spacing of the samples over the size of the closest pixel. 1 would be the limit of a single perfect image; with the blur of a
-Gaussian that overlaps its neighbours, finer spacings than 2 gain nothing that is worth their number (docs/parsimony.md)."""
+PIXELS_PER_SAMPLE = 2.5
+"""Spacing of the samples over the size of the closest pixel. 1 would be the limit of a single perfect image; a model that fine
+has more parameters than the images have values, and fits their noise. A chosen constant, judged by `mgs parsimony`
+(docs/parsimony.md)."""
 
 
 @dataclass(frozen=True)
