@@ -342,7 +342,7 @@ def parsimony_verdict(data: dict[str, Any]) -> str:
     """The automatic number of Gaussians beside fixed ones."""
     rows = []
     for scene, one in data["scenes"].items():
-        cells = [f"{one[key]:.2f}" for key in ("best", "auto", "loss")] + [
+        cells = [f"{round(one[key], 2) + 0.0:.2f}" for key in ("best", "auto", "loss")] + [
             f"{one[key]:,}" for key in ("parameters", "smallest")
         ]
         rows.append([scene, *cells, " and ".join("yes" if one[key] else "no" for key in ("close", "small"))])
@@ -360,7 +360,11 @@ def parsimony_rules(data: dict[str, Any]) -> str:
             found = [one["chosen"][f"{axis} by {rule}"] for rule in ("psnr_inside", "next_error", "predictive", "evidence")]
             cells = [f"{c['value']:,}" if axis == "gaussians" else str(c["value"]) for c in found]
             rows.append(
-                [f"{scene}, {axis}", cells[0], *(f"{c} (-{f['loss']:.2f})" for c, f in zip(cells[1:], found[1:], strict=True))]
+                [
+                    f"{scene}, {axis}",
+                    cells[0],
+                    *(f"{c} ({0.0 - round(f['loss'], 2):.2f})" for c, f in zip(cells[1:], found[1:], strict=True)),
+                ]
             )
     return markdown(["", "best on the test views", "by next error", "by predictive", "by evidence"], rows)
 
