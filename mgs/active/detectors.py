@@ -1,0 +1,170 @@
+"""Signs that a run is going wrong: small numbers from each step, the value beyond which each is said, and the words.
+
+Every sign is larger where things are worse. `mgs nbv` prints a line when a sign goes beyond its limit, and keeps all of them in
+steps.jsonl. A fit that diverges ends the run with a line of its own (`mgs.active.stopping`), and means that are frozen have no
+drift. The limits come from `mgs stress` (docs/stability.md): each is LIMIT_FACTOR times the largest value of good runs there,
+or, where a comment says so, a chosen number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class ViewSigns:
+    """What one captured image says of the model.
+
+    unexplained: mean squared error inside the rock's mask over the variance of the image there: 0 is a perfect fit, 1 is no
+    better than a single colour. error: root of that mean squared error, linear RGB. exposure: natural logarithm of the factor by
+    which the render would have to be brighter to fit best. outline: of the pixels that either the mask or the prior's Gaussians
+    cover, the share that only one of them covers.
+    """
+
+    unexplained: float
+    error: float
+    exposure: float
+    outline: float
+
+
+def outline_error(mask: np.ndarray, alpha: np.ndarray) -> float:
+    """`ViewSigns.outline`. mask: bool [H,W]; alpha: [H,W] of the Gaussians before any training, which count from 0.5 up."""
+    drawn = alpha >= 0.5
+    either = int((mask | drawn).sum())
+    return float((mask ^ drawn).sum() / either) if either else 0.0
+
+
+def view_signs(target: np.ndarray, mask: np.ndarray, rendered: np.ndarray, outline: float) -> ViewSigns:
+    """The signs of a view that was fitted. target: [H,W,4], colour and weight (`mgs.active.loop.target_of`); mask: bool [H,W];
+    rendered: [H,W,3], linear RGB; outline: of `outline_error`."""
+    counted = mask & (target[..., 3] > 0)
+    if not counted.any():
+        return ViewSigns(0.0, 0.0, 0.0, outline)
+    truth, drawn = target[counted][:, :3].astype(np.float64), rendered[counted].astype(np.float64)
+    squared, variance = float(np.mean((truth - drawn) ** 2)), float(truth.var(axis=0).mean())
+    both, own = float((truth * drawn).sum()), float((drawn * drawn).sum())
+    exposure = float(np.log(both / own)) if both > 0 and own > 0 else 0.0
+    return ViewSigns(squared / max(variance, 1e-12), squared**0.5, exposure, outline)
+
+
+def step_signs(
+    views: Sequence[ViewSigns], losses: Sequence[float], coverage: float, gains: Sequence[float], drift: float
+) -> dict[str, float]:
+    """The signs of a step, by the names in DETECTORS; those that this step cannot tell are left out.
+
+    views: of every view taken. losses: of the model that the fit started from, then of each pass. coverage: Eq. 9, 0 to 1.
+    gains: information gain of every view chosen so far, in order. drift: of `means_drift`.
+    """
+    signs = {"coverage": 1 - coverage, "means": drift}
+    if len(losses) >= 4 and losses[-3] > 0 and np.isfinite(losses).all():
+        signs["unconverged"] = 0.5 * (1 - losses[-1] / losses[-3])
+    if len(losses) >= 2 and losses[0] > 0 and np.isfinite(losses).all():
+        signs["worse"] = min(losses[1:]) / losses[0] - 1
+    if views:
+        errors = np.array([view.error for view in views])
+        exposures = np.array([view.exposure for view in views])
+        signs["residual"] = float(np.median([view.unexplained for view in views]))
+        signs["prior"] = float(np.median([view.outline for view in views]))
+        signs["exposure"] = float(np.abs(exposures - np.median(exposures)).max())
+        if len(views) >= 3:
+            signs["pose"] = float(errors.max() / max(np.median(errors), 1e-12))
+    if len(gains) >= 2 and max(gains) > 0:
+        signs["saturated"] = 1 - gains[-1] / max(gains)
+    return signs
+
+
+def means_drift(means: np.ndarray, start: np.ndarray, log_scales: np.ndarray) -> float:
+    """How far means [N,3] are from where they started, rms, over the median of the Gaussians' largest standard deviation then
+    (log_scales [N,3])."""
+    if np.array_equal(means, start):
+        return 0.0
+    size = float(np.median(np.exp(log_scales.max(axis=1))))
+    return float(np.sqrt(np.mean(((means - start) ** 2).sum(axis=1))) / size)
+
+
+@dataclass(frozen=True)
+class Detector:
+    """limit: of a sign, beyond which it is said. words(value, limit): what is said."""
+
+    limit: float
+    words: Callable[[float, float], str]
+
+
+DETECTORS: dict[str, Detector] = {
+    "unconverged": Detector(
+        0.04,
+        lambda v, limit: (
+            f"the fit was stopped while its loss still fell by {100 * v:.1f} % a pass (limit {100 * limit:.1f} %); "
+            "raise --passes"
+        ),
+    ),
+    "worse": Detector(
+        0.05,  # chosen: a warm fit of a good run lowers its loss
+        lambda v, limit: (
+            f"no pass of the fit came nearer to the images than a loss {100 * v:.0f} % above that it began with; lower the rates"
+        ),
+    ),
+    "prior": Detector(
+        0.15,
+        lambda v, limit: (
+            f"the prior's outline and the masks disagree: in the median view, {100 * v:.0f} % of the pixels that either covers "
+            f"are in one alone (limit {100 * limit:.0f} %); check prior, masks and poses"
+        ),
+    ),
+    "residual": Detector(
+        0.5,
+        lambda v, limit: (
+            f"after the fit, {100 * v:.0f} % of the images' variance inside the masks is left unexplained in the median view "
+            f"(limit {100 * limit:.0f} %)"
+        ),
+    ),
+    "exposure": Detector(
+        0.1,
+        lambda v, limit: (
+            f"exposure drifts: one image would fit best if the render were {np.exp(v):.2f} times brighter or darker than the "
+            f"median image asks for (limit {np.exp(limit):.2f})"
+        ),
+    ),
+    "pose": Detector(
+        2.0,
+        lambda v, limit: (
+            f"one view fits badly: its error after the fit is {v:.1f} times the median view's (limit {limit:.1f}); check its "
+            "pose, mask and image"
+        ),
+    ),
+    "means": Detector(
+        1.0,  # chosen: a Gaussian's own size
+        lambda v, limit: (
+            f"the means have left the prior's surface: they moved by {v:.1f} standard deviations of a Gaussian (rms; limit "
+            f"{limit:.1f})"
+        ),
+    ),
+    "coverage": Detector(
+        0.3,
+        lambda v, limit: (
+            f"only {100 * (1 - v):.0f} % of the prior's Gaussians are observed (limit {100 * (1 - limit):.0f} %): information "
+            "about the others is that of the prior"
+        ),
+    ),
+    "saturated": Detector(
+        0.9,  # chosen: a tenth
+        lambda v, limit: (
+            f"gains are saturated: the view just taken gained {100 * (1 - v):.0f} % of the largest information gain of this run "
+            f"(limit {100 * (1 - limit):.0f} %)"
+        ),
+    ),
+}
+"""By the name of the sign."""
+
+
+def alarms(signs: Mapping[str, float], before: Mapping[str, float] | None = None) -> list[str]:
+    """What to say after a step: a sentence for each sign that is beyond its limit now, and was not in the step before."""
+    before = before or {}
+    return [
+        row.words(signs[name], row.limit)
+        for name, row in DETECTORS.items()
+        if signs.get(name, -np.inf) > row.limit >= before.get(name, -np.inf)
+    ]
