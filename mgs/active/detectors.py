@@ -19,9 +19,9 @@ class ViewSigns:
     """What one captured image says of the model.
 
     unexplained: mean squared error inside the rock's mask over the variance of the image there: 0 is a perfect fit, 1 is no
-    better than a single colour. error: root of that mean squared error, linear RGB. exposure: natural logarithm of the factor by
-    which the render would have to be brighter to fit best. outline: of the pixels that either the mask or the prior's Gaussians
-    cover, the share that only one of them covers.
+    better than a single colour. error: root of that mean squared error, linear RGB. exposure: natural logarithm of the factor
+    by which the render would have to be brighter to fit best. outline: of the pixels that either the mask or the prior's
+    Gaussians cover, the share that only one of them covers.
     """
 
     unexplained: float
@@ -104,7 +104,7 @@ DETECTORS: dict[str, Detector] = {
     "worse": Detector(
         0.05,  # chosen: a warm fit of a good run lowers its loss
         lambda v, limit: (
-            f"no pass of the fit came nearer to the images than a loss {100 * v:.0f} % above that it began with; lower the rates"
+            f"every pass of the fit had a loss at least {100 * v:.0f} % above that of the model it began with; lower the rates"
         ),
     ),
     "prior": Detector(
@@ -152,7 +152,7 @@ DETECTORS: dict[str, Detector] = {
     "saturated": Detector(
         0.9,  # chosen: a tenth
         lambda v, limit: (
-            f"gains are saturated: the view just taken gained {100 * (1 - v):.0f} % of the largest information gain of this run "
+            f"gains are saturated: the view just taken gained {100 * (1 - v):.0f} % of the run's largest information gain "
             f"(limit {100 * (1 - limit):.0f} %)"
         ),
     ),

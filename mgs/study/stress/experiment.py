@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mgs.study.stress.lab import Preset, scene_cell
-from mgs.study.stress.verdict import Claim
+from mgs.study.stress.verdict import Claim, Row
 from mgs.study.sweep import Cell
 
 
@@ -31,12 +31,13 @@ class Panel:
 @dataclass(frozen=True)
 class Experiment:
     """A question about where the method fails. cells(preset): the work; the result of each holds "rows", a list of records
-    with a `run` each."""
+    with a `run` each. derived(rows): more rows, for the picture alone."""
 
     question: str
     cells: Callable[[Preset], list[Cell]]
     claims: Sequence[Claim]
     panels: Sequence[Panel]
+    derived: Callable[[Sequence[Row]], list[Row]] | None = None
 
 
 def cells_per_rock(name: str, task: str, arguments: Callable[[Preset], dict[str, Any]]) -> Callable[[Preset], list[Cell]]:

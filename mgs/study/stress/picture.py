@@ -19,6 +19,7 @@ def experiment_figure(experiment: Experiment, rows: Sequence[Row]) -> Figure:
     """All panels side by side; a panel whose x is text is as wide as its bars need."""
     import matplotlib as mpl
 
+    rows = [*rows, *(experiment.derived(rows) if experiment.derived else ())]
     drawn = [(panel, _of(panel, rows)) for panel in experiment.panels]
     drawn = [(panel, of_it) for panel, of_it in drawn if of_it]
     with mpl.rc_context(STYLE):

@@ -12,6 +12,7 @@ from mgs.files import atomic_path, write_json
 from mgs.plotting import save_figure
 from mgs.provenance import versions
 from mgs.runtime import processor
+from mgs.study.stress.alarms import ALARMS, DATA_FAULTS, PRIOR_EXPERIMENT
 from mgs.study.stress.convergence import CONVERGENCE
 from mgs.study.stress.endurance import ENDURANCE
 from mgs.study.stress.experiment import Experiment
@@ -32,6 +33,9 @@ EXPERIMENTS: dict[str, Experiment] = {
     "seeds": SEEDS,
     "numbers": NUMBERS,
     "endurance": ENDURANCE,
+    "data-faults": DATA_FAULTS,
+    "prior-faults": PRIOR_EXPERIMENT,
+    "detectors": ALARMS,
 }
 
 

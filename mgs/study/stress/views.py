@@ -14,8 +14,8 @@ from mgs.study.stress.lab import Array, Lab, agreement, greedy, open_lab
 from mgs.study.stress.verdict import Claim, Row, paired, single
 
 FREE_VIEWS = (2, 3, 4, 6, 8)
-FREE_PASSES = 60
-"""Three times the default: a collapse takes time."""
+FREE_PASSES = 40
+"""Twice the default: a collapse takes time."""
 
 KINDS = {"frozen": ("frozen", True), "free": ("free", True), "free, no prior": ("free", False)}
 """What the means may do, and whether a prior holds the parameters: the paper has none."""
