@@ -32,7 +32,7 @@ from mgs.study.sweep import Cell
 FAILURE = 1.0
 """dB."""
 
-VIEWS = 8
+VIEWS = 6
 
 
 @dataclass(frozen=True)
@@ -251,7 +251,7 @@ def _row(lab: Lab, run: str, fault: str, size: float, clean: Mapping[str, Any] |
 
 
 def faults(root: Path, out: Path, scene: str, kinds: str, others: list[str], repeats: int) -> dict[str, Any]:
-    """Fits to eight even views with every fault of a kind ("images" or "prior") at every size, beside clean ones.
+    """Fits to VIEWS even views with every fault of a kind ("images" or "prior") at every size, beside clean ones.
 
     others: rocks whose priors are tried in the place of the right one. repeats: draws of faults, each with views of its own.
     """

@@ -41,7 +41,8 @@ class Preset:
 
     images: of every dataset. tests: test views of each. gaussians: of each prior. rocks: the (scene, seed) that all experiments
     use. others: more of them, for the experiment on scenes. turns: sets of views per rock, turned against one another, so that
-    there are several runs per rock. repeats: draws of each random fault. passes: lengths of fits. steps: of the test of memory.
+    there are several runs per rock. repeats: draws of each random fault. few_views: numbers of views with free means; 2
+    and 4 are among them. passes: lengths of fits. steps: of the test of memory.
     """
 
     images: Images
@@ -51,6 +52,7 @@ class Preset:
     others: tuple[tuple[str, int], ...]
     turns: int
     repeats: int
+    few_views: tuple[int, ...]
     passes: tuple[int, ...]
     steps: int
 
@@ -58,12 +60,12 @@ class Preset:
 PRESETS = {
     "quick": Preset(
         Images(160, 120, 24, 8), 8, 3000, (("boulder", 0), ("boulder", 1)), (("contact-binary", 0), ("low-sun", 0)),
-        2, 1, (1, 2, 5, 10, 20, 60, 180), 150,
+        2, 1, (2, 4, 8), (1, 2, 5, 10, 20, 60, 120), 150,
     ),
     "full": Preset(
         Images(320, 240, 32, 8), 12, 10_000, (*(("boulder", seed) for seed in range(5)), ("strata", 0), ("strata", 1)),
         tuple((name, seed) for name in ("contact-binary", "low-sun", "pebbles") for seed in range(3)),
-        3, 3, (1, 2, 5, 10, 20, 40, 80, 160, 320, 640), 1000,
+        3, 3, (2, 3, 4, 6, 8), (1, 2, 5, 10, 20, 40, 80, 160, 320, 640), 1000,
     ),
 }  # fmt: skip
 

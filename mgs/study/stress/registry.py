@@ -23,7 +23,7 @@ from mgs.study.stress.picture import experiment_figure
 from mgs.study.stress.scales import SCALES
 from mgs.study.stress.verdict import Row, judged
 from mgs.study.stress.views import FREE_MEANS, SEEDS
-from mgs.study.sweep import Cell, run_cells
+from mgs.study.sweep import found, run_cells
 
 EXPERIMENTS: dict[str, Experiment] = {
     "free-means": FREE_MEANS,
@@ -60,20 +60,25 @@ def run_stress(
     """Do the experiments of these names in the folder `out`, and write stability.csv, verdicts.json, NAME.png and stability.md.
 
     command: the line that makes it again, for verdicts.json. report(cell, done, total) is told before each cell that is not
-    done yet. Returns what verdicts.json holds. Called again, it does what is left. Raises InputError if `out` holds results of
-    another preset or version.
+    done yet. Returns what verdicts.json holds: also of the experiments that were done in this folder before. Called again, it
+    does what is left. Raises InputError if `out` holds results of another preset or version.
     """
     by_experiment = {name: EXPERIMENTS[name].cells(preset) for name in names}
     scenes = {cell.name: cell for cell in (scene_cell(preset, *rock) for rock in (*preset.rocks, *preset.others))}
     cells = {cell.name: cell for of_one in by_experiment.values() for cell in of_one}
     needed = {need: scenes[need] for cell in cells.values() for need in cell.needs}
-    found = run_cells(out, [*needed.values(), *cells.values()], report)
-    rows = {name: _rows(of_one, found) for name, of_one in by_experiment.items()}
-    return write_results(out, rows, command)
+    run_cells(out, [*needed.values(), *cells.values()], report)
+    return write_results(out, rows_done(out, preset), command)
 
 
-def _rows(cells: Sequence[Cell], found: dict[str, dict[str, Any]]) -> list[Row]:
-    return [row for cell in cells for row in found[cell.name]["rows"]]
+def rows_done(out: Path, preset: Preset) -> dict[str, list[Row]]:
+    """Rows of every experiment all of whose cells are done in the folder `out`, now or before."""
+    done = {}
+    for name, experiment in EXPERIMENTS.items():
+        results = [found(out, cell) for cell in experiment.cells(preset)]
+        if all(result is not None for result in results):
+            done[name] = [row for result in results for row in (result or {})["rows"]]
+    return done
 
 
 def write_results(out: Path, rows: dict[str, list[Row]], command: str) -> dict[str, Any]:

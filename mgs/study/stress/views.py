@@ -13,7 +13,6 @@ from mgs.study.stress.experiment import Experiment, Panel, cells_per_rock, turns
 from mgs.study.stress.lab import Array, Lab, agreement, greedy, open_lab
 from mgs.study.stress.verdict import Claim, Row, paired, single
 
-FREE_VIEWS = (2, 3, 4, 6, 8)
 FREE_PASSES = 40
 """Twice the default: a collapse takes time."""
 
@@ -24,11 +23,11 @@ VIEWS = 8
 """Views of the models whose seeds are compared."""
 
 
-def free_means(root: Path, out: Path, scene: str, turns_: int) -> dict[str, Any]:
+def free_means(root: Path, out: Path, scene: str, turns_: int, counts: list[int]) -> dict[str, Any]:
     """Fits with frozen and with free means on few views: quality, drift of the means, ranking of the other views."""
     lab, rows = open_lab(root, scene), []
     for suffix, turn in turns(turns_):
-        for count in FREE_VIEWS:
+        for count in counts:
             taken = lab.even(count, turn)
             left, start = lab.left(taken), lab.start(taken)
             reference: Array = np.zeros(0)
@@ -53,7 +52,9 @@ def _free_minus_frozen(views: int, kind: str) -> Any:
 
 FREE_MEANS = Experiment(
     "Do free means collapse on few views?",
-    cells_per_rock("free-means", f"{__name__}:free_means", lambda preset: {"turns_": preset.turns}),
+    cells_per_rock(
+        "free-means", f"{__name__}:free_means", lambda preset: {"turns_": preset.turns, "counts": list(preset.few_views)}
+    ),
     (
         Claim("On 4 views, free means without a prior lose 1 dB or more against frozen ones (paper, section III).",
               _free_minus_frozen(4, "free, no prior"), "dB", "below", -1.0, "rock and set of views"),
