@@ -8,46 +8,89 @@ or, where a comment says so, a chosen number.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import binary_dilation, binary_erosion
+
+from mgs.camera import Camera
+from mgs.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class Before:
+    """What one captured image says of the Gaussians before any training.
+
+    outline: of the pixels that either the rock's mask or the Gaussians cover, the share where they disagree, the rim left out
+    (`outline_margin`). offset: distance between the centres of the two areas, pixels. exposure: natural logarithm of the factor
+    by which the render would have to be brighter to fit the image best; its colours are means over the seeds' images.
+    """
+
+    outline: float
+    offset: float
+    exposure: float
 
 
 @dataclass(frozen=True)
 class ViewSigns:
-    """What one captured image says of the model.
+    """What one captured image says of the fitted model, and said before.
 
     unexplained: mean squared error inside the rock's mask over the variance of the image there: 0 is a perfect fit, 1 is no
-    better than a single colour. error: root of that mean squared error, linear RGB. exposure: natural logarithm of the factor
-    by which the render would have to be brighter to fit best. outline: of the pixels that either the mask or the prior's
-    Gaussians cover, the share that only one of them covers.
+    better than a single colour. error: root of that mean squared error, linear RGB.
     """
 
+    before: Before
     unexplained: float
     error: float
-    exposure: float
-    outline: float
 
 
-def outline_error(mask: np.ndarray, alpha: np.ndarray) -> float:
-    """`ViewSigns.outline`. mask: bool [H,W]; alpha: [H,W] of the Gaussians before any training, which count from 0.5 up."""
+def before_fit(target: np.ndarray, mask: np.ndarray, rendered: np.ndarray, alpha: np.ndarray, margin: int) -> Before:
+    """The signs of a view and the Gaussians before any training.
+
+    target: [H,W,4], colour and weight (`mgs.active.loop.target_of`); mask: bool [H,W]; rendered: [H,W,3] linear RGB and alpha
+    [H,W], which count as drawn from 0.5 up. margin: pixels, of `outline_margin`: a pixel disagrees if it is drawn and farther
+    than that outside the mask, or not drawn and farther inside.
+    """
     drawn = alpha >= 0.5
     either = int((mask | drawn).sum())
-    return float((mask ^ drawn).sum() / either) if either else 0.0
+    outside = ~binary_dilation(mask, iterations=margin)
+    inside = binary_erosion(mask, iterations=margin, border_value=1)
+    wrong = int(((drawn & outside) | (inside & ~drawn)).sum())
+    both = mask & drawn & (target[..., 3] > 0)
+    truth, colour = (image[both][:, :3].astype(np.float64) for image in (target, rendered))
+    shared, own = float((truth * colour).sum()), float((colour * colour).sum())
+    exposure = float(np.log(shared / own)) if shared > 0 and own > 0 else 0.0
+    return Before(wrong / max(either, 1), _distance(mask, drawn), exposure)
 
 
-def view_signs(target: np.ndarray, mask: np.ndarray, rendered: np.ndarray, outline: float) -> ViewSigns:
-    """The signs of a view that was fitted. target: [H,W,4], colour and weight (`mgs.active.loop.target_of`); mask: bool [H,W];
-    rendered: [H,W,3], linear RGB; outline: of `outline_error`."""
+def _distance(one: np.ndarray, other: np.ndarray) -> float:
+    """Between the centres of two areas, pixels; the diagonal of the image where one of them is empty."""
+    if not one.any() or not other.any():
+        return float(np.hypot(*one.shape))
+    return float(np.linalg.norm(np.argwhere(one).mean(axis=0) - np.argwhere(other).mean(axis=0)))
+
+
+def outline_margin(start: Gaussians, camera: Camera) -> int:
+    """How far the outline of a good prior may be from the mask, pixels: Gaussians on the rim stand out by about their standard
+    deviation, and the mask has whole pixels. start: the Gaussians before any training."""
+    _, depth = camera.project(start.means)
+    in_front = depth[depth > 0]
+    if not len(in_front):
+        return 1
+    size = float(np.median(np.exp(start.log_scales.max(axis=1))))
+    return 1 + math.ceil(size * camera.K[0, 0] / float(np.median(in_front)))
+
+
+def view_signs(target: np.ndarray, mask: np.ndarray, rendered: np.ndarray, before: Before) -> ViewSigns:
+    """The signs of a view that was fitted. rendered: of the fitted model; all else as in `before_fit`."""
     counted = mask & (target[..., 3] > 0)
     if not counted.any():
-        return ViewSigns(0.0, 0.0, 0.0, outline)
+        return ViewSigns(before, 0.0, 0.0)
     truth, drawn = target[counted][:, :3].astype(np.float64), rendered[counted].astype(np.float64)
     squared, variance = float(np.mean((truth - drawn) ** 2)), float(truth.var(axis=0).mean())
-    both, own = float((truth * drawn).sum()), float((drawn * drawn).sum())
-    exposure = float(np.log(both / own)) if both > 0 and own > 0 else 0.0
-    return ViewSigns(squared / max(variance, 1e-12), squared**0.5, exposure, outline)
+    return ViewSigns(before, squared / max(variance, 1e-12), squared**0.5)
 
 
 def step_signs(
@@ -59,18 +102,19 @@ def step_signs(
     gains: information gain of every view chosen so far, in order. drift: of `means_drift`.
     """
     signs = {"coverage": 1 - coverage, "means": drift}
-    if len(losses) >= 4 and losses[-3] > 0 and np.isfinite(losses).all():
-        signs["unconverged"] = 0.5 * (1 - losses[-1] / losses[-3])
-    if len(losses) >= 2 and losses[0] > 0 and np.isfinite(losses).all():
+    if len(losses) >= 2 and min(losses) > 0 and np.isfinite(losses).all():
+        window = min(2, len(losses) - 1)
+        signs["unconverged"] = 1 - (losses[-1] / losses[-1 - window]) ** (1 / window)
         signs["worse"] = min(losses[1:]) / losses[0] - 1
     if views:
         errors = np.array([view.error for view in views])
-        exposures = np.array([view.exposure for view in views])
+        exposures = np.array([view.before.exposure for view in views])
         signs["residual"] = float(np.median([view.unexplained for view in views]))
-        signs["prior"] = float(np.median([view.outline for view in views]))
+        signs["prior"] = float(np.median([view.before.outline for view in views]))
         signs["exposure"] = float(np.abs(exposures - np.median(exposures)).max())
+        signs["pose"] = max(view.before.offset for view in views)
         if len(views) >= 3:
-            signs["pose"] = float(errors.max() / max(np.median(errors), 1e-12))
+            signs["outlier"] = float(errors.max() / max(np.median(errors), 1e-12))
     if len(gains) >= 2 and max(gains) > 0:
         signs["saturated"] = 1 - gains[-1] / max(gains)
     return signs
@@ -108,10 +152,10 @@ DETECTORS: dict[str, Detector] = {
         ),
     ),
     "prior": Detector(
-        0.15,
+        0.02,
         lambda v, limit: (
-            f"the prior's outline and the masks disagree: in the median view, {100 * v:.0f} % of the pixels that either covers "
-            f"are in one alone (limit {100 * limit:.0f} %); check prior, masks and poses"
+            f"the prior's outline and the masks disagree: in the median view, in {100 * v:.1f} % of the pixels that either "
+            f"covers (limit {100 * limit:.1f} %, rim left out); check prior, masks and poses"
         ),
     ),
     "residual": Detector(
@@ -124,11 +168,17 @@ DETECTORS: dict[str, Detector] = {
     "exposure": Detector(
         0.1,
         lambda v, limit: (
-            f"exposure drifts: one image would fit best if the render were {np.exp(v):.2f} times brighter or darker than the "
-            f"median image asks for (limit {np.exp(limit):.2f})"
+            f"exposure drifts: one image is {np.exp(v):.2f} times brighter or darker than the others, judged by the prior's "
+            f"colours (limit {np.exp(limit):.2f})"
         ),
     ),
     "pose": Detector(
+        2.0,
+        lambda v, limit: (
+            f"in one view, prior and mask are {v:.1f} pixels apart (limit {limit:.1f}); check its pose, its mask, and the prior"
+        ),
+    ),
+    "outlier": Detector(
         2.0,
         lambda v, limit: (
             f"one view fits badly: its error after the fit is {v:.1f} times the median view's (limit {limit:.1f}); check its "

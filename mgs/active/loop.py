@@ -167,7 +167,7 @@ class Loop:
         self.start = stations.initial([self.frames[i] for i in self.seeds])
         self.policy = policies.policy_named(settings.policy)
         self.seen, self.dome = cache(self._seen), cache(self._dome)  # they depend on poses and surface alone
-        self.outline = cache(self._outline)  # of the prior, so it does not change either
+        self.before_fit = cache(self._before_fit)  # and this on the images, too
 
     def check(self, state: State) -> None:
         """Raises InputError where a state is not of this run: where its means, which a fit leaves alone, are not the prior's;
@@ -313,21 +313,23 @@ class Loop:
         assert self.stations.look
         views = []
         for i in taken:
-            rgb, _ = self.stations.look(fit.gaussians, self.cameras[i])
-            mask, outline = self.outline(i)
-            views.append(detectors.view_signs(self.images[i], mask, rgb, outline))
+            mask, before = self.before_fit(i)
+            views.append(
+                detectors.view_signs(self.images[i], mask, self.stations.look(fit.gaussians, self.cameras[i])[0], before)
+            )
         gains = [step["information_gain"] for step in (*state.steps, line) if step.get("information_gain") is not None]
         drift = detectors.means_drift(fit.gaussians.means, self.start.means, self.start.log_scales)
         signs = detectors.step_signs(views, fit.losses, line["coverage"], gains, drift)
-        before = state.steps[-1].get("signs") if state.steps else None
-        said = detectors.alarms(signs, before)
+        before_this = state.steps[-1].get("signs") if state.steps else None
+        said = detectors.alarms(signs, before_this)
         return {"signs": signs, "warnings": said} if said else {"signs": signs}
 
-    def _outline(self, frame: int) -> tuple[np.ndarray, float]:
-        """The mask [H,W] of a frame that was taken, and how far the prior's outline is from it."""
+    def _before_fit(self, frame: int) -> tuple[np.ndarray, detectors.Before]:
+        """The mask [H,W] of a frame that was taken, and its signs of the Gaussians before any training."""
         assert self.stations.look
-        mask = self.frames[frame].mask()
-        return mask, detectors.outline_error(mask, self.stations.look(self.start, self.cameras[frame])[1])
+        mask, camera = self.frames[frame].mask(), self.cameras[frame]
+        margin = detectors.outline_margin(self.start, camera)
+        return mask, detectors.before_fit(self.images[frame], mask, *self.stations.look(self.start, camera), margin)
 
 
 def target_of(frame: Frame) -> np.ndarray:

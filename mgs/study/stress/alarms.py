@@ -17,7 +17,8 @@ OWN = {
     "unconverged": ("few passes",),
     "prior": (*PRIOR_FAULTS, "another rock's prior", "shifted mask", "wrong mask"),
     "exposure": ("exposure",),
-    "pose": ("pose noise",),
+    "pose": ("pose noise", "one bad pose"),
+    "outlier": ("one bad pose",),
     "means": ("free means",),
     "residual": (*IMAGE_FAULTS, *PRIOR_FAULTS, "another rock's prior"),
 }

@@ -70,6 +70,8 @@ def _resident() -> int:
 
 def slopes(rows: Sequence[Row]) -> list[float]:
     """Growth of memory from each part of the second half to the next, megabytes per step."""
+    if len(rows) < 2 * BLOCKS:
+        return []
     memory = np.array([row["megabytes"] for row in sorted(rows, key=lambda row: row["step"])])
     parts = np.array_split(memory[len(memory) // 2 :], BLOCKS)
     middles = [float(np.median(part)) for part in parts]

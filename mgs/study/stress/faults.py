@@ -221,6 +221,9 @@ SHORT_FITS = (1, 2, 5)
 FREE_VIEWS, FREE_PASSES = (2, 4), 40
 """Views and passes of fits whose means are free and held by no prior, as another."""
 
+ONE_POSE = (1.0, 4.0)
+"""Degrees of `pose_noise` in a single view."""
+
 
 def signs_of(lab: Lab, taken: Sequence[int], passes: int = 20, means: str = "frozen") -> tuple[Any, dict[str, float]]:
     """A fit, and the signs that the loop would have of it after its first step."""
@@ -229,9 +232,10 @@ def signs_of(lab: Lab, taken: Sequence[int], passes: int = 20, means: str = "fro
     lam, views = lab.lam(), []
     surface = np.sum(lab.information(start, taken), axis=0)[: len(lab.prior.points)]
     for frame in (lab.frames[i] for i in taken):
-        before, after = (render(model, frame.camera, cache=lab.cache) for model in (start, found.gaussians))
-        outline = detectors.outline_error(frame.mask(), np.asarray(before.alpha))
-        views.append(detectors.view_signs(target_of(frame), frame.mask(), np.asarray(after.rgb), outline))
+        old, new = (render(model, frame.camera, cache=lab.cache) for model in (start, found.gaussians))
+        target, mask, margin = target_of(frame), frame.mask(), detectors.outline_margin(start, frame.camera)
+        before = detectors.before_fit(target, mask, np.asarray(old.rgb), np.asarray(old.alpha), margin)
+        views.append(detectors.view_signs(target, mask, np.asarray(new.rgb), before))
     drift = detectors.means_drift(found.gaussians.means, start.means, start.log_scales)
     return found.gaussians, detectors.step_signs(views, found.losses, coverage(surface, lam), [], drift)
 
@@ -251,7 +255,7 @@ def _row(lab: Lab, run: str, fault: str, size: float, clean: Mapping[str, Any] |
 
 
 def faults(root: Path, out: Path, scene: str, kinds: str, others: list[str], repeats: int) -> dict[str, Any]:
-    """Fits to VIEWS even views with every fault of a kind ("images" or "prior") at every size, beside clean ones.
+    """Fits to evenly spread views with every fault of a kind ("images" or "prior") at every size, beside clean ones.
 
     others: rocks whose priors are tried in the place of the right one. repeats: draws of faults, each with views of its own.
     """
@@ -282,12 +286,15 @@ def _spoiled(lab: Lab, taken: Sequence[int], kinds: str, function: Any, size: fl
 
 
 def _fit_faults(lab: Lab, run: str, taken: Sequence[int], turn: float, clean: Row) -> list[Row]:
-    """Fits of too few passes, and fits with free means on few views, with their own clean runs."""
+    """Fits of too few passes, fits with free means on few views, with their own clean runs, and one view with a wrong pose."""
     rows = [_row(lab, run, "few passes", passes, clean, taken, passes) for passes in SHORT_FITS]
     for count in FREE_VIEWS:
         few = lab.even(count, turn)
         frozen = _row(lab, run, "none", count, None, few)
         rows += [frozen, _row(lab, run, "free means", count, frozen, few, FREE_PASSES, "free")]
+    for size in ONE_POSE:
+        rng = generator(0, f"stress/{run}/one bad pose/{size}")
+        rows.append(_row(_spoiled(lab, taken[:1], "images", pose_noise, size, rng), run, "one bad pose", size, clean, taken))
     return rows
 
 

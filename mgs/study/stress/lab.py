@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from mgs.active.pose_policies import seed_views
 from mgs.active.settings import MEAN_RATE, RATES, TrainSettings
 from mgs.active.stations import psnr_measure
 from mgs.camera import Camera
-from mgs.data.dataset import Dataset, Frame, load_dataset
+from mgs.data.dataset import Frame, load_dataset
 from mgs.gaussians import Gaussians
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.initial import initial_gaussians, initial_normals
@@ -94,12 +94,12 @@ def make_scene(
 
 @dataclass(frozen=True)
 class Lab:
-    """A rock to experiment on: frames to fit to, a prior, and test views that no fault ever touches."""
+    """A rock to experiment on: frames to fit to, a prior, and a measure on test views, which no fault ever touches."""
 
     name: str
     frames: tuple[Frame, ...]
     prior: Prior
-    tests: Dataset
+    measure: Callable[[Gaussians, list[int]], dict[str, float]]
     cache: ListCache = field(default_factory=lambda: ListCache(CACHE))
 
     @property
@@ -173,7 +173,7 @@ class Lab:
 
     def quality(self, model: Gaussians) -> dict[str, float]:
         """PSNR on the test views, dB: mean over whole images (`psnr`), and inside the rock's mask (`psnr_mask`)."""
-        found = psnr_measure(self.tests, self.cache)(model, [])
+        found = self.measure(model, [])
         return {"psnr": found["psnr"], "psnr_mask": found["psnr_mask"]}
 
 
@@ -182,7 +182,7 @@ def _opened(folder: Path, name: str) -> Lab:
     dataset = load_dataset(folder / "dataset")
     tests = dataset.test_views()
     assert tests is not None
-    return Lab(name, dataset.frames, load_prior(folder / "prior"), tests)
+    return Lab(name, dataset.frames, load_prior(folder / "prior"), psnr_measure(tests, ListCache(CACHE)))
 
 
 def open_lab(root: Path, scene: str) -> Lab:
