@@ -79,7 +79,7 @@ def test_signs_that_a_step_cannot_tell_are_left_out():
 
 def seen(mask, alpha, margin, rendered=0.5, truth=0.5):
     target = np.ones((*mask.shape, 4), np.float32) * [truth, truth, truth, 1]
-    return before_fit(target, mask, np.full((*mask.shape, 3), rendered), alpha, margin)
+    return before_fit(target, mask, np.broadcast_to(rendered, (*mask.shape, 3)), alpha, margin)
 
 
 def test_the_outline_is_the_share_of_pixels_that_disagree_by_more_than_the_margin():
@@ -95,8 +95,10 @@ def test_the_outline_is_the_share_of_pixels_that_disagree_by_more_than_the_margi
 
 def test_the_exposure_is_the_factor_that_the_prior_lacks():
     whole = np.ones((4, 5))
-    assert seen(whole > 0, whole, 1, rendered=0.25, truth=0.5).exposure == pytest.approx(np.log(2), abs=1e-6)
-    assert seen(whole > 0, whole, 1, rendered=0.0).exposure == 0
+    assert seen(whole > 0, whole, 1, rendered=0.25, truth=0.5).exposure == pytest.approx(np.log(0.501 / 0.251))
+    half_grey = np.where(np.arange(5) < 2, 0.9, 0.5)[None, :, None] * np.ones((4, 1, 3))
+    assert seen(whole > 0, whole, 1, rendered=half_grey).exposure == 0
+    assert seen(whole > 0, 0 * whole, 1).exposure == 0
 
 
 def test_the_margin_is_a_pixel_and_the_size_of_a_gaussian(rock):

@@ -1,4 +1,4 @@
-"""Tables of measured numbers in README.md and docs/*.md, made from docs/benchmarks/*.json.
+"""Tables of measured numbers in README.md and docs/*.md, made from docs/benchmarks/*.json and docs/results/*/*.json.
 
     python tools/tables.py            # write them anew
     python tools/tables.py --check    # exit code 1 where one is not what its numbers say
@@ -19,6 +19,7 @@ from typing import Any
 
 from mgs.bench.core import TARGETS
 from mgs.report.tables import markdown_table, table_cell
+from mgs.study.stress.verdict import effect
 
 ROOT = Path(__file__).parent.parent
 MARK = re.compile(r"<!-- (?:table: (?P<name>\S+)|end of table) -->")
@@ -278,6 +279,16 @@ def residual(data: dict[str, Any]) -> str:
     return markdown(["power, background", "full frame", "mask", "inside"], rows) + made_by(data)
 
 
+def stability(data: dict[str, Any]) -> str:
+    """Verdicts of `mgs stress`, experiment by experiment."""
+    rows = []
+    for experiment in data["experiments"]:
+        for claim in experiment["claims"]:
+            rows.append([experiment["name"], claim["hypothesis"], f"**{claim['verdict']}**", effect(claim), str(claim["runs"])])
+    heading = ["experiment", "hypothesis", "verdict", "mean effect (95 % interval)", "runs"]
+    return markdown(heading, rows) + made_by(data)
+
+
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "ranking": ("ranking", ranking),
     "linearity": ("linearity", linearity),
@@ -296,8 +307,9 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "depth-error": ("depth_error", depth_error),
     "backing": ("backing", backing),
     "own-data": ("own_data", own_data),
+    "stability": ("../results/stress/verdicts", stability),
 }
-"""By name: the file in docs/benchmarks, without `.json`, and what makes the table of its contents."""
+"""By name: the file, from docs/benchmarks and without `.json`, and what makes the table of its contents."""
 
 
 def rewritten(page: str, benchmarks: Path) -> str:

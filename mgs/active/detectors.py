@@ -18,14 +18,18 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from mgs.camera import Camera
 from mgs.gaussians import Gaussians
 
+DARK = 1e-3
+"""Linear RGB, added to brightnesses before they are compared: in the dark, a ratio says nothing."""
+
 
 @dataclass(frozen=True)
 class Before:
     """What one captured image says of the Gaussians before any training.
 
     outline: of the pixels that either the rock's mask or the Gaussians cover, the share where they disagree, the rim left out
-    (`outline_margin`). offset: distance between the centres of the two areas, pixels. exposure: natural logarithm of the factor
-    by which the render would have to be brighter to fit the image best; its colours are means over the seeds' images.
+    (`outline_margin`). offset: distance between the centres of the two areas, pixels. exposure: median over the
+    pixels of the logarithm of the image's brightness over the render's. The render has the mean colours of the seeds' images; it
+    is grey where none of them looked, which a median forgives in less than half of the pixels.
     """
 
     outline: float
@@ -59,10 +63,9 @@ def before_fit(target: np.ndarray, mask: np.ndarray, rendered: np.ndarray, alpha
     inside = binary_erosion(mask, iterations=margin, border_value=1)
     wrong = int(((drawn & outside) | (inside & ~drawn)).sum())
     both = mask & drawn & (target[..., 3] > 0)
-    truth, colour = (image[both][:, :3].astype(np.float64) for image in (target, rendered))
-    shared, own = float((truth * colour).sum()), float((colour * colour).sum())
-    exposure = float(np.log(shared / own)) if shared > 0 and own > 0 else 0.0
-    return Before(wrong / max(either, 1), _distance(mask, drawn), exposure)
+    truth, colour = (image[both][:, :3].astype(np.float64).mean(axis=1) for image in (target, rendered))
+    ratios = np.log(truth + DARK) - np.log(colour + DARK)
+    return Before(wrong / max(either, 1), _distance(mask, drawn), float(np.median(ratios)) if len(ratios) else 0.0)
 
 
 def _distance(one: np.ndarray, other: np.ndarray) -> float:

@@ -15,6 +15,7 @@ def stress(
     preset: Annotated[
         str, typer.Option(help="quick: about 10 minutes on two cores. full: more rocks, larger images, more runs; hours.")
     ] = "quick",
+    workers: Annotated[int, typer.Option(min=1, help="Processes that do cells side by side.")] = 1,
     only: Annotated[str | None, typer.Option(help="Names of experiments, separated by commas. Default: all.")] = None,
 ) -> None:
     """Try to make the methods fail: experiments with a hypothesis each, and a verdict that follows from the numbers by a rule.
@@ -31,6 +32,7 @@ def stress(
 
     runtime.start()
     from mgs.study.stress.registry import chosen, preset_named, run_stress
+    from mgs.study.stress.verdict import effect
 
     size, names = preset_named(preset), chosen([name.strip() for name in only.split(",")] if only else [])
     console = Console(highlight=False)
@@ -40,16 +42,10 @@ def stress(
         task = bar.add_task("starting", total=1)
         verdicts = run_stress(
             out, size, names, command_line(),
-            lambda cell, done, total: bar.update(task, description=cell, completed=done, total=total),
+            lambda cell, done, total: bar.update(task, description=cell, completed=done, total=total), workers,
         )  # fmt: skip
     for experiment in verdicts["experiments"]:
         console.print(f"[bold]{experiment['name']}[/bold]: {experiment['question']}", soft_wrap=True)
         for claim in experiment["claims"]:
-            console.print(f"  {claim['verdict']:8} {claim['hypothesis']} {_found(claim)}", soft_wrap=True)
+            console.print(f"  {claim['verdict']:8} {claim['hypothesis']} {effect(claim)}, {claim['runs']} runs", soft_wrap=True)
     console.print(f"wrote {out}: verdicts.json, stability.csv, stability.md and a picture of each experiment", soft_wrap=True)
-
-
-def _found(claim: dict[str, object]) -> str:
-    from mgs.study.stress.registry import effect
-
-    return f"Measured: {effect(claim)}, {claim['runs']} runs."

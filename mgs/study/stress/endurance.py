@@ -80,7 +80,8 @@ def slopes(rows: Sequence[Row]) -> list[float]:
 
 
 def _cells(preset: Preset) -> list[Cell]:
-    return [rock_cell("endurance", f"{__name__}:endurance", preset, *preset.rocks[0], steps=preset.steps)]
+    cell = rock_cell("endurance", f"{__name__}:endurance", preset, *preset.rocks[0], steps=preset.steps)
+    return [replace(cell, alone=True)]  # it starts a process, which workers may not
 
 
 ENDURANCE = Experiment(

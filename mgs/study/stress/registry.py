@@ -21,7 +21,8 @@ from mgs.study.stress.numbers import NUMBERS
 from mgs.study.stress.numerics import NUMERICS
 from mgs.study.stress.picture import experiment_figure
 from mgs.study.stress.scales import SCALES
-from mgs.study.stress.verdict import Row, judged
+from mgs.study.stress.scenes import SCENES
+from mgs.study.stress.verdict import Row, effect, judged
 from mgs.study.stress.views import FREE_MEANS, SEEDS
 from mgs.study.sweep import found, run_cells
 
@@ -36,6 +37,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "data-faults": DATA_FAULTS,
     "prior-faults": PRIOR_EXPERIMENT,
     "detectors": ALARMS,
+    "scenes": SCENES,
 }
 
 
@@ -55,19 +57,25 @@ def preset_named(name: str) -> Preset:
 
 
 def run_stress(
-    out: Path, preset: Preset, names: Sequence[str], command: str, report: Callable[[str, int, int], None]
+    out: Path,
+    preset: Preset,
+    names: Sequence[str],
+    command: str,
+    report: Callable[[str, int, int], None],
+    workers: int = 1,
 ) -> dict[str, Any]:
     """Do the experiments of these names in the folder `out`, and write stability.csv, verdicts.json, NAME.png and stability.md.
 
     command: the line that makes it again, for verdicts.json. report(cell, done, total) is told before each cell that is not
-    done yet. Returns what verdicts.json holds: also of the experiments that were done in this folder before. Called again, it
-    does what is left. Raises InputError if `out` holds results of another preset or version.
+    done yet. workers: processes that do cells side by side. Returns what verdicts.json holds: also of the experiments that were
+    done in this folder before. Called again, it does what is left. Raises InputError if `out` holds results of another preset
+    or version.
     """
     by_experiment = {name: EXPERIMENTS[name].cells(preset) for name in names}
     scenes = {cell.name: cell for cell in (scene_cell(preset, *rock) for rock in (*preset.rocks, *preset.others))}
     cells = {cell.name: cell for of_one in by_experiment.values() for cell in of_one}
     needed = {need: scenes[need] for cell in cells.values() for need in cell.needs}
-    run_cells(out, [*needed.values(), *cells.values()], report)
+    run_cells(out, [*needed.values(), *cells.values()], report, workers=workers)
     return write_results(out, rows_done(out, preset), command)
 
 
@@ -115,11 +123,3 @@ def table(verdicts: dict[str, Any]) -> str:
             cells = [experiment["name"], claim["hypothesis"], f"**{claim['verdict']}**", effect(claim), str(claim["runs"])]
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
-
-
-def effect(claim: dict[str, Any]) -> str:
-    """The effect of a claim with its interval, as text."""
-    if claim["effect"] is None:
-        return "no run"
-    between = "" if claim["interval"] is None else " ({:.3g} to {:.3g})".format(*claim["interval"])
-    return f"{claim['effect']:.3g}{between} {claim['unit']}"

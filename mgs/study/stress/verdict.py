@@ -81,6 +81,14 @@ def judged(claim: Claim, rows: Sequence[Row]) -> dict[str, Any]:
     }
 
 
+def effect(claim: dict[str, Any]) -> str:
+    """The effect of a claim with its interval, as text."""
+    if claim["effect"] is None:
+        return "no run"
+    between = "" if claim["interval"] is None else " ({:.3g} to {:.3g})".format(*claim["interval"])
+    return f"{claim['effect']:.3g}{between} {claim['unit']}"
+
+
 def paired(rows: Sequence[Row], value: str, one: Row, other: Row) -> list[float]:
     """`value` of the rows that agree with `one`, minus that of the rows that agree with `other`, run by run."""
     return [_value(rows, value, one, run) - _value(rows, value, other, run) for run in runs_of(rows, one, other)]
