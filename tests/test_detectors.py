@@ -29,7 +29,7 @@ from mgs.prior.settings import PriorSettings
 from mgs.report.page_facts import measured, read_shown
 from mgs.report.runs import read_run
 
-FITS = Before(outline=0.004, offset=0.3, exposure=0.01)
+FITS = Before(outline=0.001, offset=0.01, exposure=0.01)
 GOOD = ViewSigns(FITS, unexplained=0.05, error=0.02)
 FALLING = (1.0, 0.5, 0.3, 0.25, 0.249, 0.248)
 
@@ -49,9 +49,9 @@ BAD = {
     "prior": ({"views": (replace(GOOD, before=replace(FITS, outline=0.6)),) * 4}, "60.0 % of the pixels"),
     "residual": ({"views": (replace(GOOD, unexplained=0.9),) * 4}, "90 % of the images' variance"),
     "exposure": ({"views": (GOOD, GOOD, GOOD, replace(GOOD, before=replace(FITS, exposure=0.01 + np.log(2))))}, "2.00 times"),
-    "pose": ({"views": (GOOD, GOOD, GOOD, replace(GOOD, before=replace(FITS, offset=9.0)))}, "9.0 pixels"),
+    "pose": ({"views": (GOOD, GOOD, GOOD, replace(GOOD, before=replace(FITS, offset=0.2)))}, "20.0 % of the rock's size"),
     "outlier": ({"views": (GOOD, GOOD, GOOD, replace(GOOD, error=0.2))}, "10.0 times"),
-    "means": ({"drift": 3.0}, "3.0 standard deviations"),
+    "means": ({"drift": 4.0}, "4.0 standard deviations"),
     "coverage": ({"coverage": 0.2}, "only 20 %"),
     "saturated": ({"gains": (0.5, 0.3, 0.01)}, "gained 2 %"),
 }  # fmt: skip
@@ -89,8 +89,8 @@ def test_the_outline_is_the_share_of_pixels_that_disagree_by_more_than_the_margi
     assert seen(mask, alpha, 1).outline == pytest.approx(4 / 13)
     assert seen(mask, alpha, 2).outline == pytest.approx(2 / 13)
     assert seen(mask, alpha, 3).outline == 0
-    assert seen(mask, alpha, 1).offset == 3
-    assert seen(mask, 0 * alpha, 1).offset == pytest.approx(np.hypot(8, 20))
+    assert seen(mask, alpha, 1).offset == pytest.approx(3 / np.sqrt(80))
+    assert seen(mask, 0 * alpha, 1).offset == 1
 
 
 def test_the_exposure_is_the_factor_that_the_prior_lacks():
