@@ -73,6 +73,10 @@ def _lines(axis: Any, panel: Panel, rows: Sequence[Row]) -> None:
         axis.fill_between(x, low[order], high[order], color=line.get_color(), alpha=0.15, linewidth=0)
     if panel.log:
         axis.set_xscale("log")
+        values = sorted({float(row[panel.x]) for row in rows})
+        if len(values) < 8 and max(values) < 1e4 and min(values) > 1e-3:
+            axis.set_xticks(values, [f"{value:.3g}" for value in values])
+            axis.minorticks_off()
 
 
 def _bars(axis: Any, panel: Panel, rows: Sequence[Row]) -> None:
@@ -83,4 +87,6 @@ def _bars(axis: Any, panel: Panel, rows: Sequence[Row]) -> None:
         place = np.arange(len(names)) + (k - (len(groups) - 1) / 2) * 0.8 / len(groups)
         error = np.abs([mean - low, high - mean])
         axis.errorbar(place, mean, error, fmt="o", capsize=2, label=group)
+    if min(float(row[panel.y]) for row in rows) >= 0:
+        axis.set_ylim(bottom=0)
     axis.set_xticks(range(len(names)), names, rotation=60, ha="right", fontsize=8)
