@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from mgs.active import loop
 from mgs.active.policy_file import absolute
@@ -27,7 +27,7 @@ def run_nbv(
     out: str | Path,
     *,
     prior: str | Path | None = None,
-    gaussians: int | None = None,
+    gaussians: int | Literal["auto"] | None = None,
     on_step: Callable[[State], None] = _silent,
     progress: Callable[[str, int, int], None] = _silent,
     say: Callable[[str], None] = _silent,
@@ -50,15 +50,15 @@ def start_run(
     out: str | Path,
     *,
     prior: str | Path | None = None,
-    gaussians: int | None = None,
+    gaussians: int | Literal["auto"] | None = None,
     progress: Callable[[str, int, int], None] = _silent,
     **settings: Any,
 ) -> NbvSettings:
     """Check everything, find or build the prior, and write the run's config.json with every setting resolved.
 
     prior: folder of a prior; without it DATASET/prior where there is one, otherwise a prior is built inside the run, of this
-    many `gaussians` (or, without a number, one per pixel's footprint on the rock). settings: fields of
-    `mgs.active.settings.NbvSettings`; the budget is 50 views, or all candidates where they are fewer.
+    many `gaussians` (`mgs.prior.settings.PriorSettings`; by default, one per pixel's footprint on the rock). settings: fields
+    of `mgs.active.settings.NbvSettings`; the budget is 50 views, or all candidates where they are fewer.
     Leaves no folder behind where it fails. Raises InputError where the output folder is not empty, a setting is wrong, the
     dataset is too small for it, or the dataset or the prior is missing or damaged.
     """

@@ -22,7 +22,9 @@ from mgs.cli.doctor import doctor
 from mgs.cli.evaluate import evaluate
 from mgs.cli.import_data import import_data
 from mgs.cli.nbv import nbv
+from mgs.cli.parsimony import parsimony
 from mgs.cli.prior import prior
+from mgs.cli.prune import prune
 from mgs.cli.render import render
 from mgs.cli.report import report
 from mgs.cli.stress import stress
@@ -47,9 +49,11 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "report": report,
     "view": view,
     "render": render,
+    "prune": prune,
     "demo": demo,
     "bench": bench,
     "stress": stress,
+    "parsimony": parsimony,
 }
 """All commands, in about the order in which they are used."""
 
@@ -59,6 +63,7 @@ GOES_ON = {
     "import": _AGAIN,
     "demo": _AGAIN,
     "stress": _AGAIN,
+    "parsimony": _AGAIN,
     "nbv": "`mgs nbv --resume RUN` continues a run whose folder is there",
 }
 """What is printed after Ctrl-C, for the commands that can go on where they stopped. The others start anew."""

@@ -31,7 +31,9 @@ def nbv(
         Path | None,
         typer.Option(help="Folder of `mgs prior`; default DATASET/prior, or built inside the run where there is none."),
     ] = None,
-    gaussians: Annotated[int | None, typer.Option(help="Build a prior of this many Gaussians inside the run.")] = None,
+    gaussians: Annotated[
+        str | None, typer.Option(metavar="N|auto", help="Build a prior of this many Gaussians (`mgs prior`) inside the run.")
+    ] = None,
     policy: Annotated[
         str, typer.Option(help=f"One of {', '.join(policy_names())}; or FILE.py:FUNCTION, a function of your own.")
     ] = "d-optimal",
@@ -78,6 +80,7 @@ def nbv(
     """
     from rich.console import Console
 
+    from mgs.cli.printing import parse_gaussians
     from mgs.errors import InputError
 
     console = Console(highlight=False)
@@ -98,7 +101,7 @@ def nbv(
     }  # fmt: skip
     if budget is not None:
         settings["budget"] = budget
-    start_and_print(dataset, out, console, prior=prior, gaussians=gaussians, **settings)
+    start_and_print(dataset, out, console, prior=prior, gaussians=parse_gaussians(gaussians), **settings)
     resume_and_print(out, console)
 
 

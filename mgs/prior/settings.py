@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -13,7 +14,8 @@ from mgs.errors import InputError
 class PriorSettings:
     """What a prior is asked to be.
 
-    gaussians: number of Gaussians, on the surface and behind it. spacing: distance between samples on the surface in metres,
+    gaussians: number of Gaussians, on the surface and behind it; "auto": as many as the closest pixel of a frame can tell apart
+    (`mgs.prior.resolution`). spacing: distance between samples on the surface in metres,
     instead of a number. With neither, the spacing is the edge of the cloud's voxels, about the size of a pixel on the rock.
     backing: Gaussians behind the surface for each sample on it (`mgs.prior.initial`). With 0 all lie on it, as in the paper.
     poisson_depth: depth of the octree of the Poisson reconstruction; None chooses it such that its finest cells have an edge of
@@ -25,7 +27,7 @@ class PriorSettings:
     of range.
     """
 
-    gaussians: int | None = None
+    gaussians: int | Literal["auto"] | None = None
     spacing: float | None = None
     poisson_depth: int | None = None
     noise: float = 0.0
@@ -47,7 +49,7 @@ class PriorSettings:
             raise InputError(f"prior: {given} shape a mesh that is built of a cloud, but {why}; leave out either")
 
     def __post_init__(self) -> None:
-        if self.gaussians is not None and self.gaussians < 2:
+        if isinstance(self.gaussians, int) and self.gaussians < 2:
             raise InputError(f"prior: {self.gaussians} Gaussians are too few for a model; ask for more with --gaussians")
         if self.spacing is not None and not self.spacing > 0:
             raise InputError(f"prior: spacing {self.spacing} m must be positive; correct --spacing")
