@@ -277,6 +277,7 @@ def test_the_tables_of_the_loop_are_those_of_the_code(dataset, tmp_path):
     qualities = {f"{views}{name}": 1.0 for views in ("", "held_out_", "test_") for name in ("psnr", "psnr_mask")}
     stations = tiny.stations(measure=lambda gaussians, taken: qualities)
     state = loop.run(tmp_path / "run", settings, loaded, stations, tiny.silent)
+    keys -= {"signs", "warnings"}  # of renders, which the stand-ins do not make
     assert keys == set(state.steps[1]) == set(state.steps[0]) - {"seeds", "seed_names"}
     estimators = [row[0].strip("`") for row in rows((DOCS / "howto/estimator.md").read_text(), "| name | what")]
     assert set(estimators) == set(ESTIMATORS) - {"block"}
@@ -303,7 +304,7 @@ def test_a_stale_table_is_found_and_made_anew(tables, tmp_path, capsys):
         shutil.copy(page, tmp_path / page.relative_to(ROOT))
     numbers = tmp_path / "docs/benchmarks"
     shutil.copytree(DOCS / "benchmarks", numbers)
-    shutil.copytree(DOCS / "results", tmp_path / "docs/results")
+    shutil.copytree(DOCS / "results", tmp_path / "docs/results", dirs_exist_ok=True)
     measured = json.loads((numbers / "splat.json").read_text())
     measured["seconds"]["forward_warm"] = 0.0271
     (numbers / "splat.json").write_text(json.dumps(measured))

@@ -20,6 +20,7 @@ from typing import Any
 from mgs.bench.core import TARGETS
 from mgs.bench.fit import TARGETS as FIT_TARGETS
 from mgs.report.tables import markdown_table, table_cell
+from mgs.study.stress.verdict import effect
 
 ROOT = Path(__file__).parent.parent
 MARK = re.compile(r"<!-- (?:table: (?P<name>\S+)|end of table) -->")
@@ -323,6 +324,16 @@ def residual(data: dict[str, Any]) -> str:
     return markdown(["power, background", "full frame", "mask", "inside"], rows) + made_by(data)
 
 
+def stability(data: dict[str, Any]) -> str:
+    """Verdicts of `mgs stress`, experiment by experiment."""
+    rows = []
+    for experiment in data["experiments"]:
+        for claim in experiment["claims"]:
+            rows.append([experiment["name"], claim["hypothesis"], f"**{claim['verdict']}**", effect(claim), str(claim["runs"])])
+    heading = ["experiment", "hypothesis", "verdict", "mean effect (95 % interval)", "runs"]
+    return markdown(heading, rows) + made_by(data)
+
+
 def parsimony(data: dict[str, Any]) -> str:
     """Every fit of `mgs parsimony`."""
     rows = []
@@ -412,6 +423,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "depth-error": ("depth_error", depth_error),
     "backing": ("backing", backing),
     "own-data": ("own_data", own_data),
+    "stability": ("../results/stress/verdicts", stability),
     "parsimony": ("../results/parsimony/parsimony", parsimony),
     "parsimony-verdict": ("../results/parsimony/parsimony", parsimony_verdict),
     "parsimony-rules": ("../results/parsimony/parsimony", parsimony_rules),

@@ -27,6 +27,7 @@ from mgs.cli.prior import prior
 from mgs.cli.prune import prune
 from mgs.cli.render import render
 from mgs.cli.report import report
+from mgs.cli.stress import stress
 from mgs.cli.survey import survey
 from mgs.cli.synth_orbit import synth_orbit
 from mgs.cli.view import view
@@ -51,6 +52,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "prune": prune,
     "demo": demo,
     "bench": bench,
+    "stress": stress,
     "parsimony": parsimony,
 }
 """All commands, in about the order in which they are used."""
@@ -60,6 +62,7 @@ GOES_ON = {
     "synth-orbit": _AGAIN,
     "import": _AGAIN,
     "demo": _AGAIN,
+    "stress": _AGAIN,
     "parsimony": _AGAIN,
     "nbv": "`mgs nbv --resume RUN` continues a run whose folder is there",
 }

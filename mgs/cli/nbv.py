@@ -153,6 +153,9 @@ def resume_and_print(out: Path, console: Console, pictures: bool = False) -> Non
 
         def on_step(state: State) -> None:
             bar.update(whole, completed=len(state.taken))
+            line = state.steps[-1]
+            for warning in line.get("warnings", []):
+                bar.print(f"step {line['step']}: {warning}", soft_wrap=True)
 
         state = resume_nbv(out, on_step=on_step, progress=progress, say=lambda text: bar.print(text, soft_wrap=True))
         metrics = evaluate_run(out, pictures=pictures, progress=lambda done, total: progress("evaluating", done, total))
