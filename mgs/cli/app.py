@@ -15,6 +15,7 @@ import typer
 
 from mgs import __version__
 from mgs.cli.bench import bench
+from mgs.cli.chart import chart
 from mgs.cli.dataset import dataset
 from mgs.cli.demo import demo
 from mgs.cli.diagnose import diagnose
@@ -48,6 +49,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "render": render,
     "demo": demo,
     "bench": bench,
+    "chart": chart,
 }
 """All commands, in about the order in which they are used."""
 
@@ -56,6 +58,7 @@ GOES_ON = {
     "synth-orbit": _AGAIN,
     "import": _AGAIN,
     "demo": _AGAIN,
+    "chart": _AGAIN,
     "nbv": "`mgs nbv --resume RUN` continues a run whose folder is there",
 }
 """What is printed after Ctrl-C, for the commands that can go on where they stopped. The others start anew."""

@@ -1,0 +1,216 @@
+"""The charts as PNG files, of their rows. Nothing is measured here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.plotting import STYLE, new_figure, save_figure
+
+Rows = Sequence[dict[str, Any]]
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+
+FIT_FACTORS = {
+    "crossed": "number of Gaussians x passes", "half the size": "trained at half the size", "optimiser": "Adam, passes",
+    "learned": "less is learned",
+}  # fmt: skip
+"""What the left panels show, by factor. A point of several factors is drawn as the first of its own."""
+
+RUN_FACTORS = {
+    "crossed, run": "number of Gaussians x passes", "policy, run": "policy", "estimator, run": "estimator",
+}  # fmt: skip
+"""What the right panels show."""
+
+
+def _figure(width: float, height: float) -> Any:
+    return new_figure(width, height)
+
+
+def _points(axes: Any, rows: Rows, y: str, style: int, label: str, x: str = "seconds") -> None:
+    """Points with error bars along the time."""
+    xs, ys = np.array([row[x] for row in rows]), [row[y] for row in rows]
+    error = [xs - [row[f"{x}_low"] for row in rows], [row[f"{x}_high"] for row in rows] - xs] if f"{x}_low" in rows[0] else None
+    axes.errorbar(
+        xs, ys, xerr=error, fmt=MARKERS[style % 7], color=COLOURS[style % 7], ms=4.5, mew=0.4, mec="white", elinewidth=0.8,
+        ls="none", label=label,
+    )  # fmt: skip
+
+
+def _front(axes: Any, rows: Rows, y: str, flag: str, x: str = "seconds") -> None:
+    """A line of steps along the Pareto front: what can be had for the time."""
+    on = sorted((row for row in rows if row[flag]), key=lambda row: float(row[x]))
+    if on:
+        axes.step(
+            [row[x] for row in on], [row[y] for row in on], where="post", color="black", lw=1, zorder=1, label="Pareto front"
+        )
+
+
+def _label(axes: Any, rows: Rows, x: str, y: str, text: Callable[[dict[str, Any]], str]) -> None:
+    """Names beside points, each moved up or down to where it overlaps none that is written already, with a thin line to it."""
+    figure = axes.figure
+    figure.canvas.draw()
+    renderer, boxes = figure.canvas.get_renderer(), list[Any]()
+    taken = [axes.transData.transform((row[x], row[y])) for row in rows]
+    for row, _ in sorted(zip(rows, taken, strict=True), key=lambda pair: -float(pair[1][1])):
+        for dx, dy in _OFFSETS:
+            note = axes.annotate(
+                text(row), (row[x], row[y]), xytext=(dx, dy), textcoords="offset points", fontsize=7,
+                ha="left" if dx > 0 else "right" if dx < 0 else "center", va="center",
+                arrowprops={"arrowstyle": "-", "lw": 0.4, "color": "#888888", "shrinkA": 0, "shrinkB": 2},
+            )  # fmt: skip
+            box = note.get_window_extent(renderer).padded(1.5)
+            inside = axes.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1 and axes.bbox.y0 <= box.y0 and box.y1 <= axes.bbox.y1
+            clear = not any(box.overlaps(other) for other in boxes) and not any(box.contains(*point) for point in taken)
+            if (inside and clear) or (dx, dy) == _OFFSETS[-1]:
+                boxes.append(box)
+                break
+            note.remove()
+
+
+_OFFSETS = tuple(
+    (side * (6 + 1.2 * abs(dy)), dy) for dy in (0, 9, -9, 18, -18, 27, -27, 38, -38, 50, -50, 64, -64) for side in (1, -1)
+)
+"""Where a label is tried, points from its own point."""
+
+
+def fit_figure(path: str | Path, rows: Rows) -> None:
+    """Seconds against PSNR and SSIM, of fits (left) and of runs (right), with fronts; presets have names."""
+    import matplotlib
+
+    with matplotlib.rc_context(STYLE | {"legend.fontsize": 7}):
+        figure = _figure(9, 7)
+        panels = figure.subplots(2, 2, sharex="col")
+        most = max({row["images"] for row in rows}, key=lambda n: sum(row["images"] == n for row in rows))
+        for column, (is_run, factors) in enumerate(((False, FIT_FACTORS), (True, RUN_FACTORS))):
+            own = [row for row in rows if bool(row["policy"]) is is_run and row["images"] == most]
+            for axes, metric, flag, unit in zip(
+                panels[:, column], ("psnr", "ssim"), ("front", "front_ssim"), (", dB", ""), strict=True
+            ):
+                _front(axes, own, metric, flag)
+                done: list[int] = []
+                for style, (factor, label) in enumerate(factors.items()):
+                    some = [row for row in own if factor in row["factors"].split("; ") and id(row) not in done]
+                    done += [id(row) for row in some]
+                    if some:
+                        _points(axes, some, metric, style, label)
+                axes.set_xscale("log")
+                axes.set(ylabel=f"{metric.upper()} on the test views{unit}")
+                named = [row for row in own if row["preset"]]
+                if named:
+                    axes.plot([r["seconds"] for r in named], [r[metric] for r in named], "k*", ms=10, label="preset", zorder=4)
+                _label(axes, named, "seconds", metric, lambda row: str(row["preset"]))
+                if not named:
+                    _label(
+                        axes,
+                        [r for r in own if r[flag]],
+                        "seconds",
+                        metric,
+                        lambda r: f"{r['gaussians']:,}, {r['passes']} passes",
+                    )
+            panels[1, column].set(xlabel="seconds of the whole run" if is_run else "seconds of the fit")
+            panels[0, column].set_title(f"{'runs to' if is_run else 'one fit of'} {most} images")
+            panels[0, column].legend(loc="lower right")
+        save_figure(figure, path)
+
+
+def scoring_figure(path: str | Path, rows: Rows) -> None:
+    """Milliseconds a candidate against Kendall's tau and regret."""
+    import matplotlib
+
+    families = list(dict.fromkeys(row["family"] for row in rows))
+    scaled = [row | {f"ms{end}": 1e3 * row[f"seconds{end}"] for end in ("", "_low", "_high")} for row in rows]
+    with matplotlib.rc_context(STYLE | {"legend.fontsize": 7}):
+        figure = _figure(11, 5.2)
+        panels = figure.subplots(1, 2)
+        for axes, metric, label in zip(
+            panels,
+            ("tau", "percent"),
+            ("Kendall's tau with the exact scores", "regret, % of the best exact score"),
+            strict=True,
+        ):
+            scaled = [row | {"percent": 100 * row["regret"]} for row in scaled]
+            for style, family in enumerate(families):
+                _points(axes, [row for row in scaled if row["family"] == family], metric, style, family, "ms")
+            axes.set_xscale("log")
+            axes.margins(0.12)
+            axes.set(xlabel="milliseconds a candidate, information of the views taken included", ylabel=label)
+            _label(axes, scaled, "ms", metric, lambda row: str(row["variant"]))
+        save_figure(figure, path)
+
+
+def core_figure(path: str | Path, rows: Rows) -> None:
+    """Milliseconds at the working size against the largest error on the small scene."""
+    import matplotlib
+
+    kinds = list(dict.fromkeys(row["computes"] for row in rows))
+    scaled = [row | {f"ms{end}": 1e3 * row[f"seconds{end}"] for end in ("", "_low", "_high")} for row in rows]
+    with matplotlib.rc_context(STYLE):
+        figure = _figure(7, 4.6)
+        axes = figure.subplots()
+        for style, kind in enumerate(kinds):
+            _points(axes, [row for row in scaled if row["computes"] == kind], "error", style, kind, "ms")
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.margins(0.12)
+        axes.set(xlabel="milliseconds at the working size", ylabel="largest error, of the largest entry of the float64 oracle")
+        axes.legend()
+        _label(axes, scaled, "ms", "error", lambda row: str(row["row"]))
+        save_figure(figure, path)
+
+
+def bytes_figure(path: str | Path, rows: Rows) -> None:
+    """Kilobytes sent against PSNR: images, and models of several sizes by how their numbers are rounded."""
+    import matplotlib
+
+    scaled = [row | {"kb": row["bytes"] / 1e3} for row in rows]
+    models = [row for row in scaled if row["sent"] == "model"]
+    usual = max({row["images"] for row in models}, key=lambda n: sum(row["images"] == n for row in models))
+    with matplotlib.rc_context(STYLE | {"legend.fontsize": 7}):
+        figure = _figure(8, 5)
+        axes = figure.subplots()
+        sizes = sorted({row["gaussians"] for row in models if row["images"] == usual})
+        for style, n in enumerate(sizes):
+            for quantiser, dash in (("one step", ":"), ("by H", "-"), ("by H, known", "--")):
+                some = sorted(
+                    (r for r in models if (r["gaussians"], r["quantiser"], r["images"]) == (n, quantiser, usual)),
+                    key=lambda r: float(r["kb"]),
+                )
+                label = f"{n:,} Gaussians" if quantiser == "by H" else None
+                axes.plot(
+                    [r["kb"] for r in some],
+                    [r["psnr"] for r in some],
+                    dash + MARKERS[style % 7],
+                    color=COLOURS[style % 7],
+                    ms=3,
+                    lw=1,
+                    label=label,
+                )
+            whole = [r for r in models if (r["gaussians"], r["quantiser"], r["images"]) == (n, "float32", usual)]
+            axes.plot(
+                [r["kb"] for r in whole], [r["psnr"] for r in whole], MARKERS[style % 7], mfc="white", color=COLOURS[style % 7]
+            )
+        photos = [row for row in scaled if row["sent"] == "images" and row["density"] == 1]
+        photos.sort(key=lambda row: float(row["kb"]))
+        axes.plot([r["kb"] for r in photos], [r["psnr"] for r in photos], "k-P", ms=5, lw=0.8, label="images as PNG")
+        for dash, text in ((":", "one step a column"), ("-", "steps by H, sent"), ("--", "steps by H, known: a bound")):
+            axes.plot([], [], dash, color="#444444", lw=1, label=text)
+        axes.plot([], [], "o", mfc="white", color="#444444", label="float32")
+        axes.set_xscale("log")
+        axes.set(xlabel="kilobytes sent", ylabel="PSNR on the test views, dB")
+        axes.legend(loc="lower right", ncols=2)
+        _label(axes, photos, "kb", "psnr", lambda row: f"{row['images']} images")
+        save_figure(figure, path)
+
+
+FIGURES: dict[str, Callable[[str | Path, Rows], None]] = {
+    "fit": fit_figure,
+    "scoring": scoring_figure,
+    "core": core_figure,
+    "bytes": bytes_figure,
+}
+"""The figure of each chart."""
