@@ -1,9 +1,17 @@
 """A sweep of cells: each is done once, in the order of needs, and what was interrupted goes on."""
 
+import logging
+import os
+import signal
+import time
+
+import dask
 import pytest
+from distributed import LocalCluster
 
 from mgs.errors import InputError
-from mgs.study.sweep import Cell, cell_folder, run_cells
+from mgs.study import sweep
+from mgs.study.sweep import Cell, cell_folder, found, run_cells
 
 CALLS = []
 
@@ -52,3 +60,95 @@ def test_the_result_of_another_question_is_refused(tmp_path):
     run_cells(tmp_path, [cell("a", x=1)], silent)
     with pytest.raises(InputError, match="other settings"):
         run_cells(tmp_path, [cell("a", x=2)], silent)
+
+
+def add_slowly(root, out, x, killed=False):
+    """A task that takes part of a second; its process is killed in the middle of the first attempt, if asked for."""
+    begun = out / "begun"
+    first = not begun.exists()
+    begun.touch()
+    time.sleep(0.2)
+    if killed and first:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {"square": x * x}
+
+
+def write_process(root, out, **arguments):
+    """A task that finds its process, and whether another cell of the study had begun and not ended."""
+    others = [folder for folder in out.parent.iterdir() if folder != out and not (folder / "result.json").exists()]
+    return {"pid": os.getpid(), "beside": [folder.name for folder in others]}
+
+
+def die(root, out):
+    """A task that its process does not survive."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_two_workers_of_which_one_is_killed_find_what_a_serial_run_finds(tmp_path):
+    squares = [Cell(str(x), "test_sweep:add_slowly", {"x": x}) for x in range(4)]
+    killed = Cell("killed", "test_sweep:add_slowly", {"x": 7, "killed": True}, ("0",))
+    last = Cell("last", "test_sweep:add", {"x": 1, "to": None}, ("killed", "3"))
+    told = []
+    parallel = run_cells(tmp_path / "parallel", [*squares, killed, last], lambda *what: told.append(what), workers=2)
+    (tmp_path / "serial/cells/killed").mkdir(parents=True)
+    (tmp_path / "serial/cells/killed/begun").touch()
+    serial = run_cells(tmp_path / "serial", [*squares, killed, last], silent)
+    assert parallel == serial
+    assert list(parallel) == list(serial)
+    assert [name for name, _, _ in told][-1] == "last"
+    assert len(told) == 6
+    for name in serial:
+        files = [(tmp_path / kind / "cells" / name / "result.json").read_bytes() for kind in ("parallel", "serial")]
+        assert files[0] == files[1]
+
+
+@pytest.fixture(scope="module")
+def scheduler():
+    """Address of a Dask scheduler with two worker processes."""
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, host="127.0.0.1", memory_limit=0,
+            dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL + 1,
+        ) as cluster,
+    ):  # fmt: skip
+        yield cluster.scheduler_address
+
+
+def test_a_cell_that_must_be_alone_runs_here_and_beside_nothing(tmp_path, scheduler):
+    alone = Cell("alone", "test_sweep:write_process", alone=True)
+    cells = [alone, Cell("a", "test_sweep:add_slowly", {"x": 1}), Cell("b", "test_sweep:write_process")]
+    results = run_cells(tmp_path, cells, silent, scheduler=scheduler)
+    assert results["alone"] == {"pid": os.getpid(), "beside": []}
+    assert results["b"]["pid"] != os.getpid()
+
+
+def test_what_a_cell_raises_in_a_worker_is_raised_and_what_is_done_is_kept(tmp_path, scheduler):
+    cells = [cell("a", x=1), cell("b", ("a",), x=-1)]
+    with pytest.raises(ValueError, match="-1"):
+        run_cells(tmp_path, cells, silent, scheduler=scheduler)
+    assert found(tmp_path, cells[0]) == {"sum": 1}
+    assert found(tmp_path, cells[1]) is None
+
+
+def test_a_cell_that_kills_its_worker_again_and_again_is_one_clear_line(tmp_path, scheduler):
+    with pytest.raises(InputError, match="deadly: its worker was killed again and again"):
+        run_cells(tmp_path, [Cell("deadly", "test_sweep:die")], silent, scheduler=scheduler)
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:99999"])
+def test_a_scheduler_that_does_not_answer_is_one_clear_line(tmp_path, address, monkeypatch):
+    monkeypatch.setattr(sweep, "CONNECT_SECONDS", 0.5)
+    with pytest.raises(InputError, match=f"--scheduler {address}: no Dask scheduler answers"):
+        run_cells(tmp_path, [cell("a", x=1)], silent, scheduler=address)
+
+
+@pytest.mark.parametrize(("workers", "fault"), [(0, "has no worker"), (1, "has a worker with several threads")])
+def test_a_scheduler_whose_workers_will_not_do_is_one_clear_line(tmp_path, workers, fault, monkeypatch):
+    monkeypatch.setattr(sweep, "CONNECT_SECONDS", 1)
+    options = {"processes": False, "dashboard_address": "127.0.0.1:0"}
+    with (
+        LocalCluster(n_workers=workers, threads_per_worker=2, host="127.0.0.1", protocol="tcp://", **options) as cluster,
+        pytest.raises(InputError, match=fault),
+    ):
+        run_cells(tmp_path, [cell("a", x=1)], silent, scheduler=cluster.scheduler_address)
