@@ -19,6 +19,8 @@ from typing import Any
 
 from mgs.bench.core import TARGETS
 from mgs.report.tables import markdown_table, table_cell
+from mgs.study.chart.tables import TABLES as CHART_TABLES
+from mgs.study.chart.tables import chart_table
 
 ROOT = Path(__file__).parent.parent
 MARK = re.compile(r"<!-- (?:table: (?P<name>\S+)|end of table) -->")
@@ -278,6 +280,18 @@ def residual(data: dict[str, Any]) -> str:
     return markdown(["power, background", "full frame", "mask", "inside"], rows) + made_by(data)
 
 
+def chart(name: str) -> Callable[[dict[str, Any]], str]:
+    """What makes a table of `mgs chart`, by its name."""
+
+    def table(data: dict[str, Any]) -> str:
+        heading, rows, note = chart_table(name, data)
+        return (markdown(heading, rows) + "\n" if rows else "") + f"{note}\n"
+
+    return table
+
+
+CHART = "../results/chart/chart"
+
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "ranking": ("ranking", ranking),
     "linearity": ("linearity", linearity),
@@ -296,6 +310,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "depth-error": ("depth_error", depth_error),
     "backing": ("backing", backing),
     "own-data": ("own_data", own_data),
+    **{f"chart-{name}": (CHART, chart(name)) for name in CHART_TABLES},
 }
 """By name: the file in docs/benchmarks, without `.json`, and what makes the table of its contents."""
 

@@ -36,9 +36,9 @@ class Preset:
 
 
 PRESETS = {
-    "fast": Preset(passes=5, warm_passes=3, density=0.5),
-    "balanced": Preset(passes=10, warm_passes=5, density=1.0),
-    "accurate": Preset(passes=20, warm_passes=10, density=2.0),
+    "fast": Preset(passes=5, warm_passes=3, density=1 / 16),
+    "balanced": Preset(passes=10, warm_passes=5, density=1 / 8),
+    "accurate": Preset(passes=20, warm_passes=10, density=1 / 4),
 }
 """What `mgs nbv --preset` knows, by name."""
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
+from itertools import pairwise, zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mgs.plotting import STYLE, new_figure, save_figure
+from mgs.study.chart.plan import DENSITY
 
 Rows = Sequence[dict[str, Any]]
 
@@ -42,31 +45,57 @@ def _points(axes: Any, rows: Rows, y: str, style: int, label: str, x: str = "sec
 
 
 def _front(axes: Any, rows: Rows, y: str, flag: str, x: str = "seconds") -> None:
-    """A line of steps along the Pareto front: what can be had for the time."""
+    """A staircase along the Pareto front: what can be had for the time."""
     on = sorted((row for row in rows if row[flag]), key=lambda row: float(row[x]))
-    if on:
-        axes.step(
-            [row[x] for row in on], [row[y] for row in on], where="post", color="black", lw=1, zorder=1, label="Pareto front"
-        )
+    steps = [(row[x], row[y]) for row in on]
+    corners = [(later[0], earlier[1]) for earlier, later in pairwise(steps)]
+    stairs = [point for pair in zip_longest(steps, corners) for point in pair if point]
+    axes.plot(*zip(*stairs, strict=True), color="black", lw=1, zorder=1, label="Pareto front")
+
+
+def _seconds_axis(axes: Any) -> None:
+    """A logarithmic axis with plain numbers at 1, 2 and 5."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _drawn(axes: Any) -> np.ndarray:
+    """Points [P,2], pixels of the figure, on everything that is drawn in some axes: markers, and lines in small steps."""
+    lines = [(line.get_xydata(), line.get_linestyle() != "None") for line in axes.lines]
+    lines += [(segment, True) for bars in axes.collections for segment in bars.get_segments()]
+    points = [np.zeros((0, 2))]
+    for path, joined in lines:
+        at = axes.transData.transform(np.asarray(path, np.float64).reshape(-1, 2))
+        points.append(at)
+        if joined:
+            points += [np.linspace(a, b, 2 + int(np.abs(b - a).max() // 4)) for a, b in pairwise(at)]
+    return np.concatenate(points)
 
 
 def _label(axes: Any, rows: Rows, x: str, y: str, text: Callable[[dict[str, Any]], str]) -> None:
-    """Names beside points, each moved up or down to where it overlaps none that is written already, with a thin line to it."""
+    """Names beside points, each where it covers nothing that is drawn or written already, with a thin line to its point."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     figure = axes.figure
-    figure.canvas.draw()
-    renderer, boxes = figure.canvas.get_renderer(), list[Any]()
-    taken = [axes.transData.transform((row[x], row[y])) for row in rows]
-    for row, _ in sorted(zip(rows, taken, strict=True), key=lambda pair: -float(pair[1][1])):
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()  # which lays the figure out
+    renderer, boxes, drawn = canvas.get_renderer(), list[Any](), _drawn(axes)
+    for row in sorted(rows, key=lambda row: -float(row[y])):
         for dx, dy in _OFFSETS:
             note = axes.annotate(
                 text(row), (row[x], row[y]), xytext=(dx, dy), textcoords="offset points", fontsize=7,
-                ha="left" if dx > 0 else "right" if dx < 0 else "center", va="center",
+                ha="left" if dx > 0 else "right", va="center",
                 arrowprops={"arrowstyle": "-", "lw": 0.4, "color": "#888888", "shrinkA": 0, "shrinkB": 2},
             )  # fmt: skip
-            box = note.get_window_extent(renderer).padded(1.5)
+            note.set_in_layout(False)
+            box = note.get_window_extent(renderer).padded(2)
             inside = axes.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1 and axes.bbox.y0 <= box.y0 and box.y1 <= axes.bbox.y1
-            clear = not any(box.overlaps(other) for other in boxes) and not any(box.contains(*point) for point in taken)
-            if (inside and clear) or (dx, dy) == _OFFSETS[-1]:
+            covers = ((drawn > (box.x0, box.y0)) & (drawn < (box.x1, box.y1))).all(axis=1).any()
+            if (inside and not covers and not any(box.overlaps(other) for other in boxes)) or (dx, dy) == _OFFSETS[-1]:
                 boxes.append(box)
                 break
             note.remove()
@@ -82,40 +111,44 @@ def fit_figure(path: str | Path, rows: Rows) -> None:
     """Seconds against PSNR and SSIM, of fits (left) and of runs (right), with fronts; presets have names."""
     import matplotlib
 
-    with matplotlib.rc_context(STYLE | {"legend.fontsize": 7}):
-        figure = _figure(9, 7)
+    counts = Counter(row["images"] for row in rows)
+    most = counts.most_common(1)[0][0]
+    with matplotlib.rc_context(STYLE | {"legend.fontsize": 7, "legend.title_fontsize": 10}):
+        figure = _figure(10, 8)
         panels = figure.subplots(2, 2, sharex="col")
-        most = max({row["images"] for row in rows}, key=lambda n: sum(row["images"] == n for row in rows))
         for column, (is_run, factors) in enumerate(((False, FIT_FACTORS), (True, RUN_FACTORS))):
             own = [row for row in rows if bool(row["policy"]) is is_run and row["images"] == most]
-            for axes, metric, flag, unit in zip(
-                panels[:, column], ("psnr", "ssim"), ("front", "front_ssim"), (", dB", ""), strict=True
-            ):
-                _front(axes, own, metric, flag)
-                done: list[int] = []
-                for style, (factor, label) in enumerate(factors.items()):
-                    some = [row for row in own if factor in row["factors"].split("; ") and id(row) not in done]
-                    done += [id(row) for row in some]
-                    if some:
-                        _points(axes, some, metric, style, label)
-                axes.set_xscale("log")
+            for axes, metric, flag, unit in zip(panels[:, column], *_METRICS, strict=True):
+                _fit_panel(axes, own, metric, flag, factors)
                 axes.set(ylabel=f"{metric.upper()} on the test views{unit}")
-                named = [row for row in own if row["preset"]]
-                if named:
-                    axes.plot([r["seconds"] for r in named], [r[metric] for r in named], "k*", ms=10, label="preset", zorder=4)
-                _label(axes, named, "seconds", metric, lambda row: str(row["preset"]))
-                if not named:
-                    _label(
-                        axes,
-                        [r for r in own if r[flag]],
-                        "seconds",
-                        metric,
-                        lambda r: f"{r['gaussians']:,}, {r['passes']} passes",
-                    )
             panels[1, column].set(xlabel="seconds of the whole run" if is_run else "seconds of the fit")
-            panels[0, column].set_title(f"{'runs to' if is_run else 'one fit of'} {most} images")
-            panels[0, column].legend(loc="lower right")
+            title = f"{'runs to' if is_run else 'one fit of'} {most} images"
+            panels[0, column].legend(title=title, loc="lower left", bbox_to_anchor=(0, 1), ncols=3)
+        for axes, metric, flag, _ in zip(panels[:, 0], *_METRICS, strict=True):
+            on = [row for row in rows if not row["policy"] and row["images"] == most and row[flag]]
+            _label(axes, on, "seconds", metric, lambda row: f"{row['gaussians']:,}, {row['passes']} passes")
+        for axes, metric in zip(panels[:, 1], _METRICS[0], strict=True):
+            _label(axes, [row for row in rows if row["preset"]], "seconds", metric, lambda row: str(row["preset"]))
         save_figure(figure, path)
+
+
+_METRICS = (("psnr", "ssim"), ("front", "front_ssim"), (", dB", ""))
+"""What a row of panels shows: a quality, the column that tells its front, its unit."""
+
+
+def _fit_panel(axes: Any, rows: Rows, metric: str, flag: str, factors: dict[str, str]) -> None:
+    """Points by the first of their factors, the front, and stars for presets."""
+    _seconds_axis(axes)
+    _front(axes, rows, metric, flag)
+    left = list(rows)
+    for style, (factor, label) in enumerate(factors.items()):
+        some = [row for row in left if factor in row["factors"].split("; ")]
+        left = [row for row in left if row not in some]
+        if some:
+            _points(axes, some, metric, style, label)
+    named = [row for row in rows if row["preset"]]
+    if named:
+        axes.plot([r["seconds"] for r in named], [r[metric] for r in named], "k*", ms=10, label="preset", zorder=4)
 
 
 def scoring_figure(path: str | Path, rows: Rows) -> None:
@@ -136,7 +169,7 @@ def scoring_figure(path: str | Path, rows: Rows) -> None:
             scaled = [row | {"percent": 100 * row["regret"]} for row in scaled]
             for style, family in enumerate(families):
                 _points(axes, [row for row in scaled if row["family"] == family], metric, style, family, "ms")
-            axes.set_xscale("log")
+            _seconds_axis(axes)
             axes.margins(0.12)
             axes.set(xlabel="milliseconds a candidate, information of the views taken included", ylabel=label)
             _label(axes, scaled, "ms", metric, lambda row: str(row["variant"]))
@@ -154,11 +187,11 @@ def core_figure(path: str | Path, rows: Rows) -> None:
         axes = figure.subplots()
         for style, kind in enumerate(kinds):
             _points(axes, [row for row in scaled if row["computes"] == kind], "error", style, kind, "ms")
-        axes.set_xscale("log")
+        _seconds_axis(axes)
         axes.set_yscale("log")
         axes.margins(0.12)
         axes.set(xlabel="milliseconds at the working size", ylabel="largest error, of the largest entry of the float64 oracle")
-        axes.legend()
+        axes.legend(loc="center right")
         _label(axes, scaled, "ms", "error", lambda row: str(row["row"]))
         save_figure(figure, path)
 
@@ -169,7 +202,7 @@ def bytes_figure(path: str | Path, rows: Rows) -> None:
 
     scaled = [row | {"kb": row["bytes"] / 1e3} for row in rows]
     models = [row for row in scaled if row["sent"] == "model"]
-    usual = max({row["images"] for row in models}, key=lambda n: sum(row["images"] == n for row in models))
+    usual = Counter(row["images"] for row in models).most_common(1)[0][0]
     with matplotlib.rc_context(STYLE | {"legend.fontsize": 7}):
         figure = _figure(8, 5)
         axes = figure.subplots()
@@ -194,13 +227,13 @@ def bytes_figure(path: str | Path, rows: Rows) -> None:
             axes.plot(
                 [r["kb"] for r in whole], [r["psnr"] for r in whole], MARKERS[style % 7], mfc="white", color=COLOURS[style % 7]
             )
-        photos = [row for row in scaled if row["sent"] == "images" and row["density"] == 1]
+        photos = [row for row in scaled if row["sent"] == "images" and row["density"] == DENSITY]
         photos.sort(key=lambda row: float(row["kb"]))
         axes.plot([r["kb"] for r in photos], [r["psnr"] for r in photos], "k-P", ms=5, lw=0.8, label="images as PNG")
         for dash, text in ((":", "one step a column"), ("-", "steps by H, sent"), ("--", "steps by H, known: a bound")):
             axes.plot([], [], dash, color="#444444", lw=1, label=text)
         axes.plot([], [], "o", mfc="white", color="#444444", label="float32")
-        axes.set_xscale("log")
+        _seconds_axis(axes)
         axes.set(xlabel="kilobytes sent", ylabel="PSNR on the test views, dB")
         axes.legend(loc="lower right", ncols=2)
         _label(axes, photos, "kb", "psnr", lambda row: f"{row['images']} images")

@@ -17,7 +17,7 @@ from typing import Any
 from mgs.active.settings import PRESETS, RATES
 from mgs.data.dataset import load_dataset
 from mgs.study.chart.pareto import pareto_front
-from mgs.study.chart.plan import SCENE, Data, Plan, synthetic
+from mgs.study.chart.plan import DENSITY, SCENE, Data, Plan, synthetic
 from mgs.study.chart.subject import quality
 from mgs.study.chart.timing import timed
 from mgs.study.sweep import Cell, cell_folder
@@ -34,7 +34,7 @@ class Point:
     """Settings of one `mgs nbv`. policy: "" for a fit of all images at once. half: trained on images of half the size."""
 
     images: int
-    density: float = 1.0
+    density: float = DENSITY
     passes: int = 20
     warm_passes: int = 10
     optimiser: str = "natural"
@@ -47,7 +47,7 @@ class Point:
     def name(self) -> str:
         """A name for its cell, which tells all settings."""
         passes = f"{self.passes}-{self.warm_passes}" if self.policy else str(self.passes)
-        parts = [f"d{self.density:g}", f"i{self.images}", f"p{passes}", self.optimiser, self.learned.replace("+", "-")]
+        parts = [f"d{1 / self.density:g}", f"i{self.images}", f"p{passes}", self.optimiser, self.learned.replace("+", "-")]
         parts += [self.policy, self.estimator] if self.policy else ["fit"]
         return "-".join([*parts, *(["half"] if self.half else [])])
 
@@ -118,7 +118,7 @@ def cells(plan: Plan, data: Data, points: Iterable[Point], repeats: int, half: D
             "settings": point.settings(plan.seeds), "repeats": repeats,
         }  # fmt: skip
         name = f"fit/{data.label}/{point.name}"
-        found[name] = Cell(name, "mgs.study.chart.fit:measure", arguments, (prior.name, *trained.needs))
+        found[name] = Cell(name, "mgs.study.chart.fit:measure", arguments, (prior.name, *trained.needs), alone=True)
     return list(found.values())
 
 

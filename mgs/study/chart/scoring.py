@@ -23,7 +23,7 @@ from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.seeds import generator
-from mgs.study.chart.plan import Data, Plan, plan_named
+from mgs.study.chart.plan import DENSITY, Data, Plan, plan_named
 from mgs.study.chart.timing import timed
 from mgs.study.sweep import Cell, cell_folder
 
@@ -123,7 +123,7 @@ def lazy(state: State) -> NDArray[np.float64]:
     """
     H, scores, best = state.summed(state.taken), state.old_scores.copy(), -np.inf
     for k in np.argsort(-state.old_scores, kind="stable"):
-        if best >= state.old_scores[k]:
+        if best > state.old_scores[k]:
             break
         scores[k] = d_optimal(state.information(state.left[k]), H, state.lam)
         best = max(best, float(scores[k]))
@@ -169,7 +169,7 @@ def variants(plan: Plan) -> dict[str, tuple[str, Score]]:
 
 def cells(plan: Plan, data: Data, repeats: int, preset: str) -> list[Cell]:
     """The states, and a cell for each way to score them. preset: the name of the plan."""
-    prior = data.prior(1.0)
+    prior = data.prior(DENSITY)
     where = {"dataset": data.folder, "prior": f"cells/{prior.name}/prior"}
     states = Cell(
         f"scoring/{data.label}/states", "mgs.study.chart.scoring:make_states", {**where, "seeds": plan.seeds}, (prior.name,)
@@ -177,7 +177,7 @@ def cells(plan: Plan, data: Data, repeats: int, preset: str) -> list[Cell]:
     found = [*data.cells, prior, states]
     for name in variants(plan):
         arguments = {**where, "states": states.name, "variant": name, "preset": preset, "repeats": repeats}
-        found.append(Cell(cell_name(data, name), "mgs.study.chart.scoring:measure", arguments, (states.name,)))
+        found.append(Cell(cell_name(data, name), "mgs.study.chart.scoring:measure", arguments, (states.name,), alone=True))
     return found
 
 

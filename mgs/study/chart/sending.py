@@ -23,7 +23,7 @@ from mgs.active.criteria import PIXEL_NOISE
 from mgs.data.dataset import load_dataset
 from mgs.gaussians import Gaussians
 from mgs.study.chart.pareto import pareto_front
-from mgs.study.chart.plan import Data, Plan, plan_named
+from mgs.study.chart.plan import DENSITY, Data, Plan, plan_named
 from mgs.study.chart.subject import quality
 from mgs.study.sweep import Cell
 
@@ -82,7 +82,7 @@ def quantised(values: Array, base: Array, steps: Array) -> tuple[Array, float]:
 
 def models(plan: Plan) -> list[tuple[float, int]]:
     """(density, images) of the models that are sent."""
-    pairs = [(d, plan.images) for d in plan.densities] + [(1.0, n) for n in plan.image_counts]
+    pairs = [(d, plan.images) for d in plan.densities] + [(DENSITY, n) for n in plan.image_counts]
     return list(dict.fromkeys(pairs))
 
 
@@ -99,7 +99,7 @@ def cells(plan: Plan, data: Data, preset: str) -> list[Cell]:
 
 def cell_name(data: Data, density: float, images: int) -> str:
     """The name of the cell of a model."""
-    return f"bytes/{data.label}/d{density:g}-i{images}"
+    return f"bytes/{data.label}/d{1 / density:g}-i{images}"
 
 
 def measure(root: Path, out: Path, dataset: str, prior: str, images: int, preset: str) -> dict[str, Any]:
