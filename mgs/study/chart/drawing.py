@@ -79,6 +79,7 @@ def _drawn(axes: Any) -> np.ndarray:
 def _label(axes: Any, rows: Rows, x: str, y: str, text: Callable[[dict[str, Any]], str]) -> None:
     """Names beside points, each where it covers nothing that is drawn or written already, with a thin line to its point."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.text import Text
 
     figure = axes.figure
     canvas = FigureCanvasAgg(figure)
@@ -92,8 +93,9 @@ def _label(axes: Any, rows: Rows, x: str, y: str, text: Callable[[dict[str, Any]
                 arrowprops={"arrowstyle": "-", "lw": 0.4, "color": "#888888", "shrinkA": 0, "shrinkB": 2},
             )  # fmt: skip
             note.set_in_layout(False)
-            box = note.get_window_extent(renderer).padded(2)
-            inside = axes.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1 and axes.bbox.y0 <= box.y0 and box.y1 <= axes.bbox.y1
+            note.update_positions(renderer)
+            box = Text.get_window_extent(note, renderer).padded(2)  # without the line
+            inside = axes.bbox.x0 <= box.x0 and box.x1 <= axes.bbox.x1 and axes.bbox.y0 <= box.y0 and box.y1 <= axes.bbox.y1
             covers = ((drawn > (box.x0, box.y0)) & (drawn < (box.x1, box.y1))).all(axis=1).any()
             if (inside and not covers and not any(box.overlaps(other) for other in boxes)) or (dx, dy) == _OFFSETS[-1]:
                 boxes.append(box)
@@ -139,6 +141,7 @@ _METRICS = (("psnr", "ssim"), ("front", "front_ssim"), (", dB", ""))
 def _fit_panel(axes: Any, rows: Rows, metric: str, flag: str, factors: dict[str, str]) -> None:
     """Points by the first of their factors, the front, and stars for presets."""
     _seconds_axis(axes)
+    axes.margins(0.08)
     _front(axes, rows, metric, flag)
     left = list(rows)
     for style, (factor, label) in enumerate(factors.items()):
