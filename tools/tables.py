@@ -329,8 +329,8 @@ def chart(name: str) -> Callable[[dict[str, Any]], str]:
     """What makes a table of `mgs chart`, by its name."""
 
     def table(data: dict[str, Any]) -> str:
-        heading, rows, note = chart_table(name, data)
-        return (markdown(heading, rows) + "\n" if rows else "") + f"{note}\n"
+        picture, heading, rows, note = chart_table(name, data)
+        return picture + (markdown(heading, rows) + "\n" if rows else "") + f"{note}\n"
 
     return table
 

@@ -13,9 +13,14 @@ Cells = list[list[str]]
 
 
 def span(row: dict[str, Any], scale: float = 1.0) -> str:
-    """Seconds of a row of `mgs chart`, times a scale, and their extremes."""
-    value, low, high = (scale * row[key] for key in ("seconds", "seconds_low", "seconds_high"))
-    return f"{value:.3g} ({low:.3g} to {high:.3g})"
+    """Seconds of a row of `mgs chart`, times a scale, and their extremes where it was timed more than once."""
+    value, low, high = (_digits(scale * row[key]) for key in ("seconds", "seconds_low", "seconds_high"))
+    return value if low == high else f"{value} ({low} to {high})"
+
+
+def _digits(value: float) -> str:
+    """A number with three significant digits, or all before the point."""
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def settings_of(row: dict[str, Any]) -> str:
@@ -100,7 +105,7 @@ def scoring(rows: Rows) -> Cells:
 
 def core(rows: Rows) -> Cells:
     """Times and errors of the kernels."""
-    return [[row["row"], row["computes"], span(row, 1e3), f"{row['error']:.1e}"] for row in rows]
+    return [[row["row"], row["computes"], span(row, 1e3), f"{row['error']:.2g}"] for row in rows]
 
 
 def bytes_sent(rows: Rows) -> Cells:
@@ -144,14 +149,24 @@ TABLES: dict[str, tuple[str, tuple[str, ...], Callable[[Rows], Cells]]] = {
 """By name: the kind of rows, the heading, and what makes cells of the rows."""
 
 
-def chart_table(name: str, data: dict[str, Any]) -> tuple[tuple[str, ...], Cells, str]:
-    """(heading, cells, note) of one of TABLES; data: what chart.json holds. Without cells where nothing is measured yet.
+PICTURES = {
+    "front": "Seconds against PSNR and SSIM of fits and runs",
+    "scoring": "Milliseconds a candidate against tau and regret",
+    "core": "Milliseconds against the largest error",
+    "bytes": "Kilobytes sent against PSNR",
+}
+"""What the chart above a table shows."""
 
-    The note tells the command, the machine, and how long the reference took of all that was timed.
+
+def chart_table(name: str, data: dict[str, Any]) -> tuple[str, tuple[str, ...], Cells, str]:
+    """(chart, heading, cells, note) of one of TABLES; data: what chart.json holds. Without cells where nothing is measured yet.
+
+    The chart is a line of Markdown, empty where there is none. The note tells the command, the machine, and how long the
+    reference took of all that was timed.
     """
     kind, heading, cells = TABLES[name]
     if kind not in data:
-        return heading, [], f"Not measured yet: `mgs chart docs/results/chart --only {kind}`."
+        return "", heading, [], f"Not measured yet: `mgs chart docs/results/chart --only {kind}`."
     found = data[kind]
     machine = found["machine"]
     options = f"--only {kind} --preset {found['preset']} --repeats {found['repeats']}"
@@ -159,4 +174,5 @@ def chart_table(name: str, data: dict[str, Any]) -> tuple[tuple[str, ...], Cells
     note += f"; mgs {data['versions']['mgs']}"
     if kind != "bytes":
         note += f"; the reference took {found['reference_seconds']:.2f} s"
-    return heading, cells(found["rows"]), f"{note}."
+    picture = f"![{PICTURES[name]}](results/chart/{kind}.png)\n\n" if name in PICTURES else ""
+    return picture, heading, cells(found["rows"]), f"{note}."
