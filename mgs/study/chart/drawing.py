@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mgs.plotting import STYLE, new_figure, save_figure
+from mgs.study.chart.pareto import pareto_front
 from mgs.study.chart.plan import DENSITY
 
 Rows = Sequence[dict[str, Any]]
@@ -170,6 +171,9 @@ def scoring_figure(path: str | Path, rows: Rows) -> None:
             strict=True,
         ):
             scaled = [row | {"percent": 100 * row["regret"]} for row in scaled]
+            better = [row[metric] if metric == "tau" else -row[metric] for row in scaled]
+            on = pareto_front([row["ms"] for row in scaled], better)
+            _front(axes, [row | {"on": flag} for row, flag in zip(scaled, on, strict=True)], metric, "on", "ms")
             for style, family in enumerate(families):
                 _points(axes, [row for row in scaled if row["family"] == family], metric, style, family, "ms")
             _seconds_axis(axes)
@@ -199,48 +203,48 @@ def core_figure(path: str | Path, rows: Rows) -> None:
         save_figure(figure, path)
 
 
+DASHES = {"one step": ":", "by H": "-", "by H, known": "--"}
+"""Lines of the ways to round numbers."""
+
+
 def bytes_figure(path: str | Path, rows: Rows) -> None:
     """Kilobytes sent against PSNR: images, and models of several sizes by how their numbers are rounded."""
     import matplotlib
 
     scaled = [row | {"kb": row["bytes"] / 1e3} for row in rows]
-    models = [row for row in scaled if row["sent"] == "model"]
-    usual = Counter(row["images"] for row in models).most_common(1)[0][0]
+    usual = Counter(row["images"] for row in scaled if row["sent"] == "model").most_common(1)[0][0]
+    models = [row for row in scaled if row["sent"] == "model" and row["images"] == usual]
+    photos = [row for row in scaled if row["sent"] == "images" and row["density"] == DENSITY]
     with matplotlib.rc_context(STYLE | {"legend.fontsize": 7}):
         figure = _figure(8, 5)
         axes = figure.subplots()
-        sizes = sorted({row["gaussians"] for row in models if row["images"] == usual})
-        for style, n in enumerate(sizes):
-            for quantiser, dash in (("one step", ":"), ("by H", "-"), ("by H, known", "--")):
-                some = sorted(
-                    (r for r in models if (r["gaussians"], r["quantiser"], r["images"]) == (n, quantiser, usual)),
-                    key=lambda r: float(r["kb"]),
-                )
-                label = f"{n:,} Gaussians" if quantiser == "by H" else None
-                axes.plot(
-                    [r["kb"] for r in some],
-                    [r["psnr"] for r in some],
-                    dash + MARKERS[style % 7],
-                    color=COLOURS[style % 7],
-                    ms=3,
-                    lw=1,
-                    label=label,
-                )
-            whole = [r for r in models if (r["gaussians"], r["quantiser"], r["images"]) == (n, "float32", usual)]
-            axes.plot(
-                [r["kb"] for r in whole], [r["psnr"] for r in whole], MARKERS[style % 7], mfc="white", color=COLOURS[style % 7]
-            )
-        photos = [row for row in scaled if row["sent"] == "images" and row["density"] == DENSITY]
+        for style, n in enumerate(sorted({row["gaussians"] for row in models})):
+            _model_lines(axes, [row for row in models if row["gaussians"] == n], style)
         photos.sort(key=lambda row: float(row["kb"]))
         axes.plot([r["kb"] for r in photos], [r["psnr"] for r in photos], "k-P", ms=5, lw=0.8, label="images as PNG")
-        for dash, text in ((":", "one step a column"), ("-", "steps by H, sent"), ("--", "steps by H, known: a bound")):
-            axes.plot([], [], dash, color="#444444", lw=1, label=text)
+        shown = [*models, *photos]
+        costs = [np.nan if row["quantiser"] == "by H, known" else row["kb"] for row in shown]
+        on = pareto_front(costs, [row["psnr"] for row in shown])
+        _front(axes, [row | {"on": flag} for row, flag in zip(shown, on, strict=True)], "psnr", "on", "kb")
+        for text, name in (("one step a column", "one step"), ("steps by H, sent", "by H"), ("a bound", "by H, known")):
+            axes.plot([], [], DASHES[name], color="#444444", lw=1, label=text)
         axes.plot([], [], "o", mfc="white", color="#444444", label="float32")
         _seconds_axis(axes)
         axes.set(xlabel="kilobytes sent", ylabel="PSNR on the test views, dB")
         axes.legend(loc="lower right", ncols=2)
         _label(axes, photos, "kb", "psnr", lambda row: f"{row['images']} images")
         save_figure(figure, path)
+
+
+def _model_lines(axes: Any, rows: Rows, style: int) -> None:
+    """One model: a line for each way to round its numbers, and an empty marker for float32."""
+    look = {"marker": MARKERS[style % 7], "color": COLOURS[style % 7]}
+    for quantiser, dash in DASHES.items():
+        some = sorted((row for row in rows if row["quantiser"] == quantiser), key=lambda row: float(row["kb"]))
+        label = f"{rows[0]['gaussians']:,} Gaussians" if quantiser == "by H" else None
+        axes.plot([r["kb"] for r in some], [r["psnr"] for r in some], ls=dash, ms=3, lw=1, label=label, **look)
+    whole = [row for row in rows if row["quantiser"] == "float32"]
+    axes.plot([r["kb"] for r in whole], [r["psnr"] for r in whole], ls="none", mfc="white", **look)
 
 
 FIGURES: dict[str, Callable[[str | Path, Rows], None]] = {
