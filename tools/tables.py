@@ -20,6 +20,8 @@ from typing import Any
 from mgs.bench.core import TARGETS
 from mgs.bench.fit import TARGETS as FIT_TARGETS
 from mgs.report.tables import markdown_table, table_cell
+from mgs.study.chart.tables import TABLES as CHART_TABLES
+from mgs.study.chart.tables import chart_table
 from mgs.study.stress.verdict import effect
 
 ROOT = Path(__file__).parent.parent
@@ -401,6 +403,18 @@ def parsimony_prune(data: dict[str, Any]) -> str:
     return markdown(heading, rows)
 
 
+def chart(name: str) -> Callable[[dict[str, Any]], str]:
+    """What makes a table of `mgs chart`, by its name."""
+
+    def table(data: dict[str, Any]) -> str:
+        picture, heading, rows, note = chart_table(name, data)
+        return picture + (markdown(heading, rows) + "\n" if rows else "") + f"{note}\n"
+
+    return table
+
+
+CHART = "../results/chart/chart"
+
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "ranking": ("ranking", ranking),
     "linearity": ("linearity", linearity),
@@ -428,6 +442,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "parsimony-verdict": ("../results/parsimony/parsimony", parsimony_verdict),
     "parsimony-rules": ("../results/parsimony/parsimony", parsimony_rules),
     "parsimony-prune": ("../results/parsimony/parsimony", parsimony_prune),
+    **{f"chart-{name}": (CHART, chart(name)) for name in CHART_TABLES},
 }
 """By name: the file, seen from docs/benchmarks and without `.json`, and what makes the table of its contents."""
 

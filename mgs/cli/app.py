@@ -15,6 +15,7 @@ import typer
 
 from mgs import __version__
 from mgs.cli.bench import bench
+from mgs.cli.chart import chart
 from mgs.cli.dataset import dataset
 from mgs.cli.demo import demo
 from mgs.cli.diagnose import diagnose
@@ -52,6 +53,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "prune": prune,
     "demo": demo,
     "bench": bench,
+    "chart": chart,
     "stress": stress,
     "parsimony": parsimony,
 }
@@ -62,6 +64,7 @@ GOES_ON = {
     "synth-orbit": _AGAIN,
     "import": _AGAIN,
     "demo": _AGAIN,
+    "chart": _AGAIN,
     "stress": _AGAIN,
     "parsimony": _AGAIN,
     "nbv": "`mgs nbv --resume RUN` continues a run whose folder is there",

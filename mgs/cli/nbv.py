@@ -9,7 +9,7 @@ import typer
 
 from mgs.active.criteria import PIXEL_NOISE, PRIOR_STD
 from mgs.active.policies import policy_names
-from mgs.active.settings import RATES
+from mgs.active.settings import PRESETS, RATES
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -68,6 +68,11 @@ def nbv(
         typer.Option(metavar="KIND=NUMBER", help=f"Learning rate of a kind of parameter [{_numbers(RATES)}]; 0: not learned."),
     ] = None,
     passes: Annotated[int | None, typer.Option(help="Most passes over the images of one fit.")] = None,
+    warm_passes: Annotated[int | None, typer.Option(help="Most passes of the fits after the first.")] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option(help=f"Defaults of passes and of the number of Gaussians: {', '.join(PRESETS)}. Other options win."),
+    ] = None,
     evaluate_every: Annotated[int, typer.Option(help="Measure PSNR every so many steps; 0: only at the end.")] = 0,
     resume: Annotated[
         Path | None, typer.Option(help="Continue this run; every other setting comes from its config.json.")
@@ -99,9 +104,8 @@ def nbv(
         "pixel_noise": pixel_noise, "prior_std": pairs("--prior-std", prior_std), "evaluate_every": evaluate_every,
         "train": train,
     }  # fmt: skip
-    if budget is not None:
-        settings["budget"] = budget
-    start_and_print(dataset, out, console, prior=prior, gaussians=parse_gaussians(gaussians), **settings)
+    settings |= {name: value for name, value in {"budget": budget, "warm_passes": warm_passes}.items() if value is not None}
+    start_and_print(dataset, out, console, prior=prior, gaussians=parse_gaussians(gaussians), preset=preset, **settings)
     resume_and_print(out, console)
 
 

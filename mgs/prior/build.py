@@ -165,7 +165,9 @@ def _samples(mesh: Mesh, settings: PriorSettings, pixel: float) -> tuple[np.ndar
     total = asked if isinstance(asked, int) else None
     count = None if total is None else total - round(total * share / (1 + share))
     seed = derive_seed(settings.seed, "prior/samples")
-    points, normals, spacing = sample_surface(mesh, seed, count=count, spacing=settings.spacing or pixel)
+    points, normals, spacing = sample_surface(
+        mesh, seed, count=count, spacing=settings.spacing or pixel / settings.density**0.5
+    )
     backed = round(share * len(points)) if total is None else total - len(points)
     order = spread_first(points, backed, spacing)
     return points[order], normals[order], spacing, backed
