@@ -25,6 +25,7 @@ from mgs.cli.nbv import nbv
 from mgs.cli.prior import prior
 from mgs.cli.render import render
 from mgs.cli.report import report
+from mgs.cli.reproduce import reproduce
 from mgs.cli.survey import survey
 from mgs.cli.synth_orbit import synth_orbit
 from mgs.cli.view import view
@@ -48,6 +49,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "render": render,
     "demo": demo,
     "bench": bench,
+    "reproduce": reproduce,
 }
 """All commands, in about the order in which they are used."""
 
@@ -56,6 +58,7 @@ GOES_ON = {
     "synth-orbit": _AGAIN,
     "import": _AGAIN,
     "demo": _AGAIN,
+    "reproduce": _AGAIN,
     "nbv": "`mgs nbv --resume RUN` continues a run whose folder is there",
 }
 """What is printed after Ctrl-C, for the commands that can go on where they stopped. The others start anew."""
