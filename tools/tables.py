@@ -278,6 +278,11 @@ def residual(data: dict[str, Any]) -> str:
     return markdown(["power, background", "full frame", "mask", "inside"], rows) + made_by(data)
 
 
+def reproduced(data: dict[str, Any]) -> str:
+    """A table that `mgs reproduce` made, as it is, and its command."""
+    return f"{data['markdown']}{made_by(data)}"
+
+
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "ranking": ("ranking", ranking),
     "linearity": ("linearity", linearity),
@@ -297,7 +302,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "backing": ("backing", backing),
     "own-data": ("own_data", own_data),
 }
-"""By name: the file in docs/benchmarks, without `.json`, and what makes the table of its contents."""
+"""By name: the file without `.json`, in docs/benchmarks or, if it names a folder, in docs; what makes the table of it."""
 
 
 def rewritten(page: str, benchmarks: Path) -> str:
@@ -311,7 +316,8 @@ def rewritten(page: str, benchmarks: Path) -> str:
         if name not in TABLES:
             raise ValueError(f"{opening[0]}: no such table; tools/tables.py has {', '.join(TABLES)}")
         file, make = TABLES[name]
-        table = make(json.loads((benchmarks / f"{file}.json").read_text(encoding="utf-8")))
+        folder = benchmarks.parent if "/" in file else benchmarks
+        table = make(json.loads((folder / f"{file}.json").read_text(encoding="utf-8")))
         parts += [page[end : opening.end()], f"\n\n{table}\n"]
         end = closing.start()
     if len(marks) % 2:

@@ -12,11 +12,11 @@ import numpy as np
 from mgs.files import atomic_path, write_json
 from mgs.provenance import versions
 from mgs.report.evaluation import evaluate_run
-from mgs.report.tables import table_cell
 from mgs.report.writing import write_report
 from mgs.study import reproduce
 from mgs.study.reproduce import ORACLE, Preset, Run
 from mgs.study.reproduce_figures import curves_figure, pools_figure, seeds_figure
+from mgs.study.reproduce_tables import pools_markdown, seeds_markdown, statistics_markdown, table_markdown
 from mgs.study.statistics import area, holm, interval, permutation_p
 from mgs.study.sweep import cell_folder, found
 
@@ -28,24 +28,6 @@ Rows = list[dict[str, Any]]
 MEASURES = ("test_psnr", "test_psnr_mask")
 """What statistics are made of: mean PSNR over the test views, dB, of the full frame (the first, by which policies are judged),
 and inside the rock's mask."""
-
-PAPER_TABLE = (("D-Optimal NBV", 54, 25.97, 0.9654), ("Coverage-Greedy", 50, 26.06, 0.9648))
-"""Table I of the paper: method, images, PSNR in dB and SSIM over all 100 views of its own rock, which is not ours."""
-
-TABLE_COLUMNS = {
-    "row": "policy",
-    "images": "images",
-    "test.psnr": "test views (dB)",
-    "test.ssim": "SSIM",
-    "test.psnr_mask": "test views, rock (dB)",
-    "all.psnr": "all views (dB)",
-    "all.ssim": "SSIM",
-    "held_out.psnr": "held out (dB)",
-    "choice_seconds": "a choice (s)",
-    "seconds": "run (s)",
-    "peak_megabytes": "memory (MB)",
-}
-"""Columns of table1.md, and their headings."""
 
 
 def write_csv(path: Path, rows: Rows) -> Path:
@@ -84,32 +66,6 @@ def table_rows(found: Found, preset: Preset) -> Rows:
         row |= {key: numbers[key] for key in ("choice_seconds", "seconds", "peak_megabytes")}
         rows.append(row | {"command": run.command()})
     return rows
-
-
-def table_markdown(rows: Rows) -> str:
-    """table1.md: the paper's rows, and ours, of draws of `random` the mean."""
-    draws = [row for row in rows if row["row"].startswith("random,")]
-    mean: dict[str, Any] = {
-        key: float(np.mean([row[key] for row in draws])) for key in TABLE_COLUMNS if key not in ("row", "images")
-    }
-    ours = [row for row in rows if row not in draws[1:]]
-    ours = [{"row": f"random, mean of {len(draws)}", "images": row["images"]} | mean if row in draws else row for row in ours]
-    theirs = [
-        {"row": f"the paper's {name}, on its rock", "images": images, "all.psnr": psnr, "all.ssim": ssim}
-        for name, images, psnr, ssim in PAPER_TABLE
-    ]
-    lines = [list(TABLE_COLUMNS.values()), ["---", *["---:"] * (len(TABLE_COLUMNS) - 1)]]
-    lines += [[_cell(key, row.get(key)) for key in TABLE_COLUMNS] for row in [*theirs, *ours]]
-    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
-
-
-def _cell(key: str, value: Any) -> str:
-    """A cell of table1.md."""
-    if value is None:
-        return "–"
-    if key in ("seconds", "peak_megabytes"):
-        return f"{value:.0f}"
-    return table_cell(key, value)
 
 
 def by_rock(found: Found, runs: Sequence[Run]) -> Rows:
@@ -200,20 +156,20 @@ def pool_rows(found: Found, runs: Sequence[Run], oracle: Sequence[Run]) -> Rows:
     return rows
 
 
-def _write(out: Path, name: str, rows: Rows, command: str, **more: Any) -> list[Path]:
-    """NAME.csv and NAME.json of rows, with the command that makes them in every row of the CSV."""
+def _write(out: Path, name: str, rows: Rows, markdown: str, command: str, **more: Any) -> list[Path]:
+    """NAME.csv of rows, NAME.md of a table of them, NAME.json with both; all say by which command they were made."""
     csv_rows = [row if "command" in row else row | {"command": command} for row in rows]
-    write_json(out / f"{name}.json", {"command": command, "versions": versions()} | more | {"rows": rows})
-    return [write_csv(out / f"{name}.csv", csv_rows), out / f"{name}.json"]
+    record = {"command": command, "versions": versions()} | more | {"rows": rows, "markdown": markdown}
+    write_json(out / f"{name}.json", record)
+    with atomic_path(out / f"{name}.md") as temporary:
+        temporary.write_text(f"{markdown}\n`{command}`\n", encoding="utf-8")
+    return [write_csv(out / f"{name}.csv", csv_rows), out / f"{name}.json", out / f"{name}.md"]
 
 
 def write_table(root: Path, out: Path, found: Found, preset: Preset, count: int, command: str) -> list[Path]:
-    """table1.csv, table1.json and table1.md."""
+    """table1.csv, .json and .md."""
     rows = table_rows(found, preset)
-    text = table_markdown(rows)
-    with atomic_path(out / "table1.md") as temporary:
-        temporary.write_text(f"{text}\n`{command}`\n", encoding="utf-8")
-    return [*_write(out, "table1", rows, command, markdown=text), out / "table1.md"]
+    return _write(out, "table1", rows, table_markdown(rows), command)
 
 
 def write_figures(root: Path, out: Path, found: Found, preset: Preset, count: int, command: str) -> list[Path]:
@@ -225,34 +181,35 @@ def write_figures(root: Path, out: Path, found: Found, preset: Preset, count: in
 
 
 def write_curves(root: Path, out: Path, found: Found, preset: Preset, count: int, command: str) -> list[Path]:
-    """curves.csv, .json and .png; curves_by_rock.csv; statistics.json."""
+    """curves.csv, .json, .md and .png; curves_by_rock.csv; statistics.json."""
     runs = reproduce.curve_runs(preset, count)
     rows = curve_rows(found, runs)
-    statistics = {"command": command, "versions": versions(), "rocks": count} | curve_statistics(found, runs)
-    write_json(out / "statistics.json", statistics)
+    statistics = curve_statistics(found, runs)
+    write_json(out / "statistics.json", {"command": command, "versions": versions(), "rocks": count} | statistics)
     each = write_csv(out / "curves_by_rock.csv", by_rock(found, runs))
     curves_figure(out / "curves.png", rows)
-    return [*_write(out, "curves", rows, command, rocks=count), each, out / "statistics.json", out / "curves.png"]
+    written = _write(out, "curves", rows, statistics_markdown(statistics), command, rocks=count)
+    return [*written, each, out / "statistics.json", out / "curves.png"]
 
 
 def write_seeds(root: Path, out: Path, found: Found, preset: Preset, count: int, command: str) -> list[Path]:
-    """seeds.csv, .json and .png; seeds_by_rock.csv."""
+    """seeds.csv, .json, .md and .png; seeds_by_rock.csv."""
     runs = reproduce.seed_runs(preset, count)
     rows = seed_rows(found, runs)
     seeds_figure(out / "seeds.png", rows)
     each = write_csv(out / "seeds_by_rock.csv", by_rock(found, runs))
-    return [*_write(out, "seeds", rows, command, rocks=count), each, out / "seeds.png"]
+    return [*_write(out, "seeds", rows, seeds_markdown(rows), command, rocks=count), each, out / "seeds.png"]
 
 
 def write_pools(root: Path, out: Path, found: Found, preset: Preset, count: int, command: str) -> list[Path]:
-    """pools.csv, .json and .png; pools_by_rock.csv. With the oracle, where it is done."""
+    """pools.csv, .json, .md and .png; pools_by_rock.csv. With the oracle, where it is done."""
     runs, oracle = reproduce.pool_runs(preset, count), reproduce.oracle_runs(preset, count)
     known = dict(found) | _known(root, oracle)
     done = oracle if all(run.name in known for run in oracle) else []
     rows = pool_rows(known, runs, done)
     pools_figure(out / "pools.png", rows)
     each = write_csv(out / "pools_by_rock.csv", by_rock(known, [*runs, *done]))
-    return [*_write(out, "pools", rows, command, rocks=count), each, out / "pools.png"]
+    return [*_write(out, "pools", rows, pools_markdown(rows), command, rocks=count), each, out / "pools.png"]
 
 
 def _known(root: Path, runs: Sequence[Run]) -> dict[str, dict[str, Any]]:
