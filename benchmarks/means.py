@@ -53,7 +53,7 @@ def study(root: Path, gaussians: int, passes: int) -> list[dict[str, Any]]:
                 settings = NbvSettings(dataset=root, prior=root, train=train).with_spacing(prior.spacing)
                 stations = real_stations(dataset, prior, settings)
                 start = stations.initial(chosen)
-                fit = stations.fit(start, start, cameras, targets, 1.0, lambda done, most: None)
+                fit = stations.fit(start, start, cameras, targets, settings.train, lambda done, most: None)
                 quality = evaluate(fit.gaussians, frames, fitted_to)["held_out"]
                 record = {"views": views, "noise": noise, "means": means, "spacing": prior.spacing, "loss": fit.loss}
                 record |= {name: quality[name] for name in ("psnr", "psnr_inside")}

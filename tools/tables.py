@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from mgs.bench.core import TARGETS
+from mgs.bench.fit import TARGETS as FIT_TARGETS
 from mgs.report.tables import markdown_table, table_cell
 
 ROOT = Path(__file__).parent.parent
@@ -269,6 +270,50 @@ def linearity(data: dict[str, Any]) -> str:
     return markdown(["move", *(f"times {factor:g}" for factor in factors)], rows) + made_by(data)
 
 
+def prior_std(data: dict[str, Any]) -> str:
+    """Quality and shape of the surface against the prior's standard deviations."""
+    rows = []
+    for r in data["records"]:
+        which = "" if len(r["kinds"]) == 4 else f" for {' and '.join(r['kinds'])}"
+        cells = [f"{r[key]:.2f}" for key in ("psnr", "psnr_inside")]
+        cells += [f"{100 * r[key]:.1f} %" for key in ("too_deep_3", "see_through", "needles")]
+        rows.append([f"tau x {r['factor']:g}{which}, {r['passes']} passes", *cells])
+    heading = ["", "full frame, dB", "inside, dB", "too deep", "see-through", "needles"]
+    return markdown(heading, rows) + made_by(data)
+
+
+def optimisers(data: dict[str, Any]) -> str:
+    """Objective and quality by the number of passes, cold and warm."""
+    rows = []
+    for begin in ("cold", "warm"):
+        for row in dict.fromkeys(r["row"] for r in data["records"]):
+            found = [r for r in data["records"] if (r["start"], r["row"]) == (begin, row)]
+            cells = "; ".join(f"{r['passes']:.0f}: {r['phi']:.0f}, {r['psnr_inside']:.2f}" for r in found)
+            rows.append(f"| {begin} | {row} | {cells} |\n")
+    return "| start | optimiser | passes: Phi, PSNR inside (dB) |\n| --- | --- | --- |\n" + "".join(rows) + made_by(data)
+
+
+def fit(data: dict[str, Any]) -> str:
+    """What a fit comes to, beside what is asked for."""
+    rows = []
+    for name, (bound, target) in FIT_TARGETS.items():
+        value = data["figures"][name]
+        measured = "not reached" if value is None else f"{value:.3g}"
+        rows.append([name.replace("_", " "), measured, f"{bound} {target:.3g}"])
+    return markdown(["figure", "measured", "asked for"], rows) + made_by(data)
+
+
+def means(data: dict[str, Any]) -> str:
+    """PSNR inside the rock and distance from the true surface, by how the means are learned and how noisy the prior is."""
+    rows = []
+    for views, noise in dict.fromkeys((r["views"], r["noise"]) for r in data["records"]):
+        found = {r["means"]: r for r in data["records"] if (r["views"], r["noise"]) == (views, noise)}
+        before = f"{1e3 * found['frozen']['distance_before']:.1f} mm"
+        cells = [f"{found[m]['psnr_inside']:.2f} dB, {1e3 * found[m]['distance_after']:.1f} mm" for m in found]
+        rows.append([f"{views} views, noise of {noise:g} spacings", before, *cells])
+    return markdown(["", "prior", *found], rows) + made_by(data)
+
+
 def residual(data: dict[str, Any]) -> str:
     """Quality against the weights of pixels in the fit."""
     rows = [
@@ -287,6 +332,10 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "ranking": ("ranking", ranking),
     "linearity": ("linearity", linearity),
     "residual": ("residual", residual),
+    "prior-std": ("prior_std", prior_std),
+    "optimisers": ("optimisers", optimisers),
+    "fit": ("fit", fit),
+    "means": ("means", means),
     "demo": ("demo", demo),
     "demo-report": ("demo", demo_report),
     "policies": ("policies", policies),

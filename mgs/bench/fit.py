@@ -116,8 +116,8 @@ def bench_fit(root: Path, report: Callable[[str], None]) -> dict[str, Any]:
         "ranking_tau": float(np.mean([r["tau"] for r in ranking])),
         "ranking_regret": float(np.mean([r["regret"] for r in ranking])),
         "predicted_over_found_decrease": end["predicted"] / end["found"],
-        "passes_to_old_objective_cold": cold["passes"] / OLD_PASSES,
-        "passes_to_old_objective_warm": warm["passes"] / OLD_PASSES,
+        "passes_to_old_objective_cold": cold["share"],
+        "passes_to_old_objective_warm": warm["share"],
     }
     return {"figures": figures, "held_out": means, "end": end, "cold": cold, "warm": warm, "ranking": ranking}
 
@@ -168,8 +168,8 @@ def _end_of_fit(case: _Case, stopped: Fit) -> dict[str, Any]:
 def passes_to(case: _Case, model: Gaussians) -> dict[str, Any]:
     """How many passes a fit needs to reach the objective that the first version's rates reach in OLD_PASSES passes.
 
-    Returns that objective, the fewest of TRIED_PASSES that reach it (infinite where none does), and for every fit its passes,
-    objective and seconds.
+    Returns "share", the fewest of TRIED_PASSES that reach it over OLD_PASSES (None where none does), and of every fit its
+    passes, objective and seconds.
     """
 
     def timed(train: TrainSettings) -> dict[str, Any]:
@@ -184,7 +184,7 @@ def passes_to(case: _Case, model: Gaussians) -> dict[str, Any]:
         if tried[-1]["phi"] <= old["phi"]:
             break
     reached = tried[-1]["phi"] <= old["phi"]
-    return {"old": old, "tried": tried, "passes": tried[-1]["passes"] if reached else float("inf")}
+    return {"old": old, "tried": tried, "share": tried[-1]["passes"] / OLD_PASSES if reached else None}
 
 
 def _ranking(case: _Case) -> dict[str, float]:

@@ -119,11 +119,13 @@ def _print_splat(console: Any, result: dict[str, Any]) -> None:
     )
 
 
-def _print_figures(console: Any, figures: dict[str, float], targets: dict[str, tuple[str, float]]) -> None:
-    """Print each figure beside what is asked for."""
+def _print_figures(console: Any, figures: dict[str, float | None], targets: dict[str, tuple[str, float]]) -> None:
+    """Print each figure beside what is asked for; None is a goal that no attempt reached."""
     from rich.table import Table
 
     table = Table("figure", "measured", "asked for")
     for name, (bound, target) in targets.items():
-        table.add_row(name.replace("_", " "), f"{figures[name]:.3g}", f"{bound} {target:.3g}")
+        value = figures[name]
+        measured = "not reached" if value is None else f"{value:.3g}"
+        table.add_row(name.replace("_", " "), measured, f"{bound} {target:.3g}")
     console.print(table)

@@ -68,6 +68,7 @@ def orbit_figure(
     import matplotlib
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
+    from matplotlib.ticker import MaxNLocator
 
     with matplotlib.rc_context(STYLE):
         figure = new_figure(3.1 * len(choices) + 0.8, 3.9)
@@ -80,6 +81,7 @@ def orbit_figure(
         axes[0].set_ylabel("$y$ (m)")
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
         bar = figure.colorbar(ScalarMappable(norm, "viridis"), ax=list(axes), shrink=0.8, pad=0.01)
+        bar.locator = MaxNLocator(integer=True)
         bar.set_label("step at which the view was chosen")
         save_figure(figure, path)
 
