@@ -22,7 +22,8 @@ def reproduce(
         typer.Option(help="Which results: table1,figures,curves,seeds,pools,oracle. Default: all but the oracle."),
     ] = None,
     rocks: Annotated[
-        int | None, typer.Option(help="How many rocks the curves, seeds, pools and the oracle have. Default: the preset's.")
+        int | None,
+        typer.Option(min=1, help="How many rocks the curves, seeds, pools and the oracle have. Default: the preset's."),
     ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Worker processes, which share this machine's cores.")] = 1,
     scheduler: Annotated[

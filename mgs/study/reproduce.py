@@ -290,12 +290,13 @@ def preset_named(name: str) -> Preset:
 
 
 def rocks_of(name: str, preset: Preset, asked: int | None) -> int:
-    """How many rocks a result has: as many as asked for, but a result of one rock has one. Raises InputError otherwise."""
-    most = RESULTS[name].most
-    if asked is not None and not 1 <= asked <= most:
+    """How many rocks a result has: as many as asked for, but Table I has one. Raises InputError if out of range."""
+    default, most = RESULTS[name].rocks(preset), RESULTS[name].most
+    if asked is None or default == 1:
+        return default
+    if not 1 <= asked <= most:
         raise InputError(f"--rocks {asked}: {name} can have 1 to {most}")
-    default = RESULTS[name].rocks(preset)
-    return default if asked is None or default == 1 else asked
+    return asked
 
 
 def cells_of(name: str, preset: Preset, count: int) -> list[Cell]:
