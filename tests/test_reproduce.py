@@ -272,11 +272,11 @@ def test_every_run_of_every_result_has_its_own_cell():
         (["--preset", "huge"], "--preset 'huge': unknown; choose one of quick, paper"),
         (["--only", "table2"], "--only 'table2': is no result; choose of table1,figures,curves,seeds,pools,oracle"),
         (["--only", ","], "--only ',': is no result"),
-        (["--rocks", "0"], "0 is not in the range"),
+        (["--rocks", "0"], "should be greater than or equal to 1"),
         (["--rocks", "21"], "--rocks 21: curves can have 1 to 20"),
         (["--rocks", "11", "--only", "pools"], "--rocks 11: pools can have 1 to 10"),
         (["--workers", "2", "--scheduler", "tcp://x:1"], "give one of them"),
-        (["--workers", "0"], "0 is not in the range"),
+        (["--workers", "0"], "should be greater than or equal to 1"),
     ],
 )
 def test_bad_options_are_one_clear_line(capsys, tmp_path, arguments, line):

@@ -19,7 +19,9 @@ def reproduce(
     ] = "quick",
     only: Annotated[
         str | None,
-        typer.Option(help="Which results: table1,figures,curves,seeds,pools,oracle. Default: all but the oracle."),
+        typer.Option(
+            help="Which results, as table1,curves: table1, figures, curves, seeds, pools, oracle. Default: all but oracle."
+        ),
     ] = None,
     rocks: Annotated[
         int | None,
