@@ -12,6 +12,7 @@ from mgs.active.nbv import run_nbv
 from mgs.active.run_folder import read_checkpoint
 from mgs.cli.app import main
 from mgs.data.dataset import TEST_FOLDER, load_dataset
+from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.study import reproduce, tasks
 from mgs.study.reproduce import Preset, Rock, Run, Size
@@ -104,6 +105,12 @@ def test_a_timed_run_has_a_process_of_its_own(quick, tmp_path):
     assert found["seconds"] == pytest.approx(sum(sum(step["seconds"].values()) for step in steps))
     assert found["choice_seconds"] == pytest.approx(sum(step["seconds"]["score"] for step in steps[1:]) / 4)
     assert 100 < found["peak_megabytes"] < 4000
+
+
+def test_what_a_timed_run_raises_comes_through(quick, tmp_path):
+    run = Run(Rock("boulder", 1), SIZE, "nonsense", budget=1, timed=True)
+    with pytest.raises(InputError, match="--policy nonsense: unknown"):
+        run_cells(tmp_path, run.cells(), silent)
 
 
 def timed(root, out, dataset, prior, settings):

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import shutil
 import signal
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 from mgs.active.nbv import resume_nbv, run_nbv
 from mgs.active.run_folder import State
 from mgs.data.dataset import TEST_FOLDER, load_dataset, write_transforms
+from mgs.errors import InputError
 from mgs.files import atomic_folder
 from mgs.prior.build import build_prior, save_prior
 from mgs.prior.settings import PriorSettings
@@ -104,11 +105,33 @@ def time_policy(root: Path, out: Path, dataset: str, prior: str, settings: dict[
 
     Returns "images"; "test", "all" and "held_out" of `mgs.report.evaluation.evaluate`; "seconds", those of all steps without
     the measuring; "choice_seconds", the mean of one choice (None where none is made); "peak_megabytes", the most memory of the
-    process by the end of the run.
+    process by the end of the run. Raises InputError if that process is killed, and what it raises.
     """
-    dies_silently = (signal.SIGINT, signal.SIG_DFL)  # Ctrl-C reaches it too
-    with ProcessPoolExecutor(1, get_context("spawn"), initializer=signal.signal, initargs=dies_silently) as pool:
-        return pool.submit(_timed, root, out, dataset, prior, settings).result()
+    context = get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_send, args=(sender, root, out, dataset, prior, settings))
+    process.start()
+    sender.close()
+    try:
+        result = receiver.recv()
+    except EOFError:
+        raise InputError(
+            f"{out / 'run'}: its process was killed (is there too little memory?); give the command again"
+        ) from None
+    finally:
+        process.join()
+    if isinstance(result, Exception):
+        raise result
+    return dict(result)
+
+
+def _send(sender: Connection, *arguments: Any) -> None:
+    """Do `_timed` in this process, which was started for it, and send what it returns or raises. Ctrl-C ends it silently."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        sender.send(_timed(*arguments))
+    except Exception as error:
+        sender.send(error)
 
 
 def _timed(root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]) -> dict[str, Any]:
