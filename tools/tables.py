@@ -350,6 +350,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "depth-error": ("depth_error", depth_error),
     "backing": ("backing", backing),
     "own-data": ("own_data", own_data),
+    "reproduce-curves": ("results/reproduce/curves", reproduced),
 }
 """By name: the file without `.json`, in docs/benchmarks or, if it names a folder, in docs; what makes the table of it."""
 

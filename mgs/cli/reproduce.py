@@ -61,7 +61,8 @@ def reproduce(
         cells = study.cells_of(name, size, counts[name])
         with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
             found = run_cells(out, cells, _teller(bar, name), workers=workers, scheduler=scheduler)
-        command = f"mgs reproduce --preset {preset} --only {name}" + (f" --rocks {counts[name]}" if counts[name] > 1 else "")
+        many = f" --rocks {counts[name]}" if study.RESULTS[name].rocks(size) > 1 else ""
+        command = f"mgs reproduce --preset {preset} --only {name}{many}"
         written = WRITERS[name](out, out / "results", found, size, counts[name], command)
         console.print(f"{name}: wrote " + ", ".join(str(path) for path in written), soft_wrap=True)
 
