@@ -415,6 +415,12 @@ def chart(name: str) -> Callable[[dict[str, Any]], str]:
 
 CHART = "../results/chart/chart"
 
+
+def reproduced(data: dict[str, Any]) -> str:
+    """A table that `mgs reproduce` made, as it is, and its command."""
+    return f"{data['markdown']}{made_by(data)}"
+
+
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "ranking": ("ranking", ranking),
     "linearity": ("linearity", linearity),
@@ -442,6 +448,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "parsimony-verdict": ("../results/parsimony/parsimony", parsimony_verdict),
     "parsimony-rules": ("../results/parsimony/parsimony", parsimony_rules),
     "parsimony-prune": ("../results/parsimony/parsimony", parsimony_prune),
+    "reproduce-curves": ("../results/reproduce/curves", reproduced),
     **{f"chart-{name}": (CHART, chart(name)) for name in CHART_TABLES},
 }
 """By name: the file, seen from docs/benchmarks and without `.json`, and what makes the table of its contents."""

@@ -28,6 +28,7 @@ from mgs.cli.prior import prior
 from mgs.cli.prune import prune
 from mgs.cli.render import render
 from mgs.cli.report import report
+from mgs.cli.reproduce import reproduce
 from mgs.cli.stress import stress
 from mgs.cli.survey import survey
 from mgs.cli.synth_orbit import synth_orbit
@@ -53,6 +54,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "prune": prune,
     "demo": demo,
     "bench": bench,
+    "reproduce": reproduce,
     "chart": chart,
     "stress": stress,
     "parsimony": parsimony,
@@ -64,6 +66,7 @@ GOES_ON = {
     "synth-orbit": _AGAIN,
     "import": _AGAIN,
     "demo": _AGAIN,
+    "reproduce": _AGAIN,
     "chart": _AGAIN,
     "stress": _AGAIN,
     "parsimony": _AGAIN,

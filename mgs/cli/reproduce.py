@@ -1,0 +1,92 @@
+"""`mgs reproduce`: the paper's results and what it leaves open, each from its own cells of work."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+
+def reproduce(
+    out: Annotated[Path, typer.Argument(help="Folder for everything; the same command again goes on.")] = Path("reproduced"),
+    preset: Annotated[
+        str, typer.Option(help="quick: Table I of 12 of 32 views, 320x240. paper: of 54 of 100 views, 640x480.")
+    ] = "quick",
+    only: Annotated[
+        str | None,
+        typer.Option(
+            help="Which results, as table1,curves: table1, figures, curves, seeds, pools, oracle. Default: all but oracle."
+        ),
+    ] = None,
+    rocks: Annotated[
+        int | None,
+        typer.Option(min=1, help="How many rocks the curves, seeds, pools and the oracle have. Default: the preset's."),
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Worker processes, which share this machine's cores.")] = 1,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Use the workers of this Dask scheduler instead, as tcp://HOST:8786.")
+    ] = None,
+) -> None:
+    """Make the results of docs/results.md: Table I at equal numbers of images, PSNR against images over many rocks with
+    statistics, numbers of seeds, pools of candidates, and an oracle that looks at the truth.
+
+    Every dataset, prior and run is a cell, done once and kept in OUT/cells; what they say together is written to OUT/results.
+    Runs whose seconds are reported run alone: let nothing else run on the machine meanwhile.
+    """
+    from rich.console import Console
+    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from mgs import runtime
+    from mgs.errors import InputError
+    from mgs.files import check_writable
+    from mgs.study import reproduce as study
+
+    size, names = study.preset_named(preset), study.names_of(only)
+    counts = {name: study.rocks_of(name, size, rocks) for name in names}
+    if scheduler is not None and workers != 1:
+        raise InputError("--workers starts workers here, and --scheduler uses those of a scheduler; give one of them")
+    check_preset(check_writable(out), preset)
+    runtime.start()
+    from mgs.study.reproduce_results import WRITERS
+    from mgs.study.sweep import run_cells
+
+    console = Console(highlight=False)
+    columns = (TextColumn("{task.description}"), MofNCompleteColumn(), TimeElapsedColumn())
+    for name in names:
+        cells = study.cells_of(name, size, counts[name])
+        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+            found = run_cells(out, cells, _teller(bar, name), workers=workers, scheduler=scheduler)
+        many = f" --rocks {counts[name]}" if study.RESULTS[name].rocks(size) > 1 else ""
+        command = f"mgs reproduce --preset {preset} --only {name}{many}"
+        written = WRITERS[name](out, out / "results", found, size, counts[name], command)
+        console.print(f"{name}: wrote " + ", ".join(str(path) for path in written), soft_wrap=True)
+
+
+def _teller(bar: Progress, name: str) -> Callable[[str, int, int], None]:
+    """What is told of every cell that begins: a line is printed, and the bar moves."""
+    task = bar.add_task(name, total=None)
+
+    def tell(cell: str, done: int, total: int) -> None:
+        bar.console.print(f"{name} {done}/{total} {cell}", style="dim", soft_wrap=True)
+        bar.update(task, completed=done, total=total)
+
+    return tell
+
+
+def check_preset(out: Path, preset: str) -> None:
+    """Raises InputError if the folder is of another preset, or holds something else; records the preset in OUT/study.json."""
+    from mgs.errors import InputError
+    from mgs.files import check_new_folder, read_json, write_json
+
+    record = out / "study.json"
+    if not record.is_file():
+        check_new_folder(out)
+        write_json(record, {"preset": preset})
+    elif (there := read_json(record)) != {"preset": preset}:
+        was = there.get("preset") if isinstance(there, dict) else None
+        raise InputError(f"{out}: was begun with --preset {was}, not {preset}; give that, or another folder")

@@ -1,0 +1,304 @@
+"""The paper's results, and what it leaves open, each with the cells of work that it is made of: one table, RESULTS.
+
+A cell is a dataset, a prior or a run; cells that several results need are done once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from mgs.errors import InputError
+from mgs.study.statistics import MOST_ROCKS
+from mgs.study.sweep import Cell
+
+SCENES = ("boulder", "contact-binary", "low-sun", "pebbles", "strata")
+
+SEEDS = 4
+"""Seed views of a run, as in the paper."""
+
+POLICIES = ("d-optimal", "directional-i", "directional-d", "fisherrf", "farthest", "uniform", "random")
+"""Policies that are compared over rocks."""
+
+PAIRS = (
+    ("d-optimal", "uniform"),
+    ("d-optimal", "farthest"),
+    ("directional-i", "uniform"),
+    ("directional-i", "farthest"),
+)
+"""Pairs of policies, named before anything was measured, whose difference is tested."""
+
+DRAWS = 3
+"""Runs of the policy `random` for one row of a table."""
+
+TABLE_POLICIES = (
+    "paper", "d-optimal", "directional-d", "directional-i", "coverage", "fisherrf", "random", "uniform", "farthest", "block-d",
+)  # fmt: skip
+"""Rows of Table I."""
+
+ALL_VIEWS, FEWER = "all views", "coverage, fewer images"
+"""Rows of Table I that are no policies: `uniform` until no frame is left; and as the paper counts, 54 images against 50."""
+
+FEWER_IMAGES = 4
+"""By how many images coverage has fewer there."""
+
+POOLS: dict[str, dict[str, Any]] = {
+    "ring": {"orbit": "circle"},
+    "hemisphere": {"orbit": "hemisphere"},
+    "rings": {"orbit": "rings"},
+    "biased arc": {"orbit": "circle", "every": 6},
+    "five nearest": {"orbit": "circle", "nearest": 5},
+}
+"""Candidates to choose from. orbit: a kind of `mgs.synth.scene_file.ORBITS`; every: half of a ring of 3/2 as many frames, and
+of its other half one frame of so many; nearest: the setting of `mgs nbv`."""
+
+SEED_COUNTS = (1, 2, 3, 4, 6, 8)
+SEED_POLICIES = ("d-optimal", "paper")
+
+
+@dataclass(frozen=True)
+class Size:
+    """Images, in pixels; numbers of frames, samples per pixel, test views, Gaussians, and views chosen beyond the seeds."""
+
+    width: int
+    height: int
+    frames: int
+    spp: int
+    test_views: int
+    gaussians: int
+    budget: int
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How large a reproduction is. table: of Table I. rocks: of the results over many rocks. How many rocks the curves, the
+    study of seeds and that of pools have."""
+
+    table: Size
+    rocks: Size
+    curve_rocks: int = 12
+    seed_rocks: int = 5
+    pool_rocks: int = 3
+
+
+PRESETS = {
+    "quick": Preset(Size(320, 240, 32, 8, 12, 10_000, 8), Size(240, 180, 32, 8, 12, 5_000, 8)),
+    "paper": Preset(Size(640, 480, 100, 16, 24, 100_000, 50), Size(320, 240, 48, 8, 24, 10_000, 20), pool_rocks=5),
+}
+
+
+@dataclass(frozen=True)
+class Rock:
+    """A scene, and the seed of the rock in it. index: its place among the rocks, also the seed of the runs on it."""
+
+    scene: str
+    seed: int
+    index: int = 0
+
+    @property
+    def name(self) -> str:
+        """As it is called in tables and folders."""
+        return f"{self.scene}-{self.seed}"
+
+
+TABLE_ROCK = Rock("boulder", 0)
+"""The rock of Table I."""
+
+
+def rocks(count: int) -> list[Rock]:
+    """The first so many rocks: the scenes in turn, with seeds from 1 on. On those of seed 0 the policies were developed."""
+    return [Rock(SCENES[k % len(SCENES)], 1 + k // len(SCENES), k) for k in range(count)]
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of a policy on the views of a rock: all that decides which cells it is made of."""
+
+    rock: Rock
+    size: Size
+    policy: str
+    seeds: int = SEEDS
+    budget: int | None = None
+    """None: that of the size."""
+    draw: int = 0
+    pool: str = "ring"
+    timed: bool = False
+    """Whether it is done alone, for its seconds and memory, and measured on all views."""
+
+    def cells(self) -> list[Cell]:
+        """Its cells; the last is the run itself."""
+        size, pool = self.size, POOLS[self.pool]
+        frames = size.frames * 3 // 2 if "every" in pool else size.frames
+        shape = f"{pool['orbit']}-{frames}x{size.width}x{size.height}"
+        views = {"test_views": size.test_views}
+        preset = {"width": size.width, "height": size.height, "frames": frames, "spp": size.spp}
+        where = {"scene": self.rock.scene, "seed": self.rock.seed, "orbit": pool["orbit"]}
+        cells = [Cell(f"dataset/{self.rock.name}/{shape}", "mgs.study.tasks:make_dataset", where | views | {"preset": preset})]
+        survey = cells[0].name  # the prior is of the whole flight
+        prior = {"dataset": survey, "gaussians": size.gaussians, "seed": 0}
+        cells.append(Cell(f"prior/{self.rock.name}/{shape}-{size.gaussians}", "mgs.study.tasks:make_prior", prior, (survey,)))
+        if "every" in pool:
+            arc = {"ring": survey, "every": pool["every"]}
+            cells.append(Cell(f"dataset/{self.rock.name}/arc-{shape}", "mgs.study.tasks:make_arc", arc, (survey,)))
+        dataset, prior_name = cells[-1 if "every" in pool else 0].name, cells[1].name
+        task = f"mgs.study.{'oracle:run_oracle' if self.policy == ORACLE else 'tasks:run_policy'}"
+        return [
+            *cells,
+            Cell(
+                self.name,
+                "mgs.study.tasks:time_policy" if self.timed else task,
+                {"dataset": dataset, "prior": prior_name, "settings": self.settings()},
+                tuple(cell.name for cell in cells),
+                alone=self.timed,
+            ),
+        ]
+
+    @property
+    def name(self) -> str:
+        """Of its cell."""
+        size, settings = self.size, self.settings()
+        kind = "timed" if self.timed else "run"
+        shape = f"{size.frames}x{size.width}x{size.height}-{size.gaussians}"
+        views = f"{self.seeds}+{settings['budget']}-{settings['seed']}"
+        return f"{kind}/{self.rock.name}/{self.pool.replace(' ', '-')}-{shape}/{self.policy}-{views}"
+
+    def settings(self) -> dict[str, Any]:
+        """Of `mgs nbv`; those of the oracle name no policy."""
+        budget = self.size.budget if self.budget is None else self.budget
+        policy = {} if self.policy == ORACLE else {"policy": self.policy}
+        nearest = {"nearest": POOLS[self.pool]["nearest"]} if "nearest" in POOLS[self.pool] else {}
+        seed = self.rock.index + 1000 * self.draw
+        return {**policy, "seeds": self.seeds, "budget": budget, "seed": seed, **nearest}
+
+    def command(self) -> str:
+        """The `mgs nbv` that does the same, in the study's folder. The oracle has none."""
+        if self.policy == ORACLE:
+            return ""
+        *_, cell = self.cells()
+        options = " ".join(f"--{key} {value}" for key, value in self.settings().items())
+        dataset, prior = f"cells/{cell.arguments['dataset']}/dataset", f"cells/{cell.arguments['prior']}/prior"
+        return f"mgs nbv {dataset} --prior {prior} --out RUN {options}"
+
+
+ORACLE = "oracle"
+"""The policy that looks at the truth, `mgs.study.oracle`."""
+
+
+def table_runs(preset: Preset) -> dict[str, Run]:
+    """Table I: a run for each row, by its label."""
+    size = preset.table
+    runs = {}
+    for policy in TABLE_POLICIES:
+        draws = DRAWS if policy == "random" else 1
+        for draw in range(draws):
+            label = policy if draws == 1 else f"{policy}, draw {draw + 1}"
+            runs[label] = Run(TABLE_ROCK, size, policy, draw=draw, timed=True)
+    runs[FEWER] = Run(TABLE_ROCK, size, "coverage", budget=size.budget - FEWER_IMAGES, timed=True)
+    runs[ALL_VIEWS] = Run(TABLE_ROCK, size, "uniform", budget=size.frames - SEEDS, timed=True)
+    return runs
+
+
+def curve_runs(preset: Preset, count: int) -> list[Run]:
+    """PSNR(images): every policy on every rock."""
+    return [Run(rock, preset.rocks, policy) for rock in rocks(count) for policy in POLICIES]
+
+
+def seed_runs(preset: Preset, count: int) -> list[Run]:
+    """Numbers of seeds, at equal numbers of images in all, on so many rocks."""
+    total = SEEDS + preset.rocks.budget
+    return [
+        Run(rock, preset.rocks, policy, seeds=seeds, budget=total - seeds)
+        for rock in rocks(count)
+        for policy in SEED_POLICIES
+        for seeds in SEED_COUNTS
+    ]
+
+
+def pool_runs(preset: Preset, count: int) -> list[Run]:
+    """Every policy on every pool of so many rocks; of `random` several draws."""
+    return [
+        Run(rock, preset.rocks, policy, draw=draw, pool=pool)
+        for pool in POOLS
+        for rock in rocks(count)
+        for policy in POLICIES
+        for draw in range(DRAWS if policy == "random" else 1)
+    ]
+
+
+def oracle_runs(preset: Preset, count: int) -> list[Run]:
+    """The oracle on every pool of so many rocks."""
+    return [Run(rock, preset.rocks, ORACLE, pool=pool) for pool in POOLS for rock in rocks(count)]
+
+
+MOST_POOL_ROCKS = 10
+"""Two rocks of each scene. The twelfth is larger than the images of its hemisphere."""
+
+FIGURE_POLICIES = ("paper", "d-optimal", "coverage", "uniform")
+"""Runs of Table I that the figures show."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What one name of --only stands for."""
+
+    runs: Callable[[Preset, int], list[Run]]
+    """(preset, number of rocks) -> the runs that it needs."""
+    rocks: Callable[[Preset], int]
+    """How many rocks it has by default."""
+    optional: bool = False
+    """Done only if it is asked for."""
+    most: int = MOST_ROCKS
+    """Most rocks that can be asked for."""
+
+
+RESULTS = {
+    "table1": Result(lambda preset, _: list(table_runs(preset).values()), lambda preset: 1),
+    "figures": Result(lambda preset, _: [table_runs(preset)[policy] for policy in FIGURE_POLICIES], lambda preset: 1),
+    "curves": Result(curve_runs, lambda preset: preset.curve_rocks),
+    "seeds": Result(seed_runs, lambda preset: preset.seed_rocks),
+    "pools": Result(pool_runs, lambda preset: preset.pool_rocks, most=MOST_POOL_ROCKS),
+    "oracle": Result(
+        lambda preset, count: pool_runs(preset, count) + oracle_runs(preset, count),
+        lambda preset: preset.pool_rocks,
+        optional=True,
+        most=MOST_POOL_ROCKS,
+    ),
+}
+"""Every result by its name, in the order in which they are made."""
+
+
+def names_of(only: str | None) -> list[str]:
+    """The results to make: those named, with commas between, or all that are not optional. In the order of RESULTS.
+
+    Raises InputError for a name that is none.
+    """
+    if only is None:
+        return [name for name, result in RESULTS.items() if not result.optional]
+    asked = [name.strip() for name in only.split(",") if name.strip()]
+    for name in asked or [only]:
+        if name not in RESULTS:
+            raise InputError(f"--only {name!r}: is no result; choose of {','.join(RESULTS)}")
+    return [name for name in RESULTS if name in asked]
+
+
+def preset_named(name: str) -> Preset:
+    """A row of PRESETS. Raises InputError if there is none of this name."""
+    if name not in PRESETS:
+        raise InputError(f"--preset {name!r}: unknown; choose one of {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
+def rocks_of(name: str, preset: Preset, asked: int | None) -> int:
+    """How many rocks a result has: as many as asked for, but Table I has one. Raises InputError if out of range."""
+    default, most = RESULTS[name].rocks(preset), RESULTS[name].most
+    if asked is None or default == 1:
+        return default
+    if not 1 <= asked <= most:
+        raise InputError(f"--rocks {asked}: {name} can have 1 to {most}")
+    return asked
+
+
+def cells_of(name: str, preset: Preset, count: int) -> list[Cell]:
+    """The cells of a result over so many rocks, each once."""
+    return list({cell.name: cell for run in RESULTS[name].runs(preset, count) for cell in run.cells()}.values())
