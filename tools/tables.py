@@ -350,9 +350,9 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "depth-error": ("depth_error", depth_error),
     "backing": ("backing", backing),
     "own-data": ("own_data", own_data),
-    "reproduce-curves": ("results/reproduce/curves", reproduced),
+    "reproduce-curves": ("../results/reproduce/curves", reproduced),
 }
-"""By name: the file without `.json`, in docs/benchmarks or, if it names a folder, in docs; what makes the table of it."""
+"""By name: the file, seen from docs/benchmarks and without `.json`, and what makes the table of its contents."""
 
 
 def rewritten(page: str, benchmarks: Path) -> str:
@@ -366,8 +366,7 @@ def rewritten(page: str, benchmarks: Path) -> str:
         if name not in TABLES:
             raise ValueError(f"{opening[0]}: no such table; tools/tables.py has {', '.join(TABLES)}")
         file, make = TABLES[name]
-        folder = benchmarks.parent if "/" in file else benchmarks
-        table = make(json.loads((folder / f"{file}.json").read_text(encoding="utf-8")))
+        table = make(json.loads((benchmarks / f"{file}.json").read_text(encoding="utf-8")))
         parts += [page[end : opening.end()], f"\n\n{table}\n"]
         end = closing.start()
     if len(marks) % 2:
