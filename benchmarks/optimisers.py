@@ -167,7 +167,11 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
             line[1].set(ylabel="PSNR inside, held out (dB)")
         for axis in axes[1]:
             axis.set(xlabel="work (passes)")
-        axes[0, 0].legend()
+            axis.xaxis.set_major_formatter("{x:.0f}")
+        for axis in axes[:, 0]:
+            axis.yaxis.set_major_formatter("{x:.0f}")
+            axis.yaxis.set_minor_formatter("{x:.0f}")
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
         save_figure(figure, path)
 
 

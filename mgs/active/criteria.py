@@ -28,9 +28,13 @@ PIXEL_NOISE = 0.02
 """sigma_e, standard deviation of a pixel's residual, linear RGB (34 dB): the scale at which one pixel's evidence counts as one.
 A chosen constant."""
 
-PRIOR_STD = {"colour": 0.25, "scale": 0.125, "rotation": 0.125, "opacity": 0.5}
+PRUNE_NOISE = PIXEL_NOISE / 5
+"""rms change of a pixel value that pruning a model may make (`mgs prune`), linear RGB: so much less than the noise that it
+costs about a tenth of a decibel (docs/parsimony.md). A chosen constant."""
+
+PRIOR_STD = {"colour": 0.25, "scale": 0.125, "rotation": 0.0625, "opacity": 0.5}
 """tau: how far each parameter may plausibly lie from its start before any image is seen, in the parameter's own unit:
-colour 0.25 SH units (0.07 linear RGB), scale 0.125 (13 %), quaternion 0.125 (about 14 degrees), opacity logit 0.5. Chosen
+colour 0.25 SH units (0.07 linear RGB), scale 0.125 (13 %), quaternion 0.0625 (about 7 degrees), opacity logit 0.5. Chosen
 from docs/fit.md: the start is already the prior's surface in its mean colours, and a wider tau lets Gaussians grow into
 needles that stand out of the rock."""
 

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from mgs.active import criteria, directional, inputs, policies, policy_file, pose_policies
+from mgs.active import criteria, detectors, directional, inputs, policies, policy_file, pose_policies
 from mgs.active.outlook import Outlook
 from mgs.active.run_folder import State, check_settings, read_checkpoint, write_checkpoint, write_steps
 from mgs.active.settings import NbvSettings, TrainSettings
@@ -62,6 +62,8 @@ class Stations:
     measure(gaussians, taken frame indices) -> entries for steps.jsonl.
     exact(gaussians, camera) -> exact information of one view [N,P], for what the views see of the surface, with or without
     columns of means; None: as `fisher`.
+    look(gaussians, camera) -> linear RGB [H,W,3] and alpha [H,W] of a render, for the signs of `mgs.active.detectors`; None:
+    the steps have none.
     on_surface: how many of the Gaussians, the first, lie on the surface, so are what coverage is a share of; None: all.
     up: unit vector that points upwards in the world: azimuths are angles about it.
     prior: hash of what `initial` starts from (`mgs.active.inputs.prior_digest`).
@@ -75,6 +77,7 @@ class Stations:
     estimate: Callable[[Gaussians, Camera, str], np.ndarray]
     measure: Callable[[Gaussians, list[int]], dict[str, float]]
     exact: Callable[[Gaussians, Camera], np.ndarray] | None = None
+    look: Callable[[Gaussians, Camera], tuple[np.ndarray, np.ndarray]] | None = None
     on_surface: int | None = None
     up: Up = PLUS_Z
     prior: str = ""
@@ -164,6 +167,7 @@ class Loop:
         self.start = stations.initial([self.frames[i] for i in self.seeds])
         self.policy = policies.policy_named(settings.policy)
         self.seen, self.dome = cache(self._seen), cache(self._dome)  # they depend on poses and surface alone
+        self.before_fit = cache(self._before_fit)  # and this on the images, too
 
     def check(self, state: State) -> None:
         """Raises InputError where a state is not of this run: where its means, which a fit leaves alone, are not the prior's;
@@ -296,10 +300,36 @@ class Loop:
             "stop_reason": str(fit.stop_reason),
             "seconds": watch.seconds,
         }
+        if self.stations.look:
+            with watch("check"):
+                line |= self.signs(state, fit, taken, line)
         if self.settings.evaluate_every and step % self.settings.evaluate_every == 0:
             with watch("evaluate"):
                 line |= self.stations.measure(fit.gaussians, taken)
         return State(fit.gaussians, H, surface, taken, [*state.steps, line], made_from)
+
+    def signs(self, state: State, fit: Fit, taken: list[int], line: dict[str, Any]) -> dict[str, Any]:
+        """The entries `signs` of a step and, where one has just gone beyond its limit, `warnings` (`mgs.active.detectors`)."""
+        assert self.stations.look
+        views = []
+        for i in taken:
+            mask, before = self.before_fit(i)
+            views.append(
+                detectors.view_signs(self.images[i], mask, self.stations.look(fit.gaussians, self.cameras[i])[0], before)
+            )
+        gains = [step["information_gain"] for step in (*state.steps, line) if step.get("information_gain") is not None]
+        drift = detectors.means_drift(fit.gaussians.means, self.start.means, self.start.log_scales)
+        signs = detectors.step_signs(views, fit.losses, line["coverage"], gains, drift)
+        before_this = state.steps[-1].get("signs") if state.steps else None
+        said = detectors.alarms(signs, before_this)
+        return {"signs": signs, "warnings": said} if said else {"signs": signs}
+
+    def _before_fit(self, frame: int) -> tuple[np.ndarray, detectors.Before]:
+        """The mask [H,W] of a frame that was taken, and its signs of the Gaussians before any training."""
+        assert self.stations.look
+        mask, camera = self.frames[frame].mask(), self.cameras[frame]
+        margin = detectors.outline_margin(self.start, camera)
+        return mask, detectors.before_fit(self.images[frame], mask, *self.stations.look(self.start, camera), margin)
 
 
 def target_of(frame: Frame) -> np.ndarray:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from mgs.active import loop
 from mgs.active.policy_file import absolute
 from mgs.active.run_folder import State, check_same_frames, check_settings, read_settings, start
-from mgs.active.settings import NbvSettings, validated
+from mgs.active.settings import NbvSettings, preset_named, validated, with_preset
 from mgs.active.stations import real_stations
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
@@ -27,7 +27,8 @@ def run_nbv(
     out: str | Path,
     *,
     prior: str | Path | None = None,
-    gaussians: int | None = None,
+    gaussians: int | Literal["auto"] | None = None,
+    preset: str | None = None,
     on_step: Callable[[State], None] = _silent,
     progress: Callable[[str, int, int], None] = _silent,
     say: Callable[[str], None] = _silent,
@@ -41,7 +42,7 @@ def run_nbv(
     Returns the last state: gaussians, H, taken (frame indices in the order of their choice), steps.
     Raises InputError as `start_run` and `resume_nbv`.
     """
-    start_run(dataset, out, prior=prior, gaussians=gaussians, progress=progress, **settings)
+    start_run(dataset, out, prior=prior, gaussians=gaussians, preset=preset, progress=progress, **settings)
     return resume_nbv(out, on_step=on_step, progress=progress, say=say)
 
 
@@ -50,14 +51,16 @@ def start_run(
     out: str | Path,
     *,
     prior: str | Path | None = None,
-    gaussians: int | None = None,
+    gaussians: int | Literal["auto"] | None = None,
+    preset: str | None = None,
     progress: Callable[[str, int, int], None] = _silent,
     **settings: Any,
 ) -> NbvSettings:
     """Check everything, find or build the prior, and write the run's config.json with every setting resolved.
 
     prior: folder of a prior; without it DATASET/prior where there is one, otherwise a prior is built inside the run, of this
-    many `gaussians` (or, without a number, one per pixel's footprint on the rock). settings: fields of
+    many `gaussians` (`mgs.prior.settings.PriorSettings`; by default, one per pixel's footprint on the rock). preset: a row of
+    `mgs.active.settings.PRESETS`, whose values are the defaults of what is not given. settings: fields of
     `mgs.active.settings.NbvSettings`; the budget is 50 views, or all candidates where they are fewer.
     Leaves no folder behind where it fails. Raises InputError where the output folder is not empty, a setting is wrong, the
     dataset is too small for it, or the dataset or the prior is missing or damaged.
@@ -67,6 +70,8 @@ def start_run(
         raise InputError("nbv: --gaussians is for a prior that is built here; leave it out, or leave out --prior")
     if prior is None and gaussians is None and (dataset / "prior/prior.json").is_file():
         prior = dataset / "prior"
+    row = None if preset is None else preset_named(preset)
+    settings = settings if row is None else with_preset(row, settings)
     where = out / "prior" if prior is None else Path(prior)
     given = validated(NbvSettings, {"dataset": dataset.resolve(), "prior": where.resolve(), **settings})
     frames = load_dataset(dataset)
@@ -80,7 +85,7 @@ def start_run(
     found = None if prior is None else load_prior(prior)
     with atomic_folder(out) as unfinished:
         if found is None:
-            asked = PriorSettings(gaussians=gaussians, seed=complete.seed)
+            asked = PriorSettings(gaussians=gaussians, seed=complete.seed, density=row.density if row else 1.0)
             found, _ = build_prior(frames, asked, on_stage=lambda stage: progress(f"prior: {stage}", 0, 1))
             save_prior(unfinished / "prior", found)
         complete = complete.with_spacing(found.spacing)

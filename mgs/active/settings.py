@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -20,6 +21,34 @@ log-scale, quaternion, opacity logit. Chosen constants (docs/fit.md)."""
 MEAN_RATE = 0.02
 """The same for means that are learned, over the spacing of the prior's samples. With larger steps more Gaussians are pushed
 behind others, where no image sees them. A chosen constant."""
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A point of the chart of speed against accuracy (docs/speed-accuracy.md): defaults that give way to what is given."""
+
+    passes: int
+    """`TrainSettings.passes`."""
+    warm_passes: int
+    """`NbvSettings.warm_passes`."""
+    density: float
+    """`mgs.prior.settings.PriorSettings.density` of a prior that is built inside the run without a number of Gaussians."""
+
+
+PRESETS = {
+    "fast": Preset(passes=5, warm_passes=3, density=1 / 16),
+    "balanced": Preset(passes=10, warm_passes=5, density=1 / 8),
+    "accurate": Preset(passes=20, warm_passes=10, density=1 / 4),
+}
+"""What `mgs nbv --preset` knows, by name."""
+
+
+def preset_named(name: str) -> Preset:
+    """A row of PRESETS. Raises InputError where there is none of this name."""
+    if name not in PRESETS:
+        raise InputError(f"--preset {name}: unknown; choose one of {', '.join(PRESETS)}")
+    return PRESETS[name]
+
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -128,11 +157,18 @@ class NbvSettings(BaseModel):
         return self.model_copy(update={"train": train, "prior_std": {"mean": MEAN_STD * spacing} | self.prior_std})
 
 
+def with_preset(preset: Preset, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of NbvSettings with the defaults of a preset in them. What `values` holds stays as it is."""
+    train = values.get("train", {})
+    given = train.model_dump(exclude_unset=True) if isinstance(train, TrainSettings) else train
+    return {"warm_passes": preset.warm_passes, **values, "train": {"passes": preset.passes, **given}}
+
+
 Model = TypeVar("Model", bound=BaseModel)
 
 OPTIONS = (
     "policy", "nearest", "estimator", "budget", "seeds", "seed", "lam", "pixel_noise", "evaluate_every", "means", "optimiser",
-    "passes",
+    "passes", "warm_passes",
 )  # fmt: skip
 """Settings that `mgs nbv` has an option for, of the same name."""
 

@@ -41,6 +41,10 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
     def information(gaussians: Gaussians, camera: Camera, estimator: str) -> np.ndarray:
         return fisher(gaussians, camera, estimator, cache=cache, means=means, normals=normals)
 
+    def look(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        image = render(gaussians, camera, cache=cache)
+        return np.asarray(image.rgb), np.asarray(image.alpha)
+
     return Stations(
         centre=prior.points.mean(axis=0),
         groups=columns,
@@ -49,6 +53,7 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
         fisher=lambda gaussians, camera: information(gaussians, camera, settings.estimator),
         estimate=information,
         exact=lambda gaussians, camera: fisher(gaussians, camera, cache=cache),
+        look=look,
         measure=psnr_measure(dataset, cache),
         on_surface=len(prior.points),
         up=prior.up,

@@ -148,12 +148,11 @@ def time_core(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, f
     return seconds | {"pairs": pairs, "list_bytes": float(cache.nbytes)}
 
 
-def time_volprim(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
-    """Seconds of Mitsuba's own integrator for such Gaussians, `volprim_rf_basic`: volprim_forward, an image; volprim_gradient,
-    an image and the gradients of its sum."""
+def volprim_scene(gaussians: Gaussians, camera: Camera) -> Any:
+    """The Gaussians as a scene of Mitsuba's own integrator for them, `volprim_rf_basic`, seen by the camera."""
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     forward = camera.world_to_camera[2, :3]
-    scene = mi.load_dict(
+    return mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": "volprim_rf_basic"},
@@ -180,6 +179,12 @@ def time_volprim(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str
             },
         }
     )
+
+
+def time_volprim(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
+    """Seconds of Mitsuba's own integrator for such Gaussians, `volprim_rf_basic`: volprim_forward, an image; volprim_gradient,
+    an image and the gradients of its sum."""
+    scene = volprim_scene(gaussians, camera)
     parameters = mi.traverse(scene)
     names = ["gaussians.data", "gaussians.opacities", "gaussians.sh_coeffs"]
 

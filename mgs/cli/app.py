@@ -15,6 +15,7 @@ import typer
 
 from mgs import __version__
 from mgs.cli.bench import bench
+from mgs.cli.chart import chart
 from mgs.cli.dataset import dataset
 from mgs.cli.demo import demo
 from mgs.cli.diagnose import diagnose
@@ -22,10 +23,13 @@ from mgs.cli.doctor import doctor
 from mgs.cli.evaluate import evaluate
 from mgs.cli.import_data import import_data
 from mgs.cli.nbv import nbv
+from mgs.cli.parsimony import parsimony
 from mgs.cli.prior import prior
+from mgs.cli.prune import prune
 from mgs.cli.render import render
 from mgs.cli.report import report
 from mgs.cli.reproduce import reproduce
+from mgs.cli.stress import stress
 from mgs.cli.survey import survey
 from mgs.cli.synth_orbit import synth_orbit
 from mgs.cli.view import view
@@ -47,8 +51,12 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "report": report,
     "view": view,
     "render": render,
+    "prune": prune,
     "demo": demo,
     "bench": bench,
+    "chart": chart,
+    "stress": stress,
+    "parsimony": parsimony,
     "reproduce": reproduce,
 }
 """All commands, in about the order in which they are used."""
@@ -58,6 +66,9 @@ GOES_ON = {
     "synth-orbit": _AGAIN,
     "import": _AGAIN,
     "demo": _AGAIN,
+    "chart": _AGAIN,
+    "stress": _AGAIN,
+    "parsimony": _AGAIN,
     "reproduce": _AGAIN,
     "nbv": "`mgs nbv --resume RUN` continues a run whose folder is there",
 }

@@ -58,7 +58,7 @@ def demo(
         synth_orbit(dataset, seed=seed, test_views=TEST_VIEWS)
     heading(f"2/5 the prior: {GAUSSIANS:,} points on the rock's mesh")
     if not (folder / "prior.json").is_file():
-        prior(dataset, out=folder, gaussians=GAUSSIANS, seed=seed)
+        prior(dataset, out=folder, gaussians=str(GAUSSIANS), seed=seed)
     for policy, run in zip(POLICIES, runs, strict=True):
         heading(f"3/5 next best views: {policy}, 4 seeds and {BUDGET} views")
         if not (run / "config.json").is_file():

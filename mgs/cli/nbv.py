@@ -9,7 +9,7 @@ import typer
 
 from mgs.active.criteria import PIXEL_NOISE, PRIOR_STD
 from mgs.active.policies import policy_names
-from mgs.active.settings import RATES
+from mgs.active.settings import PRESETS, RATES
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,7 +31,9 @@ def nbv(
         Path | None,
         typer.Option(help="Folder of `mgs prior`; default DATASET/prior, or built inside the run where there is none."),
     ] = None,
-    gaussians: Annotated[int | None, typer.Option(help="Build a prior of this many Gaussians inside the run.")] = None,
+    gaussians: Annotated[
+        str | None, typer.Option(metavar="N|auto", help="Build a prior of this many Gaussians (`mgs prior`) inside the run.")
+    ] = None,
     policy: Annotated[
         str, typer.Option(help=f"One of {', '.join(policy_names())}; or FILE.py:FUNCTION, a function of your own.")
     ] = "d-optimal",
@@ -66,6 +68,11 @@ def nbv(
         typer.Option(metavar="KIND=NUMBER", help=f"Learning rate of a kind of parameter [{_numbers(RATES)}]; 0: not learned."),
     ] = None,
     passes: Annotated[int | None, typer.Option(help="Most passes over the images of one fit.")] = None,
+    warm_passes: Annotated[int | None, typer.Option(help="Most passes of the fits after the first.")] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option(help=f"Defaults of passes and of the number of Gaussians: {', '.join(PRESETS)}. Other options win."),
+    ] = None,
     evaluate_every: Annotated[int, typer.Option(help="Measure PSNR every so many steps; 0: only at the end.")] = 0,
     resume: Annotated[
         Path | None, typer.Option(help="Continue this run; every other setting comes from its config.json.")
@@ -78,6 +85,7 @@ def nbv(
     """
     from rich.console import Console
 
+    from mgs.cli.printing import parse_gaussians
     from mgs.errors import InputError
 
     console = Console(highlight=False)
@@ -96,9 +104,8 @@ def nbv(
         "pixel_noise": pixel_noise, "prior_std": pairs("--prior-std", prior_std), "evaluate_every": evaluate_every,
         "train": train,
     }  # fmt: skip
-    if budget is not None:
-        settings["budget"] = budget
-    start_and_print(dataset, out, console, prior=prior, gaussians=gaussians, **settings)
+    settings |= {name: value for name, value in {"budget": budget, "warm_passes": warm_passes}.items() if value is not None}
+    start_and_print(dataset, out, console, prior=prior, gaussians=parse_gaussians(gaussians), preset=preset, **settings)
     resume_and_print(out, console)
 
 
@@ -150,6 +157,9 @@ def resume_and_print(out: Path, console: Console, pictures: bool = False) -> Non
 
         def on_step(state: State) -> None:
             bar.update(whole, completed=len(state.taken))
+            line = state.steps[-1]
+            for warning in line.get("warnings", []):
+                bar.print(f"step {line['step']}: {warning}", soft_wrap=True)
 
         state = resume_nbv(out, on_step=on_step, progress=progress, say=lambda text: bar.print(text, soft_wrap=True))
         metrics = evaluate_run(out, pictures=pictures, progress=lambda done, total: progress("evaluating", done, total))

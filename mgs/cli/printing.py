@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -74,3 +74,17 @@ def parse_up(text: str) -> tuple[float, float, float] | None:
         return unit_up([float(part) for part in text.split(",")])
     except (ValueError, InputError):
         raise InputError(f"--up {text!r}: expected auto, or three numbers X,Y,Z that are not all zero, as in 0,0,1") from None
+
+
+def parse_gaussians(text: str | None) -> int | Literal["auto"] | None:
+    """The number of an option --gaussians, or auto. Raises InputError for anything else."""
+    from mgs.errors import InputError
+
+    if text is None:
+        return None
+    if text == "auto":
+        return "auto"
+    try:
+        return int(text)
+    except ValueError:
+        raise InputError(f"--gaussians {text!r}: expected a whole number, or auto") from None

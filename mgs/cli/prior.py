@@ -30,7 +30,12 @@ WHY = {
 def prior(
     dataset: Annotated[Path, typer.Argument(help="Dataset folder (transforms.json).")],
     out: Annotated[Path | None, typer.Option(help="Folder to write, new or empty. Default: DATASET/prior.")] = None,
-    gaussians: Annotated[int | None, typer.Option(help="Number of Gaussians, on the surface and behind it.")] = None,
+    gaussians: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N|auto", help="Number of Gaussians, on the surface and behind it; auto: what the closest pixel resolves."
+        ),
+    ] = None,
     spacing: Annotated[
         float | None,
         typer.Option(help="Distance between samples, metres, instead of N. Default: about the size of a pixel on the rock."),
@@ -77,7 +82,7 @@ def prior(
     """
     from rich.console import Console
 
-    from mgs.cli.printing import parse_up
+    from mgs.cli.printing import parse_gaussians, parse_up
     from mgs.data.dataset import load_dataset
     from mgs.data.meshes import GLTF
     from mgs.errors import InputError
@@ -94,10 +99,11 @@ def prior(
         raise InputError("prior: --mesh gives the surface, and --from or --points build one; give one of them")
     loaded = load_dataset(dataset)
     folder = check_new_folder(out if out is not None else dataset / "prior")  # before the work, not after it
-    settings = PriorSettings(gaussians, spacing, poisson_depth, prior_noise, holes, seed, backing)
+    settings = PriorSettings(parse_gaussians(gaussians), spacing, poisson_depth, prior_noise, holes, seed, backing)
     with console.status("reading") as status:
         if mesh is not None:
-            result, segmented = prior_from_mesh(mesh, settings, axis or loaded.up, loaded.unit), None
+            cameras = [frame.camera for frame in loaded.frames]
+            result, segmented = prior_from_mesh(mesh, settings, axis or loaded.up, loaded.unit, cameras), None
             if mesh.suffix.lower() in GLTF:
                 console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
         else:
@@ -112,6 +118,8 @@ def prior(
             save_prior(unfinished, result)
             draw_prior(unfinished / "prior.png", result, segmented)
     console.print(_table(result.numbers))
+    if "resolution" in result.numbers:
+        console.print(_reason(result.numbers), soft_wrap=True)
     console.print(f"wrote {folder}: mesh.ply, points.ply, prior.json, prior.png")
 
 
@@ -184,6 +192,18 @@ def _table(numbers: dict[str, Any]) -> Any:
     table.add_row("true surface seen by some frame", f"{truth['visible_share']:.2%} of what is above the ground")
     table.add_row("seen surface within 2 spacings", f"{truth['visible_within_2_spacing']:.2%}")
     return table
+
+
+def _reason(numbers: dict[str, Any]) -> str:
+    """Why there are so many Gaussians, where their number was left to the images."""
+    from mgs.prior.resolution import PIXELS_PER_SAMPLE
+
+    pixel, n, backed = numbers["resolution"]["pixel"], numbers["n"], numbers["backed"]
+    size = f"{1e3 * pixel:.2f} mm" if numbers["unit"] == "m" else f"{pixel:.4g} unit"
+    return (
+        f"--gaussians auto: {n + backed:,}, since the closest pixel covers {size} of the surface, and samples nearer than "
+        f"{PIXELS_PER_SAMPLE:g} pixels gain too little"
+    )
 
 
 def _up(numbers: dict[str, Any]) -> str:

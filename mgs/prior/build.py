@@ -15,6 +15,7 @@ import numpy as np
 from plyfile import PlyData, PlyParseError
 from scipy.spatial import cKDTree
 
+from mgs.camera import Camera
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh, write_points
 from mgs.data.up import PLUS_Z, Up, unit_up
@@ -22,6 +23,7 @@ from mgs.data.visibility import in_mask, visible
 from mgs.errors import InputError
 from mgs.files import atomic_path, new_folder, read_json, write_json
 from mgs.prior.photographs import Surface, source_of, surface_of
+from mgs.prior.resolution import Resolution, resolution
 from mgs.prior.segmentation import Plane, SegmentedCloud, segment_dataset
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import poisson_mesh, sample_surface, spread_first
@@ -84,7 +86,8 @@ def build_prior(
     tolerance = max(3 * residual, cell, 2 * noise)
     mesh = _seen_by(mesh, dataset.frames, tolerance)
     pixel = cell if chosen == "depth" else _pixel(dataset.frames, mesh.vertices.mean(0))
-    samples, normals, spacing, backed = _samples(mesh, settings, pixel)
+    resolved = _resolved(mesh, settings, [frame.camera for frame in dataset.frames])
+    samples, normals, spacing, backed = _samples(mesh, settings, resolved.spacing if resolved else pixel)
     plane = None if segmented is None else segmented.plane
     ground_up = None if plane is None else unit_up(plane.normal)
     upward = (ground_up if up == "auto" else up) or dataset.up
@@ -95,7 +98,7 @@ def build_prior(
         **({} if segmented is None or plane is None else _plane_numbers(plane, segmented.ground)),
         "fit_rms": residual,
         "depth_tolerance": tolerance,
-        **_sample_numbers(mesh, samples, spacing, backed),
+        **_sample_numbers(mesh, samples, spacing, backed, resolved),
         **_world_numbers(upward, dataset.unit),
         "settings": asdict(settings),
     }
@@ -147,22 +150,30 @@ def _pixel(frames: Sequence[Frame], point: np.ndarray) -> float:
     return float(np.median([np.linalg.norm(f.camera.position - point) / f.camera.K[0, 0] for f in frames]))
 
 
+def _resolved(mesh: Mesh, settings: PriorSettings, cameras: Sequence[Camera]) -> Resolution | None:
+    """What the cameras resolve of a mesh, where the settings leave the number of Gaussians to it. Raises InputError as
+    `resolution`."""
+    return resolution(mesh, cameras) if settings.gaussians == "auto" else None
+
+
 def _samples(mesh: Mesh, settings: PriorSettings, pixel: float) -> tuple[np.ndarray, np.ndarray, float, int]:
     """(points [N,3], unit normals [N,3], spacing in metres, how many of the first are backed) of a surface.
 
     pixel: the spacing where the settings name neither number nor spacing, metres. Raises InputError as `sample_surface`.
     """
-    count, share = settings.gaussians, settings.backing
-    if count is not None:
-        count -= round(count * share / (1 + share))
+    asked, share = settings.gaussians, settings.backing
+    total = asked if isinstance(asked, int) else None
+    count = None if total is None else total - round(total * share / (1 + share))
     seed = derive_seed(settings.seed, "prior/samples")
-    points, normals, spacing = sample_surface(mesh, seed, count=count, spacing=settings.spacing or pixel)
-    backed = round(share * len(points)) if settings.gaussians is None else settings.gaussians - len(points)
+    points, normals, spacing = sample_surface(
+        mesh, seed, count=count, spacing=settings.spacing or pixel / settings.density**0.5
+    )
+    backed = round(share * len(points)) if total is None else total - len(points)
     order = spread_first(points, backed, spacing)
     return points[order], normals[order], spacing, backed
 
 
-def _sample_numbers(mesh: Mesh, points: np.ndarray, spacing: float, backed: int) -> dict[str, Any]:
+def _sample_numbers(mesh: Mesh, points: np.ndarray, spacing: float, backed: int, resolved: Resolution | None) -> dict[str, Any]:
     """What prior.json holds of the mesh and of its samples [N,3]; areas in square metres, distances in metres."""
     nearest = cKDTree(points).query(points, 2)[0][:, 1]
     return {
@@ -174,11 +185,15 @@ def _sample_numbers(mesh: Mesh, points: np.ndarray, spacing: float, backed: int)
         "spacing": spacing,
         "nearest_neighbour_mean": float(nearest.mean()),
         "nearest_neighbour_min": float(nearest.min()),
+        **({} if resolved is None else {"resolution": asdict(resolved)}),
     }
 
 
-def prior_from_mesh(path: str | Path, settings: PriorSettings, up: Up = PLUS_Z, unit: str = "m") -> Prior:
-    """The prior of a given mesh in world coordinates, all of whose surface is sampled. up, unit: of the dataset it is for.
+def prior_from_mesh(
+    path: str | Path, settings: PriorSettings, up: Up = PLUS_Z, unit: str = "m", cameras: Sequence[Camera] = ()
+) -> Prior:
+    """The prior of a given mesh in world coordinates, all of whose surface is sampled. up, unit, cameras: of the dataset it is
+    for; the cameras are read only for a number of Gaussians that is "auto".
 
     Raises InputError as `read_mesh` and `sample_surface`, if neither the number of samples nor their spacing is given, and for
     the settings that only a mesh built from a cloud has: noise, holes and poisson_depth.
@@ -187,13 +202,14 @@ def prior_from_mesh(path: str | Path, settings: PriorSettings, up: Up = PLUS_Z, 
     mesh = read_mesh(path)
     if settings.gaussians is None and settings.spacing is None:
         raise InputError(f"{path}: a given mesh says nothing of how finely to sample it; give --gaussians or --spacing")
-    points, normals, spacing, backed = _samples(mesh, settings, 0.0)
+    resolved = _resolved(mesh, settings, cameras)
+    points, normals, spacing, backed = _samples(mesh, settings, resolved.spacing if resolved else 0.0)
     done = {key: value for key, value in asdict(settings).items() if key in ("gaussians", "spacing", "seed", "backing")}
     numbers = {
         "from": "mesh",
         "mesh": str(path),
         "depth_tolerance": spacing,
-        **_sample_numbers(mesh, points, spacing, backed),
+        **_sample_numbers(mesh, points, spacing, backed, resolved),
         **_world_numbers(up, unit),
         "settings": done,
     }

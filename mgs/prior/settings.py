@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -13,8 +14,10 @@ from mgs.errors import InputError
 class PriorSettings:
     """What a prior is asked to be.
 
-    gaussians: number of Gaussians, on the surface and behind it. spacing: distance between samples on the surface in metres,
-    instead of a number. With neither, the spacing is the edge of the cloud's voxels, about the size of a pixel on the rock.
+    gaussians: number of Gaussians, on the surface and behind it; "auto": as many as the closest pixel of a frame can tell apart
+    (`mgs.prior.resolution`). spacing: distance between samples on the surface in metres, instead of a number. With neither, the
+    spacing is the edge of the cloud's voxels, about the size of a pixel on the rock, for a density of 1. density: samples on
+    the surface for each such pixel, read only then.
     backing: Gaussians behind the surface for each sample on it (`mgs.prior.initial`). With 0 all lie on it, as in the paper.
     poisson_depth: depth of the octree of the Poisson reconstruction; None chooses it such that its finest cells have an edge of
     1.5 voxels or less.
@@ -25,13 +28,14 @@ class PriorSettings:
     of range.
     """
 
-    gaussians: int | None = None
+    gaussians: int | Literal["auto"] | None = None
     spacing: float | None = None
     poisson_depth: int | None = None
     noise: float = 0.0
     holes: float = 0.0
     seed: int = 0
     backing: float = 0.5
+    density: float = 1.0
 
     def refuse_shaping(self, why: str) -> None:
         """Raises InputError where noise, holes or a Poisson depth are asked for, which shape a mesh that is built of a cloud.
@@ -47,12 +51,14 @@ class PriorSettings:
             raise InputError(f"prior: {given} shape a mesh that is built of a cloud, but {why}; leave out either")
 
     def __post_init__(self) -> None:
-        if self.gaussians is not None and self.gaussians < 2:
+        if isinstance(self.gaussians, int) and self.gaussians < 2:
             raise InputError(f"prior: {self.gaussians} Gaussians are too few for a model; ask for more with --gaussians")
         if self.spacing is not None and not self.spacing > 0:
             raise InputError(f"prior: spacing {self.spacing} m must be positive; correct --spacing")
         if self.gaussians is not None and self.spacing is not None:
             raise InputError("prior: --gaussians and --spacing fix the same number; give one of them")
+        if not 0 < self.density < np.inf:
+            raise InputError(f"prior: density {self.density} must be positive; correct it")
         if not 0 <= self.noise < np.inf:
             raise InputError(f"prior: noise {self.noise} m must be 0 or more; correct --prior-noise")
         if not 0 <= self.holes <= 0.9:

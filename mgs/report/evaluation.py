@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from mgs.active.inputs import array_digest, camera_digest, frame_digests
-from mgs.active.run_folder import load_run, read_settings
+from mgs.active.run_folder import load_run, read_checkpoint, read_settings
 from mgs.active.settings import NbvSettings
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
@@ -192,7 +192,8 @@ def evaluate_run(
                 test_frames=tests, spacing=spacing, pictures=folder if pictures else None, progress=progress,
             )  # fmt: skip
             fit = _fit(gaussians, dataset, trained, settings, progress, say)
-            metrics = {"policy": policy, "of": subject, "pictures": pictures} | fit | found
+            informed = {"informed": _informed(run, gaussians, settings)}
+            metrics = {"policy": policy, "of": subject, "pictures": pictures} | fit | informed | found
             write_json(file, metrics)
             say(f"wrote {file}" + (f" and {folder}" if pictures else ""))
             return metrics
@@ -235,6 +236,18 @@ def _fit(
     except InputError as error:
         say(f"{error}; so it is left out how far the fit is from its end")
         return {}
+
+
+def _informed(run: Path, gaussians: Gaussians, settings: NbvSettings) -> dict[str, dict[str, int]]:
+    """Of each kind of parameter their number, and how many of them the views say more about than the prior does (H > lambda).
+    The others are about where the prior put them."""
+    from mgs.splat import groups
+
+    state = read_checkpoint(run)
+    assert state is not None  # the model was read from it
+    columns = groups(gaussians.sh_degree, settings.train.means)
+    more = settings.regularisation(columns) < state.H
+    return {kind: {"of": int(more[:, of].size), "informed": int(more[:, of].sum())} for kind, of in columns.items()}
 
 
 def _spacing(prior: Path) -> float | None:

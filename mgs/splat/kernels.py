@@ -1,12 +1,14 @@
-"""The kernels: forward (the image), jvp (its tangents), adjoint (gradients), fisher (sums for the Fisher information).
+"""The kernels: forward (the image), jvp (its tangents), adjoint (gradients), fisher (sums for the Fisher information), removal
+(how the image changes where one splat is removed).
 
-`walking.py` has what they share and says how a lane draws its block of pixels. The adjoint and Fisher kernels need, for each
-splat at each pixel, the colour S composited behind it. They do not walk back to front for it: they draw the image front to back
-once more and subtract, S = C - (colour so far), where C is the finished pixel. The same instructions then take the same
+`walking.py` has what they share and says how a lane draws its block of pixels. The last three need, for each splat at each
+pixel, the colour S composited behind it. They do not walk back to front for it: they draw the image front to back once more and
+subtract, S = C - (colour so far), where C is the finished pixel. The same instructions then take the same
 decisions (thresholds, finished pixels) as the forward kernel did, and nothing about them has to be stored.
 
-These two store their sums for a (splat, block) pair in that pair's own slot, and a second, small kernel adds the slots of each
-splat. There are no atomic additions, so that reruns are bitwise equal with any number of threads. Symbols: docs/notation.md.
+These three store their sums for a (splat, block) pair in that pair's own slot, and a second, small kernel adds the slots of
+each splat. There are no atomic additions, so that reruns are bitwise equal with any number of threads. Symbols:
+docs/notation.md.
 """
 
 from __future__ import annotations
@@ -343,3 +345,32 @@ def fisher(lists: BlockLists, packed: Any, background: Any, cross: bool, means: 
 
     walk(lists, packed, lane, [[t, *c] for t, c in zip(T, behind, strict=True)], visit)
     return sums_by_place(lists, slots, count, mi.Float64)
+
+
+@frozen(recorded_sizes)
+def removal(lists: BlockLists, packed: Any, background: Any) -> Any:
+    """For each splat the sum over pixels of alpha^2 |D|^2, to be read through `sums_by_splat` (one sum, Float64).
+
+    The colour of a pixel is affine in the alpha of each splat, with slope D. Setting alpha to 0 therefore changes it by
+    -alpha D exactly, also where alpha is clamped at ALPHA_MAX: unlike a derivative, this sum has no exception there. What the
+    removal does to the thresholds of other splats is left out. background: Color3f, linear RGB.
+    """
+    lane, T = lanes(lists)
+    pixels = _pixel_sums(lists, packed, lane, T, lambda splat: splat.colour)
+    behind = [[dr.fma(dr.abs(t), b, c) for c, b in zip(rgb, background, strict=True)] for t, *rgb in pixels]
+    dr.eval(behind)
+    slots = pair_slots(lists, 1)
+
+    def visit(i: Any, splat: Splats, rows: list[Row], pixels: Any) -> Any:
+        new, alive, total = [], mi.Bool(False), mi.Float(0)
+        for pixel, (transmittance, *behind) in enumerate(pixels):
+            alpha, w, after, room = blend(rows[pixel // BLOCK_X].raw_alpha[pixel % BLOCK_X], transmittance)
+            behind = [dr.fma(-c, w, s) for c, s in zip(splat.colour, behind, strict=True)]
+            new.append([after, *behind])
+            alive |= room
+            total += sum(s * s for s in _slopes(splat.colour, behind, alpha, w, after, room))
+        store_sums(slots, [total], dr.gather(mi.UInt32, lists.slot, i))
+        return new, alive
+
+    walk(lists, packed, lane, [[t, *c] for t, c in zip(T, behind, strict=True)], visit)
+    return sums_by_place(lists, slots, 1, mi.Float64)

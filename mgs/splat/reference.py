@@ -251,3 +251,16 @@ def fisher_block(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0
     J = jacobian(gaussians, camera, background, **options)
     rows = J.reshape(J.shape[0] * J.shape[1], *J.shape[2:])
     return np.matmul(rows.transpose(1, 2, 0), rows.transpose(1, 0, 2))
+
+
+def removal_cost(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.0)) -> np.ndarray:
+    """[N]: sum over pixels and channels of (alpha D)^2, the squared change of the image where one Gaussian is left out."""
+    projected = project(gaussians, camera)
+    order, alpha, T, _ = composite(projected, camera)
+    contribution = (alpha * T)[:, :, None] * projected.colours[order]
+    image = contribution.sum(1) + (1 - (alpha * T).sum(1))[:, None] * np.asarray(background, np.float64)
+    behind = image[:, None, :] - np.cumsum(contribution, 1)
+    change = contribution - (alpha / (1 - alpha))[:, :, None] * behind
+    cost = np.zeros(len(gaussians))
+    cost[order] = (change**2).sum((0, 2))
+    return cost

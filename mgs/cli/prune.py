@@ -1,0 +1,41 @@
+"""`mgs prune`: a smaller model of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mgs.active.criteria import PRUNE_NOISE
+
+
+def prune(
+    run: Annotated[Path, typer.Argument(help="Folder that `mgs nbv` wrote.")],
+    noise: Annotated[
+        float, typer.Option(help="How much the images that were taken may change: rms of a pixel value, linear RGB.")
+    ] = PRUNE_NOISE,
+) -> None:
+    """Leave out the Gaussians of a run without which its images hardly change; write RUN/gaussians_pruned.ply.
+
+    What the removal of each Gaussian changes is known exactly; what the removal of all of them together changes is measured,
+    and stays within --noise. Nothing is fitted again, and the run itself stays as it is.
+    """
+    from rich.console import Console
+
+    from mgs import runtime
+    from mgs.report.pruning import PRUNED, prune_run
+
+    runtime.start()
+    console = Console(highlight=False)
+    with console.status("reading") as status:
+        found = prune_run(run, noise, status.update)
+    share = 1 - found.after / found.before
+    console.print(f"{found.before:,} Gaussians, {found.after:,} stay: {share:.0%} are left out")
+    console.print(
+        f"rms change of a pixel value: predicted {found.predicted:.2g}, measured {found.actual:.2g}, allowed {noise:.2g}"
+    )
+    if found.psnr:
+        before, after = found.psnr
+        console.print(f"PSNR on the {found.views} views: {before:.2f} dB before, {after:.2f} dB after")
+    console.print(f"wrote {run / PRUNED}", soft_wrap=True)

@@ -1,0 +1,51 @@
+"""`mgs stress`: where the methods fail, by experiments with verdicts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def stress(
+    out: Annotated[Path, typer.Argument(help="Folder for everything; the same command again does what is left.")] = Path(
+        "out/stress"
+    ),
+    preset: Annotated[
+        str, typer.Option(help="quick: about 10 minutes on two cores. full: more rocks, larger images, more runs; hours.")
+    ] = "quick",
+    workers: Annotated[int, typer.Option(min=1, help="Processes that do cells side by side.")] = 1,
+    only: Annotated[str | None, typer.Option(help="Names of experiments, separated by commas. Default: all.")] = None,
+) -> None:
+    """Try to make the methods fail: experiments with a hypothesis each, and a verdict that follows from the numbers by a rule.
+
+    Writes stability.csv (all numbers), verdicts.json, stability.md (the verdicts as a table) and a picture of each experiment.
+    An interrupted run goes on where it stopped when the same command is given again.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from mgs import runtime
+    from mgs.files import check_writable
+    from mgs.provenance import command_line
+
+    runtime.start()
+    from mgs.study.stress.registry import chosen, preset_named, run_stress
+    from mgs.study.stress.verdict import effect
+
+    size, names = preset_named(preset), chosen([name.strip() for name in only.split(",")] if only else [])
+    console = Console(highlight=False)
+    check_writable(out)
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"))
+    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as bar:
+        task = bar.add_task("starting", total=1)
+        verdicts = run_stress(
+            out, size, names, command_line(),
+            lambda cell, done, total: bar.update(task, description=cell, completed=done, total=total), workers,
+        )  # fmt: skip
+    for experiment in verdicts["experiments"]:
+        console.print(f"[bold]{experiment['name']}[/bold]: {experiment['question']}", soft_wrap=True)
+        for claim in experiment["claims"]:
+            console.print(f"  {claim['verdict']:8} {claim['hypothesis']} {effect(claim)}, {claim['runs']} runs", soft_wrap=True)
+    console.print(f"wrote {out}: verdicts.json, stability.csv, stability.md and a picture of each experiment", soft_wrap=True)

@@ -1,0 +1,56 @@
+"""A smaller model of a run: pruned, and compared with the whole one on views that it was not fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mgs.active.criteria import PRUNE_NOISE
+from mgs.active.run_folder import load_run
+from mgs.data.dataset import Frame
+from mgs.gaussians import Gaussians
+from mgs.report.evaluation import evaluate
+from mgs.splat_ply import write_ply
+
+PRUNED = "gaussians_pruned.ply"
+
+
+@dataclass(frozen=True)
+class PrunedRun:
+    """before, after: number of Gaussians. predicted, actual: rms change of the images that the model was fitted to, as in
+    `mgs.splat.pruning.Pruned`. views: "test" or "held out"; psnr: on these, before and after, dB, None where there are none."""
+
+    before: int
+    after: int
+    predicted: float
+    actual: float
+    views: str
+    psnr: tuple[float, float] | None
+
+
+def prune_run(run: str | Path, noise: float = PRUNE_NOISE, say: Callable[[str], None] = lambda stage: None) -> PrunedRun:
+    """Prune the model of a run by what the views that it took see of it (`mgs.splat.pruning.prune`), and write RUN/PRUNED.
+
+    The views on which both models are compared are the test views of the dataset, where it has some, or else those never taken.
+    say(stage) is called as a stage starts. Raises InputError as `load_run` and `prune`.
+    """
+    from mgs.splat.pruning import prune
+
+    gaussians, dataset, trained, _ = load_run(Path(run))
+    say("pruning")
+    cameras = [frame.camera for frame in dataset.frames if frame.name in trained]
+    found = prune(gaussians, cameras, noise)
+    smaller = gaussians[found.kept]
+    say("comparing")
+    tests = dataset.test_views()
+    frames = tests.frames if tests else [frame for frame in dataset.frames if frame.name not in trained]
+    psnr = (_psnr(gaussians, frames), _psnr(smaller, frames)) if frames else None
+    write_ply(Path(run) / PRUNED, smaller)
+    where = "test" if tests else "held out"
+    return PrunedRun(len(gaussians), len(smaller), found.predicted, found.actual, where, psnr)
+
+
+def _psnr(gaussians: Gaussians, frames: Sequence[Frame]) -> float:
+    """Mean PSNR over views, full frame, dB."""
+    return float(evaluate(gaussians, frames, ())["all"]["psnr"])

@@ -1,0 +1,222 @@
+"""What the experiments work on: small rocks, each made once, and the calls that most experiments need."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import kendalltau
+
+from mgs.active.criteria import MEAN_STD, PRIOR_STD, Score, d_optimal, regularisation
+from mgs.active.fitting import Fit, fit
+from mgs.active.loop import target_of
+from mgs.active.pose_policies import seed_views
+from mgs.active.settings import MEAN_RATE, RATES, TrainSettings
+from mgs.active.stations import psnr_measure
+from mgs.camera import Camera
+from mgs.data.dataset import Frame, load_dataset
+from mgs.gaussians import Gaussians
+from mgs.prior.build import Prior, build_prior, load_prior, save_prior
+from mgs.prior.initial import initial_gaussians, initial_normals
+from mgs.prior.settings import PriorSettings
+from mgs.splat import ListCache, fisher, groups
+from mgs.study.sweep import Cell, cell_folder
+from mgs.synth.rendering import Preset as Images
+from mgs.synth.rendering import synthesise
+
+Array = NDArray[np.floating]
+
+CACHE = 1 << 28
+"""Budget of the block lists of one lab, bytes."""
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How large the experiments are.
+
+    images: of every dataset. tests: test views of each. gaussians: of each prior. rocks: the (scene, seed) that all experiments
+    use. others: more of them, for the experiment on scenes. turns: sets of views per rock, turned against one another, so that
+    there are several runs per rock. repeats: draws of each random fault. few_views: numbers of views with free means; 2
+    and 4 are among them. passes: lengths of fits. steps: of the test of memory.
+    """
+
+    images: Images
+    tests: int
+    gaussians: int
+    rocks: tuple[tuple[str, int], ...]
+    others: tuple[tuple[str, int], ...]
+    turns: int
+    repeats: int
+    few_views: tuple[int, ...]
+    passes: tuple[int, ...]
+    steps: int
+
+
+PRESETS = {
+    "quick": Preset(
+        Images(160, 120, 24, 8), 8, 3000, (("boulder", 0), ("boulder", 1)), (("contact-binary", 0), ("low-sun", 0)),
+        2, 1, (2, 4, 8), (1, 2, 5, 10, 20, 60, 120), 150,
+    ),
+    "full": Preset(
+        Images(320, 240, 32, 8), 12, 10_000, (*(("boulder", seed) for seed in range(5)), ("strata", 0), ("strata", 1)),
+        tuple((name, seed) for name in ("contact-binary", "low-sun", "pebbles") for seed in range(3)),
+        3, 3, (2, 3, 4, 6, 8), (1, 2, 5, 10, 20, 40, 80, 160, 320, 640), 1000,
+    ),
+}  # fmt: skip
+
+
+def scene_cell(preset: Preset, scene: str, seed: int) -> Cell:
+    """The cell that makes a dataset and its prior."""
+    images = preset.images
+    arguments = {
+        "scene": scene, "seed": seed, "width": images.width, "height": images.height, "frames": images.frames,
+        "spp": images.spp, "tests": preset.tests, "gaussians": preset.gaussians,
+    }  # fmt: skip
+    return Cell(f"dataset/{scene}-{seed}", f"{__name__}:make_scene", arguments)
+
+
+def make_scene(
+    root: Path, out: Path, scene: str, seed: int, width: int, height: int, frames: int, spp: int, tests: int, gaussians: int
+) -> dict[str, Any]:
+    """Render a dataset into OUT/dataset and build its prior in OUT/prior."""
+    if not (out / "dataset/transforms.json").is_file():
+        synthesise(out / "dataset", scene, Images(width, height, frames, spp), seed, test_views=tests)
+    if not (out / "prior/prior.json").is_file():
+        prior, _ = build_prior(load_dataset(out / "dataset"), PriorSettings(gaussians=gaussians, seed=seed))
+        save_prior(out / "prior", prior)
+    return {"gaussians": gaussians}
+
+
+@dataclass(frozen=True)
+class Lab:
+    """A rock to experiment on: frames to fit to, a prior, and a measure on test views, which no fault ever touches."""
+
+    name: str
+    frames: tuple[Frame, ...]
+    prior: Prior
+    measure: Callable[[Gaussians, list[int]], dict[str, float]]
+    cache: ListCache = field(default_factory=lambda: ListCache(CACHE))
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """Of all frames."""
+        return [frame.camera for frame in self.frames]
+
+    def changed(self, **fields: Any) -> Lab:
+        """The same with other frames or another prior, and a cache of its own."""
+        return replace(self, cache=ListCache(CACHE), **fields)
+
+    def even(self, count: int, turn: float = 0.0) -> list[int]:
+        """Views at evenly spaced azimuths; turn: from 0 to 1, by which share of the spacing they are turned."""
+        angle = -2 * np.pi * turn / count
+        about_z = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        centre = self.prior.points.mean(0)
+        positions = np.array([camera.position for camera in self.cameras])
+        return seed_views((positions - centre) @ about_z.T, np.zeros(3), count)
+
+    def left(self, taken: Sequence[int]) -> list[int]:
+        """Frames that were not taken."""
+        return [i for i in range(len(self.frames)) if i not in taken]
+
+    def start(self, taken: Sequence[int]) -> Gaussians:
+        """The Gaussians before training, coloured by the views taken."""
+        return initial_gaussians(self.prior, [self.frames[i] for i in taken])[0]
+
+    def lam(self, means: str = "frozen") -> Array:
+        """lambda of each column of the information, for the default settings of `mgs nbv`."""
+        return regularisation(groups(0, means), prior_std=PRIOR_STD | {"mean": MEAN_STD * self.prior.spacing})
+
+    def fit(
+        self,
+        taken: Sequence[int],
+        passes: int = 20,
+        means: str = "frozen",
+        with_prior: bool = True,
+        model: Gaussians | None = None,
+        start: Gaussians | None = None,
+    ) -> Fit:
+        """A fit of exactly so many passes, otherwise with the default settings of `mgs nbv`. with_prior: whether lambda holds
+        the parameters. model: where it begins; start: where lambda holds the parameters; both by default the Gaussians before
+        training."""
+        start = self.start(taken) if start is None else start
+        rates = RATES | {"mean": MEAN_RATE * self.prior.spacing}
+        settings = TrainSettings(passes=passes, tolerance=0.0, means=means, rates=rates)  # type: ignore[arg-type]
+        lam = {kind: float(self.lam(means)[columns][0]) for kind, columns in groups(0, means).items()} if with_prior else None
+        frames = [self.frames[i] for i in taken]
+        return fit(
+            start if model is None else model, [frame.camera for frame in frames], [target_of(frame) for frame in frames],
+            settings, None, self.cache, start, lam, initial_normals(self.prior),
+        )  # fmt: skip
+
+    def information(self, model: Gaussians, views: Sequence[int], means: str = "frozen") -> list[Array]:
+        """Exact Fisher information [N,P] of some of the views."""
+        return [fisher(model, self.cameras[i], cache=self.cache, means=means).astype(np.float64) for i in views]
+
+    def scores(
+        self,
+        model: Gaussians,
+        taken: Sequence[int],
+        left: Sequence[int],
+        score: Score = d_optimal,
+        lam: Array | None = None,
+        means: str = "frozen",
+    ) -> Array:
+        """What a criterion gives to each of the views left."""
+        H = np.sum(self.information(model, taken, means), axis=0)
+        lam = self.lam(means) if lam is None else lam
+        return np.array([score(F, H, lam) for F in self.information(model, left, means)])
+
+    def quality(self, model: Gaussians) -> dict[str, float]:
+        """PSNR on the test views, dB: mean over whole images (`psnr`), and inside the rock's mask (`psnr_mask`)."""
+        found = self.measure(model, [])
+        return {"psnr": found["psnr"], "psnr_mask": found["psnr_mask"]}
+
+
+@functools.lru_cache(maxsize=2)
+def _opened(folder: Path, name: str) -> Lab:
+    dataset = load_dataset(folder / "dataset")
+    tests = dataset.test_views()
+    assert tests is not None
+    return Lab(name, dataset.frames, load_prior(folder / "prior"), psnr_measure(tests, ListCache(CACHE)))
+
+
+def open_lab(root: Path, scene: str) -> Lab:
+    """The rock that the cell `dataset/SCENE` made; scene: name and seed, as in boulder-0."""
+    return _opened(cell_folder(root, f"dataset/{scene}"), scene)
+
+
+def agreement(mine: Array, reference: Array) -> dict[str, float]:
+    """How well scores of candidates agree with reference scores: Kendall's `tau`, 0 where one of them is constant; `regret`,
+    the share of the best reference score that is lost by taking our best; `same`, 1 where both take the same candidate."""
+    constant = np.ptp(mine) == 0 or np.ptp(reference) == 0
+    tau = 0.0 if constant else float(kendalltau(mine, reference).statistic)
+    best, top = int(np.argmax(mine)), float(reference.max())
+    regret = float((top - reference[best]) / max(abs(top), 1e-300))
+    return {"tau": tau, "regret": regret, "same": float(best == int(np.argmax(reference)))}
+
+
+def greedy(lab: Lab, taken: Sequence[int], allowed: Sequence[int], count: int, policy: str = "d-optimal") -> list[int]:
+    """Views after `count` steps of the loop, first fit 20 passes, later ones 10, candidates only among `allowed`.
+
+    policy: "d-optimal" or a row of `mgs.active.pose_policies.POSE_POLICIES`.
+    """
+    from mgs.active.pose_policies import POSE_POLICIES
+    from mgs.seeds import generator
+
+    views, start = list(taken), lab.start(taken)
+    model, positions = start, np.array([camera.position for camera in lab.cameras])
+    for step in range(count):
+        left = [i for i in allowed if i not in views]
+        if policy == "d-optimal":
+            model = lab.fit(views, 20 if step == 0 else 10, model=model, start=start).gaussians
+            scores = lab.scores(model, views, left)
+        else:
+            rng = generator(0, f"stress/{policy}/{step}")
+            scores = POSE_POLICIES[policy](positions[left], positions[views], lab.prior.points.mean(0), rng)
+        views.append(left[int(np.argmax(scores))])
+    return views

@@ -1,0 +1,114 @@
+"""What the removal of a Gaussian costs, against rendering without it, and pruning that counts on it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mgs.errors import InputError
+from mgs.splat import reference, render
+from mgs.splat.pruning import NEIGHBOURS, prune, removal_cost
+
+from .scenes import calm, make_camera, make_gaussians
+
+BACKGROUND = (0.3, 0.6, 0.1)
+
+
+def without(gaussians, j):
+    return gaussians[np.arange(len(gaussians)) != j]
+
+
+def brute_force(gaussians, camera):
+    """Squared change of the float64 image as each Gaussian is left out in turn."""
+    whole = reference.render(gaussians, camera, BACKGROUND)["rgb"]
+    return np.array([
+        ((reference.render(without(gaussians, j), camera, BACKGROUND)["rgb"] - whole) ** 2).sum() for j in range(len(gaussians))
+    ])  # fmt: skip
+
+
+def never_finished(seed, n=12, logits=(-3.0, 1.0)):
+    """A scene in which no pixel is finished before its last splat: so no removal makes others appear."""
+    g = make_gaussians(n, seed, log_scales=(-4.0, -1.0), logits=logits)
+    g.logit_opacities[1:] = np.minimum(g.logit_opacities[1:], -0.5)
+    g.logit_opacities[0] = 8.0  # clamped at ALPHA_MAX, where derivatives are 0 and the removal costs most
+    return g
+
+
+@settings(derandomize=True, deadline=None, max_examples=20)
+@given(seed=st.integers(0, 2**31))
+def test_the_cost_is_the_change_of_the_image(seed):
+    camera = make_camera((26, 18), focal=30.0)
+    g = calm(lambda s: never_finished(s, n=6), camera, seed)
+    expected = reference.removal_cost(g, camera, BACKGROUND)
+    np.testing.assert_allclose(expected, brute_force(g, camera), rtol=1e-9, atol=1e-12)
+    found = removal_cost(g, [camera], BACKGROUND)
+    assert found.dtype == np.float64
+    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-6 * expected.max())
+
+
+def test_alpha_is_clamped_in_such_scenes_and_no_pixel_is_finished():
+    camera = make_camera((26, 18), focal=30.0)
+    g = replace(never_finished(3, n=6), log_scales=np.full((6, 3), -1.5, np.float32))
+    _, alpha, T, clipped = reference.composite(reference.project(g, camera), camera)
+    assert clipped.any()
+    assert (T[:, -1] * (1 - alpha[:, -1])).min() > 1e-4
+
+
+def test_any_scene_and_several_cameras_against_the_oracle():
+    """Also where pixels are finished: the formula is the same, whatever the removal would uncover."""
+    cameras = [make_camera(), make_camera(eye=(-0.5, 2.1, 0.9))]
+    g = make_gaussians(60, 5, degree=1, log_scales=(-4.0, -1.0))
+    expected = sum(reference.removal_cost(g, camera, BACKGROUND) for camera in cameras)
+    found = removal_cost(g, cameras, BACKGROUND)
+    assert np.abs(found - expected).max() < 2e-3 * expected.max()
+    assert removal_cost(g[:0], cameras).shape == (0,)
+
+
+def wall(side=9, spacing=0.12):
+    """Splats on a surface, and others of about the same colours behind it, as a prior puts them: some of them can go."""
+    y, z = (spacing * (grid.ravel() - side / 2) for grid in np.mgrid[:side, :side])
+    n = side * side
+    g = make_gaussians(2 * n, 1, logits=(2.0, 2.2))
+    g.means[:] = np.concatenate([np.stack([np.full(n, x), y, z], 1) for x in (0.3, 0.3 - spacing)])
+    g.log_scales[:] = np.log(spacing * np.array([0.1, 0.65, 0.65]))
+    g.quats[:] = (1, 0, 0, 0)
+    g.sh[:] = 0.3 * np.sin(2 * g.means + [0, 1, 2])[:, None]
+    return g
+
+
+def test_what_is_pruned_changes_images_by_about_what_was_predicted():
+    cameras = [make_camera(), make_camera(eye=(2.0, -0.8, 0.5))]
+    g = wall()
+    found = prune(g, cameras, 0.01)
+    assert NEIGHBOURS < len(found.kept) < len(g)
+    assert found.actual <= found.noise == 0.01
+    covered = 3 * sum(float(np.asarray(render(g, camera).alpha).sum()) for camera in cameras)
+    change = sum(
+        ((np.asarray(render(g[found.kept], camera).rgb, np.float64) - np.asarray(render(g, camera).rgb)) ** 2).sum()
+        for camera in cameras
+    )
+    assert found.actual == pytest.approx(np.sqrt(change / covered), rel=1e-4)
+    assert 0.5 < (found.actual / found.predicted) ** 2 < 2
+    more = prune(g, cameras, 0.03)
+    assert len(more.kept) < len(found.kept)
+
+
+def test_gaussians_that_no_camera_sees_go_first_and_reruns_are_equal():
+    camera = make_camera()
+    g = wall()
+    g.means[::4] = 2 * camera.position - g.means[::4]  # behind the camera
+    first, again = (prune(g, [camera], 1e-6) for _ in range(2))
+    removed = np.delete(np.arange(len(g)), first.kept)
+    assert len(removed) > 10
+    assert (removed % 4 == 0).all()
+    assert first.actual == 0
+    np.testing.assert_array_equal(first.kept, again.kept)
+    assert prune(g[:0], [camera], 0.01).kept.shape == (0,)
+
+
+@pytest.mark.parametrize("noise", [0.0, -1.0, float("nan")])
+def test_a_noise_that_is_not_positive_is_one_line(noise):
+    with pytest.raises(InputError, match="noise"):
+        prune(wall(), [make_camera()], noise)
