@@ -32,10 +32,13 @@ def curves_figure(path: Path, rows: Rows) -> None:
                 low, high = ([row[f"test_psnr_over_uniform_{end}"] for row in of] for end in ("low", "high"))
                 right.fill_between(images, low, high, color=style["color"], alpha=0.12, linewidth=0)
         count = rows[0]["rocks"]
-        left.set(
-            xlabel="images", ylabel="PSNR on the test views (dB)", title=f"mean of {count} rocks" if count > 1 else "one rock"
+        titles = (
+            (f"mean of {count} rocks", "bands: 95 % intervals of the mean over rocks")
+            if count > 1
+            else ("one rock", "one rock")
         )
-        right.set(xlabel="images", ylabel="difference from uniform (dB)", title="bands: 95 % intervals of the mean over rocks")
+        left.set(xlabel="images", ylabel="PSNR on the test views (dB)", title=titles[0])
+        right.set(xlabel="images", ylabel="difference from uniform (dB)", title=titles[1])
         left.legend(fontsize=8)
         save_figure(figure, path)
 
