@@ -1,9 +1,9 @@
 """How tight should the prior on the parameters be? `python benchmarks/prior_std.py DATASET OUT.json`
 
 Fits 10,000 Gaussians to 12 views spread evenly in azimuth, with the prior's standard deviations tau times several factors, and
-judges on the other views: PSNR, in the full frame and inside the rock; share of the rock's pixels whose expected depth is more
-than 3 spacings too deep, or whose opacity is below 0.9; and the share of Gaussians that are needles, more than 4 times as long
-as broad. The dataset needs exact depth.
+judges on the other views of the orbit and on the test views: PSNR, in the full frame and inside the rock; share of the rock's
+pixels whose expected depth is more than 3 spacings too deep, or whose opacity is below 0.9; and the share of Gaussians that
+are needles, more than 4 times as long as broad. The dataset needs exact depth, and test views.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from mgs.active.loop import target_of
 from mgs.active.pose_policies import seed_views
 from mgs.active.settings import TrainSettings
 from mgs.data.dataset import load_dataset
+from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.gaussians import Gaussians
 from mgs.prior.build import build_prior
@@ -37,8 +38,10 @@ CASES = (
     (2.0, tuple(PRIOR_STD), 20),
     (1.0, tuple(PRIOR_STD), 20),
     (0.5, tuple(PRIOR_STD), 20),
+    (2.0, ("rotation",), 20),
+    (0.5, ("rotation",), 20),
+    (2.0, ("scale",), 20),
     (4.0, ("colour", "opacity"), 20),
-    (4.0, ("colour",), 20),
     (4.0, tuple(PRIOR_STD), 80),
     (1.0, tuple(PRIOR_STD), 80),
 )
@@ -59,6 +62,9 @@ def study(root: Path) -> list[dict[str, Any]]:
     prior, _ = build_prior(dataset, PriorSettings(gaussians=GAUSSIANS))
     taken = seed_views(np.array([frame.camera.position for frame in dataset.frames]), prior.points.mean(0), VIEWS)
     frames = [dataset.frames[i] for i in taken]
+    tests = dataset.test_views()
+    if tests is None:
+        raise InputError(f"{root}: has no test views; make it with `mgs synth-orbit --test-views 12`")
     start, names = initial_gaussians(prior, frames)[0], [frame.name for frame in frames]
     records = []
     for factor, kinds, passes in CASES:
@@ -69,6 +75,8 @@ def study(root: Path) -> list[dict[str, Any]]:
         model = fit(start, cameras, targets, train, cache=cache, start=start, lam=lam).gaussians
         found = evaluate(model, dataset.frames, names, spacing=prior.spacing)["held_out"]
         kept = {key: found[key] for key in ("psnr", "psnr_inside", "too_deep_3", "see_through")}
+        found = evaluate(model, tests.frames, ())["all"]
+        kept |= {f"test_{key}": found[key] for key in ("psnr", "psnr_inside")}
         records.append({"factor": factor, "kinds": kinds, "passes": passes, "needles": needles(model), **kept})
         print(records[-1], flush=True)
     return records

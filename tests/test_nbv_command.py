@@ -171,7 +171,7 @@ def test_damaged_settings_of_the_fit_are_one_line_on_resume(dataset, tmp_path, c
 def test_learning_rates_that_are_too_high_are_one_line(dataset, prior, tmp_path, capsys):
     """The loss settles on that of a black image: flat, but above its start."""
     run = tmp_path / "run"
-    train = {"rates": [20, 20, 10, 50]}
+    train = {"optimiser": "adam", "rates": [20, 20, 10, 50]}
     tiny.start(run, load_dataset(dataset), prior=prior, budget=1, train=train)
     said = refused(capsys, ["nbv", "--resume", run])
     assert "the fit to the seeds diverged: its loss was" in said
@@ -314,7 +314,7 @@ def test_options_of_the_criterion_and_the_fit_reach_the_run(dataset, prior, tmp_
     state = run_folder.read_checkpoint(tmp_path / "run")
     settings = run_folder.read_settings(tmp_path / "run")
     assert settings.train.rates == {"colour": 0.1, "scale": 0.04, "rotation": 0.02, "opacity": 0}
-    assert settings.prior_std == {"colour": 1.0, "scale": 2.0, "rotation": 0.5, "opacity": 2.0}
+    assert settings.prior_std == criteria.PRIOR_STD | {"scale": 2.0}
     np.testing.assert_array_equal(state.gaussians.logit_opacities[0], state.gaussians.logit_opacities)
     cameras = [load_dataset(dataset).frames[i].camera for i in state.taken]
     paper = sum(fisher(state.gaussians, camera, "loss-gradient").astype(np.float64) for camera in cameras)

@@ -278,10 +278,10 @@ def prior_std(data: dict[str, Any]) -> str:
     rows = []
     for r in data["records"]:
         which = "" if len(r["kinds"]) == 4 else f" for {' and '.join(r['kinds'])}"
-        cells = [f"{r[key]:.2f}" for key in ("psnr", "psnr_inside")]
+        cells = [f"{r[key]:.2f}" for key in ("psnr", "psnr_inside", "test_psnr", "test_psnr_inside")]
         cells += [f"{100 * r[key]:.1f} %" for key in ("too_deep_3", "see_through", "needles")]
         rows.append([f"tau x {r['factor']:g}{which}, {r['passes']} passes", *cells])
-    heading = ["", "full frame, dB", "inside, dB", "too deep", "see-through", "needles"]
+    heading = ["", "held out, dB", "inside", "test views", "inside", "too deep", "see-through", "needles"]
     return markdown(heading, rows) + made_by(data)
 
 
