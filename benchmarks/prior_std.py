@@ -33,17 +33,17 @@ from mgs.splat import ListCache, groups
 
 GAUSSIANS, VIEWS = 10_000, 12
 CASES = (
-    (8.0, tuple(PRIOR_STD), 20),
-    (4.0, tuple(PRIOR_STD), 20),
-    (2.0, tuple(PRIOR_STD), 20),
     (1.0, tuple(PRIOR_STD), 20),
-    (0.5, tuple(PRIOR_STD), 20),
+    (4.0, ("scale", "rotation"), 20),
+    (2.0, ("scale", "rotation"), 20),
+    (0.5, ("scale", "rotation"), 20),
+    (2.0, ("scale",), 20),
     (2.0, ("rotation",), 20),
     (0.5, ("rotation",), 20),
-    (2.0, ("scale",), 20),
-    (4.0, ("colour", "opacity"), 20),
-    (4.0, tuple(PRIOR_STD), 80),
+    (0.25, ("opacity",), 20),
+    (0.25, ("colour",), 20),
     (1.0, tuple(PRIOR_STD), 80),
+    (4.0, ("scale", "rotation"), 80),
 )
 """A factor of tau, the kinds of parameter that it is for, and the passes of the fit."""
 NEEDLE = 4.0

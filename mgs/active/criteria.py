@@ -32,11 +32,11 @@ PRUNE_NOISE = PIXEL_NOISE / 5
 """rms change of a pixel value that pruning a model may make (`mgs prune`), linear RGB: so much less than the noise that it
 costs about a tenth of a decibel (docs/parsimony.md). A chosen constant."""
 
-PRIOR_STD = {"colour": 0.25, "scale": 0.125, "rotation": 0.0625, "opacity": 0.5}
+PRIOR_STD = {"colour": 1.0, "scale": 0.125, "rotation": 0.0625, "opacity": 2.0}
 """tau: how far each parameter may plausibly lie from its start before any image is seen, in the parameter's own unit:
-colour 0.25 SH units (0.07 linear RGB), scale 0.125 (13 %), quaternion 0.0625 (about 7 degrees), opacity logit 0.5. Chosen
-from docs/fit.md: the start is already the prior's surface in its mean colours, and a wider tau lets Gaussians grow into
-needles that stand out of the rock."""
+colour 1 SH unit (0.28 linear RGB: albedo and shading of a rock), scale 0.125 (13 %), quaternion 0.0625 (about 7 degrees),
+opacity logit 2 (0.12 to 0.88 about one half). The mesh says how large the Gaussians are and how they lie, so scale and rotation
+are held tightly: with a wider tau they grow into needles that stand out of the rock (docs/fit.md)."""
 
 MEAN_STD = 0.5
 """tau of means that are learned, over the spacing of the prior's samples: a surface that is off by more than that between its

@@ -143,7 +143,7 @@ class Detector:
 
 DETECTORS: dict[str, Detector] = {
     "unconverged": Detector(
-        0.04,
+        0.08,
         lambda v, limit: (
             f"the fit was stopped while its loss still fell by {100 * v:.1f} % a pass (limit {100 * limit:.1f} %); "
             "raise --passes"
