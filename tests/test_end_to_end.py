@@ -150,7 +150,7 @@ def test_ctrl_c_inside_a_call_of_drjit_is_one_line_too(capsys, monkeypatch):
             main([name])
         assert stop.value.code == 130
         # Only these go on: the others write nothing before they are done, or start anew.
-        goes_on = ("synth-orbit", "import", "demo", "parsimony", "stress")
+        goes_on = ("synth-orbit", "import", "demo", "reproduce", "chart", "stress", "parsimony")
         again = "; run the same command again to continue" if name in goes_on else ""
         resume = "; `mgs nbv --resume RUN` continues a run whose folder is there" if name == "nbv" else ""
         assert capsys.readouterr().err == f"mgs: interrupted{again}{resume}\n"

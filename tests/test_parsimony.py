@@ -208,7 +208,8 @@ def test_a_run_is_pruned_beside_its_model(data, tmp_path, capsys):
     }  # fmt: skip
     H = read_checkpoint(run).H
     assert informed["colour"]["informed"] == (H[:, :3] > (PIXEL_NOISE / PRIOR_STD["colour"]) ** 2).sum()
-    assert 0 < informed["colour"]["informed"] < 1200
+    assert informed["rotation"]["informed"] == (H[:, 6:10] > (PIXEL_NOISE / PRIOR_STD["rotation"]) ** 2).sum()
+    assert 0 < informed["rotation"]["informed"] < 1600
     whole = (run / "gaussians.ply").read_bytes()
     with pytest.raises(SystemExit) as exit_:
         main(["prune", str(run)])
