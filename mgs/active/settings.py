@@ -76,7 +76,7 @@ class TrainSettings(BaseModel):
     """What the means may do: stay, as in the paper; move along the prior's normals; move freely (`mgs.splat.MEANS`)."""
     optimiser: str = "natural"
     """A row of `mgs.active.optimisers.OPTIMISERS`."""
-    passes: Annotated[int, Field(ge=1)] = 20
+    passes: Annotated[int, Field(ge=1)] = 10
     """Most passes over the images."""
     tolerance: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.01
     """Settled when a pass lowers the loss by less than this share, twice in a row, and does not raise it by more
@@ -121,7 +121,7 @@ class NbvSettings(BaseModel):
     read only where means are learned, and must be there then; `mgs nbv` sets it (`with_spacing`)."""
     evaluate_every: Annotated[int, Field(ge=0)] = 0
     """Measure PSNR on all views after every so many steps; 0 = only at the end. Never feeds back into the choice."""
-    warm_passes: Annotated[int, Field(ge=1)] = 10
+    warm_passes: Annotated[int, Field(ge=1)] = 5
     """Most passes of the fits after the first, if `train.passes` is not less: they start from a model that was fitted to all
     images but one. A chosen constant (docs/fit.md)."""
     warm_rate: Positive = 1.0
