@@ -7,7 +7,6 @@ from pathlib import Path
 
 from mgs.active.settings import NbvSettings, TrainSettings
 from mgs.errors import InputError
-
 from mgs.study.sweep import Cell
 
 KINDS = ("fit", "scoring", "core", "bytes", "presets")
