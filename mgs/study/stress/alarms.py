@@ -159,7 +159,7 @@ ALARMS = Experiment(
     ),
     (
         Panel("false alarms", "caught", "good runs with an alarm (share)", "failed runs with an alarm (share)", "sign"),
-        Panel("label", "failed", "fault and its size", "runs that failed (share)"),
+        Panel("fault", "failed", "fault, at all its sizes", "runs that failed (share)"),
     ),
     roc_curves,
 )  # fmt: skip

@@ -9,7 +9,6 @@ from typing import Any
 
 from mgs.errors import InputError
 from mgs.files import atomic_path, write_json
-from mgs.plotting import save_figure
 from mgs.provenance import versions
 from mgs.runtime import processor
 from mgs.study.stress.alarms import ALARMS, DATA_FAULTS, PRIOR_EXPERIMENT
@@ -19,7 +18,7 @@ from mgs.study.stress.experiment import Experiment
 from mgs.study.stress.lab import PRESETS, Preset, scene_cell
 from mgs.study.stress.numbers import NUMBERS
 from mgs.study.stress.numerics import NUMERICS
-from mgs.study.stress.picture import experiment_figure
+from mgs.study.stress.picture import draw_experiment
 from mgs.study.stress.scales import SCALES
 from mgs.study.stress.scenes import SCENES
 from mgs.study.stress.verdict import Row, effect, judged
@@ -96,7 +95,7 @@ def write_results(out: Path, rows: dict[str, list[Row]], command: str) -> dict[s
         experiment = EXPERIMENTS[name]
         claims = [judged(claim, of_one) for claim in experiment.claims]
         experiments.append({"name": name, "question": experiment.question, "claims": claims})
-        save_figure(experiment_figure(experiment, of_one), out / f"{name}.png")
+        draw_experiment(out / f"{name}.png", experiment, of_one)
     verdicts = {"experiments": experiments, "command": command, "machine": processor(), "versions": versions()}
     _write_csv(out / "stability.csv", rows)
     with atomic_path(out / "stability.md") as temporary:
