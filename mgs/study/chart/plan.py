@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from mgs.errors import InputError
 from mgs.study.sweep import Cell
 
 KINDS = ("fit", "scoring", "core", "bytes", "presets")
@@ -58,13 +57,6 @@ SCENE = "boulder"
 
 OTHER_SCENES = ("contact-binary", "pebbles")
 """The scenes on which the presets are judged."""
-
-
-def plan_named(name: str) -> Plan:
-    """A row of PLANS. Raises InputError where there is none of this name."""
-    if name not in PLANS:
-        raise InputError(f"--preset {name}: unknown; choose one of {', '.join(PLANS)}")
-    return PLANS[name]
 
 
 @dataclass(frozen=True)
