@@ -12,6 +12,7 @@ from mgs.files import atomic_path, write_csv, write_json
 from mgs.provenance import versions
 from mgs.report.evaluation import evaluate_run
 from mgs.report.writing import write_report
+from mgs.runtime import processor
 from mgs.study import reproduce
 from mgs.study.reproduce import ORACLE, Preset, Run
 from mgs.study.reproduce_figures import curves_figure, pools_figure, seeds_figure
@@ -159,7 +160,7 @@ def _write(out: Path, name: str, rows: Rows, markdown: str, command: str, **more
 def write_table(root: Path, out: Path, found: Found, preset: Preset, count: int, command: str) -> list[Path]:
     """table1.csv, .json and .md."""
     rows = table_rows(found, preset)
-    return _write(out, "table1", rows, table_markdown(rows), command)
+    return _write(out, "table1", rows, table_markdown(rows), command, machine=processor())
 
 
 def write_figures(root: Path, out: Path, found: Found, preset: Preset, count: int, command: str) -> list[Path]:
