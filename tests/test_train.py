@@ -178,6 +178,7 @@ LONG = [2 * 0.9**k for k in range(6)]
         ([1, 0.5, 0.6, 0.598, 0.597], 40, None),  # flat, but well above what it had
         ([1, 1.2, 1.2, 1.2, 1.2, 1.2], 40, None),  # flat above the start
         ([1, 1.2, 1.2, 1.2, 1.2, 1.2], 5, StopReason.DIVERGED),
+        ([2.06, 2.40, 2.31, 2.25, 2.18, 2.08], 5, StopReason.PASS_LIMIT),  # risen by one new view, and on its way back
         ([1, 1.2, 1.1, 1.05, 1.02, 1.005], 5, StopReason.PASS_LIMIT),
         ([1, 1.04], 1, StopReason.PASS_LIMIT),  # as the first pass of a healthy fit
         ([1, 3, 1.4, 3, 3, 3, 3], 40, None),
