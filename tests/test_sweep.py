@@ -14,7 +14,7 @@ from distributed import LocalCluster
 
 from mgs.errors import InputError
 from mgs.study import sweep
-from mgs.study.sweep import Cell, cell_folder, found, run_cells
+from mgs.study.sweep import Cell, cell_folder, found, names_of, run_cells
 
 CALLS = []
 
@@ -50,6 +50,14 @@ def test_cells_come_after_those_they_need_and_are_done_once(tmp_path):
     assert run_cells(tmp_path, cells, lambda *what: told.append(what)) == {"a/1": {"sum": 1}, "b": {"sum": 3}}
     assert CALLS == ["1", "b"]
     assert told == []
+
+
+def test_names_come_in_the_order_of_those_known():
+    assert names_of(None, "abc") == ["a", "b", "c"]
+    assert names_of("c, a,c", "abc") == ["a", "c"]
+    for only in ("", "a,", "d"):
+        with pytest.raises(InputError, match=r"--only '.?': unknown; choose some of a,b,c"):
+            names_of(only, "abc")
 
 
 def test_what_failed_is_done_again_and_the_rest_is_kept(tmp_path):

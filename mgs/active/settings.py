@@ -43,13 +43,6 @@ PRESETS = {
 """What `mgs nbv --preset` knows, by name: points on the front of runs in docs/speed-accuracy.md."""
 
 
-def preset_named(name: str) -> Preset:
-    """A row of PRESETS. Raises InputError where there is none of this name."""
-    if name not in PRESETS:
-        raise InputError(f"--preset {name}: unknown; choose one of {', '.join(PRESETS)}")
-    return PRESETS[name]
-
-
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 Scale = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]

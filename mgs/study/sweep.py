@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from graphlib import TopologicalSorter
@@ -51,6 +51,19 @@ class Cell:
     """Names of the cells that must be done before."""
     alone: bool = False
     """Whether its seconds are reported: it is done in this process, while no worker has anything to do."""
+
+
+def names_of(only: str | None, known: Iterable[str]) -> list[str]:
+    """The names that an option --only gives, with commas between, or all where it is None; in the order of those known.
+
+    Raises InputError for a name that is not known, and where there is none.
+    """
+    known = list(known)
+    asked = known if only is None else [name.strip() for name in only.split(",")]
+    for name in asked:
+        if name not in known:
+            raise InputError(f"--only {name!r}: unknown; choose some of {','.join(known)}")
+    return [name for name in known if name in asked]
 
 
 def cell_folder(root: Path, name: str) -> Path:

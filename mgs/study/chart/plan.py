@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mgs.active.settings import NbvSettings, TrainSettings
-from mgs.errors import InputError
 from mgs.study.sweep import Cell
 
 KINDS = ("fit", "scoring", "core", "bytes", "presets")
@@ -62,13 +61,6 @@ SCENE = "boulder"
 
 OTHER_SCENES = ("contact-binary", "pebbles")
 """The scenes on which the presets are judged."""
-
-
-def plan_named(name: str) -> Plan:
-    """A row of PLANS. Raises InputError where there is none of this name."""
-    if name not in PLANS:
-        raise InputError(f"--preset {name}: unknown; choose one of {', '.join(PLANS)}")
-    return PLANS[name]
 
 
 @dataclass(frozen=True)
