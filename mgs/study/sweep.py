@@ -28,6 +28,10 @@ CELLS = "cells"
 CONNECT_SECONDS = 10
 """How long to wait for a scheduler to answer, and for it to have a worker."""
 
+PRELOAD = "pymeshlab"
+"""A module that workers import before they begin. Where a thread other than the first imports it and then makes a Poisson
+surface, the process aborts when it ends."""
+
 Report = Callable[[str, int, int], None]
 """Called as report(name, done, total) before each cell that is not done yet."""
 
@@ -146,7 +150,7 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
                 with (
                     LocalCluster(
                         n_workers=workers, threads_per_worker=1, host="127.0.0.1", memory_limit=0,
-                        dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL + 1,
+                        dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL + 1, preload=PRELOAD,
                     ) as cluster,
                     Client(cluster) as client,
                 ):  # fmt: skip
