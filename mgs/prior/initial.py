@@ -38,8 +38,8 @@ passes. In an image it is less, because the renderer widens each Gaussian by EPS
 there the derivative of the opacity by its logit, o (1 - o), is almost zero; at 0.9 it is 0.09."""
 
 INSET = 0.2
-"""How far below the surface a Gaussian lies, over the spacing. Flat Gaussians on the surface stand out from it: at the outline, and
-wherever it bends, since each is tangent to it and has some width. A chosen constant (docs/fit.md)."""
+"""How far below the surface a Gaussian lies, over the spacing. Flat Gaussians on the surface stand out from it: at the outline,
+and wherever it bends, since each is tangent to it and has some width. A chosen constant (docs/fit.md)."""
 
 THICKNESS = 0.1
 """Standard deviation of a Gaussian across the surface, over the spacing. It is flat, but thick enough for its projection to be

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from mgs.active.settings import NbvSettings, TrainSettings
 from mgs.study.sweep import Cell
 
 KINDS = ("fit", "scoring", "core", "bytes", "presets")
@@ -52,9 +51,6 @@ PLANS = {
 
 DENSITY = 1 / 8
 """Density of the prior of the default point (`mgs.prior.settings.PriorSettings`): about what `mgs demo` has."""
-
-PASSES, WARM_PASSES = TrainSettings().passes, NbvSettings.model_fields["warm_passes"].default
-"""Passes of the default point: those of `mgs nbv`."""
 
 SCENE = "boulder"
 """The scene of the charts."""

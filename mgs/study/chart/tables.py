@@ -6,7 +6,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from mgs.study.chart.plan import DENSITY, PASSES, WARM_PASSES
+from mgs.active.settings import PASSES, WARM_PASSES
+from mgs.study.chart.plan import DENSITY
 
 Rows = list[dict[str, Any]]
 Cells = list[list[str]]

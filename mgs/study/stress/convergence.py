@@ -13,7 +13,7 @@ from mgs.study.stress.verdict import Claim, Row, runs_of, single
 
 SCORES: dict[str, Score] = {"d-optimal": d_optimal, "fisherrf": fisherrf, "t-optimal": t_optimal}
 EARLY = 5
-"""Passes of a choice that is made too early; the default is 20 for the seeds and 10 later."""
+"""Passes of a choice that is made too early; the default of the first fit is twice as many."""
 
 
 def convergence(root: Path, out: Path, scene: str, turns_: int, passes: list[int]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from mgs.study.stress.lab import Array, Lab, agreement, greedy, open_lab
 from mgs.study.stress.verdict import Claim, Effects, paired, single
 
 FREE_PASSES = 40
-"""Twice the default: a collapse takes time."""
+"""Four times the default: a collapse takes time."""
 
 KINDS = {"frozen": ("frozen", True), "free": ("free", True), "free, no prior": ("free", False)}
 """What the means may do, and whether a prior holds the parameters: the paper has none."""
