@@ -64,8 +64,7 @@ def initial_gaussians(prior: Prior, seed_frames: Sequence[Frame], inset: float =
 
     A frame sees a sample that lies inside its rock mask, whose normal points towards the camera, and whose depth agrees with
     the depth image, up to `prior.depth_tolerance` and the slope of the surface within a pixel. For a frame without depth image
-    the depth of the prior's mesh is used. A sample that no frame
-    sees is grey.
+    the depth of the prior's mesh is used. A sample that no frame sees is grey.
     inset: how far below its sample a Gaussian lies, over the `pixel_on` the prior.
     Returns (N + backed Gaussians of degree 0, seen [N] bool: which samples some frame sees).
     Raises InputError if a file of a frame cannot be read, and as `mesh_depth` where a frame has no depth image.
