@@ -20,7 +20,10 @@ from mgs.splat_ply import read_ply
 GROUP_NAMES = {"all": "all views", "held_out": "held out", "test": "test views"}
 """What metrics.json calls the views that it has means of -> headings. Other groups are called by their key."""
 
-STEP_KEYS = {"step", "frame", "images", "iterations", "score", "information_gain", "coverage", "loss", "seconds", "signs"}
+STEP_KEYS = {
+    "step", "frame", "images", "iterations", "score", "information_gain", "coverage", "loss", "seconds", "signs",
+    "exposure",
+}  # fmt: skip
 """Keys of steps.jsonl that hold numbers, and no metrics of images."""
 
 

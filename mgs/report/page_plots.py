@@ -33,6 +33,8 @@ METRIC_NAMES = {
     "psnr_mask": "PSNR, rock only (dB)",
     "ssim_mask": "SSIM, rock only",
     "psnr_inside": "PSNR, without the outline (dB)",
+    "psnr_corrected": "PSNR, exposure fitted to each view (dB)",
+    "psnr_mask_corrected": "PSNR, rock only, exposure fitted to each view (dB)",
     "held_out_psnr": "PSNR, held out (dB)",
     "held_out_psnr_mask": "PSNR, held out, rock only (dB)",
     "test_psnr": "PSNR, test views (dB)",
