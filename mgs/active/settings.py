@@ -77,7 +77,7 @@ class TrainSettings(BaseModel):
     optimiser: str = "natural"
     """A row of `mgs.active.optimisers.OPTIMISERS`."""
     passes: Annotated[int, Field(ge=1)] = 10
-    """Most passes over the images."""
+    """Most passes over the images. A chosen constant (docs/speed-accuracy.md)."""
     tolerance: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.01
     """Settled when a pass lowers the loss by less than this share, twice in a row, and does not raise it by more
     (`mgs.active.stopping.stop_reason`)."""

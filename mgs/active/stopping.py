@@ -32,8 +32,9 @@ def stop_reason(losses: Sequence[float], tolerance: float, limit: int) -> StopRe
     losses: of the model that the fit started from, then of each pass. tolerance: share of a loss. limit: most passes.
 
     Diverged: the last loss is not finite; or the last DIVERGED_PASSES (all, where the limit is lower) are above DIVERGED_FACTOR
-    times the start; or the limit, of DIVERGED_PASSES or more, was reached, no pass came within the tolerance of the start, and the
-    last is no lower than the first: a fit that starts from a fitted model rises first, and a short one may end while it comes back.
+    times the start; or the limit, of DIVERGED_PASSES or more, was reached, no pass came within the tolerance of the start, and
+    the last is no lower than the first: a fit that starts from a fitted model rises first, and a short one may end on its way
+    back.
     Settled: two passes in a row lower the loss of the pass before by less than the tolerance, and neither is more than the
     tolerance above the lowest loss until then. So a rise within the tolerance is the noise of a loss that falls no more; a
     larger one, or small ones that add up to more, are not. How far away the minimum is, it does not say: that is what

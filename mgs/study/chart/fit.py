@@ -17,7 +17,7 @@ from typing import Any
 from mgs.active.settings import PRESETS, RATES
 from mgs.data.dataset import load_dataset
 from mgs.study.chart.pareto import pareto_front
-from mgs.study.chart.plan import DENSITY, SCENE, Data, Plan, synthetic
+from mgs.study.chart.plan import DENSITY, PASSES, SCENE, WARM_PASSES, Data, Plan, synthetic
 from mgs.study.chart.subject import quality
 from mgs.study.chart.timing import timed
 from mgs.study.sweep import Cell, cell_folder
@@ -25,7 +25,7 @@ from mgs.study.sweep import Cell, cell_folder
 LEARNED = ("colour", "colour+opacity", "colour+opacity+scale", "all")
 """Kinds of parameters that are learned; the others have a rate of 0."""
 
-WARM_PASSES = {2: 2, 5: 3, 10: 5, 20: 10, 40: 20}
+LATER_PASSES = {2: 2, 5: 3, 10: 5, 20: 10, 40: 20}
 """Passes of the fits after the first in runs, for each number of passes of the first."""
 
 
@@ -35,8 +35,8 @@ class Point:
 
     images: int
     density: float = DENSITY
-    passes: int = 20
-    warm_passes: int = 10
+    passes: int = PASSES
+    warm_passes: int = WARM_PASSES
     optimiser: str = "natural"
     learned: str = "all"
     policy: str = ""
@@ -88,7 +88,9 @@ def factors(plan: Plan, halves: bool) -> dict[str, list[Point]]:
         "crossed, run": crossed_runs(plan),
     }
     if halves:
-        known["half the size"] = [replace(fit, half=True, density=d, passes=p) for d in plan.densities[:-1] for p in (5, 20)]
+        known["half the size"] = [
+            replace(fit, half=True, density=d, passes=p) for d in plan.densities[:-1] for p in (5, PASSES)
+        ]
     return known
 
 
@@ -96,7 +98,7 @@ def crossed_runs(plan: Plan) -> list[Point]:
     """Runs of the default policy over the settings that presets are made of."""
     run = Point(plan.images, policy="d-optimal")
     grid = [
-        replace(run, density=d, passes=p, warm_passes=WARM_PASSES[p]) for d in plan.densities[-3:] for p in plan.passes[-3:]
+        replace(run, density=d, passes=p, warm_passes=LATER_PASSES[p]) for d in plan.densities[-3:] for p in plan.passes[-3:]
     ]
     return list(dict.fromkeys([*grid, *preset_points(plan).values()]))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from mgs.active.settings import NbvSettings, TrainSettings
 from mgs.errors import InputError
 from mgs.study.sweep import Cell
 
@@ -52,6 +53,9 @@ PLANS = {
 
 DENSITY = 1 / 8
 """Density of the prior of the default point (`mgs.prior.settings.PriorSettings`): about what `mgs demo` has."""
+
+PASSES, WARM_PASSES = TrainSettings().passes, NbvSettings.model_fields["warm_passes"].default
+"""Passes of the default point: those of `mgs nbv`."""
 
 SCENE = "boulder"
 """The scene of the charts."""

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from mgs.study.chart.plan import DENSITY
+from mgs.study.chart.plan import DENSITY, PASSES, WARM_PASSES
 
 Rows = list[dict[str, Any]]
 Cells = list[list[str]]
@@ -64,8 +64,8 @@ def factors(rows: Rows) -> Cells:
     """Points that differ from the default in one factor, and how they differ from it."""
     default = {
         "density": DENSITY,
-        "passes": 20,
-        "warm_passes": 10,
+        "passes": PASSES,
+        "warm_passes": WARM_PASSES,
         "optimiser": "natural",
         "learned": "all",
         "estimator": "exact",
