@@ -73,8 +73,13 @@ def test_a_warning_comes_once_and_again_after_it_was_over():
 
 
 def test_signs_that_a_step_cannot_tell_are_left_out():
-    assert set(step_signs([], [1.0], 1.0, [], 0.0)) == {"coverage", "means"}
+    assert set(step_signs([], [1.0], 1.0, [], 0.0)) == {"means"}
     assert {"unconverged", "worse"}.isdisjoint(step_signs([], [1.0, float("nan"), 1.0, 1.0], 1.0, [], 0.0))
+
+
+@pytest.mark.parametrize("views", [1, 2, 3, 4])
+def test_coverage_is_expected_of_four_views_and_more(views):
+    assert bool(alarms(signs(views=(GOOD,) * views, coverage=0.7))) == (views == 4)
 
 
 def seen(mask, alpha, margin, rendered=0.5, truth=0.5):
