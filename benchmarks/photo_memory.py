@@ -2,7 +2,7 @@
 
 The scene is a ball whose colour changes with height alone, seen by a ring of cameras at one height: all of them see the same
 image. So one JPEG and one mask stand for any number of photographs, by hard links, as a nerfstudio capture with distortion and
-points. Every station is a process of its own; what is reported is its largest resident set (getrusage).
+points. Every station is a process of its own; what is reported is its largest resident set.
 """
 
 from __future__ import annotations
@@ -83,13 +83,24 @@ def dataset(folder: Path, image: Path, mask: Path, count: int) -> None:
     trimesh.PointCloud(points / np.linalg.norm(points, axis=1, keepdims=True)).export(folder / "sparse.ply")
 
 
-def peak(*command: str | Path) -> float:
-    """Largest resident set of `mgs COMMAND`, GB."""
-    process = subprocess.Popen([sys.executable, "-m", "mgs", *map(str, command)], stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(process.pid, 0)
-    if status:
-        raise SystemExit(f"mgs {' '.join(map(str, command))}: ended with status {status}")
-    return usage.ru_maxrss * 1024 / 1e9
+WATCHED = """
+import sys
+from pathlib import Path
+from mgs.cli.app import main
+try:
+    main(sys.argv[2:])
+finally:
+    lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    Path(sys.argv[1]).write_text(lines["VmHWM"].split()[0])
+"""
+"""A program that runs `mgs` and writes the largest resident set of its process, kB, into a file. getrusage is of no use here: a
+process starts with the number of the one that started it."""
+
+
+def peak(note: Path, *command: str | Path) -> float:
+    """Largest resident set of `mgs COMMAND`, GB. note: a file to write."""
+    subprocess.run([sys.executable, "-c", WATCHED, str(note), *map(str, command)], stdout=subprocess.DEVNULL, check=True)
+    return int(note.read_text()) * 1024 / 1e9
 
 
 def main(out: Path) -> None:
@@ -97,7 +108,7 @@ def main(out: Path) -> None:
     rows: list[dict[str, Any]] = []
 
     def measure(name: str, photographs: int, *command: str | Path) -> None:
-        rows.append({"station": name, "photographs": photographs, "gigabytes": peak(*command)})
+        rows.append({"station": name, "photographs": photographs, "gigabytes": peak(folder / "note", *command)})
         print(rows[-1], flush=True)
 
     with tempfile.TemporaryDirectory() as name:

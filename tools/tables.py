@@ -224,6 +224,23 @@ def own_data(data: dict[str, Any]) -> str:
     return markdown(heading, rows) + made_by(data)
 
 
+def exposure(data: dict[str, Any]) -> str:
+    """Fits to photographs of differing exposure, without gains and with them."""
+    rows = []
+    for row in data["records"]:
+        cells = [f"{row['stops']:g}", "estimated" if row["exposure"] else "none"]
+        cells += [f"{row[key]:.2f}" for key in ("psnr_mask_corrected", "psnr_mask")]
+        rows.append([*cells, f"{row['gain_rms']:.1%}, {row['gain_worst']:.1%}" if row["exposure"] else ""])
+    heading = ["stops", "gains", "exposure fitted to each view, dB", "as it is, dB", "error of gains, rms and worst"]
+    return markdown(heading, rows) + made_by(data)
+
+
+def photo_memory(data: dict[str, Any]) -> str:
+    """Most memory of each station for photographs of 12 megapixels."""
+    rows = [[f"`{r['station']}`", f"{r['photographs']}", f"{r['gigabytes']:.1f} GB"] for r in data["records"]]
+    return markdown(["station", "photographs", "most memory"], rows) + made_by(data)
+
+
 def backing(data: dict[str, Any]) -> str:
     """Held-out quality and see-through of fits with and without Gaussians behind the surface."""
     found = {(row["gaussians"], row["passes"], row["backing"]): row for row in data["records"]}
@@ -443,6 +460,8 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "depth-error": ("depth_error", depth_error),
     "backing": ("backing", backing),
     "own-data": ("own_data", own_data),
+    "exposure": ("exposure", exposure),
+    "photo-memory": ("photo_memory", photo_memory),
     "stability": ("../results/stress/verdicts", stability),
     "parsimony": ("../results/parsimony/parsimony", parsimony),
     "parsimony-verdict": ("../results/parsimony/parsimony", parsimony_verdict),
