@@ -6,12 +6,13 @@ the temporary file behind, but never an incomplete file under the real name.
 
 from __future__ import annotations
 
+import csv
 import fcntl
 import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -95,6 +96,19 @@ def write_json(path: str | Path, data: Any) -> None:
     text = json.dumps(data, indent=2, allow_nan=False)
     with atomic_path(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
+    """Write records as CSV, in UTF-8; the file appears complete. Returns its path. Raises InputError as `atomic_path`.
+
+    Columns are all keys, in the order in which they are met; what a record lacks, and None, is written as nothing.
+    """
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    return Path(path)
 
 
 def read_json(path: str | Path) -> Any:

@@ -21,6 +21,7 @@ from mgs.errors import InputError
 from mgs.prior.settings import PriorSettings
 from mgs.study.chart import core, fit, plan, presets, scoring, sending, study, subject, timing
 from mgs.study.chart.pareto import pareto_front, within
+from mgs.study.chart.tables import chart_table
 
 NUMBERS = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=12)
 
@@ -116,7 +117,7 @@ def test_a_run_with_a_preset_writes_what_it_came_to(dataset, prior, tmp_path, mo
     settings = json.loads((tmp_path / "run/config.json").read_text())["settings"]
     assert settings["train"]["passes"] == PRESETS["fast"].passes
     assert settings["warm_passes"] == 4
-    with pytest.raises(InputError, match="--preset best: unknown; choose one of fast, balanced, accurate"):
+    with pytest.raises(InputError, match="--preset 'best': unknown; choose one of fast, balanced, accurate"):
         start_run(dataset, tmp_path / "other", prior=prior, preset="best")
     asked = []
 
@@ -285,6 +286,10 @@ def test_a_chart_is_measured_once_and_written(small_study, capsys):
         assert len(rows) == len(written[kind]["rows"])
         assert (out / f"{kind}.png").stat().st_size > 10_000
         assert all(parsed(row["command"]) for row in rows)
+        command = f"mgs chart {out} --only {kind} --preset quick --repeats 1 --dataset {small_study.dataset}"
+        assert written[kind]["command"] == command
+        table = {"fit": "front"}.get(kind, kind)
+        assert chart_table(table, written)[3].startswith(f"`{command}` on ")
     by_name = {row["variant"]: row for row in written["scoring"]["rows"]}
     assert by_name["exact"]["tau"] == pytest.approx(1)
     assert by_name["exact"]["regret"] == 0
@@ -301,7 +306,7 @@ def test_a_chart_is_measured_once_and_written(small_study, capsys):
 def test_what_cannot_be_charted_is_said_in_one_line(dataset, tmp_path):
     with pytest.raises(InputError, match="has no test views"):
         study.chart(tmp_path / "out", "quick", ["fit"], 1, dataset)
-    with pytest.raises(InputError, match="--preset slow: unknown; choose one of quick, full"):
+    with pytest.raises(InputError, match="--preset 'slow': unknown; choose one of quick, full"):
         study.chart(tmp_path / "out", "slow", ["fit"], 1)
     assert not (tmp_path / "out").exists()
     assert load_dataset(dataset)
@@ -311,4 +316,4 @@ def test_an_unknown_chart_is_refused(capsys, tmp_path):
     with pytest.raises(SystemExit) as ended:
         main(["chart", str(tmp_path / "out"), "--only", "fit,speed"])
     assert ended.value.code == 2
-    assert "--only speed: unknown; choose some of fit, scoring, core, bytes, presets" in capsys.readouterr().err
+    assert "--only 'speed': unknown; choose some of fit,scoring,core,bytes,presets" in capsys.readouterr().err

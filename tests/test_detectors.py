@@ -76,6 +76,8 @@ def test_a_warning_comes_once_and_again_after_it_was_over():
 
 def test_signs_that_a_step_cannot_tell_are_left_out():
     assert set(step_signs([], [1.0], 1.0, [], 0.0)) == {"means"}
+    back = step_signs([], [1.0, 1.2, 1.1, 1.0], 1.0, [], 0.0)  # of a warm fit: lower than before, but not than at its start
+    assert back["unconverged"] == 0
     assert {"unconverged", "worse"}.isdisjoint(step_signs([], [1.0, float("nan"), 1.0, 1.0], 1.0, [], 0.0))
 
 

@@ -1,7 +1,7 @@
 """The README and the pages in docs/: against the code they describe, their links, their tables, and the site made of them."""
 
 import ast
-import importlib.util
+import importlib
 import json
 import pkgutil
 import re
@@ -285,11 +285,10 @@ def test_the_tables_of_the_loop_are_those_of_the_code(dataset, tmp_path):
 
 @pytest.fixture(scope="module")
 def tables():
-    """tools/tables.py, which is no part of the package."""
-    spec = importlib.util.spec_from_file_location("tables", ROOT / "tools/tables.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    """tools/tables.py, which is no part of the package; it imports what lies beside it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(ROOT / "tools")
+        yield importlib.import_module("tables")
 
 
 def test_tables_are_what_their_numbers_say(tables, capsys):
@@ -317,6 +316,20 @@ def test_a_stale_table_is_found_and_made_anew(tables, tmp_path, capsys):
     assert tables.main(["--check"], tmp_path) == 0
 
 
+def test_a_table_that_was_not_run_yet_says_so(tables, tmp_path):
+    page = "<!-- table: reproduce-seeds -->\n<!-- end of table -->"
+    not_run = tables.rewritten(page, tmp_path)
+    assert "\n\nNot run yet: `mgs reproduce OUT --only seeds`.\n\n" in not_run
+    (tmp_path / "results/reproduce").mkdir(parents=True)
+    versions = {"mgs": "1", "mitsuba": "2", "drjit": "3"}
+    made = {"command": "mgs reproduce --only seeds", "versions": versions, "markdown": "| a |\n| --- |\n"}
+    (tmp_path / "results/reproduce/seeds.json").write_text(json.dumps(made))
+    new = tables.rewritten(not_run, tmp_path)
+    assert "\n| a |\n| --- |\n\n`mgs reproduce --only seeds`; mgs 1," in new
+    assert "(results/reproduce/seeds.png)" in new
+    assert "Not run" not in new
+
+
 @pytest.mark.parametrize(
     ("page", "message"),
     [
@@ -328,4 +341,4 @@ def test_a_stale_table_is_found_and_made_anew(tables, tmp_path, capsys):
 )
 def test_marks_of_tables_that_are_wrong(tables, page, message):
     with pytest.raises(ValueError, match=message):
-        tables.rewritten(page, DOCS / "benchmarks")
+        tables.rewritten(page, DOCS)

@@ -16,6 +16,8 @@ from mgs.active import criteria, run_folder
 from mgs.cli import app
 from mgs.cli.app import COMMANDS, main
 from mgs.data.dataset import load_dataset
+from mgs.images import read_exr
+from mgs.report import predicted_error
 from mgs.splat_ply import read_ply
 
 OPTIONS = ["--gaussians", "300", "--seeds", "3", "--budget", "4", "--passes", "6", "--seed", "1"]
@@ -66,6 +68,24 @@ def command(*arguments) -> None:
 
 def steps(out: Path) -> list[dict]:
     return [json.loads(line) for line in (out / "steps.jsonl").read_text().splitlines()]
+
+
+def test_errors_are_predicted_and_judged(run):
+    """The calibration of a real run: on its own views, whose shares inside the intervals are what they were fitted to be."""
+    command("diagnose", run, "--calibrate")
+    found = json.loads((run / "diagnostics/uncertainty.json").read_text())
+    assert found["views"] == {"folds": 7, "held out": 3}
+    rows = {(row["prediction"], row["views"]): row for row in found["rows"]}
+    assert len(rows) == 4 * 2
+    for prediction in predicted_error.ROWS:
+        assert rows[prediction, "folds"]["held"]["0.9"][0] == pytest.approx(0.9, abs=0.01)
+        assert rows[prediction, "held out"]["spearman"] > 0
+    maps = read_exr(next((run / "diagnostics").glob("*.errors.exr")))
+    assert set(maps) == {f"{what}.{channel}" for what in ("error", "sigma") for channel in "RGB"}
+    assert min(maps[f"sigma.{channel}"].min() for channel in "RGB") > 0
+    first = (run / "diagnostics/uncertainty.json").read_bytes()
+    command("diagnose", run, "--calibrate")
+    assert (run / "diagnostics/uncertainty.json").read_bytes() == first
 
 
 def test_the_run_is_whole(dataset, run):

@@ -19,8 +19,18 @@ from PIL import Image
 
 from mgs.colour import linear_from_srgb
 from mgs.data.meshes import load_mesh
-from mgs.errors import InputError
-from mgs.files import atomic_folder, atomic_path, check_writable, copy_file, folder_or_nothing, locked, read_json, write_json
+from mgs.errors import InputError, row_named
+from mgs.files import (
+    atomic_folder,
+    atomic_path,
+    check_writable,
+    copy_file,
+    folder_or_nothing,
+    locked,
+    read_json,
+    write_csv,
+    write_json,
+)
 from mgs.images import read_exr, read_mask, read_png, read_rgba, read_values, write_exr, write_png
 
 
@@ -41,6 +51,17 @@ def test_what_the_disk_says_is_one_line(tmp_path, number):
         write()
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
     assert (tmp_path / "a.txt").read_text() == "before"
+
+
+def test_records_with_other_keys_share_one_csv(tmp_path):
+    assert write_csv(tmp_path / "a.csv", [{"a": 1, "b": None}, {"c": "x, y", "a": 0.5}]) == tmp_path / "a.csv"
+    assert (tmp_path / "a.csv").read_bytes() == b'a,b,c\n1,,\n0.5,,"x, y"\n'
+
+
+def test_an_unknown_row_is_named_with_those_there_are():
+    assert row_named({"a": 1, "b": 2}, "b", "--it") == 2
+    with pytest.raises(InputError, match="--it 'c': unknown; choose one of a, b"):
+        row_named({"a": 1, "b": 2}, "c", "--it")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's device that is always full")

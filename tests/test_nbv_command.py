@@ -272,7 +272,7 @@ def test_scales_of_lambda_are_finite(dataset, tmp_path, values):
     [
         (["--estimator", "block"], "--estimator block: gives no diagonal, or is unknown; choose one of exact, hutchinson"),
         (["--estimator", "guess"], "--estimator guess: gives no diagonal, or is unknown"),
-        (["--optimiser", "hope"], "--optimiser hope: unknown; choose one of natural, adam"),
+        (["--optimiser", "hope"], "--optimiser 'hope': unknown; choose one of natural, adam"),
         (["--lam", "0"], "--lam 0.0: Input should be greater than or equal to"),
         (["--rate", "colour"], "--rate colour: expected KIND=NUMBER, as in --rate colour=0.01"),
         (["--rate", "colour=-1"], "--rate colour=-1.0: Input should be greater than or equal to 0"),

@@ -129,7 +129,7 @@ def test_a_start_in_the_memory_of_the_model_is_kept_apart(case):
 @pytest.mark.parametrize(
     ("means", "normals", "message"),
     [
-        ("loose", None, "means 'loose' is unknown; choose one of frozen, normal, free"),
+        ("loose", None, "means 'loose': unknown; choose one of frozen, normal, free"),
         ("normal", None, "needs normals"),
         ("normal", np.zeros((50, 3)), "a normal is zero"),
         ("normal", np.ones((49, 3)), "normals have shape"),

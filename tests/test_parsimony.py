@@ -196,7 +196,7 @@ def test_an_unknown_preset_is_one_line(tmp_path, capsys):
     with pytest.raises(SystemExit) as exit_:
         main(["parsimony", str(tmp_path / "out"), "--preset", "huge"])
     assert exit_.value.code == 2
-    assert "--preset huge: unknown" in capsys.readouterr().err
+    assert "--preset 'huge': unknown" in capsys.readouterr().err
 
 
 def test_a_run_is_pruned_beside_its_model(data, tmp_path, capsys):

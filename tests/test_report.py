@@ -11,20 +11,24 @@ import pytest
 import tiny
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from PIL import Image
 from rich.console import Console
+from skimage.color import rgb2lab
 
 from mgs import plotting
 from mgs.active import loop
+from mgs.active.policies import policy_names
 from mgs.active.run_folder import load_run
 from mgs.cli import printing
-from mgs.colour import srgb_from_linear
+from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.report import figures, tables, writing
 from mgs.report.evaluation import evaluate
 from mgs.report.figures import POLICY_STYLE
+from mgs.report.page_plots import SYMBOLS
 from mgs.report.runs import evaluated_runs, read_run
 
 
@@ -393,6 +397,27 @@ def test_every_line_of_a_figure_looks_different(labels):
     styles = figures.line_styles(labels)
     assert [style["label"] for style in styles] == labels
     assert len({(style["color"], style["marker"], style["linestyle"]) for style in styles}) == len(labels)
+
+
+SEEN = {
+    "normal": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "tritanopia": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+}
+"""Linear RGB as colour-blind people see it (Machado, Oliveira, Fernandes 2009)."""
+
+
+@pytest.mark.parametrize("eyes", SEEN)
+def test_every_policy_has_a_colour_and_a_marker_of_its_own(eyes):
+    assert set(POLICY_STYLE) >= set(policy_names())
+    colours, markers = zip(*POLICY_STYLE.values(), strict=True)
+    assert len(set(markers)) == len(markers) == len({SYMBOLS[marker] for marker in markers})
+    linear = linear_from_srgb(np.array([to_rgb(colour) for colour in colours])) @ np.array(SEEN[eyes]).T
+    seen = rgb2lab(srgb_from_linear(np.clip(linear, 0, 1)))
+    apart = np.linalg.norm(seen[:, None] - seen[None], axis=2) + 100 * np.eye(len(seen))
+    assert apart.min() > 9  # a difference of 2 is just seen where patches touch
+    assert seen[:, 0].max() < 80  # and all are seen on white
 
 
 def test_a_policy_keeps_its_style_whatever_it_is_compared_with():

@@ -277,8 +277,8 @@ def test_every_run_of_every_result_has_its_own_cell():
     ("arguments", "line"),
     [
         (["--preset", "huge"], "--preset 'huge': unknown; choose one of quick, paper"),
-        (["--only", "table2"], "--only 'table2': is no result; choose of table1,figures,curves,seeds,pools,oracle"),
-        (["--only", ","], "--only ',': is no result"),
+        (["--only", "table2"], "--only 'table2': unknown; choose some of table1,figures,curves,seeds,pools,oracle"),
+        (["--only", ","], "--only '': unknown"),
         (["--rocks", "0"], "should be greater than or equal to 1"),
         (["--rocks", "21"], "--rocks 21: curves can have 1 to 20"),
         (["--rocks", "11", "--only", "pools"], "--rocks 11: pools can have 1 to 10"),

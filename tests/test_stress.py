@@ -70,7 +70,7 @@ def test_runs_are_paired_by_their_name():
         {"run": "a", "kind": "x", "v": 3.0}, {"run": "a", "kind": "y", "v": 1.0}, {"run": "b", "kind": "x", "v": 9.0},
         {"run": "c", "kind": "y", "v": 1.0}, {"run": "c", "kind": "x", "v": 1.5},
     ]  # fmt: skip
-    assert paired(rows, "v", {"kind": "x"}, {"kind": "y"}) == [2.0, 0.5]
+    assert paired("v", {"kind": "x"}, {"kind": "y"})(rows) == [2.0, 0.5]
 
 
 def test_the_roc_area_is_the_probability_that_a_failed_run_has_the_larger_value():
@@ -301,8 +301,8 @@ def test_cells_of_all_experiments_have_tasks_that_are_there_and_needs_that_are_m
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--only", "nothing"], "--only nothing: unknown"),
-        (["--preset", "huge"], "--preset huge: unknown; choose one of"),
+        (["--only", "nothing"], "--only 'nothing': unknown"),
+        (["--preset", "huge"], "--preset 'huge': unknown; choose one of"),
     ],
 )
 def test_what_is_unknown_is_one_line(options, words, tmp_path, capsys):

@@ -3,15 +3,18 @@
 import logging
 import os
 import signal
+import subprocess
+import sys
 import time
 
 import dask
+import numpy as np
 import pytest
 from distributed import LocalCluster
 
 from mgs.errors import InputError
 from mgs.study import sweep
-from mgs.study.sweep import Cell, cell_folder, found, run_cells
+from mgs.study.sweep import Cell, cell_folder, found, names_of, run_cells
 
 CALLS = []
 
@@ -47,6 +50,14 @@ def test_cells_come_after_those_they_need_and_are_done_once(tmp_path):
     assert run_cells(tmp_path, cells, lambda *what: told.append(what)) == {"a/1": {"sum": 1}, "b": {"sum": 3}}
     assert CALLS == ["1", "b"]
     assert told == []
+
+
+def test_names_come_in_the_order_of_those_known():
+    assert names_of(None, "abc") == ["a", "b", "c"]
+    assert names_of("c, a,c", "abc") == ["a", "c"]
+    for only in ("", "a,", "d"):
+        with pytest.raises(InputError, match=r"--only '.?': unknown; choose some of a,b,c"):
+            names_of(only, "abc")
 
 
 def test_what_failed_is_done_again_and_the_rest_is_kept(tmp_path):
@@ -113,6 +124,37 @@ def scheduler():
         ) as cluster,
     ):  # fmt: skip
         yield cluster.scheduler_address
+
+
+SURFACES = """
+import sys
+from pathlib import Path
+from mgs.study.sweep import Cell, run_cells
+
+if __name__ == "__main__":
+    cells = [Cell(f"surface/{i}", "test_sweep:surface", {}) for i in range(2)]
+    run_cells(Path(sys.argv[1]), cells, lambda *_: None, workers=2)
+"""
+
+
+def surface(root, out):
+    """A task: a Poisson surface of a sphere's points."""
+    import pymeshlab
+
+    points = np.random.default_rng(0).normal(size=(500, 3))
+    points /= np.linalg.norm(points, axis=1)[:, None]
+    meshes = pymeshlab.MeshSet()
+    meshes.add_mesh(pymeshlab.Mesh(points, v_normals_matrix=points))
+    meshes.generate_surface_reconstruction_screened_poisson(depth=5)
+    return {}
+
+
+def test_workers_that_made_a_surface_end_in_silence(tmp_path):
+    (tmp_path / "program.py").write_text(SURFACES)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([os.path.dirname(__file__), os.getcwd()])}
+    command = [sys.executable, tmp_path / "program.py", tmp_path / "study"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 def test_a_cell_that_must_be_alone_runs_here_and_beside_nothing(tmp_path, scheduler):

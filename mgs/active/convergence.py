@@ -44,7 +44,7 @@ def remaining_decrease(
     a share of phi; and "converged", whether that is at most CONVERGED_SHARE. Raises InputError where a frame cannot be read.
     """
     seeds, exposure = frames[: settings.seeds], exposure_of(prior) if settings.exposure else None
-    start = initial_gaussians(prior, seeds, exposure(seeds) if exposure else None)[0]
+    start = initial_gaussians(prior, seeds, gains=exposure(seeds) if exposure else None)[0]
     means, kinds = settings.train.means, groups(0, settings.train.means)
     lam = settings.regularisation(kinds)
     by_kind = {kind: float(lam[columns][0]) for kind, columns in kinds.items()}

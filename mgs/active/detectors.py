@@ -111,8 +111,9 @@ def step_signs(
     """
     signs = {"means": drift}
     if len(losses) >= 2 and min(losses) > 0 and np.isfinite(losses).all():
-        window = min(2, len(losses) - 1)
-        signs["unconverged"] = 1 - (losses[-1] / losses[-1 - window]) ** (1 / window)
+        # A fit that starts from a fitted model rises first: coming back to where it began is no sign of more to come.
+        window, lowest = min(2, len(losses) - 1), np.minimum.accumulate(losses)
+        signs["unconverged"] = float(1 - (lowest[-1] / lowest[-1 - window]) ** (1 / window))
         signs["worse"] = min(losses[1:]) / losses[0] - 1
     if views:
         errors = np.array([view.error for view in views])
@@ -149,7 +150,7 @@ class Detector:
 
 DETECTORS: dict[str, Detector] = {
     "unconverged": Detector(
-        0.15,  # good runs with 10 passes, and 5 for the later fits: up to 0.11
+        0.15,  # good runs of few and small images: up to 0.11, in the first fits with one more view
         lambda v, limit: (
             f"the fit was stopped while its loss still fell by {100 * v:.1f} % a pass (limit {100 * limit:.1f} %); "
             "raise --passes"

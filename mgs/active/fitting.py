@@ -20,7 +20,7 @@ from mgs.active.settings import TrainSettings
 from mgs.active.stopping import StopReason, stop_reason
 from mgs.camera import Camera
 from mgs.colour import SH_C0
-from mgs.errors import InputError
+from mgs.errors import InputError, row_named
 from mgs.gaussians import Gaussians, learned
 from mgs.seeds import generator
 from mgs.splat import ListCache, as_drjit
@@ -144,14 +144,12 @@ def fit(
     finite, the optimiser is unknown, `start` is of another shape, or means are to move without normals or without a rate.
     """
     settings = settings or TrainSettings()
-    if settings.optimiser not in OPTIMISERS:
-        raise InputError(f"optimiser {settings.optimiser!r} is unknown; choose one of {', '.join(OPTIMISERS)}")
+    optimiser = row_named(OPTIMISERS, settings.optimiser, "optimiser")
     kinds = learned(settings.means).values()
     if missing := [kind for kind in kinds if kind not in settings.rates]:
         raise InputError(f"train.rates: has no rate of {missing[0]}, which is learned; give one, metres")
     model = as_drjit(gaussians)
     goal = objective(gaussians, cameras, targets, start, lam, cache, settings.means, normals)
-    optimiser = OPTIMISERS[settings.optimiser]
     shapes = [away.shape for away, _ in goal.pulls(model)]
     buffers = [[dr.zeros(mi.TensorXf, shape) for _ in range(optimiser.buffers)] for shape in shapes]
     information: list[Any] = [None] * len(shapes)

@@ -9,10 +9,10 @@ from typing import Any, Literal
 from mgs.active import loop
 from mgs.active.policy_file import absolute
 from mgs.active.run_folder import State, check_same_frames, check_settings, read_settings, start
-from mgs.active.settings import NbvSettings, preset_named, validated, with_preset
+from mgs.active.settings import PRESETS, NbvSettings, validated, with_preset
 from mgs.active.stations import real_stations
 from mgs.data.dataset import load_dataset
-from mgs.errors import InputError
+from mgs.errors import InputError, row_named
 from mgs.files import atomic_folder
 from mgs.prior.build import build_prior, load_prior, save_prior
 from mgs.prior.settings import PriorSettings
@@ -70,7 +70,7 @@ def start_run(
         raise InputError("nbv: --gaussians is for a prior that is built here; leave it out, or leave out --prior")
     if prior is None and gaussians is None and (dataset / "prior/prior.json").is_file():
         prior = dataset / "prior"
-    row = None if preset is None else preset_named(preset)
+    row = None if preset is None else row_named(PRESETS, preset, "--preset")
     settings = settings if row is None else with_preset(row, settings)
     where = out / "prior" if prior is None else Path(prior)
     given = validated(NbvSettings, {"dataset": dataset.resolve(), "prior": where.resolve(), **settings})

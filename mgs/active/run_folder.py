@@ -29,7 +29,7 @@ from mgs.active.policies import policy_named
 from mgs.active.policy_file import label
 from mgs.active.settings import NbvSettings, validated
 from mgs.data.dataset import Dataset, load_dataset
-from mgs.errors import InputError
+from mgs.errors import InputError, row_named
 from mgs.files import atomic_path, read_json, write_json
 from mgs.gaussians import Gaussians
 from mgs.provenance import versions
@@ -69,8 +69,7 @@ def check_settings(settings: NbvSettings, frames: int) -> None:
     blind += ["--policy paper"] if settings.policy == "paper" else []
     if settings.train.means != "frozen" and blind:
         raise InputError(f"--means {settings.train.means}: {blind[0]} knows nothing of means; leave out either")
-    if settings.train.optimiser not in OPTIMISERS:
-        raise InputError(f"--optimiser {settings.train.optimiser}: unknown; choose one of {', '.join(OPTIMISERS)}")
+    row_named(OPTIMISERS, settings.train.optimiser, "--optimiser")
     if frames < settings.seeds:
         raise InputError(f"{settings.dataset}: has {frames} frames, fewer than {settings.seeds} seeds; lower --seeds")
     left = frames - settings.seeds

@@ -22,6 +22,10 @@ MEAN_RATE = 0.02
 """The same for means that are learned, over the spacing of the prior's samples. With larger steps more Gaussians are pushed
 behind others, where no image sees them. A chosen constant."""
 
+PASSES, WARM_PASSES = 10, 5
+"""Most passes of the first fit of a run, and of those after it, which start from a model that was fitted to all images but one.
+More cost more and overfit. Chosen constants (docs/speed-accuracy.md)."""
+
 
 @dataclass(frozen=True)
 class Preset:
@@ -37,17 +41,10 @@ class Preset:
 
 PRESETS = {
     "fast": Preset(passes=5, warm_passes=3, density=1 / 8),
-    "balanced": Preset(passes=10, warm_passes=5, density=1 / 8),
-    "accurate": Preset(passes=10, warm_passes=5, density=1 / 4),
+    "balanced": Preset(passes=PASSES, warm_passes=WARM_PASSES, density=1 / 8),
+    "accurate": Preset(passes=PASSES, warm_passes=WARM_PASSES, density=1 / 4),
 }
 """What `mgs nbv --preset` knows, by name: points on the front of runs in docs/speed-accuracy.md."""
-
-
-def preset_named(name: str) -> Preset:
-    """A row of PRESETS. Raises InputError where there is none of this name."""
-    if name not in PRESETS:
-        raise InputError(f"--preset {name}: unknown; choose one of {', '.join(PRESETS)}")
-    return PRESETS[name]
 
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -76,8 +73,8 @@ class TrainSettings(BaseModel):
     """What the means may do: stay, as in the paper; move along the prior's normals; move freely (`mgs.splat.MEANS`)."""
     optimiser: str = "natural"
     """A row of `mgs.active.optimisers.OPTIMISERS`."""
-    passes: Annotated[int, Field(ge=1)] = 10
-    """Most passes over the images. A chosen constant (docs/speed-accuracy.md)."""
+    passes: Annotated[int, Field(ge=1)] = PASSES
+    """Most passes over the images."""
     tolerance: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.01
     """Settled when a pass lowers the loss by less than this share, twice in a row, and does not raise it by more
     (`mgs.active.stopping.stop_reason`)."""
@@ -121,9 +118,8 @@ class NbvSettings(BaseModel):
     read only where means are learned, and must be there then; `mgs nbv` sets it (`with_spacing`)."""
     evaluate_every: Annotated[int, Field(ge=0)] = 0
     """Measure PSNR on all views after every so many steps; 0 = only at the end. Never feeds back into the choice."""
-    warm_passes: Annotated[int, Field(ge=1)] = 5
-    """Most passes of the fits after the first, if `train.passes` is not less: they start from a model that was fitted to all
-    images but one. A chosen constant (docs/fit.md)."""
+    warm_passes: Annotated[int, Field(ge=1)] = WARM_PASSES
+    """Most passes of the fits after the first, if `train.passes` is not less."""
     warm_rate: Positive = 1.0
     """Learning rates of the fits after the first, over those of the first."""
     exposure: bool = False

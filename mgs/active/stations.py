@@ -50,7 +50,7 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
     return Stations(
         centre=prior.points.mean(axis=0),
         groups=columns,
-        initial=lambda frames: initial_gaussians(prior, frames, exposure(frames) if exposure else None)[0],
+        initial=lambda frames: initial_gaussians(prior, frames, gains=exposure(frames) if exposure else None)[0],
         fit=run_fit,
         fisher=lambda gaussians, camera: information(gaussians, camera, settings.estimator),
         estimate=information,

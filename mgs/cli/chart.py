@@ -18,7 +18,7 @@ def chart(
         Path | None, typer.Option(help="A dataset with test views, in place of the one that is rendered; not for `presets`.")
     ] = None,
     preset: Annotated[str, typer.Option(help="quick: ten minutes on two quiet cores. full: hours.")] = "quick",
-    only: Annotated[str, typer.Option(help="Some of the charts, separated by commas.")] = ",".join(KINDS),
+    only: Annotated[str | None, typer.Option(help=f"Some of {','.join(KINDS)}, as fit,core. Default: all.")] = None,
     repeats: Annotated[int, typer.Option(min=1, help="How often each point is timed; the median counts.")] = 3,
 ) -> None:
     """Chart speed against accuracy: of fits and runs, of scoring, of the core, and of what is sent; and try the presets of
@@ -30,13 +30,11 @@ def chart(
     """
     from rich.console import Console
 
-    from mgs.errors import InputError
     from mgs.files import check_writable
     from mgs.study.chart.study import chart as measure
+    from mgs.study.sweep import names_of
 
-    kinds = [kind.strip() for kind in only.split(",")]
-    if unknown := [kind for kind in kinds if kind not in KINDS]:
-        raise InputError(f"--only {unknown[0]}: unknown; choose some of {', '.join(KINDS)}")
+    kinds = names_of(only, KINDS)
     check_writable(out)
     console = Console(highlight=False)
 

@@ -23,22 +23,21 @@ def parsimony(
     parsimony.csv and parsimony.png. What was interrupted goes on when the same command is given again.
     """
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from mgs import runtime
-    from mgs.files import check_writable, write_json
+    from mgs.cli.printing import cells_bar
+    from mgs.errors import row_named
+    from mgs.files import check_writable, write_csv, write_json
     from mgs.provenance import command_line, versions
-    from mgs.study.parsimony import preset_named, run_study, write_csv
+    from mgs.study.parsimony import PRESETS, run_study
     from mgs.study.parsimony_figure import draw_parsimony
 
-    size = preset_named(preset)
+    size = row_named(PRESETS, preset, "--preset")
     check_writable(out)
     runtime.start()
     console = Console(highlight=False)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("reading")
-        found = run_study(out, size, lambda name, done, total: bar.update(task, description=name, completed=done, total=total))
+    with cells_bar(console) as report:
+        found = run_study(out, size, report)
     about = {"command": command_line(), "preset": preset, "machine": runtime.processor(), "versions": versions()}
     write_json(out / "parsimony.json", about | found)
     write_csv(out / "parsimony.csv", found["rows"])

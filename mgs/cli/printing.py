@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
@@ -61,6 +62,17 @@ def _heading(key: str) -> str:
         return {"coverage": "cover", "images": "n"}.get(key, key)  # short, so that the table fits 80 columns
     name, _, mask = metric.partition("_")
     return f"{name.upper()}\n{GROUPS[views]}" + ("\nrock" if mask else "")
+
+
+@contextmanager
+def cells_bar(console: Console) -> Iterator[Callable[[str, int, int], None]]:
+    """Context manager: a bar of the cells of a study, and the function (name, done, total) that moves it."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("reading", total=None)
+        yield lambda name, done, total: bar.update(task, description=name, completed=done, total=total)
 
 
 def parse_up(text: str) -> tuple[float, float, float] | None:

@@ -42,11 +42,11 @@ def reproduce(
     from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from mgs import runtime
-    from mgs.errors import InputError
+    from mgs.errors import InputError, row_named
     from mgs.files import check_writable
     from mgs.study import reproduce as study
 
-    size, names = study.preset_named(preset), study.names_of(only)
+    size, names = row_named(study.PRESETS, preset, "--preset"), study.results_of(only)
     counts = {name: study.rocks_of(name, size, rocks) for name in names}
     if scheduler is not None and workers != 1:
         raise InputError("--workers starts workers here, and --scheduler uses those of a scheduler; give one of them")

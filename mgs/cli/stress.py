@@ -24,26 +24,24 @@ def stress(
     An interrupted run goes on where it stopped when the same command is given again.
     """
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from mgs import runtime
+    from mgs.cli.printing import cells_bar
+    from mgs.errors import row_named
     from mgs.files import check_writable
     from mgs.provenance import command_line
 
     runtime.start()
-    from mgs.study.stress.registry import chosen, preset_named, run_stress
+    from mgs.study.stress.lab import PRESETS
+    from mgs.study.stress.registry import EXPERIMENTS, run_stress
     from mgs.study.stress.verdict import effect
+    from mgs.study.sweep import names_of
 
-    size, names = preset_named(preset), chosen([name.strip() for name in only.split(",")] if only else [])
+    size, names = row_named(PRESETS, preset, "--preset"), names_of(only, EXPERIMENTS)
     console = Console(highlight=False)
     check_writable(out)
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"))
-    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as bar:
-        task = bar.add_task("starting", total=1)
-        verdicts = run_stress(
-            out, size, names, command_line(),
-            lambda cell, done, total: bar.update(task, description=cell, completed=done, total=total), workers,
-        )  # fmt: skip
+    with cells_bar(console) as report:
+        verdicts = run_stress(out, size, names, command_line(), report, workers)
     for experiment in verdicts["experiments"]:
         console.print(f"[bold]{experiment['name']}[/bold]: {experiment['question']}", soft_wrap=True)
         for claim in experiment["claims"]:

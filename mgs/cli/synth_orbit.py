@@ -46,11 +46,11 @@ def synth_orbit(
     from rich.progress import Progress
 
     from mgs import runtime
-    from mgs.errors import InputError
+    from mgs.errors import InputError, row_named
     from mgs.synth.scene_file import ORBITS, load_scene_file
 
     runtime.start()
-    from mgs.synth.rendering import PoseNoise, preset_named, synthesise
+    from mgs.synth.rendering import PRESETS, PoseNoise, synthesise
 
     settings = load_scene_file(scene)
     if orbit is not None:
@@ -60,14 +60,15 @@ def synth_orbit(
     if mesh_up is not None and mesh is None:
         raise InputError("--mesh-up: says how a mesh stands, but there is none; give --mesh too")
     given = {"spp": spp, "frames": frames, **_parse_size(size)}
-    chosen = replace(preset_named(preset), **{key: value for key, value in given.items() if value is not None})
+    images = row_named(PRESETS, preset, "--preset")
+    images = replace(images, **{key: value for key, value in given.items() if value is not None})
     noise = PoseNoise(pose_noise, rotation_noise) if pose_noise or rotation_noise else None
     console = Console()
     with Progress(console=console) as bar:
-        views = f"{chosen.frames} frames" + (f" and {test_views} test views" if test_views else "")
-        task = bar.add_task(f"{views}, {chosen.width}x{chosen.height}", total=chosen.frames + test_views)
+        views = f"{images.frames} frames" + (f" and {test_views} test views" if test_views else "")
+        task = bar.add_task(f"{views}, {images.width}x{images.height}", total=images.frames + test_views)
         synthesise(
-            out, settings, chosen, seed, mesh, noise,
+            out, settings, images, seed, mesh, noise,
             progress=lambda done, total: bar.update(task, completed=done), say=console.print,
             mesh_up=mesh_up and mesh_up.value, test_views=test_views,
         )  # fmt: skip

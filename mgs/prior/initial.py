@@ -38,6 +38,10 @@ spacing^2, which is -2 pi (s / spacing)^2 Li2(o), with the dilogarithm Li2. For 
 passes. In an image it is less, because the renderer widens each Gaussian by EPS2D. An opacity of 0.99 would hide more, but
 there the derivative of the opacity by its logit, o (1 - o), is almost zero; at 0.9 it is 0.09."""
 
+INSET = 0.2
+"""How far below the surface a Gaussian lies, over the spacing. Flat Gaussians on the surface stand out from it: at the outline,
+and wherever it bends, since each is tangent to it and has some width. A chosen constant (docs/fit.md)."""
+
 THICKNESS = 0.1
 """Standard deviation of a Gaussian across the surface, over the spacing. It is flat, but thick enough for its projection to be
 numerically well conditioned."""
@@ -56,15 +60,16 @@ GREY = 0.5
 
 
 def initial_gaussians(
-    prior: Prior, seed_frames: Sequence[Frame], gains: np.ndarray | None = None
+    prior: Prior, seed_frames: Sequence[Frame], inset: float = INSET, gains: np.ndarray | None = None
 ) -> tuple[Gaussians, np.ndarray]:
     """One flat Gaussian for each of the N samples of a prior, with a colour averaged over the seed frames that see the sample;
     then one behind each of the first `prior.backed` samples, of the same colour.
 
     A frame sees a sample that lies inside its rock mask, whose normal points towards the camera, and whose depth agrees with
     the depth image, up to `prior.depth_tolerance` and the slope of the surface within a pixel. For a frame without depth image
-    the depth of the prior's mesh is used. A sample that no frame
-    sees is grey. gains: [V,3] of the frames' exposures, by which their colours are divided (`mgs.prior.exposure`).
+    the depth of the prior's mesh is used. A sample that no frame sees is grey.
+    inset: how far below its sample a Gaussian lies, over the spacing. gains: [V,3] of the frames' exposures, by which their
+    colours are divided (`mgs.prior.exposure`).
     Returns (N + backed Gaussians of degree 0, seen [N] bool: which samples some frame sees).
     Raises InputError if a file of a frame cannot be read, and as `mesh_depth` where a frame has no depth image.
     """
@@ -79,7 +84,7 @@ def initial_gaussians(
     rgb = np.where(seen[:, None], total / np.maximum(count, 1)[:, None], GREY)
     scales = np.log(prior.spacing * np.array([IN_PLANE_SCALE, IN_PLANE_SCALE, THICKNESS]))
     surface = Gaussians(
-        means=prior.points.astype(np.float32),
+        means=(prior.points - inset * prior.spacing * prior.normals).astype(np.float32),
         log_scales=np.tile(scales, (n, 1)).astype(np.float32),
         quats=quat_from_normals(prior.normals).astype(np.float32),
         logit_opacities=np.full(n, logit(INITIAL_OPACITY), np.float32),

@@ -21,7 +21,7 @@ from mgs.plotting import STYLE, crop, new_figure, save_figure
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-POLICY_STYLE = {
+POLICY_STYLE: dict[str, tuple[str, str | tuple[int, int, int]]] = {
     "d-optimal": ("#0072B2", "o"),
     "coverage": ("#D55E00", "s"),
     "random": ("#009E73", "^"),
@@ -31,9 +31,15 @@ POLICY_STYLE = {
     "a-optimal": ("#000000", "X"),
     "fisherrf": ("#7f7f7f", "p"),
     "e-optimal": ("#8c510a", "*"),
+    "directional-i": ("#5500bb", "<"),
+    "directional-d": ("#770000", ">"),
+    "paper": ("#335533", "h"),
+    "i-optimal": ("#7755dd", "d"),
+    "block-d": ("#bbbb77", (4, 1, 0)),
+    "angle": ("#553355", (6, 1, 0)),
 }
-"""Colour and marker of each policy, the same in every figure. The colours are those of Okabe and Ito, which colour-blind people
-can tell apart, and grey and brown."""
+"""Colour and marker of each policy, the same in every figure. The first seven colours are those of Okabe and Ito; the others
+were chosen so that colour-blind people can tell them all apart. The markers tell them apart in grey."""
 
 
 def line_styles(labels: Iterable[str]) -> list[dict[str, Any]]:

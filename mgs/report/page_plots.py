@@ -16,9 +16,10 @@ from mgs.data.up import PLUS_Z, Up, upright
 from mgs.gaussians import Gaussians
 from mgs.report.figures import axis_names, line_styles
 
-SYMBOLS = {
+SYMBOLS: dict[str | tuple[int, int, int], str] = {
     "o": "circle", "s": "square", "^": "triangle-up", "D": "diamond", "v": "triangle-down", "P": "cross", "X": "x",
-    "p": "pentagon", "*": "star",
+    "p": "pentagon", "*": "star", "<": "triangle-left", ">": "triangle-right", "h": "hexagon", "d": "diamond-tall",
+    (4, 1, 0): "star-diamond", (6, 1, 0): "hexagram",
 }  # fmt: skip
 """Matplotlib's markers, as `mgs.report.figures.POLICY_STYLE` has them -> Plotly's."""
 

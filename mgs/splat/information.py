@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from mgs.camera import Camera
-from mgs.errors import InputError
+from mgs.errors import InputError, row_named
 from mgs.gaussians import LEARNED, Gaussians
 from mgs.seeds import derive_seed
 from mgs.splat import kernels
@@ -55,9 +55,8 @@ EXACT = ("exact", "block")
 def groups(sh_degree: int, means: str = "frozen") -> dict[str, slice]:
     """Columns of each group of parameters, for colours of this SH degree: "colour", "scale", "rotation", "opacity", and "mean"
     if these are not frozen. Raises InputError if `means` is not a name in `MEANS`."""
-    if means not in MEANS:
-        raise InputError(f"means {means!r} is unknown; choose one of {', '.join(MEANS)}")
-    sizes = {"colour": 3 * (sh_degree + 1) ** 2, "scale": 3, "rotation": 4, "opacity": 1, "mean": MEANS[means]}
+    of_mean = row_named(MEANS, means, "means")
+    sizes = {"colour": 3 * (sh_degree + 1) ** 2, "scale": 3, "rotation": 4, "opacity": 1, "mean": of_mean}
     ends = np.cumsum(list(sizes.values())).tolist()
     return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True) if size}
 
@@ -87,8 +86,7 @@ def fisher(
     Raises InputError for an unknown estimator, where `render` does, for blocks of 2^31 numbers or more, for unusable means,
     normals or alpha_weight, which only the estimators `exact` and `block` know, and with means for too many pairs (`MAX_SUMS`).
     """
-    if estimator not in ESTIMATORS:
-        raise InputError(f"estimator {estimator!r} is unknown; choose one of {', '.join(ESTIMATORS)}")
+    compute = row_named(ESTIMATORS, estimator, "estimator")
     gaussians.check_shapes()
     n, size = len(gaussians), list(groups(gaussians.sh_degree, means).values())[-1].stop
     if not 0 <= alpha_weight <= ALPHA_WEIGHT_MAX:
@@ -105,7 +103,7 @@ def fisher(
             f"fisher: blocks of {n:,} Gaussians of SH degree {gaussians.sh_degree} would take {n * size * size / 2**28:.1f} "
             "GiB, and 8 are the most; take fewer Gaussians, a lower degree, or the estimator `exact`"
         )
-    return ESTIMATORS[estimator](as_drjit(gaussians), camera, background, cache, **options)
+    return compute(as_drjit(gaussians), camera, background, cache, **options)
 
 
 def unit_normals(n: int, normals: Any) -> np.ndarray:

@@ -15,7 +15,6 @@ free test. The rules:
 
 from __future__ import annotations
 
-import csv
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -25,8 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from mgs.errors import InputError
-from mgs.files import atomic_path, read_json
+from mgs.files import read_json
 from mgs.study.sweep import Cell, cell_folder, run_cells
 
 AUTO = "auto"
@@ -74,13 +72,6 @@ PRESETS = {
         ("boulder", "pebbles", "strata", "contact-binary"), (2500, 5000, 10_000, 20_000, 40_000), 320, 240, 32, 12, 12
     ),
 }
-
-
-def preset_named(name: str) -> Preset:
-    """A row of PRESETS. Raises InputError where there is none of this name."""
-    if name not in PRESETS:
-        raise InputError(f"--preset {name}: unknown; choose one of {', '.join(PRESETS)}")
-    return PRESETS[name]
 
 
 def _cell(name: str, task: str, needs: Sequence[str], **arguments: Any) -> Cell:
@@ -259,14 +250,6 @@ def run_study(root: Path, size: Preset, report: Callable[[str, int, int], None])
     for scene in size.scenes:
         scenes[scene] |= {"prior": found[f"prior/{scene}/{AUTO}"], "pruned": found[f"prune/{scene}"]["rows"]}
     return {"rows": rows, "scenes": scenes}
-
-
-def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Write rows, which have the same keys, as a CSV file with a heading; it appears complete."""
-    with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def axes_of(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:

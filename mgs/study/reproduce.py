@@ -11,7 +11,7 @@ from typing import Any
 
 from mgs.errors import InputError
 from mgs.study.statistics import MOST_ROCKS
-from mgs.study.sweep import Cell
+from mgs.study.sweep import Cell, names_of
 
 SCENES = ("boulder", "contact-binary", "low-sun", "pebbles", "strata")
 
@@ -268,25 +268,14 @@ RESULTS = {
 """Every result by its name, in the order in which they are made."""
 
 
-def names_of(only: str | None) -> list[str]:
+def results_of(only: str | None) -> list[str]:
     """The results to make: those named, with commas between, or all that are not optional. In the order of RESULTS.
 
     Raises InputError for a name that is none.
     """
     if only is None:
         return [name for name, result in RESULTS.items() if not result.optional]
-    asked = [name.strip() for name in only.split(",") if name.strip()]
-    for name in asked or [only]:
-        if name not in RESULTS:
-            raise InputError(f"--only {name!r}: is no result; choose of {','.join(RESULTS)}")
-    return [name for name in RESULTS if name in asked]
-
-
-def preset_named(name: str) -> Preset:
-    """A row of PRESETS. Raises InputError if there is none of this name."""
-    if name not in PRESETS:
-        raise InputError(f"--preset {name!r}: unknown; choose one of {', '.join(PRESETS)}")
-    return PRESETS[name]
+    return names_of(only, RESULTS)
 
 
 def rocks_of(name: str, preset: Preset, asked: int | None) -> int:

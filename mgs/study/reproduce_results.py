@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mgs.files import atomic_path, write_json
+from mgs.files import atomic_path, write_csv, write_json
 from mgs.provenance import versions
 from mgs.report.evaluation import evaluate_run
 from mgs.report.writing import write_report
+from mgs.runtime import processor
 from mgs.study import reproduce
 from mgs.study.reproduce import ORACLE, Preset, Run
 from mgs.study.reproduce_figures import curves_figure, pools_figure, seeds_figure
@@ -28,15 +28,6 @@ Rows = list[dict[str, Any]]
 MEASURES = ("test_psnr", "test_psnr_mask")
 """What statistics are made of: mean PSNR over the test views, dB, of the full frame (the first, by which policies are judged),
 and inside the rock's mask."""
-
-
-def write_csv(path: Path, rows: Rows) -> Path:
-    """Write rows with the same keys as CSV; the file appears complete. None is written as nothing."""
-    with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    return path
 
 
 def paired(values: Mapping[int, float], others: Mapping[int, float]) -> list[float]:
@@ -169,7 +160,7 @@ def _write(out: Path, name: str, rows: Rows, markdown: str, command: str, **more
 def write_table(root: Path, out: Path, found: Found, preset: Preset, count: int, command: str) -> list[Path]:
     """table1.csv, .json and .md."""
     rows = table_rows(found, preset)
-    return _write(out, "table1", rows, table_markdown(rows), command)
+    return _write(out, "table1", rows, table_markdown(rows), command, machine=processor())
 
 
 def write_figures(root: Path, out: Path, found: Found, preset: Preset, count: int, command: str) -> list[Path]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from graphlib import TopologicalSorter
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 CELLS = "cells"
 CONNECT_SECONDS = 10
 """How long to wait for a scheduler to answer, and for it to have a worker."""
+
+PRELOAD = "pymeshlab"
+"""A module that workers import before they begin. Where a thread other than the first imports it and then makes a Poisson
+surface, the process aborts when it ends."""
 
 Report = Callable[[str, int, int], None]
 """Called as report(name, done, total) before each cell that is not done yet."""
@@ -47,6 +51,19 @@ class Cell:
     """Names of the cells that must be done before."""
     alone: bool = False
     """Whether its seconds are reported: it is done in this process, while no worker has anything to do."""
+
+
+def names_of(only: str | None, known: Iterable[str]) -> list[str]:
+    """The names that an option --only gives, with commas between, or all where it is None; in the order of those known.
+
+    Raises InputError for a name that is not known, and where there is none.
+    """
+    known = list(known)
+    asked = known if only is None else [name.strip() for name in only.split(",")]
+    for name in asked:
+        if name not in known:
+            raise InputError(f"--only {name!r}: unknown; choose some of {','.join(known)}")
+    return [name for name in known if name in asked]
 
 
 def cell_folder(root: Path, name: str) -> Path:
@@ -133,7 +150,7 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
                 with (
                     LocalCluster(
                         n_workers=workers, threads_per_worker=1, host="127.0.0.1", memory_limit=0,
-                        dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL + 1,
+                        dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL + 1, preload=PRELOAD,
                     ) as cluster,
                     Client(cluster) as client,
                 ):  # fmt: skip

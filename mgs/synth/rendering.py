@@ -18,7 +18,7 @@ from mgs.camera import Camera, opengl_from_opencv
 from mgs.data.dataset import FRAME_INTERVAL, TEST_FOLDER, Dataset, Frame, load_dataset, resumes, write_transforms
 from mgs.data.meshes import GLTF, to_glb
 from mgs.data.rock_image import write_rock_image
-from mgs.errors import InputError
+from mgs.errors import InputError, row_named
 from mgs.files import atomic_path, check_new_folder, check_writable, fingerprint, locked, new_folder, write_json
 from mgs.images import write_exr, write_png
 from mgs.provenance import versions
@@ -63,13 +63,6 @@ class PoseNoise:
 PRESETS = {"quick": Preset(320, 240, 32, 8), "paper": Preset(640, 480, 100, 16)}
 
 
-def preset_named(name: str) -> Preset:
-    """A row of PRESETS. Raises InputError where there is none of this name."""
-    if name not in PRESETS:
-        raise InputError(f"preset {name!r}: unknown; choose one of {', '.join(PRESETS)}")
-    return PRESETS[name]
-
-
 def synthesise(
     out: str | Path,
     scene: SceneFile | str | Path = "boulder",
@@ -99,7 +92,7 @@ def synthesise(
     runtime.start()
     started, out = time.perf_counter(), Path(out)
     settings = scene if isinstance(scene, SceneFile) else load_scene_file(scene)
-    preset = preset_named(preset) if isinstance(preset, str) else preset
+    preset = row_named(PRESETS, preset, "preset") if isinstance(preset, str) else preset
     check_writable(out)
     if (out / "transforms.json").exists() or not (out / "config.json").exists():
         check_new_folder(out)  # before the rock is made, which takes seconds

@@ -248,5 +248,5 @@ def test_loss_gradient_is_not_the_fisher_information():
 
 def test_every_estimator_is_named_and_unknown_ones_are_an_error():
     assert set(ESTIMATORS) == {"exact", "block", "hutchinson", "loss-gradient"}
-    with pytest.raises(InputError, match=r"estimator 'magic' is unknown; choose one of .*exact"):
+    with pytest.raises(InputError, match=r"estimator 'magic': unknown; choose one of .*exact"):
         fisher(make_gaussians(1, 1), make_camera(), "magic")

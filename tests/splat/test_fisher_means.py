@@ -206,7 +206,7 @@ def test_extreme_scenes_give_finite_information(name):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"means": "fixed"}, "means 'fixed' is unknown; choose one of frozen, normal, free"),
+        ({"means": "fixed"}, "means 'fixed': unknown; choose one of frozen, normal, free"),
         ({"means": "normal"}, r"fisher: means='normal' needs normals \[N,3\]"),
         ({"means": "normal", "normals": np.ones((4, 3))}, r"fisher: normals have shape \(4, 3\), expected \(5, 3\)"),
         ({"means": "normal", "normals": np.eye(5, 3)}, "fisher: a normal is zero, NaN or infinite, first at Gaussian 3"),

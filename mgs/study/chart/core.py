@@ -18,7 +18,7 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.gaussians import Gaussians
-from mgs.study.chart.plan import Plan, plan_named
+from mgs.study.chart.plan import PLANS, Plan
 from mgs.study.chart.timing import timed
 from mgs.study.sweep import Cell
 
@@ -153,7 +153,7 @@ def measure(root: Path, out: Path, row: str, preset: str, repeats: int) -> dict[
     from mgs import runtime
 
     runtime.start()
-    plan = plan_named(preset)
+    plan = PLANS[preset]
     what, make = rows_of(plan)[row]
     small = scene(*SMALL)
     found, on_small = _of_one_call(make(small), repeats)

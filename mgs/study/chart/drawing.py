@@ -31,10 +31,6 @@ RUN_FACTORS = {
 """What the right panels show."""
 
 
-def _figure(width: float, height: float) -> Any:
-    return new_figure(width, height)
-
-
 def _points(axes: Any, rows: Rows, y: str, style: int, label: str, x: str = "seconds") -> None:
     """Points with error bars along the time."""
     xs, ys = np.array([row[x] for row in rows]), [row[y] for row in rows]
@@ -117,7 +113,7 @@ def fit_figure(path: str | Path, rows: Rows) -> None:
     counts = Counter(row["images"] for row in rows)
     most = counts.most_common(1)[0][0]
     with matplotlib.rc_context(STYLE | {"legend.fontsize": 7, "legend.title_fontsize": 10}):
-        figure = _figure(10, 8)
+        figure = new_figure(10, 8)
         panels = figure.subplots(2, 2, sharex="col")
         for column, (is_run, factors) in enumerate(((False, FIT_FACTORS), (True, RUN_FACTORS))):
             own = [row for row in rows if bool(row["policy"]) is is_run and row["images"] == most]
@@ -162,7 +158,7 @@ def scoring_figure(path: str | Path, rows: Rows) -> None:
     families = list(dict.fromkeys(row["family"] for row in rows))
     scaled = [row | {f"ms{end}": 1e3 * row[f"seconds{end}"] for end in ("", "_low", "_high")} for row in rows]
     with matplotlib.rc_context(STYLE | {"legend.fontsize": 7}):
-        figure = _figure(11, 5.2)
+        figure = new_figure(11, 5.2)
         panels = figure.subplots(1, 2)
         for axes, metric, label in zip(
             panels,
@@ -190,7 +186,7 @@ def core_figure(path: str | Path, rows: Rows) -> None:
     kinds = list(dict.fromkeys(row["computes"] for row in rows))
     scaled = [row | {f"ms{end}": 1e3 * row[f"seconds{end}"] for end in ("", "_low", "_high")} for row in rows]
     with matplotlib.rc_context(STYLE):
-        figure = _figure(7, 4.6)
+        figure = new_figure(7, 4.6)
         axes = figure.subplots()
         for style, kind in enumerate(kinds):
             _points(axes, [row for row in scaled if row["computes"] == kind], "error", style, kind, "ms")
@@ -216,7 +212,7 @@ def bytes_figure(path: str | Path, rows: Rows) -> None:
     models = [row for row in scaled if row["sent"] == "model" and row["images"] == usual]
     photos = [row for row in scaled if row["sent"] == "images" and row["density"] == DENSITY]
     with matplotlib.rc_context(STYLE | {"legend.fontsize": 7}):
-        figure = _figure(8, 5)
+        figure = new_figure(8, 5)
         axes = figure.subplots()
         for style, n in enumerate(sorted({row["gaussians"] for row in models})):
             _model_lines(axes, [row for row in models if row["gaussians"] == n], style)

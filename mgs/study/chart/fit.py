@@ -14,10 +14,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mgs.active.settings import PRESETS, RATES
+from mgs.active.settings import PASSES, PRESETS, RATES, WARM_PASSES
 from mgs.data.dataset import load_dataset
 from mgs.study.chart.pareto import pareto_front
-from mgs.study.chart.plan import DENSITY, PASSES, SCENE, WARM_PASSES, Data, Plan, synthetic
+from mgs.study.chart.plan import DENSITY, SCENE, Data, Plan, synthetic
 from mgs.study.chart.subject import quality
 from mgs.study.chart.timing import timed
 from mgs.study.sweep import Cell, cell_folder

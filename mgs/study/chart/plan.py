@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from mgs.active.settings import NbvSettings, TrainSettings
-from mgs.errors import InputError
 from mgs.study.sweep import Cell
 
 KINDS = ("fit", "scoring", "core", "bytes", "presets")
@@ -54,21 +52,11 @@ PLANS = {
 DENSITY = 1 / 8
 """Density of the prior of the default point (`mgs.prior.settings.PriorSettings`): about what `mgs demo` has."""
 
-PASSES, WARM_PASSES = TrainSettings().passes, NbvSettings.model_fields["warm_passes"].default
-"""Passes of the default point: those of `mgs nbv`."""
-
 SCENE = "boulder"
 """The scene of the charts."""
 
 OTHER_SCENES = ("contact-binary", "pebbles")
 """The scenes on which the presets are judged."""
-
-
-def plan_named(name: str) -> Plan:
-    """A row of PLANS. Raises InputError where there is none of this name."""
-    if name not in PLANS:
-        raise InputError(f"--preset {name}: unknown; choose one of {', '.join(PLANS)}")
-    return PLANS[name]
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.seeds import generator
-from mgs.study.chart.plan import DENSITY, Data, Plan, plan_named
+from mgs.study.chart.plan import DENSITY, PLANS, Data, Plan
 from mgs.study.chart.timing import timed
 from mgs.study.sweep import Cell, cell_folder
 
@@ -205,7 +205,7 @@ def measure(
     root: Path, out: Path, dataset: str, prior: str, states: str, variant: str, preset: str, repeats: int
 ) -> dict[str, Any]:
     """Time a way to score over all states. Returns times (`timed`) of one candidate, and the scores in each state."""
-    _, score = variants(plan_named(preset))[variant]
+    _, score = variants(PLANS[preset])[variant]
     last = variant.rpartition(" ")[2]
     age = int(last) if variant.startswith(("stale", "lazy")) else min(AGES)
     there = [State(root, dataset, prior, cell_folder(root, states), step, age) for step in STATES]

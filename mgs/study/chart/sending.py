@@ -23,7 +23,7 @@ from mgs.active.criteria import PIXEL_NOISE
 from mgs.data.dataset import load_dataset
 from mgs.gaussians import Gaussians
 from mgs.study.chart.pareto import pareto_front
-from mgs.study.chart.plan import DENSITY, Data, Plan, plan_named
+from mgs.study.chart.plan import DENSITY, PLANS, Data, Plan
 from mgs.study.chart.subject import quality
 from mgs.study.sweep import Cell
 
@@ -129,7 +129,7 @@ def measure(root: Path, out: Path, dataset: str, prior: str, images: int, preset
     ]
     for name, quantiser in QUANTISERS.items():
         steps, told = quantiser(state.H.astype(np.float64), lam)
-        for factor in plan_named(preset).step_sizes:
+        for factor in PLANS[preset].step_sizes:
             received, bytes_ = quantised(model, start, factor * PIXEL_NOISE * steps)
             quality_then = quality(as_gaussians(received, state.gaussians.means), data)
             rows.append({"sent": "model", "quantiser": name, "step": factor, "bytes": bytes_ + told, **quality_then})

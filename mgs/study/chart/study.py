@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from mgs.files import atomic_path, locked, write_json
+from mgs.errors import row_named
+from mgs.files import locked, write_csv, write_json
 from mgs.provenance import versions
 from mgs.study.chart import core, drawing, fit, presets, scoring, sending
-from mgs.study.chart.plan import SCENE, Data, Plan, own, plan_named, synthetic
+from mgs.study.chart.plan import PLANS, SCENE, Data, Plan, own, synthetic
 from mgs.study.chart.subject import test_views_of
 from mgs.study.chart.timing import with_seconds
 from mgs.study.sweep import Cell, run_cells
@@ -34,12 +34,12 @@ def chart(
     Writes KIND.csv of every kind, KIND.png of every chart, and chart.json, which has all rows; kinds that are not asked for are
     left as they are. dataset: in place of the one that is rendered; it needs test views. report(cell, done, total) is told
     before each cell. Returns what chart.json holds.
-    Raises InputError as `plan_named`, `load_dataset` and `run_cells`, and where the dataset has no test views.
+    Raises InputError for an unknown preset, as `load_dataset` and `run_cells`, and where the dataset has no test views.
     """
     from mgs import runtime
     from mgs.data.dataset import load_dataset
 
-    plan = plan_named(preset)
+    plan = row_named(PLANS, preset, "--preset")
     if dataset is not None:
         test_views_of(load_dataset(dataset))
     runtime.start()
@@ -49,11 +49,12 @@ def chart(
     with locked(out):
         found = run_cells(out, list(cells.values()), report)
         unit = float(np.median([result["reference"] for result in found.values() if "reference" in result] or [0.0]))
-        rows = {kind: rows_of(kind, plan, preset, data, out, found, unit, repeats) for kind in kinds}
-        path = out / "chart.json"
-        before = _known(path)
+        commands = {kind: command_of(kind, preset, data, out, repeats) for kind in kinds}
+        rows = {kind: rows_of(kind, plan, data, out, found, unit, commands[kind]) for kind in kinds}
         about = {"preset": preset, "repeats": repeats, "reference_seconds": unit, "machine": runtime.processor()}
-        result = {**before, **{kind: {**about, "rows": made} for kind, made in rows.items()}, "versions": versions()}
+        measured = {kind: {"command": commands[kind], **about, "rows": made} for kind, made in rows.items()}
+        path = out / "chart.json"
+        result = {**_known(path), **measured, "versions": versions()}
         for kind, made in rows.items():
             write_csv(out / f"{kind}.csv", made)
             if kind in drawing.FIGURES:
@@ -83,12 +84,14 @@ def cells_of(kind: str, plan: Plan, preset: str, data: Data, repeats: int) -> li
     return sending.cells(plan, data, preset) if kind == "bytes" else presets.cells(plan, repeats)
 
 
-def rows_of(
-    kind: str, plan: Plan, preset: str, data: Data, root: Path, found: dict[str, Any], unit: float, repeats: int
-) -> Rows:
-    """The rows of a chart, with their command. unit: seconds of the reference."""
-    words = ["mgs", "chart", str(root), "--only", kind, "--preset", preset, "--repeats", str(repeats)]
-    command = shlex.join([*words, *([] if data.cells else ["--dataset", data.folder])])
+def command_of(kind: str, preset: str, data: Data, out: Path, repeats: int) -> str:
+    """The command that measures a chart in the folder `out`."""
+    words = ["mgs", "chart", str(out), "--only", kind, "--preset", preset, "--repeats", str(repeats)]
+    return shlex.join([*words, *([] if data.cells else ["--dataset", data.folder])])
+
+
+def rows_of(kind: str, plan: Plan, data: Data, root: Path, found: dict[str, Any], unit: float, command: str) -> Rows:
+    """The rows of a chart, with a command each. unit: seconds of the reference. command: that of the whole chart."""
     if kind == "fit":
         return fit.with_fronts(with_seconds(fit.rows(plan, data, root, found, bool(data.cells)), unit))
     if kind == "scoring":
@@ -96,11 +99,3 @@ def rows_of(
     if kind == "core":
         return with_seconds(core.rows(plan, found, command), unit)
     return sending.rows(plan, data, found, command) if kind == "bytes" else presets.rows(plan, root, found, unit)
-
-
-def write_csv(path: Path, rows: Rows) -> None:
-    """Write rows of the same keys; the file appears complete."""
-    with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)

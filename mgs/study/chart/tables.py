@@ -6,7 +6,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from mgs.study.chart.plan import DENSITY, PASSES, WARM_PASSES
+from mgs.active.settings import PASSES, WARM_PASSES
+from mgs.study.chart.plan import DENSITY
 
 Rows = list[dict[str, Any]]
 Cells = list[list[str]]
@@ -166,11 +167,10 @@ def chart_table(name: str, data: dict[str, Any]) -> tuple[str, tuple[str, ...], 
     """
     kind, heading, cells = TABLES[name]
     if kind not in data:
-        return "", heading, [], f"Not measured yet: `mgs chart docs/results/chart --only {kind}`."
+        return "", heading, [], f"Not measured yet: `mgs chart OUT --only {kind}`."
     found = data[kind]
     machine = found["machine"]
-    options = f"--only {kind} --preset {found['preset']} --repeats {found['repeats']}"
-    note = f"`mgs chart docs/results/chart {options}` on {machine['threads']} threads ({machine['cpu']})"
+    note = f"`{found['command']}` on {machine['threads']} threads ({machine['cpu']})"
     note += f"; mgs {data['versions']['mgs']}"
     if kind != "bytes":
         note += f"; the reference took {found['reference_seconds']:.2f} s"

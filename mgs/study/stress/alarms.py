@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -75,15 +75,18 @@ def roc_curves(rows: Sequence[Row]) -> list[Row]:
 
 
 def false_alarms(rows: Sequence[Row]) -> list[float]:
-    """For each clean run, 1 where any sign is beyond the limit in `mgs.active.detectors`."""
-    clean = [row for row in rows if row["fault"] == "none"]
-    return [float(any(row.get(f"sign {s}", -np.inf) > d.limit for s, d in DETECTORS.items())) for row in clean]
+    """For each clean run, 1 where it raises an alarm."""
+    return [_alarm(row) for row in rows if row["fault"] == "none"]
 
 
 def caught(rows: Sequence[Row]) -> list[float]:
-    """For each failed run, 1 where any sign is beyond the limit in `mgs.active.detectors`."""
-    failed = [row for row in rows if row["failed"]]
-    return [float(any(row.get(f"sign {s}", -np.inf) > d.limit for s, d in DETECTORS.items())) for row in failed]
+    """For each failed run, 1 where it raises an alarm."""
+    return [_alarm(row) for row in rows if row["failed"]]
+
+
+def _alarm(row: Row) -> float:
+    """1 where any sign is beyond its limit in `mgs.active.detectors`, else 0."""
+    return float(any(row.get(f"sign {sign}", -np.inf) > detector.limit for sign, detector in DETECTORS.items()))
 
 
 def _by_scene(rows: Sequence[Row]) -> dict[str, list[Row]]:
@@ -93,16 +96,15 @@ def _by_scene(rows: Sequence[Row]) -> dict[str, list[Row]]:
     return scenes
 
 
-def _lost(fault: str, size: float) -> Callable[[Sequence[Row]], list[float]]:
-    return lambda rows: single(rows, "lost", {"fault": fault, "size": size})
-
-
 def _harm(fault: str, size: float, words: str, bound: float = 1.0, harmless: bool = False) -> Claim:
     """The claim that a fault of this size costs more, or no more, than the bound."""
     amount = f"at most {bound:g} dB" if harmless else f"{bound:g} dB or more"
     hypothesis = f"{words} costs {amount} on the test views."
-    return Claim(hypothesis, _lost(fault, size), "dB", "below" if harmless else "above", bound, "rock and draw")
+    lost = single("lost", {"fault": fault, "size": size})
+    return Claim(hypothesis, lost, "dB", "below" if harmless else "above", bound, "rock and draw")
 
+
+LOST = Panel("label", "lost", "fault and its size", "PSNR lost on test views (dB)")
 
 DATA_FAULTS = Experiment(
     "Which faults of the images spoil a model?",
@@ -117,7 +119,7 @@ DATA_FAULTS = Experiment(
         _harm("shifted mask", 4.0, "A mask that is off by 4 pixels"),
         _harm("wrong mask", 3.0, "A mask that is 3 pixels too large or too small"),
     ),
-    (Panel("label", "lost", "fault and its size", "PSNR lost on test views (dB)"),),
+    (LOST,),
 )
 
 PRIOR_EXPERIMENT = Experiment(
@@ -132,7 +134,7 @@ PRIOR_EXPERIMENT = Experiment(
         _harm("turned prior", 15.0, "A prior that is turned by 15 degrees"),
         _harm("another rock's prior", 0, "The prior of another rock"),
     ),
-    (Panel("label", "lost", "fault and its size", "PSNR lost on test views (dB)"),),
+    (LOST,),
 )
 
 
@@ -159,7 +161,7 @@ ALARMS = Experiment(
     ),
     (
         Panel("false alarms", "caught", "good runs with an alarm (share)", "failed runs with an alarm (share)", "sign"),
-        Panel("label", "failed", "fault and its size", "runs that failed (share)"),
+        Panel("fault", "failed", "fault, at all its sizes", "runs that failed (share)"),
     ),
     roc_curves,
 )  # fmt: skip

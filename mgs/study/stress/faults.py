@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from mgs.active import detectors
 from mgs.active.criteria import coverage
 from mgs.active.loop import target_of
+from mgs.active.settings import PASSES
 from mgs.camera import Camera
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data.dataset import Frame
@@ -225,7 +226,7 @@ ONE_POSE = (1.0, 4.0)
 """Degrees of `pose_noise` in a single view."""
 
 
-def signs_of(lab: Lab, taken: Sequence[int], passes: int = 20, means: str = "frozen") -> tuple[Any, dict[str, float]]:
+def signs_of(lab: Lab, taken: Sequence[int], passes: int = PASSES, means: str = "frozen") -> tuple[Any, dict[str, float]]:
     """A fit, and the signs that the loop would have of it after its first step."""
     start = lab.start(taken)
     found = lab.fit(taken, passes, means, with_prior=means == "frozen", start=start)

@@ -16,7 +16,7 @@ from mgs.active.criteria import MEAN_STD, PRIOR_STD, Score, d_optimal, regularis
 from mgs.active.fitting import Fit, fit
 from mgs.active.loop import target_of
 from mgs.active.pose_policies import seed_views
-from mgs.active.settings import MEAN_RATE, RATES, TrainSettings
+from mgs.active.settings import MEAN_RATE, PASSES, RATES, WARM_PASSES, TrainSettings
 from mgs.active.stations import psnr_measure
 from mgs.camera import Camera
 from mgs.data.dataset import Frame, load_dataset
@@ -134,7 +134,7 @@ class Lab:
     def fit(
         self,
         taken: Sequence[int],
-        passes: int = 20,
+        passes: int = PASSES,
         means: str = "frozen",
         with_prior: bool = True,
         model: Gaussians | None = None,
@@ -201,7 +201,7 @@ def agreement(mine: Array, reference: Array) -> dict[str, float]:
 
 
 def greedy(lab: Lab, taken: Sequence[int], allowed: Sequence[int], count: int, policy: str = "d-optimal") -> list[int]:
-    """Views after `count` steps of the loop, first fit 20 passes, later ones 10, candidates only among `allowed`.
+    """Views after `count` steps of the loop, fitted as `mgs nbv` does by default, candidates only among `allowed`.
 
     policy: "d-optimal" or a row of `mgs.active.pose_policies.POSE_POLICIES`.
     """
@@ -213,7 +213,7 @@ def greedy(lab: Lab, taken: Sequence[int], allowed: Sequence[int], count: int, p
     for step in range(count):
         left = [i for i in allowed if i not in views]
         if policy == "d-optimal":
-            model = lab.fit(views, 20 if step == 0 else 10, model=model, start=start).gaussians
+            model = lab.fit(views, PASSES if step == 0 else WARM_PASSES, model=model, start=start).gaussians
             scores = lab.scores(model, views, left)
         else:
             rng = generator(0, f"stress/{policy}/{step}")

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from mgs.errors import InputError
-from mgs.files import atomic_path, write_json
-from mgs.plotting import save_figure
+from mgs.files import atomic_path, write_csv, write_json
 from mgs.provenance import versions
 from mgs.runtime import processor
 from mgs.study.stress.alarms import ALARMS, DATA_FAULTS, PRIOR_EXPERIMENT
 from mgs.study.stress.convergence import CONVERGENCE
 from mgs.study.stress.endurance import ENDURANCE
 from mgs.study.stress.experiment import Experiment
-from mgs.study.stress.lab import PRESETS, Preset, scene_cell
+from mgs.study.stress.lab import Preset, scene_cell
 from mgs.study.stress.numbers import NUMBERS
 from mgs.study.stress.numerics import NUMERICS
-from mgs.study.stress.picture import experiment_figure
+from mgs.study.stress.picture import draw_experiment
 from mgs.study.stress.scales import SCALES
 from mgs.study.stress.scenes import SCENES
 from mgs.study.stress.verdict import Row, effect, judged
@@ -39,21 +36,6 @@ EXPERIMENTS: dict[str, Experiment] = {
     "detectors": ALARMS,
     "scenes": SCENES,
 }
-
-
-def chosen(names: Sequence[str]) -> list[str]:
-    """The experiments to do, in the order of EXPERIMENTS; none named: all. Raises InputError for an unknown name."""
-    for name in names:
-        if name not in EXPERIMENTS:
-            raise InputError(f"--only {name}: unknown; choose from {', '.join(EXPERIMENTS)}")
-    return [name for name in EXPERIMENTS if not names or name in names]
-
-
-def preset_named(name: str) -> Preset:
-    """A row of PRESETS. Raises InputError where there is none of this name."""
-    if name not in PRESETS:
-        raise InputError(f"--preset {name}: unknown; choose one of {', '.join(PRESETS)}")
-    return PRESETS[name]
 
 
 def run_stress(
@@ -96,23 +78,14 @@ def write_results(out: Path, rows: dict[str, list[Row]], command: str) -> dict[s
         experiment = EXPERIMENTS[name]
         claims = [judged(claim, of_one) for claim in experiment.claims]
         experiments.append({"name": name, "question": experiment.question, "claims": claims})
-        save_figure(experiment_figure(experiment, of_one), out / f"{name}.png")
+        draw_experiment(out / f"{name}.png", experiment, of_one)
     verdicts = {"experiments": experiments, "command": command, "machine": processor(), "versions": versions()}
-    _write_csv(out / "stability.csv", rows)
+    flat = [{"experiment": name} | row for name, of_one in rows.items() for row in of_one]
+    write_csv(out / "stability.csv", flat)
     with atomic_path(out / "stability.md") as temporary:
         temporary.write_text(table(verdicts), encoding="utf-8")
     write_json(out / "verdicts.json", verdicts)
     return verdicts
-
-
-def _write_csv(path: Path, rows: dict[str, list[Row]]) -> None:
-    """One line for each row of every experiment; columns that an experiment does not have stay empty."""
-    flat = [{"experiment": name} | row for name, of_one in rows.items() for row in of_one]
-    columns = list(dict.fromkeys(key for row in flat for key in row))
-    with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns)
-        writer.writeheader()
-        writer.writerows(flat)
 
 
 def table(verdicts: dict[str, Any]) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 from mgs.study.stress.experiment import Experiment, Panel, rock_cell, turns
 from mgs.study.stress.lab import Preset, greedy, open_lab
-from mgs.study.stress.verdict import Claim, paired
+from mgs.study.stress.verdict import Claim, Effects, paired
 from mgs.study.sweep import Cell
 
 POLICIES = ("d-optimal", "uniform", "random")
@@ -33,9 +33,8 @@ def _cells(preset: Preset) -> list[Cell]:
     return [rock_cell("scenes", f"{__name__}:scenes", preset, *rock, kind=kind, turns_=preset.turns) for rock, kind in kinds]
 
 
-def _difference(kind: str, other: str) -> Any:
-    one = {"kind": kind, "policy": "d-optimal"}
-    return lambda rows: paired(rows, "psnr", one, {"kind": kind, "policy": other})
+def _difference(kind: str, other: str) -> Effects:
+    return paired("psnr", {"kind": kind, "policy": "d-optimal"}, {"kind": kind, "policy": other})
 
 
 SCENES = Experiment(

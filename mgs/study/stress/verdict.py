@@ -20,6 +20,9 @@ LEVEL = 0.95
 
 Row = dict[str, Any]
 
+Effects = Callable[[Sequence[Row]], list[float]]
+"""From the rows of an experiment to one number per run."""
+
 
 class Outcome(StrEnum):
     """What the numbers say of a claim."""
@@ -33,12 +36,12 @@ class Outcome(StrEnum):
 class Claim:
     """A hypothesis that was fixed before its numbers were seen.
 
-    hypothesis: a sentence. effects: from the rows of an experiment to one number per run. unit: of these numbers. side, bound:
+    hypothesis: a sentence. effects: the numbers. unit: of these numbers. side, bound:
     the hypothesis in numbers: the mean effect is "above" the bound (or equal) or "below" it (or equal). over: what a run is.
     """
 
     hypothesis: str
-    effects: Callable[[Sequence[Row]], list[float]]
+    effects: Effects
     unit: str
     side: Literal["above", "below"]
     bound: float
@@ -89,14 +92,14 @@ def effect(claim: dict[str, Any]) -> str:
     return f"{claim['effect']:.3g}{between} {claim['unit']}"
 
 
-def paired(rows: Sequence[Row], value: str, one: Row, other: Row) -> list[float]:
-    """`value` of the rows that agree with `one`, minus that of the rows that agree with `other`, run by run."""
-    return [_value(rows, value, one, run) - _value(rows, value, other, run) for run in runs_of(rows, one, other)]
+def paired(value: str, one: Row, other: Row) -> Effects:
+    """Effects: `value` of the rows that agree with `one`, minus that of the rows that agree with `other`, run by run."""
+    return lambda rows: [_value(rows, value, one, run) - _value(rows, value, other, run) for run in runs_of(rows, one, other)]
 
 
-def single(rows: Sequence[Row], value: str, one: Row) -> list[float]:
-    """`value` of the rows that agree with `one`, run by run."""
-    return [_value(rows, value, one, run) for run in runs_of(rows, one)]
+def single(value: str, one: Row) -> Effects:
+    """Effects: `value` of the rows that agree with `one`, run by run."""
+    return lambda rows: [_value(rows, value, one, run) for run in runs_of(rows, one)]
 
 
 def runs_of(rows: Sequence[Row], *wanted: Row) -> list[str]:

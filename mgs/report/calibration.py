@@ -1,0 +1,130 @@
+"""Are predicted errors true? Pure functions: errors and the standard deviations that were predicted for them, both [n].
+
+AUSE and the calibration follow the usual definitions for uncertainty maps (sparsification curves; probability integral
+transform; continuous ranked probability score of a normal distribution).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import ndtr
+from scipy.stats import norm, spearmanr
+
+Array = NDArray[np.floating]
+
+LEVELS = (0.5, 0.9)
+"""Shares of the errors that the intervals shall hold."""
+
+STEPS = 100
+"""Points of a sparsification curve: 0, 1, ... 99 % of the pixels are left out."""
+
+BINS = 20
+"""Of the histogram of the probability integral transform."""
+
+NORMAL = {level: float(norm.ppf(0.5 + level / 2)) for level in LEVELS}
+"""Half-widths of intervals of a normal distribution, standard deviations."""
+
+
+def sparsification(errors: Array, sigma: Array) -> Array:
+    """Mean error of the pixels that are left when those of the largest sigma are left out, over the mean of all, [STEPS].
+
+    errors: [n], 0 or more. Where all errors are 0 the curve is 0.
+    """
+    total = errors.sum()
+    if total == 0:
+        return np.zeros(STEPS)
+    left_out = (np.arange(STEPS) * len(errors)) // STEPS
+    sums = np.concatenate([[0.0], np.cumsum(errors[np.argsort(-sigma, kind="stable")], dtype=np.float64)])
+    curve: Array = (total - sums[left_out]) / (len(errors) - left_out) * (len(errors) / total)
+    return curve
+
+
+def ause(errors: Array, sigma: Array) -> float:
+    """Area between the sparsification curve by sigma and the best one, by the errors themselves. errors: [n], 0 or more."""
+    return float((sparsification(errors, sigma) - sparsification(errors, errors)).mean())
+
+
+def ause_of_constant(errors: Array) -> float:
+    """AUSE of a sigma that tells no pixel from another, which leaves out pixels at random: its curve is 1 in the mean."""
+    return float((1 - sparsification(errors, errors)).mean())
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """How terms of a predicted variance are weighed, and how wide intervals are.
+
+    weights: by the name of a term, and "noise", a variance. widths: half-width of the interval of each of LEVELS, in sigmas.
+    """
+
+    weights: Mapping[str, float]
+    widths: Mapping[float, float]
+
+    def sigma(self, terms: Mapping[str, Array]) -> Array:
+        """Standard deviations of the errors, of the shape of each term."""
+        named = [weight * terms[name] for name, weight in self.weights.items() if name != "noise"]
+        variance: Array = np.sqrt(sum(named, np.full(1, self.weights["noise"])))
+        return variance
+
+
+def fit_calibration(terms: Mapping[str, Array], errors: Array) -> Calibration:
+    """Weights that make the errors most probable, if they are normal with the weighted sum of the terms as their variance.
+
+    terms: name -> [n], variances; errors: [n], signed. The widths are the quantiles of |error| / sigma, so that long tails do
+    not need to be normal.
+    """
+    columns = np.stack([*terms.values(), np.ones(len(errors))], axis=1).astype(np.float64)
+    scale = np.maximum(columns.mean(axis=0), np.finfo(np.float32).tiny)
+    columns, squares = columns / scale, np.square(errors, dtype=np.float64)
+    unit = max(float(squares.mean()), np.finfo(np.float32).tiny)
+
+    def loss(logs: Array) -> tuple[float, Array]:
+        weights = np.exp(logs)
+        variance = columns @ weights
+        slope = columns.T @ (1 / variance - squares / unit / variance**2) / len(squares)
+        return float((np.log(variance) + squares / unit / variance).mean()), weights * slope
+
+    count = columns.shape[1]
+    first = np.full(count, -np.log(count))
+    found = minimize(loss, first, jac=True, method="L-BFGS-B", bounds=[(-16.0, 4.0)] * count).x
+    weights = dict(zip([*terms, "noise"], (np.exp(found) * unit / scale).tolist(), strict=True))
+    z = np.abs(errors) / Calibration(weights, {}).sigma(terms)
+    return Calibration(weights, {level: float(np.quantile(z, level)) for level in LEVELS})
+
+
+def judged(errors: Array, sigma: Array, widths: Mapping[float, float], rng: np.random.Generator) -> dict[str, Any]:
+    """How well sigma [n] predicted the signed errors [n].
+
+    ause: for absolute and squared errors ("mae", "mse"), with that of a constant sigma, and of this sigma if it were perfect:
+    on errors drawn from it. spearman, pearson: of sigma with the absolute error. held: share of the errors inside the interval
+    of each of LEVELS, over all pixels and over thirds of them by sigma. crps: mean, of normal distributions, and that of one
+    sigma for all. pit: shares of the probability integral transform in BINS bins.
+    """
+    drawn = sigma * rng.standard_normal(len(sigma))
+    areas = {
+        name: {"ause": ause(of(errors), sigma), "constant": ause_of_constant(of(errors)), "perfect": ause(of(drawn), sigma)}
+        for name, of in (("mae", np.abs), ("mse", np.square))
+    }
+    z, order = errors / sigma, np.argsort(sigma, kind="stable")
+    parts = (order, *np.array_split(order, 3))
+    held = {str(level): [float((np.abs(z[part]) <= width).mean()) for part in parts] for level, width in widths.items()}
+    rms = float(np.sqrt(np.square(errors).mean()))
+    return {
+        "count": len(errors), "rms": rms, "mean_sigma": float(np.sqrt(np.square(sigma).mean())), "ause": areas,
+        "spearman": float(spearmanr(sigma, np.abs(errors)).statistic) if np.ptp(sigma) > 0 else 0.0,
+        "pearson": float(np.corrcoef(sigma, np.abs(errors))[0, 1]) if np.ptp(sigma) > 0 else 0.0,
+        "held": held, "crps": crps(errors, sigma), "crps_constant": crps(errors, np.full(len(errors), max(rms, 1e-30))),
+        "pit": (np.histogram(ndtr(z), BINS, (0, 1))[0] / len(z)).tolist(),
+    }  # fmt: skip
+
+
+def crps(errors: Array, sigma: Array) -> float:
+    """Mean continuous ranked probability score of normal distributions around 0, in the unit of the errors (the smaller, the
+    better)."""
+    z = errors / sigma
+    return float((sigma * (z * (2 * ndtr(z) - 1) + 2 * norm.pdf(z) - 1 / np.sqrt(np.pi))).mean())

@@ -1,0 +1,1 @@
+"""What makes the tables of tools/tables.py, by where their numbers are."""

@@ -1,0 +1,337 @@
+"""Tables of docs/benchmarks/*.json.
+
+Most of these files say which command wrote them; demo.json and policies.json are demo/report/table.json after `make demo`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from mgs.bench.core import TARGETS
+from mgs.bench.fit import TARGETS as FIT_TARGETS
+from mgs.report.tables import markdown_table, table_cell
+from table_makers.markdown import made_by, markdown, short
+
+
+def demo(rows: list[dict[str, Any]]) -> str:
+    """The columns of the demo's table that the README shows."""
+    headings = {
+        "policy": "policy",
+        "test.psnr": "test views",
+        "test.psnr_mask": "test views, rock",
+        "all.psnr": "all views",
+        "held_out.psnr": "held out",
+        "held_out.psnr_mask": "held out, rock",
+        "coverage": "coverage (%)",
+    }
+    return _shown(headings, rows)
+
+
+def _shown(headings: dict[str, str], rows: list[dict[str, Any]]) -> str:
+    """The columns of the reports' rows that have a heading; of a dataset without test views, none of these."""
+    keys = [key for key in headings if key in rows[0]]
+    return markdown([headings[key] for key in keys], [[table_cell(key, row[key]) for key in keys] for row in rows])
+
+
+def demo_report(rows: list[dict[str, Any]]) -> str:
+    """`table.md` of the demo's report."""
+    return markdown_table(rows)
+
+
+def policies(rows: list[dict[str, Any]]) -> str:
+    """More policies on the demo's dataset, compared inside the rock's mask too."""
+    headings = {
+        "policy": "policy",
+        "test.psnr": "test views",
+        "test.psnr_mask": "test views, rock only",
+        "all.psnr": "all views",
+        "all.psnr_mask": "all, rock only",
+        "held_out.psnr": "held out",
+        "held_out.psnr_mask": "held out, rock only",
+        "held_out.ssim_mask": "SSIM, held out, rock only",
+    }
+    return _shown(headings, rows)
+
+
+def splat(data: dict[str, Any]) -> str:
+    """Times of `mgs bench splat`, ratios to the peer or to a gradient, and what is asked for."""
+    seconds, figures, scene = data["seconds"], data["figures"], data["scene"]
+    rows = []
+    for name, own, peer, figure in (
+        ("forward, warm", "forward_warm", "volprim_forward", "forward_warm_speedup"),
+        ("forward, cold (a view never seen before)", "forward_cold", "volprim_forward", "forward_cold_speedup"),
+        ("forward + adjoint, warm", "gradient_warm", "volprim_gradient", "gradient_warm_speedup"),
+        ("exact Fisher diagonal, warm, over forward + adjoint", "fisher_exact", None, "fisher_over_gradient"),
+        ("exact 11x11 blocks, warm, over forward + adjoint", "fisher_block", None, "block_fisher_over_gradient"),
+    ):
+        bound, target = TARGETS[figure]
+        times = [f"{1e3 * seconds[own]:.1f} ms", f"{1e3 * seconds[peer]:.0f} ms" if peer else ""]
+        rows.append([name, *times, f"{figures[figure]:.{0 if peer else 2}f}", f"{bound} {target:g}"])
+    bound, target = TARGETS["tiny_forward_ms"]
+    tiny = f"{figures['tiny_forward_ms']:.2f} ms"
+    rows.append(["forward, 1,000 Gaussians, 64x48, warm", tiny, "", "", f"{bound} {target:g} ms"])
+    title = f"{scene['gaussians']:,} Gaussians of a rock, {scene['width']}x{scene['height']}"
+    return markdown([title, "mgs", "`volprim_rf_basic`", "ratio", "asked for"], rows) + made_by(data)
+
+
+def splat_short(data: dict[str, Any]) -> str:
+    """The times of `splat` alone, and how many times as long Mitsuba's own integrator takes."""
+    seconds, figures, scene = data["seconds"], data["figures"], data["scene"]
+    rows = []
+    for name, own, figure in (
+        ("forward, warm", "forward_warm", "forward_warm_speedup"),
+        ("forward, a view never seen before", "forward_cold", "forward_cold_speedup"),
+        ("forward + adjoint, warm", "gradient_warm", "gradient_warm_speedup"),
+        ("exact Fisher diagonal, warm", "fisher_exact", None),
+        ("exact 11x11 blocks, warm", "fisher_block", None),
+    ):
+        rows.append([name, f"{1e3 * seconds[own]:.1f} ms", f"{figures[figure]:.0f} times" if figure else ""])
+    title = f"{scene['gaussians']:,} Gaussians, {scene['width']}x{scene['height']}"
+    return markdown([title, "mgs", "Mitsuba over mgs"], rows) + made_by(data)
+
+
+def splat_work(data: dict[str, Any]) -> str:
+    """Work and memory of the same run."""
+    peak, share = f"{data['peak_gflops_measured']:.0f} Gflop/s", data["share_of_peak"]
+    rows = [
+        ["(splat, block) pairs", f"{data['pairs']:,}"],
+        ["pixels of pairs a second, forward", f"{data['pixel_splat_pairs_per_second']['forward'] / 1e9:.1f} billion"],
+        [f"share of the measured FMA rate ({peak}), forward", f"{share['forward']:.0%}"],
+        ["share of the measured FMA rate, exact Fisher", f"{share['fisher_exact']:.0%}"],
+        ["block lists of a camera", f"{data['list_megabytes']:.0f} MB"],
+        ["most memory of the process, before the peer is loaded", f"{data['peak_memory_megabytes']:.0f} MB"],
+    ]
+    return markdown(["in the same run", ""], rows)
+
+
+def scaling(data: dict[str, Any]) -> str:
+    """Exponents of growth, and times as sums of what grows linearly."""
+    costs, start = data["linear_growth"], f"{data['exponents_from_n']:,}"
+    exponents = {
+        "exponent against pairs, N and the image growing together": "pairs alone",
+        "as the image grows alone": "pairs, image growing",
+        f"as N grows alone, from {start}": "pairs, N growing",
+    }
+    fits = {"fit: ns per pair": "ns per pair", "ns per Gaussian": "ns per Gaussian", "constant, ms": "constant, ms"}
+    rows = [[name, *(f"{data['exponents'][what][key]:.2f}" for what in costs)] for name, key in exponents.items()]
+    rows += [[name, *(f"{cost[key]:.{int('ms' in name)}f}" for cost in costs.values())] for name, key in fits.items()]
+    rows.append(["worst deviation", *(f"{cost['worst deviation']:.0%}" for cost in costs.values())])
+    return markdown(["", *costs], rows) + made_by(data)
+
+
+def block_accuracy(data: dict[str, Any]) -> str:
+    """Errors of block entries against the float64 oracle."""
+    error = data["error_over_sqrt_HiiHjj"]
+    rows = [
+        ["entries beyond the tolerance of the tests", f"{data['entries_beyond_tolerance']:,}"],
+        ["worst relative error", short(data["worst_relative_error"], 2)],
+        ["error over sqrt(H_ii H_jj), median", short(error["median"])],
+        ["error over sqrt(H_ii H_jj), 99th percentile", short(error["p99"])],
+        ["error over sqrt(H_ii H_jj), worst", short(error["max"])],
+    ]
+    title = f"{data['entries']:,} entries of blocks, {data['scenes']:,} random scenes"
+    return markdown([title, "measured"], rows) + made_by(data)
+
+
+def hutchinson(data: dict[str, Any]) -> str:
+    """Error of the estimator against the number of probes."""
+    mean = [sum(column) / len(column) for column in zip(*data["relative_l2"], strict=True)]
+    rows = [[f"relative L2 error, mean of {len(data['relative_l2'])} seeds", *(f"{value:.2f}" for value in mean)]]
+    slope = f"Growth with k: exponent {data['slope']:.2f}, expected -0.50."
+    return markdown(["probes k", *map(str, data["probes"])], rows) + f"\n{slope}\n" + made_by(data)
+
+
+def render_settings(data: dict[str, Any]) -> str:
+    """PSNR and cost of path-traced frames, plain and denoised."""
+    plain, denoised = ([row for row in data["settings"] if row["denoise"] is flag] for flag in (False, True))
+    rows = [
+        [str(a["spp"]), *(text for row in (a, b) for text in (f"{row['psnr_rock']:.1f} dB", f"{row['cpu_seconds']:.1f}"))]
+        for a, b in zip(plain, denoised, strict=True)
+    ]
+    heading = ["samples a pixel", "plain: PSNR on the rock", "CPU seconds", "denoised: PSNR on the rock", "CPU seconds"]
+    return markdown(heading, rows) + made_by(data)
+
+
+def lambda_ranking(data: dict[str, Any]) -> str:
+    """Rank correlation and choice for some of the lambdas."""
+    named = {("default times", power): f"default x 10^{power}" for power in (-8, -4, -2, 0, 1, 2, 4, 8)}
+    named |= {("single", power): f"10^{power} for all parameters" for power in (-12, -3, 0)}
+    named |= {("default times", 0): "default", ("single", 0): "1 for all parameters"}
+    found = {(row["kind"], round(math.log10(row["value"]))): row for row in data["rows"]}
+    rows = [[name, f"{found[key]['spearman']:.2f}", found[key]["chosen"]] for key, name in named.items()]
+    return markdown(["lambda", "Spearman with the default", "chosen view"], rows)
+
+
+def depth_error(data: dict[str, Any]) -> str:
+    """Shares of the rock's pixels that are drawn too deep, or not whole."""
+    deep, deeper = (f"{100 * limit:.0f} cm" for limit in data["too_deep"])
+    heading = ["", f"expected depth more than {deep} too deep", f"more than {deeper}", f"opacity below {data['opaque']}"]
+    return markdown(heading, [[name, *(f"{100 * share:.1f} %" for share in row)] for name, row in data["shares"].items()])
+
+
+def exposure(data: dict[str, Any]) -> str:
+    """Fits to photographs of differing exposure, without gains and with them."""
+    rows = []
+    for row in data["records"]:
+        cells = [f"{row['stops']:g}", "estimated" if row["exposure"] else "none"]
+        cells += [f"{row[key]:.2f}" for key in ("psnr_mask_corrected", "psnr_mask")]
+        rows.append([*cells, f"{row['gain_rms']:.1%}, {row['gain_worst']:.1%}" if row["exposure"] else ""])
+    heading = ["stops", "gains", "exposure fitted to each view, dB", "as it is, dB", "error of gains, rms and worst"]
+    return markdown(heading, rows) + made_by(data)
+
+
+def photo_memory(data: dict[str, Any]) -> str:
+    """Most memory of each station for photographs of 12 megapixels."""
+    rows = [[f"`{r['station']}`", f"{r['photographs']}", f"{r['gigabytes']:.1f} GB"] for r in data["records"]]
+    return markdown(["station", "photographs", "most memory"], rows) + made_by(data)
+
+
+def own_data(data: dict[str, Any]) -> str:
+    """Held-out quality from strangers' data, and what is lost against the exact prior."""
+    rows = []
+    for row in data["records"]:
+        cells = [f"{row[key]:.2f} ({row[loss]:+.2f})" for key, loss in (("psnr", "loss"), ("psnr_rock", "loss_rock"))]
+        overlaps = (row.get(key) for key in ("masks_overlap_unrefined", "masks_overlap"))
+        overlap = ", ".join("" if value is None else f"{value:.3f}" for value in overlaps).strip(", ")
+        cells += [f"{1e3 * row['accuracy']:.0f} mm", overlap]
+        rows.append([f"{row['kind']}: {row['from']}, masks {row['masks']}", *cells])
+    heading = [
+        "data, prior from",
+        "all pixels, dB",
+        "inside the rock, dB",
+        "accuracy",
+        "overlap of made masks, before and after",
+    ]
+    return markdown(heading, rows) + made_by(data)
+
+
+def backing(data: dict[str, Any]) -> str:
+    """Held-out quality and see-through of fits with and without Gaussians behind the surface."""
+    found = {(row["gaussians"], row["passes"], row["backing"]): row for row in data["records"]}
+    rows = []
+    for n, passes in dict.fromkeys((n, passes) for n, passes, _ in found):
+        without, with_ = found[n, passes, 0.0], found[n, passes, 0.5]
+        cells = [f"{row['psnr_inside']:.2f} dB" for row in (without, with_)]
+        cells += [f"{100 * row[key]:.1f} %" for key in ("too_deep", "see_through") for row in (without, with_)]
+        rows.append([f"{n:,}, {passes} passes", *cells])
+    heading = [
+        "Gaussians",
+        "PSNR, all on the surface",
+        "a third behind",
+        "too deep",
+        "a third behind",
+        "see-through",
+        "a third behind",
+    ]
+    return markdown(heading, rows) + made_by(data)
+
+
+def ranking(data: dict[str, Any]) -> str:
+    """Agreement of rankings after short fits with those after the longest, mean over the states."""
+    rows, passes = [], sorted({r["passes"] for r in data["rows"]})[:-1]
+    for criterion in dict.fromkeys(r["criterion"] for r in data["rows"]):
+        cells = []
+        for count in passes:
+            of = [r for r in data["rows"] if (r["criterion"], r["passes"]) == (criterion, count)]
+            tau, regret = (sum(r[key] for r in of) / len(of) for key in ("tau", "regret"))
+            cells.append(f"{tau:.2f} / {100 * regret:.1f} %")
+        rows.append([criterion, *cells])
+    return markdown(["criterion", *(f"{count} passes" for count in passes)], rows) + made_by(data)
+
+
+def linearity(data: dict[str, Any]) -> str:
+    """Departure from linear of moves of several sizes; of added views the mean."""
+    records = data["records"]
+    factors = sorted({r["factor"] for r in records})
+    rows = []
+    for passes in dict.fromkeys(r["passes"] for r in records):
+        for move in dict.fromkeys(r["move"] for r in records):
+            cells = []
+            for factor in factors:
+                of = [r["departure"] for r in records if (r["passes"], r["move"], r["factor"]) == (passes, move, factor)]
+                cells.append(f"{sum(of) / len(of):.2g}" if of else "")
+            rows.append([f"{move}, after {passes} passes", *cells])
+    return markdown(["move", *(f"times {factor:g}" for factor in factors)], rows) + made_by(data)
+
+
+def prior_std(data: dict[str, Any]) -> str:
+    """Quality and shape of the surface against the prior's standard deviations."""
+    rows = []
+    for r in data["records"]:
+        which = "" if len(r["kinds"]) == 4 else f" for {' and '.join(r['kinds'])}"
+        cells = [f"{r[key]:.2f}" for key in ("psnr", "psnr_inside", "test_psnr", "test_psnr_inside")]
+        cells += [f"{100 * r[key]:.1f} %" for key in ("too_deep_3", "see_through", "needles")]
+        rows.append([f"tau x {r['factor']:g}{which}, {r['passes']} passes", *cells])
+    heading = ["", "held out, dB", "inside", "test views", "inside", "too deep", "see-through", "needles"]
+    return markdown(heading, rows) + made_by(data)
+
+
+def optimisers(data: dict[str, Any]) -> str:
+    """Objective and quality by the number of passes, cold and warm."""
+    rows = []
+    for begin in ("cold", "warm"):
+        for row in dict.fromkeys(r["row"] for r in data["records"]):
+            found = [r for r in data["records"] if (r["start"], r["row"]) == (begin, row)]
+            cells = "; ".join(f"{r['passes']:.0f}: {r['phi']:.0f}, {r['psnr_inside']:.2f}" for r in found)
+            rows.append(f"| {begin} | {row} | {cells} |\n")
+    return "| start | optimiser | passes: Phi, PSNR inside (dB) |\n| --- | --- | --- |\n" + "".join(rows) + made_by(data)
+
+
+def fit(data: dict[str, Any]) -> str:
+    """What a fit comes to, beside what is asked for."""
+    rows = []
+    for name, (bound, target) in FIT_TARGETS.items():
+        value = data["figures"][name]
+        measured = "not reached" if value is None else f"{value:.3g}"
+        rows.append([name.replace("_", " "), measured, f"{bound} {target:.3g}"])
+    return markdown(["figure", "measured", "asked for"], rows) + made_by(data)
+
+
+def means(data: dict[str, Any]) -> str:
+    """PSNR inside the rock and distance from the true surface, by how the means are learned and how noisy the prior is."""
+    rows = []
+    for views, noise in dict.fromkeys((r["views"], r["noise"]) for r in data["records"]):
+        found = {r["means"]: r for r in data["records"] if (r["views"], r["noise"]) == (views, noise)}
+        before = f"{1e3 * found['frozen']['distance_before']:.1f} mm"
+        cells = [f"{found[m]['psnr_inside']:.2f} dB, {1e3 * found[m]['distance_after']:.1f} mm" for m in found]
+        rows.append([f"{views} views, noise of {noise:g} spacings", before, *cells])
+    return markdown(["", "prior", *found], rows) + made_by(data)
+
+
+def residual(data: dict[str, Any]) -> str:
+    """Quality against the weights of pixels in the fit."""
+    rows = [
+        [f"{r['power']:g}, {r['background']}", *(f"{r[key]:.2f}" for key in ("psnr", "psnr_mask", "psnr_inside"))]
+        for r in data["records"]
+    ]
+    return markdown(["power, background", "full frame", "mask", "inside"], rows) + made_by(data)
+
+
+TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "ranking": ("benchmarks/ranking", ranking),
+    "linearity": ("benchmarks/linearity", linearity),
+    "residual": ("benchmarks/residual", residual),
+    "prior-std": ("benchmarks/prior_std", prior_std),
+    "optimisers": ("benchmarks/optimisers", optimisers),
+    "fit": ("benchmarks/fit", fit),
+    "means": ("benchmarks/means", means),
+    "demo": ("benchmarks/demo", demo),
+    "demo-report": ("benchmarks/demo", demo_report),
+    "policies": ("benchmarks/policies", policies),
+    "splat": ("benchmarks/splat", splat),
+    "splat-short": ("benchmarks/splat", splat_short),
+    "splat-work": ("benchmarks/splat", splat_work),
+    "scaling": ("benchmarks/scaling", scaling),
+    "block-accuracy": ("benchmarks/block_accuracy", block_accuracy),
+    "hutchinson": ("benchmarks/hutchinson", hutchinson),
+    "render-settings": ("benchmarks/render_settings", render_settings),
+    "lambda-ranking": ("benchmarks/lambda_ranking", lambda_ranking),
+    "depth-error": ("benchmarks/depth_error", depth_error),
+    "backing": ("benchmarks/backing", backing),
+    "own-data": ("benchmarks/own_data", own_data),
+    "exposure": ("benchmarks/exposure", exposure),
+    "photo-memory": ("benchmarks/photo_memory", photo_memory),
+}
+"""By name: the file, seen from docs/ and without `.json`, and what makes the table of its contents."""

@@ -1,0 +1,27 @@
+"""Markdown of which all tables are made."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+
+def markdown(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table; all columns but the first are right-aligned."""
+    lines = [heading, ["---", *["---:"] * (len(heading) - 1)], *rows]
+    return "".join("|" + "".join(f" {cell} |" if cell else " |" for cell in line) + "\n" for line in lines)
+
+
+def short(value: float, digits: int = 1) -> str:
+    """A number of any size with so many significant digits, 6.1e-4."""
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+def made_by(data: dict[str, Any]) -> str:
+    """The command that measured the numbers, the machine where the file names it, and the versions."""
+    command, machine, versions = data["command"], data.get("machine"), data["versions"]
+    if not command.startswith("mgs "):
+        command = f"python benchmarks/{command}"
+    cores = f" on {machine['threads']} threads ({machine['cpu']}, {machine['simd_width']} float32 lanes)" if machine else ""
+    return f"\n`{command}`{cores}; mgs {versions['mgs']}, Mitsuba {versions['mitsuba']}, Dr.Jit {versions['drjit']}.\n"

@@ -1,0 +1,133 @@
+"""Tables of docs/results/*/*.json: what the studies found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from mgs.study.chart.tables import TABLES as CHART_TABLES
+from mgs.study.chart.tables import chart_table
+from mgs.study.stress.verdict import effect
+from table_makers.markdown import made_by, markdown
+
+
+def stability(data: dict[str, Any]) -> str:
+    """Verdicts of `mgs stress`, experiment by experiment."""
+    rows = []
+    for experiment in data["experiments"]:
+        for claim in experiment["claims"]:
+            rows.append([experiment["name"], claim["hypothesis"], f"**{claim['verdict']}**", effect(claim), str(claim["runs"])])
+    heading = ["experiment", "hypothesis", "verdict", "mean effect (95 % interval)", "runs"]
+    return markdown(heading, rows) + made_by(data)
+
+
+def parsimony(data: dict[str, Any]) -> str:
+    """Every fit of `mgs parsimony`."""
+    rows = []
+    for r in data["rows"]:
+        n = f"{r['gaussians']:,}" + (" (auto)" if r["asked"] == "auto" else "")
+        cells = [n, r["learned"], str(r["degree"]), f"{r['parameters']:,}", f"{r['psnr_inside']:.2f}", f"{r['psnr']:.2f}"]
+        cells += [f"{1e3 * math.sqrt(r['next_error']):.1f}", f"{r['predictive']:.2f}", f"{r['evidence'] / 1e3:,.0f}"]
+        rows.append([r["scene"], *cells, f"{r['seconds']:.0f}"])
+    heading = [
+        "scene", "N", "learned", "SH", "parameters", "PSNR inside", "PSNR", "rms of the next view, 1e-3", "predictive",
+        "evidence, 1e3", "seconds of fits",
+    ]  # fmt: skip
+    return markdown(heading, rows) + made_by(data)
+
+
+def parsimony_verdict(data: dict[str, Any]) -> str:
+    """The automatic number of Gaussians beside fixed ones."""
+    rows = []
+    for scene, one in data["scenes"].items():
+        cells = [f"{round(one[key], 2) + 0.0:.2f}" for key in ("best", "auto", "loss")] + [
+            f"{one[key]:,}" for key in ("parameters", "smallest")
+        ]
+        rows.append([scene, *cells, " and ".join("yes" if one[key] else "no" for key in ("close", "small"))])
+    heading = [
+        "scene", "best fixed, dB", "automatic", "loss", "parameters", "smallest fixed within 0.1 dB", "close, and no larger",
+    ]  # fmt: skip
+    return markdown(heading, rows) + made_by(data)
+
+
+def parsimony_rules(data: dict[str, Any]) -> str:
+    """What each rule would choose along each axis, and what that loses."""
+    rows = []
+    for scene, one in data["scenes"].items():
+        for axis in ("gaussians", "learned", "degree"):
+            found = [one["chosen"][f"{axis} by {rule}"] for rule in ("psnr_inside", "next_error", "predictive", "evidence")]
+            cells = [f"{c['value']:,}" if axis == "gaussians" else str(c["value"]) for c in found]
+            rows.append(
+                [
+                    f"{scene}, {axis}",
+                    cells[0],
+                    *(f"{c} ({0.0 - round(f['loss'], 2):.2f})" for c, f in zip(cells[1:], found[1:], strict=True)),
+                ]
+            )
+    return markdown(["", "best on the test views", "by next error", "by predictive", "by evidence"], rows)
+
+
+def parsimony_prune(data: dict[str, Any]) -> str:
+    """How much pruning leaves of the automatic model, and what it changes."""
+    rows = []
+    for scene, one in data["scenes"].items():
+        before = next(r["gaussians"] for r in data["rows"] if r["scene"] == scene and r["asked"] == "auto")
+        for p in one["pruned"]:
+            left = f"{p['gaussians']:,} of {before:,} ({p['gaussians'] / before:.0%})"
+            change = [f"{1e3 * p[key]:.2f}" for key in ("predicted", "actual")]
+            ratio = f"{(p['actual'] / p['predicted']) ** 2:.2f}" if p["predicted"] else ""
+            rows.append([f"{scene}, {p['noise']:g} sigma", left, *change, ratio, f"{p['psnr_inside'] - one['auto']:+.2f}"])
+    heading = [
+        "scene, noise",
+        "Gaussians left",
+        "rms change predicted, 1e-3",
+        "measured",
+        "ratio of squares",
+        "PSNR inside, dB",
+    ]
+    return markdown(heading, rows)
+
+
+def chart(name: str) -> Callable[[dict[str, Any]], str]:
+    """What makes a table of `mgs chart`, by its name."""
+
+    def table(data: dict[str, Any]) -> str:
+        picture, heading, rows, note = chart_table(name, data)
+        return picture + (markdown(heading, rows) + "\n" if rows else "") + f"{note}\n"
+
+    return table
+
+
+REPRODUCED = {
+    "table1": "",
+    "curves": "PSNR against images, and differences from uniform",
+    "seeds": "PSNR of the last model against the number of seeds",
+    "pools": "PSNR of the last model over random, for each pool and policy",
+}
+"""Results of `mgs reproduce` that have a table, by name, and what their picture shows; Table I has none."""
+
+
+def reproduced(name: str) -> Callable[[dict[str, Any]], str]:
+    """What makes a table of `mgs reproduce`, by its name: as the study wrote it, its command, and its picture."""
+
+    def table(data: dict[str, Any]) -> str:
+        picture = f"\n![{REPRODUCED[name]}](results/reproduce/{name}.png)\n" if REPRODUCED[name] else ""
+        return f"{data['markdown']}{made_by(data)}{picture}"
+
+    return table
+
+
+TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "stability": ("results/stress/verdicts", stability),
+    "parsimony": ("results/parsimony/parsimony", parsimony),
+    "parsimony-verdict": ("results/parsimony/parsimony", parsimony_verdict),
+    "parsimony-rules": ("results/parsimony/parsimony", parsimony_rules),
+    "parsimony-prune": ("results/parsimony/parsimony", parsimony_prune),
+    **{f"reproduce-{name}": (f"results/reproduce/{name}", reproduced(name)) for name in REPRODUCED},
+    **{f"chart-{name}": ("results/chart/chart", chart(name)) for name in CHART_TABLES},
+}
+"""By name: the file, seen from docs/ and without `.json`, and what makes the table of its contents."""
+
+NOT_RUN = {f"results/reproduce/{name}": f"Not run yet: `mgs reproduce OUT --only {name}`.\n" for name in REPRODUCED}
+"""What stands for a table whose file may be missing."""
