@@ -1,6 +1,6 @@
 """How far below the prior's surface should Gaussians lie? `python benchmarks/inset.py OUT.json DATASET...`
 
-Fits Gaussians to 12 views spread evenly in azimuth, as `mgs nbv` does it, from several depths below the prior's surface, and
+Fits Gaussians to 12 views spread evenly in azimuth, as `mgs nbv` does it, from several depths below the surface, in pixels, and
 judges on the test views: PSNR, in the full frame, in the mask and wholly inside the rock; median error of the depth inside, and
 its median with the sign, positive where the model lies behind the true surface. Datasets need exact depth, and test views.
 """
@@ -23,7 +23,7 @@ from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.gaussians import Gaussians
 from mgs.prior.build import build_prior
-from mgs.prior.initial import INSET, initial_gaussians
+from mgs.prior.initial import INSET, initial_gaussians, pixel_on
 from mgs.prior.settings import PriorSettings
 from mgs.provenance import command_line, versions
 from mgs.report.evaluation import evaluate, render_view
@@ -31,7 +31,8 @@ from mgs.splat import ListCache, groups
 
 VIEWS = 12
 SIZES = (2_500, 10_000, 40_000)
-INSETS = (0.0, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4)
+INSETS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+"""In pixels on the rock."""
 
 
 def bias(model: Gaussians, tests: Dataset) -> float:
@@ -63,7 +64,8 @@ def study(root: Path) -> list[dict[str, Any]]:
             model = fit(start, cameras, targets, cache=ListCache(), start=start, lam=lam).gaussians
             found = evaluate(model, tests.frames, ())["all"]
             kept = {key: found[key] for key in ("psnr", "psnr_mask", "psnr_inside", "ssim_mask", "depth_error", "see_through")}
-            records.append({"gaussians": n, "inset": inset, "spacing": prior.spacing, "bias": bias(model, tests), **kept})
+            about = {"gaussians": n, "inset": inset, "spacing": prior.spacing, "pixel": pixel_on(prior, cameras)}
+            records.append(about | {"bias": bias(model, tests)} | kept)
             print(root, records[-1], flush=True)
     return records
 

@@ -17,11 +17,12 @@ sys.path.insert(0, str(Path(__file__).parent))
 import synthetic
 
 from mgs.active.inputs import prior_digest
+from mgs.camera import Camera, look_at
 from mgs.data.dataset import Dataset
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
-from mgs.prior.initial import GREY, IN_PLANE_SCALE, INITIAL_OPACITY, THICKNESS, initial_gaussians
+from mgs.prior.initial import GREY, IN_PLANE_SCALE, INITIAL_OPACITY, INSET, THICKNESS, initial_gaussians, pixel_on
 from mgs.prior.settings import PriorSettings
 from mgs.rotation import rotmat_from_quat
 from mgs.splat import render
@@ -42,12 +43,40 @@ def test_shapes_scales_and_rotations(prior: Prior, dataset: Dataset) -> None:
     assert gaussians.check() is gaussians
     assert all(getattr(gaussians, name).dtype == np.float32 for name in ("means", "log_scales", "quats", "sh"))
     assert seen.shape == (2000,)
-    assert np.allclose(gaussians.means, prior.points, atol=1e-6)
+    off = gaussians.means - prior.points
+    pixel = pixel_on(prior, [frame.camera for frame in dataset.frames[::3]])
+    assert np.allclose(off, -INSET * pixel * prior.normals, atol=1e-6)
+    on_it = initial_gaussians(prior, dataset.frames[::3], inset=0)[0]
+    assert np.allclose(on_it.means, prior.points, atol=1e-6)
     expected = prior.spacing * np.array([IN_PLANE_SCALE, IN_PLANE_SCALE, THICKNESS])
     assert np.allclose(np.exp(gaussians.log_scales), expected, rtol=1e-5)
     thin = rotmat_from_quat(gaussians.quats)[:, :, 2]
     assert np.allclose(thin, prior.normals, atol=1e-5)
     assert np.allclose(gaussians.opacities, INITIAL_OPACITY, atol=1e-6)
+
+
+def test_a_pixel_on_the_surface(prior: Prior) -> None:
+    """At the middle of the rock a pixel spans depth / focal length; of several cameras the median, of none in front nothing."""
+    K = np.array([[100.0, 0, 20], [0, 100.0, 15], [0, 0, 1]])
+    centre, x = np.median(prior.points, axis=0), np.array([1.0, 0, 0])
+    near, far, turned = (
+        Camera(K, 40, 30, look_at(centre + d * x, centre + (d - sign) * x)) for d, sign in ((5, 1), (10, 1), (10, -1))
+    )
+    assert pixel_on(prior, [near]) == pytest.approx(0.05, rel=0.01)
+    assert pixel_on(prior, [near, far, turned]) == pytest.approx(0.075, rel=0.01)
+    assert pixel_on(prior, [turned]) == 0
+
+
+def test_outlines_are_where_they_are_in_the_images(dataset: Dataset, prior: Prior) -> None:
+    """Drawn from below the surface, the rock before any training covers about as much as its masks; from the surface, more."""
+
+    def excess(inset: float) -> float:
+        gaussians = initial_gaussians(prior, dataset.frames[::3], inset)[0]
+        return (
+            float(np.mean([np.asarray(render(gaussians, f.camera).alpha).sum() / f.mask().sum() for f in dataset.frames])) - 1
+        )
+
+    assert excess(0) > 2 * abs(excess(INSET))
 
 
 def test_one_layer_hides_what_is_behind_it() -> None:

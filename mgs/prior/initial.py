@@ -38,16 +38,16 @@ spacing^2, which is -2 pi (s / spacing)^2 Li2(o), with the dilogarithm Li2. For 
 passes. In an image it is less, because the renderer widens each Gaussian by EPS2D. An opacity of 0.99 would hide more, but
 there the derivative of the opacity by its logit, o (1 - o), is almost zero; at 0.9 it is 0.09."""
 
-INSET = 0.2
-"""How far below the surface a Gaussian lies, over the spacing. Flat Gaussians on the surface stand out from it: at the outline,
-and wherever it bends, since each is tangent to it and has some width. A chosen constant (docs/fit.md)."""
+INSET = 0.6
+"""How far below the surface a Gaussian lies, in pixels on the rock. The renderer widens every footprint by EPS2D, about half a
+pixel, so that Gaussians on the surface would draw a rock that is larger than the true one. A chosen constant (docs/fit.md)."""
 
 THICKNESS = 0.1
 """Standard deviation of a Gaussian across the surface, over the spacing. It is flat, but thick enough for its projection to be
 numerically well conditioned."""
 
 BACKING_DEPTH = 1.0
-"""How far behind the surface a backing Gaussian lies, over the spacing of the surface's."""
+"""How far behind its Gaussian on the surface one of the backing lies, over the spacing of the surface's."""
 
 BACKING_SCALE = (0.8, 0.8, 0.2)
 """Standard deviations of a backing Gaussian along the surface and along the normal, over the spacing of the backing's own: more
@@ -68,8 +68,8 @@ def initial_gaussians(
     A frame sees a sample that lies inside its rock mask, whose normal points towards the camera, and whose depth agrees with
     the depth image, up to `prior.depth_tolerance` and the slope of the surface within a pixel. For a frame without depth image
     the depth of the prior's mesh is used. A sample that no frame sees is grey.
-    inset: how far below its sample a Gaussian lies, over the spacing. gains: [V,3] of the frames' exposures, by which their
-    colours are divided (`mgs.prior.exposure`).
+    inset: how far below its sample a Gaussian lies, over the `pixel_on` the prior. gains: [V,3] of the frames' exposures, by
+    which their colours are divided (`mgs.prior.exposure`).
     Returns (N + backed Gaussians of degree 0, seen [N] bool: which samples some frame sees).
     Raises InputError if a file of a frame cannot be read, and as `mesh_depth` where a frame has no depth image.
     """
@@ -82,15 +82,24 @@ def initial_gaussians(
         count[seen] += 1
     seen = count > 0
     rgb = np.where(seen[:, None], total / np.maximum(count, 1)[:, None], GREY)
+    below = inset * pixel_on(prior, [frame.camera for frame in seed_frames])
     scales = np.log(prior.spacing * np.array([IN_PLANE_SCALE, IN_PLANE_SCALE, THICKNESS]))
     surface = Gaussians(
-        means=(prior.points - inset * prior.spacing * prior.normals).astype(np.float32),
+        means=(prior.points - below * prior.normals).astype(np.float32),
         log_scales=np.tile(scales, (n, 1)).astype(np.float32),
         quats=quat_from_normals(prior.normals).astype(np.float32),
         logit_opacities=np.full(n, logit(INITIAL_OPACITY), np.float32),
         sh=sh_from_rgb(rgb),
     )
     return _with_backing(surface, prior), seen
+
+
+def pixel_on(prior: Prior, cameras: Sequence[Camera]) -> float:
+    """Size of a pixel on the surface, metres: z-depth over focal length, the median over the samples and then over the cameras
+    that have some in front of them; 0 where none has."""
+    depths = [(camera, camera.project(prior.points)[1]) for camera in cameras]
+    sizes = [np.median(z[z > 0]) / np.sqrt(camera.K[0, 0] * camera.K[1, 1]) for camera, z in depths if (z > 0).any()]
+    return float(np.median(sizes)) if sizes else 0.0
 
 
 def initial_normals(prior: Prior) -> np.ndarray:
@@ -100,12 +109,12 @@ def initial_normals(prior: Prior) -> np.ndarray:
 
 
 def _with_backing(surface: Gaussians, prior: Prior) -> Gaussians:
-    """The surface's Gaussians, then those behind its first `prior.backed`."""
+    """The surface's Gaussians, then those behind the first `prior.backed` of them."""
     count = prior.backed
     if count == 0:
         return surface
     over = surface[:count]
-    behind = prior.points[:count] - BACKING_DEPTH * prior.spacing * prior.normals[:count]
+    behind = over.means - BACKING_DEPTH * prior.spacing * prior.normals[:count]
     scales = np.log(prior.spacing * np.sqrt(len(surface) / count) * np.array(BACKING_SCALE))
     backing = Gaussians(
         means=behind.astype(np.float32),
