@@ -122,7 +122,7 @@ def main(out: Path) -> None:
             dataset(folder / f"full{count}", folder / "ball.png", folder / "mask.png", count)
         few, many = COUNTS
         size = ["--gaussians", "4000"]
-        run = ["--policy", "uniform", "--passes", "1", "--warm-passes", "1", *size]
+        run = ["--policy", "uniform", "--passes", "1", "--warm-passes", "1"]
         measure("mgs import", few, "import", folder / f"photos{few}", "--out", folder / "imported")
         for count in COUNTS:
             small = folder / f"small{count}"
@@ -130,11 +130,8 @@ def main(out: Path) -> None:
         for source, count in (("hull", few), ("hull", many), ("points", many)):
             to = folder / f"prior-{source}-{count}"
             measure(f"mgs prior --from {source}", count, "prior", folder / f"full{count}", "--from", source, "--out", to, *size)
-        for count in COUNTS:
-            given = ["--out", folder / f"run-small{count}", "--seeds", "4", "--budget", str(count - 4), *run]
-            measure("mgs nbv, after --downscale 4, all taken", count, "nbv", folder / f"small{count}", *given)
-        given = ["--out", folder / "run-full", "--seeds", str(few), "--budget", "0", *run]
-        measure("mgs nbv, all taken", few, "nbv", folder / f"full{few}", *given)
+        given = ["--prior", folder / f"prior-hull-{few}", "--seeds", str(few), "--budget", "0", *run]
+        measure("mgs nbv, after --downscale 4", few, "nbv", folder / f"small{few}", "--out", folder / "run", *given)
     write_json(out, {"command": command_line(), "machine": runtime.processor(), "versions": versions(), "records": rows})
 
 
