@@ -268,6 +268,38 @@ def prior_std(data: dict[str, Any]) -> str:
     return markdown(heading, rows) + made_by(data)
 
 
+def inset(data: dict[str, Any]) -> str:
+    """Quality and error of depth against how far below the surface Gaussians lie."""
+    rows = []
+    depths = list(dict.fromkeys(r["inset"] for scene in data["scenes"] for r in scene["records"]))
+    for k, scene in enumerate(data["scenes"]):
+        for n in dict.fromkeys(r["gaussians"] for r in scene["records"]):
+            found = [r for r in scene["records"] if r["gaussians"] == n]
+            cells = [f"{r['psnr']:.2f}, {r['psnr_inside']:.2f}, {1e3 * r['depth_error']:.0f}" for r in found]
+            about = f"rock {k + 1}, {n:,}, {1e3 * found[0]['pixel']:.0f} mm, {1e3 * found[0]['spacing']:.0f} mm"
+            rows.append([about, *cells])
+    return markdown(["rock, Gaussians, pixel, spacing", *(f"{d:g} pixels" for d in depths)], rows) + made_by(data)
+
+
+def uncertainty(data: dict[str, Any]) -> str:
+    """How well errors are predicted in the test views, means over runs, and the least and the largest share inside intervals."""
+    rows = []
+    of_tests = [row for record in data["records"] for row in record["rows"] if row["views"] == "test"]
+    for prediction in dict.fromkeys(row["prediction"] for row in of_tests):
+        found = [row for row in of_tests if row["prediction"] == prediction]
+        areas = [[row["ause"][kind][name] for row in found] for kind in ("mae", "mse") for name in ("ause", "perfect", "constant")]
+        cells = [f"{sum(values) / len(values):.2f}" for values in areas]
+        cells = [f"{a} ({p}; {c})" for a, p, c in (cells[:3], cells[3:])]
+        cells += [f"{sum(row[key] for row in found) / len(found):.2f}" for key in ("spearman", "pearson")]
+        whole = sum(row["held"]["0.9"][0] for row in found) / len(found)
+        thirds = [share for row in found for share in row["held"]["0.9"][1:]]
+        cells += [f"{100 * whole:.0f} % ({100 * min(thirds):.0f} to {100 * max(thirds):.0f})"]
+        crps = sum(row["crps"] / row["crps_constant"] for row in found) / len(found)
+        rows.append([prediction, *cells, f"{crps:.2f}"])
+    heading = ["prediction", "AUSE of absolute errors (perfect; constant)", "of squared errors", "Spearman", "Pearson"]
+    return markdown([*heading, "in the interval of 90 % (thirds)", "CRPS over a constant's"], rows) + made_by(data)
+
+
 def optimisers(data: dict[str, Any]) -> str:
     """Objective and quality by the number of passes, cold and warm."""
     rows = []
@@ -314,6 +346,8 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "linearity": ("benchmarks/linearity", linearity),
     "residual": ("benchmarks/residual", residual),
     "prior-std": ("benchmarks/prior_std", prior_std),
+    "inset": ("benchmarks/inset", inset),
+    "uncertainty": ("benchmarks/uncertainty", uncertainty),
     "optimisers": ("benchmarks/optimisers", optimisers),
     "fit": ("benchmarks/fit", fit),
     "means": ("benchmarks/means", means),
