@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -72,6 +73,21 @@ def exif_orientation(path: str | Path) -> int:
     image, _ = _open_image(Path(path))
     found = image.getexif().get(ORIENTATION, 1)
     return found if found in range(1, 9) else 1
+
+
+def exif_exposure(path: str | Path) -> float | None:
+    """How bright EXIF says that an image was exposed, stops from an unknown origin: log2 of time times ISO over the square of
+    the f-number. None where the file does not say. Only the file's header is read; what cannot be read says nothing."""
+    from PIL import ExifTags, Image
+
+    base = ExifTags.Base
+    try:
+        with Image.open(path) as image:
+            exif = image.getexif().get_ifd(ExifTags.IFD.Exif)
+        time, speed, number = (float(exif[tag]) for tag in (base.ExposureTime, base.ISOSpeedRatings, base.FNumber))
+        return math.log2(time * speed / number**2)
+    except (OSError, SyntaxError, KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None
 
 
 def read_values(path: str | Path) -> np.ndarray:

@@ -19,9 +19,10 @@ SSIM_SIGMA = 1.5
 SSIM_WINDOW = 11
 """Width and height of that window, pixels (Wang et al. 2004)."""
 
-METRICS = ("psnr", "ssim", "psnr_mask", "ssim_mask", "psnr_inside")
+METRICS = ("psnr", "ssim", "psnr_mask", "ssim_mask", "psnr_inside", "psnr_corrected", "psnr_mask_corrected")
 """Names of the numbers that `compare` gives, as in metrics.json. PSNR is in dB. They are over the whole image; with `_mask`,
-over the rock's mask; with `_inside`, over the pixels that the rock covers wholly, so without its outline."""
+over the rock's mask; with `_inside`, over the pixels that the rock covers wholly, so without its outline. With `_corrected`,
+the render is first brought to the exposure and the white balance of the truth (`colour_corrected`)."""
 
 SPACINGS = (1, 3, 10)
 """How far behind the true surface a pixel must be drawn to count as too deep, in spacings of the prior's samples. One spacing
@@ -77,6 +78,19 @@ def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     return float(similarity[mask].mean()) if mask.any() else math.nan
 
 
+def colour_corrected(truth: np.ndarray, rendered: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """A render times a gain per channel: those that bring it nearest to the truth in the pixels of a mask, in least squares.
+
+    truth, rendered: [H,W,3] linear RGB; mask: [H,W] bool. The error that is left is none of exposure or white balance. Because
+    the gains are taken from the truth, what is measured of it says less than PSNR does, and has a name of its own.
+    A channel that is black in the mask keeps its values.
+    """
+    a, b = truth[mask].astype(np.float64), rendered[mask].astype(np.float64)
+    squares = (b * b).sum(axis=0)
+    gains = np.where(squares > 0, (a * b).sum(axis=0) / np.where(squares > 0, squares, 1), 1.0)
+    return (rendered * gains).astype(rendered.dtype)
+
+
 def _check_same_shape(a: np.ndarray, b: np.ndarray) -> None:
     if a.shape != b.shape:
         raise InputError(f"images of {a.shape} and {b.shape} cannot be compared; render at the size of the dataset")
@@ -90,12 +104,15 @@ def compare(truth: np.ndarray, rendered: np.ndarray, mask: np.ndarray, weight: n
     """
     a, b, known = srgb_from_linear(truth[..., :3]), srgb_from_linear(rendered), weight > 0
     whole = None if known.all() else known
+    corrected = srgb_from_linear(colour_corrected(truth[..., :3], rendered, mask & known))
     return {
         "psnr": psnr(a, b, whole),
         "ssim": ssim(a, b, whole),
         "psnr_mask": psnr(a, b, mask & known),
         "ssim_mask": ssim(a, b, mask & known),
         "psnr_inside": psnr(a, b, (truth[..., 3] >= 1) & known),
+        "psnr_corrected": psnr(a, corrected, whole),
+        "psnr_mask_corrected": psnr(a, corrected, mask & known),
     }
 
 

@@ -1,5 +1,6 @@
 """Detectors: each fires on what it is for, none on a good run, and what they say is kept, printed and reported."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +24,8 @@ from mgs.active.detectors import (
 from mgs.active.nbv import run_nbv
 from mgs.active.settings import TrainSettings
 from mgs.cli.nbv import resume_and_print
-from mgs.data.dataset import load_dataset
+from mgs.data.dataset import load_dataset, write_transforms
+from mgs.images import write_png
 from mgs.prior.build import build_prior, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.report.page_facts import measured, read_shown
@@ -73,10 +75,15 @@ def test_a_warning_comes_once_and_again_after_it_was_over():
 
 
 def test_signs_that_a_step_cannot_tell_are_left_out():
-    assert set(step_signs([], [1.0], 1.0, [], 0.0)) == {"coverage", "means"}
+    assert set(step_signs([], [1.0], 1.0, [], 0.0)) == {"means"}
     back = step_signs([], [1.0, 1.2, 1.1, 1.0], 1.0, [], 0.0)  # of a warm fit: lower than before, but not than at its start
     assert back["unconverged"] == 0
     assert {"unconverged", "worse"}.isdisjoint(step_signs([], [1.0, float("nan"), 1.0, 1.0], 1.0, [], 0.0))
+
+
+@pytest.mark.parametrize("views", [1, 2, 3, 4])
+def test_coverage_is_expected_of_four_views_and_more(views):
+    assert bool(alarms(signs(views=(GOOD,) * views, coverage=0.7))) == (views == 4)
 
 
 def seen(mask, alpha, margin, rendered=0.5, truth=0.5):
@@ -173,3 +180,58 @@ def test_a_loop_without_renders_has_no_signs(dataset, tmp_path):
     settings = tiny.start(tmp_path / "run", loaded)
     state = loop.run(tmp_path / "run", settings, loaded, tiny.stations(), tiny.silent)
     assert not any("signs" in line or "warnings" in line for line in state.steps)
+
+
+def wrong_pose(frames):
+    """One camera is turned by 3 degrees."""
+    from scipy.spatial.transform import Rotation
+
+    pose = frames[2].camera.world_to_camera.copy()
+    pose[:3] = Rotation.from_euler("y", 3, degrees=True).as_matrix() @ pose[:3]
+    return [replace(f, camera=replace(f.camera, world_to_camera=pose)) if k == 2 else f for k, f in enumerate(frames)]
+
+
+def drifting_exposure(frames):
+    """Each image is 5 % brighter than the one before."""
+    for k, frame in enumerate(frames):
+        write_png(frame.image_path, frame.rgb() * np.float32(0.6 * 1.05**k))
+    return frames
+
+
+def one_wrong_mask(frames):
+    """A quarter of one mask is missing."""
+    mask = frames[4].mask()
+    columns = np.flatnonzero(mask.any(axis=0))
+    mask[:, columns[: len(columns) // 3]] = False
+    write_png(frames[4].mask_path, mask)
+    return frames
+
+
+def wide_masks(frames):
+    """All masks reach far beyond the rock."""
+    from scipy.ndimage import binary_dilation
+
+    for frame in frames:
+        write_png(frame.mask_path, binary_dilation(frame.mask(), iterations=6))
+    return frames
+
+
+SPOILED = {
+    "pose": (wrong_pose, "prior and mask are"),
+    "exposure": (drifting_exposure, "exposure drifts"),
+    "mask": (one_wrong_mask, "prior and mask are"),
+    "masks": (wide_masks, "the prior's outline and the masks disagree"),
+}
+
+
+@pytest.mark.parametrize("fault", SPOILED)
+def test_a_spoiled_capture_raises_the_alarm_that_is_meant_for_it(rock, tmp_path, fault):
+    spoil, words = SPOILED[fault]
+    root = tmp_path / "dataset"
+    shutil.copytree(rock, root)
+    write_transforms(root, spoil(list(load_dataset(root).frames)))
+    state = run_nbv(root, tmp_path / "run", prior=rock / "prior", policy="uniform", budget=5, seeds=5)
+    said = [warning for line in state.steps for warning in line.get("warnings", [])]
+    assert any(words in warning for warning in said), said
+    others = {word for name, (_, word) in SPOILED.items() if name != fault} - {words}
+    assert not any(word in warning for warning in said for word in others), said

@@ -15,8 +15,8 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGE = "mgs"
 ROOMS = (
-    "errors", "seeds", "runtime", "resources", "provenance", "colour", "rotation", "camera", "gaussians", "files", "images",
-    "splat_ply", "metrics", "plotting",
+    "errors", "seeds", "runtime", "resources", "provenance", "colour", "rotation", "memory", "camera", "gaussians", "files",
+    "images", "splat_ply", "metrics", "plotting",
     "data", "synth", "survey", "prior", "splat", "active", "report", "view", "bench", "study", "cli", "__main__",
 )  # fmt: skip
 """All rooms, lowest first: each may import from those before it, and from none after it."""

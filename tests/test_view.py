@@ -94,7 +94,7 @@ def test_what_the_kernel_draws(run):
     for layer, (picture, z, (low, high)) in drawn.items():
         assert picture.dtype == np.uint8
         np.testing.assert_allclose(z, np.where(seen, depth, layers.FAR), rtol=1e-6)
-        assert layers.legend(layer, (low, high))
+        assert layers.legend(layer, (low, high), "m")
         if layer not in ("colour", "alpha"):
             assert (picture[~seen] == 0).all()
     low, high = drawn["depth"][2]

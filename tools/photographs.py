@@ -1,6 +1,7 @@
 """Makes of an exact dataset what a photographer would have: photographs, and the files of the tools that find their cameras.
 
     python tools/photographs.py DATASET OUT --kind colmap-binary     # or colmap-text, nerfstudio, nerf-synthetic, rgbd
+    python tools/photographs.py DATASET OUT --kind colmap-binary --exposure 0.3
 
 DATASET is a folder of `mgs synth-orbit`. Its images are rendered, and its cameras and depth are exact; OUT holds the same rock
 as a stranger's data do, in the format of the kind:
@@ -11,8 +12,12 @@ as a stranger's data do, in the format of the kind:
 - nerf-synthetic: PNG files with alpha, exact poses in a world of another scale, no points.
 - rgbd: PNG files, noisy depth of 16 bits, exact poses in metres.
 
+With --exposure STOPS, the JPEG files of COLMAP and nerfstudio differ in exposure and white balance, and their EXIF has the
+times of exposure.
+
 Beside them OUT/masks has the true masks, OUT/truth.ply the true rock in the world of these data, and OUT/truth.json the
-similarity that leads from DATASET's world to it. No importer looks at these three. The same seed gives the same files.
+similarity that leads from DATASET's world to it, and the gains of the images. No importer looks at these three. The same seed
+gives the same files.
 """
 
 from __future__ import annotations
@@ -25,7 +30,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import ExifTags, Image
 
 from mgs.camera import Camera, opengl_from_opencv
 from mgs.colour import srgb_from_linear
@@ -64,6 +69,10 @@ CROP = 1.2
 """Focal length of the photographs over that of the dataset: the distorted and rolled image must not look beyond its rim."""
 QUALITY = 92
 """Of the JPEG files."""
+WHITE_BALANCE = 1 / 3
+"""With --exposure, how far the gains of red and blue differ from that of green at most, over the largest exposure."""
+SHUTTER = 0.005
+"""Time of an exposure with a gain of 1, seconds."""
 SCALE = 0.37
 """Units of the new world in a metre: nobody knows it."""
 SHIFT = np.array([2.0, -1.0, 0.5])
@@ -224,12 +233,26 @@ def _shows(photo: Photograph, depth: np.ndarray, place: np.ndarray) -> bool:
     return bool(inside and abs(depth[min(int(v), depth.shape[0] - 1), min(int(u), depth.shape[1] - 1)] / z - 1) < 0.01)
 
 
-def write_photographs(photos: Sequence[Photograph], out: Path) -> None:
-    """The JPEG files and the true masks."""
+def exposures(count: int, stops: float, seed: int) -> np.ndarray:
+    """Gains [count,3] of images: an exposure of up to so many stops more or less, and a white balance, both evenly spread."""
+    rng = generator(seed, "photographs/exposure")
+    exposure, balance = rng.uniform(-stops, stops, (count, 1)), WHITE_BALANCE * rng.uniform(-stops, stops, (count, 3))
+    return 2.0 ** (exposure + balance * [1, 0, 1])
+
+
+def write_photographs(photos: Sequence[Photograph], out: Path, gains: np.ndarray | None) -> None:
+    """The JPEG files and the true masks. gains: [V,3] of the images, linear RGB; None: all 1, and no EXIF."""
     (out / "images").mkdir(parents=True)
-    for photo in photos:
-        pixels = photo.resample(np.round(srgb_from_linear(photo.frame.rgb()) * 255).astype(np.uint8))
-        Image.fromarray(pixels).save(out / f"images/{photo.frame.name}.jpg", quality=QUALITY)
+    for k, photo in enumerate(photos):
+        rgb, exif = photo.frame.rgb(), Image.Exif()
+        if gains is not None:
+            rgb = rgb * gains[k].astype(np.float32)
+            exif.get_ifd(ExifTags.IFD.Exif).update({
+                ExifTags.Base.ExposureTime: SHUTTER * float(gains[k, 1]), ExifTags.Base.FNumber: 2.8,
+                ExifTags.Base.ISOSpeedRatings: 100,
+            })  # fmt: skip
+        pixels = photo.resample(np.round(np.clip(srgb_from_linear(rgb), 0, 1) * 255).astype(np.uint8))
+        Image.fromarray(pixels).save(out / f"images/{photo.frame.name}.jpg", quality=QUALITY, exif=exif)
         write_png(out / f"masks/{photo.frame.name}.png", photo.resample(photo.frame.mask().astype(np.float32)) >= 0.5)
 
 
@@ -324,8 +347,8 @@ def write_rgbd(dataset: Dataset, out: Path, seed: int) -> None:
     _write_json(out / "transforms.json", {"camera_model": "OPENCV", **lens, "frames": frames})
 
 
-def make(root: Path, out: Path, kind: str, seed: int = 0) -> None:
-    """Write the data of a kind into a new folder."""
+def make(root: Path, out: Path, kind: str, seed: int = 0, stops: float = 0.0) -> None:
+    """Write the data of a kind into a new folder. stops: of COLMAP and nerfstudio's images, by how much exposure differs."""
     dataset, rng = load_dataset(root), generator(seed, "photographs")
     out.mkdir(parents=True)
     world = World(SCALE, random_rotation(rng), SHIFT)
@@ -333,6 +356,7 @@ def make(root: Path, out: Path, kind: str, seed: int = 0) -> None:
         world = World(SCALE, np.eye(3), np.zeros(3))
     if kind == "rgbd":
         world = World(1.0, np.eye(3), np.zeros(3))
+    gains = None
     writers: dict[str, Callable[[], None]] = {
         "nerf-synthetic": lambda: write_nerf_synthetic(dataset, world, out),
         "rgbd": lambda: write_rgbd(dataset, out, seed),
@@ -341,23 +365,26 @@ def make(root: Path, out: Path, kind: str, seed: int = 0) -> None:
         writers[kind]()
     else:
         photos = [photograph(frame, rng) for frame in dataset.frames]
-        write_photographs(photos, out)
+        gains = exposures(len(photos), stops, seed) if stops else None
+        write_photographs(photos, out, gains)
         points = triangulated(photos, rng)
         if kind == "nerfstudio":
             write_nerfstudio(photos, points, world, out, seed)
         else:
             write_colmap(photos, points, world, out, seed, kind == "colmap-binary")
-    _write_truth(root, world, out)
+    _write_truth(
+        root, world, out, {} if gains is None else {f.name: g.tolist() for f, g in zip(dataset.frames, gains, strict=True)}
+    )
 
 
-def _write_truth(root: Path, world: World, out: Path) -> None:
+def _write_truth(root: Path, world: World, out: Path, gains: dict[str, list[float]]) -> None:
     import trimesh
 
     if (root / "rock.glb").is_file():
         rock = read_rock(root / "rock.glb")
         trimesh.Trimesh(world.points(rock.vertices), rock.faces, process=False).export(out / "truth.ply")
     similarity = {"scale": world.scale, "rotation": world.rotation.tolist(), "shift": world.shift.tolist()}
-    _write_json(out / "truth.json", similarity | {"up": world.rotation[:, 2].tolist()})
+    _write_json(out / "truth.json", similarity | {"up": world.rotation[:, 2].tolist(), "gains": gains})
 
 
 def _distance(photos: Sequence[Photograph]) -> float:
@@ -376,5 +403,8 @@ if __name__ == "__main__":
     parser.add_argument("out", type=Path)
     parser.add_argument("--kind", choices=KINDS, required=True)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--exposure", type=float, default=0.0, metavar="STOPS", help="let exposure differ by up to STOPS")
     given = parser.parse_args()
-    make(given.dataset, given.out, given.kind, given.seed)
+    if given.exposure and given.kind in ("nerf-synthetic", "rgbd"):
+        parser.error(f"--exposure is for photographs of colmap and nerfstudio, not {given.kind}")
+    make(given.dataset, given.out, given.kind, given.seed, given.exposure)

@@ -10,12 +10,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
+
 from mgs.active.loop import target_of
 from mgs.active.objective import newton_decrease, objective
 from mgs.active.settings import NbvSettings
 from mgs.data.dataset import Frame
 from mgs.gaussians import Gaussians
+from mgs.memory import Deferred
 from mgs.prior.build import Prior
+from mgs.prior.exposure import exposure_of
 from mgs.prior.initial import initial_gaussians, initial_normals
 from mgs.splat import as_drjit, groups
 
@@ -39,11 +43,14 @@ def remaining_decrease(
     Returns "phi" (`mgs.active.objective`, squared pixel values); "predicted_decrease", the Newton decrease after CG_ITERATIONS,
     a share of phi; and "converged", whether that is at most CONVERGED_SHARE. Raises InputError where a frame cannot be read.
     """
-    start = initial_gaussians(prior, frames[: settings.seeds])[0]
+    seeds, exposure = frames[: settings.seeds], exposure_of(prior) if settings.exposure else None
+    start = initial_gaussians(prior, seeds, gains=exposure(seeds) if exposure else None)[0]
     means, kinds = settings.train.means, groups(0, settings.train.means)
     lam = settings.regularisation(kinds)
     by_kind = {kind: float(lam[columns][0]) for kind, columns in kinds.items()}
-    cameras, targets = [frame.camera for frame in frames], [target_of(frame) for frame in frames]
+    cameras, gains = [frame.camera for frame in frames], exposure(frames) if exposure else np.ones((len(frames), 3))
+    divisors = np.column_stack([gains, np.ones(len(gains))]).astype(np.float32)
+    targets = Deferred(range(len(frames)), lambda k: target_of(frames[k]) / divisors[k])
     goal = objective(gaussians, cameras, targets, start, by_kind, None, means, initial_normals(prior))
     model = as_drjit(gaussians)
     phi = goal.phi(model)

@@ -22,6 +22,10 @@ DARK = 1e-3
 """Linear RGB, added to brightnesses before they are compared: in the dark, a ratio says nothing."""
 
 
+COVERING_VIEWS = 4
+"""Fewest views of which a good coverage can be expected: two or three do not see all sides of a rock, however good they are."""
+
+
 @dataclass(frozen=True)
 class Before:
     """What one captured image says of the Gaussians before any training.
@@ -105,7 +109,7 @@ def step_signs(
     views: of every view taken. losses: of the model that the fit started from, then of each pass. coverage: Eq. 9, 0 to 1.
     gains: information gain of every view chosen so far, in order. drift: of `means_drift`.
     """
-    signs = {"coverage": 1 - coverage, "means": drift}
+    signs = {"means": drift}
     if len(losses) >= 2 and min(losses) > 0 and np.isfinite(losses).all():
         # A fit that starts from a fitted model rises first: coming back to where it began is no sign of more to come.
         window, lowest = min(2, len(losses) - 1), np.minimum.accumulate(losses)
@@ -118,6 +122,8 @@ def step_signs(
         signs["prior"] = float(np.median([view.before.outline for view in views]))
         signs["exposure"] = float(np.abs(exposures - np.median(exposures)).max())
         signs["pose"] = max(view.before.offset for view in views)
+        if len(views) >= COVERING_VIEWS:
+            signs["coverage"] = 1 - coverage
         if len(views) >= 3:
             signs["outlier"] = float(errors.max() / max(np.median(errors), 1e-12))
     if len(gains) >= 2 and max(gains) > 0:

@@ -6,7 +6,7 @@ in an order of its own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -123,8 +123,8 @@ def _step(
 
 def fit(
     gaussians: Gaussians,
-    cameras: list[Camera],
-    targets: list[np.ndarray],
+    cameras: Sequence[Camera],
+    targets: Sequence[np.ndarray],
     settings: TrainSettings | None = None,
     on_pass: Callable[[int, int], None] | None = None,
     cache: ListCache | None = None,

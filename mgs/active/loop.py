@@ -26,6 +26,7 @@ from mgs.data.up import PLUS_Z, Up, upright
 from mgs.errors import InputError
 from mgs.files import locked
 from mgs.gaussians import Gaussians
+from mgs.memory import IMAGE_BYTES, Deferred, kept_within
 from mgs.seeds import generator
 from mgs.splat_ply import write_ply
 
@@ -55,6 +56,7 @@ class Stations:
     centre: [3] the rock, metres.
     groups: columns of the Fisher information by kind of parameter (`mgs.splat.groups`).
     initial(seed frames) -> Gaussians before any training.
+    exposure(frames) -> gains [V,3] by which the colours of frames are divided; None: they are taken as they are.
     fit(gaussians, start, cameras, targets, train, on_pass) -> Fit; start: the Gaussians before any training; targets and train
     (the settings) as in `mgs.active.fitting.fit`.
     fisher(gaussians, camera) -> information of one view [N,P], by the estimator of the run.
@@ -72,10 +74,11 @@ class Stations:
     centre: np.ndarray
     groups: dict[str, slice]
     initial: Callable[[list[Frame]], Gaussians]
-    fit: Callable[[Gaussians, Gaussians, list[Camera], list[np.ndarray], TrainSettings, Callable[[int, int], None]], Fit]
+    fit: Callable[[Gaussians, Gaussians, list[Camera], Sequence[np.ndarray], TrainSettings, Callable[[int, int], None]], Fit]
     fisher: Callable[[Gaussians, Camera], np.ndarray]
     estimate: Callable[[Gaussians, Camera, str], np.ndarray]
     measure: Callable[[Gaussians, list[int]], dict[str, float]]
+    exposure: Callable[[Sequence[Frame]], np.ndarray] | None = None
     exact: Callable[[Gaussians, Camera], np.ndarray] | None = None
     look: Callable[[Gaussians, Camera], tuple[np.ndarray, np.ndarray]] | None = None
     on_surface: int | None = None
@@ -160,7 +163,7 @@ class Loop:
         appearance = {kind: columns for kind, columns in stations.groups.items() if kind != "mean"}
         self.prior_lam = criteria.regularisation(appearance, settings.pixel_noise, settings.prior_std)
         self.lam = settings.regularisation(stations.groups)
-        self.images: dict[int, np.ndarray] = {}
+        self.image = kept_within(IMAGE_BYTES, lambda i: target_of(self.frames[i]), lambda image: image.nbytes)
         cameras = {frame.name: inputs.camera_digest(frame.camera) for frame in self.frames}
         self.made_from = {"prior": stations.prior, "cameras": cameras, **inputs.policy_record(settings.policy)}
         self.seeds = pose_policies.seed_views(self.positions, self.centre, settings.seeds)
@@ -272,11 +275,11 @@ class Loop:
         step, taken = len(state.steps), [*state.taken, *new]
         cameras = [self.cameras[i] for i in taken]
         with watch("capture"):
-            for i in taken:
-                if i not in self.images:
-                    self.images[i] = target_of(self.frames[i])
+            for i in new:
+                self.image(i)
+            gains = self.stations.exposure([self.frames[i] for i in taken]) if self.stations.exposure else None
+            targets = self.targets(taken, gains)
         with watch("fit"):
-            targets = [self.images[i] for i in taken]
             on_pass = partial(self.progress, "fitting")
             fit = self.stations.fit(state.gaussians, self.start, cameras, targets, self.settings.train_at(step), on_pass)
         if fit.stop_reason == StopReason.DIVERGED:
@@ -300,36 +303,47 @@ class Loop:
             "stop_reason": str(fit.stop_reason),
             "seconds": watch.seconds,
         }
+        if gains is not None:
+            line["exposure"] = {self.frames[i].name: gain for i, gain in zip(taken, gains.tolist(), strict=True)}
         if self.stations.look:
             with watch("check"):
-                line |= self.signs(state, fit, taken, line)
+                line |= self.signs(state, fit, taken, gains, line)
         if self.settings.evaluate_every and step % self.settings.evaluate_every == 0:
             with watch("evaluate"):
                 line |= self.stations.measure(fit.gaussians, taken)
         return State(fit.gaussians, H, surface, taken, [*state.steps, line], made_from)
 
-    def signs(self, state: State, fit: Fit, taken: list[int], line: dict[str, Any]) -> dict[str, Any]:
+    def targets(self, taken: list[int], gains: np.ndarray | None = None) -> Sequence[np.ndarray]:
+        """What the model is fitted to in these frames, each [H,W,4] as `target_of`; colours divided by `gains` [V,3]."""
+        if gains is None:
+            return Deferred(taken, self.image)
+        divisors = np.column_stack([gains, np.ones(len(gains))]).astype(np.float32)
+        return Deferred(range(len(taken)), lambda k: self.image(taken[k]) / divisors[k])
+
+    def signs(self, state: State, fit: Fit, taken: list[int], gains: np.ndarray | None, line: dict[str, Any]) -> dict[str, Any]:
         """The entries `signs` of a step and, where one has just gone beyond its limit, `warnings` (`mgs.active.detectors`)."""
         assert self.stations.look
         views = []
-        for i in taken:
-            mask, before = self.before_fit(i)
-            views.append(
-                detectors.view_signs(self.images[i], mask, self.stations.look(fit.gaussians, self.cameras[i])[0], before)
-            )
-        gains = [step["information_gain"] for step in (*state.steps, line) if step.get("information_gain") is not None]
+        for k, (i, target) in enumerate(zip(taken, self.targets(taken, gains), strict=True)):
+            packed, before = self.before_fit(i)
+            mask = np.unpackbits(packed, count=target[..., 0].size).astype(bool).reshape(target.shape[:2])
+            if gains is not None:  # what was explained by the gain is no sign
+                before = replace(before, exposure=before.exposure - float(np.log(gains[k].mean())))
+            views.append(detectors.view_signs(target, mask, self.stations.look(fit.gaussians, self.cameras[i])[0], before))
+        scores = [step["information_gain"] for step in (*state.steps, line) if step.get("information_gain") is not None]
         drift = detectors.means_drift(fit.gaussians.means, self.start.means, self.start.log_scales)
-        signs = detectors.step_signs(views, fit.losses, line["coverage"], gains, drift)
+        signs = detectors.step_signs(views, fit.losses, line["coverage"], scores, drift)
         before_this = state.steps[-1].get("signs") if state.steps else None
         said = detectors.alarms(signs, before_this)
         return {"signs": signs, "warnings": said} if said else {"signs": signs}
 
     def _before_fit(self, frame: int) -> tuple[np.ndarray, detectors.Before]:
-        """The mask [H,W] of a frame that was taken, and its signs of the Gaussians before any training."""
+        """The mask of a frame that was taken, one bit a pixel, and its signs of the Gaussians before any training."""
         assert self.stations.look
         mask, camera = self.frames[frame].mask(), self.cameras[frame]
         margin = detectors.outline_margin(self.start, camera)
-        return mask, detectors.before_fit(self.images[frame], mask, *self.stations.look(self.start, camera), margin)
+        signs = detectors.before_fit(self.image(frame), mask, *self.stations.look(self.start, camera), margin)
+        return np.packbits(mask), signs
 
 
 def target_of(frame: Frame) -> np.ndarray:

@@ -30,6 +30,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians, learned
+from mgs.memory import IMAGE_BYTES, Deferred, kept_within
 from mgs.splat import ListCache, as_drjit, fisher, groups, render
 from mgs.splat.blocks import BlockLists
 from mgs.splat.information import unit_normals
@@ -55,6 +56,11 @@ class Photo:
     def size(self) -> tuple[int, int]:
         """Width and height, pixels."""
         return self.camera.width, self.camera.height
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of pixels and weights."""
+        return 4 * (len(self.pixels) + len(self.weights))
 
 
 @dataclass
@@ -92,9 +98,11 @@ class Prior:
 
 @dataclass(frozen=True)
 class Objective:
-    """Phi of this module's docstring, for some images. Models are Gaussians with TensorXf fields."""
+    """Phi of this module's docstring, for some images. Models are Gaussians with TensorXf fields.
 
-    photos: list[Photo]
+    photos: those beyond IMAGE_BYTES are made anew from their target at every use."""
+
+    photos: Sequence[Photo]
     prior: Prior
     cache: ListCache
 
@@ -105,6 +113,7 @@ class Objective:
         for photo in self.photos:
             rgb = render(model, photo.camera, cache=self.cache).rgb.array
             errors.append(dr.mean(dr.square((rgb - photo.pixels) * photo.weights)) + penalty / len(photo.pixels))
+            dr.eval(errors[-1])  # or it would hold the image until the last one is done
         return float(np.mean([float(error[0]) for error in errors]))
 
     def phi(self, model: Gaussians) -> float:
@@ -183,7 +192,10 @@ def objective(
     """
     groups(gaussians.sh_degree, means)  # raises where the name is unknown
     unit = unit_normals(len(gaussians), normals) if means == "normal" else None
-    photos = [_photo(camera, np.asarray(target, np.float32)) for camera, target in zip(cameras, targets, strict=True)]
+    if len(cameras) != len(targets):
+        raise ValueError(f"there are {len(cameras)} cameras, but {len(targets)} targets")
+    photo = kept_within(IMAGE_BYTES, lambda i: _photo(cameras[i], np.asarray(targets[i], np.float32)), lambda p: p.nbytes)
+    photos = Deferred(range(len(cameras)), photo)
     start = gaussians if start is None else start
     if start.sh.shape != gaussians.sh.shape:
         raise InputError(f"start: has colours of shape {start.sh.shape}, expected {gaussians.sh.shape}, that of the Gaussians")

@@ -8,8 +8,9 @@
 A line of `steps.jsonl` holds: `step` (0 = the seeds), `frame` and `name` of the chosen view (null at step 0, which has `seeds`
 and `seed_names` instead), `images` (how many the model has now), `score` (the policy's own number; of random, the draw),
 `information_gain` (Eq. 7 of the chosen view by the run's estimator, whatever the policy), `coverage` (Eq. 9 of all images),
-`iterations`, `loss` and `stop_reason` of the fit, `signs` of what may go wrong (`mgs.active.detectors`) and, where one of them
-has just gone beyond its limit, `warnings`, sentences; `seconds` per stage, and, where the step was evaluated, mean PSNR in dB
+`iterations`, `loss` and `stop_reason` of the fit; with the setting `exposure`, under that name, the gains (red, green, blue) by
+which the image of each frame was divided; `signs` of what may go wrong (`mgs.active.detectors`) and, where one of them has just
+gone beyond its limit, `warnings`, sentences; `seconds` per stage, and, where the step was evaluated, mean PSNR in dB
 over all views (`psnr`; `psnr_mask` in the rock mask), over those never trained on (`held_out_psnr`, `held_out_psnr_mask`), and
 over the test views of the dataset where it has some (`test_psnr`, `test_psnr_mask`).
 """

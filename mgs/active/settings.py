@@ -122,6 +122,8 @@ class NbvSettings(BaseModel):
     """Most passes of the fits after the first, if `train.passes` is not less."""
     warm_rate: Positive = 1.0
     """Learning rates of the fits after the first, over those of the first."""
+    exposure: bool = False
+    """Estimate a gain per image and channel before every fit, and fit to the images divided by it (`mgs.prior.exposure`)."""
     train: TrainSettings = TrainSettings()
     """How each fit is done."""
 
@@ -164,7 +166,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 OPTIONS = (
     "policy", "nearest", "estimator", "budget", "seeds", "seed", "lam", "pixel_noise", "evaluate_every", "means", "optimiser",
-    "passes", "warm_passes",
+    "exposure", "passes", "warm_passes",
 )  # fmt: skip
 """Settings that `mgs nbv` has an option for, of the same name."""
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -12,11 +11,13 @@ from mgs.active.inputs import prior_digest
 from mgs.active.loop import Stations
 from mgs.active.settings import NbvSettings, TrainSettings
 from mgs.camera import Camera
-from mgs.colour import srgb_from_linear
+from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data.dataset import Dataset
 from mgs.gaussians import Gaussians
-from mgs.metrics import psnr
+from mgs.memory import IMAGE_BYTES, kept_within
+from mgs.metrics import colour_corrected, psnr
 from mgs.prior.build import Prior
+from mgs.prior.exposure import exposure_of
 from mgs.prior.initial import initial_gaussians, initial_normals
 from mgs.splat import ListCache, fisher, groups, render
 
@@ -26,13 +27,14 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
     cache, means = ListCache(), settings.train.means
     columns = groups(0, means)
     lam, normals = settings.regularisation(columns), initial_normals(prior)
+    exposure = exposure_of(prior) if settings.exposure else None
     by_kind = {kind: float(lam[of_kind][0]) for kind, of_kind in columns.items()}
 
     def run_fit(
         gaussians: Gaussians,
         start: Gaussians,
         cameras: list[Camera],
-        targets: list[np.ndarray],
+        targets: Sequence[np.ndarray],
         train: TrainSettings,
         on_pass: Callable[[int, int], None],
     ) -> Fit:
@@ -48,48 +50,56 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
     return Stations(
         centre=prior.points.mean(axis=0),
         groups=columns,
-        initial=lambda frames: initial_gaussians(prior, frames)[0],
+        initial=lambda frames: initial_gaussians(prior, frames, gains=exposure(frames) if exposure else None)[0],
         fit=run_fit,
         fisher=lambda gaussians, camera: information(gaussians, camera, settings.estimator),
         estimate=information,
         exact=lambda gaussians, camera: fisher(gaussians, camera, cache=cache),
         look=look,
-        measure=psnr_measure(dataset, cache),
+        measure=psnr_measure(dataset, cache, settings.exposure),
+        exposure=exposure,
         on_surface=len(prior.points),
         up=prior.up,
         prior=prior_digest(prior),
     )
 
 
-def psnr_measure(dataset: Dataset, cache: ListCache) -> Callable[[Gaussians, list[int]], dict[str, float]]:
+def psnr_measure(
+    dataset: Dataset, cache: ListCache, exposure: bool = False
+) -> Callable[[Gaussians, list[int]], dict[str, float]]:
     """measure(gaussians, frames taken) -> mean PSNR, dB: `psnr` and `psnr_mask` (inside the rock mask) over all views,
     `held_out_psnr` and `held_out_psnr_mask` over those never trained on, `test_psnr` and `test_psnr_mask` over the test views
-    where the dataset has some. As `mgs.report.evaluation`, without its other metrics, which cost more. A mean over no view (all
-    masks empty, none held out) is left out. Raises InputError as `Dataset.test_views`.
+    where the dataset has some; with `exposure` the same once more with `_corrected` at the end, of renders that are brought to
+    the exposure of the view (`mgs.metrics.colour_corrected`). As `mgs.report.evaluation`, without its other metrics, which cost
+    more. A mean over no view (all masks empty, none held out) is left out. Raises InputError as `Dataset.test_views`.
     """
     tests = dataset.test_views()
     frames = [*dataset.frames, *(tests.frames if tests else ())]
+    names = ("psnr", "psnr_mask", *(("psnr_corrected", "psnr_mask_corrected") if exposure else ()))
 
-    @functools.cache
-    def truth(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def read(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         rgba, weight = frames[index].target()
         return srgb_from_linear(rgba[..., :3]), weight > 0, frames[index].mask() & (weight > 0)
 
+    truth = kept_within(IMAGE_BYTES, read, lambda parts: sum(part.nbytes for part in parts))
+
+    def values(image: np.ndarray, known: np.ndarray, rock: np.ndarray, rendered: np.ndarray) -> list[float]:
+        shown = [rendered, colour_corrected(linear_from_srgb(image), rendered, rock)] if exposure else [rendered]
+        return [psnr(srgb_from_linear(one), image, mask) for one in shown for mask in (known, rock)]
+
     def measure(gaussians: Gaussians, taken: list[int]) -> dict[str, float]:
-        values = np.empty((len(frames), 2))
+        found = np.empty((len(frames), len(names)))
         for i, frame in enumerate(frames):
-            image, known, rock = truth(i)
-            rendered = srgb_from_linear(np.asarray(render(gaussians, frame.camera, cache=cache).rgb))
-            values[i] = psnr(rendered, image, known), psnr(rendered, image, rock)
-        views, test_views = values[: len(dataset)], values[len(dataset) :]
+            found[i] = values(*truth(i), np.asarray(render(gaussians, frame.camera, cache=cache).rgb))
+        views, test_views = found[: len(dataset)], found[len(dataset) :]
         held_out = np.delete(views, taken, axis=0)
-        return _means(views, "") | _means(held_out, "held_out_") | _means(test_views, "test_")
+        return _means(views, "", names) | _means(held_out, "held_out_", names) | _means(test_views, "test_", names)
 
     return measure
 
 
-def _means(values: np.ndarray, prefix: str) -> dict[str, float]:
-    """Mean of each column of [V,2] over the views that have it, by name."""
+def _means(values: np.ndarray, prefix: str, names: Sequence[str]) -> dict[str, float]:
+    """Mean of each column of [V,names] over the views that have it, by name."""
     known = ~np.isnan(values).all(axis=0)
     means = np.nanmean(np.where(known, values, 0), axis=0) if known.any() else values
-    return {prefix + name: float(means[i]) for i, name in enumerate(("psnr", "psnr_mask")) if known[i]}
+    return {prefix + name: float(means[i]) for i, name in enumerate(names) if known[i]}

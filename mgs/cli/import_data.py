@@ -10,6 +10,9 @@ import typer
 MANY_PIXELS = 2_000_000
 """Images with more pixels than this are worth a word on --downscale."""
 
+EXPOSURE_DIFFERS = 0.1
+"""Stops by which the exposure of photographs must differ, by their EXIF, to be worth a word."""
+
 
 def import_data(
     source: Annotated[Path, typer.Argument(help="A transforms.json, or a folder with one or with a COLMAP model (sparse/0).")],
@@ -45,6 +48,7 @@ def import_data(
     from mgs.data.importers import import_source, read_source
     from mgs.data.meshes import GLTF
     from mgs.errors import InputError
+    from mgs.images import exif_exposure
 
     console, notes = Console(), Console(stderr=True)
     if masks is not None and mesh is not None:
@@ -74,6 +78,12 @@ def import_data(
     axis = ", ".join(f"{value:.4g}" for value in upward)
     lengths = "metres" if result.unit == "m" else f"in {result.unit}s (no --unit was given)"
     console.print(f"up is ({axis}): {reason}; lengths are {lengths}")
+    stops = [value for shot in found.shots if (value := exif_exposure(shot.image)) is not None]
+    if stops and max(stops) - min(stops) > EXPOSURE_DIFFERS:
+        notes.print(
+            f"mgs: by their EXIF, exposure differs by up to {max(stops) - min(stops):.1f} stops between photographs; "
+            "`mgs nbv --exposure` estimates a gain for each"
+        )
     camera = result.frames[0].camera
     if camera.width * camera.height > MANY_PIXELS:
         notes.print(f"mgs: images of {camera.width}x{camera.height} take long to fit; --downscale 2 or more makes them smaller")

@@ -67,6 +67,12 @@ def nbv(
         list[str] | None,
         typer.Option(metavar="KIND=NUMBER", help=f"Learning rate of a kind of parameter [{_numbers(RATES)}]; 0: not learned."),
     ] = None,
+    exposure: Annotated[
+        bool,
+        typer.Option(
+            "--exposure", help="Exposure and white balance differ between images: estimate a gain of each image and channel."
+        ),
+    ] = False,
     passes: Annotated[int | None, typer.Option(help="Most passes over the images of one fit.")] = None,
     warm_passes: Annotated[int | None, typer.Option(help="Most passes of the fits after the first.")] = None,
     preset: Annotated[
@@ -102,7 +108,7 @@ def nbv(
     settings: dict[str, Any] = {
         "policy": policy, "nearest": nearest, "seeds": seeds, "seed": seed, "estimator": estimator, "lam": lam,
         "pixel_noise": pixel_noise, "prior_std": pairs("--prior-std", prior_std), "evaluate_every": evaluate_every,
-        "train": train,
+        "exposure": exposure, "train": train,
     }  # fmt: skip
     settings |= {name: value for name, value in {"budget": budget, "warm_passes": warm_passes}.items() if value is not None}
     start_and_print(dataset, out, console, prior=prior, gaussians=parse_gaussians(gaussians), preset=preset, **settings)
@@ -202,6 +208,14 @@ def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console
                 f"{label} ({mean['count']}): PSNR {shown['psnr']} dB, SSIM {shown['ssim']}; "
                 f"inside the rock mask PSNR {shown['psnr_mask']} dB, SSIM {shown['ssim_mask']}"
             )
+            if "exposure" in state.steps[-1]:
+                found = [
+                    "–" if mean.get(key) is None else f"{mean[key]:.2f}" for key in ("psnr_corrected", "psnr_mask_corrected")
+                ]
+                console.print(
+                    f"{label}, with a gain per channel fitted to each view itself: PSNR {found[0]} dB; "
+                    f"inside the rock mask {found[1]} dB"
+                )
     if "fit" in metrics:
         console.print(fit_line(metrics["fit"], state.steps[-1]["stop_reason"]))
     console.print(f"wrote {out}", soft_wrap=True)

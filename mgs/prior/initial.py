@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -58,27 +59,26 @@ GREY = 0.5
 """Colour of a Gaussian that no seed frame sees, linear RGB in every channel: all its spherical harmonics are zero."""
 
 
-def initial_gaussians(prior: Prior, seed_frames: Sequence[Frame], inset: float = INSET) -> tuple[Gaussians, np.ndarray]:
+def initial_gaussians(
+    prior: Prior, seed_frames: Sequence[Frame], inset: float = INSET, gains: np.ndarray | None = None
+) -> tuple[Gaussians, np.ndarray]:
     """One flat Gaussian for each of the N samples of a prior, with a colour averaged over the seed frames that see the sample;
     then one behind each of the first `prior.backed` samples, of the same colour.
 
     A frame sees a sample that lies inside its rock mask, whose normal points towards the camera, and whose depth agrees with
     the depth image, up to `prior.depth_tolerance` and the slope of the surface within a pixel. For a frame without depth image
     the depth of the prior's mesh is used. A sample that no frame sees is grey.
-    inset: how far below its sample a Gaussian lies, over the `pixel_on` the prior.
+    inset: how far below its sample a Gaussian lies, over the `pixel_on` the prior. gains: [V,3] of the frames' exposures, by
+    which their colours are divided (`mgs.prior.exposure`).
     Returns (N + backed Gaussians of degree 0, seen [N] bool: which samples some frame sees).
     Raises InputError if a file of a frame cannot be read, and as `mesh_depth` where a frame has no depth image.
     """
     n = len(prior.points)
     total, count = np.zeros((n, 3)), np.zeros(n)
-    depth_of_mesh = None if all(frame.depth_path for frame in seed_frames) else _depth_of_mesh(prior)
-    for frame in seed_frames:
-        depth = depth_of_mesh(frame.camera) if depth_of_mesh and frame.depth_path is None else frame.depth()
-        seen = visible(prior.points, prior.normals, frame.camera, depth, prior.depth_tolerance) & in_mask(prior.points, frame)
-        pixels, _ = frame.camera.project(prior.points[seen])
-        at = [pixels[:, 1] - 0.5, pixels[:, 0] - 0.5]
-        rgb = frame.rgb()
-        total[seen] += np.stack([map_coordinates(rgb[..., k], at, order=1, mode="nearest") for k in range(3)], 1)
+    depth = depth_of(prior)
+    for k, frame in enumerate(seed_frames):
+        seen, rgb = seen_colours(prior.points, prior.normals, frame, depth(frame), prior.depth_tolerance)
+        total[seen] += rgb if gains is None else rgb / gains[k]
         count[seen] += 1
     seen = count > 0
     rgb = np.where(seen[:, None], total / np.maximum(count, 1)[:, None], GREY)
@@ -126,11 +126,32 @@ def _with_backing(surface: Gaussians, prior: Prior) -> Gaussians:
     return Gaussians(*(np.concatenate([getattr(g, field.name) for g in (surface, backing)]) for field in fields(Gaussians)))
 
 
-def _depth_of_mesh(prior: Prior) -> Callable[[Camera], np.ndarray]:
-    """A function that gives the depth image [H,W], metres, of the prior's mesh in a camera."""
-    from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
+def seen_colours(
+    points: np.ndarray, normals: np.ndarray, frame: Frame, depth: np.ndarray, tolerance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(which points [N] of a surface a frame sees inside its mask, bool; the colours of these there, [seen,3] linear RGB).
 
-    return mesh_depth(prior.mesh)
+    normals, depth [H,W], tolerance: as in `mgs.data.visibility.visible`. Raises InputError if a file cannot be read.
+    """
+    seen = visible(points, normals, frame.camera, depth, tolerance) & in_mask(points, frame)
+    pixels, _ = frame.camera.project(points[seen])
+    at, rgb = [pixels[:, 1] - 0.5, pixels[:, 0] - 0.5], frame.rgb()
+    return seen, np.stack([map_coordinates(rgb[..., k], at, order=1, mode="nearest") for k in range(3)], 1)
+
+
+def depth_of(prior: Prior) -> Callable[[Frame], np.ndarray]:
+    """A function that gives the depth image [H,W] of a frame, metres: its own, or where it has none, that of the prior's mesh.
+
+    Raises InputError as `mesh_depth`, when the mesh is first needed, and as `Frame.depth`.
+    """
+
+    @cache
+    def of_mesh() -> Callable[[Camera], np.ndarray]:
+        from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
+
+        return mesh_depth(prior.mesh)
+
+    return lambda frame: of_mesh()(frame.camera) if frame.depth_path is None else frame.depth()
 
 
 def with_share_seen(prior: Prior, seed_frames: Sequence[Frame]) -> Prior:

@@ -125,7 +125,7 @@ def write_information_ply(path: str | Path, gaussians: Gaussians, scalars: dict[
 
 
 PANELS = {
-    "Z": ("depth (m)", "viridis"),
+    "Z": ("depth", "viridis"),
     "unobserved": ("unobserved", "cividis"),
     "fisher.colour": ("Fisher information, colour", "magma"),
     "fisher.scale": ("Fisher information, log-scale", "magma"),
@@ -137,10 +137,11 @@ PANELS = {
 """Panels of a preview: channel -> title and colour map. The colour maps are perceptually uniform."""
 
 
-def write_preview(path: str | Path, maps: dict[str, np.ndarray], title: str) -> None:
+def write_preview(path: str | Path, maps: dict[str, np.ndarray], title: str, unit: str = "m") -> None:
     """Write the preview of one view as a PNG: its render and the PANELS with colour bars, cropped to the model.
 
-    maps: as `view_maps` gives them, of all scalars; title: of the render. Raises InputError if the file cannot be written.
+    maps: as `view_maps` gives them, of all scalars; title: of the render; unit: what a length of 1 is called. Raises InputError
+    if the file cannot be written.
     """
     import matplotlib
 
@@ -158,7 +159,7 @@ def write_preview(path: str | Path, maps: dict[str, np.ndarray], title: str) -> 
         for axis, (channel, (label, colours)) in zip(axes[1:], PANELS.items(), strict=True):
             values = np.ma.masked_where(~visible, maps[channel])[window]
             shown = axis.imshow(values, cmap=_on_grey(colours), norm=_norm(channel, values), interpolation="nearest")
-            axis.set_title(label)
+            axis.set_title(f"{label} ({unit})" if channel == "Z" else label)
             ticks = [0, 1] if channel == "unobserved" else None
             figure.colorbar(shown, ax=axis, shrink=0.85, aspect=16, pad=0.02, ticks=ticks)
         for axis in axes:
@@ -235,7 +236,7 @@ def diagnose_run(
         seen = "trained on" if frame.name in trained else "never trained on"
         if settings.estimator != "exact":  # then the maps are not in the units that their panels name
             seen += f"; by {settings.estimator}"
-        write_preview(out / f"{frame.name}.png", maps, f"{frame.name}, {seen}")
+        write_preview(out / f"{frame.name}.png", maps, f"{frame.name}, {seen}", dataset.unit)
         written += [out / f"{frame.name}.exr", out / f"{frame.name}.png"]
     if progress:
         progress(len(frames), len(frames))

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mgs.colour import srgb_from_linear
+from mgs.data.up import PLUS_Z, Up, upright
 from mgs.plotting import STYLE, crop, new_figure, save_figure
 
 if TYPE_CHECKING:
@@ -65,17 +66,23 @@ def orbit_figure(
     positions: np.ndarray,
     surface: np.ndarray | None,
     choices: Mapping[str, tuple[Sequence[int], Sequence[int]]],
+    up: Up = PLUS_Z,
+    unit: str = "m",
 ) -> None:
     """The orbit from above, in one panel for each run: all poses, the seeds, and the chosen views, numbered in their order.
 
-    positions: [C,3] camera centres, metres. surface: [N,3] points of the rock, metres, or None to leave it out. choices: label
-    -> (indices of the seeds, indices of the chosen views in their order), into positions.
+    positions: [C,3] camera centres, world. surface: [N,3] points of the rock, or None to leave it out. choices: label ->
+    (indices of the seeds, indices of the chosen views in their order), into positions. up, unit: of the world
+    (`mgs.data.dataset.Dataset`); where +Z is not up, the world is turned by `mgs.data.up.upright` before it is drawn.
     """
     import matplotlib
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.ticker import MaxNLocator
 
+    turn, (x, y, _) = upright(up), axis_names(up, unit)
+    positions = np.asarray(positions) @ turn.T
+    surface = None if surface is None else np.asarray(surface) @ turn.T
     with matplotlib.rc_context(STYLE):
         figure = new_figure(3.1 * len(choices) + 0.8, 3.9)
         axes = figure.subplots(1, len(choices), sharex=True, sharey=True, squeeze=False)[0]
@@ -83,13 +90,19 @@ def orbit_figure(
         norm = Normalize(1, max(last, 2))
         for axis, (policy, (seeds, chosen)) in zip(axes, choices.items(), strict=True):
             _orbit_panel(axis, positions, surface, list(seeds), list(chosen), norm)
-            axis.set(title=_in_lines(f"{policy}: {len(seeds)} seeds, {len(chosen)} chosen"), xlabel="$x$ (m)")
-        axes[0].set_ylabel("$y$ (m)")
+            axis.set(title=_in_lines(f"{policy}: {len(seeds)} seeds, {len(chosen)} chosen"), xlabel=x)
+        axes[0].set_ylabel(y)
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
         bar = figure.colorbar(ScalarMappable(norm, "viridis"), ax=list(axes), shrink=0.8, pad=0.01)
         bar.locator = MaxNLocator(integer=True)
         bar.set_label("step at which the view was chosen")
         save_figure(figure, path)
+
+
+def axis_names(up: Up, unit: str) -> tuple[str, str, str]:
+    """What the axes of a world are called that is turned so that +Z is up: x, y and z only where it had not to be turned."""
+    names = ("x", "y", "z") if up == PLUS_Z else ("horizontal", "horizontal, across", "up")
+    return (f"{names[0]} ({unit})", f"{names[1]} ({unit})", f"{names[2]} ({unit})")
 
 
 def _orbit_panel(

@@ -16,6 +16,7 @@ import numpy as np
 
 from mgs.active.run_folder import read_settings
 from mgs.data.dataset import Dataset, Frame
+from mgs.data.up import upright
 from mgs.files import atomic_path
 from mgs.report.page_facts import Shown, cell, links, measured, measured_views, read_shown, setting_rows, summary_rows
 from mgs.report.page_pictures import (
@@ -146,11 +147,11 @@ def _sections(one: Shown, dataset: Dataset) -> dict[str, Any]:
                 "name": frame.name,
                 "facts": facts,
                 "pictures": _pictures(one, frame, k + 1),
-                "eye": frame.camera.position.tolist(),
+                "eye": (upright(one.up) @ frame.camera.position).tolist(),
             }
         )
     cameras, names = [frame.camera for frame in dataset.frames], [frame.name for frame in dataset.frames]
-    orbit = orbit_plot(one.label, cameras, names, one.run.seeds, one.run.chosen, one.model)
+    orbit = orbit_plot(one.label, cameras, names, one.run.seeds, one.run.chosen, one.model, one.up, one.unit)
     return {"label": one.label, "views": views, "orbit": orbit, "time": timing_plot(one.label, steps)}
 
 

@@ -11,16 +11,20 @@ from urllib.parse import quote
 
 from mgs.active.run_folder import read_checkpoint
 from mgs.data.dataset import Dataset, Frame
+from mgs.data.up import PLUS_Z, Up
 from mgs.files import read_json
 from mgs.gaussians import Gaussians
 from mgs.report.page_plots import metric_name
-from mgs.report.runs import Run
+from mgs.report.runs import Run, up_of
 from mgs.splat_ply import read_ply
 
 GROUP_NAMES = {"all": "all views", "held_out": "held out", "test": "test views"}
 """What metrics.json calls the views that it has means of -> headings. Other groups are called by their key."""
 
-STEP_KEYS = {"step", "frame", "images", "iterations", "score", "information_gain", "coverage", "loss", "seconds", "signs"}
+STEP_KEYS = {
+    "step", "frame", "images", "iterations", "score", "information_gain", "coverage", "loss", "seconds", "signs",
+    "exposure",
+}  # fmt: skip
 """Keys of steps.jsonl that hold numbers, and no metrics of images."""
 
 
@@ -30,7 +34,7 @@ class Shown:
 
     run: with the steps of the checkpoint where there is one, as steps.jsonl can be a step behind. model: its Gaussians; None
     where the folder holds none. metrics: of this very model; None where it was not measured since its last step. frames: taken,
-    in their order. notes: what a reader should know.
+    in their order. notes: what a reader should know. up, unit: of the world (`mgs.data.dataset.Dataset`).
     """
 
     label: str
@@ -39,6 +43,8 @@ class Shown:
     metrics: dict[str, Any] | None
     frames: list[Frame]
     notes: list[str]
+    up: Up = PLUS_Z
+    unit: str = "m"
 
 
 def read_shown(label: str, run: Run, dataset: Dataset) -> Shown:
@@ -52,7 +58,8 @@ def read_shown(label: str, run: Run, dataset: Dataset) -> Shown:
     taken = run.seeds + run.chosen
     fresh = run.metrics is not None and run.metrics["images"] == len(taken)
     metrics = run.metrics if fresh else None
-    return Shown(label, run, model, metrics, [dataset.frames[i] for i in taken], _notes(run, model is not None, fresh))
+    frames, notes = [dataset.frames[i] for i in taken], _notes(run, model is not None, fresh)
+    return Shown(label, run, model, metrics, frames, notes, up_of(run.settings.get("prior", ""), dataset), dataset.unit)
 
 
 def _notes(run: Run, drawn: bool, measured: bool) -> list[str]:
@@ -94,7 +101,7 @@ def summary_rows(shown: Sequence[Shown]) -> list[tuple[str, list[str]]]:
     means = [_flat({k: v for k, v in (one.metrics or {}).items() if isinstance(v, dict)}) for one in shown]
     for path in dict.fromkeys(path for found in means for path in found):
         *groups, key = path
-        name = "number" if key == "count" else metric_name(key)
+        name = "number" if key == "count" else metric_name(key, shown[0].unit)
         heading = ", ".join([*(GROUP_NAMES.get(group, group.replace("_", " ")) for group in groups), name])
         rows.append((heading, [cell(key, found.get(path)) for found in means]))
     return rows

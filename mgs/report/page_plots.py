@@ -12,8 +12,9 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
+from mgs.data.up import PLUS_Z, Up, upright
 from mgs.gaussians import Gaussians
-from mgs.report.figures import line_styles
+from mgs.report.figures import axis_names, line_styles
 
 SYMBOLS: dict[str | tuple[int, int, int], str] = {
     "o": "circle", "s": "square", "^": "triangle-up", "D": "diamond", "v": "triangle-down", "P": "cross", "X": "x",
@@ -34,18 +35,20 @@ METRIC_NAMES = {
     "psnr_mask": "PSNR, rock only (dB)",
     "ssim_mask": "SSIM, rock only",
     "psnr_inside": "PSNR, without the outline (dB)",
+    "psnr_corrected": "PSNR, exposure fitted to each view (dB)",
+    "psnr_mask_corrected": "PSNR, rock only, exposure fitted to each view (dB)",
     "held_out_psnr": "PSNR, held out (dB)",
     "held_out_psnr_mask": "PSNR, held out, rock only (dB)",
     "test_psnr": "PSNR, test views (dB)",
     "test_psnr_mask": "PSNR, test views, rock only (dB)",
-    "depth_error": "depth error (m)",
+    "depth_error": "depth error ({unit})",
 }
 """Headings of metrics whose key says too little. Any other number is called by its key."""
 
 
-def metric_name(key: str) -> str:
-    """The heading of a metric, by its key in metrics.json or steps.jsonl."""
-    return METRIC_NAMES.get(key, key.replace("_", " "))
+def metric_name(key: str, unit: str = "m") -> str:
+    """The heading of a metric, by its key in metrics.json or steps.jsonl. unit: what a length of 1 is called."""
+    return METRIC_NAMES.get(key, key.replace("_", " ")).replace("{unit}", unit)
 
 
 Curves = Mapping[str, tuple[Sequence[float], Sequence[float]]]
@@ -133,26 +136,34 @@ def views_plot(metric: str, runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> 
 
 
 def orbit_plot(
-    label: str, cameras: Sequence[Camera], names: Sequence[str], seeds: list[int], chosen: list[int], model: Gaussians | None
+    label: str,
+    cameras: Sequence[Camera],
+    names: Sequence[str],
+    seeds: list[int],
+    chosen: list[int],
+    model: Gaussians | None,
+    up: Up = PLUS_Z,
+    unit: str = "m",
 ) -> dict[str, Any]:
     """The orbit in 3D: the model as points, all poses, seeds, and the chosen views with their numbers, joined in their order.
 
-    names: of the frames; seeds, chosen: their indices. The last trace, "shown above", is the view that the page's slider is
+    names: of the frames; seeds, chosen: their indices. up, unit: of the world, which is turned by
+    `mgs.data.up.upright` before it is drawn. The last trace, "shown above", is the view that the page's slider is
     at; the page moves it.
     """
-    eyes = np.array([camera.position for camera in cameras])
-    traces = []
+    turn, traces = upright(up), []
+    eyes = np.array([camera.position for camera in cameras]) @ turn.T
     if model is not None:
         some = model[:: max(1, -(-len(model) // POINTS))]
         colours = np.round(srgb_from_linear(some.rgb) * 255).astype(int).tolist()
         marker = {"size": 2, "color": [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in colours]}
-        traces.append(_points("model", np.round(some.means.astype(float), 4), marker, hoverinfo="skip"))
+        traces.append(_points("model", np.round(some.means.astype(float) @ turn.T, 4), marker, hoverinfo="skip"))
     left = [i for i in range(len(eyes)) if i not in seeds + chosen]
     traces += [
         _points(
             "candidates", eyes[left], {"size": 3, "color": "#9a9a9a", "symbol": "circle-open"}, names=[names[i] for i in left]
         ),
-        _frusta([cameras[i] for i in seeds + chosen], FRUSTUM * _distance(eyes, model)),
+        _frusta([cameras[i] for i in seeds + chosen], FRUSTUM * _distance(cameras, model), turn),
         _points("seeds", eyes[seeds], {"size": 6, "color": "#D55E00", "symbol": "diamond"}, names=[names[i] for i in seeds]),
     ]
     order = list(range(1, len(chosen) + 1))
@@ -164,7 +175,8 @@ def orbit_plot(
     first = (seeds + chosen)[:1]
     here = {"size": 12, "color": "#dd1111", "symbol": "circle-open"}
     traces.append(_points("shown above", eyes[first], here, hoverinfo="skip"))
-    axes = {f"{a}axis": {"title": {"text": f"{a} (m)"}} for a in "xyz"}
+    titles = axis_names(up, unit)
+    axes = {f"{a}axis": {"title": {"text": title}} for a, title in zip("xyz", titles, strict=True)}
     view = {"eye": {"x": 0.9, "y": 0.9, "z": 0.7}}
     layout = {"scene": {"aspectmode": "data", "camera": view, **axes}}
     alt = (
@@ -175,12 +187,13 @@ def orbit_plot(
         [what, names[i], *(f"{value:.3f}" for value in eyes[i])]
         for what, i in [*(("seed", i) for i in seeds), *((f"step {k}", i) for k, i in zip(order, chosen, strict=True))]
     ]
-    numbers = {"heading": ["taken as", "view", "x (m)", "y (m)", "z (m)"], "rows": rows}
+    numbers = {"heading": ["taken as", "view", *titles], "rows": rows}
     return {"title": f"Orbit, {label}", "alt": alt, "data": traces, "layout": layout, "numbers": numbers}
 
 
-def _distance(eyes: np.ndarray, model: Gaussians | None) -> float:
+def _distance(cameras: Sequence[Camera], model: Gaussians | None) -> float:
     """Mean distance of the cameras from the middle of the model, or of the cameras."""
+    eyes = np.array([camera.position for camera in cameras])
     middle = np.mean(eyes if model is None else model.means, axis=0)
     return float(np.linalg.norm(eyes - middle, axis=1).mean())
 
@@ -202,18 +215,18 @@ def _points(
 
 
 def corners_at(camera: Camera, depth: float) -> np.ndarray:
-    """The corners of a camera's image at this z-depth in metres, as points of the world [4,3], in order around the image."""
+    """The corners of a camera's image at this z-depth, as points of the world [4,3], in order around the image."""
     width, height = camera.width, camera.height
     pixels = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1]], float)
     pose = camera.camera_to_world
     return depth * pixels @ np.linalg.inv(camera.K).T @ pose[:3, :3].T + pose[:3, 3]
 
 
-def _frusta(cameras: Sequence[Camera], length: float) -> dict[str, Any]:
-    """Cameras as wire pyramids of this length, metres, in one trace of lines."""
+def _frusta(cameras: Sequence[Camera], length: float, turn: np.ndarray) -> dict[str, Any]:
+    """Cameras as wire pyramids of this length in one trace of lines. turn: [3,3], the rotation of the world."""
     lines: list[list[float | None]] = [[], [], []]
     for camera in cameras:
-        corners, eye = corners_at(camera, length), camera.position
+        corners, eye = corners_at(camera, length) @ turn.T, turn @ camera.position
         for a, b in [*((eye, corner) for corner in corners), *zip(corners, np.roll(corners, -1, axis=0), strict=True)]:
             for axis, values in enumerate(lines):
                 values += [round(float(a[axis]), 4), round(float(b[axis]), 4), None]

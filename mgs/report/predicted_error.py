@@ -231,6 +231,8 @@ def _views(
     """The frames that the run was trained on, and sets of views that it was not, by name; none of these is empty."""
     if settings.train.means != "frozen":
         raise InputError(f"{run}: learns means; --calibrate knows the errors of frozen means only")
+    if settings.exposure:
+        raise InputError(f"{run}: estimates exposure; --calibrate knows the errors of images as they are only")
     if len(trained) < 2 * FOLDS:
         raise InputError(
             f"{run}: has {len(trained)} images; --calibrate leaves out a third of them, and needs {2 * FOLDS} or more"

@@ -14,6 +14,7 @@ from mgs.active.policy_file import label
 from mgs.active.run_folder import check_same_frames, read_settings
 from mgs.active.settings import validated
 from mgs.data.dataset import Dataset, load_dataset
+from mgs.data.up import Up, unit_up
 from mgs.errors import InputError
 from mgs.files import read_json
 
@@ -179,3 +180,13 @@ def dataset_of(runs: Sequence[Run]) -> Dataset:
     for run in runs:
         check_same_frames(run.folder, dataset)
     return dataset
+
+
+def up_of(prior: str | Path, dataset: Dataset) -> Up:
+    """Which way was up for a run: as the folder of its prior says, or, where that is not there, as the dataset does.
+
+    Raises InputError if the prior's file is damaged.
+    """
+    file = Path(prior) / "prior.json"
+    numbers = read_json(file) if file.is_file() else None
+    return unit_up(numbers["up"]) if isinstance(numbers, dict) and "up" in numbers else dataset.up

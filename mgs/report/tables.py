@@ -15,16 +15,19 @@ COLUMNS = {
     "test.ssim": "SSIM, test views",
     "test.psnr_mask": "PSNR, test views, rock only (dB)",
     "test.ssim_mask": "SSIM, test views, rock only",
+    "test.psnr_mask_corrected": "PSNR, test views, rock only, exposure fitted to each view (dB)",
     "all.psnr": "PSNR, all (dB)",
     "all.ssim": "SSIM, all",
     "held_out.psnr": "PSNR, held out (dB)",
     "held_out.ssim": "SSIM, held out",
     "held_out.psnr_mask": "PSNR, held out, rock only (dB)",
     "held_out.ssim_mask": "SSIM, held out, rock only",
+    "held_out.psnr_mask_corrected": "PSNR, held out, rock only, exposure fitted to each view (dB)",
     "coverage": "coverage (%)",
 }
 """Columns of the table: the key of the number in a row of `table_numbers` -> the heading. Those of the test views stand first,
-because they are the same for every run; where no run was measured on test views, they are left out (`table_columns`)."""
+because they are the same for every run; where no run was measured on test views, they are left out, and where no run estimated
+the exposure of images, those with an exposure that was fitted (`table_columns`)."""
 
 
 def table_numbers(folders: Sequence[str | Path]) -> list[dict[str, Any]]:
@@ -32,7 +35,8 @@ def table_numbers(folders: Sequence[str | Path]) -> list[dict[str, Any]]:
 
     policy: the run's label (`evaluated_runs`); images: how many the model was trained on; coverage: of the surface, per cent;
     test.NAME (where the dataset has test views), all.NAME and held_out.NAME: the means in metrics.json, PSNR in dB, None if
-    there is no view to average. Raises InputError as `evaluated_runs`.
+    there is no view to average. A run that estimated the exposure of images has "exposure": True. Raises InputError as
+    `evaluated_runs`.
     """
     rows = []
     for label, run in evaluated_runs(folders).items():
@@ -40,13 +44,15 @@ def table_numbers(folders: Sequence[str | Path]) -> list[dict[str, Any]]:
         row = {"policy": label, "images": metrics["images"]}
         sets = [views for views in ("test", "all", "held_out") if views in metrics]
         row |= {f"{views}.{name}": metrics[views][name] for views in sets for name in metrics[views]}
+        row |= {"exposure": True} if run.settings.get("exposure") else {}
         rows.append(row | {"coverage": 100 * run.steps[-1]["coverage"]})
     return rows
 
 
 def table_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The keys of COLUMNS, in order, without those of the test views where no row of `table_numbers` has them."""
-    return [key for key in COLUMNS if not key.startswith("test.") or any(key in row for row in rows)]
+    """The keys of COLUMNS, in order, that say something of these rows of `table_numbers`."""
+    exposure, tests = any(row.get("exposure") for row in rows), any("test.psnr" in row for row in rows)
+    return [key for key in COLUMNS if (exposure or "corrected" not in key) and (tests or not key.startswith("test."))]
 
 
 def table_cell(column: str, value: Any) -> str:

@@ -12,7 +12,7 @@ from mgs.errors import InputError
 from mgs.files import atomic_path, write_json
 from mgs.report.evaluation import read_comparison
 from mgs.report.figures import comparison_figure, coverage_figure, gain_figure, orbit_figure, psnr_figure
-from mgs.report.runs import Run, check_finished, dataset_of, evaluated_runs, read_run
+from mgs.report.runs import Run, check_finished, dataset_of, evaluated_runs, read_run, up_of
 from mgs.report.tables import markdown_table, table_numbers
 from mgs.splat_ply import read_ply
 
@@ -43,7 +43,8 @@ def write_report(out: str | Path, folders: Sequence[str | Path]) -> list[Path]:
 
     positions = np.array([frame.camera.position for frame in dataset.frames])
     choices = {label: (run.seeds, run.chosen) for label, run in runs.items()}
-    orbit_figure(out / "orbit.png", positions, read_ply(first.folder / "gaussians.ply").means, choices)
+    means, up = read_ply(first.folder / "gaussians.ply").means, up_of(first.settings.get("prior", ""), dataset)
+    orbit_figure(out / "orbit.png", positions, means, choices, up, dataset.unit)
     gain_figure(out / "gain.png", {label: [s["information_gain"] for s in run.steps[1:]] for label, run in runs.items()})
     curves = {label: ([s["images"] for s in run.steps], [s["coverage"] for s in run.steps]) for label, run in runs.items()}
     coverage_figure(out / "coverage.png", curves)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from mgs.active.loop import Loop, Progress, Stations, target_of
+from mgs.active.loop import Loop, Progress, Stations
 from mgs.active.nbv import start_run
 from mgs.active.run_folder import State, read_checkpoint, read_settings, write_checkpoint
 from mgs.active.settings import NbvSettings
@@ -41,10 +41,7 @@ class Oracle(Loop):
     def worth(self, state: State, frame: int) -> float:
         """Mean PSNR over the test views, dB, of the very fit that the loop does once it takes this frame."""
         taken = [*state.taken, frame]
-        for i in taken:
-            if i not in self.images:
-                self.images[i] = target_of(self.frames[i])
-        cameras, targets = [self.cameras[i] for i in taken], [self.images[i] for i in taken]
+        cameras, targets = [self.cameras[i] for i in taken], self.targets(taken)
         train = self.settings.train_at(len(state.steps))
         fit = self.stations.fit(state.gaussians, self.start, cameras, targets, train, lambda done, most: None)
         return self.judge(fit.gaussians, [])["psnr"]

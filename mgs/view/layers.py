@@ -78,13 +78,13 @@ def scale(subject: Subject, layer: str) -> tuple[float, float]:
     return 0.0, max(float(np.quantile(subject.scalars[layer], 0.999)), 1e-9)
 
 
-def legend(layer: str, ends: tuple[float, float]) -> str:
-    """What the colours of a layer mean, in one line."""
+def legend(layer: str, ends: tuple[float, float], unit: str) -> str:
+    """What the colours of a layer mean, in one line. unit: what a length of 1 is called."""
     low, high = ends
     return {
         "colour": "The colours of the model.",
         "alpha": "Opacity: black 0, white 1.",
-        "depth": f"Depth: dark {low:.2f} m, bright {high:.2f} m. Grey while the camera moves.",
+        "depth": f"Depth: dark {low:.3g} {unit}, bright {high:.3g} {unit}. Grey while the camera moves.",
         "information": f"Information gained: dark 0, bright {high:.0f} nats and more.",
         "uncertainty": "Variance left over that of the prior: blue 0, all known; yellow 1, nothing.",
         "unobserved": "Yellow: no image has seen this part of the surface.",

@@ -19,6 +19,7 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
+from mgs.data.up import upright
 from mgs.errors import InputError
 from mgs.report.page_plots import FRUSTUM
 from mgs.rotation import rotmat_from_quat
@@ -137,16 +138,17 @@ class Viewer:
         """Backdrop, light, first camera, mesh."""
         server, subject = self.server, self.subject
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        server.scene.set_up_direction("+z")
+        server.scene.set_up_direction(subject.up)
         server.scene.configure_environment_map(None)
         server.scene.world_axes.visible = False
         server.scene.set_background_image(BLACK)
         centre, size = self._extent()
         server.initial_camera.look_at = centre
-        direction = np.array([1.0, -1.0, 0.8]) * 2 * size
+        up, turn = np.array(subject.up), upright(subject.up)
+        direction = turn.T @ np.array([1.0, -1.0, 0.8]) * 2 * size
         if subject.views:  # as from the first camera, but from above and behind the cameras, so that they are seen too
             eye = subject.views[0].frame.camera.position
-            direction = 1.6 * (eye - centre) + np.array([0, 0, np.linalg.norm(eye - centre)])
+            direction = 1.6 * (eye - centre) + np.linalg.norm(eye - centre) * up
             server.initial_camera.fov = _vertical_fov(subject.views[0].frame.camera)
         server.initial_camera.position = centre + direction
         if subject.mesh is not None:
@@ -324,13 +326,15 @@ class Viewer:
         camera = window_camera(client.handle.camera)
         if self.exact.value and self.gaussians.value and camera is not None:
             image, depth, ends = layers.kernel_image(subject, camera, layer)
-            self.legend.content = layers.legend(layer, ends)
+            self.legend.content = layers.legend(layer, ends, subject.unit)
             if asked[0] == client.moved:
                 client.splats.visible, client.covered = False, True
                 client.handle.scene.set_background_image(image, format="png", depth=depth)
         else:
             ends = layers.scale(subject, layer) if layer in subject.scalars else (math.nan, math.nan)
-            self.legend.content = layers.legend(layer, ends) if layer != "depth" else "Depth is drawn by the kernel, at rest."
+            self.legend.content = (
+                layers.legend(layer, ends, subject.unit) if layer != "depth" else "Depth is drawn by the kernel, at rest."
+            )
             self._uncover(client)
         client.drawn = asked
 

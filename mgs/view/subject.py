@@ -13,12 +13,14 @@ from mgs.active.policy_file import label
 from mgs.active.settings import NbvSettings
 from mgs.data.dataset import Frame, load_dataset
 from mgs.data.meshes import Mesh, read_mesh
+from mgs.data.up import PLUS_Z, Up
 from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.gaussians import Gaussians
 from mgs.report.diagnostics import gaussian_scalars
 from mgs.report.page_facts import cell, measured
 from mgs.report.page_plots import metric_name
+from mgs.report.runs import up_of
 from mgs.splat_ply import ply_colour_space, read_ply
 
 SCALARS = ("information", "uncertainty", "unobserved")
@@ -39,7 +41,8 @@ class View:
 @dataclass(frozen=True)
 class Subject:
     """gaussians: the model; None where a run has no finished step yet. space: "linear" or "srgb", in which its colours are
-    blended. scalars: name -> [N], of SCALARS; none for a PLY. views: of the dataset, in its order; none for a PLY."""
+    blended. scalars: name -> [N], of SCALARS; none for a PLY. views: of the dataset, in its order; none for a PLY. up, unit:
+    of the world (`mgs.data.dataset.Dataset`); a PLY says nothing of either, and is taken to be +Z up."""
 
     title: str
     gaussians: Gaussians | None
@@ -47,6 +50,8 @@ class Subject:
     scalars: dict[str, np.ndarray] = field(default_factory=dict)
     views: list[View] = field(default_factory=list)
     mesh: Mesh | None = None
+    up: Up = PLUS_Z
+    unit: str = "m"
 
     @property
     def taken(self) -> list[View]:
@@ -67,7 +72,7 @@ def read_subject(path: str | Path, follow: bool = False) -> Subject:
         raise InputError(f"{path}: --follow needs the folder of a run")
     if not path.is_file():
         raise InputError(f"{path}: no such run folder or PLY file")
-    return Subject(path.name, read_ply(path), ply_colour_space(path))
+    return Subject(path.name, read_ply(path), ply_colour_space(path), unit="unit")
 
 
 def _read_run(run: Path, follow: bool) -> Subject:
@@ -79,14 +84,14 @@ def _read_run(run: Path, follow: bool) -> Subject:
     run_folder.check_same_frames(run, dataset)
     mesh_path = settings.prior / "mesh.ply"
     mesh = read_mesh(mesh_path) if mesh_path.is_file() else None
-    name = run.resolve().name
+    name, up = run.resolve().name, up_of(settings.prior, dataset)
     if state is None:
         waiting = [View(frame, "candidate", None, []) for frame in dataset.frames]
-        return Subject(f"{name}: no finished step yet", None, views=waiting, mesh=mesh)
+        return Subject(f"{name}: no finished step yet", None, views=waiting, mesh=mesh, up=up, unit=dataset.unit)
     views = _views(dataset.frames, state, _psnr(run, len(state.taken)))
     planned = settings.seeds + settings.budget
     title = f"{name}: {label(settings.policy)}, {len(state.taken)} of {planned} views, {len(state.gaussians):,} Gaussians"
-    return Subject(title, state.gaussians, "linear", _scalars(settings, state), views, mesh)
+    return Subject(title, state.gaussians, "linear", _scalars(settings, state), views, mesh, up, dataset.unit)
 
 
 def _scalars(settings: NbvSettings, state: run_folder.State) -> dict[str, np.ndarray]:

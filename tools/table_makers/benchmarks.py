@@ -171,6 +171,23 @@ def depth_error(data: dict[str, Any]) -> str:
     return markdown(heading, [[name, *(f"{100 * share:.1f} %" for share in row)] for name, row in data["shares"].items()])
 
 
+def exposure(data: dict[str, Any]) -> str:
+    """Fits to photographs of differing exposure, without gains and with them."""
+    rows = []
+    for row in data["records"]:
+        cells = [f"{row['stops']:g}", "estimated" if row["exposure"] else "none"]
+        cells += [f"{row[key]:.2f}" for key in ("psnr_mask_corrected", "psnr_mask")]
+        rows.append([*cells, f"{row['gain_rms']:.1%}, {row['gain_worst']:.1%}" if row["exposure"] else ""])
+    heading = ["stops", "gains", "exposure fitted to each view, dB", "as it is, dB", "error of gains, rms and worst"]
+    return markdown(heading, rows) + made_by(data)
+
+
+def photo_memory(data: dict[str, Any]) -> str:
+    """Most memory of each station for photographs of 12 megapixels."""
+    rows = [[f"`{r['station']}`", f"{r['photographs']}", f"{r['gigabytes']:.1f} GB"] for r in data["records"]]
+    return markdown(["station", "photographs", "most memory"], rows) + made_by(data)
+
+
 def own_data(data: dict[str, Any]) -> str:
     """Held-out quality from strangers' data, and what is lost against the exact prior."""
     rows = []
@@ -348,5 +365,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "depth-error": ("benchmarks/depth_error", depth_error),
     "backing": ("benchmarks/backing", backing),
     "own-data": ("benchmarks/own_data", own_data),
+    "exposure": ("benchmarks/exposure", exposure),
+    "photo-memory": ("benchmarks/photo_memory", photo_memory),
 }
 """By name: the file, seen from docs/ and without `.json`, and what makes the table of its contents."""

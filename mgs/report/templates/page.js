@@ -21,6 +21,7 @@ function layoutOf(spec) {
   if (layout.scene) {
     const inSpace = {gridcolor: style("--line"), zerolinecolor: style("--line"), color: style("--soft"), showbackground: false};
     for (const name of ["xaxis", "yaxis", "zaxis"]) layout.scene[name] = {...inSpace, ...layout.scene[name]};
+    if (innerWidth < 600) for (const a of "xyz") layout.scene.camera.eye[a] *= 1.7;  // or the outer cameras are cut off
     layout.uirevision = "keep";
   }
   return {

@@ -1,0 +1,121 @@
+"""Memory is bounded: images beyond a budget are read again, and nothing of a result changes."""
+
+from __future__ import annotations
+
+import gc
+import sys
+import weakref
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+import synthetic
+
+from mgs.active import loop, objective, stations
+from mgs.active.nbv import run_nbv
+from mgs.data.dataset import Dataset, Frame, load_dataset
+from mgs.data.importers import import_source, read_source
+from mgs.memory import Deferred, kept_within
+from mgs.prior.build import build_prior, save_prior
+from mgs.prior.settings import PriorSettings
+
+
+def test_results_are_kept_while_there_is_room_and_made_anew_beyond() -> None:
+    made: Counter[int] = Counter()
+
+    def make(key: int) -> np.ndarray:
+        made[key] += 1
+        return np.full(10, key, np.uint8)
+
+    get = kept_within(25, make, lambda array: array.nbytes)
+    for _ in range(3):
+        assert [int(get(key)[0]) for key in range(4)] == [0, 1, 2, 3]
+    assert made == {0: 1, 1: 1, 2: 3, 3: 3}
+
+
+def test_a_deferred_sequence_asks_for_an_item_whenever_it_is_used() -> None:
+    asked = []
+    items = Deferred([5, 6, 7], lambda key: asked.append(key) or 10 * key)  # type: ignore[func-returns-value]
+    assert len(items) == 3
+    assert asked == []
+    assert items[1] == 60
+    assert list(items[1:]) == list(items)[1:] == [60, 70]
+    assert asked == [6, 6, 7, 5, 6, 7]
+    with pytest.raises(IndexError):
+        items[3]
+
+
+class Live:
+    """Counts the images that are alive, and the most there have been at once."""
+
+    def __init__(self) -> None:
+        self.now, self.most = 0, 0
+
+    def watch(self, image: np.ndarray) -> np.ndarray:
+        self.now += 1
+        self.most = max(self.most, self.now)
+        weakref.finalize(image, self.died)
+        return image
+
+    def died(self) -> None:
+        self.now -= 1
+
+
+@pytest.fixture(scope="module")
+def rock(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    root = tmp_path_factory.mktemp("rock") / "dataset"
+    dataset = synthetic.write_dataset(root, synthetic.orbit_cameras(12, 48, 36))
+    save_prior(root / "prior", build_prior(dataset, PriorSettings(gaussians=300))[0])
+    return dataset
+
+
+def test_a_run_holds_few_images_at_once_and_finds_the_same(
+    rock: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    live, target = Live(), Frame.target
+
+    def watched(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+        rgba, weight = target(frame)
+        return live.watch(rgba), weight
+
+    monkeypatch.setattr(Frame, "target", watched)
+    found, most = [], []
+    for name, budget in (("kept", 1 << 30), ("read again", 0)):
+        for module in (loop, objective, stations):
+            monkeypatch.setattr(module, "IMAGE_BYTES", budget)
+        monkeypatch.setattr(loop, "target_of", lambda frame: live.watch(TARGET_OF(frame)))
+        gc.collect()
+        live.now = live.most = 0
+        settings = {"policy": "uniform", "seeds": 6, "budget": 3, "evaluate_every": 1}
+        found.append(run_nbv(rock.root, tmp_path / name, exposure=True, **settings))
+        most.append(live.most)
+    assert most[0] >= 9  # all that were taken: what is counted is what is meant
+    assert most[1] <= 4
+    kept, again = found
+    assert np.array_equal(kept.gaussians.sh, again.gaussians.sh)
+    assert np.array_equal(kept.H, again.H)
+
+
+TARGET_OF = loop.target_of
+
+
+def test_stations_before_a_run_hold_few_images_at_once(rock: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from mgs.data import importers
+    from mgs.data.masks import make_masks
+    from mgs.data.meshes import read_mesh
+
+    live, read, rgb, mask = Live(), importers.read_rgba, Frame.rgb, Frame.mask
+    monkeypatch.setattr(importers, "read_rgba", lambda path: live.watch(np.array(read(path))))
+    monkeypatch.setattr(Frame, "rgb", lambda frame: live.watch(rgb(frame).copy()))
+    monkeypatch.setattr(Frame, "mask", lambda frame: live.watch(mask(frame).copy()))
+    build_prior(rock, PriorSettings(gaussians=300), source="hull")
+    imported = import_source(read_source(rock.root), tmp_path / "d")
+    for path in (tmp_path / "d/masks").iterdir():
+        path.unlink()
+    bare = [Frame(f.name, f.camera, f.timestamp, f.image_path) for f in imported.frames]
+    make_masks(Dataset(tmp_path / "d", tuple(bare)), read_mesh(rock.root / "rock.glb"), 0.1)
+    assert live.most <= 4
+    assert len(load_dataset(tmp_path / "d")) == 12

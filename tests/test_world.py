@@ -1,0 +1,130 @@
+"""Reports of a world whose up axis is not +Z, and whose unit of length nobody knows: figures, page, maps, viewer."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+sys.path.insert(0, str(Path(__file__).parent))
+import tiny
+
+from mgs import plotting
+from mgs.active import loop
+from mgs.active.run_folder import load_run, read_settings
+from mgs.camera import Camera
+from mgs.data.dataset import load_dataset, write_transforms
+from mgs.data.up import PLUS_Z, unit_up, upright
+from mgs.files import write_json
+from mgs.gaussians import Gaussians
+from mgs.report import diagnostics, figures
+from mgs.report.evaluation import evaluate
+from mgs.report.page import write_page
+from mgs.report.runs import up_of
+from mgs.report.writing import write_report
+from mgs.view import layers
+from mgs.view.subject import read_subject
+
+UP = unit_up([0.3, -0.8, 0.2])
+
+
+def make_run(root: Path, tilted: bool) -> Path:
+    """A measured run; tilted: in the same world turned so that UP is up, and in units."""
+    dataset = load_dataset(tiny.write_dataset(root / "dataset"))
+    turn = upright(UP).T if tilted else np.eye(3)
+    frames = []
+    for frame in dataset.frames:
+        pose = frame.camera.world_to_camera.copy()
+        pose[:3, :3] = pose[:3, :3] @ turn.T
+        frames.append(replace(frame, camera=replace(frame.camera, world_to_camera=pose)))
+    write_transforms(dataset.root, frames, UP if tilted else PLUS_Z, "unit" if tilted else "m")
+    dataset = load_dataset(dataset.root)
+
+    def turned(g: Gaussians) -> Gaussians:
+        return replace(g, means=(g.means @ turn.T).astype(np.float32))
+
+    stations = tiny.stations(initial=lambda frames: turned(tiny.initial(frames)), up=dataset.up)
+    settings = tiny.start(root / "run", dataset, policy="uniform")
+    loop.run(root / "run", settings, dataset, stations, tiny.silent)
+    gaussians, _, trained, _ = load_run(root / "run")
+
+    def black(g: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        shape = camera.height, camera.width
+        return np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
+
+    metrics = evaluate(gaussians, dataset.frames, trained, renderer=black, pictures=root / "run/renders")
+    write_json(root / "run/metrics.json", {"policy": "uniform"} | metrics)
+    return root / "run"
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    return [make_run(tmp_path_factory.mktemp(name), name == "tilted") for name in ("level", "tilted")]
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, Figure]:
+    """The last figure of each name that was saved."""
+    found: dict[str, Figure] = {}
+    for module in (figures, plotting):
+        monkeypatch.setattr(module, "save_figure", lambda figure, path: found.update({Path(path).name: figure}))
+    return found
+
+
+def test_the_orbit_of_a_tilted_world_is_drawn_as_that_of_the_upright_one(
+    runs: list[Path], drawn: dict[str, Figure], tmp_path: Path
+) -> None:
+    shown = []
+    for run, names in zip(runs, (("x (m)", "y (m)"), ("horizontal (unit)", "horizontal, across (unit)")), strict=True):
+        write_report(tmp_path / "report", [run])
+        axis = drawn["orbit.png"].axes[0]
+        assert (axis.get_xlabel(), axis.get_ylabel()) == names
+        shown.append([np.asarray(points.get_offsets()) for points in axis.collections])
+        assert len(shown[-1]) == 4
+    for level, tilted in zip(*shown, strict=True):
+        np.testing.assert_allclose(tilted, level, atol=1e-5)
+
+
+def test_the_page_draws_it_upright_too_and_names_the_unit(runs: list[Path], tmp_path: Path) -> None:
+    data = []
+    for run in runs:
+        write_page(tmp_path / "page.html", [run])
+        text = (tmp_path / "page.html").read_text()
+        data.append(json.loads(text.split('type="application/json">')[1].split("</script>")[0])["runs"][0])
+    level, tilted = data
+    for one, other in zip(level["orbit"]["data"], tilted["orbit"]["data"], strict=True):
+        for axis in "xyz":
+            np.testing.assert_allclose(np.array(other[axis], float), np.array(one[axis], float), atol=2e-4, err_msg=one["name"])
+    np.testing.assert_allclose([v["eye"] for v in tilted["views"]], [v["eye"] for v in level["views"]], atol=1e-9)
+    titles = [
+        [orbit["layout"]["scene"][f"{a}axis"]["title"]["text"] for a in "xyz"] for orbit in (level["orbit"], tilted["orbit"])
+    ]
+    assert titles[0] == ["x (m)", "y (m)", "z (m)"]
+    assert titles[1] == ["horizontal (unit)", "horizontal, across (unit)", "up (unit)"]
+    assert "depth error (unit)" in text
+    assert "(m)" not in text.split("<script")[0]
+
+
+def test_maps_of_depth_name_the_unit(runs: list[Path], drawn: dict[str, Figure]) -> None:
+    for run, unit in zip(runs, ("m", "unit"), strict=True):
+        diagnostics.diagnose_run(run, ["kf_0001"])
+        assert f"depth ({unit})" in [axis.get_title() for axis in drawn["kf_0001.png"].axes]
+
+
+def test_the_viewer_knows_both(runs: list[Path]) -> None:
+    for run, up, unit in zip(runs, (PLUS_Z, UP), ("m", "unit"), strict=True):
+        subject = read_subject(run)
+        assert subject.up == pytest.approx(up)
+        assert f"3 {unit}" in layers.legend("depth", (1.0, 3.0), subject.unit)
+
+
+def test_the_axis_of_the_prior_goes_before_that_of_the_dataset(runs: list[Path], tmp_path: Path) -> None:
+    dataset = load_dataset(read_settings(runs[1]).dataset)
+    assert up_of(tmp_path, dataset) == dataset.up
+    write_json(tmp_path / "prior.json", {"up": [0, 2, 0]})
+    assert up_of(tmp_path, dataset) == (0, 1, 0)
