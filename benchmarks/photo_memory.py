@@ -131,7 +131,7 @@ def main(out: Path) -> None:
             to = folder / f"prior-{source}-{count}"
             measure(f"mgs prior --from {source}", count, "prior", folder / f"full{count}", "--from", source, "--out", to, *size)
         given = ["--prior", folder / f"prior-hull-{few}", "--seeds", str(few), "--budget", "0", *run]
-        measure("mgs nbv, after --downscale 4", few, "nbv", folder / f"small{few}", "--out", folder / "run", *given)
+        measure("mgs nbv", few, "nbv", folder / f"small{few}", "--out", folder / "run", *given)
     write_json(out, {"command": command_line(), "machine": runtime.processor(), "versions": versions(), "records": rows})
 
 

@@ -282,12 +282,13 @@ def inset(data: dict[str, Any]) -> str:
 
 
 def uncertainty(data: dict[str, Any]) -> str:
-    """How well errors are predicted in the test views, means over runs, and the least and the largest share inside intervals."""
+    """How well errors are predicted in the test views: means over runs; of shares inside intervals the extremes, too."""
     rows = []
     of_tests = [row for record in data["records"] for row in record["rows"] if row["views"] == "test"]
     for prediction in dict.fromkeys(row["prediction"] for row in of_tests):
         found = [row for row in of_tests if row["prediction"] == prediction]
-        areas = [[row["ause"][kind][name] for row in found] for kind in ("mae", "mse") for name in ("ause", "perfect", "constant")]
+        names = [(kind, name) for kind in ("mae", "mse") for name in ("ause", "perfect", "constant")]
+        areas = [[row["ause"][kind][name] for row in found] for kind, name in names]
         cells = [f"{sum(values) / len(values):.2f}" for values in areas]
         cells = [f"{a} ({p}; {c})" for a, p, c in (cells[:3], cells[3:])]
         cells += [f"{sum(row[key] for row in found) / len(found):.2f}" for key in ("spearman", "pearson")]
