@@ -152,10 +152,11 @@ def write_run(out: Path, root: Path, prior: Path) -> Path:
     """A run folder of the seeds alone, on the stand-ins."""
     from mgs.active.inputs import prior_digest
     from mgs.prior.build import load_prior
+    from mgs.prior.initial import initial_gaussians
 
-    dataset = load_dataset(root)
+    dataset, known = load_dataset(root), load_prior(prior)
     settings = start(out, dataset, prior=prior, budget=2)
-    parts = stations(prior=prior_digest(load_prior(prior)))
+    parts = stations(prior=prior_digest(known), initial=lambda frames: initial_gaussians(known, frames)[0])
     loop.run(out, settings.model_copy(update={"budget": 0}), dataset, parts, silent)
     return out
 

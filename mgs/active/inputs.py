@@ -98,3 +98,9 @@ def check_same_policy(out: Path, record: dict[str, Any], policy: str) -> None:
 def changed_prior(out: Path, prior: Path) -> str:
     """What to say where the prior is another one."""
     return f"{prior}: is not the prior that {out} was started on; restore it, or start a new run"
+
+
+def moved_start(out: Path, prior: Path) -> str:
+    """What to say where Gaussians do not lie where a run of this prior starts them."""
+    other = f"{out} is of a version of mgs that puts Gaussians elsewhere"
+    return f"{prior}: is not the prior that {out} was started on, or {other}; restore it, or start a new run"

@@ -179,7 +179,7 @@ class Loop:
             where = f"{self.out / 'config.json'}: settings.train.means"
             raise InputError(f"{where} has changed since {self.out} was started; restore it, or start a new run")
         if self.settings.train.means == "frozen" and not np.array_equal(state.gaussians.means, self.start.means):
-            raise InputError(inputs.changed_prior(self.out, self.settings.prior))
+            raise InputError(inputs.moved_start(self.out, self.settings.prior))
 
     def first(self) -> State:
         """Step 0: the seeds."""

@@ -208,7 +208,7 @@ def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console
                 f"{label} ({mean['count']}): PSNR {shown['psnr']} dB, SSIM {shown['ssim']}; "
                 f"inside the rock mask PSNR {shown['psnr_mask']} dB, SSIM {shown['ssim_mask']}"
             )
-            if "exposure" in state.steps[-1]:
+            if any("exposure" in step for step in state.steps):
                 found = [
                     "–" if mean.get(key) is None else f"{mean[key]:.2f}" for key in ("psnr_corrected", "psnr_mask_corrected")
                 ]
