@@ -41,7 +41,7 @@ class Preset:
 
 PRESETS = {
     "fast": Preset(passes=5, warm_passes=3, density=1 / 8),
-    "balanced": Preset(passes=PASSES, warm_passes=WARM_PASSES, density=1 / 8),
+    "balanced": Preset(passes=5, warm_passes=3, density=1 / 4),
     "accurate": Preset(passes=PASSES, warm_passes=WARM_PASSES, density=1 / 4),
 }
 """What `mgs nbv --preset` knows, by name: points on the front of runs in docs/speed-accuracy.md."""
