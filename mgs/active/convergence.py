@@ -19,7 +19,7 @@ from mgs.data.dataset import Frame
 from mgs.gaussians import Gaussians
 from mgs.memory import Deferred
 from mgs.prior.build import Prior
-from mgs.prior.exposure import exposure_of
+from mgs.prior.exposure import exposure_of, without_gain
 from mgs.prior.initial import initial_gaussians, initial_normals
 from mgs.splat import as_drjit, groups
 
@@ -49,8 +49,7 @@ def remaining_decrease(
     lam = settings.regularisation(kinds)
     by_kind = {kind: float(lam[columns][0]) for kind, columns in kinds.items()}
     cameras, gains = [frame.camera for frame in frames], exposure(frames) if exposure else np.ones((len(frames), 3))
-    divisors = np.column_stack([gains, np.ones(len(gains))]).astype(np.float32)
-    targets = Deferred(range(len(frames)), lambda k: target_of(frames[k]) / divisors[k])
+    targets = Deferred(range(len(frames)), lambda k: without_gain(target_of(frames[k]), gains[k]))
     goal = objective(gaussians, cameras, targets, start, by_kind, None, means, initial_normals(prior))
     model = as_drjit(gaussians)
     phi = goal.phi(model)

@@ -27,6 +27,7 @@ from mgs.errors import InputError
 from mgs.files import locked
 from mgs.gaussians import Gaussians
 from mgs.memory import IMAGE_BYTES, Deferred, kept_within
+from mgs.prior.exposure import without_gain
 from mgs.seeds import generator
 from mgs.splat_ply import write_ply
 
@@ -317,8 +318,7 @@ class Loop:
         """What the model is fitted to in these frames, each [H,W,4] as `target_of`; colours divided by `gains` [V,3]."""
         if gains is None:
             return Deferred(taken, self.image)
-        divisors = np.column_stack([gains, np.ones(len(gains))]).astype(np.float32)
-        return Deferred(range(len(taken)), lambda k: self.image(taken[k]) / divisors[k])
+        return Deferred(range(len(taken)), lambda k: without_gain(self.image(taken[k]), gains[k]))
 
     def signs(self, state: State, fit: Fit, taken: list[int], gains: np.ndarray | None, line: dict[str, Any]) -> dict[str, Any]:
         """The entries `signs` of a step and, where one has just gone beyond its limit, `warnings` (`mgs.active.detectors`)."""

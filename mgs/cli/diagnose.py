@@ -22,7 +22,7 @@ def diagnose(
 
     Writes into RUN/diagnostics: for each view an EXR with the channels R G B A Z, fisher.colour, fisher.scale, fisher.rotation,
     fisher.opacity, information, uncertainty and unobserved, and a PNG that shows them; and information.ply, a point for each
-        Gaussian, coloured by its information.
+    Gaussian, coloured by its information.
 
     With --calibrate it writes uncertainty.json and uncertainty.png: how well errors are predicted for the test views and for
     frames never trained on, after a calibration on the run's own views, each left out of a fit once; and NAME.errors.exr, true
@@ -36,7 +36,6 @@ def diagnose(
 
     if calibrate and views is not None:
         raise InputError("--calibrate takes all views that were not seen; leave out --views")
-
     wanted = None if views is None else [name.strip() for name in views.split(",") if name.strip()]
     if wanted == []:
         raise InputError(f"--views {views!r}: names no frame; give some, as in kf_0003,kf_0010, or leave it out")
@@ -53,6 +52,5 @@ def diagnose(
             written = calibrate_run(run, progress)
         else:
             written = diagnose_run(run, wanted, progress)
-
     for path in written:
         typer.echo(f"wrote {path}")

@@ -66,6 +66,12 @@ def solve_gains(colours: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.exp(found - found.mean(axis=0))
 
 
+def without_gain(target: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    """A target [H,W,4], colours and the weight of the pixel (`mgs.active.loop.target_of`), with its colours divided by the
+    gains [3] of the three channels; float32."""
+    return target / np.append(gain, 1).astype(np.float32)
+
+
 def exposure_of(prior: Prior) -> Callable[[Sequence[Frame]], np.ndarray]:
     """A function that gives the gains [V,3] of frames by `solve_gains`; it reads every frame once.
 

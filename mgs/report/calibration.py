@@ -68,8 +68,8 @@ class Calibration:
     def sigma(self, terms: Mapping[str, Array]) -> Array:
         """Standard deviations of the errors, of the shape of each term."""
         named = [weight * terms[name] for name, weight in self.weights.items() if name != "noise"]
-        variance: Array = np.sqrt(sum(named, np.full(1, self.weights["noise"])))
-        return variance
+        sigma: Array = np.sqrt(sum(named, np.full(1, self.weights["noise"])))
+        return sigma
 
 
 def fit_calibration(terms: Mapping[str, Array], errors: Array) -> Calibration:

@@ -13,7 +13,7 @@ and a constant. Their weights are fitted to views of the run itself, each predic
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +92,7 @@ def residual_variance(gaussians: Gaussians, frames: Sequence[Frame]) -> Array:
         for row, pixels in zip(sums, (error, weight), strict=True):
             sh = mi.TensorXf(grey.sh)
             dr.enable_grad(sh)
-            image = render(Gaussians(grey.means, grey.log_scales, grey.quats, grey.logit_opacities, sh), frame.camera)
+            image = render(replace(grey, sh=sh), frame.camera)
             dr.backward(dr.sum(image.rgb.array * mi.Float(np.repeat(pixels.ravel(), 3).astype(np.float32))))
             row += np.asarray(dr.grad(sh))[:, 0].mean(axis=-1) / SH_C0
     return sums[0] / np.maximum(sums[1], np.finfo(np.float32).tiny)
@@ -100,8 +100,7 @@ def residual_variance(gaussians: Gaussians, frames: Sequence[Frame]) -> Array:
 
 def _coloured(gaussians: Gaussians, values: Array) -> Gaussians:
     """The Gaussians with these numbers [N] as their grey."""
-    g = gaussians
-    return Gaussians(g.means, g.log_scales, g.quats, g.logit_opacities, sh_from_rgb(np.repeat(values[:, None], 3, axis=1)))
+    return replace(gaussians, sh=sh_from_rgb(np.repeat(values[:, None], 3, axis=1)))
 
 
 @dataclass(frozen=True)
