@@ -8,7 +8,6 @@ each of these views, because nobody knows their exposure. The gains that were fo
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import sys
 import tempfile
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from own_data import photographs
 
 from mgs import runtime
 from mgs.active.nbv import run_nbv
@@ -30,18 +30,6 @@ VIEWS, GAUSSIANS, DOWNSCALE = 12, 4_000, 2
 
 STOPS = (0.0, 0.3, 1.0)
 """By how much exposure differs at most, more or less; white balance by a third of that."""
-
-
-def photographs() -> Any:
-    """tools/photographs.py, which is no part of the package."""
-    path = Path(__file__).parent.parent / "tools/photographs.py"
-    spec = importlib.util.spec_from_file_location("photographs", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["photographs"] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def gain_errors(found: dict[str, list[float]], true: dict[str, list[float]]) -> dict[str, float]:
