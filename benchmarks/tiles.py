@@ -58,7 +58,7 @@ def main(prefix: str, n: int = 100_000) -> None:
     dr.eval(splats)
     black, chosen, settings = as_colour(0.0), blocks.TILE, {}
     for blocks.TILE in TILES:
-        settings[blocks.TILE] = blocks.build(splats, blocks.depth_order(splats.depth), camera.width, camera.height, 0.0)
+        settings[blocks.TILE] = blocks.build(splats, camera.width, camera.height)
     blocks.TILE = chosen
     settings["splats anywhere"] = anywhere(settings[TILES[-1]])
     prepared = {}

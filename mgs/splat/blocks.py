@@ -3,9 +3,8 @@
 A block is a rectangle of BLOCK_X x BLOCK_Y pixels; the kernels give each block to one lane of a SIMD register (see
 `mgs.splat.walking`). A splat that touches five blocks is in five lists: it makes five (splat, block) *pairs*.
 
-Lists can be built with a margin around every footprint. They then stay valid as long as each footprint stays inside its margin
-(`outgrown`), like the neighbour lists with a skin of molecular dynamics. That works because the means are frozen, so that the
-centres of the splats and their depth order stay the same in each camera.
+Lists serve as long as no footprint changes (`changes`). As the means are frozen, the depth order of the splats stays the same in
+each camera, so that new lists of a camera take it over from the old ones.
 
 Splats of neighbouring blocks should lie near one another in memory. So blocks are grouped into square *tiles*, and the splats
 are stored tile by tile; where a splat lies is called its *place*.
@@ -48,10 +47,9 @@ means their sums take 32 and 48 more (exact information with means and an SH deg
 
 @dataclass
 class Footprints:
-    """The ellipses for which lists were built, Float [N] each. Fields as in `Splats`, grown by the margin.
+    """The ellipses for which lists were built, Float [N] each. Fields as in `Splats`.
 
-    level: the value of xi^2 + eta^2 at the rim of the ellipse, margin and SLACK included; not positive where the splat is in no
-    list.
+    level: the value of xi^2 + eta^2 at the rim of the ellipse, SLACK included; not positive where the splat is in no list.
     """
 
     mean_x: Any
@@ -67,10 +65,10 @@ class Footprints:
 class BlockLists:
     """The lists of all blocks, as M (splat, block) pairs sorted by block, tile by tile, and within a block by depth.
 
-    Each splat has a place, its position in memory: splats are stored by the tile of their centre, then block, then depth.
-    Each pair has a slot, which is where kernels store their sums for it. The slots of one splat follow one another.
+    Each splat has a place, its position in memory: splats are stored by the tile of their centre, then block, then depth. (In
+    lists that took their places over from older ones, by those of then.) Each pair has a slot, which is where kernels store their sums for it. The slots of one splat follow one another.
 
-    place: UInt32 [N], the place of each Gaussian's splat.
+    order: UInt32 [N], the Gaussians front to back; place: UInt32 [N], the place of each Gaussian's splat.
     splat: UInt32 [M], the place of the pair's splat; slot: UInt32 [M], the pair's slot. The last are unused (see `_room`).
     slot_start, slot_end: UInt32 [N], the range of slots of the splat at each place.
     block: UInt32 [L], the block of each lane, counted row by row through the image. Lanes go tile by tile, and in a tile the
@@ -79,6 +77,7 @@ class BlockLists:
     footprints: what the lists were built for.
     """
 
+    order: Any
     place: Any
     splat: Any
     slot: Any
@@ -95,48 +94,30 @@ class BlockLists:
     @property
     def nbytes(self) -> int:
         """Memory held, bytes."""
-        return 4 * (2 * len(self.splat) + 10 * len(self.slot_start) + 3 * len(self.block))
+        return 4 * (2 * len(self.splat) + 11 * len(self.slot_start) + 3 * len(self.block))
 
 
-def level(splats: Splats) -> Any:
-    """Float [N]: the value of xi^2 + eta^2 at the rim where alpha = ALPHA_MIN; not positive where nothing is drawn."""
-    return dr.select(splats.visible, splats.log2_opacity + LOG2_INV_ALPHA_MIN, -1)
+def footprints(splats: Splats) -> Footprints:
+    """The splats' footprints: each ends where alpha = ALPHA_MIN."""
+    level = splats.log2_opacity + LOG2_INV_ALPHA_MIN
+    drawn = splats.visible & (level > 0)
+    shape = splats.mean_x, splats.mean_y, splats.depth, splats.shear, splats.white_x, splats.white_y
+    return Footprints(*shape, level=dr.select(drawn, level + SLACK, -1))
 
 
-def inflate(splats: Splats, margin: float) -> Footprints:
-    """The splats' footprints, larger by `margin`, a share of their size (0: exact), and more opaque by `margin` bits."""
-    exact = level(splats)
-    growth = 1 / (1 + margin)
-    return Footprints(
-        mean_x=splats.mean_x,
-        mean_y=splats.mean_y,
-        depth=splats.depth,
-        shear=splats.shear,
-        white_x=splats.white_x * growth,
-        white_y=splats.white_y * growth,
-        level=dr.select(exact > -margin, exact + margin + SLACK, -1),
-    )
+RESHAPED, REORDERED = 1, 2
+"""What `changes` finds."""
 
 
-def outgrown(built: Footprints, splats: Splats) -> Any:
-    """Mask [N] of splats for which lists are no longer valid: the centre or depth changed, the splat left or entered the view,
-    or its footprint is not wholly inside the one that its lists were built for.
-
-    The test for "inside": let x be the whitened coordinates of the built ellipse, scaled so that it is the unit disc, and S the
-    matrix [s00 s01; 0 s11] that maps them to those of the present ellipse, scaled alike. In x the present ellipse is then
-    {x: |S x| <= 1}, and it lies in the unit disc exactly where the smaller eigenvalue of S^T S = [a b; b c] is at least 1.
+def changes(built: Footprints, splats: Splats) -> Any:
+    """UInt32 [N]: how each splat differs from those for which lists were built. 0: not at all, or it is drawn in neither;
+    RESHAPED: its footprint is another, so that the lists no longer serve; REORDERED: nor does their depth order.
     """
-    now = level(splats)
-    ratio = dr.sqrt(dr.maximum(built.level, 0) / dr.maximum(now, 1e-6))
-    s00 = ratio * splats.white_x / built.white_x
-    s01 = ratio * splats.white_x * (built.shear - splats.shear) / built.white_y
-    s11 = ratio * splats.white_y / built.white_y
-    a, b, c = s00 * s00, s00 * s01, s01 * s01 + s11 * s11
-    half = 0.5 * (a + c)
-    spread = dr.sqrt(0.25 * (a - c) * (a - c) + b * b)
-    smallest = s00 * s00 * (s11 * s11) / (half + spread)
-    moved = (built.mean_x != splats.mean_x) | (built.mean_y != splats.mean_y) | (built.depth != splats.depth)
-    return (moved & ((now > 0) | (built.level > 0))) | ((now > 0) & ~(smallest >= 1))
+    now = footprints(splats)
+    other = (built.mean_x != now.mean_x) | (built.mean_y != now.mean_y) | (built.shear != now.shear)
+    other |= (built.white_x != now.white_x) | (built.white_y != now.white_y) | (built.level != now.level)
+    reshaped = other & ((built.level > 0) | (now.level > 0))
+    return dr.select(built.depth == now.depth, mi.UInt32(dr.select(reshaped, RESHAPED, 0)), REORDERED)
 
 
 def depth_order(depth: Any) -> Any:
@@ -149,14 +130,16 @@ def depth_order(depth: Any) -> Any:
     return _sorted(order, dr.gather(mi.UInt32, bits, order) >> 16, 1 << 16)
 
 
-def build(splats: Splats, order: Any, width: int, height: int, margin: float) -> BlockLists:
-    """Block lists of detached splats; order: UInt32 [N] from `depth_order`; width, height: pixels; margin: see `inflate`.
+def build(splats: Splats, width: int, height: int, older: BlockLists | None = None) -> BlockLists:
+    """Block lists of detached splats; width, height: pixels; older: lists of the same camera whose depth order and places are
+    taken over, where no splat was REORDERED since.
 
     Whether a splat touches a block is decided by its ellipse, not by a bounding box.
     Raises InputError for more than MAX_PAIRS pairs, before memory is taken for them.
     """
     blocks_x, blocks_y = -(-width // BLOCK_X), -(-height // BLOCK_Y)
-    foot, place = inflate(splats, margin), _memory_places(splats, order, blocks_x, blocks_y)
+    foot, order = footprints(splats), older.order if older else depth_order(splats.depth)
+    place = older.place if older else _memory_places(splats, order, blocks_x, blocks_y)
     splat, number, slot_start, slot_end = _pairs(splats, foot, place, blocks_x, blocks_y)
     numbers = _tile_number(dr.arange(mi.UInt32, blocks_x * blocks_y), blocks_x)
     if len(splat) == 0:  # Dr.Jit has no operations on arrays of length 0
@@ -170,6 +153,7 @@ def build(splats: Splats, order: Any, width: int, height: int, margin: float) ->
     room = _room(len(splat))
     lane = _lanes_by_tile(end - start, numbers, _tile_numbers(blocks_x, blocks_y))
     lists = BlockLists(
+        order=order,
         place=place,
         splat=_padded(splat, room),
         slot=_padded(slot, room),

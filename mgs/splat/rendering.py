@@ -20,12 +20,6 @@ from mgs.splat.blocks import BLOCK_X, BLOCK_Y, BlockLists
 from mgs.splat.projection import Splats, camera_array, project
 from mgs.splat.walking import PIXELS, pack, sums_by_splat
 
-MARGIN = 0.15
-"""How much a footprint may grow before its lists must be rebuilt: a share of its size, and bits of its opacity.
-
-The first lists of a camera have no margin: a model that is only looked at pays for none. The margin comes with the lists that
-replace them, since then the model is being trained."""
-
 CACHE_BYTES = 1 << 30
 """Default memory budget of a `ListCache`, bytes: enough for 100 cameras of 100,000 Gaussians at 640x480."""
 
@@ -51,7 +45,7 @@ class ListCache:
 
     The lists of one camera are kept even where they alone exceed the budget.
 
-    Lists that no longer fit the Gaussians are found out and rebuilt at every use (see `mgs.splat.blocks.outgrown`), so keeping
+    Lists that no longer fit the Gaussians are found out and rebuilt at every use (see `mgs.splat.blocks.changes`), so keeping
     them never changes an image.
 
     What is kept: cameras are mostly gone through again and again, in one order (to score views) or in a new order each time (to
@@ -80,28 +74,37 @@ class ListCache:
         """
         key = camera.key
         lists = self._lists.get(key)
-        margin = 0.0 if lists is None else MARGIN
         dr.eval(splats)
         if lists is not None and len(lists.place) != len(splats.mean_x):
             lists = None
-        if lists is not None:
-            stale = dr.select(splats.finite, mi.UInt32(blocks.outgrown(lists.footprints, splats)), 2)
-            dr.schedule(stale)
-            packed = pack(splats, lists.place)
-            worst = int(dr.max(stale)[0])
-            _raise_unless_finite(worst < 2)
-            lists = None if worst else lists
         if lists is None:
             _raise_unless_finite(dr.all(splats.finite))
-            lists = blocks.build(splats, blocks.depth_order(splats.depth), camera.width, camera.height, margin)
+            lists = self._build(key, splats, camera)
             packed = pack(splats, lists.place)
-            self.builds += 1
-            self._keep(key, lists)
+        else:
+            not_finite = blocks.REORDERED + 1
+            change = dr.select(splats.finite, blocks.changes(lists.footprints, splats), not_finite)
+            dr.schedule(change)
+            packed = pack(splats, lists.place)
+            worst = int(dr.max(change)[0])
+            _raise_unless_finite(worst < not_finite)
+            if worst == blocks.RESHAPED:  # the places stay, and what is packed
+                lists = self._build(key, splats, camera, lists)
+            elif worst == blocks.REORDERED:
+                lists = self._build(key, splats, camera)
+                packed = pack(splats, lists.place)
         self._clock += 1
         self._used[key] = self._clock
         if key in self._lists:
             self._lists.move_to_end(key)
         return lists, packed
+
+    def _build(self, key: bytes, splats: Splats, camera: Camera, older: BlockLists | None = None) -> BlockLists:
+        """New lists, kept if there is room for them."""
+        lists = blocks.build(splats, camera.width, camera.height, older)
+        self.builds += 1
+        self._keep(key, lists)
+        return lists
 
     def _keep(self, key: bytes, lists: BlockLists) -> None:
         """Hold new lists; then keep the budget, by dropping those used longest ago or the new ones (see the class)."""

@@ -143,9 +143,8 @@ def block_rows(lane: Lane, s: Splats) -> list[Row]:
     four times as large.
 
     Going outwards from the row's centre, nothing underflows that is drawn: EPS2D keeps white_x below 1.6, so where a pixel of
-    the row is drawn, alpha at the centre is at least 2^-100. It can be smaller in blocks that the splat no longer reaches, as
-    it shrank after its lists were built. There `exp2` returns too much, 2^-120, so the ratios are set to 2^-120
-    too, and all alphas of the row stay far below the threshold.
+    the row is drawn, alpha at the centre is at least 2^-100. It can be smaller in a row that the splat does not reach. There
+    `exp2` returns too much, 2^-120, so the ratios are set to 2^-120 too, and all alphas of the row stay far below the threshold.
 
     The offset of the block's first pixel from the splat is computed in double: far along a slanted needle, xi is a small
     difference of large numbers.
