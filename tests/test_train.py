@@ -177,7 +177,8 @@ LONG = [2 * 0.9**k for k in range(6)]
         ([1, 0.5, 0.504, 0.508], 40, None),  # small rises that add up
         ([1, 0.5, 0.6, 0.598, 0.597], 40, None),  # flat, but well above what it had
         ([1, 1.2, 1.2, 1.2, 1.2, 1.2], 40, None),  # flat above the start
-        ([1, 1.2, 1.2, 1.2, 1.2, 1.2], 5, StopReason.DIVERGED),
+        ([1, 1.2, 1.2, 1.2, 1.2, 1.2], 5, StopReason.PASS_LIMIT),  # worse than the start, which is not yet divergence
+        ([1, 1.03, 1.2, 1.28, 1.05, 1.05], 5, StopReason.PASS_LIMIT),  # as a short fit with a new view may end
         ([2.06, 2.40, 2.31, 2.25, 2.18, 2.08], 5, StopReason.PASS_LIMIT),  # risen by one new view, and on its way back
         ([1, 1.2, 1.1, 1.05, 1.02, 1.005], 5, StopReason.PASS_LIMIT),
         ([1, 1.04], 1, StopReason.PASS_LIMIT),  # as the first pass of a healthy fit

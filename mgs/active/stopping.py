@@ -32,9 +32,8 @@ def stop_reason(losses: Sequence[float], tolerance: float, limit: int) -> StopRe
     losses: of the model that the fit started from, then of each pass. tolerance: share of a loss. limit: most passes.
 
     Diverged: the last loss is not finite; or the last DIVERGED_PASSES (all, where the limit is lower) are above DIVERGED_FACTOR
-    times the start; or the limit, of DIVERGED_PASSES or more, was reached, no pass came within the tolerance of the start, and
-    the last is no lower than the first: a fit that starts from a fitted model rises first, and a short one may end on its way
-    back.
+    times the start. A fit that ends less far above its start has not diverged: one that starts from a fitted model rises first,
+    and a short one may end on its way back (the sign `worse` of `mgs.active.detectors` tells of it).
     Settled: two passes in a row lower the loss of the pass before by less than the tolerance, and neither is more than the
     tolerance above the lowest loss until then. So a rise within the tolerance is the noise of a loss that falls no more; a
     larger one, or small ones that add up to more, are not. How far away the minimum is, it does not say: that is what
@@ -50,8 +49,7 @@ def stop_reason(losses: Sequence[float], tolerance: float, limit: int) -> StopRe
         return StopReason.SETTLED
     if passes < limit:
         return None
-    risen = min(losses[1:]) > (1 + tolerance) * start and losses[-1] >= losses[1]
-    return StopReason.DIVERGED if risen and limit >= DIVERGED_PASSES else StopReason.PASS_LIMIT
+    return StopReason.PASS_LIMIT
 
 
 def _settled(losses: Sequence[float], k: int, tolerance: float) -> bool:
