@@ -64,10 +64,10 @@ def main(prefix: str, n: int = 100_000) -> None:
     prepared = {}
     for name, lists in settings.items():
         packed = pack(splats, lists.place)
-        prepared[name] = lists, packed, kernels.forward(lists, packed)
+        prepared[name] = lists, packed, kernels.forward(lists, packed, True)
     operations = {
-        "forward": lambda lists, packed, out: kernels.forward(lists, packed),
-        "adjoint": lambda lists, packed, out: kernels.adjoint(lists, packed, out, out, False),
+        "forward": lambda lists, packed, out: kernels.forward(lists, packed, True),
+        "adjoint": lambda lists, packed, out: kernels.adjoint(lists, packed, out, out, False, True),
         "exact Fisher": lambda lists, packed, out: kernels.fisher(lists, packed, black, False),
     }
     seconds = {name: {setting: [] for setting in settings} for name in operations}

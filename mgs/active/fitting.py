@@ -27,7 +27,7 @@ from mgs.splat import ListCache, as_drjit
 from mgs.splat.blocks import BlockLists
 from mgs.splat.projection import project
 from mgs.splat.recording import frozen
-from mgs.splat.rendering import composite
+from mgs.splat.rendering import composite_rgb
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def _step(
     t: UInt32, step number from 1; target, weight: Float [H*W*3]; information: see `mgs.active.optimisers.Optimiser`.
     """
     copy = watched(gaussians, prior)
-    rgb = composite(project(copy, camera), packed, lists, *size).rgb
+    rgb = composite_rgb(project(copy, camera), packed, lists, *size)
     error = (rgb.array - target) * weight
     loss = dr.mean(dr.square(error))
     dr.backward(0.5 * dr.sum(dr.square(error)))

@@ -36,7 +36,7 @@ from mgs.splat.blocks import BlockLists
 from mgs.splat.information import unit_normals
 from mgs.splat.projection import camera_array, project, rows_as_vectors
 from mgs.splat.recording import frozen
-from mgs.splat.rendering import composite
+from mgs.splat.rendering import composite_rgb
 
 Vector = list[Any]
 """A number for every learned parameter: a TensorXf for each array of `mgs.gaussians.learned`, of its shape; for means that move
@@ -277,7 +277,7 @@ def _image_gradient(
 ) -> Vector:
     """The derivative of half the summed squared error of one image."""
     copy = watched(model, prior)
-    rgb = composite(project(copy, camera), packed, lists, *size).rgb
+    rgb = composite_rgb(project(copy, camera), packed, lists, *size)
     dr.backward(0.5 * dr.sum(dr.square((rgb.array - target) * weight)))
     return _gradients(copy, prior)
 
@@ -290,11 +290,11 @@ def _image_curvature(
     copy = watched(model, prior)
     for name, tangent in zip(prior.lam, vector, strict=True):
         dr.set_grad(getattr(copy, name), prior.across(name, tangent))
-    rgb = composite(project(copy, camera), packed, lists, *size).rgb
+    rgb = composite_rgb(project(copy, camera), packed, lists, *size)
     dr.forward_to(rgb)
     along = dr.detach(dr.grad(rgb).array) * dr.square(weight)
     copy = watched(model, prior)
-    rgb = composite(project(copy, camera), packed, lists, *size).rgb
+    rgb = composite_rgb(project(copy, camera), packed, lists, *size)
     dr.backward(dr.sum(rgb.array * along))
     return _gradients(copy, prior)
 

@@ -59,27 +59,30 @@ def _pixel_sums(lists: BlockLists, packed: Any, lane: Lane, T: list[Any], number
 
 
 @frozen(recorded_sizes)
-def forward(lists: BlockLists, packed: Any) -> tuple[Any, Any]:
-    """The image of packed splats. Returns Float arrays rgba [L*32*4] and depth [L*32].
+def forward(lists: BlockLists, packed: Any, whole: bool) -> tuple[Any, ...]:
+    """The image of packed splats. Returns Float arrays rgba [L*32*4] and, if `whole`, depth [L*32].
 
     Pixels lie block by block, in a block row by row (`mgs.splat.rendering` puts them in the image's order). Colour is sum w c,
     without the background; alpha is sum w; depth is sum w z, metres, not yet divided by alpha.
 
-    Mathematically alpha is 1 - T, too. But expected depth is a quotient by alpha, and in faint pixels the difference 1 - T
-    would have kept only its last few bits.
+    Mathematically alpha is 1 - T, too, and without `whole` it is computed so, which saves a sum. But expected depth is a
+    quotient by alpha, and in faint pixels the difference 1 - T would have kept only its last few bits.
     """
-    pixels = _pixel_sums(lists, packed, *lanes(lists), lambda splat: [*splat.colour, mi.Float(1), splat.depth])
-    return _store_pixels(lists, [[*rgba, z] for _, *rgba, z in pixels])
+    lane, T = lanes(lists)
+    if whole:
+        pixels = _pixel_sums(lists, packed, lane, T, lambda splat: [*splat.colour, mi.Float(1), splat.depth])
+        return _store_pixels(lists, [sums for _, *sums in pixels])
+    pixels = _pixel_sums(lists, packed, lane, T, lambda splat: splat.colour)
+    return _store_pixels(lists, [[*rgb, 1 - dr.abs(t)] for t, *rgb in pixels])
 
 
-def _store_pixels(lists: BlockLists, pixels: list[list[Any]]) -> tuple[Any, Any]:
-    """Write red, green, blue, alpha and depth of each pixel of the lanes' blocks, as `forward` returns them."""
-    rgba, depth = (dr.empty(mi.Float, len(lists.block) * PIXELS * size) for size in (4, 1))
-    for pixel, (*colour, z) in enumerate(pixels):
-        index = lists.block * PIXELS + pixel
-        dr.scatter(rgba, mi.Vector4f(*colour), index, mode=dr.ReduceMode.NoConflicts)
-        dr.scatter(depth, z, index, mode=dr.ReduceMode.NoConflicts)
-    return rgba, depth
+def _store_pixels(lists: BlockLists, pixels: list[list[Any]]) -> tuple[Any, ...]:
+    """Write red, green, blue, alpha and, where given, depth of each pixel of the lanes' blocks, as `forward` returns them."""
+    out = tuple(dr.empty(mi.Float, len(lists.block) * PIXELS * size) for size in ((4, 1) if len(pixels[0]) == 5 else (4,)))
+    for pixel, (r, g, b, a, *depth) in enumerate(pixels):
+        for array, value in zip(out, (mi.Vector4f(r, g, b, a), *depth), strict=True):
+            dr.scatter(array, value, lists.block * PIXELS + pixel, mode=dr.ReduceMode.NoConflicts)
+    return out
 
 
 POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
@@ -113,7 +116,7 @@ def pack_tangents(tangents: Splats, splats: Splats, place: Any) -> Any:
 
 
 @frozen(recorded_sizes)
-def jvp(lists: BlockLists, packed: Any, packed_tangents: Any) -> tuple[Any, Any]:
+def jvp(lists: BlockLists, packed: Any, packed_tangents: Any) -> tuple[Any, ...]:
     """How the output of `forward` changes as the splats change along their tangents (`pack_tangents`), in the same layout.
 
     This is the product J v of the Jacobian of `forward` and the tangents v, in one pass front to back (forward-mode
@@ -186,21 +189,24 @@ ADJOINT_SUMS = {False: 8, True: 10}
 
 
 @frozen(recorded_sizes)
-def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, Any], d_out: tuple[Any, Any], means: bool) -> Any:
+def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, ...], d_out: tuple[Any, ...], means: bool, whole: bool) -> Any:
     """What `splat_gradient` needs to make the gradient of each splat: sums over pixels, to be read through `sums_by_splat`.
 
-    out, d_out: the output of `forward`, and the gradient dL of a loss with respect to it.
+    out, d_out: the output of `forward`, and the gradient dL of a loss with respect to it. Without `whole` the loss depends on
+    red, green and blue alone; of alpha and depth nothing is read then, and the sum for depth is 0.
     Sums: w dL for red, green, blue and depth (4). With s the derivative of the loss by ln alpha at the pixel: s times 1, xi^2,
     xi eta, eta^2 (4), and, if means have gradients, s times xi, eta (2).
     """
     lane, T = lanes(lists)
     dL, pixels = [], []
     for pixel in range(PIXELS):
-        place = lists.block * PIXELS + pixel
-        rgba, d_rgba = (dr.gather(mi.Vector4f, a[0], place) for a in (out, d_out))
-        z, dz = (dr.gather(mi.Float, a[1], place) for a in (out, d_out))
-        dL.append((*d_rgba, dz))
-        pixels.append([T[pixel], dr.dot(rgba, d_rgba) + z * dz])
+        places = lists.block * PIXELS + pixel
+        rgba, d_rgba = (list(dr.gather(mi.Vector4f, a[0], places)) for a in (out, d_out))
+        values, slopes = (rgba, d_rgba) if whole else (rgba[:3], d_rgba[:3])
+        if whole:
+            values, slopes = (v + [dr.gather(mi.Float, a[1], places)] for v, a in ((rgba, out), (d_rgba, d_out)))
+        dL.append(slopes)
+        pixels.append([T[pixel], sum(v * d for v, d in zip(values, slopes, strict=True))])
     count = ADJOINT_SUMS[means]
     slots = pair_slots(lists, count)
 
@@ -211,14 +217,18 @@ def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, Any], d_out: tuple[A
             m0, m1, m2 = mi.Float(0), mi.Float(0), mi.Float(0)
             for x, (raw, xi) in enumerate(zip(row.raw_alpha, row.xi, strict=True)):
                 transmittance, behind = pixels[j * BLOCK_X + x]
-                dr_, dg, db, da, dz = dL[j * BLOCK_X + x]
+                dr_, dg, db, *others = dL[j * BLOCK_X + x]
                 alpha, w, after, room = blend(raw, transmittance)
-                c = dr.fma(r, dr_, dr.fma(g, dg, dr.fma(b, db, dr.fma(splat.depth, dz, da))))
+                c = b * db
+                if others:  # of alpha and depth
+                    c = dr.fma(b, db, dr.fma(splat.depth, others[1], others[0]))
+                    sums[3] = dr.fma(w, others[1], sums[3])
+                c = dr.fma(r, dr_, dr.fma(g, dg, c))
                 behind = dr.fma(-c, w, behind)
                 new.append([after, behind])
                 alive |= room
                 (slope,) = _slopes([c], [behind], alpha, w, after, room & (raw <= ALPHA_MAX))
-                sums[:4] = [dr.fma(w, d, s) for d, s in zip((dr_, dg, db, dz), sums[:4], strict=True)]
+                sums[:3] = [dr.fma(w, d, s) for d, s in zip((dr_, dg, db), sums[:3], strict=True)]
                 first = slope * xi
                 m0, m1, m2 = m0 + slope, m1 + first, dr.fma(first, xi, m2)
             eta_m0 = row.eta * m0

@@ -158,31 +158,34 @@ class _Rasterise(dr.CustomOp):
     """Compositing as an operation of Dr.Jit's AD: splats -> red, green, blue, alpha, depth times alpha, Float [H*W] each.
 
     Its derivative is written by hand: Dr.Jit's own would have to store the state of every pixel before every splat.
-    packed, lists: of these splats; places: from `_block_major`; means: whether mean_x and mean_y have gradients.
+    packed, lists: of these splats; places: from `_block_major`; means: whether mean_x and mean_y have gradients; whole: whether
+    alpha and depth are wanted, too. Otherwise they are left out.
     """
 
-    def eval(self, splats: Splats, packed: Any, lists: BlockLists, places: Any, means: bool) -> Any:
-        self.splats, self.packed, self.lists, self.places, self.means = splats, packed, lists, places, means
-        self.out = kernels.forward(lists, packed)
+    def eval(self, splats: Splats, packed: Any, lists: BlockLists, places: Any, means: bool, whole: bool) -> Any:
+        self.splats, self.packed, self.lists, self.places, self.means, self.whole = splats, packed, lists, places, means, whole
+        self.out = kernels.forward(lists, packed, whole)
         return self._in_order(self.out)
 
-    def _in_order(self, out: tuple[Any, Any]) -> Any:
-        """The output of a kernel, block by block, as five arrays of pixels row by row."""
-        rgba, depth = out
-        pixel = dr.gather(mi.Vector4f, rgba, self.places, mode=dr.ReduceMode.NoConflicts)
-        return *pixel, dr.gather(mi.Float, depth, self.places, mode=dr.ReduceMode.NoConflicts)
+    def _in_order(self, out: tuple[Any, ...]) -> Any:
+        """The output of a kernel, block by block, as arrays of pixels row by row."""
+        pixel = dr.gather(mi.Vector4f, out[0], self.places, mode=dr.ReduceMode.NoConflicts)
+        if not self.whole:
+            return tuple(pixel)[:3]
+        return *pixel, dr.gather(mi.Float, out[1], self.places, mode=dr.ReduceMode.NoConflicts)
 
     def forward(self) -> None:
         tangents = kernels.pack_tangents(self.grad_in("splats"), self.splats, self.lists.place)
         self.set_grad_out(self._in_order(kernels.jvp(self.lists, self.packed, tangents)))
 
     def backward(self) -> None:
-        *d_pixel, d_weighted = self.grad_out()
-        dr.eval(d_pixel, d_weighted)  # Dr.Jit 1.5 ends the process where a scatter's value awaits a scatter itself
-        d_rgba, d_depth = (dr.zeros(mi.Float, len(out)) for out in self.out)
-        dr.scatter(d_rgba, mi.Vector4f(*d_pixel), self.places, mode=dr.ReduceMode.NoConflicts)
-        dr.scatter(d_depth, d_weighted, self.places, mode=dr.ReduceMode.NoConflicts)
-        placed = kernels.adjoint(self.lists, self.packed, self.out, (d_rgba, d_depth), self.means)
+        r, g, b, *others = self.grad_out()
+        dr.eval(r, g, b, others)  # Dr.Jit 1.5 ends the process where a scatter's value awaits a scatter itself
+        alpha, *depth = others or [mi.Float(0)]
+        d_out = tuple(dr.zeros(mi.Float, len(out)) for out in self.out)
+        for array, value in zip(d_out, (mi.Vector4f(r, g, b, alpha), *depth), strict=True):
+            dr.scatter(array, value, self.places, mode=dr.ReduceMode.NoConflicts)
+        placed = kernels.adjoint(self.lists, self.packed, self.out, d_out, self.means, self.whole)
         sums = sums_by_splat(self.lists, placed, kernels.ADJOINT_SUMS[self.means])
         self.set_grad_in("splats", kernels.splat_gradient(sums, self.splats))
 
@@ -290,10 +293,23 @@ def composite(splats: Splats, packed: Any, lists: BlockLists, width: int, height
 
     packed: the splats' numbers from `walking.pack`; lists: their block lists; width, height: pixels.
     """
-    places = _block_major(width, height)
-    r, g, b, alpha, weighted = dr.custom(_Rasterise, splats, packed, lists, places, dr.grad_enabled(splats.mean_x))
+    r, g, b, alpha, weighted = _rasterised(splats, packed, lists, width, height, True)
     rgb = mi.Color3f(r, g, b) + (1 - alpha) * background
     expected = dr.select(alpha > 0, weighted / dr.select(alpha > 0, alpha, 1), 0)
     alpha = alpha + 0  # a variable that nothing else depends on: forward-mode AD clears the others when it is done
     shape = (height, width)
     return Image(mi.TensorXf(dr.ravel(rgb), (*shape, 3)), mi.TensorXf(alpha, shape), mi.TensorXf(expected, shape))
+
+
+def composite_rgb(splats: Splats, packed: Any, lists: BlockLists, width: int, height: int) -> Any:
+    """The colours of `composite` over black, TensorXf [H,W,3], differentiable in the splats' fields.
+
+    It is what a fit needs, and takes less time: neither alpha nor depth is summed, nor differentiated.
+    """
+    rgb = mi.Color3f(*_rasterised(splats, packed, lists, width, height, False))
+    return mi.TensorXf(dr.ravel(rgb), (height, width, 3))
+
+
+def _rasterised(splats: Splats, packed: Any, lists: BlockLists, width: int, height: int, whole: bool) -> Any:
+    """Call `_Rasterise`."""
+    return dr.custom(_Rasterise, splats, packed, lists, _block_major(width, height), dr.grad_enabled(splats.mean_x), whole)

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mgs.splat import Image, as_drjit, reference, render
+from mgs.splat.rendering import composite_rgb, splats_and_lists
 
 from .scenes import PARAMETERS, calm, compare, double, make_camera, make_gaussians, margins
 
@@ -149,6 +150,42 @@ def test_gradient_of_any_loss(loss):
     weights = {name: np.asarray(dr.grad(getattr(leaf, name))) for name in OUTPUTS}
     expected = gradients(gaussians, camera, weights, ("log_scales",))["log_scales"]
     assert compare(np.asarray(dr.grad(watched.log_scales)), expected)[0] < 1e-5
+
+
+@pytest.mark.parametrize("means", [False, True])
+def test_colours_alone_have_the_same_image_and_derivatives(means):
+    """What fits draw (`composite_rgb`): the colours of `render` over black bit for bit, its gradients and tangents."""
+    camera, gaussians = make_camera(), make_gaussians(60, 3, 1, log_scales=(-5.0, -1.5))
+    weights = mi.TensorXf(image_weights(camera)["rgb"].astype(np.float32))
+    wanted = PARAMETERS if means else PARAMETERS[1:]
+
+    def alone(watched):
+        splats, lists, packed = splats_and_lists(watched, camera, None)
+        return composite_rgb(splats, packed, lists, camera.width, camera.height)
+
+    def derivatives(draw):
+        """Image, tangent along the parameters' own values, and gradients by them."""
+        results = []
+        for forward in (True, False):
+            watched = as_drjit(gaussians)
+            for name in wanted:
+                setattr(watched, name, dr.copy(getattr(watched, name)))
+                dr.enable_grad(getattr(watched, name))
+                if forward:
+                    dr.set_grad(getattr(watched, name), getattr(gaussians, name))
+            rgb = draw(watched)
+            if forward:
+                dr.forward_to(rgb)
+                results += [dr.detach(rgb), dr.grad(rgb)]
+            else:
+                dr.backward(dr.sum(rgb * weights, axis=None))
+                results += [dr.grad(getattr(watched, name)) for name in wanted]
+        return [np.asarray(result) for result in results]
+
+    expected, found = derivatives(lambda watched: render(watched, camera).rgb), derivatives(alone)
+    np.testing.assert_array_equal(found[0], expected[0])
+    for name, a, b in zip(("tangent", *wanted), found[1:], expected[1:], strict=True):
+        assert compare(a, b)[0] < 1e-5, name
 
 
 def test_frozen_means_change_no_other_gradient():
