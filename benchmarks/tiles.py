@@ -40,14 +40,12 @@ ROUNDS = 15
 def anywhere(lists: blocks.BlockLists) -> blocks.BlockLists:
     """The same lists with every splat, and its slots, at its index."""
     place = np.asarray(lists.place)
-    index = np.argsort(place)
-    start, end = (np.asarray(a).astype(np.int64) for a in (lists.slot_start, lists.slot_end))
-    moved_end = np.cumsum((end - start)[place])
-    moved_start = moved_end - (end - start)[place]
-    splat = index[np.asarray(lists.splat)]
-    slot = np.asarray(lists.slot).astype(np.int64) - start[place[splat]] + moved_start[splat]
-    slot[np.asarray(lists.end).max() :] = 0
-    arrays = {"place": np.arange(len(place)), "splat": splat, "slot": slot, "slot_start": moved_start, "slot_end": moved_end}
+    start, end = (np.asarray(a).astype(np.int64)[place] for a in (lists.slot_start, lists.slot_end))
+    moved_end = np.cumsum(end - start)
+    moved_start, pair = moved_end - (end - start), np.asarray(lists.pair).copy()
+    pair[: moved_end[-1]] = pair[np.repeat(start - moved_start, end - start) + np.arange(moved_end[-1])]
+    splat = np.argsort(place)[np.asarray(lists.splat)]
+    arrays = {"place": np.arange(len(place)), "splat": splat, "pair": pair, "slot_start": moved_start, "slot_end": moved_end}
     return replace(lists, **{name: mi.UInt32(values) for name, values in arrays.items()})
 
 

@@ -3,8 +3,8 @@
 A block is a rectangle of BLOCK_X x BLOCK_Y pixels; the kernels give each block to one lane of a SIMD register (see
 `mgs.splat.walking`). A splat that touches five blocks is in five lists: it makes five (splat, block) *pairs*.
 
-Lists serve as long as no footprint changes (`changes`). As the means are frozen, the depth order of the splats stays the same in
-each camera, so that new lists of a camera take it over from the old ones.
+Lists serve as long as no footprint changes (`changes`). As the means are frozen, the depth order of the splats stays the same
+in each camera, so that new lists of a camera take it over from the old ones.
 
 Splats of neighbouring blocks should lie near one another in memory. So blocks are grouped into square *tiles*, and the splats
 are stored tile by tile; where a splat lies is called its *place*.
@@ -65,11 +65,13 @@ class Footprints:
 class BlockLists:
     """The lists of all blocks, as M (splat, block) pairs sorted by block, tile by tile, and within a block by depth.
 
-    Each splat has a place, its position in memory: splats are stored by the tile of their centre, then block, then depth. (In
-    lists that took their places over from older ones, by those of then.) Each pair has a slot, which is where kernels store their sums for it. The slots of one splat follow one another.
+    Each splat has a place, its position in memory: splats are stored by the tile of their centre, then block, then depth (in
+    lists that took their places over from older ones, as it was for these). Kernels store their sums pair by pair. To add
+    those of one splat, each pair also has a slot: the slots of the splat at one place follow one another.
 
     order: UInt32 [N], the Gaussians front to back; place: UInt32 [N], the place of each Gaussian's splat.
-    splat: UInt32 [M], the place of the pair's splat; slot: UInt32 [M], the pair's slot. The last are unused (see `_room`).
+    splat: UInt32 [M], the place of the pair's splat; pair: UInt32 [M], the pair at each slot. The last of both are unused (see
+    `_room`).
     slot_start, slot_end: UInt32 [N], the range of slots of the splat at each place.
     block: UInt32 [L], the block of each lane, counted row by row through the image. Lanes go tile by tile, and in a tile the
     block with the longest list comes first. start, end: UInt32 [L], the range of the lane's pairs.
@@ -80,7 +82,7 @@ class BlockLists:
     order: Any
     place: Any
     splat: Any
-    slot: Any
+    pair: Any
     slot_start: Any
     slot_end: Any
     block: Any
@@ -143,11 +145,11 @@ def build(splats: Splats, width: int, height: int, older: BlockLists | None = No
     splat, number, slot_start, slot_end = _pairs(splats, foot, place, blocks_x, blocks_y)
     numbers = _tile_number(dr.arange(mi.UInt32, blocks_x * blocks_y), blocks_x)
     if len(splat) == 0:  # Dr.Jit has no operations on arrays of length 0
-        slot, start, end = mi.UInt32(), dr.zeros(mi.UInt32, len(numbers)), dr.zeros(mi.UInt32, len(numbers))
+        pair, start, end = mi.UInt32(), dr.zeros(mi.UInt32, len(numbers)), dr.zeros(mi.UInt32, len(numbers))
     else:
         slot = _front_to_back(slot_start, slot_end, dr.gather(mi.UInt32, place, order), len(splat))
         slot = _sorted(slot, dr.gather(mi.UInt32, number, slot), _tile_numbers(blocks_x, blocks_y))
-        splat, number = dr.gather(mi.UInt32, splat, slot), dr.gather(mi.UInt32, number, slot)
+        splat, number, pair = dr.gather(mi.UInt32, splat, slot), dr.gather(mi.UInt32, number, slot), _inverse(slot)
         dr.eval(splat, number)
         start, end = (dr.gather(mi.UInt32, a, numbers) for a in _key_ranges(number, _tile_numbers(blocks_x, blocks_y)))
     room = _room(len(splat))
@@ -156,7 +158,7 @@ def build(splats: Splats, width: int, height: int, older: BlockLists | None = No
         order=order,
         place=place,
         splat=_padded(splat, room),
-        slot=_padded(slot, room),
+        pair=_padded(pair, room),
         slot_start=slot_start,
         slot_end=slot_end,
         block=lane,
@@ -211,10 +213,15 @@ def _memory_places(splats: Splats, order: Any, blocks_x: int, blocks_y: int) -> 
     )
     dr.eval(number)
     at = _sorted(order, dr.gather(mi.UInt32, number, order), _tile_numbers(blocks_x, blocks_y))
-    place = dr.empty(mi.UInt32, len(at))
-    dr.scatter(place, dr.arange(mi.UInt32, len(at)), at, mode=dr.ReduceMode.NoConflicts)
-    dr.eval(place)
-    return place
+    return _inverse(at)
+
+
+def _inverse(permutation: Any) -> Any:
+    """The inverse of a permutation, UInt32; evaluated."""
+    inverse = dr.empty(mi.UInt32, len(permutation))
+    dr.scatter(inverse, dr.arange(mi.UInt32, len(permutation)), permutation, mode=dr.ReduceMode.NoConflicts)
+    dr.eval(inverse)
+    return inverse
 
 
 def _lanes_by_tile(length: Any, number: Any, numbers: int) -> Any:

@@ -6,8 +6,8 @@ pixel, the colour S composited behind it. They do not walk back to front for it:
 subtract, S = C - (colour so far), where C is the finished pixel. The same instructions then take the same
 decisions (thresholds, finished pixels) as the forward kernel did, and nothing about them has to be stored.
 
-These three store their sums for a (splat, block) pair in that pair's own slot, and a second, small kernel adds the slots of
-each splat. There are no atomic additions, so that reruns are bitwise equal with any number of threads. Symbols:
+These three store their sums for each (splat, block) pair apart, and a second, small kernel adds those of each splat. There are
+no atomic additions, so that reruns are bitwise equal with any number of threads. Symbols:
 docs/notation.md.
 """
 
@@ -30,12 +30,11 @@ from mgs.splat.walking import (
     blend,
     lanes,
     pack_parts,
-    pair_slots,
     recorded_sizes,
-    store_sums,
     sums_by_place,
     unpack,
     walk,
+    walk_and_store,
     without_denormals,
 )
 
@@ -204,13 +203,12 @@ def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, ...], d_out: tuple[A
         rgba, d_rgba = (list(dr.gather(mi.Vector4f, a[0], places)) for a in (out, d_out))
         values, slopes = (rgba, d_rgba) if whole else (rgba[:3], d_rgba[:3])
         if whole:
-            values, slopes = (v + [dr.gather(mi.Float, a[1], places)] for v, a in ((rgba, out), (d_rgba, d_out)))
+            values, slopes = ([*v, dr.gather(mi.Float, a[1], places)] for v, a in ((rgba, out), (d_rgba, d_out)))
         dL.append(slopes)
         pixels.append([T[pixel], sum(v * d for v, d in zip(values, slopes, strict=True))])
     count = ADJOINT_SUMS[means]
-    slots = pair_slots(lists, count)
 
-    def visit(i: Any, splat: Splats, rows: list[Row], pixels: Any) -> Any:
+    def visit(_: Any, splat: Splats, rows: list[Row], pixels: Any) -> Any:
         new, alive = [], mi.Bool(False)
         sums, (r, g, b) = [mi.Float(0)] * 10, splat.colour
         for j, row in enumerate(rows):
@@ -234,11 +232,9 @@ def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, ...], d_out: tuple[A
             eta_m0 = row.eta * m0
             moments = (m0, m2, m1 * row.eta, eta_m0 * row.eta, m1, eta_m0)
             sums[4:] = [a + b for a, b in zip(sums[4:], moments, strict=True)]
-        store_sums(slots, sums[:count], dr.gather(mi.UInt32, lists.slot, i))
-        return new, alive
+        return new, alive, sums[:count]
 
-    walk(lists, packed, lane, pixels, visit)
-    return sums_by_place(lists, slots, count, mi.Float)
+    return sums_by_place(lists, walk_and_store(lists, packed, lane, pixels, visit, count), count, mi.Float)
 
 
 def splat_gradient(sums: list[Any], splats: Splats) -> Splats:
@@ -317,9 +313,8 @@ def fisher(lists: BlockLists, packed: Any, background: Any, cross: bool, means: 
     dr.eval(behind, last)
     squared, mixed = fisher_moments(cross, means)
     count = fisher_sums(cross, means)
-    slots = pair_slots(lists, count)
 
-    def visit(i: Any, splat: Splats, rows: list[Row], pixels: Any) -> Any:
+    def visit(_: Any, splat: Splats, rows: list[Row], pixels: Any) -> Any:
         new, alive = [], mi.Bool(False)
         sums = [mi.Float(0)] * count
         for j, row in enumerate(rows):
@@ -350,11 +345,10 @@ def fisher(lists: BlockLists, packed: Any, background: Any, cross: bool, means: 
             moments = [_monomial(m, power, eta, eta2) for power in squared]
             moments += [_monomial(a, power, eta, eta2) for a in cross_m for power in mixed]
             sums[1:] = [a + b for a, b in zip(sums[1:], moments, strict=True)]
-        store_sums(slots, sums, dr.gather(mi.UInt32, lists.slot, i))
-        return new, alive
+        return new, alive, sums
 
-    walk(lists, packed, lane, [[t, *c] for t, c in zip(T, behind, strict=True)], visit)
-    return sums_by_place(lists, slots, count, mi.Float64)
+    pixels = [[t, *c] for t, c in zip(T, behind, strict=True)]
+    return sums_by_place(lists, walk_and_store(lists, packed, lane, pixels, visit, count), count, mi.Float64)
 
 
 @frozen(recorded_sizes)
@@ -369,9 +363,8 @@ def removal(lists: BlockLists, packed: Any, background: Any) -> Any:
     pixels = _pixel_sums(lists, packed, lane, T, lambda splat: splat.colour)
     behind = [[dr.fma(dr.abs(t), b, c) for c, b in zip(rgb, background, strict=True)] for t, *rgb in pixels]
     dr.eval(behind)
-    slots = pair_slots(lists, 1)
 
-    def visit(i: Any, splat: Splats, rows: list[Row], pixels: Any) -> Any:
+    def visit(_: Any, splat: Splats, rows: list[Row], pixels: Any) -> Any:
         new, alive, total = [], mi.Bool(False), mi.Float(0)
         for pixel, (transmittance, *behind) in enumerate(pixels):
             alpha, w, after, room = blend(rows[pixel // BLOCK_X].raw_alpha[pixel % BLOCK_X], transmittance)
@@ -379,8 +372,7 @@ def removal(lists: BlockLists, packed: Any, background: Any) -> Any:
             new.append([after, *behind])
             alive |= room
             total += sum(s * s for s in _slopes(splat.colour, behind, alpha, w, after, room))
-        store_sums(slots, [total], dr.gather(mi.UInt32, lists.slot, i))
-        return new, alive
+        return new, alive, [total]
 
-    walk(lists, packed, lane, [[t, *c] for t, c in zip(T, behind, strict=True)], visit)
-    return sums_by_place(lists, slots, 1, mi.Float64)
+    pixels = [[t, *c] for t, c in zip(T, behind, strict=True)]
+    return sums_by_place(lists, walk_and_store(lists, packed, lane, pixels, visit, 1), 1, mi.Float64)

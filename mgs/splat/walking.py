@@ -144,7 +144,8 @@ def block_rows(lane: Lane, s: Splats) -> list[Row]:
 
     Going outwards from the row's centre, nothing underflows that is drawn: EPS2D keeps white_x below 1.6, so where a pixel of
     the row is drawn, alpha at the centre is at least 2^-100. It can be smaller in a row that the splat does not reach. There
-    `exp2` returns too much, 2^-120, so the ratios are set to 2^-120 too, and all alphas of the row stay far below the threshold.
+    `exp2` returns too much, 2^-120, so the ratios are set to 2^-120 too, and all alphas of the row stay far below the
+    threshold.
 
     The offset of the block's first pixel from the splat is computed in double: far along a slanted needle, xi is a small
     difference of large numbers.
@@ -198,6 +199,45 @@ def walk(lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], vi
     The numbers of one pixel stay together in the list, since the compiler keeps that order: it finishes each pixel before the
     next one needs registers.
     """
+    return _walk_until_done(lists, packed, lane, pixels, visit)[1]
+
+
+def walk_and_store(
+    lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], visit: Callable[..., Any], count: int
+) -> Any:
+    """`walk`, where visit(pair, splat, rows, pixels) -> (pixels, alive, sums) also returns `count` sums over the pixels of the
+    pair. Returns them, Float, rounded up to whole packets of four for each pair, in the order of the lists; 0 where a list was
+    not walked to its end.
+
+    A lane writes to its own list's pairs, one after the other, so no atomic operations are needed, and a line of the cache is
+    full before it is left.
+    """
+    packets = packet_count(count)
+    stored = dr.empty(mi.Float, len(lists.splat) * 4 * packets)
+
+    def store(pair: Any, sums: list[Any]) -> None:
+        padded = sums + [mi.Float(0)] * (-len(sums) % 4)
+        for i in range(packets):
+            dr.scatter(stored, mi.Vector4f(*padded[4 * i : 4 * i + 4]), pair * packets + i, mode=dr.ReduceMode.NoConflicts)
+
+    def visit_and_store(pair: Any, *others: Any) -> tuple[Any, Any]:
+        pixels, alive, sums = visit(pair, *others)
+        store(pair, sums)
+        return pixels, alive
+
+    def skip(pair: Any) -> Any:
+        store(pair, [mi.Float(0)] * count)
+        return pair + 1
+
+    pair, _ = _walk_until_done(lists, packed, lane, pixels, visit_and_store)
+    dr.while_loop((pair,), lambda pair: pair < lane.end, lambda pair: (skip(pair),))
+    return stored
+
+
+def _walk_until_done(
+    lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], visit: Callable[..., Any]
+) -> tuple[Any, list[list[Any]]]:
+    """The loop of `walk`. Returns the first pair that was not visited, and the pixels' state."""
 
     def body(i: Any, pixels: Any, alive: Any) -> Any:
         splat = unpack(packed, dr.gather(mi.UInt32, lists.splat, i))
@@ -205,13 +245,8 @@ def walk(lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], vi
         return i + 1, pixels, (i + 1 < lane.end) & alive
 
     start = mi.UInt32(lane.start)
-    _, pixels, _ = dr.while_loop((start, pixels, start < lane.end), lambda i, pixels, alive: alive, body)
-    return pixels
-
-
-def pair_slots(lists: BlockLists, count: int) -> Any:
-    """Zeros, Float: for every (splat, block) pair room for `count` sums, rounded up to whole packets of four."""
-    return dr.zeros(mi.Float, len(lists.splat) * 4 * packet_count(count))
+    pair, pixels, _ = dr.while_loop((start, pixels, start < lane.end), lambda i, pixels, alive: alive, body)
+    return pair, pixels
 
 
 def packet_count(count: int) -> int:
@@ -219,30 +254,34 @@ def packet_count(count: int) -> int:
     return -(-count // 4)
 
 
-def store_sums(slots: Any, sums: list[Any], slot: Any) -> None:
-    """Write a pair's sums to its own slot (UInt32). No other lane writes there, so no atomic operations are needed."""
-    padded, packets = sums + [mi.Float(0)] * (-len(sums) % 4), packet_count(len(sums))
-    for i in range(packets):
-        dr.scatter(slots, mi.Vector4f(*padded[4 * i : 4 * i + 4]), slot * packets + i, mode=dr.ReduceMode.NoConflicts)
+AT_ONCE = 4
+"""How many pairs of a splat `sums_by_place` reads before it tests for the end: reads at scattered addresses, which wait for one
+another otherwise."""
 
 
-def sums_by_place(lists: BlockLists, slots: Any, count: int, real: Any) -> Any:
-    """Add the slots of each splat, which follow one another, in this order and in double: so reruns are bitwise equal.
+def sums_by_place(lists: BlockLists, stored: Any, count: int, real: Any) -> Any:
+    """Add what `walk_and_store` stored for the pairs of each splat, in the order of their slots and in double: so reruns are
+    bitwise equal.
 
     Returns [N * packets * 4] of the type `real` (Float or Float64), by the splats' places in memory.
     """
-    dr.eval(slots)
-    packets = packet_count(count)
-    lane = dr.arange(mi.UInt32, len(lists.place) * packets)
-    place, packet = lane // packets, lane % packets
-    start, end = (dr.gather(mi.UInt32, a, place) for a in (lists.slot_start, lists.slot_end))
+    dr.eval(stored)
+    packets, end = packet_count(count), lists.slot_end
 
-    def body(i: Any, total: Any) -> Any:
-        return i + 1, total + mi.Vector4d(dr.gather(mi.Vector4f, slots, i * packets + packet))
+    def body(first: Any, totals: list[Any]) -> Any:
+        for slot in (first + k for k in range(AT_ONCE)):
+            pair = dr.gather(mi.UInt32, lists.pair, slot, slot < end) * packets
+            parts = [dr.gather(mi.Vector4f, stored, pair + i, slot < end) for i in range(packets)]
+            totals = [total + mi.Vector4d(part) for total, part in zip(totals, parts, strict=True)]
+        return first + AT_ONCE, totals
 
-    _, total = dr.while_loop((start, mi.Vector4d(0)), lambda i, total: i < end, body)
-    total = [without_denormals(x) for x in total]
-    return dr.ravel((mi.Vector4f if real is mi.Float else mi.Vector4d)(*total))
+    start = (mi.UInt32(lists.slot_start), [mi.Vector4d(0)] * packets)
+    _, totals = dr.while_loop(start, lambda first, totals: first < end, body)
+    place, summed = dr.arange(mi.UInt32, len(lists.place)), dr.empty(real, len(lists.place) * 4 * packets)
+    for i, total in enumerate(totals):
+        vector = (mi.Vector4f if real is mi.Float else mi.Vector4d)(*(without_denormals(x) for x in total))
+        dr.scatter(summed, vector, place * packets + i, mode=dr.ReduceMode.NoConflicts)
+    return summed
 
 
 def sums_by_splat(lists: BlockLists, placed: Any, count: int) -> list[Any]:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mgs.camera import MAX_PIXELS, MAX_SIDE
 from mgs.errors import InputError
 from mgs.gaussians import MAX_GAUSSIANS, Gaussians
-from mgs.splat import ListCache, as_drjit, blocks, fisher, kernels, reference, render
+from mgs.splat import ListCache, as_drjit, blocks, fisher, kernels, reference, render, walking
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, REORDERED, RESHAPED, TILE, build, changes, depth_order, footprints
 from mgs.splat.projection import camera_array, project
 from mgs.splat.walking import PIXELS, packet_count
@@ -61,16 +61,16 @@ def test_lists_hold_every_pair_and_little_more(seed, scales):
 def test_lists_are_in_depth_order_and_slots_of_a_splat_contiguous():
     camera, g = make_camera(), make_gaussians(60, 9)
     lists, splats = lists_of(g, camera)
-    splat, slot, start, end = (np.asarray(a) for a in (lists.splat, lists.slot, lists.start, lists.end))
+    splat, pair, start, end = (np.asarray(a) for a in (lists.splat, lists.pair, lists.start, lists.end))
     by_place = np.argsort(np.asarray(lists.place))
     assert sorted(by_place) == list(range(60)), "every splat has a place of its own"
     z, used = np.asarray(splats.depth)[by_place], int((end - start).sum())
     for s, e in zip(start, end, strict=True):
         assert (np.diff(z[splat[s:e]]) >= 0).all()
-    assert sorted(slot[:used]) == list(range(used))
+    assert sorted(pair[:used]) == list(range(used))
     first, last = np.asarray(lists.slot_start), np.asarray(lists.slot_end)
     for j in range(len(g)):
-        assert sorted(slot[:used][splat[:used] == j]) == list(range(first[j], last[j]))
+        assert sorted(pair[first[j] : last[j]]) == list(np.nonzero(splat[:used] == j)[0])
 
 
 def test_memory_and_lanes_go_by_tile():
@@ -108,8 +108,8 @@ def test_kernels_are_recorded_once_whether_lists_are_new_kept_or_rebuilt(monkeyp
     """A recording also depends on which of its inputs are one and the same array, as the splats and the footprints of new lists
     may be, and those of kept lists are not. No kernel must be recorded twice for that."""
     camera, g, cache, recorded = make_camera((46, 31)), make_gaussians(37, 3), ListCache(), []
-    walk = kernels.walk
-    monkeypatch.setattr(kernels, "walk", lambda *arguments: recorded.append(1) or walk(*arguments))
+    walk = walking._walk_until_done
+    monkeypatch.setattr(walking, "_walk_until_done", lambda *arguments: recorded.append(1) or walk(*arguments))
     for growth, builds in ((0, 1), (0, 1), (0.05, 2), (0.05, 2), (0.4, 3)):
         drawn = as_drjit(changed(g, log_scales=g.log_scales + np.float32(growth)))
         dr.enable_grad(drawn.log_scales)
@@ -127,7 +127,7 @@ def test_depth_order_is_a_stable_sort():
 
 
 def test_changes_are_found_where_they_matter():
-    """One splat is reshaped, one moved in depth, one, which is drawn in neither, reshaped, and others only get other colours."""
+    """One splat is reshaped, one moved in depth, one reshaped that is never drawn; all others only get other colours."""
     camera = make_camera()
     g = make_gaussians(40, 1, logits=(1, 3))
     g = changed(g, logit_opacities=np.where(np.arange(40) == 7, -9.0, g.logit_opacities))
@@ -136,7 +136,8 @@ def test_changes_are_found_where_they_matter():
     moved[5] += 0.01 * np.asarray(camera.world_to_camera[2, :3])
     built = footprints(projected(g, camera))
     drawn = np.asarray(built.level) > 0
-    assert drawn[[3, 5]].all() and not drawn[7]
+    assert drawn[[3, 5]].all()
+    assert not drawn[7]
     found = np.asarray(changes(built, projected(changed(g, log_scales=turned, means=moved, sh=g.sh + 1), camera)))
     expected = np.zeros(40, int)
     expected[3], expected[5] = RESHAPED, REORDERED
