@@ -19,7 +19,7 @@ from mgs.active.criteria import PRIOR_STD, regularisation
 from mgs.active.fitting import fit
 from mgs.active.loop import target_of
 from mgs.active.pose_policies import seed_views
-from mgs.active.settings import TrainSettings
+from mgs.active.settings import PASSES, TrainSettings
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import write_json
@@ -33,17 +33,17 @@ from mgs.splat import ListCache, groups
 
 GAUSSIANS, VIEWS = 10_000, 12
 CASES = (
-    (1.0, tuple(PRIOR_STD), 20),
-    (4.0, ("scale", "rotation"), 20),
-    (2.0, ("scale", "rotation"), 20),
-    (0.5, ("scale", "rotation"), 20),
-    (2.0, ("scale",), 20),
-    (2.0, ("rotation",), 20),
-    (0.5, ("rotation",), 20),
-    (0.25, ("opacity",), 20),
-    (0.25, ("colour",), 20),
-    (1.0, tuple(PRIOR_STD), 80),
-    (4.0, ("scale", "rotation"), 80),
+    (1.0, tuple(PRIOR_STD), PASSES),
+    (4.0, ("scale", "rotation"), PASSES),
+    (2.0, ("scale", "rotation"), PASSES),
+    (0.5, ("scale", "rotation"), PASSES),
+    (2.0, ("scale",), PASSES),
+    (2.0, ("rotation",), PASSES),
+    (0.5, ("rotation",), PASSES),
+    (0.25, ("opacity",), PASSES),
+    (0.25, ("colour",), PASSES),
+    (1.0, tuple(PRIOR_STD), 4 * PASSES),
+    (4.0, ("scale", "rotation"), 4 * PASSES),
 )
 """A factor of tau, the kinds of parameter that it is for, and the passes of the fit."""
 NEEDLE = 4.0

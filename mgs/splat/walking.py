@@ -44,14 +44,15 @@ def pack(s: Splats, place: Any) -> Any:
     """The numbers of each splat side by side in memory, at the splat's `place` (UInt32 [N], see `BlockLists.place`).
 
     The splats must be detached. Splats from `project` become Float [16 N], so one splat fills one cache line:
-    (mean_x, mean_y, shear, white_x), (white_y, log2_opacity, depth, mean_x_rest), (red, green, blue, mean_y_rest),
-    (shear_rest, 0, 0, 0). Splats from `project64` become Float64 [12 N], the same without the rests.
+    (mean_x, mean_y, shear, white_x), (white_y, log2_opacity, mean_x_rest, mean_y_rest), (red, green, blue, shear_rest),
+    (depth, 0, 0, 0). What only some kernels need comes last, alone, as packets of which nothing is used are not read.
+    Splats from `project64` become Float64 [12 N]: the same without the rests, and depth behind the opacity.
     """
     parts = [[s.mean_x, s.mean_y, s.shear, s.white_x]]
     if s.mean_x_rest is None:
         parts += [[s.white_y, s.log2_opacity, s.depth, 0], [*s.colour, 0]]
     else:
-        parts += [[s.white_y, s.log2_opacity, s.depth, s.mean_x_rest], [*s.colour, s.mean_y_rest], [s.shear_rest, 0, 0, 0]]
+        parts += [[s.white_y, s.log2_opacity, s.mean_x_rest, s.mean_y_rest], [*s.colour, s.shear_rest], [s.depth, 0, 0, 0]]
     return pack_parts(parts, place)
 
 
@@ -72,7 +73,7 @@ def unpack(packed: Any, place: Any) -> Splats:
             dr.gather(mi.Vector4d, packed, place * 3 + i) for i in range(3)
         )
     else:
-        (mean_x, mean_y, shear, white_x), (white_y, log2_opacity, depth, x_rest), (*colour, y_rest), (shear_rest, *_) = (
+        (mean_x, mean_y, shear, white_x), (white_y, log2_opacity, x_rest, y_rest), (*colour, shear_rest), (depth, *_) = (
             dr.gather(mi.Vector4f, packed, place * 4 + i) for i in range(4)
         )
         mean_x, mean_y = mi.Float64(mean_x) + mi.Float64(x_rest), mi.Float64(mean_y) + mi.Float64(y_rest)
