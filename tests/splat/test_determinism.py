@@ -144,10 +144,10 @@ import gc
 import time
 from concurrent.futures import ThreadPoolExecutor
 import numpy as np
-from mgs.splat import fisher, kernels, render
+from mgs.splat import fisher, render, walking
 from splat.scenes import make_camera, make_gaussians
 
-collecting, walk = [], kernels.walk
+collecting, walk = [], walking._walk_until_done
 
 def watched(*arguments):
     result = walk(*arguments)
@@ -159,7 +159,7 @@ def draw(i):
     gaussians, camera = make_gaussians(20 + 9 * i, i), make_camera((40 + i, 30))
     return np.asarray(render(gaussians, camera).rgb).tobytes() + fisher(gaussians, camera).tobytes()
 
-kernels.walk = watched
+walking._walk_until_done = watched
 with ThreadPoolExecutor(4) as pool:
     at_once = list(pool.map(draw, range(8)))
 assert len(collecting) == 24 and not any(collecting), collecting
