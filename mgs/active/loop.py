@@ -1,4 +1,4 @@
-"""The paper's loop: seeds -> fit -> information of the training set -> choose a pose -> capture -> fit -> ... until the budget.
+"""The paper's loop: seeds -> fit -> information of the training set -> choose a pose -> capture -> fit -> ... to its end.
 
 The candidates' images are never read: only the cameras of frames not taken yet are touched before a choice.
 """
@@ -19,7 +19,7 @@ from mgs.active import criteria, detectors, directional, inputs, policies, polic
 from mgs.active.outlook import Outlook
 from mgs.active.run_folder import State, check_settings, read_checkpoint, write_checkpoint, write_steps
 from mgs.active.settings import NbvSettings, TrainSettings
-from mgs.active.stopping import StopReason
+from mgs.active.stopping import StopReason, diverged, run_end
 from mgs.camera import Camera
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.up import PLUS_Z, Up, upright
@@ -109,7 +109,7 @@ def run(
     on_step: Callable[[State], None] = lambda state: None,
     say: Callable[[str], None] = lambda text: None,
 ) -> State:
-    """Run or resume the loop in `out` (which has its config.json) until the budget is spent; returns the last state.
+    """Run or resume the loop in `out` (which has its config.json) until the run ends; returns the last state.
 
     progress is told of the work inside a step, on_step of every state that is committed, say of what a user should know.
 
@@ -124,32 +124,22 @@ def run(
             leftover.unlink()
         state = read_checkpoint(out)
         if state is not None:
-            check_inputs(out, state, settings, dataset, stations.prior, say)
+            inputs.check(out, state, settings, dataset, stations.prior, say)
         loop = Loop(out, settings, dataset, stations, progress)
         if state is not None:
             loop.check(state)
-        if state is None:
-            state = loop.first()
+        found, state = state, loop.first() if state is None else loop.marked(state)
+        if found is None or found.steps != state.steps:
             write_checkpoint(out, state)
         on_step(state)
-        while len(state.steps) <= settings.budget:
-            state = loop.next(state)
+        while "ended" not in state.steps[-1]:
+            finished, state = len(state.steps), loop.next(state)
             write_checkpoint(out, state)
-            on_step(state)
+            if len(state.steps) > finished:
+                on_step(state)
         write_steps(out, state)
         write_ply(out / "gaussians.ply", state.gaussians)
         return state
-
-
-def check_inputs(
-    out: Path, state: State, settings: NbvSettings, dataset: Dataset, prior: str, say: Callable[[str], None]
-) -> None:
-    """Raises InputError where the run cannot go on from what it was made from; says so where that was never recorded."""
-    if state.inputs:
-        inputs.check_unchanged(out, state.inputs, prior, settings.prior, dataset)
-        inputs.check_same_policy(out, state.inputs, settings.policy)
-    elif len(state.steps) <= settings.budget:
-        say(f"{out}: was started by a version that kept no record of its inputs; it goes on with the files as they are now")
 
 
 class Loop:
@@ -197,15 +187,27 @@ class Loop:
         on_surface = nothing[: self.stations.on_surface, : len(self.prior_lam)]
         return self.learn(State(self.start, nothing, on_surface, [], []), self.seeds, choice, _Stopwatch())
 
+    def marked(self, state: State, refused: dict[str, Any] | None = None) -> State:
+        """The state with `ended` in the last of its steps where the run ends there (`mgs.active.stopping.run_end`), otherwise
+        without it, by the settings as they are now. refused: the choice that comes next, if it is known; otherwise it is what a
+        run that ended recorded of it."""
+        last = {key: value for key, value in state.steps[-1].items() if key != "ended"}
+        uncertainty = float(criteria.uncertainty(state.H, self.lam).mean())
+        views = len(state.taken) - self.settings.seeds
+        ended = run_end(self.settings, views, uncertainty, refused or state.steps[-1].get("ended"))
+        return replace(state, steps=[*state.steps[:-1], last | ({"ended": ended} if ended else {})])
+
     def next(self, state: State) -> State:
-        """One step: choose a pose, capture its image, learn."""
+        """One step: choose a pose, capture its image, learn. Where the run ends before it: the same steps, the last of them
+        marked."""
         watch = _Stopwatch()
         with watch("score"):
             frame, score = self.choose(state)
             F = self.stations.fisher(state.gaussians, self.cameras[frame])
             information_gain = criteria.d_optimal(F, state.H, self.lam)
         choice = {"frame": frame, "name": self.frames[frame].name, "score": score, "information_gain": information_gain}
-        return self.learn(state, [frame], choice, watch)
+        refused = self.marked(state, choice)
+        return refused if "ended" in refused.steps[-1] else self.learn(state, [frame], choice, watch)
 
     def choose(self, state: State) -> tuple[int, float]:
         """Frame of the largest score among those in reach, and that score. Looks at poses, never at candidates' images."""
@@ -284,7 +286,7 @@ class Loop:
             on_pass = partial(self.progress, "fitting")
             fit = self.stations.fit(state.gaussians, self.start, cameras, targets, self.settings.train_at(step), on_pass)
         if fit.stop_reason == StopReason.DIVERGED:
-            raise InputError(_diverged(self.out, step, fit.losses))
+            raise InputError(diverged(self.out, step, len(state.steps), fit.losses))
         with watch("information"):
             H = np.zeros((len(fit.gaussians), len(self.lam)))
             for done, camera in enumerate(cameras):
@@ -299,6 +301,7 @@ class Loop:
             **choice,
             "images": len(taken),
             "coverage": criteria.coverage(surface, self.prior_lam),
+            "uncertainty": float(criteria.uncertainty(H, self.lam).mean()),
             "iterations": int(fit.iterations),
             "loss": float(fit.loss),
             "stop_reason": str(fit.stop_reason),
@@ -312,7 +315,7 @@ class Loop:
         if self.settings.evaluate_every and step % self.settings.evaluate_every == 0:
             with watch("evaluate"):
                 line |= self.stations.measure(fit.gaussians, taken)
-        return State(fit.gaussians, H, surface, taken, [*state.steps, line], made_from)
+        return self.marked(State(fit.gaussians, H, surface, taken, [*state.steps, line], made_from))
 
     def targets(self, taken: list[int], gains: np.ndarray | None = None) -> Sequence[np.ndarray]:
         """What the model is fitted to in these frames, each [H,W,4] as `target_of`; colours divided by `gains` [V,3]."""
@@ -355,15 +358,3 @@ def target_of(frame: Frame) -> np.ndarray:
         raise InputError(f"{frame.mask_path}: the rock mask of frame {frame.name} is empty; correct it, or remove the frame")
     rgba, weight = frame.target()
     return np.dstack([rgba[..., :3], weight])
-
-
-def _diverged(out: Path, step: int, losses: Sequence[float]) -> str:
-    """What to say of a fit that diverged: the loss of the model it started from, and of its last passes."""
-    first, *passes = (f"{loss:.3g}" for loss in losses)
-    fit = "the fit to the seeds" if step == 0 else f"the fit of step {step}"
-    kept = {0: "", 1: "; step 0 is kept"}.get(step, f"; steps 0 to {step - 1} are kept")
-    rates = "`train.rates`" if step == 0 else "`warm_rate` or `train.rates`"
-    return (
-        f"{out}: {fit} diverged: its loss was {first} at the start, and {', '.join(passes[-3:])} in the last passes; "
-        f"lower the learning rates ({rates} in {out / 'config.json'}) and go on with `mgs nbv --resume {out}`{kept}"
-    )

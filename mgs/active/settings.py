@@ -104,7 +104,13 @@ class NbvSettings(BaseModel):
     estimator: str = "exact"
     """A row of `mgs.splat.ESTIMATORS` that gives [N,P]: how the Fisher information that criteria see is computed."""
     budget: Annotated[int, Field(ge=0)] = 50
-    """Views chosen beyond the seeds."""
+    """Most views that are chosen beyond the seeds."""
+    stop_gain: Positive | None = None
+    """The run ends where the view to be taken next has a smaller `information_gain` than this, nats per parameter; None: never
+    for that reason (`mgs.active.stopping.run_end`)."""
+    stop_uncertainty: Annotated[float, Field(gt=0, lt=1)] | None = None
+    """The run ends where no more than this share of the prior's variance is left (`mgs.active.criteria.uncertainty`, averaged);
+    None: never for that reason."""
     seeds: Annotated[int, Field(ge=1)] = 4
     """Views at evenly spaced azimuths that start the model."""
     seed: Annotated[int, Field(ge=0)] = 0
@@ -165,8 +171,8 @@ def with_preset(preset: Preset, values: Mapping[str, Any]) -> dict[str, Any]:
 Model = TypeVar("Model", bound=BaseModel)
 
 OPTIONS = (
-    "policy", "nearest", "estimator", "budget", "seeds", "seed", "lam", "pixel_noise", "evaluate_every", "means", "optimiser",
-    "exposure", "passes", "warm_passes",
+    "policy", "nearest", "estimator", "budget", "stop_gain", "stop_uncertainty", "seeds", "seed", "lam", "pixel_noise",
+    "evaluate_every", "means", "optimiser", "exposure", "passes", "warm_passes",
 )  # fmt: skip
 """Settings that `mgs nbv` has an option for, of the same name."""
 

@@ -10,6 +10,7 @@ from typing import Any
 from urllib.parse import quote
 
 from mgs.active.run_folder import read_checkpoint
+from mgs.active.stopping import why_ended
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.up import PLUS_Z, Up
 from mgs.files import read_json
@@ -22,8 +23,8 @@ GROUP_NAMES = {"all": "all views", "held_out": "held out", "test": "test views"}
 """What metrics.json calls the views that it has means of -> headings. Other groups are called by their key."""
 
 STEP_KEYS = {
-    "step", "frame", "images", "iterations", "score", "information_gain", "coverage", "loss", "seconds", "signs",
-    "exposure",
+    "step", "frame", "images", "iterations", "score", "information_gain", "coverage", "uncertainty", "loss", "seconds", "signs",
+    "exposure", "ended",
 }  # fmt: skip
 """Keys of steps.jsonl that hold numbers, and no metrics of images."""
 
@@ -65,8 +66,10 @@ def read_shown(label: str, run: Run, dataset: Dataset) -> Shown:
 def _notes(run: Run, drawn: bool, measured: bool) -> list[str]:
     """What a reader of a run's numbers should know: what is unfinished, unconverged, missing; and warnings in its files."""
     taken, planned, notes = len(run.seeds + run.chosen), run.settings["seeds"] + run.settings["budget"], []
-    if taken < planned:
+    if run.ended is None:
         notes.append(f"Unfinished: {taken} of {planned} views are taken; `mgs nbv --resume {run.folder}` goes on.")
+    else:
+        notes.append(f"The run has ended: {why_ended(run.ended)}.")
     if run.metrics is None:
         notes.append(f"Not measured: `mgs eval {run.folder}` adds its PSNR and SSIM.")
     elif not measured:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from mgs.active.stopping import RunEnd
 from mgs.report.runs import evaluated_runs
 
 COLUMNS = {
@@ -24,10 +25,12 @@ COLUMNS = {
     "held_out.ssim_mask": "SSIM, held out, rock only",
     "held_out.psnr_mask_corrected": "PSNR, held out, rock only, exposure fitted to each view (dB)",
     "coverage": "coverage (%)",
+    "ended": "ended by",
 }
 """Columns of the table: the key of the number in a row of `table_numbers` -> the heading. Those of the test views stand first,
 because they are the same for every run; where no run was measured on test views, they are left out, and where no run estimated
-the exposure of images, those with an exposure that was fitted (`table_columns`)."""
+the exposure of images, those with an exposure that was fitted; where all runs spent their budget, why they ended
+(`table_columns`)."""
 
 
 def table_numbers(folders: Sequence[str | Path]) -> list[dict[str, Any]]:
@@ -35,8 +38,8 @@ def table_numbers(folders: Sequence[str | Path]) -> list[dict[str, Any]]:
 
     policy: the run's label (`evaluated_runs`); images: how many the model was trained on; coverage: of the surface, per cent;
     test.NAME (where the dataset has test views), all.NAME and held_out.NAME: the means in metrics.json, PSNR in dB, None if
-    there is no view to average. A run that estimated the exposure of images has "exposure": True. Raises InputError as
-    `evaluated_runs`.
+    there is no view to average. A run that estimated the exposure of images has "exposure": True, and one that ended before its
+    budget was spent has "ended": the reason (`mgs.active.stopping.RunEnd`). Raises InputError as `evaluated_runs`.
     """
     rows = []
     for label, run in evaluated_runs(folders).items():
@@ -45,6 +48,7 @@ def table_numbers(folders: Sequence[str | Path]) -> list[dict[str, Any]]:
         sets = [views for views in ("test", "all", "held_out") if views in metrics]
         row |= {f"{views}.{name}": metrics[views][name] for views in sets for name in metrics[views]}
         row |= {"exposure": True} if run.settings.get("exposure") else {}
+        row |= {"ended": run.ended["reason"]} if run.ended and run.ended["reason"] != RunEnd.BUDGET else {}
         rows.append(row | {"coverage": 100 * run.steps[-1]["coverage"]})
     return rows
 
@@ -52,7 +56,8 @@ def table_numbers(folders: Sequence[str | Path]) -> list[dict[str, Any]]:
 def table_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """The keys of COLUMNS, in order, that say something of these rows of `table_numbers`."""
     exposure, tests = any(row.get("exposure") for row in rows), any("test.psnr" in row for row in rows)
-    return [key for key in COLUMNS if (exposure or "corrected" not in key) and (tests or not key.startswith("test."))]
+    shown = [key for key in COLUMNS if (exposure or "corrected" not in key) and (tests or not key.startswith("test."))]
+    return [key for key in shown if key != "ended" or any("ended" in row for row in rows)]
 
 
 def table_cell(column: str, value: Any) -> str:
