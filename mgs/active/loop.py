@@ -89,7 +89,7 @@ class Stations:
 
 @dataclass
 class _Stopwatch:
-    """Seconds per stage."""
+    """Seconds per stage, added up where a stage is met again."""
 
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -97,7 +97,7 @@ class _Stopwatch:
     def __call__(self, stage: str) -> Iterator[None]:
         start = time.perf_counter()
         yield
-        self.seconds[stage] = round(time.perf_counter() - start, 4)
+        self.seconds[stage] = round(self.seconds.get(stage, 0.0) + time.perf_counter() - start, 4)
 
 
 def run(
@@ -175,17 +175,12 @@ class Loop:
     def first(self) -> State:
         """Step 0: the seeds."""
         names = [self.frames[i].name for i in self.seeds]
-        choice = {
-            "frame": None,
-            "name": None,
-            "seeds": self.seeds,
-            "seed_names": names,
-            "score": None,
-            "information_gain": None,
-        }
+        choice = {"frame": None, "name": None, "seeds": self.seeds, "seed_names": names}
+        choice |= {"score": None, "information_gain": None}
         nothing = np.zeros((len(self.start), len(self.lam)))
         on_surface = nothing[: self.stations.on_surface, : len(self.prior_lam)]
-        return self.learn(State(self.start, nothing, on_surface, [], []), self.seeds, choice, _Stopwatch())
+        start = State(self.start, nothing, on_surface, [], [])
+        return self.learn(start, self.planned(start, self.seeds, choice, _Stopwatch()))
 
     def marked(self, state: State, refused: dict[str, Any] | None = None) -> State:
         """The state with `ended` in the last of its steps where the run ends there (`mgs.active.stopping.run_end`), otherwise
@@ -198,16 +193,36 @@ class Loop:
         return replace(state, steps=[*state.steps[:-1], last | ({"ended": ended} if ended else {})])
 
     def next(self, state: State) -> State:
-        """One step: choose a pose, capture its image, learn. Where the run ends before it: the same steps, the last of them
-        marked."""
+        """One batch of views, a step each: choose their poses, capture their images, learn. A batch is closed before a view
+        that would end the run; where that is its first, the state comes back as it is, its last step marked."""
+        planned = state
+        for _ in range(min(self.settings.batch, self.settings.budget - (len(state.taken) - self.settings.seeds))):
+            further = self.plan(planned)
+            refused = self.marked(state, further.steps[-1])
+            if "ended" in refused.steps[-1]:
+                return refused if planned is state else self.learn(state, planned)
+            planned = further
+        return self.learn(state, planned)
+
+    def plan(self, state: State) -> State:
+        """The state with one more view, of which only the pose is known. What the view says about the model as it is now is
+        added to H, so the next view of a batch is chosen as if this one were taken."""
         watch = _Stopwatch()
         with watch("score"):
             frame, score = self.choose(state)
             F = self.stations.fisher(state.gaussians, self.cameras[frame])
             information_gain = criteria.d_optimal(F, state.H, self.lam)
         choice = {"frame": frame, "name": self.frames[frame].name, "score": score, "information_gain": information_gain}
-        refused = self.marked(state, choice)
-        return refused if "ended" in refused.steps[-1] else self.learn(state, [frame], choice, watch)
+        return replace(self.planned(state, [frame], choice, watch), H=state.H + F)
+
+    def planned(self, state: State, new: list[int], choice: dict[str, Any], watch: _Stopwatch) -> State:
+        """The state with a step for these new views: what is known of it before their images are read."""
+        with watch("information"):
+            surface = state.surface + sum(self.surface_information(self.cameras[i]) for i in new)
+        taken = [*state.taken, *new]
+        known = {"images": len(taken), "coverage": criteria.coverage(surface, self.prior_lam), "seconds": watch.seconds}
+        line = {"step": len(state.steps), **choice, **known}
+        return replace(state, surface=surface, taken=taken, steps=[*state.steps, line])
 
     def choose(self, state: State) -> tuple[int, float]:
         """Frame of the largest score among those in reach, and that score. Looks at poses, never at candidates' images."""
@@ -273,10 +288,12 @@ class Loop:
         seen = [directional.squared_weights(self.surface_information(camera)) for camera in cameras]
         return directional.Views(np.array([camera.position for camera in upright_cameras]), np.stack(seen))
 
-    def learn(self, state: State, new: list[int], choice: dict[str, Any], watch: _Stopwatch) -> State:
-        """Read the new images, fit to convergence on all so far, sum their information at the new model."""
-        step, taken = len(state.steps), [*state.taken, *new]
-        cameras = [self.cameras[i] for i in taken]
+    def learn(self, state: State, planned: State) -> State:
+        """Read the images of the views that are planned beyond a state, fit to convergence on all so far, sum their information
+        at the new model. What the fit says goes into the last of the planned steps."""
+        *steps, known = planned.steps
+        step, taken, new = known["step"], planned.taken, planned.taken[len(state.taken) :]
+        cameras, watch = [self.cameras[i] for i in taken], _Stopwatch(known["seconds"])
         with watch("capture"):
             for i in new:
                 self.image(i)
@@ -292,15 +309,10 @@ class Loop:
             for done, camera in enumerate(cameras):
                 self.progress("information of the training set", done, len(cameras))
                 H += self.stations.fisher(fit.gaussians, camera)
-            surface = state.surface + sum(self.surface_information(self.cameras[i]) for i in new)
         kinds = ["image", "mask", "rock"] + ["depth"] * (not step)  # depth gives the seeds' colours to the surface
         files = {self.frames[i].name: inputs.frame_digests(self.frames[i], kinds) for i in new}
         made_from = {**self.made_from, "files": state.inputs.get("files", {}) | files}
-        line = {
-            "step": step,
-            **choice,
-            "images": len(taken),
-            "coverage": criteria.coverage(surface, self.prior_lam),
+        line = known | {
             "uncertainty": float(criteria.uncertainty(H, self.lam).mean()),
             "iterations": int(fit.iterations),
             "loss": float(fit.loss),
@@ -311,11 +323,12 @@ class Loop:
             line["exposure"] = {self.frames[i].name: gain for i, gain in zip(taken, gains.tolist(), strict=True)}
         if self.stations.look:
             with watch("check"):
-                line |= self.signs(state, fit, taken, gains, line)
-        if self.settings.evaluate_every and step % self.settings.evaluate_every == 0:
+                line |= self.signs(planned, fit, gains)
+        every, first = self.settings.evaluate_every, len(state.steps)
+        if every and any(k % every == 0 for k in range(first, step + 1)):
             with watch("evaluate"):
                 line |= self.stations.measure(fit.gaussians, taken)
-        return self.marked(State(fit.gaussians, H, surface, taken, [*state.steps, line], made_from))
+        return self.marked(State(fit.gaussians, H, planned.surface, taken, [*steps, line], made_from))
 
     def targets(self, taken: list[int], gains: np.ndarray | None = None) -> Sequence[np.ndarray]:
         """What the model is fitted to in these frames, each [H,W,4] as `target_of`; colours divided by `gains` [V,3]."""
@@ -323,20 +336,21 @@ class Loop:
             return Deferred(taken, self.image)
         return Deferred(range(len(taken)), lambda k: without_gain(self.image(taken[k]), gains[k]))
 
-    def signs(self, state: State, fit: Fit, taken: list[int], gains: np.ndarray | None, line: dict[str, Any]) -> dict[str, Any]:
-        """The entries `signs` of a step and, where one has just gone beyond its limit, `warnings` (`mgs.active.detectors`)."""
+    def signs(self, state: State, fit: Fit, gains: np.ndarray | None) -> dict[str, Any]:
+        """The entries `signs` of the last step of a state and, where one has just gone beyond its limit, `warnings`
+        (`mgs.active.detectors`). fit, gains: those of this step."""
         assert self.stations.look
-        views = []
+        views, taken = [], state.taken
         for k, (i, target) in enumerate(zip(taken, self.targets(taken, gains), strict=True)):
             packed, before = self.before_fit(i)
             mask = np.unpackbits(packed, count=target[..., 0].size).astype(bool).reshape(target.shape[:2])
             if gains is not None:  # what was explained by the gain is no sign
                 before = replace(before, exposure=before.exposure - float(np.log(gains[k].mean())))
             views.append(detectors.view_signs(target, mask, self.stations.look(fit.gaussians, self.cameras[i])[0], before))
-        scores = [step["information_gain"] for step in (*state.steps, line) if step.get("information_gain") is not None]
+        scores = [step["information_gain"] for step in state.steps if step.get("information_gain") is not None]
         drift = detectors.means_drift(fit.gaussians.means, self.start.means, self.start.log_scales)
-        signs = detectors.step_signs(views, fit.losses, line["coverage"], scores, drift)
-        before_this = state.steps[-1].get("signs") if state.steps else None
+        signs = detectors.step_signs(views, fit.losses, state.steps[-1]["coverage"], scores, drift)
+        before_this = next((step["signs"] for step in reversed(state.steps[:-1]) if "signs" in step), None)
         said = detectors.alarms(signs, before_this)
         return {"signs": signs, "warnings": said} if said else {"signs": signs}
 

@@ -5,8 +5,9 @@
 - `steps.jsonl`: one line a step, rebuilt from the checkpoint, so it can lag behind by a killed step but never disagree;
 - `gaussians.ply`: the model, once the run has ended.
 
+A step is one chosen view, whatever the size of a batch; only the last step of a batch has a fit, and what is measured after it.
 A line of `steps.jsonl` holds: `step` (0 = the seeds), `frame` and `name` of the chosen view (null at step 0, which has `seeds`
-and `seed_names` instead), `images` (how many the model has now), `score` (the policy's own number; of random, the draw),
+and `seed_names` instead), `images` (how many are taken by then), `score` (the policy's own number; of random, the draw),
 `information_gain` (Eq. 7 of the chosen view by the run's estimator, whatever the policy), `coverage` (Eq. 9 of all images),
 `uncertainty` (the mean over all parameters of the variance that is left, over that of the prior), `iterations`, `loss` and
 `stop_reason` of the fit; with the setting `exposure`, under that name, the gains (red, green, blue) by which the image of each

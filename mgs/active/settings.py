@@ -105,6 +105,8 @@ class NbvSettings(BaseModel):
     """A row of `mgs.splat.ESTIMATORS` that gives [N,P]: how the Fisher information that criteria see is computed."""
     budget: Annotated[int, Field(ge=0)] = 50
     """Most views that are chosen beyond the seeds."""
+    batch: Annotated[int, Field(ge=1)] = 1
+    """Views that are chosen before their images are read and the model is fitted again; the last batch may be smaller."""
     stop_gain: Positive | None = None
     """The run ends where the view to be taken next has a smaller `information_gain` than this, nats per parameter; None: never
     for that reason (`mgs.active.stopping.run_end`)."""
@@ -123,7 +125,8 @@ class NbvSettings(BaseModel):
     """tau of each kind of parameter; kinds left out take those of `mgs.active.criteria.PRIOR_STD`. That of `mean`, metres, is
     read only where means are learned, and must be there then; `mgs nbv` sets it (`with_spacing`)."""
     evaluate_every: Annotated[int, Field(ge=0)] = 0
-    """Measure PSNR on all views after every so many steps; 0 = only at the end. Never feeds back into the choice."""
+    """Measure PSNR on all views after every so many steps, or at the end of the batch that such a step is in; 0 = only at the
+    end of the run. Never feeds back into the choice."""
     warm_passes: Annotated[int, Field(ge=1)] = WARM_PASSES
     """Most passes of the fits after the first, if `train.passes` is not less."""
     warm_rate: Positive = 1.0
@@ -171,7 +174,7 @@ def with_preset(preset: Preset, values: Mapping[str, Any]) -> dict[str, Any]:
 Model = TypeVar("Model", bound=BaseModel)
 
 OPTIONS = (
-    "policy", "nearest", "estimator", "budget", "stop_gain", "stop_uncertainty", "seeds", "seed", "lam", "pixel_noise",
+    "policy", "nearest", "estimator", "budget", "batch", "stop_gain", "stop_uncertainty", "seeds", "seed", "lam", "pixel_noise",
     "evaluate_every", "means", "optimiser", "exposure", "passes", "warm_passes",
 )  # fmt: skip
 """Settings that `mgs nbv` has an option for, of the same name."""

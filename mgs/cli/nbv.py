@@ -44,6 +44,7 @@ def nbv(
     budget: Annotated[
         int | None, typer.Option(help="Most views chosen beyond the seeds; default 50, or all candidates where they are fewer.")
     ] = None,
+    batch: Annotated[int, typer.Option(metavar="K", help="Choose so many views before their images are read and fitted.")] = 1,
     stop_gain: Annotated[
         float | None,
         typer.Option(metavar="NATS", help="Stop where the next view has less information gain (Eq. 7, nats per parameter)."),
@@ -114,7 +115,7 @@ def nbv(
     if passes is not None:
         train["passes"] = passes
     settings: dict[str, Any] = {
-        "policy": policy, "nearest": nearest, "stop_gain": stop_gain, "stop_uncertainty": stop_uncertainty,
+        "policy": policy, "nearest": nearest, "batch": batch, "stop_gain": stop_gain, "stop_uncertainty": stop_uncertainty,
         "seeds": seeds, "seed": seed, "estimator": estimator, "lam": lam, "pixel_noise": pixel_noise,
         "prior_std": pairs("--prior-std", prior_std), "evaluate_every": evaluate_every, "exposure": exposure, "train": train,
     }  # fmt: skip
@@ -193,7 +194,8 @@ def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console
         score = "" if number is None else f"{number:.4g}"
         rows.append((
             str(line["step"]), "\n".join(names), score, f"{100 * line['coverage']:.2f} %",
-            str(line["iterations"]), f"{line['loss']:.3g}", line["stop_reason"], f"{sum(line['seconds'].values()):.1f}",
+            *((str(line["iterations"]), f"{line['loss']:.3g}", line["stop_reason"]) if "loss" in line else ("", "", "")),
+            f"{sum(line['seconds'].values()):.1f}",
         ))  # fmt: skip
 
     def table(*shown: int) -> Table:

@@ -79,7 +79,7 @@ def _notes(run: Run, drawn: bool, measured: bool) -> list[str]:
         )
     stopped = [str(step["step"]) for step in run.steps if step.get("stop_reason", "converged") != "converged"]
     if stopped:
-        reasons = ", ".join(sorted({step["stop_reason"] for step in run.steps} - {"converged"}))
+        reasons = ", ".join(sorted({step.get("stop_reason", "converged") for step in run.steps} - {"converged"}))
         notes.append(f"Fits that ended before they converged ({reasons}): steps {', '.join(stopped)}.")
     estimator = run.settings.get("estimator", "exact")
     if estimator != "exact":
