@@ -165,9 +165,9 @@ def test_one_line_says_why_a_run_ended_when_it_ends_when_it_is_resumed_and_in_th
         mgs(capsys, "eval", tmp_path / name)
     runs = [tmp_path / name for name in ("early", "whole", "known")]
     shown = mgs(capsys, "report", *runs, "--out", tmp_path / "report")
-    assert f"d-optimal has ended: {line.removeprefix('the run has ended: ')}\n" in shown
-    assert "random has ended: its budget is spent, 2 chosen views\n" in shown
     rows = table_numbers(runs)
+    assert f"d-optimal: a path of {rows[0]['path']:.2f} m; {line}\n" in shown
+    assert f"random: a path of {rows[1]['path']:.2f} m; the run has ended: its budget is spent, 2 chosen views\n" in shown
     assert [row.get("ended") for row in rows] == ["gain", None, "uncertainty"]
     table = [[cell.strip() for cell in row.split("|")[1:-1]] for row in markdown_table(rows).splitlines()]
     assert [row[-1] for row in table] == ["ended by", "---:", "gain", "–", "uncertainty"]

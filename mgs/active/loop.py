@@ -225,17 +225,27 @@ class Loop:
         return replace(state, surface=surface, taken=taken, steps=[*state.steps, line])
 
     def choose(self, state: State) -> tuple[int, float]:
-        """Frame of the largest score among those in reach, and that score. Looks at poses, never at candidates' images."""
+        """Frame of the largest score over its cost among those in reach, and that score. Looks at poses, never at candidates'
+        images."""
         outlook = self.outlook(state, self.reachable(state))
         scores = np.asarray(self.policy(outlook), np.float64)
         farthest = pose_policies.farthest_pose(outlook.candidates, outlook.taken, outlook.centre, outlook.rng)
         where = f"policy {self.settings.policy}: gave"
         if scores.shape != (len(outlook.left),):
             raise InputError(f"{where} scores of shape {scores.shape} to {len(outlook.left)} candidates; give each one number")
-        best = max(range(len(outlook.left)), key=lambda k: (scores[k], farthest[k]))
+        weighed = scores / self.cost(outlook)
+        best = max(range(len(outlook.left)), key=lambda k: (weighed[k], farthest[k]))
         if np.isnan(scores).any() or np.isinf(scores[best]):
             raise InputError(f"{where} a score that is NaN or infinite; correct it (docs/howto/policy.md)")
+        if self.settings.travel is not None and scores[best] < 0:
+            raise InputError(f"{where} negative scores, which --travel cannot divide by a cost; leave it out, or correct them")
         return outlook.left[best], float(scores[best])
+
+    def cost(self, outlook: Outlook) -> np.ndarray:
+        """By what the scores of the candidates are divided, [C]; with the setting `travel` it grows with the way to them."""
+        if self.settings.travel is None:
+            return np.ones(len(outlook.left))
+        return pose_policies.travel_cost(outlook.candidates, outlook.taken[-1], self.settings.travel)
 
     def reachable(self, state: State) -> list[int]:
         """Frames not taken; with the setting `nearest`, so many of them that are nearest to the view taken last."""

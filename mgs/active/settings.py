@@ -50,7 +50,8 @@ PRESETS = {
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 Scale = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
-"""A scale of lambda = (pixel noise / prior std)^2, bounded so that lambda is far from what overflows or vanishes in float64."""
+"""A scale, as of lambda = (pixel noise / prior std)^2, bounded so that what is divided by it is far from what overflows or
+vanishes in float64."""
 
 
 def _complete(given: Any, defaults: Mapping[str, float]) -> Any:
@@ -101,6 +102,9 @@ class NbvSettings(BaseModel):
     without it."""
     nearest: Annotated[int, Field(ge=1)] | None = None
     """The next view is one of so many that are nearest to the view taken last (at first, to the last seed); None: any view."""
+    travel: Scale | None = None
+    """Distance from view to view, metres, that costs as much as an image: scores are divided by 1 + distance / travel; None:
+    moving costs nothing (`mgs.active.pose_policies.travel_cost`)."""
     estimator: str = "exact"
     """A row of `mgs.splat.ESTIMATORS` that gives [N,P]: how the Fisher information that criteria see is computed."""
     budget: Annotated[int, Field(ge=0)] = 50
@@ -174,8 +178,8 @@ def with_preset(preset: Preset, values: Mapping[str, Any]) -> dict[str, Any]:
 Model = TypeVar("Model", bound=BaseModel)
 
 OPTIONS = (
-    "policy", "nearest", "estimator", "budget", "batch", "stop_gain", "stop_uncertainty", "seeds", "seed", "lam", "pixel_noise",
-    "evaluate_every", "means", "optimiser", "exposure", "passes", "warm_passes",
+    "policy", "nearest", "travel", "estimator", "budget", "batch", "stop_gain", "stop_uncertainty", "seeds", "seed", "lam",
+    "pixel_noise", "evaluate_every", "means", "optimiser", "exposure", "passes", "warm_passes",
 )  # fmt: skip
 """Settings that `mgs nbv` has an option for, of the same name."""
 

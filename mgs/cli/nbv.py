@@ -41,6 +41,12 @@ def nbv(
     nearest: Annotated[
         int | None, typer.Option(help="Move only to one of so many views that are nearest to the last one. Default: to any.")
     ] = None,
+    travel: Annotated[
+        float | None,
+        typer.Option(
+            metavar="METRES", help="Moving so far costs as much as an image: scores are divided by 1 + distance/METRES."
+        ),
+    ] = None,
     budget: Annotated[
         int | None, typer.Option(help="Most views chosen beyond the seeds; default 50, or all candidates where they are fewer.")
     ] = None,
@@ -115,9 +121,10 @@ def nbv(
     if passes is not None:
         train["passes"] = passes
     settings: dict[str, Any] = {
-        "policy": policy, "nearest": nearest, "batch": batch, "stop_gain": stop_gain, "stop_uncertainty": stop_uncertainty,
-        "seeds": seeds, "seed": seed, "estimator": estimator, "lam": lam, "pixel_noise": pixel_noise,
-        "prior_std": pairs("--prior-std", prior_std), "evaluate_every": evaluate_every, "exposure": exposure, "train": train,
+        "policy": policy, "nearest": nearest, "travel": travel, "batch": batch, "stop_gain": stop_gain,
+        "stop_uncertainty": stop_uncertainty, "seeds": seeds, "seed": seed, "estimator": estimator, "lam": lam,
+        "pixel_noise": pixel_noise, "prior_std": pairs("--prior-std", prior_std), "evaluate_every": evaluate_every,
+        "exposure": exposure, "train": train,
     }  # fmt: skip
     settings |= {name: value for name, value in {"budget": budget, "warm_passes": warm_passes}.items() if value is not None}
     start_and_print(dataset, out, console, prior=prior, gaussians=parse_gaussians(gaussians), preset=preset, **settings)

@@ -55,10 +55,12 @@ def _write_figures(runs: list[Path], out: Path) -> None:
 
     check_writable(out / "table.md")  # before the figures are drawn, not after it
     written = write_report(out, runs)
-    print_table(Console(), table_numbers(runs))
-    for label, run in labelled_runs(runs).items():
+    rows = table_numbers(runs)
+    print_table(Console(), rows)
+    for row, run in zip(rows, labelled_runs(runs).values(), strict=True):
         if run.ended:
-            typer.echo(f"{label} has ended: {why_ended(run.ended)}")
+            length = f"{row['path']:.2f} {row['unit']}"
+            typer.echo(f"{row['policy']}: a path of {length}; the run has ended: {why_ended(run.ended)}")
     for path in written:
         typer.echo(f"wrote {path}")
 

@@ -9,6 +9,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import numpy as np
+
+from mgs.active.pose_policies import path_length
 from mgs.active.run_folder import read_checkpoint
 from mgs.active.stopping import why_ended
 from mgs.data.dataset import Dataset, Frame
@@ -97,6 +100,7 @@ def summary_rows(shown: Sequence[Shown]) -> list[tuple[str, list[str]]]:
     last = [one.run.steps[-1] for one in shown]
     rows = [
         ("images", [str(step["images"]) for step in last]),
+        (f"path from view to view ({shown[0].unit})", [f"{_path(one.frames):.2f}" for one in shown]),
         ("surface coverage (%)", [f"{100 * step['coverage']:.2f}" for step in last]),
         ("Gaussians", ["–" if one.model is None else f"{len(one.model):,}" for one in shown]),
         ("time of all steps (s)", [f"{sum(sum(s.get('seconds', {}).values()) for s in one.run.steps):.1f}" for one in shown]),
@@ -108,6 +112,11 @@ def summary_rows(shown: Sequence[Shown]) -> list[tuple[str, list[str]]]:
         heading = ", ".join([*(GROUP_NAMES.get(group, group.replace("_", " ")) for group in groups), name])
         rows.append((heading, [cell(key, found.get(path)) for found in means]))
     return rows
+
+
+def _path(frames: Sequence[Frame]) -> float:
+    """Length of the straight lines from frame to frame."""
+    return path_length(np.array([frame.camera.position for frame in frames]))
 
 
 def measured(step: Mapping[str, Any]) -> dict[str, float]:
