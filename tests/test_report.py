@@ -275,14 +275,16 @@ def test_missing_and_damaged_files(runs, tmp_path):
         tables.table_numbers([tmp_path])
 
 
-@pytest.mark.parametrize("key", ["coverage", "images", "information_gain", "frame"])
-@pytest.mark.parametrize("value", [None, "a", ...])
+DAMAGED = [(key, value) for key in ("coverage", "images", "information_gain", "frame") for value in (None, "a", ...)]
+
+
+@pytest.mark.parametrize(("key", "value"), [*DAMAGED, ("ended", "gain"), ("ended", {"reason": "tired", "views": 1})])
 def test_a_damaged_line(runs, tmp_path, key, value):
     run = shutil.copytree(runs[0], tmp_path / "run")
     lines = [json.loads(line) for line in (run / "steps.jsonl").read_text().splitlines()]
     lines[2] = {k: v for k, v in (lines[2] | {key: value}).items() if v is not ...}
     (run / "steps.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    with pytest.raises(InputError, match=rf"steps\.jsonl: line 3 is damaged \({key}: .*anew with `mgs nbv --resume"):
+    with pytest.raises(InputError, match=rf"steps\.jsonl: line 3 is damaged \({key}\b.*: .*anew with `mgs nbv --resume"):
         writing.write_report(tmp_path / "report", [run])
 
 

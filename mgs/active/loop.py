@@ -122,14 +122,14 @@ def run(
     with locked(out):
         for leftover in out.glob(".*.part*"):  # of a killed write
             leftover.unlink()
-        state = read_checkpoint(out)
-        if state is not None:
-            inputs.check(out, state, settings, dataset, stations.prior, say)
+        known = read_checkpoint(out)
+        if known is not None:
+            inputs.check(out, known, settings, dataset, stations.prior, say)
         loop = Loop(out, settings, dataset, stations, progress)
-        if state is not None:
-            loop.check(state)
-        found, state = state, loop.first() if state is None else loop.marked(state)
-        if found is None or found.steps != state.steps:
+        if known is not None:
+            loop.check(known)
+        state = loop.first() if known is None else loop.marked(known)
+        if known is None or known.steps != state.steps:
             write_checkpoint(out, state)
         on_step(state)
         while "ended" not in state.steps[-1]:

@@ -29,12 +29,20 @@ class _Settings(BaseModel):
     budget: int
 
 
+class _Ended(BaseModel):
+    """What it needs of why a run ended."""
+
+    reason: RunEnd
+    views: int
+
+
 class _SeedLine(BaseModel):
     """What it needs of the first line of steps.jsonl, which is about the seeds."""
 
     seeds: list[int]
     images: int
     coverage: float
+    ended: _Ended | None = None
 
 
 class _ChoiceLine(BaseModel):
@@ -44,6 +52,7 @@ class _ChoiceLine(BaseModel):
     information_gain: float
     images: int
     coverage: float
+    ended: _Ended | None = None
 
 
 class _View(BaseModel):
