@@ -23,7 +23,7 @@ import mgs
 from mgs.active import loop
 from mgs.active.criteria import PIXEL_NOISE
 from mgs.active.policies import policy_names
-from mgs.active.stopping import StopReason
+from mgs.active.stopping import RunEnd, StopReason
 from mgs.cli.app import app
 from mgs.colour import SH_C0
 from mgs.data.dataset import load_dataset
@@ -271,6 +271,7 @@ def test_the_tables_of_the_loop_are_those_of_the_code(dataset, tmp_path):
     page = (DOCS / "nbv.md").read_text()
     assert [row[0].strip("`") for row in rows(page, "| `--policy`")] == policy_names()
     assert [row[0].strip("`") for row in rows(page, "| reason |")] == [str(reason) for reason in StopReason]
+    assert [row[0].strip("`") for row in rows(page, "| `ended` |")] == [str(reason) for reason in RunEnd]
     keys = {key for row in rows(page, "| key of `steps.jsonl`") for key in re.findall(r"`(\w+)`", row[0])}
     loaded = load_dataset(dataset)
     settings = tiny.start(tmp_path / "run", loaded, budget=1, evaluate_every=1)
@@ -278,7 +279,7 @@ def test_the_tables_of_the_loop_are_those_of_the_code(dataset, tmp_path):
     stations = tiny.stations(measure=lambda gaussians, taken: qualities)
     state = loop.run(tmp_path / "run", settings, loaded, stations, tiny.silent)
     keys -= {"signs", "warnings", "exposure"}  # of renders and images, which the stand-ins do not make
-    assert keys == set(state.steps[1]) == set(state.steps[0]) - {"seeds", "seed_names"}
+    assert keys == set(state.steps[1]) == set(state.steps[0]) - {"seeds", "seed_names"} | {"ended"}
     estimators = [row[0].strip("`") for row in rows((DOCS / "howto/estimator.md").read_text(), "| name | what")]
     assert set(estimators) == set(ESTIMATORS) - {"block"}
 

@@ -323,6 +323,15 @@ def test_options_of_the_criterion_and_the_fit_reach_the_run(dataset, prior, tmp_
     assert np.abs(state.H - exact).max() > 0.5 * exact.max()
 
 
+def test_options_of_the_choice_and_the_end_reach_the_run(dataset, prior, tmp_path):
+    options = "--budget 0 --passes 1 --nearest 5 --travel 2.5 --batch 3 --stop-gain 0.01 --stop-uncertainty 0.2"
+    with pytest.raises(SystemExit) as stop:
+        main(["nbv", str(dataset), "--prior", str(prior), "--out", str(tmp_path / "run"), *options.split()])
+    assert stop.value.code == 0
+    found = run_folder.read_settings(tmp_path / "run")
+    assert (found.nearest, found.travel, found.batch, found.stop_gain, found.stop_uncertainty) == (5, 2.5, 3, 0.01, 0.2)
+
+
 def test_settings_of_the_fit_are_read_as_older_runs_wrote_them():
     older = {"passes": 6, "tolerance": 0.01, "rates": [0.1, 0.2, 0.3, 0.4], "decay": 0.1, "seed": 2}
     found = TrainSettings(**older)

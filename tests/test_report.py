@@ -160,7 +160,11 @@ def test_table(request, sets):
     metrics = json.loads((runs[1] / "metrics.json").read_text())
     means = {f"{views}.{name}": value for views in sets for name, value in metrics[views].items()}
     last = json.loads((runs[1] / "steps.jsonl").read_text().splitlines()[-1])
-    assert rows[1] == means | {"policy": "random", "images": 8, "coverage": 100 * last["coverage"]}
+    run = read_run(runs[1])
+    positions = [tiny.orbit()[i].position for i in run.seeds + run.chosen]
+    path = pytest.approx(sum(np.linalg.norm(b - a) for a, b in pairwise(positions)))
+    known = {"policy": "random", "images": 8, "coverage": 100 * last["coverage"], "path": path, "unit": "m"}
+    assert rows[1] == means | known
     lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in tables.markdown_table(rows).splitlines()]
     assert len(lines) == 4
     row = dict(zip(lines[0], lines[3], strict=True))
@@ -168,7 +172,12 @@ def test_table(request, sets):
     assert row["images"] == "8"
     assert row["PSNR, all (dB)"] == f"{metrics['all']['psnr']:.2f}"
     assert row["SSIM, held out, rock only"] == f"{metrics['held_out']['ssim_mask']:.4f}"
-    assert len(row) == 9 + 4 * ("test" in sets)
+    assert row["path (m)"] == f"{rows[1]['path']:.2f}"
+    assert len(row) == 10 + 4 * ("test" in sets)
+    nobody_knows = tables.markdown_table([row | {"unit": "unit"} for row in rows])
+    assert "| path (unit) |" in nobody_knows
+    older = [{key: value for key, value in row.items() if key not in ("path", "unit")} for row in rows]
+    assert "path" not in tables.markdown_table(older)
     if "test" in sets:
         assert lines[0][2] == "PSNR, test views (dB)"
         assert lines[3][2] == f"{metrics['test']['psnr']:.2f}"
@@ -266,14 +275,16 @@ def test_missing_and_damaged_files(runs, tmp_path):
         tables.table_numbers([tmp_path])
 
 
-@pytest.mark.parametrize("key", ["coverage", "images", "information_gain", "frame"])
-@pytest.mark.parametrize("value", [None, "a", ...])
+DAMAGED = [(key, value) for key in ("coverage", "images", "information_gain", "frame") for value in (None, "a", ...)]
+
+
+@pytest.mark.parametrize(("key", "value"), [*DAMAGED, ("ended", "gain"), ("ended", {"reason": "tired", "views": 1})])
 def test_a_damaged_line(runs, tmp_path, key, value):
     run = shutil.copytree(runs[0], tmp_path / "run")
     lines = [json.loads(line) for line in (run / "steps.jsonl").read_text().splitlines()]
     lines[2] = {k: v for k, v in (lines[2] | {key: value}).items() if v is not ...}
     (run / "steps.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    with pytest.raises(InputError, match=rf"steps\.jsonl: line 3 is damaged \({key}: .*anew with `mgs nbv --resume"):
+    with pytest.raises(InputError, match=rf"steps\.jsonl: line 3 is damaged \({key}\b.*: .*anew with `mgs nbv --resume"):
         writing.write_report(tmp_path / "report", [run])
 
 

@@ -76,6 +76,14 @@ def coverage(H: Array, lam: Array) -> float:
     return float(observed(H, lam).mean())
 
 
+def uncertainty(H: Array, lam: Array) -> NDArray[np.float64]:
+    """[N] mean over the parameters of each Gaussian of lam / (H + lam): the variance that is left, over that of the prior.
+
+    In (0, 1]: 1 where nothing is known but the prior, near 0 where nearly everything is.
+    """
+    return np.asarray((lam / (H + lam)).mean(axis=1, dtype=np.float64))
+
+
 def d_optimal(F: Array, H: Array, lam: Array) -> float:
     """Paper's Eq. 7: 1/l sum log(1 + F / (H + lam)), the decrease of the log-determinant of the posterior's covariance,
     per parameter."""

@@ -8,7 +8,7 @@ Files of frames that were not taken are never opened.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,8 @@ from mgs.data.up import PLUS_Z
 from mgs.errors import InputError
 
 if TYPE_CHECKING:
+    from mgs.active.run_folder import State
+    from mgs.active.settings import NbvSettings
     from mgs.prior.build import Prior
 
 DECIMALS = 9
@@ -67,6 +69,15 @@ def frame_digests(frame: Frame, kinds: Iterable[str]) -> dict[str, str | None]:
 
 def _path(frame: Frame, kind: str) -> Path | None:
     return {"image": frame.image_path, "mask": frame.mask_path, "rock": frame.rock_path, "depth": frame.depth_path}[kind]
+
+
+def check(out: Path, state: State, settings: NbvSettings, dataset: Dataset, prior: str, say: Callable[[str], None]) -> None:
+    """Raises InputError where a run cannot go on from what it was made from; says so where that was never recorded."""
+    if state.inputs:
+        check_unchanged(out, state.inputs, prior, settings.prior, dataset)
+        check_same_policy(out, state.inputs, settings.policy)
+    elif len(state.steps) <= settings.budget:
+        say(f"{out}: was started by a version that kept no record of its inputs; it goes on with the files as they are now")
 
 
 def check_unchanged(out: Path, record: dict[str, Any], prior: str, prior_path: Path, dataset: Dataset) -> None:

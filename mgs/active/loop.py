@@ -1,4 +1,4 @@
-"""The paper's loop: seeds -> fit -> information of the training set -> choose a pose -> capture -> fit -> ... until the budget.
+"""The paper's loop: seeds -> fit -> information of the training set -> choose a pose -> capture -> fit -> ... to its end.
 
 The candidates' images are never read: only the cameras of frames not taken yet are touched before a choice.
 """
@@ -19,7 +19,7 @@ from mgs.active import criteria, detectors, directional, inputs, policies, polic
 from mgs.active.outlook import Outlook
 from mgs.active.run_folder import State, check_settings, read_checkpoint, write_checkpoint, write_steps
 from mgs.active.settings import NbvSettings, TrainSettings
-from mgs.active.stopping import StopReason
+from mgs.active.stopping import StopReason, diverged, run_end
 from mgs.camera import Camera
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.up import PLUS_Z, Up, upright
@@ -89,7 +89,7 @@ class Stations:
 
 @dataclass
 class _Stopwatch:
-    """Seconds per stage."""
+    """Seconds per stage, added up where a stage is met again."""
 
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -97,7 +97,7 @@ class _Stopwatch:
     def __call__(self, stage: str) -> Iterator[None]:
         start = time.perf_counter()
         yield
-        self.seconds[stage] = round(time.perf_counter() - start, 4)
+        self.seconds[stage] = round(self.seconds.get(stage, 0.0) + time.perf_counter() - start, 4)
 
 
 def run(
@@ -109,7 +109,7 @@ def run(
     on_step: Callable[[State], None] = lambda state: None,
     say: Callable[[str], None] = lambda text: None,
 ) -> State:
-    """Run or resume the loop in `out` (which has its config.json) until the budget is spent; returns the last state.
+    """Run or resume the loop in `out` (which has its config.json) until the run ends; returns the last state.
 
     progress is told of the work inside a step, on_step of every state that is committed, say of what a user should know.
 
@@ -122,34 +122,24 @@ def run(
     with locked(out):
         for leftover in out.glob(".*.part*"):  # of a killed write
             leftover.unlink()
-        state = read_checkpoint(out)
-        if state is not None:
-            check_inputs(out, state, settings, dataset, stations.prior, say)
+        known = read_checkpoint(out)
+        if known is not None:
+            inputs.check(out, known, settings, dataset, stations.prior, say)
         loop = Loop(out, settings, dataset, stations, progress)
-        if state is not None:
-            loop.check(state)
-        if state is None:
-            state = loop.first()
+        if known is not None:
+            loop.check(known)
+        state = loop.first() if known is None else loop.marked(known)
+        if known is None or known.steps != state.steps:
             write_checkpoint(out, state)
         on_step(state)
-        while len(state.steps) <= settings.budget:
-            state = loop.next(state)
+        while "ended" not in state.steps[-1]:
+            finished, state = len(state.steps), loop.next(state)
             write_checkpoint(out, state)
-            on_step(state)
+            if len(state.steps) > finished:
+                on_step(state)
         write_steps(out, state)
         write_ply(out / "gaussians.ply", state.gaussians)
         return state
-
-
-def check_inputs(
-    out: Path, state: State, settings: NbvSettings, dataset: Dataset, prior: str, say: Callable[[str], None]
-) -> None:
-    """Raises InputError where the run cannot go on from what it was made from; says so where that was never recorded."""
-    if state.inputs:
-        inputs.check_unchanged(out, state.inputs, prior, settings.prior, dataset)
-        inputs.check_same_policy(out, state.inputs, settings.policy)
-    elif len(state.steps) <= settings.budget:
-        say(f"{out}: was started by a version that kept no record of its inputs; it goes on with the files as they are now")
 
 
 class Loop:
@@ -185,40 +175,77 @@ class Loop:
     def first(self) -> State:
         """Step 0: the seeds."""
         names = [self.frames[i].name for i in self.seeds]
-        choice = {
-            "frame": None,
-            "name": None,
-            "seeds": self.seeds,
-            "seed_names": names,
-            "score": None,
-            "information_gain": None,
-        }
+        choice = {"frame": None, "name": None, "seeds": self.seeds, "seed_names": names}
+        choice |= {"score": None, "information_gain": None}
         nothing = np.zeros((len(self.start), len(self.lam)))
         on_surface = nothing[: self.stations.on_surface, : len(self.prior_lam)]
-        return self.learn(State(self.start, nothing, on_surface, [], []), self.seeds, choice, _Stopwatch())
+        start = State(self.start, nothing, on_surface, [], [])
+        return self.learn(start, self.planned(start, self.seeds, choice, _Stopwatch()))
+
+    def marked(self, state: State, refused: dict[str, Any] | None = None) -> State:
+        """The state with `ended` in the last of its steps where the run ends there (`mgs.active.stopping.run_end`), otherwise
+        without it, by the settings as they are now. refused: the choice that comes next, if it is known; otherwise it is what a
+        run that ended recorded of it."""
+        last = {key: value for key, value in state.steps[-1].items() if key != "ended"}
+        uncertainty = float(criteria.uncertainty(state.H, self.lam).mean())
+        views = len(state.taken) - self.settings.seeds
+        ended = run_end(self.settings, views, uncertainty, refused or state.steps[-1].get("ended"))
+        return replace(state, steps=[*state.steps[:-1], last | ({"ended": ended} if ended else {})])
 
     def next(self, state: State) -> State:
-        """One step: choose a pose, capture its image, learn."""
+        """One batch of views, a step each: choose their poses, capture their images, learn. A batch is closed before a view
+        that would end the run; where that is its first, the state comes back as it is, its last step marked."""
+        planned = state
+        for _ in range(min(self.settings.batch, self.settings.budget - (len(state.taken) - self.settings.seeds))):
+            further = self.plan(planned)
+            refused = self.marked(state, further.steps[-1])
+            if "ended" in refused.steps[-1]:
+                return refused if planned is state else self.learn(state, planned)
+            planned = further
+        return self.learn(state, planned)
+
+    def plan(self, state: State) -> State:
+        """The state with one more view, of which only the pose is known. What the view says about the model as it is now is
+        added to H, so the next view of a batch is chosen as if this one were taken."""
         watch = _Stopwatch()
         with watch("score"):
             frame, score = self.choose(state)
             F = self.stations.fisher(state.gaussians, self.cameras[frame])
             information_gain = criteria.d_optimal(F, state.H, self.lam)
         choice = {"frame": frame, "name": self.frames[frame].name, "score": score, "information_gain": information_gain}
-        return self.learn(state, [frame], choice, watch)
+        return replace(self.planned(state, [frame], choice, watch), H=state.H + F)
+
+    def planned(self, state: State, new: list[int], choice: dict[str, Any], watch: _Stopwatch) -> State:
+        """The state with a step for these new views: what is known of it before their images are read."""
+        with watch("information"):
+            surface = state.surface + sum(self.surface_information(self.cameras[i]) for i in new)
+        taken = [*state.taken, *new]
+        known = {"images": len(taken), "coverage": criteria.coverage(surface, self.prior_lam), "seconds": watch.seconds}
+        line = {"step": len(state.steps), **choice, **known}
+        return replace(state, surface=surface, taken=taken, steps=[*state.steps, line])
 
     def choose(self, state: State) -> tuple[int, float]:
-        """Frame of the largest score among those in reach, and that score. Looks at poses, never at candidates' images."""
+        """Frame of the largest score over its cost among those in reach, and that score. Looks at poses, never at candidates'
+        images."""
         outlook = self.outlook(state, self.reachable(state))
         scores = np.asarray(self.policy(outlook), np.float64)
         farthest = pose_policies.farthest_pose(outlook.candidates, outlook.taken, outlook.centre, outlook.rng)
         where = f"policy {self.settings.policy}: gave"
         if scores.shape != (len(outlook.left),):
             raise InputError(f"{where} scores of shape {scores.shape} to {len(outlook.left)} candidates; give each one number")
-        best = max(range(len(outlook.left)), key=lambda k: (scores[k], farthest[k]))
+        weighed = scores / self.cost(outlook)
+        best = max(range(len(outlook.left)), key=lambda k: (weighed[k], farthest[k]))
         if np.isnan(scores).any() or np.isinf(scores[best]):
             raise InputError(f"{where} a score that is NaN or infinite; correct it (docs/howto/policy.md)")
+        if self.settings.travel is not None and scores[best] < 0:
+            raise InputError(f"{where} negative scores, which --travel cannot divide by a cost; leave it out, or correct them")
         return outlook.left[best], float(scores[best])
+
+    def cost(self, outlook: Outlook) -> np.ndarray:
+        """By what the scores of the candidates are divided, [C]; with the setting `travel` it grows with the way to them."""
+        if self.settings.travel is None:
+            return np.ones(len(outlook.left))
+        return pose_policies.travel_cost(outlook.candidates, outlook.taken[-1], self.settings.travel)
 
     def reachable(self, state: State) -> list[int]:
         """Frames not taken; with the setting `nearest`, so many of them that are nearest to the view taken last."""
@@ -271,10 +298,12 @@ class Loop:
         seen = [directional.squared_weights(self.surface_information(camera)) for camera in cameras]
         return directional.Views(np.array([camera.position for camera in upright_cameras]), np.stack(seen))
 
-    def learn(self, state: State, new: list[int], choice: dict[str, Any], watch: _Stopwatch) -> State:
-        """Read the new images, fit to convergence on all so far, sum their information at the new model."""
-        step, taken = len(state.steps), [*state.taken, *new]
-        cameras = [self.cameras[i] for i in taken]
+    def learn(self, state: State, planned: State) -> State:
+        """Read the images of the views that are planned beyond a state, fit to convergence on all so far, sum their information
+        at the new model. What the fit says goes into the last of the planned steps."""
+        *steps, known = planned.steps
+        step, taken, new = known["step"], planned.taken, planned.taken[len(state.taken) :]
+        cameras, watch = [self.cameras[i] for i in taken], _Stopwatch(known["seconds"])
         with watch("capture"):
             for i in new:
                 self.image(i)
@@ -284,21 +313,17 @@ class Loop:
             on_pass = partial(self.progress, "fitting")
             fit = self.stations.fit(state.gaussians, self.start, cameras, targets, self.settings.train_at(step), on_pass)
         if fit.stop_reason == StopReason.DIVERGED:
-            raise InputError(_diverged(self.out, step, fit.losses))
+            raise InputError(diverged(self.out, step, len(state.steps), fit.losses))
         with watch("information"):
             H = np.zeros((len(fit.gaussians), len(self.lam)))
             for done, camera in enumerate(cameras):
                 self.progress("information of the training set", done, len(cameras))
                 H += self.stations.fisher(fit.gaussians, camera)
-            surface = state.surface + sum(self.surface_information(self.cameras[i]) for i in new)
         kinds = ["image", "mask", "rock"] + ["depth"] * (not step)  # depth gives the seeds' colours to the surface
         files = {self.frames[i].name: inputs.frame_digests(self.frames[i], kinds) for i in new}
         made_from = {**self.made_from, "files": state.inputs.get("files", {}) | files}
-        line = {
-            "step": step,
-            **choice,
-            "images": len(taken),
-            "coverage": criteria.coverage(surface, self.prior_lam),
+        line = known | {
+            "uncertainty": float(criteria.uncertainty(H, self.lam).mean()),
             "iterations": int(fit.iterations),
             "loss": float(fit.loss),
             "stop_reason": str(fit.stop_reason),
@@ -308,11 +333,12 @@ class Loop:
             line["exposure"] = {self.frames[i].name: gain for i, gain in zip(taken, gains.tolist(), strict=True)}
         if self.stations.look:
             with watch("check"):
-                line |= self.signs(state, fit, taken, gains, line)
-        if self.settings.evaluate_every and step % self.settings.evaluate_every == 0:
+                line |= self.signs(planned, fit, gains)
+        every, first = self.settings.evaluate_every, len(state.steps)
+        if every and any(k % every == 0 for k in range(first, step + 1)):
             with watch("evaluate"):
                 line |= self.stations.measure(fit.gaussians, taken)
-        return State(fit.gaussians, H, surface, taken, [*state.steps, line], made_from)
+        return self.marked(State(fit.gaussians, H, planned.surface, taken, [*steps, line], made_from))
 
     def targets(self, taken: list[int], gains: np.ndarray | None = None) -> Sequence[np.ndarray]:
         """What the model is fitted to in these frames, each [H,W,4] as `target_of`; colours divided by `gains` [V,3]."""
@@ -320,20 +346,21 @@ class Loop:
             return Deferred(taken, self.image)
         return Deferred(range(len(taken)), lambda k: without_gain(self.image(taken[k]), gains[k]))
 
-    def signs(self, state: State, fit: Fit, taken: list[int], gains: np.ndarray | None, line: dict[str, Any]) -> dict[str, Any]:
-        """The entries `signs` of a step and, where one has just gone beyond its limit, `warnings` (`mgs.active.detectors`)."""
+    def signs(self, state: State, fit: Fit, gains: np.ndarray | None) -> dict[str, Any]:
+        """The entries `signs` of the last step of a state and, where one has just gone beyond its limit, `warnings`
+        (`mgs.active.detectors`). fit, gains: those of this step."""
         assert self.stations.look
-        views = []
+        views, taken = [], state.taken
         for k, (i, target) in enumerate(zip(taken, self.targets(taken, gains), strict=True)):
             packed, before = self.before_fit(i)
             mask = np.unpackbits(packed, count=target[..., 0].size).astype(bool).reshape(target.shape[:2])
             if gains is not None:  # what was explained by the gain is no sign
                 before = replace(before, exposure=before.exposure - float(np.log(gains[k].mean())))
             views.append(detectors.view_signs(target, mask, self.stations.look(fit.gaussians, self.cameras[i])[0], before))
-        scores = [step["information_gain"] for step in (*state.steps, line) if step.get("information_gain") is not None]
+        scores = [step["information_gain"] for step in state.steps if step.get("information_gain") is not None]
         drift = detectors.means_drift(fit.gaussians.means, self.start.means, self.start.log_scales)
-        signs = detectors.step_signs(views, fit.losses, line["coverage"], scores, drift)
-        before_this = state.steps[-1].get("signs") if state.steps else None
+        signs = detectors.step_signs(views, fit.losses, state.steps[-1]["coverage"], scores, drift)
+        before_this = next((step["signs"] for step in reversed(state.steps[:-1]) if "signs" in step), None)
         said = detectors.alarms(signs, before_this)
         return {"signs": signs, "warnings": said} if said else {"signs": signs}
 
@@ -355,15 +382,3 @@ def target_of(frame: Frame) -> np.ndarray:
         raise InputError(f"{frame.mask_path}: the rock mask of frame {frame.name} is empty; correct it, or remove the frame")
     rgba, weight = frame.target()
     return np.dstack([rgba[..., :3], weight])
-
-
-def _diverged(out: Path, step: int, losses: Sequence[float]) -> str:
-    """What to say of a fit that diverged: the loss of the model it started from, and of its last passes."""
-    first, *passes = (f"{loss:.3g}" for loss in losses)
-    fit = "the fit to the seeds" if step == 0 else f"the fit of step {step}"
-    kept = {0: "", 1: "; step 0 is kept"}.get(step, f"; steps 0 to {step - 1} are kept")
-    rates = "`train.rates`" if step == 0 else "`warm_rate` or `train.rates`"
-    return (
-        f"{out}: {fit} diverged: its loss was {first} at the start, and {', '.join(passes[-3:])} in the last passes; "
-        f"lower the learning rates ({rates} in {out / 'config.json'}) and go on with `mgs nbv --resume {out}`{kept}"
-    )

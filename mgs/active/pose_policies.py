@@ -69,6 +69,20 @@ def nearest_poses(positions: Array, here: Array, count: int) -> list[int]:
     return sorted(int(k) for k in np.argsort(distance, kind="stable")[:count])
 
 
+def travel_cost(positions: Array, here: Array, travel: float) -> NDArray[np.float64]:
+    """Cost of an image at each of the positions [C,3] for a camera that is `here` [3], in images: 1 + distance / travel.
+
+    The distance is that of the straight line, the least that there is to go. travel: the distance, metres, that costs as much
+    as an image.
+    """
+    return np.asarray(1 + _rounded(np.linalg.norm(positions - here, axis=1)) / travel)
+
+
+def path_length(positions: Array) -> float:
+    """Length of the straight lines from each position [T,3] to the next, metres."""
+    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+
+
 def seed_views(positions: Array, centre: Array, count: int) -> list[int]:
     """Frames nearest to `count` evenly spaced azimuths (0, 360/count, ...), each frame once; in that order.
 

@@ -50,7 +50,8 @@ PRESETS = {
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 Scale = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
-"""A scale of lambda = (pixel noise / prior std)^2, bounded so that lambda is far from what overflows or vanishes in float64."""
+"""A scale, as of lambda = (pixel noise / prior std)^2, bounded so that what is divided by it is far from what overflows or
+vanishes in float64."""
 
 
 def _complete(given: Any, defaults: Mapping[str, float]) -> Any:
@@ -101,10 +102,21 @@ class NbvSettings(BaseModel):
     without it."""
     nearest: Annotated[int, Field(ge=1)] | None = None
     """The next view is one of so many that are nearest to the view taken last (at first, to the last seed); None: any view."""
+    travel: Scale | None = None
+    """Distance from view to view, metres, that costs as much as an image: scores are divided by 1 + distance / travel; None:
+    moving costs nothing (`mgs.active.pose_policies.travel_cost`)."""
     estimator: str = "exact"
     """A row of `mgs.splat.ESTIMATORS` that gives [N,P]: how the Fisher information that criteria see is computed."""
     budget: Annotated[int, Field(ge=0)] = 50
-    """Views chosen beyond the seeds."""
+    """Most views that are chosen beyond the seeds."""
+    batch: Annotated[int, Field(ge=1)] = 1
+    """Views that are chosen before their images are read and the model is fitted again; the last batch may be smaller."""
+    stop_gain: Positive | None = None
+    """The run ends where the view to be taken next has a smaller `information_gain` than this, nats per parameter; None: never
+    for that reason (`mgs.active.stopping.run_end`)."""
+    stop_uncertainty: Annotated[float, Field(gt=0, lt=1)] | None = None
+    """The run ends where no more than this share of the prior's variance is left (`mgs.active.criteria.uncertainty`, averaged);
+    None: never for that reason."""
     seeds: Annotated[int, Field(ge=1)] = 4
     """Views at evenly spaced azimuths that start the model."""
     seed: Annotated[int, Field(ge=0)] = 0
@@ -117,7 +129,8 @@ class NbvSettings(BaseModel):
     """tau of each kind of parameter; kinds left out take those of `mgs.active.criteria.PRIOR_STD`. That of `mean`, metres, is
     read only where means are learned, and must be there then; `mgs nbv` sets it (`with_spacing`)."""
     evaluate_every: Annotated[int, Field(ge=0)] = 0
-    """Measure PSNR on all views after every so many steps; 0 = only at the end. Never feeds back into the choice."""
+    """Measure PSNR on all views after every so many steps, or at the end of the batch that such a step is in; 0 = only at the
+    end of the run. Never feeds back into the choice."""
     warm_passes: Annotated[int, Field(ge=1)] = WARM_PASSES
     """Most passes of the fits after the first, if `train.passes` is not less."""
     warm_rate: Positive = 1.0
@@ -165,8 +178,8 @@ def with_preset(preset: Preset, values: Mapping[str, Any]) -> dict[str, Any]:
 Model = TypeVar("Model", bound=BaseModel)
 
 OPTIONS = (
-    "policy", "nearest", "estimator", "budget", "seeds", "seed", "lam", "pixel_noise", "evaluate_every", "means", "optimiser",
-    "exposure", "passes", "warm_passes",
+    "policy", "nearest", "travel", "estimator", "budget", "batch", "stop_gain", "stop_uncertainty", "seeds", "seed", "lam",
+    "pixel_noise", "evaluate_every", "means", "optimiser", "exposure", "passes", "warm_passes",
 )  # fmt: skip
 """Settings that `mgs nbv` has an option for, of the same name."""
 

@@ -10,6 +10,7 @@ import typer
 from mgs.active.criteria import PIXEL_NOISE, PRIOR_STD
 from mgs.active.policies import policy_names
 from mgs.active.settings import PRESETS, RATES
+from mgs.active.stopping import why_ended
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -40,8 +41,22 @@ def nbv(
     nearest: Annotated[
         int | None, typer.Option(help="Move only to one of so many views that are nearest to the last one. Default: to any.")
     ] = None,
+    travel: Annotated[
+        float | None,
+        typer.Option(
+            metavar="METRES", help="Moving so far costs as much as an image: scores are divided by 1 + distance/METRES."
+        ),
+    ] = None,
     budget: Annotated[
-        int | None, typer.Option(help="Views chosen beyond the seeds; default 50, or all candidates where they are fewer.")
+        int | None, typer.Option(help="Most views chosen beyond the seeds; default 50, or all candidates where they are fewer.")
+    ] = None,
+    batch: Annotated[int, typer.Option(metavar="K", help="Choose so many views before their images are read and fitted.")] = 1,
+    stop_gain: Annotated[
+        float | None,
+        typer.Option(metavar="NATS", help="Stop where the next view has less information gain (Eq. 7, nats per parameter)."),
+    ] = None,
+    stop_uncertainty: Annotated[
+        float | None, typer.Option(metavar="SHARE", help="Stop where no more than this share of the prior's variance is left.")
     ] = None,
     seeds: Annotated[int, typer.Option(help="Views at evenly spaced azimuths that start the model.")] = 4,
     seed: Annotated[int, typer.Option(min=0, help="Root of every random draw.")] = 0,
@@ -84,7 +99,7 @@ def nbv(
         Path | None, typer.Option(help="Continue this run; every other setting comes from its config.json.")
     ] = None,
 ) -> None:
-    """Fit to the seeds, then choose, capture and fit again, view by view, until the budget is spent.
+    """Fit to the seeds, then choose, capture and fit again, view by view, until the budget is spent, or a --stop- rule holds.
 
     Writes config.json, steps.jsonl (one line a step), checkpoint.npz, gaussians.ply and metrics.json into the run folder. A run
     that was interrupted at any moment, kill -9 included, goes on with --resume and takes the same views.
@@ -106,7 +121,8 @@ def nbv(
     if passes is not None:
         train["passes"] = passes
     settings: dict[str, Any] = {
-        "policy": policy, "nearest": nearest, "seeds": seeds, "seed": seed, "estimator": estimator, "lam": lam,
+        "policy": policy, "nearest": nearest, "travel": travel, "batch": batch, "stop_gain": stop_gain,
+        "stop_uncertainty": stop_uncertainty, "seeds": seeds, "seed": seed, "estimator": estimator, "lam": lam,
         "pixel_noise": pixel_noise, "prior_std": pairs("--prior-std", prior_std), "evaluate_every": evaluate_every,
         "exposure": exposure, "train": train,
     }  # fmt: skip
@@ -185,7 +201,8 @@ def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console
         score = "" if number is None else f"{number:.4g}"
         rows.append((
             str(line["step"]), "\n".join(names), score, f"{100 * line['coverage']:.2f} %",
-            str(line["iterations"]), f"{line['loss']:.3g}", line["stop_reason"], f"{sum(line['seconds'].values()):.1f}",
+            *((str(line["iterations"]), f"{line['loss']:.3g}", line["stop_reason"]) if "loss" in line else ("", "", "")),
+            f"{sum(line['seconds'].values()):.1f}",
         ))  # fmt: skip
 
     def table(*shown: int) -> Table:
@@ -218,6 +235,8 @@ def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console
                 )
     if "fit" in metrics:
         console.print(fit_line(metrics["fit"], state.steps[-1]["stop_reason"]))
+    if state.steps and "ended" in state.steps[-1]:
+        console.print(f"the run has ended: {why_ended(state.steps[-1]['ended'])}", soft_wrap=True)
     console.print(f"wrote {out}", soft_wrap=True)
 
 

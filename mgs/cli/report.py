@@ -46,14 +46,21 @@ def _write_figures(runs: list[Path], out: Path) -> None:
     """Write the figures and the table, and print the table."""
     from rich.console import Console
 
+    from mgs.active.stopping import why_ended
     from mgs.cli.printing import print_table
     from mgs.files import check_writable
+    from mgs.report.runs import labelled_runs
     from mgs.report.tables import table_numbers
     from mgs.report.writing import write_report
 
     check_writable(out / "table.md")  # before the figures are drawn, not after it
     written = write_report(out, runs)
-    print_table(Console(), table_numbers(runs))
+    rows = table_numbers(runs)
+    print_table(Console(), rows)
+    for row, run in zip(rows, labelled_runs(runs).values(), strict=True):
+        if run.ended:
+            length = f"{row['path']:.2f} {row['unit']}"
+            typer.echo(f"{row['policy']}: a path of {length}; the run has ended: {why_ended(run.ended)}")
     for path in written:
         typer.echo(f"wrote {path}")
 

@@ -57,16 +57,11 @@ def gaussian_scalars(
     """
     scalars = {f"fisher.{name}": H[:, columns].sum(axis=1, dtype=np.float64) for name, columns in groups.items()}
     scalars["information"] = 0.5 * np.log1p(H / lam).sum(axis=1)
-    scalars["uncertainty"] = uncertainty(H, lam)
+    scalars["uncertainty"] = criteria.uncertainty(H, lam)
     unseen = ~criteria.observed(surface, prior_lam)
     scalars["unobserved"] = np.zeros(len(H))
     scalars["unobserved"][: len(unseen)] = unseen
     return scalars
-
-
-def uncertainty(H: np.ndarray, lam: np.ndarray) -> np.ndarray:
-    """The scalar `uncertainty` of each Gaussian, [N], in (0, 1]. H: [N,P] information; lam: [P] that of the prior."""
-    return (lam / (H + lam)).mean(axis=1)
 
 
 def view_maps(gaussians: Gaussians, camera: Camera, scalars: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

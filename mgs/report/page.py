@@ -220,6 +220,7 @@ def _plots(shown: Sequence[Shown]) -> list[dict[str, Any]]:
         ("Information gain of each chosen view (the paper's Fig. 2)", curves("information_gain"), "gain, Eq. 7", True),
         ("Surface coverage (Fig. 3)", covered, "coverage (%)", False),
         ("Coverage that each view added (Fig. 3)", added, "percentage points", True),
+        ("Variance that is left, over that of the prior", curves("uncertainty"), "mean over all parameters", True),
     ]
     keys = dict.fromkeys(key for one in shown for step in one.run.steps for key in measured(step))
     wanted += [(f"{metric_name(key)} after each step", curves(key), metric_name(key), False) for key in keys]

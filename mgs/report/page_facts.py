@@ -9,7 +9,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import numpy as np
+
+from mgs.active.pose_policies import path_length
 from mgs.active.run_folder import read_checkpoint
+from mgs.active.stopping import why_ended
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.up import PLUS_Z, Up
 from mgs.files import read_json
@@ -22,8 +26,8 @@ GROUP_NAMES = {"all": "all views", "held_out": "held out", "test": "test views"}
 """What metrics.json calls the views that it has means of -> headings. Other groups are called by their key."""
 
 STEP_KEYS = {
-    "step", "frame", "images", "iterations", "score", "information_gain", "coverage", "loss", "seconds", "signs",
-    "exposure",
+    "step", "frame", "images", "iterations", "score", "information_gain", "coverage", "uncertainty", "loss", "seconds", "signs",
+    "exposure", "ended",
 }  # fmt: skip
 """Keys of steps.jsonl that hold numbers, and no metrics of images."""
 
@@ -65,8 +69,10 @@ def read_shown(label: str, run: Run, dataset: Dataset) -> Shown:
 def _notes(run: Run, drawn: bool, measured: bool) -> list[str]:
     """What a reader of a run's numbers should know: what is unfinished, unconverged, missing; and warnings in its files."""
     taken, planned, notes = len(run.seeds + run.chosen), run.settings["seeds"] + run.settings["budget"], []
-    if taken < planned:
+    if run.ended is None:
         notes.append(f"Unfinished: {taken} of {planned} views are taken; `mgs nbv --resume {run.folder}` goes on.")
+    else:
+        notes.append(f"The run has ended: {why_ended(run.ended)}.")
     if run.metrics is None:
         notes.append(f"Not measured: `mgs eval {run.folder}` adds its PSNR and SSIM.")
     elif not measured:
@@ -76,7 +82,7 @@ def _notes(run: Run, drawn: bool, measured: bool) -> list[str]:
         )
     stopped = [str(step["step"]) for step in run.steps if step.get("stop_reason", "converged") != "converged"]
     if stopped:
-        reasons = ", ".join(sorted({step["stop_reason"] for step in run.steps} - {"converged"}))
+        reasons = ", ".join(sorted({step.get("stop_reason", "converged") for step in run.steps} - {"converged"}))
         notes.append(f"Fits that ended before they converged ({reasons}): steps {', '.join(stopped)}.")
     estimator = run.settings.get("estimator", "exact")
     if estimator != "exact":
@@ -94,6 +100,7 @@ def summary_rows(shown: Sequence[Shown]) -> list[tuple[str, list[str]]]:
     last = [one.run.steps[-1] for one in shown]
     rows = [
         ("images", [str(step["images"]) for step in last]),
+        (f"path from view to view ({shown[0].unit})", [f"{_path(one.frames):.2f}" for one in shown]),
         ("surface coverage (%)", [f"{100 * step['coverage']:.2f}" for step in last]),
         ("Gaussians", ["–" if one.model is None else f"{len(one.model):,}" for one in shown]),
         ("time of all steps (s)", [f"{sum(sum(s.get('seconds', {}).values()) for s in one.run.steps):.1f}" for one in shown]),
@@ -105,6 +112,11 @@ def summary_rows(shown: Sequence[Shown]) -> list[tuple[str, list[str]]]:
         heading = ", ".join([*(GROUP_NAMES.get(group, group.replace("_", " ")) for group in groups), name])
         rows.append((heading, [cell(key, found.get(path)) for found in means]))
     return rows
+
+
+def _path(frames: Sequence[Frame]) -> float:
+    """Length of the straight lines from frame to frame."""
+    return path_length(np.array([frame.camera.position for frame in frames]))
 
 
 def measured(step: Mapping[str, Any]) -> dict[str, float]:

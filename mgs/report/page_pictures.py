@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from mgs.active.criteria import regularisation
+from mgs.active.criteria import regularisation, uncertainty
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import Frame
 from mgs.gaussians import Gaussians
 from mgs.plotting import crop
-from mgs.report.diagnostics import VISIBLE, uncertainty, view_maps
+from mgs.report.diagnostics import VISIBLE, view_maps
 
 PIXELS = 40e6
 """Most pixels of all pictures of a page together. At the 0.1 to 0.2 bytes that WebP takes for a pixel of a rock, they are 4 to

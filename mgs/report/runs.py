@@ -13,6 +13,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from mgs.active.policy_file import label
 from mgs.active.run_folder import check_same_frames, read_settings
 from mgs.active.settings import validated
+from mgs.active.stopping import RunEnd
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.up import Up, unit_up
 from mgs.errors import InputError
@@ -28,12 +29,20 @@ class _Settings(BaseModel):
     budget: int
 
 
+class _Ended(BaseModel):
+    """What it needs of why a run ended."""
+
+    reason: RunEnd
+    views: int
+
+
 class _SeedLine(BaseModel):
     """What it needs of the first line of steps.jsonl, which is about the seeds."""
 
     seeds: list[int]
     images: int
     coverage: float
+    ended: _Ended | None = None
 
 
 class _ChoiceLine(BaseModel):
@@ -43,6 +52,7 @@ class _ChoiceLine(BaseModel):
     information_gain: float
     images: int
     coverage: float
+    ended: _Ended | None = None
 
 
 class _View(BaseModel):
@@ -88,6 +98,14 @@ class Run:
     def chosen(self) -> list[int]:
         """Indices of the frames that the policy chose, in the order of their choice."""
         return [int(step["frame"]) for step in self.steps[1:]]
+
+    @property
+    def ended(self) -> dict[str, Any] | None:
+        """Why the run ended, as `ended` of steps.jsonl, which older runs lack; None: it is unfinished."""
+        views, recorded = len(self.chosen), self.steps[-1].get("ended")
+        if views >= self.settings["budget"]:
+            return {"reason": str(RunEnd.BUDGET), "views": views}
+        return None if recorded is None or recorded["reason"] == RunEnd.BUDGET else recorded
 
 
 def read_run(folder: str | Path) -> Run:
@@ -135,13 +153,13 @@ def _cause(error: ValueError) -> str:
 
 
 def check_finished(run: Run) -> None:
-    """Raises InputError if the budget of a run is not spent, or its last file, gaussians.ply, is missing."""
+    """Raises InputError if a run has not ended, or its last file, gaussians.ply, is missing."""
     taken, planned = len(run.seeds + run.chosen), run.settings["seeds"] + run.settings["budget"]
     resume = f"`mgs nbv --resume {run.folder}`"
-    if taken < planned:
+    if run.ended is None:
         raise InputError(f"{run.folder}: is unfinished, with {taken} of {planned} views; go on with {resume}, then report")
     if not (run.folder / "gaussians.ply").is_file():
-        raise InputError(f"{run.folder}: has all {planned} views, but no gaussians.ply; write it with {resume}, then report")
+        raise InputError(f"{run.folder}: has all {taken} views, but no gaussians.ply; write it with {resume}, then report")
 
 
 def labelled_runs(folders: Sequence[str | Path]) -> dict[str, Run]:

@@ -66,9 +66,9 @@ def choose_all(run: Path, progress: Progress = lambda stage, done, total: None) 
         raise InputError(f"{loaded.root}: has no test views to judge by; make them with `mgs synth-orbit --test-views`")
     stations = real_stations(loaded, load_prior(settings.prior), settings)
     oracle = Oracle(run, settings, loaded, tests, stations, progress)
-    state = read_checkpoint(run) or oracle.first()
+    state = oracle.marked(read_checkpoint(run) or oracle.first())
     write_checkpoint(run, state)
-    while len(state.steps) <= settings.budget:
+    while "ended" not in state.steps[-1]:
         state = oracle.next(state)
         write_checkpoint(run, state)
     return state

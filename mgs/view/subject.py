@@ -11,6 +11,7 @@ import numpy as np
 from mgs.active import criteria, run_folder
 from mgs.active.policy_file import label
 from mgs.active.settings import NbvSettings
+from mgs.active.stopping import RunEnd
 from mgs.data.dataset import Frame, load_dataset
 from mgs.data.meshes import Mesh, read_mesh
 from mgs.data.up import PLUS_Z, Up
@@ -89,8 +90,9 @@ def _read_run(run: Path, follow: bool) -> Subject:
         waiting = [View(frame, "candidate", None, []) for frame in dataset.frames]
         return Subject(f"{name}: no finished step yet", None, views=waiting, mesh=mesh, up=up, unit=dataset.unit)
     views = _views(dataset.frames, state, _psnr(run, len(state.taken)))
-    planned = settings.seeds + settings.budget
-    title = f"{name}: {label(settings.policy)}, {len(state.taken)} of {planned} views, {len(state.gaussians):,} Gaussians"
+    early = state.steps[-1].get("ended", {}).get("reason", RunEnd.BUDGET) != RunEnd.BUDGET
+    planned = "" if early else f" of {settings.seeds + settings.budget}"
+    title = f"{name}: {label(settings.policy)}, {len(state.taken)}{planned} views, {len(state.gaussians):,} Gaussians"
     return Subject(title, state.gaussians, "linear", _scalars(settings, state), views, mesh, up, dataset.unit)
 
 

@@ -1,6 +1,7 @@
 """Tables of docs/benchmarks/*.json.
 
-Most of these files say which command wrote them; demo.json and policies.json are demo/report/table.json after `make demo`.
+Most of these files say which command wrote them; demo.json and policies.json are demo/report/table.json after `make demo`, and
+docs/nbv.md has the commands of flights.json.
 """
 
 from __future__ import annotations
@@ -51,6 +52,19 @@ def policies(rows: list[dict[str, Any]]) -> str:
         "held_out.psnr": "held out",
         "held_out.psnr_mask": "held out, rock only",
         "held_out.ssim_mask": "SSIM, held out, rock only",
+    }
+    return _shown(headings, rows)
+
+
+def flights(rows: list[dict[str, Any]]) -> str:
+    """Batches and the cost of the way on the demo's dataset."""
+    headings = {
+        "policy": "policy (folder of the run)",
+        "test.psnr": "test views",
+        "test.psnr_mask": "test views, rock only",
+        "held_out.psnr": "held out",
+        "held_out.psnr_mask": "held out, rock only",
+        "path": "path (m)",
     }
     return _shown(headings, rows)
 
@@ -354,6 +368,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "means": ("benchmarks/means", means),
     "demo": ("benchmarks/demo", demo),
     "demo-report": ("benchmarks/demo", demo_report),
+    "flights": ("benchmarks/flights", flights),
     "policies": ("benchmarks/policies", policies),
     "splat": ("benchmarks/splat", splat),
     "splat-short": ("benchmarks/splat", splat_short),
