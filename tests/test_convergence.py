@@ -1,5 +1,7 @@
 """Whether a fit has converged is said of the objective, not of how its loss moved: and it is true."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import tiny
@@ -24,7 +26,7 @@ def case(tmp_path_factory):
     prior = load_prior(tiny.write_prior(root.parent / "prior"))
     settings = NbvSettings(dataset=root, prior=root, seeds=2)
     frames = [dataset.frames[i] for i in (0, 6, 3, 9)]
-    start = initial_gaussians(prior, frames[:2])[0]
+    start = replace(initial_gaussians(prior, frames[:2])[0], sh=initial_gaussians(prior, frames)[0].sh)
     lam = settings.regularisation(groups(0))
     return settings, prior, frames, start, {kind: float(lam[c][0]) for kind, c in groups(0).items()}
 

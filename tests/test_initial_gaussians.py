@@ -22,7 +22,7 @@ from mgs.data.dataset import Dataset
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
-from mgs.prior.initial import GREY, IN_PLANE_SCALE, INITIAL_OPACITY, INSET, THICKNESS, initial_gaussians, pixel_on
+from mgs.prior.initial import GREY, IN_PLANE_SCALE, INITIAL_OPACITY, INSET, THICKNESS, initial_gaussians, pixel_on, warm_start
 from mgs.prior.settings import PriorSettings
 from mgs.rotation import rotmat_from_quat
 from mgs.splat import render
@@ -53,6 +53,22 @@ def test_shapes_scales_and_rotations(prior: Prior, dataset: Dataset) -> None:
     thin = rotmat_from_quat(gaussians.quats)[:, :, 2]
     assert np.allclose(thin, prior.normals, atol=1e-5)
     assert np.allclose(gaussians.opacities, INITIAL_OPACITY, atol=1e-6)
+
+
+def test_a_warm_start_gives_new_images_to_what_none_saw_before(prior: Prior, dataset: Dataset) -> None:
+    """A Gaussian that only the new image sees takes its colour from it, up to what the model had made of it; one that it does
+    not see, and everything but colours, stays as it was fitted."""
+    (before, seen_before), (start, seen) = (initial_gaussians(prior, dataset.frames[:k]) for k in (1, 2))
+    new = seen & ~seen_before
+    assert new.mean() > 0.05
+    learned = np.random.default_rng(0).normal(0, 0.1, before.sh.shape).astype(np.float32)
+    model = replace(before, sh=before.sh + learned, log_scales=before.log_scales + 1)
+    found = warm_start(model, before, start)
+    np.testing.assert_allclose(found.sh[new], start.sh[new] + learned[new], atol=1e-6)
+    seen_now = initial_gaussians(prior, dataset.frames[1:2])[1]
+    np.testing.assert_array_equal(found.sh[~seen_now], model.sh[~seen_now])
+    assert found.log_scales is model.log_scales
+    assert found.sh.dtype == np.float32
 
 
 def test_a_pixel_on_the_surface(prior: Prior) -> None:

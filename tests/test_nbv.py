@@ -91,6 +91,31 @@ def test_coverage_is_of_the_surface_and_does_not_depend_on_training(dataset, tmp
     assert forgot.taken == state.taken
 
 
+def test_fits_start_in_the_colours_of_all_images_taken(dataset, tmp_path):
+    """Before every fit the prior's colours are those of all frames taken, and the model moves with them; the surface that is
+    scored, and the means, stay those of the seeds."""
+    handed, drawn = [], []
+
+    def initial(frames):
+        g = tiny.initial(frames)
+        return replace(g, sh=g.sh + np.float32(len(frames)), means=g.means + np.float32(len(frames)))
+
+    def fit(gaussians, start, *others):
+        handed.append((gaussians, start))
+        found = tiny.fit(gaussians, start, *others)
+        drawn.append(found.gaussians)
+        return found
+
+    run(tmp_path / "run", dataset, tiny.stations(initial=initial, fit=fit), budget=2)
+    assert len(handed) == 3
+    for step, (model, start) in enumerate(handed):
+        np.testing.assert_array_equal(start.sh, initial([None] * (3 + step)).sh)
+        np.testing.assert_array_equal(start.means, initial([None] * 3).means)
+        expected = start if step == 0 else replace(drawn[step - 1], sh=drawn[step - 1].sh + np.float32(1))
+        np.testing.assert_allclose(model.sh, expected.sh, atol=1e-5)
+        np.testing.assert_array_equal(model.means, start.means)
+
+
 def test_a_tie_goes_to_the_farthest_camera(dataset, tmp_path):
     """Where every view sees everything, coverage has nothing to say after the seeds: the views must spread all the same."""
     stations = tiny.stations(fisher=lambda gaussians, camera: np.ones((tiny.POINTS, 11), np.float32))

@@ -8,6 +8,7 @@ of g^T (J^T J + lam)^-1 g, exact where images are linear in the parameters.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,8 @@ def remaining_decrease(
     a share of phi; and "converged", whether that is at most CONVERGED_SHARE. Raises InputError where a frame cannot be read.
     """
     seeds, exposure = frames[: settings.seeds], exposure_of(prior) if settings.exposure else None
-    start = initial_gaussians(prior, seeds, gains=exposure(seeds) if exposure else None)[0]
+    of_seeds, of_all = (initial_gaussians(prior, f, gains=exposure(f) if exposure else None)[0] for f in (seeds, frames))
+    start = replace(of_seeds, sh=of_all.sh)
     means, kinds = settings.train.means, groups(0, settings.train.means)
     lam = settings.regularisation(kinds)
     by_kind = {kind: float(lam[columns][0]) for kind, columns in kinds.items()}

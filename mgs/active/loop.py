@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -28,6 +28,7 @@ from mgs.files import locked
 from mgs.gaussians import Gaussians
 from mgs.memory import IMAGE_BYTES, Deferred, kept_within
 from mgs.prior.exposure import without_gain
+from mgs.prior.initial import warm_start
 from mgs.seeds import generator
 from mgs.splat_ply import write_ply
 
@@ -56,7 +57,7 @@ class Stations:
 
     centre: [3] the rock, metres.
     groups: columns of the Fisher information by kind of parameter (`mgs.splat.groups`).
-    initial(seed frames) -> Gaussians before any training.
+    initial(frames) -> Gaussians before any training, in the colours of these frames.
     exposure(frames) -> gains [V,3] by which the colours of frames are divided; None: they are taken as they are.
     fit(gaussians, start, cameras, targets, train, on_pass) -> Fit; start: the Gaussians before any training; targets and train
     (the settings) as in `mgs.active.fitting.fit`.
@@ -161,7 +162,8 @@ class Loop:
         self.start = stations.initial([self.frames[i] for i in self.seeds])
         self.policy = policies.policy_named(settings.policy)
         self.seen, self.dome = cache(self._seen), cache(self._dome)  # they depend on poses and surface alone
-        self.before_fit = cache(self._before_fit)  # and this on the images, too
+        self.before_fit = cache(self._before_fit)  # and these on the images, too
+        self.coloured = lru_cache(maxsize=2)(self._coloured)
 
     def check(self, state: State) -> None:
         """Raises InputError where a state is not of this run: where its means, which a fit leaves alone, are not the prior's;
@@ -303,23 +305,22 @@ class Loop:
         at the new model. What the fit says goes into the last of the planned steps."""
         *steps, known = planned.steps
         step, taken, new = known["step"], planned.taken, planned.taken[len(state.taken) :]
-        cameras, watch = [self.cameras[i] for i in taken], _Stopwatch(known["seconds"])
+        watch = _Stopwatch(known["seconds"])
         with watch("capture"):
             for i in new:
                 self.image(i)
             gains = self.stations.exposure([self.frames[i] for i in taken]) if self.stations.exposure else None
             targets = self.targets(taken, gains)
         with watch("fit"):
-            on_pass = partial(self.progress, "fitting")
-            fit = self.stations.fit(state.gaussians, self.start, cameras, targets, self.settings.train_at(step), on_pass)
+            fit = self.fit(state, taken, targets, step, partial(self.progress, "fitting"))
         if fit.stop_reason == StopReason.DIVERGED:
             raise InputError(diverged(self.out, step, len(state.steps), fit.losses))
         with watch("information"):
             H = np.zeros((len(fit.gaussians), len(self.lam)))
-            for done, camera in enumerate(cameras):
-                self.progress("information of the training set", done, len(cameras))
-                H += self.stations.fisher(fit.gaussians, camera)
-        kinds = ["image", "mask", "rock"] + ["depth"] * (not step)  # depth gives the seeds' colours to the surface
+            for done, i in enumerate(taken):
+                self.progress("information of the training set", done, len(taken))
+                H += self.stations.fisher(fit.gaussians, self.cameras[i])
+        kinds = ["image", "mask", "rock", "depth"]  # depth tells which part of the surface a colour belongs to
         files = {self.frames[i].name: inputs.frame_digests(self.frames[i], kinds) for i in new}
         made_from = {**self.made_from, "files": state.inputs.get("files", {}) | files}
         line = known | {
@@ -339,6 +340,19 @@ class Loop:
             with watch("evaluate"):
                 line |= self.stations.measure(fit.gaussians, taken)
         return self.marked(State(fit.gaussians, H, planned.surface, taken, [*steps, line], made_from))
+
+    def fit(
+        self, state: State, taken: list[int], targets: Sequence[np.ndarray], step: int, on_pass: Callable[[int, int], None]
+    ) -> Fit:
+        """A fit to frames taken, of which those of a state are the first, from the model of that state."""
+        start = self.coloured(tuple(taken))
+        model = warm_start(state.gaussians, self.coloured(tuple(state.taken)), start) if state.taken else start
+        cameras = [self.cameras[i] for i in taken]
+        return self.stations.fit(model, start, cameras, targets, self.settings.train_at(step), on_pass)
+
+    def _coloured(self, taken: tuple[int, ...]) -> Gaussians:
+        """The Gaussians before any training, in the colours of all frames taken."""
+        return replace(self.start, sh=self.stations.initial([self.frames[i] for i in taken]).sh)
 
     def targets(self, taken: list[int], gains: np.ndarray | None = None) -> Sequence[np.ndarray]:
         """What the model is fitted to in these frames, each [H,W,4] as `target_of`; colours divided by `gains` [V,3]."""

@@ -12,13 +12,13 @@ from mgs.active.loop import Stations
 from mgs.active.settings import NbvSettings, TrainSettings
 from mgs.camera import Camera
 from mgs.colour import linear_from_srgb, srgb_from_linear
-from mgs.data.dataset import Dataset
+from mgs.data.dataset import Dataset, Frame
 from mgs.gaussians import Gaussians
 from mgs.memory import IMAGE_BYTES, kept_within
 from mgs.metrics import colour_corrected, psnr
 from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of
-from mgs.prior.initial import initial_gaussians, initial_normals
+from mgs.prior.initial import Colours, colours_of, initial_gaussians, initial_normals
 from mgs.splat import ListCache, fisher, groups, render
 
 
@@ -28,6 +28,7 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
     columns = groups(0, means)
     lam, normals = settings.regularisation(columns), initial_normals(prior)
     exposure = exposure_of(prior) if settings.exposure else None
+    colours = kept_colours(dataset, prior)
     by_kind = {kind: float(lam[of_kind][0]) for kind, of_kind in columns.items()}
 
     def run_fit(
@@ -50,7 +51,9 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
     return Stations(
         centre=prior.points.mean(axis=0),
         groups=columns,
-        initial=lambda frames: initial_gaussians(prior, frames, gains=exposure(frames) if exposure else None)[0],
+        initial=lambda frames: initial_gaussians(prior, frames, gains=exposure(frames) if exposure else None, colours=colours)[
+            0
+        ],
         fit=run_fit,
         fisher=lambda gaussians, camera: information(gaussians, camera, settings.estimator),
         estimate=information,
@@ -62,6 +65,13 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
         up=prior.up,
         prior=prior_digest(prior),
     )
+
+
+def kept_colours(dataset: Dataset, prior: Prior) -> Callable[[Frame], Colours]:
+    """`mgs.prior.initial.colours_of` the prior, whose results for frames of the dataset are kept within IMAGE_BYTES."""
+    of, index = colours_of(prior), {frame.name: i for i, frame in enumerate(dataset.frames)}
+    kept = kept_within(IMAGE_BYTES, lambda i: of(dataset.frames[i]), lambda found: sum(part.nbytes for part in found))
+    return lambda frame: kept(index[frame.name])
 
 
 def psnr_measure(

@@ -1,4 +1,4 @@
-"""The prior and the seed frames -> initial Gaussians (paper, section III-A), with a backing that keeps the rock opaque.
+"""The prior and some frames -> initial Gaussians (paper, section III-A), with a backing that keeps the rock opaque.
 
 Nothing in an image asks for an opaque surface. Where only a layer of Gaussians on the surface is fitted, as in the paper,
 bright patches turn see-through, and what shines through is the far side of the rock, another part of it from every camera.
@@ -56,33 +56,41 @@ overlap than on the surface, since gaps are what it is there to prevent."""
 BACKING_OPACITY = 0.99
 
 GREY = 0.5
-"""Colour of a Gaussian that no seed frame sees, linear RGB in every channel: all its spherical harmonics are zero."""
+"""Colour of a Gaussian that no frame sees, linear RGB in every channel: all its spherical harmonics are zero."""
+
+
+Colours = tuple[np.ndarray, np.ndarray]
+"""What `seen_colours` returns."""
 
 
 def initial_gaussians(
-    prior: Prior, seed_frames: Sequence[Frame], inset: float = INSET, gains: np.ndarray | None = None
+    prior: Prior,
+    frames: Sequence[Frame],
+    inset: float = INSET,
+    gains: np.ndarray | None = None,
+    colours: Callable[[Frame], Colours] | None = None,
 ) -> tuple[Gaussians, np.ndarray]:
-    """One flat Gaussian for each of the N samples of a prior, with a colour averaged over the seed frames that see the sample;
-    then one behind each of the first `prior.backed` samples, of the same colour.
+    """One flat Gaussian for each of the N samples of a prior, with a colour averaged over the frames that see the sample; then
+    one behind each of the first `prior.backed` samples, of the same colour.
 
     A frame sees a sample that lies inside its rock mask, whose normal points towards the camera, and whose depth agrees with
     the depth image, up to `prior.depth_tolerance` and the slope of the surface within a pixel. For a frame without depth image
     the depth of the prior's mesh is used. A sample that no frame sees is grey.
     inset: how far below its sample a Gaussian lies, over the `pixel_on` the prior. gains: [V,3] of the frames' exposures, by
-    which their colours are divided (`mgs.prior.exposure`).
+    which their colours are divided (`mgs.prior.exposure`). colours: `colours_of` the prior, where it is kept between calls.
     Returns (N + backed Gaussians of degree 0, seen [N] bool: which samples some frame sees).
     Raises InputError if a file of a frame cannot be read, and as `mesh_depth` where a frame has no depth image.
     """
     n = len(prior.points)
     total, count = np.zeros((n, 3)), np.zeros(n)
-    depth = depth_of(prior)
-    for k, frame in enumerate(seed_frames):
-        seen, rgb = seen_colours(prior.points, prior.normals, frame, depth(frame), prior.depth_tolerance)
+    colours = colours or colours_of(prior)
+    for k, frame in enumerate(frames):
+        seen, rgb = colours(frame)
         total[seen] += rgb if gains is None else rgb / gains[k]
         count[seen] += 1
     seen = count > 0
     rgb = np.where(seen[:, None], total / np.maximum(count, 1)[:, None], GREY)
-    below = inset * pixel_on(prior, [frame.camera for frame in seed_frames])
+    below = inset * pixel_on(prior, [frame.camera for frame in frames])
     scales = np.log(prior.spacing * np.array([IN_PLANE_SCALE, IN_PLANE_SCALE, THICKNESS]))
     surface = Gaussians(
         means=(prior.points - below * prior.normals).astype(np.float32),
@@ -92,6 +100,21 @@ def initial_gaussians(
         sh=sh_from_rgb(rgb),
     )
     return _with_backing(surface, prior), seen
+
+
+def warm_start(model: Gaussians, before: Gaussians, start: Gaussians) -> Gaussians:
+    """Where a fit begins that has more images than the one before it: the model of that one, its colours moved by as much as
+    those of the Gaussians before training moved, from `before` to `start`, as the new images were added to their mean.
+
+    A Gaussian that no image saw before takes its colour from the new images so, while it would need many passes to learn it.
+    """
+    return replace(model, sh=model.sh + (start.sh - before.sh))
+
+
+def colours_of(prior: Prior) -> Callable[[Frame], Colours]:
+    """A function that gives `seen_colours` of a frame for the samples of a prior."""
+    depth = depth_of(prior)
+    return lambda frame: seen_colours(prior.points, prior.normals, frame, depth(frame), prior.depth_tolerance)
 
 
 def pixel_on(prior: Prior, cameras: Sequence[Camera]) -> float:
@@ -126,9 +149,7 @@ def _with_backing(surface: Gaussians, prior: Prior) -> Gaussians:
     return Gaussians(*(np.concatenate([getattr(g, field.name) for g in (surface, backing)]) for field in fields(Gaussians)))
 
 
-def seen_colours(
-    points: np.ndarray, normals: np.ndarray, frame: Frame, depth: np.ndarray, tolerance: float
-) -> tuple[np.ndarray, np.ndarray]:
+def seen_colours(points: np.ndarray, normals: np.ndarray, frame: Frame, depth: np.ndarray, tolerance: float) -> Colours:
     """(which points [N] of a surface a frame sees inside its mask, bool; the colours of these there, [seen,3] linear RGB).
 
     normals, depth [H,W], tolerance: as in `mgs.data.visibility.visible`. Raises InputError if a file cannot be read.

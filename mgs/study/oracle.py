@@ -41,9 +41,7 @@ class Oracle(Loop):
     def worth(self, state: State, frame: int) -> float:
         """Mean PSNR over the test views, dB, of the very fit that the loop does once it takes this frame."""
         taken = [*state.taken, frame]
-        cameras, targets = [self.cameras[i] for i in taken], self.targets(taken)
-        train = self.settings.train_at(len(state.steps))
-        fit = self.stations.fit(state.gaussians, self.start, cameras, targets, train, lambda done, most: None)
+        fit = self.fit(state, taken, self.targets(taken), len(state.steps), lambda done, most: None)
         return self.judge(fit.gaussians, [])["psnr"]
 
 

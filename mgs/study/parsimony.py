@@ -152,8 +152,9 @@ def fit_and_judge(
     from mgs.active.objective import objective
     from mgs.active.settings import RATES, NbvSettings, TrainSettings
     from mgs.data.dataset import load_dataset
+    from mgs.gaussians import Gaussians
     from mgs.prior.build import load_prior
-    from mgs.prior.initial import initial_gaussians
+    from mgs.prior.initial import initial_gaussians, warm_start
     from mgs.splat import ListCache, as_drjit, fisher, groups
     from mgs.splat_ply import write_ply
 
@@ -167,13 +168,20 @@ def fit_and_judge(
     positions = np.array([frame.camera.position for frame in dataset.frames])
     frames = [dataset.frames[i] for i in views_in_order(positions, prior.points.mean(0), views, seeds)]
     cameras, targets = [frame.camera for frame in frames], [target_of(frame) for frame in frames]
-    start = initial_gaussians(prior, frames[:seeds])[0]
-    sh = np.zeros((len(start), (degree + 1) ** 2, 3), np.float32)
-    sh[:, :1] = start.sh
-    start = model = replace(start, sh=sh)
+
+    def start_of(count: int) -> Gaussians:
+        """The Gaussians before training, in the colours of the first `count` frames, as the loop of `mgs nbv` has them."""
+        of_seeds, coloured = (initial_gaussians(prior, frames[:k])[0] for k in (seeds, count))
+        sh = np.zeros((len(of_seeds), (degree + 1) ** 2, 3), np.float32)
+        sh[:, :1] = coloured.sh
+        return replace(of_seeds, sh=sh)
+
+    start = model = start_of(seeds)
     fitted, following, seconds, passes = list[float](), list[float](), 0.0, 0
     for step, count in enumerate(range(seeds, views + 1)):
         began = time.perf_counter()
+        before, start = start, start_of(count)
+        model = warm_start(model, before, start)
         found = fit(model, cameras[:count], targets[:count], settings.train_at(step), None, cache, start, by_kind)
         seconds, passes, model = seconds + time.perf_counter() - began, passes + found.passes, found.gaussians
         if count < views:
