@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -17,9 +15,6 @@ from mgs.bench.chart import scaling_figure
 from mgs.bench.growth import OPERATIONS, fitted, linear_growth, scaling_exponents
 from mgs.cli.app import main
 from mgs.files import read_json
-from mgs.splat import fisher, render
-from mgs.splat.blocks import BLOCK_X, BLOCK_Y
-from mgs.splat.walking import PIXELS
 
 
 def points(most: int = 1_000_000) -> list[dict]:
@@ -141,23 +136,3 @@ def test_the_json_holds_the_command_as_typed(monkeypatch, capsys, tmp_path):
 
 def test_one_n_is_too_few_to_fit(capsys):
     assert "at least 3000" in refused(capsys, ["bench", "scaling", "--gaussians", 2999])
-
-
-def test_operations_per_pixel_are_those_of_the_kernels():
-    """Counted in the LLVM IR of every kernel that walks block lists: two for an FMA, one for each other operation."""
-    gaussians = core.surface_gaussians(500)
-    camera = core.surface_camera(gaussians, 184, 92)
-    lanes = -(-184 // BLOCK_X) * -(-92 // BLOCK_Y)
-    counts = []
-    for call in (lambda: dr.eval(render(gaussians, camera).rgb), lambda: fisher(gaussians, camera)):
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            dr.kernel_history_clear()
-            call()
-            kernels = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT and entry["size"] == lanes]
-        code = "".join(entry["ir"].getvalue() for entry in kernels)
-        fma, other = (
-            re.findall(r"call <\d+ x float> @llvm\.fma", code),
-            re.findall(r"= f(?:add|sub|mul|div) <\d+ x float>", code),
-        )
-        counts.append(round((2 * len(fma) + len(other)) / PIXELS))
-    assert counts == [core.FORWARD_FLOPS, core.FISHER_FLOPS]

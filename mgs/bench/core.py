@@ -18,11 +18,14 @@ import mitsuba as mi
 import numpy as np
 
 from mgs import runtime
+from mgs.bench.machine import peak_flops
+from mgs.bench.work import count_work
 from mgs.camera import Camera, look_at
 from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
 from mgs.rotation import quat_from_normals
 from mgs.seeds import derive_seed, generator
 from mgs.splat import ListCache, as_drjit, fisher, render
+from mgs.splat.blocks import BLOCK_X, BLOCK_Y
 from mgs.splat.projection import camera_array, project
 from mgs.splat.walking import PIXELS
 
@@ -40,10 +43,6 @@ and gradient; tiny_forward_ms: milliseconds."""
 
 WARM_UP = 2
 """Number of calls before those that are timed: they compile kernels and allocate memory."""
-
-FORWARD_FLOPS, FISHER_FLOPS = 21, 73
-"""Floating-point operations of a render and of an exact Fisher pass, for each pixel of each (splat, block) pair, counted in the
-LLVM code of their kernels. A fused multiply-add (FMA) counts as two."""
 
 
 def surface_gaussians(n: int, seed: int = 0) -> Gaussians:
@@ -198,22 +197,15 @@ def time_volprim(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str
     return {"volprim_forward": primal, "volprim_gradient": median_seconds(backward, repeats)}
 
 
-def peak_flops() -> float:
-    """Floating-point operations per second that this machine reaches, measured: FMAs on registers, in 8 independent chains for
-    each SIMD lane."""
-    n, rounds = 1 << 16, 256
-    scale = dr.opaque(mi.Float, 0.999)
-
-    def body(i: Any, chains: list[Any]) -> Any:
-        for _ in range(16):
-            chains = [dr.fma(value, scale, x) for value in chains]
-        return i + 1, chains
-
-    x = dr.arange(mi.Float, n) * (1 / n)
-    dr.eval(x)
-    start = [x + i for i in range(8)]
-    seconds = median_seconds(lambda: dr.while_loop((mi.UInt32(0), start), lambda i, _: i < rounds, body)[1], 5)
-    return 2 * 8 * 16 * n * rounds / seconds
+def flops_per_pair(call: Callable[[], Any], lanes: int) -> float:
+    """Floating-point operations of a call for each (splat, block) pair, counted in the LLVM IR of the kernels that walk through
+    block lists: those with this number of lanes, that of the image's blocks. An FMA counts as two."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        dr.eval(call())
+        found = [entry for entry in dr.kernel_history([dr.KernelType.JIT]) if entry["size"] == lanes]
+    loops = [count_work(entry["ir"].getvalue()).loop for entry in found]
+    return sum(work.flops + work.flops64 for work in loops)
 
 
 def bench_splat(n: int, width: int, height: int, repeats: int, report: Callable[[str], None]) -> dict[str, Any]:
@@ -236,6 +228,9 @@ def bench_splat(n: int, width: int, height: int, repeats: int, report: Callable[
     peer = time_volprim(gaussians, camera, max(repeats // 3, 3))
     report("peak arithmetic")
     peak = peak_flops()
+    device, lanes = as_drjit(gaussians), -(-width // BLOCK_X) * -(-height // BLOCK_Y)
+    forward = flops_per_pair(lambda: render(device, camera).rgb, lanes)
+    exact = flops_per_pair(lambda: fisher(device, camera), lanes)
     pixels = own["pairs"] * PIXELS
     ratios = {
         "forward_warm_speedup": peer["volprim_forward"] / own["forward_warm"],
@@ -256,8 +251,8 @@ def bench_splat(n: int, width: int, height: int, repeats: int, report: Callable[
         },
         "peak_gflops_measured": peak / 1e9,
         "share_of_peak": {
-            "forward": FORWARD_FLOPS * pixels / own["forward_warm"] / peak,
-            "fisher_exact": FISHER_FLOPS * pixels / own["fisher_exact"] / peak,
+            "forward": forward * own["pairs"] / own["forward_warm"] / peak,
+            "fisher_exact": exact * own["pairs"] / own["fisher_exact"] / peak,
         },
         "list_megabytes": own["list_bytes"] / 1e6,
         "peak_memory_megabytes": memory,

@@ -14,6 +14,7 @@ class Kind(StrEnum):
 
     splat = "splat"
     scaling = "scaling"
+    roofline = "roofline"
     fit = "fit"
 
 
@@ -22,15 +23,19 @@ def bench(
         Kind,
         typer.Argument(
             help="splat: compared with Mitsuba's own integrator, volprim_rf_basic. scaling: as the numbers of Gaussians, "
-            "pixels and threads grow. fit: accuracy and convergence of the fit of a dataset."
+            "pixels and threads grow. roofline: each kernel against the limits of the machine. fit: accuracy and "
+            "convergence of the fit of a dataset."
         ),
     ],
     json: Annotated[Path | None, typer.Option(help="Write everything that is measured to this file.")] = None,
-    chart: Annotated[Path | None, typer.Option(help="scaling only: draw the chart to this PNG.")] = None,
+    chart: Annotated[Path | None, typer.Option(help="scaling and roofline: draw the chart to this PNG.")] = None,
     gaussians: Annotated[
-        int | None, typer.Option(min=1000, help="splat: number of Gaussians [100000]; scaling: the largest number [1000000].")
+        int | None,
+        typer.Option(min=1000, help="splat, roofline: number of Gaussians [100000]; scaling: the largest number [1000000]."),
     ] = None,
-    repeats: Annotated[int, typer.Option(min=3, help="Number of calls of each operation; their median counts.")] = 9,
+    repeats: Annotated[
+        int, typer.Option(min=3, help="Number of calls of each operation; the median counts, in a roofline the fastest.")
+    ] = 9,
     dataset: Annotated[Path, typer.Option(help="fit only: the dataset, with depth.")] = Path("demo/dataset"),
 ) -> None:
     """Time rendering, gradients and Fisher information on Gaussians of a rock in an image of 640x480 pixels; or, `fit`, measure
@@ -53,12 +58,13 @@ def bench(
             if target.is_dir():
                 raise InputError(f"{target}: is a folder; name a file to write")
     runtime.start()
-    from mgs.bench.chart import scaling_figure
+    from mgs.bench.chart import roofline_figure, scaling_figure
     from mgs.bench.core import TARGETS as SPLAT_TARGETS
     from mgs.bench.core import bench_scaling, bench_splat
     from mgs.bench.fit import TARGETS as FIT_TARGETS
     from mgs.bench.fit import bench_fit
     from mgs.bench.growth import growth
+    from mgs.bench.roofline import bench_roofline
 
     console = Console()
 
@@ -73,6 +79,12 @@ def bench(
     elif kind is Kind.fit:
         result = bench_fit(dataset, report)
         _print_figures(console, result["figures"], FIT_TARGETS)
+    elif kind is Kind.roofline:
+        result = bench_roofline(gaussians or 100_000, 640, 480, repeats, report)
+        _print_roofline(console, result)
+        if chart:
+            roofline_figure(chart, result)
+            console.print(f"wrote {chart}")
     else:
         points = bench_scaling(repeats, report, gaussians or 1_000_000)
         result = {"repeats": repeats, "points": points} | growth(points)
@@ -100,6 +112,36 @@ def _print_scaling(console: Any, result: dict[str, Any]) -> None:
         *values, deviation = row.values()
         costs.add_row(name, *(f"{value:.1f}" for value in values), f"{deviation:.0%}")
     console.print(table, costs)
+
+
+def _print_roofline(console: Any, result: dict[str, Any]) -> None:
+    """Print the limits of the machine, the work of each kernel, and where it stands."""
+    from rich.table import Column, Table
+
+    def table(*numbers: str, last: str = "") -> Table:
+        columns = [Column(name, justify="right", no_wrap=True) for name in numbers]
+        return Table("kernel", *columns, *([last] if last else []))
+
+    limits, rows = result["limits"], result["kernels"]
+    bandwidths = ", ".join(f"{name} {value / 1e9:.0f}" for name, value in limits["bandwidth"].items())
+    console.print(
+        f"FMA {limits['flops'] / 1e9:.0f} Gflop/s, in double {limits['flops64'] / 1e9:.0f}; divisions "
+        f"{limits['divisions'] / 1e9:.1f} billion a second, in double {limits['divisions64'] / 1e9:.1f}; GB/s: {bandwidths}"
+    )
+    work = table("operations", "divisions", "instructions", "bytes", "state", last="for each")
+    for row in rows:
+        each = row["each"]
+        counts = [each[a] + each[b] for a, b in (("flops", "flops64"), ("divisions", "divisions64"))]
+        counts += [each[key] for key in ("instructions", "bytes", "state_bytes")]
+        work.add_row(row["name"], *(f"{count:,.0f}" for count in counts), row["unit"])
+    share = table(*rows[0]["shares"])
+    share.title = "share of the time that each limit takes alone"
+    time = table("ms", "Gflop/s", "busy lanes", last="bound by")
+    for row in rows:
+        share.add_row(row["name"], *(f"{value:.0%}" for value in row["shares"].values()))
+        numbers = f"{1e3 * row['seconds']:.2f}", f"{row['gflops']:.1f}", f"{row['lanes_active']:.0%}"
+        time.add_row(row["name"], *numbers, row["verdict"])
+    console.print(work, share, time)
 
 
 def _print_splat(console: Any, result: dict[str, Any]) -> None:

@@ -120,6 +120,49 @@ def splat_work(data: dict[str, Any]) -> str:
     return markdown(["in the same run", ""], rows)
 
 
+def roofline(data: dict[str, Any]) -> str:
+    """What share of each kernel's time each limit of the machine takes, and the limits."""
+    limits, rows = data["limits"], data["kernels"]
+    lines = [
+        [
+            row["name"],
+            f"{1e3 * row['seconds']:.2f}",
+            f"{row['gflops']:.1f}" if row["gflops"] else "",
+            *(f"{share:.0%}" for share in row["shares"].values()),
+            row["verdict"],
+        ]
+        for row in rows
+    ]
+    bandwidths = ", ".join(f"{name} {value / 1e9:.0f}" for name, value in limits["bandwidth"].items())
+    text = (
+        f"\nLimits: FMAs {limits['flops'] / 1e9:.0f} Gflop/s, in double {limits['flops64'] / 1e9:.0f}; divisions "
+        f"{limits['divisions'] / 1e9:.1f} billion a second, in double {limits['divisions64'] / 1e9:.1f}; GB/s: {bandwidths}.\n"
+    )
+    return markdown(["kernel", "ms", "Gflop/s", *rows[0]["shares"], "bound by"], lines) + text + made_by(data)
+
+
+def roofline_work(data: dict[str, Any]) -> str:
+    """Operations and bytes of each kernel, counted, and the lanes that are busy."""
+    rows = []
+    for row in data["kernels"]:
+        each = row["each"]
+        counts = [each["flops"], each["flops64"], each["divisions"] + each["divisions64"]]
+        counts += [each[key] for key in ("instructions", "bytes", "state_bytes")]
+        rows.append([row["name"], row["unit"], *(f"{count:,.0f}" for count in counts), f"{row['lanes_active']:.0%}"])
+    heading = [
+        "kernel",
+        "for each",
+        "operations",
+        "in double",
+        "divisions",
+        "instructions",
+        "bytes",
+        "state bytes",
+        "busy lanes",
+    ]
+    return markdown(heading, rows)
+
+
 def scaling(data: dict[str, Any]) -> str:
     """Exponents of growth, and times as sums of what grows linearly."""
     costs, start = data["linear_growth"], f"{data['exponents_from_n']:,}"
@@ -373,6 +416,8 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "splat": ("benchmarks/splat", splat),
     "splat-short": ("benchmarks/splat", splat_short),
     "splat-work": ("benchmarks/splat", splat_work),
+    "roofline": ("benchmarks/roofline", roofline),
+    "roofline-work": ("benchmarks/roofline", roofline_work),
     "scaling": ("benchmarks/scaling", scaling),
     "block-accuracy": ("benchmarks/block_accuracy", block_accuracy),
     "hutchinson": ("benchmarks/hutchinson", hutchinson),
