@@ -109,11 +109,11 @@ def test_the_work_of_a_kernel_is_counted():
     number of the array read and written; a copy of its 8 bytes a lane; and f1, which was made before, read.
     """
     found = count_work(KERNEL)
-    assert (found.width, found.loops) == (8, 1)
+    assert (found.width, len(found.loops)) == (8, 1)
     assert found.straight == Work(bytes=4 + 8 + 2 * 4, state_bytes=2 * 4)
     instructions = 1 + 1 + 1 + 1 + 2 + 2 + 1  # icmp, fma, fdiv, select, fpext and fadd on doubles, add
     loop = Work(3, 1, 1, 0, instructions, 4 + 16 + 2 * 16, state_bytes=2 * (4 + 8) + 2 * 4 + 2 * 8 + 4)
-    assert found.loop == loop
+    assert found.loops[0] == loop
     assert loop * 2 + loop == loop * 3
 
 
@@ -141,33 +141,38 @@ def test_the_reader_understands_what_drjit_writes_today():
 
     kernel = compiled(lambda: sum(dr.while_loop((dr.zeros(mi.UInt32, 64), [x] * 5), lambda i, _: i < n, body)[1]))
     found = count_work(kernel.ir)
-    assert (kernel.size, found.loops) == (64, 1)
-    assert (found.loop.flops, found.loop.divisions, found.loop.bytes) == (5 * 3, 5, 0)
-    assert found.loop.state_bytes == 2 * 4 * (5 + 1) + 4  # five numbers, the counter, and x
+    (loop,) = found.loops
+    assert kernel.size == 64
+    assert (loop.flops, loop.divisions, loop.bytes) == (5 * 3, 5, 0)
+    assert loop.state_bytes == 2 * 4 * (5 + 1) + 4  # five numbers, the counter, and x
     assert (found.straight.flops, found.straight.bytes) == (4, 4 + 4)
 
 
 def test_work_of_the_kernels_is_what_their_authors_meant():
-    """A pair is read as an index and a splat of 64 bytes; the adjoint reads its slot, too, and writes two packets of sums.
-    Of each pixel forward carries six numbers."""
+    """A pair is read as an index and a splat of 64 bytes, without depth 48; the adjoint writes two packets of sums. Of each
+    pixel forward carries six numbers, without alpha and depth four."""
     gaussians = core.surface_gaussians(500)
     camera = core.surface_camera(gaussians, 184, 92)
     device = as_drjit(gaussians)
     splats = project(device, camera_array(camera))
     lists, packed = ListCache().get(camera, splats)
-    out = kernels.forward(lists, packed)
+    (whole,), (forward,) = (count_work(compiled(lambda w=w: kernels.forward(lists, packed, w)).ir).loops for w in (True, False))
+    assert (whole.bytes, forward.bytes) == (4 + 64, 4 + 48)
+    assert 2 * 6 * 4 * PIXELS <= whole.state_bytes < 2 * 7 * 4 * PIXELS
+    assert 2 * 4 * 4 * PIXELS <= forward.state_bytes < 2 * 5 * 4 * PIXELS
+    assert whole.divisions == forward.divisions == 0
+    out = kernels.forward(lists, packed, False)
     dr.eval(out)
-    forward = count_work(compiled(lambda: kernels.forward(lists, packed)).ir).loop
-    assert forward.bytes == 4 + 64
-    assert forward.state_bytes >= 2 * 6 * 4 * PIXELS
-    assert forward.divisions == 0
-    walk = next(k for k in run_kernels(lambda: kernels.adjoint(lists, packed, out, out, False), 1) if k.ir)
-    adjoint = count_work(walk.ir).loop
-    assert adjoint.bytes == 4 + 64 + 4 + 2 * 16
+    walk = next(k for k in run_kernels(lambda: kernels.adjoint(lists, packed, out, out, False, False), 1) if k.ir)
+    adjoint, zeros = count_work(walk.ir).loops
+    assert adjoint.bytes == 4 + 48 + 2 * 16
+    assert (zeros.bytes, zeros.flops) == (2 * 16, 0)
     assert adjoint.divisions == PIXELS
     assert adjoint.flops > forward.flops > 15 * PIXELS
-    assert core.flops_per_pair(lambda: kernels.forward(lists, packed), len(lists.block)) == forward.flops + forward.flops64
-    assert core.flops_per_pair(lambda: kernels.forward(lists, packed), 1) == 0
+    assert core.flops_per_pair(lambda: kernels.forward(lists, packed, False), len(lists.block)) == (
+        forward.flops + forward.flops64
+    )
+    assert core.flops_per_pair(lambda: kernels.forward(lists, packed, False), 1) == 0
 
 
 @given(st.lists(st.integers(0, 50), min_size=1, max_size=40), st.sampled_from([4, 8, 16]))
@@ -233,13 +238,13 @@ def test_rates_are_those_of_the_work_that_the_timed_kernels_do(monkeypatch):
     calls = []
     monkeypatch.setattr(machine, "kernel_seconds", lambda call: calls.append(call) or 1.0)
     lanes = 1 << 14
-    assert machine.peak_flops() == lanes * 64 * (flops := count_work(compiled(calls.pop()).ir).loop).flops
+    assert machine.peak_flops() == lanes * 64 * (flops := count_work(compiled(calls.pop()).ir).loops[0]).flops
     assert flops.flops == 2 * 8 * 16
-    assert machine.peak_flops(mi.Float64) == lanes * 64 * count_work(compiled(calls.pop()).ir).loop.flops64
-    assert machine.division_rate(mi.Float) == lanes * 4 * count_work(compiled(calls.pop()).ir).loop.divisions
+    assert machine.peak_flops(mi.Float64) == lanes * 64 * count_work(compiled(calls.pop()).ir).loops[0].flops64
+    assert machine.division_rate(mi.Float) == lanes * 4 * count_work(compiled(calls.pop()).ir).loops[0].divisions
     found = machine.local_bandwidth(4096)
     counter = 2 * 4
-    assert found == lanes / 4 * 64 * (count_work(compiled(calls.pop()).ir).loop.state_bytes - counter)
+    assert found == lanes / 4 * 64 * (count_work(compiled(calls.pop()).ir).loops[0].state_bytes - counter)
     assert found == lanes / 4 * 64 * (4096 // 64) * 8
 
 
@@ -268,7 +273,7 @@ def result():
 def test_every_kernel_has_its_place(result, tmp_path, monkeypatch):
     rows = {row["name"]: row for row in result["kernels"]}
     steps = ["projection", "packing", "block lists", "sums to gradient", "sums to exact Fisher", "sums to block Fisher"]
-    assert {"forward", "jvp", "adjoint: walk", "adjoint: sum slots", "block Fisher: sum slots", *steps} <= rows.keys()
+    assert {"forward", "jvp", "adjoint: walk", "adjoint: add up", "block Fisher: add up", *steps} <= rows.keys()
     assert any(name.startswith("exact Fisher: walk") for name in rows)
     for row in rows.values():
         assert row["seconds"] > 0
@@ -279,7 +284,11 @@ def test_every_kernel_has_its_place(result, tmp_path, monkeypatch):
     executed = walk["executed"]["flops"] + walk["executed"]["flops64"]
     assert walk["gflops"] == pytest.approx(executed / walk["seconds"] / 1e9)
     assert walk["intensity"] < walk["array_intensity"] == pytest.approx(executed / walk["executed"]["bytes"])
-    assert (walk["unit"], rows["projection"]["unit"], rows["adjoint: sum slots"]["unit"]) == ("pair", "Gaussian", "four sums")
+    assert (walk["unit"], rows["projection"]["unit"], rows["adjoint: add up"]["unit"]) == (
+        "pair",
+        "Gaussian",
+        "4 pairs of a splat",
+    )
     assert rows["block lists"]["own_seconds"] > 0
     assert rows["sums to block Fisher"]["each"]["flops64"] > rows["sums to exact Fisher"]["each"]["flops64"]
 

@@ -82,7 +82,7 @@ COLOURS = {"forward": "#0072b2", "jvp": "#56b4e9", "adjoint": "#d55e00", "exact 
 
 MARKERS = {
     "walk 1": "v",
-    "sum slots": "s",
+    "add up": "s",
     "projection": "*",
     "block lists": "P",
     "sums to gradient": "X",

@@ -22,7 +22,7 @@ from mgs.gaussians import Gaussians
 from mgs.splat import ListCache, as_drjit, blocks, fisher, kernels
 from mgs.splat.blocks import BlockLists
 from mgs.splat.projection import camera_array, project, project64
-from mgs.splat.walking import pack
+from mgs.splat.walking import AT_ONCE, pack
 
 ROOFS = ("FMA", "division", "instructions", "L1")
 """Limits on a kernel, whatever its data: all its additions and multiplications at the measured rate of FMAs; its divisions at
@@ -80,9 +80,9 @@ def kernel_row(name: str, unit: str, kernel: Kernel, lists: BlockLists) -> dict[
     """What is known of one kernel: "name"; "seconds"; "each", the `Work` of a lane for one `unit`: of its loop for one
     iteration; "useful" and "executed", the `Work` of all busy lanes, and of all lanes.
 
-    A loop follows the block lists where there is a lane for each block, and all pairs count: that a block skips the rest of
-    its list once its pixels are finished is left out. Else it follows the slots of each splat. Of memory that is cleared only
-    the bytes are known.
+    A kernel's first loop follows the block lists where there is a lane for each block, and all pairs count: that a block skips
+    the rest of its list once its pixels are finished is left out, and so is the second loop, which then writes zeros. Else it
+    follows the pairs of each splat, AT_ONCE in an iteration. Of memory that is cleared only the bytes are known.
     """
     if kernel.kind != "JIT":
         cleared = Work(bytes=kernel.size)
@@ -91,11 +91,12 @@ def kernel_row(name: str, unit: str, kernel: Kernel, lists: BlockLists) -> dict[
     lanes = -(-kernel.size // counted.width) * counted.width
     if not counted.loops:
         return _row(name, kernel.seconds, unit, counted.straight, counted.straight * kernel.size, counted.straight * lanes)
-    start, end = (lists.start, lists.end) if kernel.size == len(lists.block) else (lists.slot_start, lists.slot_end)
-    length = np.asarray(end).astype(np.int64) - np.asarray(start)
-    busy, every = trips(np.repeat(length, kernel.size // len(length)), counted.width)
-    useful, executed = counted.straight * kernel.size + counted.loop * busy, counted.straight * lanes + counted.loop * every
-    return _row(name, kernel.seconds, unit, counted.loop, useful, executed)
+    walks = kernel.size == len(lists.block)
+    start, end = (lists.start, lists.end) if walks else (lists.slot_start, lists.slot_end)
+    length, loop = np.asarray(end).astype(np.int64) - np.asarray(start), counted.loops[0]
+    busy, every = trips(length if walks else -(-length // AT_ONCE), counted.width)
+    useful, executed = counted.straight * kernel.size + loop * busy, counted.straight * lanes + loop * every
+    return _row(name, kernel.seconds, unit, loop, useful, executed)
 
 
 def _row(name: str, seconds: float, unit: str, each: Work, useful: Work, executed: Work) -> dict[str, Any]:
@@ -116,15 +117,15 @@ def step_row(name: str, found: list[Kernel], lists: BlockLists) -> dict[str, Any
 
 
 def operation_rows(operation: str, found: list[Kernel], lists: BlockLists) -> list[dict[str, Any]]:
-    """A row for each kernel of an operation that walks through block lists: its walks, the clearing of the slots for their
-    sums, and the adding up of these. Kernels that take less than a hundredth of its time are left out."""
+    """A row for each kernel of an operation that walks through block lists: its walks, and the adding up of their sums. Kernels
+    that take less than a hundredth of its time are left out."""
     least = 0.01 * sum(kernel.seconds for kernel in found)
     walks = [kernel for kernel in found if kernel.ir and kernel.size == len(lists.block)]
     rows = []
     for kernel in found:
         if kernel.kind not in ("JIT", "Memset") or kernel.seconds < least:
             continue
-        what, unit = ("clear slots", "byte") if kernel.kind == "Memset" else ("sum slots", "four sums")
+        what, unit = ("clear memory", "byte") if kernel.kind == "Memset" else ("add up", f"{AT_ONCE} pairs of a splat")
         if kernel in walks:
             what, unit = "walk" if len(walks) == 1 else f"walk {1 + walks.index(kernel)}", "pair"
         rows.append(kernel_row(operation if len(found) == 1 else f"{operation}: {what}", unit, kernel, lists))
@@ -147,22 +148,22 @@ def roofline_rows(gaussians: Gaussians, camera: Camera, repeats: int, report: Ca
     dr.eval(device, splats, splats64)
     lists, packed = cache.get(camera, splats)
     packed64, tangents = pack(splats64, lists.place), kernels.pack_tangents(splats, splats, lists.place)
-    out = kernels.forward(lists, packed)
+    out = kernels.forward(lists, packed, False)
     noise = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
-    d_out = mi.Float(np.resize(noise, len(out[0]))), dr.zeros(mi.Float, len(out[1]))
+    d_out = (mi.Float(np.resize(noise, len(out[0]))),)
     weights, background = mi.TensorXf(noise), mi.Color3f(*(dr.opaque(mi.Float, 0.0) for _ in range(3)))
     dr.eval(out, d_out, weights)
     walks = {
-        "forward": lambda: kernels.forward(lists, packed),
+        "forward": lambda: kernels.forward(lists, packed, False),
         "jvp": lambda: kernels.jvp(lists, packed, tangents),
-        "adjoint": lambda: kernels.adjoint(lists, packed, out, d_out, False),
+        "adjoint": lambda: kernels.adjoint(lists, packed, out, d_out, False, False),
         "exact Fisher": lambda: kernels.fisher(lists, packed, background, False),
         "block Fisher": lambda: kernels.fisher(lists, packed64, background, True),
     }
     steps = {
         "projection": lambda: project(device, place),
         "packing": lambda: pack(splats, lists.place),
-        "block lists": lambda: blocks.build(splats, blocks.depth_order(splats.depth), camera.width, camera.height, 0.0),
+        "block lists": lambda: blocks.build(splats, camera.width, camera.height),
     }
     wholes = {
         "sums to gradient": lambda: gradient(device, camera, weights, cache),

@@ -1,8 +1,8 @@
 """The work of a compiled kernel, counted in its LLVM IR, the code that Dr.Jit hands to LLVM. Nothing is measured here.
 
 A kernel of Dr.Jit is one function, which takes one SIMD register of numbers after the other. An instruction on vectors so
-counts once for each lane. Most kernels are straight code. Those that follow lists have a loop, and its counts, those of one
-iteration, are kept apart. Code that runs only under a condition counts as if it always ran.
+counts once for each lane. Most kernels are straight code. Those that follow lists have loops, and the counts of each, those of
+one iteration, are kept apart. Code that runs only under a condition counts as if it always ran.
 """
 
 from __future__ import annotations
@@ -55,12 +55,11 @@ class Work:
 
 @dataclass(frozen=True)
 class KernelWork:
-    """Work of one lane of a kernel. straight: outside of loops. loop: of one iteration; where loops follow one another, the
-    sum over them. loops: their number. width: lanes of a register."""
+    """Work of one lane of a kernel. straight: outside of loops. loops: of one iteration of each loop, in their order. width:
+    lanes of a register."""
 
     straight: Work
-    loop: Work
-    loops: int
+    loops: tuple[Work, ...]
     width: int
 
 
@@ -77,17 +76,19 @@ def count_work(ir: str) -> KernelWork:
     loops, constant = _loops(lines)
     if any(a != b and a[0] <= b[0] <= a[1] for a in loops for b in loops):
         raise ValueError("a loop inside a loop: its iterations have no common number")
-    reader, straight, loop, header = _Reader(int(step[1])), Work(), Work(), False
+    reader, straight, header = _Reader(int(step[1])), Work(), False
+    works = [Work()] * len(loops)
     for number, line in enumerate(lines):
         if line.endswith(":"):
             header = any(start == number for start, _ in loops)
         found = reader.read(line, header) * next((n for (start, end), n in constant.items() if start <= number <= end), 1)
-        if any(start <= number <= end for start, end in loops):
-            loop += found + reader.taken_over(line)
-        else:
+        inside = next((k for k, (start, end) in enumerate(loops) if start <= number <= end), None)
+        if inside is None:
             straight += found
             reader.remember(line)
-    return KernelWork(straight, loop, len(loops), reader.width)
+        else:
+            works[inside] += found + reader.taken_over(line)
+    return KernelWork(straight, tuple(works), reader.width)
 
 
 def _kernel_lines(ir: str) -> list[str]:
