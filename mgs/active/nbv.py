@@ -37,7 +37,8 @@ def run_nbv(
     """Choose views one by one, as the paper does: `start_run`, then `resume_nbv`.
 
     dataset: a dataset folder. out: the run's folder, new. prior, gaussians, settings: see `start_run`.
-    on_step(state): called after every step that is finished and on disk; state.steps[-1] is its line of steps.jsonl.
+    on_step(state): called after every step, or batch of steps, that is finished and on disk; state.steps[-1] is its (last) line
+    of steps.jsonl.
     progress(stage, done, total): called while a step is worked on. say(text): called with what a person should know.
     Returns the last state: gaussians, H, taken (frame indices in the order of their choice), steps.
     Raises InputError as `start_run` and `resume_nbv`.
@@ -100,7 +101,9 @@ def resume_nbv(
     progress: Callable[[str, int, int], None] = _silent,
     say: Callable[[str], None] = _silent,
 ) -> State:
-    """Run the loop in a run's folder from where it stands to the end of its budget. A finished run gives the same files again.
+    """Run the loop in a run's folder from where it stands to its end. A finished run gives the same files again.
+
+    Why it ended is `ended` of the last of state.steps (`mgs.active.stopping.run_end`).
 
     Callbacks and result as `run_nbv`. Raises InputError where the folder holds no run, its dataset or prior is missing or has
     changed, another process works on it, or a fit diverged (the steps before it are kept).

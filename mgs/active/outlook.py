@@ -16,7 +16,8 @@ class Outlook:
     """What is known when a view is chosen: nothing of it from a candidate's image. Views are meant by the index of their frame.
 
     positions: [V,3] camera centres of all frames, metres; like `centre` and `points`, in coordinates in which +Z is up.
-    left: the candidates. visited: the views taken, in their order.
+    left: the candidates. visited: the views taken, in their order, then those chosen before in the same batch: no image of
+    these was read, but they count as taken, and what they would say about the present model is in H and surface_H.
     centre: [3] the middle of the rock. rng: new in each step, drawn from the run's seed.
     H, lam: [M,P] information of the views taken about the model fitted so far, and [P] lambda, of the run.
     points: [N,3] the Gaussians on the prior's surface, before training. surface_H, prior_lam: the same as H and lam for these.
