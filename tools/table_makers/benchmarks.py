@@ -353,6 +353,27 @@ def warm_colours(data: dict[str, Any]) -> str:
     return markdown(["seeds, start of a fit", *images], rows) + made_by(data)
 
 
+OPERATIONS = {
+    "forward_cold": "draw a view never seen before",
+    "forward_warm": "draw a view seen before",
+    "gradient_warm": "image and gradient",
+    "fisher_exact": "exact Fisher diagonal",
+    "fisher_block": "exact 11x11 blocks",
+    "fit": "a fit of 12 views of 320x240, 10,000 Gaussians, 5 passes",
+}
+
+
+def two_versions(data: dict[str, Any]) -> str:
+    """Seconds of two versions, and the ratios of the rounds."""
+    rows = []
+    for key, name in OPERATIONS.items():
+        old, new = (f"{1e3 * data['seconds'][which][key]:.1f}" for which in ("old", "new"))
+        low, median, high = data["ratios"][key]
+        rows.append([name, old, new, f"{median:.2f} ({low:.2f} to {high:.2f})"])
+    heading = ["", f"commit {data['old']} (ms)", "now (ms)", f"ratio, median of {data['rounds']} rounds (range)"]
+    return markdown(heading, rows) + made_by(data)
+
+
 def uncertainty(data: dict[str, Any]) -> str:
     """How well errors are predicted in the test views: means over runs; of shares inside intervals the extremes, too."""
     rows = []
@@ -420,6 +441,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "residual": ("benchmarks/residual", residual),
     "prior-std": ("benchmarks/prior_std", prior_std),
     "inset": ("benchmarks/inset", inset),
+    "versions": ("benchmarks/versions", two_versions),
     "warm-colours": ("benchmarks/warm_colours", warm_colours),
     "uncertainty": ("benchmarks/uncertainty", uncertainty),
     "optimisers": ("benchmarks/optimisers", optimisers),
