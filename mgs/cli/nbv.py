@@ -72,7 +72,9 @@ def nbv(
     ] = PIXEL_NOISE,
     prior_std: Annotated[
         list[str] | None,
-        typer.Option(metavar="KIND=NUMBER", help=f"Prior standard deviation of a kind of parameter [{_numbers(PRIOR_STD)}]."),
+        typer.Option(
+            metavar="KIND=NUMBER", help=f"Prior standard deviation of a kind of parameter; default: {_numbers(PRIOR_STD)}."
+        ),
     ] = None,
     means: Annotated[
         str, typer.Option(help="What the means may do: frozen (stay), normal (move along the prior's normals), or free.")
@@ -80,7 +82,9 @@ def nbv(
     optimiser: Annotated[str, typer.Option(help="Optimiser of the fit: natural or adam.")] = "natural",
     rate: Annotated[
         list[str] | None,
-        typer.Option(metavar="KIND=NUMBER", help=f"Learning rate of a kind of parameter [{_numbers(RATES)}]; 0: not learned."),
+        typer.Option(
+            metavar="KIND=NUMBER", help=f"Learning rate of a kind of parameter; default: {_numbers(RATES)}. 0: not learned."
+        ),
     ] = None,
     exposure: Annotated[
         bool,
