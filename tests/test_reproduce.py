@@ -20,6 +20,7 @@ from mgs.study.reproduce_figures import curves_figure, pools_figure, seeds_figur
 from mgs.study.reproduce_results import (
     curve_rows,
     curve_statistics,
+    largest_gap,
     pool_rows,
     seed_rows,
     write_pools,
@@ -142,7 +143,8 @@ def fake(run, value, steps=3):
     """What a run might have found: a curve that ends in a value."""
     images = [run.seeds + k for k in range(steps)]
     values = [value - 0.5 * (steps - 1 - k) for k in range(steps)]
-    return {"images": images, "coverage": [0.9] * steps, "test_psnr": values, "test_psnr_mask": [v - 3 for v in values]}
+    measured = {"coverage": [0.9] * steps, "test_psnr": values, "test_psnr_mask": [v - 3 for v in values]}
+    return {"images": images, "taken": [0, run.size.frames // 2]} | measured
 
 
 def test_differences_are_paired_by_rock():
@@ -189,13 +191,19 @@ def test_shares_are_of_what_the_oracle_gains_over_random():
     assert {row["test_psnr_share"] for row in without} == {None}
 
 
+def test_the_largest_gap_of_a_ring():
+    assert largest_gap([0, 27, 23, 19], 32) == pytest.approx(19 * 360 / 32)
+    assert largest_gap([5], 8) == 360
+    assert largest_gap([6, 0, 2, 4], 8) == 90
+
+
 def test_numbers_of_seeds_are_compared_at_equal_images(tmp_path):
     runs = reproduce.seed_runs(TINY, 2)
     assert {run.seeds + run.settings()["budget"] for run in runs} == {6}
     found = {run.name: fake(run, 25 + run.seeds / 10) for run in runs}
     rows = seed_rows(found, runs)
     assert [row["test_psnr_over_four"] for row in rows[:6]] == pytest.approx([-0.3, -0.2, -0.1, 0, 0.2, 0.4])
-    assert "| d-optimal | 1 | 90.0 | 25.10 | -0.30 [-0.30, -0.30] | -0.30 [-0.30, -0.30] |" in seeds_markdown(rows)
+    assert "| d-optimal | 1 | 90.0 | 180 (180) | 25.10 | -0.30 [-0.30, -0.30] | -0.30 [-0.30, -0.30] |" in seeds_markdown(rows)
     seeds_figure(tmp_path / "seeds.png", rows)
     assert (tmp_path / "seeds.png").stat().st_size > 10_000
 

@@ -108,8 +108,15 @@ def curve_statistics(found: Found, runs: Sequence[Run]) -> dict[str, Any]:
     return result
 
 
+def largest_gap(taken: Sequence[int], frames: int) -> float:
+    """The largest angle, degrees, between neighbours among the frames taken of a ring of so many, evenly spaced."""
+    turned = np.sort(taken)
+    return float(np.diff(turned, append=turned[0] + frames).max() * 360 / frames)
+
+
 def seed_rows(found: Found, runs: Sequence[Run]) -> Rows:
-    """A row for each policy and number of seeds: the model of all images, and its difference from that of four seeds."""
+    """A row for each policy and number of seeds: the model of all images, and its difference from that of four seeds; gap,
+    gap_max: mean and largest `largest_gap` of the rocks."""
     rows = []
     last = {(run.policy, run.seeds, run.rock.index): found[run.name] for run in runs}
     indices = sorted({rock for *_, rock in last})
@@ -118,6 +125,8 @@ def seed_rows(found: Found, runs: Sequence[Run]) -> Rows:
             row: dict[str, Any] = {"policy": policy, "seeds": seeds, "rocks": len(indices)}
             row |= {"images": last[policy, seeds, indices[0]]["images"][-1]}
             row |= {"first_coverage": float(np.mean([last[policy, seeds, rock]["coverage"][0] for rock in indices]))}
+            gaps = [largest_gap(last[policy, seeds, rock]["taken"], runs[0].size.frames) for rock in indices]
+            row |= {"gap": float(np.mean(gaps)), "gap_max": max(gaps)}
             for key in MEASURES:
                 own, four = ([last[policy, n, rock][key][-1] for rock in indices] for n in (seeds, reproduce.SEEDS))
                 row |= flat(key, own) | flat(f"{key}_over_four", np.subtract(own, four).tolist())

@@ -66,12 +66,14 @@ def statistics_markdown(statistics: Mapping[str, Any]) -> str:
 
 
 def seeds_markdown(rows: Rows) -> str:
-    """PSNR of the last model for each policy and number of seeds, and its difference from four seeds."""
+    """Largest gap in azimuth and PSNR of the last model for each policy and number of seeds, and its difference from four."""
     lines = []
     for row in rows:
         four = ["–"] * 2 if row["seeds"] == 4 else [_with_interval(row, key) for key in _over("four")]
-        lines.append([row["policy"], str(row["seeds"]), f"{100 * row['first_coverage']:.1f}", f"{row['test_psnr']:.2f}", *four])
-    heading = ["policy", "seeds", "they see (%)", "test views (dB)", "over four seeds (dB)", "rock (dB)"]
+        about = [f"{100 * row['first_coverage']:.1f}", f"{row['gap']:.0f} ({row['gap_max']:.0f})", f"{row['test_psnr']:.2f}"]
+        lines.append([row["policy"], str(row["seeds"]), *about, *four])
+    heading = ["policy", "seeds", "they see (%)", "largest gap (most), degrees", "test views (dB)", "over four seeds (dB)"]
+    heading.append("rock (dB)")
     return _markdown(heading, lines)
 
 

@@ -338,6 +338,21 @@ def inset(data: dict[str, Any]) -> str:
     return markdown(["rock, Gaussians, pixel, spacing", *(f"{d:g} pixels" for d in depths)], rows) + made_by(data)
 
 
+def warm_colours(data: dict[str, Any]) -> str:
+    """Quality by the colours in which fits start, for numbers of seeds and of images: means over the rocks."""
+    records = [r for scene in data["scenes"] for r in scene["records"]]
+    rows = []
+    for seeds in dict.fromkeys(r["seeds"] for r in records):
+        for way in dict.fromkeys(r["way"] for r in records):
+            cells = []
+            for images in dict.fromkeys(r["images"] for r in records):
+                found = [r for r in records if (r["seeds"], r["way"], r["images"]) == (seeds, way, images)]
+                cells.append(", ".join(f"{sum(r[key] for r in found) / len(found):.2f}" for key in ("psnr", "psnr_mask")))
+            rows.append([f"{seeds}, {way}", *cells])
+    images = [f"{n} images" for n in dict.fromkeys(r["images"] for r in records)]
+    return markdown(["seeds, start of a fit", *images], rows) + made_by(data)
+
+
 def uncertainty(data: dict[str, Any]) -> str:
     """How well errors are predicted in the test views: means over runs; of shares inside intervals the extremes, too."""
     rows = []
@@ -405,6 +420,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "residual": ("benchmarks/residual", residual),
     "prior-std": ("benchmarks/prior_std", prior_std),
     "inset": ("benchmarks/inset", inset),
+    "warm-colours": ("benchmarks/warm_colours", warm_colours),
     "uncertainty": ("benchmarks/uncertainty", uncertainty),
     "optimisers": ("benchmarks/optimisers", optimisers),
     "fit": ("benchmarks/fit", fit),
