@@ -19,6 +19,7 @@ from mgs.cli.app import main
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.report.writing import write_report
+from mgs.study import tasks
 
 OF_A_FIT = {"uncertainty", "iterations", "loss", "stop_reason"}
 AT_THE_MODEL = {"d-optimal", "t-optimal", "a-optimal", "e-optimal", "fisherrf", "i-optimal", "block-d", "paper"}
@@ -36,6 +37,17 @@ def run(out: Path, dataset, stations=None, **values) -> run_folder.State:
 
 def lines(out: Path) -> list[dict]:
     return [json.loads(line) for line in (out / "steps.jsonl").read_text().splitlines()]
+
+
+def test_a_study_has_a_number_for_each_fit_of_a_run(loaded, tmp_path, monkeypatch):
+    measure = lambda gaussians, taken: {"test_psnr": 10 + len(taken), "test_psnr_mask": len(taken)}  # noqa: E731
+    state = run(tmp_path / "run", loaded, tiny.stations(measure=measure), batch=2, evaluate_every=1)
+    monkeypatch.setattr(tasks, "run_or_resume", lambda *arguments: state)
+    curves = tasks.run_policy(tmp_path, tmp_path, "dataset", "prior", {"batch": 2})
+    assert curves["taken"] == state.taken
+    assert curves["images"] == curves["test_psnr_mask"] == [3, 5, 7, 8]
+    assert curves["test_psnr"] == [13, 15, 17, 18]
+    assert len(curves["coverage"]) == 4
 
 
 def test_a_step_is_a_view_and_the_last_of_a_batch_has_its_fit(loaded, tmp_path):

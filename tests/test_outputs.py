@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 import synthetic
 import tiny
+import typer
 from refusals import a_file, listing, occupied, refused
 
 from mgs import __version__
-from mgs.cli.app import main
+from mgs.cli.app import COMMANDS, app, main
 from mgs.splat_ply import write_ply
 
 
@@ -161,6 +162,20 @@ def test_help_and_version(capsys, arguments, said):
         main(arguments)
     assert stop.value.code == 0
     assert said in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_word_of_a_help_text_is_printed(capsys, monkeypatch, name):
+    """rich takes a word in brackets, such as [colour=1], for markup and leaves it out."""
+    monkeypatch.setenv("COLUMNS", "1000")
+    with pytest.raises(SystemExit):
+        main([name, "--help"])
+    printed = " ".join(capsys.readouterr().out.split())
+    command = typer.main.get_command(app).commands[name]
+    helps = [command.help, *(parameter.help for parameter in command.params)]
+    for text in filter(None, helps):
+        for paragraph in text.split("\n\n"):
+            assert " ".join(paragraph.split()) in printed
 
 
 def test_a_paragraph_of_a_help_text_is_one_line_in_a_wide_terminal(capsys, monkeypatch):

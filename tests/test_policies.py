@@ -215,3 +215,11 @@ def test_seeds_are_evenly_spaced_wherever_the_orbit_starts():
 def test_azimuth_is_measured_about_the_rock():
     positions = np.array([[2.0, 1.0, 9.0], [1.0, 2.0, -1.0], [0.0, 1.0, 0.0]])
     assert pose_policies.azimuths(positions, np.array([1.0, 1.0, 0.0])) == pytest.approx([0, np.pi / 2, np.pi])
+
+
+def test_each_kind_of_parameter_has_one_lambda():
+    columns = {"colour": slice(0, 3), "scale": slice(3, 6), "rotation": slice(6, 10), "opacity": slice(10, 11)}
+    lam = criteria.regularisation(columns, 0.1, {"colour": 1, "scale": 0.5, "rotation": 0.2, "opacity": 2})
+    assert criteria.lam_by_kind(lam, columns) == pytest.approx(
+        {"colour": 0.01, "scale": 0.04, "rotation": 0.25, "opacity": 0.0025}
+    )

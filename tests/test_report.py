@@ -389,15 +389,46 @@ def test_no_word_of_a_comparison_is_cut_off_or_written_over(tmp_path, monkeypatc
     assert all(a.x1 < b.x0 for a, b in pairwise(titles))
 
 
-def test_titles_of_an_orbit_are_not_written_over(tmp_path, monkeypatch):
+@pytest.mark.parametrize("runs", [1, 2, 4, 8])
+@pytest.mark.parametrize("name", ["d-optimal", "random (a folder of a long name)"])
+def test_no_word_of_an_orbit_is_cut_off_or_written_over(tmp_path, monkeypatch, runs, name):
     drawn = []
     monkeypatch.setattr(figures, "save_figure", lambda figure, path: drawn.append(figure))
-    choices = {f"random (a folder of a long name {i})": ([0], [1]) for i in range(2)}
-    figures.orbit_figure(tmp_path / "a.png", np.eye(3), None, choices)
+    figures.orbit_figure(tmp_path / "a.png", np.eye(3), None, {f"{name} {i}": ([0], [1]) for i in range(runs)})
+    figure, *axes = drawn[0], *drawn[0].axes[:runs]
     with rc_context(plotting.STYLE):
-        FigureCanvasAgg(drawn[0]).draw()
-    a, b = (axis.title.get_window_extent() for axis in drawn[0].axes[:2])
-    assert 0 <= a.x0 < a.x1 < b.x0 < b.x1 <= drawn[0].bbox.x1
+        FigureCanvasAgg(figure).draw()
+    titles = [axis.title.get_window_extent() for axis in axes]
+    assert all(a.x1 < b.x0 for a, b in pairwise(titles))
+    assert 0 <= titles[0].x0 < titles[-1].x1 <= figure.bbox.x1
+    assert all(box.y1 <= figure.bbox.y1 for box in titles)
+    legend = figure.legends[0].get_window_extent()
+    assert legend.y0 >= 0
+    assert all(legend.y1 <= axis.xaxis.label.get_window_extent().y0 for axis in axes)
+
+
+@pytest.mark.parametrize("runs", [1, 4, 8, 20])
+def test_a_legend_covers_no_line(tmp_path, monkeypatch, runs):
+    """It stands beside the axes, which keep their size, whole."""
+    drawn = []
+    monkeypatch.setattr(figures, "save_figure", lambda figure, path: drawn.append(figure))
+    labels = [f"random (a folder of a long name {i})" for i in range(runs)]
+    curve = ([4, 5, 6], [0.1, 0.2, 0.3])
+    figures.gain_figure(tmp_path / "a.png", dict.fromkeys(labels, curve[1]))
+    figures.coverage_figure(tmp_path / "a.png", dict.fromkeys(labels, curve))
+    figures.psnr_figure(tmp_path / "a.png", {what: dict.fromkeys(labels, curve) for what in ("test views", "rock only")})
+    assert len(drawn) == 3
+    for figure in drawn:
+        with rc_context(plotting.STYLE):
+            FigureCanvasAgg(figure).draw()
+        legend = figure.legends[0].get_window_extent()
+        assert [text.get_text() for text in figure.legends[0].get_texts()] == labels
+        assert figure.bbox.x0 <= legend.x0 < legend.x1 <= figure.bbox.x1
+        assert figure.bbox.y0 <= legend.y0 < legend.y1 <= figure.bbox.y1
+        for axis in figure.axes:
+            assert axis.get_legend() is None
+            assert axis.get_tightbbox().x1 <= legend.x0
+            assert axis.bbox.width > 2.3 * figure.dpi
 
 
 @pytest.mark.parametrize(

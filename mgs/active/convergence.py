@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from mgs.active.criteria import lam_by_kind
 from mgs.active.loop import target_of
 from mgs.active.objective import newton_decrease, objective
 from mgs.active.settings import NbvSettings
@@ -48,8 +49,7 @@ def remaining_decrease(
     of_seeds, of_all = (initial_gaussians(prior, f, gains=exposure(f) if exposure else None)[0] for f in (seeds, frames))
     start = replace(of_seeds, sh=of_all.sh)
     means, kinds = settings.train.means, groups(0, settings.train.means)
-    lam = settings.regularisation(kinds)
-    by_kind = {kind: float(lam[columns][0]) for kind, columns in kinds.items()}
+    by_kind = lam_by_kind(settings.regularisation(kinds), kinds)
     cameras, gains = [frame.camera for frame in frames], exposure(frames) if exposure else np.ones((len(frames), 3))
     targets = Deferred(range(len(frames)), lambda k: without_gain(target_of(frames[k]), gains[k]))
     goal = objective(gaussians, cameras, targets, start, by_kind, None, means, initial_normals(prior))

@@ -59,6 +59,11 @@ def regularisation(
     return lam
 
 
+def lam_by_kind(lam: Array, groups: dict[str, slice]) -> dict[str, float]:
+    """The number that lam [P] has in all columns of a kind of parameter, for each kind. groups: as in `regularisation`."""
+    return {kind: float(lam[columns][0]) for kind, columns in groups.items()}
+
+
 def observed(H: Array, lam: Array) -> NDArray[np.bool_]:
     """[N] which Gaussians the images say more about than the prior does (Eq. 9 with epsilon = lam).
 

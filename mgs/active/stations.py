@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from mgs.active.criteria import lam_by_kind
 from mgs.active.fitting import Fit, fit
 from mgs.active.inputs import prior_digest
 from mgs.active.loop import Stations
@@ -26,10 +27,9 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
     """Stations on the splat core, starting from the prior; the rock is at the prior's centre of mass."""
     cache, means = ListCache(), settings.train.means
     columns = groups(0, means)
-    lam, normals = settings.regularisation(columns), initial_normals(prior)
+    by_kind, normals = lam_by_kind(settings.regularisation(columns), columns), initial_normals(prior)
     exposure = exposure_of(prior) if settings.exposure else None
     colours = kept_colours(dataset, prior)
-    by_kind = {kind: float(lam[of_kind][0]) for kind, of_kind in columns.items()}
 
     def run_fit(
         gaussians: Gaussians,

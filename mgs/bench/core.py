@@ -276,7 +276,7 @@ def bench_scaling(repeats: int, report: Callable[[str], None], most: int = 1_000
     points += [("threads", base, 640, 480, t) for t in sorted({1, threads})]
     records = []
     for sweep, n, width, height, count in points:
-        report(f"{n:,} Gaussians, {width}x{height}, {count} threads")
+        report(f"{n:,} Gaussians, {width}x{height}, {count} thread{'' if count == 1 else 's'}")
         where = {"sweep": sweep, "n": n, "pixels": width * height, "threads": count}
         records.append(where | in_new_process(scaling_point, n, width, height, count, repeats))
     return records

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import kendalltau
 
 from mgs.active.convergence import CG_ITERATIONS
-from mgs.active.criteria import d_optimal, regularisation
+from mgs.active.criteria import d_optimal, lam_by_kind, regularisation
 from mgs.active.fitting import Fit, fit
 from mgs.active.loop import target_of
 from mgs.active.objective import Objective, newton_decrease, objective
@@ -123,8 +123,7 @@ def bench_fit(root: Path, report: Callable[[str], None]) -> dict[str, Any]:
 
 
 def _lam_by_kind() -> dict[str, float]:
-    lam = regularisation(groups(0))
-    return {kind: float(lam[columns][0]) for kind, columns in groups(0).items()}
+    return lam_by_kind(regularisation(groups(0)), groups(0))
 
 
 def _case(dataset: Dataset, gaussians: int, how: str, count: int) -> _Case:

@@ -9,7 +9,7 @@ import typer
 
 from mgs.active.criteria import PIXEL_NOISE, PRIOR_STD
 from mgs.active.policies import policy_names
-from mgs.active.settings import PRESETS, RATES
+from mgs.active.settings import PASSES, PRESETS, RATES, WARM_PASSES
 from mgs.active.stopping import why_ended
 
 if TYPE_CHECKING:
@@ -44,19 +44,27 @@ def nbv(
     travel: Annotated[
         float | None,
         typer.Option(
-            metavar="METRES", help="Moving so far costs as much as an image: scores are divided by 1 + distance/METRES."
+            metavar="METRES", help="Distance that costs as much as taking an image: scores are divided by 1 + distance/METRES."
         ),
     ] = None,
     budget: Annotated[
         int | None, typer.Option(help="Most views chosen beyond the seeds; default 50, or all candidates where they are fewer.")
     ] = None,
-    batch: Annotated[int, typer.Option(metavar="K", help="Choose so many views before their images are read and fitted.")] = 1,
+    batch: Annotated[
+        int,
+        typer.Option(metavar="K", help="Choose so many views, one after the other, before their images are read and fitted."),
+    ] = 1,
     stop_gain: Annotated[
         float | None,
-        typer.Option(metavar="NATS", help="Stop where the next view has less information gain (Eq. 7, nats per parameter)."),
+        typer.Option(
+            metavar="NATS", help="End the run before a view whose information gain (Eq. 7, nats per parameter) is less."
+        ),
     ] = None,
     stop_uncertainty: Annotated[
-        float | None, typer.Option(metavar="SHARE", help="Stop where no more than this share of the prior's variance is left.")
+        float | None,
+        typer.Option(
+            metavar="SHARE", help="End the run when no more than this share (0 to 1) of the prior's variance is left."
+        ),
     ] = None,
     seeds: Annotated[int, typer.Option(help="Views at evenly spaced azimuths that start the model.")] = 4,
     seed: Annotated[int, typer.Option(min=0, help="Root of every random draw.")] = 0,
@@ -72,7 +80,9 @@ def nbv(
     ] = PIXEL_NOISE,
     prior_std: Annotated[
         list[str] | None,
-        typer.Option(metavar="KIND=NUMBER", help=f"Prior standard deviation of a kind of parameter [{_numbers(PRIOR_STD)}]."),
+        typer.Option(
+            metavar="KIND=NUMBER", help=f"Prior standard deviation of a kind of parameter; default: {_numbers(PRIOR_STD)}."
+        ),
     ] = None,
     means: Annotated[
         str, typer.Option(help="What the means may do: frozen (stay), normal (move along the prior's normals), or free.")
@@ -80,7 +90,9 @@ def nbv(
     optimiser: Annotated[str, typer.Option(help="Optimiser of the fit: natural or adam.")] = "natural",
     rate: Annotated[
         list[str] | None,
-        typer.Option(metavar="KIND=NUMBER", help=f"Learning rate of a kind of parameter [{_numbers(RATES)}]; 0: not learned."),
+        typer.Option(
+            metavar="KIND=NUMBER", help=f"Learning rate of a kind of parameter; default: {_numbers(RATES)}. 0: not learned."
+        ),
     ] = None,
     exposure: Annotated[
         bool,
@@ -88,21 +100,27 @@ def nbv(
             "--exposure", help="Exposure and white balance differ between images: estimate a gain of each image and channel."
         ),
     ] = False,
-    passes: Annotated[int | None, typer.Option(help="Most passes over the images of one fit.")] = None,
-    warm_passes: Annotated[int | None, typer.Option(help="Most passes of the fits after the first.")] = None,
+    passes: Annotated[int | None, typer.Option(help=f"Most passes over the images in any fit; default {PASSES}.")] = None,
+    warm_passes: Annotated[
+        int | None, typer.Option(help=f"Most passes of the fits after the first; default {WARM_PASSES}.")
+    ] = None,
     preset: Annotated[
         str | None,
         typer.Option(help=f"Defaults of passes and of the number of Gaussians: {', '.join(PRESETS)}. Other options win."),
     ] = None,
-    evaluate_every: Annotated[int, typer.Option(help="Measure PSNR every so many steps; 0: only at the end.")] = 0,
+    evaluate_every: Annotated[
+        int, typer.Option(help="Measure PSNR every so many chosen views, of a batch at its end; 0: only at the end of the run.")
+    ] = 0,
     resume: Annotated[
         Path | None, typer.Option(help="Continue this run; every other setting comes from its config.json.")
     ] = None,
 ) -> None:
-    """Fit to the seeds, then choose, capture and fit again, view by view, until the budget is spent, or a --stop- rule holds.
+    """Fit to the seeds, then choose a view (with --batch several), read its image and fit again, until the budget is spent, or
+    --stop-gain or --stop-uncertainty ends the run.
 
-    Writes config.json, steps.jsonl (one line a step), checkpoint.npz, gaussians.ply and metrics.json into the run folder. A run
-    that was interrupted at any moment, kill -9 included, goes on with --resume and takes the same views.
+    Writes config.json, steps.jsonl (a line for the seeds, then one for each chosen view), checkpoint.npz, gaussians.ply and
+    metrics.json into the run folder. A run that was interrupted at any moment, kill -9 included, goes on with --resume and
+    takes the same views.
     """
     from rich.console import Console
 

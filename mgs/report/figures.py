@@ -20,6 +20,7 @@ from mgs.plotting import STYLE, crop, new_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 POLICY_STYLE: dict[str, tuple[str, str | tuple[int, int, int]]] = {
     "d-optimal": ("#0072B2", "o"),
@@ -96,6 +97,8 @@ def orbit_figure(
         bar = figure.colorbar(ScalarMappable(norm, "viridis"), ax=list(axes), shrink=0.8, pad=0.01)
         bar.locator = MaxNLocator(integer=True)
         bar.set_label("step at which the view was chosen")
+        for _ in range(3):  # panels of a fixed aspect: matplotlib's layout finds room for titles of two lines by and by only
+            figure.draw_without_rendering()
         save_figure(figure, path)
 
 
@@ -145,7 +148,7 @@ def gain_figure(path: str | Path, gains: Mapping[str, Sequence[float]]) -> None:
         axis.set(xlabel="active step", ylabel=r"$\mathrm{IG}_D$ of the selected view")
         axis.set_ylim(bottom=0)
         _whole_steps(axis)
-        axis.legend()
+        _legend_beside(figure)
         save_figure(figure, path)
 
 
@@ -169,7 +172,7 @@ def coverage_figure(path: str | Path, coverage: Mapping[str, tuple[Sequence[int]
         right.axhline(0, color="#9a9a9a", linewidth=0.8, zorder=0)
         for axis in (left, right):
             _whole_steps(axis)
-        left.legend()
+        _legend_beside(figure)
         save_figure(figure, path)
 
 
@@ -188,8 +191,16 @@ def psnr_figure(path: str | Path, panels: Mapping[str, Mapping[str, tuple[Sequen
                 axis.plot(images, decibels, **style)
             axis.set(xlabel="images in the training set", ylabel=f"PSNR, {what} (dB)")
             _whole_steps(axis)
-        axes[0].legend()
+        _legend_beside(figure)
         save_figure(figure, path)
+
+
+def _legend_beside(figure: Figure) -> None:
+    """Put the legend of a figure's first axes to the right of all axes, where it covers no line, and make the figure larger by
+    the room that it takes."""
+    legend = figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right upper")
+    box, (width, height) = legend.get_window_extent(), figure.get_size_inches()
+    figure.set_size_inches(width + box.width / figure.dpi, max(height, box.height / figure.dpi + 0.1))
 
 
 def _whole_steps(axis: Axes) -> None:

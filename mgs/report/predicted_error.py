@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mgs.active import run_folder
+from mgs.active.criteria import lam_by_kind
 from mgs.active.fitting import fit
 from mgs.active.loop import target_of
 from mgs.active.settings import NbvSettings
@@ -139,8 +140,7 @@ def _without(fold: int, frames: Sequence[Frame], prior: Prior, settings: NbvSett
     kept = [frame for i, frame in enumerate(frames) if i % FOLDS != fold]
     start, cache = initial_gaussians(prior, kept)[0], ListCache()
     columns = groups(start.sh_degree)
-    lam = settings.regularisation(columns)
-    by_kind = {kind: float(lam[where][0]) for kind, where in columns.items()}
+    by_kind = lam_by_kind(settings.regularisation(columns), columns)
     targets = [target_of(frame) for frame in kept]
     model = fit(start, [f.camera for f in kept], targets, settings.train, cache=cache, start=start, lam=by_kind).gaussians
     H = np.stack([fisher(model, frame.camera, cache=cache) for frame in kept]).sum(axis=0, dtype=np.float64)

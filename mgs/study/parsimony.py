@@ -146,7 +146,7 @@ def fit_and_judge(
     root: Path, out: Path, scene: str, gaussians: int | str, learned: str, degree: int, views: int, seeds: int
 ) -> Any:
     """A task: fit views one after the other; what the test views, the next views and the evidence say of the model."""
-    from mgs.active.criteria import PIXEL_NOISE
+    from mgs.active.criteria import PIXEL_NOISE, lam_by_kind
     from mgs.active.fitting import fit
     from mgs.active.loop import target_of
     from mgs.active.objective import objective
@@ -164,7 +164,7 @@ def fit_and_judge(
     train = TrainSettings(rates={kind: rate if kind in LEARNED[learned] else 0.0 for kind, rate in RATES.items()})
     settings = NbvSettings(dataset=folder, prior=kept, train=train)
     lam = settings.regularisation(columns)
-    by_kind = {kind: float(lam[of_kind][0]) for kind, of_kind in columns.items()}
+    by_kind = lam_by_kind(lam, columns)
     positions = np.array([frame.camera.position for frame in dataset.frames])
     frames = [dataset.frames[i] for i in views_in_order(positions, prior.points.mean(0), views, seeds)]
     cameras, targets = [frame.camera for frame in frames], [target_of(frame) for frame in frames]

@@ -26,7 +26,7 @@ from mgs.synth.rendering import Preset, synthesise
 from mgs.synth.scene_file import load_scene_file
 
 CURVES = ("images", "coverage", "test_psnr", "test_psnr_mask")
-"""What `run_policy` tells of every step."""
+"""What `run_policy` tells of every fit."""
 
 
 def dataset_of(root: Path, name: str) -> Path:
@@ -81,13 +81,14 @@ def make_prior(root: Path, out: Path, dataset: str, gaussians: int, seed: int) -
 
 
 def run_policy(root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]) -> dict[str, Any]:
-    """Run a policy, and measure the model on the test views after every step.
+    """Run a policy, and measure the model on the test views after every fit.
 
-    settings: fields of `mgs.active.settings.NbvSettings`. Returns a list of numbers for each of CURVES, a number for each step,
-    and "taken", the frames in the order of their choice.
+    settings: fields of `mgs.active.settings.NbvSettings`. Returns a list of numbers for each of CURVES, a number for each fit
+    (of a batch only the last step has one), and "taken", the frames in the order of their choice.
     """
     state = run_or_resume(root, out, dataset, prior, {"evaluate_every": 1, **settings})
-    return {key: [step[key] for step in state.steps] for key in CURVES} | {"taken": state.taken}
+    fitted = [step for step in state.steps if "loss" in step]
+    return {key: [step[key] for step in fitted] for key in CURVES} | {"taken": state.taken}
 
 
 def run_or_resume(root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]) -> State:

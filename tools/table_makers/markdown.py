@@ -23,5 +23,9 @@ def made_by(data: dict[str, Any]) -> str:
     command, machine, versions = data["command"], data.get("machine"), data["versions"]
     if not command.startswith("mgs "):
         command = f"python benchmarks/{command}"
-    cores = f" on {machine['threads']} threads ({machine['cpu']}, {machine['simd_width']} float32 lanes)" if machine else ""
+    cores = f" on {_threads(machine['threads'])} ({machine['cpu']}, {machine['simd_width']} float32 lanes)" if machine else ""
     return f"\n`{command}`{cores}; mgs {versions['mgs']}, Mitsuba {versions['mitsuba']}, Dr.Jit {versions['drjit']}.\n"
+
+
+def _threads(number: int) -> str:
+    return f"{number} thread{'' if number == 1 else 's'}"

@@ -170,7 +170,7 @@ def chart_table(name: str, data: dict[str, Any]) -> tuple[str, tuple[str, ...], 
         return "", heading, [], f"Not measured yet: `mgs chart OUT --only {kind}`."
     found = data[kind]
     machine = found["machine"]
-    note = f"`{found['command']}` on {machine['threads']} threads ({machine['cpu']})"
+    note = f"`{found['command']}` on {machine['threads']} thread{'' if machine['threads'] == 1 else 's'} ({machine['cpu']})"
     note += f"; mgs {data['versions']['mgs']}"
     if kind != "bytes":
         note += f"; the reference took {found['reference_seconds']:.2f} s"

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import kendalltau
 
-from mgs.active.criteria import MEAN_STD, PRIOR_STD, Score, d_optimal, regularisation
+from mgs.active.criteria import MEAN_STD, PRIOR_STD, Score, d_optimal, lam_by_kind, regularisation
 from mgs.active.fitting import Fit, fit
 from mgs.active.loop import target_of
 from mgs.active.pose_policies import seed_views
@@ -146,7 +146,7 @@ class Lab:
         start = self.start(taken) if start is None else start
         rates = RATES | {"mean": MEAN_RATE * self.prior.spacing}
         settings = TrainSettings(passes=passes, tolerance=0.0, means=means, rates=rates)  # type: ignore[arg-type]
-        lam = {kind: float(self.lam(means)[columns][0]) for kind, columns in groups(0, means).items()} if with_prior else None
+        lam = lam_by_kind(self.lam(means), groups(0, means)) if with_prior else None
         frames = [self.frames[i] for i in taken]
         return fit(
             start if model is None else model, [frame.camera for frame in frames], [target_of(frame) for frame in frames],
