@@ -35,6 +35,7 @@ from mgs.splat.derivatives import (
     weighted_sum,
 )
 from mgs.splat.projection import camera_array, project64
+from mgs.splat.recording import one_at_a_time
 from mgs.splat.rendering import ListCache, as_colour, as_drjit, render, splats_and_lists
 from mgs.splat.walking import pack, packet_count, sums_by_splat
 
@@ -61,6 +62,7 @@ def groups(sh_degree: int, means: str = "frozen") -> dict[str, slice]:
     return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True) if size}
 
 
+@one_at_a_time
 def fisher(
     gaussians: Gaussians,
     camera: Camera,

@@ -14,6 +14,7 @@ from mgs.camera import Camera
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.splat import kernels
+from mgs.splat.recording import one_at_a_time
 from mgs.splat.rendering import ListCache, as_colour, as_drjit, render, splats_and_lists
 from mgs.splat.walking import sums_by_splat
 
@@ -25,6 +26,7 @@ ROUNDS = 8
 """Most rounds. In each, half of the change that is still allowed is spent, and what it came to is then measured."""
 
 
+@one_at_a_time
 def removal_cost(
     gaussians: Gaussians, cameras: Sequence[Camera], background: Any = (0.0, 0.0, 0.0), cache: ListCache | None = None
 ) -> np.ndarray:

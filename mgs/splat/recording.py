@@ -6,13 +6,30 @@ import functools
 import gc
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import drjit as dr
 
 _one_at_a_time = threading.RLock()
-"""Held during every recording and replay. Dr.Jit 1.5 hangs or fails where two threads record at once; and the garbage
-collector, which must rest meanwhile, is one for the whole process."""
+"""Held during every recording and replay, and by all that `one_at_a_time` decorates. Dr.Jit 1.5 hangs or fails where two
+threads record at once; and the garbage collector, which must rest meanwhile, is one for the whole process."""
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def one_at_a_time(function: Function) -> Function:
+    """Decorator: of all decorated functions together, one runs at a time; other threads wait.
+
+    To replay a recording Dr.Jit 1.5 calls Python while it holds a lock of its own. If Python turns to another thread meanwhile
+    that calls Dr.Jit, both wait for ever. So what draws must not even trace while another thread does.
+    """
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        with _one_at_a_time:
+            return function(*args, **kwargs)
+
+    return cast(Function, call)
 
 
 def frozen(sizes: Callable[..., tuple[int, ...]]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -26,9 +43,9 @@ def frozen(sizes: Callable[..., tuple[int, ...]]) -> Callable[[Callable[..., Any
     Python's garbage collector is off during the call: if it frees a Mitsuba scene while Dr.Jit records, the process ends
     ("enqueue_host_func(): this function cannot be recorded", Dr.Jit 1.5).
 
-    Threads: all decorated functions together run one at a time. So threads may draw at once if each has a `ListCache` of its
-    own, and afterwards the collector is on again if it was before. Not protected: a `ListCache` or a gradient that threads
-    share, and a thread that switches the collector on or off by itself.
+    Threads: all decorated functions together run one at a time, with those of `one_at_a_time`. So threads may draw at once if
+    each has a `ListCache` of its own, and afterwards the collector is on again if it was before. Not protected: a `ListCache`
+    or a gradient that threads share, and a thread that switches the collector on or off by itself.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -18,6 +18,7 @@ from mgs.gaussians import SH_MAX, Gaussians
 from mgs.splat import blocks, kernels
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, BlockLists
 from mgs.splat.projection import Splats, camera_array, project
+from mgs.splat.recording import one_at_a_time
 from mgs.splat.walking import PIXELS, pack, sums_by_splat
 
 CACHE_BYTES = 1 << 30
@@ -212,6 +213,7 @@ def splats_and_lists(gaussians: Gaussians, camera: Camera, cache: ListCache | No
         raise
 
 
+@one_at_a_time
 def render(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.0), cache: ListCache | None = None) -> Image:
     """Render Gaussians by EWA splatting (Kerbl et al. 2023, with the constants of `mgs.splat.constants`).
 
@@ -234,6 +236,7 @@ def render(gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.
     return composite(splats, packed, lists, camera.width, camera.height, colour)
 
 
+@one_at_a_time
 def jvp(
     gaussians: Gaussians,
     tangents: Mapping[str, Any],
