@@ -45,12 +45,12 @@ def remaining_decrease(
     Returns "phi" (`mgs.active.objective`, squared pixel values); "predicted_decrease", the Newton decrease after CG_ITERATIONS,
     a share of phi; and "converged", whether that is at most CONVERGED_SHARE. Raises InputError where a frame cannot be read.
     """
-    seeds, exposure = frames[: settings.seeds], exposure_of(prior) if settings.exposure else None
-    of_seeds, of_all = (initial_gaussians(prior, f, gains=exposure(f) if exposure else None)[0] for f in (seeds, frames))
-    start = replace(of_seeds, sh=of_all.sh)
+    cameras = [frame.camera for frame in frames]
+    gains = exposure_of(prior)(frames) if settings.exposure else np.ones((len(frames), 3))
+    of_seeds, of_all = initial_gaussians(prior, frames[: settings.seeds])[0], initial_gaussians(prior, frames, gains=gains)[0]
+    start = replace(of_seeds, sh=of_all.sh)  # as in the loop: means of the seeds' start, colours of all frames
     means, kinds = settings.train.means, groups(0, settings.train.means)
     by_kind = lam_by_kind(settings.regularisation(kinds), kinds)
-    cameras, gains = [frame.camera for frame in frames], exposure(frames) if exposure else np.ones((len(frames), 3))
     targets = Deferred(range(len(frames)), lambda k: without_gain(target_of(frames[k]), gains[k]))
     goal = objective(gaussians, cameras, targets, start, by_kind, None, means, initial_normals(prior))
     model = as_drjit(gaussians)

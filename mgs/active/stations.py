@@ -31,6 +31,10 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
     exposure = exposure_of(prior) if settings.exposure else None
     colours = kept_colours(dataset, prior)
 
+    def initial(frames: Sequence[Frame]) -> Gaussians:
+        gains = exposure(frames) if exposure else None
+        return initial_gaussians(prior, frames, gains=gains, colours=colours)[0]
+
     def run_fit(
         gaussians: Gaussians,
         start: Gaussians,
@@ -51,9 +55,7 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
     return Stations(
         centre=prior.points.mean(axis=0),
         groups=columns,
-        initial=lambda frames: initial_gaussians(prior, frames, gains=exposure(frames) if exposure else None, colours=colours)[
-            0
-        ],
+        initial=initial,
         fit=run_fit,
         fisher=lambda gaussians, camera: information(gaussians, camera, settings.estimator),
         estimate=information,

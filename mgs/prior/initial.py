@@ -103,10 +103,12 @@ def initial_gaussians(
 
 
 def warm_start(model: Gaussians, before: Gaussians, start: Gaussians) -> Gaussians:
-    """Where a fit begins that has more images than the one before it: the model of that one, its colours moved by as much as
-    those of the Gaussians before training moved, from `before` to `start`, as the new images were added to their mean.
+    """The model from which a fit goes on after images were added.
 
-    A Gaussian that no image saw before takes its colour from the new images so, while it would need many passes to learn it.
+    model: the result of the fit before, to the images taken until then. before, start: the Gaussians before any training, in
+    the mean colours of those images, and of all images now (`initial_gaussians`). Each colour of the model is changed by the
+    difference of the two; all else stays as it was fitted. So a Gaussian that no image showed before has the colour of the new
+    images at once, for which a fit would need many passes.
     """
     return replace(model, sh=model.sh + (start.sh - before.sh))
 

@@ -20,8 +20,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def one_at_a_time(function: Function) -> Function:
     """Decorator: of all decorated functions together, one runs at a time; other threads wait.
 
-    To replay a recording Dr.Jit 1.5 calls Python while it holds a lock of its own. If Python turns to another thread meanwhile
-    that calls Dr.Jit, both wait for ever. So what draws must not even trace while another thread does.
+    While Dr.Jit 1.5 replays a recording, it holds a lock of its own and calls Python. If Python then switches to another thread
+    which calls Dr.Jit, that one waits for the lock, the first one for Python, and both wait for ever. The lock here covers
+    everything between the start and the end of a drawing, so that the other thread does not get so far.
     """
 
     @functools.wraps(function)

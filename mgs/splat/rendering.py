@@ -314,5 +314,5 @@ def composite_rgb(splats: Splats, packed: Any, lists: BlockLists, width: int, he
 
 
 def _rasterised(splats: Splats, packed: Any, lists: BlockLists, width: int, height: int, whole: bool) -> Any:
-    """Call `_Rasterise`."""
+    """The outputs of `_Rasterise` for an image of this size, with gradients of the means where these are enabled."""
     return dr.custom(_Rasterise, splats, packed, lists, _block_major(width, height), dr.grad_enabled(splats.mean_x), whole)

@@ -206,9 +206,9 @@ def walk(lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], vi
 def walk_and_store(
     lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], visit: Callable[..., Any], count: int
 ) -> Any:
-    """`walk`, where visit(pair, splat, rows, pixels) -> (pixels, alive, sums) also returns `count` sums over the pixels of the
-    pair. Returns them, Float, rounded up to whole packets of four for each pair, in the order of the lists; 0 where a list was
-    not walked to its end.
+    """As `walk`, but visit(pair, splat, rows, pixels) -> (pixels, alive, sums) also returns `count` numbers, Float: sums over
+    the pixels of the pair. Returns these sums of all pairs, in the order of the lists, each pair's rounded up to whole packets
+    of four; they are 0 for pairs that no lane visited, because their block's pixels were all finished.
 
     A lane writes to its own list's pairs, one after the other, so no atomic operations are needed, and a line of the cache is
     full before it is left.
@@ -226,12 +226,12 @@ def walk_and_store(
         store(pair, sums)
         return pixels, alive
 
-    def skip(pair: Any) -> Any:
+    def store_zeros(pair: Any) -> tuple[Any]:
         store(pair, [mi.Float(0)] * count)
-        return pair + 1
+        return (pair + 1,)
 
-    pair, _ = _walk_until_done(lists, packed, lane, pixels, visit_and_store)
-    dr.while_loop((pair,), lambda pair: pair < lane.end, lambda pair: (skip(pair),))
+    left, _ = _walk_until_done(lists, packed, lane, pixels, visit_and_store)
+    dr.while_loop((left,), lambda pair: pair < lane.end, store_zeros)
     return stored
 
 
@@ -256,8 +256,8 @@ def packet_count(count: int) -> int:
 
 
 AT_ONCE = 4
-"""How many pairs of a splat `sums_by_place` reads before it tests for the end: reads at scattered addresses, which wait for one
-another otherwise."""
+"""How many pairs of a splat `sums_by_place` reads in one iteration of its loop. Their addresses are scattered, so each read
+takes long, but several can be under way at once."""
 
 
 def sums_by_place(lists: BlockLists, stored: Any, count: int, real: Any) -> Any:

