@@ -67,7 +67,7 @@ class BlockLists:
 
     Each splat has a place, its position in memory: splats are stored by the tile of their centre, then block, then depth (in
     lists that took their places over from older ones, as it was for these). Kernels store their sums pair by pair. To add
-    those of one splat, each pair also has a slot: the slots of the splat at one place follow one another.
+    those of one splat, each pair also has a slot: slots go front to back, so those of one splat follow one another.
 
     order: UInt32 [N], the Gaussians front to back; place: UInt32 [N], the place of each Gaussian's splat.
     splat: UInt32 [M], the place of the pair's splat; pair: UInt32 [M], the pair at each slot. The last of both are unused (see
@@ -136,29 +136,23 @@ def build(splats: Splats, width: int, height: int, older: BlockLists | None = No
     """Block lists of detached splats; width, height: pixels; older: lists of the same camera whose depth order and places are
     taken over, where no splat was REORDERED since.
 
-    Whether a splat touches a block is decided by its ellipse, not by a bounding box.
+    Pairs are made splat by splat, front to back, and then sorted by block; as the sort is stable, each block's list is front to
+    back too. Whether a splat touches a block is decided by its ellipse, not by a bounding box.
     Raises InputError for more than MAX_PAIRS pairs, before memory is taken for them.
     """
     blocks_x, blocks_y = -(-width // BLOCK_X), -(-height // BLOCK_Y)
-    foot, order = footprints(splats), older.order if older else depth_order(splats.depth)
-    place = older.place if older else _memory_places(splats, order, blocks_x, blocks_y)
-    splat, number, slot_start, slot_end = _pairs(splats, foot, place, blocks_x, blocks_y)
+    foot = footprints(splats)
+    order, place = (older.order, older.place) if older else _orders(splats, blocks_x, blocks_y)
     numbers = _tile_number(dr.arange(mi.UInt32, blocks_x * blocks_y), blocks_x)
-    if len(splat) == 0:  # Dr.Jit has no operations on arrays of length 0
-        pair, start, end = mi.UInt32(), dr.zeros(mi.UInt32, len(numbers)), dr.zeros(mi.UInt32, len(numbers))
-    else:
-        slot = _front_to_back(slot_start, slot_end, dr.gather(mi.UInt32, place, order), len(splat))
-        slot = _sorted(slot, dr.gather(mi.UInt32, number, slot), _tile_numbers(blocks_x, blocks_y))
-        splat, number, pair = dr.gather(mi.UInt32, splat, slot), dr.gather(mi.UInt32, number, slot), _inverse(slot)
-        dr.eval(splat, number)
-        start, end = (dr.gather(mi.UInt32, a, numbers) for a in _key_ranges(number, _tile_numbers(blocks_x, blocks_y)))
-    room = _room(len(splat))
+    owner, number, slot_start, slot_end = _pairs(foot, order, place, blocks_x, blocks_y)
+    splat, pair, start, end = _by_block(owner, number, _tile_numbers(blocks_x, blocks_y))
+    start, end = dr.gather(mi.UInt32, start, numbers), dr.gather(mi.UInt32, end, numbers)
     lane = _lanes_by_tile(end - start, numbers, _tile_numbers(blocks_x, blocks_y))
     lists = BlockLists(
         order=order,
         place=place,
-        splat=_padded(splat, room),
-        pair=_padded(pair, room),
+        splat=splat,
+        pair=pair,
         slot_start=slot_start,
         slot_end=slot_end,
         block=lane,
@@ -199,10 +193,11 @@ def _sorted(values: Any, keys: Any, count: int) -> Any:
     return values
 
 
-def _memory_places(splats: Splats, order: Any, blocks_x: int, blocks_y: int) -> Any:
-    """UInt32 [N], the place of each splat: they are stored by the tile of their centre, then its block, then depth.
+def _orders(splats: Splats, blocks_x: int, blocks_y: int) -> tuple[Any, Any]:
+    """The Gaussians front to back, and the place of each Gaussian's splat, UInt32 [N].
 
-    A centre outside the image counts to the nearest block.
+    They are stored by the tile of their centre, then its block, then depth. A centre outside the image counts to the nearest
+    block.
     """
 
     def block(pixel: Any, size: int, count: int) -> Any:
@@ -211,17 +206,13 @@ def _memory_places(splats: Splats, order: Any, blocks_x: int, blocks_y: int) -> 
     number = _tile_number(
         block(splats.mean_y, BLOCK_Y, blocks_y) * blocks_x + block(splats.mean_x, BLOCK_X, blocks_x), blocks_x
     )
+    order = depth_order(splats.depth)
     dr.eval(number)
     at = _sorted(order, dr.gather(mi.UInt32, number, order), _tile_numbers(blocks_x, blocks_y))
-    return _inverse(at)
-
-
-def _inverse(permutation: Any) -> Any:
-    """The inverse of a permutation, UInt32; evaluated."""
-    inverse = dr.empty(mi.UInt32, len(permutation))
-    dr.scatter(inverse, dr.arange(mi.UInt32, len(permutation)), permutation, mode=dr.ReduceMode.NoConflicts)
-    dr.eval(inverse)
-    return inverse
+    place = dr.empty(mi.UInt32, len(at))
+    dr.scatter(place, dr.arange(mi.UInt32, len(at)), at, mode=dr.ReduceMode.NoConflicts)
+    dr.eval(place)
+    return order, place
 
 
 def _lanes_by_tile(length: Any, number: Any, numbers: int) -> Any:
@@ -234,8 +225,8 @@ def _lanes_by_tile(length: Any, number: Any, numbers: int) -> Any:
     return _sorted(longest, dr.gather(mi.UInt32, number, longest) // (TILE * TILE), numbers // (TILE * TILE))
 
 
-def _pairs(splats: Splats, foot: Footprints, place: Any, blocks_x: int, blocks_y: int) -> tuple[Any, ...]:
-    """All (splat, block) pairs, in the order of their slots: by the splat's place, then by block, row by row.
+def _pairs(foot: Footprints, order: Any, place: Any, blocks_x: int, blocks_y: int) -> tuple[Any, ...]:
+    """All (splat, block) pairs, in the order of their slots: front to back, and for one splat block by block, row by row.
 
     Returns the place of each pair's splat [M], the `_tile_number` of its block [M], and the first slot and the end of the
     slots of the splat at each place [N], UInt32. The first two are empty where no splat is drawn.
@@ -243,33 +234,40 @@ def _pairs(splats: Splats, foot: Footprints, place: Any, blocks_x: int, blocks_y
     First come the (splat, row of blocks) pairs, then the blocks of each row. So the work grows with the pairs that are kept; a
     bounding box around a slanted needle would first list a whole square of blocks.
     """
-    n = len(splats.mean_x)
-    half = dr.sqrt(dr.maximum(foot.level, 0)) * dr.rcp(foot.white_y)
-    low = dr.clip(dr.ceil((splats.mean_y - half + 0.5) / BLOCK_Y) - 1, 0, blocks_y)
-    high = dr.clip(dr.floor((splats.mean_y + half - 0.5) / BLOCK_Y) + 1, 0, blocks_y)
-    rows, shapes = dr.select(foot.level > 0, dr.maximum(high - low, 0), 0), dr.empty(mi.Float, 8 * n)
-    ellipse = mi.Vector4f(foot.mean_x, foot.mean_y, foot.shear, foot.white_x), mi.Vector4f(foot.white_y, foot.level, low, rows)
-    for i, part in enumerate(ellipse):
-        dr.scatter(shapes, part, 2 * place + i, mode=dr.ReduceMode.NoConflicts)
-    dr.eval(foot, shapes)
+    n = len(order)
+    dr.eval(foot)
+    u, v, k, p, e, q = (
+        dr.gather(mi.Float, part, order)
+        for part in (foot.mean_x, foot.mean_y, foot.shear, foot.white_x, foot.white_y, foot.level)
+    )
+    half = dr.sqrt(dr.maximum(q, 0)) * dr.rcp(e)
+    low = dr.clip(dr.ceil((v - half + 0.5) / BLOCK_Y) - 1, 0, blocks_y)
+    high = dr.clip(dr.floor((v + half - 0.5) / BLOCK_Y) + 1, 0, blocks_y)
+    rows, shapes = mi.UInt32(dr.select(q > 0, dr.maximum(high - low, 0), 0)), dr.empty(mi.Float, 8 * n)
+    for i, part in enumerate((mi.Vector4f(u, v, k, p), mi.Vector4f(e, q, low, 0))):
+        dr.scatter(shapes, part, 2 * dr.arange(mi.UInt32, n) + i, mode=dr.ReduceMode.NoConflicts)
+    nearest = dr.gather(mi.UInt32, place, order)
+    dr.eval(shapes, rows, nearest)
 
-    rows = mi.UInt32(dr.gather(mi.Float, shapes, 8 * dr.arange(mi.UInt32, n) + 7))
     first_row = dr.prefix_sum(rows)
-    row_splat = _run_numbers(first_row, _total(rows, blocks_y, "rows of blocks"))
-    block, columns = mi.UInt32(), mi.UInt32()
-    if len(row_splat) > 0:
-        offset = dr.arange(mi.UInt32, len(row_splat)) - dr.gather(mi.UInt32, first_row, row_splat)
-        block, columns = _blocks_of_row(shapes, row_splat, offset, blocks_x)
-        dr.eval(row_splat, block, columns)
+    rank = _run_numbers(first_row, rows, _total(rows, blocks_y, "rows of blocks"))
+    owner, block, columns = mi.UInt32(), mi.UInt32(), mi.UInt32()
+    if len(rank) > 0:
+        owner = dr.gather(mi.UInt32, nearest, rank)
+        offset = dr.arange(mi.UInt32, len(rank)) - dr.gather(mi.UInt32, first_row, rank)
+        block, columns = _blocks_of_row(shapes, rank, offset, blocks_x)
+        dr.eval(owner, block, columns)
     count = _total(columns, blocks_x, "blocks")
     if count == 0:
         return mi.UInt32(), mi.UInt32(), dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n)
     first = dr.prefix_sum(columns)
-    row, end = _run_numbers(first, count), first + columns
+    row, slots = _run_numbers(first, columns, count), [dr.empty(mi.UInt32, n) for _ in range(2)]
     number = _tile_number(dr.gather(mi.UInt32, block - first, row) + dr.arange(mi.UInt32, count), blocks_x)
-    slot_start = dr.gather(mi.UInt32, first, first_row, rows > 0)
-    slot_end = dr.gather(mi.UInt32, end, first_row + rows - 1, rows > 0)
-    pairs = dr.gather(mi.UInt32, row_splat, row), number, slot_start, slot_end
+    start = dr.gather(mi.UInt32, first, first_row, rows > 0)
+    end = dr.gather(mi.UInt32, first + columns, first_row + rows - 1, rows > 0)
+    for array, value in zip(slots, (start, end), strict=True):
+        dr.scatter(array, value, nearest, mode=dr.ReduceMode.NoConflicts)
+    pairs = dr.gather(mi.UInt32, owner, row), number, *slots
     dr.eval(pairs)
     return pairs
 
@@ -288,38 +286,23 @@ def _total(counts: Any, most: int, what: str) -> int:
     return total
 
 
-def _front_to_back(slot_start: Any, slot_end: Any, by_depth: Any, count: int) -> Any:
-    """UInt32 [count]: all slots, those of the nearest splat first; by_depth: UInt32 [N], places of the splats front to back."""
-    dr.eval(by_depth)
-    start, end = dr.gather(mi.UInt32, slot_start, by_depth), dr.gather(mi.UInt32, slot_end, by_depth)
-    dr.eval(start, end)
-    first = dr.prefix_sum(end - start)
-    rank = _run_numbers(first, count)
-    slots = dr.gather(mi.UInt32, start - first, rank) + dr.arange(mi.UInt32, count)
-    dr.eval(slots)
-    return slots
-
-
-def _run_numbers(start: Any, count: int) -> Any:
+def _run_numbers(start: Any, length: Any, count: int) -> Any:
     """UInt32 [count]: for each of `count` numbers cut into runs, which run it belongs to.
 
-    start: UInt32, where each run begins, never decreasing; where two begin at one number, the first of them is empty.
+    start, length: UInt32, where each run begins, and how many numbers it has (0 for an empty one).
     """
     if count == 0:
         return mi.UInt32()
-    begun, inside = (
-        dr.zeros(mi.UInt32, count),
-        start < dr.opaque(mi.UInt32, count),
-    )  # a Python number would be compiled into the kernel
-    dr.scatter_add(begun, mi.UInt32(1), start, inside, mode=dr.ReduceMode.Direct)
-    return dr.cumsum(begun) - 1
+    begun = dr.zeros(mi.UInt32, count)
+    dr.scatter(begun, dr.arange(mi.UInt32, len(start)), start, length > 0, mode=dr.ReduceMode.NoConflicts)
+    return dr.block_prefix_reduce(dr.ReduceOp.Max, begun, count, exclusive=False)
 
 
 def _blocks_of_row(shapes: Any, splat: Any, offset: Any, blocks_x: int) -> tuple[Any, Any]:
     """The blocks that a footprint's ellipse reaches in one row of blocks: number of the first (row by row), and how many.
 
-    shapes: two packets for the splat at each place, (mean_x, mean_y, shear, white_x) and (white_y, level, first row, unused);
-    splat: UInt32, its place; offset: UInt32, the row counted from the splat's first row.
+    shapes: two packets for each splat, front to back: (mean_x, mean_y, shear, white_x) and (white_y, level, first row, unused);
+    splat: UInt32, its number in them; offset: UInt32, the row counted from the splat's first row.
 
     The ellipse counts between the centres of the row's first and last pixels. At height y from the splat's centre its right
     rim is x = k y + sqrt(q - e^2 y^2) / p, with the letters of docs/notation.md. That is concave in y, so in this band it is
@@ -343,11 +326,30 @@ def _blocks_of_row(shapes: Any, splat: Any, offset: Any, blocks_x: int) -> tuple
     return by * blocks_x + mi.UInt32(first), columns
 
 
-def _padded(values: Any, size: int) -> Any:
-    """UInt32 values, then zeros up to `size` (dr.concat refuses arrays of length 0)."""
-    padded = dr.zeros(mi.UInt32, size)
-    dr.scatter(padded, values, dr.arange(mi.UInt32, len(values)), mode=dr.ReduceMode.NoConflicts)
-    return padded
+def _by_block(owner: Any, number: Any, numbers: int) -> tuple[Any, Any, Any, Any]:
+    """Sort pairs by block. owner, number: UInt32 [M], the place of each pair's splat, and its block, one of `numbers`.
+
+    Returns the place of the splat of each sorted pair, and the sorted pair at each slot, UInt32 [_room(M)], then where the
+    pairs of each block begin and end, UInt32 [numbers] (0 and 0 where there are none).
+    """
+    count = len(number)
+    pair, start, end = dr.zeros(mi.UInt32, _room(count)), dr.zeros(mi.UInt32, numbers), dr.zeros(mi.UInt32, numbers)
+    if count == 0:  # Dr.Jit has no operations on arrays of length 0
+        return dr.zeros(mi.UInt32, _room(count)), pair, start, end
+    slot, at = dr.detail.block_mkperm(number, count, numbers), dr.arange(mi.UInt32, _room(count))
+    used, last = at < dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, count - 1)
+    slot = dr.gather(mi.UInt32, slot, at, used)
+    dr.scatter(pair, at, slot, used, mode=dr.ReduceMode.NoConflicts)
+    dr.eval(pair)  # each alone: one kernel with all three at random addresses takes half as long again
+    splat = dr.gather(mi.UInt32, owner, slot, used)
+    dr.eval(splat)
+    number = dr.gather(mi.UInt32, number, slot, used)
+    dr.eval(number)
+    previous = dr.gather(mi.UInt32, number, dr.maximum(at, 1) - 1)
+    following = dr.gather(mi.UInt32, number, dr.minimum(at + 1, last))
+    dr.scatter(start, at, number, used & ((at == 0) | (previous != number)), mode=dr.ReduceMode.NoConflicts)
+    dr.scatter(end, at + 1, number, used & ((at == last) | (following != number)), mode=dr.ReduceMode.NoConflicts)
+    return splat, pair, start, end
 
 
 def _room(pairs: int) -> int:
@@ -355,15 +357,3 @@ def _room(pairs: int) -> int:
     anew for each."""
     step = max(1024, 1 << max(pairs.bit_length() - 4, 0))
     return -(-max(pairs, 1) // step) * step
-
-
-def _key_ranges(key: Any, buckets: int) -> tuple[Any, Any]:
-    """Start and end, UInt32 [buckets] each, of the keys equal to 0, 1, 2, ... in sorted keys (0 and 0 where there are none)."""
-    start, end = dr.zeros(mi.UInt32, buckets), dr.zeros(mi.UInt32, buckets)
-    m = len(key)
-    place, last = dr.arange(mi.UInt32, m), dr.opaque(mi.UInt32, m - 1)
-    previous = dr.gather(mi.UInt32, key, dr.maximum(place, 1) - 1)
-    following = dr.gather(mi.UInt32, key, dr.minimum(place + 1, last))
-    dr.scatter(start, place, key, (place == 0) | (previous != key), mode=dr.ReduceMode.NoConflicts)
-    dr.scatter(end, place + 1, key, (place == last) | (following != key), mode=dr.ReduceMode.NoConflicts)
-    return start, end
