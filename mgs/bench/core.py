@@ -123,13 +123,13 @@ def gradient(gaussians: Gaussians, camera: Camera, weights: Any, cache: ListCach
     return gradients
 
 
-def time_core(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
+def time_core(gaussians: Gaussians, camera: Camera, repeats: int, blocks: bool = True) -> dict[str, float]:
     """Seconds of each operation on these Gaussians (NumPy fields).
 
     forward_cold: render a view that was never seen before, another one in each call, so that its block lists must be built. The
     other operations see the same camera again, whose lists are kept: forward_warm, render; gradient_warm, `gradient`;
-    fisher_exact and fisher_block, `mgs.splat.fisher` with these estimators. Also pairs: the number of (splat, block) pairs of
-    the camera; list_bytes: memory of its lists, bytes.
+    fisher_exact and, if `blocks`, fisher_block, `mgs.splat.fisher` with these estimators. Also pairs: the number of (splat,
+    block) pairs of the camera; list_bytes: memory of its lists, bytes.
     """
     device, cache = as_drjit(gaussians), ListCache()
     new_views = iter(turned_cameras(camera, gaussians, repeats + WARM_UP))
@@ -140,8 +140,9 @@ def time_core(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, f
         "forward_warm": median_seconds(lambda: render(device, camera, cache=cache).rgb, repeats),
         "gradient_warm": median_seconds(lambda: gradient(device, camera, weights, cache), repeats),
         "fisher_exact": median_seconds(lambda: fisher(device, camera, "exact", cache=cache), repeats),
-        "fisher_block": median_seconds(lambda: fisher(device, camera, "block", cache=cache), repeats),
     }
+    if blocks:
+        seconds["fisher_block"] = median_seconds(lambda: fisher(device, camera, "block", cache=cache), repeats)
     lists, _ = cache.get(camera, project(device, camera_array(camera)))
     pairs = float(np.sum(np.asarray(lists.end).astype(np.int64) - np.asarray(lists.start)))
     return seconds | {"pairs": pairs, "list_bytes": float(cache.nbytes)}
@@ -282,12 +283,12 @@ def bench_scaling(repeats: int, report: Callable[[str], None], most: int = 1_000
     return records
 
 
-def scaling_point(n: int, width: int, height: int, threads: int, repeats: int) -> dict[str, float]:
+def scaling_point(n: int, width: int, height: int, threads: int, repeats: int, blocks: bool = True) -> dict[str, float]:
     """What `time_core` returns, with this many threads, and peak_bytes: the most memory that Dr.Jit has held in this
     process."""
     dr.set_thread_count(threads)
     gaussians = surface_gaussians(n)
-    seconds = time_core(gaussians, surface_camera(gaussians, width, height), repeats)
+    seconds = time_core(gaussians, surface_camera(gaussians, width, height), repeats, blocks)
     return seconds | {"peak_bytes": float(dr.detail.malloc_watermark(dr.JitBackend.LLVM))}
 
 

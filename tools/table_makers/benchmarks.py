@@ -359,14 +359,38 @@ OPERATIONS = {
     "gradient_warm": "image and gradient",
     "fisher_exact": "exact Fisher diagonal",
     "fisher_block": "exact 11x11 blocks",
-    "fit": "a fit of 12 views of 320x240, 10,000 Gaussians, 5 passes",
 }
+"""Operations of the core (`mgs.bench.core.time_core`)."""
+
+
+def lanes(data: dict[str, Any]) -> str:
+    """Seconds of the core with AVX-512 and with AVX2, and the ratios of the rounds."""
+    wide, narrow = data["lanes"]["AVX-512"], data["lanes"]["AVX2"]
+    rows = []
+    for key, name in OPERATIONS.items():
+        low, median, high = data["ratios"][key]
+        rows.append([name, f"{1e3 * wide[key]:.1f}", f"{1e3 * narrow[key]:.1f}", f"{median:.2f} ({low:.2f} to {high:.2f})"])
+    for key, name in {"error_image": "largest error of an image", "error_fisher": "of exact Fisher information"}.items():
+        rows.append([name, short(wide[key], 2), short(narrow[key], 2), ""])
+    heading = ["100,000 Gaussians, 640x480", "AVX-512 (ms)", "AVX2 (ms)", f"ratio, median of {data['rounds']} rounds (range)"]
+    return markdown(heading, rows) + made_by(data)
+
+
+def sizes(data: dict[str, Any]) -> str:
+    """Seconds and memory of large models and images."""
+    rows = []
+    for size in data["sizes"]:
+        seconds = [f"{size[key]:.2f}" if key in size else "–" for key in OPERATIONS]
+        label = f"{size['n']:,} Gaussians, {size['width']}x{size['height']}"
+        rows.append([label, f"{size['pairs'] / 1e6:.1f}", *seconds, f"{size['peak_bytes'] / 2**30:.1f}"])
+    heading = ["", "million pairs", *(f"{name} (s)" for name in OPERATIONS.values()), "memory (GiB)"]
+    return markdown(heading, rows) + made_by(data)
 
 
 def two_versions(data: dict[str, Any]) -> str:
     """Seconds of two versions, and the ratios of the rounds."""
     rows = []
-    for key, name in OPERATIONS.items():
+    for key, name in (OPERATIONS | {"fit": "a fit of 12 views of 320x240, 10,000 Gaussians, 5 passes"}).items():
         old, new = (f"{1e3 * data['seconds'][which][key]:.1f}" for which in ("old", "new"))
         low, median, high = data["ratios"][key]
         rows.append([name, old, new, f"{median:.2f} ({low:.2f} to {high:.2f})"])
@@ -442,6 +466,8 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "prior-std": ("benchmarks/prior_std", prior_std),
     "inset": ("benchmarks/inset", inset),
     "versions": ("benchmarks/versions", two_versions),
+    "lanes": ("benchmarks/lanes", lanes),
+    "sizes": ("benchmarks/sizes", sizes),
     "warm-colours": ("benchmarks/warm_colours", warm_colours),
     "uncertainty": ("benchmarks/uncertainty", uncertainty),
     "optimisers": ("benchmarks/optimisers", optimisers),

@@ -1,0 +1,38 @@
+"""Kernels do not depend on how many lanes a register has."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mgs import runtime
+from mgs.splat import fisher, render
+
+from .scenes import make_camera, make_gaussians
+
+CODE = """
+import sys
+import numpy as np
+from mgs import runtime
+runtime.start()
+sys.path += ["benchmarks", "tests"]
+from lanes import set_lanes
+set_lanes(8)
+from splat.scenes import make_camera, make_gaussians
+from mgs.splat import fisher, render
+camera, gaussians = make_camera(), make_gaussians(60, 4)
+np.savez(sys.argv[1], rgb=np.asarray(render(gaussians, camera).rgb), fisher=fisher(gaussians, camera))
+"""
+
+
+def test_eight_lanes_draw_the_same_image_and_information_as_sixteen(tmp_path):
+    runtime.start()
+    if runtime.processor()["simd_width"] != 16:
+        pytest.skip("this processor has no registers of sixteen lanes")
+    subprocess.run([sys.executable, "-c", CODE, str(tmp_path / "x.npz")], cwd=Path(__file__).parents[2], check=True)
+    camera, gaussians = make_camera(), make_gaussians(60, 4)
+    narrow = np.load(tmp_path / "x.npz")
+    np.testing.assert_array_equal(narrow["rgb"], np.asarray(render(gaussians, camera).rgb))
+    np.testing.assert_array_equal(narrow["fisher"], fisher(gaussians, camera))
