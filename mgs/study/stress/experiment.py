@@ -38,6 +38,7 @@ class Experiment:
     claims: Sequence[Claim]
     panels: Sequence[Panel]
     derived: Callable[[Sequence[Row]], list[Row]] | None = None
+    data: Callable[[Preset], list[Cell]] = lambda preset: []
 
 
 def cells_per_rock(name: str, task: str, arguments: Callable[[Preset], dict[str, Any]]) -> Callable[[Preset], list[Cell]]:
