@@ -59,7 +59,7 @@ class Rock(_Strict):
     dust: Colour = (0.42, 0.30, 0.20)
     """Dust on faces that look up."""
     specular: Fraction = 0.3
-    """Strength of the mirror-like reflection on top of the colour (Mitsuba's `principled`): 0 has none, 0.5 is that of glass."""
+    """Strength of the mirror-like reflection on top of the colour (Mitsuba's `principled`): 0 for none, 0.5 as of glass."""
     roughness: Annotated[float, Field(gt=0, le=1)] = 0.8
     """How far that reflection spreads: the smaller, the sharper the highlights."""
     detail: Positive = 0.011

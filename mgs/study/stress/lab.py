@@ -89,16 +89,13 @@ def scene_cell(preset: Preset, scene: str, seed: int) -> Cell:
     return Cell(f"dataset/{scene}-{seed}", f"{__name__}:make_scene", arguments)
 
 
-def variant_cell(
-    preset: Preset, scene: str, seed: int, variant: str, changes: dict[str, dict[str, Any]], frames: int | None = None
-) -> Cell:
+def variant_cell(preset: Preset, scene: str, seed: int, variant: str, changes: dict[str, dict[str, Any]], **other: int) -> Cell:
     """The same for a scene of which some keys have other values; its name ends in that of the variant.
 
-    changes: the values by section and key of the scene file. frames: how many; by default as many as all datasets have.
+    changes: the values by section and key of the scene file. other: arguments of `make_scene` in place of the preset's.
     """
     cell = scene_cell(preset, scene, seed)
-    arguments = cell.arguments | {"changes": changes} | ({} if frames is None else {"frames": frames})
-    return replace(cell, name=f"{cell.name}-{variant}", arguments=arguments)
+    return replace(cell, name=f"{cell.name}-{variant}", arguments=cell.arguments | {"changes": changes} | other)
 
 
 def make_scene(
@@ -114,13 +111,14 @@ def make_scene(
     gaussians: int,
     changes: dict[str, dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
-    """Render a dataset into OUT/dataset and build its prior in OUT/prior. changes: as in `variant_cell`."""
+    """Render a dataset into OUT/dataset and build its prior, unless it has 0 Gaussians, in OUT/prior. changes: as in
+    `variant_cell`."""
     if not (out / "dataset/transforms.json").is_file():
         loaded = load_scene_file(scene)
         sections = {name: getattr(loaded, name).model_copy(update=values) for name, values in (changes or {}).items()}
         images = Images(width, height, frames, spp)
         synthesise(out / "dataset", loaded.model_copy(update=sections), images, seed, test_views=tests)
-    if not (out / "prior/prior.json").is_file():
+    if gaussians and not (out / "prior/prior.json").is_file():
         prior, _ = build_prior(load_dataset(out / "dataset"), PriorSettings(gaussians=gaussians, seed=seed))
         save_prior(out / "prior", prior)
     return {"gaussians": gaussians}

@@ -20,7 +20,9 @@ from mgs.study.stress.verdict import Claim, Effects, Row, paired, runs_of
 from mgs.study.sweep import Cell, cell_folder
 
 MATERIALS = {"diffuse": {"specular": 0.0, "roughness": 0.8}, "specular": {"specular": 0.5, "roughness": 0.3}}
-"""Keys of [rock] in a scene file: no mirror-like reflection at all, and that of polished stone."""
+"""Keys of [rock] in a scene file: no mirror-like reflection at all, and a strong one."""
+
+SHINY = "specular"
 
 FRAMES, FEW = 32, 12
 """Frames of each dataset, all of which are fitted at last; and how many are fitted before."""
@@ -57,39 +59,50 @@ def errors_by_angle(lab: Lab, model: Gaussians, views: Sequence[int], sun: float
 
 
 def specular(root: Path, out: Path, scene: str, turns_: int) -> dict[str, Any]:
-    """Models of the rock in each material: of every SH degree, on few views and on all; and of views that policies chose."""
+    """Models of the rock in each material, on few views and of views that policies chose; of the specular one, of every SH
+    degree, and on all views too."""
     rows = list[Row]()
     for material in MATERIALS:
         lab = open_lab(root, f"{scene}-{material}")
         folder = cell_folder(root, f"dataset/{scene}-{material}") / "dataset"
         sun = float(read_json(folder / "config.json")["scene"]["sky"]["sun_azimuth"])
-        sets = [(f"{scene}, {suffix}", lab.even(FEW, turn), turn) for suffix, turn in turns(turns_)]
-        for run, taken, turn in [*sets, (scene, list(range(len(lab.frames))), None)]:
-            named = {"run": run, "material": material}
-            for degree in DEGREES:
-                model = lab.fit(taken, start=with_degree(lab.start(taken), degree)).gaussians
-                kind = f"{material}, {len(taken)} views"
-                rows.append({**named, "views": len(taken), "kind": kind, "degree": degree, **lab.quality(model)})
-                if degree == 0 and turn is not None:
-                    rows += [{**named, **row} for row in errors_by_angle(lab, model, lab.left(taken), sun)]
-            if turn is not None:
-                rows += _choices(lab, named, lab.even(SEEDS, turn))
+        degrees = DEGREES if material == SHINY else DEGREES[:1]
+        for suffix, turn in turns(turns_):
+            named, taken = {"run": f"{scene}, {suffix}", "material": material}, lab.even(FEW, turn)
+            models = _fits(lab, taken, degrees)
+            rows += [named | row for row in _qualities(lab, taken, models)]
+            rows += [named | row for row in errors_by_angle(lab, models[0], lab.left(taken), sun)]
+            rows += [named | row for row in _choices(lab, lab.even(SEEDS, turn))]
+        if material == SHINY:
+            taken = list(range(len(lab.frames)))
+            rows += [{"run": scene, "material": material} | row for row in _qualities(lab, taken, _fits(lab, taken, degrees))]
     return {"rows": rows}
 
 
-def _choices(lab: Lab, named: Row, seeds: list[int]) -> list[Row]:
+def _fits(lab: Lab, taken: Sequence[int], degrees: Sequence[int]) -> list[Gaussians]:
+    """A model of each SH degree."""
+    start = lab.start(taken)
+    return [lab.fit(taken, start=with_degree(start, degree)).gaussians for degree in degrees]
+
+
+def _qualities(lab: Lab, taken: Sequence[int], models: Sequence[Gaussians]) -> list[Row]:
+    fitted = {"views": len(taken), "fitted": f"{len(taken)} views"}
+    return [fitted | {"degree": model.sh_degree, **lab.quality(model)} for model in models]
+
+
+def _choices(lab: Lab, seeds: list[int]) -> list[Row]:
     """Models of views chosen by each policy."""
-    rows = []
+    rows = list[Row]()
     for policy in POLICIES:
         views = greedy(lab, seeds, range(len(lab.frames)), VIEWS - len(seeds), policy)
-        rows.append(named | {"policy": policy, **lab.quality(lab.fit(views).gaussians)})
+        rows.append({"policy": policy, **lab.quality(lab.fit(views).gaussians)})
     return rows
 
 
 def _data(preset: Preset) -> list[Cell]:
     """A dataset of every rock in every material."""
     return [
-        variant_cell(preset, scene, seed, name, {"rock": rock}, FRAMES)
+        variant_cell(preset, scene, seed, name, {"rock": rock}, frames=FRAMES)
         for scene, seed in preset.rocks
         for name, rock in MATERIALS.items()
     ]
@@ -111,7 +124,7 @@ def best_of_degrees(views: int) -> Effects:
     return lambda rows: [float(max(gains)) for gains in zip(*(effects(rows) for effects in of), strict=True)]
 
 
-def _fit(views: int, degree: int, material: str = "specular") -> Row:
+def _fit(views: int, degree: int, material: str = SHINY) -> Row:
     return {"material": material, "views": views, "degree": degree}
 
 
@@ -132,7 +145,7 @@ def towards_the_sun(rows: Sequence[Row]) -> list[float]:
 
 
 def _ahead(policy: str, other: str) -> Effects:
-    return paired("psnr", {"material": "specular", "policy": policy}, {"material": "specular", "policy": other})
+    return paired("psnr", {"material": SHINY, "policy": policy}, {"material": SHINY, "policy": other})
 
 
 SPECULAR = Experiment(
@@ -153,7 +166,7 @@ SPECULAR = Experiment(
               _ahead("directional-i", "uniform"), "dB", "above", 0.0, "rock and set of seeds"),
     ),
     (
-        Panel("degree", "psnr", "SH degree", "PSNR on test views (dB)", "kind"),
+        Panel("degree", "psnr", "SH degree (specular rock)", "PSNR on test views (dB)", "fitted", only=(("material", SHINY),)),
         Panel("angle of sun", "rms", "from sun to camera (degrees)", "rms error of views not fitted (linear RGB)", "material"),
         Panel("material", "psnr", "rock", "PSNR on test views (dB)", "policy"),
     ),
