@@ -15,8 +15,8 @@ from mgs.study.sweep import Cell
 class Panel:
     """One plot of an experiment's rows: the mean of column y over runs, with its 95 % interval, against column x.
 
-    by: column whose values are lines of their own. log: whether x is logarithmic. Where x is text, each value has a bar.
-    only: entries that a row must have to count.
+    by: column whose values are lines of their own. log: whether x is logarithmic. Where x is text, each value has a bar. only:
+    entries that a row must have to count; it must have the columns too.
     """
 
     x: str

@@ -252,6 +252,15 @@ def greedy(lab: Lab, taken: Sequence[int], allowed: Sequence[int], count: int, p
     return views
 
 
+def by_policy(lab: Lab, seeds: Sequence[int], count: int, policies: Sequence[str] = POLICIES) -> list[dict[str, Any]]:
+    """Quality of a model of `count` views, of which all but the seeds were chosen by a policy: a row for each policy."""
+    rows = []
+    for policy in policies:
+        views = greedy(lab, seeds, range(len(lab.frames)), count - len(seeds), policy)
+        rows.append({"policy": policy, **lab.quality(lab.fit(views).gaussians)})
+    return rows
+
+
 def _surface_scores(
     lab: Lab, start: Gaussians, policy: str
 ) -> Callable[[list[int], list[int], np.random.Generator], NDArray[np.float64]]:

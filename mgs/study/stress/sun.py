@@ -113,13 +113,14 @@ def _data(preset: Preset) -> list[Cell]:
 
 
 def of_limits(rows: Sequence[Row]) -> list[Row]:
-    """Every sign of the fits without gains over its limit, for the picture."""
+    """Signs of the fits without gains over their limits, for the picture; without those that are of no use here: `means`, which
+    are frozen, and `worse`, which is of fits that start from a fitted model."""
     return [
         {"run": row["run"], "sign": name, "of limit": row[f"sign {name}"] / detector.limit, "under": row["light"]}
         for row in rows
         if row.get("gains") is False and row["light"] != HALF
         for name, detector in DETECTORS.items()
-        if f"sign {name}" in row and name != "means"
+        if f"sign {name}" in row and name not in ("means", "worse")
     ]  # fmt: skip
 
 

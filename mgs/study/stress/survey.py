@@ -13,7 +13,7 @@ from mgs.files import atomic_folder, read_json, write_json
 from mgs.prior.build import build_prior, load_prior, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.study.stress.experiment import Experiment, Panel, cells_per_rock, turns
-from mgs.study.stress.lab import POLICIES, Lab, greedy, open_lab
+from mgs.study.stress.lab import POLICIES, Lab, by_policy, open_lab
 from mgs.study.stress.verdict import Claim, Effects, Row, paired, runs_of
 from mgs.study.sweep import cell_folder
 from mgs.survey.flight import SurveySettings, fly, survey_numbers
@@ -63,10 +63,9 @@ def survey(root: Path, out: Path, scene: str, turns_: int, gaussians: int) -> di
         found, errors = surveyed(lab, root, out, level, gaussians)
         for suffix, turn in turns(turns_):
             seeds = lab.even(SEEDS, turn)
-            for policy in POLICIES if level in COMPARED else ("uniform",):
-                views = greedy(found, seeds, range(len(lab.frames)), VIEWS - len(seeds), policy)
-                quality = found.quality(found.fit(views).gaussians)
-                rows.append({"run": f"{scene}, {suffix}", "level": level, "policy": policy, **quality, **errors})
+            policies = POLICIES if level in COMPARED else ("uniform",)
+            known = {"run": f"{scene}, {suffix}", "level": level, **errors}
+            rows += [known | row for row in by_policy(found, seeds, VIEWS, policies)]
     return {"rows": rows}
 
 
