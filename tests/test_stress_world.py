@@ -1,7 +1,9 @@
 """The experiments of `mgs stress` on light, material and sensor: a second sun, a specular rock, a noisy survey."""
 
 import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ import synthetic
 
 from mgs.active.nbv import run_nbv
 from mgs.active.pose_policies import seed_views
-from mgs.data.dataset import write_transforms
+from mgs.data.dataset import load_dataset, write_transforms
 from mgs.images import write_png
 from mgs.prior.build import build_prior, save_prior
 from mgs.prior.settings import PriorSettings
@@ -26,18 +28,21 @@ FRAMES = 10
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """A study's folder with a small rock as its dataset's cell leaves it, and the same rock half as bright, metered so."""
+    """A study's folder with a small rock as the cell of its dataset leaves it, and its variants: the same again, `later` half
+    as bright and metered so."""
     folder = tmp_path_factory.mktemp("study")
-    for name, exposure in (("rock", 2.0), ("rock-later", 1.0), ("rock-diffuse", 2.0), ("rock-specular", 2.0)):
-        out = cell_folder(folder, f"dataset/{name}")
-        dataset = synthetic.write_dataset(out / "dataset", synthetic.orbit_cameras(FRAMES, 64, 48))
-        for frame in dataset.frames if exposure == 1 else ():
-            write_png(frame.image_path, frame.rgb() / 2)
-        tests = synthetic.write_dataset(out / "dataset/test", synthetic.orbit_cameras(3, 64, 48, altitude=2.0))
-        write_transforms(out / "dataset/test", tests.frames)
-        record = {"exposure": exposure, "scene": {"sky": {"sun_azimuth": 35.0}}}
-        (out / "dataset/config.json").write_text(json.dumps(record))
-        save_prior(out / "prior", build_prior(dataset, PriorSettings(gaussians=300))[0])
+    out = cell_folder(folder, "dataset/rock")
+    dataset = synthetic.write_dataset(out / "dataset", synthetic.orbit_cameras(FRAMES, 64, 48))
+    tests = synthetic.write_dataset(out / "dataset/test", synthetic.orbit_cameras(3, 64, 48, altitude=2.0))
+    write_transforms(out / "dataset/test", tests.frames)
+    save_prior(out / "prior", build_prior(dataset, PriorSettings(gaussians=300))[0])
+    record = {"exposure": 2.0, "scene": {"sky": {"sun_azimuth": 35.0}}}
+    (out / "dataset/config.json").write_text(json.dumps(record))
+    for variant in ("later", "diffuse", "specular"):
+        shutil.copytree(out, f"{out}-{variant}")
+    for frame in load_dataset(Path(f"{out}-later/dataset")).frames:
+        write_png(frame.image_path, frame.rgb() / 2)
+    Path(f"{out}-later/dataset/config.json").write_text(json.dumps(record | {"exposure": 1.0}))
     return folder
 
 
@@ -138,6 +143,7 @@ def test_errors_are_told_by_the_angle_between_sun_and_camera(root):
 
 def test_a_specular_rock_is_measured_and_judged(root, monkeypatch, tmp_path):
     monkeypatch.setattr(specular, "FEW", 4)
+    monkeypatch.setattr(specular, "DEGREES", (0, 1))
     monkeypatch.setattr(specular, "VIEWS", 4)
     monkeypatch.setattr(specular, "SEEDS", 3)
     rows = specular.specular(root, root, "rock", 1)["rows"]
