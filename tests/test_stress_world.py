@@ -196,6 +196,30 @@ def test_a_survey_has_measured_depth_and_estimated_poses_and_is_flown_once(root,
     assert np.array_equal(again.prior.points, noisy.prior.points)
 
 
+def test_surveys_of_every_level_are_measured_and_judged(root, tmp_path, monkeypatch):
+    """Made-up qualities: each level costs 3 dB more than the one before, whichever policy chose the views."""
+    place = list(survey.LEVELS)
+    asked = []
+
+    def flown(lab, root, out, level, gaussians):
+        return level, {"depth error": 1.0, "pose error": 2.0}
+
+    def qualities(level, seeds, count, policies):
+        asked.append((level, tuple(policies), tuple(seeds), count))
+        return [{"policy": policy, "psnr": 40 - 3.0 * place.index(level) - k / 8} for k, policy in enumerate(policies)]
+
+    monkeypatch.setattr(survey, "surveyed", flown)
+    monkeypatch.setattr(survey, "by_policy", qualities)
+    rows = survey.survey(root, tmp_path, "rock", 2, 300)["rows"]
+    assert {level: policies for level, policies, *_ in asked} == {
+        level: labs.POLICIES if level in survey.COMPARED else ("uniform",) for level in survey.LEVELS
+    }
+    assert len({seeds for *_, seeds, _ in asked}) == 2
+    verdicts = [judged(claim, rows)["verdict"] for claim in survey.SURVEY.claims]
+    assert verdicts == ["fails", "holds", "holds", "holds", "holds", "holds", "holds", "holds"]
+    draw_experiment(tmp_path / "survey.png", survey.SURVEY, rows)
+
+
 def test_datasets_of_all_experiments_have_names_of_their_own():
     for preset in PRESETS.values():
         cells = registry.datasets(preset)
