@@ -148,6 +148,29 @@ def test_a_rock_of_one_colour_keeps_it():
     np.testing.assert_allclose(continued(expected, coverage), np.broadcast_to(colour, expected.shape), atol=1e-5)
 
 
+def test_a_specular_rock_shines_where_it_mirrors_the_sun_and_nowhere_else():
+    """The highlight of a ball lies where its normal halves the angle between the sun and the camera."""
+    camera = Camera(K, 64, 48, look_at([3, 0, 1.5], [0, 0, 0.6]))
+    images = {}
+    for specular in (0.0, 0.5):
+        rock = trimesh.creation.icosphere(4, 0.7)
+        rock.apply_translation([0, 0, 0.7])
+        settings = SceneFile(rock=Rock(specular=specular, roughness=0.2), arena=Arena(stones=0))
+        images[specular] = Scene(settings, rock, camera, seed=0).render(camera, spp=16, seed=0, denoise=False)
+    seen = images[0.0].mask & images[0.5].mask
+    diffuse = images[0.0].rgb[seen].mean(-1)
+    gained = images[0.5].rgb[seen].mean(-1) - diffuse
+    sky = SceneFile().sky
+    elevation, azimuth = np.radians([sky.sun_elevation, sky.sun_azimuth])
+    sun = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    points = camera.unproject(images[0.0].depth)[seen]
+    normal, view = (points - [0, 0, 0.7]) / 0.7, camera.position - points
+    half = sun + view / np.linalg.norm(view, axis=1, keepdims=True)
+    cosine = (normal * half).sum(1) / np.linalg.norm(half, axis=1)
+    assert gained[cosine > np.cos(np.radians(3))].mean() > diffuse.mean()
+    assert abs(np.median(gained[cosine < np.cos(np.radians(30))])) < 0.1 * diffuse.mean()
+
+
 def test_the_rock_alone_is_the_image_inside_and_its_own_colour_at_the_rim(ball):
     """Against many samples: the denoised layer at its rim is far nearer to the truth than image times mask."""
     scene, camera = ball
@@ -169,6 +192,8 @@ def test_the_rock_alone_is_the_image_inside_and_its_own_colour_at_the_rim(ball):
     [
         ("[rock]\nsiz = 1\n", "unknown key 'rock.siz'"),
         ("[rock]\nsize = -1\n", "rock.size"),
+        ("[rock]\nspecular = 2\n", "rock.specular"),
+        ("[rock]\nroughness = 0\n", "rock.roughness"),
         ("[rock\n", "not valid TOML"),
         ("[orbit]\nkind = 'figure-eight'\n", "orbit.kind"),
         ("[sky]\nturbidity = nan\n", "sky.turbidity"),

@@ -288,12 +288,12 @@ def test_cells_of_all_experiments_have_tasks_that_are_there_and_needs_that_are_m
     from importlib import import_module
 
     for preset in PRESETS.values():
-        scenes = {f"dataset/{scene}-{seed}" for scene, seed in (*preset.rocks, *preset.others)}
+        datasets = {cell.name: cell for cell in registry.datasets(preset)}
         for experiment in registry.EXPERIMENTS.values():
-            for cell in experiment.cells(preset):
+            for cell in [*experiment.cells(preset), *experiment.data(preset)]:
                 module, _, function = cell.task.partition(":")
                 assert callable(getattr(import_module(module), function))
-                assert set(cell.needs) <= scenes
+                assert set(cell.needs) <= set(datasets)
                 json.dumps(cell.arguments)
     assert rock_cell("n", "m:f", PRESETS["quick"], "boulder", 0, x=1).arguments == {"scene": "boulder-0", "x": 1}
 

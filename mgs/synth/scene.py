@@ -18,7 +18,7 @@ from mgs.colour import linear_from_srgb
 from mgs.data.rock_image import boundary
 from mgs.seeds import generator
 from mgs.synth.arena import make_ground, make_stones, regolith
-from mgs.synth.scene_file import SceneFile, Sky
+from mgs.synth.scene_file import Rock, SceneFile, Sky
 
 MAX_DEPTH = 4
 """Longest light path, in Mitsuba's count: direct light and two bounces. In the shade, light that rock and ground throw on each
@@ -62,7 +62,7 @@ class Scene:
 
         ground = make_ground(settings.arena, rock, generator(seed, "ground"))
         stones = make_stones(settings.arena, rock, ground, generator(seed, "stones"))
-        shapes = {"rock": _mesh("rock", rock, _rock_bsdf(rock, settings.rock.colours[0]))}
+        shapes = {"rock": _mesh("rock", rock, _rock_bsdf(rock, settings.rock))}
         tiles = regolith(settings.arena, generator(seed, "regolith"))
         drift, lag = ({"type": "diffuse", "reflectance": _bitmap(tile)} for tile in tiles)
         weight = {"type": "mesh_attribute", "name": "vertex_blend"}
@@ -191,8 +191,8 @@ def _bitmap(linear: np.ndarray) -> dict[str, Any]:
     return {"type": "bitmap", "data": mi.TensorXf(np.ascontiguousarray(linear, np.float32)), "raw": True}
 
 
-def _rock_bsdf(rock: trimesh.Trimesh, plain: tuple[float, float, float]) -> dict[str, Any]:
-    """A rough, slightly glossy material; its colour is the mesh's texture, or else its vertex colours, or else `plain`."""
+def _rock_bsdf(rock: trimesh.Trimesh, settings: Rock) -> dict[str, Any]:
+    """The rock's material; its colour is the mesh's texture, or else its vertex colours, or else the light mineral."""
     visual: Any = rock.visual
     image = getattr(visual, "material", None) and _texture_image(visual.material)
     if image is not None and visual.uv is not None:
@@ -202,8 +202,8 @@ def _rock_bsdf(rock: trimesh.Trimesh, plain: tuple[float, float, float]) -> dict
         rock.vertex_attributes["color"] = rgb
         colour = {"type": "mesh_attribute", "name": "vertex_color"}
     else:
-        colour = {"type": "rgb", "value": list(plain)}
-    return {"type": "principled", "base_color": colour, "roughness": 0.8, "specular": 0.3}
+        colour = {"type": "rgb", "value": list(settings.colours[0])}
+    return {"type": "principled", "base_color": colour, "roughness": settings.roughness, "specular": settings.specular}
 
 
 def _texture_image(material: Any) -> Any:

@@ -58,6 +58,10 @@ class Rock(_Strict):
     """Light and dark mineral."""
     dust: Colour = (0.42, 0.30, 0.20)
     """Dust on faces that look up."""
+    specular: Fraction = 0.3
+    """Strength of the mirror-like reflection on top of the colour (Mitsuba's `principled`): 0 for none, 0.5 as of glass."""
+    roughness: Annotated[float, Field(gt=0, le=1)] = 0.8
+    """How far that reflection spreads: the smaller, the sharper the highlights."""
     detail: Positive = 0.011
     """Length of a mesh edge, metres."""
 

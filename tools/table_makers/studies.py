@@ -120,6 +120,7 @@ def reproduced(name: str) -> Callable[[dict[str, Any]], str]:
 
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "stability": ("results/stress/verdicts", stability),
+    "stability-world": ("results/stress/world", stability),
     "parsimony": ("results/parsimony/parsimony", parsimony),
     "parsimony-verdict": ("results/parsimony/parsimony", parsimony_verdict),
     "parsimony-rules": ("results/parsimony/parsimony", parsimony_rules),

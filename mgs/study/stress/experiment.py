@@ -15,8 +15,8 @@ from mgs.study.sweep import Cell
 class Panel:
     """One plot of an experiment's rows: the mean of column y over runs, with its 95 % interval, against column x.
 
-    by: column whose values are lines of their own. log: whether x is logarithmic. Where x is text, each value has a bar.
-    only: entries that a row must have to count.
+    by: column whose values are lines of their own. log: whether x is logarithmic. Where x is text, each value has a bar. only:
+    entries that a row must have to count; it must have the columns too.
     """
 
     x: str
@@ -38,6 +38,7 @@ class Experiment:
     claims: Sequence[Claim]
     panels: Sequence[Panel]
     derived: Callable[[Sequence[Row]], list[Row]] | None = None
+    data: Callable[[Preset], list[Cell]] = lambda preset: []
 
 
 def cells_per_rock(name: str, task: str, arguments: Callable[[Preset], dict[str, Any]]) -> Callable[[Preset], list[Cell]]:

@@ -13,8 +13,11 @@ from numpy.typing import NDArray
 from scipy.stats import kendalltau
 
 from mgs.active.criteria import MEAN_STD, PRIOR_STD, Score, d_optimal, lam_by_kind, regularisation
+from mgs.active.directional import Views, dome_cameras, squared_weights
 from mgs.active.fitting import Fit, fit
 from mgs.active.loop import target_of
+from mgs.active.outlook import Outlook
+from mgs.active.policies import policy_named
 from mgs.active.pose_policies import seed_views
 from mgs.active.settings import MEAN_RATE, PASSES, RATES, WARM_PASSES, TrainSettings
 from mgs.active.stations import psnr_measure
@@ -22,17 +25,23 @@ from mgs.camera import Camera
 from mgs.data.dataset import Frame, load_dataset
 from mgs.gaussians import Gaussians
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
-from mgs.prior.initial import initial_gaussians, initial_normals
+from mgs.prior.initial import initial_gaussians, initial_normals, warm_start
 from mgs.prior.settings import PriorSettings
+from mgs.seeds import generator
 from mgs.splat import ListCache, fisher, groups
 from mgs.study.sweep import Cell, cell_folder
 from mgs.synth.rendering import Preset as Images
 from mgs.synth.rendering import synthesise
+from mgs.synth.scene_file import load_scene_file
 
 Array = NDArray[np.floating]
 
 CACHE = 1 << 28
 """Budget of the block lists of one lab, bytes."""
+
+
+POLICIES = ("d-optimal", "directional-i", "uniform", "random")
+"""Whose order is compared, where data or light are bad."""
 
 
 @dataclass(frozen=True)
@@ -80,13 +89,36 @@ def scene_cell(preset: Preset, scene: str, seed: int) -> Cell:
     return Cell(f"dataset/{scene}-{seed}", f"{__name__}:make_scene", arguments)
 
 
+def variant_cell(preset: Preset, scene: str, seed: int, variant: str, changes: dict[str, dict[str, Any]], **other: int) -> Cell:
+    """The same for a scene of which some keys have other values; its name ends in that of the variant.
+
+    changes: the values by section and key of the scene file. other: arguments of `make_scene` in place of the preset's.
+    """
+    cell = scene_cell(preset, scene, seed)
+    return replace(cell, name=f"{cell.name}-{variant}", arguments=cell.arguments | {"changes": changes} | other)
+
+
 def make_scene(
-    root: Path, out: Path, scene: str, seed: int, width: int, height: int, frames: int, spp: int, tests: int, gaussians: int
+    root: Path,
+    out: Path,
+    scene: str,
+    seed: int,
+    width: int,
+    height: int,
+    frames: int,
+    spp: int,
+    tests: int,
+    gaussians: int,
+    changes: dict[str, dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
-    """Render a dataset into OUT/dataset and build its prior in OUT/prior."""
+    """Render a dataset into OUT/dataset and build its prior, unless it has 0 Gaussians, in OUT/prior. changes: as in
+    `variant_cell`."""
     if not (out / "dataset/transforms.json").is_file():
-        synthesise(out / "dataset", scene, Images(width, height, frames, spp), seed, test_views=tests)
-    if not (out / "prior/prior.json").is_file():
+        loaded = load_scene_file(scene)
+        sections = {name: getattr(loaded, name).model_copy(update=values) for name, values in (changes or {}).items()}
+        images = Images(width, height, frames, spp)
+        synthesise(out / "dataset", loaded.model_copy(update=sections), images, seed, test_views=tests)
+    if gaussians and not (out / "prior/prior.json").is_file():
         prior, _ = build_prior(load_dataset(out / "dataset"), PriorSettings(gaussians=gaussians, seed=seed))
         save_prior(out / "prior", prior)
     return {"gaussians": gaussians}
@@ -203,20 +235,61 @@ def agreement(mine: Array, reference: Array) -> dict[str, float]:
 def greedy(lab: Lab, taken: Sequence[int], allowed: Sequence[int], count: int, policy: str = "d-optimal") -> list[int]:
     """Views after `count` steps of the loop, fitted as `mgs nbv` does by default, candidates only among `allowed`.
 
-    policy: "d-optimal" or a row of `mgs.active.pose_policies.POSE_POLICIES`.
+    policy: "d-optimal", or one of `mgs.active.policies.policy_names` that looks at poses and the prior's surface alone.
     """
-    from mgs.active.pose_policies import POSE_POLICIES
-    from mgs.seeds import generator
-
     views, start = list(taken), lab.start(taken)
-    model, positions = start, np.array([camera.position for camera in lab.cameras])
+    model, of_surface = start, None if policy == "d-optimal" else _surface_scores(lab, start, policy)
     for step in range(count):
         left = [i for i in allowed if i not in views]
-        if policy == "d-optimal":
-            model = lab.fit(views, PASSES if step == 0 else WARM_PASSES, model=model, start=start).gaussians
+        if of_surface is None:
+            before, start = start, lab.start(views)
+            passes = PASSES if step == 0 else WARM_PASSES
+            model = lab.fit(views, passes, model=warm_start(model, before, start), start=start).gaussians
             scores = lab.scores(model, views, left)
         else:
-            rng = generator(0, f"stress/{policy}/{step}")
-            scores = POSE_POLICIES[policy](positions[left], positions[views], lab.prior.points.mean(0), rng)
+            scores = of_surface(views, left, generator(0, f"stress/{policy}/{step}"))
         views.append(left[int(np.argmax(scores))])
     return views
+
+
+def by_policy(lab: Lab, seeds: Sequence[int], count: int, policies: Sequence[str] = POLICIES) -> list[dict[str, Any]]:
+    """Quality of a model of `count` views, of which all but the seeds were chosen by a policy: a row for each policy."""
+    rows = []
+    for policy in policies:
+        views = greedy(lab, seeds, range(len(lab.frames)), count - len(seeds), policy)
+        rows.append({"policy": policy, **lab.quality(lab.fit(views).gaussians)})
+    return rows
+
+
+def _surface_scores(
+    lab: Lab, start: Gaussians, policy: str
+) -> Callable[[list[int], list[int], np.random.Generator], NDArray[np.float64]]:
+    """A function of the views taken, those left and a generator, that gives each of those left the score of a policy.
+
+    start: the Gaussians before training, in any colours."""
+    choose, lam, n = policy_named(policy), lab.lam(), len(lab.prior.points)
+    positions, centre = np.array([camera.position for camera in lab.cameras]), lab.prior.points.mean(0)
+
+    def weights(camera: Camera) -> Array:
+        return squared_weights(fisher(start, camera, cache=lab.cache)[:n])
+
+    @functools.cache
+    def dome() -> Views:
+        cameras = dome_cameras(lab.cameras[0], positions, centre)
+        return Views(np.array([camera.position for camera in cameras]), np.stack([weights(camera) for camera in cameras]))
+
+    seen = functools.cache(lambda view: weights(lab.cameras[view]))
+    unknown, nothing = np.zeros((0, len(lam))), _of_fit
+
+    def scores(views: list[int], left: list[int], rng: np.random.Generator) -> NDArray[np.float64]:
+        return np.asarray(choose(Outlook(
+            positions=positions, left=left, visited=views, centre=centre, rng=rng, H=unknown, lam=lam, points=start.means[:n],
+            surface_H=unknown, prior_lam=lam, information=nothing, surface_information=nothing, estimate=nothing, seen=seen,
+            dome=dome,
+        )))  # fmt: skip
+
+    return scores
+
+
+def _of_fit(*_: object) -> Array:
+    raise NotImplementedError("greedy: has no information for this policy; it serves d-optimal, and what needs no fit")

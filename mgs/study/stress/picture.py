@@ -59,7 +59,8 @@ def _bands(drawn: Drawn) -> list[Drawn]:
 
 
 def _of(panel: Panel, rows: Sequence[Row]) -> list[Row]:
-    return [r for r in rows if panel.x in r and panel.y in r and all(r.get(k) == v for k, v in panel.only)]
+    named = {panel.x, panel.y, panel.by or panel.x}
+    return [r for r in rows if named <= r.keys() and all(r.get(k) == v for k, v in panel.only)]
 
 
 def _numeric(panel: Panel, rows: Sequence[Row]) -> bool:

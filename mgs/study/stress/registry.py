@@ -19,9 +19,12 @@ from mgs.study.stress.numerics import NUMERICS
 from mgs.study.stress.picture import draw_experiment
 from mgs.study.stress.scales import SCALES
 from mgs.study.stress.scenes import SCENES
+from mgs.study.stress.specular import SPECULAR
+from mgs.study.stress.sun import SUN
+from mgs.study.stress.survey import SURVEY
 from mgs.study.stress.verdict import Row, effect, judged
 from mgs.study.stress.views import FREE_MEANS, SEEDS
-from mgs.study.sweep import found, run_cells
+from mgs.study.sweep import Cell, found, run_cells
 
 EXPERIMENTS: dict[str, Experiment] = {
     "free-means": FREE_MEANS,
@@ -35,6 +38,9 @@ EXPERIMENTS: dict[str, Experiment] = {
     "prior-faults": PRIOR_EXPERIMENT,
     "detectors": ALARMS,
     "scenes": SCENES,
+    "sun": SUN,
+    "specular": SPECULAR,
+    "survey": SURVEY,
 }
 
 
@@ -53,12 +59,17 @@ def run_stress(
     done in this folder before. Called again, it does what is left. Raises InputError if `out` holds results of another preset
     or version.
     """
-    by_experiment = {name: EXPERIMENTS[name].cells(preset) for name in names}
-    scenes = {cell.name: cell for cell in (scene_cell(preset, *rock) for rock in (*preset.rocks, *preset.others))}
-    cells = {cell.name: cell for of_one in by_experiment.values() for cell in of_one}
-    needed = {need: scenes[need] for cell in cells.values() for need in cell.needs}
+    cells = {cell.name: cell for name in names for cell in EXPERIMENTS[name].cells(preset)}
+    data = {cell.name: cell for cell in datasets(preset)}
+    needed = {need: data[need] for cell in cells.values() for need in cell.needs}
     run_cells(out, [*needed.values(), *cells.values()], report, workers=workers)
     return write_results(out, rows_done(out, preset), command)
+
+
+def datasets(preset: Preset) -> list[Cell]:
+    """The cells of all datasets that experiments may need."""
+    usual = [scene_cell(preset, *rock) for rock in (*preset.rocks, *preset.others)]
+    return usual + [cell for experiment in EXPERIMENTS.values() for cell in experiment.data(preset)]
 
 
 def rows_done(out: Path, preset: Preset) -> dict[str, list[Row]]:

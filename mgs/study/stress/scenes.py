@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mgs.study.stress.experiment import Experiment, Panel, rock_cell, turns
-from mgs.study.stress.lab import Preset, greedy, open_lab
+from mgs.study.stress.lab import Preset, by_policy, open_lab
 from mgs.study.stress.verdict import Claim, Effects, paired
 from mgs.study.sweep import Cell
 
@@ -18,13 +18,8 @@ def scenes(root: Path, out: Path, scene: str, kind: str, turns_: int) -> dict[st
     """Models of eight images, four of them seeds, chosen by each policy. kind: "usual" or "hard", for the claims."""
     lab, rows = open_lab(root, scene), []
     for suffix, turn in turns(turns_):
-        seeds = lab.even(4, turn)
-        for policy in POLICIES:
-            views = greedy(lab, seeds, range(len(lab.frames)), VIEWS - len(seeds), policy)
-            quality = lab.quality(lab.fit(views).gaussians)
-            rows.append({
-                "run": f"{scene}, {suffix}", "scene": scene.rpartition("-")[0], "kind": kind, "policy": policy, **quality,
-            })  # fmt: skip
+        known = {"run": f"{scene}, {suffix}", "scene": scene.rpartition("-")[0], "kind": kind}
+        rows += [known | row for row in by_policy(lab, lab.even(4, turn), VIEWS, POLICIES)]
     return {"rows": rows}
 
 
