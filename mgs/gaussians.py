@@ -6,7 +6,7 @@ but inside `mgs.splat`, where they are Dr.Jit tensors.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -83,6 +83,12 @@ class Gaussians:
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""
         return round(self.sh.shape[1] ** 0.5) - 1
+
+    def with_degree(self, degree: int) -> Gaussians:
+        """The same Gaussians (NumPy fields) with the further coefficients of an SH degree that is not lower, which are 0."""
+        sh = np.zeros((len(self), (degree + 1) ** 2, 3), np.float32)
+        sh[:, : self.sh.shape[1]] = self.sh
+        return replace(self, sh=sh)
 
     @property
     def rgb(self) -> np.ndarray:

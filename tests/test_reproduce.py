@@ -14,8 +14,8 @@ from mgs.cli.app import main
 from mgs.data.dataset import TEST_FOLDER, load_dataset
 from mgs.errors import InputError
 from mgs.files import write_json
-from mgs.study import reproduce, tasks
-from mgs.study.reproduce import Preset, Rock, Run, Size
+from mgs.study import free_fit, reproduce, tasks
+from mgs.study.reproduce import FREE_FIT, Preset, Rock, Run, Size
 from mgs.study.reproduce_figures import curves_figure, pools_figure, seeds_figure
 from mgs.study.reproduce_results import (
     curve_rows,
@@ -108,6 +108,20 @@ def test_a_timed_run_has_a_process_of_its_own(quick, tmp_path):
     assert 100 < found["peak_megabytes"] < 4000
 
 
+def test_a_free_fit_is_measured_on_all_views(quick, tmp_path, monkeypatch):
+    monkeypatch.setattr(free_fit, "in_own_process", lambda task, out, *arguments: task(*arguments))  # it would not see PASSES
+    monkeypatch.setattr(free_fit, "PASSES", 3)
+    *before, cell = Run(Rock("boulder", 1), SIZE, FREE_FIT, seeds=SIZE.frames, budget=0, timed=True).cells()
+    found = run_cells(tmp_path, [*before, cell], silent)[cell.name]
+    assert cell.alone
+    assert found["images"] == found["all"]["count"] == SIZE.frames
+    assert found["test"]["count"] == SIZE.test_views
+    assert found["held_out"]["psnr"] is None
+    assert found["choice_seconds"] is None
+    assert found["all"]["psnr"] > 15
+    assert found["seconds"] > 0
+
+
 def test_what_a_timed_run_raises_comes_through(quick, tmp_path):
     run = Run(Rock("boulder", 1), SIZE, "nonsense", budget=1, timed=True)
     with pytest.raises(InputError, match="--policy nonsense: unknown"):
@@ -124,12 +138,14 @@ def timed(root, out, dataset, prior, settings):
 
 def test_table_1_has_equal_counts_and_the_papers_rows(quick, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(tasks, "time_policy", timed)
+    monkeypatch.setattr(free_fit, "time_free_fit", timed)
     monkeypatch.setattr(reproduce, "FEWER_IMAGES", 1)
     out = tmp_path / "out"
     done(capsys, out, "--only", "table1")
     rows = {row["row"]: row for row in rows_of(out / "results/table1.csv")}
-    assert list(rows) == ["d-optimal", "random, draw 1", "random, draw 2", "coverage, fewer images", "all views"]
-    assert [row["images"] for row in rows.values()] == ["6", "6", "6", "5", "8"]
+    policies = ["d-optimal", "random, draw 1", "random, draw 2", "coverage, fewer images", "all views", "all views, as 3DGS"]
+    assert list(rows) == policies
+    assert [row["images"] for row in rows.values()] == ["6", "6", "6", "5", "8", "8"]
     text = (out / "results/table1.md").read_text()
     assert "| the paper's D-Optimal NBV, on its rock | 54 | – | – | – | 25.97 | 0.9654 |" in text
     assert "| d-optimal | 6 | 20.20 | 0.9000 | 22.00 | 20.20 | 0.9000 | 20.20 | 0.50 | 12 | 513 |" in text

@@ -125,7 +125,7 @@ def test_a_sun_that_moved_is_measured_and_judged(root, monkeypatch, tmp_path):
 def test_higher_degrees_start_as_the_same_picture(root):
     lab = open_lab(root, "rock")
     start = lab.start(lab.even(4))
-    assert lab.quality(specular.with_degree(start, 3)) == pytest.approx(lab.quality(start), abs=1e-3)
+    assert lab.quality(start.with_degree(3)) == pytest.approx(lab.quality(start), abs=1e-3)
 
 
 def test_errors_are_told_by_the_angle_between_sun_and_camera(root):

@@ -37,8 +37,9 @@ TABLE_POLICIES = (
 )  # fmt: skip
 """Rows of Table I."""
 
-ALL_VIEWS, FEWER = "all views", "coverage, fewer images"
-"""Rows of Table I that are no policies: `uniform` until no frame is left; and as the paper counts, 54 images against 50."""
+ALL_VIEWS, FEWER, AS_3DGS = "all views", "coverage, fewer images", "all views, as 3DGS"
+"""Rows of Table I that are no policies: `uniform` until no frame is left; as the paper counts, 54 images against 50; and a fit
+that is not held to a surface (`mgs.study.free_fit`)."""
 
 FEWER_IMAGES = 4
 """By how many images coverage has fewer there."""
@@ -142,12 +143,12 @@ class Run:
             arc = {"ring": survey, "every": pool["every"]}
             cells.append(Cell(f"dataset/{self.rock.name}/arc-{shape}", "mgs.study.tasks:make_arc", arc, (survey,)))
         dataset, prior_name = cells[-1 if "every" in pool else 0].name, cells[1].name
-        task = f"mgs.study.{'oracle:run_oracle' if self.policy == ORACLE else 'tasks:run_policy'}"
+        task = OTHER_TASKS.get(self.policy, "mgs.study.tasks:time_policy" if self.timed else "mgs.study.tasks:run_policy")
         return [
             *cells,
             Cell(
                 self.name,
-                "mgs.study.tasks:time_policy" if self.timed else task,
+                task,
                 {"dataset": dataset, "prior": prior_name, "settings": self.settings()},
                 tuple(cell.name for cell in cells),
                 alone=self.timed,
@@ -164,16 +165,16 @@ class Run:
         return f"{kind}/{self.rock.name}/{self.pool.replace(' ', '-')}-{shape}/{self.policy}-{views}"
 
     def settings(self) -> dict[str, Any]:
-        """Of `mgs nbv`; those of the oracle name no policy."""
+        """Of `mgs nbv`; those of OTHER_TASKS name no policy."""
         budget = self.size.budget if self.budget is None else self.budget
-        policy = {} if self.policy == ORACLE else {"policy": self.policy}
+        policy = {} if self.policy in OTHER_TASKS else {"policy": self.policy}
         nearest = {"nearest": POOLS[self.pool]["nearest"]} if "nearest" in POOLS[self.pool] else {}
         seed = self.rock.index + 1000 * self.draw
         return {**policy, "seeds": self.seeds, "budget": budget, "seed": seed, **nearest}
 
     def command(self) -> str:
-        """The `mgs nbv` that does the same, in the study's folder. The oracle has none."""
-        if self.policy == ORACLE:
+        """The `mgs nbv` that does the same, in the study's folder. Those of OTHER_TASKS have none."""
+        if self.policy in OTHER_TASKS:
             return ""
         *_, cell = self.cells()
         options = " ".join(f"--{key} {value}" for key, value in self.settings().items())
@@ -181,8 +182,11 @@ class Run:
         return f"mgs nbv {dataset} --prior {prior} --out RUN {options}"
 
 
-ORACLE = "oracle"
-"""The policy that looks at the truth, `mgs.study.oracle`."""
+ORACLE, FREE_FIT = "oracle", "free-fit"
+"""The policy that looks at the truth, `mgs.study.oracle`, and a fit to all views, `mgs.study.free_fit`."""
+
+OTHER_TASKS = {ORACLE: "mgs.study.oracle:run_oracle", FREE_FIT: "mgs.study.free_fit:time_free_fit"}
+"""What does the cell of these, which are no policies of `mgs nbv`."""
 
 
 def table_runs(preset: Preset) -> dict[str, Run]:
@@ -196,6 +200,7 @@ def table_runs(preset: Preset) -> dict[str, Run]:
             runs[label] = Run(TABLE_ROCK, size, policy, draw=draw, timed=True)
     runs[FEWER] = Run(TABLE_ROCK, size, "coverage", budget=size.budget - FEWER_IMAGES, timed=True)
     runs[ALL_VIEWS] = Run(TABLE_ROCK, size, "uniform", budget=size.frames - SEEDS, timed=True)
+    runs[AS_3DGS] = Run(TABLE_ROCK, size, FREE_FIT, seeds=size.frames, budget=0, timed=True)
     return runs
 
 

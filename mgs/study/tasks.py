@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 import signal
+from collections.abc import Callable
 from dataclasses import asdict
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -108,17 +109,23 @@ def time_policy(root: Path, out: Path, dataset: str, prior: str, settings: dict[
     the measuring; "choice_seconds", the mean of one choice (None where none is made); "peak_megabytes", the most memory of the
     process by the end of the run. Raises InputError if that process is killed, and what it raises.
     """
+    return in_own_process(_timed, out, root, out, dataset, prior, settings)
+
+
+def in_own_process(task: Callable[..., dict[str, Any]], out: Path, *arguments: Any) -> dict[str, Any]:
+    """What a task returns that is done in a new process, so that its memory is its own. out: its cell, for messages.
+
+    Raises InputError if that process is killed, and what it raises.
+    """
     context = get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_send, args=(sender, root, out, dataset, prior, settings))
+    process = context.Process(target=_send, args=(sender, task, *arguments))
     process.start()
     sender.close()
     try:
         result = receiver.recv()
     except EOFError:
-        raise InputError(
-            f"{out / 'run'}: its process was killed (is there too little memory?); give the command again"
-        ) from None
+        raise InputError(f"{out}: its process was killed (is there too little memory?); give the command again") from None
     finally:
         process.join()
     if isinstance(result, Exception):
@@ -126,11 +133,11 @@ def time_policy(root: Path, out: Path, dataset: str, prior: str, settings: dict[
     return dict(result)
 
 
-def _send(sender: Connection, *arguments: Any) -> None:
-    """Do `_timed` in this process, which was started for it, and send what it returns or raises. Ctrl-C ends it silently."""
+def _send(sender: Connection, task: Callable[..., dict[str, Any]], *arguments: Any) -> None:
+    """Do a task in this process, which was started for it, and send what it returns or raises. Ctrl-C ends it silently."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
-        sender.send(_timed(*arguments))
+        sender.send(task(*arguments))
     except Exception as error:
         sender.send(error)
 
@@ -140,7 +147,7 @@ def _timed(root: Path, out: Path, dataset: str, prior: str, settings: dict[str, 
     from mgs.report.evaluation import evaluate_run
 
     steps = run_or_resume(root, out, dataset, prior, settings).steps
-    peak = _peak_megabytes()
+    peak = peak_megabytes()
     metrics = evaluate_run(out / "run", pictures=False)
     choices = [step["seconds"]["score"] for step in steps[1:]]
     seconds = sum(value for step in steps for stage, value in step["seconds"].items() if stage != "evaluate")
@@ -151,7 +158,7 @@ def _timed(root: Path, out: Path, dataset: str, prior: str, settings: dict[str, 
     }
 
 
-def _peak_megabytes() -> float:
+def peak_megabytes() -> float:
     """Most memory that this process has had, megabytes; not that of the process that started it, as `getrusage` may tell."""
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) * 1.024e-3

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +33,6 @@ VIEWS, SEEDS = 8, 4
 
 BIN = 30
 """Degrees: angles are rounded to multiples of it."""
-
-
-def with_degree(gaussians: Gaussians, degree: int) -> Gaussians:
-    """The same Gaussians, with the further coefficients of a higher SH degree, which are 0."""
-    sh = np.zeros((len(gaussians), (degree + 1) ** 2, 3), np.float32)
-    sh[:, : gaussians.sh.shape[1]] = gaussians.sh
-    return replace(gaussians, sh=sh)
 
 
 def errors_by_angle(lab: Lab, model: Gaussians, views: Sequence[int], sun: float) -> list[Row]:
@@ -86,7 +78,7 @@ def specular(root: Path, out: Path, scene: str, turns_: int) -> dict[str, Any]:
 def _fits(lab: Lab, taken: Sequence[int], degrees: Sequence[int]) -> list[Gaussians]:
     """A model of each SH degree."""
     start = lab.start(taken)
-    return [lab.fit(taken, start=with_degree(start, degree)).gaussians for degree in degrees]
+    return [lab.fit(taken, start=start.with_degree(degree)).gaussians for degree in degrees]
 
 
 def _qualities(lab: Lab, taken: Sequence[int], models: Sequence[Gaussians]) -> list[Row]:
