@@ -256,7 +256,8 @@ def small_study(dataset, tmp_path, monkeypatch):
     monkeypatch.setitem(plan.PLANS, "quick", TINY)
     monkeypatch.setattr(fit, "factors", lambda plan, halves: some)
     monkeypatch.setattr(scoring, "STATES", (2, 3))
-    known, few = scoring.variants, ("exact", "block", "size 1/2", "1/2 of Gaussians", "stale 2", "lazy 2", "directional-d")
+    few = ("exact", "block", "size 1/2", "1/2 of Gaussians", "incremental", "stale 2", "lazy 2", "directional-d")
+    known = scoring.variants
     monkeypatch.setattr(scoring, "variants", lambda plan: {name: known(plan)[name] for name in few})
     monkeypatch.setattr(timing, "_reference", lambda: lambda: sum(range(1000)))
 
@@ -295,6 +296,7 @@ def test_a_chart_is_measured_once_and_written(small_study, capsys):
     assert by_name["exact"]["regret"] == 0
     assert by_name["size 1/2"]["tau"] > 0.5
     assert by_name["lazy 2"]["regret"] < 0.2
+    assert by_name["incremental"]["tau"] > 0.3
     fits = written["fit"]["rows"]
     assert [row["total_passes"] for row in fits[:2]] == [2, 2]
     assert any(row["front"] for row in fits)

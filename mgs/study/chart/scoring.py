@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.stats import kendalltau
 
 from mgs.active.criteria import d_optimal
+from mgs.active.run_folder import read_checkpoint
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
@@ -43,7 +44,7 @@ class State:
 
     def __init__(self, root: Path, dataset: str, prior: str, runs: Path, step: int, age: int) -> None:
         from mgs.active.loop import Loop
-        from mgs.active.run_folder import read_checkpoint, read_settings
+        from mgs.active.run_folder import read_settings
         from mgs.active.stations import real_stations
         from mgs.prior.build import load_prior
         from mgs.splat import ListCache
@@ -61,6 +62,7 @@ class State:
         )
         self.cameras, self.cache = [frame.camera for frame in data.frames], ListCache()
         self.left = [i for i in range(len(data)) if i not in self.taken]
+        self.folders = [runs / str(k) for k in range(step + 1)]
         stations = real_stations(data, load_prior(root / prior), settings)
         self.loop = Loop(runs / "run", settings, data, stations, lambda *_: None)
         self.lam = settings.regularisation(stations.groups)
@@ -69,6 +71,17 @@ class State:
     def old_information(self) -> NDArray[np.float64]:
         """Information of the views taken by now, measured at the older model."""
         return self.summed(self.taken, model=self.old)
+
+    @functools.cached_property
+    def first_information(self) -> NDArray[np.float64]:
+        """Information of the views taken by now, that of each as it was measured at the first model that was fitted to it."""
+        parts, known = [], 0
+        for folder in self.folders:
+            then = read_checkpoint(folder)
+            assert then is not None
+            parts.append(self.summed(then.taken[known:], model=then.gaussians))
+            known = len(then.taken)
+        return np.sum(parts, axis=0)
 
     @functools.cached_property
     def old_scores(self) -> NDArray[np.float64]:
@@ -115,6 +128,11 @@ def stale(state: State) -> NDArray[np.float64]:
     return np.array([d_optimal(state.information(i), state.old_information, state.lam) for i in state.left])
 
 
+def incremental(state: State) -> NDArray[np.float64]:
+    """Scores where information of each view taken is measured once, when it is taken; that of the candidates is new."""
+    return np.array([d_optimal(state.information(i), state.first_information, state.lam) for i in state.left])
+
+
 def lazy(state: State) -> NDArray[np.float64]:
     """Candidates in the order of their old scores, scored anew until the best new score is above the next old one.
 
@@ -158,6 +176,7 @@ def variants(plan: Plan) -> dict[str, tuple[str, Score]]:
     for part in (2, 4, 10):
         found[f"1/{part} of Gaussians"] = ("subset", partial(of_subset, share=1 / part))
     found["colour only"] = ("columns", partial(scored, columns=slice(0, 3)))
+    found["incremental"] = ("stale", incremental)
     for age in AGES:
         found[f"stale {age}"], found[f"lazy {age}"] = ("stale", stale), ("lazy", lazy)
     for name in ("coverage", "directional-d", "directional-i"):
