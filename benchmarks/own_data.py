@@ -26,7 +26,7 @@ from mgs.active.pose_policies import seed_views
 from mgs.active.settings import TrainSettings
 from mgs.cli.dataset import UNCERTAINTY
 from mgs.colour import srgb_from_linear
-from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
+from mgs.data.dataset import Dataset, Frame, load_dataset
 from mgs.data.importers import import_source, read_source
 from mgs.data.masks import make_masks
 from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh
@@ -43,16 +43,21 @@ VIEWS = 12
 GAUSSIANS = 4_000
 DOWNSCALE = 2
 
+GIVEN, PROJECTED, REFINED = "given", "of the prior", "of the prior, refined"
+"""Where masks come from."""
+
 WAYS = (
-    ("colmap-binary", "points", True),
-    ("colmap-binary", "hull", True),
-    ("colmap-binary", "points", False),
-    ("nerfstudio", "points", True),
-    ("nerfstudio", "points", False),
-    ("nerf-synthetic", "hull", True),
-    ("rgbd", "depth", True),
+    ("colmap-binary", "points", GIVEN),
+    ("colmap-binary", "hull", GIVEN),
+    ("colmap-binary", "points", PROJECTED),
+    ("colmap-binary", "points", REFINED),
+    ("nerfstudio", "points", GIVEN),
+    ("nerfstudio", "points", PROJECTED),
+    ("nerfstudio", "points", REFINED),
+    ("nerf-synthetic", "hull", GIVEN),
+    ("rgbd", "depth", GIVEN),
 )
-"""Kind of data, source of the prior, and whether the masks are given, or made of the prior."""
+"""Kind of data, source of the prior, and where the masks come from."""
 
 
 def photographs() -> Any:
@@ -110,18 +115,15 @@ def overlap(frames: Sequence[Frame], judged: Sequence[Frame]) -> float:
     return float(np.mean([(a & b).sum() / (a | b).sum() for a, b in pairs]))
 
 
-def way(data: Path, work: Path, kind: str, source: str, given: bool, exact: Prior) -> dict[str, Any]:
-    """One record: a kind of data, the source of the prior, with the masks given or made."""
+def way(data: Path, work: Path, kind: str, source: str, masks: str, exact: Prior) -> dict[str, Any]:
+    """One record: a kind of data, the source of the prior, and where the masks come from."""
     settings, truth = PriorSettings(gaussians=GAUSSIANS), json.loads((data / "truth.json").read_text())
     judged = imported(data, work / "judged", True)
-    dataset = judged if given else imported(data, work / "bare", False)
+    dataset = judged if masks == GIVEN else imported(data, work / "bare", False)
     prior, _ = build_prior(dataset, settings, source=source)
-    record: dict[str, Any] = {"kind": kind, "from": source, "masks": "given" if given else "of the prior"}
-    if not given:
-        outlines = make_masks(dataset, prior.mesh, 0.0, refine=False)
-        record["masks_overlap_unrefined"] = overlap(outlines.frames, judged.frames)
-        write_transforms(dataset.root, dataset.frames, dataset.up, dataset.unit)  # without those masks
-        dataset = make_masks(load_dataset(dataset.root), prior.mesh, UNCERTAINTY * prior.depth_tolerance)
+    record: dict[str, Any] = {"kind": kind, "from": source, "masks": masks}
+    if masks != GIVEN:
+        dataset = make_masks(dataset, prior.mesh, UNCERTAINTY * prior.depth_tolerance, refine=masks == REFINED)
         record["masks_overlap"] = overlap(dataset.frames, judged.frames)
     rock = read_mesh(data / "truth.ply")
     distance = distances_to_mesh(prior.points, rock.vertices, rock.faces) / truth["scale"]
@@ -141,8 +143,8 @@ def main(root: Path, out: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for kind in dict.fromkeys(kind for kind, _, _ in WAYS):
             make.make(root, Path(folder) / kind, kind)
-        for k, (kind, source, given) in enumerate(WAYS):
-            records.append(way(Path(folder) / kind, Path(folder) / f"way{k}", kind, source, given, exact))
+        for k, (kind, source, masks) in enumerate(WAYS):
+            records.append(way(Path(folder) / kind, Path(folder) / f"way{k}", kind, source, masks, exact))
             print(records[-1], flush=True)
     result = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
     size = {"views": VIEWS, "gaussians": GAUSSIANS, "downscale": DOWNSCALE}

@@ -549,3 +549,19 @@ def test_photographs_repeat_by_seed(exact: Path, photographs: ModuleType, tmp_pa
     assert texts[0] == texts[1] != texts[2]
     assert clouds[0] == clouds[1] != clouds[2]
     assert json.loads(texts[0])["k1"] == photographs.DISTORTION[0]
+
+
+def test_a_part_with_few_points_belongs_to_the_object_above_the_ground():
+    """Few points in shade are no cluster of their own; other things, farther off, stay out."""
+    from mgs.prior.points import _grown
+
+    rng = np.random.default_rng(0)
+    lit = rng.uniform([0, 0, 0], [1, 1, 1], (800, 3))
+    shade = rng.uniform([1, 0, 0], [1.3, 1, 0.02], (40, 3))
+    elsewhere = rng.uniform([2, 0, 0], [2.2, 0.2, 0.2], (60, 3))
+    lonely = np.array([[0.5, 0.5, 1.4]])
+    points = np.concatenate([lit, shade, elsewhere, lonely])
+    grown = _grown(points, np.arange(len(points)) < 800)
+    assert grown[:800].all()
+    assert grown[800:840].mean() > 0.95
+    assert not grown[840:].any()

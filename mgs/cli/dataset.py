@@ -10,7 +10,7 @@ import typer
 
 UNCERTAINTY = 2.0
 """By how much a prior may be wrong, over its depth tolerance, where masks are made of it. benchmarks/own_data.py measures what
-the refinement gains."""
+the refinement loses or gains."""
 
 
 class Action(StrEnum):
@@ -26,15 +26,15 @@ def dataset(
     ],
     path: Annotated[Path, typer.Argument(help="Folder of the dataset.")],
     prior: Annotated[Path | None, typer.Option(help="masks: the prior to project. Default: DATASET/prior.")] = None,
-    refine: Annotated[bool, typer.Option(help="masks: move outlines to where colours change, near the prior's.")] = True,
+    refine: Annotated[bool, typer.Option(help="masks: move outlines to where colours change, near the prior's.")] = False,
 ) -> None:
     """Check that every file of a dataset can be read and has the right size, and that colour, depth, masks and poses agree.
 
     Prints every problem and its cure. The exit code is 2 where there is one. Test views are a dataset of their own: give
     DATASET/test.
 
-    `mgs dataset masks DATASET` makes masks for a dataset that has none: it projects the prior into every image, moves the
-    outlines to where colours change, writes masks/, and masks.png for a person to look at.
+    `mgs dataset masks DATASET` makes masks for a dataset that has none: it projects the prior into every image, with --refine
+    moves the outlines to where colours change, writes masks/, and masks.png for a person to look at.
     """
     if action == Action.masks:
         _make_masks(path, path / "prior" if prior is None else prior, refine)

@@ -1,5 +1,9 @@
-"""Masks where there are none: a mesh of the object is projected into the photographs, and its outline moved to where colours
-change (GrabCut, Rother et al. 2004, by OpenCV), within a band as wide as the mesh may be wrong."""
+"""Masks where there are none: a mesh of the object is projected into the photographs.
+
+Its outline can be moved to where colours change (GrabCut, Rother et al. 2004, by OpenCV), within a band as wide as the mesh may
+be wrong. Where that cuts off a part of the object, a fit learns that nothing is there, which costs more than an outline that is
+a little too wide (benchmarks/own_data.py).
+"""
 
 from __future__ import annotations
 
@@ -64,13 +68,13 @@ def make_masks(
     mesh: Mesh,
     uncertainty: float,
     *,
-    refine: bool = True,
+    refine: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Dataset:
     """Write a mask for each frame of a dataset from a mesh of its object, and a contact sheet of them; transforms.json last.
 
-    uncertainty: by how much the mesh may be wrong, in units of the world: the half width of the band of `refined_mask`. refine:
-    False leaves the outlines of the mesh as they are. progress: called as progress(frames done, all frames).
+    uncertainty: by how much the mesh may be wrong, in units of the world: with `refine` the half width of the band in which
+    outlines move (`refined_mask`). progress: called as progress(frames done, all frames).
     Raises InputError if a frame has a mask already, if the mesh is in no image, or if a file cannot be read or written.
     """
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba

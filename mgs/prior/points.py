@@ -49,6 +49,11 @@ JOINED = 4.0
 """Clusters with points nearer to each other than this many distances between neighbouring points are one: texture that comes
 and goes makes several of one object."""
 
+GROWN, GROWN_NEIGHBOURS = 0.15, 4
+"""Above a ground plane, points that are joined to the cluster belong to it too: DBSCAN with eps this share of the cluster's
+extent, and min_samples. A part with few points, for instance in shade, is no cluster of its own, but nothing else stands
+there."""
+
 PLANE_VOXEL = 0.25
 """What the ground plane takes for the voxel of a cloud, over the distance between its points: points of a fused cloud are as
 far from the plane as their voxels are large, triangulated ones are better than they are dense."""
@@ -177,5 +182,17 @@ def _cluster_looked_at(cloud: Cloud, frames: Sequence[Frame], plane: Plane | Non
     height = np.ones(len(away)) if plane is None else plane.height(cloud.points)
     kept = (away < REACH) & (height > (0 if plane is None else plane.tolerance))
     inside, clusters = main_cluster(cloud.points[kept], (height * (1 - np.minimum(away / REACH, 1)))[kept])
+    if plane is not None and inside.sum() >= LEAST_POINTS:
+        inside = _grown(cloud.points[kept], inside)
     kept[kept] = inside
     return kept, clusters
+
+
+def _grown(points: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Which points [N,3] above the ground belong to a cluster [N] bool, or are joined to it (GROWN)."""
+    from sklearn.cluster import DBSCAN
+
+    eps = GROWN * float(np.ptp(points[inside], axis=0).max())
+    labels = DBSCAN(eps=eps, min_samples=GROWN_NEIGHBOURS).fit_predict(points)
+    found = labels[inside & (labels >= 0)]
+    return inside | (labels == np.bincount(found).argmax()) if len(found) else inside

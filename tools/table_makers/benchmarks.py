@@ -250,17 +250,9 @@ def own_data(data: dict[str, Any]) -> str:
     rows = []
     for row in data["records"]:
         cells = [f"{row[key]:.2f} ({row[loss]:+.2f})" for key, loss in (("psnr", "loss"), ("psnr_rock", "loss_rock"))]
-        overlaps = (row.get(key) for key in ("masks_overlap_unrefined", "masks_overlap"))
-        overlap = ", ".join("" if value is None else f"{value:.3f}" for value in overlaps).strip(", ")
-        cells += [f"{1e3 * row['accuracy']:.0f} mm", overlap]
+        cells += [f"{1e3 * row['accuracy']:.0f} mm", f"{row['masks_overlap']:.3f}" if "masks_overlap" in row else ""]
         rows.append([f"{row['kind']}: {row['from']}, masks {row['masks']}", *cells])
-    heading = [
-        "data, prior from",
-        "all pixels, dB",
-        "inside the rock, dB",
-        "accuracy",
-        "overlap of made masks, before and after",
-    ]
+    heading = ["data, prior from", "all pixels, dB", "inside the rock, dB", "accuracy", "overlap of made masks"]
     return markdown(heading, rows) + made_by(data)
 
 
