@@ -29,6 +29,9 @@ PAIRS = (
 )
 """Pairs of policies, named before anything was measured, whose difference is tested."""
 
+LEADER = "directional-i"
+"""The policy whose difference from every other is told for each pool."""
+
 DRAWS = 3
 """Runs of the policy `random` for one row of a table."""
 

@@ -135,8 +135,9 @@ def seed_rows(found: Found, runs: Sequence[Run]) -> Rows:
 
 
 def pool_rows(found: Found, runs: Sequence[Run], oracle: Sequence[Run]) -> Rows:
-    """A row for each pool and policy: the last model, its difference from the mean of the draws of `random`, and the share of
-    what the oracle gains over `random` that it gets; None without an oracle, or where that gains nothing."""
+    """A row for each pool and policy: the last model, its difference from the mean of the draws of `random`, by how much the
+    LEADER is ahead of it, and the share of what the oracle gains over `random` that it gets. None: without an oracle or a
+    leader, or where the oracle gains nothing."""
     rows: Rows = []
     policies = list(dict.fromkeys(run.policy for run in [*runs, *oracle]))
     for pool in reproduce.POOLS:
@@ -151,6 +152,9 @@ def pool_rows(found: Found, runs: Sequence[Run], oracle: Sequence[Run]) -> Rows:
                 gained = paired(mean[policy], mean["random"])
                 won = float(np.mean(paired(mean[ORACLE], mean["random"]))) if ORACLE in mean else 0.0
                 row |= flat(key, [mean[policy][k] for k in sorted(mean[policy])]) | flat(f"{key}_over_random", gained)
+                led = paired(mean[reproduce.LEADER], mean[policy]) if reproduce.LEADER in mean else []
+                if policy != reproduce.LEADER and led:
+                    row |= flat(f"{key}_led", led)
                 row[f"{key}_share"] = float(np.mean(gained)) / won if won > 0 else None
             rows.append(row)
     return rows

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mgs.report.tables import table_cell
+from mgs.study.reproduce import LEADER
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -82,9 +83,18 @@ def pools_markdown(rows: Rows) -> str:
     lines = []
     for row in rows:
         over = ["–"] * 2 if row["policy"] == "random" else [_with_interval(row, key) for key in _over("random")]
+        led = _with_interval(row, "test_psnr_led") if "test_psnr_led" in row else "–"
         share = "–" if row["test_psnr_share"] is None else f"{row['test_psnr_share']:.0%}"
-        lines.append([row["pool"], row["policy"], f"{row['test_psnr']:.2f}", *over, share])
-    heading = ["pool", "policy", "test views (dB)", "over random (dB)", "rock (dB)", "share of the oracle's"]
+        lines.append([row["pool"], row["policy"], f"{row['test_psnr']:.2f}", *over, led, share])
+    heading = [
+        "pool",
+        "policy",
+        "test views (dB)",
+        "over random (dB)",
+        "rock (dB)",
+        f"{LEADER} over it (dB)",
+        "share of the oracle's",
+    ]
     return _markdown(heading, lines)
 
 
