@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from splat.scenes import calm, make_camera, make_gaussians
 
 from mgs.active import run_folder
-from mgs.data.dataset import Frame
+from mgs.data.dataset import Dataset, Frame
 from mgs.errors import InputError
 from mgs.images import write_png
 from mgs.report import calibration, predicted_error
@@ -147,16 +147,10 @@ def test_sigma_of_maps_has_their_shape():
         (list("abcdefgh"), "frozen", "was trained on all views there are"),
     ],
 )
-def test_runs_that_cannot_be_calibrated(trained, means, said):
-    class Views:
-        frames = tuple(Frame(name, make_camera(), 0.0, None, None, None) for name in "abcdefgh")
-
-        @staticmethod
-        def test_views():
-            return None
-
+def test_runs_that_cannot_be_calibrated(trained, means, said, tmp_path):
+    dataset = Dataset(tmp_path, tuple(Frame(name, make_camera(), 0.0, None, None, None) for name in "abcdefgh"))
     settings = run_folder.NbvSettings(
         dataset="d", prior="p", train={"means": means, "rates": {"mean": 1}}, prior_std={"mean": 1}
     )
     with pytest.raises(InputError, match=said):
-        predicted_error._views("run", settings, Views, trained)
+        predicted_error._views("run", settings, dataset, trained)

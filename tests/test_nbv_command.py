@@ -114,10 +114,10 @@ def test_a_quality_that_could_not_be_measured_is_a_dash(dataset, tmp_path):
     console = Console(record=True, width=500)
     print_run(tmp_path, state, {"all": views, "held_out": {"count": 0}}, console)
     text = "(2): PSNR 30.12 dB, SSIM 0.9500; inside the rock mask PSNR – dB, SSIM –"
-    assert f"all views {text}" in console.export_text(clear=False)
+    assert f"views trained on {text}" in console.export_text(clear=False)
     assert "test views" not in console.export_text()
     print_run(tmp_path, state, {"all": views, "held_out": {"count": 0}, "test": views}, console)
-    assert f"test views {text}\nall views {text}" in console.export_text()
+    assert f"test views {text}\nviews trained on {text}" in console.export_text()
 
 
 @pytest.mark.parametrize("name", ["kf_{}", "DJI_20231105103211_000{}_W_some_flight", "frame {} of the [second] flight"])

@@ -148,7 +148,7 @@ def test_report_writes_every_figure(runs, tmp_path, drawn):
 
 def test_unseen_view(runs):
     read = [read_run(folder) for folder in runs]
-    index = writing.unseen_view(read, tiny.FRAMES)
+    index = writing.unseen_view(read, range(tiny.FRAMES))
     counts = [sum(i in run.seeds + run.chosen for run in read) for i in range(tiny.FRAMES)]
     assert counts[index] == min(counts)
 
@@ -221,7 +221,7 @@ def test_a_run_that_was_not_measured_on_the_test_views_is_compared_on_the_others
     writing.write_report(tmp_path / "report", [tested[0], run])
     assert drawn["psnr.png"].axes[0].get_ylabel() == "PSNR, all views (dB)"
     read = [read_run(folder) for folder in (tested[0], run)]
-    shown = f"kf_{writing.unseen_view(read, tiny.FRAMES):04d}"
+    shown = f"kf_{writing.unseen_view(read, range(tiny.FRAMES)):04d}"
     assert drawn["comparison.png"].axes[0].get_title() == f"truth\n{shown}"
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from mgs.active import criteria, detectors, directional, inputs, policies, policy_file, pose_policies
 from mgs.active.outlook import Outlook
-from mgs.active.run_folder import State, check_settings, read_checkpoint, write_checkpoint, write_steps
+from mgs.active.run_folder import DATASET, State, check_settings, read_checkpoint, write_checkpoint, write_steps
 from mgs.active.settings import NbvSettings, TrainSettings
 from mgs.active.stopping import StopReason, diverged, run_end
 from mgs.camera import Camera
@@ -71,6 +71,7 @@ class Stations:
     on_surface: how many of the Gaussians, the first, lie on the surface, so are what coverage is a share of; None: all.
     up: unit vector that points upwards in the world: azimuths are angles about it.
     prior: hash of what `initial` starts from (`mgs.active.inputs.prior_digest`).
+    capture(frames): have their images made where they do not exist yet; called before the first of them is read.
     """
 
     centre: np.ndarray
@@ -86,6 +87,7 @@ class Stations:
     on_surface: int | None = None
     up: Up = PLUS_Z
     prior: str = ""
+    capture: Callable[[Sequence[Frame]], None] = lambda frames: None
 
 
 @dataclass
@@ -121,7 +123,7 @@ def run(
     """
     check_settings(settings, len(dataset))
     with locked(out):
-        for leftover in out.glob(".*.part*"):  # of a killed write
+        for leftover in [*out.glob(".*.part*"), *(out / DATASET).rglob(".*.part*")]:  # of a killed write
             leftover.unlink()
         known = read_checkpoint(out)
         if known is not None:
@@ -159,11 +161,11 @@ class Loop:
         cameras = {frame.name: inputs.camera_digest(frame.camera) for frame in self.frames}
         self.made_from = {"prior": stations.prior, "cameras": cameras, **inputs.policy_record(settings.policy)}
         self.seeds = pose_policies.seed_views(self.positions, self.centre, settings.seeds)
+        stations.capture([self.frames[i] for i in self.seeds])
         self.start = stations.initial([self.frames[i] for i in self.seeds])
         self.policy = policies.policy_named(settings.policy)
         self.seen, self.dome = cache(self._seen), cache(self._dome)  # they depend on poses and surface alone
-        self.before_fit = cache(self._before_fit)  # and these on the images, too
-        self.coloured = lru_cache(maxsize=2)(self._coloured)
+        self.before_fit, self.coloured = cache(self._before_fit), lru_cache(maxsize=2)(self._coloured)  # on images, too
 
     def check(self, state: State) -> None:
         """Raises InputError where a state is not of this run: where its means, which a fit leaves alone, are not the prior's;
@@ -307,6 +309,7 @@ class Loop:
         step, taken, new = known["step"], planned.taken, planned.taken[len(state.taken) :]
         watch = _Stopwatch(known["seconds"])
         with watch("capture"):
+            self.stations.capture([self.frames[i] for i in new])
             for i in new:
                 self.image(i)
             gains = self.stations.exposure([self.frames[i] for i in taken]) if self.stations.exposure else None
@@ -388,10 +391,8 @@ class Loop:
 
 
 def target_of(frame: Frame) -> np.ndarray:
-    """What a frame is fitted to: [H,W,4], the colour and the weight of `Frame.target`.
-
-    Raises InputError where the mask is empty: a fit to black would hide the rock.
-    """
+    """What a frame is fitted to: [H,W,4], the colour and the weight of `Frame.target`. Raises InputError where the mask is
+    empty: a fit to black would hide the rock."""
     if not frame.mask().any():
         raise InputError(f"{frame.mask_path}: the rock mask of frame {frame.name} is empty; correct it, or remove the frame")
     rgba, weight = frame.target()

@@ -6,16 +6,24 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
+from mgs import runtime
 from mgs.active import loop
 from mgs.active.policy_file import absolute
-from mgs.active.run_folder import State, check_same_frames, check_settings, read_settings, start
+from mgs.active.run_folder import DATASET, State, check_same_frames, check_settings, read_settings, start
 from mgs.active.settings import PRESETS, NbvSettings, validated, with_preset
 from mgs.active.stations import real_stations
-from mgs.data.dataset import load_dataset
+from mgs.data.dataset import Dataset, load_dataset
 from mgs.errors import InputError, row_named
 from mgs.files import atomic_folder
 from mgs.prior.build import build_prior, load_prior, save_prior
 from mgs.prior.settings import PriorSettings
+from mgs.synth.scene_file import load_scene_file
+
+CAPTURE_PRESET = "quick"
+"""Size and number of the images that a run captures, a row of `mgs.synth.rendering.PRESETS`."""
+
+CAPTURE_TEST_VIEWS = 12
+"""Number of test views that judge a run with captured images, which has no view that is held out."""
 
 
 def _silent(*_: Any) -> None:
@@ -23,9 +31,10 @@ def _silent(*_: Any) -> None:
 
 
 def run_nbv(
-    dataset: str | Path,
+    dataset: str | Path | None,
     out: str | Path,
     *,
+    capture: str | Path | None = None,
     prior: str | Path | None = None,
     gaussians: int | Literal["auto"] | None = None,
     preset: str | None = None,
@@ -36,21 +45,22 @@ def run_nbv(
 ) -> State:
     """Choose views one by one, as the paper does: `start_run`, then `resume_nbv`.
 
-    dataset: a dataset folder. out: the run's folder, new. prior, gaussians, settings: see `start_run`.
+    dataset: a dataset folder. out: the run's folder, new. capture, prior, gaussians, preset, settings: see `start_run`.
     on_step(state): called after every step, or batch of steps, that is finished and on disk; state.steps[-1] is its (last) line
     of steps.jsonl.
     progress(stage, done, total): called while a step is worked on. say(text): called with what a person should know.
     Returns the last state: gaussians, H, taken (frame indices in the order of their choice), steps.
     Raises InputError as `start_run` and `resume_nbv`.
     """
-    start_run(dataset, out, prior=prior, gaussians=gaussians, preset=preset, progress=progress, **settings)
+    start_run(dataset, out, capture=capture, prior=prior, gaussians=gaussians, preset=preset, progress=progress, **settings)
     return resume_nbv(out, on_step=on_step, progress=progress, say=say)
 
 
 def start_run(
-    dataset: str | Path,
+    dataset: str | Path | None,
     out: str | Path,
     *,
+    capture: str | Path | None = None,
     prior: str | Path | None = None,
     gaussians: int | Literal["auto"] | None = None,
     preset: str | None = None,
@@ -59,14 +69,21 @@ def start_run(
 ) -> NbvSettings:
     """Check everything, find or build the prior, and write the run's config.json with every setting resolved.
 
+    capture: a scene (`mgs.synth.scene_file.load_scene_file`) in place of a dataset, which is None then. The run has a dataset
+    of its own, OUT/dataset, as `mgs synth-orbit --on-demand` writes it with the run's seed: the poses of the scene's orbit,
+    images of which are rendered when they are chosen, and CAPTURE_TEST_VIEWS test views.
     prior: folder of a prior; without it DATASET/prior where there is one, otherwise a prior is built inside the run, of this
-    many `gaussians` (`mgs.prior.settings.PriorSettings`; by default, one per pixel's footprint on the rock). preset: a row of
-    `mgs.active.settings.PRESETS`, whose values are the defaults of what is not given. settings: fields of
-    `mgs.active.settings.NbvSettings`; the budget is 50 views, or all candidates where they are fewer.
+    many `gaussians` (`mgs.prior.settings.PriorSettings`; by default, one per pixel's footprint on the rock); of an on-demand
+    dataset it is built of its survey. preset: a row of `mgs.active.settings.PRESETS`, whose values are the defaults of what is
+    not given. settings: fields of `mgs.active.settings.NbvSettings`; the budget is 50 views, or all candidates where they are
+    fewer.
     Leaves no folder behind where it fails. Raises InputError where the output folder is not empty, a setting is wrong, the
-    dataset is too small for it, or the dataset or the prior is missing or damaged.
+    dataset is too small for it, or the dataset, the scene or the prior is missing or damaged.
     """
-    dataset, out = Path(dataset), Path(out)
+    out = Path(out)
+    if (dataset is None) == (capture is None):
+        raise InputError("nbv: give either a DATASET or --capture SCENE")
+    dataset = out / DATASET if dataset is None else Path(dataset)
     if prior is not None and gaussians is not None:
         raise InputError("nbv: --gaussians is for a prior that is built here; leave it out, or leave out --prior")
     if prior is None and gaussians is None and (dataset / "prior/prior.json").is_file():
@@ -75,23 +92,45 @@ def start_run(
     settings = settings if row is None else with_preset(row, settings)
     where = out / "prior" if prior is None else Path(prior)
     given = validated(NbvSettings, {"dataset": dataset.resolve(), "prior": where.resolve(), **settings})
-    frames = load_dataset(dataset)
+    loaded = load_dataset(dataset) if capture is None else None
+    count = _candidates(capture) if capture is not None else len(loaded or ())
     own_seed = "seed" in given.train.model_fields_set
     resolved: dict[str, Any] = {"policy": absolute(given.policy)}
     resolved |= {"train": given.train if own_seed else given.train.model_copy(update={"seed": given.seed})}
     if "budget" not in settings:
-        resolved["budget"] = min(given.budget, max(0, len(frames) - given.seeds))
+        resolved["budget"] = min(given.budget, max(0, count - given.seeds))
     complete = given.model_copy(update=resolved)
-    check_settings(complete, len(frames))
+    check_settings(complete, count)
     found = None if prior is None else load_prior(prior)
     with atomic_folder(out) as unfinished:
+        frames = loaded or _poses(unfinished / DATASET, str(capture), complete.seed, progress)
         if found is None:
             asked = PriorSettings(gaussians=gaussians, seed=complete.seed, density=row.density if row else 1.0)
-            found, _ = build_prior(frames, asked, on_stage=lambda stage: progress(f"prior: {stage}", 0, 1))
+            found, _ = build_prior(frames.survey(), asked, on_stage=lambda stage: progress(f"prior: {stage}", 0, 1))
             save_prior(unfinished / "prior", found)
         complete = complete.with_spacing(found.spacing)
         start(unfinished, complete, frames)
     return complete
+
+
+def _candidates(scene: str | Path) -> int:
+    """Number of poses that a run captures a scene from. Raises InputError where there is no such scene, or its file is bad."""
+    load_scene_file(scene)
+    runtime.start()
+    from mgs.synth.rendering import PRESETS
+
+    return PRESETS[CAPTURE_PRESET].frames
+
+
+def _poses(folder: Path, scene: str | Path, seed: int, progress: Callable[[str, int, int], None]) -> Dataset:
+    """The on-demand dataset of a run that captures a scene, written into a folder."""
+    from mgs.synth.rendering import synthesise  # which needs the variant that `_candidates` sets
+
+    def rendered(done: int, total: int) -> None:
+        progress("rendering test views", done, total)
+
+    views = CAPTURE_TEST_VIEWS
+    return synthesise(folder, scene, CAPTURE_PRESET, seed, progress=rendered, test_views=views, on_demand=True)
 
 
 def resume_nbv(

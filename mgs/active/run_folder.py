@@ -37,6 +37,9 @@ from mgs.files import atomic_path, read_json, write_json
 from mgs.gaussians import Gaussians
 from mgs.provenance import versions
 
+DATASET = "dataset"
+"""Folder of a run that holds its dataset, where the run captures images (`mgs nbv --capture`)."""
+
 
 @dataclass
 class State:

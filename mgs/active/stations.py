@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
+from mgs import runtime
 from mgs.active.criteria import lam_by_kind
 from mgs.active.fitting import Fit, fit
 from mgs.active.inputs import prior_digest
@@ -66,7 +67,16 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
         on_surface=len(prior.points),
         up=prior.up,
         prior=prior_digest(prior),
+        capture=capture_of(dataset) if dataset.on_demand else lambda frames: None,
     )
+
+
+def capture_of(dataset: Dataset) -> Callable[[Sequence[Frame]], None]:
+    """`mgs.synth.capture.capture_of`, imported here because only runs that capture need it, and a variant before it."""
+    runtime.start()
+    from mgs.synth import capture
+
+    return capture.capture_of(dataset)
 
 
 def kept_colours(dataset: Dataset, prior: Prior) -> Callable[[Frame], Colours]:
@@ -81,9 +91,10 @@ def psnr_measure(
 ) -> Callable[[Gaussians, list[int]], dict[str, float]]:
     """measure(gaussians, frames taken) -> mean PSNR, dB: `psnr` and `psnr_mask` (inside the rock mask) over all views,
     `held_out_psnr` and `held_out_psnr_mask` over those never trained on, `test_psnr` and `test_psnr_mask` over the test views
-    where the dataset has some; with `exposure` the same once more with `_corrected` at the end, of renders that are brought to
-    the exposure of the view (`mgs.metrics.colour_corrected`). As `mgs.report.evaluation`, without its other metrics, which cost
-    more. A mean over no view (all masks empty, none held out) is left out. Raises InputError as `Dataset.test_views`.
+    where the dataset has some; frames on demand that were not taken have no image, and no part in any of them. With `exposure`
+    the same once more with `_corrected` at the end, of renders that are brought to the exposure of the view
+    (`mgs.metrics.colour_corrected`). As `mgs.report.evaluation`, without its other metrics, which cost more. A mean over no
+    view (all masks empty, none held out) is left out. Raises InputError as `Dataset.test_views`.
     """
     tests = dataset.test_views()
     frames = [*dataset.frames, *(tests.frames if tests else ())]
@@ -99,12 +110,14 @@ def psnr_measure(
         shown = [rendered, colour_corrected(linear_from_srgb(image), rendered, rock)] if exposure else [rendered]
         return [psnr(srgb_from_linear(one), image, mask) for one in shown for mask in (known, rock)]
 
+    def measured(gaussians: Gaussians, chosen: Iterable[int]) -> np.ndarray:
+        found = [values(*truth(i), np.asarray(render(gaussians, frames[i].camera, cache=cache).rgb)) for i in chosen]
+        return np.array(found).reshape(-1, len(names))
+
     def measure(gaussians: Gaussians, taken: list[int]) -> dict[str, float]:
-        found = np.empty((len(frames), len(names)))
-        for i, frame in enumerate(frames):
-            found[i] = values(*truth(i), np.asarray(render(gaussians, frame.camera, cache=cache).rgb))
-        views, test_views = found[: len(dataset)], found[len(dataset) :]
-        held_out = np.delete(views, taken, axis=0)
+        shown = [i for i, frame in enumerate(dataset.frames) if i in taken or not frame.on_demand]
+        views, test_views = measured(gaussians, shown), measured(gaussians, range(len(dataset), len(frames)))
+        held_out = views[[i not in taken for i in shown]]
         return _means(views, "", names) | _means(held_out, "held_out_", names) | _means(test_views, "test_", names)
 
     return measure

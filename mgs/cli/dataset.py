@@ -68,7 +68,7 @@ def _check(path: Path) -> None:
     from rich.console import Console
     from rich.progress import Progress
 
-    from mgs.data.check import check_dataset
+    from mgs.data.check import check_dataset, there
     from mgs.data.dataset import load_dataset
     from mgs.errors import InputError
 
@@ -78,7 +78,9 @@ def _check(path: Path) -> None:
         task = bar.add_task("reading", total=len(loaded))
         check = check_dataset(loaded, lambda done, total: bar.update(task, completed=done))
     camera, (low, high) = loaded.frames[0].camera, check.depth_range
-    console.print(f"{path}: {len(loaded)} frames, {camera.width}x{camera.height}, rock on {check.mask_share:.0%} of the pixels")
+    missing = len(loaded) - len(there(loaded))
+    count = f"{len(loaded)} frames" + (f" ({missing} of them on demand, not taken yet)" if missing else "")
+    console.print(f"{path}: {count}, {camera.width}x{camera.height}, rock on {check.mask_share:.0%} of the pixels")
     if high > 0:
         console.print(f"depth of the rock {low:.2f} to {high:.2f} m; neighbours see through {check.seen_through:.1%} of it")
     if check.problems:

@@ -28,6 +28,12 @@ def _numbers(defaults: dict[str, float]) -> str:
 def nbv(
     dataset: Annotated[Path | None, typer.Argument(help="Dataset folder (transforms.json). Not needed with --resume.")] = None,
     out: Annotated[Path | None, typer.Option(help="New folder for the run.")] = None,
+    capture: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SCENE", help="In place of DATASET, a scene (name or .toml): an image is rendered only when it is chosen."
+        ),
+    ] = None,
     prior: Annotated[
         Path | None,
         typer.Option(help="Folder of `mgs prior`; default DATASET/prior, or built inside the run where there is none."),
@@ -129,12 +135,12 @@ def nbv(
 
     console = Console(highlight=False)
     if resume is not None:
-        if dataset is not None or out is not None:
-            raise InputError("nbv: --resume RUN continues RUN as it was started; leave DATASET and --out out")
+        if dataset is not None or out is not None or capture is not None:
+            raise InputError("nbv: --resume RUN continues RUN as it was started; leave DATASET, --out and --capture out")
         resume_and_print(resume, console)
         return
-    if dataset is None or out is None:
-        raise InputError("nbv: give a DATASET and --out RUN, or --resume RUN")
+    if (dataset is None) == (capture is None) or out is None:
+        raise InputError("nbv: give a DATASET or --capture SCENE, and --out RUN; or --resume RUN")
     train: dict[str, Any] = {"means": means, "optimiser": optimiser, "rates": pairs("--rate", rate)}
     if passes is not None:
         train["passes"] = passes
@@ -145,7 +151,9 @@ def nbv(
         "exposure": exposure, "train": train,
     }  # fmt: skip
     settings |= {name: value for name, value in {"budget": budget, "warm_passes": warm_passes}.items() if value is not None}
-    start_and_print(dataset, out, console, prior=prior, gaussians=parse_gaussians(gaussians), preset=preset, **settings)
+    start_and_print(
+        dataset, out, console, capture=capture, prior=prior, gaussians=parse_gaussians(gaussians), preset=preset, **settings
+    )
     resume_and_print(out, console)
 
 
@@ -163,13 +171,13 @@ def pairs(option: str, given: list[str] | None) -> dict[str, float]:
     return table
 
 
-def start_and_print(dataset: Path, out: Path, console: Console, **settings: Any) -> None:
+def start_and_print(dataset: Path | None, out: Path, console: Console, **settings: Any) -> None:
     """`mgs.active.nbv.start_run` under a spinner; says which prior it found."""
     from mgs.active.nbv import start_run
 
     with console.status("starting") as status:
         found = start_run(dataset, out, progress=lambda stage, done, total: status.update(stage), **settings)
-    if settings.get("prior") is None and found.prior.parent == dataset.resolve():
+    if settings.get("prior") is None and dataset is not None and found.prior.parent == dataset.resolve():
         console.print(f"prior: {found.prior}", soft_wrap=True)
 
 
@@ -235,7 +243,8 @@ def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console
     else:
         console.print(table(0, *range(2, len(columns))))
         console.print(table(0, 1))
-    for name, label in (("test", "test views"), ("all", "all views"), ("held_out", "views never trained on")):
+    every = "all views" if metrics.get("held_out", {}).get("count") else "views trained on"
+    for name, label in (("test", "test views"), ("all", every), ("held_out", "views never trained on")):
         mean = metrics.get(name, {"count": 0})
         if mean["count"]:
             shown = {key: "–" if mean[key] is None else f"{mean[key]:.{digits}f}" for key, digits in DIGITS.items()}

@@ -29,18 +29,19 @@ def print_table(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from mgs.report.tables import table_cell
+    from mgs.report.tables import has_held_out, table_cell
 
-    tested = any("test.psnr" in row for row in rows)
-    keys = ("images", *SHOWN[tested], "coverage")
+    tested, new = any("test.psnr" in row for row in rows), has_held_out(rows)
+    keys = ("images", *(key for key in SHOWN[tested] if new or not key.startswith("held_out.")), "coverage")
     names = [row["policy"] for row in rows]
 
     def table(heading: str, first: Sequence[str]) -> Table:
         caption = "n: images; dB and %; new: views never trained on; rock: inside its mask"
+        caption = caption if new else "n: images; dB, %; own: trained on; rock: in its mask"
         made = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption=caption)
         made.add_column(heading, no_wrap=True)
         for key in keys:
-            made.add_column(_heading(key), justify="right", no_wrap=True)
+            made.add_column(_heading(key, new), justify="right", no_wrap=True)
         for name, row in zip(first, rows, strict=True):
             made.add_row(Text(name), *(table_cell(key, row.get(key)) for key in keys))
         return made
@@ -55,13 +56,15 @@ def print_table(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
         console.print(Text(f"{number}: {name}"), soft_wrap=True)
 
 
-def _heading(key: str) -> str:
-    """A column's heading: the metric, and below it the set of views, and `rock` where the metric is inside its mask."""
+def _heading(key: str, new: bool) -> str:
+    """A column's heading: the metric, and below it the set of views, and `rock` where the metric is inside its mask. new:
+    whether there are views that were not trained on; otherwise all are the runs' own."""
     views, _, metric = key.partition(".")
     if not metric:
         return {"coverage": "cover", "images": "n"}.get(key, key)  # short, so that the table fits 80 columns
     name, _, mask = metric.partition("_")
-    return f"{name.upper()}\n{GROUPS[views]}" + ("\nrock" if mask else "")
+    group = GROUPS[views] if new or views != "all" else "own"
+    return f"{name.upper()}\n{group}" + ("\nrock" if mask else "")
 
 
 @contextmanager

@@ -32,6 +32,10 @@ def synth_orbit(
     test_views: Annotated[
         int, typer.Option(min=0, help="Number of views on a dome around the rock, to judge models by; written to OUT/test.")
     ] = 0,
+    on_demand: Annotated[
+        bool,
+        typer.Option("--on-demand", help="Render test views and a survey, but no frame: `mgs nbv OUT` renders those it takes."),
+    ] = False,
     pose_noise: Annotated[float, typer.Option(min=0, help="Noise on the positions in transforms.json, metres per axis.")] = 0.0,
     rotation_noise: Annotated[float, typer.Option(min=0, help="Noise on the rotations there, degrees per axis.")] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="Root seed: the same seed gives the same dataset, bit for bit.")] = 0,
@@ -41,6 +45,9 @@ def synth_orbit(
     Writes transforms.json (as nerfstudio has it), images/, depth/, masks/, rock/ (images of the rock alone, with alpha), the
     true rock as rock.glb, config.json and contact_sheet.png. An interrupted run goes on where it stopped when the same command
     is given again.
+
+    With --on-demand it writes poses, test views and a survey (depth and masks, OUT/survey), and an image of a frame exists only
+    once a run of `mgs nbv` has taken it.
     """
     from rich.console import Console
     from rich.progress import Progress
@@ -65,14 +72,17 @@ def synth_orbit(
     noise = PoseNoise(pose_noise, rotation_noise) if pose_noise or rotation_noise else None
     console = Console()
     with Progress(console=console) as bar:
-        views = f"{images.frames} frames" + (f" and {test_views} test views" if test_views else "")
-        task = bar.add_task(f"{views}, {images.width}x{images.height}", total=images.frames + test_views)
+        frames_of_orbit = f"{images.frames} frames" + (", none rendered" if on_demand else "")
+        views = frames_of_orbit + (f" and {test_views} test views" if test_views else "")
+        total = test_views + (0 if on_demand else images.frames)
+        task = bar.add_task(f"{views}, {images.width}x{images.height}", total=total)
         synthesise(
             out, settings, images, seed, mesh, noise,
             progress=lambda done, total: bar.update(task, completed=done), say=console.print,
-            mesh_up=mesh_up and mesh_up.value, test_views=test_views,
+            mesh_up=mesh_up and mesh_up.value, test_views=test_views, on_demand=on_demand,
         )  # fmt: skip
-    console.print(f"{out}: {views}; look at {out / 'contact_sheet.png'}")
+    look = "" if on_demand and not test_views else f"; look at {out / 'contact_sheet.png'}"
+    console.print(f"{out}: {views}{look}")
 
 
 def _parse_size(size: str | None) -> dict[str, int | None]:

@@ -34,8 +34,15 @@ class Check:
     seen_through: float
 
 
+def there(dataset: Dataset) -> list[Frame]:
+    """The frames of a dataset, without those on demand that nobody has taken."""
+    return [
+        frame for frame in dataset.frames if not frame.on_demand or (frame.mask_path is not None and frame.mask_path.exists())
+    ]
+
+
 def check_dataset(dataset: Dataset, progress: Callable[[int, int], None] = lambda done, total: None) -> Check:
-    """Read every pixel of a dataset and list all that is wrong with it.
+    """Read every pixel of the frames that are `there` in a dataset, and list all that is wrong with it.
 
     progress: called as progress(frames done, all frames).
     """
@@ -43,9 +50,11 @@ def check_dataset(dataset: Dataset, progress: Callable[[int, int], None] = lambd
     shares, ranges, shares_through = [], [], []
     poses: dict[bytes, str] = {}
     before: tuple[Frame, np.ndarray, np.ndarray] | None = None
-    for index, frame in enumerate(dataset.frames):
+    frames = there(dataset)
+    for index, frame in enumerate(frames):
         try:
-            frame.rgb()
+            if not frame.on_demand or frame.image_path.exists():  # a survey has no images
+                frame.rgb()
             mask = frame.mask()
             shares.append(mask.mean())
             if not mask.any():
@@ -69,7 +78,7 @@ def check_dataset(dataset: Dataset, progress: Callable[[int, int], None] = lambd
                     before = frame, depth, mask
         except InputError as error:
             problems.append(str(error))
-        progress(index + 1, len(dataset))
+        progress(index + 1, len(frames))
     common = [share for share in shares_through if np.isfinite(share)]
     through = float(np.median(common)) if common else float("nan")
     if shares_through and not through <= MAX_SEEN_THROUGH:

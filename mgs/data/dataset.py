@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,13 +31,19 @@ FRAME_INTERVAL = 0.5
 TEST_FOLDER = "test"
 """Folder of a dataset that holds its test views, a dataset of its own."""
 
+SURVEY_FOLDER = "survey"
+"""Folder of an on-demand dataset that holds its survey, a dataset of its own: depth and masks from every pose, and no image."""
+
 FILES = {"image_path": "file_path", "depth_path": "depth_file_path", "mask_path": "mask_path", "rock_path": "rock_file_path"}
 """The keys of transforms.json under which the paths of a `Frame` are written."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One keyframe: its camera, its time in seconds, and the files of its images."""
+    """One keyframe: its camera, its time in seconds, and the files of its images.
+
+    on_demand: the files exist only once a run has taken the frame. Before that, reading one of them raises InputError.
+    """
 
     name: str
     camera: Camera
@@ -45,16 +52,17 @@ class Frame:
     depth_path: Path | None = None
     mask_path: Path | None = None
     rock_path: Path | None = None
+    on_demand: bool = False
 
     def rgb(self) -> np.ndarray:
         """Linear RGB float32 [H,W,3]. Raises InputError where it is missing, damaged or of another size."""
-        return self._sized(self.image_path, read_png(self.image_path))
+        return self._sized(self.image_path, read_png(self._there(self.image_path)))
 
     def depth(self) -> np.ndarray:
         """z-depth float32 [H,W], metres, 0 = no return. Raises InputError as `rgb`, or where the frame has none."""
         if self.depth_path is None:
             raise InputError(f"frame {self.name}: has no depth_file_path; this command needs RGB-D frames")
-        channels = read_exr(self.depth_path)
+        channels = read_exr(self._there(self.depth_path))
         depth = channels.get("Z", next(iter(channels.values())))
         return np.nan_to_num(self._sized(self.depth_path, depth), nan=0.0, posinf=0.0, neginf=0.0)
 
@@ -65,7 +73,7 @@ class Frame:
         pixels with an alpha of at least 0.5 in the rock's image; without that too, all of them. Raises InputError as `rgb`.
         """
         if self.mask_path is not None:
-            return self._sized(self.mask_path, read_mask(self.mask_path))
+            return self._sized(self.mask_path, read_mask(self._there(self.mask_path)))
         if self.rock_path is not None:
             return self.target()[0][..., 3] >= 0.5
         return np.ones((self.camera.height, self.camera.width), bool)
@@ -82,7 +90,7 @@ class Frame:
         nothing but rock: alpha and weight are 1 everywhere. Raises InputError as `rgb`.
         """
         if self.rock_path is not None:
-            rgba = self._sized(self.rock_path, read_rock_image(self.rock_path))
+            rgba = self._sized(self.rock_path, read_rock_image(self._there(self.rock_path)))
             return rgba, np.ones(rgba.shape[:2], np.float32)
         mask = self.mask()
         rgba = np.dstack([self.rgb(), np.ones(mask.shape, np.float32)]) * mask[..., None]
@@ -91,6 +99,15 @@ class Frame:
     def masked_rgb(self) -> np.ndarray:
         """The colour of `target`: linear RGB float32 [H,W,3] of the rock alone in front of black."""
         return self.target()[0][..., :3]
+
+    def _there(self, path: Path) -> Path:
+        """The path of a file of this frame. Raises InputError where it does not exist because nobody has taken the frame."""
+        if self.on_demand and not path.exists():
+            raise InputError(
+                f"{path}: does not exist, since no run has taken frame {self.name} of this on-demand dataset; `mgs nbv` takes "
+                f"what it chooses, and what `mgs prior` reads is in the dataset's folder {SURVEY_FOLDER}"
+            )
+        return path
 
     def _sized(self, path: Path, pixels: np.ndarray) -> np.ndarray:
         expected = (self.camera.height, self.camera.width)
@@ -115,6 +132,15 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.frames)
 
+    @property
+    def on_demand(self) -> bool:
+        """Whether images of some frames exist only once a run has taken them."""
+        return any(frame.on_demand for frame in self.frames)
+
+    def with_images(self, taken: Collection[str]) -> tuple[Frame, ...]:
+        """The frames that have images where those of the names `taken` were taken: all, but of those on demand only these."""
+        return tuple(frame for frame in self.frames if not frame.on_demand or frame.name in taken)
+
     def test_views(self) -> Dataset | None:
         """The dataset in the folder `test` of this one: views to judge a model by, which no model is trained on.
 
@@ -123,9 +149,22 @@ class Dataset:
         folder = self.root / TEST_FOLDER
         return load_dataset(folder) if (folder / "transforms.json").is_file() else None
 
+    def survey(self) -> Dataset:
+        """What a prior is built of: the dataset in the folder `survey` of an on-demand dataset, otherwise this one itself.
+
+        Raises InputError where an on-demand dataset has no survey, and as `load_dataset`.
+        """
+        if not self.on_demand:
+            return self
+        folder = self.root / SURVEY_FOLDER
+        if not folder.is_dir():
+            raise InputError(f"{self.root}: has neither images nor a survey to build a prior of; give one with --prior")
+        return load_dataset(folder)
+
 
 def load_dataset(root: str | Path) -> Dataset:
-    """Read transforms.json and check that every file it names exists. Images are read later, by the methods of `Frame`.
+    """Read transforms.json and check that every file it names exists, unless it says `"on_demand": true`. Images are read
+    later, by the methods of `Frame`.
 
     Raises InputError where the folder or a file is missing, intrinsics are missing, images are distorted, a pose is not finite
     or singular, there are no frames, or two frames have the same name.
@@ -200,7 +239,7 @@ def _camera(path: Path, data: dict[str, Any], index: int, record: dict[str, Any]
 
 def _frame(root: Path, path: Path, data: dict[str, Any], index: int, record: dict[str, Any]) -> Frame:
     where = f"{path}: frame {index}"
-    camera = _camera(path, data, index, record)
+    camera, on_demand = _camera(path, data, index, record), data.get("on_demand") is True
     try:
         timestamp = float(record.get("timestamp", FRAME_INTERVAL * index))
     except (TypeError, ValueError, OverflowError):
@@ -212,12 +251,12 @@ def _frame(root: Path, path: Path, data: dict[str, Any], index: int, record: dic
         if not record.get(key):
             return None
         target = root / record[key]
-        if not target.is_file():
+        if not on_demand and not target.is_file():
             raise InputError(f"{where}: {key} {record[key]} does not exist in {root}; restore it or remove the frame")
         return target
 
     paths: dict[str, Any] = {field: file(key) for field, key in FILES.items()}
-    return Frame(Path(record["file_path"]).stem, camera, timestamp, **paths)
+    return Frame(Path(record["file_path"]).stem, camera, timestamp, **paths, on_demand=on_demand)
 
 
 def _intrinsics(camera: Camera) -> dict[str, float]:
@@ -228,12 +267,13 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
 def write_transforms(root: str | Path, frames: list[Frame] | tuple[Frame, ...], up: Up = PLUS_Z, unit: str = "m") -> None:
     """Write transforms.json into the folder `root`; the paths in it are relative to that folder. up, unit: as `Dataset`.
 
-    The intrinsics of the first frame are written once, for the whole file; a frame with other intrinsics has its own. Write
-    this file after all others: a folder that has it counts as a finished dataset.
+    The intrinsics of the first frame are written once, for the whole file; a frame with other intrinsics has its own. Either
+    all frames are on demand or none. Write this file after all others: a folder that has it counts as a finished dataset.
     """
     root = Path(root)
     header: dict[str, Any] = {"camera_model": "OPENCV", **_intrinsics(frames[0].camera)}
     world = {"up": list(up), "unit": unit} if (up, unit) != (PLUS_Z, "m") else {}  # what is left out is +Z and metres
+    demand = {"on_demand": True} if frames[0].on_demand else {}
     records = []
     for frame in frames:
         paths = {key: getattr(frame, field) for field, key in FILES.items()}
@@ -243,7 +283,7 @@ def write_transforms(root: str | Path, frames: list[Frame] | tuple[Frame, ...], 
         own = _intrinsics(frame.camera)
         record |= {key: value for key, value in own.items() if value != header[key]}
         records.append(record)
-    write_json(root / "transforms.json", header | world | {"frames": records})
+    write_json(root / "transforms.json", header | world | demand | {"frames": records})
 
 
 def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:

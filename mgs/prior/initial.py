@@ -151,12 +151,18 @@ def _with_backing(surface: Gaussians, prior: Prior) -> Gaussians:
     return Gaussians(*(np.concatenate([getattr(g, field.name) for g in (surface, backing)]) for field in fields(Gaussians)))
 
 
-def seen_colours(points: np.ndarray, normals: np.ndarray, frame: Frame, depth: np.ndarray, tolerance: float) -> Colours:
-    """(which points [N] of a surface a frame sees inside its mask, bool; the colours of these there, [seen,3] linear RGB).
+def sees(points: np.ndarray, normals: np.ndarray, frame: Frame, depth: np.ndarray, tolerance: float) -> np.ndarray:
+    """Which points [N] of a surface a frame sees inside its mask, bool.
 
-    normals, depth [H,W], tolerance: as in `mgs.data.visibility.visible`. Raises InputError if a file cannot be read.
+    normals, depth [H,W], tolerance: as in `mgs.data.visibility.visible`. Raises InputError if the mask cannot be read.
     """
-    seen = visible(points, normals, frame.camera, depth, tolerance) & in_mask(points, frame)
+    return visible(points, normals, frame.camera, depth, tolerance) & in_mask(points, frame)
+
+
+def seen_colours(points: np.ndarray, normals: np.ndarray, frame: Frame, depth: np.ndarray, tolerance: float) -> Colours:
+    """(which points [N] of a surface a frame `sees`; the colours of these there, [seen,3] linear RGB). Raises InputError if a
+    file cannot be read."""
+    seen = sees(points, normals, frame, depth, tolerance)
     pixels, _ = frame.camera.project(points[seen])
     at, rgb = [pixels[:, 1] - 0.5, pixels[:, 0] - 0.5], frame.rgb()
     return seen, np.stack([map_coordinates(rgb[..., k], at, order=1, mode="nearest") for k in range(3)], 1)
@@ -180,7 +186,8 @@ def depth_of(prior: Prior) -> Callable[[Frame], np.ndarray]:
 def with_share_seen(prior: Prior, seed_frames: Sequence[Frame]) -> Prior:
     """The prior with one more of its `numbers`, seen_by_seeds: the share of its samples that some of the seed frames see.
 
-    The others would start grey. Raises InputError as `initial_gaussians`.
+    The others would start grey. Raises InputError if a depth image or a mask cannot be read.
     """
-    seen = initial_gaussians(prior, seed_frames)[1]
+    depth = depth_of(prior)
+    seen = np.logical_or.reduce([sees(prior.points, prior.normals, f, depth(f), prior.depth_tolerance) for f in seed_frames])
     return replace(prior, numbers=prior.numbers | {"seen_by_seeds": float(seen.mean())})

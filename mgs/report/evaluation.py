@@ -171,6 +171,7 @@ def evaluate_run(
     """`evaluate` of a run of `mgs nbv` on its dataset and its test views; writes RUN/metrics.json, and RUN/renders where
     `pictures`: NAME.png of every view, test/NAME.png of every test view.
 
+    Of an on-demand dataset only the frames that the run has taken are measured: the others have no image, so none is held out.
     What is there of this very model, dataset and version of mgs is kept: nothing is measured or drawn twice. say is told
     which metrics are left out because there is no truth for them, then what was written and what was kept. Raises InputError
     as `load_run`, where the test views cannot be read, and where another process works on the run.
@@ -181,14 +182,15 @@ def evaluate_run(
     prior = settings.prior
     with locked(run):
         gaussians, dataset, trained, policy = load_run(run)
+        frames = dataset.with_images(trained)
         tests, spacing = _test_frames(dataset), _spacing(prior)
-        subject = _subject(gaussians, [*dataset.frames, *tests], trained, spacing)
+        subject = _subject(gaussians, [*frames, *tests], trained, spacing)
         for reason in _left_out(dataset, prior, spacing):
             say(reason)
         metrics = _measured_before(file, subject)
         if metrics is None:
             found = evaluate(
-                gaussians, dataset.frames, trained,
+                gaussians, frames, trained,
                 test_frames=tests, spacing=spacing, pictures=folder if pictures else None, progress=progress,
             )  # fmt: skip
             fit = _fit(gaussians, dataset, trained, settings, progress, say)
@@ -198,11 +200,11 @@ def evaluate_run(
             say(f"wrote {file}" + (f" and {folder}" if pictures else ""))
             return metrics
         kept = f"kept {file}, measured before on this very model and dataset"
-        paths = [folder / f"{frame.name}.png" for frame in dataset.frames]
+        paths = [folder / f"{frame.name}.png" for frame in frames]
         paths += [folder / TEST_FOLDER / f"{frame.name}.png" for frame in tests]
         if pictures and not (metrics["pictures"] and all(path.is_file() for path in paths)):
             decibels = [view["psnr"] for view in [*metrics["views"], *metrics.get("test_views", [])]]
-            _draw(gaussians, [*dataset.frames, *tests], paths, decibels, progress)
+            _draw(gaussians, [*frames, *tests], paths, decibels, progress)
             metrics = metrics | {"pictures": True}
             write_json(file, metrics)
             say(f"{kept}; wrote {folder}")

@@ -116,8 +116,10 @@ def draw_pictures(
 
 def compared_frames(runs: Sequence[Run], dataset: Dataset) -> list[Frame]:
     """The frames that `draw_pictures` compares truth and renders on."""
-    counts = [sum(i in run.seeds + run.chosen for run in runs) for i in range(len(dataset))]
-    pool = [frame for frame, count in zip(dataset.frames, counts, strict=True) if count == min(counts)]
+    taken = [{dataset.frames[i].name for i in run.seeds + run.chosen} for run in runs]
+    there = dataset.with_images(set.union(*taken))
+    counts = [sum(frame.name in names for names in taken) for frame in there]
+    pool = [frame for frame, count in zip(there, counts, strict=True) if count == min(counts)]
     tests = dataset.test_views()
     named = [] if tests is None else [replace(frame, name=f"test/{frame.name}") for frame in tests.frames]
     return [*_spread(pool), *_spread(named)]

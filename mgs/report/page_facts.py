@@ -105,11 +105,14 @@ def summary_rows(shown: Sequence[Shown]) -> list[tuple[str, list[str]]]:
         ("Gaussians", ["–" if one.model is None else f"{len(one.model):,}" for one in shown]),
         ("time of all steps (s)", [f"{sum(sum(s.get('seconds', {}).values()) for s in one.run.steps):.1f}" for one in shown]),
     ]
-    means = [_flat({k: v for k, v in (one.metrics or {}).items() if isinstance(v, dict)}) for one in shown]
+    means = [
+        _flat({k: v for k, v in (one.metrics or {}).items() if isinstance(v, dict) and v.get("count") != 0}) for one in shown
+    ]
+    names = GROUP_NAMES if any(("held_out", "count") in found for found in means) else GROUP_NAMES | {"all": "views trained on"}
     for path in dict.fromkeys(path for found in means for path in found):
         *groups, key = path
         name = "number" if key == "count" else metric_name(key, shown[0].unit)
-        heading = ", ".join([*(GROUP_NAMES.get(group, group.replace("_", " ")) for group in groups), name])
+        heading = ", ".join([*(names.get(group, group.replace("_", " ")) for group in groups), name])
         rows.append((heading, [cell(key, found.get(path)) for found in means]))
     return rows
 

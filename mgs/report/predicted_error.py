@@ -237,7 +237,7 @@ def _views(
             f"{run}: has {len(trained)} images; --calibrate leaves out a third of them, and needs {2 * FOLDS} or more"
         )
     by_name, tests = {frame.name: frame for frame in dataset.frames}, dataset.test_views()
-    held_out = tuple(frame for frame in dataset.frames if frame.name not in set(trained))
+    held_out = tuple(frame for frame in dataset.with_images(trained) if frame.name not in set(trained))
     unseen = ({"test": tests.frames} if tests else {}) | ({"held out": held_out} if held_out else {})
     if not unseen:
         raise InputError(f"{run}: was trained on all views there are; --calibrate needs some that it has not seen")

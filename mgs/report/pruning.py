@@ -44,7 +44,7 @@ def prune_run(run: str | Path, noise: float = PRUNE_NOISE, say: Callable[[str], 
     smaller = gaussians[found.kept]
     say("comparing")
     tests = dataset.test_views()
-    frames = tests.frames if tests else [frame for frame in dataset.frames if frame.name not in trained]
+    frames = tests.frames if tests else [frame for frame in dataset.with_images(trained) if frame.name not in trained]
     psnr = (_psnr(gaussians, frames), _psnr(smaller, frames)) if frames else None
     write_ply(Path(run) / PRUNED, smaller)
     where = "test" if tests else "held out"

@@ -32,9 +32,9 @@ COLUMNS = {
     "ended": "ended by",
 }
 """Columns of the table: the key of the number in a row of `table_numbers` -> the heading. Those of the test views stand first,
-because they are the same for every run; where no run was measured on test views, they are left out, and where no run estimated
-the exposure of images, those with an exposure that was fitted; where all runs spent their budget, why they ended. Rows that
-older versions wrote have no path (`table_columns`)."""
+because they are the same for every run; where no run was measured on test views, they are left out, and where no run has views
+held out, those of them; where no run estimated the exposure of images, those with an exposure that was fitted; where all runs
+spent their budget, why they ended. Rows that older versions wrote have no path (`table_columns`)."""
 
 
 def table_numbers(folders: Sequence[str | Path]) -> list[dict[str, Any]]:
@@ -65,7 +65,14 @@ def table_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """The keys of COLUMNS, in order, that say something of these rows of `table_numbers`."""
     exposure, tests = any(row.get("exposure") for row in rows), any("test.psnr" in row for row in rows)
     shown = [key for key in COLUMNS if (exposure or "corrected" not in key) and (tests or not key.startswith("test."))]
+    if not has_held_out(rows):
+        shown = [key for key in shown if not key.startswith("held_out.")]
     return [key for key in shown if key not in ("path", "ended") or any(key in row for row in rows)]
+
+
+def has_held_out(rows: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether a run of these rows has views with images that it was not trained on. Rows of older versions have no count."""
+    return any(row.get("held_out.count", 1) for row in rows)
 
 
 def table_cell(column: str, value: Any) -> str:
@@ -78,7 +85,8 @@ def table_cell(column: str, value: Any) -> str:
 def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
     """The rows of `table_numbers` as a Markdown table, with the numbers aligned to the right."""
     columns = table_columns(rows)
-    headings = [COLUMNS[key].replace("{unit}", rows[0].get("unit", "m")) for key in columns]
+    every = ", all" if has_held_out(rows) else ", views trained on"
+    headings = [COLUMNS[key].replace("{unit}", rows[0].get("unit", "m")).replace(", all", every) for key in columns]
     lines = [headings, ["---", *["---:"] * (len(columns) - 1)]]
     lines += [[table_cell(key, row.get(key)) for key in columns] for row in rows]
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)

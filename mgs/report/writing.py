@@ -54,7 +54,7 @@ def write_report(out: str | Path, folders: Sequence[str | Path]) -> list[Path]:
     comparison_figure(out / "comparison.png", truth, renders, title=frame.name, captions=captions)
     written = [out / f"{name}.png" for name in ("orbit", "gain", "coverage", "comparison")]
 
-    panels = _psnr_panels(runs)
+    panels = _psnr_panels(runs, "views taken so far" if dataset.on_demand else "all views")
     if panels:
         psnr_figure(out / "psnr.png", panels)
         written.append(out / "psnr.png")
@@ -69,20 +69,25 @@ def shown_view(runs: Sequence[Run], dataset: Dataset) -> tuple[Frame, str]:
     """The view that the comparison shows, and the key of metrics.json that has its numbers: "test_views" or "views".
 
     It is the middle one of the test views where all runs were measured on them, otherwise a view that the fewest runs were
-    trained on (`unseen_view`). Raises InputError as `Dataset.test_views`.
+    trained on (`unseen_view`); of frames on demand, one that all runs have taken. Raises InputError as `Dataset.test_views`,
+    and where there is no such frame.
     """
     tests = dataset.test_views()
     if tests is not None and all((run.metrics or {}).get("test_views") for run in runs):
         return tests.frames[len(tests) // 2], "test_views"
-    return dataset.frames[unseen_view(runs, len(dataset))], "views"
+    shared = set.intersection(*({dataset.frames[i].name for i in run.seeds + run.chosen} for run in runs))
+    shown = {frame.name for frame in dataset.with_images(shared)}
+    if not shown:
+        raise InputError(f"{dataset.root}: has no test views, and no frame that all runs have taken; report them one by one")
+    indices = [index for index, frame in enumerate(dataset.frames) if frame.name in shown]
+    return dataset.frames[unseen_view(runs, indices)], "views"
 
 
-def _psnr_panels(runs: Mapping[str, Run]) -> dict[str, dict[str, tuple[list[int], list[float]]]]:
-    """What `psnr_figure` draws: PSNR over the test views, or, where a run was never measured on them, over all views.
-
-    Nothing where a run was never measured on these either.
+def _psnr_panels(runs: Mapping[str, Run], every: str) -> dict[str, dict[str, tuple[list[int], list[float]]]]:
+    """What `psnr_figure` draws: PSNR over the test views, or, where a run was never measured on them, over all views, which are
+    called `every`. Nothing where a run was never measured on these either.
     """
-    for prefix, views in (("test_", "test views"), ("", "all views")):
+    for prefix, views in (("test_", "test views"), ("", every)):
         keys = {views: f"{prefix}psnr", f"{views}, rock only": f"{prefix}psnr_mask"}
         measured = {label: [s for s in run.steps if set(keys.values()) <= s.keys()] for label, run in runs.items()}
         if all(measured.values()):
@@ -93,11 +98,11 @@ def _psnr_panels(runs: Mapping[str, Run]) -> dict[str, dict[str, tuple[list[int]
     return {}
 
 
-def unseen_view(runs: Sequence[Run], frames: int) -> int:
-    """Index of a frame that the fewest runs were trained on; of several such frames, the middle one. frames: how many there
-    are."""
-    counts = [sum(index in run.seeds + run.chosen for run in runs) for index in range(frames)]
-    fewest = [index for index in range(frames) if counts[index] == min(counts)]
+def unseen_view(runs: Sequence[Run], frames: Sequence[int]) -> int:
+    """Index of a frame that the fewest runs were trained on; of several such frames, the middle one. frames: indices of those
+    among which to choose."""
+    counts = {index: sum(index in run.seeds + run.chosen for run in runs) for index in frames}
+    fewest = [index for index in frames if counts[index] == min(counts.values())]
     return fewest[len(fewest) // 2]
 
 

@@ -65,7 +65,7 @@ def make_arc(root: Path, out: Path, ring: str, every: int) -> dict[str, Any]:
                     target = unfinished / path.relative_to(source.root)
                     target.parent.mkdir(parents=True, exist_ok=True)
                     shutil.copyfile(path, target)
-                moved = {key: unfinished / path.relative_to(source.root) for key, path in paths.items()}
+                moved: dict[str, Any] = {key: unfinished / path.relative_to(source.root) for key, path in paths.items()}
                 copies.append(type(frame)(frame.name, frame.camera, frame.timestamp, **moved))
             shutil.copytree(source.root / TEST_FOLDER, unfinished / TEST_FOLDER)
             write_transforms(unfinished, copies, source.up, source.unit)

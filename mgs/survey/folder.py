@@ -36,8 +36,8 @@ def write_survey(out: Path, dataset: Dataset, survey: Survey) -> Dataset:
     """Write a survey of a dataset as another dataset, into the folder `out`, and load it.
 
     It has the images (the rock's too) and masks of the dataset surveyed, the depth images that were measured, the poses
-    that were estimated, and the true rock (rock.glb) if there is one. Raises InputError if a file cannot be read or
-    written.
+    that were estimated, and the true rock (rock.glb) if there is one. Where the dataset surveyed is on demand, as the survey
+    of an on-demand dataset is, no image is copied. Raises InputError if a file cannot be read or written.
     """
     frames = []
     for frame, pose, depth in zip(dataset.frames, survey.optimised, survey.depths, strict=True):
@@ -47,13 +47,14 @@ def write_survey(out: Path, dataset: Dataset, survey: Survey) -> Dataset:
         mask = frame.mask_path and out / "masks" / f"{frame.name}{frame.mask_path.suffix}"
         rock = frame.rock_path and out / "rock" / f"{frame.name}{frame.rock_path.suffix}"
         measured = out / "depth" / f"{frame.name}.exr"
-        copy_file(frame.image_path, image)
+        if not frame.on_demand:
+            copy_file(frame.image_path, image)
         if mask and frame.mask_path:
             copy_file(frame.mask_path, mask)
         if rock and frame.rock_path:
             copy_file(frame.rock_path, rock)
         write_exr(measured, {"Z": depth})
-        frames.append(Frame(frame.name, estimated, frame.timestamp, image, measured, mask, rock))
+        frames.append(Frame(frame.name, estimated, frame.timestamp, image, measured, mask, rock, frame.on_demand))
     truth = dataset.root / "rock.glb"
     if truth.is_file():
         copy_file(truth, out / "rock.glb")

@@ -15,11 +15,20 @@ from PIL import Image
 
 from mgs import runtime
 from mgs.camera import Camera, opengl_from_opencv
-from mgs.data.dataset import FRAME_INTERVAL, TEST_FOLDER, Dataset, Frame, load_dataset, resumes, write_transforms
+from mgs.data.dataset import (
+    FRAME_INTERVAL,
+    SURVEY_FOLDER,
+    TEST_FOLDER,
+    Dataset,
+    Frame,
+    load_dataset,
+    resumes,
+    write_transforms,
+)
 from mgs.data.meshes import GLTF, to_glb
 from mgs.data.rock_image import write_rock_image
 from mgs.errors import InputError, row_named
-from mgs.files import atomic_path, check_new_folder, check_writable, fingerprint, locked, new_folder, write_json
+from mgs.files import atomic_path, check_new_folder, check_writable, copy_file, fingerprint, locked, new_folder, write_json
 from mgs.images import write_exr, write_png
 from mgs.provenance import versions
 from mgs.seeds import derive_seed, generator
@@ -74,6 +83,7 @@ def synthesise(
     say: Callable[[str], None] = lambda message: None,
     mesh_up: str | None = None,
     test_views: int = 0,
+    on_demand: bool = False,
 ) -> Dataset:
     """Render a scene as a dataset into the folder `out`; what it holds is listed in docs/data.md.
 
@@ -82,8 +92,9 @@ def synthesise(
     of the procedural rock; mesh_up: its up axis, "y" or "z", by default that of `mgs.synth.rock.up_axis`. With
     `pose_noise`, transforms.json holds noisy poses, and true_poses.json those of the cameras that took the images.
     test_views: number of views of `dome_cameras` that are rendered into the folder `test` of the dataset
-    (`Dataset.test_views`); their poses are exact, and the orbit is the same with and without them. progress: called as
-    progress(views done, all views); say: called with lines for the user.
+    (`Dataset.test_views`); their poses are exact, and the orbit is the same with and without them. on_demand: render no frame
+    of the orbit, only its survey (`Dataset.survey`) and the test views; `mgs.synth.capture` renders a frame when a run takes
+    it. progress: called as progress(views done, all views); say: called with lines for the user.
 
     A folder that an interrupted run of the same settings left is completed, and ends with the same files as after one run.
     Raises InputError where the scene or the preset is unknown, where the output folder is not empty, cannot be written or is in
@@ -96,12 +107,12 @@ def synthesise(
     check_writable(out)
     if (out / "transforms.json").exists() or not (out / "config.json").exists():
         check_new_folder(out)  # before the rock is made, which takes seconds
-    rock, scale = _rock(settings, seed, mesh, mesh_up, say)
+    rock, scale = rock_of(settings, seed, mesh, mesh_up, say)
     cameras = rock_cameras(settings, preset, rock)
-    frames = _frames(out, cameras, "kf")
+    frames = orbit_frames(out, cameras)
     tests = _frames(out / TEST_FOLDER, dome_cameras(settings, preset, rock, test_views), "tv")
     denoise = importlib.util.find_spec("pyoidn") is not None
-    resolved = _resolved(settings, preset, seed, mesh, mesh_up, denoise, pose_noise, test_views)
+    resolved = _resolved(settings, preset, seed, mesh, mesh_up, denoise, pose_noise, test_views, on_demand)
     goes_on = resumes(out, "config.json", resolved)
     glb = to_glb(rock)  # before the scene adds its attributes to the mesh
     world = Scene(settings, rock, cameras[0], seed)
@@ -117,17 +128,24 @@ def synthesise(
             temporary.write_bytes(glb)
 
         prepared = time.perf_counter()
-        seconds = _render_frames(world, [*frames, *tests], exposure, spp, seed, denoise, progress)
-        write_contact_sheet(out / "contact_sheet.png", frames)
+        orbit = [] if on_demand else frames
+        seconds = _render_frames(Photographer(world, exposure, spp, seed, denoise), [*orbit, *tests], progress)
+        if orbit or tests:
+            write_contact_sheet(out / "contact_sheet.png", orbit or tests)
         record = {"mesh_scale": scale, "exposure": exposure, "samples_per_pixel": spp, "versions": versions()}
         write_json(out / "config.json", resolved | record | {"timings": _timings(started, prepared, seconds)})
         if tests:
             write_transforms(out / TEST_FOLDER, tests)
-        write_transforms(out, frames if pose_noise is None else _told(out, frames, pose_noise, seed))
+        told = frames if pose_noise is None else _told(out, frames, pose_noise, seed)
+        if on_demand:
+            told = [replace(frame, on_demand=True) for frame in told]
+            copy_file(out / "rock.glb", out / SURVEY_FOLDER / "rock.glb")
+            _write_survey(out / SURVEY_FOLDER, world, cameras, told)
+        write_transforms(out, told)
         return load_dataset(out)
 
 
-def _rock(
+def rock_of(
     settings: SceneFile, seed: int, mesh: str | Path | None, mesh_up: str | None, say: Callable[[str], None]
 ) -> tuple[trimesh.Trimesh, float]:
     """The procedural rock, or that of the file `mesh`, standing in the ground, and the scale that was applied to it."""
@@ -160,6 +178,7 @@ def _resolved(
     denoise: bool,
     pose_noise: PoseNoise | None,
     test_views: int,
+    on_demand: bool,
 ) -> dict[str, Any]:
     """All that decides what the dataset holds. An interrupted run is continued only where it is the same."""
     return {
@@ -170,6 +189,7 @@ def _resolved(
         "denoise": denoise,
         "pose_noise": None if pose_noise is None else asdict(pose_noise),
         "test_views": test_views,
+        "on_demand": {"mesh": mesh and str(Path(mesh).resolve())} if on_demand else None,
     }
 
 
@@ -191,28 +211,51 @@ def _told(out: Path, frames: list[Frame], pose_noise: PoseNoise, seed: int) -> l
     return [replace(frame, camera=camera) for frame, camera in zip(frames, told, strict=True)]
 
 
-def _render_frames(
-    scene: Scene,
-    frames: list[Frame],
-    exposure: float,
-    spp: int,
-    seed: int,
-    denoise: bool,
-    progress: Callable[[int, int], None],
-) -> list[float]:
+@dataclass(frozen=True)
+class Photographer:
+    """Renders frames of one scene, all in the same way. exposure: factor on the radiance; spp: samples per pixel; seed: root
+    seed of the rendering; denoise: as `Scene.render`."""
+
+    scene: Scene
+    exposure: float
+    spp: int
+    seed: int
+    denoise: bool
+
+    def take(self, frame: Frame) -> None:
+        """Render a frame and write its files. They depend on its name and camera alone, not on what was rendered before."""
+        rendered = self.scene.render(frame.camera, self.spp, derive_seed(self.seed, frame.name), self.denoise)
+        assert frame.depth_path
+        assert frame.mask_path
+        assert frame.rock_path
+        write_exr(frame.depth_path, {"Z": rendered.depth})
+        write_png(frame.mask_path, rendered.mask)
+        write_rock_image(frame.rock_path, rendered.rock * [self.exposure, self.exposure, self.exposure, 1])
+        write_png(frame.image_path, rendered.rgb * self.exposure)
+
+
+def _write_survey(folder: Path, scene: Scene, cameras: list[Camera], told: list[Frame]) -> None:
+    """Write the survey of an on-demand dataset: depth and mask, as their frames will have them, but no image.
+
+    cameras: where the depth is measured; told: the frames with the poses that are told to whoever reads the dataset.
+    """
+    frames = [replace(frame, rock_path=None, on_demand=True) for frame in orbit_frames(folder, cameras)]
+    for frame in frames:
+        assert frame.depth_path
+        assert frame.mask_path
+        depth, mask = scene.cast(frame.camera)
+        write_exr(frame.depth_path, {"Z": depth})
+        write_png(frame.mask_path, mask)
+    write_transforms(folder, [replace(frame, camera=known.camera) for frame, known in zip(frames, told, strict=True)])
+
+
+def _render_frames(photographer: Photographer, frames: list[Frame], progress: Callable[[int, int], None]) -> list[float]:
     """Render and write the frames whose files do not all exist yet; returns the seconds that each took."""
     seconds = []
     for index, frame in enumerate(frames):
-        if not _is_done(frame):
+        if not is_done(frame):
             begun = time.perf_counter()
-            rendered = scene.render(frame.camera, spp, derive_seed(seed, frame.name), denoise)
-            assert frame.depth_path
-            assert frame.mask_path
-            assert frame.rock_path
-            write_exr(frame.depth_path, {"Z": rendered.depth})
-            write_png(frame.mask_path, rendered.mask)
-            write_rock_image(frame.rock_path, rendered.rock * [exposure, exposure, exposure, 1])
-            write_png(frame.image_path, rendered.rgb * exposure)
+            photographer.take(frame)
             seconds.append(time.perf_counter() - begun)
         progress(index + 1, len(frames))
     return seconds
@@ -260,6 +303,11 @@ def write_contact_sheet(path: str | Path, frames: list[Frame]) -> None:
         sheet.save(temporary)
 
 
+def orbit_frames(out: Path, cameras: list[Camera]) -> list[Frame]:
+    """The frames of an orbit, whose files lie in the folder `out`, in the order of its cameras."""
+    return _frames(out, cameras, "kf")
+
+
 def _frames(out: Path, cameras: list[Camera], prefix: str) -> list[Frame]:
     """Frames named prefix_0000, prefix_0001 and so on, with the files that will hold them in the folder `out`."""
     return [
@@ -271,7 +319,7 @@ def _frames(out: Path, cameras: list[Camera], prefix: str) -> list[Frame]:
     ]  # fmt: skip
 
 
-def _is_done(frame: Frame) -> bool:
+def is_done(frame: Frame) -> bool:
     """Whether all files of a frame exist; none exists in part (`mgs.files.atomic_path`)."""
     paths = frame.image_path, frame.depth_path, frame.mask_path, frame.rock_path
     return all(path is not None and path.is_file() for path in paths)
