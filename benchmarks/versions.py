@@ -21,7 +21,7 @@ from mgs import runtime
 from mgs.files import write_json
 from mgs.provenance import command_line, versions
 
-ROUNDS = 4
+ROUNDS = 8
 
 WORKER = """
 import json, sys, time
