@@ -161,11 +161,17 @@ class Loop:
         cameras = {frame.name: inputs.camera_digest(frame.camera) for frame in self.frames}
         self.made_from = {"prior": stations.prior, "cameras": cameras, **inputs.policy_record(settings.policy)}
         self.seeds = pose_policies.seed_views(self.positions, self.centre, settings.seeds)
-        stations.capture([self.frames[i] for i in self.seeds])
+        self.capture(self.seeds)
         self.start = stations.initial([self.frames[i] for i in self.seeds])
         self.policy = policies.policy_named(settings.policy)
         self.seen, self.dome = cache(self._seen), cache(self._dome)  # they depend on poses and surface alone
         self.before_fit, self.coloured = cache(self._before_fit), lru_cache(maxsize=2)(self._coloured)  # on images, too
+
+    def capture(self, views: Sequence[int]) -> None:
+        """Have the images of these frames made where they do not exist yet."""
+        for done, i in enumerate(views):
+            self.progress("capturing", done, len(views))
+            self.stations.capture([self.frames[i]])
 
     def check(self, state: State) -> None:
         """Raises InputError where a state is not of this run: where its means, which a fit leaves alone, are not the prior's;
@@ -309,7 +315,7 @@ class Loop:
         step, taken, new = known["step"], planned.taken, planned.taken[len(state.taken) :]
         watch = _Stopwatch(known["seconds"])
         with watch("capture"):
-            self.stations.capture([self.frames[i] for i in new])
+            self.capture(new)
             for i in new:
                 self.image(i)
             gains = self.stations.exposure([self.frames[i] for i in taken]) if self.stations.exposure else None
