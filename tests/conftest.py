@@ -30,3 +30,14 @@ def dataset(pristine, tmp_path):
 def prior(tmp_path):
     """A tiny prior that fits the tiny dataset."""
     return tiny.write_prior(tmp_path / "prior")
+
+
+@pytest.fixture(scope="module")
+def coarse_arena():
+    """A ground of few vertices and texels: how fine it is decides most of a scene's cost and nothing that is tested."""
+    from mgs.synth import arena
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(arena, "ROWS", 60)
+        patched.setattr(arena, "TEXELS", 64)
+        yield

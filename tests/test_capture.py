@@ -56,13 +56,7 @@ main()
 """The program, which kills itself before it writes the PNG file of that number, a mask or an image of a captured frame."""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def coarse_arena():
-    """A ground of few vertices and texels, as in the tests of the synthetic dataset."""
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(arena, "ROWS", 60)
-        patched.setattr(arena, "TEXELS", 64)
-        yield
+pytestmark = pytest.mark.usefixtures("coarse_arena")
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,6 @@ from mgs.files import locked, read_json
 from mgs.resources import resource_folder
 from mgs.rotation import WORLD_FROM_GLTF
 from mgs.seeds import generator
-from mgs.synth import arena
 from mgs.synth.rendering import ROCK_EXPOSURE, PoseNoise, Preset, _meter, dome_cameras, rock_cameras, synthesise
 from mgs.synth.rock import make_rock
 from mgs.synth.scene_file import ORBITS, Arena, Orbit, Rock, SceneFile, load_scene_file
@@ -29,13 +28,7 @@ TINY = Preset(width=64, height=48, frames=5, spp=2)
 SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=20))
 
 
-@pytest.fixture(scope="module", autouse=True)
-def coarse_arena():
-    """A ground of few vertices and texels: how fine it is decides most of a scene's cost and nothing that is tested here."""
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(arena, "ROWS", 60)
-        patched.setattr(arena, "TEXELS", 64)
-        yield
+pytestmark = pytest.mark.usefixtures("coarse_arena")
 
 
 @pytest.fixture(scope="module")
