@@ -204,8 +204,20 @@ def test_a_run_is_followed_from_its_beginning(dataset, prior, tmp_path):
         viewer.close()
 
 
-KNOWN = "THREE.BufferGeometry.computeBoundingSphere(): Computed radius is NaN"
-"""viser's mesh for Gaussians has corners of two coordinates, of which three.js complains once."""
+SPLAT_CORNERS = """geometry => {
+    const corners = geometry.attributes.position;
+    return geometry.type === "InstancedBufferGeometry" && corners.itemSize === 2 && corners.array.every(Number.isFinite);
+}"""
+"""Whether a geometry of three.js is that of viser's Gaussians."""
+
+
+def of_viser(message) -> bool:
+    """Whether an error on the console is one that viser 1.1.1 makes by itself, with any Gaussians.
+
+    The corners of its squares have two coordinates each. three.js reads three of each, past the end of the last, and says that
+    the radius of what it read is NaN. The same complaint about anything else would be ours."""
+    return "Computed radius is NaN" in message.text and bool(message.args[1].evaluate(SPLAT_CORNERS))
+
 
 WIDTH, HEIGHT = 1000, 640
 
@@ -255,7 +267,7 @@ def test_the_viewer_in_a_browser(browser, run):
     def off(picture):
         return np.abs(picture - expected)[inside].mean()
 
-    with viewing(run, "--follow") as address, opened(browser, address, WIDTH, HEIGHT) as (tab, wrong):
+    with viewing(run, "--follow") as address, opened(browser, address, WIDTH, HEIGHT, known=of_viser) as (tab, wrong):
         tab.get_by_text(subject.title).wait_for()
         tab.get_by_label("Cameras", exact=True).first.uncheck(force=True)
         for layer in ("alpha", "uncertainty", "colour"):
@@ -305,12 +317,13 @@ def test_the_viewer_in_a_browser(browser, run):
 
         steps(run, 3)
         tab.get_by_text("6 of 7 views").wait_for(timeout=10_000)
-        assert [text for text in wrong if KNOWN not in text] == []
+        assert wrong == []
 
 
 def test_a_ply_in_a_browser_at_phone_width(browser, run, tmp_path):
     write_ply(tmp_path / "splats.ply", read_subject(run).gaussians)
-    with viewing(tmp_path / "splats.ply", "--host", "0.0.0.0") as address, opened(browser, address, 390, 760) as (tab, wrong):
+    shown = viewing(tmp_path / "splats.ply", "--host", "0.0.0.0")
+    with shown as address, opened(browser, address, 390, 760, known=of_viser) as (tab, wrong):
         tab.get_by_text("splats.ply").wait_for()
         assert screen_becomes(tab, lambda picture: picture[:300].std() > 5)[:300].std() > 5
-        assert [text for text in wrong if KNOWN not in text] == []
+        assert wrong == []
