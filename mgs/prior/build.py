@@ -22,7 +22,7 @@ from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.data.visibility import in_mask, visible
 from mgs.errors import InputError
 from mgs.files import atomic_path, new_folder, read_json, write_json
-from mgs.prior.photographs import Surface, source_of, surface_of
+from mgs.prior.photographs import Surface, check_masks, source_of, surface_of
 from mgs.prior.resolution import Resolution, resolution
 from mgs.prior.segmentation import Plane, SegmentedCloud, segment_dataset
 from mgs.prior.settings import PriorSettings
@@ -70,12 +70,13 @@ def build_prior(
     dataset has. points: a PLY file of points, in place of the dataset's. up: which way is up; "auto": the normal of the
     ground plane where one was found; None, or no such plane: as the dataset says.
     Returns the prior, and the cloud that its mesh was built from, None for a hull.
-    Raises InputError as `source_of`, `surface_of` and `segment_dataset` (nothing to build it from, too few photographs, no
-    rock, two equal rocks), `poisson_mesh` (no closed surface) and `sample_surface` (too few or too many samples), or if no
-    frame sees the mesh; and NoSurface, which has the cloud, where points give no surface.
+    Raises InputError as `source_of`, `check_masks`, `surface_of` and `segment_dataset` (nothing to build it from, too few
+    photographs, no rock, two equal rocks), `poisson_mesh` (no closed surface) and `sample_surface` (too few or too many
+    samples), or if no frame sees the mesh; and NoSurface, which has the cloud, where points give no surface.
     """
     tell = on_stage or (lambda stage: None)
     chosen = source_of(dataset, source, points)
+    check_masks(dataset.frames)
     surface = _of_depth(dataset, settings, tell) if chosen == "depth" else surface_of(dataset, chosen, settings, tell, points)
     mesh, segmented, cell = surface.mesh, surface.segmented, surface.cell
     tell("surface samples")

@@ -70,7 +70,7 @@ def visual_hull(frames: Sequence[Frame], tell: Callable[[str], None] = lambda st
     if field.max() <= 0:
         kept = np.unravel_index(np.argmin(carved), carved.shape)
         point = (lo + edge / cells * np.array(kept))[None]
-        against = [frame.name for frame, view in zip(frames, views, strict=True) if view(point)[0] <= 0]
+        against = [frame.name for frame, view in zip(frames, views, strict=True) if not 0 < view(point)[0] < np.inf]
         raise InputError(
             f"prior: the masks share no point of space (at best {len(against)} of {len(frames)} frames, such as {against[0]}, "
             "are against it); poses and masks do not fit, or the object moved; correct or remove frames"
@@ -168,12 +168,16 @@ def _inside(views: Sequence[_View], points: np.ndarray, reach: float) -> np.ndar
 
 
 def _first_grid(views: Sequence[_View], lo: np.ndarray, edge: float) -> tuple[np.ndarray, np.ndarray]:
-    """The values of the nodes of the coarse grid, and how many views carve each away, [n,n,n] with n = COARSE + 1."""
+    """The values of the nodes of the coarse grid, and how many views carve each away, [n,n,n] with n = COARSE + 1; all views
+    where fewer than LEAST_VIEWS have the node in their image."""
     nodes = np.stack(np.meshgrid(*[np.arange(COARSE + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
     points = lo + edge / COARSE * nodes
-    carved = np.zeros(len(points), int)
+    carved, count = np.zeros(len(points), int), np.zeros(len(points), int)
     for view in views:
-        carved += view(points) <= 0
+        value = view(points)
+        carved += value <= 0
+        count += np.isfinite(value)
+    carved[count < min(LEAST_VIEWS, len(views))] = len(views)
     shape = (COARSE + 1,) * 3
     return _inside(views, points, 2 * NEAR_SURFACE * edge / COARSE).reshape(shape), carved.reshape(shape)
 
