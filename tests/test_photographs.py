@@ -167,7 +167,7 @@ def test_a_frame_whose_mask_does_not_fit_is_named(tmp_path: Path) -> None:
 
 def test_masks_of_scattered_pixels_are_one_line(tmp_path: Path) -> None:
     """The grid then reaches beyond all images, where nothing speaks against a point."""
-    dataset = floating(tmp_path / "d", lattice(12))
+    dataset = floating(tmp_path / "d", synthetic.orbit_cameras(12, 96, 72))
     for k, frame in enumerate(dataset.frames):
         assert frame.mask_path is not None
         write_png(frame.mask_path, np.random.default_rng(k).random((72, 96)) < 0.01)
