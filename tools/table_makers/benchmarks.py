@@ -390,6 +390,22 @@ def two_versions(data: dict[str, Any]) -> str:
     return markdown(heading, rows) + made_by(data)
 
 
+def whole_runs(data: dict[str, Any]) -> str:
+    """Seconds of whole runs by stage, against the older version, and what their models are like on the test views."""
+    rows = []
+    for record in data["records"]:
+        seconds = record["seconds"]
+        old = next(other for other in data["records"] if other["gaussians"] == record["gaussians"])  # the first of its kind
+        total = sum(seconds.values())
+        stages = [seconds["fit"], seconds["score"], seconds["information"]]
+        name = record["run"].replace("old,", f"commit {data['old']},")
+        cells = [f"{value:.1f}" for value in [*stages, total - sum(stages), total]]
+        ratio = f"{total / sum(old['seconds'].values()):.2f}"
+        rows.append([f"{record['gaussians']:,}: {name}", *cells, ratio, f"{record['psnr']:.2f}", f"{record['psnr_mask']:.2f}"])
+    heading = ["Gaussians: run", "fits, s", "scores", "information", "rest", "sum", "ratio", "test views, dB", "rock only"]
+    return markdown(heading, rows) + made_by(data)
+
+
 def uncertainty(data: dict[str, Any]) -> str:
     """How well errors are predicted in the test views: means over runs; of shares inside intervals the extremes, too."""
     rows = []
@@ -458,6 +474,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "prior-std": ("benchmarks/prior_std", prior_std),
     "inset": ("benchmarks/inset", inset),
     "versions": ("benchmarks/versions", two_versions),
+    "whole-runs": ("benchmarks/whole_runs", whole_runs),
     "lanes": ("benchmarks/lanes", lanes),
     "sizes": ("benchmarks/sizes", sizes),
     "warm-colours": ("benchmarks/warm_colours", warm_colours),
