@@ -74,9 +74,9 @@ def study(root: Path, state: str) -> list[dict[str, Any]]:
     for passes in PASSES:
         found = fit(start, cameras, targets, TrainSettings(passes=passes, tolerance=0.0), cache=cache, start=start, lam=by_kind)
         values = scores(found.gaussians, taken, dataset, lam, cache)
-        record = {"dataset": root.name, "state": state, "views": taken, "passes": passes, "loss": found.loss, "scores": values}
+        record = {"dataset": str(root), "state": state, "views": taken, "passes": passes, "loss": found.loss, "scores": values}
         records.append(record)
-        print(root.name, state, passes, f"loss {found.loss:.4g}", flush=True)
+        print(root, state, passes, f"loss {found.loss:.4g}", flush=True)
     return records
 
 
@@ -125,7 +125,7 @@ def main(prefix: Path, roots: list[Path]) -> None:
     records = json.loads(path.read_text())["records"] if path.is_file() else []
     for state in STATES:
         for root in roots:
-            if not any((r["dataset"], r["state"]) == (root.name, state) for r in records):
+            if not any((r["dataset"], r["state"]) == (str(root), state) for r in records):
                 records += study(root, state)
                 made = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
                 write_json(path, made | {"rows": compared(records), "records": records})

@@ -10,10 +10,9 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from mgs.bench.core import TARGETS
 from mgs.bench.fit import TARGETS as FIT_TARGETS
 from mgs.report.tables import markdown_table, table_cell
-from table_makers.markdown import made_by, markdown, short
+from table_makers.markdown import made_by, markdown
 
 
 def demo(rows: list[dict[str, Any]]) -> str:
@@ -67,129 +66,6 @@ def flights(rows: list[dict[str, Any]]) -> str:
         "path": "path (m)",
     }
     return _shown(headings, rows)
-
-
-def splat(data: dict[str, Any]) -> str:
-    """Times of `mgs bench splat`, ratios to the peer or to a gradient, and what is asked for."""
-    seconds, figures, scene = data["seconds"], data["figures"], data["scene"]
-    rows = []
-    for name, own, peer, figure in (
-        ("forward, warm", "forward_warm", "volprim_forward", "forward_warm_speedup"),
-        ("forward, cold (a view never seen before)", "forward_cold", "volprim_forward", "forward_cold_speedup"),
-        ("forward + adjoint, warm", "gradient_warm", "volprim_gradient", "gradient_warm_speedup"),
-        ("exact Fisher diagonal, warm, over forward + adjoint", "fisher_exact", None, "fisher_over_gradient"),
-        ("exact 11x11 blocks, warm, over forward + adjoint", "fisher_block", None, "block_fisher_over_gradient"),
-    ):
-        bound, target = TARGETS[figure]
-        times = [f"{1e3 * seconds[own]:.1f} ms", f"{1e3 * seconds[peer]:.0f} ms" if peer else ""]
-        rows.append([name, *times, f"{figures[figure]:.{0 if peer else 2}f}", f"{bound} {target:g}"])
-    bound, target = TARGETS["tiny_forward_ms"]
-    tiny = f"{figures['tiny_forward_ms']:.2f} ms"
-    rows.append(["forward, 1,000 Gaussians, 64x48, warm", tiny, "", "", f"{bound} {target:g} ms"])
-    title = f"{scene['gaussians']:,} Gaussians of a rock, {scene['width']}x{scene['height']}"
-    return markdown([title, "mgs", "`volprim_rf_basic`", "ratio", "asked for"], rows) + made_by(data)
-
-
-def splat_short(data: dict[str, Any]) -> str:
-    """The times of `splat` alone, and how many times as long Mitsuba's own integrator takes."""
-    seconds, figures, scene = data["seconds"], data["figures"], data["scene"]
-    rows = []
-    for name, own, figure in (
-        ("forward, warm", "forward_warm", "forward_warm_speedup"),
-        ("forward, a view never seen before", "forward_cold", "forward_cold_speedup"),
-        ("forward + adjoint, warm", "gradient_warm", "gradient_warm_speedup"),
-        ("exact Fisher diagonal, warm", "fisher_exact", None),
-        ("exact 11x11 blocks, warm", "fisher_block", None),
-    ):
-        rows.append([name, f"{1e3 * seconds[own]:.1f} ms", f"{figures[figure]:.0f} times" if figure else ""])
-    title = f"{scene['gaussians']:,} Gaussians, {scene['width']}x{scene['height']}"
-    return markdown([title, "mgs", "Mitsuba over mgs"], rows) + made_by(data)
-
-
-def splat_work(data: dict[str, Any]) -> str:
-    """Work and memory of the same run."""
-    peak, share = f"{data['peak_gflops_measured']:.0f} Gflop/s", data["share_of_peak"]
-    rows = [
-        ["(splat, block) pairs", f"{data['pairs']:,}"],
-        ["pixels of pairs a second, forward", f"{data['pixel_splat_pairs_per_second']['forward'] / 1e9:.1f} billion"],
-        [f"share of the measured FMA rate ({peak}), forward", f"{share['forward']:.0%}"],
-        ["share of the measured FMA rate, exact Fisher", f"{share['fisher_exact']:.0%}"],
-        ["block lists of a camera", f"{data['list_megabytes']:.0f} MB"],
-        ["most memory of the process, before the peer is loaded", f"{data['peak_memory_megabytes']:.0f} MB"],
-    ]
-    return markdown(["in the same run", ""], rows)
-
-
-def roofline(data: dict[str, Any]) -> str:
-    """What share of each kernel's time each limit of the machine takes, and the limits."""
-    limits, rows = data["limits"], data["kernels"]
-    lines = [
-        [
-            row["name"],
-            f"{1e3 * row['seconds']:.2f}",
-            f"{row['gflops']:.1f}" if row["gflops"] else "",
-            *(f"{share:.0%}" for share in row["shares"].values()),
-            row["verdict"],
-        ]
-        for row in rows
-    ]
-    bandwidths = ", ".join(f"{name} {value / 1e9:.0f}" for name, value in limits["bandwidth"].items())
-    text = (
-        f"\nLimits: FMAs {limits['flops'] / 1e9:.0f} Gflop/s, in double {limits['flops64'] / 1e9:.0f}; divisions "
-        f"{limits['divisions'] / 1e9:.1f} billion a second, in double {limits['divisions64'] / 1e9:.1f}; GB/s: {bandwidths}.\n"
-    )
-    return markdown(["kernel", "ms", "Gflop/s", *rows[0]["shares"], "bound by"], lines) + text + made_by(data)
-
-
-def roofline_work(data: dict[str, Any]) -> str:
-    """Operations and bytes of each kernel, counted, and the lanes that are busy."""
-    rows = []
-    for row in data["kernels"]:
-        each = row["each"]
-        counts = [each["flops"], each["flops64"], each["divisions"] + each["divisions64"]]
-        counts += [each[key] for key in ("instructions", "bytes", "state_bytes")]
-        rows.append([row["name"], row["unit"], *(f"{count:,.0f}" for count in counts), f"{row['lanes_active']:.0%}"])
-    heading = [
-        "kernel",
-        "for each",
-        "operations",
-        "in double",
-        "divisions",
-        "instructions",
-        "bytes",
-        "state bytes",
-        "busy lanes",
-    ]
-    return markdown(heading, rows)
-
-
-def scaling(data: dict[str, Any]) -> str:
-    """Exponents of growth, and times as sums of what grows linearly."""
-    costs, start = data["linear_growth"], f"{data['exponents_from_n']:,}"
-    exponents = {
-        "exponent against pairs, N and the image growing together": "pairs alone",
-        "as the image grows alone": "pairs, image growing",
-        f"as N grows alone, from {start}": "pairs, N growing",
-    }
-    fits = {"fit: ns per pair": "ns per pair", "ns per Gaussian": "ns per Gaussian", "constant, ms": "constant, ms"}
-    rows = [[name, *(f"{data['exponents'][what][key]:.2f}" for what in costs)] for name, key in exponents.items()]
-    rows += [[name, *(f"{cost[key]:.{int('ms' in name)}f}" for cost in costs.values())] for name, key in fits.items()]
-    rows.append(["worst deviation", *(f"{cost['worst deviation']:.0%}" for cost in costs.values())])
-    return markdown(["", *costs], rows) + made_by(data)
-
-
-def block_accuracy(data: dict[str, Any]) -> str:
-    """Errors of block entries against the float64 oracle."""
-    error = data["error_over_sqrt_HiiHjj"]
-    rows = [
-        ["entries beyond the tolerance of the tests", f"{data['entries_beyond_tolerance']:,}"],
-        ["worst relative error", short(data["worst_relative_error"], 2)],
-        ["error over sqrt(H_ii H_jj), median", short(error["median"])],
-        ["error over sqrt(H_ii H_jj), 99th percentile", short(error["p99"])],
-        ["error over sqrt(H_ii H_jj), worst", short(error["max"])],
-    ]
-    title = f"{data['entries']:,} entries of blocks, {data['scenes']:,} random scenes"
-    return markdown([title, "measured"], rows) + made_by(data)
 
 
 def hutchinson(data: dict[str, Any]) -> str:
@@ -345,49 +221,7 @@ def warm_colours(data: dict[str, Any]) -> str:
     return markdown(["seeds, start of a fit", *images], rows) + made_by(data)
 
 
-OPERATIONS = {
-    "forward_cold": "draw a view never seen before",
-    "forward_warm": "draw a view seen before",
-    "gradient_warm": "image and gradient",
-    "fisher_exact": "exact Fisher diagonal",
-    "fisher_block": "exact 11x11 blocks",
-}
 """Operations of the core (`mgs.bench.core.time_core`)."""
-
-
-def lanes(data: dict[str, Any]) -> str:
-    """Seconds of the core with AVX-512 and with AVX2, and the ratios of the rounds."""
-    wide, narrow = data["lanes"]["AVX-512"], data["lanes"]["AVX2"]
-    rows = []
-    for key, name in OPERATIONS.items():
-        low, median, high = data["ratios"][key]
-        rows.append([name, f"{1e3 * wide[key]:.1f}", f"{1e3 * narrow[key]:.1f}", f"{median:.2f} ({low:.2f} to {high:.2f})"])
-    for key, name in {"error_image": "largest error of an image", "error_fisher": "of exact Fisher information"}.items():
-        rows.append([name, short(wide[key], 2), short(narrow[key], 2), ""])
-    heading = ["100,000 Gaussians, 640x480", "AVX-512 (ms)", "AVX2 (ms)", f"ratio, median of {data['rounds']} rounds (range)"]
-    return markdown(heading, rows) + made_by(data)
-
-
-def sizes(data: dict[str, Any]) -> str:
-    """Seconds and memory of large models and images."""
-    rows = []
-    for size in data["sizes"]:
-        seconds = [f"{size[key]:.2f}" if key in size else "–" for key in OPERATIONS]
-        label = f"{size['n']:,} Gaussians, {size['width']}x{size['height']}"
-        rows.append([label, f"{size['pairs'] / 1e6:.1f}", *seconds, f"{size['peak_bytes'] / 2**30:.1f}"])
-    heading = ["", "million pairs", *(f"{name} (s)" for name in OPERATIONS.values()), "memory (GiB)"]
-    return markdown(heading, rows) + made_by(data)
-
-
-def two_versions(data: dict[str, Any]) -> str:
-    """Seconds of two versions, and the ratios of the rounds."""
-    rows = []
-    for key, name in (OPERATIONS | {"fit": "a fit of 12 views of 320x240, 10,000 Gaussians, 5 passes"}).items():
-        old, new = (f"{1e3 * data['seconds'][which][key]:.1f}" for which in ("old", "new"))
-        low, median, high = data["ratios"][key]
-        rows.append([name, old, new, f"{median:.2f} ({low:.2f} to {high:.2f})"])
-    heading = ["", f"commit {data['old']} (ms)", "now (ms)", f"ratio, median of {data['rounds']} rounds (range)"]
-    return markdown(heading, rows) + made_by(data)
 
 
 def uncertainty(data: dict[str, Any]) -> str:
@@ -457,9 +291,6 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "residual": ("benchmarks/residual", residual),
     "prior-std": ("benchmarks/prior_std", prior_std),
     "inset": ("benchmarks/inset", inset),
-    "versions": ("benchmarks/versions", two_versions),
-    "lanes": ("benchmarks/lanes", lanes),
-    "sizes": ("benchmarks/sizes", sizes),
     "warm-colours": ("benchmarks/warm_colours", warm_colours),
     "uncertainty": ("benchmarks/uncertainty", uncertainty),
     "optimisers": ("benchmarks/optimisers", optimisers),
@@ -469,13 +300,6 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "demo-report": ("benchmarks/demo", demo_report),
     "flights": ("benchmarks/flights", flights),
     "policies": ("benchmarks/policies", policies),
-    "splat": ("benchmarks/splat", splat),
-    "splat-short": ("benchmarks/splat", splat_short),
-    "splat-work": ("benchmarks/splat", splat_work),
-    "roofline": ("benchmarks/roofline", roofline),
-    "roofline-work": ("benchmarks/roofline", roofline_work),
-    "scaling": ("benchmarks/scaling", scaling),
-    "block-accuracy": ("benchmarks/block_accuracy", block_accuracy),
     "hutchinson": ("benchmarks/hutchinson", hutchinson),
     "render-settings": ("benchmarks/render_settings", render_settings),
     "lambda-ranking": ("benchmarks/lambda_ranking", lambda_ranking),
