@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -32,7 +33,7 @@ from mgs.splat import render
 from mgs.splat_ply import write_ply
 from mgs.view import layers
 from mgs.view.server import Viewer, check_address, window_camera
-from mgs.view.subject import read_subject
+from mgs.view.subject import fitted, read_subject
 
 
 def steps(run, budget):
@@ -101,6 +102,29 @@ def test_what_the_kernel_draws(run):
     assert (low, high) == pytest.approx((depth[seen].min(), depth[seen].max()))
     informed = subject.scalars["information"]
     assert drawn["information"][2] == (0, pytest.approx(np.quantile(informed, 0.999)))
+
+
+def test_a_world_of_large_numbers_is_shown_smaller(run):
+    """Depth in a browser ends at 160: with 1,000 times the lengths of a run all would be behind that."""
+    subject = read_subject(run)
+    assert subject.scale == 1
+    assert fitted(subject) is subject
+
+    g = subject.gaussians
+    large = replace(
+        subject,
+        gaussians=replace(g, means=1000 * g.means, log_scales=g.log_scales + np.float32(np.log(1000))),
+        views=[replace(view, frame=replace(view.frame, camera=view.frame.camera.scaled(1000))) for view in subject.views],
+        mesh=replace(subject.mesh, vertices=1000 * subject.mesh.vertices),
+    )
+    shown = fitted(large)
+    assert np.ptp(shown.mesh.vertices) == pytest.approx(shown.scale * np.ptp(large.mesh.vertices))
+    for layer in ("colour", "depth", "uncertainty"):
+        picture, depth, ends = layers.kernel_image(shown, shown.views[1].frame.camera, layer)
+        expected, _, (low, high) = layers.kernel_image(subject, subject.views[1].frame.camera, layer)
+        np.testing.assert_allclose(picture, expected, atol=2)
+        assert depth[depth < layers.FAR].max() < 2.5 * 40
+        assert ends == pytest.approx((1000 * low, 1000 * high) if layer == "depth" else (low, high), rel=1e-4)
 
 
 def test_covariances_have_the_scales_and_the_axes(run):

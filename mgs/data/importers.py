@@ -78,7 +78,7 @@ class Source:
         """
         if not 0 < unit < np.inf:
             raise InputError(f"import: --unit {unit} must be a positive number of metres; correct it")
-        shots = [replace(shot, camera=_scaled(shot.camera, unit)) for shot in self.shots]
+        shots = [replace(shot, camera=shot.camera.scaled(unit)) for shot in self.shots]
         return replace(self, shots=shots, sparse=self.sparse and self.sparse.scaled(unit), unit="m")
 
     def up_or_estimate(self) -> tuple[Up, str]:
@@ -125,12 +125,6 @@ def read_source(source: str | Path, images: Path | None = None, split: str = "tr
     if repeated:
         raise InputError(f"{source}: lists {repeated[0]} more than once; remove the duplicate frames")
     return result
-
-
-def _scaled(camera: Camera, factor: float) -> Camera:
-    pose = camera.world_to_camera.copy()
-    pose[:3, 3] *= factor
-    return Camera(camera.K, camera.width, camera.height, pose)
 
 
 def _find(folder: Path, name: str) -> Path | None:
