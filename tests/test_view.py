@@ -268,6 +268,16 @@ def screen_becomes(tab, wanted, seconds=60.0) -> np.ndarray:
     return picture
 
 
+def finger(tab, way):
+    """Move a finger over the screen, along points (x, y) in pixels."""
+    session = tab.context.new_cdp_session(tab)
+    for k, (x, y) in enumerate(way):
+        kind = "touchMove" if k else "touchStart"
+        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": [{"x": x, "y": y}]})
+        tab.wait_for_timeout(30)
+    session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+
+
 def choose(tab, label, option):
     tab.get_by_label(label, exact=True).first.click()
     tab.get_by_role("option", name=option, exact=True).click()
@@ -345,9 +355,32 @@ def test_the_viewer_in_a_browser(browser, run):
 
 
 def test_a_ply_in_a_browser_at_phone_width(browser, run, tmp_path):
+    """A finger and the keys move the camera."""
     write_ply(tmp_path / "splats.ply", read_subject(run).gaussians)
     shown = viewing(tmp_path / "splats.ply", "--host", "0.0.0.0")
     with shown as address, opened(browser, address, 390, 760, known=of_viser) as (tab, wrong):
         tab.get_by_text("splats.ply").wait_for()
-        assert screen_becomes(tab, lambda picture: picture[:300].std() > 5)[:300].std() > 5
+
+        def drawn():
+            """What is between the notice of viser, above, and the panel, below."""
+            return screenshot(tab)[180:540]
+
+        def at_rest():
+            until, before = time.monotonic() + 60, drawn()
+            while True:
+                tab.wait_for_timeout(1500)
+                picture = drawn()
+                if (np.abs(picture - before).mean() < 0.01 and picture.std() > 5) or time.monotonic() > until:
+                    return picture
+                before = picture
+
+        first = at_rest()
+        assert first.std() > 5
+        finger(tab, [(190 + 8 * k, 330) for k in range(12)])
+        turned = at_rest()
+        assert np.abs(turned - first).mean() > 1
+        tab.keyboard.down("d")
+        tab.wait_for_timeout(300)
+        tab.keyboard.up("d")
+        assert np.abs(at_rest() - turned).mean() > 1
         assert wrong == []
