@@ -24,7 +24,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.stats import spearmanr
@@ -37,6 +37,9 @@ from mgs.active.pose_policies import farthest_pose
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import read_json, write_json
+
+if TYPE_CHECKING:
+    from mgs.active.loop import Loop
 
 METRIC = "psnr_mask"
 
@@ -64,12 +67,17 @@ class Bench:
 
         self.stations = real_stations(self.dataset, self.prior, self.settings)
 
-    def scores(self, policies: Sequence[str]) -> dict[str, list[float]]:
-        """The scores of the candidates, by policy, and how far they are from the views taken, by which ties are decided."""
+    def loop(self, order: int) -> Loop:
+        """The loop of the run; fits take the images in another order for each number."""
         from mgs.active.loop import Loop
 
-        loop = Loop(self.run, self.settings, self.dataset, self.stations, silent)
-        found = {}
+        train = self.settings.train.model_copy(update={"seed": self.settings.train.seed + order})
+        settings = self.settings.model_copy(update={"train": train})
+        return Loop(self.run, settings, self.dataset, self.stations, silent)
+
+    def scores(self, policies: Sequence[str]) -> dict[str, list[float]]:
+        """The scores of the candidates, by policy, and how far they are from the views taken, by which ties are decided."""
+        loop, found = self.loop(0), {}
         for name in policies:
             outlook = loop.outlook(self.state, self.left)  # with draws of its own
             found[name] = np.asarray(policy_named(name)(outlook), np.float64).tolist()
@@ -78,18 +86,11 @@ class Bench:
 
     def measured(self, candidate: int | None, order: int) -> float:
         """PSNR of the model after a fit with the candidate's image too, in this order; None: of the model as it is."""
-        from mgs.active.loop import target_of
-
         if candidate is None:
             return float(self.stations.measure(self.state.gaussians, self.state.taken)[self.metric])
-        taken = [*self.state.taken, candidate]
-        cameras = [self.dataset.frames[i].camera for i in taken]
-        targets = [target_of(self.dataset.frames[i]) for i in taken]
-        fit = self.stations.fit
-        start = self.stations.initial([self.dataset.frames[i] for i in self.state.taken[: self.settings.seeds]])
-        train = self.settings.train_at(1).model_copy(update={"seed": self.settings.train.seed + order})
-        gaussians = fit(self.state.gaussians, start, cameras, targets, train, lambda done, most: None).gaussians
-        return float(self.stations.measure(gaussians, taken)[self.metric])
+        loop, taken = self.loop(order), [*self.state.taken, candidate]
+        fit = loop.fit(self.state, taken, loop.targets(taken), len(self.state.steps), lambda done, most: None)
+        return float(self.stations.measure(fit.gaussians, taken)[self.metric])
 
 
 def study(out: Path, runs: Sequence[Path], orders: int, policies: Sequence[str]) -> dict[str, Any]:

@@ -71,7 +71,7 @@ class Stations:
     on_surface: how many of the Gaussians, the first, lie on the surface, so are what coverage is a share of; None: all.
     up: unit vector that points upwards in the world: azimuths are angles about it.
     prior: hash of what `initial` starts from (`mgs.active.inputs.prior_digest`).
-    capture(frames): have their images made where they do not exist yet; called before the first of them is read.
+    capture(frame): have its images made where they do not exist yet; called before they are read.
     """
 
     centre: np.ndarray
@@ -87,7 +87,7 @@ class Stations:
     on_surface: int | None = None
     up: Up = PLUS_Z
     prior: str = ""
-    capture: Callable[[Sequence[Frame]], None] = lambda frames: None
+    capture: Callable[[Frame], None] = lambda frame: None
 
 
 @dataclass
@@ -171,7 +171,7 @@ class Loop:
         """Have the images of these frames made where they do not exist yet."""
         for done, i in enumerate(views):
             self.progress("capturing", done, len(views))
-            self.stations.capture([self.frames[i]])
+            self.stations.capture(self.frames[i])
 
     def check(self, state: State) -> None:
         """Raises InputError where a state is not of this run: where its means, which a fit leaves alone, are not the prior's;

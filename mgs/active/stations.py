@@ -67,11 +67,11 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
         on_surface=len(prior.points),
         up=prior.up,
         prior=prior_digest(prior),
-        capture=capture_of(dataset) if dataset.on_demand else lambda frames: None,
+        capture=capture_of(dataset) if dataset.on_demand else lambda frame: None,
     )
 
 
-def capture_of(dataset: Dataset) -> Callable[[Sequence[Frame]], None]:
+def capture_of(dataset: Dataset) -> Callable[[Frame], None]:
     """`mgs.synth.capture.capture_of`, imported here because only runs that capture need it, and a variant before it."""
     runtime.start()
     from mgs.synth import capture

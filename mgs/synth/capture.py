@@ -6,7 +6,7 @@ The variant must be set before this module is imported (`mgs.runtime.start`).
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -26,8 +26,8 @@ POSE_TOLERANCE = 1e-9
 """By how much an entry of a pose (metres, cosines) may change when it is written as text and read."""
 
 
-def capture_of(dataset: Dataset) -> Callable[[Sequence[Frame]], None]:
-    """capture(frames): render those of an on-demand dataset whose files do not all exist yet.
+def capture_of(dataset: Dataset) -> Callable[[Frame], None]:
+    """capture(frame): render a frame of an on-demand dataset, unless all its files exist.
 
     What is written is bit for bit what `mgs.synth.rendering.synthesise` writes without `on_demand`. The scene is built when the
     first image is asked for, in seconds. capture raises InputError where the dataset has no config.json of `mgs synth-orbit
@@ -36,15 +36,15 @@ def capture_of(dataset: Dataset) -> Callable[[Sequence[Frame]], None]:
     """
     prepared = cache(lambda: _prepared(dataset.root))
 
-    def capture(frames: Sequence[Frame]) -> None:
-        for frame in frames:
-            if not is_done(frame):
-                photographer, orbit, exact = prepared()
-                known = orbit.get(frame.name)
-                if known is None or (exact and not _same_pose(known.camera, frame.camera)):
-                    where = f"{dataset.root / 'transforms.json'}: frame {frame.name}"
-                    raise InputError(f"{where} is not one of the scene's orbit, so it cannot be rendered; restore or remove it")
-                photographer.take(known)
+    def capture(frame: Frame) -> None:
+        if is_done(frame):
+            return
+        photographer, orbit, exact = prepared()
+        known = orbit.get(frame.name)
+        if known is None or (exact and not _same_pose(known.camera, frame.camera)):
+            where = f"{dataset.root / 'transforms.json'}: frame {frame.name}"
+            raise InputError(f"{where} is not one of the scene's orbit, so it cannot be rendered; restore or remove it")
+        photographer.take(known)
 
     return capture
 
