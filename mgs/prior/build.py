@@ -78,7 +78,6 @@ def build_prior(
     """
     tell = on_stage or (lambda stage: None)
     chosen = source_of(dataset, source, points)
-    check_masks(dataset.frames)
     surface = _of_depth(dataset, settings, tell) if chosen == "depth" else surface_of(dataset, chosen, settings, tell, points)
     mesh, segmented, cell = surface.mesh, surface.segmented, surface.cell
     tell("surface samples")
@@ -115,6 +114,7 @@ def build_prior(
 def _of_depth(dataset: Dataset, settings: PriorSettings, tell: Callable[[str], None]) -> Surface:
     """The surface by the source "depth"."""
     segmented = segment_dataset(dataset, settings, tell)
+    check_masks(dataset.frames)
     cloud, plane = segmented.cloud, segmented.plane
     assert plane is not None
     tell("Poisson mesh")

@@ -120,9 +120,10 @@ def surface_of(
     """The surface by the source "points" or "hull". points: the cloud's file, if not the dataset's own.
 
     With masks the hull bounds what points give, and closes it where there are none. Raises InputError as `check_photographs`,
-    `visual_hull`, `read_cloud` and `segment_points`, and NoSurface where the surface cannot be closed.
+    `check_masks`, `visual_hull`, `read_cloud` and `segment_points`, and NoSurface where the surface cannot be closed.
     """
     check_photographs(dataset.frames)
+    check_masks(dataset.frames)
     if source == "hull":
         settings.refuse_shaping("a hull is carved from masks")
         carved = visual_hull(dataset.frames, tell)
