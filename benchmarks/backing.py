@@ -17,6 +17,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 
 from mgs import runtime
+from mgs.active.criteria import lam_by_kind, regularisation
 from mgs.active.fitting import fit
 from mgs.active.loop import target_of
 from mgs.active.pose_policies import seed_views
@@ -31,12 +32,12 @@ from mgs.prior.build import build_prior
 from mgs.prior.initial import initial_gaussians
 from mgs.prior.settings import PriorSettings
 from mgs.provenance import command_line, versions
-from mgs.splat import ListCache, render
+from mgs.splat import ListCache, groups, render
 
 VIEWS = 12
 SIZES = (2_500, 5_000, 10_000, 20_000, 40_000)
 BACKINGS = (0.0, 0.5)
-PASSES = (40, 150)
+PASSES = (10, 100)
 """Passes of the fits; the longer one, of one size, shows what fitting on does."""
 DEEP = 0.05
 """Metres."""
@@ -61,7 +62,7 @@ def measure(gaussians: Gaussians, frames: Sequence[Frame], spacing: float) -> di
 def study(root: Path) -> list[dict[str, Any]]:
     """One record per model: its size, backing, passes, and what `measure` says of it."""
     dataset = load_dataset(root)
-    frames, cache = dataset.frames, ListCache()
+    frames, cache, lam = dataset.frames, ListCache(), lam_by_kind(regularisation(groups(0)), groups(0))
     positions = np.array([frame.camera.position for frame in frames])
     settings = [(n, backing, PASSES[0]) for n in SIZES for backing in BACKINGS]
     settings += [(10_000, backing, PASSES[1]) for backing in BACKINGS]
@@ -73,7 +74,7 @@ def study(root: Path) -> list[dict[str, Any]]:
         start = initial_gaussians(prior, chosen)[0]
         train = TrainSettings(passes=passes, tolerance=0.0)
         cameras, targets = [frame.camera for frame in chosen], [target_of(frame) for frame in chosen]
-        fitted = fit(start, cameras, targets, train, cache=cache).gaussians
+        fitted = fit(start, cameras, targets, train, cache=cache, start=start, lam=lam).gaussians
         held_out = [frame for i, frame in enumerate(frames) if i not in taken]
         found = measure(fitted, held_out, prior.spacing)
         records.append({"gaussians": n, "backing": backing, "passes": passes, "spacing": prior.spacing} | found)

@@ -113,11 +113,11 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
                 axis.plot([r["factor"] for r in rows], [r["departure"] for r in rows], "o-", color=colour, label=kind)
             real = [r["departure"] for r in records if (r["passes"], r["move"]) == (passes, "one added view")]
             axis.plot([1.0] * len(real), real, "x", color="#000000", label="one added view")
-            axis.set(xscale="log", yscale="log", xlabel="size of the draw (posterior standard deviations)")
+            axis.set(xscale="log", ylim=(0, None), xlabel="size of the draw (posterior standard deviations)")
             axis.set_title(f"after {passes} passes")
             axis.axhline(1, color="#888888", linewidth=0.8)
         figure.axes[0].set(ylabel="departure from linear")
-        figure.axes[0].legend()
+        figure.axes[0].legend(ncols=3, loc="lower left", columnspacing=0.8, handlelength=1.2)
         save_figure(figure, path)
 
 
