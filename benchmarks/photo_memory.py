@@ -27,7 +27,7 @@ from mgs.provenance import command_line, versions
 
 WIDTH, HEIGHT = 4000, 3000
 DISTANCE, ALTITUDE = 3.0, 1.2
-COUNTS = (8, 32)
+COUNTS = (8, 100)
 """Numbers of photographs: what is bounded takes no more for the second than for the first."""
 DISTORTION = -0.02
 """k1 of the lens."""
@@ -69,15 +69,16 @@ def capture(folder: Path, image: Path, mask: Path, count: int) -> None:
     trimesh.PointCloud(points / np.linalg.norm(points, axis=1, keepdims=True)).export(folder / "points.ply")
 
 
-def dataset(folder: Path, image: Path, mask: Path, count: int) -> None:
-    """What a capture without distortion would be imported as, at full size."""
+def dataset(folder: Path, image: Path, mask: Path | None, count: int) -> None:
+    """What a capture without distortion would be imported as, at full size; mask None: without masks."""
     frames = []
     for k, camera in enumerate(ring(count)):
         paths = folder / f"images/{k:03d}.png", folder / f"masks/{k:03d}.png"
         for path, source in zip(paths, (image, mask), strict=True):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            os.link(source, path)
-        frames.append(Frame(f"{k:03d}", camera, float(k), paths[0], mask_path=paths[1]))
+            if source is not None:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                os.link(source, path)
+        frames.append(Frame(f"{k:03d}", camera, float(k), paths[0], mask_path=paths[1] if mask else None))
     write_transforms(folder, frames)
     points = np.random.default_rng(1).standard_normal((4000, 3))
     trimesh.PointCloud(points / np.linalg.norm(points, axis=1, keepdims=True)).export(folder / "sparse.ply")
@@ -103,14 +104,24 @@ def peak(note: Path, *command: str | Path) -> float:
     return int(note.read_text()) * 1024 / 1e9
 
 
+def commands(folder: Path, count: int) -> list[tuple[str, list[str | Path]]]:
+    """The stations that photographs go through: (what the table calls it, its command line), in the order to run them."""
+    photos, small, prior = (folder / f"{name}{count}" for name in ("photos", "small", "prior"))
+    full, size = folder / f"full{count}", ["--gaussians", "4000"]
+    run = ["--policy", "uniform", "--passes", "1", "--warm-passes", "1", "--seeds", str(count), "--budget", "0"]
+    return [
+        ("mgs import", ["import", photos, "--out", folder / f"imported{count}"]),
+        ("mgs import --downscale 4", ["import", photos, "--out", small, "--downscale", "4"]),
+        ("mgs prior --from hull", ["prior", full, "--from", "hull", "--out", prior, *size]),
+        ("mgs prior --from points", ["prior", full, "--from", "points", "--out", folder / f"points{count}", *size]),
+        ("mgs dataset masks", ["dataset", "masks", folder / f"bare{count}", "--prior", prior]),
+        ("mgs nbv", ["nbv", small, "--prior", prior, "--out", folder / f"run{count}", *run]),
+    ]
+
+
 def main(out: Path) -> None:
     """Measure and write."""
     rows: list[dict[str, Any]] = []
-
-    def measure(name: str, photographs: int, *command: str | Path) -> None:
-        rows.append({"station": name, "photographs": photographs, "gigabytes": peak(folder / "note", *command)})
-        print(rows[-1], flush=True)
-
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         pixels, mask = ball(ring(1)[0])
@@ -120,18 +131,13 @@ def main(out: Path) -> None:
         for count in COUNTS:
             capture(folder / f"photos{count}", folder / "ball.jpg", folder / "mask.png", count)
             dataset(folder / f"full{count}", folder / "ball.png", folder / "mask.png", count)
-        few, many = COUNTS
-        size = ["--gaussians", "4000"]
-        run = ["--policy", "uniform", "--passes", "1", "--warm-passes", "1"]
-        measure("mgs import", few, "import", folder / f"photos{few}", "--out", folder / "imported")
-        for count in COUNTS:
-            small = folder / f"small{count}"
-            measure("mgs import --downscale 4", count, "import", folder / f"photos{count}", "--out", small, "--downscale", "4")
-        for source, count in (("hull", few), ("hull", many), ("points", many)):
-            to = folder / f"prior-{source}-{count}"
-            measure(f"mgs prior --from {source}", count, "prior", folder / f"full{count}", "--from", source, "--out", to, *size)
-        given = ["--prior", folder / f"prior-hull-{few}", "--seeds", str(few), "--budget", "0", *run]
-        measure("mgs nbv", few, "nbv", folder / f"small{few}", "--out", folder / "run", *given)
+            dataset(folder / f"bare{count}", folder / "ball.png", None, count)
+        for station in zip(*(commands(folder, count) for count in COUNTS), strict=True):
+            for count, (name, command) in zip(COUNTS, station, strict=True):
+                if name == "mgs import" and count != COUNTS[0]:
+                    continue  # takes minutes to write, and --downscale reads and undistorts as many pixels
+                rows.append({"station": name, "photographs": count, "gigabytes": peak(folder / "note", *command)})
+                print(rows[-1], flush=True)
     write_json(out, {"command": command_line(), "machine": runtime.processor(), "versions": versions(), "records": rows})
 
 

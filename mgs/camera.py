@@ -122,6 +122,12 @@ class Camera:
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return Camera(scale @ self.K, width, height, self.world_to_camera)
 
+    def scaled(self, factor: float) -> Camera:
+        """The same camera in a world whose lengths are multiplied by a factor."""
+        pose = self.world_to_camera.copy()
+        pose[:3, 3] *= factor
+        return Camera(self.K, self.width, self.height, pose)
+
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:
     """world_to_camera [4,4] of a camera at `eye` [3] that looks at `target` [3], metres, with the direction `up` [3] upwards.

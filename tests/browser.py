@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -31,12 +31,21 @@ def chromium() -> Iterator[Any]:
 
 
 @contextmanager
-def opened(browser: Any, address: str, width: int, height: int, scheme: str = "light") -> Iterator[tuple[Any, list[str]]]:
+def opened(
+    browser: Any,
+    address: str,
+    width: int,
+    height: int,
+    scheme: str = "light",
+    known: Callable[[Any], bool] = lambda message: False,
+) -> Iterator[tuple[Any, list[str]]]:
     """Context manager that opens an address in a window of this size, and gives the page and what went wrong on it: errors on
-    its console, exceptions, and requests to places other than the address's own host and the disk."""
+    its console but those that are known, exceptions, and requests to places other than the address's own host and the disk.
+
+    known: of an error on the console, a ConsoleMessage of playwright, whether it is left out."""
     context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme, has_touch=width < 600)
     page, wrong = context.new_page(), []
-    page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
+    page.on("console", lambda message: wrong.append(message.text) if message.type == "error" and not known(message) else None)
     page.on("pageerror", lambda error: wrong.append(str(error)))
     own = ("data:", "blob:", "file:", "about:", address, address.replace("http", "ws"))
     page.on("request", lambda request: wrong.append(request.url) if not request.url.startswith(own) else None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -316,6 +317,16 @@ def test_masks_by_projecting_a_mesh_or_from_files(dataset: Dataset, tmp_path: Pa
         assert (a.mask() & ~true).sum() < 0.15 * true.sum()
 
 
+def test_masks_may_be_named_as_colmap_names_them(tmp_path: Path) -> None:
+    """0001.jpg.png is the mask of 0001.jpg."""
+    root = synthetic.write_dataset(tmp_path / "data").root
+    true = [frame.mask() for frame in load_dataset(root).frames]
+    for path in list((root / "masks").iterdir()):
+        path.rename(path.with_name(f"{path.name}.png"))
+    imported = import_source(read_source(root), tmp_path / "out", masks=root / "masks")
+    assert all(np.array_equal(frame.mask(), mask) for frame, mask in zip(imported.frames, true, strict=True))
+
+
 def test_a_prior_of_a_given_mesh(dataset: Dataset, tmp_path: Path) -> None:
     options = ["prior", str(dataset.root), "--mesh", str(dataset.root / "rock.glb"), "--gaussians", "300", "--backing", "0"]
     with pytest.raises(SystemExit) as exit_:
@@ -353,6 +364,38 @@ def _truncated_image(root: Path) -> Path:
     path = synthetic.write_dataset(root).frames[0].image_path
     path.write_bytes(path.read_bytes()[:100])
     return root
+
+
+def _corrupt_jpeg(root: Path) -> Path:
+    """The header is whole, the pixels are cut off."""
+    dataset = synthetic.write_dataset(root)
+    jpeg = root / "images/kf_0000.jpg"
+    Image.open(dataset.frames[0].image_path).save(jpeg, quality=95)
+    jpeg.write_bytes(jpeg.read_bytes()[:-500])
+    records = read_json(root / "transforms.json")
+    records["frames"][0]["file_path"] = "images/kf_0000.jpg"
+    (root / "transforms.json").write_text(json.dumps(records))
+    return root
+
+
+def _mask(root: Path, spoil: Callable[[Path], object]) -> Path:
+    """The masks of all frames are in order but one."""
+    synthetic.write_dataset(root)
+    spoil(root / "masks/kf_0000.png")
+    return root
+
+
+def _cloud(vertices: str) -> Callable[[Path], Path]:
+    """A transforms.json that names a PLY file of these points."""
+
+    def make(root: Path) -> Path:
+        _edit(root, lambda data: data.update(ply_file_path="points.ply"))
+        columns = "".join(f"property float {name}\n" for name in "xyz")
+        count = len(vertices.splitlines())
+        (root / "points.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex {count}\n{columns}end_header\n{vertices}")
+        return root
+
+    return make
 
 
 def _empty(root: Path) -> Path:
@@ -394,8 +437,24 @@ BAD: dict[str, tuple[Callable[[Path], Path], list[str], str]] = {
     "unit of words": (lambda root: _edit(root, lambda data: data.update(depth_unit_scale_factor="mm")), [], "depth_unit"),
     "no images": (_no_images, [], "none of the 8 images"),
     "truncated image": (_truncated_image, [], "not a readable image"),
+    "corrupt JPEG": (_corrupt_jpeg, [], "kf_0000.jpg: not a readable image"),
+    "up of words": (lambda root: _edit(root, lambda data: data.update(up="skyward")), [], "up: must be three finite numbers"),
+    "angle of view of 0": (
+        lambda root: _edit(root, lambda data: (data.pop("fl_x"), data.update(camera_angle_x=0))),
+        [],
+        "no usable intrinsics",
+    ),
+    "no points in the cloud": (_cloud(""), [], "points.ply: has values that are not finite, or fewer than two different"),
+    "all points in one place": (_cloud("1 2 3\n" * 500), [], "points.ply: has values that are not finite, or fewer than two"),
+    "no model in sparse": (lambda root: _colmap(root, shutil.rmtree), [], "COLMAP model (cameras, images and points3D"),
     "truncated colmap": (lambda root: _colmap(root, _truncate), [], "not a readable COLMAP model"),
     "no mask": (lambda root: synthetic.write_dataset(root).root, ["--masks", "."], "no mask for image"),
+    "one mask missing": (lambda root: _mask(root, Path.unlink), ["--masks", "{source}/masks"], "no mask for image kf_0000.png"),
+    "one mask of another size": (
+        lambda root: _mask(root, lambda path: write_png(path, np.ones((24, 32), bool))),
+        ["--masks", "{source}/masks"],
+        "kf_0000.png: is 32x24, but its camera is 64x48",
+    ),
     "no mask folder": (lambda root: synthetic.write_dataset(root).root, ["--masks", "none"], "none: no such folder"),
     "no mesh": (lambda root: synthetic.write_dataset(root).root, ["--mesh", "none.glb"], "no such mesh"),
     "both masks": (lambda root: synthetic.write_dataset(root).root, ["--mesh", "a.glb", "--masks", "b"], "give one of them"),
@@ -407,7 +466,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(case: str, tmp_path: Path, cap
     make, options, message = BAD[case]
     source = make(tmp_path / "src")
     with pytest.raises(SystemExit) as exit_:
-        main(["import", str(source), "--out", str(tmp_path / "out"), *options])
+        main(["import", str(source), "--out", str(tmp_path / "out"), *(option.format(source=source) for option in options)])
     error = capfd.readouterr().err.strip()
     assert exit_.value.code == 2
     assert message in error
@@ -435,5 +494,5 @@ def test_an_empty_mask_in_every_frame_is_one_line(dataset: Dataset) -> None:
     empty = dataset.root / "masks/empty.png"
     write_png(empty, np.zeros((48, 64), bool))
     blind = Dataset(dataset.root, tuple(replace(frame, mask_path=empty) for frame in dataset.frames))
-    with pytest.raises(InputError, match="rock mask"):
+    with pytest.raises(InputError, match="masks are black in every frame"):
         build_prior(blind, PriorSettings(gaussians=100, backing=0))

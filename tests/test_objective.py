@@ -110,6 +110,15 @@ def test_the_newton_decrease_grows_to_that_of_a_dense_solve(case):
     assert found[0] < 0.9 * expected  # it takes more than one iteration: the parameters are correlated
 
 
+def test_at_a_minimum_nothing_is_predicted_to_be_gained(case):
+    """As for a model that no camera sees."""
+    goal, *_ = case
+    model = surface_gaussians(50)
+    unseen = np.zeros((20, 24, 4), np.float32)  # of weight 0
+    resting = objective(model, [goal.photos[0].camera], [unseen], lam={"colour": 1.0})
+    assert newton_decrease(resting, as_drjit(model), 5) == [0.0]
+
+
 def test_a_start_in_the_memory_of_the_model_is_kept_apart(case):
     """Dr.Jit takes two arrays in one memory for one when it records: a later fit would then be pulled to the wrong start."""
     from mgs.active.fitting import fit

@@ -165,6 +165,16 @@ def test_a_frame_whose_mask_does_not_fit_is_named(tmp_path: Path) -> None:
         visual_hull(dataset.frames)
 
 
+def test_masks_of_scattered_pixels_are_one_line(tmp_path: Path) -> None:
+    """The grid then reaches beyond all images, where nothing speaks against a point."""
+    dataset = floating(tmp_path / "d", synthetic.orbit_cameras(12, 96, 72))
+    for k, frame in enumerate(dataset.frames):
+        assert frame.mask_path is not None
+        write_png(frame.mask_path, np.random.default_rng(k).random((72, 96)) < 0.01)
+    with pytest.raises(InputError, match=r"share no point of space \(at best \d+ of 12 frames, such as kf_"):
+        visual_hull(dataset.frames)
+
+
 # Points
 
 
@@ -253,6 +263,16 @@ def test_a_cloud_survives_its_file(tmp_path: Path) -> None:
     read = read_cloud(tmp_path / "c.ply")
     for name in ("points", "views", "track", "error"):
         assert np.allclose(getattr(read, name), getattr(cloud, name), atol=1e-6)
+
+
+def test_of_points_in_the_same_place_one_is_kept(tmp_path: Path) -> None:
+    """As where a program wrote a vertex for each corner of each face."""
+    points = np.random.default_rng(4).random((50, 3)).astype(np.float32)
+    write_cloud(tmp_path / "c.ply", SparseCloud(np.concatenate([points, points[::-1], points]), track=np.arange(150.0)))
+    read = read_cloud(tmp_path / "c.ply")
+    assert np.array_equal(read.points, points)
+    assert read.track is not None
+    assert np.array_equal(read.track, np.arange(50))
 
 
 def test_a_refused_cloud_leaves_a_picture(
@@ -526,6 +546,20 @@ def test_what_cannot_be_used_is_one_line(
     assert message in error
     assert "\n" not in error
     assert not (tmp_path / "d/prior").exists()
+
+
+def test_a_world_in_which_nothing_would_be_drawn_is_one_line(
+    data: Callable[[str], Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A prior has no unit, but the kernels draw nothing that is nearer than 0.01."""
+    assert run("import", data("nerf-synthetic"), "--out", tmp_path / "d", "--unit", "0.005") == 0
+    assert run("prior", tmp_path / "d", "--gaussians", "300") == 0
+    capfd.readouterr()
+    assert run("nbv", tmp_path / "d", "--out", tmp_path / "run", "--budget", "1") == 2
+    error = capfd.readouterr().err.strip()
+    assert "m from it, and nothing nearer than 0.01 is drawn; import the data with --unit M" in error
+    assert "\n" not in error
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_damaged_cloud_is_one_line(data: Callable[[str], Path], tmp_path: Path) -> None:

@@ -6,6 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+from scipy.spatial import cKDTree
+
 from mgs import runtime
 from mgs.active import loop
 from mgs.active.policy_file import absolute
@@ -15,8 +18,9 @@ from mgs.active.stations import real_stations
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.errors import InputError, row_named
 from mgs.files import atomic_folder
-from mgs.prior.build import build_prior, load_prior, save_prior
+from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.settings import PriorSettings
+from mgs.splat.constants import NEAR
 from mgs.synth.scene_file import load_scene_file
 
 CAPTURE_PRESET = "quick"
@@ -78,7 +82,8 @@ def start_run(
     not given. settings: fields of `mgs.active.settings.NbvSettings`; the budget is 50 views, or all candidates where they are
     fewer.
     Leaves no folder behind where it fails. Raises InputError where the output folder is not empty, a setting is wrong, the
-    dataset is too small for it, or the dataset, the scene or the prior is missing or damaged.
+    dataset is too small for it, the dataset, the scene or the prior is missing or damaged, or the cameras are so near to the
+    prior that it would not be drawn.
     """
     out = Path(out)
     if (dataset is None) == (capture is None):
@@ -108,9 +113,22 @@ def start_run(
             asked = PriorSettings(gaussians=gaussians, seed=complete.seed, density=row.density if row else 1.0)
             found, _ = build_prior(frames.survey(), asked, on_stage=lambda stage: progress(f"prior: {stage}", 0, 1))
             save_prior(unfinished / "prior", found)
+        _check_near(found, frames, where)
         complete = complete.with_spacing(found.spacing)
         start(unfinished, complete, frames)
     return complete
+
+
+def _check_near(prior: Prior, dataset: Dataset, where: Path) -> None:
+    """Raises InputError where most cameras are nearer to the prior than NEAR: a length of 1 then stands for many metres. where:
+    the folder of the prior."""
+    positions = np.stack([frame.camera.position for frame in dataset.frames])
+    nearest = float(np.median(cKDTree(prior.points).query(positions)[0]))
+    if nearest < NEAR:
+        raise InputError(
+            f"{where}: the cameras are {nearest:.2g} {dataset.unit} from it, and nothing nearer than {NEAR} is drawn; import "
+            "the data with --unit M, the metres in a length of 1, and build the prior again"
+        )
 
 
 def _candidates(scene: str | Path) -> int:

@@ -230,6 +230,8 @@ def newton_decrease(
     residual = [-g for g in gradient]
     z = [mi.TensorXf(i * r.array, r.shape) for i, r in zip(inverse, residual, strict=True)]
     direction, rz, decreases = z, dot(residual, z), []
+    if rz == 0:  # at a minimum; so is a model that no camera sees
+        return [0.0]
     for done in range(iterations):
         progress(done, iterations)
         product = found.curvature_times(model, direction)

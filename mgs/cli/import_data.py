@@ -84,10 +84,11 @@ def import_data(
             f"mgs: by their EXIF, exposure differs by up to {max(stops) - min(stops):.1f} stops between photographs; "
             "`mgs nbv --exposure` estimates a gain for each"
         )
+    points = 0 if found.sparse is None else len(found.sparse.points)
     camera = result.frames[0].camera
     if camera.width * camera.height > MANY_PIXELS:
         notes.print(f"mgs: images of {camera.width}x{camera.height} take long to fit; --downscale 2 or more makes them smaller")
     console.print(
         f"{found.kind}: {len(result)} frames, {masked} with mask, {layered} with alpha, {deep} with depth, "
-        f"{undone} undistorted; wrote {out}"
+        f"{undone} undistorted, {points:,} points; wrote {out}"
     )

@@ -51,7 +51,8 @@ def write_cloud(path: str | Path, cloud: SparseCloud) -> None:
 
 
 def read_cloud(path: str | Path) -> SparseCloud:
-    """Read the points of any PLY file; nx ny nz, track and error are read where it has them.
+    """Read the points of any PLY file; nx ny nz, track and error are read where it has them. Of points in the same place the
+    first is kept: some programs write a vertex for each corner of each face.
 
     Raises InputError if the file is missing, damaged, holds a value that is not finite, or has fewer than two points.
     """
@@ -68,8 +69,11 @@ def read_cloud(path: str | Path) -> SparseCloud:
         track, error = (np.asarray(data[name], np.float64) if name in names else None for name in ("track", "error"))
     except (PlyParseError, KeyError, ValueError, TypeError, UnicodeDecodeError) as error_:
         raise InputError(f"{path}: not a readable cloud ({error_}); give a PLY file with x y z, or import again") from None
+    first = np.sort(np.unique(points, axis=0, return_index=True)[1])
+    points = points[first]
+    views, track, error = (None if a is None else a[first] for a in (views, track, error))
     if len(points) < 2 or not all(np.isfinite(a).all() for a in (points, views, track, error) if a is not None):
-        raise InputError(f"{path}: has values that are not finite, or fewer than two points; make it again")
+        raise InputError(f"{path}: has values that are not finite, or fewer than two different points; make it again")
     if views is not None and not np.linalg.norm(views, axis=1).all():
         views = None  # such as the normals of zeros that some programs write
     return SparseCloud(points, views, track, error)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -77,7 +78,7 @@ class Source:
         """
         if not 0 < unit < np.inf:
             raise InputError(f"import: --unit {unit} must be a positive number of metres; correct it")
-        shots = [replace(shot, camera=_scaled(shot.camera, unit)) for shot in self.shots]
+        shots = [replace(shot, camera=shot.camera.scaled(unit)) for shot in self.shots]
         return replace(self, shots=shots, sparse=self.sparse and self.sparse.scaled(unit), unit="m")
 
     def up_or_estimate(self) -> tuple[Up, str]:
@@ -115,7 +116,8 @@ def read_source(source: str | Path, images: Path | None = None, split: str = "tr
     else:
         model = next((folder for folder in (source / "sparse/0", source / "sparse", source) if is_model(folder)), None)
         if model is None:
-            raise InputError(f"{source}: holds no transforms.json, transforms_{split}.json or COLMAP model; check the folder")
+            three = "cameras, images and points3D, .bin or .txt, in sparse/0, sparse or the folder itself"
+            raise InputError(f"{source}: holds no transforms.json, transforms_{split}.json or COLMAP model ({three})")
         result = _read_colmap(model, images if images is not None else source / "images")
     if not result.shots:
         raise InputError(f"{source}: none of the {result.missing} images it lists exists; restore them or give --images")
@@ -123,12 +125,6 @@ def read_source(source: str | Path, images: Path | None = None, split: str = "tr
     if repeated:
         raise InputError(f"{source}: lists {repeated[0]} more than once; remove the duplicate frames")
     return result
-
-
-def _scaled(camera: Camera, factor: float) -> Camera:
-    pose = camera.world_to_camera.copy()
-    pose[:3, 3] *= factor
-    return Camera(camera.K, camera.width, camera.height, pose)
 
 
 def _find(folder: Path, name: str) -> Path | None:
@@ -185,12 +181,12 @@ def _transforms_camera(path: Path, index: int, record: dict[str, Any], image: Pa
             width, height = int(record["w"]), int(record["h"])
         else:
             height, width = read_rgba(image).shape[:2]
-        fl_x = float(record["fl_x"]) if "fl_x" in record else width / 2 / np.tan(float(record["camera_angle_x"]) / 2)
+        fl_x = float(record["fl_x"]) if "fl_x" in record else width / 2 / math.tan(float(record["camera_angle_x"]) / 2)
         fl_y, cx, cy = (float(record.get(*pair)) for pair in (("fl_y", fl_x), ("cx", width / 2), ("cy", height / 2)))
         K = np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]])
         distortion = np.array([float(record.get(key, 0)) for key in DISTORTION_KEYS])
         pose = np.array(record["transform_matrix"], np.float64)
-    except (KeyError, TypeError, ValueError, OverflowError):
+    except (KeyError, TypeError, ValueError, ArithmeticError):
         raise InputError(f"{where} has no usable intrinsics or pose; give fl_x (or camera_angle_x) and a matrix") from None
     if record.get("k4"):
         raise InputError(f"{where} has k4, which the OPENCV model lacks; undistort the images first")
@@ -227,8 +223,8 @@ def import_source(
 ) -> Dataset:
     """Write a source as a dataset into the folder `out`: a new or empty one, or one that an interrupted import of it left.
 
-    Masks come from the first of these that there is: files in the folder `masks` that are named as the images; the pixels whose
-    centre shows the `mesh` (world coordinates); the source's own mask files; the
+    Masks come from the first of these that there is: files in the folder `masks` that are named as the images (0001.png, or
+    0001.jpg.png for 0001.jpg); the pixels whose centre shows the `mesh` (world coordinates); the source's own mask files; the
     images' alpha. Images of the rock alone come from the source's own images of it, or from an alpha that gives the mask and
     has values between empty and full. With `masks` or `mesh` there are none.
     Distorted images, depth and masks are undistorted to a pinhole camera in which every pixel is valid; then blocks of
@@ -270,7 +266,8 @@ def import_source(
 
 
 def _mask_file(masks: Path, shot: Shot) -> Path:
-    path = _find(masks, shot.image.stem) or _find(masks, shot.name)
+    names = shot.image.stem, shot.name, shot.image.name  # the last with a suffix more, as COLMAP names masks: 0001.jpg.png
+    path = next((found for name in names if (found := _find(masks, name))), None)
     if not masks.is_dir():
         raise InputError(f"{masks}: no such folder; give the folder of the masks")
     if path is None:

@@ -70,6 +70,11 @@ def shrunk(camera: Camera, undo: Undo, factor: int) -> tuple[Camera, Undo]:
     return Camera(K, width, height, camera.world_to_camera), smaller
 
 
+def stride_for(camera: Camera, most: float) -> int:
+    """The least factor for `shrunk` with which an image of the camera has at most so many pixels."""
+    return int(np.ceil(np.sqrt(camera.width * camera.height / most)))
+
+
 def fit_to_camera(path: Path, pixels: np.ndarray, camera: Camera) -> np.ndarray:
     """The pixels of an image file, turned as its EXIF says if only that makes it as wide and high as its camera.
 

@@ -39,7 +39,10 @@ def up_of_cameras(cameras: Sequence[Camera]) -> Up:
 def unit_up(vector: Sequence[float] | np.ndarray) -> Up:
     """A vector of length 1 in the direction of the one given. Raises InputError if that is not finite or zero, or not of three
     numbers."""
-    given = np.asarray(vector, np.float64)
+    try:
+        given = np.asarray(vector, np.float64)
+    except (TypeError, ValueError):
+        given = np.full(3, np.nan)
     length = np.linalg.norm(given)
     if given.shape != (3,) or not np.isfinite(given).all() or length == 0:
         raise InputError("up: must be three finite numbers that are not all zero; correct --up, or `up` of transforms.json")

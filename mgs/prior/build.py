@@ -17,12 +17,14 @@ from scipy.spatial import cKDTree
 
 from mgs.camera import Camera
 from mgs.data.dataset import Dataset, Frame
+from mgs.data.lens import shrunk, stride_for
 from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh, write_points
 from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.data.visibility import in_mask, visible
 from mgs.errors import InputError
 from mgs.files import atomic_path, new_folder, read_json, write_json
-from mgs.prior.photographs import Surface, source_of, surface_of
+from mgs.prior.hull import MOST_PIXELS
+from mgs.prior.photographs import Surface, check_masks, source_of, surface_of
 from mgs.prior.resolution import Resolution, resolution
 from mgs.prior.segmentation import Plane, SegmentedCloud, segment_dataset
 from mgs.prior.settings import PriorSettings
@@ -70,9 +72,9 @@ def build_prior(
     dataset has. points: a PLY file of points, in place of the dataset's. up: which way is up; "auto": the normal of the
     ground plane where one was found; None, or no such plane: as the dataset says.
     Returns the prior, and the cloud that its mesh was built from, None for a hull.
-    Raises InputError as `source_of`, `surface_of` and `segment_dataset` (nothing to build it from, too few photographs, no
-    rock, two equal rocks), `poisson_mesh` (no closed surface) and `sample_surface` (too few or too many samples), or if no
-    frame sees the mesh; and NoSurface, which has the cloud, where points give no surface.
+    Raises InputError as `source_of`, `check_masks`, `surface_of` and `segment_dataset` (nothing to build it from, too few
+    photographs, no rock, two equal rocks), `poisson_mesh` (no closed surface) and `sample_surface` (too few or too many
+    samples), or if no frame sees the mesh; and NoSurface, which has the cloud, where points give no surface.
     """
     tell = on_stage or (lambda stage: None)
     chosen = source_of(dataset, source, points)
@@ -112,6 +114,7 @@ def build_prior(
 def _of_depth(dataset: Dataset, settings: PriorSettings, tell: Callable[[str], None]) -> Surface:
     """The surface by the source "depth"."""
     segmented = segment_dataset(dataset, settings, tell)
+    check_masks(dataset.frames)
     cloud, plane = segmented.cloud, segmented.plane
     assert plane is not None
     tell("Poisson mesh")
@@ -230,8 +233,11 @@ def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:
     of_mesh = None if with_depth else mesh_depth(mesh)
     seen, normals = np.zeros(len(mesh.vertices), bool), mesh.vertex_normals
     for frame in with_depth or frames:
-        depth = of_mesh(frame.camera) if of_mesh else frame.depth()
-        seen |= visible(mesh.vertices, normals, frame.camera, depth, tolerance) & in_mask(mesh.vertices, frame)
+        camera = frame.camera
+        if of_mesh:  # of a large photograph every few pixels will do
+            camera = shrunk(camera, lambda pixels, smooth: pixels, stride_for(camera, MOST_PIXELS))[0]
+        depth = of_mesh(camera) if of_mesh else frame.depth()
+        seen |= visible(mesh.vertices, normals, camera, depth, tolerance) & in_mask(mesh.vertices, frame)
     narrowed = mesh.seen & seen[mesh.faces].any(1)
     if not narrowed.any():
         raise InputError("prior: no frame sees the mesh in its rock mask; check masks and poses")

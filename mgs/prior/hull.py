@@ -15,7 +15,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, label
 
 from mgs.camera import Camera
 from mgs.data.dataset import Frame
-from mgs.data.lens import shrunk
+from mgs.data.lens import shrunk, stride_for
 from mgs.data.meshes import Mesh
 from mgs.errors import InputError
 
@@ -70,7 +70,7 @@ def visual_hull(frames: Sequence[Frame], tell: Callable[[str], None] = lambda st
     if field.max() <= 0:
         kept = np.unravel_index(np.argmin(carved), carved.shape)
         point = (lo + edge / cells * np.array(kept))[None]
-        against = [frame.name for frame, view in zip(frames, views, strict=True) if view(point)[0] <= 0]
+        against = [frame.name for frame, view in zip(frames, views, strict=True) if not 0 < view(point)[0] < np.inf]
         raise InputError(
             f"prior: the masks share no point of space (at best {len(against)} of {len(frames)} frames, such as {against[0]}, "
             "are against it); poses and masks do not fit, or the object moved; correct or remove frames"
@@ -85,7 +85,7 @@ def visual_hull(frames: Sequence[Frame], tell: Callable[[str], None] = lambda st
     vertices, faces, _, _ = marching_cubes(solid, 0.0, gradient_direction="ascent")
     vertices = lo + cell * (vertices.astype(np.float64) - 1)
     mesh = Mesh(vertices, faces.astype(np.int64), np.ones(len(faces), bool))
-    return Hull(mesh, cell, _checked_agreement(frames, mesh))
+    return Hull(mesh, cell, _checked_agreement(frames, views, mesh))
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,7 @@ class _View:
 
 def _view(frame: Frame) -> _View:
     """The view of a frame. All are kept in memory, so a mask of more than MOST_PIXELS is made smaller."""
-    stride = int(np.ceil(np.sqrt(frame.camera.width * frame.camera.height / MOST_PIXELS)))
-    camera, smaller = shrunk(frame.camera, lambda pixels, smooth: pixels, stride)
+    camera, smaller = shrunk(frame.camera, lambda pixels, smooth: pixels, stride_for(frame.camera, MOST_PIXELS))
     return _View(camera, _signed_distance(smaller(frame.mask().astype(np.uint8) * 255, True) >= 128))
 
 
@@ -168,12 +167,16 @@ def _inside(views: Sequence[_View], points: np.ndarray, reach: float) -> np.ndar
 
 
 def _first_grid(views: Sequence[_View], lo: np.ndarray, edge: float) -> tuple[np.ndarray, np.ndarray]:
-    """The values of the nodes of the coarse grid, and how many views carve each away, [n,n,n] with n = COARSE + 1."""
+    """The values of the nodes of the coarse grid, and how many views carve each away, [n,n,n] with n = COARSE + 1; all views
+    where fewer than LEAST_VIEWS have the node in their image."""
     nodes = np.stack(np.meshgrid(*[np.arange(COARSE + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
     points = lo + edge / COARSE * nodes
-    carved = np.zeros(len(points), int)
+    carved, count = np.zeros(len(points), int), np.zeros(len(points), int)
     for view in views:
-        carved += view(points) <= 0
+        value = view(points)
+        carved += value <= 0
+        count += np.isfinite(value)
+    carved[count < min(LEAST_VIEWS, len(views))] = len(views)
     shape = (COARSE + 1,) * 3
     return _inside(views, points, 2 * NEAR_SURFACE * edge / COARSE).reshape(shape), carved.reshape(shape)
 
@@ -197,15 +200,15 @@ def _largest(field: np.ndarray) -> np.ndarray:
     return np.where((pieces == sizes.argmax()) | (field <= 0), field, -np.abs(field))
 
 
-def _checked_agreement(frames: Sequence[Frame], mesh: Mesh) -> np.ndarray:
+def _checked_agreement(frames: Sequence[Frame], views: Sequence[_View], mesh: Mesh) -> np.ndarray:
     """For each frame the share of its mask that the mesh fills. Raises InputError where the median is below AGREEMENT."""
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
     depth = mesh_depth(mesh)
     filled = []
-    for frame in frames:
-        mask = frame.mask()
-        filled.append((depth(frame.camera)[mask] > 0).mean() if mask.any() else np.nan)
+    for view in views:
+        mask = view.distance > 0
+        filled.append((depth(view.camera)[mask] > 0).mean() if mask.any() else np.nan)
     agreement = np.array(filled)
     if not np.nanmedian(agreement) >= AGREEMENT:
         worst = frames[int(np.nanargmin(agreement))].name

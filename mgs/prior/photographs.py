@@ -17,7 +17,7 @@ from mgs.data.visibility import has_masks
 from mgs.errors import InputError
 from mgs.prior.hull import Hull, visual_hull
 from mgs.prior.points import segment_points, spacing_of
-from mgs.prior.segmentation import NoSurface, SegmentedCloud
+from mgs.prior.segmentation import NoSurface, Plane, SegmentedCloud
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import closed_poisson, intersection, poisson_mesh
 from mgs.survey.fusion import focus, voxel_means
@@ -45,6 +45,10 @@ Measured: larger cells lose detail, and smaller ones gain nothing."""
 BEYOND_POINTS = 0.15
 """A face farther than this from every point, over the extent of the points, closes the surface where nothing was seen, and is
 not sampled. With a hull or a ground plane there is no such need."""
+
+
+ONE_SIDED = 0.5
+"""Least length of the mean normal of points that were seen from one side; it is 0 all around an object, and 1 of a wall."""
 
 
 @dataclass(frozen=True)
@@ -89,8 +93,8 @@ def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = 
 
 
 def check_photographs(frames: Sequence[Frame]) -> None:
-    """Raises InputError where photographs cannot show a surface: fewer than LEAST_PHOTOGRAPHS, cameras that do not look at one
-    thing, masks that are all empty."""
+    """Raises InputError where photographs without depth cannot show a surface: fewer than LEAST_PHOTOGRAPHS, or cameras that do
+    not look at one thing."""
     if len(frames) < LEAST_PHOTOGRAPHS:
         raise InputError(
             f"prior: {len(frames)} photographs without depth are too few; take at least {LEAST_PHOTOGRAPHS}, from all sides"
@@ -102,6 +106,10 @@ def check_photographs(frames: Sequence[Frame]) -> None:
             f"prior: the photographs do not overlap: of {len(frames)} cameras only {sum(seen)} have in their image what all "
             "look at; walk around the object, or check the poses"
         )
+
+
+def check_masks(frames: Sequence[Frame]) -> None:
+    """Raises InputError where there are masks, and no pixel of any of them is the object."""
     if has_masks(frames) and not any(frame.mask().any() for frame in frames):
         raise InputError("prior: the masks are black in every frame; white is the object")
 
@@ -112,9 +120,10 @@ def surface_of(
     """The surface by the source "points" or "hull". points: the cloud's file, if not the dataset's own.
 
     With masks the hull bounds what points give, and closes it where there are none. Raises InputError as `check_photographs`,
-    `visual_hull`, `read_cloud` and `segment_points`, and NoSurface where the surface cannot be closed.
+    `check_masks`, `visual_hull`, `read_cloud` and `segment_points`, and NoSurface where the surface cannot be closed.
     """
     check_photographs(dataset.frames)
+    check_masks(dataset.frames)
     if source == "hull":
         settings.refuse_shaping("a hull is carved from masks")
         carved = visual_hull(dataset.frames, tell)
@@ -143,8 +152,8 @@ def surface_of(
 
 
 def _closed(segmented: SegmentedCloud, hull: Hull | None, spacing: float, settings: PriorSettings) -> tuple[Mesh, int]:
-    """A closed mesh of the object's points, and the depth of the octree: bounded by the hull, or cut at the ground, or with the
-    faces marked as not seen that close it far from every point."""
+    """A closed mesh of the object's points, and the depth of the octree: bounded by the hull, or cut at the ground, or behind
+    what was seen from one side, and with the faces marked as not seen that close it far from every point."""
     points, normals = segmented.rock_points, segmented.rock_normals
     cell = CELL_OF_SPACING * spacing
     if segmented.plane is not None:
@@ -155,10 +164,27 @@ def _closed(segmented: SegmentedCloud, hull: Hull | None, spacing: float, settin
         points, normals = np.concatenate([points, body[gap]]), np.concatenate([normals, body_normals[gap]])
         mesh, depth = closed_poisson(points, normals, cell, settings.poisson_depth)
         return intersection(mesh, hull.mesh), depth
-    mesh, depth = closed_poisson(points, normals, cell, settings.poisson_depth)
+    try:
+        mesh, depth = closed_poisson(points, normals, cell, settings.poisson_depth)
+    except InputError:
+        back = _back_of(points, normals, spacing)
+        if back is None:
+            raise
+        mesh, depth = poisson_mesh(points, normals, cell, back, settings.poisson_depth)
     reach = BEYOND_POINTS * float(np.ptp(points, axis=0).max())
     seen = cKDTree(points).query(mesh.vertices[mesh.faces].mean(1))[0] < reach
     return Mesh(mesh.vertices, mesh.faces, seen), depth
+
+
+def _back_of(points: np.ndarray, normals: np.ndarray, spacing: float) -> Plane | None:
+    """A plane behind points [N,3] that were seen from one side, such as those of a building's front: their surface is a sheet,
+    which closes where it is mirrored in this plane and cut at it. None where the normals [N,3] face all sides."""
+    towards = normals.mean(0)
+    if np.linalg.norm(towards) < ONE_SIDED:
+        return None
+    axis = np.linalg.svd(points - points.mean(0), full_matrices=False)[2][2]
+    axis = axis * np.sign(axis @ towards)
+    return Plane(axis, float((points @ axis).min()) - spacing, 0.0, spacing)
 
 
 def _thinned(mesh: Mesh, spacing: float) -> tuple[np.ndarray, np.ndarray]:

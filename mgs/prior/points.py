@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from mgs.data.clouds import SparseCloud, views_of
 from mgs.data.dataset import Dataset, Frame
+from mgs.data.up import Up
 from mgs.data.visibility import has_masks, mask_share
 from mgs.errors import InputError
 from mgs.prior.segmentation import NoSurface, Plane, SegmentedCloud, degrade, estimate_normals, ground_plane
@@ -53,6 +54,9 @@ GROWN, GROWN_NEIGHBOURS = 0.15, 4
 """Above a ground plane, points that are joined to the cluster belong to it too: DBSCAN with eps this share of the cluster's
 extent, and min_samples. A part with few points, for instance in shade, is no cluster of its own, but nothing else stands
 there."""
+
+PLANE_TILT = 45.0
+"""Largest angle between the ground plane's normal and the dataset's up, degrees: the front of a building is a plane as well."""
 
 PLANE_VOXEL = 0.25
 """What the ground plane takes for the voxel of a cloud, over the distance between its points: points of a fused cloud are as
@@ -144,7 +148,7 @@ def segment_points(
         where = "inside the masks; give masks and poses that fit, or --from hull"
     else:
         tell("ground plane and clusters")
-        plane = _plane_or_none(cloud, frames, settings)
+        plane = _plane_or_none(cloud, frames, dataset.up, settings)
         ground = np.zeros(len(points), bool) if plane is None else np.abs(plane.height(points)) <= plane.tolerance
         kept, clusters = _cluster_looked_at(cloud, frames, plane)
         where = f"in one cluster {'above the ground' if plane else 'near what the cameras look at'}; give masks of the object"
@@ -157,8 +161,9 @@ def segment_points(
     return SegmentedCloud(cloud, plane, ground, rock[left], normals, 0.0, clusters)
 
 
-def _plane_or_none(cloud: Cloud, frames: Sequence[Frame], settings: PriorSettings) -> Plane | None:
-    """The ground plane, where a fifth of the points near what the cameras look at lie on one that all cameras are above."""
+def _plane_or_none(cloud: Cloud, frames: Sequence[Frame], up: Up, settings: PriorSettings) -> Plane | None:
+    """The ground plane, where a fifth of the points near what the cameras look at lie on one that all cameras are above, and
+    that is about level."""
     target = focus(frames)
     near = np.linalg.norm(cloud.points - target.point, axis=1) < REACH * target.distance
     fine = PLANE_VOXEL * cloud.voxel
@@ -168,7 +173,8 @@ def _plane_or_none(cloud: Cloud, frames: Sequence[Frame], settings: PriorSetting
     except InputError:
         return None
     above = plane.height(np.stack([frame.camera.position for frame in frames])) > 0
-    return plane if above.all() else None
+    level = abs(plane.normal @ up) > np.cos(np.radians(PLANE_TILT))
+    return plane if above.all() and level else None
 
 
 def _cluster_looked_at(cloud: Cloud, frames: Sequence[Frame], plane: Plane | None) -> tuple[np.ndarray, int]:

@@ -45,7 +45,8 @@ def gaussian_colours(subject: Subject, layer: str) -> np.ndarray:
 
 
 def kernel_image(subject: Subject, camera: Camera, layer: str) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-    """(sRGB uint8 [H,W,3], z-depth float32 [H,W] in metres, (low, high) of the colour scale) of a layer seen from a camera.
+    """(sRGB uint8 [H,W,3], z-depth float32 [H,W], (low, high) of the colour scale) of a layer seen from a camera. Lengths are
+    those that are shown, but in the colour scale those of the world (`Subject.scale`).
 
     Behind the model it is black, and FAR away. Layers but colour and alpha are drawn where the opacity is at least VISIBLE.
     """
@@ -67,7 +68,8 @@ def kernel_image(subject: Subject, camera: Camera, layer: str) -> tuple[np.ndarr
         values, colours = maps["Z"], PANELS["Z"][1]
     else:
         (low, high), values, colours = scale(subject, layer), maps[layer], PANELS[layer][1]
-    return painted(values, low, high, colours) * seen[..., None].astype(np.uint8), depth, (low, high)
+    ends = (low / subject.scale, high / subject.scale) if layer == "depth" else (low, high)
+    return painted(values, low, high, colours) * seen[..., None].astype(np.uint8), depth, ends
 
 
 def scale(subject: Subject, layer: str) -> tuple[float, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,11 @@ SCALARS = ("information", "uncertainty", "unobserved")
 """Those of `mgs.report.diagnostics` that the viewer shows."""
 
 
+LARGEST = 40.0
+"""Largest distance of a camera, or of 95 % of the Gaussians, from the middle of what is shown. The unit of a world may be
+anything, but depth in a browser ends at about four times of this (`mgs.view.layers.FAR`)."""
+
+
 @dataclass(frozen=True)
 class View:
     """A camera of the dataset. role: "seed", "chosen" or "candidate"; step: at which it was chosen, 0 for seeds, None for
@@ -43,7 +48,8 @@ class View:
 class Subject:
     """gaussians: the model; None where a run has no finished step yet. space: "linear" or "srgb", in which its colours are
     blended. scalars: name -> [N], of SCALARS; none for a PLY. views: of the dataset, in its order; none for a PLY. up, unit:
-    of the world (`mgs.data.dataset.Dataset`); a PLY says nothing of either, and is taken to be +Z up."""
+    of the world (`mgs.data.dataset.Dataset`); a PLY says nothing of either, and is taken to be +Z up. scale: all lengths over
+    those of the world."""
 
     title: str
     gaussians: Gaussians | None
@@ -53,6 +59,7 @@ class Subject:
     mesh: Mesh | None = None
     up: Up = PLUS_Z
     unit: str = "m"
+    scale: float = 1.0
 
     @property
     def taken(self) -> list[View]:
@@ -68,12 +75,32 @@ def read_subject(path: str | Path, follow: bool = False) -> Subject:
     """
     path = Path(path)
     if path.is_dir():
-        return _read_run(path, follow)
+        return fitted(_read_run(path, follow))
     if follow:
         raise InputError(f"{path}: --follow needs the folder of a run")
     if not path.is_file():
         raise InputError(f"{path}: no such run folder or PLY file")
-    return Subject(path.name, read_ply(path), ply_colour_space(path), unit="unit")
+    return fitted(Subject(path.name, read_ply(path), ply_colour_space(path), unit="unit"))
+
+
+def fitted(subject: Subject) -> Subject:
+    """The same, with all lengths multiplied such that nothing is farther than LARGEST from the middle."""
+    g, mesh = subject.gaussians, subject.mesh
+    eyes = np.array([view.frame.camera.position for view in subject.views]).reshape(-1, 3)
+    means = eyes[:0] if g is None else g.means
+    if len(means) + len(eyes) == 0:
+        return subject
+    centre = np.median(means if len(means) else eyes, axis=0)
+    of_means, of_eyes = (np.linalg.norm(points - centre, axis=1) for points in (means, eyes))
+    size = max(float(np.quantile(of_means, 0.95)) if len(means) else 0.0, float(of_eyes.max(initial=0)))
+    if size <= LARGEST:
+        return subject
+    scale = LARGEST / size
+    views = [replace(view, frame=replace(view.frame, camera=view.frame.camera.scaled(scale))) for view in subject.views]
+    if g is not None:
+        g = replace(g, means=g.means * np.float32(scale), log_scales=g.log_scales + np.float32(np.log(scale)))
+    surface = None if mesh is None else replace(mesh, vertices=mesh.vertices * scale)
+    return replace(subject, gaussians=g, views=views, mesh=surface, scale=scale)
 
 
 def _read_run(run: Path, follow: bool) -> Subject:
