@@ -38,7 +38,6 @@ RUNS = {
     "old, d-optimal": ("old", ["--policy", "d-optimal"]),
     "d-optimal": ("new", ["--policy", "d-optimal"]),
     "d-optimal, 5 at a time": ("new", ["--policy", "d-optimal", "--batch", "5"]),
-    "directional-i": ("new", ["--policy", "directional-i"]),
     "directional-i, all at once": ("new", ["--policy", "directional-i", "--batch", "BUDGET"]),
 }
 """Runs by name: which version, and its options."""

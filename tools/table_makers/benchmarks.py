@@ -7,7 +7,7 @@ docs/nbv.md has the commands of flights.json.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from mgs.bench.fit import TARGETS as FIT_TARGETS
@@ -276,6 +276,34 @@ def means(data: dict[str, Any]) -> str:
     return markdown(["", "prior", *found], rows) + made_by(data)
 
 
+def criteria(data: dict[str, Any]) -> str:
+    """How well scores predict the gain of a view: means over the states of rings and of domes, and over all."""
+    states = data["states"]
+    kinds = {"ring": [s for s in states if "-circle-" in s], "dome": [s for s in states if "-hemisphere-" in s]}
+    sets = [*kinds.values(), list(states)]
+    ceilings = [_mean(states[s]["result"]["ceiling"] for s in names) for names in sets]
+    rows = []
+    for policy in states[sets[0][0]]["result"]["spearman"]:
+        found = [[states[s]["result"]["spearman"][policy] for s in names] for names in sets]
+        if any(value is None for value in found[-1]):  # scores that are all equal rank nothing
+            continue
+        values = [_mean(numbers) for numbers in found]
+        regrets = [_mean(states[s]["result"]["regret"][policy] for s in names) for names in sets]
+        cells = [*(f"{value:.2f}" for value in values), f"{values[-1] / ceilings[-1]:.2f}", *(f"{r:.2f}" for r in regrets)]
+        rows.append((values[-1], [policy, *cells]))
+    ranked = [row for _, row in sorted(rows, key=lambda row: -row[0])]
+    ranked.append(["(ceiling)", *(f"{value:.2f}" for value in ceilings), "1", "", "", ""])
+    spearman = [f"Spearman, {len(names)} {kind}s" for kind, names in kinds.items()]
+    heading = ["score", *spearman, "all", "of the ceiling", "regret, rings, dB", "domes", "all"]
+    program, out, *_ = data["command"].split()  # the states' names are many
+    return markdown(heading, ranked) + made_by(data | {"command": f"{program} {out} out/states/* --orders 3"})
+
+
+def _mean(values: Iterable[float]) -> float:
+    numbers = list(values)
+    return sum(numbers) / len(numbers)
+
+
 def residual(data: dict[str, Any]) -> str:
     """Quality against the weights of pixels in the fit."""
     rows = [
@@ -296,6 +324,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "optimisers": ("benchmarks/optimisers", optimisers),
     "fit": ("benchmarks/fit", fit),
     "means": ("benchmarks/means", means),
+    "criteria": ("benchmarks/criteria", criteria),
     "demo": ("benchmarks/demo", demo),
     "demo-report": ("benchmarks/demo", demo_report),
     "flights": ("benchmarks/flights", flights),
