@@ -324,6 +324,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "optimisers": ("benchmarks/optimisers", optimisers),
     "fit": ("benchmarks/fit", fit),
     "means": ("benchmarks/means", means),
+    "criteria": ("benchmarks/criteria", criteria),
     "demo": ("benchmarks/demo", demo),
     "demo-report": ("benchmarks/demo", demo_report),
     "flights": ("benchmarks/flights", flights),

@@ -194,6 +194,7 @@ def whole_runs(data: dict[str, Any]) -> str:
 
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "versions": ("benchmarks/versions", two_versions),
+    "whole-runs": ("benchmarks/whole_runs", whole_runs),
     "lanes": ("benchmarks/lanes", lanes),
     "sizes": ("benchmarks/sizes", sizes),
     "splat": ("benchmarks/splat", splat),
