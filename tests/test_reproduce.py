@@ -153,6 +153,26 @@ def test_table_1_has_equal_counts_and_the_papers_rows(quick, tmp_path, capsys, m
     assert rows["random, draw 2"]["command"].startswith("mgs nbv cells/dataset/boulder-0/")
     assert rows["random, draw 2"]["command"].endswith("--policy random --seeds 4 --budget 2 --seed 1000")
     assert "`mgs reproduce --preset quick --only table1`" in text
+    assert "Not done yet" not in text
+
+
+def test_table_1_is_there_for_the_rows_that_are_done(quick, tmp_path, capsys, monkeypatch):
+    def killed(root, out, dataset, prior, settings):
+        if settings["policy"] == "random" and settings["seed"]:
+            raise KeyboardInterrupt
+        return timed(root, out, dataset, prior, settings)
+
+    monkeypatch.setattr(tasks, "time_policy", killed)
+    monkeypatch.setattr(reproduce, "FEWER_IMAGES", 1)
+    out = tmp_path / "out"
+    with pytest.raises(SystemExit) as stop:
+        main(["reproduce", str(out), "--only", "table1"])
+    assert stop.value.code == 130
+    assert "run the same command again to continue" in capsys.readouterr().err
+    text = (out / "results/table1.md").read_text()
+    assert [row["row"] for row in rows_of(out / "results/table1.csv")] == ["d-optimal", "random, draw 1"]
+    assert "| random, mean of 1 | 6 |" in text
+    assert "Not done yet: random, draw 2; coverage, fewer images; all views; all views, as 3DGS.\n" in text
 
 
 def fake(run, value, steps=3):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -52,30 +51,33 @@ def reproduce(
         raise InputError("--workers starts workers here, and --scheduler uses those of a scheduler; give one of them")
     check_preset(check_writable(out), preset)
     runtime.start()
-    from mgs.study.reproduce_results import WRITERS
-    from mgs.study.sweep import run_cells
-
     console = Console(highlight=False)
     columns = (TextColumn("{task.description}"), MofNCompleteColumn(), TimeElapsedColumn())
     for name in names:
-        cells = study.cells_of(name, size, counts[name])
         with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-            found = run_cells(out, cells, _teller(bar, name), workers=workers, scheduler=scheduler)
-        many = f" --rocks {counts[name]}" if study.RESULTS[name].rocks(size) > 1 else ""
-        command = f"mgs reproduce --preset {preset} --only {name}{many}"
-        written = WRITERS[name](out, out / "results", found, size, counts[name], command)
+            written = _make(name, out, preset, counts[name], bar, workers, scheduler)
         console.print(f"{name}: wrote " + ", ".join(str(path) for path in written), soft_wrap=True)
 
 
-def _teller(bar: Progress, name: str) -> Callable[[str, int, int], None]:
-    """What is told of every cell that begins: a line is printed, and the bar moves."""
+def _make(name: str, out: Path, preset: str, count: int, bar: Progress, workers: int, scheduler: str | None) -> list[Path]:
+    """Do the cells of a result over so many rocks, telling of each that begins, and write it. Returns its files."""
+    from mgs.study import reproduce as study
+    from mgs.study.reproduce_results import WRITERS, known_runs
+    from mgs.study.sweep import run_cells
+
+    size, result = study.PRESETS[preset], study.RESULTS[name]
+    many = f" --rocks {count}" if result.rocks(size) > 1 else ""
+    command = f"mgs reproduce --preset {preset} --only {name}{many}"
     task = bar.add_task(name, total=None)
 
     def tell(cell: str, done: int, total: int) -> None:
+        if result.grows and (so_far := known_runs(out, result.runs(size, count))):
+            WRITERS[name](out, out / "results", so_far, size, count, command)
         bar.console.print(f"{name} {done}/{total} {cell}", style="dim", soft_wrap=True)
         bar.update(task, completed=done, total=total)
 
-    return tell
+    found = run_cells(out, study.cells_of(name, size, count), tell, workers=workers, scheduler=scheduler)
+    return WRITERS[name](out, out / "results", found, size, count, command)
 
 
 def check_preset(out: Path, preset: str) -> None:

@@ -47,9 +47,11 @@ def flat(key: str, values: Sequence[float]) -> dict[str, float | None]:
 
 
 def table_rows(found: Found, preset: Preset) -> Rows:
-    """Table I: a row for each run."""
+    """Table I: a row for each run that is done."""
     rows = []
     for label, run in reproduce.table_runs(preset).items():
+        if run.name not in found:
+            continue
         numbers = found[run.name]
         row: dict[str, Any] = {"row": label, "images": numbers["images"]}
         for views in ("test", "all", "held_out"):
@@ -171,9 +173,10 @@ def _write(out: Path, name: str, rows: Rows, markdown: str, command: str, **more
 
 
 def write_table(root: Path, out: Path, found: Found, preset: Preset, count: int, command: str) -> list[Path]:
-    """table1.csv, .json and .md."""
+    """table1.csv, .json and .md, of the runs that are done; the last two name the others."""
     rows = table_rows(found, preset)
-    return _write(out, "table1", rows, table_markdown(rows), command, machine=processor())
+    left = [label for label in reproduce.table_runs(preset) if label not in {row["row"] for row in rows}]
+    return _write(out, "table1", rows, table_markdown(rows, left), command, machine=processor(), left=left)
 
 
 def write_figures(root: Path, out: Path, found: Found, preset: Preset, count: int, command: str) -> list[Path]:
@@ -208,7 +211,7 @@ def write_seeds(root: Path, out: Path, found: Found, preset: Preset, count: int,
 def write_pools(root: Path, out: Path, found: Found, preset: Preset, count: int, command: str) -> list[Path]:
     """pools.csv, .json, .md and .png; pools_by_rock.csv. With the oracle, where it is done."""
     runs, oracle = reproduce.pool_runs(preset, count), reproduce.oracle_runs(preset, count)
-    known = dict(found) | _known(root, oracle)
+    known = dict(found) | known_runs(root, oracle)
     done = oracle if all(run.name in known for run in oracle) else []
     rows = pool_rows(known, runs, done)
     pools_figure(out / "pools.png", rows)
@@ -216,8 +219,8 @@ def write_pools(root: Path, out: Path, found: Found, preset: Preset, count: int,
     return [*_write(out, "pools", rows, pools_markdown(rows), command, rocks=count), each, out / "pools.png"]
 
 
-def _known(root: Path, runs: Sequence[Run]) -> dict[str, dict[str, Any]]:
-    """What the runs found, of those that are done."""
+def known_runs(root: Path, runs: Sequence[Run]) -> dict[str, dict[str, Any]]:
+    """What the runs found, of those that are done. root: the study's folder."""
     results = {run.name: found(root, run.cells()[-1]) for run in runs}
     return {name: result for name, result in results.items() if result is not None}
 

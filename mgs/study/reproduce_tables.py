@@ -31,19 +31,23 @@ TABLE_COLUMNS = {
 """Columns of Table I, and their headings."""
 
 
-def table_markdown(rows: Rows) -> str:
-    """Table I: the paper's rows, and ours, of draws of `random` the mean."""
+def table_markdown(rows: Rows, left: Sequence[str] = ()) -> str:
+    """Table I: the paper's rows, and ours, of draws of `random` the mean. left: rows to come, which a line below names."""
     draws = [row for row in rows if row["row"].startswith("random,")]
-    numbers = [key for key in TABLE_COLUMNS if key != "row"]
-    mean = {key: float(np.mean([row[key] for row in draws])) for key in numbers}
-    random: dict[str, Any] = {"row": f"random, mean of {len(draws)}"} | mean | {"images": draws[0]["images"]}
-    ours = [random if row is draws[0] else row for row in rows if row not in draws[1:]]
+    ours = [_mean_row(draws) if row is draws[0] else row for row in rows if row not in draws[1:]] if draws else list(rows)
     theirs = [
         {"row": f"the paper's {name}, on its rock", "images": images, "all.psnr": psnr, "all.ssim": ssim}
         for name, images, psnr, ssim in PAPER_TABLE
     ]
     lines = [[_cell(key, row.get(key)) for key in TABLE_COLUMNS] for row in [*theirs, *ours]]
-    return _markdown(list(TABLE_COLUMNS.values()), lines)
+    return _markdown(list(TABLE_COLUMNS.values()), lines) + (f"\nNot done yet: {'; '.join(left)}.\n" if left else "")
+
+
+def _mean_row(draws: Rows) -> dict[str, Any]:
+    """The row of Table I for the draws of `random`."""
+    numbers = [key for key in TABLE_COLUMNS if key != "row"]
+    mean: dict[str, Any] = {key: float(np.mean([row[key] for row in draws])) for key in numbers}
+    return {"row": f"random, mean of {len(draws)}"} | mean | {"images": draws[0]["images"]}
 
 
 def _cell(key: str, value: Any) -> str:
