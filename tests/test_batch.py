@@ -91,6 +91,23 @@ def test_a_batch_is_chosen_greedily_at_one_model(loaded, tmp_path):
     np.testing.assert_allclose(state.H, after, err_msg="after the fit nothing of the prediction is left")
 
 
+@pytest.mark.parametrize("room", [1 << 30, 0], ids=["kept", "no room"])
+def test_a_batch_measures_each_candidate_once_if_there_is_room(loaded, tmp_path, monkeypatch, room):
+    measured = []
+
+    def fisher(gaussians, camera):
+        measured.append((gaussians.sh.tobytes(), camera.key))
+        return tiny.fisher(gaussians, camera)
+
+    monkeypatch.setattr(loop, "IMAGE_BYTES", room)
+    state = run(tmp_path / "run", loaded, replace(tiny.stations(), fisher=fisher, exact=tiny.fisher), budget=6, batch=3)
+    assert state.taken == run(tmp_path / "as before", loaded, budget=6, batch=3).taken
+    left, taken = 9 + 6, 3 + 6 + 9  # candidates of two batches; views whose information is summed after three fits
+    again = 0 if room else (8 + 7) + (5 + 4) + 6
+    assert len(measured) == left + taken + again
+    assert len(set(measured)) == left + taken
+
+
 def test_the_policies_that_look_at_the_model_are_known():
     assert set(policies.policy_names()) >= AT_THE_MODEL
 

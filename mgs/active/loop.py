@@ -165,6 +165,7 @@ class Loop:
         self.start = stations.initial([self.frames[i] for i in self.seeds])
         self.policy = policies.policy_named(settings.policy)
         self.seen, self.dome = cache(self._seen), cache(self._dome)  # they depend on poses and surface alone
+        self.informed: tuple[Gaussians | None, Callable[[int], np.ndarray]] = None, lambda frame: np.empty(0)
         self.before_fit, self.coloured = cache(self._before_fit), lru_cache(maxsize=2)(self._coloured)  # on images, too
 
     def capture(self, views: Sequence[int]) -> None:
@@ -220,7 +221,7 @@ class Loop:
         watch = _Stopwatch()
         with watch("score"):
             frame, score = self.choose(state)
-            F = self.stations.fisher(state.gaussians, self.cameras[frame])
+            F = self.information(state.gaussians)(frame)
             information_gain = criteria.d_optimal(F, state.H, self.lam)
         choice = {"frame": frame, "name": self.frames[frame].name, "score": score, "information_gain": information_gain}
         return replace(self.planned(state, [frame], choice, watch), H=state.H + F)
@@ -283,12 +284,20 @@ class Loop:
             points=self.start.means[: self.stations.on_surface] @ self.turn.T,
             surface_H=state.surface,
             prior_lam=self.prior_lam,
-            information=lambda view: self.stations.fisher(state.gaussians, self.cameras[told(view)]),
+            information=lambda view: self.information(state.gaussians)(told(view)),
             surface_information=lambda view: self.surface_information(self.cameras[told(view)]),
             estimate=lambda view, estimator: self.stations.estimate(state.gaussians, self.cameras[told(view)], estimator),
             seen=lambda view: self.seen(told(view)),
             dome=self.dome,
         )
+
+    def information(self, model: Gaussians) -> Callable[[int], np.ndarray]:
+        """The information [N,P] of each frame's view about a model. Where views are chosen in batches it is kept, because all
+        choices of a batch are about the same model."""
+        if self.informed[0] is not model:
+            room = IMAGE_BYTES if self.settings.batch > 1 else 0
+            self.informed = model, kept_within(room, lambda i: self.stations.fisher(model, self.cameras[i]), lambda F: F.nbytes)
+        return self.informed[1]
 
     def surface_information(self, camera: Camera) -> np.ndarray:
         """What a pose sees of the surface: exact information about how the Gaussians on it look before any training."""
