@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import json
 import math
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -38,6 +40,9 @@ Renderer = Callable[[Gaussians, Camera], tuple[np.ndarray, np.ndarray, np.ndarra
 
 Progress = Callable[[int, int], None]
 """A function that is told how the work goes on: (frames done, frames in all)."""
+
+MEASURED_AT_ONCE = 4
+"""How many views are measured at the same time, each in a thread: so many renders and their truths are in memory."""
 
 DIFFERENCE_GAIN = 4
 """Factor by which differences are brightened in the pictures."""
@@ -83,13 +88,19 @@ def evaluate(
     trained, views, tests = set(trained), list[dict[str, Any]](), list[dict[str, Any]]()
     work = [(views, frame, pictures) for frame in frames]
     work += [(tests, frame, pictures and pictures / TEST_FOLDER) for frame in test_frames]
-    for done, (found, frame, folder) in enumerate(work):
-        if progress:
-            progress(done, len(work))
-        measured = _measured(frame, renderer(gaussians, frame.camera), spacing, folder)
-        found.append({"name": frame.name, "trained": found is views and frame.name in trained} | measured)
-    if progress:
-        progress(len(work), len(work))
+    waiting: deque[Future[dict[str, float]]] = deque()
+    tell = progress or (lambda done, of: None)
+    tell(0, len(work))
+    with ThreadPoolExecutor(MEASURED_AT_ONCE) as pool:  # most of the time goes into filters that run beside other threads
+        for begun in range(len(work) + MEASURED_AT_ONCE):
+            if begun >= MEASURED_AT_ONCE:
+                found, frame, _ = work[begun - MEASURED_AT_ONCE]
+                measured = waiting.popleft().result()
+                found.append({"name": frame.name, "trained": found is views and frame.name in trained} | measured)
+                tell(begun - MEASURED_AT_ONCE + 1, len(work))
+            if begun < len(work):
+                _, frame, folder = work[begun]
+                waiting.append(pool.submit(_measured, frame, renderer(gaussians, frame.camera), spacing, folder))
     held_out = [view for view in views if not view["trained"]]
     result: dict[str, Any] = {"images": len(trained)} | ({"test": _means(tests, tests)} if tests else {})
     result |= {"all": _means(views, views), "held_out": _means(held_out, views)}
