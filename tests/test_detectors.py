@@ -152,6 +152,13 @@ def test_a_good_run_raises_no_alarm(rock, tmp_path):
     assert all("prior" in line["signs"] for line in state.steps)
 
 
+def test_a_side_that_no_seed_saw_is_no_drift_of_the_exposure(rock, tmp_path):
+    """Gaussians that no seed saw are grey, and the rock is not."""
+    state = run_nbv(rock, tmp_path / "run", policy="farthest", budget=3, seeds=1)
+    said = [warning for line in state.steps for warning in line.get("warnings", [])]
+    assert not any("exposure" in warning for warning in said), said
+
+
 def test_a_run_that_is_stopped_too_early_says_so_in_the_console_in_its_steps_and_on_the_page(rock, tmp_path):
     from mgs.active.nbv import start_run
 

@@ -397,11 +397,14 @@ class Loop:
         return {"signs": signs, "warnings": said} if said else {"signs": signs}
 
     def _before_fit(self, frame: int) -> tuple[np.ndarray, detectors.Before]:
-        """The mask of a frame that was taken, one bit a pixel, and its signs of the Gaussians before any training."""
+        """The mask of a frame that was taken, one bit a pixel, and its signs of the Gaussians before any training. Those that no
+        seed saw, which are grey, have the frame's own colours: grey would be taken for a change of the exposure."""
         assert self.stations.look
         mask, camera = self.frames[frame].mask(), self.cameras[frame]
         margin = detectors.outline_margin(self.start, camera)
-        signs = detectors.before_fit(self.image(frame), mask, *self.stations.look(self.start, camera), margin)
+        grey = ~self.start.sh.any(axis=(1, 2), keepdims=True)
+        start = replace(self.start, sh=np.where(grey, self._coloured((frame,)).sh, self.start.sh))
+        signs = detectors.before_fit(self.image(frame), mask, *self.stations.look(start, camera), margin)
         return np.packbits(mask), signs
 
 
