@@ -24,6 +24,8 @@ Poses and the prior's surface are all that is needed: no images and no fit.
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -107,12 +109,16 @@ def gains(
 
     points: [N,3] means of the Gaussians on the surface, metres. lam, degree, tau: the prior (`precision`).
     """
-    total, prior = np.zeros(len(candidates.positions)), np.diag(precision(degree, tau, lam))
-    for first in range(0, len(points), CHUNK):
+    prior = np.diag(precision(degree, tau, lam))
+
+    def part(first: int) -> NDArray[np.float64]:
         some = slice(first, first + CHUNK)
-        part = [None if views is None else Views(views.positions, views.seen[:, some]) for views in (taken, candidates, dome)]
-        total += _gains(points[some], prior, degree, *part)  # type: ignore[arg-type]
-    return total
+        views = [None if views is None else Views(views.positions, views.seen[:, some]) for views in (taken, candidates, dome)]
+        return _gains(points[some], prior, degree, *views)  # type: ignore[arg-type]
+
+    chunks = range(0, len(points), CHUNK)
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:  # NumPy lets other threads run
+        return np.asarray(sum(pool.map(part, chunks), np.zeros(len(candidates.positions))))  # in the order of the chunks
 
 
 def _gains(

@@ -397,8 +397,8 @@ class Loop:
         return {"signs": signs, "warnings": said} if said else {"signs": signs}
 
     def _before_fit(self, frame: int) -> tuple[np.ndarray, detectors.Before]:
-        """The mask of a frame that was taken, one bit a pixel, and its signs of the Gaussians before any training. Those that no
-        seed saw, which are grey, have the frame's own colours: grey would be taken for a change of the exposure."""
+        """The mask of a frame that was taken, one bit a pixel, and its signs of the Gaussians before any training. Those that
+        no seed saw, which are grey, have the frame's own colours: grey would be taken for a change of the exposure."""
         assert self.stations.look
         mask, camera = self.frames[frame].mask(), self.cameras[frame]
         margin = detectors.outline_margin(self.start, camera)

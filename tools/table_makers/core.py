@@ -192,9 +192,41 @@ def whole_runs(data: dict[str, Any]) -> str:
     return markdown(heading, rows) + made_by(data)
 
 
+PAPER_SIZE = 100_000
+"""Gaussians of the runs at the paper's size."""
+
+
+def paper_size(data: dict[str, Any]) -> str:
+    """Today's runs at the paper's size."""
+    rows = []
+    for record in data["records"]:
+        if record["gaussians"] != PAPER_SIZE or record["run"].startswith("old"):
+            continue
+        quality = [f"{record['psnr']:.2f}", f"{record['ssim']:.4f}", f"{record['psnr_mask']:.2f}"]
+        minutes = f"{sum(record['seconds'].values()) / 60:.1f}"
+        rows.append([record["run"], str(record["images"]), str(record["fits"]), f"{record['passes']:g}", *quality, minutes])
+    heading = ["policy", "images", "fits", "passes in all", "test views, dB", "SSIM", "rock only, dB", "minutes"]
+    return markdown(heading, rows) + made_by(data)
+
+
+def later_passes(data: dict[str, Any]) -> str:
+    """Time and quality of whole runs against the passes of their later fits."""
+    rows = []
+    for record in data["records"]:
+        total, curve = sum(record["seconds"].values()), dict(zip(record["images"], record["test_psnr"], strict=True))
+        cells = [f"{record['seconds']['fit']:.1f}", f"{total:.1f}", f"{curve[12]:.2f}"]
+        cells += [f"{record['test_psnr'][-1]:.2f}", f"{record['test_psnr_mask'][-1]:.2f}"]
+        rows.append([str(record["passes"]), *cells])
+    images = data["records"][0]["images"][-1]
+    last = [f"{images} images, dB", f"{images} images, rock only"]
+    return markdown(["passes of later fits", "fits, s", "whole run, s", "12 images, dB", *last], rows) + made_by(data)
+
+
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "versions": ("benchmarks/versions", two_versions),
     "whole-runs": ("benchmarks/whole_runs", whole_runs),
+    "paper-size": ("benchmarks/whole_runs", paper_size),
+    "later-passes": ("benchmarks/warm_passes", later_passes),
     "lanes": ("benchmarks/lanes", lanes),
     "sizes": ("benchmarks/sizes", sizes),
     "splat": ("benchmarks/splat", splat),
