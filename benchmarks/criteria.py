@@ -165,7 +165,7 @@ def table(found: dict[str, Any], runs: Sequence[Path]) -> str:
         mean = f"{np.mean(known):.2f}" if known else "–"
         regret = np.mean([result["regret"][name] for result in results if name in result["regret"]])
         cells = "".join(f"{'–' if value is None else f'{value:.2f}':>14}" for value in values)
-        lines.append(f"{name:16}{cells}{mean:>10}{regret:>12.3f}")
+        lines.append(f"{Path(name).name:16}{cells}{mean:>10}{regret:>12.3f}")
     ceilings = [result.get("ceiling") for result in results]
     if all(value is not None for value in ceilings):
         lines.append(f"{'(ceiling)':16}" + "".join(f"{value:14.2f}" for value in ceilings) + f"{np.mean(ceilings):10.2f}")
@@ -178,11 +178,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("out", type=Path, metavar="OUT.json")
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
     parser.add_argument("--orders", type=int, default=1, help="fits of each candidate, in different orders of the images")
-    parser.add_argument("--policy", action="append", help="a name, or FILE.py:FUNCTION; default: all names")
+    parser.add_argument("--policy", action="append", help="FILE.py:FUNCTION, beside all names")
     given = parser.parse_args(arguments)
     runtime.start()
     try:
-        found = study(given.out, given.runs, given.orders, given.policy or policy_names())
+        found = study(given.out, given.runs, given.orders, [*policy_names(), *(given.policy or [])])
     except InputError as error:
         raise SystemExit(f"error: {error}") from None
     print(table(found, given.runs))

@@ -38,6 +38,8 @@ RUNS = {
     "old, d-optimal": ("old", ["--policy", "d-optimal"]),
     "d-optimal": ("new", ["--policy", "d-optimal"]),
     "d-optimal, 5 at a time": ("new", ["--policy", "d-optimal", "--batch", "5"]),
+    "coverage, 5 at a time": ("new", ["--policy", "coverage", "--batch", "5"]),
+    "uniform, 5 at a time": ("new", ["--policy", "uniform", "--batch", "5"]),
     "directional-i, all at once": ("new", ["--policy", "directional-i", "--batch", "BUDGET"]),
 }
 """Runs by name: which version, and its options."""

@@ -94,6 +94,23 @@ def test_curves_are_made_once_and_hold_what_the_runs_found(quick, tmp_path, caps
     assert {path.name: path.read_bytes() for path in results.iterdir()} == before
 
 
+def test_a_policy_of_ones_own_is_compared_over_rocks(quick, tmp_path, capsys):
+    out, mine = tmp_path / "out", tmp_path / "mine.py"
+    mine.write_text("def first(candidates):\n    return -1.0 * len(candidates) * (candidates[:, 0] > -9)\n")
+    done(capsys, out, "--only", "curves", "--rocks", 1)
+    said = done(capsys, out, "--only", "curves", "--rocks", 1, "--policy", f"{mine}:first")
+    assert "curves 4/5 run/boulder-1" in said, "the other policies are not run again"
+    rows = rows_of(out / "results/curves.csv")
+    assert {row["policy"] for row in rows} == {"farthest", "uniform", "mine.py:first"}
+    assert {row["command"] for row in rows} == {"mgs reproduce --preset quick --only curves --rocks 1 --policy mine.py:first"}
+    pairs = json.loads((out / "results/statistics.json").read_text())["test_psnr"]["pairs"]
+    own = [("mine.py:first", "uniform"), ("mine.py:first", "farthest")]
+    assert [(pair["policy"], pair["other"]) for pair in pairs] == [("farthest", "uniform"), *own]
+    mine.write_text("def first(candidates):\n    return candidates[:, 0]\n")
+    again = done(capsys, out, "--only", "curves", "--rocks", 1, "--policy", f"{mine}:first")
+    assert "curves 4/5 run/boulder-1" in again, "another file is another policy"
+
+
 def test_a_timed_run_has_a_process_of_its_own(quick, tmp_path):
     run = Run(Rock("boulder", 1), SIZE, "farthest", budget=4, timed=True)
     *before, cell = run.cells()
@@ -328,6 +345,10 @@ def test_every_run_of_every_result_has_its_own_cell():
         (["--rocks", "11", "--only", "pools"], "--rocks 11: pools can have 1 to 10"),
         (["--workers", "2", "--scheduler", "tcp://x:1"], "give one of them"),
         (["--workers", "0"], "should be greater than or equal to 1"),
+        (["--policy", "best"], "--policy best: unknown; choose one of"),
+        (["--policy", "uniform"], "--policy uniform: is compared anyway"),
+        (["--policy", "block-d", "--only", "table1"], "--policy block-d: is for curves and pools, and --only leaves both out"),
+        (["--policy", "none.py:f"], "none.py"),
     ],
 )
 def test_bad_options_are_one_clear_line(capsys, tmp_path, arguments, line):

@@ -164,7 +164,8 @@ class Loop:
         self.capture(self.seeds)
         self.start = stations.initial([self.frames[i] for i in self.seeds])
         self.policy = policies.policy_named(settings.policy)
-        self.seen, self.dome = cache(self._seen), cache(self._dome)  # they depend on poses and surface alone
+        self.seen, self.dome = cache(self._seen), cache(self._dome)  # they depend on poses and surface alone, as this does:
+        self.surface_from = kept_within(IMAGE_BYTES, self._surface_from, lambda F: F.nbytes)
         self.informed: tuple[Gaussians | None, Callable[[int], np.ndarray]] = None, lambda frame: np.empty(0)
         self.before_fit, self.coloured = cache(self._before_fit), lru_cache(maxsize=2)(self._coloured)  # on images, too
 
@@ -285,7 +286,7 @@ class Loop:
             surface_H=state.surface,
             prior_lam=self.prior_lam,
             information=lambda view: self.information(state.gaussians)(told(view)),
-            surface_information=lambda view: self.surface_information(self.cameras[told(view)]),
+            surface_information=lambda view: self.surface_from(told(view)),
             estimate=lambda view, estimator: self.stations.estimate(state.gaussians, self.cameras[told(view)], estimator),
             seen=lambda view: self.seen(told(view)),
             dome=self.dome,
@@ -303,6 +304,10 @@ class Loop:
         """What a pose sees of the surface: exact information about how the Gaussians on it look before any training."""
         fisher = self.stations.exact or self.stations.fisher
         return fisher(self.start, camera)[: self.stations.on_surface, : len(self.prior_lam)]
+
+    def _surface_from(self, frame: int) -> np.ndarray:
+        """`surface_information` from a frame's pose, with memory of its own."""
+        return np.array(self.surface_information(self.cameras[frame]))
 
     def _seen(self, frame: int) -> np.ndarray:
         """Squared blending weights [N] of the Gaussians on the surface in a frame's view."""

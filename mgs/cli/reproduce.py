@@ -10,6 +10,8 @@ import typer
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+    from mgs.study.reproduce import Preset
+
 
 def reproduce(
     out: Annotated[Path, typer.Argument(help="Folder for everything; the same command again goes on.")] = Path("reproduced"),
@@ -25,6 +27,9 @@ def reproduce(
     rocks: Annotated[
         int | None,
         typer.Option(min=1, help="How many rocks the curves, seeds, pools and the oracle have. Default: the preset's."),
+    ] = None,
+    policy: Annotated[
+        str | None, typer.Option(help="Compare one policy more in curves and pools: a name, or FILE.py:FUNCTION of your own.")
     ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Worker processes, which share this machine's cores.")] = 1,
     scheduler: Annotated[
@@ -45,7 +50,8 @@ def reproduce(
     from mgs.files import check_writable
     from mgs.study import reproduce as study
 
-    size, names = row_named(study.PRESETS, preset, "--preset"), study.results_of(only)
+    names = study.results_of(only)
+    size = study.with_policy(row_named(study.PRESETS, preset, "--preset"), names, policy)
     counts = {name: study.rocks_of(name, size, rocks) for name in names}
     if scheduler is not None and workers != 1:
         raise InputError("--workers starts workers here, and --scheduler uses those of a scheduler; give one of them")
@@ -55,19 +61,22 @@ def reproduce(
     columns = (TextColumn("{task.description}"), MofNCompleteColumn(), TimeElapsedColumn())
     for name in names:
         with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-            written = _make(name, out, preset, counts[name], bar, workers, scheduler)
+            written = _make(name, out, preset, size, counts[name], bar, workers, scheduler)
         console.print(f"{name}: wrote " + ", ".join(str(path) for path in written), soft_wrap=True)
 
 
-def _make(name: str, out: Path, preset: str, count: int, bar: Progress, workers: int, scheduler: str | None) -> list[Path]:
+def _make(
+    name: str, out: Path, preset: str, size: Preset, count: int, bar: Progress, workers: int, scheduler: str | None
+) -> list[Path]:
     """Do the cells of a result over so many rocks, telling of each that begins, and write it. Returns its files."""
     from mgs.study import reproduce as study
     from mgs.study.reproduce_results import WRITERS, known_runs
     from mgs.study.sweep import run_cells
 
-    size, result = study.PRESETS[preset], study.RESULTS[name]
+    result = study.RESULTS[name]
     many = f" --rocks {count}" if result.rocks(size) > 1 else ""
-    command = f"mgs reproduce --preset {preset} --only {name}{many}"
+    own = "".join(f" --policy {_from_here(policy)}" for policy in size.own_policies if name in ("curves", "pools"))
+    command = f"mgs reproduce --preset {preset} --only {name}{many}{own}"
     task = bar.add_task(name, total=None)
 
     def tell(cell: str, done: int, total: int) -> None:
@@ -78,6 +87,12 @@ def _make(name: str, out: Path, preset: str, count: int, bar: Progress, workers:
 
     found = run_cells(out, study.cells_of(name, size, count), tell, workers=workers, scheduler=scheduler)
     return WRITERS[name](out, out / "results", found, size, count, command)
+
+
+def _from_here(policy: str) -> str:
+    """A policy as one would give it here: where its file lies below the current folder, by its path from there."""
+    here = Path.cwd()
+    return str(Path(policy).relative_to(here)) if Path(policy).is_relative_to(here) else Path(policy).name
 
 
 def check_preset(out: Path, preset: str) -> None:

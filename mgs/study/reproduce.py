@@ -5,10 +5,13 @@ A cell is a dataset, a prior or a run; cells that several results need are done 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from typing import Any
 
+from mgs.active import policy_file
+from mgs.active.inputs import policy_record
+from mgs.active.policies import policy_named
 from mgs.errors import InputError
 from mgs.study.statistics import MOST_ROCKS
 from mgs.study.sweep import Cell, names_of
@@ -84,6 +87,13 @@ class Preset:
     curve_rocks: int = 12
     seed_rocks: int = 5
     pool_rocks: int = 3
+    own_policies: tuple[str, ...] = ()
+    """Policies of the user's own that the curves and the pools compare, too (`with_policy`)."""
+
+    @property
+    def policies(self) -> tuple[str, ...]:
+        """All that the curves and the pools compare."""
+        return (*POLICIES, *self.own_policies)
 
 
 PRESETS = {
@@ -165,7 +175,13 @@ class Run:
         kind = "timed" if self.timed else "run"
         shape = f"{size.frames}x{size.width}x{size.height}-{size.gaussians}"
         views = f"{self.seeds}+{settings['budget']}-{settings['seed']}"
-        return f"{kind}/{self.rock.name}/{self.pool.replace(' ', '-')}-{shape}/{self.policy}-{views}"
+        version = "".join(f"-{digest[:8]}" for digest in policy_record(self.policy).values())  # of a policy's file
+        return f"{kind}/{self.rock.name}/{self.pool.replace(' ', '-')}-{shape}/{self.label}{version}-{views}"
+
+    @property
+    def label(self) -> str:
+        """The policy as it is called in tables."""
+        return policy_file.label(self.policy)
 
     def settings(self) -> dict[str, Any]:
         """Of `mgs nbv`; those of OTHER_TASKS name no policy."""
@@ -209,7 +225,7 @@ def table_runs(preset: Preset) -> dict[str, Run]:
 
 def curve_runs(preset: Preset, count: int) -> list[Run]:
     """PSNR(images): every policy on every rock."""
-    return [Run(rock, preset.rocks, policy) for rock in rocks(count) for policy in POLICIES]
+    return [Run(rock, preset.rocks, policy) for rock in rocks(count) for policy in preset.policies]
 
 
 def seed_runs(preset: Preset, count: int) -> list[Run]:
@@ -229,7 +245,7 @@ def pool_runs(preset: Preset, count: int) -> list[Run]:
         Run(rock, preset.rocks, policy, draw=draw, pool=pool)
         for pool in POOLS
         for rock in rocks(count)
-        for policy in POLICIES
+        for policy in preset.policies
         for draw in range(DRAWS if policy == "random" else 1)
     ]
 
@@ -301,3 +317,25 @@ def rocks_of(name: str, preset: Preset, asked: int | None) -> int:
 def cells_of(name: str, preset: Preset, count: int) -> list[Cell]:
     """The cells of a result over so many rocks, each once."""
     return list({cell.name: cell for run in RESULTS[name].runs(preset, count) for cell in run.cells()}.values())
+
+
+def with_policy(preset: Preset, names: list[str], policy: str | None) -> Preset:
+    """A preset whose curves and pools compare one policy more, if one is given: a name, or FILE.py:FUNCTION.
+
+    names: the results to make. Raises InputError where none of them compares policies over rocks, where there is no such
+    policy, and where it is compared anyway.
+    """
+    if policy is None:
+        return preset
+    if not {"curves", "pools"} & set(names):
+        raise InputError(f"--policy {policy}: is for curves and pools, and --only leaves both out")
+    if policy in POLICIES:
+        raise InputError(f"--policy {policy}: is compared anyway")
+    policy_named(policy)
+    return replace(preset, own_policies=(policy_file.absolute(policy),))
+
+
+def pairs_of(policies: Iterable[str]) -> tuple[tuple[str, str], ...]:
+    """The pairs of policies whose difference is tested: PAIRS, and those of the user's own policies with the same two."""
+    own = [policy for policy in policies if policy not in POLICIES]
+    return (*PAIRS, *((policy, other) for policy in own for other in ("uniform", "farthest")))

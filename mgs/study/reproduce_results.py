@@ -68,7 +68,7 @@ def by_rock(found: Found, runs: Sequence[Run]) -> Rows:
         numbers = found[run.name]
         for k, images in enumerate(numbers["images"]):
             row = {"rock": run.rock.index, "scene": run.rock.scene, "rock_seed": run.rock.seed, "pool": run.pool}
-            row |= {"policy": run.policy, "draw": run.draw, "seeds": run.seeds, "images": images}
+            row |= {"policy": run.label, "draw": run.draw, "seeds": run.seeds, "images": images}
             rows.append(row | {key: numbers[key][k] for key in (*MEASURES, "coverage")})
     return rows
 
@@ -76,9 +76,9 @@ def by_rock(found: Found, runs: Sequence[Run]) -> Rows:
 def curve_rows(found: Found, runs: Sequence[Run]) -> Rows:
     """A row for each policy and number of images: means over the rocks with intervals, and the difference from `uniform`."""
     rows = []
-    values = {(run.policy, run.rock.index): found[run.name] for run in runs}
+    values = {(run.label, run.rock.index): found[run.name] for run in runs}
     indices = sorted({rock for _, rock in values})
-    for policy in dict.fromkeys(run.policy for run in runs):
+    for policy in dict.fromkeys(run.label for run in runs):
         for k, images in enumerate(values[policy, indices[0]]["images"]):
             row: dict[str, Any] = {"policy": policy, "images": images, "rocks": len(indices)}
             for key in MEASURES:
@@ -89,14 +89,14 @@ def curve_rows(found: Found, runs: Sequence[Run]) -> Rows:
 
 
 def curve_statistics(found: Found, runs: Sequence[Run]) -> dict[str, Any]:
-    """For each of MEASURES the area under PSNR(images) by policy and rock, and the tests of the PAIRS named in advance."""
+    """For each of MEASURES the area under PSNR(images) by policy and rock, and the tests of pairs (`reproduce.pairs_of`)."""
     result: dict[str, Any] = {}
     for key in MEASURES:
         areas: dict[str, dict[int, float]] = {}
         for run in runs:
-            areas.setdefault(run.policy, {})[run.rock.index] = area(found[run.name]["images"], found[run.name][key])
+            areas.setdefault(run.label, {})[run.rock.index] = area(found[run.name]["images"], found[run.name][key])
         pairs: Rows = []
-        for policy, other in reproduce.PAIRS:
+        for policy, other in reproduce.pairs_of(areas):
             differences = paired(areas[policy], areas[other])
             ahead = sum(difference > 0 for difference in differences)
             pair = {"policy": policy, "other": other, "rocks": len(differences), "ahead": ahead, "differences": differences}
@@ -141,12 +141,12 @@ def pool_rows(found: Found, runs: Sequence[Run], oracle: Sequence[Run]) -> Rows:
     LEADER is ahead of it, and the share of what the oracle gains over `random` that it gets. None: without an oracle or a
     leader, or where the oracle gains nothing."""
     rows: Rows = []
-    policies = list(dict.fromkeys(run.policy for run in [*runs, *oracle]))
+    policies = list(dict.fromkeys(run.label for run in [*runs, *oracle]))
     for pool in reproduce.POOLS:
         last: dict[str, dict[str, dict[int, list[float]]]] = {key: {policy: {} for policy in policies} for key in MEASURES}
         for run in [*runs, *oracle]:
             for key in MEASURES if run.pool == pool else ():
-                last[key][run.policy].setdefault(run.rock.index, []).append(found[run.name][key][-1])
+                last[key][run.label].setdefault(run.rock.index, []).append(found[run.name][key][-1])
         for policy in policies:
             row: dict[str, Any] = {"pool": pool, "policy": policy, "rocks": len(last[MEASURES[0]][policy])}
             for key in MEASURES:

@@ -7,7 +7,9 @@ docs/nbv.md has the commands of flights.json.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
 from mgs.bench.fit import TARGETS as FIT_TARGETS
@@ -290,13 +292,13 @@ def criteria(data: dict[str, Any]) -> str:
         values = [_mean(numbers) for numbers in found]
         regrets = [_mean(states[s]["result"]["regret"][policy] for s in names) for names in sets]
         cells = [*(f"{value:.2f}" for value in values), f"{values[-1] / ceilings[-1]:.2f}", *(f"{r:.2f}" for r in regrets)]
-        rows.append((values[-1], [policy, *cells]))
+        rows.append((values[-1], [Path(policy).name, *cells]))
     ranked = [row for _, row in sorted(rows, key=lambda row: -row[0])]
     ranked.append(["(ceiling)", *(f"{value:.2f}" for value in ceilings), "1", "", "", ""])
     spearman = [f"Spearman, {len(names)} {kind}s" for kind, names in kinds.items()]
     heading = ["score", *spearman, "all", "of the ceiling", "regret, rings, dB", "domes", "all"]
-    program, out, *_ = data["command"].split()  # the states' names are many
-    return markdown(heading, ranked) + made_by(data | {"command": f"{program} {out} out/states/* --orders 3"})
+    command = re.sub(r"(out/states/\S+ )+", "out/states/* ", data["command"])  # their names are many
+    return markdown(heading, ranked) + made_by(data | {"command": command})
 
 
 def _mean(values: Iterable[float]) -> float:

@@ -8,6 +8,7 @@ from typing import Any
 
 from mgs.study.chart.tables import TABLES as CHART_TABLES
 from mgs.study.chart.tables import chart_table
+from mgs.study.reproduce import LEADER
 from mgs.study.stress.verdict import effect
 from table_makers.markdown import made_by, markdown
 
@@ -118,6 +119,20 @@ def reproduced(name: str) -> Callable[[dict[str, Any]], str]:
     return table
 
 
+def own_policy(data: dict[str, Any]) -> str:
+    """The policy of one's own in a study of pools, against the leader."""
+    rows = []
+    for row in data["rows"]:
+        if ".py:" in row["policy"]:
+            led = [
+                f"{row[key]:+.2f} [{row[f'{key}_low']:+.2f}, {row[f'{key}_high']:+.2f}]"
+                for key in ("test_psnr_led", "test_psnr_mask_led")
+            ]
+            rows.append([row["pool"], f"{row['test_psnr']:.2f}", *led])
+    heading = ["pool", "test views (dB)", f"{LEADER} over it (dB)", "rock only"]
+    return markdown(heading, rows) + made_by(data)
+
+
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "stability": ("results/stress/verdicts", stability),
     "stability-world": ("results/stress/world", stability),
@@ -126,13 +141,10 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "parsimony-rules": ("results/parsimony/parsimony", parsimony_rules),
     "parsimony-prune": ("results/parsimony/parsimony", parsimony_prune),
     **{f"reproduce-{name}": (f"results/reproduce/{name}", reproduced(name)) for name in REPRODUCED},
-    "paper-size-table1": ("results/paper-size/table1", reproduced("table1")),
+    "linear-look": ("results/linear-look/pools", own_policy),
     **{f"chart-{name}": ("results/chart/chart", chart(name)) for name in CHART_TABLES},
 }
 """By name: the file, seen from docs/ and without `.json`, and what makes the table of its contents."""
 
-NOT_RUN = {
-    **{f"results/reproduce/{name}": f"Not run yet: `mgs reproduce OUT --only {name}`.\n" for name in REPRODUCED},
-    "results/paper-size/table1": "Not run yet: `mgs reproduce OUT --preset paper --only table1`.\n",
-}
+NOT_RUN = {f"results/reproduce/{name}": f"Not run yet: `mgs reproduce OUT --only {name}`.\n" for name in REPRODUCED}
 """What stands for a table whose file may be missing."""
