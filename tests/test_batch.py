@@ -108,6 +108,18 @@ def test_a_batch_measures_each_candidate_once_if_there_is_room(loaded, tmp_path,
     assert len(set(measured)) == left + taken
 
 
+def test_what_a_pose_sees_of_the_surface_is_measured_once_for_all_choices(loaded, tmp_path):
+    measured = []
+
+    def exact(gaussians, camera):
+        measured.append(camera.key)
+        return tiny.fisher(gaussians, camera)
+
+    run(tmp_path / "run", loaded, replace(tiny.stations(), exact=exact), policy="coverage", budget=4)
+    taken, candidates = 3 + 4, 12 - 3
+    assert len(measured) == taken + candidates
+
+
 def test_the_policies_that_look_at_the_model_are_known():
     assert set(policies.policy_names()) >= AT_THE_MODEL
 
