@@ -2,6 +2,8 @@
 
 import json
 import math
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -87,6 +89,27 @@ def grey(n: int = 1) -> Gaussians:
         np.zeros(n, "f4"),
         sh_from_rgb(np.ones((n, 3))),
     )
+
+
+@pytest.mark.parametrize(("pixels", "most"), [(4_000_000, 4), (1, 1)])
+def test_views_are_measured_beside_each_other_but_large_ones_alone(tmp_path, monkeypatch, pixels, most):
+    dataset, lock, active, seen = write_dataset(tmp_path / "data", orbit_cameras(8)), threading.Lock(), [0], []
+
+    def measured(frame, rendered, spacing, folder):
+        with lock:
+            active[0] += 1
+            seen.append(active[0])
+        time.sleep(0.02)
+        with lock:
+            active[0] -= 1
+        return {"psnr": float(frame.name[-1])}
+
+    monkeypatch.setattr(evaluation, "_measured", measured)
+    monkeypatch.setattr(evaluation, "PIXELS_AT_ONCE", pixels)
+    result = evaluate(grey(), dataset.frames, (), renderer=lambda gaussians, camera: None)
+    assert [view["psnr"] for view in result["views"]] == list(range(8)), "in their order"
+    assert len(seen) == 8
+    assert (max(seen) == 1) if most == 1 else (1 < max(seen) <= most)
 
 
 def test_evaluate(tmp_path):

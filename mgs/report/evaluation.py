@@ -42,7 +42,10 @@ Progress = Callable[[int, int], None]
 """A function that is told how the work goes on: (frames done, frames in all)."""
 
 MEASURED_AT_ONCE = 4
-"""How many views are measured at the same time, each in a thread: so many renders and their truths are in memory."""
+"""Most views that are measured at the same time, each in a thread."""
+
+PIXELS_AT_ONCE = 4_000_000
+"""Most pixels of all of these, which bounds the memory; a larger view is measured alone."""
 
 DIFFERENCE_GAIN = 4
 """Factor by which differences are brightened in the pictures."""
@@ -88,16 +91,18 @@ def evaluate(
     trained, views, tests = set(trained), list[dict[str, Any]](), list[dict[str, Any]]()
     work = [(views, frame, pictures) for frame in frames]
     work += [(tests, frame, pictures and pictures / TEST_FOLDER) for frame in test_frames]
+    largest = max((frame.camera.width * frame.camera.height for _, frame, _ in work), default=1)
+    at_once = max(1, min(MEASURED_AT_ONCE, PIXELS_AT_ONCE // largest))
     waiting: deque[Future[dict[str, float]]] = deque()
     tell = progress or (lambda done, of: None)
     tell(0, len(work))
-    with ThreadPoolExecutor(MEASURED_AT_ONCE) as pool:  # most of the time goes into filters that run beside other threads
-        for begun in range(len(work) + MEASURED_AT_ONCE):
-            if begun >= MEASURED_AT_ONCE:
-                found, frame, _ = work[begun - MEASURED_AT_ONCE]
+    with ThreadPoolExecutor(at_once) as pool:  # most of the time goes into filters that run beside other threads
+        for begun in range(len(work) + at_once):
+            if begun >= at_once:
+                found, frame, _ = work[begun - at_once]
                 measured = waiting.popleft().result()
                 found.append({"name": frame.name, "trained": found is views and frame.name in trained} | measured)
-                tell(begun - MEASURED_AT_ONCE + 1, len(work))
+                tell(begun - at_once + 1, len(work))
             if begun < len(work):
                 _, frame, folder = work[begun]
                 waiting.append(pool.submit(_measured, frame, renderer(gaussians, frame.camera), spacing, folder))
