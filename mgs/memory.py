@@ -8,8 +8,8 @@ from typing import TypeVar, overload
 Value = TypeVar("Value")
 
 IMAGE_BYTES = 1 << 30
-"""Most memory for images that are kept to be used again, bytes: as targets of a fit 218 of 640x480, or five of 12
-megapixels. All others are read again at every use."""
+"""Most memory for arrays of one kind that are kept to be used again, bytes. Of images, as targets of a fit, these are 218 of
+640x480, or five of 12 megapixels. All others are read or computed again at every use."""
 
 
 def kept_within(budget: int, make: Callable[[int], Value], size: Callable[[Value], int]) -> Callable[[int], Value]:

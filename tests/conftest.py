@@ -1,6 +1,8 @@
 """Shared test set-up: the variant is set once, before any test module that imports kernels; and a tiny dataset to spoil."""
 
+import importlib.util
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -41,3 +43,15 @@ def coarse_arena():
         patched.setattr(arena, "ROWS", 60)
         patched.setattr(arena, "TEXELS", 64)
         yield
+
+
+@pytest.fixture(scope="session")
+def photographs():
+    """tools/photographs.py, which is no part of the package."""
+    spec = importlib.util.spec_from_file_location("photographs", Path(__file__).parent.parent / "tools/photographs.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["photographs"] = module
+    spec.loader.exec_module(module)
+    return module

@@ -3,8 +3,6 @@ without any ground. Both are made here, with outliers, noise, parts without poin
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -24,8 +22,6 @@ from mgs.files import read_json
 from mgs.images import write_exr, write_png
 from mgs.prior.build import Prior, build_prior
 from mgs.prior.settings import PriorSettings
-
-ROOT = Path(__file__).parent.parent
 
 WIDTH, HEIGHT = 128, 96
 
@@ -117,18 +113,6 @@ def write(root: Path, thing: trimesh.Trimesh, around: trimesh.Trimesh | None, ca
 
 def _depth(mesh: trimesh.Trimesh) -> Callable[[Camera], np.ndarray]:
     return mesh_depth(Mesh(np.asarray(mesh.vertices, float), np.asarray(mesh.faces), np.ones(len(mesh.faces), bool)))
-
-
-@pytest.fixture(scope="module")
-def photographs() -> ModuleType:
-    """tools/photographs.py, which is no part of the package."""
-    spec = importlib.util.spec_from_file_location("photographs", ROOT / "tools/photographs.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["photographs"] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import sys
 from collections.abc import Callable
@@ -40,25 +39,11 @@ from mgs.prior.hull import visual_hull
 from mgs.prior.points import main_cluster, on_surface
 from mgs.prior.settings import PriorSettings
 
-ROOT = Path(__file__).parent.parent
-
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hulls on a grid of half the usual fineness."""
     monkeypatch.setattr(hull, "COARSE", 24)
-
-
-@pytest.fixture(scope="session")
-def photographs() -> ModuleType:
-    """tools/photographs.py, which is no part of the package."""
-    spec = importlib.util.spec_from_file_location("photographs", ROOT / "tools/photographs.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["photographs"] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(scope="module")

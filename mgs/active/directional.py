@@ -44,8 +44,8 @@ DOME_ELEVATIONS = (0.0, 85.0)
 """Lowest and highest elevation of the dome, degrees: all of the sky, so no knowledge of where a model will be judged from."""
 
 CHUNK = 1024
-"""How many Gaussians are worked on at once, which bounds the memory: with 100 candidates and degree 3, an array of all their
-coefficients takes 13 MB."""
+"""How many Gaussians a thread works on at once, which bounds the memory: with 100 candidates and degree 3, an array of all
+their coefficients takes 13 MB."""
 
 
 class Views(NamedTuple):
@@ -117,8 +117,9 @@ def gains(
         return _gains(points[some], prior, degree, *views)  # type: ignore[arg-type]
 
     chunks = range(0, len(points), CHUNK)
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:  # NumPy lets other threads run
-        return np.asarray(sum(pool.map(part, chunks), np.zeros(len(candidates.positions))))  # in the order of the chunks
+    # NumPy lets other threads run while it computes. The sum is in the order of the chunks, so it is always the same.
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        return np.asarray(sum(pool.map(part, chunks), np.zeros(len(candidates.positions))))
 
 
 def _gains(

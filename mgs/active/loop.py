@@ -164,8 +164,10 @@ class Loop:
         self.capture(self.seeds)
         self.start = stations.initial([self.frames[i] for i in self.seeds])
         self.policy = policies.policy_named(settings.policy)
-        self.seen, self.dome = cache(self._seen), cache(self._dome)  # they depend on poses and surface alone, as this does:
+        # These depend on poses and surface alone, so they are the same in every step.
+        self.seen, self.dome = cache(self._seen), cache(self._dome)
         self.surface_from = kept_within(IMAGE_BYTES, self._surface_from, lambda F: F.nbytes)
+        # The model that was asked about last, and what gives the information of a frame's view about it (`information`).
         self.informed: tuple[Gaussians | None, Callable[[int], np.ndarray]] = None, lambda frame: np.empty(0)
         self.before_fit, self.coloured = cache(self._before_fit), lru_cache(maxsize=2)(self._coloured)  # on images, too
 
@@ -306,7 +308,7 @@ class Loop:
         return fisher(self.start, camera)[: self.stations.on_surface, : len(self.prior_lam)]
 
     def _surface_from(self, frame: int) -> np.ndarray:
-        """`surface_information` from a frame's pose, with memory of its own."""
+        """`surface_information` from a frame's pose; a copy, because what the kernel returns is part of a larger array."""
         return np.array(self.surface_information(self.cameras[frame]))
 
     def _seen(self, frame: int) -> np.ndarray:
