@@ -297,6 +297,20 @@ def test_missing_images_are_skipped_and_counted(dataset: Dataset, tmp_path: Path
     assert "5 frames" in output.out
 
 
+def test_a_named_cloud_that_is_not_there_is_said(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = dataset.root / "transforms.json"
+    for cloud, said in (("sparse_pc.ply", 1), (None, 0)):
+        write_json(path, read_json(path) | {"ply_file_path": cloud})
+        with pytest.raises(SystemExit) as exit_:
+            main(["import", str(dataset.root), "--out", str(tmp_path / str(said))])
+        output = capsys.readouterr()
+        assert exit_.value.code == 0
+        text = " ".join(output.err.split())
+        assert (f"{dataset.root / 'sparse_pc.ply'}, do not exist; imported without them" in text) == bool(said), text
+        assert " 0 points" in " ".join(output.out.split())
+        assert not (tmp_path / str(said) / "sparse.ply").exists()
+
+
 def test_masks_by_projecting_a_mesh_or_from_files(dataset: Dataset, tmp_path: Path) -> None:
     data = read_json(dataset.root / "transforms.json")
     for record in data["frames"]:

@@ -91,6 +91,11 @@ def basis(points: Array, views: Views, degree: int) -> NDArray[np.float64]:
     return y
 
 
+def spread(points: int, count: int) -> NDArray[np.int64]:
+    """Indices of about `count` of so many points, every k-th."""
+    return np.arange(0, points, max(1, -(-points // count)))
+
+
 def precision(degree: int, tau: float, lam: float) -> NDArray[np.float64]:
     """[K] Lambda, the prior's information about each coefficient: lam = (sigma_e / tau_0)^2 for degree 0, lam / tau^2 above."""
     return np.repeat([lam, *[lam / tau**2] * degree], [2 * order + 1 for order in range(degree + 1)])

@@ -72,6 +72,8 @@ def import_data(
         console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
     if found.missing:
         notes.print(f"mgs: {found.missing} of {found.missing + len(found.shots)} listed images do not exist; skipped them")
+    if found.no_cloud:
+        notes.print(f"mgs: the points that {source.name} names, {found.no_cloud}, do not exist; imported without them")
     keys = ("mask_path", "rock_path", "depth_path")
     masked, layered, deep = (sum(bool(getattr(frame, key)) for frame in result.frames) for key in keys)
     undone = sum(shot.distortion.any() for shot in found.shots)

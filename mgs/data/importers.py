@@ -62,7 +62,7 @@ class Shot:
 class Source:
     """The data to import: its format, the shots whose image exists, the number of those whose image does not, and the points
     that were triangulated with the cameras. up: which way is up, unit: "m" or "unit", what a length of 1 is; None where the
-    source does not say."""
+    source does not say. no_cloud: the file of points that the source names and that does not exist."""
 
     kind: str
     shots: list[Shot]
@@ -70,6 +70,7 @@ class Source:
     sparse: SparseCloud | None = None
     up: Up | None = None
     unit: str | None = None
+    no_cloud: Path | None = None
 
     def in_metres(self, unit: float) -> Source:
         """The same data, whose unit of length is so many metres: cameras and points are scaled, depth is metres already.
@@ -158,10 +159,11 @@ def _read_transforms(path: Path) -> Source:
         shots.append(Shot(_frame_name(record["file_path"]), camera, distortion, time, image, depth, unit, mask, rock))
     kind = "NeRF-synthetic" if "camera_angle_x" in data and "fl_x" not in data else "nerfstudio"
     cloud = path.parent / str(data["ply_file_path"]) if data.get("ply_file_path") else None
-    sparse = read_cloud(cloud) if cloud is not None and cloud.is_file() else None
+    no_cloud = cloud if cloud is not None and not cloud.is_file() else None
+    sparse = read_cloud(cloud) if cloud is not None and no_cloud is None else None
     up = unit_up(data["up"]) if data.get("up") else None
     length = str(data.get("unit") or "") or ("m" if any(shot.depth for shot in shots) else None)
-    return Source(kind, shots, missing, sparse, up, length)
+    return Source(kind, shots, missing, sparse, up, length, no_cloud)
 
 
 def _number(path: Path, what: str, value: Any) -> float:
