@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from mgs.active.directional import gains
 from mgs.active.outlook import Outlook
 
 
 def linear_look(outlook: Outlook) -> np.ndarray:
     """`directional-i` with colours that change with the direction linearly (SH degree 1, tau 0.1) instead of degree 3."""
-    views = outlook.views
-    return gains(
-        outlook.points, float(outlook.prior_lam[0]), 1, 0.1, views(outlook.visited), views(outlook.left), outlook.dome()
-    )
+    return outlook.gains(outlook.visited, outlook.left, 1, 0.1, True)

@@ -4,6 +4,7 @@ import json
 import math
 import threading
 import time
+import weakref
 
 import numpy as np
 import pytest
@@ -106,10 +107,29 @@ def test_views_are_measured_beside_each_other_but_large_ones_alone(tmp_path, mon
 
     monkeypatch.setattr(evaluation, "_measured", measured)
     monkeypatch.setattr(evaluation, "PIXELS_AT_ONCE", pixels)
-    result = evaluate(grey(), dataset.frames, (), renderer=lambda gaussians, camera: None)
+    result = evaluate(grey(), dataset.frames, (), renderer=lambda gaussians, camera: (np.zeros(1),) * 3)
     assert [view["psnr"] for view in result["views"]] == list(range(8)), "in their order"
     assert len(seen) == 8
     assert (max(seen) == 1) if most == 1 else (1 < max(seen) <= most)
+
+
+def test_what_a_renderer_returns_is_freed_by_the_thread_that_draws(tmp_path, monkeypatch):
+    """Memory of Dr.Jit that another thread frees while the next view is drawn stops both for ever, now and then."""
+    dataset, freed = write_dataset(tmp_path / "data", orbit_cameras(8)), []
+
+    def renderer(gaussians, camera):
+        drawn = tuple(np.zeros((2, 2)) for _ in range(3))
+        for part in drawn:
+            weakref.finalize(part, lambda: freed.append(threading.current_thread()))
+        return drawn
+
+    def measured(frame, rendered, spacing, folder):
+        time.sleep(0.02)
+        return {"psnr": 1.0}
+
+    monkeypatch.setattr(evaluation, "_measured", measured)
+    evaluate(grey(), dataset.frames, (), renderer=renderer)
+    assert freed == [threading.main_thread()] * 24
 
 
 def test_evaluate(tmp_path):

@@ -156,6 +156,7 @@ def outlook_of(models, H, **given):
         "H": H, "lam": LAM, "points": np.zeros((0, 3)), "surface_H": nothing, "prior_lam": LAM,
         "information": lambda view: models["exact"][view], "surface_information": lambda view: nothing,
         "estimate": lambda view, estimator: models[estimator][view], "seen": lambda view: np.zeros(0), "dome": lambda: None,
+        "gains": lambda *_: np.zeros(0),
     }  # fmt: skip
     return policies.Outlook(**(parts | given))
 

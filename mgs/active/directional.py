@@ -19,14 +19,16 @@ Sherman-Morrison formula):
   M_j = sum over the dome of W_vj y_vj y_vj^T that is sum_j W_cj (S_j y_cj)^T M_j (S_j y_cj) / (1 + W_cj y_cj^T S_j y_cj), for
   one channel and in units of sigma_e^2.
 
-Poses and the prior's surface are all that is needed: no images and no fit.
+Poses and the prior's surface are all that is needed: no images and no fit. Everything here is computed anew at every call. Runs
+use `mgs.active.pool_gains`, which is tested against it and much faster.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +38,8 @@ from mgs.camera import Camera, look_at
 from mgs.colour import SH_C0
 from mgs.synth.orbit import orbit_positions
 from mgs.synth.scene_file import Orbit
+
+Result = TypeVar("Result")
 
 DOME = 48
 """Number of poses of the dome, over which I-optimality averages. A chosen constant."""
@@ -91,11 +95,6 @@ def basis(points: Array, views: Views, degree: int) -> NDArray[np.float64]:
     return y
 
 
-def spread(points: int, count: int) -> NDArray[np.int64]:
-    """Indices of about `count` of so many points, every k-th."""
-    return np.arange(0, points, max(1, -(-points // count)))
-
-
 def precision(degree: int, tau: float, lam: float) -> NDArray[np.float64]:
     """[K] Lambda, the prior's information about each coefficient: lam = (sigma_e / tau_0)^2 for degree 0, lam / tau^2 above."""
     return np.repeat([lam, *[lam / tau**2] * degree], [2 * order + 1 for order in range(degree + 1)])
@@ -116,15 +115,18 @@ def gains(
     """
     prior = np.diag(precision(degree, tau, lam))
 
-    def part(first: int) -> NDArray[np.float64]:
-        some = slice(first, first + CHUNK)
+    def part(some: slice) -> NDArray[np.float64]:
         views = [None if views is None else Views(views.positions, views.seen[:, some]) for views in (taken, candidates, dome)]
         return _gains(points[some], prior, degree, *views)  # type: ignore[arg-type]
 
-    chunks = range(0, len(points), CHUNK)
-    # NumPy lets other threads run while it computes. The sum is in the order of the chunks, so it is always the same.
+    return np.asarray(sum(in_parts(len(points), part), np.zeros(len(candidates.positions))))
+
+
+def in_parts(count: int, part: Callable[[slice], Result]) -> list[Result]:
+    """Results for CHUNK of so many Gaussians at a time, in their order. NumPy lets other threads run while it computes."""
+    chunks = [slice(first, first + CHUNK) for first in range(0, count, CHUNK)]
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        return np.asarray(sum(pool.map(part, chunks), np.zeros(len(candidates.positions))))
+        return list(pool.map(part, chunks))
 
 
 def _gains(

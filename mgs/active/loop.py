@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from mgs.active import criteria, detectors, directional, inputs, policies, policy_file, pose_policies
-from mgs.active.outlook import Outlook
+from mgs.active.outlook import Gains, Outlook
 from mgs.active.run_folder import DATASET, State, check_settings, read_checkpoint, write_checkpoint, write_steps
 from mgs.active.settings import NbvSettings, TrainSettings
 from mgs.active.stopping import StopReason, diverged, run_end
@@ -163,9 +163,11 @@ class Loop:
         self.seeds = pose_policies.seed_views(self.positions, self.centre, settings.seeds)
         self.capture(self.seeds)
         self.start = stations.initial([self.frames[i] for i in self.seeds])
+        self.points = self.start.means[: self.stations.on_surface] @ self.turn.T
         self.policy = policies.policy_named(settings.policy)
         # These depend on poses and surface alone, so they are the same in every step.
         self.seen, self.dome = cache(self._seen), cache(self._dome)
+        self.gains = cache(self._gains)
         self.surface_from = kept_within(IMAGE_BYTES, self._surface_from, lambda F: F.nbytes)
         # The model that was asked about last, and what gives the information of a frame's view about it (`information`).
         self.informed: tuple[Gaussians | None, Callable[[int], np.ndarray]] = None, lambda frame: np.empty(0)
@@ -284,7 +286,7 @@ class Loop:
             rng=generator(self.settings.seed, f"{policy_file.label(self.settings.policy)}/{len(state.steps)}"),
             H=state.H,
             lam=self.lam,
-            points=self.start.means[: self.stations.on_surface] @ self.turn.T,
+            points=self.points,
             surface_H=state.surface,
             prior_lam=self.prior_lam,
             information=lambda view: self.information(state.gaussians)(told(view)),
@@ -292,6 +294,7 @@ class Loop:
             estimate=lambda view, estimator: self.stations.estimate(state.gaussians, self.cameras[told(view)], estimator),
             seen=lambda view: self.seen(told(view)),
             dome=self.dome,
+            gains=self.gains(),
         )
 
     def information(self, model: Gaussians) -> Callable[[int], np.ndarray]:
@@ -314,6 +317,20 @@ class Loop:
     def _seen(self, frame: int) -> np.ndarray:
         """Squared blending weights [N] of the Gaussians on the surface in a frame's view."""
         return directional.squared_weights(self.surface_information(self.cameras[frame]))
+
+    def _gains(self) -> Gains:
+        """Directional gains of all frames."""
+        from mgs.active.pool_gains import pool_gains  # imported here because it loads Dr.Jit
+
+        @cache
+        def pool() -> directional.Views:
+            seen = []
+            for i in range(len(self.frames)):
+                self.progress("scoring candidates", i, len(self.frames))
+                seen.append(self.seen(i))
+            return directional.Views(self.positions, np.stack(seen))
+
+        return pool_gains(self.points, float(self.prior_lam[0]), pool, self.dome)
 
     def _dome(self) -> directional.Views:
         """A dome of poses around the rock, and what they see of the surface."""

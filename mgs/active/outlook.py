@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mgs.active.criteria import Array
 from mgs.active.directional import Views
+
+Gains = Callable[[Sequence[int], Sequence[int], int, float, bool], NDArray[np.float64]]
+"""(views taken, candidates, degree, tau, whether over a dome) -> the gain of each candidate [C] by directional I-optimality, or
+without a dome D-optimality (`mgs.active.directional`)."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +30,7 @@ class Outlook:
     estimate(view, estimator): the information of one view about the fitted model, by any row of `mgs.splat.ESTIMATORS`.
     seen(view): [N] squared blending weights of the surface in one view (`mgs.active.directional.squared_weights`).
     dome(): a dome of poses around the rock, and what they see of the surface.
+    gains(visited, left, degree, tau, over_dome): directional gains of candidates (`Gains`), fast where `visited` only grows.
     """
 
     positions: Array
@@ -42,6 +48,7 @@ class Outlook:
     estimate: Callable[[int, str], Array]
     seen: Callable[[int], Array]
     dome: Callable[[], Views]
+    gains: Gains
 
     @property
     def candidates(self) -> Array:

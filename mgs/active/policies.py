@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from mgs.active.criteria import CRITERIA, Array, Criterion, block_log_determinant, d_optimal
 from mgs.active.criteria import i_optimal as i_optimality
-from mgs.active.directional import gains
 from mgs.active.outlook import Outlook, Policy
 from mgs.active.policy_file import in_file, load
 from mgs.active.pose_policies import POSE_POLICIES
@@ -24,14 +23,12 @@ PAPER_LAM = 1e-6
 
 def directional_d(outlook: Outlook) -> Array:
     """Directional D-optimality, nats, with colours of SH degree 2 and tau 0.3 (`mgs.active.directional`)."""
-    lam, views = float(outlook.prior_lam[0]), outlook.views
-    return gains(outlook.points, lam, 2, 0.3, views(outlook.visited), views(outlook.left))
+    return outlook.gains(outlook.visited, outlook.left, 2, 0.3, False)
 
 
 def directional_i(outlook: Outlook) -> Array:
     """Directional I-optimality over a dome, with colours of SH degree 3 and tau 0.1 (`mgs.active.directional`)."""
-    lam, views = float(outlook.prior_lam[0]), outlook.views
-    return gains(outlook.points, lam, 3, 0.1, views(outlook.visited), views(outlook.left), outlook.dome())
+    return outlook.gains(outlook.visited, outlook.left, 3, 0.1, True)
 
 
 def i_optimal(outlook: Outlook) -> Array:

@@ -105,7 +105,10 @@ def evaluate(
                 tell(begun - at_once + 1, len(work))
             if begun < len(work):
                 _, frame, folder = work[begun]
-                waiting.append(pool.submit(_measured, frame, renderer(gaussians, frame.camera), spacing, folder))
+                # Copies: what a renderer returns may be memory of Dr.Jit, and a thread that frees it waits for a lock of Dr.Jit
+                # with Python's own lock in its hands, while this thread, which draws the next view, holds the first one.
+                rgb, alpha, depth = map(np.array, renderer(gaussians, frame.camera))
+                waiting.append(pool.submit(_measured, frame, (rgb, alpha, depth), spacing, folder))
     held_out = [view for view in views if not view["trained"]]
     result: dict[str, Any] = {"images": len(trained)} | ({"test": _means(tests, tests)} if tests else {})
     result |= {"all": _means(views, views), "held_out": _means(held_out, views)}

@@ -18,6 +18,7 @@ from mgs.active.fitting import Fit, fit
 from mgs.active.loop import target_of
 from mgs.active.outlook import Outlook
 from mgs.active.policies import policy_named
+from mgs.active.pool_gains import pool_gains
 from mgs.active.pose_policies import seed_views
 from mgs.active.settings import MEAN_RATE, PASSES, RATES, WARM_PASSES, TrainSettings
 from mgs.active.stations import psnr_measure
@@ -279,13 +280,19 @@ def _surface_scores(
         return Views(np.array([camera.position for camera in cameras]), np.stack([weights(camera) for camera in cameras]))
 
     seen = functools.cache(lambda view: weights(lab.cameras[view]))
+
+    @functools.cache
+    def pool() -> Views:
+        return Views(positions, np.stack([seen(view) for view in range(len(positions))]))
+
     unknown, nothing = np.zeros((0, len(lam))), _of_fit
+    gains = pool_gains(start.means[:n], float(lam[0]), pool, dome)
 
     def scores(views: list[int], left: list[int], rng: np.random.Generator) -> NDArray[np.float64]:
         return np.asarray(choose(Outlook(
             positions=positions, left=left, visited=views, centre=centre, rng=rng, H=unknown, lam=lam, points=start.means[:n],
             surface_H=unknown, prior_lam=lam, information=nothing, surface_information=nothing, estimate=nothing, seen=seen,
-            dome=dome,
+            dome=dome, gains=gains,
         )))  # fmt: skip
 
     return scores
