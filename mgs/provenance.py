@@ -23,5 +23,8 @@ def versions() -> dict[str, str]:
 
 
 def command_line() -> str:
-    """The command line of this process as the user typed it: the program's name without its folder, and the arguments."""
-    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    """The command line of this process as the user typed it: the program's name without its folder, and the arguments.
+
+    `python -m mgs` is called `mgs`."""
+    program = Path(sys.argv[0])
+    return shlex.join([program.parent.name if program.name == "__main__.py" else program.name, *sys.argv[1:]])

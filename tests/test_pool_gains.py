@@ -89,6 +89,14 @@ def test_what_does_not_fit_into_memory_is_computed_anew(monkeypatch):
     assert np.array_equal(function(points, pool, dome)([0, 1], [3, 4], 3, 0.1, True), expected)
 
 
+@pytest.mark.parametrize("points", [0, 3])
+def test_poses_that_see_nothing_gain_nothing(points):
+    blind = Views(scene(0)[1].positions, np.zeros((POSES, points), np.float32))
+    for over_dome in (False, True):
+        found = function(np.zeros((points, 3)), blind, blind)([0], [3, 4], 3, 0.1, over_dome)
+        assert np.array_equal(found, [0, 0])
+
+
 def test_the_memory_that_is_reckoned_with_is_what_is_held():
     """Bytes of all arrays of a pool, over those that BYTES_OF_GAUSSIAN and BYTES_OF_PAIR say; points and poses are few."""
     rng = np.random.default_rng(0)

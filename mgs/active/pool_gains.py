@@ -43,7 +43,8 @@ def pool_gains(points: Array, lam: float, pool: Callable[[], Views], dome: Calla
 
     def found(taken: Sequence[int], left: Sequence[int], degree: int, tau: float, over_dome: bool) -> NDArray[np.float64]:
         key, views = (degree, tau, over_dome), pool()
-        if BYTES_OF_GAUSSIAN * len(points) * (degree + 1) ** 4 + BYTES_OF_PAIR * pairs() > IMAGE_BYTES:
+        kept = BYTES_OF_GAUSSIAN * len(points) * (degree + 1) ** 4 + BYTES_OF_PAIR * pairs()
+        if kept > IMAGE_BYTES or not pairs():  # kernels cannot be empty
             before, candidates = (Views(views.positions[list(some)], views.seen[list(some)]) for some in (taken, left))
             return gains(points, lam, degree, tau, before, candidates, dome() if over_dome else None)
         if key not in known or known[key].taken != list(taken[: len(known[key].taken)]):

@@ -40,9 +40,9 @@ class Preset:
 
 
 PRESETS = {
-    "fast": Preset(passes=5, warm_passes=3, density=1 / 8),
-    "balanced": Preset(passes=5, warm_passes=3, density=1 / 4),
-    "accurate": Preset(passes=PASSES, warm_passes=WARM_PASSES, density=1 / 4),
+    "fast": Preset(passes=5, warm_passes=3, density=1 / 4),
+    "balanced": Preset(passes=5, warm_passes=3, density=1 / 2),
+    "accurate": Preset(passes=PASSES, warm_passes=WARM_PASSES, density=1 / 2),
 }
 """What `mgs nbv --preset` knows, by name: points on the front of runs in docs/speed-accuracy.md."""
 

@@ -13,7 +13,7 @@ def parsimony(
         "parsimony"
     ),
     preset: Annotated[
-        str, typer.Option(help="quick: two scenes of small images, minutes. full: four scenes of 320x240, hours.")
+        str, typer.Option(help="quick: four scenes of small images, minutes. full: the same of 320x240, hours.")
     ] = "quick",
 ) -> None:
     """Chart quality and cost against the number of Gaussians, what is learned, and the SH degree, with the automatic choice

@@ -16,10 +16,9 @@ from mgs.camera import Camera
 from mgs.data.meshes import Mesh
 from mgs.errors import InputError
 
-PIXELS_PER_SAMPLE = 2.5
-"""Spacing of the samples over the size of the closest pixel. 1 would be the limit of a single perfect image; a model that fine
-has more parameters than the images have values, and fits their noise. A chosen constant, judged by `mgs parsimony`
-(docs/parsimony.md)."""
+PIXELS_PER_SAMPLE = 1.15
+"""Spacing of the samples over the size of the closest pixel. Finer models are no better, and much finer ones are worse: they
+have more parameters than the images have values. A chosen constant, judged by `mgs parsimony` (docs/parsimony.md)."""
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from mgs.bench.core import TARGETS
@@ -222,7 +223,27 @@ def later_passes(data: dict[str, Any]) -> str:
     return markdown(["passes of later fits", "fits, s", "whole run, s", "12 images, dB", *last], rows) + made_by(data)
 
 
+WAYS = {"anew": "all Gaussians, anew for every choice", "updated": "**all Gaussians, brought up to date**"}
+"""Ways of `benchmarks/planning.py`; the others are numbers of Gaussians."""
+
+
+def planning(data: dict[str, Any]) -> str:
+    """Seconds to plan a flight, and what the plan brings, by how the gains are computed."""
+    rows = []
+    for row in data["rows"]:
+        way = WAYS.get(row["way"], f"{row['gaussians']:,} Gaussians, anew")
+        kept = (
+            "–" if row["way"] == "anew" else f"{row['kept']} of {data['budget']}" + (", the same order" if row["same"] else "")
+        )
+        error = f"{row['largest_difference']:.0e}" if "largest_difference" in row else "–"
+        worth = f"{100 * row['worth']:.2f} %" if "worth" in row else "100 %"
+        rows.append([Path(row["dataset"]).name, row["criterion"], way, f"{row['seconds']:.1f}", kept, error, worth])
+    heading = ["poses", "criterion", "gains of", "seconds", "the same choices", "largest error of a gain", "the plan's worth"]
+    return markdown(heading, rows) + made_by(data)
+
+
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "planning": ("benchmarks/planning", planning),
     "versions": ("benchmarks/versions", two_versions),
     "whole-runs": ("benchmarks/whole_runs", whole_runs),
     "paper-size": ("benchmarks/whole_runs", paper_size),

@@ -35,13 +35,13 @@ class Plan:
 PLANS = {
     "quick": Plan(
         width=192, height=144, frames=24, test_views=8, seeds=4, images=8,
-        densities=(1 / 32, 1 / 16, 1 / 8, 1 / 4), passes=(5, 10, 20), image_counts=(4, 12),
+        densities=(1 / 16, 1 / 8, 1 / 4, 1 / 2), passes=(5, 10, 20), image_counts=(4, 12),
         policies=("directional-i", "random"), probes=(1, 4, 16),
         core_gaussians=10_000, core_size=(320, 240), step_sizes=(0.5, 1, 2, 4, 8),
     ),
     "full": Plan(
         width=320, height=240, frames=32, test_views=12, seeds=4, images=12,
-        densities=(1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2), passes=(2, 5, 10, 20, 40), image_counts=(4, 6, 8, 16, 24),
+        densities=(1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1), passes=(2, 5, 10, 20, 40), image_counts=(4, 6, 8, 16, 24),
         policies=("directional-i", "directional-d", "fisherrf", "uniform", "farthest", "random", "paper"),
         probes=(1, 2, 4, 8, 16, 32, 64), core_gaussians=100_000, core_size=(640, 480),
         step_sizes=(0.125, 0.25, 0.5, 1, 2, 4, 8, 16),
