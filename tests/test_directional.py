@@ -177,3 +177,24 @@ def test_a_flight_is_planned_without_looking_at_any_fit(dataset, tmp_path, polic
     expected = gains(start.means, criteria.regularisation(tiny.GROUPS)[0], degree, tau, *pools, around)
     assert states[0].steps[1]["score"] == pytest.approx(expected.max())
     assert expected[left.index(first)] == pytest.approx(expected.max())
+
+
+@pytest.mark.parametrize("policy", ["coverage", "directional-d", "directional-i"])
+def test_what_poses_see_is_measured_once_and_again_when_it_is_forgotten(dataset, tmp_path, policy):
+    """A choice that is timed must not profit from what the one before it kept (`mgs chart --only scoring`)."""
+    looked, loaded = [], load_dataset(dataset)
+
+    def exact(gaussians, camera):
+        looked.append(camera)
+        return tiny.fisher(gaussians, camera)
+
+    settings = tiny.start(tmp_path / "run", loaded, policy=policy)
+    run = loop.Loop(tmp_path / "run", settings, loaded, tiny.stations(exact=exact), tiny.silent)
+    state, counts = run.first(), []
+    for forget in (False, False, True, True):
+        if forget:
+            run.look_anew()
+        looked.clear()
+        run.choose(state)
+        counts.append(len(looked))
+    assert counts[1] == 0 < counts[0] == counts[2] == counts[3]

@@ -165,13 +165,16 @@ class Loop:
         self.start = stations.initial([self.frames[i] for i in self.seeds])
         self.points = self.start.means[: self.stations.on_surface] @ self.turn.T
         self.policy = policies.policy_named(settings.policy)
-        # These depend on poses and surface alone, so they are the same in every step.
-        self.seen, self.dome = cache(self._seen), cache(self._dome)
-        self.gains = cache(self._gains)
-        self.surface_from = kept_within(IMAGE_BYTES, self._surface_from, lambda F: F.nbytes)
+        self.look_anew()
         # The model that was asked about last, and what gives the information of a frame's view about it (`information`).
         self.informed: tuple[Gaussians | None, Callable[[int], np.ndarray]] = None, lambda frame: np.empty(0)
         self.before_fit, self.coloured = cache(self._before_fit), lru_cache(maxsize=2)(self._coloured)  # on images, too
+
+    def look_anew(self) -> None:
+        """Forget what poses see of the surface. It depends on poses and surface alone, so it is the same in every step, and is
+        measured when it is asked for first."""
+        self.seen, self.dome, self.gains = cache(self._seen), cache(self._dome), cache(self._gains)
+        self.surface_from = kept_within(IMAGE_BYTES, self._surface_from, lambda F: F.nbytes)
 
     def capture(self, views: Sequence[int]) -> None:
         """Have the images of these frames made where they do not exist yet."""

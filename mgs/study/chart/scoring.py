@@ -149,11 +149,10 @@ def lazy(state: State) -> NDArray[np.float64]:
 
 
 def by_policy(state: State, name: str) -> NDArray[np.float64]:
-    """Scores by a policy that looks at poses and the prior's surface, with everything computed anew."""
+    """Scores by a policy that looks at poses and the prior's surface, all computed anew, as for the first choice."""
     from mgs.active.policies import policy_named
 
-    state.loop.seen.cache_clear()
-    state.loop.dome.cache_clear()
+    state.loop.look_anew()
     return np.asarray(policy_named(name)(state.loop.outlook(state.state, state.left)), np.float64)
 
 
