@@ -129,7 +129,10 @@ def test_a_run_with_a_preset_writes_what_it_came_to(dataset, prior, tmp_path, mo
     for options in ({"preset": "accurate"}, {"preset": "accurate", "gaussians": 50}):
         with pytest.raises(InputError, match="enough"):
             start_run(dataset, tmp_path / "built", seeds=3, **options)
-    assert [(given.density, given.gaussians) for given in asked] == [(0.25, None), (0.25, 50)]
+    assert [(given.density, given.gaussians) for given in asked] == [
+        (PRESETS["accurate"].density, None),
+        (PRESETS["accurate"].density, 50),
+    ]
 
 
 def test_the_density_of_a_prior_is_samples_for_each_pixel():
