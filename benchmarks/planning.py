@@ -23,7 +23,7 @@ from mgs.active.criteria import regularisation
 from mgs.active.directional import Views
 from mgs.active.pose_policies import seed_views
 from mgs.active.settings import NbvSettings
-from mgs.camera import Camera
+from mgs.active.sight import Sight
 from mgs.data.dataset import load_dataset
 from mgs.files import write_json
 from mgs.prior.build import load_prior
@@ -62,17 +62,12 @@ def pool_of(dataset: Path, prior_folder: Path) -> Pool:
     prior, frames = load_prior(prior_folder), load_dataset(dataset).frames
     unseen = np.zeros(len(prior.points), bool), np.zeros((0, 3))
     start = initial_gaussians(prior, frames, colours=lambda frame: unseen)[0]
-    cameras, cache = [frame.camera for frame in frames], ListCache()
-    positions, centre = np.array([camera.position for camera in cameras]), prior.points.mean(axis=0)
-
-    def views(those: list[Camera]) -> Views:
-        seen = [directional.squared_weights(fisher(start, camera, cache=cache)[: len(prior.points)]) for camera in those]
-        return Views(np.array([camera.position for camera in those]), np.stack(seen))
-
+    cameras, cache, n = [frame.camera for frame in frames], ListCache(), len(prior.points)
+    centre, points = prior.points.mean(axis=0), np.asarray(start.means[:n])
     settings = NbvSettings(dataset=dataset, prior=prior_folder)
     lam = float(regularisation(groups(0), settings.pixel_noise, settings.prior_std)[0])
-    dome = views(directional.dome_cameras(cameras[0], positions, centre))
-    return Pool(np.asarray(start.means[: len(prior.points)]), views(cameras), dome, lam, seed_views(positions, centre, SEEDS))
+    sight = Sight(cameras, lambda camera: fisher(start, camera, cache=cache)[:n], points, centre, lam)
+    return Pool(points, sight.pool(), sight.dome(), lam, seed_views(sight.positions, centre, SEEDS))
 
 
 def anew(pool: Pool, criterion: str) -> Callable[[list[int], list[int]], np.ndarray]:

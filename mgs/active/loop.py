@@ -15,10 +15,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from mgs.active import criteria, detectors, directional, inputs, policies, policy_file, pose_policies
-from mgs.active.outlook import Gains, Outlook
+from mgs.active import criteria, detectors, inputs, policies, policy_file, pose_policies
+from mgs.active.outlook import Outlook
 from mgs.active.run_folder import DATASET, State, check_settings, read_checkpoint, write_checkpoint, write_steps
 from mgs.active.settings import NbvSettings, TrainSettings
+from mgs.active.sight import Sight
 from mgs.active.stopping import StopReason, diverged, run_end
 from mgs.camera import Camera
 from mgs.data.dataset import Dataset, Frame
@@ -171,10 +172,10 @@ class Loop:
         self.before_fit, self.coloured = cache(self._before_fit), lru_cache(maxsize=2)(self._coloured)  # on images, too
 
     def look_anew(self) -> None:
-        """Forget what poses see of the surface. It depends on poses and surface alone, so it is the same in every step, and is
-        measured when it is asked for first."""
-        self.seen, self.dome, self.gains = cache(self._seen), cache(self._dome), cache(self._gains)
-        self.surface_from = kept_within(IMAGE_BYTES, self._surface_from, lambda F: F.nbytes)
+        """Forget what poses see of the surface, so that it is measured again."""
+        told = partial(self.progress, "scoring candidates")
+        lam = float(self.prior_lam[0])
+        self.sight = Sight(self.cameras, self.surface_information, self.points, self.centre, lam, self.turn, told)
 
     def capture(self, views: Sequence[int]) -> None:
         """Have the images of these frames made where they do not exist yet."""
@@ -293,11 +294,11 @@ class Loop:
             surface_H=state.surface,
             prior_lam=self.prior_lam,
             information=lambda view: self.information(state.gaussians)(told(view)),
-            surface_information=lambda view: self.surface_from(told(view)),
+            surface_information=lambda view: self.sight.information(told(view)),
             estimate=lambda view, estimator: self.stations.estimate(state.gaussians, self.cameras[told(view)], estimator),
-            seen=lambda view: self.seen(told(view)),
-            dome=self.dome,
-            gains=self.gains(),
+            seen=lambda view: self.sight.seen(told(view)),
+            dome=self.sight.dome,
+            gains=self.sight.gains,
         )
 
     def information(self, model: Gaussians) -> Callable[[int], np.ndarray]:
@@ -312,37 +313,6 @@ class Loop:
         """What a pose sees of the surface: exact information about how the Gaussians on it look before any training."""
         fisher = self.stations.exact or self.stations.fisher
         return fisher(self.start, camera)[: self.stations.on_surface, : len(self.prior_lam)]
-
-    def _surface_from(self, frame: int) -> np.ndarray:
-        """`surface_information` from a frame's pose; a copy, because what the kernel returns is part of a larger array."""
-        return np.array(self.surface_information(self.cameras[frame]))
-
-    def _seen(self, frame: int) -> np.ndarray:
-        """Squared blending weights [N] of the Gaussians on the surface in a frame's view."""
-        return directional.squared_weights(self.surface_information(self.cameras[frame]))
-
-    def _gains(self) -> Gains:
-        """Directional gains of all frames."""
-        from mgs.active.pool_gains import pool_gains  # imported here because it loads Dr.Jit
-
-        @cache
-        def pool() -> directional.Views:
-            seen = []
-            for i in range(len(self.frames)):
-                self.progress("scoring candidates", i, len(self.frames))
-                seen.append(self.seen(i))
-            return directional.Views(self.positions, np.stack(seen))
-
-        return pool_gains(self.points, float(self.prior_lam[0]), pool, self.dome)
-
-    def _dome(self) -> directional.Views:
-        """A dome of poses around the rock, and what they see of the surface."""
-        upright_cameras = directional.dome_cameras(self.cameras[0], self.positions, self.centre)
-        to_upright = np.eye(4)
-        to_upright[:3, :3] = self.turn
-        cameras = [replace(camera, world_to_camera=camera.world_to_camera @ to_upright) for camera in upright_cameras]
-        seen = [directional.squared_weights(self.surface_information(camera)) for camera in cameras]
-        return directional.Views(np.array([camera.position for camera in upright_cameras]), np.stack(seen))
 
     def learn(self, state: State, planned: State) -> State:
         """Read the images of the views that are planned beyond a state, fit to convergence on all so far, sum their information

@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from scipy.stats import kendalltau
 
 from mgs.active.criteria import MEAN_STD, PRIOR_STD, Score, d_optimal, lam_by_kind, regularisation
-from mgs.active.directional import Views, dome_cameras, squared_weights
 from mgs.active.fitting import Fit, fit
 from mgs.active.loop import target_of
 from mgs.active.outlook import Outlook
 from mgs.active.policies import policy_named
-from mgs.active.pool_gains import pool_gains
 from mgs.active.pose_policies import seed_views
 from mgs.active.settings import MEAN_RATE, PASSES, RATES, WARM_PASSES, TrainSettings
+from mgs.active.sight import Sight
 from mgs.active.stations import psnr_measure
 from mgs.camera import Camera
 from mgs.data.dataset import Frame, load_dataset
@@ -269,30 +268,19 @@ def _surface_scores(
 
     start: the Gaussians before training, in any colours."""
     choose, lam, n = policy_named(policy), lab.lam(), len(lab.prior.points)
-    positions, centre = np.array([camera.position for camera in lab.cameras]), lab.prior.points.mean(0)
+    points, centre = start.means[:n], lab.prior.points.mean(0)
 
-    def weights(camera: Camera) -> Array:
-        return squared_weights(fisher(start, camera, cache=lab.cache)[:n])
+    def look(camera: Camera) -> Array:
+        return fisher(start, camera, cache=lab.cache)[:n]
 
-    @functools.cache
-    def dome() -> Views:
-        cameras = dome_cameras(lab.cameras[0], positions, centre)
-        return Views(np.array([camera.position for camera in cameras]), np.stack([weights(camera) for camera in cameras]))
-
-    seen = functools.cache(lambda view: weights(lab.cameras[view]))
-
-    @functools.cache
-    def pool() -> Views:
-        return Views(positions, np.stack([seen(view) for view in range(len(positions))]))
-
+    sight = Sight(lab.cameras, look, points, centre, float(lam[0]))
     unknown, nothing = np.zeros((0, len(lam))), _of_fit
-    gains = pool_gains(start.means[:n], float(lam[0]), pool, dome)
 
     def scores(views: list[int], left: list[int], rng: np.random.Generator) -> NDArray[np.float64]:
         return np.asarray(choose(Outlook(
-            positions=positions, left=left, visited=views, centre=centre, rng=rng, H=unknown, lam=lam, points=start.means[:n],
-            surface_H=unknown, prior_lam=lam, information=nothing, surface_information=nothing, estimate=nothing, seen=seen,
-            dome=dome, gains=gains,
+            positions=sight.positions, left=left, visited=views, centre=centre, rng=rng, H=unknown, lam=lam, points=points,
+            surface_H=unknown, prior_lam=lam, information=nothing, surface_information=nothing, estimate=nothing,
+            seen=sight.seen, dome=sight.dome, gains=sight.gains,
         )))  # fmt: skip
 
     return scores
