@@ -1,15 +1,35 @@
-"""Bounded memory: results that are kept while there is room for them, and sequences whose items are made when asked for."""
+"""Memory: results that are kept while there is room for them, sequences whose items are made when asked for, and arrays for
+Dr.Jit."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TypeVar, overload
+from typing import Any, TypeVar, overload
+
+import numpy as np
 
 Value = TypeVar("Value")
 
 IMAGE_BYTES = 1 << 30
 """Most memory for arrays of one kind that are kept to be used again, bytes. Of images, as targets of a fit, these are 218 of
 640x480, or five of 12 megapixels. All others are read or computed again at every use."""
+
+
+PADDING = 64
+"""Numbers that a kernel may read beyond the end of an array: it takes as many at once as fit into a register, 16 at most."""
+
+
+def padded(values: Any, dtype: Any = np.float32) -> np.ndarray:
+    """A copy of an array, of this type and contiguous, behind which more of its memory follows.
+
+    Every array that Dr.Jit is to take over from NumPy must be one. Dr.Jit 1.5 does not copy it, and its kernels read a few
+    numbers beyond the end: where the memory ends there, which depends on sizes and on chance, the process dies.
+    """
+    values = np.asarray(values)
+    memory = np.empty(values.size + PADDING, dtype)
+    copy = memory[: values.size].reshape(values.shape)
+    copy[...] = values
+    return copy
 
 
 def kept_within(budget: int, make: Callable[[int], Value], size: Callable[[Value], int]) -> Callable[[int], Value]:

@@ -1,8 +1,10 @@
-"""Memory is bounded: images beyond a budget are read again, and nothing of a result changes."""
+"""Memory is bounded: images beyond a budget are read again, nothing of a result changes. And none is read beyond its end."""
 
 from __future__ import annotations
 
 import gc
+import re
+import subprocess
 import sys
 import weakref
 from collections import Counter
@@ -14,11 +16,12 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 import synthetic
 
+import mgs
 from mgs.active import loop, objective, stations
 from mgs.active.nbv import run_nbv
 from mgs.data.dataset import Dataset, Frame, load_dataset
 from mgs.data.importers import import_source, read_source
-from mgs.memory import Deferred, kept_within
+from mgs.memory import PADDING, Deferred, kept_within, padded
 from mgs.prior.build import build_prior, save_prior
 from mgs.prior.settings import PriorSettings
 
@@ -119,3 +122,54 @@ def test_stations_before_a_run_hold_few_images_at_once(rock: Dataset, tmp_path: 
     make_masks(Dataset(tmp_path / "d", tuple(bare)), read_mesh(rock.root / "rock.glb"), 0.1)
     assert live.most <= 4
     assert len(load_dataset(tmp_path / "d")) == 12
+
+
+AT_THE_END = """
+import ctypes, dataclasses, mmap
+import numpy as np
+import tiny, mgs
+from mgs.splat import fisher, render
+
+def at_the_end(values):
+    "The same array in memory that ends with it: the page behind must not be read."
+    values = np.ascontiguousarray(values, np.float32)
+    size = -(-values.nbytes // mmap.PAGESIZE) * mmap.PAGESIZE
+    pages = np.frombuffer(mmap.mmap(-1, size + mmap.PAGESIZE), np.uint8)
+    assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(pages.ctypes.data + size), mmap.PAGESIZE, 0) == 0
+    copy = pages[size - values.nbytes : size].view(np.float32).reshape(values.shape)
+    copy[:] = values
+    return copy
+
+model, camera = tiny.initial([]), tiny.orbit(1)[0]
+moved = dataclasses.replace(model, **{f.name: at_the_end(getattr(model, f.name)) for f in dataclasses.fields(model)})
+assert np.array_equal(np.asarray(render(moved, camera).rgb), np.asarray(render(model, camera).rgb))
+assert np.array_equal(fisher(moved, camera), fisher(model, camera))
+print("drawn")
+"""
+
+
+def test_memory_that_ends_with_an_array_is_not_read_beyond():
+    """A process of its own, since Dr.Jit would end it: it takes arrays of NumPy as they are, and reads beyond their end."""
+    done = subprocess.run([sys.executable, "-c", AT_THE_END], cwd=Path(__file__).parent, capture_output=True, text=True)
+    assert done.stdout == "drawn\n", (done.returncode, done.stderr)
+
+
+@pytest.mark.parametrize("shape", [(0,), (5,), (3, 4), (2, 3, 4)])
+def test_a_padded_array_is_the_same_with_memory_behind_it(shape):
+    values = np.random.default_rng(0).normal(size=shape)
+    copy = padded(np.asfortranarray(values), np.float64)
+    assert np.array_equal(copy, values)
+    assert copy.flags.c_contiguous
+    memory = copy.base if copy.base.base is None else copy.base.base
+    assert memory.size == copy.size + PADDING
+    assert padded([1, 2]).dtype == np.float32
+
+
+def test_all_that_dr_jit_takes_from_numpy_is_padded():
+    """By the words of the code: what is made of a NumPy expression says `padded`."""
+    taken = re.compile(r"mi\.(?:Float|Float64|UInt32|TensorXf|Vector\d[fd]?|Point\d[fd]?)\((.*)")
+    for path in (Path(mgs.__file__).parent).rglob("*.py"):
+        for line in path.read_text().splitlines():
+            found = taken.search(line)
+            if found and re.search(r"np\.|\.astype\(|asarray", found[1]):
+                assert "padded(" in found[1], f"{path}: {line.strip()}"

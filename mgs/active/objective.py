@@ -30,7 +30,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians, learned
-from mgs.memory import IMAGE_BYTES, Deferred, kept_within
+from mgs.memory import IMAGE_BYTES, Deferred, kept_within, padded
 from mgs.splat import ListCache, as_drjit, fisher, groups, render
 from mgs.splat.blocks import BlockLists
 from mgs.splat.information import unit_normals
@@ -164,7 +164,7 @@ class Objective:
         normals = np.asarray(self.prior.normals) if means == "normal" else None
         found = fisher(model, photo.camera, cache=self.cache, means=means, normals=normals)
         columns = zip(self.pulls(model), groups(model.sh_degree, means).values(), strict=True)
-        return [mi.TensorXf(np.ascontiguousarray(found[:, c]).reshape(d.shape)) for (d, _), c in columns]
+        return [mi.TensorXf(padded(found[:, c]).reshape(d.shape)) for (d, _), c in columns]
 
     def lists(self, model: Gaussians, photo: Photo) -> tuple[BlockLists, Any]:
         """Block lists of one image and the splats packed for them. Raises InputError as `ListCache.get`."""
@@ -203,7 +203,7 @@ def objective(
     # if they were in the same memory when it was recorded (Dr.Jit 1.5).
     start = as_drjit(Gaussians(*(np.array(getattr(start, f.name), np.float32) for f in fields(start))))
     values = {name: dr.opaque(mi.Float, float((lam or {}).get(kind, 0.0))) for name, kind in learned(means).items()}
-    directions = None if unit is None else mi.TensorXf(unit.astype(np.float32))
+    directions = None if unit is None else mi.TensorXf(padded(unit))
     prior = Prior(start, values, dr.opaque(mi.Float, 1 / max(len(photos), 1)), directions)
     return Objective(photos, prior, cache or ListCache())
 
@@ -212,7 +212,7 @@ def _photo(camera: Camera, target: np.ndarray) -> Photo:
     """target: as `fit` takes it."""
     rgb = target[..., :3]
     weights = np.broadcast_to(target[..., 3:] if target.shape[-1] == 4 else np.ones((), np.float32), rgb.shape)
-    return Photo(camera, camera_array(camera), *(mi.Float(np.ascontiguousarray(a).ravel()) for a in (rgb, weights)))
+    return Photo(camera, camera_array(camera), *(mi.Float(padded(a).ravel()) for a in (rgb, weights)))
 
 
 def newton_decrease(

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from mgs.active.criteria import Array
 from mgs.active.directional import Views, gains, in_parts, information, precision
 from mgs.active.outlook import Gains
-from mgs.memory import IMAGE_BYTES
+from mgs.memory import IMAGE_BYTES, padded
 from mgs.splat.recording import one_at_a_time
 
 BYTES_OF_GAUSSIAN, BYTES_OF_PAIR = 16, 40
@@ -66,20 +66,20 @@ class PoolGains:
     @one_at_a_time
     def __init__(self, points: Array, pool: Views, lam: float, degree: int, tau: float, dome: Views | None = None) -> None:
         self.pool, self.degree, self.taken = pool, degree, list[int]()
-        self.points = mi.Float64(np.ravel(np.asarray(points, np.float64)))
-        self.positions = mi.Float64(np.ravel(np.asarray(pool.positions, np.float64)))
+        self.points = mi.Float64(padded(points, np.float64).ravel())
+        self.positions = mi.Float64(padded(pool.positions, np.float64).ravel())
         of, self.poses = np.nonzero(pool.seen.T)
-        self.of, self.by = mi.UInt32(of.astype(np.uint32)), mi.UInt32(self.poses.astype(np.uint32))
-        self.weights = mi.Float64(np.asarray(pool.seen[self.poses, of], np.float64))
+        self.of, self.by = mi.UInt32(padded(of, np.uint32)), mi.UInt32(padded(self.poses, np.uint32))
+        self.weights = mi.Float64(padded(pool.seen[self.poses, of], np.float64))
         variance = 1 / precision(degree, tau, lam)
         self.size = len(variance)
-        self.S = mi.Float64(np.tile(np.diag(variance).ravel(), len(points)))
+        self.S = mi.Float64(padded(np.tile(np.diag(variance).ravel(), len(points)), np.float64))
         y = self._harmonics(self.of, self.by)
         moved = [float(v) * value for v, value in zip(variance, y, strict=True)]
         self.g, self.M, self.q = _dot(moved, y), None, None
         if dome is not None:
             M = in_parts(len(points), lambda s: information(points[s], Views(dome.positions, dome.seen[:, s]), degree))
-            self.M, first = mi.Float64(np.ravel(np.concatenate(M))), self.of * self.size**2
+            self.M, first = mi.Float64(padded(np.concatenate(M), np.float64).ravel()), self.of * self.size**2
             self.q = _dot([_dot(self._row(self.M, first + a * self.size), moved) for a in range(self.size)], moved)
         dr.eval(self.S, self.M, self.g, self.q)
 
@@ -97,10 +97,10 @@ class PoolGains:
             self.taken.append(view)
             seen = np.flatnonzero(self.pool.seen[view])
             if len(seen):
-                self._take(mi.UInt32(seen.astype(np.uint32)), np.asarray(self.pool.seen[view, seen], np.float64), view)
+                self._take(mi.UInt32(padded(seen, np.uint32)), mi.Float64(padded(self.pool.seen[view, seen], np.float64)), view)
 
-    def _take(self, rows: Any, seen: Array, view: int) -> None:
-        """Take a view, which sees the Gaussians `rows` with the squared weights `seen`."""
+    def _take(self, rows: Any, weights: Any, view: int) -> None:
+        """Take a view, which sees the Gaussians `rows` with these squared weights."""
         K, n = self.size, len(rows)
         columns = self._harmonics(rows, dr.opaque(mi.UInt32, view, n))
         y, start = dr.zeros(mi.Float64, n * K), dr.arange(mi.UInt32, n) * K
@@ -119,7 +119,6 @@ class PoolGains:
 
         u = times(self.S, y)
         w = None if self.M is None else times(self.S, times(self.M, u))
-        weights = mi.Float64(seen)
         k = weights / (1 + weights * _dot(self._row(u, start), columns))
         both = None if w is None else dr.square(k) * _dot(self._row(w, start), columns)
         dr.eval(k, both)

@@ -22,6 +22,7 @@ from mgs.bench.machine import peak_flops
 from mgs.bench.work import count_work
 from mgs.camera import Camera, look_at
 from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
+from mgs.memory import padded
 from mgs.rotation import quat_from_normals
 from mgs.seeds import derive_seed, generator
 from mgs.splat import ListCache, as_drjit, fisher, render
@@ -133,7 +134,7 @@ def time_core(gaussians: Gaussians, camera: Camera, repeats: int, blocks: bool =
     """
     device, cache = as_drjit(gaussians), ListCache()
     new_views = iter(turned_cameras(camera, gaussians, repeats + WARM_UP))
-    weights = mi.TensorXf(np.random.default_rng(0).normal(size=(camera.height, camera.width, 3)).astype(np.float32))
+    weights = mi.TensorXf(padded(np.random.default_rng(0).normal(size=(camera.height, camera.width, 3))))
     dr.eval(device, weights)
     seconds = {
         "forward_cold": median_seconds(lambda: render(device, next(new_views)).rgb, repeats),
@@ -171,11 +172,11 @@ def volprim_scene(gaussians: Gaussians, camera: Camera) -> Any:
             },
             "gaussians": {
                 "type": "ellipsoids",
-                "centers": mi.TensorXf(gaussians.means),
-                "scales": mi.TensorXf(np.exp(gaussians.log_scales)),
-                "quaternions": mi.TensorXf(np.ascontiguousarray(quats[:, [1, 2, 3, 0]])),
-                "opacities": mi.TensorXf(gaussians.opacities[:, None]),
-                "sh_coeffs": mi.TensorXf(gaussians.sh.reshape(len(gaussians), -1)),
+                "centers": mi.TensorXf(padded(gaussians.means)),
+                "scales": mi.TensorXf(padded(np.exp(gaussians.log_scales))),
+                "quaternions": mi.TensorXf(padded(quats[:, [1, 2, 3, 0]])),
+                "opacities": mi.TensorXf(padded(gaussians.opacities[:, None])),
+                "sh_coeffs": mi.TensorXf(padded(gaussians.sh.reshape(len(gaussians), -1))),
             },
         }
     )

@@ -19,6 +19,7 @@ from mgs.bench.machine import machine_limits
 from mgs.bench.work import Work, count_work
 from mgs.camera import Camera
 from mgs.gaussians import Gaussians
+from mgs.memory import padded
 from mgs.splat import ListCache, as_drjit, blocks, fisher, kernels
 from mgs.splat.blocks import BlockLists
 from mgs.splat.projection import camera_array, project, project64
@@ -150,7 +151,7 @@ def roofline_rows(gaussians: Gaussians, camera: Camera, repeats: int, report: Ca
     packed64, tangents = pack(splats64, lists.place), kernels.pack_tangents(splats, splats, lists.place)
     out = kernels.forward(lists, packed, False)
     noise = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
-    d_out = (mi.Float(np.resize(noise, len(out[0]))),)
+    d_out = (mi.Float(padded(np.resize(noise, len(out[0])))),)
     weights, background = mi.TensorXf(noise), mi.Color3f(*(dr.opaque(mi.Float, 0.0) for _ in range(3)))
     dr.eval(out, d_out, weights)
     walks = {

@@ -11,6 +11,7 @@ import numpy as np
 
 from mgs import runtime
 from mgs.camera import Camera
+from mgs.memory import padded
 
 if TYPE_CHECKING:
     from mgs.data.meshes import Mesh
@@ -26,8 +27,8 @@ def mesh_depth(mesh: Mesh) -> Callable[[Camera], np.ndarray]:
     centre = mesh.vertices.mean(0)  # rays are cast in coordinates around it: float32 is finest near the origin
     shape = mi.Mesh("mesh", len(mesh.vertices), len(mesh.faces))
     params = mi.traverse(shape)
-    params["vertex_positions"] = mi.Float((mesh.vertices - centre).astype(np.float32).ravel())
-    params["faces"] = mi.UInt32(mesh.faces.astype(np.uint32).ravel())
+    params["vertex_positions"] = mi.Float(padded(mesh.vertices - centre).ravel())
+    params["faces"] = mi.UInt32(padded(mesh.faces, np.uint32).ravel())
     params.update()
     scene = mi.load_dict({"type": "scene", "mesh": shape})
 

@@ -32,6 +32,7 @@ from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.gaussians import Gaussians, learned, sh_from_rgb
 from mgs.images import write_exr
+from mgs.memory import padded
 from mgs.prior.build import Prior, load_prior
 from mgs.prior.initial import initial_gaussians
 from mgs.provenance import versions
@@ -91,10 +92,10 @@ def residual_variance(gaussians: Gaussians, frames: Sequence[Frame]) -> Array:
         truth, weight = frame.target()
         error = np.square(np.asarray(render(gaussians, frame.camera).rgb) - truth[..., :3]).mean(axis=-1) * weight
         for row, pixels in zip(sums, (error, weight), strict=True):
-            sh = mi.TensorXf(grey.sh)
+            sh = mi.TensorXf(padded(grey.sh))
             dr.enable_grad(sh)
             image = render(replace(grey, sh=sh), frame.camera)
-            dr.backward(dr.sum(image.rgb.array * mi.Float(np.repeat(pixels.ravel(), 3).astype(np.float32))))
+            dr.backward(dr.sum(image.rgb.array * mi.Float(padded(np.repeat(pixels.ravel(), 3)))))
             row += np.asarray(dr.grad(sh))[:, 0].mean(axis=-1) / SH_C0
     return sums[0] / np.maximum(sums[1], np.finfo(np.float32).tiny)
 

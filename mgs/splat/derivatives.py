@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from mgs.gaussians import Gaussians
+from mgs.memory import padded
 from mgs.splat.constants import LOG_SCALE_RANGE
 from mgs.splat.kernels import LN2, POWERS, log_alpha_tangent
 from mgs.splat.projection import axes2d, is_rotation, project64, rows_as_vectors, sh_basis, whitening
@@ -111,7 +112,7 @@ def by_means(gaussians: Gaussians, camera: Any) -> list[ByMean]:
         with dr.resume_grad():
             means = dr.copy(values["means"])
             dr.enable_grad(means)
-            dr.set_grad(means, mi.TensorXf(np.tile(axis, (len(gaussians), 1))))
+            dr.set_grad(means, mi.TensorXf(padded(np.tile(axis, (len(gaussians), 1)))))
             splats = project64(Gaussians(**{**values, "means": means}), camera)
             dr.forward_to(splats, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)  # the opacity does not depend on the means
             tangents, splats = dr.grad(splats), dr.detach(splats)
@@ -127,7 +128,7 @@ def along_normals(columns: list[ByMean], normals: np.ndarray) -> ByMean:
     They are combined here, in double: rounded to float32, a normal that points to the camera would be turned a little to the
     side, where a small splat is up to thousands of times as sensitive.
     """
-    parts = [mi.Float64(np.ascontiguousarray(part)) for part in normals.T]
+    parts = [mi.Float64(padded(part, np.float64)) for part in normals.T]
     polynomial = {powers: sum(n * c.log_alpha[powers] for n, c in zip(parts, columns, strict=True)) for powers in POWERS[1:]}
     by_axis = zip(*(c.colour for c in columns), strict=True)
     return ByMean(polynomial, [sum(n * g for n, g in zip(parts, channel, strict=True)) for channel in by_axis])

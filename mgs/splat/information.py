@@ -20,6 +20,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.errors import InputError, row_named
 from mgs.gaussians import LEARNED, Gaussians
+from mgs.memory import padded
 from mgs.seeds import derive_seed
 from mgs.splat import kernels
 from mgs.splat.derivatives import (
@@ -261,7 +262,7 @@ def hutchinson(
     for probe in range(int(probes)):
         rng = np.random.default_rng(derive_seed(seed, f"hutchinson/{camera.key.hex()}/{probe}"))
         z = rng.choice(np.array([-1, 1], np.float32), (camera.height, camera.width, 3))
-        squared = _gradient(gaussians, lambda _, z=z: mi.TensorXf(z), camera, background, cache).astype(np.float64) ** 2
+        squared = _gradient(gaussians, lambda _, z=z: mi.TensorXf(padded(z)), camera, background, cache).astype(np.float64) ** 2
         total = squared if probe == 0 else total + squared
     return (total / probes).astype(np.float32)
 

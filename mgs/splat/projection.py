@@ -26,6 +26,7 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.gaussians import SH_MAX, Gaussians
+from mgs.memory import padded
 from mgs.rotation import QUAT_MIN
 from mgs.splat.constants import EPS2D, FRUSTUM_MARGIN, LOG_SCALE_RANGE, NEAR
 
@@ -83,7 +84,7 @@ def camera_array(camera: Camera) -> Any:
     ]
     pose = camera.world_to_camera
     numbers = [*pose[:3, :3].ravel(), *pose[:3, 3], fx, fy, cx, cy, *clamp, *camera.position]
-    return mi.Float64(np.array(numbers, np.float64))
+    return mi.Float64(padded(numbers, np.float64))
 
 
 def _camera_parts(array: Any) -> tuple[Any, Any, list[Any], list[Any], Any]:

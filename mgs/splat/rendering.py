@@ -15,6 +15,7 @@ from mgs import runtime
 from mgs.camera import Camera
 from mgs.errors import InputError
 from mgs.gaussians import SH_MAX, Gaussians
+from mgs.memory import padded
 from mgs.splat import blocks, kernels
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, BlockLists
 from mgs.splat.projection import Splats, camera_array, project
@@ -152,7 +153,7 @@ def as_drjit(gaussians: Gaussians) -> Gaussians:
     runtime.start()
     gaussians.check_shapes()
     values = {f.name: getattr(gaussians, f.name) for f in fields(gaussians)}
-    return Gaussians(**{k: v if dr.is_array_v(v) else mi.TensorXf(np.asarray(v, np.float32)) for k, v in values.items()})
+    return Gaussians(**{k: v if dr.is_array_v(v) else mi.TensorXf(padded(v)) for k, v in values.items()})
 
 
 class _Rasterise(dr.CustomOp):

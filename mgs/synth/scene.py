@@ -16,6 +16,7 @@ import trimesh
 from mgs.camera import Camera
 from mgs.colour import linear_from_srgb
 from mgs.data.rock_image import boundary
+from mgs.memory import padded
 from mgs.seeds import generator
 from mgs.synth.arena import make_ground, make_stones, regolith
 from mgs.synth.scene_file import Rock, SceneFile, Sky
@@ -137,7 +138,8 @@ class Scene:
         rays [N,3]: directions in world axes, each as long as reaches a z-depth of 1.
         """
         length = np.linalg.norm(rays, axis=1)
-        origin, directions = mi.Point3f(*camera.position.tolist()), mi.Vector3f((rays / length[:, None]).T.astype(np.float32))
+        origin = mi.Point3f(*camera.position.tolist())
+        directions = mi.Vector3f(*(mi.Float(padded(column)) for column in (rays / length[:, None]).T))
         dr.make_opaque(origin)  # a number that the compiler knows would cost a new kernel for every camera
         hit = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, directions))
         dr.eval(hit)  # otherwise each array that is read below would trace the rays again
@@ -188,7 +190,7 @@ def _sunsky(sky: Sky) -> dict[str, Any]:
 
 
 def _bitmap(linear: np.ndarray) -> dict[str, Any]:
-    return {"type": "bitmap", "data": mi.TensorXf(np.ascontiguousarray(linear, np.float32)), "raw": True}
+    return {"type": "bitmap", "data": mi.TensorXf(padded(linear)), "raw": True}
 
 
 def _rock_bsdf(rock: trimesh.Trimesh, settings: Rock) -> dict[str, Any]:
@@ -222,11 +224,11 @@ def _mesh(name: str, mesh: trimesh.Trimesh, bsdf: dict[str, Any]) -> Any:
         flat: Any = np.ravel(values)
         shape.add_attribute(f"vertex_{attribute}", np.shape(values)[1], flat)
     params = mi.traverse(shape)
-    params["vertex_positions"] = mi.Float(mesh.vertices.astype(np.float32).ravel())
-    params["vertex_normals"] = mi.Float(mesh.vertex_normals.astype(np.float32).ravel())
-    params["faces"] = mi.UInt32(mesh.faces.astype(np.uint32).ravel())
+    params["vertex_positions"] = mi.Float(padded(mesh.vertices).ravel())
+    params["vertex_normals"] = mi.Float(padded(mesh.vertex_normals).ravel())
+    params["faces"] = mi.UInt32(padded(mesh.faces, np.uint32).ravel())
     if uv is not None:
-        params["vertex_texcoords"] = mi.Float(np.stack([uv[:, 0], 1 - uv[:, 1]], 1).astype(np.float32).ravel())
+        params["vertex_texcoords"] = mi.Float(padded(np.stack([uv[:, 0], 1 - uv[:, 1]], 1)).ravel())
     params.update()
     dr.eval(params["vertex_positions"])
     return shape

@@ -18,6 +18,7 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.gaussians import Gaussians
+from mgs.memory import padded
 from mgs.study.chart.plan import PLANS, Plan
 from mgs.study.chart.timing import timed
 from mgs.study.sweep import Cell
@@ -67,7 +68,7 @@ def gradient(where: Scene) -> Call:
     from mgs.bench.core import gradient as parts
     from mgs.splat import ListCache, as_drjit
 
-    device, cache, weights = as_drjit(where.gaussians), ListCache(), mi.TensorXf(where.weights)
+    device, cache, weights = as_drjit(where.gaussians), ListCache(), mi.TensorXf(padded(where.weights))
     n = len(where.gaussians)
 
     def call() -> np.ndarray:

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mgs import runtime
+from mgs.memory import padded
 
 REFERENCE_GAUSSIANS, REFERENCE_SIZE, REFERENCE_CALLS = 10_000, (320, 240), 10
 """The reference: so many images of so many Gaussians of a rock, of this width and height, with their gradients."""
@@ -33,7 +34,7 @@ def _reference() -> Callable[[], Any]:
 
     gaussians = surface_gaussians(REFERENCE_GAUSSIANS)
     camera, device, cache = surface_camera(gaussians, *REFERENCE_SIZE), as_drjit(gaussians), ListCache()
-    weights = mi.TensorXf(np.ones((camera.height, camera.width, 3), np.float32))
+    weights = mi.TensorXf(padded(np.ones((camera.height, camera.width, 3))))
 
     def call() -> None:
         for _ in range(REFERENCE_CALLS):
