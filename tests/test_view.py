@@ -326,8 +326,10 @@ def test_the_viewer_in_a_browser(browser, run):
         tab.wait_for_timeout(1500)
         tab.mouse.click(x, y)
         tab.get_by_text(f"{clicked.frame.name}:").wait_for()
+        # The frame's image comes after the words, in place of another or as a new one.
+        size = "([w, h]) => { const i = [...document.images].at(-1); return i.naturalWidth == w && i.naturalHeight == h }"
+        tab.wait_for_function(size, arg=[tiny.WIDTH, tiny.HEIGHT], timeout=30_000)
         image = tab.locator("img").last
-        assert image.evaluate("i => [i.naturalWidth, i.naturalHeight]") == [tiny.WIDTH, tiny.HEIGHT]
         shown = np.asarray(Image.open(io.BytesIO(image.screenshot())).convert("RGB")).astype(float)
         frame = 255 * srgb_from_linear(clicked.frame.rgb())
         np.testing.assert_allclose(shown.mean((0, 1)), frame.mean((0, 1)), atol=6)
