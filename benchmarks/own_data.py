@@ -8,7 +8,7 @@ depth turned into the world of the photographs, with the true masks. The differe
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import json
 import sys
 import tempfile
@@ -62,14 +62,8 @@ WAYS = (
 
 def photographs() -> Any:
     """tools/photographs.py, which is no part of the package."""
-    path = Path(__file__).parent.parent / "tools/photographs.py"
-    spec = importlib.util.spec_from_file_location("photographs", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["photographs"] = module
-    spec.loader.exec_module(module)
-    return module
+    sys.path.insert(0, str(Path(__file__).parent.parent / "tools"))
+    return importlib.import_module("photographs")
 
 
 def imported(data: Path, out: Path, masks: bool) -> Dataset:

@@ -128,21 +128,20 @@ def compared(pool: Pool, criterion: str, budget: int) -> list[dict[str, Any]]:
 def worth(pool: Pool, criterion: str, taken: list[int]) -> float:
     """What the chosen views of a plan bring by the criterion, all Gaussians counted: the sum of their gains."""
     degree, tau = CRITERIA[criterion]
-    prior = np.diag(directional.precision(degree, tau, pool.lam))
-    total = 0.0
-    for first in range(0, len(pool.points), directional.CHUNK):
-        some = slice(first, first + directional.CHUNK)
+    prior, dome = np.diag(directional.precision(degree, tau, pool.lam)), pool.dome
+
+    def part(some: slice) -> float:
+        points = pool.points[some]
         seeds, plan = (
-            prior
-            + directional.information(pool.points[some], Views(pool.poses.positions[v], pool.poses.seen[v][:, some]), degree)
+            prior + directional.information(points, Views(pool.poses.positions[v], pool.poses.seen[v][:, some]), degree)
             for v in (pool.seeds, taken)
         )
         if criterion == "directional-d":
-            total += 1.5 * (np.linalg.slogdet(plan)[1] - np.linalg.slogdet(seeds)[1]).sum()
-        else:
-            M = directional.information(pool.points[some], Views(pool.dome.positions, pool.dome.seen[:, some]), degree)
-            total += np.einsum("nkl,nkl->", M, np.linalg.inv(seeds) - np.linalg.inv(plan))
-    return float(total)
+            return float(1.5 * (np.linalg.slogdet(plan)[1] - np.linalg.slogdet(seeds)[1]).sum())
+        M = directional.information(points, Views(dome.positions, dome.seen[:, some]), degree)
+        return float(np.einsum("nkl,nkl->", M, np.linalg.inv(seeds) - np.linalg.inv(plan)))
+
+    return sum(directional.in_parts(len(pool.points), part))
 
 
 def main(out: Path, budget: int, cases: list[str]) -> None:

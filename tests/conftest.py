@@ -1,8 +1,7 @@
 """Shared test set-up: the variant is set once, before any test module that imports kernels; and a tiny dataset to spoil."""
 
-import importlib.util
+import importlib
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
@@ -48,10 +47,6 @@ def coarse_arena():
 @pytest.fixture(scope="session")
 def photographs():
     """tools/photographs.py, which is no part of the package."""
-    spec = importlib.util.spec_from_file_location("photographs", Path(__file__).parent.parent / "tools/photographs.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["photographs"] = module
-    spec.loader.exec_module(module)
-    return module
+    with pytest.MonkeyPatch.context() as patched:
+        patched.syspath_prepend(Path(__file__).parent.parent / "tools")
+        return importlib.import_module("photographs")

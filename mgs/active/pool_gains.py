@@ -44,7 +44,7 @@ def pool_gains(points: Array, lam: float, pool: Callable[[], Views], dome: Calla
     def found(taken: Sequence[int], left: Sequence[int], degree: int, tau: float, over_dome: bool) -> NDArray[np.float64]:
         key, views = (degree, tau, over_dome), pool()
         kept = BYTES_OF_GAUSSIAN * len(points) * (degree + 1) ** 4 + BYTES_OF_PAIR * pairs()
-        if kept > IMAGE_BYTES or not pairs():  # kernels cannot be empty
+        if kept > IMAGE_BYTES or not pairs():  # Dr.Jit has no kernels for empty arrays
             before, candidates = (Views(views.positions[list(some)], views.seen[list(some)]) for some in (taken, left))
             return gains(points, lam, degree, tau, before, candidates, dome() if over_dome else None)
         if key not in known or known[key].taken != list(taken[: len(known[key].taken)]):
@@ -107,7 +107,7 @@ class PoolGains:
         for a, column in enumerate(columns):
             dr.scatter(y, column, start + a)
         dr.eval(y)
-        # A lane for every Gaussian that is seen, and every row of its matrices.
+        # One number of a kernel (`lane`) for each Gaussian that is seen and each row of its matrices.
         lane = dr.arange(mi.UInt32, n * K)
         row, a = lane // K, lane % K
         first = dr.gather(mi.UInt32, rows, row) * K**2 + a * K
@@ -130,7 +130,7 @@ class PoolGains:
 
     def _update(self, rows: Any, u: Any, w: Any, k: Any, both: Any) -> None:
         """Bring g and q up to date with a view that sees the Gaussians `rows`. both: k^2 (y^T w)."""
-        place = dr.zeros(mi.UInt32, len(self.points) // 3)  # of each Gaussian in `rows`, counted from 1
+        place = dr.zeros(mi.UInt32, len(self.points) // 3)  # where in `rows` each Gaussian is, from 1; 0: the view misses it
         dr.scatter(place, dr.arange(mi.UInt32, len(k)) + 1, rows)
         dr.eval(place)
         row = dr.gather(mi.UInt32, place, self.of)

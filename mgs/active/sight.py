@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -36,20 +36,17 @@ class Sight:
         self.cameras, self.look, self.points, self.centre, self.lam, self.told = cameras, look, points, centre, lam, told
         self.turn = np.eye(3) if turn is None else turn
         self.positions = np.array([camera.position for camera in cameras]) @ self.turn.T
-        self.seen, self.pool, self.dome, self._gains = (
-            cache(self._seen),
-            cache(self._pool),
-            cache(self._dome),
-            cache(self._made),
-        )
+        self.seen, self.pool, self.dome = cache(self._seen), cache(self._pool), cache(self._dome)
         # A copy, because what the kernel returns is part of a larger array.
         self.information = kept_within(IMAGE_BYTES, lambda view: np.array(look(cameras[view])), lambda F: F.nbytes)
         """(view) -> `look` from its pose."""
 
-    @property
+    @cached_property
     def gains(self) -> Gains:
         """Directional gains of the poses."""
-        return self._gains()
+        from mgs.active.pool_gains import pool_gains  # imported here because it loads Dr.Jit
+
+        return pool_gains(self.points, self.lam, self.pool, self.dome)
 
     def _seen(self, view: int) -> Array:
         """[N] squared blending weights of the Gaussians in one view."""
@@ -71,8 +68,3 @@ class Sight:
         cameras = [replace(camera, world_to_camera=camera.world_to_camera @ to_upright) for camera in upright]
         seen = np.stack([squared_weights(self.look(camera)) for camera in cameras])
         return Views(np.array([camera.position for camera in upright]), seen)
-
-    def _made(self) -> Gains:
-        from mgs.active.pool_gains import pool_gains  # imported here because it loads Dr.Jit
-
-        return pool_gains(self.points, self.lam, self.pool, self.dome)
