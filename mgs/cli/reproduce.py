@@ -31,6 +31,9 @@ def reproduce(
     policy: Annotated[
         str | None, typer.Option(help="Compare one policy more in curves and pools: a name, or FILE.py:FUNCTION of your own.")
     ] = None,
+    batch: Annotated[
+        int, typer.Option(min=1, help="Of Table I and the figures: views that are chosen before the model is fitted again.")
+    ] = 1,
     workers: Annotated[int, typer.Option(min=1, help="Worker processes, which share this machine's cores.")] = 1,
     scheduler: Annotated[
         str | None, typer.Option(help="Use the workers of this Dask scheduler instead, as tcp://HOST:8786.")
@@ -52,6 +55,7 @@ def reproduce(
 
     names = study.results_of(only)
     size = study.with_policy(row_named(study.PRESETS, preset, "--preset"), names, policy)
+    size = study.with_batch(size, names, batch)
     counts = {name: study.rocks_of(name, size, rocks) for name in names}
     if scheduler is not None and workers != 1:
         raise InputError("--workers starts workers here, and --scheduler uses those of a scheduler; give one of them")
@@ -76,7 +80,8 @@ def _make(
     result = study.RESULTS[name]
     many = f" --rocks {count}" if result.rocks(size) > 1 else ""
     own = "".join(f" --policy {_from_here(policy)}" for policy in size.own_policies if name in ("curves", "pools"))
-    command = f"mgs reproduce --preset {preset} --only {name}{many}{own}"
+    batch = f" --batch {size.table.batch}" if size.table.batch > 1 and name in ("table1", "figures") else ""
+    command = f"mgs reproduce --preset {preset} --only {name}{many}{own}{batch}"
     task = bar.add_task(name, total=None)
 
     def tell(cell: str, done: int, total: int) -> None:

@@ -66,7 +66,8 @@ SEED_POLICIES = ("d-optimal", "paper")
 
 @dataclass(frozen=True)
 class Size:
-    """Images, in pixels; numbers of frames, samples per pixel, test views, Gaussians, and views chosen beyond the seeds."""
+    """Images, in pixels; numbers of frames, samples per pixel, test views, Gaussians, views chosen beyond the seeds, and of
+    these, how many are chosen before the model is fitted again."""
 
     width: int
     height: int
@@ -75,6 +76,7 @@ class Size:
     test_views: int
     gaussians: int
     budget: int
+    batch: int = 1
 
 
 @dataclass(frozen=True)
@@ -175,6 +177,7 @@ class Run:
         kind = "timed" if self.timed else "run"
         shape = f"{size.frames}x{size.width}x{size.height}-{size.gaussians}"
         views = f"{self.seeds}+{settings['budget']}-{settings['seed']}"
+        views += f"-by{settings['batch']}" if "batch" in settings else ""
         version = "".join(f"-{digest[:8]}" for digest in policy_record(self.policy).values())  # of a policy's file
         return f"{kind}/{self.rock.name}/{self.pool.replace(' ', '-')}-{shape}/{self.label}{version}-{views}"
 
@@ -186,7 +189,9 @@ class Run:
     def settings(self) -> dict[str, Any]:
         """Of `mgs nbv`; those of OTHER_TASKS name no policy."""
         budget = self.size.budget if self.budget is None else self.budget
-        policy = {} if self.policy in OTHER_TASKS else {"policy": self.policy}
+        policy: dict[str, Any] = {} if self.policy in OTHER_TASKS else {"policy": self.policy}
+        if policy and self.size.batch > 1:
+            policy["batch"] = self.size.batch
         nearest = {"nearest": POOLS[self.pool]["nearest"]} if "nearest" in POOLS[self.pool] else {}
         seed = self.rock.index + 1000 * self.draw
         return {**policy, "seeds": self.seeds, "budget": budget, "seed": seed, **nearest}
@@ -333,6 +338,18 @@ def with_policy(preset: Preset, names: list[str], policy: str | None) -> Preset:
         raise InputError(f"--policy {policy}: is compared anyway")
     policy_named(policy)
     return replace(preset, own_policies=(policy_file.absolute(policy),))
+
+
+def with_batch(preset: Preset, names: list[str], batch: int) -> Preset:
+    """A preset whose Table I, and so its figures, has runs that choose so many views before they fit again.
+
+    names: the results to make. Raises InputError where neither is among them.
+    """
+    if batch == 1:
+        return preset
+    if not {"table1", "figures"} & set(names):
+        raise InputError(f"--batch {batch}: is for table1 and figures, and --only leaves both out")
+    return replace(preset, table=replace(preset.table, batch=batch))
 
 
 def pairs_of(policies: Iterable[str]) -> tuple[tuple[str, str], ...]:
