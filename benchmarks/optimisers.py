@@ -1,10 +1,11 @@
-"""How fast optimisers lower the objective: `python benchmarks/optimisers.py DATASET PREFIX` writes PREFIX.json and PREFIX.png.
+"""How fast optimisers lower the objective: `python benchmarks/optimisers.py PREFIX DATASET:N [DATASET:N ...]`.
 
-Fits 10,000 Gaussians to 12 views spread evenly in azimuth, from the prior (cold), and goes on from such a fit with one more
-view (warm). Every point is a fit of its own, since rates fall over the length of a fit. Compared are the rows of
+Fits N Gaussians to 12 views of a dataset, spread evenly in azimuth, from the prior (cold), and goes on from such a fit with one
+more view (warm). Every point is a fit of its own, since rates fall over the length of a fit. Compared are the rows of
 `mgs.active.optimisers.OPTIMISERS` and Levenberg-Marquardt steps, solved by conjugate gradients with exact curvature products,
-which are made here only. Measured are the objective, PSNR inside the rock over the views that were not fitted, and work in
-passes: one is a render with gradients of every view. Seconds are given beside them.
+which are made here only. Measured are the objective, PSNR inside the rock over the dataset's test views, seconds, and work in
+passes: one is a render with gradients of every view. Writes PREFIX.json, and PREFIX_N.png for each number of Gaussians. Let
+nothing else run.
 """
 
 from __future__ import annotations
@@ -39,16 +40,18 @@ from mgs.provenance import command_line, versions
 from mgs.report.evaluation import evaluate
 from mgs.splat import ListCache, as_drjit, groups
 
-GAUSSIANS, VIEWS = 10_000, 12
+VIEWS = 12
 FIRST_RATES = {"colour": 0.02, "scale": 0.02, "rotation": 0.01, "opacity": 0.05}
 """Rates of the first version of mgs, whose optimiser was Adam."""
 FAST_RATES = {kind: 2 * rate for kind, rate in RATES.items()}
 """The best that were found for Adam: at twice these it ends lower on the images fitted and worse on the others."""
 ROWS = {
-    "Adam, first version's rates": ("adam", FIRST_RATES, (5, 10, 20, 40, 80)),
-    "Adam, rates chosen for it": ("adam", FAST_RATES, (5, 10, 20, 40, 80)),
-    "natural gradient": ("natural", RATES, (5, 10, 20, 40, 80)),
+    "Adam, first version's rates": ("adam", FIRST_RATES),
+    "Adam, rates chosen for it": ("adam", FAST_RATES),
+    "natural gradient": ("natural", RATES),
 }
+LENGTHS = (5, 10, 20, 40)
+"""Passes of the fits."""
 LM_STEPS, LM_CG, LM_DAMPING = 5, 8, 300.0
 """Levenberg-Marquardt: steps, iterations of conjugate gradients in each, and first damping, a factor of the prior's lam."""
 CURVATURE_COST = 1.5
@@ -59,9 +62,13 @@ gradient takes one in reverse mode and the render."""
 class _Case:
     """A dataset with the views to fit to, and those to judge by."""
 
-    def __init__(self, root: Path) -> None:
-        self.dataset, self.cache = load_dataset(root), ListCache()
-        prior, _ = build_prior(self.dataset, PriorSettings(gaussians=GAUSSIANS))
+    def __init__(self, root: Path, gaussians: int) -> None:
+        self.dataset, self.cache, self.gaussians = load_dataset(root), ListCache(), gaussians
+        tests = self.dataset.test_views()
+        if tests is None:
+            raise SystemExit(f"{root}: has no test views to judge by; make them with `mgs synth-orbit --test-views`")
+        self.tests = tests.frames
+        prior, _ = build_prior(self.dataset, PriorSettings(gaussians=gaussians))
         positions = np.array([frame.camera.position for frame in self.dataset.frames])
         self.taken = seed_views(positions, prior.points.mean(0), VIEWS)
         self.added = [*self.taken, next(i for i in range(len(positions)) if i not in self.taken)]
@@ -84,9 +91,8 @@ class _Case:
         return fit(model, *self.images(views), train, cache=self.cache, start=self.start, lam=self.lam).gaussians
 
     def psnr(self, model: Gaussians) -> float:
-        """PSNR inside the rock over the views never fitted in any case, dB."""
-        names = [self.dataset.frames[i].name for i in self.added]
-        found: float = evaluate(model, self.dataset.frames, names)["held_out"]["psnr_inside"]
+        """PSNR inside the rock over the test views, dB."""
+        found: float = evaluate(model, (), (), test_frames=self.tests)["test"]["psnr_inside"]
         return found
 
 
@@ -122,67 +128,77 @@ def levenberg_marquardt(goal: Objective, model: Gaussians) -> Iterator[tuple[flo
 
 
 def study(case: _Case) -> list[dict[str, Any]]:
-    """One record per fit: whether warm, which row, passes of work, seconds, objective, PSNR."""
+    """One record per fit: number of Gaussians, whether warm, which row, passes of work, seconds, objective, PSNR."""
     records = []
 
     def record(begin: str, row: str, work: float, seconds: float, goal: Objective, model: Gaussians) -> None:
-        phi, decibels = goal.phi(as_drjit(model)), case.psnr(model)
-        records.append({"start": begin, "row": row, "passes": work, "seconds": seconds, "phi": phi, "psnr_inside": decibels})
+        which = {"gaussians": case.gaussians, "start": begin, "row": row, "passes": work, "seconds": seconds}
+        records.append(which | {"phi": goal.phi(as_drjit(model)), "psnr_inside": case.psnr(model)})
         print(records[-1], flush=True)
 
+    for optimiser in OPTIMISERS:  # their kernels are compiled here, and the lists of both starts made
+        case.fitted(case.start, case.added, optimiser, RATES, 1)
     before = case.fitted(case.start, case.taken, "natural", RATES, TrainSettings().passes)
     for begin, model, views in (("cold", case.start, case.taken), ("warm", before, case.added)):
         goal = case.objective(views)
-        for row, (optimiser, rates, lengths) in ROWS.items():
-            for passes in lengths:
+        for row, (optimiser, rates) in ROWS.items():
+            for passes in LENGTHS:
                 began = time.perf_counter()
                 found = case.fitted(model, views, optimiser, rates, passes)
                 seconds = time.perf_counter() - began
                 extra = -(-passes // INFORMATION_PASSES) if OPTIMISERS[optimiser].uses_information else 0
                 record(begin, row, passes + extra, seconds, goal, found)
-        began = time.perf_counter()
+        seconds, began = 0.0, time.perf_counter()
         for work, moved in levenberg_marquardt(goal, as_drjit(model)):
             numpy = Gaussians(*(np.asarray(getattr(moved, f.name)) for f in fields(moved)))
-            record(begin, "Levenberg-Marquardt, CG", work, time.perf_counter() - began, goal, numpy)
+            seconds += time.perf_counter() - began
+            record(begin, "Levenberg-Marquardt, CG", work, seconds, goal, numpy)
+            began = time.perf_counter()  # judging took time that is not the optimiser's
     return records
 
 
 def draw(path: Path, records: list[dict[str, Any]]) -> None:
-    """Objective and PSNR against work, cold above, warm below."""
+    """Objective and PSNR against passes and against seconds, cold above, warm below."""
     import matplotlib
+    from matplotlib.ticker import NullFormatter
 
     colours = ("#D55E00", "#E69F00", "#0072B2", "#009E73")
+    columns = [("passes", "phi"), ("seconds", "phi"), ("passes", "psnr_inside"), ("seconds", "psnr_inside")]
+    names = {"passes": "work (passes)", "seconds": "seconds", "phi": "objective", "psnr_inside": "PSNR inside, test views (dB)"}
     with matplotlib.rc_context(STYLE):
-        figure = new_figure(7.2, 5.6)
-        axes = figure.subplots(2, 2, sharex=True)
+        figure = new_figure(10.4, 5.4)
+        axes = figure.subplots(2, 4, sharex="col")
         for line, begin in zip(axes, ("cold", "warm"), strict=True):
-            rows = list(dict.fromkeys(r["row"] for r in records))
-            for row, colour in zip(rows, colours, strict=True):
-                shown = [r for r in records if (r["start"], r["row"]) == (begin, row)]
-                for axis, key in zip(line, ("phi", "psnr_inside"), strict=True):
-                    axis.plot(
-                        [r["passes"] for r in shown], [r[key] for r in shown], "o-", color=colour, markersize=3, label=row
-                    )
-            line[0].set(xscale="log", yscale="log", ylabel=f"objective, {begin} start")
-            line[1].set(ylabel="PSNR inside, held out (dB)")
-        for axis in axes[1]:
-            axis.set(xlabel="work (passes)")
-            axis.xaxis.set_major_formatter("{x:.0f}")
-        for axis in axes[:, 0]:
-            axis.yaxis.set_major_formatter("{x:.0f}")
-            axis.yaxis.set_minor_formatter("{x:.0f}")
-        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+            for axis, (x, y) in zip(line, columns, strict=True):
+                for row, colour in zip(dict.fromkeys(r["row"] for r in records), colours, strict=True):
+                    shown = [r for r in records if (r["start"], r["row"]) == (begin, row)]
+                    axis.plot([r[x] for r in shown], [r[y] for r in shown], "o-", color=colour, markersize=3, label=row)
+                axis.set(xscale="log", yscale="log" if y == "phi" else "linear", ylabel=f"{names[y]}, {begin}")
+                limits = axis.get_xlim()
+                axis.set_xticks((5, 10, 20, 40, 80) if x == "passes" else (1, 2, 5, 10, 20, 40))
+                axis.set_xlim(limits)  # ticks outside of them would widen the axis
+                axis.xaxis.set_major_formatter("{x:g}")
+                axis.xaxis.set_minor_formatter(NullFormatter())
+                if y == "phi":
+                    axis.yaxis.set_major_formatter("{x:.0f}")
+                    axis.yaxis.set_minor_formatter("{x:.0f}")
+        for axis, (x, _) in zip(axes[1], columns, strict=True):
+            axis.set(xlabel=names[x])
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
         save_figure(figure, path)
 
 
-def main(root: Path, prefix: Path) -> None:
+def main(prefix: Path, given: list[str]) -> None:
     """Measure, write, draw."""
     runtime.start()
-    records = study(_Case(root))
+    records: list[dict[str, Any]] = []
+    for root, gaussians in (case.rsplit(":", 1) for case in given):
+        found = study(_Case(Path(root), int(gaussians)))
+        draw(prefix.with_name(f"{prefix.name}_{gaussians}.png"), found)
+        records += found
     made = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
     write_json(prefix.with_suffix(".json"), made | {"records": records})
-    draw(prefix.with_suffix(".png"), records)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main(Path(sys.argv[1]), sys.argv[2:])

@@ -147,7 +147,7 @@ def worth(pool: Pool, criterion: str, taken: list[int]) -> float:
 def main(out: Path, budget: int, cases: list[str]) -> None:
     """Measure, write after each case."""
     runtime.start()
-    rows = []
+    rows, made = [], {"machine": runtime.processor(), "versions": versions()}
     for case in cases:
         dataset, prior = case.split(":")
         began = time.perf_counter()
@@ -159,7 +159,7 @@ def main(out: Path, budget: int, cases: list[str]) -> None:
                 {"dataset": dataset, "criterion": criterion, "poses": len(pool.poses.positions), "looking": looking, **row}
                 for row in found
             ]
-            write_json(out, {"command": command_line(), "budget": budget, "rows": rows, "versions": versions()})
+            write_json(out, {"command": command_line(), "budget": budget, "rows": rows, **made})
 
 
 if __name__ == "__main__":

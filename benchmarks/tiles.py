@@ -86,6 +86,7 @@ def main(prefix: str, n: int = 100_000) -> None:
         "gaussians": n,
         "seconds": median,
         "relative_to_chosen": relative,
+        "machine": runtime.processor(),
         "versions": versions(),
     }
     write_json(f"{prefix}.json", found)

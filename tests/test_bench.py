@@ -134,5 +134,18 @@ def test_the_json_holds_the_command_as_typed(monkeypatch, capsys, tmp_path):
     assert "1.40" in printed
 
 
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["splat", "--chart", "x.png"], "--chart: is for scaling and roofline, not for splat; leave it out"),
+        (["fit", "--gaussians", 5000], "--gaussians: is for splat and scaling and roofline, not for fit"),
+        (["fit", "--repeats", 5], "--repeats: is for"),
+        (["roofline", "--dataset", "demo/dataset"], "--dataset: is for fit, not for roofline"),
+    ],
+)
+def test_what_a_benchmark_has_no_use_for_is_refused(capsys, arguments, line):
+    assert line in refused(capsys, ["bench", *arguments])
+
+
 def test_one_n_is_too_few_to_fit(capsys):
     assert "at least 3000" in refused(capsys, ["bench", "scaling", "--gaussians", 2999])

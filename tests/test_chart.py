@@ -57,6 +57,15 @@ def test_times_are_ratios_to_a_reference_that_is_timed_beside_each_call(monkeypa
     assert timing.with_seconds([times, {"bytes": 1}], 0.5)[1] == {"bytes": 1}
 
 
+def test_what_takes_little_time_is_timed_more_often(monkeypatch):
+    seconds = {"reference": 0.1, "short": 0.25, "shorter": 0.01}
+    monkeypatch.setattr(timing, "_clock", lambda call: ((name := call()), seconds[name], 0.0))
+    for name, often in (("short", 4), ("shorter", timing.MOST_REPEATS)):
+        calls = []
+        timing.timed(lambda name=name, calls=calls: calls.append(1) or name, 2, lambda: "reference")
+        assert len(calls) == 1 + often  # the first is not timed
+
+
 COMMANDS = typer.main.get_command(app).commands
 
 
@@ -141,7 +150,7 @@ def test_the_density_of_a_prior_is_samples_for_each_pixel():
 
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     square = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.ones(2, bool))
-    counts = [len(_samples(square, PriorSettings(density=d), 0.05)[0]) for d in (1, 4)]
+    counts = [len(_samples(square, PriorSettings(density=d), None, 0.05)[0]) for d in (1, 4)]
     assert counts[1] / counts[0] == pytest.approx(4, rel=0.05)
     with pytest.raises(InputError, match="density 0 must be positive"):
         PriorSettings(density=0)

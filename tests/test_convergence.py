@@ -11,7 +11,7 @@ from mgs.active.fitting import fit
 from mgs.active.loop import target_of
 from mgs.active.objective import objective
 from mgs.active.settings import NbvSettings, TrainSettings
-from mgs.cli.nbv import fit_line
+from mgs.active.stopping import fit_line
 from mgs.data.dataset import load_dataset
 from mgs.prior.build import load_prior
 from mgs.prior.initial import initial_gaussians

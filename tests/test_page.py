@@ -16,6 +16,7 @@ from mgs.active import loop
 from mgs.active.run_folder import read_checkpoint, read_settings
 from mgs.camera import Camera
 from mgs.data.dataset import load_dataset
+from mgs.files import write_json
 from mgs.report import page_pictures
 from mgs.report.evaluation import evaluate_run
 from mgs.report.page import write_page
@@ -31,7 +32,9 @@ def runs(tmp_path_factory):
         settings = tiny.start(root / policy, dataset, policy=policy, budget=3, evaluate_every=1)
         stations = tiny.stations(measure=lambda gaussians, taken: {"psnr": float(len(taken)), "test": {"lpips": 0.25}})
         loop.run(root / policy, settings.model_copy(update={"budget": budget}), dataset, stations, tiny.silent)
-    evaluate_run(root / "d-optimal", pictures=False)
+    metrics = evaluate_run(root / "d-optimal", pictures=False)
+    fit = {"phi": 1.0, "predicted_decrease": 0.004, "converged": True}  # stand-ins have no objective to measure it by
+    write_json(root / "d-optimal/metrics.json", metrics | {"fit": fit})
     (root / "d-optimal/diagnostics").mkdir()
     (root / "d-optimal/diagnostics/kf_0001.exr").write_bytes(b"")
     return [root / "d-optimal", root / "random"]
@@ -82,6 +85,8 @@ def test_the_page_says_what_the_files_say(page, runs):
     assert "Unfinished: 4 of 6 views are taken" in parsed.text
     assert "Not measured: `mgs eval" in parsed.text
     steps = [json.loads(line) for line in (runs[0] / "steps.jsonl").read_text().splitlines()]
+    assert "Last fit: converged; its objective could fall by 0.4 % yet" in parsed.text
+    assert "stopped early" not in parsed.text
     plots = {plot["title"]: plot["data"] for plot in data["plots"]}
     gain, both = plots["Information gain of each chosen view (the paper's Fig. 2)"]
     assert gain["y"] == [step["information_gain"] for step in steps[1:]]

@@ -15,7 +15,7 @@ from mgs.camera import Camera, look_at
 from mgs.cli.app import main
 from mgs.data.meshes import Mesh
 from mgs.errors import InputError
-from mgs.prior.build import build_prior
+from mgs.prior.build import build_prior, prior_from_mesh
 from mgs.prior.resolution import PIXELS_PER_SAMPLE, resolution
 from mgs.prior.settings import PriorSettings
 from mgs.report.evaluation import evaluate_run
@@ -75,16 +75,17 @@ def write_data(root, size=(48, 36)):
     return synthetic.write_dataset(root, synthetic.orbit_cameras(12, *size))
 
 
-def test_a_prior_takes_its_number_from_the_pixels(data, tmp_path, capsys):
+@pytest.mark.parametrize("asked", [[], ["--gaussians", "auto"]], ids=["default", "auto"])
+def test_a_prior_takes_its_number_from_the_pixels(data, tmp_path, capsys, asked):
     with pytest.raises(SystemExit) as exit_:
-        main(["prior", str(data.root), "--out", str(tmp_path / "p"), "--gaussians", "auto"])
+        main(["prior", str(data.root), "--out", str(tmp_path / "p"), *asked])
     assert exit_.value.code == 0
     numbers = json.loads((tmp_path / "p/prior.json").read_text())
     pixel = numbers["resolution"]["pixel"]
     assert numbers["spacing"] == pytest.approx(PIXELS_PER_SAMPLE * pixel, rel=0.01)
     assert 1.4 / 52.8 < pixel < 2.6 / 52.8  # between the nearest and the farthest point of the rock
     said = capsys.readouterr().out
-    assert f"--gaussians auto: {numbers['n'] + numbers['backed']:,}, since the closest pixel covers" in said
+    assert f"{numbers['n'] + numbers['backed']:,} Gaussians, since the closest pixel covers" in said
     double, _ = build_prior(write_data(tmp_path / "double", (96, 72)), PriorSettings(gaussians="auto"))
     assert len(double.points) / numbers["n"] == pytest.approx(4, rel=0.15)
 
@@ -92,10 +93,10 @@ def test_a_prior_takes_its_number_from_the_pixels(data, tmp_path, capsys):
 def test_a_given_mesh_takes_its_number_from_the_pixels_too(data, tmp_path, capsys):
     synthetic.rock_mesh().export(tmp_path / "rock.ply")
     with pytest.raises(SystemExit):
-        main([
-            "prior", str(data.root), "--out", str(tmp_path / "p"), "--mesh", str(tmp_path / "rock.ply"), "--gaussians", "auto"
-        ])  # fmt: skip
+        main(["prior", str(data.root), "--out", str(tmp_path / "p"), "--mesh", str(tmp_path / "rock.ply")])
     assert "resolution" in json.loads((tmp_path / "p/prior.json").read_text())
+    with pytest.raises(InputError, match="a density counts by the voxels of a cloud"):
+        prior_from_mesh(tmp_path / "rock.ply", PriorSettings(density=0.5))
 
 
 @pytest.mark.parametrize("command", ["prior", "nbv"])

@@ -56,6 +56,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(reproduce, "POLICIES", ("farthest", "uniform"))
     monkeypatch.setattr(reproduce, "PAIRS", (("farthest", "uniform"),))
     monkeypatch.setattr(reproduce, "TABLE_POLICIES", ("d-optimal", "random"))
+    monkeypatch.setattr(reproduce, "SLOW_POLICIES", ())
     monkeypatch.setattr(reproduce, "DRAWS", 2)
 
 
@@ -171,6 +172,25 @@ def test_table_1_has_equal_counts_and_the_papers_rows(quick, tmp_path, capsys, m
     assert rows["random, draw 2"]["command"].endswith("--policy random --seeds 4 --budget 2 --seed 1000")
     assert "`mgs reproduce --preset quick --only table1`" in text
     assert "Not done yet" not in text
+
+
+def test_table_1_can_choose_several_views_between_fits(quick, tmp_path, capsys, monkeypatch):
+    asked = []
+
+    def told(root, out, dataset, prior, settings):
+        asked.append(settings)
+        return timed(root, out, dataset, prior, settings)
+
+    monkeypatch.setattr(tasks, "time_policy", told)
+    monkeypatch.setattr(free_fit, "time_free_fit", told)
+    out = tmp_path / "out"
+    done(capsys, out, "--only", "table1", "--batch", 2)
+    rows = {row["row"]: row for row in rows_of(out / "results/table1.csv")}
+    assert rows["d-optimal"]["command"].endswith("--policy d-optimal --batch 2 --seeds 4 --budget 2 --seed 0")
+    assert [settings.get("batch") for settings in asked] == [*[2] * (len(asked) - 1), None]  # the last is no run
+    assert "`mgs reproduce --preset quick --only table1 --batch 2`" in (out / "results/table1.md").read_text()
+    done(capsys, out, "--only", "table1")  # other runs, but for the fit to all views
+    assert len(asked) == 2 * len(rows) - 1
 
 
 def test_table_1_is_there_for_the_rows_that_are_done(quick, tmp_path, capsys, monkeypatch):
@@ -349,6 +369,8 @@ def test_every_run_of_every_result_has_its_own_cell():
         (["--policy", "uniform"], "--policy uniform: is compared anyway"),
         (["--policy", "block-d", "--only", "table1"], "--policy block-d: is for curves and pools, and --only leaves both out"),
         (["--policy", "none.py:f"], "none.py"),
+        (["--batch", "0"], "should be greater than or equal to 1"),
+        (["--batch", "5", "--only", "curves"], "--batch 5: is for table1 and figures, and --only leaves both out"),
     ],
 )
 def test_bad_options_are_one_clear_line(capsys, tmp_path, arguments, line):

@@ -274,7 +274,7 @@ def test_without_the_denoiser_more_samples_and_a_note(tmp_path, monkeypatch):
     [
         (["--scene", "moon"], "scene 'moon': unknown"),
         (["--preset", "huge"], "preset 'huge': unknown"),
-        (["--orbit", "figure-eight"], "orbit 'figure-eight': unknown"),
+        (["--orbit", "figure-eight"], "--orbit 'figure-eight': unknown"),
         (["--size", "320"], "expected WIDTHxHEIGHT"),
         (["--mesh", "nowhere.glb"], "no such mesh"),
     ],

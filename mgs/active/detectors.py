@@ -153,7 +153,7 @@ DETECTORS: dict[str, Detector] = {
         0.15,  # good runs of few and small images: up to 0.11, in the first fits with one more view
         lambda v, limit: (
             f"the fit was stopped while its loss still fell by {100 * v:.1f} % a pass (limit {100 * limit:.1f} %); "
-            "raise --passes"
+            "raise --passes, and --warm-passes for the fits after the first"
         ),
     ),
     "worse": Detector(

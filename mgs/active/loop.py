@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -33,23 +33,11 @@ from mgs.prior.initial import warm_start
 from mgs.seeds import generator
 from mgs.splat_ply import write_ply
 
+if TYPE_CHECKING:
+    from mgs.active.fitting import Fit
+
 Progress = Callable[[str, int, int], None]
 """Called as progress(stage, done, total)."""
-
-
-class Fit(Protocol):
-    """What a fit returns: `mgs.active.fitting.Fit`."""
-
-    @property
-    def gaussians(self) -> Gaussians: ...
-    @property
-    def loss(self) -> float: ...
-    @property
-    def iterations(self) -> int: ...
-    @property
-    def losses(self) -> Sequence[float]: ...
-    @property
-    def stop_reason(self) -> StopReason: ...
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ def start_run(
     of its own, OUT/dataset, as `mgs synth-orbit --on-demand` writes it with the run's seed: the poses of the scene's orbit,
     images of which are rendered when they are chosen, and CAPTURE_TEST_VIEWS test views.
     prior: folder of a prior; without it DATASET/prior where there is one, otherwise a prior is built inside the run, of this
-    many `gaussians` (`mgs.prior.settings.PriorSettings`; by default, one per pixel's footprint on the rock); of an on-demand
+    many `gaussians` (`mgs.prior.settings.PriorSettings`; by default, as many as the images can tell apart); of an on-demand
     dataset it is built of its survey. preset: a row of `mgs.active.settings.PRESETS`, whose values are the defaults of what is
     not given. settings: fields of `mgs.active.settings.NbvSettings`; the budget is 50 views, or all candidates where they are
     fewer.
@@ -110,7 +110,7 @@ def start_run(
     with atomic_folder(out) as unfinished:
         frames = loaded or _poses(unfinished / DATASET, str(capture), complete.seed, progress)
         if found is None:
-            asked = PriorSettings(gaussians=gaussians, seed=complete.seed, density=row.density if row else 1.0)
+            asked = PriorSettings(gaussians=gaussians, seed=complete.seed, density=row.density if row else None)
             found, _ = build_prior(frames.survey(), asked, on_stage=lambda stage: progress(f"prior: {stage}", 0, 1))
             save_prior(unfinished / "prior", found)
         _check_near(found, frames, where)

@@ -77,6 +77,14 @@ def diverged(out: Path, step: int, kept: int, losses: Sequence[float]) -> str:
     )
 
 
+def fit_line(fit: dict[str, Any], stop_reason: str) -> str:
+    """What to say of the last fit: whether it has converged, or how far from its end it stopped."""
+    share = f"{100 * fit['predicted_decrease']:.2g} %"
+    if fit["converged"]:
+        return f"last fit: converged; its objective could fall by {share} yet, as predicted from its curvature"
+    return f"last fit: stopped early ({stop_reason}); its objective could fall by {share} yet, as predicted from its curvature"
+
+
 class RunEnd(StrEnum):
     """Why a run ended: `reason` of `ended`, in the last line of steps.jsonl."""
 

@@ -18,6 +18,15 @@ class Kind(StrEnum):
     fit = "fit"
 
 
+OF = {
+    "--chart": (Kind.scaling, Kind.roofline),
+    "--gaussians": (Kind.splat, Kind.scaling, Kind.roofline),
+    "--repeats": (Kind.splat, Kind.scaling, Kind.roofline),
+    "--dataset": (Kind.fit,),
+}
+"""What the options are for."""
+
+
 def bench(
     kind: Annotated[
         Kind,
@@ -34,9 +43,12 @@ def bench(
         typer.Option(min=1000, help="splat, roofline: number of Gaussians [100000]; scaling: the largest number [1000000]."),
     ] = None,
     repeats: Annotated[
-        int, typer.Option(min=3, help="Number of calls of each operation; the median counts, in a roofline the fastest.")
-    ] = 9,
-    dataset: Annotated[Path, typer.Option(help="fit only: the dataset, with depth.")] = Path("demo/dataset"),
+        int | None,
+        typer.Option(
+            min=3, help="Number of calls of each operation; the median counts, in a roofline the fastest. Default: 9."
+        ),
+    ] = None,
+    dataset: Annotated[Path | None, typer.Option(help="fit only: the dataset, with depth. Default: demo/dataset.")] = None,
 ) -> None:
     """Time rendering, gradients and Fisher information on Gaussians of a rock in an image of 640x480 pixels; or, `fit`, measure
     how accurate the fit of a dataset is and how near its end it stops.
@@ -50,6 +62,11 @@ def bench(
     from mgs.files import check_writable, write_json
     from mgs.provenance import command_line, versions
 
+    given = {"--chart": chart, "--gaussians": gaussians, "--repeats": repeats, "--dataset": dataset}
+    for option, value in given.items():
+        if value is not None and kind not in OF[option]:
+            raise InputError(f"{option}: is for {' and '.join(OF[option])}, not for {kind.value}; leave it out")
+    repeats = repeats or 9
     if kind is Kind.scaling and gaussians is not None and gaussians < 3000:
         raise InputError(f"--gaussians {gaussians}: scaling fits the growth with N, from 1000 up; give at least 3000")
     for target in (json, chart):
@@ -77,7 +94,7 @@ def bench(
         _print_splat(console, result)
         _print_figures(console, result["figures"], SPLAT_TARGETS)
     elif kind is Kind.fit:
-        result = bench_fit(dataset, report)
+        result = bench_fit(dataset or Path("demo/dataset"), report)
         _print_figures(console, result["figures"], FIT_TARGETS)
     elif kind is Kind.roofline:
         result = bench_roofline(gaussians or 100_000, 640, 480, repeats, report)

@@ -56,7 +56,7 @@ def demo(
     heading(f"1/5 a photoreal orbit: 32 frames with depth and masks, and {TEST_VIEWS} test views")
     if not (dataset / "transforms.json").is_file():
         synth_orbit(dataset, seed=seed, test_views=TEST_VIEWS)
-    heading(f"2/5 the prior: {GAUSSIANS:,} points on the rock's mesh")
+    heading(f"2/5 the prior: {GAUSSIANS:,} Gaussians on the rock's mesh")
     if not (folder / "prior.json").is_file():
         prior(dataset, out=folder, gaussians=str(GAUSSIANS), seed=seed)
     for policy, run in zip(POLICIES, runs, strict=True):

@@ -10,7 +10,7 @@ import typer
 from mgs.active.criteria import PIXEL_NOISE, PRIOR_STD
 from mgs.active.policies import policy_names
 from mgs.active.settings import PASSES, PRESETS, RATES, WARM_PASSES
-from mgs.active.stopping import why_ended
+from mgs.active.stopping import fit_line, why_ended
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -265,11 +265,3 @@ def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console
     if state.steps and "ended" in state.steps[-1]:
         console.print(f"the run has ended: {why_ended(state.steps[-1]['ended'])}", soft_wrap=True)
     console.print(f"wrote {out}", soft_wrap=True)
-
-
-def fit_line(fit: dict[str, Any], stop_reason: str) -> str:
-    """What to say of the last fit: whether it has converged, or how far from its end it stopped."""
-    share = f"{100 * fit['predicted_decrease']:.2g} %"
-    if fit["converged"]:
-        return f"last fit: converged; its objective could fall by {share} yet, as predicted from its curvature"
-    return f"last fit: stopped early ({stop_reason}); its objective could fall by {share} yet, as predicted from its curvature"

@@ -33,12 +33,13 @@ def prior(
     gaussians: Annotated[
         str | None,
         typer.Option(
-            metavar="N|auto", help="Number of Gaussians, on the surface and behind it; auto: what the closest pixel resolves."
+            metavar="N|auto",
+            help="Number of Gaussians, on the surface and behind it. Default: auto, what the closest pixel resolves.",
         ),
     ] = None,
     spacing: Annotated[
         float | None,
-        typer.Option(help="Distance between samples, metres, instead of N. Default: about the size of a pixel on the rock."),
+        typer.Option(help="Distance between samples, metres, instead of N."),
     ] = None,
     source: Annotated[
         str | None,
@@ -201,7 +202,7 @@ def _reason(numbers: dict[str, Any]) -> str:
     pixel, n, backed = numbers["resolution"]["pixel"], numbers["n"], numbers["backed"]
     size = f"{1e3 * pixel:.2f} mm" if numbers["unit"] == "m" else f"{pixel:.4g} unit"
     return (
-        f"--gaussians auto: {n + backed:,}, since the closest pixel covers {size} of the surface, and samples nearer than "
+        f"{n + backed:,} Gaussians, since the closest pixel covers {size} of the surface, and samples nearer than "
         f"{PIXELS_PER_SAMPLE:g} pixels gain too little"
     )
 

@@ -62,7 +62,7 @@ def synth_orbit(
     settings = load_scene_file(scene)
     if orbit is not None:
         if orbit not in ORBITS:
-            raise InputError(f"orbit {orbit!r}: unknown; choose one of {', '.join(ORBITS)}")
+            raise InputError(f"--orbit {orbit!r}: unknown; choose one of {', '.join(ORBITS)}")
         settings = settings.model_copy(update={"orbit": settings.orbit.model_copy(update={"kind": orbit})})
     if mesh_up is not None and mesh is None:
         raise InputError("--mesh-up: says how a mesh stands, but there is none; give --mesh too")

@@ -89,7 +89,7 @@ def build_prior(
     mesh = _seen_by(mesh, dataset.frames, tolerance)
     pixel = cell if chosen == "depth" else _pixel(dataset.frames, mesh.vertices.mean(0))
     resolved = _resolved(mesh, settings, [frame.camera for frame in dataset.frames])
-    samples, normals, spacing, backed = _samples(mesh, settings, resolved.spacing if resolved else pixel)
+    samples, normals, spacing, backed = _samples(mesh, settings, resolved, pixel)
     plane = None if segmented is None else segmented.plane
     ground_up = None if plane is None else unit_up(plane.normal)
     upward = (ground_up if up == "auto" else up) or dataset.up
@@ -156,21 +156,22 @@ def _pixel(frames: Sequence[Frame], point: np.ndarray) -> float:
 def _resolved(mesh: Mesh, settings: PriorSettings, cameras: Sequence[Camera]) -> Resolution | None:
     """What the cameras resolve of a mesh, where the settings leave the number of Gaussians to it. Raises InputError as
     `resolution`."""
-    return resolution(mesh, cameras) if settings.gaussians == "auto" else None
+    return resolution(mesh, cameras) if settings.resolved_by_cameras else None
 
 
-def _samples(mesh: Mesh, settings: PriorSettings, pixel: float) -> tuple[np.ndarray, np.ndarray, float, int]:
+def _samples(
+    mesh: Mesh, settings: PriorSettings, resolved: Resolution | None, pixel: float
+) -> tuple[np.ndarray, np.ndarray, float, int]:
     """(points [N,3], unit normals [N,3], spacing in metres, how many of the first are backed) of a surface.
 
-    pixel: the spacing where the settings name neither number nor spacing, metres. Raises InputError as `sample_surface`.
+    resolved: what `_resolved` found. pixel: that a density counts by, metres. Raises InputError as `sample_surface`.
     """
     asked, share = settings.gaussians, settings.backing
     total = asked if isinstance(asked, int) else None
     count = None if total is None else total - round(total * share / (1 + share))
     seed = derive_seed(settings.seed, "prior/samples")
-    points, normals, spacing = sample_surface(
-        mesh, seed, count=count, spacing=settings.spacing or pixel / settings.density**0.5
-    )
+    asked_spacing = resolved.spacing if resolved else settings.spacing or pixel / (settings.density or 1.0) ** 0.5
+    points, normals, spacing = sample_surface(mesh, seed, count=count, spacing=asked_spacing)
     backed = round(share * len(points)) if total is None else total - len(points)
     order = spread_first(points, backed, spacing)
     return points[order], normals[order], spacing, backed
@@ -196,17 +197,17 @@ def prior_from_mesh(
     path: str | Path, settings: PriorSettings, up: Up = PLUS_Z, unit: str = "m", cameras: Sequence[Camera] = ()
 ) -> Prior:
     """The prior of a given mesh in world coordinates, all of whose surface is sampled. up, unit, cameras: of the dataset it is
-    for; the cameras are read only for a number of Gaussians that is "auto".
+    for; the cameras are read only where the number of Gaussians is left to them.
 
-    Raises InputError as `read_mesh` and `sample_surface`, if neither the number of samples nor their spacing is given, and for
-    the settings that only a mesh built from a cloud has: noise, holes and poisson_depth.
+    Raises InputError as `read_mesh`, `resolution` and `sample_surface`, and for the settings that only a mesh built from a
+    cloud has: noise, holes, poisson_depth and density.
     """
     settings.refuse_shaping("--mesh gives one")
     mesh = read_mesh(path)
-    if settings.gaussians is None and settings.spacing is None:
-        raise InputError(f"{path}: a given mesh says nothing of how finely to sample it; give --gaussians or --spacing")
+    if settings.density is not None:
+        raise InputError(f"{path}: a density counts by the voxels of a cloud, which a mesh has not; give a number or a spacing")
     resolved = _resolved(mesh, settings, cameras)
-    points, normals, spacing, backed = _samples(mesh, settings, resolved.spacing if resolved else 0.0)
+    points, normals, spacing, backed = _samples(mesh, settings, resolved, 0.0)
     done = {key: value for key, value in asdict(settings).items() if key in ("gaussians", "spacing", "seed", "backing")}
     numbers = {
         "from": "mesh",

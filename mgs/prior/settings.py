@@ -14,10 +14,10 @@ from mgs.errors import InputError
 class PriorSettings:
     """What a prior is asked to be.
 
-    gaussians: number of Gaussians, on the surface and behind it; "auto": as many as the closest pixel of a frame can tell apart
-    (`mgs.prior.resolution`). spacing: distance between samples on the surface in metres, instead of a number. With neither, the
-    spacing is the edge of the cloud's voxels, about the size of a pixel on the rock, for a density of 1. density: samples on
-    the surface for each such pixel, read only then.
+    gaussians: number of Gaussians, on the surface and behind it. spacing: distance between samples on the surface in metres,
+    instead of a number. density: instead of both, samples on the surface for each square of the edge of the cloud's voxels,
+    which is about the size of a pixel on the rock; read only without them. With none of the three, or where the number is
+    "auto": as many as the closest pixel of a frame can tell apart (`mgs.prior.resolution`).
     backing: Gaussians behind the surface for each sample on it (`mgs.prior.initial`). With 0 all lie on it, as in the paper.
     poisson_depth: depth of the octree of the Poisson reconstruction; None chooses it such that its finest cells have an edge of
     1.5 voxels or less.
@@ -35,7 +35,12 @@ class PriorSettings:
     holes: float = 0.0
     seed: int = 0
     backing: float = 0.5
-    density: float = 1.0
+    density: float | None = None
+
+    @property
+    def resolved_by_cameras(self) -> bool:
+        """Whether the number of Gaussians is left to what the cameras can tell apart."""
+        return self.gaussians == "auto" or (self.gaussians, self.spacing, self.density) == (None, None, None)
 
     def refuse_shaping(self, why: str) -> None:
         """Raises InputError where noise, holes or a Poisson depth are asked for, which shape a mesh that is built of a cloud.
@@ -57,7 +62,7 @@ class PriorSettings:
             raise InputError(f"prior: spacing {self.spacing} m must be positive; correct --spacing")
         if self.gaussians is not None and self.spacing is not None:
             raise InputError("prior: --gaussians and --spacing fix the same number; give one of them")
-        if not 0 < self.density < np.inf:
+        if self.density is not None and not 0 < self.density < np.inf:
             raise InputError(f"prior: density {self.density} must be positive; correct it")
         if not 0 <= self.noise < np.inf:
             raise InputError(f"prior: noise {self.noise} m must be 0 or more; correct --prior-noise")

@@ -108,9 +108,6 @@ def draw_pictures(
             if f"render/{frame.name}/{one.label}" not in album.pictures:
                 draw_render(album, f"{frame.name}/{one.label}", frame, np.asarray(render(one.model, frame.camera).rgb))
             drawn()
-    for frame in views:
-        if f"truth/{frame.name}" not in album.pictures:
-            album.add_colours(f"truth/{frame.name}", frame.masked_rgb())
     return album, views
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from mgs.active.pose_policies import path_length
 from mgs.active.run_folder import read_checkpoint
-from mgs.active.stopping import why_ended
+from mgs.active.stopping import fit_line, why_ended
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.up import PLUS_Z, Up
 from mgs.files import read_json
@@ -67,7 +67,8 @@ def read_shown(label: str, run: Run, dataset: Dataset) -> Shown:
 
 
 def _notes(run: Run, drawn: bool, measured: bool) -> list[str]:
-    """What a reader of a run's numbers should know: what is unfinished, unconverged, missing; and warnings in its files."""
+    """What a reader of a run's numbers should know: what is unfinished or missing, whether its last fit
+    converged, and warnings."""
     taken, planned, notes = len(run.seeds + run.chosen), run.settings["seeds"] + run.settings["budget"], []
     if run.ended is None:
         notes.append(f"Unfinished: {taken} of {planned} views are taken; `mgs nbv --resume {run.folder}` goes on.")
@@ -80,18 +81,16 @@ def _notes(run: Run, drawn: bool, measured: bool) -> list[str]:
             f"metrics.json is of {run.metrics['images']} images, the model of {taken}: its numbers are left out; "
             f"`mgs eval {run.folder}` measures again."
         )
-    stopped = [str(step["step"]) for step in run.steps if step.get("stop_reason", "converged") != "converged"]
-    if stopped:
-        reasons = ", ".join(sorted({step.get("stop_reason", "converged") for step in run.steps} - {"converged"}))
-        notes.append(f"Fits that ended before they converged ({reasons}): steps {', '.join(stopped)}.")
+    elif "fit" in run.metrics and "stop_reason" in run.steps[-1]:
+        line = fit_line(run.metrics["fit"], run.steps[-1]["stop_reason"])
+        notes.append(f"{line[0].upper()}{line[1:]}.")
     estimator = run.settings.get("estimator", "exact")
     if estimator != "exact":
         notes.append(f"Its information gain is by the estimator {estimator}: compare it with that of the same estimator only.")
     if not drawn:
         notes.append("Its folder holds no model (checkpoint.npz or gaussians.ply), so there are no renders of it.")
-    for source in (*run.steps, run.metrics or {}):
-        where = f"step {source['step']}: " if "step" in source else ""
-        notes += [f"{where}{warning}" for warning in source.get("warnings", []) if isinstance(warning, str)]
+    for step in run.steps:
+        notes += [f"step {step['step']}: {warning}" for warning in step.get("warnings", [])]
     return notes
 
 

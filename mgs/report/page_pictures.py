@@ -153,9 +153,9 @@ def draw_render(album: Album, name: str, frame: Frame, rendered: np.ndarray) -> 
     album.add_error(f"error/{name}", truth, rendered)
 
 
-def colour_scale(name: str, steps: int = 16) -> list[str]:
+def colour_scale(name: str) -> list[str]:
     """Colours of a colour map from its low to its high end, as CSS writes them: for the legend of maps."""
     import matplotlib
 
-    rows: Any = matplotlib.colormaps[name](np.linspace(0, 1, steps), bytes=True)
+    rows: Any = matplotlib.colormaps[name](np.linspace(0, 1, 16), bytes=True)
     return [f"#{r:02x}{g:02x}{b:02x}" for r, g, b, _ in rows.tolist()]

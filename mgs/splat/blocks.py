@@ -3,8 +3,8 @@
 A block is a rectangle of BLOCK_X x BLOCK_Y pixels; the kernels give each block to one lane of a SIMD register (see
 `mgs.splat.walking`). A splat that touches five blocks is in five lists: it makes five (splat, block) *pairs*.
 
-Lists serve as long as no footprint changes (`changes`). As the means are frozen, the depth order of the splats stays the same
-in each camera, so that new lists of a camera take it over from the old ones.
+Lists serve as long as no footprint changes (`changes`). Where the means stay, so does the depth order of the splats in each
+camera, and new lists of a camera take it over from the old ones.
 
 Splats of neighbouring blocks should lie near one another in memory. So blocks are grouped into square *tiles*, and the splats
 are stored tile by tile; where a splat lies is called its *place*.

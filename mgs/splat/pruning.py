@@ -15,7 +15,7 @@ from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.splat import kernels
 from mgs.splat.recording import one_at_a_time
-from mgs.splat.rendering import ListCache, as_colour, as_drjit, render, splats_and_lists
+from mgs.splat.rendering import as_colour, as_drjit, render, splats_and_lists
 from mgs.splat.walking import sums_by_splat
 
 NEIGHBOURS = 8
@@ -27,21 +27,19 @@ ROUNDS = 8
 
 
 @one_at_a_time
-def removal_cost(
-    gaussians: Gaussians, cameras: Sequence[Camera], background: Any = (0.0, 0.0, 0.0), cache: ListCache | None = None
-) -> np.ndarray:
+def removal_cost(gaussians: Gaussians, cameras: Sequence[Camera], background: Any = (0.0, 0.0, 0.0)) -> np.ndarray:
     """The squared change of the images of these cameras where one Gaussian is removed: float64 [N], (linear RGB)².
 
     It is sum alpha² |D|² over pixels (docs/notation.md), summed over the cameras: exact, since a pixel is affine in each alpha.
     Left out is what the removal does to thresholds: where a pixel was finished before (TRANSMITTANCE_MIN), Gaussians that lay
-    too deep to be drawn may appear. gaussians, background, cache: as in `mgs.splat.render`. Raises InputError as `render`.
+    too deep to be drawn may appear. gaussians, background: as in `mgs.splat.render`. Raises InputError as `render`.
     """
     cost = np.zeros(len(gaussians))
     if len(gaussians) == 0:
         return cost
     model, colour = as_drjit(gaussians), dr.detach(as_colour(background))
     for camera in cameras:
-        _, lists, packed = splats_and_lists(model, camera, cache)
+        _, lists, packed = splats_and_lists(model, camera, None)
         cost += np.asarray(sums_by_splat(lists, kernels.removal(lists, packed, colour), 1)[0])
     return cost
 
@@ -58,7 +56,7 @@ class Pruned:
     actual: float
 
 
-def prune(gaussians: Gaussians, cameras: Sequence[Camera], noise: float, background: Any = (0.0, 0.0, 0.0)) -> Pruned:
+def prune(gaussians: Gaussians, cameras: Sequence[Camera], noise: float) -> Pruned:
     """Remove the Gaussians without which the images of these cameras change least, as many as the noise allows.
 
     noise: rms change of a pixel value that is allowed, linear RGB, over the pixels that the model covers (each counts by its
@@ -69,14 +67,14 @@ def prune(gaussians: Gaussians, cameras: Sequence[Camera], noise: float, backgro
     """
     if not 0 < noise < np.inf:
         raise InputError(f"prune: noise {noise} must be positive, linear RGB; correct --noise")
-    before, covered = _images(gaussians, cameras, background)
+    before, covered = _images(gaussians, cameras)
     kept, predicted, actual, allowed = np.arange(len(gaussians)), 0.0, 0.0, noise**2 * covered
     for _ in range(ROUNDS):
         left = gaussians[kept]
-        cost = removal_cost(left, cameras, background)
+        cost = removal_cost(left, cameras)
         chosen = _cheapest_apart(cost, left.means, (allowed - actual) / 2)
         fewer = np.delete(kept, chosen)
-        after, _ = _images(gaussians[fewer], cameras, background)
+        after, _ = _images(gaussians[fewer], cameras)
         change = sum(float(((a - b) ** 2).sum()) for a, b in zip(after, before, strict=True))
         if not chosen or change > allowed:
             break
@@ -85,9 +83,9 @@ def prune(gaussians: Gaussians, cameras: Sequence[Camera], noise: float, backgro
     return Pruned(kept, noise, float(np.sqrt(predicted / scale)), float(np.sqrt(actual / scale)))
 
 
-def _images(gaussians: Gaussians, cameras: Sequence[Camera], background: Any) -> tuple[list[np.ndarray], float]:
+def _images(gaussians: Gaussians, cameras: Sequence[Camera]) -> tuple[list[np.ndarray], float]:
     """The images [H,W,3], float64, and the number of pixel values that the model covers: three times the sum of alpha."""
-    drawn = [render(gaussians, camera, background) for camera in cameras]
+    drawn = [render(gaussians, camera) for camera in cameras]
     covered = 3 * sum(float(np.asarray(image.alpha, np.float64).sum()) for image in drawn)
     return [np.asarray(image.rgb).astype(np.float64) for image in drawn], covered
 

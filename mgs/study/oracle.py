@@ -55,7 +55,7 @@ def run_oracle(root: Path, out: Path, dataset: str, prior: str, settings: dict[s
     return {key: [step[key] for step in state.steps] for key in CURVES} | {"taken": state.taken}
 
 
-def choose_all(run: Path, progress: Progress = lambda stage, done, total: None) -> State:
+def choose_all(run: Path) -> State:
     """Run or resume the oracle in a run folder to the end of its budget. Raises InputError if there are no test views."""
     settings = read_settings(run)
     loaded = load_dataset(settings.dataset)
@@ -63,7 +63,7 @@ def choose_all(run: Path, progress: Progress = lambda stage, done, total: None) 
     if tests is None:
         raise InputError(f"{loaded.root}: has no test views to judge by; make them with `mgs synth-orbit --test-views`")
     stations = real_stations(loaded, load_prior(settings.prior), settings)
-    oracle = Oracle(run, settings, loaded, tests, stations, progress)
+    oracle = Oracle(run, settings, loaded, tests, stations, lambda stage, done, total: None)
     state = oracle.marked(read_checkpoint(run) or oracle.first())
     write_checkpoint(run, state)
     while "ended" not in state.steps[-1]:

@@ -21,12 +21,12 @@ def area(images: Sequence[float], values: Sequence[float]) -> float:
     return float(np.trapezoid(values, images) / (images[-1] - images[0]))
 
 
-def interval(differences: Sequence[float], level: float = 0.95) -> tuple[float, float] | None:
-    """Student's t interval of the mean of independent differences, [low, high]; None for fewer than two of them."""
-    if len(differences) < 2:
+def interval(numbers: Sequence[float]) -> tuple[float, float] | None:
+    """Student's t interval of 95 % of the mean of independent numbers, (low, high); None for fewer than two of them."""
+    if len(numbers) < 2:
         return None
-    values = np.asarray(differences, np.float64)
-    half = float(stats.t.ppf((1 + level) / 2, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)))
+    values = np.asarray(numbers, np.float64)
+    half = float(stats.t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)))
     return float(values.mean()) - half, float(values.mean()) + half
 
 

@@ -95,7 +95,7 @@ class Viewer:
         check_address(host, port)
         with redirect_stdout(StringIO()):  # viser greets, and names every window; the command says what is needed
             self.server = viser.ViserServer(host, port, label="mgs", verbose=False)
-        self.host, self.port = host, self.server.get_port()
+        self.port = self.server.get_port()
         if port not in (0, self.port):  # taken since the check: viser then goes on to the next
             self.close()
             raise InputError(f"--port {port}: is in use; choose another one")

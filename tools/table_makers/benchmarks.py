@@ -247,14 +247,14 @@ def uncertainty(data: dict[str, Any]) -> str:
 
 
 def optimisers(data: dict[str, Any]) -> str:
-    """Objective and quality by the number of passes, cold and warm."""
-    rows = []
-    for begin in ("cold", "warm"):
-        for row in dict.fromkeys(r["row"] for r in data["records"]):
-            found = [r for r in data["records"] if (r["start"], r["row"]) == (begin, row)]
-            cells = "; ".join(f"{r['passes']:.0f}: {r['phi']:.0f}, {r['psnr_inside']:.2f}" for r in found)
-            rows.append(f"| {begin} | {row} | {cells} |\n")
-    return "| start | optimiser | passes: Phi, PSNR inside (dB) |\n| --- | --- | --- |\n" + "".join(rows) + made_by(data)
+    """Objective and quality by the number of passes and seconds, for each number of Gaussians, cold and warm."""
+    rows: dict[tuple[str, str, str], list[str]] = {}
+    for r in data["records"]:
+        cell = f"{r['passes']:.0f} ({r['seconds']:.1f} s): {r['phi']:.0f}, {r['psnr_inside']:.2f}"
+        rows.setdefault((f"{r['gaussians']:,}", r["start"], r["row"]), []).append(cell)
+    lines = "".join(f"| {' | '.join(key)} | {'; '.join(cells)} |\n" for key, cells in rows.items())
+    heading = "| Gaussians | start | optimiser | passes (seconds): Phi, PSNR inside (dB) |\n| ---: | --- | --- | --- |\n"
+    return heading + lines + made_by(data)
 
 
 def fit(data: dict[str, Any]) -> str:
@@ -265,6 +265,45 @@ def fit(data: dict[str, Any]) -> str:
         measured = "not reached" if value is None else f"{value:.3g}"
         rows.append([name.replace("_", " "), measured, f"{bound} {target:.3g}"])
     return markdown(["figure", "measured", "asked for"], rows) + made_by(data)
+
+
+PRIORS = {
+    "exact": "exact depth and poses",
+    "survey, exact poses": "of `mgs survey --poses exact`: noisy depth",
+    "survey": "of `mgs survey`: noisy depth, estimated poses",
+    "--prior-noise 0.01": "`--prior-noise 0.01` (every point, 10 mm per axis)",
+    "--holes 0.1": "`--holes 0.1` (share of the rock's points removed)",
+    "--poisson-depth 7": "`--poisson-depth 7` (8 is automatic)",
+}
+"""What is said of a prior of `benchmarks/prior_errors.py`; of others, their option."""
+
+
+def prior_errors(data: dict[str, Any]) -> str:
+    """Errors of the priors of the first scene."""
+    first, rows = data["rows"][0]["scene"], []
+    of_first = [row for row in data["rows"] if row["scene"] == first]
+    for row in sorted(of_first, key=lambda row: row["prior"].startswith("--")):  # those of options last
+        truth = row["truth"]
+        lengths = [f"{1e3 * truth[key]:.1f} mm" for key in ("accuracy", "completeness")]
+        lengths += [f"{1e3 * truth['hausdorff']:.0f} mm", f"{100 * truth['visible_within_2_spacing']:.1f} %"]
+        rows.append([PRIORS.get(row["prior"], f"`{row['prior']}`"), *lengths])
+    heading = [f"prior of the {first}", "accuracy", "completeness", "Hausdorff", "visible within 2 spacings"]
+    return markdown(heading, rows) + made_by(data)
+
+
+def prior_scenes(data: dict[str, Any]) -> str:
+    """Errors of priors and surveys of all scenes, millimetres."""
+    rows, scenes = [], {(row["scene"], row["prior"]): row for row in data["rows"]}
+
+    def both(row: dict[str, Any]) -> str:
+        return " / ".join(f"{1e3 * row['truth'][key]:.1f}" for key in ("accuracy", "completeness"))
+
+    for scene in dict.fromkeys(row["scene"] for row in data["rows"]):
+        exact, flown = scenes[scene, "exact"], scenes[scene, "survey"]
+        errors = [f"{1e3 * error:.0f}" for error in flown["trajectory"].values()]
+        rows.append([scene, both(exact), str(exact["clusters"]), *errors, both(flown)])
+    heading = ["scene", "prior, exact: accuracy / completeness", "clusters found", "odometry", "registered", "loop closed"]
+    return markdown([*heading, "prior of the survey: accuracy / completeness"], rows) + made_by(data)
 
 
 def means(data: dict[str, Any]) -> str:
@@ -324,6 +363,8 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "warm-colours": ("benchmarks/warm_colours", warm_colours),
     "uncertainty": ("benchmarks/uncertainty", uncertainty),
     "optimisers": ("benchmarks/optimisers", optimisers),
+    "prior-errors": ("benchmarks/prior_errors", prior_errors),
+    "prior-scenes": ("benchmarks/prior_errors", prior_scenes),
     "fit": ("benchmarks/fit", fit),
     "means": ("benchmarks/means", means),
     "criteria": ("benchmarks/criteria", criteria),

@@ -229,15 +229,18 @@ WAYS = {"anew": "all Gaussians, anew for every choice", "updated": "**all Gaussi
 
 def planning(data: dict[str, Any]) -> str:
     """Seconds to plan a flight, and what the plan brings, by how the gains are computed."""
-    rows = []
+    rows: list[list[str]] = []
     for row in data["rows"]:
+        poses = Path(row["dataset"]).name
+        if poses not in (line[0] for line in rows):
+            rows.append([poses, "both", "(the pass over the poses)", f"{row['looking']:.1f}", "–", "–", "–"])
         way = WAYS.get(row["way"], f"{row['gaussians']:,} Gaussians, anew")
         kept = (
             "–" if row["way"] == "anew" else f"{row['kept']} of {data['budget']}" + (", the same order" if row["same"] else "")
         )
         error = f"{row['largest_difference']:.0e}" if "largest_difference" in row else "–"
         worth = f"{100 * row['worth']:.2f} %" if "worth" in row else "100 %"
-        rows.append([Path(row["dataset"]).name, row["criterion"], way, f"{row['seconds']:.1f}", kept, error, worth])
+        rows.append([poses, row["criterion"], way, f"{row['seconds']:.1f}", kept, error, worth])
     heading = ["poses", "criterion", "gains of", "seconds", "the same choices", "largest error of a gain", "the plan's worth"]
     return markdown(heading, rows) + made_by(data)
 

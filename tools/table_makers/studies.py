@@ -141,6 +141,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "parsimony-rules": ("results/parsimony/parsimony", parsimony_rules),
     "parsimony-prune": ("results/parsimony/parsimony", parsimony_prune),
     **{f"reproduce-{name}": (f"results/reproduce/{name}", reproduced(name)) for name in REPRODUCED},
+    "paper-size-table1": ("results/paper-size/table1", reproduced("table1")),
     "linear-look": ("results/linear-look/pools", own_policy),
     **{f"chart-{name}": ("results/chart/chart", chart(name)) for name in CHART_TABLES},
 }

@@ -79,7 +79,7 @@ def factors(plan: Plan, halves: bool) -> dict[str, list[Point]]:
     known = {
         "density": [replace(fit, density=d) for d in plan.densities],
         "passes": [replace(fit, passes=p) for p in plan.passes],
-        "optimiser": [replace(fit, optimiser="adam", passes=p) for p in plan.passes],
+        "optimiser": [replace(fit, optimiser="adam")],
         "learned": [replace(fit, learned=kinds) for kinds in LEARNED],
         "images": [replace(fit, images=n) for n in plan.image_counts],
         "crossed": [replace(fit, density=d, passes=p) for d in plan.densities for p in plan.passes],
@@ -88,9 +88,7 @@ def factors(plan: Plan, halves: bool) -> dict[str, list[Point]]:
         "crossed, run": crossed_runs(plan),
     }
     if halves:
-        known["half the size"] = [
-            replace(fit, half=True, density=d, passes=p) for d in plan.densities[:-1] for p in (5, PASSES)
-        ]
+        known["half the size"] = [replace(fit, half=True, density=d) for d in plan.densities[:-1]]
     return known
 
 
@@ -98,7 +96,7 @@ def crossed_runs(plan: Plan) -> list[Point]:
     """Runs of the default policy over the settings that presets are made of."""
     run = Point(plan.images, policy="d-optimal")
     grid = [
-        replace(run, density=d, passes=p, warm_passes=LATER_PASSES[p]) for d in plan.densities[-3:] for p in plan.passes[-3:]
+        replace(run, density=d, passes=p, warm_passes=LATER_PASSES[p]) for d in plan.densities[-3:] for p in plan.run_passes
     ]
     return list(dict.fromkeys([*grid, *preset_points(plan).values()]))
 

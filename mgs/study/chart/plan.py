@@ -14,7 +14,8 @@ KINDS = ("fit", "scoring", "core", "bytes", "presets")
 @dataclass(frozen=True)
 class Plan:
     """width, height: of the images, pixels; half of them for "half". frames, test_views: of the data. images: how many are
-    fitted, of which `seeds` at evenly spaced azimuths. The others are values of factors."""
+    fitted, of which `seeds` at evenly spaced azimuths. repeats: how often a point is timed, if it is not said. The others are
+    values of factors; run_passes: of the first fit of runs."""
 
     width: int
     height: int
@@ -22,8 +23,10 @@ class Plan:
     test_views: int
     seeds: int
     images: int
+    repeats: int
     densities: tuple[float, ...]
     passes: tuple[int, ...]
+    run_passes: tuple[int, ...]
     image_counts: tuple[int, ...]
     policies: tuple[str, ...]
     probes: tuple[int, ...]
@@ -34,20 +37,21 @@ class Plan:
 
 PLANS = {
     "quick": Plan(
-        width=192, height=144, frames=24, test_views=8, seeds=4, images=8,
-        densities=(1 / 16, 1 / 8, 1 / 4, 1 / 2), passes=(5, 10, 20), image_counts=(4, 12),
-        policies=("directional-i", "random"), probes=(1, 4, 16),
+        width=192, height=144, frames=24, test_views=8, seeds=4, images=8, repeats=2,
+        densities=(1 / 16, 1 / 8, 1 / 4, 1 / 2), passes=(5, 10, 20), run_passes=(5, 10), image_counts=(4, 12),
+        policies=("directional-i", "random"), probes=(1, 4),
         core_gaussians=10_000, core_size=(320, 240), step_sizes=(0.5, 1, 2, 4, 8),
     ),
     "full": Plan(
-        width=320, height=240, frames=32, test_views=12, seeds=4, images=12,
-        densities=(1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1), passes=(2, 5, 10, 20, 40), image_counts=(4, 6, 8, 16, 24),
+        width=320, height=240, frames=32, test_views=12, seeds=4, images=12, repeats=3,
+        densities=(1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1), passes=(2, 5, 10, 20, 40), run_passes=(5, 10, 20),
+        image_counts=(4, 6, 8, 16, 24),
         policies=("directional-i", "directional-d", "fisherrf", "uniform", "farthest", "random", "paper"),
         probes=(1, 2, 4, 8, 16, 32, 64), core_gaussians=100_000, core_size=(640, 480),
         step_sizes=(0.125, 0.25, 0.5, 1, 2, 4, 8, 16),
     ),
 }  # fmt: skip
-"""`quick` takes about twelve minutes on two cores, `full` some hours."""
+"""`quick` takes about ten minutes on two quiet cores, `full` some hours."""
 
 DENSITY = 1 / 8
 """Density of the prior of the default point (`mgs.prior.settings.PriorSettings`): about what `mgs demo` has."""

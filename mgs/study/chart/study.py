@@ -25,7 +25,7 @@ def chart(
     out: Path,
     preset: str,
     kinds: Sequence[str],
-    repeats: int,
+    repeats: int | None = None,
     dataset: Path | None = None,
     report: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> dict[str, Any]:
@@ -40,6 +40,7 @@ def chart(
     from mgs.data.dataset import load_dataset
 
     plan = row_named(PLANS, preset, "--preset")
+    repeats = repeats or plan.repeats
     if dataset is not None:
         test_views_of(load_dataset(dataset))
     runtime.start()

@@ -20,6 +20,8 @@ from mgs.memory import padded
 REFERENCE_GAUSSIANS, REFERENCE_SIZE, REFERENCE_CALLS = 10_000, (320, 240), 10
 """The reference: so many images of so many Gaussians of a rock, of this width and height, with their gradients."""
 
+LEAST_SECONDS, MOST_REPEATS = 0.8, 15
+
 Result = TypeVar("Result")
 
 
@@ -55,7 +57,8 @@ def _clock(call: Callable[[], Result]) -> tuple[Result, float, float]:
 def timed(
     call: Callable[[], Result], repeats: int, reference: Callable[[], Any] | None = None
 ) -> tuple[Result, dict[str, float]]:
-    """Call a function once untimed, which compiles its kernels, and then `repeats` times, each after the reference.
+    """Call a function once untimed, which compiles its kernels, and then `repeats` times, each after the reference; more often
+    where that takes less than LEAST_SECONDS together, since short times scatter most.
 
     It must return NumPy arrays or plain values, so that nothing is left to be computed when it returns.
     Returns the last result; and medians over the repeats: wall and cpu (seconds), reference (wall-clock seconds of the
@@ -64,7 +67,7 @@ def timed(
     reference = reference or _reference()
     result = call()
     walls, cpus, references = [], [], []
-    for _ in range(repeats):
+    while len(walls) < repeats or (sum(walls) < LEAST_SECONDS and len(walls) < MOST_REPEATS):
         references.append(_clock(reference)[1])
         result, wall, cpu = _clock(call)
         walls.append(wall)

@@ -145,17 +145,17 @@ def _masked(frame: Captured, mask: np.ndarray) -> Captured:
     return replace(frame, rock=mask, rgba=np.concatenate([frame.pixels * alpha, alpha], axis=-1, dtype=np.float32))
 
 
-IMAGE_FAULTS: dict[str, tuple[ImageFault, tuple[float, ...], str]] = {
-    "pose noise": (pose_noise, (0.25, 1.0, 4.0), "degrees"),
-    "image noise": (image_noise, (0.02, 0.1, 0.3), "of sRGB range"),
-    "exposure": (exposure, (0.1, 0.3, 1.0), "stops"),
-    "motion blur": (motion_blur, (2.0, 5.0, 12.0), "pixels"),
-    "defocus": (defocus, (0.5, 1.5, 4.0), "pixels"),
-    "missing depth": (missing_depth, (0.2, 0.6, 0.95), "of pixels"),
-    "shifted mask": (shifted_mask, (1.0, 4.0, 10.0), "pixels"),
-    "wrong mask": (wrong_mask, (1.0, 3.0, 8.0), "pixels"),
+IMAGE_FAULTS: dict[str, tuple[ImageFault, tuple[float, ...]]] = {
+    "pose noise": (pose_noise, (0.25, 1.0, 4.0)),  # degrees
+    "image noise": (image_noise, (0.02, 0.1, 0.3)),  # of sRGB range
+    "exposure": (exposure, (0.1, 0.3, 1.0)),  # stops
+    "motion blur": (motion_blur, (2.0, 5.0, 12.0)),  # pixels
+    "defocus": (defocus, (0.5, 1.5, 4.0)),  # pixels
+    "missing depth": (missing_depth, (0.2, 0.6, 0.95)),  # of pixels
+    "shifted mask": (shifted_mask, (1.0, 4.0, 10.0)),  # pixels
+    "wrong mask": (wrong_mask, (1.0, 3.0, 8.0)),  # pixels
 }
-"""By name: the fault, its sizes from small to large, and their unit."""
+"""By name: the fault, and its sizes from small to large."""
 
 
 def _of_points(prior: Prior, points: np.ndarray, normals: np.ndarray | None = None) -> Prior:
@@ -206,13 +206,13 @@ def turned(prior: Prior, size: float, rng: np.random.Generator) -> Prior:
     return _of_points(prior, centre + (prior.points - centre) @ turn.T, prior.normals @ turn.T)
 
 
-PRIOR_FAULTS: dict[str, tuple[PriorFault, tuple[float, ...], str]] = {
-    "noisy prior": (noisy_prior, (0.5, 2.0, 6.0), "spacings"),
-    "smoothed prior": (smoothed_prior, (2.0, 10.0, 40.0), "rounds"),
-    "holes": (holes, (0.05, 0.2, 0.5), "of the surface"),
-    "shifted prior": (shifted, (0.02, 0.1, 0.4), "m"),
-    "scaled prior": (scaled, (1.02, 1.1, 1.4), "times"),
-    "turned prior": (turned, (3.0, 15.0, 90.0), "degrees"),
+PRIOR_FAULTS: dict[str, tuple[PriorFault, tuple[float, ...]]] = {
+    "noisy prior": (noisy_prior, (0.5, 2.0, 6.0)),  # spacings
+    "smoothed prior": (smoothed_prior, (2.0, 10.0, 40.0)),  # rounds
+    "holes": (holes, (0.05, 0.2, 0.5)),  # of the surface
+    "shifted prior": (shifted, (0.02, 0.1, 0.4)),  # m
+    "scaled prior": (scaled, (1.02, 1.1, 1.4)),  # times
+    "turned prior": (turned, (3.0, 15.0, 90.0)),  # degrees
 }
 """By name, as IMAGE_FAULTS."""
 
@@ -267,7 +267,7 @@ def faults(root: Path, out: Path, scene: str, kinds: str, others: list[str], rep
         named, taken = f"{scene}, {run}", lab.even(VIEWS, turn)
         clean = _row(lab, named, "none", VIEWS, None, taken)
         rows.append(clean)
-        for fault, (function, sizes, _) in table.items():
+        for fault, (function, sizes) in table.items():
             for size in sizes:
                 rng = generator(0, f"stress/{named}/{fault}/{size}")
                 rows.append(_row(_spoiled(lab, taken, kinds, function, size, rng), named, fault, size, clean, taken))

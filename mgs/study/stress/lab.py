@@ -195,12 +195,11 @@ class Lab:
         taken: Sequence[int],
         left: Sequence[int],
         score: Score = d_optimal,
-        lam: Array | None = None,
         means: str = "frozen",
     ) -> Array:
         """What a criterion gives to each of the views left."""
         H = np.sum(self.information(model, taken, means), axis=0)
-        lam = self.lam(means) if lam is None else lam
+        lam = self.lam(means)
         return np.array([score(F, H, lam) for F in self.information(model, left, means)])
 
     def quality(self, model: Gaussians) -> dict[str, float]:
@@ -223,13 +222,13 @@ def open_lab(root: Path, scene: str) -> Lab:
 
 
 def agreement(mine: Array, reference: Array) -> dict[str, float]:
-    """How well scores of candidates agree with reference scores: Kendall's `tau`, 0 where one of them is constant; `regret`,
-    the share of the best reference score that is lost by taking our best; `same`, 1 where both take the same candidate."""
+    """How well scores of candidates agree with reference scores: Kendall's `tau`, 0 where one of them is constant; and
+    `regret`, the share of the best reference score that is lost by taking our best."""
     constant = np.ptp(mine) == 0 or np.ptp(reference) == 0
     tau = 0.0 if constant else float(kendalltau(mine, reference).statistic)
     best, top = int(np.argmax(mine)), float(reference.max())
     regret = float((top - reference[best]) / max(abs(top), 1e-300))
-    return {"tau": tau, "regret": regret, "same": float(best == int(np.argmax(reference)))}
+    return {"tau": tau, "regret": regret}
 
 
 def greedy(lab: Lab, taken: Sequence[int], allowed: Sequence[int], count: int, policy: str = "d-optimal") -> list[int]:

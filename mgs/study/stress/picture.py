@@ -12,8 +12,9 @@ import numpy as np
 
 from mgs.plotting import STYLE, new_figure, save_figure
 from mgs.report.figures import POLICY_STYLE
+from mgs.study.statistics import interval
 from mgs.study.stress.experiment import Experiment, Panel
-from mgs.study.stress.verdict import Row, interval
+from mgs.study.stress.verdict import Row
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,8 +1,9 @@
 """From numbers to a verdict, by one rule for all experiments.
 
-A claim says on which side of a bound the mean of an effect lies. It *holds* where the whole 95 % interval of the mean lies on
-that side, it *fails* where the whole interval lies on the other side, and otherwise it *depends*: on the rock, on the views, or
-on chance, which so few runs cannot tell apart. Fewer than two runs have no interval, so their verdict is `depends`.
+A claim says on which side of a bound the mean of an effect lies. It *holds* where the whole 95 % interval of the mean
+(Student's t over runs, which it takes for independent) lies on that side, it *fails* where the whole interval lies on the other
+side, and otherwise it *depends*: on the rock, on the views, or on chance, which so few runs cannot tell apart. Fewer than two
+runs have no interval, so their verdict is `depends`.
 """
 
 from __future__ import annotations
@@ -13,10 +14,8 @@ from enum import StrEnum
 from typing import Any, Literal
 
 import numpy as np
-from scipy import stats
 
-LEVEL = 0.95
-"""Of the intervals: Student's t over runs, which it takes for independent."""
+from mgs.study.statistics import interval
 
 Row = dict[str, Any]
 
@@ -46,15 +45,6 @@ class Claim:
     side: Literal["above", "below"]
     bound: float
     over: str
-
-
-def interval(effects: Sequence[float]) -> tuple[float, float] | None:
-    """The 95 % interval of the mean of some runs; None of fewer than two."""
-    if len(effects) < 2:
-        return None
-    half = float(stats.t.ppf((1 + LEVEL) / 2, len(effects) - 1) * stats.sem(effects))
-    mean = float(np.mean(effects))
-    return mean - half, mean + half
 
 
 def outcome(side: str, bound: float, between: tuple[float, float] | None) -> Outcome:

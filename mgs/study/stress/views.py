@@ -15,8 +15,14 @@ from mgs.study.stress.verdict import Claim, Effects, paired, single
 FREE_PASSES = 40
 """Four times the default: a collapse takes time."""
 
-KINDS = {"frozen": ("frozen", True), "free": ("free", True), "free, no prior": ("free", False)}
-"""What the means may do, and whether a prior holds the parameters: the paper has none."""
+KINDS = {
+    "frozen": ("frozen", True),
+    "free": ("free", True),
+    "frozen, no prior": ("frozen", False),
+    "free, no prior": ("free", False),
+}
+"""What the means may do, and whether a prior holds all parameters: the paper has none. Free means are compared with frozen ones
+of the same prior, since a fit without one loses quality whatever its means do."""
 
 VIEWS = 8
 """Views of the models whose seeds are compared."""
@@ -29,11 +35,11 @@ def free_means(root: Path, out: Path, scene: str, turns_: int, counts: list[int]
         for count in counts:
             taken = lab.even(count, turn)
             left, start = lab.left(taken), lab.start(taken)
-            reference: Array = np.zeros(0)
+            references: dict[bool, Array] = {}
             for kind, (means, with_prior) in KINDS.items():
                 model = lab.fit(taken, FREE_PASSES, means, with_prior, start=start).gaussians
                 scores = lab.scores(model, taken, left, means=means)
-                reference = scores if kind == "frozen" else reference
+                reference = references.setdefault(with_prior, scores)
                 drift = np.linalg.norm(model.means - start.means, axis=1) / lab.prior.spacing
                 rows.append({
                     "run": f"{scene}, {suffix}", "views": count, "means": kind, **lab.quality(model),
@@ -42,8 +48,8 @@ def free_means(root: Path, out: Path, scene: str, turns_: int, counts: list[int]
     return {"rows": rows}
 
 
-def _free_minus_frozen(views: int, kind: str) -> Effects:
-    return paired("psnr", {"views": views, "means": kind}, {"views": views, "means": "frozen"})
+def _difference(views: int, kind: str, other: str) -> Effects:
+    return paired("psnr", {"views": views, "means": kind}, {"views": views, "means": other})
 
 
 FREE_MEANS = Experiment(
@@ -52,12 +58,14 @@ FREE_MEANS = Experiment(
         "free-means", f"{__name__}:free_means", lambda preset: {"turns_": preset.turns, "counts": list(preset.few_views)}
     ),
     (
-        Claim("On 4 views, free means without a prior lose 1 dB or more against frozen ones (paper, section III).",
-              _free_minus_frozen(4, "free, no prior"), "dB", "below", -1.0, "rock and set of views"),
-        Claim("On 2 views, free means without a prior lose 1 dB or more against frozen ones.",
-              _free_minus_frozen(2, "free, no prior"), "dB", "below", -1.0, "rock and set of views"),
+        Claim("On 4 views, free means lose 1 dB or more against frozen ones, both without a prior (paper, section III).",
+              _difference(4, "free, no prior", "frozen, no prior"), "dB", "below", -1.0, "rock and set of views"),
+        Claim("On 2 views, free means lose 1 dB or more against frozen ones, both without a prior.",
+              _difference(2, "free, no prior", "frozen, no prior"), "dB", "below", -1.0, "rock and set of views"),
+        Claim("On 4 views, frozen means lose 0.5 dB or more where no prior holds the other parameters.",
+              _difference(4, "frozen, no prior", "frozen"), "dB", "below", -0.5, "rock and set of views"),
         Claim("With the prior on their place, free means lose no more than 0.5 dB on 4 views.",
-              _free_minus_frozen(4, "free"), "dB", "above", -0.5, "rock and set of views"),
+              _difference(4, "free", "frozen"), "dB", "above", -0.5, "rock and set of views"),
         Claim("On 4 views, freeing the means (no prior) changes the D-optimal ranking: Kendall's tau is at most 0.8.",
               single("tau", {"views": 4, "means": "free, no prior"}), "tau", "below", 0.8,
               "rock and set of views"),
@@ -65,7 +73,7 @@ FREE_MEANS = Experiment(
     (
         Panel("views", "psnr", "views", "PSNR on test views (dB)", "means"),
         Panel("views", "drift", "views", "drift of the means, rms (spacings)", "means"),
-        Panel("views", "tau", "views", "Kendall's tau with frozen means", "means"),
+        Panel("views", "tau", "views", "Kendall's tau with frozen means of the same prior", "means"),
     ),
 )  # fmt: skip
 
