@@ -66,7 +66,7 @@ def timed(
     """
     reference = reference or _reference()
     result = call()
-    walls, cpus, references = [], [], []
+    walls, cpus, references = list[float](), list[float](), list[float]()
     while len(walls) < repeats or (sum(walls) < LEAST_SECONDS and len(walls) < MOST_REPEATS):
         references.append(_clock(reference)[1])
         result, wall, cpu = _clock(call)
