@@ -41,8 +41,8 @@ class Preset:
 
 PRESETS = {
     "fast": Preset(passes=5, warm_passes=3, density=1 / 4),
-    "balanced": Preset(passes=5, warm_passes=3, density=1 / 2),
-    "accurate": Preset(passes=PASSES, warm_passes=WARM_PASSES, density=1 / 2),
+    "balanced": Preset(passes=PASSES, warm_passes=WARM_PASSES, density=1 / 2),
+    "accurate": Preset(passes=PASSES, warm_passes=WARM_PASSES, density=3 / 4),
 }
 """What `mgs nbv --preset` knows, by name: points on the front of runs in docs/speed-accuracy.md."""
 

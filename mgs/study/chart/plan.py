@@ -38,13 +38,13 @@ class Plan:
 PLANS = {
     "quick": Plan(
         width=192, height=144, frames=24, test_views=8, seeds=4, images=8, repeats=2,
-        densities=(1 / 16, 1 / 8, 1 / 4, 1 / 2), passes=(5, 10, 20), run_passes=(5, 10), image_counts=(4, 12),
+        densities=(1 / 8, 1 / 4, 1 / 2, 3 / 4), passes=(5, 10, 20), run_passes=(5, 10), image_counts=(4, 12),
         policies=("directional-i", "random"), probes=(1, 4),
         core_gaussians=10_000, core_size=(320, 240), step_sizes=(0.5, 1, 2, 4, 8),
     ),
     "full": Plan(
         width=320, height=240, frames=32, test_views=12, seeds=4, images=12, repeats=3,
-        densities=(1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1), passes=(2, 5, 10, 20, 40), run_passes=(5, 10, 20),
+        densities=(1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4), passes=(2, 5, 10, 20, 40), run_passes=(5, 10, 20),
         image_counts=(4, 6, 8, 16, 24),
         policies=("directional-i", "directional-d", "fisherrf", "uniform", "farthest", "random", "paper"),
         probes=(1, 2, 4, 8, 16, 32, 64), core_gaussians=100_000, core_size=(640, 480),
