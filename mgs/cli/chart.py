@@ -17,7 +17,7 @@ def chart(
     dataset: Annotated[
         Path | None, typer.Option(help="A dataset with test views, in place of the one that is rendered; not for `presets`.")
     ] = None,
-    preset: Annotated[str, typer.Option(help="quick: ten minutes on two quiet cores. full: hours.")] = "quick",
+    preset: Annotated[str, typer.Option(help="quick: nine to eleven minutes on two quiet cores. full: hours.")] = "quick",
     only: Annotated[str | None, typer.Option(help=f"Some of {','.join(KINDS)}, as fit,core. Default: all.")] = None,
     repeats: Annotated[
         int | None, typer.Option(min=1, help="How often each point is timed; the median counts. Default: quick 2, full 3.")

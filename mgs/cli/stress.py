@@ -13,7 +13,10 @@ def stress(
         "out/stress"
     ),
     preset: Annotated[
-        str, typer.Option(help="quick: about 10 minutes on two cores. full: more rocks, larger images, more runs; hours.")
+        str,
+        typer.Option(
+            help="quick: about 12 minutes on two cores with --workers 2. full: more rocks, larger images, more runs; hours."
+        ),
     ] = "quick",
     workers: Annotated[int, typer.Option(min=1, help="Processes that do cells side by side.")] = 1,
     only: Annotated[str | None, typer.Option(help="Names of experiments, separated by commas. Default: all.")] = None,

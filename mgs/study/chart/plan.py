@@ -51,7 +51,7 @@ PLANS = {
         step_sizes=(0.125, 0.25, 0.5, 1, 2, 4, 8, 16),
     ),
 }  # fmt: skip
-"""`quick` takes about ten minutes on two quiet cores, `full` some hours."""
+"""`quick` takes nine to eleven minutes on two quiet cores, `full` some hours."""
 
 DENSITY = 1 / 8
 """Density of the prior of the default point (`mgs.prior.settings.PriorSettings`): about what `mgs demo` has."""
