@@ -174,9 +174,8 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
                     shown = [r for r in records if (r["start"], r["row"]) == (begin, row)]
                     axis.plot([r[x] for r in shown], [r[y] for r in shown], "o-", color=colour, markersize=3, label=row)
                 axis.set(xscale="log", yscale="log" if y == "phi" else "linear", ylabel=f"{names[y]}, {begin}")
-                limits = axis.get_xlim()
-                axis.set_xticks((5, 10, 20, 40, 80) if x == "passes" else (1, 2, 5, 10, 20, 40))
-                axis.set_xlim(limits)  # ticks outside of them would widen the axis
+                most = max(r[x] for r in records)
+                axis.set_xticks([tick for tick in (1, 2, 5, 10, 20, 40) if min(r[x] for r in records) <= tick <= most])
                 axis.xaxis.set_major_formatter("{x:g}")
                 axis.xaxis.set_minor_formatter(NullFormatter())
                 if y == "phi":

@@ -35,18 +35,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
 """Options of `mgs prior`, and the settings that they are."""
 
 NUMBERS = (
-    "n",
-    "spacing",
-    "pixels",
-    "points",
-    "voxel",
-    "plane_sigma",
-    "clusters",
-    "cluster_size",
-    "eps",
-    "fit_rms",
-    "mesh_faces",
-)
+    "n", "spacing", "pixels", "points", "voxel", "plane_sigma", "clusters", "cluster_size", "eps", "fit_rms", "mesh_faces",
+)  # fmt: skip
 """Of prior.json."""
 
 
