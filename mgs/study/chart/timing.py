@@ -21,6 +21,7 @@ REFERENCE_GAUSSIANS, REFERENCE_SIZE, REFERENCE_CALLS = 10_000, (320, 240), 10
 """The reference: so many images of so many Gaussians of a rock, of this width and height, with their gradients."""
 
 LEAST_SECONDS, MOST_REPEATS = 0.8, 15
+"""A call is timed again until its times add up to so many seconds, at most so often."""
 
 Result = TypeVar("Result")
 
