@@ -19,15 +19,23 @@ PADDING = 64
 """Numbers that a kernel may read beyond the end of an array: it takes as many at once as fit into a register, 16 at most."""
 
 
+ALIGNMENT = 64
+"""Bytes. Dr.Jit compiles one kernel for arrays whose addresses are multiples of this, and another where one is not."""
+
+
 def padded(values: Any, dtype: Any = np.float32) -> np.ndarray:
-    """A copy of an array, of this type and contiguous, behind which more of its memory follows.
+    """A copy of an array, of this type and contiguous, that begins at a multiple of ALIGNMENT, and behind which more of its
+    memory follows.
 
     Every array that Dr.Jit is to take over from NumPy must be one. Dr.Jit 1.5 does not copy it, and its kernels read a few
-    numbers beyond the end: where the memory ends there, which depends on sizes and on chance, the process dies.
+    numbers beyond the end: where the memory ends there, which depends on sizes and on chance, the process dies. And where an
+    array happened to begin would decide which of two kernels is needed: with a hundred arrays, hardly ever one that was
+    compiled before.
     """
     values = np.asarray(values)
-    memory = np.empty(values.size + PADDING, dtype)
-    copy = memory[: values.size].reshape(values.shape)
+    memory = np.empty(values.size + PADDING + ALIGNMENT, dtype)
+    first = -memory.ctypes.data % ALIGNMENT // memory.itemsize
+    copy = memory[first : first + values.size].reshape(values.shape)
     copy[...] = values
     return copy
 

@@ -98,11 +98,11 @@ def test_poses_that_see_nothing_gain_nothing(points):
 
 
 def test_the_memory_that_is_reckoned_with_is_what_is_held():
-    """Bytes of all arrays of a pool, over those that BYTES_OF_GAUSSIAN and BYTES_OF_PAIR say; points and poses are few."""
+    """Bytes of all arrays of a pool, over those that BYTES_OF_ENTRY and BYTES_OF_PAIR say; points and poses are few."""
     rng = np.random.default_rng(0)
     points, pool, dome = rng.normal(size=(3000, 3)), views_of(rng, 60, 3000), views_of(rng, 4, 3000)
     held = module.PoolGains(points, pool, LAM, 3, 0.1, dome)
     arrays = [np.asarray(held.S), np.asarray(held.M), np.asarray(held.g), np.asarray(held.q), np.asarray(held.weights)]
     arrays += [np.asarray(held.of), np.asarray(held.by), held.poses]
-    expected = module.BYTES_OF_GAUSSIAN * 3000 * 256 + module.BYTES_OF_PAIR * np.count_nonzero(pool.seen)
+    expected = module.BYTES_OF_ENTRY * 3000 * (16 * 17 // 2) + module.BYTES_OF_PAIR * np.count_nonzero(pool.seen)
     assert sum(array.nbytes for array in arrays) == pytest.approx(expected, rel=0.01)

@@ -9,6 +9,9 @@ j along y with the squared weights W. With u = S_j y, w = S_j M_j u and k = W / 
 so a choice costs two products of vectors for each pose and Gaussian, and nothing is inverted. All is float64: in float32 a
 variance that falls from that of the prior to that of a hundred measured pixels would be lost in rounding. Each number is
 written by one lane alone and depends on the views and their order only, so a resumed run has the same, bit for bit.
+
+What the matrices cost is reading and writing them. So of each only the upper triangle is kept, entry by entry, all Gaussians'
+numbers of one entry side by side: one kernel reads S and M once, and writes S once.
 """
 
 from __future__ import annotations
@@ -28,8 +31,9 @@ from mgs.active.outlook import Gains
 from mgs.memory import IMAGE_BYTES, padded
 from mgs.splat.recording import one_at_a_time
 
-BYTES_OF_GAUSSIAN, BYTES_OF_PAIR = 16, 40
-"""Memory of a Gaussian, for each entry of its matrices; and of a pose and a Gaussian that it sees."""
+BYTES_OF_ENTRY, BYTES_OF_PAIR = 16, 40
+"""Memory of a Gaussian's entry of both matrices, and of a pose and a Gaussian that it sees. While a view is taken, S, g and q
+exist twice."""
 
 
 def pool_gains(points: Array, lam: float, pool: Callable[[], Views], dome: Callable[[], Views]) -> Gains:
@@ -43,7 +47,7 @@ def pool_gains(points: Array, lam: float, pool: Callable[[], Views], dome: Calla
 
     def found(taken: Sequence[int], left: Sequence[int], degree: int, tau: float, over_dome: bool) -> NDArray[np.float64]:
         key, views = (degree, tau, over_dome), pool()
-        kept = BYTES_OF_GAUSSIAN * len(points) * (degree + 1) ** 4 + BYTES_OF_PAIR * pairs()
+        kept = BYTES_OF_ENTRY * len(points) * len(_upper((degree + 1) ** 2)) + BYTES_OF_PAIR * pairs()
         if kept > IMAGE_BYTES or not pairs():  # Dr.Jit has no kernels for empty arrays
             before, candidates = (Views(views.positions[list(some)], views.seen[list(some)]) for some in (taken, left))
             return gains(points, lam, degree, tau, before, candidates, dome() if over_dome else None)
@@ -59,8 +63,8 @@ class PoolGains:
     """Gains of the poses of a pool after views among them, `taken`. pool: all poses; the others as in
     `mgs.active.directional.gains`.
 
-    S, M: [N*K*K] matrices, one Gaussian after another. g, q: of each pair of a pose and a Gaussian that it sees, whose indices
-    are `by` and `of`. M and q are None for D-optimality.
+    S, M: the matrices, as `_upper` counts their entries; of each, one number for every Gaussian. g, q: of each pair of a pose
+    and a Gaussian that it sees, whose indices are `by` and `of`. M and q are None for D-optimality.
     """
 
     @one_at_a_time
@@ -72,15 +76,16 @@ class PoolGains:
         self.of, self.by = mi.UInt32(padded(of, np.uint32)), mi.UInt32(padded(self.poses, np.uint32))
         self.weights = mi.Float64(padded(pool.seen[self.poses, of], np.float64))
         variance = 1 / precision(degree, tau, lam)
-        self.size = len(variance)
-        self.S = mi.Float64(padded(np.tile(np.diag(variance).ravel(), len(points)), np.float64))
+        upper = _upper(len(variance))
+        self.S = [dr.opaque(mi.Float64, variance[a] if a == b else 0.0, len(points)) for a, b in upper]
         y = self._harmonics(self.of, self.by)
         moved = [float(v) * value for v, value in zip(variance, y, strict=True)]
         self.g, self.M, self.q = _dot(moved, y), None, None
         if dome is not None:
-            M = in_parts(len(points), lambda s: information(points[s], Views(dome.positions, dome.seen[:, s]), degree))
-            self.M, first = mi.Float64(padded(np.concatenate(M), np.float64).ravel()), self.of * self.size**2
-            self.q = _dot([_dot(self._row(self.M, first + a * self.size), moved) for a in range(self.size)], moved)
+            parts = in_parts(len(points), lambda s: information(points[s], Views(dome.positions, dome.seen[:, s]), degree))
+            M = np.concatenate(parts)
+            self.M = [mi.Float64(padded(M[:, a, b], np.float64)) for a, b in upper]
+            self.q = _dot(_times([_at(entry, self.of) for entry in self.M], moved), moved)
         dr.eval(self.S, self.M, self.g, self.q)
 
     @one_at_a_time
@@ -95,52 +100,36 @@ class PoolGains:
         """Take more views, one after another."""
         for view in views:
             self.taken.append(view)
-            seen = np.flatnonzero(self.pool.seen[view])
-            if len(seen):
-                self._take(mi.UInt32(padded(seen, np.uint32)), mi.Float64(padded(self.pool.seen[view, seen], np.float64)), view)
+            self._take(view)
 
-    def _take(self, rows: Any, weights: Any, view: int) -> None:
-        """Take a view, which sees the Gaussians `rows` with these squared weights."""
-        K, n = self.size, len(rows)
-        columns = self._harmonics(rows, dr.opaque(mi.UInt32, view, n))
-        y, start = dr.zeros(mi.Float64, n * K), dr.arange(mi.UInt32, n) * K
-        for a, column in enumerate(columns):
-            dr.scatter(y, column, start + a)
-        dr.eval(y)
-        # One number of a kernel (`lane`) for each Gaussian that is seen and each row of its matrices.
-        lane = dr.arange(mi.UInt32, n * K)
-        row, a = lane // K, lane % K
-        first = dr.gather(mi.UInt32, rows, row) * K**2 + a * K
+    def _take(self, view: int) -> None:
+        """Bring everything up to date with one more view."""
+        n = len(self.points) // 3
+        weights, everyone = mi.Float64(padded(self.pool.seen[view], np.float64)), dr.arange(mi.UInt32, n)
+        y = self._harmonics(everyone, dr.opaque(mi.UInt32, view, n))
+        u = _times(self.S, y)
+        w = None if self.M is None else _times(self.S, _times(self.M, u))
+        k = weights / (1 + weights * _dot(y, u))
+        both = None if w is None else dr.square(k) * _dot(y, w)
+        self.S = [entry - k * u[a] * u[b] for entry, (a, b) in zip(self.S, _upper(len(y)), strict=True)]
+        u, w = _side_by_side(u), None if w is None else _side_by_side(w)
+        dr.eval(self.S, u, w, k, both)
+        self._update(u, w, k, both)
 
-        def times(matrices: Any, vectors: Any) -> Any:
-            product = _dot(self._row(matrices, first), self._row(vectors, row * K))
-            dr.eval(product)
-            return product
+    def _update(self, u: Any, w: Any, k: Any, both: Any) -> None:
+        """Bring g and q up to date. u, w: [N*K]; k: [N], 0 where the view misses a Gaussian; both: k^2 y^T w."""
 
-        u = times(self.S, y)
-        w = None if self.M is None else times(self.S, times(self.M, u))
-        k = weights / (1 + weights * _dot(self._row(u, start), columns))
-        both = None if w is None else dr.square(k) * _dot(self._row(w, start), columns)
-        dr.eval(k, both)
-        change, by = -_at(k, row) * _at(u, lane), self._row(u, row * K)
-        for b in range(K):
-            dr.scatter_reduce(dr.ReduceOp.Add, self.S, change * by[b], first + b, mode=dr.ReduceMode.NoConflicts)
-        dr.eval(self.S)
-        self._update(rows, u, w, k, both)
+        def change(k_of: Any, g: Any, q: Any) -> Any:
+            y = self._harmonics(self.of, self.by)
+            uy = _dot(self._row(u), y)
+            if w is not None:
+                q = q + _at(both, self.of) * dr.square(uy) - 2 * k_of * uy * _dot(self._row(w), y)
+            return mi.Float64(0), g - k_of * dr.square(uy), q
 
-    def _update(self, rows: Any, u: Any, w: Any, k: Any, both: Any) -> None:
-        """Bring g and q up to date with a view that sees the Gaussians `rows`. both: k^2 (y^T w)."""
-        place = dr.zeros(mi.UInt32, len(self.points) // 3)  # where in `rows` each Gaussian is, from 1; 0: the view misses it
-        dr.scatter(place, dr.arange(mi.UInt32, len(k)) + 1, rows)
-        dr.eval(place)
-        row = dr.gather(mi.UInt32, place, self.of)
-        seen, row = row > 0, row - 1
-        y, k = self._harmonics(self.of, self.by), _at(k, row, seen)
-        uy = _dot(self._row(u, row * self.size, seen), y)
-        if w is not None:
-            wy = _dot(self._row(w, row * self.size, seen), y)
-            self.q += _at(both, row, seen) * dr.square(uy) - 2 * k * uy * wy
-        self.g -= k * dr.square(uy)
+        # A loop of one round. Lanes side by side are mostly of one Gaussian, and where the view misses it they skip the round.
+        before = _at(k, self.of), self.g, mi.Float64(0) if w is None else self.q
+        _, self.g, q = dr.while_loop(before, lambda k_of, g, q: k_of > 0, change)
+        self.q = None if w is None else q
         dr.eval(self.g, self.q)
 
     def _harmonics(self, of: Any, by: Any) -> list[Any]:
@@ -148,15 +137,36 @@ class PoolGains:
         offset = dr.gather(mi.Point3d, self.points, of) - dr.gather(mi.Point3d, self.positions, by)
         return list(dr.sh_eval(mi.Vector3d(offset * dr.rcp(dr.norm(offset))), self.degree))
 
-    def _row(self, values: Any, first: Any, active: Any = True) -> list[Any]:
-        """K numbers that stand one after another in an array; four are read at once where K allows it."""
-        if self.size % 4:
-            return [_at(values, first + b, active) for b in range(self.size)]
-        return [v for b in range(self.size // 4) for v in dr.gather(mi.Vector4d, values, first // 4 + b, active)]
+    def _row(self, vectors: Any) -> list[Any]:
+        """K numbers of each pair's Gaussian from vectors [N*K]; four are read at once where K allows it."""
+        K = (self.degree + 1) ** 2
+        if K % 4:
+            return [_at(vectors, self.of * K + b) for b in range(K)]
+        return [v for b in range(K // 4) for v in dr.gather(mi.Vector4d, vectors, self.of * (K // 4) + b)]
 
 
-def _at(values: Any, index: Any, active: Any = True) -> Any:
-    return dr.gather(mi.Float64, values, index, active)
+def _upper(K: int) -> list[tuple[int, int]]:
+    """Rows and columns of the upper triangle of a K x K matrix."""
+    return [(a, b) for a in range(K) for b in range(a, K)]
+
+
+def _times(matrix: list[Any], vector: list[Any]) -> list[Any]:
+    """Product of a symmetric matrix, given by its upper triangle, and a vector."""
+    entries = dict(zip(_upper(len(vector)), matrix, strict=True))
+    return [_dot([entries[min(a, b), max(a, b)] for b in range(len(vector))], vector) for a in range(len(vector))]
+
+
+def _side_by_side(vector: list[Any]) -> Any:
+    """[N*K] with the K numbers of a Gaussian side by side, from K arrays [N]."""
+    n, K = len(vector[0]), len(vector)
+    packed, first = dr.zeros(mi.Float64, n * K), dr.arange(mi.UInt32, n) * K
+    for b, values in enumerate(vector):
+        dr.scatter_reduce(dr.ReduceOp.Add, packed, values, first + b, mode=dr.ReduceMode.NoConflicts)
+    return packed
+
+
+def _at(values: Any, index: Any) -> Any:
+    return dr.gather(mi.Float64, values, index)
 
 
 def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
