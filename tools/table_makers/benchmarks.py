@@ -168,6 +168,19 @@ def ranking(data: dict[str, Any]) -> str:
     return markdown(["criterion", *(f"{count} passes" for count in passes)], rows) + made_by(data)
 
 
+def noise_ranking(data: dict[str, Any]) -> str:
+    """Agreement of rankings under other assumptions with the default's, over the states."""
+    rows, names = [], {"sigma": "sigma = {:g}", "alpha in F": "alpha in F, weight {:g}"}
+    names["alpha in lambda"] = "alpha in lambda, weight {:g}"
+    for assumption, name in names.items():
+        for number in dict.fromkeys(r["number"] for r in data["records"] if r["assumption"] == assumption):
+            of = [r for r in data["records"] if (r["assumption"], r["number"]) == (assumption, number)]
+            tau, regret = (sum(r[key] for r in of) / len(of) for key in ("tau", "regret"))
+            same = f"{sum(r['same'] for r in of)} of {len(of)}"
+            rows.append([name.format(number), f"{tau:.2f}", f"{100 * regret:.1f} %", same])
+    return markdown(["assumption", "Kendall's tau with the default", "regret", "the same view"], rows) + made_by(data)
+
+
 def linearity(data: dict[str, Any]) -> str:
     """Departure from linear of moves of several sizes; of added views the mean."""
     records = data["records"]
@@ -356,6 +369,7 @@ def residual(data: dict[str, Any]) -> str:
 
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "ranking": ("benchmarks/ranking", ranking),
+    "noise-ranking": ("benchmarks/noise_ranking", noise_ranking),
     "linearity": ("benchmarks/linearity", linearity),
     "residual": ("benchmarks/residual", residual),
     "prior-std": ("benchmarks/prior_std", prior_std),
