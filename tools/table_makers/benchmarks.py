@@ -181,6 +181,28 @@ def noise_ranking(data: dict[str, Any]) -> str:
     return markdown(["assumption", "Kendall's tau with the default", "regret", "the same view"], rows) + made_by(data)
 
 
+def local_density(data: dict[str, Any]) -> str:
+    """PSNR inside the rock on test views, for each scene and number of Gaussians, by how much the spacing follows the texture."""
+    rows: list[list[str]] = []
+    strengths = list(dict.fromkeys(r["strength"] for r in data["scenes"][0]["records"]))
+    for scene in data["scenes"]:
+        for n in dict.fromkeys(r["asked"] for r in scene["records"]):
+            of = {r["strength"]: r for r in scene["records"] if r["asked"] == n}
+            name = f"{_rock(scene['dataset'])}, {n:,} Gaussians, {scene['views']} views"
+            gain = of[strengths[-1]]["psnr_inside"] - of[0.0]["psnr_inside"]
+            ratio = f"{of[strengths[-1]]['spacings']:.1f}"
+            rows.append([name, *(f"{of[strength]['psnr_inside']:.2f}" for strength in strengths), f"{gain:+.2f}", ratio])
+    names = ["as `mgs prior` has it" if strength is None else f"strength {strength:g}" for strength in strengths]
+    heading = ["rock", *names, f"{strengths[-1]:g} over 0, dB", "largest spacing over smallest"]
+    return markdown(heading, rows) + made_by(data)
+
+
+def _rock(dataset: str) -> str:
+    """The scene that a dataset of the commands here is of, by its path."""
+    parts = Path(dataset).parts
+    return "boulder" if parts[0] == "demo" else parts[-2]
+
+
 def linearity(data: dict[str, Any]) -> str:
     """Departure from linear of moves of several sizes; of added views the mean."""
     records = data["records"]
@@ -370,6 +392,7 @@ def residual(data: dict[str, Any]) -> str:
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "ranking": ("benchmarks/ranking", ranking),
     "noise-ranking": ("benchmarks/noise_ranking", noise_ranking),
+    "local-density": ("benchmarks/local_density", local_density),
     "linearity": ("benchmarks/linearity", linearity),
     "residual": ("benchmarks/residual", residual),
     "prior-std": ("benchmarks/prior_std", prior_std),

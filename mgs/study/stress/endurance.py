@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import gc
 import itertools
-import multiprocessing
 import resource
+import subprocess
+import sys
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mgs import runtime
 from mgs.camera import Camera
+from mgs.files import read_json, write_json
 from mgs.study.stress.experiment import Experiment, Panel, rock_cell
 from mgs.study.stress.lab import Lab, Preset, open_lab
 from mgs.study.stress.verdict import Claim, Row
@@ -29,9 +31,11 @@ LISTS = 1 << 22
 
 
 def endurance(root: Path, out: Path, scene: str, steps: int) -> dict[str, Any]:
-    """Steps as those of `mgs nbv`, in a process of its own, so that nothing done before counts."""
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return {"rows": pool.submit(_steps, root, scene, steps).result()}
+    """Steps as those of `mgs nbv`, in a process of its own, so that nothing done before counts. It runs this module: workers
+    may not start processes of `multiprocessing`."""
+    rows = out / "rows.json"
+    subprocess.run([sys.executable, "-m", __name__, root, scene, str(steps), rows], check=True)
+    return {"rows": read_json(rows)}
 
 
 def _steps(root: Path, scene: str, steps: int) -> list[Row]:
@@ -80,8 +84,7 @@ def slopes(rows: Sequence[Row]) -> list[float]:
 
 
 def _cells(preset: Preset) -> list[Cell]:
-    cell = rock_cell("endurance", f"{__name__}:endurance", preset, *preset.rocks[0], steps=preset.steps)
-    return [replace(cell, alone=True)]  # it starts a process, which workers may not
+    return [rock_cell("endurance", f"{__name__}:endurance", preset, *preset.rocks[0], steps=preset.steps)]
 
 
 ENDURANCE = Experiment(
@@ -93,3 +96,7 @@ ENDURANCE = Experiment(
     ),
     (Panel("step", "megabytes", "step", "resident memory (MB)"),),
 )  # fmt: skip
+
+if __name__ == "__main__":
+    runtime.start()
+    write_json(Path(sys.argv[4]), _steps(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])))
