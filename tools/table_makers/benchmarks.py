@@ -182,7 +182,7 @@ def noise_ranking(data: dict[str, Any]) -> str:
 
 
 def local_density(data: dict[str, Any]) -> str:
-    """PSNR inside the rock on test views, for each scene and number of Gaussians, by how much the spacing follows the texture."""
+    """PSNR inside the rock on test views, by scene, number of Gaussians, and how much the spacing follows the texture."""
     rows: list[list[str]] = []
     strengths = list(dict.fromkeys(r["strength"] for r in data["scenes"][0]["records"]))
     for scene in data["scenes"]:
