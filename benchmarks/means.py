@@ -4,7 +4,7 @@ Fits with means that are frozen, that move along the prior's normals, and that a
 is added to the points that the prior's mesh is built from, in spacings of its samples. Each is fitted to 12 and to 4 views
 spread evenly in azimuth, at default settings otherwise, and judged on the views that none is fitted to: PSNR inside the rock.
 Where the dataset has the true rock (rock.glb), the mean distance from it is measured too, of the means that lie on the surface,
-before and after the fit; 5,000 Gaussians and 20 passes unless said.
+before and after the fit; 5,000 Gaussians and the default number of passes unless said.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from mgs.cli.app import main
 from mgs.data.dataset import load_dataset, write_transforms
 from mgs.prior.build import build_prior, save_prior
 from mgs.prior.settings import PriorSettings
-from mgs.study.stress import alarms, endurance, faults, numbers, registry
+from mgs.study.stress import alarms, endurance, faults, numbers, registry, spread
 from mgs.study.stress.convergence import CONVERGENCE
 from mgs.study.stress.experiment import Experiment, Panel, rock_cell
 from mgs.study.stress.lab import PRESETS, agreement, greedy, open_lab
@@ -137,7 +137,8 @@ def alarm_rows(sign_of_failed):
     """Runs of three scenes: one clean, one failed by exposure, one harmless; the sign of the failed one is given."""
     rows = []
     for scene in "abc":
-        rows.append({"scene": scene, "fault": "none", "failed": False, "sign exposure": 0.01, "sign coverage": 0.05})
+        clean = {"scene": scene, "run": scene, "size": 6, "fault": "none", "failed": False}
+        rows.append(clean | {"sign exposure": 0.01, "sign coverage": 0.05})
         rows.append(
             {"scene": scene, "fault": "exposure", "failed": True, "sign exposure": sign_of_failed, "sign coverage": 0.05}
         )
@@ -155,8 +156,17 @@ def test_detectors_are_judged_both_ways():
     assert alarms.false_alarms(alarm_rows(0.8)) == [0.0] * 3
     noisy = [row | {"sign exposure": 0.9} for row in alarm_rows(0.8)]
     assert alarms.false_alarms(noisy) == [1.0] * 3
+    assert alarms.false_alarms(noisy + noisy) == [1.0] * 3, "a clean run of two experiments counts once"
     curve = {(row["false alarms"], row["caught"]) for row in alarms.roc_curves(alarm_rows(0.8))}
     assert {(0.0, 1.0), (1.0, 1.0)} <= curve
+
+
+def test_the_spread_of_models_is_that_of_their_pixels():
+    images = np.zeros((4, 100, 3))
+    assert spread.spread_of(images) == 0
+    images[::2] = 0.2
+    assert spread.spread_of(images) == pytest.approx(0.1)
+    assert spread.spread_of(images + np.linspace(0, 1, 100)[None, :, None]) == pytest.approx(0.1), "pixels may differ"
 
 
 def test_every_claim_names_what_its_panels_and_bounds_need():

@@ -22,8 +22,8 @@ NATURAL_BETA = 0.9
 
 NATURAL_OVERLAP = 4.0
 """By how much the exact diagonal is raised in `natural`. The diagonal says how an image changes with one parameter alone, while
-a pixel is blended from several splats that move at once: steps of the diagonal's own length would overshoot. A chosen constant;
-between 2 and 8 the fit hardly changes (docs/fit.md)."""
+a pixel is blended from several splats that move at once: steps of the diagonal's own length would overshoot. A chosen
+constant."""
 
 LEAST_INFORMATION = 1e-6
 """Least information that `natural` assumes, (pixel value per unit of the parameter)^2: without a prior, a parameter that no

@@ -44,7 +44,7 @@ PRESETS = {
     "balanced": Preset(passes=PASSES, warm_passes=WARM_PASSES, density=1 / 2),
     "accurate": Preset(passes=PASSES, warm_passes=WARM_PASSES, density=3 / 4),
 }
-"""What `mgs nbv --preset` knows, by name: points on the front of runs in docs/speed-accuracy.md."""
+"""What `mgs nbv --preset` knows, by name: chosen with the charts of docs/speed-accuracy.md, which name them."""
 
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]

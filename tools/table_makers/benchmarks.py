@@ -176,9 +176,10 @@ def noise_ranking(data: dict[str, Any]) -> str:
         for number in dict.fromkeys(r["number"] for r in data["records"] if r["assumption"] == assumption):
             of = [r for r in data["records"] if (r["assumption"], r["number"]) == (assumption, number)]
             tau, regret = (sum(r[key] for r in of) / len(of) for key in ("tau", "regret"))
-            same = f"{sum(r['same'] for r in of)} of {len(of)}"
-            rows.append([name.format(number), f"{tau:.2f}", f"{100 * regret:.1f} %", same])
-    return markdown(["assumption", "Kendall's tau with the default", "regret", "the same view"], rows) + made_by(data)
+            regrets, same = f"{100 * regret:.1f} % ({100 * max(r['regret'] for r in of):.1f})", sum(r["same"] for r in of)
+            rows.append([name.format(number), f"{tau:.2f}", regrets, f"{same} of {len(of)}"])
+    heading = ["assumption", "Kendall's tau with the default", "regret, mean (worst)", "the same view"]
+    return markdown(heading, rows) + made_by(data)
 
 
 def local_density(data: dict[str, Any]) -> str:
@@ -298,8 +299,23 @@ def fit(data: dict[str, Any]) -> str:
     for name, (bound, target) in FIT_TARGETS.items():
         value = data["figures"][name]
         measured = "not reached" if value is None else f"{value:.3g}"
-        rows.append([name.replace("_", " "), measured, f"{bound} {target:.3g}"])
+        rows.append([FIT_FIGURES[name], measured, f"{bound} {target:.3g}"])
     return markdown(["figure", "measured", "asked for"], rows) + made_by(data)
+
+
+FIT_FIGURES = {
+    "psnr_held_out": "PSNR of views held out, full frame (dB)",
+    "psnr_inside_10k": "the same inside the rock, 10,000 Gaussians (dB)",
+    "psnr_inside_20k": "20,000 Gaussians (dB)",
+    "too_deep_3_spacings": "share of pixels more than 3 spacings too deep",
+    "see_through": "share of pixels inside the rock with alpha below 0.9",
+    "ranking_tau": "Kendall's tau of the ranking with that of a fit ten times as long",
+    "ranking_regret": "regret of the view chosen, share of the best gain",
+    "predicted_over_found_decrease": "predicted decrease of Phi over the one found",
+    "passes_to_old_objective_cold": "passes to the Phi of 400 passes of Adam, over 400, from the prior",
+    "passes_to_old_objective_warm": "the same with one view added",
+}
+"""What is said of each figure of `mgs bench fit`."""
 
 
 PRIORS = {

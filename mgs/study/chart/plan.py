@@ -59,8 +59,8 @@ DENSITY = 1 / 8
 SCENE = "boulder"
 """The scene of the charts."""
 
-OTHER_SCENES = ("contact-binary", "pebbles")
-"""The scenes on which the presets are judged."""
+OTHER_SCENES = ("strata", "low-sun")
+"""The scenes on which the presets are judged. On SCENE, contact-binary and pebbles they were chosen."""
 
 
 @dataclass(frozen=True)

@@ -75,8 +75,10 @@ def roc_curves(rows: Sequence[Row]) -> list[Row]:
 
 
 def false_alarms(rows: Sequence[Row]) -> list[float]:
-    """For each clean run, 1 where it raises an alarm."""
-    return [_alarm(row) for row in rows if row["fault"] == "none"]
+    """For each clean run, 1 where it raises an alarm. The faults of images and those of priors have some clean runs in common,
+    which count once."""
+    clean = {(row["run"], row["size"]): row for row in rows if row["fault"] == "none"}
+    return [_alarm(row) for row in clean.values()]
 
 
 def caught(rows: Sequence[Row]) -> list[float]:

@@ -171,13 +171,14 @@ class Lab:
         with_prior: bool = True,
         model: Gaussians | None = None,
         start: Gaussians | None = None,
+        seed: int = 0,
     ) -> Fit:
         """A fit of exactly so many passes, otherwise with the default settings of `mgs nbv`. with_prior: whether lambda holds
         the parameters. model: where it begins; start: where lambda holds the parameters; both by default the Gaussians before
-        training."""
+        training. seed: of the order of the images."""
         start = self.start(taken) if start is None else start
         rates = RATES | {"mean": MEAN_RATE * self.prior.spacing}
-        settings = TrainSettings(passes=passes, tolerance=0.0, means=means, rates=rates)  # type: ignore[arg-type]
+        settings = TrainSettings(passes=passes, tolerance=0.0, means=means, rates=rates, seed=seed)  # type: ignore[arg-type]
         lam = lam_by_kind(self.lam(means), groups(0, means)) if with_prior else None
         frames = [self.frames[i] for i in taken]
         return fit(

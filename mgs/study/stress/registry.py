@@ -20,6 +20,7 @@ from mgs.study.stress.picture import draw_experiment
 from mgs.study.stress.scales import SCALES
 from mgs.study.stress.scenes import SCENES
 from mgs.study.stress.specular import SPECULAR
+from mgs.study.stress.spread import SPREAD
 from mgs.study.stress.sun import SUN
 from mgs.study.stress.survey import SURVEY
 from mgs.study.stress.verdict import Row, effect, judged
@@ -32,6 +33,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "scales": SCALES,
     "numerics": NUMERICS,
     "seeds": SEEDS,
+    "spread": SPREAD,
     "numbers": NUMBERS,
     "endurance": ENDURANCE,
     "data-faults": DATA_FAULTS,
