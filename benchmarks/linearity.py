@@ -4,7 +4,8 @@ The Fisher information stands for the posterior as far as the image h is linear 
 width (paper, section III-C). Measured is the departure |h(theta + delta) - h(theta) - J delta| / |J delta| over views that were
 not fitted, with J delta from one forward-mode derivative, for moves delta of two kinds:
 
-- draws from the diagonal posterior, N(0, sigma^2 / (H + lam)), of all parameters and of one kind at a time, times a factor;
+- draws from the diagonal posterior, N(0, sigma^2 / (H + lam)), of all parameters that are learned by default and of one kind at
+  a time, and of the means, as if they were free, times a factor;
 - the move that one added view really causes when the fit goes on with it.
 
 Models: fitted to four views spread evenly in azimuth for few and for many passes.
@@ -21,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from mgs import runtime
-from mgs.active.criteria import PIXEL_NOISE, regularisation
+from mgs.active.criteria import MEAN_STD, PIXEL_NOISE, regularisation
 from mgs.active.fitting import fit
 from mgs.active.loop import target_of
 from mgs.active.pose_policies import seed_views
@@ -38,11 +39,14 @@ from mgs.provenance import command_line, versions
 from mgs.seeds import generator
 from mgs.splat import ListCache, fisher, groups, jvp, render
 
-PASSES = (20, 400)
+PASSES = (10, 400)
 FACTORS = (0.03, 0.1, 0.3, 1.0)
 GAUSSIANS = 10_000
 JUDGED = 4
 """Views on which the departure is measured."""
+
+ACROSS = "mean across the view"
+"""Moves of means without their part along the axis of the camera, for each view those of its own."""
 
 
 def departure(
@@ -59,6 +63,12 @@ def departure(
         linear = np.asarray(jvp(model, delta, camera, cache=cache).rgb, np.float64)
         away, along, count = away + ((h1 - h0 - linear) ** 2).sum(), along + (linear**2).sum(), count + linear.size
     return float(np.sqrt(away / along)), float(np.sqrt(along / count))
+
+
+def across(moves: np.ndarray, camera: Camera) -> np.ndarray:
+    """Moves of means [N,3] without their part along the axis of a camera, so that the order of depth stays."""
+    axis = camera.world_to_camera[2, :3]
+    return moves - (moves @ axis)[:, None] * axis
 
 
 def study(root: Path) -> list[dict[str, Any]]:
@@ -78,19 +88,29 @@ def study(root: Path) -> list[dict[str, Any]]:
         targets = [target_of(dataset.frames[i]) for i in views]
         return fit(model, [cameras[i] for i in views], targets, train, cache=cache, start=start, lam=by_kind).gaussians
 
-    records = []
+    records, mean = [], groups(0, "free")["mean"]
     for passes in PASSES:
         model = fitted(start, taken, passes)
         H = np.sum([fisher(model, cameras[i], cache=cache) for i in taken], axis=0, dtype=np.float64)
         draw = generator(0, "linearity").standard_normal(H.shape) * PIXEL_NOISE / np.sqrt(H + lam)
         columns = dict(zip(LEARNED, groups(0).values(), strict=True))
         whole = {name: draw[:, c].reshape(getattr(model, name).shape) for name, c in columns.items()}
-        moves = {"all": whole} | {kind: {name: whole[name]} for kind, name in zip(KINDS, LEARNED, strict=True)}
+        free = generator(0, "linearity/means").standard_normal((len(model), 3))
+        of_means = np.sum(
+            [fisher(model, cameras[i], cache=cache, means="free")[:, mean] for i in taken], axis=0, dtype=np.float64
+        )
+        free *= PIXEL_NOISE / np.sqrt(of_means + (PIXEL_NOISE / (MEAN_STD * prior.spacing)) ** 2)
+        moves = {"all": whole, "mean": {"means": free}} | {
+            kind: {name: whole[name]} for kind, name in zip(KINDS, LEARNED, strict=True)
+        }
         for factor in FACTORS:
             for name, move in moves.items():
                 ratio, size = departure(model, {k: factor * v for k, v in move.items()}, judged, cache)
                 records.append({"passes": passes, "move": f"draw, {name}", "factor": factor, "departure": ratio, "rms": size})
                 print(records[-1], flush=True)
+            found = [departure(model, {"means": factor * across(free, camera)}, [camera], cache) for camera in judged]
+            ratio, size = np.mean(found, axis=0)
+            records.append({"passes": passes, "move": f"draw, {ACROSS}", "factor": factor, "departure": ratio, "rms": size})
         for added in left[2::7][:3]:
             after = fitted(model, [*taken, added], passes)
             move = {name: getattr(after, name) - getattr(model, name) for name in LEARNED}
@@ -104,7 +124,13 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
     """Departure against the size of the move, by kind of parameter."""
     import matplotlib
 
-    colours = dict(zip(("all", *KINDS), ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7"), strict=True))
+    colours = dict(
+        zip(
+            ("all", *KINDS, "mean", ACROSS),
+            ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"),
+            strict=True,
+        )
+    )
     with matplotlib.rc_context(STYLE):
         figure = new_figure(7.2, 3.1)
         for axis, passes in zip(figure.subplots(1, 2, sharey=True), PASSES, strict=True):
@@ -113,11 +139,11 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
                 axis.plot([r["factor"] for r in rows], [r["departure"] for r in rows], "o-", color=colour, label=kind)
             real = [r["departure"] for r in records if (r["passes"], r["move"]) == (passes, "one added view")]
             axis.plot([1.0] * len(real), real, "x", color="#000000", label="one added view")
-            axis.set(xscale="log", ylim=(0, None), xlabel="size of the draw (posterior standard deviations)")
+            axis.set(xscale="log", yscale="log", ylim=(0.2, 40), xlabel="size of the draw (posterior standard deviations)")
             axis.set_title(f"after {passes} passes")
             axis.axhline(1, color="#888888", linewidth=0.8)
         figure.axes[0].set(ylabel="departure from linear")
-        figure.axes[0].legend(ncols=3, loc="lower left", columnspacing=0.8, handlelength=1.2)
+        figure.axes[0].legend(ncols=3, loc="upper right", columnspacing=0.8, handlelength=1.2)
         save_figure(figure, path)
 
 

@@ -198,6 +198,17 @@ def local_density(data: dict[str, Any]) -> str:
     return markdown(heading, rows) + made_by(data)
 
 
+def truth(data: dict[str, Any]) -> str:
+    """PSNR on test views of fits to several truths, judged by two of them."""
+    judges = [(judge, part) for judge in ("alpha", "mask") for part in ("", ", inside")]
+    rows = []
+    for record in data["records"]:
+        scene = "boulder" if record["dataset"].startswith("demo") else "contact binary"
+        rows.append([f"{scene}: {record['fitted']}", *(f"{record[judge + part]:.2f}" for judge, part in judges)])
+    named = [f"judged by {judge}, {'rock' if part else 'full frame'} (dB)" for judge, part in judges]
+    return markdown(["fitted to", *named], rows) + made_by(data)
+
+
 def _rock(dataset: str) -> str:
     """The scene that a dataset of the commands here is of, by its path."""
     parts = Path(dataset).parts
@@ -409,6 +420,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "ranking": ("benchmarks/ranking", ranking),
     "noise-ranking": ("benchmarks/noise_ranking", noise_ranking),
     "local-density": ("benchmarks/local_density", local_density),
+    "truth": ("benchmarks/truth", truth),
     "linearity": ("benchmarks/linearity", linearity),
     "residual": ("benchmarks/residual", residual),
     "prior-std": ("benchmarks/prior_std", prior_std),
