@@ -133,6 +133,18 @@ def own_policy(data: dict[str, Any]) -> str:
     return markdown(heading, rows) + made_by(data)
 
 
+def oracle(data: dict[str, Any]) -> str:
+    """What each policy gains over random draws on the test views, and its share of what the oracle gains, pool by pool."""
+    rows = data["rows"]
+    pools, policies = (list(dict.fromkeys(row[key] for row in rows)) for key in ("pool", "policy"))
+    found = {(row["policy"], row["pool"]): row for row in rows}
+    lines = []
+    for policy in policies:
+        of = [found[policy, pool] for pool in pools]
+        lines.append([policy, *(f"{row['test_psnr_over_random']:+.2f} ({row['test_psnr_share']:.2f})" for row in of)])
+    return markdown([f"{data['rocks']} rocks: over random, dB (share)", *pools], lines) + made_by(data)
+
+
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "stability": ("results/stress/verdicts", stability),
     "stability-world": ("results/stress/world", stability),
@@ -143,6 +155,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     **{f"reproduce-{name}": (f"results/reproduce/{name}", reproduced(name)) for name in REPRODUCED},
     "paper-size-table1": ("results/paper-size/table1", reproduced("table1")),
     "linear-look": ("results/linear-look/pools", own_policy),
+    "oracle": ("results/oracle/pools", oracle),
     **{f"chart-{name}": ("results/chart/chart", chart(name)) for name in CHART_TABLES},
 }
 """By name: the file, seen from docs/ and without `.json`, and what makes the table of its contents."""

@@ -17,8 +17,3 @@ def pareto_front(costs: Sequence[float], gains: Sequence[float]) -> NDArray[np.b
     no_worse = (cost[None] <= cost[:, None]) & (gain[None] >= gain[:, None])
     better = (cost[None] < cost[:, None]) | (gain[None] > gain[:, None])
     return np.asarray(~(no_worse & better).any(axis=1) & ~np.isnan(cost) & ~np.isnan(gain))
-
-
-def within(costs: Sequence[float], gains: Sequence[float], limit: float) -> float:
-    """The best gain that costs at most `limit`; NaN if nothing does."""
-    return max((gain for cost, gain in zip(costs, gains, strict=True) if cost <= limit), default=float("nan"))
