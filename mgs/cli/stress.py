@@ -15,7 +15,7 @@ def stress(
     preset: Annotated[
         str,
         typer.Option(
-            help="quick: about 12 minutes on two cores with --workers 2. full: more rocks, larger images, more runs; hours."
+            help="quick: about 8 minutes on two cores with --workers 2. full: more rocks, larger images, more runs; hours."
         ),
     ] = "quick",
     workers: Annotated[int, typer.Option(min=1, help="Processes that do cells side by side.")] = 1,
