@@ -8,8 +8,10 @@ import socket
 import subprocess
 import sys
 import time
+import warnings
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -202,6 +204,20 @@ def viewing(*arguments):
     finally:
         process.kill()
         process.wait()
+
+
+def test_a_window_that_is_closed_while_its_image_is_drawn_is_not_warned_of(run):
+    from viser.infra._async_message_buffer import AsyncMessageBuffer
+
+    said = "on a closed connection"
+    assert said in Path(sys.modules[AsyncMessageBuffer.__module__].__file__).read_text(), "viser words it otherwise now"
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        viewer = Viewer(run, port=0)
+        warnings.warn(f"Queued a BackgroundImageMessage {said} (e.g. via a handle of a client)", stacklevel=1)
+        warnings.warn("another", stacklevel=1)
+        viewer.close()
+    assert [str(one.message) for one in heard] == ["another"]
 
 
 def test_a_run_is_followed_from_its_beginning(dataset, prior, tmp_path):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import socket
 import time
+import warnings
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from io import StringIO
@@ -93,6 +94,8 @@ class Viewer:
         except ImportError:
             raise InputError("mgs view: needs viser, which is not installed; `pip install 'mgs[view]'`") from None
         check_address(host, port)
+        # A window may be closed while its image is drawn; viser then warns that nobody gets it.
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         with redirect_stdout(StringIO()):  # viser greets, and names every window; the command says what is needed
             self.server = viser.ViserServer(host, port, label="mgs", verbose=False)
         self.port = self.server.get_port()
