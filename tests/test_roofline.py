@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -110,9 +111,9 @@ def test_the_work_of_a_kernel_is_counted():
     """
     found = count_work(KERNEL)
     assert (found.width, len(found.loops)) == (8, 1)
-    assert found.straight == Work(bytes=4 + 8 + 2 * 4, state_bytes=2 * 4)
+    assert found.straight == Work(bytes=4 + 8 + 2 * 4, state_bytes=2 * 4, addresses=2)
     instructions = 1 + 1 + 1 + 1 + 2 + 2 + 1  # icmp, fma, fdiv, select, fpext and fadd on doubles, add
-    loop = Work(3, 1, 1, 0, instructions, 4 + 16 + 2 * 16, state_bytes=2 * (4 + 8) + 2 * 4 + 2 * 8 + 4)
+    loop = Work(3, 1, 1, 0, instructions, 4 + 16 + 2 * 16, state_bytes=2 * (4 + 8) + 2 * 4 + 2 * 8 + 4, addresses=3)
     assert found.loops[0] == loop
     assert loop * 2 + loop == loop * 3
 
@@ -158,6 +159,7 @@ def test_work_of_the_kernels_is_what_their_authors_meant():
     lists, packed = ListCache().get(camera, splats)
     (whole,), (forward,) = (count_work(compiled(lambda w=w: kernels.forward(lists, packed, w)).ir).loops for w in (True, False))
     assert (whole.bytes, forward.bytes) == (4 + 64, 4 + 48)
+    assert (whole.addresses, forward.addresses) == (1 + 4, 1 + 3)
     assert 2 * 6 * 4 * PIXELS <= whole.state_bytes < 2 * 7 * 4 * PIXELS
     assert 2 * 4 * 4 * PIXELS <= forward.state_bytes < 2 * 5 * 4 * PIXELS
     assert whole.divisions == forward.divisions == 0
@@ -184,14 +186,16 @@ def test_a_register_runs_until_its_last_lane_ends(lengths, width):
 
 LIMITS = {
     "flops": 100e9, "flops64": 50e9, "divisions": 4e9, "divisions64": 2e9,
-    "bandwidth": {"L1": 200e9, "L2": 100e9, "L3": 40e9, "memory": 10e9},
+    "bandwidth": {"L1": 200e9, "L2": 100e9, "L3": 40e9, "memory": 10e9}, "addresses": 500e6,
 }  # fmt: skip
 
 
 def test_shares_of_the_limits():
     work = Work(flops=10e9, flops64=5e9, divisions=1e9, divisions64=1e9, instructions=20e9, bytes=8e9, state_bytes=12e9)
+    work = replace(work, addresses=3e8)
     share = limit_shares({"seconds": 2.0, "executed": vars(work)}, LIMITS)
     expected = {"FMA": 0.1, "division": 0.375, "instructions": 0.2, "L1": 0.05, "L2": 0.04, "L3": 0.1, "memory": 0.4}
+    expected["addresses"] = 0.3
     assert share == pytest.approx(expected)
 
 
@@ -201,6 +205,9 @@ def test_shares_of_the_limits():
         ({}, 0.0, "none; nearest is division"),
         ({"L3": 0.4}, 0.0, "none; nearest is L3"),
         ({}, 0.6, "Dr.Jit's sorts and prefix sums"),
+        ({"addresses": 0.2}, 0.31, "Dr.Jit's sorts and prefix sums, and addresses"),
+        ({"addresses": 0.2}, 0.29, "none; nearest is division"),
+        ({"addresses": 0.6}, 0.0, "addresses, if they lie in L3"),
         ({"instructions": 0.8, "L3": 0.9}, 0.1, "instructions"),
         ({"L3": 0.6, "memory": 2.4}, 0.0, "L3, if its bytes come from there"),
         ({"memory": 1.6}, 0.0, "memory, if part of its bytes come from there"),
@@ -237,15 +244,17 @@ def test_rates_are_those_of_the_work_that_the_timed_kernels_do(monkeypatch):
     """With a kernel that takes a second, a rate is the number of operations that are in its code."""
     calls = []
     monkeypatch.setattr(machine, "kernel_seconds", lambda call: calls.append(call) or 1.0)
-    lanes = 1 << 14
+    lanes = 1 << 16
     assert machine.peak_flops() == lanes * 64 * (flops := count_work(compiled(calls.pop()).ir).loops[0]).flops
     assert flops.flops == 2 * 8 * 16
     assert machine.peak_flops(mi.Float64) == lanes * 64 * count_work(compiled(calls.pop()).ir).loops[0].flops64
     assert machine.division_rate(mi.Float) == lanes * 4 * count_work(compiled(calls.pop()).ir).loops[0].divisions
+    reads = machine.address_rate(1 << 16)
+    assert reads == (1 << 18) * count_work(compiled(calls.pop()).ir).straight.addresses == 16 * (1 << 18)
     found = machine.local_bandwidth(4096)
     counter = 2 * 4
-    assert found == lanes / 4 * 64 * (count_work(compiled(calls.pop()).ir).loops[0].state_bytes - counter)
-    assert found == lanes / 4 * 64 * (4096 // 64) * 8
+    assert found == lanes / 16 * 64 * (count_work(compiled(calls.pop()).ir).loops[0].state_bytes - counter)
+    assert found == lanes / 16 * 64 * (4096 // 64) * 8
 
 
 def test_a_bandwidth_is_bytes_over_seconds(monkeypatch):

@@ -56,10 +56,11 @@ def kernel_seconds(call: Callable[[], Any]) -> float:
     return min(seconds)
 
 
-def operation_rate(operation: Callable[[Any], Any], real: Any, lanes: int = 1 << 14, rounds: int = 64) -> float:
+def operation_rate(operation: Callable[[Any], Any], real: Any, lanes: int = 1 << 16, rounds: int = 64) -> float:
     """How often a second an operation is done, in 8 independent chains for each SIMD lane, on registers.
 
-    operation: a function of a number of type `real` (mi.Float or mi.Float64).
+    operation: a function of a number of type `real` (mi.Float or mi.Float64). A quarter of these lanes Dr.Jit often gives all
+    to one thread.
     """
 
     def body(i: Any, chains: list[Any]) -> Any:
@@ -131,11 +132,27 @@ def stream_bandwidth(size: int) -> float:
     return 12 * n * rounds * threads / min(seconds)
 
 
+def address_rate(size: int, lanes: int = 1 << 18) -> float:
+    """Numbers a second that are read at random addresses of an array of `size` bytes for each thread, in a kernel in which each
+    lane makes 16 such reads that do not wait for one another."""
+    count, reads = size * dr.thread_count() // 4, 16
+    array, seed = dr.arange(mi.Float, count), dr.opaque(mi.UInt32, 1)
+    dr.eval(array)
+
+    def call() -> Any:
+        lane = dr.arange(mi.UInt32, lanes) * reads + seed
+        at = (dr.mul_hi((lane + i) * 2654435769, mi.UInt32(count)) for i in range(reads))  # a multiplicative hash (Knuth)
+        return sum(dr.gather(mi.Float, array, index) for index in at)
+
+    return reads * lanes / kernel_seconds(call)
+
+
 def machine_limits(report: Callable[[str], None]) -> dict[str, Any]:
     """All limits of this machine; report(what) is called before each group of measurements.
 
     "flops", "flops64": FMAs count twice; "divisions", "divisions64"; "bandwidth": bytes a second from "L1", "L2", "L3" and
-    "memory"; "working_set": the bytes for each thread with which they were measured; "cache_bytes" of `cache_sizes`.
+    "memory"; "addresses": numbers a second, read at random addresses of an array that L3 holds; "working_set": the bytes for
+    each thread with which bandwidths were measured, and addresses, as L3; "cache_bytes" of `cache_sizes`.
     """
     sizes, threads = cache_sizes(), dr.thread_count()
     sets = {
@@ -151,4 +168,5 @@ def machine_limits(report: Callable[[str], None]) -> dict[str, Any]:
     }  # fmt: skip
     report("bandwidth of the caches and of memory")
     bandwidth = {"L1": local_bandwidth(sets["L1"])} | {name: stream_bandwidth(sets[name]) for name in ("L2", "L3", "memory")}
+    rates["addresses"] = address_rate(sets["L3"])
     return rates | {"bandwidth": bandwidth, "working_set": sets, "cache_bytes": sizes}

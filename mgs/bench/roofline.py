@@ -29,8 +29,9 @@ ROOFS = ("FMA", "division", "instructions", "L1")
 """Limits on a kernel, whatever its data: all its additions and multiplications at the measured rate of FMAs; its divisions at
 that of divisions; every vector instruction in the time of an FMA; all its bytes at the bandwidth of the first cache."""
 
-SUPPLIES = ("L2", "L3", "memory")
-"""Where the bytes of arrays may come from. From which of them they do come only hardware counters tell."""
+SUPPLIES = ("L2", "L3", "memory", "addresses")
+"""Where the bytes of arrays may come from; "addresses": every number or packet that a lane reads or writes by itself comes from
+another line of L3. From where they do come only hardware counters tell."""
 
 BOUND = 0.5
 """A kernel is called bound by a limit that alone takes at least this share of its time."""
@@ -193,7 +194,8 @@ def limit_shares(row: dict[str, Any], limits: dict[str, Any]) -> dict[str, float
         "division": work.divisions / limits["divisions"] + work.divisions64 / limits["divisions64"],
         "instructions": 2 * work.instructions / limits["flops"],
         "L1": (work.bytes + work.state_bytes) / bandwidth["L1"],
-    } | {name: work.bytes / bandwidth[name] for name in SUPPLIES}
+    } | {name: work.bytes / bandwidth[name] for name in SUPPLIES[:-1]}
+    seconds["addresses"] = work.addresses / limits["addresses"]
     return {name: value / row["seconds"] for name, value in seconds.items()}
 
 
@@ -203,14 +205,19 @@ def verdict(share: dict[str, float], own: float = 0.0) -> str:
     own: the share of its time in what Dr.Jit brings compiled. Where a level would need more than the whole time, not all bytes
     can come from it.
     """
+    sorts = "Dr.Jit's sorts and prefix sums"
     if own >= BOUND:
-        return "Dr.Jit's sorts and prefix sums"
+        return sorts
     roof = max(ROOFS, key=lambda name: share[name])
     if share[roof] >= BOUND:
         return roof
     supply = next((name for name in SUPPLIES if share[name] >= BOUND), None)
+    if supply is None and own and own + share["addresses"] >= BOUND:  # one after the other
+        return f"{sorts}, and addresses"
     if supply is None:
         return f"none; nearest is {max(share, key=lambda name: share[name])}"
+    if supply == "addresses":
+        return "addresses, if they lie in L3"
     return (
         f"{supply}, if its bytes come from there" if share[supply] <= 1 else f"{supply}, if part of its bytes come from there"
     )

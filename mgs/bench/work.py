@@ -15,7 +15,10 @@ VECTOR = re.compile(r"<(\d+) x (\w+)>")
 CALLED = re.compile(r"@([\w.]+)\(")
 PACKET = re.compile(r"(?:gather|scatter)(?P<add>_add)?_(?P<count>\d+)x[a-z](?P<bits>\d+)")
 ADDED = re.compile(r"reduce_\w+?_[a-z](?P<bits>\d+)")
-MEMORY = ("load", "store", "masked", "memcpy", "gather_", "scatter_", "reduce_")
+SCATTERED = ("masked", "gather_", "scatter_", "reduce_")
+"""Beginnings of the operations that load and store at an address of each lane's own."""
+
+MEMORY = ("load", "store", "memcpy", *SCATTERED)
 """Beginnings of the operations that load and store; their bytes are counted."""
 
 FREE = ("alloca", "phi", "getelementptr", "bitcast", "insert", "extract", "shufflevector", "fneg", "vector")
@@ -36,6 +39,7 @@ class Work:
     bytes: loaded from arrays and stored in them.
     state_bytes: of what a loop carries along. Read and written: its variables, and its local arrays at each access. Read:
     what was computed before it, the same for all iterations.
+    addresses: at which a lane reads or writes arrays by itself, each perhaps in another line of the cache; a packet is one.
     """
 
     flops: float = 0
@@ -45,6 +49,7 @@ class Work:
     instructions: float = 0
     bytes: float = 0
     state_bytes: float = 0
+    addresses: float = 0
 
     def __add__(self, other: Work) -> Work:
         return Work(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
@@ -142,7 +147,7 @@ class _Reader:
         if operation.startswith(MEMORY):
             size = self._moved(operation, rest)
             if not local:
-                return Work(bytes=size)
+                return Work(bytes=size, addresses=operation.startswith(SCATTERED))
             known = (
                 operation == "load" and local in self._held
             )  # so before a write under a mask, which blends with the old value

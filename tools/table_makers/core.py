@@ -88,7 +88,7 @@ def roofline_work(data: dict[str, Any]) -> str:
     for row in data["kernels"]:
         each = row["each"]
         counts = [each["flops"], each["flops64"], each["divisions"] + each["divisions64"]]
-        counts += [each[key] for key in ("instructions", "bytes", "state_bytes")]
+        counts += [each[key] for key in ("instructions", "bytes", "state_bytes", "addresses")]
         rows.append([row["name"], row["unit"], *(f"{count:,.0f}" for count in counts), f"{row['lanes_active']:.0%}"])
     heading = [
         "kernel",
@@ -99,9 +99,46 @@ def roofline_work(data: dict[str, Any]) -> str:
         "instructions",
         "bytes",
         "state bytes",
+        "addresses",
         "busy lanes",
     ]
     return markdown(heading, rows)
+
+
+def roofline_short(data: dict[str, Any]) -> str:
+    """Of each kernel its time, the limits that bind some kernel, and which of them does."""
+    shown = ("division", "instructions", "memory", "addresses")
+    rows = [
+        [row["name"], f"{1e3 * row['seconds']:.1f}", *(f"{row['shares'][name]:.0%}" for name in shown), row["verdict"]]
+        for row in data["kernels"]
+    ]
+    return markdown(["kernel", "ms", *shown, "bound by"], rows) + made_by(data)
+
+
+def variants(data: dict[str, Any]) -> str:
+    """Times of variants of the core over that of the core as it is, and their errors."""
+    rows = []
+    for row in data["rows"]:
+        times = [
+            f"{middle:.2f} ({low:.2f} to {high:.2f})"
+            for low, middle, high in (row["ratios"][key] for key in ("forward_warm", "gradient_warm", "fisher_exact"))
+        ]
+        rows.append([row["name"], *times, *(short(value) for value in row["errors"].values())])
+    heading = ["", "image", "image and gradient", "exact Fisher", "error of the image", "gradient", "Fisher"]
+    return markdown(heading, rows) + made_by(data)
+
+
+def unseen(data: dict[str, Any]) -> str:
+    """Seconds of the fits of a run, and its model, against the information below which Gaussians are left out."""
+    rows = []
+    for record in data["records"]:
+        first = next(other for other in data["records"] if other["gaussians"] == record["gaussians"])
+        limit = "all are drawn" if record["limit"] is None else short(record["limit"], 2) if record["limit"] else "0"
+        cells = [f"{record['seen']:.0%}", f"{record['fit']:.1f}", f"{record['fit'] / first['fit']:.2f}"]
+        cells += [f"{record[key]:.3f}" for key in ("test_psnr", "test_psnr_mask")]
+        rows.append([f"{record['gaussians']:,}: {limit}", *cells])
+    heading = ["Gaussians: limit", "drawn in a view", "fits, s", "ratio", "test views, dB", "rock only"]
+    return markdown(heading, rows) + made_by(data)
 
 
 def scaling(data: dict[str, Any]) -> str:
@@ -179,7 +216,8 @@ def two_versions(data: dict[str, Any]) -> str:
                 row.append(f"{median:.2f} ({low:.2f} to {high:.2f}){asked}")
         rows.append(row + ["–"] * (5 - len(row)))
     heading = ["", f"commit {data['old']} (ms)", "now (ms)", f"ratio, median of {data['rounds']} rounds (range), asked for"]
-    return markdown([*heading, f"with the {data['culled']['gaussians']:,} Gaussians that are seen"], rows) + made_by(data)
+    seen = data["culled"]["seen"] / data["culled"]["gaussians"]
+    return markdown([*heading, f"a fitted model, the {seen:.0%} that are seen against all"], rows) + made_by(data)
 
 
 def whole_runs(data: dict[str, Any]) -> str:
@@ -262,6 +300,9 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "splat-short": ("benchmarks/splat", splat_short),
     "splat-work": ("benchmarks/splat", splat_work),
     "roofline": ("benchmarks/roofline", roofline),
+    "roofline-million": ("benchmarks/roofline_million", roofline_short),
+    "variants": ("benchmarks/variants", variants),
+    "unseen": ("benchmarks/unseen", unseen),
     "roofline-work": ("benchmarks/roofline", roofline_work),
     "scaling": ("benchmarks/scaling", scaling),
     "block-accuracy": ("benchmarks/block_accuracy", block_accuracy),

@@ -1,0 +1,230 @@
+"""Variants of the core that were tried, those that lost too: speed against accuracy. `python benchmarks/variants.py PREFIX`
+
+Writes PREFIX.json and PREFIX.png. Every variant replaces constants or functions of `mgs.splat` in a process of its own. Timed
+are an image, an image with its gradient, and the exact Fisher information, of 100,000 Gaussians at 640x480, in rounds in which
+each variant has its turn; a ratio is the median over the rounds of the variant's time over that of the core as it is. Errors
+are the largest over all entries, relative to the largest entry of the float64 oracle (`mgs.splat.reference`), of the worst kind
+of parameter (`mgs.study.chart.core.error`), on SMALL. Let nothing else run.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from unseen import UNSEEN
+
+from mgs import runtime
+from mgs.bench.core import in_new_process, time_core
+from mgs.files import write_json
+from mgs.plotting import STYLE, new_figure, save_figure
+from mgs.provenance import command_line, versions
+from mgs.splat import reference  # imported before any constant is replaced
+from mgs.study.chart.core import Call, Scene, error, gradient, image, information, oracle, scene
+
+SMALL = 150, (96, 72)
+"""Number of Gaussians, and size of the image, of the scene on which errors are measured."""
+
+ROUNDS, REPEATS = 5, 9
+
+TIMED = {"image": "forward_warm", "gradient": "gradient_warm", "diagonal": "fisher_exact"}
+"""What is timed, by what is computed; `forward_cold` is kept beside them."""
+
+
+def put(**values: Any) -> None:
+    """Replace names of `mgs.splat` in every module that has them, but not in the oracle. Before the first kernel."""
+    for name, module in list(sys.modules.items()):
+        if name.startswith(("mgs.splat", "mgs.bench")) and module is not reference:
+            for key in values.keys() & vars(module).keys():
+                setattr(module, key, values[key])
+
+
+def block_size(width: int, height: int) -> None:
+    """Blocks of other pixels."""
+    put(BLOCK_X=width, BLOCK_Y=height, PIXELS=width * height, CENTRE=width // 2)
+
+
+def rows_of_alphas(position: str, each_pixel: bool) -> Callable[..., Any]:
+    """`mgs.splat.walking.block_rows` with the offset of a block in another precision ("Float", "Float64"), or with an exp2 at
+    every pixel instead of three in a row."""
+    import mitsuba as mi
+
+    from mgs.splat import walking
+
+    wide, size, middle = getattr(mi, position), walking.BLOCK_X, walking.CENTRE
+
+    def rows(lane: Any, s: Any) -> list[Any]:
+        real = type(s.white_x)
+        dx, dy = wide(lane.left) - wide(s.mean_x), wide(lane.top) - wide(s.mean_y)
+        corner, down, slant = real(wide(s.white_x) * (dx - wide(s.shear) * dy)), real(dy), s.white_x * real(s.shear)
+        bend, made = walking.exp2(-2 * s.white_x * s.white_x), []
+        for j in range(walking.BLOCK_Y):
+            eta, first = s.white_y * (down + j), dr.fma(-slant, real(j), corner)
+            xi = [dr.fma(s.white_x, real(i), first) for i in range(size)]
+            row = dr.fma(-eta, eta, s.log2_opacity)
+            raw = [walking.exp2(dr.fma(-x, x, row)) for x in (xi if each_pixel else xi[middle : middle + 1])]
+            if not each_pixel:
+                raw = raw * size
+                for columns, sign in ((range(middle + 1, size), -1), (range(middle - 1, -1, -1), 1)):
+                    step = s.white_x * dr.fma(real(2 * sign), xi[middle], -s.white_x)
+                    ratio = walking.exp2(dr.select(dr.fma(-xi[middle], xi[middle], row) > -120, step, -120))
+                    for i in columns:
+                        raw[i], ratio = raw[i + sign] * ratio, ratio * bend
+            made.append(walking.Row(eta, xi, raw))
+        return made
+
+    return rows
+
+
+def each_pixel_alone() -> None:
+    """An exp2 at every pixel, instead of three in a row."""
+    put(block_rows=rows_of_alphas("Float64", each_pixel=True))
+
+
+def single_positions() -> None:
+    """The centre of a splat, and its distance to a block, in single precision."""
+    import mitsuba as mi
+
+    from mgs.splat import walking
+
+    def unpack(packed: Any, place: Any) -> Any:
+        (mean_x, mean_y, shear, white_x), (white_y, log2_opacity, *_), (*colour, _), (depth, *_) = (
+            dr.gather(mi.Vector4f, packed, place * 4 + i) for i in range(4)
+        )
+        return walking.Splats(mean_x, mean_y, shear, white_x, white_y, log2_opacity, depth, *colour)
+
+    put(unpack=unpack, block_rows=rows_of_alphas("Float", each_pixel=False))
+
+
+def single_projection() -> None:
+    """Projection, and the way from sums to entries, in single precision."""
+    from mgs.splat import derivatives, information, projection
+
+    names = {f"{kind}64": kind for kind in ("Float", "Int", "UInt")} | {f"Vector{k}d": f"Vector{k}f" for k in (2, 3, 4)}
+    projection.mi = derivatives.mi = information.mi = Renamed(**names)
+
+
+class Renamed:
+    """Mitsuba's module, some of its names standing for others."""
+
+    def __init__(self, **names: str) -> None:
+        self.names = names
+
+    def __getattr__(self, name: str) -> Any:
+        import mitsuba as mi
+
+        return getattr(mi, self.names.get(name, name))
+
+
+def least_alpha(value: float) -> None:
+    """A footprint that ends where alpha falls below another value."""
+    put(ALPHA_MIN=value, LOG2_INV_ALPHA_MIN=-np.log2(value))
+
+
+VARIANTS: dict[str, tuple[Callable[[], None], float | None]] = {
+    "as it is": (lambda: None, None),
+    "an exp2 at every pixel": (each_pixel_alone, None),
+    "Dr.Jit's exp2": (partial(put, exp2=dr.exp2), None),
+    "positions in single precision": (single_positions, None),
+    "projection in single precision": (single_projection, None),
+    "blocks of 8x2": (partial(block_size, 8, 2), None),
+    "blocks of 4x4": (partial(block_size, 4, 4), None),
+    "blocks of 16x2": (partial(block_size, 16, 2), None),
+    "one tile": (partial(put, TILE=256), None),
+    "one pair read at a time": (partial(put, AT_ONCE=1), None),
+    "pixels end at 1e-3": (partial(put, TRANSMITTANCE_MIN=1e-3), None),
+    "pixels end at 1e-2": (partial(put, TRANSMITTANCE_MIN=1e-2), None),
+    "footprints end at 2/255": (partial(least_alpha, 2 / 255), None),
+    "without what is not seen": (lambda: None, UNSEEN),
+    "without what is hardly seen": (lambda: None, 1e-3),
+}
+"""By name: what is replaced, and where Gaussians are left out, the information (`unseen.UNSEEN`) below which they are."""
+
+
+def measure(name: str, with_errors: bool) -> dict[str, float]:
+    """Seconds of a variant, and if asked its errors."""
+    change, least = VARIANTS[name]
+    change()
+    where, small = scene(100_000, (640, 480)), scene(*SMALL)
+    found = time_core(where.gaussians[seen(where, least)], where.camera, REPEATS, blocks=False)
+    if with_errors:
+        for what in TIMED:
+            found[f"error_{what}"] = error(in_full(small, least, what), oracle(what, small), what)
+    return found
+
+
+def seen(where: Scene, least: float | None) -> np.ndarray:
+    """Mask [N] of the Gaussians that are drawn."""
+    if least is None:
+        return np.ones(len(where.gaussians), bool)
+    return np.asarray((information(where, "exact")() > least).any(axis=1))
+
+
+def in_full(where: Scene, least: float | None, what: str) -> np.ndarray:
+    """An image, a gradient or information of the Gaussians that are drawn; zeros for the others."""
+    calls: dict[str, Callable[[Scene], Call]]
+    calls = {"image": image, "gradient": gradient, "diagonal": partial(information, estimator="exact")}
+    drawn = seen(where, least)
+    found = calls[what](replace(where, gaussians=where.gaussians[drawn]))()
+    if what == "image":
+        return found
+    whole = np.zeros((len(drawn), found.shape[1]), found.dtype)
+    whole[drawn] = found
+    return whole
+
+
+def chart(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Times over that of the core as it is, against errors."""
+    import matplotlib
+
+    with matplotlib.rc_context(STYLE):
+        save_figure(drawn(rows), path)
+
+
+def drawn(rows: list[dict[str, Any]]) -> Any:
+    """The figure of `chart`."""
+    figure = new_figure(11, 4.6)
+    axes = figure.subplots(1, 3, sharey=True)
+    titles = {"image": "image", "gradient": "image and gradient", "diagonal": "exact Fisher information"}
+    for ax, (what, title) in zip(axes, titles.items(), strict=True):
+        for number, row in enumerate(rows):
+            low, middle, high = row["ratios"][TIMED[what]]
+            style = {"marker": "ov^<>sDPX*"[number % 10], "color": f"C{number % 7}", "label": row["name"]}
+            error = [[middle - low], [high - middle]]
+            ax.errorbar(middle, row["errors"][what], xerr=error, linestyle="none", elinewidth=0.8, markersize=6, **style)
+        ax.axvline(1, color="0.8", linewidth=0.8, zorder=0)
+        ax.set(yscale="log", title=title, xlabel="time over that of the core as it is")
+    axes[0].set_ylabel("largest error over largest entry")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize="small", frameon=False)
+    return figure
+
+
+def main(prefix: str) -> None:
+    """Measure, write and draw."""
+    runtime.start()
+    runs: dict[str, list[dict[str, float]]] = {name: [] for name in VARIANTS}
+    for turn in range(ROUNDS):
+        for name in VARIANTS:
+            runs[name].append(in_new_process(measure, name, turn == 0))
+            print(name, runs[name][-1], flush=True)
+    rows = []
+    for name, found in runs.items():
+        ratios = {
+            key: [run[key] / base[key] for run, base in zip(found, runs["as it is"], strict=True)]
+            for key in ("forward_cold", *TIMED.values())
+        }
+        between = {key: [min(r), float(np.median(r)), max(r)] for key, r in ratios.items()}
+        rows.append({"name": name, "ratios": between, "errors": {what: found[0][f"error_{what}"] for what in TIMED}})
+    made = {"command": command_line(), "machine": runtime.processor(), "versions": versions(), "rounds": ROUNDS, "rows": rows}
+    write_json(Path(f"{prefix}.json"), made)
+    chart(Path(f"{prefix}.png"), rows)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
