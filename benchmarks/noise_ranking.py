@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 from ranking import GAUSSIANS, STATES, views_of
-from scipy.stats import kendalltau
 
 from mgs import runtime
 from mgs.active.criteria import d_optimal, regularisation
@@ -30,6 +29,7 @@ from mgs.active.settings import TrainSettings
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.files import write_json
 from mgs.gaussians import Gaussians
+from mgs.metrics import agreement
 from mgs.prior.build import build_prior
 from mgs.prior.initial import initial_gaussians
 from mgs.prior.settings import PriorSettings
@@ -85,8 +85,7 @@ def study(root: Path, state: str) -> list[dict[str, Any]]:
     for name, number, scores in found:
         mine = np.array(scores)
         record = {"dataset": str(root), "state": state, "assumption": name, "number": number, "scores": scores}
-        record |= {"tau": float(kendalltau(mine, default).statistic), "same": int(mine.argmax()) == int(default.argmax())}
-        records.append(record | {"regret": float(1 - default[mine.argmax()] / default.max())})
+        records.append(record | agreement(mine, default) | {"same": int(mine.argmax()) == int(default.argmax())})
     return records
 
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import kendalltau
 
 from mgs import runtime
 from mgs.active.criteria import CRITERIA, regularisation
@@ -26,6 +25,7 @@ from mgs.active.settings import TrainSettings
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.files import write_json
 from mgs.gaussians import Gaussians
+from mgs.metrics import agreement
 from mgs.plotting import STYLE, new_figure, save_figure
 from mgs.prior.build import build_prior
 from mgs.prior.initial import initial_gaussians
@@ -91,8 +91,7 @@ def compared(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
         for name in FITTED:
             mine, end = np.array(record["scores"][name]), np.array(longest["scores"][name])
             row = {key: record[key] for key in ("dataset", "state", "passes")} | {"criterion": name}
-            row |= {"tau": float(kendalltau(mine, end).statistic), "regret": float(1 - end[mine.argmax()] / end.max())}
-            found.append(row)
+            found.append(row | agreement(mine, end))
     return found
 
 

@@ -1,4 +1,7 @@
-"""How good a rendered view is: as an image (PSNR and SSIM, of sRGB values in [0,1]), and as a surface (alpha and depth)."""
+"""How good a rendered view is: as an image (PSNR and SSIM, of sRGB values in [0,1]), and as a surface (alpha and depth).
+
+And how well two rankings agree.
+"""
 
 from __future__ import annotations
 
@@ -169,3 +172,14 @@ def compare_surface(
 def _mean(values: np.ndarray) -> float:
     """Mean of any number of values, NaN of none."""
     return float(values.mean()) if values.size else math.nan
+
+
+def agreement(mine: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+    """How well scores of candidates [C] agree with reference scores: Kendall's `tau`, 0 where one of them is constant; and
+    `regret`, the share of the best reference score that is lost by taking our best."""
+    from scipy.stats import kendalltau  # imported here, because it takes half a second and few programs rank
+
+    constant = np.ptp(mine) == 0 or np.ptp(reference) == 0
+    tau = 0.0 if constant else float(kendalltau(mine, reference).statistic)
+    best, top = int(np.argmax(mine)), float(reference.max())
+    return {"tau": tau, "regret": float((top - reference[best]) / max(abs(top), 1e-300))}

@@ -215,12 +215,6 @@ def test_lazy_scores_leave_out_what_cannot_win():
     assert state.asked == [0]
 
 
-def test_agreement_of_scores():
-    assert scoring.agreement([1, 2, 3], [10, 20, 40]) == (pytest.approx(1), pytest.approx(0))
-    assert scoring.agreement([3, 2, 1], [10, 20, 40]) == (pytest.approx(-1), pytest.approx(0.75))
-    assert scoring.agreement([5, 5, 5], [10, 20, 40]) == (0, pytest.approx(0.75))
-
-
 def test_the_kernels_are_far_closer_to_the_oracle_than_probes_are():
     small = core.scene(60, (24, 18))
     for name in ("render", "adjoint", "exact", "block"):

@@ -13,12 +13,13 @@ from refusals import refused
 
 from mgs.cli.app import main
 from mgs.data.dataset import load_dataset, write_transforms
+from mgs.metrics import agreement
 from mgs.prior.build import build_prior, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.study.stress import alarms, endurance, faults, numbers, registry, spread
 from mgs.study.stress.convergence import CONVERGENCE
 from mgs.study.stress.experiment import Experiment, Panel, rock_cell
-from mgs.study.stress.lab import PRESETS, agreement, greedy, open_lab
+from mgs.study.stress.lab import PRESETS, greedy, open_lab
 from mgs.study.stress.scales import SCALES
 from mgs.study.stress.verdict import Claim, Outcome, interval, judged, outcome, paired, roc_area
 from mgs.study.sweep import Cell, cell_folder

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import kendalltau
 
 from mgs.active.convergence import CG_ITERATIONS
 from mgs.active.criteria import d_optimal, lam_by_kind, regularisation
@@ -24,6 +23,7 @@ from mgs.active.pose_policies import seed_views
 from mgs.active.settings import TrainSettings
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.gaussians import Gaussians
+from mgs.metrics import agreement
 from mgs.prior.build import Prior, build_prior
 from mgs.prior.initial import initial_gaussians
 from mgs.prior.settings import PriorSettings
@@ -191,8 +191,7 @@ def _ranking(case: _Case) -> dict[str, float]:
     stopped = case.fit(case.start, case.taken, TrainSettings())
     longer = case.fit(case.start, case.taken, TrainSettings(passes=LONGER * stopped.passes, tolerance=0.0))
     mine, end = (_scores(case, found.gaussians) for found in (stopped, longer))
-    regret = 1 - end[mine.argmax()] / end.max()
-    return {"views": len(case.taken), "tau": float(kendalltau(mine, end).statistic), "regret": float(regret)}
+    return {"views": len(case.taken), **agreement(mine, end)}
 
 
 def _scores(case: _Case, model: Gaussians) -> np.ndarray:

@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import kendalltau
 
 from mgs.active.criteria import d_optimal
 from mgs.active.run_folder import read_checkpoint
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
+from mgs.metrics import agreement
 from mgs.seeds import generator
 from mgs.study.chart.plan import DENSITY, PLANS, Data, Plan
 from mgs.study.chart.timing import timed
@@ -234,20 +234,13 @@ def measure(
     }
 
 
-def agreement(scores: list[float], exact: list[float]) -> tuple[float, float]:
-    """(Kendall's tau with the exact scores, 0 where all scores are equal; regret: the share of the best exact score that is
-    lost if these scores choose)."""
-    tau = float(kendalltau(scores, exact).statistic) if np.ptp(scores) > 0 else 0.0
-    return tau, float(1 - exact[int(np.argmax(scores))] / max(exact))
-
-
 def rows(plan: Plan, data: Data, found: dict[str, Any], command: str) -> list[dict[str, Any]]:
     """A row for each way to score: its time, and its agreement with the exact scores, mean over the states."""
     exact, made = found[cell_name(data, "exact")]["scores"], []
     for name, (family, _) in variants(plan).items():
         result = found[cell_name(data, name)]
-        pairs = [agreement(scores, truth) for scores, truth in zip(result["scores"], exact, strict=True)]
-        tau, regret = (float(np.mean(values)) for values in zip(*pairs, strict=True))
+        agree = [agreement(*map(np.array, pair)) for pair in zip(result["scores"], exact, strict=True)]
+        tau, regret = (float(np.mean([one[key] for one in agree])) for key in ("tau", "regret"))
         times = {key: value for key, value in result.items() if key != "scores"}
         made.append({"variant": name, "family": family, **times, "tau": tau, "regret": regret, "command": command})
     return made

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from mgs.active.criteria import Score, d_optimal, fisherrf, t_optimal
+from mgs.metrics import agreement
 from mgs.study.stress.experiment import Experiment, Panel, cells_per_rock, turns
-from mgs.study.stress.lab import agreement, open_lab
+from mgs.study.stress.lab import open_lab
 from mgs.study.stress.verdict import Claim, Row, runs_of, single
 
 SCORES: dict[str, Score] = {"d-optimal": d_optimal, "fisherrf": fisherrf, "t-optimal": t_optimal}

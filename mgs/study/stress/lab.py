@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import kendalltau
 
 from mgs.active.criteria import MEAN_STD, PRIOR_STD, Score, d_optimal, lam_by_kind, regularisation
 from mgs.active.fitting import Fit, fit
@@ -220,16 +219,6 @@ def _opened(folder: Path, name: str) -> Lab:
 def open_lab(root: Path, scene: str) -> Lab:
     """The rock that the cell `dataset/SCENE` made; scene: name and seed, as in boulder-0."""
     return _opened(cell_folder(root, f"dataset/{scene}"), scene)
-
-
-def agreement(mine: Array, reference: Array) -> dict[str, float]:
-    """How well scores of candidates agree with reference scores: Kendall's `tau`, 0 where one of them is constant; and
-    `regret`, the share of the best reference score that is lost by taking our best."""
-    constant = np.ptp(mine) == 0 or np.ptp(reference) == 0
-    tau = 0.0 if constant else float(kendalltau(mine, reference).statistic)
-    best, top = int(np.argmax(mine)), float(reference.max())
-    regret = float((top - reference[best]) / max(abs(top), 1e-300))
-    return {"tau": tau, "regret": regret}
 
 
 def greedy(lab: Lab, taken: Sequence[int], allowed: Sequence[int], count: int, policy: str = "d-optimal") -> list[int]:

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from mgs.active.criteria import d_optimal, e_optimal
+from mgs.metrics import agreement
 from mgs.splat import fisher
 from mgs.study.stress.experiment import Experiment, Panel, cells_per_rock, turns
-from mgs.study.stress.lab import Array, agreement, open_lab
+from mgs.study.stress.lab import Array, open_lab
 from mgs.study.stress.verdict import Claim, single
 
 LAMBDAS = (1e-10, 1e-8, 1e-6, 1e-4, 1e-2)

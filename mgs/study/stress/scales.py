@@ -12,9 +12,10 @@ import numpy as np
 from mgs.active.criteria import d_optimal
 from mgs.camera import Camera
 from mgs.gaussians import Gaussians
+from mgs.metrics import agreement
 from mgs.splat import fisher, groups
 from mgs.study.stress.experiment import Experiment, Panel, cells_per_rock, turns
-from mgs.study.stress.lab import Array, agreement, open_lab
+from mgs.study.stress.lab import Array, open_lab
 from mgs.study.stress.verdict import Claim, Row, runs_of, single
 
 EXPONENTS = tuple(range(-10, 3))

@@ -13,11 +13,12 @@ from mgs.active.detectors import DETECTORS
 from mgs.active.stations import psnr_measure
 from mgs.data.dataset import load_dataset
 from mgs.files import read_json
+from mgs.metrics import agreement
 from mgs.prior.exposure import exposure_of
 from mgs.splat import ListCache
 from mgs.study.stress.experiment import Experiment, Panel, turns
 from mgs.study.stress.faults import Captured, captured, signs_of
-from mgs.study.stress.lab import CACHE, Lab, Preset, agreement, open_lab, scene_cell, variant_cell
+from mgs.study.stress.lab import CACHE, Lab, Preset, open_lab, scene_cell, variant_cell
 from mgs.study.stress.verdict import Claim, Row, paired, single
 from mgs.study.sweep import Cell, cell_folder
 from mgs.synth.scene_file import load_scene_file

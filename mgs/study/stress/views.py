@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from mgs.active.pose_policies import azimuths
+from mgs.metrics import agreement
 from mgs.study.stress.experiment import Experiment, Panel, cells_per_rock, turns
-from mgs.study.stress.lab import Array, Lab, agreement, greedy, open_lab
+from mgs.study.stress.lab import Array, Lab, greedy, open_lab
 from mgs.study.stress.verdict import Claim, Effects, paired, single
 
 FREE_PASSES = 40
