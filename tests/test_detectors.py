@@ -21,6 +21,7 @@ from mgs.active.detectors import (
     step_signs,
     view_signs,
 )
+from mgs.active.loop import target_of
 from mgs.active.nbv import run_nbv
 from mgs.active.settings import TrainSettings
 from mgs.cli.nbv import resume_and_print
@@ -30,6 +31,7 @@ from mgs.prior.build import build_prior, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.report.page_facts import measured, read_shown
 from mgs.report.runs import read_run
+from mgs.splat import render
 
 FITS = Before(outline=0.001, offset=0.01, exposure=0.01)
 GOOD = ViewSigns(FITS, unexplained=0.05, error=0.02)
@@ -242,3 +244,13 @@ def test_a_spoiled_capture_raises_the_alarm_that_is_meant_for_it(rock, tmp_path,
     assert any(words in warning for warning in said), said
     others = {word for name, (_, word) in SPOILED.items() if name != fault} - {words}
     assert not any(word in warning for warning in said for word in others), said
+
+
+def test_new_images_are_held_against_the_model_before_them(rock, tmp_path):
+    before, after = (run_nbv(rock, tmp_path / f"{budget}", budget=budget, seeds=4) for budget in (1, 2))
+    assert ["residual" in line for line in after.steps] == [False, True, True]
+    frame = load_dataset(rock).frames[after.taken[-1]]
+    target = target_of(frame)
+    known = frame.mask() & (target[..., 3] > 0)
+    wrong = np.asarray(render(before.gaussians, frame.camera).rgb) - target[..., :3]
+    assert after.steps[-1]["residual"] == pytest.approx(np.sqrt(np.mean(wrong[known] ** 2)), rel=1e-4)

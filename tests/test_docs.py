@@ -278,7 +278,7 @@ def test_the_tables_of_the_loop_are_those_of_the_code(dataset, tmp_path):
     qualities = {f"{views}{name}": 1.0 for views in ("", "held_out_", "test_") for name in ("psnr", "psnr_mask")}
     stations = tiny.stations(measure=lambda gaussians, taken: qualities)
     state = loop.run(tmp_path / "run", settings, loaded, stations, tiny.silent)
-    keys -= {"signs", "warnings", "exposure"}  # of renders and images, which the stand-ins do not make
+    keys -= {"signs", "warnings", "exposure", "residual"}  # of renders and images, which the stand-ins do not make
     assert keys == set(state.steps[1]) == set(state.steps[0]) - {"seeds", "seed_names"} | {"ended"}
     estimators = [row[0].strip("`") for row in rows((DOCS / "howto/estimator.md").read_text(), "| name | what")]
     assert set(estimators) == set(ESTIMATORS) - {"block"}

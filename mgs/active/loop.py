@@ -337,6 +337,8 @@ class Loop:
             line["exposure"] = {self.frames[i].name: gain for i, gain in zip(taken, gains.tolist(), strict=True)}
         if self.stations.look:
             with watch("check"):
+                if state.taken:
+                    line["residual"] = self.residual(state.gaussians, new, targets[-len(new) :])
                 line |= self.signs(planned, fit, gains)
         every, first = self.settings.evaluate_every, len(state.steps)
         if every and any(k % every == 0 for k in range(first, step + 1)):
@@ -362,6 +364,16 @@ class Loop:
         if gains is None:
             return Deferred(taken, self.image)
         return Deferred(range(len(taken)), lambda k: without_gain(self.image(taken[k]), gains[k]))
+
+    def residual(self, model: Gaussians, new: list[int], targets: Sequence[np.ndarray]) -> float:
+        """Root mean square difference, linear RGB, inside the mask, of new images to a model that was not fitted to them: what
+        the noise that the criteria assume (the setting `pixel_noise`) can be held against."""
+        assert self.stations.look
+        squares = []
+        for i, target in zip(new, targets, strict=True):
+            known = self.frames[i].mask() & (target[..., 3] > 0)
+            squares.append(np.square(self.stations.look(model, self.cameras[i])[0] - target[..., :3])[known])
+        return float(np.sqrt(np.concatenate(squares).mean()))
 
     def signs(self, state: State, fit: Fit, gains: np.ndarray | None) -> dict[str, Any]:
         """The entries `signs` of the last step of a state and, where one has just gone beyond its limit, `warnings`

@@ -5,16 +5,17 @@
 - `steps.jsonl`: one line a step, rebuilt from the checkpoint, so it can lag behind by a killed step but never disagree;
 - `gaussians.ply`: the model, once the run has ended.
 
-A step is one chosen view, whatever the size of a batch; only the last step of a batch has a fit, and what is measured after it.
-A line of `steps.jsonl` holds: `step` (0 = the seeds), `frame` and `name` of the chosen view (null at step 0, which has `seeds`
-and `seed_names` instead), `images` (how many are taken by then), `score` (the policy's own number; of random, the draw),
-`information_gain` (Eq. 7 of the chosen view by the run's estimator, whatever the policy), `coverage` (Eq. 9 of all images),
-`uncertainty` (the mean over all parameters of the variance that is left, over that of the prior), `iterations`, `loss` and
-`stop_reason` of the fit; with the setting `exposure`, under that name, the gains (red, green, blue) by which the image of each
-frame was divided; `signs` of what may go wrong (`mgs.active.detectors`) and, where one of them has just gone beyond its limit,
-`warnings`, sentences; `seconds` per stage, and, where the step was evaluated, mean PSNR in dB over all views (`psnr`;
-`psnr_mask` in the rock mask), over those never trained on (`held_out_psnr`, `held_out_psnr_mask`), and over the test views of
-the dataset where it has some (`test_psnr`, `test_psnr_mask`). The last line of a run that has ended has `ended`, which says why
+A step is one chosen view, whatever the size of a batch; only the last step of a batch has a fit, and what is measured after
+it. A line of `steps.jsonl` holds: `step` (0 = the seeds), `frame` and `name` of the chosen view (null at step 0, which has
+`seeds` and `seed_names` instead), `images` (how many are taken by then), `score` (the policy's own number; of random, the
+draw), `information_gain` (Eq. 7 of the chosen view by the run's estimator, whatever the policy), `coverage` (Eq. 9 of all
+images), `uncertainty` (the mean over all parameters of the variance that is left, over that of the prior), `iterations`,
+`loss` and `stop_reason` of the fit, and from step 1 `residual`, by how much the new images differed from the model before it;
+with the setting `exposure`, under that name, the gains (red, green, blue) by which the image of each frame was divided;
+`signs` of what may go wrong (`mgs.active.detectors`) and, where one of them has just gone beyond its limit, `warnings`,
+sentences; `seconds` per stage, and, where the step was evaluated, mean PSNR in dB over all views (`psnr`; `psnr_mask` in the
+rock mask), over those never trained on (`held_out_psnr`, `held_out_psnr_mask`), and over the test views of the dataset where
+it has some (`test_psnr`, `test_psnr_mask`). The last line of a run that has ended has `ended`, which says why
 (`mgs.active.stopping.run_end`).
 """
 

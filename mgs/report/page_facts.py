@@ -27,7 +27,7 @@ GROUP_NAMES = {"all": "all views", "held_out": "held out", "test": "test views"}
 
 STEP_KEYS = {
     "step", "frame", "images", "iterations", "score", "information_gain", "coverage", "uncertainty", "loss", "seconds", "signs",
-    "exposure", "ended",
+    "residual", "exposure", "ended",
 }  # fmt: skip
 """Keys of steps.jsonl that hold numbers, and no metrics of images."""
 
