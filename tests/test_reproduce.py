@@ -234,7 +234,19 @@ def test_differences_are_paired_by_rock():
     assert [p["p"] for p in pairs] == pytest.approx([0.25] * 4)
     assert [p["p_holm"] for p in pairs] == pytest.approx([1.0] * 4)
     text = statistics_markdown(curve_statistics(found, runs))
-    assert "| d-optimal − uniform | full frame | -0.30 [-0.30, -0.30] | 0 of 3 | 0.25 | 1 |" in text
+    assert "| d-optimal − uniform | full frame | -0.30 [-0.30, -0.30] | 0 of 3 | 0.25 | 1 | -0.30, 0 of 1 |" in text
+
+
+def test_what_holds_on_scenes_that_chose_no_setting_is_told():
+    """Of five rocks, one a scene, policies were developed on the first two."""
+    runs = reproduce.curve_runs(TINY, 5)
+    ahead = {0: 5.0, 1: 5.0, 2: 0.1, 3: 0.2, 4: -0.6}
+    found = {run.name: fake(run, 25 + (ahead[run.rock.index] if run.policy == "directional-i" else 0.0)) for run in runs}
+    pairs = curve_statistics(found, runs)["test_psnr"]["pairs"]
+    pair = next(pair for pair in pairs if (pair["policy"], pair["other"]) == ("directional-i", "uniform"))
+    assert (pair["rocks"], pair["ahead"], pair["difference"]) == (5, 4, pytest.approx(9.7 / 5))
+    there = pair["elsewhere"]
+    assert (there["rocks"], there["ahead"], there["difference"]) == (3, 2, pytest.approx(-0.1))
 
 
 def test_of_one_rock_nothing_is_claimed():
@@ -242,7 +254,9 @@ def test_of_one_rock_nothing_is_claimed():
     found = {run.name: fake(run, 25) for run in runs}
     for pair in curve_statistics(found, runs)["test_psnr"]["pairs"]:
         assert [pair[key] for key in ("difference_low", "difference_high", "p", "p_holm")] == [None] * 4
-    assert "| d-optimal − uniform | full frame | +0.00 | 0 of 1 | – | – |" in statistics_markdown(curve_statistics(found, runs))
+    assert "| d-optimal − uniform | full frame | +0.00 | 0 of 1 | – | – | – |" in statistics_markdown(
+        curve_statistics(found, runs)
+    )
 
 
 def test_shares_are_of_what_the_oracle_gains_over_random():
@@ -257,7 +271,8 @@ def test_shares_are_of_what_the_oracle_gains_over_random():
         shares = {policy: rows[pool, policy]["test_psnr_share"] for policy in ("oracle", "random", "d-optimal", "farthest")}
         assert shares == pytest.approx({"oracle": 1, "random": 0, "d-optimal": 0.25, "farthest": 0.5})
         assert rows[pool, "random"]["rocks"] == 2
-    ours = "| ring | d-optimal | 26.00 | +0.50 [+0.50, +0.50] | +0.50 [+0.50, +0.50] | +0.50 [+0.50, +0.50] | 25% |"
+    half = "+0.50 [+0.50, +0.50]"
+    ours = f"| ring | d-optimal | 26.00 | {half} | {half} | {half} | {half} | 25% |"
     assert ours in pools_markdown(list(rows.values()))
     assert "test_psnr_led" not in rows["ring", "directional-i"]
     without = pool_rows(found, runs, [])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,13 @@ def summary(values: Sequence[float]) -> dict[str, float | None]:
 def flat(key: str, values: Sequence[float]) -> dict[str, float | None]:
     """A `summary` as entries of a row: KEY, KEY_low, KEY_high."""
     return {f"{key}{'' if name == 'mean' else '_' + name}": value for name, value in summary(values).items()}
+
+
+def ahead(differences: Sequence[float]) -> dict[str, Any]:
+    """Differences of two policies over rocks as entries of a row: how many `rocks`, on how many the first is `ahead`, and their
+    mean, `flat`."""
+    count = sum(difference > 0 for difference in differences)
+    return {"rocks": len(differences), "ahead": count, **flat("difference", differences)}
 
 
 def table_rows(found: Found, preset: Preset) -> Rows:
@@ -89,8 +96,13 @@ def curve_rows(found: Found, runs: Sequence[Run]) -> Rows:
 
 
 def curve_statistics(found: Found, runs: Sequence[Run]) -> dict[str, Any]:
-    """For each of MEASURES the area under PSNR(images) by policy and rock, and the tests of pairs (`reproduce.pairs_of`)."""
+    """For each of MEASURES the area under PSNR(images) by policy and rock, and the tests of pairs (`reproduce.pairs_of`).
+
+    A pair also has, in "elsewhere", its differences on rocks of the scenes that are not in `reproduce.DEVELOPED_ON`; None where
+    there are none.
+    """
     result: dict[str, Any] = {}
+    elsewhere = {run.rock.index for run in runs if run.rock.scene not in reproduce.DEVELOPED_ON}
     for key in MEASURES:
         areas: dict[str, dict[int, float]] = {}
         for run in runs:
@@ -98,9 +110,10 @@ def curve_statistics(found: Found, runs: Sequence[Run]) -> dict[str, Any]:
         pairs: Rows = []
         for policy, other in reproduce.pairs_of(areas):
             differences = paired(areas[policy], areas[other])
-            ahead = sum(difference > 0 for difference in differences)
-            pair = {"policy": policy, "other": other, "rocks": len(differences), "ahead": ahead, "differences": differences}
-            pairs.append(pair | flat("difference", differences) | {"p": permutation_p(differences)})
+            there = paired({k: v for k, v in areas[policy].items() if k in elsewhere}, areas[other])
+            pair = {"policy": policy, "other": other, **ahead(differences), "differences": differences}
+            pair["elsewhere"] = ahead(there) if there else None
+            pairs.append(pair | {"p": permutation_p(differences)})
         p_values = [pair["p"] for pair in pairs]
         corrected = p_values if None in p_values else holm(p_values)  # None: of one rock nothing can be claimed
         means = {policy: summary(list(values.values())) for policy, values in areas.items()}
@@ -136,27 +149,38 @@ def seed_rows(found: Found, runs: Sequence[Run]) -> Rows:
     return rows
 
 
+def by_policy(values: Iterable[tuple[Run, float]]) -> dict[str, dict[int, float]]:
+    """The mean of a value of runs over the draws of each policy and rock, by policy and the rock's index."""
+    drawn: dict[str, dict[int, list[float]]] = {}
+    for run, value in values:
+        drawn.setdefault(run.label, {}).setdefault(run.rock.index, []).append(value)
+    return {policy: {rock: float(np.mean(values)) for rock, values in of.items()} for policy, of in drawn.items()}
+
+
 def pool_rows(found: Found, runs: Sequence[Run], oracle: Sequence[Run]) -> Rows:
     """A row for each pool and policy: the last model, its difference from the mean of the draws of `random`, by how much the
-    LEADER is ahead of it, and the share of what the oracle gains over `random` that it gets. None: without an oracle or a
-    leader, or where the oracle gains nothing."""
+    LEADER is ahead of it, there and in the area under its curve, and the share of what the oracle gains over `random` that it
+    gets. None: without an oracle or a leader, or where the oracle gains nothing."""
     rows: Rows = []
     policies = list(dict.fromkeys(run.label for run in [*runs, *oracle]))
     for pool in reproduce.POOLS:
-        last: dict[str, dict[str, dict[int, list[float]]]] = {key: {policy: {} for policy in policies} for key in MEASURES}
-        for run in [*runs, *oracle]:
-            for key in MEASURES if run.pool == pool else ():
-                last[key][run.label].setdefault(run.rock.index, []).append(found[run.name][key][-1])
+        inside = [run for run in [*runs, *oracle] if run.pool == pool]
+        last, areas = {}, {}
+        for key in MEASURES:
+            curves = [(run, found[run.name]["images"], found[run.name][key]) for run in inside]
+            last[key] = by_policy((run, curve[-1]) for run, _, curve in curves)
+            areas[key] = by_policy((run, area(images, curve)) for run, images, curve in curves)
         for policy in policies:
-            row: dict[str, Any] = {"pool": pool, "policy": policy, "rocks": len(last[MEASURES[0]][policy])}
+            row: dict[str, Any] = {"pool": pool, "policy": policy, "rocks": len(last[MEASURES[0]].get(policy, {}))}
             for key in MEASURES:
-                mean = {name: {k: float(np.mean(v)) for k, v in of.items()} for name, of in last[key].items()}
+                mean = {name: last[key].get(name, {}) for name in policies}
                 gained = paired(mean[policy], mean["random"])
                 won = float(np.mean(paired(mean[ORACLE], mean["random"]))) if ORACLE in mean else 0.0
                 row |= flat(key, [mean[policy][k] for k in sorted(mean[policy])]) | flat(f"{key}_over_random", gained)
                 led = paired(mean[reproduce.LEADER], mean[policy]) if reproduce.LEADER in mean else []
                 if policy != reproduce.LEADER and led:
                     row |= flat(f"{key}_led", led)
+                    row |= flat(f"{key}_area_led", paired(areas[key][reproduce.LEADER], areas[key][policy]))
                 row[f"{key}_share"] = float(np.mean(gained)) / won if won > 0 else None
             rows.append(row)
     return rows

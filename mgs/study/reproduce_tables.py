@@ -64,10 +64,18 @@ def statistics_markdown(statistics: Mapping[str, Any]) -> str:
     pairs = []
     for what, pair in [("full frame", pair) for pair in full["pairs"]] + [("rock", pair) for pair in rock["pairs"]]:
         p_values = ["–" if pair[p] is None else f"{pair[p]:.2g}" for p in ("p", "p_holm")]
-        ahead = f"{pair['ahead']} of {pair['rocks']}"
-        pairs.append([f"{pair['policy']} − {pair['other']}", what, _with_interval(pair, "difference"), ahead, *p_values])
+        there = pair["elsewhere"]
+        cells = [_with_interval(pair, "difference"), _ahead(pair), *p_values]
+        cells.append(f"{_with_interval(there, 'difference')}, {_ahead(there)}" if there else "–")
+        pairs.append([f"{pair['policy']} − {pair['other']}", what, *cells])
     heading = ["pair", "PSNR of", "difference of areas (dB)", "ahead on rocks", "p", "p, Holm"]
+    heading.append("on scenes that chose no setting")
     return f"{_markdown(['policy', 'area, full frame (dB)', 'area, rock (dB)'], areas)}\n{_markdown(heading, pairs)}"
+
+
+def _ahead(pair: Mapping[str, Any]) -> str:
+    """On how many rocks the first of a pair is ahead."""
+    return f"{pair['ahead']} of {pair['rocks']}"
 
 
 def seeds_markdown(rows: Rows) -> str:
@@ -87,9 +95,9 @@ def pools_markdown(rows: Rows) -> str:
     lines = []
     for row in rows:
         over = ["–"] * 2 if row["policy"] == "random" else [_with_interval(row, key) for key in _over("random")]
-        led = _with_interval(row, "test_psnr_led") if "test_psnr_led" in row else "–"
+        led = [_with_interval(row, key) if key in row else "–" for key in ("test_psnr_led", "test_psnr_area_led")]
         share = "–" if row["test_psnr_share"] is None else f"{row['test_psnr_share']:.0%}"
-        lines.append([row["pool"], row["policy"], f"{row['test_psnr']:.2f}", *over, led, share])
+        lines.append([row["pool"], row["policy"], f"{row['test_psnr']:.2f}", *over, *led, share])
     heading = [
         "pool",
         "policy",
@@ -97,6 +105,7 @@ def pools_markdown(rows: Rows) -> str:
         "over random (dB)",
         "rock (dB)",
         f"{LEADER} over it (dB)",
+        "over the curve (dB)",
         "share of the oracle's",
     ]
     return _markdown(heading, lines)
