@@ -1,7 +1,7 @@
 """What the backing is worth: `python benchmarks/backing.py DATASET PREFIX` writes PREFIX.json and PREFIX.png.
 
 Fits models of several sizes, with and without Gaussians behind the surface, to 12 views spread evenly in azimuth, and
-measures on the other views: PSNR inside the rock (pixels at least two from its silhouette), and the shares of those pixels
+measures on the test views: PSNR inside the rock (pixels at least two from its silhouette), and the shares of those pixels
 whose expected depth is more than 5 cm or more than 3 spacings too deep, or whose opacity is below 0.9. The dataset needs
 exact depth.
 """
@@ -62,6 +62,7 @@ def measure(gaussians: Gaussians, frames: Sequence[Frame], spacing: float) -> di
 def study(root: Path) -> list[dict[str, Any]]:
     """One record per model: its size, backing, passes, and what `measure` says of it."""
     dataset = load_dataset(root)
+    tests = dataset.test_views().frames
     frames, cache, lam = dataset.frames, ListCache(), lam_by_kind(regularisation(groups(0)), groups(0))
     positions = np.array([frame.camera.position for frame in frames])
     settings = [(n, backing, PASSES[0]) for n in SIZES for backing in BACKINGS]
@@ -75,8 +76,7 @@ def study(root: Path) -> list[dict[str, Any]]:
         train = TrainSettings(passes=passes, tolerance=0.0)
         cameras, targets = [frame.camera for frame in chosen], [target_of(frame) for frame in chosen]
         fitted = fit(start, cameras, targets, train, cache=cache, start=start, lam=lam).gaussians
-        held_out = [frame for i, frame in enumerate(frames) if i not in taken]
-        found = measure(fitted, held_out, prior.spacing)
+        found = measure(fitted, tests, prior.spacing)
         records.append({"gaussians": n, "backing": backing, "passes": passes, "spacing": prior.spacing} | found)
         print(records[-1], flush=True)
     return records
@@ -87,7 +87,7 @@ def draw(path: Path, records: Sequence[dict[str, Any]]) -> None:
     import matplotlib
 
     panels = (
-        ("psnr_inside", "PSNR inside the rock, held out (dB)", 1),
+        ("psnr_inside", "PSNR inside the rock, test views (dB)", 1),
         ("too_deep", "pixels more than 5 cm too deep (%)", 100),
     )
     with matplotlib.rc_context(STYLE):

@@ -1,8 +1,9 @@
 """What learned means buy: `python benchmarks/means.py DATASET PREFIX [GAUSSIANS PASSES]` writes PREFIX.json and PREFIX.png.
 
 Fits with means that are frozen, that move along the prior's normals, and that are free, from priors of several errors: noise
-is added to the points that the prior's mesh is built from, in spacings of its samples. Each is fitted to 12 and to 4 views
-spread evenly in azimuth, at default settings otherwise, and judged on the views that none is fitted to: PSNR inside the rock.
+is added to the points that the prior's mesh is built from, in spacings of its samples; the crudest prior is the visual hull of
+the masks, which fills every hollow. Each is fitted to 12 and to 4 views spread evenly in azimuth, at default settings
+otherwise, and judged on the test views: PSNR inside the rock.
 Where the dataset has the true rock (rock.glb), the mean distance from it is measured too, of the means that lie on the surface,
 before and after the fit; 5,000 Gaussians and the default number of passes unless said.
 """
@@ -30,21 +31,25 @@ from mgs.provenance import command_line, versions
 from mgs.report.evaluation import evaluate
 from mgs.splat import MEANS
 
-GAUSSIANS, VIEWS, NOISES = 5_000, (12, 4), (0.0, 0.5, 1.5)
+GAUSSIANS, VIEWS, NOISES, HULL = 5_000, (12, 4), (0.0, 0.5, 1.5), "hull"
+"""HULL stands among the priors in the place of a noise."""
 
 
 def study(root: Path, gaussians: int, passes: int) -> list[dict[str, Any]]:
-    """One record per fit: views, noise in spacings, means; the PSNR held out, dB, the last loss, and the distances, metres."""
+    """One record per fit: views, noise in spacings or HULL, means; the PSNR, dB, the last loss, and the distances, metres."""
     dataset = load_dataset(root)
+    tests = dataset.test_views().frames
     frames, records = dataset.frames, []
     true = read_rock(root / "rock.glb") if (root / "rock.glb").is_file() else None
     exact, _ = build_prior(dataset, PriorSettings(gaussians=gaussians))
     positions = np.array([frame.camera.position for frame in frames])
     taken = {views: seed_views(positions, exact.points.mean(0), views) for views in VIEWS}
-    fitted_to = [frames[i].name for i in sorted(set().union(*taken.values()))]
-    for noise in NOISES:
-        asked = PriorSettings(gaussians=gaussians, noise=noise * exact.spacing)
-        prior = exact if noise == 0 else build_prior(dataset, asked)[0]
+    priors = {noise: PriorSettings(gaussians=gaussians, noise=noise * exact.spacing) for noise in NOISES}
+    for noise in (*NOISES, HULL):
+        if noise == HULL:
+            prior = build_prior(dataset, PriorSettings(gaussians=gaussians), source="hull")[0]
+        else:
+            prior = exact if noise == 0 else build_prior(dataset, priors[noise])[0]
         for views in VIEWS:
             chosen = [frames[i] for i in taken[views]]
             cameras, targets = [frame.camera for frame in chosen], [target_of(frame) for frame in chosen]
@@ -54,7 +59,7 @@ def study(root: Path, gaussians: int, passes: int) -> list[dict[str, Any]]:
                 stations = real_stations(dataset, prior, settings)
                 start = stations.initial(chosen)
                 fit = stations.fit(start, start, cameras, targets, settings.train, lambda done, most: None)
-                quality = evaluate(fit.gaussians, frames, fitted_to)["held_out"]
+                quality = evaluate(fit.gaussians, [], [], test_frames=tests)["test"]
                 record = {"views": views, "noise": noise, "means": means, "spacing": prior.spacing, "loss": fit.loss}
                 record |= {name: quality[name] for name in ("psnr", "psnr_inside")}
                 if true is not None:
@@ -78,13 +83,13 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
             for means, colour, marker in zip(MEANS, ("#0072B2", "#009E73", "#D55E00"), "os^", strict=True):
                 shown = [r for r in records if (r["views"], r["means"]) == (views, means)]
                 line = {"color": colour, "marker": marker, "label": means}
-                noises = [r["noise"] for r in shown]
+                noises = [f"{r['noise']}" for r in shown]
                 axes[0, column].plot(noises, [r["psnr_inside"] for r in shown], **line)
                 if measured:
                     axes[1, column].plot(noises, [1000 * r["distance_after"] for r in shown], **line)
             axes[0, column].set_title(f"{views} views")
-            axes[-1, column].set(xlabel="noise of the prior's points (spacings)")
-        axes[0, 0].set(ylabel="PSNR inside, held out (dB)")
+            axes[-1, column].set(xlabel="noise of the prior's points (spacings), or its hull")
+        axes[0, 0].set(ylabel="PSNR inside, test views (dB)")
         if measured:
             axes[1, 0].set(ylabel="means from the true rock (mm)")
             axes[1, 0].set_ylim(bottom=0)

@@ -4,9 +4,35 @@ from __future__ import annotations
 
 import numpy as np
 
+from mgs.active.directional import Views, gains, squared_weights
 from mgs.active.outlook import Outlook
 
 
 def linear_look(outlook: Outlook) -> np.ndarray:
     """`directional-i` with colours that change with the direction linearly (SH degree 1, tau 0.1) instead of degree 3."""
     return outlook.gains(outlook.visited, outlook.left, 1, 0.1, True)
+
+
+def degree_0(outlook: Outlook) -> np.ndarray:
+    """`directional-i` with colours that are the same from everywhere: what is left are pixels on parts seen little so far."""
+    return outlook.gains(outlook.visited, outlook.left, 0, 0.1, True)
+
+
+def poses_alone(outlook: Outlook) -> np.ndarray:
+    """`directional-i` of one point in the middle of the rock, which every pose sees alike: angles between poses, no surface."""
+
+    def alike(positions: np.ndarray) -> Views:
+        return Views(positions, np.ones((len(positions), 1)))
+
+    middle, lam = outlook.centre[None], float(outlook.prior_lam[0])
+    return gains(middle, lam, 3, 0.1, alike(outlook.taken), alike(outlook.candidates), alike(outlook.dome().positions))
+
+
+def trained_d(outlook: Outlook) -> np.ndarray:
+    """`directional-d` by what poses see of the Gaussians as they are fitted, instead of before any training."""
+
+    def views(frames: list[int]) -> Views:
+        seen = [squared_weights(outlook.information(i))[: len(outlook.points)] for i in frames]
+        return Views(outlook.positions[frames], np.stack(seen))
+
+    return gains(outlook.points, float(outlook.prior_lam[0]), 2, 0.3, views(outlook.visited), views(outlook.left))

@@ -4,7 +4,7 @@ Quality is measured on sRGB display values, and a fit lowers squared errors of l
 exact. To first order an sRGB error is a linear error times the slope of the sRGB curve. So each pixel is weighted by that slope
 at its target to a power: 0 is the linear residual, 1 the display residual, 1/2 lies between. Weights have a root mean square of
 1 over the rock, so that the prior weighs the same. The black background, where the curve is steepest, is weighted like the rest
-or, in the other rows, by 1.
+or, in the other rows, by 1. Judged on the test views.
 """
 
 from __future__ import annotations
@@ -42,8 +42,9 @@ def slope(linear: np.ndarray) -> np.ndarray:
 
 
 def main(root: Path, out: Path) -> None:
-    """Fit once for each power and background; print and write the means over the views held out."""
+    """Fit once for each power and background; print and write the means over the test views."""
     runtime.start()
+    tests = load_dataset(root).test_views().frames
     dataset, lam, cache = load_dataset(root), regularisation(groups(0)), ListCache()
     by_kind = {kind: float(lam[columns][0]) for kind, columns in groups(0).items()}
     prior, _ = build_prior(dataset, PriorSettings(gaussians=GAUSSIANS))
@@ -65,7 +66,7 @@ def main(root: Path, out: Path) -> None:
                 target[frame.target()[0][..., 3] == 0, 3] = 1.0
         cameras = [frame.camera for frame in frames]
         found = fit(start, cameras, targets, TrainSettings(tolerance=0.0), cache=cache, start=start, lam=by_kind).gaussians
-        means = evaluate(found, dataset.frames, [frame.name for frame in frames])["held_out"]
+        means = evaluate(found, [], [], test_frames=tests)["test"]
         records.append({"power": power, "background": background} | {k: means[k] for k in ("psnr", "psnr_mask", "psnr_inside")})
         print(records[-1], flush=True)
     write_json(out, {"command": command_line(), "machine": runtime.processor(), "versions": versions(), "records": records})

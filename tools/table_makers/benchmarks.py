@@ -135,7 +135,7 @@ def own_data(data: dict[str, Any]) -> str:
 
 
 def backing(data: dict[str, Any]) -> str:
-    """Held-out quality and see-through of fits with and without Gaussians behind the surface."""
+    """Quality and see-through of fits with and without Gaussians behind the surface."""
     found = {(row["gaussians"], row["passes"], row["backing"]): row for row in data["records"]}
     rows = []
     for n, passes in dict.fromkeys((n, passes) for n, passes, _ in found):
@@ -375,7 +375,8 @@ def means(data: dict[str, Any]) -> str:
         found = {r["means"]: r for r in data["records"] if (r["views"], r["noise"]) == (views, noise)}
         before = f"{1e3 * found['frozen']['distance_before']:.1f} mm"
         cells = [f"{found[m]['psnr_inside']:.2f} dB, {1e3 * found[m]['distance_after']:.1f} mm" for m in found]
-        rows.append([f"{views} views, noise of {noise:g} spacings", before, *cells])
+        prior = "visual hull" if noise == "hull" else f"noise of {noise:g} spacings"
+        rows.append([f"{views} views, {prior}", before, *cells])
     return markdown(["", "prior", *found], rows) + made_by(data)
 
 
