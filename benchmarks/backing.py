@@ -19,11 +19,10 @@ from scipy.ndimage import binary_erosion
 from mgs import runtime
 from mgs.active.criteria import lam_by_kind, regularisation
 from mgs.active.fitting import fit
-from mgs.active.loop import target_of
 from mgs.active.pose_policies import seed_views
 from mgs.active.settings import TrainSettings
 from mgs.colour import srgb_from_linear
-from mgs.data.dataset import Frame, load_dataset
+from mgs.data.dataset import Frame, load_dataset, target_of
 from mgs.files import write_json
 from mgs.gaussians import Gaussians
 from mgs.metrics import psnr

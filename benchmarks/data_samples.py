@@ -15,9 +15,8 @@ from typing import Any
 from mgs import runtime
 from mgs.active.criteria import lam_by_kind, regularisation
 from mgs.active.fitting import fit
-from mgs.active.loop import target_of
 from mgs.active.settings import TrainSettings
-from mgs.data.dataset import load_dataset
+from mgs.data.dataset import load_dataset, target_of
 from mgs.files import read_json, write_json
 from mgs.prior.build import build_prior
 from mgs.prior.initial import initial_gaussians

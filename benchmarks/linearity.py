@@ -24,11 +24,10 @@ import numpy as np
 from mgs import runtime
 from mgs.active.criteria import MEAN_STD, PIXEL_NOISE, regularisation
 from mgs.active.fitting import fit
-from mgs.active.loop import target_of
 from mgs.active.pose_policies import seed_views
 from mgs.active.settings import TrainSettings
 from mgs.camera import Camera
-from mgs.data.dataset import load_dataset
+from mgs.data.dataset import load_dataset, target_of
 from mgs.files import write_json
 from mgs.gaussians import KINDS, LEARNED, Gaussians
 from mgs.plotting import STYLE, new_figure, save_figure

@@ -23,10 +23,9 @@ from scipy.spatial import cKDTree
 from mgs import runtime
 from mgs.active.criteria import regularisation
 from mgs.active.fitting import fit
-from mgs.active.loop import target_of
 from mgs.active.pose_policies import seed_views
 from mgs.colour import SH_C0
-from mgs.data.dataset import Dataset, Frame, load_dataset
+from mgs.data.dataset import Dataset, Frame, load_dataset, target_of
 from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.gaussians import Gaussians

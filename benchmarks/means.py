@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 
 from mgs import runtime
-from mgs.active.loop import target_of
 from mgs.active.pose_policies import seed_views
 from mgs.active.settings import NbvSettings, TrainSettings
 from mgs.active.stations import real_stations
-from mgs.data.dataset import load_dataset
+from mgs.data.dataset import load_dataset, target_of
 from mgs.data.meshes import distances_to_mesh, read_rock
 from mgs.files import write_json
 from mgs.plotting import STYLE, new_figure, save_figure

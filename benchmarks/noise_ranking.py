@@ -24,9 +24,8 @@ from ranking import GAUSSIANS, STATES, views_of
 from mgs import runtime
 from mgs.active.criteria import d_optimal, regularisation
 from mgs.active.fitting import fit
-from mgs.active.loop import target_of
 from mgs.active.settings import TrainSettings
-from mgs.data.dataset import Dataset, load_dataset
+from mgs.data.dataset import Dataset, load_dataset, target_of
 from mgs.files import write_json
 from mgs.gaussians import Gaussians
 from mgs.metrics import agreement

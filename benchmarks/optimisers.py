@@ -24,12 +24,11 @@ import numpy as np
 from mgs import runtime
 from mgs.active.criteria import regularisation
 from mgs.active.fitting import fit
-from mgs.active.loop import target_of
 from mgs.active.objective import Objective, dot, objective, plus
 from mgs.active.optimisers import INFORMATION_PASSES, OPTIMISERS
 from mgs.active.pose_policies import seed_views
 from mgs.active.settings import RATES, TrainSettings
-from mgs.data.dataset import load_dataset
+from mgs.data.dataset import load_dataset, target_of
 from mgs.files import write_json
 from mgs.gaussians import LEARNED, Gaussians
 from mgs.plotting import STYLE, new_figure, save_figure

@@ -21,12 +21,11 @@ import numpy as np
 
 from mgs import runtime
 from mgs.active.fitting import fit
-from mgs.active.loop import target_of
 from mgs.active.pose_policies import seed_views
 from mgs.active.settings import TrainSettings
 from mgs.cli.dataset import UNCERTAINTY
 from mgs.colour import srgb_from_linear
-from mgs.data.dataset import Dataset, Frame, load_dataset
+from mgs.data.dataset import Dataset, Frame, load_dataset, target_of
 from mgs.data.importers import import_source, read_source
 from mgs.data.masks import make_masks
 from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh

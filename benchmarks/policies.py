@@ -36,3 +36,13 @@ def trained_d(outlook: Outlook) -> np.ndarray:
         return Views(outlook.positions[frames], np.stack(seen))
 
     return gains(outlook.points, float(outlook.prior_lam[0]), 2, 0.3, views(outlook.visited), views(outlook.left))
+
+
+def without_opacity(F: np.ndarray, H: np.ndarray, lam: np.ndarray) -> float:
+    """`d-optimal` of all parameters but the opacities (column 10), which POp-GS leaves out of its score."""
+    return float(np.log1p(F / (H + lam))[:, :10].mean(dtype=np.float64))
+
+
+def colours_alone(F: np.ndarray, H: np.ndarray, lam: np.ndarray) -> float:
+    """`d-optimal` of the colours alone (columns 0 to 2)."""
+    return float(np.log1p(F / (H + lam))[:, :3].mean(dtype=np.float64))

@@ -18,10 +18,9 @@ import numpy as np
 from mgs import runtime
 from mgs.active.criteria import regularisation
 from mgs.active.fitting import fit
-from mgs.active.loop import target_of
 from mgs.active.pose_policies import seed_views
 from mgs.active.settings import TrainSettings
-from mgs.data.dataset import load_dataset
+from mgs.data.dataset import load_dataset, target_of
 from mgs.files import write_json
 from mgs.prior.build import build_prior
 from mgs.prior.initial import initial_gaussians

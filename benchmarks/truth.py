@@ -19,10 +19,9 @@ import numpy as np
 from mgs import runtime
 from mgs.active.criteria import regularisation
 from mgs.active.fitting import fit
-from mgs.active.loop import target_of
 from mgs.active.pose_policies import seed_views
 from mgs.colour import srgb_from_linear
-from mgs.data.dataset import Frame, load_dataset
+from mgs.data.dataset import Frame, load_dataset, target_of
 from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.metrics import psnr

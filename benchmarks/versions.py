@@ -103,7 +103,7 @@ def main(out: Path, old: Path, new: Path, run: Path) -> None:
                 print(name, runs[name][-1], flush=True)
     medians = {name: {key: float(np.median([run[key] for run in found])) for key in found[0]} for name, found in runs.items()}
     made: dict[str, Any] = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
-    made |= {"old": commit(old), "rounds": ROUNDS, "seconds": medians, "culled": culled}
+    made |= {"old": commit(old), "new": commit(new), "rounds": ROUNDS, "seconds": medians, "culled": culled}
     made |= {"targets": TARGETS | {f"culled {key}": value for key, value in CULLED_TARGETS.items()}, "ratios": {}}
     for key in medians["new"]:
         ratios = [b[key] / a[key] for a, b in zip(runs["old"], runs["new"], strict=True)]

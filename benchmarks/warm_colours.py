@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 
 from mgs import runtime
-from mgs.active.loop import target_of
 from mgs.active.pose_policies import farthest_pose, seed_views
 from mgs.active.settings import NbvSettings
 from mgs.active.stations import real_stations
-from mgs.data.dataset import Dataset, load_dataset
+from mgs.data.dataset import Dataset, load_dataset, target_of
 from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.gaussians import Gaussians

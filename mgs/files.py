@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import fcntl
+import glob
 import hashlib
 import json
 import os
@@ -174,15 +175,30 @@ def folder_or_nothing(path: str | Path) -> Iterator[Path]:
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Context manager that gives a temporary folder beside `path` for its block to fill; after the block it becomes `path`.
 
-    So a folder named `path` is always complete, even if the process is killed. Raises InputError as `new_folder`.
+    So a folder named `path` is always complete, even if the process is killed; what a killed one left is removed here. Raises
+    InputError as `new_folder`.
     """
     path = check_new_folder(path).resolve()
+    for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
+        if not _is_running(leftover.name.split(".")[-2]):
+            shutil.rmtree(leftover, ignore_errors=True)
     with folder_or_nothing(path.with_name(f".{path.name}.{os.getpid()}.part")) as temporary:
         yield temporary
         try:
             os.replace(temporary, path)
         except OSError as error:
             raise _not_writable(path, error) from None
+
+
+def _is_running(process: str) -> bool:
+    """Whether there is a process of this id, or the text is none."""
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
+        return False
+    except (ValueError, OverflowError, PermissionError):
+        pass
+    return True
 
 
 @contextmanager

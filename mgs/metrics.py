@@ -54,6 +54,14 @@ def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     return PSNR_LIMIT if error <= 10 ** (-PSNR_LIMIT / 10) else -10 * math.log10(error)
 
 
+def masked_squares(rendered: np.ndarray, target: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Squared differences [K,3], (linear RGB)², of the pixels of a mask [H,W] whose colour is known.
+
+    rendered: [H,W,3]. target: [H,W,4], colour and weight as `mgs.data.dataset.target_of`; a weight of 0 means not known.
+    """
+    return np.square(rendered - target[..., :3])[mask & (target[..., 3] > 0)]
+
+
 def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Structural similarity of two images (Wang et al. 2004, computed by scikit-image), mean over pixels and channels.
 

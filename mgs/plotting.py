@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mgs.errors import InputError
 from mgs.files import atomic_path
 
 if TYPE_CHECKING:
@@ -34,6 +35,10 @@ DPI = 200
 """Pixels per inch of a figure."""
 
 
+FORMATS = ("png", "pdf", "svg")
+"""What figures can be written as."""
+
+
 def new_figure(width: float, height: float, dpi: int = DPI) -> Figure:
     """An empty figure of this width and height, inches. It needs no display."""
     from matplotlib.figure import Figure
@@ -42,9 +47,15 @@ def new_figure(width: float, height: float, dpi: int = DPI) -> Figure:
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:
-    """Write a figure as a PNG; the file appears complete. Raises InputError as `mgs.files.atomic_path`."""
+    """Write a figure as its name ends: .png, .pdf or .svg; the file appears complete.
+
+    Raises InputError for another ending, and as `mgs.files.atomic_path`.
+    """
+    kind = Path(path).suffix.lower()[1:]
+    if kind not in FORMATS:
+        raise InputError(f"{path}: figures are written as {', '.join(FORMATS)}; choose another ending")
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png")
+        figure.savefig(temporary, format=kind)
 
 
 def crop(mask: np.ndarray, margin: float = 0.06) -> tuple[slice, slice]:

@@ -297,6 +297,7 @@ def test_a_chart_is_measured_once_and_written(small_study, capsys):
         assert written[kind]["command"] == command
         table = {"fit": "front"}.get(kind, kind)
         assert chart_table(table, written)[3].startswith(f"`{command}` on ")
+    assert (out / "passes.png").stat().st_size > 10_000
     by_name = {row["variant"]: row for row in written["scoring"]["rows"]}
     assert by_name["exact"]["tau"] == pytest.approx(1)
     assert by_name["exact"]["regret"] == 0

@@ -8,11 +8,10 @@ import tiny
 
 from mgs.active.convergence import CONVERGED_SHARE, remaining_decrease
 from mgs.active.fitting import fit
-from mgs.active.loop import target_of
 from mgs.active.objective import objective
 from mgs.active.settings import NbvSettings, TrainSettings
 from mgs.active.stopping import fit_line
-from mgs.data.dataset import load_dataset
+from mgs.data.dataset import load_dataset, target_of
 from mgs.prior.build import load_prior
 from mgs.prior.initial import initial_gaussians
 from mgs.splat import as_drjit, groups

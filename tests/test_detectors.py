@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,11 +22,10 @@ from mgs.active.detectors import (
     step_signs,
     view_signs,
 )
-from mgs.active.loop import target_of
 from mgs.active.nbv import run_nbv
 from mgs.active.settings import TrainSettings
 from mgs.cli.nbv import resume_and_print
-from mgs.data.dataset import load_dataset, write_transforms
+from mgs.data.dataset import load_dataset, target_of, write_transforms
 from mgs.images import write_png
 from mgs.prior.build import build_prior, save_prior
 from mgs.prior.settings import PriorSettings
@@ -254,3 +254,12 @@ def test_new_images_are_held_against_the_model_before_them(rock, tmp_path):
     known = frame.mask() & (target[..., 3] > 0)
     wrong = np.asarray(render(before.gaussians, frame.camera).rgb) - target[..., :3]
     assert after.steps[-1]["residual"] == pytest.approx(np.sqrt(np.mean(wrong[known] ** 2)), rel=1e-4)
+
+
+def test_an_image_of_which_no_colour_is_known_has_no_residual():
+    one = SimpleNamespace(mask=lambda: np.ones((2, 3), bool))
+    run = SimpleNamespace(stations=SimpleNamespace(look=lambda *_: (np.zeros((2, 3, 3)), None)), frames=[one], cameras=[None])
+    target = np.full((2, 3, 4), 0.5)
+    assert loop.Loop.residual(run, None, [0], [target]) == {"residual": 0.5}
+    target[..., 3] = 0
+    assert loop.Loop.residual(run, None, [0], [target]) == {}

@@ -186,6 +186,17 @@ def test_an_atomic_folder_appears_whole(tmp_path, there):
     assert (out / "file").exists()
 
 
+def test_what_a_killed_process_left_of_an_atomic_folder_is_removed(tmp_path):
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        pass
+    for owner, name in ((ended.pid, "out"), (os.getpid(), "out"), (ended.pid, "other"), ("mine", "out")):
+        (tmp_path / f".{name}.{owner}.part/images").mkdir(parents=True)
+    with pytest.raises(InputError, match="not empty"), atomic_folder(tmp_path / "out"):  # this process makes it already
+        pass
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {f".out.{os.getpid()}.part", f".other.{ended.pid}.part", ".out.mine.part"}
+
+
 def encode_png(samples, bits, colour, palette=None, transparent=None):
     """A PNG of samples [H,W,C], byte by byte from its specification; palette [K,3], transparent: the bytes of tRNS."""
     big = samples.reshape(len(samples), -1).astype(">u2")

@@ -297,6 +297,36 @@ def test_missing_images_are_skipped_and_counted(dataset: Dataset, tmp_path: Path
     assert "5 frames" in output.out
 
 
+def test_images_are_set_apart_as_test_views(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["import", str(dataset.root), "--out", str(tmp_path / "out"), "--test-every", "3"]
+    for part in ("transforms.json", "test/transforms.json"):  # the second time it had been interrupted before its end
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        assert stop.value.code == 0, capsys.readouterr().err
+        assert "images, which are no candidates; wrote" in capsys.readouterr().out
+        assert (tmp_path / "out" / part).is_file()
+        if part == "transforms.json":
+            (tmp_path / "out" / part).unlink()
+    made = load_dataset(tmp_path / "out")
+    tests = made.test_views()
+    assert tests is not None
+    names = [frame.name for frame in dataset.frames]
+    assert [frame.name for frame in tests.frames] == names[::3]
+    assert [frame.name for frame in made.frames] == [name for i, name in enumerate(names) if i % 3]
+    assert tests.up == made.up
+    whole = {frame.name: frame for frame in dataset.frames}
+    for frame in [*made.frames, *tests.frames]:
+        assert np.array_equal(frame.rgb(), whole[frame.name].rgb())
+        assert np.allclose(frame.camera.world_to_camera, whole[frame.name].camera.world_to_camera)
+    few = [frame.image_path for frame in dataset.frames][1:]
+    for path in few:
+        path.unlink()
+    with pytest.raises(SystemExit) as stop:
+        main([*arguments[:3], str(tmp_path / "none"), *arguments[4:]])
+    assert stop.value.code == 2
+    assert "--test-every 3 of 1 images leaves none to choose from" in capsys.readouterr().err
+
+
 def test_a_named_cloud_that_is_not_there_is_said(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = dataset.root / "transforms.json"
     for cloud, said in (("sparse_pc.ply", 1), (None, 0)):

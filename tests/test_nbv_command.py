@@ -124,10 +124,10 @@ def test_a_quality_that_could_not_be_measured_is_a_dash(dataset, tmp_path):
 @pytest.mark.parametrize("width", [80, 200])
 def test_names_and_numbers_are_readable_at_80_columns(tmp_path, name, width):
     line = {
-        "step": 0, "name": None, "seed_names": [name.format(i) for i in range(4)], "gain": None, "coverage": 1.0,
+        "step": 0, "name": None, "seed_names": [name.format(i) for i in range(4)], "score": None, "coverage": 1.0,
         "iterations": 1120, "loss": 2.34e-4, "stop_reason": "pass-limit", "seconds": {"fit": 123.4},
     }  # fmt: skip
-    steps = [line, line | {"step": 1, "name": name.format(5), "gain": 1.234e-05}]
+    steps = [line, line | {"step": 1, "name": name.format(5), "score": 1.234e-05}]
     console = Console(record=True, width=width)
     metrics = {"all": {"count": 0}, "held_out": {"count": 0}}
     print_run(tmp_path, nbv.State(tiny.initial([]), np.zeros(0), np.zeros(0), [0], steps), metrics, console)
@@ -373,3 +373,16 @@ def test_what_a_run_was_made_from_has_moved(dataset, prior, tmp_path, capsys, mo
         f"run/config.json: {moved} {tmp_path / moved} is not there; if it was moved, correct `{moved}`"
         in capsys.readouterr().err
     )
+
+
+def test_a_run_that_is_there_is_not_begun_again(dataset, prior, tmp_path, capsys):
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    said = refused(capsys, ["nbv", dataset, "--prior", prior, "--out", run], run)
+    assert f"{run}: holds a run; `mgs nbv --resume {run}` goes on with it, or choose another folder for a new one" in said
+
+
+@pytest.mark.parametrize("option", ["--budget 9", "--policy random", "--exposure", "--prior-std colour=1"])
+def test_resume_takes_no_other_setting(dataset, prior, tmp_path, capsys, option):
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    said = refused(capsys, ["nbv", "--resume", run, *option.split()], run)
+    assert f"nbv: {option.split()[0]}: --resume takes its settings from {run / 'config.json'}; change it there" in said

@@ -40,6 +40,15 @@ def test_domes_keep_distance_and_elevation(kind):
     assert len(np.unique(p.round(6), axis=0)) == 40
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_distances_are_taken_in_turn(kind):
+    near = orbit_positions(Orbit(kind=kind), 7, TARGET)
+    far = orbit_positions(Orbit(kind=kind, distances=(1, 2, 3)), 7, TARGET)
+    factors = np.array([1, 2, 3, 1, 2, 3, 1])
+    np.testing.assert_allclose(far - TARGET, factors[:, None] * (near - TARGET))
+    assert np.array_equal(far[factors == 1], near[factors == 1]), "not a bit of these changes"
+
+
 def test_hemisphere_is_even():
     """Nearest-neighbour distances of a Fibonacci lattice are within a factor of two and a half of each other."""
     p = orbit_positions(Orbit(kind="hemisphere", radius=1, elevations=(0, 90)), 100, np.zeros(3))

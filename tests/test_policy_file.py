@@ -18,6 +18,10 @@ from mgs.errors import InputError
 from mgs.report.runs import read_run
 
 FUNCTIONS = """
+from __future__ import annotations
+
+from dataclasses import dataclass
+
 import numpy as np
 
 def poses(candidates, taken):
@@ -41,6 +45,16 @@ def everything(outlook, seen, seen_taken, points, candidate, centre):
 
 def wrong(F, photos):
     return 0.0
+
+@dataclass
+class Height:
+    weight: float
+
+    def __call__(self, candidates: np.ndarray) -> np.ndarray:
+        return self.weight * candidates[:, 2]
+
+def higher(candidates):
+    return Height(2.0)(candidates)
 
 def broken(candidates):
     return 1 / 0
@@ -77,6 +91,11 @@ def test_a_function_can_ask_for_everything(dataset, file, tmp_path):
     assert [step["score"] for step in state.steps[1:]] == pytest.approx([1.5] * 3)
 
 
+def test_a_file_can_hold_classes(dataset, file, tmp_path):
+    state = run(tmp_path / "run", load_dataset(dataset), policy=f"{file}:higher", budget=1)
+    assert state.steps[1]["score"] == pytest.approx(2 * tiny.orbit()[state.taken[-1]].position[2])
+
+
 def test_draws_do_not_depend_on_the_folder_of_the_file(dataset, file, tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere/mine.py").write_text(FUNCTIONS)
@@ -108,7 +127,7 @@ def test_a_policy_that_cannot_be_loaded_is_one_line(dataset, file, tmp_path, nam
 @pytest.mark.parametrize(
     ("function", "message"),
     [
-        ("broken", r"line 27 of .*mine\.py failed: ZeroDivisionError: division by zero"),
+        ("broken", r"line 41 of .*mine\.py failed: ZeroDivisionError: division by zero"),
         ("few", r"gave scores of shape \(1,\) to 9 candidates"),
     ],
 )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 
 import pytest
 
-from mgs.provenance import command_line
+from mgs import provenance
+from mgs.provenance import command_line, versions
 
 
 @pytest.mark.parametrize(
@@ -20,3 +22,29 @@ from mgs.provenance import command_line
 def test_the_command_that_is_recorded_is_the_one_that_was_typed(monkeypatch, typed, said):
     monkeypatch.setattr(sys, "argv", typed)
     assert command_line() == said
+
+
+def test_a_checkout_tells_its_commit(monkeypatch, tmp_path):
+    def git(*words):
+        who = ["-c", "user.name=nobody", "-c", "user.email=nobody@example.org"]
+        done = subprocess.run(["git", "-C", tmp_path, *who, *words], check=True, capture_output=True, text=True)
+        return done.stdout.strip()
+
+    def told():
+        provenance._commit.cache_clear()
+        return versions().get("commit")
+
+    (tmp_path / "mgs").mkdir()
+    (tmp_path / "mgs/provenance.py").write_text("")
+    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "mgs/provenance.py"))
+    assert told() is None
+    git("init", "-q")
+    git("add", ".")
+    git("commit", "-q", "-m", "begun")
+    commit = git("rev-parse", "--short=7", "HEAD")
+    assert told() == commit
+    (tmp_path / "mgs/provenance.py").write_text("changed")
+    assert told() == f"{commit}+"
+    monkeypatch.setenv("PATH", "")  # no git
+    assert told() is None
+    provenance._commit.cache_clear()

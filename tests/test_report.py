@@ -13,6 +13,7 @@ from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from PIL import Image
+from refusals import refused
 from rich.console import Console
 from skimage.color import rgb2lab
 
@@ -21,6 +22,7 @@ from mgs.active import loop
 from mgs.active.policies import policy_names
 from mgs.active.run_folder import load_run
 from mgs.cli import printing
+from mgs.cli.app import main
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
@@ -146,6 +148,37 @@ def test_report_writes_every_figure(runs, tmp_path, drawn):
         np.testing.assert_allclose(shown[policy].images[0].get_array(), srgb_from_linear(np.float64(grey)), atol=1 / 255)
 
 
+def test_figures_are_written_as_asked_for(runs, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["report", *map(str, runs), "--out", str(tmp_path / "report"), "--figures", "pdf"])
+    assert stop.value.code == 0
+    assert "left out" not in capsys.readouterr().out
+    names = {path.name for path in (tmp_path / "report").iterdir()}
+    assert names == {*(f"{name}.pdf" for name in ("orbit", "gain", "coverage", "comparison", "psnr")), "table.md", "table.json"}
+    assert (tmp_path / "report/gain.pdf").read_bytes().startswith(b"%PDF")
+    figures.gain_figure(tmp_path / "gain.svg", {"random": [0.2, 0.1]})
+    assert "<svg" in (tmp_path / "gain.svg").read_text()
+    with pytest.raises(InputError, match=r"gain\.eps: figures are written as png, pdf, svg; choose another ending"):
+        figures.gain_figure(tmp_path / "gain.eps", {"random": [0.2, 0.1]})
+    assert "--figures eps: unknown; choose one of png, pdf, svg" in refused(capsys, ["report", *runs, "--figures", "eps"])
+
+
+def test_a_figure_that_is_left_out_is_named(runs, tmp_path, capsys):
+    copies = [tmp_path / run.name for run in runs]
+    for run, copy in zip(runs, copies, strict=True):
+        shutil.copytree(run, copy)
+        lines = [json.loads(line) for line in (copy / "steps.jsonl").read_text().splitlines()]
+        bare = [{key: value for key, value in line.items() if "psnr" not in key} for line in lines]
+        (copy / "steps.jsonl").write_text("".join(json.dumps(line) + "\n" for line in bare))
+    with pytest.raises(SystemExit) as stop:
+        main(["report", *map(str, copies), "--out", str(tmp_path / "report")])
+    assert stop.value.code == 0
+    assert (
+        "PSNR against images is left out: it is known of runs that were made with --evaluate-every 1" in capsys.readouterr().out
+    )
+    assert not (tmp_path / "report/psnr.png").exists()
+
+
 def test_unseen_view(runs):
     read = [read_run(folder) for folder in runs]
     index = writing.unseen_view(read, range(tiny.FRAMES))
@@ -259,7 +292,7 @@ def test_pictures_of_an_earlier_model_are_not_shown(runs, tmp_path):
 
 
 def test_missing_and_damaged_files(runs, tmp_path):
-    with pytest.raises(InputError, match=r"config\.json: no such file"):
+    with pytest.raises(InputError, match=r"holds no run \(no config\.json\)"):
         read_run(tmp_path)
     (tmp_path / "config.json").write_text((runs[0] / "config.json").read_text())
     with pytest.raises(InputError, match=r"steps\.jsonl: no such file; .*--resume"):

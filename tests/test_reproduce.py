@@ -110,6 +110,14 @@ def test_a_policy_of_ones_own_is_compared_over_rocks(quick, tmp_path, capsys):
     mine.write_text("def first(candidates):\n    return candidates[:, 0]\n")
     again = done(capsys, out, "--only", "curves", "--rocks", 1, "--policy", f"{mine}:first")
     assert "curves 4/5 run/boulder-1" in again, "another file is another policy"
+    more = done(capsys, out, "--only", "curves", "--rocks", 1, "--policy", f"{mine}:first", "--policy", "coverage")
+    assert "curves 5/6 run/boulder-1" in more, "two more"
+    assert {row["policy"] for row in rows_of(out / "results/curves.csv")} == {
+        "farthest",
+        "uniform",
+        "mine.py:first",
+        "coverage",
+    }
 
 
 def test_a_timed_run_has_a_process_of_its_own(quick, tmp_path):
@@ -229,10 +237,10 @@ def test_differences_are_paired_by_rock():
     assert [row[f"test_psnr_over_uniform{end}"] for end in ("", "_low", "_high")] == pytest.approx([-0.3] * 3)
     pairs = curve_statistics(found, runs)["test_psnr"]["pairs"]
     assert [(p["policy"], p["other"]) for p in pairs] == list(reproduce.PAIRS)
-    assert [p["difference"] for p in pairs] == pytest.approx([-0.3, -0.1, 0.2, 0.4])
-    assert [p["ahead"] for p in pairs] == [0, 0, 3, 3]
-    assert [p["p"] for p in pairs] == pytest.approx([0.25] * 4)
-    assert [p["p_holm"] for p in pairs] == pytest.approx([1.0] * 4)
+    assert [p["difference"] for p in pairs] == pytest.approx([-0.3, -0.1, 0.2, 0.4, 0, -0.1])
+    assert [p["ahead"] for p in pairs] == [0, 0, 3, 3, 0, 0]
+    assert [p["p"] for p in pairs] == pytest.approx([*[0.25] * 4, 1, 0.25])
+    assert [p["p_holm"] for p in pairs] == pytest.approx([1.0] * 6)
     text = statistics_markdown(curve_statistics(found, runs))
     assert "| d-optimal − uniform | full frame | -0.30 [-0.30, -0.30] | 0 of 3 | 0.25 | 1 | -0.30, 0 of 1 |" in text
 
@@ -271,9 +279,13 @@ def test_shares_are_of_what_the_oracle_gains_over_random():
         shares = {policy: rows[pool, policy]["test_psnr_share"] for policy in ("oracle", "random", "d-optimal", "farthest")}
         assert shares == pytest.approx({"oracle": 1, "random": 0, "d-optimal": 0.25, "farthest": 0.5})
         assert rows[pool, "random"]["rocks"] == 2
-    half = "+0.50 [+0.50, +0.50]"
-    ours = f"| ring | d-optimal | 26.00 | {half} | {half} | {half} | {half} | 25% |"
-    assert ours in pools_markdown(list(rows.values()))
+    half, pools = "+0.50 [+0.50, +0.50]", len(reproduce.POOLS)
+    text = pools_markdown(list(rows.values()))
+    assert f"| test views (dB) | {' | '.join(reproduce.POOLS)} |" in text
+    assert f"| d-optimal |{' 26.00 |' * pools}\n" in text
+    assert text.count(f"| d-optimal |{f' {half} |' * pools}\n") == 3  # full frame, rock, and over the whole curve
+    assert f"| directional-i |{' – |' * pools}\n" in text
+    assert f"| d-optimal |{' 25% |' * pools}\n" in text
     assert "test_psnr_led" not in rows["ring", "directional-i"]
     without = pool_rows(found, runs, [])
     assert {row["test_psnr_share"] for row in without} == {None}
@@ -294,6 +306,18 @@ def test_numbers_of_seeds_are_compared_at_equal_images(tmp_path):
     assert "| d-optimal | 1 | 90.0 | 180 (180) | 25.10 | -0.30 [-0.30, -0.30] | -0.30 [-0.30, -0.30] |" in seeds_markdown(rows)
     seeds_figure(tmp_path / "seeds.png", rows)
     assert (tmp_path / "seeds.png").stat().st_size > 10_000
+
+
+def test_the_pool_of_mixed_distances_has_near_and_far_views(tmp_path):
+    run = Run(Rock("boulder", 1), SIZE, "uniform", pool="mixed distances")
+    dataset, _, cell = run.cells()
+    assert dataset.name == "dataset/boulder-1/hemisphere-1-2-3-8x48x36"
+    assert cell.arguments["dataset"] == dataset.name
+    assert run_cells(tmp_path, [dataset], silent)[dataset.name] == {"frames": 8}
+    loaded = load_dataset(tasks.dataset_of(tmp_path, dataset.name))
+    middle = loaded.test_views().frames[0].camera.position
+    reach = [np.linalg.norm(frame.camera.position) for frame in loaded.frames]
+    assert [round(r / np.linalg.norm(middle)) for r in reach] == [1, 2, 3, 1, 2, 3, 1, 2]
 
 
 def test_the_pool_of_an_arc_is_half_dense_and_half_sparse(tmp_path):
@@ -382,6 +406,7 @@ def test_every_run_of_every_result_has_its_own_cell():
         (["--workers", "0"], "should be greater than or equal to 1"),
         (["--policy", "best"], "--policy best: unknown; choose one of"),
         (["--policy", "uniform"], "--policy uniform: is compared anyway"),
+        (["--policy", "angle", "--policy", "angle"], "--policy angle: is compared anyway"),
         (["--policy", "block-d", "--only", "table1"], "--policy block-d: is for curves and pools, and --only leaves both out"),
         (["--policy", "none.py:f"], "none.py"),
         (["--batch", "0"], "should be greater than or equal to 1"),

@@ -154,7 +154,7 @@ def test_one_line_says_why_a_run_ended_when_it_ends_when_it_is_resumed_and_in_th
     start = ["nbv", dataset, "--prior", prior, "--budget", "2", "--passes", "1"]
     shown = mgs(capsys, *start, "--out", tmp_path / "early", "--stop-gain", "1e3")
     ended = json.loads((tmp_path / "early/steps.jsonl").read_text().splitlines()[-1])["ended"]
-    said = f"would gain {ended['information_gain']:.4g} nats per parameter after 0 chosen views, less than --stop-gain 1000"
+    said = f"would gain {ended['information_gain']:.4g} after 0 chosen views, less than --stop-gain 1000"
     line = f"the run has ended: the next view, {ended['name']}, {said}"
     assert shown.count(line) == 1
     assert mgs(capsys, "nbv", "--resume", tmp_path / "early").count(line) == 1

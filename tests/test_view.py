@@ -179,7 +179,7 @@ def test_refusals(capsys, run, dataset, prior, tmp_path, monkeypatch):
     assert "no finished step yet" in refused(capsys, ["view", tmp_path / "begun"])
     assert read_subject(tmp_path / "begun", follow=True).gaussians is None
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert "pip install 'mgs[view]'" in refused(capsys, ["view", run])
+    assert "pip install viser" in refused(capsys, ["view", run])
     check_address("127.0.0.1", 0)
 
 

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from mgs.active.criteria import lam_by_kind
-from mgs.active.loop import target_of
 from mgs.active.objective import newton_decrease, objective
 from mgs.active.settings import NbvSettings
-from mgs.data.dataset import Frame
+from mgs.data.dataset import Frame, target_of
 from mgs.gaussians import Gaussians
 from mgs.memory import Deferred
 from mgs.prior.build import Prior

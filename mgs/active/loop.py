@@ -22,12 +22,13 @@ from mgs.active.settings import NbvSettings, TrainSettings
 from mgs.active.sight import Sight
 from mgs.active.stopping import StopReason, diverged, run_end
 from mgs.camera import Camera
-from mgs.data.dataset import Dataset, Frame
+from mgs.data.dataset import Dataset, Frame, target_of
 from mgs.data.up import PLUS_Z, Up, upright
 from mgs.errors import InputError
 from mgs.files import locked
 from mgs.gaussians import Gaussians
 from mgs.memory import IMAGE_BYTES, Deferred, kept_within
+from mgs.metrics import masked_squares
 from mgs.prior.exposure import without_gain
 from mgs.prior.initial import warm_start
 from mgs.seeds import generator
@@ -338,7 +339,7 @@ class Loop:
         if self.stations.look:
             with watch("check"):
                 if state.taken:
-                    line["residual"] = self.residual(state.gaussians, new, targets[-len(new) :])
+                    line |= self.residual(state.gaussians, new, targets[-len(new) :])
                 line |= self.signs(planned, fit, gains)
         every, first = self.settings.evaluate_every, len(state.steps)
         if every and any(k % every == 0 for k in range(first, step + 1)):
@@ -365,15 +366,15 @@ class Loop:
             return Deferred(taken, self.image)
         return Deferred(range(len(taken)), lambda k: without_gain(self.image(taken[k]), gains[k]))
 
-    def residual(self, model: Gaussians, new: list[int], targets: Sequence[np.ndarray]) -> float:
-        """Root mean square difference, linear RGB, inside the mask, of new images to a model that was not fitted to them: what
-        the noise that the criteria assume (the setting `pixel_noise`) can be held against."""
+    def residual(self, model: Gaussians, new: list[int], targets: Sequence[np.ndarray]) -> dict[str, float]:
+        """The entry `residual` of a step: the root mean square difference, linear RGB, inside the mask, of new images to a
+        model that was not fitted to them. What the noise that the criteria assume (the setting `pixel_noise`) can be held
+        against. No entry where the colour of no pixel is known for certain."""
         assert self.stations.look
-        squares = []
-        for i, target in zip(new, targets, strict=True):
-            known = self.frames[i].mask() & (target[..., 3] > 0)
-            squares.append(np.square(self.stations.look(model, self.cameras[i])[0] - target[..., :3])[known])
-        return float(np.sqrt(np.concatenate(squares).mean()))
+        pairs = zip(new, targets, strict=True)
+        squares = [masked_squares(self.stations.look(model, self.cameras[i])[0], t, self.frames[i].mask()) for i, t in pairs]
+        together = np.concatenate(squares)
+        return {"residual": float(np.sqrt(together.mean()))} if len(together) else {}
 
     def signs(self, state: State, fit: Fit, gains: np.ndarray | None) -> dict[str, Any]:
         """The entries `signs` of the last step of a state and, where one has just gone beyond its limit, `warnings`
@@ -403,12 +404,3 @@ class Loop:
         start = replace(self.start, sh=np.where(grey, self._coloured((frame,)).sh, self.start.sh))
         signs = detectors.before_fit(self.image(frame), mask, *self.stations.look(start, camera), margin)
         return np.packbits(mask), signs
-
-
-def target_of(frame: Frame) -> np.ndarray:
-    """What a frame is fitted to: [H,W,4], the colour and the weight of `Frame.target`. Raises InputError where the mask is
-    empty: a fit to black would hide the rock."""
-    if not frame.mask().any():
-        raise InputError(f"{frame.mask_path}: the rock mask of frame {frame.name} is empty; correct it, or remove the frame")
-    rgba, weight = frame.target()
-    return np.dstack([rgba[..., :3], weight])

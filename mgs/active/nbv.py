@@ -88,6 +88,10 @@ def start_run(
     out = Path(out)
     if (dataset is None) == (capture is None):
         raise InputError("nbv: give either a DATASET or --capture SCENE")
+    if (out / "config.json").is_file():
+        raise InputError(
+            f"{out}: holds a run; `mgs nbv --resume {out}` goes on with it, or choose another folder for a new one"
+        )
     dataset = out / DATASET if dataset is None else Path(dataset)
     if prior is not None and gaussians is not None:
         raise InputError("nbv: --gaussians is for a prior that is built here; leave it out, or leave out --prior")

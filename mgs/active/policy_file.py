@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -67,7 +68,8 @@ def load(name: str) -> Policy:
     path, function = file_of(name), name.rpartition(":")[2]
     if not path.is_file():
         raise InputError(f"--policy {name}: no such file {path}; correct the path (of a run, `policy` in its config.json)")
-    module = ModuleType(path.stem)
+    module = ModuleType(f"policy {path.resolve()}")
+    sys.modules[module.__name__] = module  # where a dataclass looks for the names in its annotations
     try:
         exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)
     except Exception as error:

@@ -95,15 +95,21 @@ def start(out: Path, settings: NbvSettings, dataset: Dataset) -> None:
     write_json(out / "config.json", config)
 
 
-def read_settings(out: Path) -> NbvSettings:
-    """Settings of a run folder. Raises InputError where there is no run, its config.json is damaged, or the dataset is gone."""
+def read_config(out: Path) -> dict[str, Any]:
+    """What config.json of a run folder holds. Raises InputError where there is no run, and where its config.json is damaged."""
     path = out / "config.json"
     if not path.is_file():
         raise InputError(f"{out}: holds no run (no config.json); start one with `mgs nbv DATASET --out {out}`")
     config = read_json(path)
     if not isinstance(config, dict) or not isinstance(config.get("settings"), dict):
         raise InputError(f"{path}: has no settings; the file is damaged, start the run anew")
-    settings = validated(NbvSettings, config["settings"], path)
+    return config
+
+
+def read_settings(out: Path) -> NbvSettings:
+    """Settings of a run folder. Raises InputError as `read_config`, where a setting is wrong, and if the dataset is gone."""
+    path = out / "config.json"
+    settings = validated(NbvSettings, read_config(out)["settings"], path)
     if not settings.dataset.is_dir():
         raise InputError(f"{path}: dataset {settings.dataset} is not there; if it was moved, correct `dataset` in this file")
     return settings

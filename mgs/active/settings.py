@@ -112,8 +112,8 @@ class NbvSettings(BaseModel):
     batch: Annotated[int, Field(ge=1)] = 1
     """Views that are chosen before their images are read and the model is fitted again; the last batch may be smaller."""
     stop_gain: Positive | None = None
-    """The run ends where the view to be taken next has a smaller `information_gain` than this, nats per parameter; None: never
-    for that reason (`mgs.active.stopping.run_end`)."""
+    """The run ends where the view to be taken next has a smaller `information_gain` than this (Eq. 7); None: never for
+    that reason (`mgs.active.stopping.run_end`)."""
     stop_uncertainty: Annotated[float, Field(gt=0, lt=1)] | None = None
     """The run ends where no more than this share of the prior's variance is left (`mgs.active.criteria.uncertainty`, averaged);
     None: never for that reason."""

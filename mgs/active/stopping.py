@@ -118,5 +118,5 @@ def why_ended(ended: Mapping[str, Any]) -> str:
     if ended["reason"] == RunEnd.UNCERTAINTY:
         limit = f"no more than --stop-uncertainty {ended['limit']:g}"
         return f"{ended['uncertainty']:.4g} of the prior's variance is left after {views}, {limit}"
-    gain, limit = f"{ended['information_gain']:.4g} nats per parameter", f"less than --stop-gain {ended['limit']:g}"
+    gain, limit = f"{ended['information_gain']:.4g}", f"less than --stop-gain {ended['limit']:g}"
     return f"the next view, {ended['name']}, would gain {gain} after {views}, {limit}"

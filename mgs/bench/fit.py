@@ -17,11 +17,10 @@ import numpy as np
 from mgs.active.convergence import CG_ITERATIONS
 from mgs.active.criteria import d_optimal, lam_by_kind, regularisation
 from mgs.active.fitting import Fit, fit
-from mgs.active.loop import target_of
 from mgs.active.objective import Objective, newton_decrease, objective
 from mgs.active.pose_policies import seed_views
 from mgs.active.settings import TrainSettings
-from mgs.data.dataset import Dataset, load_dataset
+from mgs.data.dataset import Dataset, load_dataset, target_of
 from mgs.gaussians import Gaussians
 from mgs.metrics import agreement
 from mgs.prior.build import Prior, build_prior

@@ -26,7 +26,7 @@ def chart(
     """Chart speed against accuracy: of fits and runs, of scoring, of the core, and of what is sent; and try the presets of
     `mgs nbv` on other scenes.
 
-    Writes KIND.csv and KIND.png for each chart, and chart.json; each row names the command that makes it again. Points are
+    Writes KIND.csv and pictures for each chart, and chart.json; each row names the command that makes it again. Points are
     timed one after another; let nothing else run meanwhile. What was interrupted goes on where it stopped when the same command
     is given again.
     """

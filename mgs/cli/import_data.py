@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from mgs.data.importers import Source
 
 MANY_PIXELS = 2_000_000
 """Images with more pixels than this are worth a word on --downscale."""
@@ -32,6 +35,10 @@ def import_data(
     unit: Annotated[
         float | None, typer.Option(help="Metres in the source's unit of length. Default: unknown, unless there is depth.")
     ] = None,
+    test_every: Annotated[
+        int | None,
+        typer.Option(min=2, help="Set every so manieth image apart as a test view, by name from the first on; 8 is usual."),
+    ] = None,
     split: Annotated[str, typer.Option(help="Which split of NeRF-synthetic data to import: train, val or test.")] = "train",
 ) -> None:
     """Make a dataset of your own data: cameras and images, and depth and masks if there are any. Lens distortion is undone.
@@ -45,6 +52,7 @@ def import_data(
     from rich.progress import Progress
 
     from mgs.cli.printing import parse_up
+    from mgs.data.dataset import TEST_FOLDER
     from mgs.data.importers import import_source, read_source
     from mgs.data.meshes import GLTF
     from mgs.errors import InputError
@@ -57,6 +65,9 @@ def import_data(
     found = found if unit is None else found.in_metres(unit)
     given = parse_up(up)
     upward, reason = found.up_or_estimate() if given is None else (given, "as --up says")
+    tests: Source | None = None
+    if test_every is not None:
+        found, tests = found.set_apart(test_every)
     with Progress(console=console, transient=True) as progress:
         bar = progress.add_task("importing")
         result = import_source(
@@ -66,6 +77,7 @@ def import_data(
             mesh=mesh,
             downscale=downscale,
             up=upward,
+            tests=tests,
             on_frame=lambda done, total: progress.update(bar, completed=done, total=total),
         )
     if mesh is not None and mesh.suffix.lower() in GLTF:
@@ -94,3 +106,5 @@ def import_data(
         f"{found.kind}: {len(result)} frames, {masked} with mask, {layered} with alpha, {deep} with depth, "
         f"{undone} undistorted, {points:,} points; wrote {out}"
     )
+    if tests is not None:
+        console.print(f"test views: {len(tests.shots)} images, which are no candidates; wrote {out / TEST_FOLDER}")

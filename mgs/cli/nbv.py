@@ -26,6 +26,7 @@ def _numbers(defaults: dict[str, float]) -> str:
 
 
 def nbv(
+    context: typer.Context,
     dataset: Annotated[Path | None, typer.Argument(help="Dataset folder (transforms.json). Not needed with --resume.")] = None,
     out: Annotated[Path | None, typer.Option(help="New folder for the run.")] = None,
     capture: Annotated[
@@ -63,7 +64,7 @@ def nbv(
     stop_gain: Annotated[
         float | None,
         typer.Option(
-            metavar="NATS", help="End the run before a view whose information gain (Eq. 7, nats per parameter) is less."
+            metavar="GAIN", help="End the run before a view whose `information_gain` (Eq. 7, in steps.jsonl) is less than this."
         ),
     ] = None,
     stop_uncertainty: Annotated[
@@ -125,8 +126,8 @@ def nbv(
     --stop-gain or --stop-uncertainty ends the run.
 
     Writes config.json, steps.jsonl (a line for the seeds, then one for each chosen view), checkpoint.npz, gaussians.ply and
-    metrics.json into the run folder. A run that was interrupted at any moment, kill -9 included, goes on with --resume and
-    takes the same views.
+    metrics.json into the run folder. Once the folder is there, a run that was interrupted at any moment, kill -9 included, goes
+    on with --resume and takes the same views; before that, give the same command again.
     """
     from rich.console import Console
 
@@ -137,6 +138,11 @@ def nbv(
     if resume is not None:
         if dataset is not None or out is not None or capture is not None:
             raise InputError("nbv: --resume RUN continues RUN as it was started; leave DATASET, --out and --capture out")
+        for name in context.params:
+            source = context.get_parameter_source(name)
+            if name != "resume" and source is not None and source.name == "COMMANDLINE":
+                option = f"--{name.replace('_', '-')}"
+                raise InputError(f"nbv: {option}: --resume takes its settings from {resume / 'config.json'}; change it there")
         resume_and_print(resume, console)
         return
     if (dataset is None) == (capture is None) or out is None:
@@ -223,8 +229,7 @@ def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console
     rows = []
     for line in state.steps:
         names = [line["name"]] if line["name"] else line["seed_names"]
-        number = line.get("score", line.get("gain"))  # as older runs called it
-        score = "" if number is None else f"{number:.4g}"
+        score = "" if line["score"] is None else f"{line['score']:.4g}"
         rows.append((
             str(line["step"]), "\n".join(names), score, f"{100 * line['coverage']:.2f} %",
             *((str(line["iterations"]), f"{line['loss']:.3g}", line["stop_reason"]) if "loss" in line else ("", "", "")),

@@ -17,6 +17,7 @@ def report(
             show_default="report; with --html none",
         ),
     ] = None,
+    figures: Annotated[str, typer.Option(metavar="png|pdf|svg", help="What the figures are written as.")] = "png",
     html: Annotated[
         Path | None,
         typer.Option("--html", help="One page with everything, interactive; it opens from the disk and loads nothing."),
@@ -33,17 +34,20 @@ def report(
     """
     from mgs.errors import InputError
     from mgs.files import check_writable
+    from mgs.plotting import FORMATS
 
+    if figures not in FORMATS:
+        raise InputError(f"--figures {figures}: unknown; choose one of {', '.join(FORMATS)}")
     if html is not None and check_writable(html).is_dir():
         raise InputError(f"--html {html}: is a folder; name a file to write")
     if out is not None or html is None:
-        _write_figures(runs, out or Path("report"))
+        _write_figures(runs, out or Path("report"), figures)
     if html is not None:
         _write_page(runs, html)
 
 
-def _write_figures(runs: list[Path], out: Path) -> None:
-    """Write the figures and the table, and print the table."""
+def _write_figures(runs: list[Path], out: Path, kind: str) -> None:
+    """Write the figures and the table, print the table, and say what was left out."""
     from rich.console import Console
 
     from mgs.active.stopping import why_ended
@@ -54,7 +58,7 @@ def _write_figures(runs: list[Path], out: Path) -> None:
     from mgs.report.writing import write_report
 
     check_writable(out / "table.md")  # before the figures are drawn, not after it
-    written = write_report(out, runs)
+    written = write_report(out, runs, kind)
     rows = table_numbers(runs)
     print_table(Console(), rows)
     for row, run in zip(rows, labelled_runs(runs).values(), strict=True):
@@ -63,6 +67,8 @@ def _write_figures(runs: list[Path], out: Path) -> None:
             typer.echo(f"{row['policy']}: a path of {length}; the run has ended: {why_ended(run.ended)}")
     for path in written:
         typer.echo(f"wrote {path}")
+    if not any(path.stem == "psnr" for path in written):
+        typer.echo("PSNR against images is left out: it is known of runs that were made with --evaluate-every 1")
 
 
 def _write_page(runs: list[Path], html: Path) -> None:

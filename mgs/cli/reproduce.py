@@ -29,7 +29,8 @@ def reproduce(
         typer.Option(min=1, help="How many rocks the curves, seeds, pools and the oracle have. Default: the preset's."),
     ] = None,
     policy: Annotated[
-        str | None, typer.Option(help="Compare one policy more in curves and pools: a name, or FILE.py:FUNCTION of your own.")
+        list[str] | None,
+        typer.Option(help="One policy more in curves and pools: a name, or FILE.py:FUNCTION. May be given several times."),
     ] = None,
     batch: Annotated[
         int, typer.Option(min=1, help="Of Table I and the figures: views that are chosen before the model is fitted again.")
@@ -54,7 +55,7 @@ def reproduce(
     from mgs.study import reproduce as study
 
     names = study.results_of(only)
-    size = study.with_policy(row_named(study.PRESETS, preset, "--preset"), names, policy)
+    size = study.with_policies(row_named(study.PRESETS, preset, "--preset"), names, policy or [])
     size = study.with_batch(size, names, batch)
     counts = {name: study.rocks_of(name, size, rocks) for name in names}
     if scheduler is not None and workers != 1:

@@ -17,7 +17,17 @@ import numpy as np
 from mgs.camera import Camera, opencv_from_opengl
 from mgs.data.clouds import SparseCloud, read_cloud, write_cloud
 from mgs.data.colmap import is_model, read_model
-from mgs.data.dataset import FRAME_INTERVAL, PINHOLES, Dataset, Frame, load_dataset, read_records, resumes, write_transforms
+from mgs.data.dataset import (
+    FRAME_INTERVAL,
+    PINHOLES,
+    TEST_FOLDER,
+    Dataset,
+    Frame,
+    load_dataset,
+    read_records,
+    resumes,
+    write_transforms,
+)
 from mgs.data.lens import Undo, fit_to_camera, shrunk, undistorter
 from mgs.data.meshes import read_mesh
 from mgs.data.rock_image import premultiplied, write_rock_image
@@ -81,6 +91,18 @@ class Source:
             raise InputError(f"import: --unit {unit} must be a positive number of metres; correct it")
         shots = [replace(shot, camera=shot.camera.scaled(unit)) for shot in self.shots]
         return replace(self, shots=shots, sparse=self.sparse and self.sparse.scaled(unit), unit="m")
+
+    def set_apart(self, every: int) -> tuple[Source, Source]:
+        """The data without every so manieth shot by name, from the first on, and these alone, without points: test views.
+
+        Raises InputError where one of the two would have no shots.
+        """
+        names = sorted(shot.name for shot in self.shots)[::every]
+        apart = [shot for shot in self.shots if shot.name in names]
+        kept = [shot for shot in self.shots if shot.name not in names]
+        if not kept:
+            raise InputError(f"import: --test-every {every} of {len(self.shots)} images leaves none to choose from; correct it")
+        return replace(self, shots=kept), replace(self, shots=apart, sparse=None)
 
     def up_or_estimate(self) -> tuple[Up, str]:
         """Which way is up, and how that is known: as the source says, or as the cameras were held (`up_of_cameras`).
@@ -221,6 +243,7 @@ def import_source(
     mesh: Path | None = None,
     downscale: int = 1,
     up: Up = PLUS_Z,
+    tests: Source | None = None,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Dataset:
     """Write a source as a dataset into the folder `out`: a new or empty one, or one that an interrupted import of it left.
@@ -230,7 +253,8 @@ def import_source(
     images' alpha. Images of the rock alone come from the source's own images of it, or from an alpha that gives the mask and
     has values between empty and full. With `masks` or `mesh` there are none.
     Distorted images, depth and masks are undistorted to a pinhole camera in which every pixel is valid; then blocks of
-    `downscale` x `downscale` pixels become one. up: what transforms.json says is up. One frame is in memory at a time.
+    `downscale` x `downscale` pixels become one. up: what transforms.json says is up. tests: shots of the same world that become
+    the test views (`Dataset.test_views`), in the same way. One frame is in memory at a time.
 
     import.json, which says what is imported, is written first, and transforms.json last. When an interrupted import is
     continued, a finished frame is made again only if one of its files has a newer modification time. The result is the
@@ -246,6 +270,7 @@ def import_source(
     by_mesh = None if project is None or mesh is None else fingerprint(mesh)
     asked = {"kind": source.kind, "frames": len(shots), "sha256_of_frames": _digest(shots), "mesh": by_mesh}
     asked |= {"downscale": downscale} if downscale != 1 else {}
+    asked |= {"test_views": len(tests.shots)} if tests is not None else {}
     frames = []
     with ExitStack() as lock:
         if resumes(out, RECORD, asked):
@@ -263,6 +288,8 @@ def import_source(
             frames.append(_import_shot(shot, out, project, downscale, begin))
         if source.sparse is not None:
             write_cloud(out / "sparse.ply", source.sparse)
+        if tests is not None and not (out / TEST_FOLDER / "transforms.json").is_file():
+            import_source(tests, out / TEST_FOLDER, masks=masks, mesh=mesh, downscale=downscale, up=up, on_frame=on_frame)
         write_transforms(out, frames, up, source.unit or "unit")
     return load_dataset(out)
 

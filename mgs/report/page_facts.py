@@ -12,11 +12,10 @@ from urllib.parse import quote
 import numpy as np
 
 from mgs.active.pose_policies import path_length
-from mgs.active.run_folder import read_checkpoint
+from mgs.active.run_folder import read_checkpoint, read_config
 from mgs.active.stopping import fit_line, why_ended
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.up import PLUS_Z, Up
-from mgs.files import read_json
 from mgs.gaussians import Gaussians
 from mgs.report.page_plots import metric_name
 from mgs.report.runs import Run, up_of
@@ -158,7 +157,7 @@ def setting_rows(shown: Sequence[Shown]) -> list[tuple[str, list[str], bool]]:
     rows = []
     columns = []
     for one in shown:
-        config = read_json(one.run.folder / "config.json")
+        config = read_config(one.run.folder)
         versions = config.get("versions", {})
         columns.append(_texts(config["settings"]) | {f"version of {name}": str(v) for name, v in versions.items()})
     for key in dict.fromkeys(key for column in columns for key in column):

@@ -23,11 +23,10 @@ from numpy.typing import NDArray
 from mgs.active import run_folder
 from mgs.active.criteria import lam_by_kind
 from mgs.active.fitting import fit
-from mgs.active.loop import target_of
 from mgs.active.settings import NbvSettings
 from mgs.camera import Camera
 from mgs.colour import SH_C0
-from mgs.data.dataset import Frame
+from mgs.data.dataset import Frame, target_of
 from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.gaussians import Gaussians, learned, sh_from_rgb

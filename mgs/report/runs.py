@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from mgs.active.policy_file import label
-from mgs.active.run_folder import check_same_frames, read_settings
+from mgs.active.run_folder import check_same_frames, read_config, read_settings
 from mgs.active.settings import validated
 from mgs.active.stopping import RunEnd
 from mgs.data.dataset import Dataset, load_dataset
@@ -114,11 +114,8 @@ def read_run(folder: str | Path) -> Run:
     Raises InputError if the folder holds no run, or a file is damaged, empty, or lacks a number that a report needs.
     """
     folder = Path(folder)
-    path = folder / "config.json"
-    config = read_json(path)
-    if not isinstance(config, dict) or not isinstance(config.get("settings"), dict):
-        raise InputError(f"{path}: has no settings; the file is damaged, start the run anew")
-    settings = validated(_Settings, config["settings"], path)
+    config = read_config(folder)
+    settings = validated(_Settings, config["settings"], folder / "config.json")
     steps = _read_steps(folder)
     path = folder / "metrics.json"
     metrics = read_json(path) if path.exists() else None

@@ -87,6 +87,10 @@ def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
     columns = table_columns(rows)
     every = ", all" if has_held_out(rows) else ", views trained on"
     headings = [COLUMNS[key].replace("{unit}", rows[0].get("unit", "m")).replace(", all", every) for key in columns]
-    lines = [headings, ["---", *["---:"] * (len(columns) - 1)]]
-    lines += [[table_cell(key, row.get(key)) for key in columns] for row in rows]
+    return markdown(headings, [[table_cell(key, row.get(key)) for key in columns] for row in rows])
+
+
+def markdown(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table; all columns but the first are right-aligned."""
+    lines = [heading, ["---", *["---:"] * (len(heading) - 1)], *rows]
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)

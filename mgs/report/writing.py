@@ -17,12 +17,13 @@ from mgs.report.tables import markdown_table, table_numbers
 from mgs.splat_ply import read_ply
 
 
-def write_report(out: str | Path, folders: Sequence[str | Path]) -> list[Path]:
+def write_report(out: str | Path, folders: Sequence[str | Path], kind: str = "png") -> list[Path]:
     """Write all figures and the table of runs into the folder `out`, and return the paths of the files.
 
-    folders: the run folders. The files: orbit.png, gain.png, coverage.png, comparison.png (of a test view, or where there are
-    none, of a view that the fewest runs were trained on), psnr.png (only if all runs were evaluated after some of their steps;
-    over the test views, or where there are none, over all views), table.md and table.json (`table_numbers`).
+    folders: the run folders. kind: what the figures are written as, one of `mgs.plotting.FORMATS`. The files: orbit.png,
+    gain.png, coverage.png, comparison.png (of a test view, or where there are none, of a view that the fewest runs were trained
+    on), psnr.png (only if all runs were evaluated after some of their steps; over the test views, or where there are none, over
+    all views), table.md and table.json (`table_numbers`).
     Files of an earlier report are replaced. Raises InputError as `evaluated_runs` and `dataset_of`, if a run is unfinished, or
     if a picture of `mgs eval` is missing or damaged; then nothing is written.
     """
@@ -41,23 +42,24 @@ def write_report(out: str | Path, folders: Sequence[str | Path]) -> list[Path]:
     captions = {label: _caption(run, views, frame.name) for label, run in runs.items()}
     pairs = {label: read_comparison(picture, frame.camera) for label, picture in pictures.items()}
 
+    figures = {name: out / f"{name}.{kind}" for name in ("orbit", "gain", "coverage", "comparison")}
     positions = np.array([frame.camera.position for frame in dataset.frames])
     choices = {label: (run.seeds, run.chosen) for label, run in runs.items()}
     means, up = read_ply(first.folder / "gaussians.ply").means, up_of(first.settings.get("prior", ""), dataset)
-    orbit_figure(out / "orbit.png", positions, means, choices, up, dataset.unit)
-    gain_figure(out / "gain.png", {label: [s["information_gain"] for s in run.steps[1:]] for label, run in runs.items()})
+    orbit_figure(figures["orbit"], positions, means, choices, up, dataset.unit)
+    gain_figure(figures["gain"], {label: [s["information_gain"] for s in run.steps[1:]] for label, run in runs.items()})
     curves = {label: ([s["images"] for s in run.steps], [s["coverage"] for s in run.steps]) for label, run in runs.items()}
-    coverage_figure(out / "coverage.png", curves)
+    coverage_figure(figures["coverage"], curves)
 
     truth = next(iter(pairs.values()))[0]
     renders = {label: rendered for label, (_, rendered) in pairs.items()}
-    comparison_figure(out / "comparison.png", truth, renders, title=frame.name, captions=captions)
-    written = [out / f"{name}.png" for name in ("orbit", "gain", "coverage", "comparison")]
+    comparison_figure(figures["comparison"], truth, renders, title=frame.name, captions=captions)
+    written = list(figures.values())
 
     panels = _psnr_panels(runs, "views taken so far" if dataset.on_demand else "all views")
     if panels:
-        psnr_figure(out / "psnr.png", panels)
-        written.append(out / "psnr.png")
+        psnr_figure(out / f"psnr.{kind}", panels)
+        written.append(out / f"psnr.{kind}")
     numbers = table_numbers(folders)
     with atomic_path(out / "table.md") as temporary:
         temporary.write_text(markdown_table(numbers), encoding="utf-8")

@@ -282,7 +282,7 @@ def _checked_tangent(gaussians: Gaussians, name: str, tangent: Any) -> Any:
     if not np.isfinite(values).all():
         first = np.argwhere(~np.isfinite(values))[0][0]
         raise InputError(f"tangents: {name} is NaN or infinite, first at Gaussian {first}; remove or repair it")
-    return mi.TensorXf(values)
+    return mi.TensorXf(padded(values))
 
 
 def _empty(camera: Camera, background: Any) -> Image:

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from mgs.active.fitting import fit
-from mgs.active.loop import target_of
 from mgs.active.settings import TrainSettings
-from mgs.data.dataset import Frame, load_dataset
+from mgs.data.dataset import Frame, load_dataset, target_of
 from mgs.memory import IMAGE_BYTES, Deferred, kept_within
 from mgs.prior.build import load_prior
 from mgs.prior.initial import initial_gaussians

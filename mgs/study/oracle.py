@@ -15,9 +15,9 @@ from mgs.active.run_folder import State, read_checkpoint, read_settings, write_c
 from mgs.active.settings import NbvSettings
 from mgs.active.stations import psnr_measure, real_stations
 from mgs.data.dataset import Dataset, load_dataset
-from mgs.errors import InputError
 from mgs.prior.build import load_prior
 from mgs.splat import ListCache
+from mgs.study.material import test_views_of
 from mgs.study.sweep import cell_folder
 from mgs.study.tasks import CURVES, dataset_of
 
@@ -59,9 +59,7 @@ def choose_all(run: Path) -> State:
     """Run or resume the oracle in a run folder to the end of its budget. Raises InputError if there are no test views."""
     settings = read_settings(run)
     loaded = load_dataset(settings.dataset)
-    tests = loaded.test_views()
-    if tests is None:
-        raise InputError(f"{loaded.root}: has no test views to judge by; make them with `mgs synth-orbit --test-views`")
+    tests = test_views_of(loaded)
     stations = real_stations(loaded, load_prior(settings.prior), settings)
     oracle = Oracle(run, settings, loaded, tests, stations, lambda stage, done, total: None)
     state = oracle.marked(read_checkpoint(run) or oracle.first())

@@ -15,7 +15,6 @@ free test. The rules:
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -111,22 +110,18 @@ def make_dataset(
     root: Path, out: Path, scene: str, width: int, height: int, frames: int, tests: int, spp: int, seed: int
 ) -> Any:
     """A task: the data set of a scene, in the cell's folder "data"."""
+    from mgs.study.material import made_dataset
     from mgs.synth import rendering
 
-    rendering.synthesise(out / "data", scene, rendering.Preset(width, height, frames, spp), seed, test_views=tests)
+    made_dataset(out / "data", scene, rendering.Preset(width, height, frames, spp), seed, tests)
     return {}
 
 
 def make_prior(root: Path, out: Path, scene: str, gaussians: int | str, seed: int) -> Any:
     """A task: a prior of so many Gaussians, or "auto", in the cell's folder "prior"."""
-    from mgs.data.dataset import load_dataset
-    from mgs.prior.build import build_prior, save_prior
-    from mgs.prior.settings import PriorSettings
+    from mgs.study.material import made_prior
 
-    shutil.rmtree(out / "prior", ignore_errors=True)  # of an interrupted call
-    dataset = load_dataset(cell_folder(root, f"dataset/{scene}") / "data")
-    prior, _ = build_prior(dataset, PriorSettings(gaussians=gaussians, seed=seed))  # type: ignore[arg-type]
-    save_prior(out / "prior", prior)
+    prior = made_prior(out / "prior", cell_folder(root, f"dataset/{scene}") / "data", gaussians=gaussians, seed=seed)
     return {"gaussians": len(prior.points) + prior.backed, "spacing": prior.spacing} | {
         key: prior.numbers[key] for key in ("sampled_area", "resolution") if key in prior.numbers
     }
@@ -149,10 +144,9 @@ def fit_and_judge(
     """A task: fit views one after the other; what the test views, the next views and the evidence say of the model."""
     from mgs.active.criteria import PIXEL_NOISE, lam_by_kind
     from mgs.active.fitting import fit
-    from mgs.active.loop import target_of
     from mgs.active.objective import objective
     from mgs.active.settings import RATES, NbvSettings, TrainSettings
-    from mgs.data.dataset import load_dataset
+    from mgs.data.dataset import load_dataset, target_of
     from mgs.gaussians import Gaussians
     from mgs.prior.build import load_prior
     from mgs.prior.initial import initial_gaussians, warm_start
@@ -213,10 +207,12 @@ def log_likelihood(error: float, variance: float) -> float:
 
 def _squared_error(model: Any, frame: Any) -> float:
     """Mean squared error of a frame's pixel values inside the rock's mask, linear RGB."""
+    from mgs.data.dataset import target_of
+    from mgs.metrics import masked_squares
     from mgs.splat import render
 
-    (target, weight), rgb = frame.target(), np.asarray(render(model, frame.camera).rgb, np.float64)
-    return float(((rgb - target[..., :3])[frame.mask() & (weight > 0)] ** 2).mean())
+    rgb = np.asarray(render(model, frame.camera).rgb, np.float64)
+    return float(masked_squares(rgb, target_of(frame), frame.mask()).mean())
 
 
 def _quality(model: Any, dataset: Any) -> dict[str, float]:

@@ -5,7 +5,7 @@ A cell is a dataset, a prior or a run; cells that several results need are done 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,7 +24,9 @@ DEVELOPED_ON = ("boulder", "contact-binary")
 SEEDS = 4
 """Seed views of a run, as in the paper."""
 
-POLICIES = ("d-optimal", "directional-i", "directional-d", "fisherrf", "farthest", "uniform", "random")
+POLICIES = (
+    "paper", "d-optimal", "directional-i", "directional-d", "fisherrf", "coverage", "farthest", "uniform", "random",
+)  # fmt: skip
 """Policies that are compared over rocks."""
 
 PAIRS = (
@@ -32,8 +34,11 @@ PAIRS = (
     ("d-optimal", "farthest"),
     ("directional-i", "uniform"),
     ("directional-i", "farthest"),
+    ("paper", "coverage"),
+    ("d-optimal", "coverage"),
 )
-"""Pairs of policies, named before anything was measured, whose difference is tested."""
+"""Pairs of policies, named before they were measured over rocks, whose difference is tested. The last two are what the paper
+compares."""
 
 LEADER = "directional-i"
 """The policy whose difference from every other is told for each pool."""
@@ -62,9 +67,10 @@ POOLS: dict[str, dict[str, Any]] = {
     "rings": {"orbit": "rings"},
     "biased arc": {"orbit": "circle", "every": 6},
     "five nearest": {"orbit": "circle", "nearest": 5},
+    "mixed distances": {"orbit": "hemisphere", "distances": (1, 2, 3)},
 }
-"""Candidates to choose from. orbit: a kind of `mgs.synth.scene_file.ORBITS`; every: half of a ring of 3/2 as many frames, and
-of its other half one frame of so many; nearest: the setting of `mgs nbv`."""
+"""Candidates to choose from. orbit, distances: as in `mgs.synth.scene_file.Orbit`; every: half of a ring of 3/2 as many frames,
+and of its other half one frame of so many; nearest: the setting of `mgs nbv`."""
 
 SEED_COUNTS = (1, 2, 3, 4, 6, 8)
 SEED_POLICIES = ("d-optimal", "paper")
@@ -96,7 +102,7 @@ class Preset:
     seed_rocks: int = 5
     pool_rocks: int = 3
     own_policies: tuple[str, ...] = ()
-    """Policies of the user's own that the curves and the pools compare, too (`with_policy`)."""
+    """Policies of the user's own that the curves and the pools compare, too (`with_policies`)."""
 
     @property
     def policies(self) -> tuple[str, ...]:
@@ -152,10 +158,12 @@ class Run:
         """Its cells; the last is the run itself."""
         size, pool = self.size, POOLS[self.pool]
         frames = size.frames * 3 // 2 if "every" in pool else size.frames
-        shape = f"{pool['orbit']}-{frames}x{size.width}x{size.height}"
+        distances = pool.get("distances", ())
+        shape = "-".join([pool["orbit"], *map(str, distances), f"{frames}x{size.width}x{size.height}"])
         views = {"test_views": size.test_views}
         preset = {"width": size.width, "height": size.height, "frames": frames, "spp": size.spp}
         where = {"scene": self.rock.scene, "seed": self.rock.seed, "orbit": pool["orbit"]}
+        where |= {"distances": list(distances)} if distances else {}
         cells = [Cell(f"dataset/{self.rock.name}/{shape}", "mgs.study.tasks:make_dataset", where | views | {"preset": preset})]
         survey = cells[0].name  # the prior is of the whole flight
         prior = {"dataset": survey, "gaussians": size.gaussians, "seed": 0}
@@ -331,20 +339,19 @@ def cells_of(name: str, preset: Preset, count: int) -> list[Cell]:
     return list({cell.name: cell for run in RESULTS[name].runs(preset, count) for cell in run.cells()}.values())
 
 
-def with_policy(preset: Preset, names: list[str], policy: str | None) -> Preset:
-    """A preset whose curves and pools compare one policy more, if one is given: a name, or FILE.py:FUNCTION.
+def with_policies(preset: Preset, names: list[str], policies: Sequence[str]) -> Preset:
+    """A preset whose curves and pools compare these policies, too: names, or FILE.py:FUNCTION.
 
     names: the results to make. Raises InputError where none of them compares policies over rocks, where there is no such
-    policy, and where it is compared anyway.
+    policy, and where it is compared anyway or given twice.
     """
-    if policy is None:
-        return preset
-    if not {"curves", "pools"} & set(names):
-        raise InputError(f"--policy {policy}: is for curves and pools, and --only leaves both out")
-    if policy in POLICIES:
-        raise InputError(f"--policy {policy}: is compared anyway")
-    policy_named(policy)
-    return replace(preset, own_policies=(policy_file.absolute(policy),))
+    for k, policy in enumerate(policies):
+        if not {"curves", "pools"} & set(names):
+            raise InputError(f"--policy {policy}: is for curves and pools, and --only leaves both out")
+        if policy in (*POLICIES, *policies[:k]):
+            raise InputError(f"--policy {policy}: is compared anyway")
+        policy_named(policy)
+    return replace(preset, own_policies=tuple(policy_file.absolute(policy) for policy in policies))
 
 
 def with_batch(preset: Preset, names: list[str], batch: int) -> Preset:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from mgs.report.tables import table_cell
+from mgs.report.tables import markdown, table_cell
 from mgs.study.reproduce import LEADER
 
 Rows = Sequence[Mapping[str, Any]]
@@ -40,7 +40,7 @@ def table_markdown(rows: Rows, left: Sequence[str] = ()) -> str:
         for name, images, psnr, ssim in PAPER_TABLE
     ]
     lines = [[_cell(key, row.get(key)) for key in TABLE_COLUMNS] for row in [*theirs, *ours]]
-    return _markdown(list(TABLE_COLUMNS.values()), lines) + (f"\nNot done yet: {'; '.join(left)}.\n" if left else "")
+    return markdown(list(TABLE_COLUMNS.values()), lines) + (f"\nNot done yet: {'; '.join(left)}.\n" if left else "")
 
 
 def _mean_row(draws: Rows) -> dict[str, Any]:
@@ -70,7 +70,7 @@ def statistics_markdown(statistics: Mapping[str, Any]) -> str:
         pairs.append([f"{pair['policy']} − {pair['other']}", what, *cells])
     heading = ["pair", "PSNR of", "difference of areas (dB)", "ahead on rocks", "p", "p, Holm"]
     heading.append("on scenes that chose no setting")
-    return f"{_markdown(['policy', 'area, full frame (dB)', 'area, rock (dB)'], areas)}\n{_markdown(heading, pairs)}"
+    return f"{markdown(['policy', 'area, full frame (dB)', 'area, rock (dB)'], areas)}\n{markdown(heading, pairs)}"
 
 
 def _ahead(pair: Mapping[str, Any]) -> str:
@@ -87,28 +87,38 @@ def seeds_markdown(rows: Rows) -> str:
         lines.append([row["policy"], str(row["seeds"]), *about, *four])
     heading = ["policy", "seeds", "they see (%)", "largest gap (most), degrees", "test views (dB)", "over four seeds (dB)"]
     heading.append("rock (dB)")
-    return _markdown(heading, lines)
+    return markdown(heading, lines)
 
 
 def pools_markdown(rows: Rows) -> str:
-    """PSNR of the last model for each pool and policy, its difference from `random`, and its share of the oracle's."""
-    lines = []
-    for row in rows:
-        over = ["–"] * 2 if row["policy"] == "random" else [_with_interval(row, key) for key in _over("random")]
-        led = [_with_interval(row, key) if key in row else "–" for key in ("test_psnr_led", "test_psnr_area_led")]
-        share = "–" if row["test_psnr_share"] is None else f"{row['test_psnr_share']:.0%}"
-        lines.append([row["pool"], row["policy"], f"{row['test_psnr']:.2f}", *over, *led, share])
-    heading = [
-        "pool",
-        "policy",
-        "test views (dB)",
-        "over random (dB)",
-        "rock (dB)",
-        f"{LEADER} over it (dB)",
-        "over the curve (dB)",
-        "share of the oracle's",
+    """Tables with a row for each policy and a column for each pool: PSNR of the last model; by how much the LEADER is ahead of
+    it, there and over the whole curve; and, where there is an oracle, the share of what the oracle gains over `random`."""
+    tables = [
+        matrix(rows, "test views (dB)", lambda row: f"{row['test_psnr']:.2f}"),
+        matrix(rows, f"{LEADER} over it (dB)", lambda row: led(row, "test_psnr_led")),
+        matrix(rows, "inside the rock (dB)", lambda row: led(row, "test_psnr_mask_led")),
+        matrix(rows, "over the whole curve (dB)", lambda row: led(row, "test_psnr_area_led")),
     ]
-    return _markdown(heading, lines)
+    if any(row["test_psnr_share"] is not None for row in rows):
+        tables.append(matrix(rows, "share of the oracle's", _share))
+    return "\n".join(tables)
+
+
+def matrix(rows: Rows, title: str, cell: Callable[[Mapping[str, Any]], str]) -> str:
+    """A table of the rows of pools, with a line for each policy and a column for each pool."""
+    pools, policies = (list(dict.fromkeys(row[key] for row in rows)) for key in ("pool", "policy"))
+    found = {(row["policy"], row["pool"]): cell(row) for row in rows}
+    return markdown([title, *pools], [[policy, *(found.get((policy, pool), "–") for pool in pools)] for policy in policies])
+
+
+def led(row: Mapping[str, Any], key: str) -> str:
+    """By how much the LEADER is ahead of a row's policy, with its interval; a dash for itself."""
+    return _with_interval(row, key) if key in row else "–"
+
+
+def _share(row: Mapping[str, Any]) -> str:
+    """The share of the oracle's gain."""
+    return "–" if row["test_psnr_share"] is None else f"{row['test_psnr_share']:.0%}"
 
 
 def _over(what: str) -> list[str]:
@@ -120,9 +130,3 @@ def _with_interval(row: Mapping[str, Any], key: str) -> str:
     """A difference with its interval, where it has one."""
     text = f"{row[key]:+.2f}"
     return text if row[f"{key}_low"] is None else f"{text} [{row[f'{key}_low']:+.2f}, {row[f'{key}_high']:+.2f}]"
-
-
-def _markdown(heading: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """A Markdown table; all columns but the first are right-aligned."""
-    rows = [heading, ["---", *["---:"] * (len(heading) - 1)], *lines]
-    return "".join("| " + " | ".join(row) + " |\n" for row in rows)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -20,10 +20,9 @@ from mgs.active.run_folder import State
 from mgs.data.dataset import TEST_FOLDER, load_dataset, write_transforms
 from mgs.errors import InputError
 from mgs.files import atomic_folder
-from mgs.prior.build import build_prior, save_prior
-from mgs.prior.settings import PriorSettings
+from mgs.study.material import made_dataset, made_prior
 from mgs.study.sweep import cell_folder
-from mgs.synth.rendering import Preset, synthesise
+from mgs.synth.rendering import Preset
 from mgs.synth.scene_file import load_scene_file
 
 CURVES = ("images", "coverage", "test_psnr", "test_psnr_mask")
@@ -36,15 +35,21 @@ def dataset_of(root: Path, name: str) -> Path:
 
 
 def make_dataset(
-    root: Path, out: Path, scene: str, seed: int, orbit: str, test_views: int, preset: dict[str, int]
+    root: Path,
+    out: Path,
+    scene: str,
+    seed: int,
+    orbit: str,
+    test_views: int,
+    preset: dict[str, int],
+    distances: Sequence[float] = (1,),
 ) -> dict[str, Any]:
-    """Render a scene's rock of that seed from an orbit of that kind. preset: fields of `mgs.synth.rendering.Preset`."""
-    folder = out / "dataset"
-    if not (folder / "transforms.json").is_file():
-        loaded = load_scene_file(scene)
-        settings = loaded.model_copy(update={"orbit": loaded.orbit.model_copy(update={"kind": orbit})})
-        synthesise(folder, settings, Preset(**preset), seed, test_views=test_views)
-    return {"frames": len(load_dataset(folder))}
+    """Render a scene's rock of that seed from an orbit of that kind. preset: fields of `mgs.synth.rendering.Preset`;
+    distances: of `mgs.synth.scene_file.Orbit`."""
+    loaded = load_scene_file(scene)
+    flight = loaded.orbit.model_copy(update={"kind": orbit, "distances": tuple(distances)})
+    settings = loaded.model_copy(update={"orbit": flight})
+    return {"frames": len(made_dataset(out / "dataset", settings, Preset(**preset), seed, test_views))}
 
 
 def make_arc(root: Path, out: Path, ring: str, every: int) -> dict[str, Any]:
@@ -74,10 +79,7 @@ def make_arc(root: Path, out: Path, ring: str, every: int) -> dict[str, Any]:
 
 def make_prior(root: Path, out: Path, dataset: str, gaussians: int, seed: int) -> dict[str, Any]:
     """Build the prior of a dataset."""
-    if not (out / "prior").is_dir():
-        prior, _ = build_prior(load_dataset(dataset_of(root, dataset)), PriorSettings(gaussians=gaussians, seed=seed))
-        with atomic_folder(out / "prior") as unfinished:
-            save_prior(unfinished, prior)
+    made_prior(out / "prior", dataset_of(root, dataset), gaussians=gaussians, seed=seed)
     return {"gaussians": gaussians}
 
 

@@ -20,8 +20,15 @@ def orbit_positions(settings: Orbit, frames: int, target: np.ndarray) -> np.ndar
 
     settings.kind is one of: circle, of fixed radius and altitude, as in the paper; rings, `turns` circles at rising elevations;
     spiral, `turns` turns with rising elevation; hemisphere, positions spread evenly between the two elevations (Fibonacci
-    lattice), sorted by azimuth. target [3]: the point that all look at, world, metres.
+    lattice), sorted by azimuth. Frame k is then moved away from the target to settings.distances[k % len] times its distance.
+    target [3]: the point that all look at, world, metres.
     """
+    positions = _at_one_distance(settings, frames, target)
+    return positions + (np.resize(settings.distances, frames)[:, None] - 1) * (positions - target)
+
+
+def _at_one_distance(settings: Orbit, frames: int, target: np.ndarray) -> np.ndarray:
+    """Camera centres [frames,3] as of `orbit_positions`, without the factors on their distances."""
     step = np.arange(frames)
     if settings.kind == "circle":
         azimuth = 2 * np.pi * step / frames

@@ -274,7 +274,7 @@ def dome_cameras(settings: SceneFile, preset: Preset, rock: trimesh.Trimesh, cou
 
     The dome covers all azimuths and the elevations of DOME_ELEVATIONS. Raises InputError as `rock_cameras`.
     """
-    dome = settings.orbit.model_copy(update={"kind": "hemisphere", "elevations": DOME_ELEVATIONS})
+    dome = settings.orbit.model_copy(update={"kind": "hemisphere", "elevations": DOME_ELEVATIONS, "distances": (1,)})
     return _aimed(dome, settings, preset, count, rock, "test view")
 
 

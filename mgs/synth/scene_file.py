@@ -112,6 +112,9 @@ class Orbit(_Strict):
     """Lowest and highest elevation above the rock's middle (the others)."""
     turns: Positive = 3
     """Turns of the spiral, or number of rings."""
+    distances: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1,)
+    """How far from the rock's middle the frames are in turn, as multiples of what they would be: (1, 2, 3) mixes near and far
+    views."""
 
 
 class Sensor(_Strict):

@@ -92,7 +92,7 @@ class Viewer:
         try:
             import viser
         except ImportError:
-            raise InputError("mgs view: needs viser, which is not installed; `pip install 'mgs[view]'`") from None
+            raise InputError("mgs view: needs viser, which is not installed; `pip install viser`") from None
         check_address(host, port)
         # A window may be closed while its image is drawn; viser then warns that nobody gets it.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")

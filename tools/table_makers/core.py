@@ -52,7 +52,10 @@ def splat_work(data: dict[str, Any]) -> str:
     peak, share = f"{data['peak_gflops_measured']:.0f} Gflop/s", data["share_of_peak"]
     rows = [
         ["(splat, block) pairs", f"{data['pairs']:,}"],
-        ["pixels of pairs a second, forward", f"{data['pixel_splat_pairs_per_second']['forward'] / 1e9:.1f} billion"],
+        [
+            "pixels evaluated a second (32 a pair), forward",
+            f"{data['pixel_splat_pairs_per_second']['forward'] / 1e9:.1f} billion",
+        ],
         [f"share of the measured FMA rate ({peak}), forward", f"{share['forward']:.0%}"],
         ["share of the measured FMA rate, exact Fisher", f"{share['fisher_exact']:.0%}"],
         ["block lists of a camera", f"{data['list_megabytes']:.0f} MB"],
@@ -63,7 +66,7 @@ def splat_work(data: dict[str, Any]) -> str:
 
 def roofline(data: dict[str, Any]) -> str:
     """What share of each kernel's time each limit of the machine takes, and the limits."""
-    limits, rows = data["limits"], data["kernels"]
+    rows = data["kernels"]
     lines = [
         [
             row["name"],
@@ -74,12 +77,19 @@ def roofline(data: dict[str, Any]) -> str:
         ]
         for row in rows
     ]
-    bandwidths = ", ".join(f"{name} {value / 1e9:.0f}" for name, value in limits["bandwidth"].items())
-    text = (
-        f"\nLimits: FMAs {limits['flops'] / 1e9:.0f} Gflop/s, in double {limits['flops64'] / 1e9:.0f}; divisions "
-        f"{limits['divisions'] / 1e9:.1f} billion a second, in double {limits['divisions64'] / 1e9:.1f}; GB/s: {bandwidths}.\n"
+    return (
+        markdown(["kernel", "ms", "Gflop/s", *rows[0]["shares"], "bound by"], lines) + _limits(data["limits"]) + made_by(data)
     )
-    return markdown(["kernel", "ms", "Gflop/s", *rows[0]["shares"], "bound by"], lines) + text + made_by(data)
+
+
+def _limits(limits: dict[str, Any]) -> str:
+    """What the machine could do at most, as measured in the same run."""
+    bandwidths = ", ".join(f"{name} {value / 1e9:.0f}" for name, value in limits["bandwidth"].items())
+    return (
+        f"\nLimits: FMAs {limits['flops'] / 1e9:.0f} Gflop/s, in double {limits['flops64'] / 1e9:.0f}; divisions "
+        f"{limits['divisions'] / 1e9:.1f} billion a second, in double {limits['divisions64'] / 1e9:.1f}; addresses "
+        f"{limits['addresses'] / 1e9:.2f} billion a second; GB/s: {bandwidths}.\n"
+    )
 
 
 def roofline_work(data: dict[str, Any]) -> str:
@@ -112,7 +122,7 @@ def roofline_short(data: dict[str, Any]) -> str:
         [row["name"], f"{1e3 * row['seconds']:.1f}", *(f"{row['shares'][name]:.0%}" for name in shown), row["verdict"]]
         for row in data["kernels"]
     ]
-    return markdown(["kernel", "ms", *shown, "bound by"], rows) + made_by(data)
+    return markdown(["kernel", "ms", *shown, "bound by"], rows) + _limits(data["limits"]) + made_by(data)
 
 
 def variants(data: dict[str, Any]) -> str:
@@ -215,9 +225,10 @@ def two_versions(data: dict[str, Any]) -> str:
                 asked = f", at most {data['targets'][column]}" if column in data["targets"] else ""
                 row.append(f"{median:.2f} ({low:.2f} to {high:.2f}){asked}")
         rows.append(row + ["–"] * (5 - len(row)))
-    heading = ["", f"commit {data['old']} (ms)", "now (ms)", f"ratio, median of {data['rounds']} rounds (range), asked for"]
+    heading = ["", *(f"commit {data[which]} (ms)" for which in ("old", "new"))]
+    heading += [f"ratio, median of {data['rounds']} rounds (range), asked for"]
     seen = data["culled"]["seen"] / data["culled"]["gaussians"]
-    return markdown([*heading, f"a fitted model, the {seen:.0%} that are seen against all"], rows) + made_by(data)
+    return markdown([*heading, f"a fitted model: the {seen:.0%} that are seen (new) over all (old)"], rows) + made_by(data)
 
 
 def whole_runs(data: dict[str, Any]) -> str:
@@ -266,6 +277,17 @@ def later_passes(data: dict[str, Any]) -> str:
     return markdown(["passes of later fits", "fits, s", "whole run, s", "12 images, dB", *last], rows) + made_by(data)
 
 
+def data_samples(data: dict[str, Any]) -> str:
+    """What samples per pixel of the data cost, and what they bring to a model that is fitted to it."""
+    rows = []
+    for record in data["records"]:
+        views = [f"{record[f'{name}_{key}']:.2f}" for name in ("reference", "own") for key in ("psnr", "psnr_mask")]
+        rows.append([str(record["samples"]), f"{record['seconds']['frame_s']:.2f}", *views])
+    most = data["records"][-1]["samples"]
+    judges = [f"{tests}, {part}" for tests in (f"test views of {most} samples", "of its own") for part in ("dB", "rock")]
+    return markdown(["samples a pixel", "s a frame", *judges], rows) + made_by(data)
+
+
 WAYS = {"anew": "all Gaussians, anew for every choice", "updated": "**all Gaussians, brought up to date**"}
 """Ways of `benchmarks/planning.py`; the others are numbers of Gaussians."""
 
@@ -293,6 +315,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "versions": ("benchmarks/versions", two_versions),
     "whole-runs": ("benchmarks/whole_runs", whole_runs),
     "paper-size": ("benchmarks/whole_runs", paper_size),
+    "data-samples": ("benchmarks/data_samples", data_samples),
     "later-passes": ("benchmarks/warm_passes", later_passes),
     "lanes": ("benchmarks/lanes", lanes),
     "sizes": ("benchmarks/sizes", sizes),

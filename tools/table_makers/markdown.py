@@ -24,7 +24,8 @@ def made_by(data: dict[str, Any]) -> str:
     if not command.startswith("mgs "):
         command = f"python benchmarks/{command}"
     cores = f" on {_threads(machine['threads'])} ({machine['cpu']}, {machine['simd_width']} float32 lanes)" if machine else ""
-    return f"\n`{command}`{cores}; mgs {versions['mgs']}, Mitsuba {versions['mitsuba']}, Dr.Jit {versions['drjit']}.\n"
+    commit = f" ({versions['commit']})" if "commit" in versions else ""
+    return f"\n`{command}`{cores}; mgs {versions['mgs']}{commit}, Mitsuba {versions['mitsuba']}, Dr.Jit {versions['drjit']}.\n"
 
 
 def _threads(number: int) -> str:

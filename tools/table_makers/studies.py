@@ -9,6 +9,7 @@ from typing import Any
 from mgs.study.chart.tables import TABLES as CHART_TABLES
 from mgs.study.chart.tables import chart_table
 from mgs.study.reproduce import LEADER
+from mgs.study.reproduce_tables import led, matrix
 from mgs.study.stress.verdict import effect
 from table_makers.markdown import made_by, markdown
 
@@ -119,18 +120,10 @@ def reproduced(name: str) -> Callable[[dict[str, Any]], str]:
     return table
 
 
-def own_policy(data: dict[str, Any]) -> str:
-    """The policy of one's own in a study of pools, against the leader."""
-    rows = []
-    for row in data["rows"]:
-        if ".py:" in row["policy"]:
-            led = [
-                f"{row[key]:+.2f} [{row[f'{key}_low']:+.2f}, {row[f'{key}_high']:+.2f}]"
-                for key in ("test_psnr_led", "test_psnr_mask_led")
-            ]
-            rows.append([row["pool"], f"{row['test_psnr']:.2f}", *led])
-    heading = ["pool", "test views (dB)", f"{LEADER} over it (dB)", "rock only"]
-    return markdown(heading, rows) + made_by(data)
+def ablations(data: dict[str, Any]) -> str:
+    """What is left of two policies without one of their parts: by how much the leader is ahead of each."""
+    rows = [row for row in data["rows"] if ".py:" in row["policy"] or row["policy"] == "d-optimal"]
+    return matrix(rows, f"{LEADER} over it (dB)", lambda row: led(row, "test_psnr_led")) + made_by(data)
 
 
 def oracle(data: dict[str, Any]) -> str:
@@ -145,6 +138,20 @@ def oracle(data: dict[str, Any]) -> str:
     return markdown([f"{data['rocks']} rocks: over random, dB (share)", *pools], lines) + made_by(data)
 
 
+def clean_alarms(data: dict[str, Any]) -> str:
+    """How often each detector speaks in runs in which nothing is wrong."""
+    rows = []
+    for name, found in data["signs"].items():
+        rows.append(
+            [name, f"{found['runs']} of {data['runs']}", f"{found['rocks']} of {data['rocks']}", f"{found['largest']:.2f}"]
+        )
+    alarms = sum(pool["alarms"] for pool in data["pools"].values())
+    rows.append(["any", f"{alarms} of {data['runs']}", "", ""])
+    pools = ", ".join(f"{name} {pool['alarms']} of {pool['runs']}" for name, pool in data["pools"].items())
+    heading = ["sign", "runs beyond its limit", "rocks", "largest value over the limit"]
+    return markdown(heading, rows) + f"\nBy pool: {pools}.\n" + made_by(data)
+
+
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "stability": ("results/stress/verdicts", stability),
     "stability-world": ("results/stress/world", stability),
@@ -154,7 +161,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "parsimony-prune": ("results/parsimony/parsimony", parsimony_prune),
     **{f"reproduce-{name}": (f"results/reproduce/{name}", reproduced(name)) for name in REPRODUCED},
     "paper-size-table1": ("results/paper-size/table1", reproduced("table1")),
-    "linear-look": ("results/linear-look/pools", own_policy),
+    "ablations": ("results/linear-look/pools", ablations),
     "oracle": ("results/oracle/pools", oracle),
     **{f"chart-{name}": ("results/chart/chart", chart(name)) for name in CHART_TABLES},
 }

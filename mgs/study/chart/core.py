@@ -125,6 +125,8 @@ def oracle(what: str, where: Scene) -> np.ndarray:
 def error(found: np.ndarray, truth: np.ndarray, what: str) -> float:
     """Largest error over the largest entry of the truth; of gradients and information the worst over the kinds of parameters,
     of blocks after each entry is divided by sqrt(H_ii H_jj)."""
+    from mgs.splat import groups
+
     difference = np.abs(found - truth)
     if what == "image":
         return float(difference.max() / np.abs(truth).max())
@@ -132,8 +134,7 @@ def error(found: np.ndarray, truth: np.ndarray, what: str) -> float:
         diagonal = np.sqrt(np.maximum(np.einsum("nii->ni", truth), 0))
         scale = diagonal[:, :, None] * diagonal[:, None, :]
         return float((difference[scale > 0] / scale[scale > 0]).max())
-    kinds = (slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 11))
-    return float(max(difference[:, kind].max() / np.abs(truth[:, kind]).max() for kind in kinds))
+    return float(max(difference[:, kind].max() / np.abs(truth[:, kind]).max() for kind in groups(0).values()))
 
 
 def cells(plan: Plan, repeats: int, preset: str) -> list[Cell]:

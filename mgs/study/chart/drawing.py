@@ -135,6 +135,54 @@ _METRICS = (("psnr", "ssim"), ("front", "front_ssim"), (", dB", ""))
 """What a row of panels shows: a quality, the column that tells its front, its unit."""
 
 
+def passes_figure(path: str | Path, rows: Rows) -> None:
+    """PSNR against what does not depend on a machine: passes (left), and the number of images (right)."""
+    import matplotlib
+
+    most = Counter(row["images"] for row in rows).most_common(1)[0][0]
+    with matplotlib.rc_context(STYLE | {"legend.fontsize": 7}):
+        figure = new_figure(10, 4)
+        left, right = figure.subplots(1, 2)
+        _passes_panel(left, [row for row in rows if row["images"] == most])
+        _images_panel(right, rows)
+        save_figure(figure, path)
+
+
+def _passes_panel(axes: Any, rows: Rows) -> None:
+    """Passes of all fits together against PSNR: a line for each number of Gaussians, of fits (-) and of runs (--)."""
+    crossed = [row for row in rows if "crossed" in row["factors"]]
+    for style, n in enumerate(sorted({row["gaussians"] for row in crossed})):
+        look = {"color": COLOURS[style % 7], "marker": MARKERS[style % 7], "ms": 4, "lw": 1}
+        for dashes, is_run in (("-", False), ("--", True)):
+            some = sorted(
+                (row for row in crossed if row["gaussians"] == n and bool(row["policy"]) is is_run),
+                key=lambda row: int(row["total_passes"]),
+            )
+            label = None if is_run else f"{n:,} Gaussians"
+            axes.plot([r["total_passes"] for r in some], [r["psnr"] for r in some], ls=dashes, label=label, **look)
+    axes.plot([], [], "k--", lw=1, label="runs")
+    _seconds_axis(axes)
+    axes.set(xlabel="passes over the images, of all fits of a run together", ylabel="PSNR on the test views, dB")
+    axes.legend(loc="lower right")
+
+
+def _images_panel(axes: Any, rows: Rows) -> None:
+    """The number of images of one fit against PSNR, in the frame and inside the rock."""
+    default = next(row for row in rows if not row["policy"])  # the first has the defaults
+    some = [row for row in rows if not row["policy"] and all(row[key] == default[key] for key in _SETTINGS)]
+    some.sort(key=lambda row: int(row["images"]))
+    for style, (metric, label) in enumerate((("psnr", "full frame"), ("psnr_mask", "rock"))):
+        look = {"color": COLOURS[style], "marker": MARKERS[style], "ms": 4, "lw": 1}
+        axes.plot([r["images"] for r in some], [r[metric] for r in some], label=label, **look)
+    axes.set_xticks([row["images"] for row in some])
+    axes.set(xlabel=f"images of one fit of {default['gaussians']:,} Gaussians", ylabel="PSNR on the test views, dB")
+    axes.legend(loc="center right")
+
+
+_SETTINGS = ("gaussians", "passes", "optimiser", "learned", "half")
+"""What two fits have to share to differ in their images alone."""
+
+
 def _fit_panel(axes: Any, rows: Rows, metric: str, flag: str, factors: dict[str, str]) -> None:
     """Points by the first of their factors, the front, and stars for presets."""
     _seconds_axis(axes)
@@ -243,10 +291,11 @@ def _model_lines(axes: Any, rows: Rows, style: int) -> None:
     axes.plot([r["kb"] for r in whole], [r["psnr"] for r in whole], ls="none", mfc="white", **look)
 
 
-FIGURES: dict[str, Callable[[str | Path, Rows], None]] = {
-    "fit": fit_figure,
-    "scoring": scoring_figure,
-    "core": core_figure,
-    "bytes": bytes_figure,
+FIGURES: dict[str, tuple[str, Callable[[str | Path, Rows], None]]] = {
+    "fit": ("fit", fit_figure),
+    "passes": ("fit", passes_figure),
+    "scoring": ("scoring", scoring_figure),
+    "core": ("core", core_figure),
+    "bytes": ("bytes", bytes_figure),
 }
-"""The figure of each chart."""
+"""Each figure by its name: the chart whose rows it draws, and how."""

@@ -31,9 +31,9 @@ def chart(
 ) -> dict[str, Any]:
     """Measure and draw; what is measured already is kept. kinds: of `mgs.study.chart.plan.KINDS`.
 
-    Writes KIND.csv of every kind, KIND.png of every chart, and chart.json, which has all rows; kinds that are not asked for are
-    left as they are. dataset: in place of the one that is rendered; it needs test views. report(cell, done, total) is told
-    before each cell. Returns what chart.json holds.
+    Writes KIND.csv of every kind, its figures (`mgs.study.chart.drawing.FIGURES`), and chart.json, which has all rows; kinds
+    that are not asked for are left as they are. dataset: in place of the one that is rendered; it needs test views.
+    report(cell, done, total) is told before each cell. Returns what chart.json holds.
     Raises InputError for an unknown preset, as `load_dataset` and `run_cells`, and where the dataset has no test views.
     """
     from mgs import runtime
@@ -58,8 +58,9 @@ def chart(
         result = {**_known(path), **measured, "versions": versions()}
         for kind, made in rows.items():
             write_csv(out / f"{kind}.csv", made)
-            if kind in drawing.FIGURES:
-                drawing.FIGURES[kind](out / f"{kind}.png", made)
+        for name, (kind, draw) in drawing.FIGURES.items():
+            if kind in rows:
+                draw(out / f"{name}.png", rows[kind])
         write_json(path, result)
     return result
 

@@ -17,11 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from mgs.active import detectors
 from mgs.active.criteria import coverage
-from mgs.active.loop import target_of
 from mgs.active.settings import PASSES
 from mgs.camera import Camera
 from mgs.colour import linear_from_srgb, srgb_from_linear
-from mgs.data.dataset import Frame
+from mgs.data.dataset import Frame, target_of
 from mgs.prior.build import Prior
 from mgs.seeds import generator
 from mgs.splat import render

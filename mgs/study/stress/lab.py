@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from mgs.active.criteria import MEAN_STD, PRIOR_STD, Score, d_optimal, lam_by_kind, regularisation
 from mgs.active.fitting import Fit, fit
-from mgs.active.loop import target_of
 from mgs.active.outlook import Outlook
 from mgs.active.policies import policy_named
 from mgs.active.pose_policies import seed_views
@@ -21,16 +20,15 @@ from mgs.active.settings import MEAN_RATE, PASSES, RATES, WARM_PASSES, TrainSett
 from mgs.active.sight import Sight
 from mgs.active.stations import psnr_measure
 from mgs.camera import Camera
-from mgs.data.dataset import Frame, load_dataset
+from mgs.data.dataset import Frame, load_dataset, target_of
 from mgs.gaussians import Gaussians
-from mgs.prior.build import Prior, build_prior, load_prior, save_prior
+from mgs.prior.build import Prior, load_prior
 from mgs.prior.initial import initial_gaussians, initial_normals, warm_start
-from mgs.prior.settings import PriorSettings
 from mgs.seeds import generator
 from mgs.splat import ListCache, fisher, groups
+from mgs.study.material import made_dataset, made_prior, test_views_of
 from mgs.study.sweep import Cell, cell_folder
 from mgs.synth.rendering import Preset as Images
-from mgs.synth.rendering import synthesise
 from mgs.synth.scene_file import load_scene_file
 
 Array = NDArray[np.floating]
@@ -112,14 +110,12 @@ def make_scene(
 ) -> dict[str, Any]:
     """Render a dataset into OUT/dataset and build its prior, unless it has 0 Gaussians, in OUT/prior. changes: as in
     `variant_cell`."""
-    if not (out / "dataset/transforms.json").is_file():
-        loaded = load_scene_file(scene)
-        sections = {name: getattr(loaded, name).model_copy(update=values) for name, values in (changes or {}).items()}
-        images = Images(width, height, frames, spp)
-        synthesise(out / "dataset", loaded.model_copy(update=sections), images, seed, test_views=tests)
-    if gaussians and not (out / "prior/prior.json").is_file():
-        prior, _ = build_prior(load_dataset(out / "dataset"), PriorSettings(gaussians=gaussians, seed=seed))
-        save_prior(out / "prior", prior)
+    loaded = load_scene_file(scene)
+    sections = {name: getattr(loaded, name).model_copy(update=values) for name, values in (changes or {}).items()}
+    images = Images(width, height, frames, spp)
+    made_dataset(out / "dataset", loaded.model_copy(update=sections), images, seed, tests)
+    if gaussians:
+        made_prior(out / "prior", out / "dataset", gaussians=gaussians, seed=seed)
     return {"gaussians": gaussians}
 
 
@@ -211,9 +207,8 @@ class Lab:
 @functools.lru_cache(maxsize=2)
 def _opened(folder: Path, name: str) -> Lab:
     dataset = load_dataset(folder / "dataset")
-    tests = dataset.test_views()
-    assert tests is not None
-    return Lab(name, dataset.frames, load_prior(folder / "prior"), psnr_measure(tests, ListCache(CACHE)))
+    measure = psnr_measure(test_views_of(dataset), ListCache(CACHE))
+    return Lab(name, dataset.frames, load_prior(folder / "prior"), measure)
 
 
 def open_lab(root: Path, scene: str) -> Lab:

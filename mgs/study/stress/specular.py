@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from mgs.active.loop import target_of
 from mgs.active.pose_policies import angle_between, azimuths
 from mgs.active.stations import psnr_measure
-from mgs.data.dataset import load_dataset
+from mgs.data.dataset import load_dataset, target_of
 from mgs.files import read_json
 from mgs.gaussians import Gaussians
+from mgs.metrics import masked_squares
 from mgs.splat import ListCache, render
 from mgs.study.stress.experiment import Experiment, Panel, turns
 from mgs.study.stress.lab import CACHE, Lab, Preset, by_policy, open_lab, variant_cell
@@ -45,9 +45,9 @@ def errors_by_angle(lab: Lab, model: Gaussians, views: Sequence[int], sun: float
     rows = []
     for i, angle in zip(views, angles, strict=True):
         frame = lab.frames[i]
-        off = (np.asarray(render(model, frame.camera, cache=lab.cache).rgb) - target_of(frame)[..., :3])[frame.mask()]
+        squares = masked_squares(np.asarray(render(model, frame.camera, cache=lab.cache).rgb), target_of(frame), frame.mask())
         rows.append(
-            {"angle": float(angle), "angle of sun": float(BIN * round(angle / BIN)), "rms": float(np.sqrt(np.mean(off**2)))}
+            {"angle": float(angle), "angle of sun": float(BIN * round(angle / BIN)), "rms": float(np.sqrt(np.mean(squares)))}
         )
     return rows
 

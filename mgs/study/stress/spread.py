@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from mgs.active.loop import target_of
+from mgs.data.dataset import target_of
 from mgs.gaussians import Gaussians
+from mgs.metrics import masked_squares
 from mgs.seeds import generator
 from mgs.splat import render
 from mgs.study.stress.experiment import Experiment, Panel, cells_per_rock, turns
@@ -70,13 +71,11 @@ def spread(root: Path, out: Path, scene: str, turns_: int, counts: list[int]) ->
 
 def error_of(lab: Lab, model: Gaussians, views: Sequence[int]) -> float:
     """Root of the mean squared error inside the masks, linear RGB."""
-    off = [
-        (np.asarray(render(model, lab.cameras[view], cache=lab.cache).rgb) - target_of(lab.frames[view])[..., :3])[
-            lab.frames[view].mask()
-        ]
-        for view in views
+    squares = [
+        masked_squares(np.asarray(render(model, frame.camera, cache=lab.cache).rgb), target_of(frame), frame.mask())
+        for frame in (lab.frames[view] for view in views)
     ]
-    return float(np.sqrt(np.mean(np.concatenate(off) ** 2)))
+    return float(np.sqrt(np.mean(np.concatenate(squares))))
 
 
 SPREAD = Experiment(

@@ -16,6 +16,7 @@ from mgs.files import read_json
 from mgs.metrics import agreement
 from mgs.prior.exposure import exposure_of
 from mgs.splat import ListCache
+from mgs.study.material import test_views_of
 from mgs.study.stress.experiment import Experiment, Panel, turns
 from mgs.study.stress.faults import Captured, captured, signs_of
 from mgs.study.stress.lab import CACHE, Lab, Preset, open_lab, scene_cell, variant_cell
@@ -64,8 +65,7 @@ def sun(root: Path, out: Path, scene: str, other: str, turns_: int) -> dict[str,
     """Fits to evenly spread views under one sun and under two, and the ranking of candidates. other: the second sun's cell."""
     lab, rows = open_lab(root, scene), list[Row]()
     labs = {ONE: lab, TWO: two_suns(lab, root, scene, other)}
-    tests = load_dataset(cell_folder(root, f"dataset/{scene}") / "dataset").test_views()
-    assert tests is not None
+    tests = test_views_of(load_dataset(cell_folder(root, f"dataset/{scene}") / "dataset"))
     corrected = psnr_measure(tests, ListCache(CACHE), exposure=True)
     for suffix, turn in turns(turns_):
         run, even = {"run": f"{scene}, {suffix}"}, lab.even(VIEWS, turn)
