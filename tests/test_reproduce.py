@@ -14,7 +14,7 @@ from mgs.cli.app import main
 from mgs.data.dataset import TEST_FOLDER, load_dataset
 from mgs.errors import InputError
 from mgs.files import write_json
-from mgs.study import free_fit, reproduce, tasks
+from mgs.study import free_fit, material, reproduce, tasks
 from mgs.study.reproduce import FREE_FIT, Preset, Rock, Run, Size
 from mgs.study.reproduce_figures import curves_figure, pools_figure, seeds_figure
 from mgs.study.reproduce_results import (
@@ -118,6 +118,26 @@ def test_a_policy_of_ones_own_is_compared_over_rocks(quick, tmp_path, capsys):
         "mine.py:first",
         "coverage",
     }
+
+
+def test_a_prior_is_built_once_and_whole(tmp_path, monkeypatch):
+    """Killed while it was being saved, and asked for again."""
+    dataset, folder = tmp_path / "dataset", tmp_path / "cell/prior"
+    synthetic.write_dataset(dataset, synthetic.orbit_cameras(8, 48, 36))
+
+    def struck(out, prior):
+        (out / "mesh.ply").write_text("half of a mesh")
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(material, "save_prior", struck)
+        with pytest.raises(KeyboardInterrupt):
+            material.made_prior(folder, dataset, gaussians=200)
+    assert not folder.exists()
+    prior = material.made_prior(folder, dataset, gaussians=200)
+    monkeypatch.setattr(material, "build_prior", None)
+    assert np.array_equal(material.made_prior(folder, dataset, gaussians=200).points, prior.points)
+    assert material.made_dataset(dataset, "boulder", None).frames == load_dataset(dataset).frames, "it is there"
 
 
 def test_a_timed_run_has_a_process_of_its_own(quick, tmp_path):
