@@ -191,8 +191,10 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
 
 def _is_running(process: str) -> bool:
-    """Whether there is a process of this id, or the text is none."""
+    """Whether there is another process of this id, or the text is none. (In a container every process may have the same id.)"""
     try:
+        if int(process) == os.getpid():
+            return False
         os.kill(int(process), 0)
     except ProcessLookupError:
         return False

@@ -343,6 +343,18 @@ def test_what_is_known_of_a_model_is_not_measured_again(dataset, prior, tmp_path
     assert listing(run / "renders") == pictures
 
 
+@pytest.mark.parametrize(("other", "measured"), [({"commit": "1234567"}, 0), ({"mitsuba": "0.1"}, 12)])
+def test_another_commit_keeps_the_metrics_and_another_version_does_not(
+    dataset, prior, tmp_path, work, monkeypatch, other, measured
+):
+    run, versions = tiny.write_run(tmp_path / "run", dataset, prior), evaluation.versions()
+    evaluate_run(run)
+    work()
+    monkeypatch.setattr(evaluation, "versions", lambda: versions | other)
+    evaluate_run(run)
+    assert work()[0] == measured
+
+
 def brighten(path):
     with np.load(path) as data:
         arrays = dict(data)

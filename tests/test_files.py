@@ -191,10 +191,13 @@ def test_what_a_killed_process_left_of_an_atomic_folder_is_removed(tmp_path):
         pass
     for owner, name in ((ended.pid, "out"), (os.getpid(), "out"), (ended.pid, "other"), ("mine", "out")):
         (tmp_path / f".{name}.{owner}.part/images").mkdir(parents=True)
-    with pytest.raises(InputError, match="not empty"), atomic_folder(tmp_path / "out"):  # this process makes it already
-        pass
+    other = os.getppid()  # which runs
+    (tmp_path / f".out.{other}.part").mkdir()
+    with atomic_folder(tmp_path / "out") as made:
+        (made / "file").touch()
     left = {path.name for path in tmp_path.iterdir()}
-    assert left == {f".out.{os.getpid()}.part", f".other.{ended.pid}.part", ".out.mine.part"}
+    assert left == {"out", f".out.{other}.part", f".other.{ended.pid}.part", ".out.mine.part"}
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["file"]
 
 
 def encode_png(samples, bits, colour, palette=None, transparent=None):

@@ -378,7 +378,7 @@ def test_what_a_run_was_made_from_has_moved(dataset, prior, tmp_path, capsys, mo
 def test_a_run_that_is_there_is_not_begun_again(dataset, prior, tmp_path, capsys):
     run = tiny.write_run(tmp_path / "run", dataset, prior)
     said = refused(capsys, ["nbv", dataset, "--prior", prior, "--out", run], run)
-    assert f"{run}: holds a run; `mgs nbv --resume {run}` goes on with it, or choose another folder for a new one" in said
+    assert f"{run}: holds a run; `mgs nbv --resume {run}` goes on with it; for another, choose a new folder" in said
 
 
 @pytest.mark.parametrize("option", ["--budget 9", "--policy random", "--exposure", "--prior-std colour=1"])
@@ -386,3 +386,11 @@ def test_resume_takes_no_other_setting(dataset, prior, tmp_path, capsys, option)
     run = tiny.write_run(tmp_path / "run", dataset, prior)
     said = refused(capsys, ["nbv", "--resume", run, *option.split()], run)
     assert f"nbv: {option.split()[0]}: --resume takes its settings from {run / 'config.json'}; change it there" in said
+
+
+def test_a_dataset_is_not_taken_for_a_run(dataset, prior, tmp_path, capsys):
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/config.json").write_text('{"scene": {}}')
+    said = refused(capsys, ["nbv", dataset, "--prior", prior, "--out", tmp_path / "other"], tmp_path)
+    assert "not empty" in said
+    assert "--resume" not in said

@@ -161,6 +161,8 @@ def test_figures_are_written_as_asked_for(runs, tmp_path, capsys):
     with pytest.raises(InputError, match=r"gain\.eps: figures are written as png, pdf, svg; choose another ending"):
         figures.gain_figure(tmp_path / "gain.eps", {"random": [0.2, 0.1]})
     assert "--figures eps: unknown; choose one of png, pdf, svg" in refused(capsys, ["report", *runs, "--figures", "eps"])
+    page = ["--html", tmp_path / "page.html", "--figures", "pdf"]
+    assert "--html alone writes no figures" in refused(capsys, ["report", *runs, *page])
 
 
 def test_a_figure_that_is_left_out_is_named(runs, tmp_path, capsys):
@@ -173,9 +175,7 @@ def test_a_figure_that_is_left_out_is_named(runs, tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         main(["report", *map(str, copies), "--out", str(tmp_path / "report")])
     assert stop.value.code == 0
-    assert (
-        "PSNR against images is left out: it is known of runs that were made with --evaluate-every 1" in capsys.readouterr().out
-    )
+    assert "PSNR against images is left out: it needs that all runs were made with --evaluate-every" in capsys.readouterr().out
     assert not (tmp_path / "report/psnr.png").exists()
 
 

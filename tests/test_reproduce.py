@@ -426,7 +426,7 @@ def test_every_run_of_every_result_has_its_own_cell():
         (["--workers", "0"], "should be greater than or equal to 1"),
         (["--policy", "best"], "--policy best: unknown; choose one of"),
         (["--policy", "uniform"], "--policy uniform: is compared anyway"),
-        (["--policy", "angle", "--policy", "angle"], "--policy angle: is compared anyway"),
+        (["--policy", "angle", "--policy", "angle"], "--policy angle: there is one of this name already"),
         (["--policy", "block-d", "--only", "table1"], "--policy block-d: is for curves and pools, and --only leaves both out"),
         (["--policy", "none.py:f"], "none.py"),
         (["--batch", "0"], "should be greater than or equal to 1"),

@@ -221,7 +221,7 @@ def test_a_window_that_is_closed_while_its_image_is_drawn_is_not_warned_of(run):
 
 
 def test_a_run_is_followed_from_its_beginning(dataset, prior, tmp_path):
-    pytest.importorskip("viser", reason="viser is not installed (pip install 'mgs[view]')")
+    pytest.importorskip("viser", reason="viser is not installed (pip install viser)")
     tiny.start(tmp_path / "run", load_dataset(dataset), prior=prior, budget=2)
     viewer = Viewer(tmp_path / "run", port=0, follow=True)
     try:
@@ -301,7 +301,7 @@ def choose(tab, label, option):
 
 @pytest.fixture(scope="module")
 def browser():
-    pytest.importorskip("viser", reason="viser is not installed (pip install 'mgs[view]')")
+    pytest.importorskip("viser", reason="viser is not installed (pip install viser)")
     with chromium() as found:
         yield found
 

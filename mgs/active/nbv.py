@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from mgs import runtime
 from mgs.active import loop
 from mgs.active.policy_file import absolute
-from mgs.active.run_folder import DATASET, State, check_same_frames, check_settings, read_settings, start
+from mgs.active.run_folder import DATASET, State, check_same_frames, check_settings, holds_run, read_settings, start
 from mgs.active.settings import PRESETS, NbvSettings, validated, with_preset
 from mgs.active.stations import real_stations
 from mgs.data.dataset import Dataset, load_dataset
@@ -88,10 +88,8 @@ def start_run(
     out = Path(out)
     if (dataset is None) == (capture is None):
         raise InputError("nbv: give either a DATASET or --capture SCENE")
-    if (out / "config.json").is_file():
-        raise InputError(
-            f"{out}: holds a run; `mgs nbv --resume {out}` goes on with it, or choose another folder for a new one"
-        )
+    if holds_run(out):
+        raise InputError(f"{out}: holds a run; `mgs nbv --resume {out}` goes on with it; for another, choose a new folder")
     dataset = out / DATASET if dataset is None else Path(dataset)
     if prior is not None and gaussians is not None:
         raise InputError("nbv: --gaussians is for a prior that is built here; leave it out, or leave out --prior")

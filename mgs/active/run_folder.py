@@ -106,6 +106,15 @@ def read_config(out: Path) -> dict[str, Any]:
     return config
 
 
+def holds_run(out: Path) -> bool:
+    """Whether a folder holds a run that can be read. A dataset has a config.json, too, but no settings of a run."""
+    try:
+        read_config(out)
+    except InputError:
+        return False
+    return True
+
+
 def read_settings(out: Path) -> NbvSettings:
     """Settings of a run folder. Raises InputError as `read_config`, where a setting is wrong, and if the dataset is gone."""
     path = out / "config.json"

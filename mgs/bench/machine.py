@@ -152,7 +152,7 @@ def machine_limits(report: Callable[[str], None]) -> dict[str, Any]:
 
     "flops", "flops64": FMAs count twice; "divisions", "divisions64"; "bandwidth": bytes a second from "L1", "L2", "L3" and
     "memory"; "addresses": numbers a second, read at random addresses of an array that L3 holds; "working_set": the bytes for
-    each thread with which bandwidths were measured, and addresses, as L3; "cache_bytes" of `cache_sizes`.
+    each thread with which each bandwidth was measured (addresses use that of L3); "cache_bytes" of `cache_sizes`.
     """
     sizes, threads = cache_sizes(), dr.thread_count()
     sets = {

@@ -143,13 +143,14 @@ def _print_roofline(console: Any, result: dict[str, Any]) -> None:
     bandwidths = ", ".join(f"{name} {value / 1e9:.0f}" for name, value in limits["bandwidth"].items())
     console.print(
         f"FMA {limits['flops'] / 1e9:.0f} Gflop/s, in double {limits['flops64'] / 1e9:.0f}; divisions "
-        f"{limits['divisions'] / 1e9:.1f} billion a second, in double {limits['divisions64'] / 1e9:.1f}; GB/s: {bandwidths}"
+        f"{limits['divisions'] / 1e9:.1f} billion a second, in double {limits['divisions64'] / 1e9:.1f}; addresses "
+        f"{limits['addresses'] / 1e9:.2f} billion a second; GB/s: {bandwidths}"
     )
-    work = table("operations", "divisions", "instructions", "bytes", "state", last="for each")
+    work = table("operations", "divisions", "instructions", "bytes", "state", "addresses", last="for each")
     for row in rows:
         each = row["each"]
         counts = [each[a] + each[b] for a, b in (("flops", "flops64"), ("divisions", "divisions64"))]
-        counts += [each[key] for key in ("instructions", "bytes", "state_bytes")]
+        counts += [each[key] for key in ("instructions", "bytes", "state_bytes", "addresses")]
         work.add_row(row["name"], *(f"{count:,.0f}" for count in counts), row["unit"])
     share = table(*rows[0]["shares"])
     share.title = "share of the time that each limit takes alone"

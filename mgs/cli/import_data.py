@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
-
-if TYPE_CHECKING:
-    from mgs.data.importers import Source
 
 MANY_PIXELS = 2_000_000
 """Images with more pixels than this are worth a word on --downscale."""
@@ -65,7 +62,7 @@ def import_data(
     found = found if unit is None else found.in_metres(unit)
     given = parse_up(up)
     upward, reason = found.up_or_estimate() if given is None else (given, "as --up says")
-    tests: Source | None = None
+    tests, listed = None, found.missing + len(found.shots)
     if test_every is not None:
         found, tests = found.set_apart(test_every)
     with Progress(console=console, transient=True) as progress:
@@ -83,7 +80,7 @@ def import_data(
     if mesh is not None and mesh.suffix.lower() in GLTF:
         console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
     if found.missing:
-        notes.print(f"mgs: {found.missing} of {found.missing + len(found.shots)} listed images do not exist; skipped them")
+        notes.print(f"mgs: {found.missing} of {listed} listed images do not exist; skipped them")
     if found.no_cloud:
         notes.print(f"mgs: the points that {source.name} names, {found.no_cloud}, do not exist; imported without them")
     keys = ("mask_path", "rock_path", "depth_path")

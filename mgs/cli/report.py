@@ -17,7 +17,9 @@ def report(
             show_default="report; with --html none",
         ),
     ] = None,
-    figures: Annotated[str, typer.Option(metavar="png|pdf|svg", help="What the figures are written as.")] = "png",
+    figures: Annotated[
+        str | None, typer.Option(metavar="png|pdf|svg", help="What the figures are written as.", show_default="png")
+    ] = None,
     html: Annotated[
         Path | None,
         typer.Option("--html", help="One page with everything, interactive; it opens from the disk and loads nothing."),
@@ -36,12 +38,14 @@ def report(
     from mgs.files import check_writable
     from mgs.plotting import FORMATS
 
-    if figures not in FORMATS:
+    if figures not in (None, *FORMATS):
         raise InputError(f"--figures {figures}: unknown; choose one of {', '.join(FORMATS)}")
+    if figures and html is not None and out is None:
+        raise InputError(f"--figures {figures}: --html alone writes no figures; give --out, too")
     if html is not None and check_writable(html).is_dir():
         raise InputError(f"--html {html}: is a folder; name a file to write")
     if out is not None or html is None:
-        _write_figures(runs, out or Path("report"), figures)
+        _write_figures(runs, out or Path("report"), figures or "png")
     if html is not None:
         _write_page(runs, html)
 
@@ -68,7 +72,7 @@ def _write_figures(runs: list[Path], out: Path, kind: str) -> None:
     for path in written:
         typer.echo(f"wrote {path}")
     if not any(path.stem == "psnr" for path in written):
-        typer.echo("PSNR against images is left out: it is known of runs that were made with --evaluate-every 1")
+        typer.echo("PSNR against images is left out: it needs that all runs were made with --evaluate-every")
 
 
 def _write_page(runs: list[Path], html: Path) -> None:

@@ -298,10 +298,11 @@ def _left_out(dataset: Dataset, prior: Path, spacing: float | None) -> list[str]
 
 def _subject(gaussians: Gaussians, frames: Sequence[Frame], trained: list[str], spacing: float | None) -> str:
     """Hash of all that the metrics of a run depend on: the model, the cameras and files of all views, the prior's spacing, and
-    the versions."""
+    the versions, but not the commit, which changes with every word in a page."""
     kinds = ("image", "mask", "rock", "depth")
     views = [[frame.name, camera_digest(frame.camera), frame_digests(frame, kinds)] for frame in frames]
-    text = json.dumps([array_digest(asdict(gaussians).values()), views, trained, spacing, versions()])
+    known = {name: version for name, version in versions().items() if name != "commit"}
+    text = json.dumps([array_digest(asdict(gaussians).values()), views, trained, spacing, known])
     return array_digest([np.frombuffer(text.encode(), np.uint8)])
 
 

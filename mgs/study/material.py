@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +30,8 @@ def made_dataset(folder: Path, scene: str | SceneFile, preset: Preset, seed: int
 def made_prior(folder: Path, dataset: Path, **settings: Any) -> Prior:
     """The prior of a dataset: read where it is there, else built. settings: of `mgs.prior.settings.PriorSettings`. Raises
     InputError as `mgs.prior.build.build_prior` and `load_prior`."""
-    if not folder.is_dir():
+    if not (folder / "prior.json").is_file():  # which is written last
+        shutil.rmtree(folder, ignore_errors=True)
         prior, _ = build_prior(load_dataset(dataset), PriorSettings(**settings))
         with atomic_folder(folder) as unfinished:
             save_prior(unfinished, prior)

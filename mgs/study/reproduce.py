@@ -343,13 +343,17 @@ def with_policies(preset: Preset, names: list[str], policies: Sequence[str]) -> 
     """A preset whose curves and pools compare these policies, too: names, or FILE.py:FUNCTION.
 
     names: the results to make. Raises InputError where none of them compares policies over rocks, where there is no such
-    policy, and where it is compared anyway or given twice.
+    policy, where it is compared anyway, and where two would have the same name in tables.
     """
-    for k, policy in enumerate(policies):
+    labels = list(POLICIES)
+    for policy in policies:
         if not {"curves", "pools"} & set(names):
             raise InputError(f"--policy {policy}: is for curves and pools, and --only leaves both out")
-        if policy in (*POLICIES, *policies[:k]):
+        if policy in POLICIES:
             raise InputError(f"--policy {policy}: is compared anyway")
+        if policy_file.label(policy) in labels:
+            raise InputError(f"--policy {policy}: there is one of this name already; leave it out, or rename its file")
+        labels.append(policy_file.label(policy))
         policy_named(policy)
     return replace(preset, own_policies=tuple(policy_file.absolute(policy) for policy in policies))
 

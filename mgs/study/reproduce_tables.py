@@ -92,7 +92,8 @@ def seeds_markdown(rows: Rows) -> str:
 
 def pools_markdown(rows: Rows) -> str:
     """Tables with a row for each policy and a column for each pool: PSNR of the last model; by how much the LEADER is ahead of
-    it, there and over the whole curve; and, where there is an oracle, the share of what the oracle gains over `random`."""
+    it, there, inside the rock, and over the whole curve; and, where there is an oracle, the share of what the oracle gains over
+    `random`."""
     tables = [
         matrix(rows, "test views (dB)", lambda row: f"{row['test_psnr']:.2f}"),
         matrix(rows, f"{LEADER} over it (dB)", lambda row: led(row, "test_psnr_led")),

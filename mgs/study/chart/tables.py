@@ -181,7 +181,8 @@ def chart_table(name: str, data: dict[str, Any]) -> tuple[str, tuple[str, ...], 
     found = data[kind]
     machine = found["machine"]
     note = f"`{found['command']}` on {machine['threads']} thread{'' if machine['threads'] == 1 else 's'} ({machine['cpu']})"
-    note += f"; mgs {data['versions']['mgs']}"
+    commit = f" ({data['versions']['commit']})" if "commit" in data["versions"] else ""
+    note += f"; mgs {data['versions']['mgs']}{commit}"
     if kind != "bytes":
         note += f"; the reference took {found['reference_seconds']:.2f} s"
     picture = f"![{PICTURES[name]}](results/chart/{kind}.png)\n\n" if name in PICTURES else ""
