@@ -2,7 +2,8 @@
 
 STUDY: a folder of `mgs reproduce` with curves and pools: none of its runs has a fault, and no limit was chosen by them. Of each
 sign of `mgs.active.detectors`: in how many runs, and on how many rocks, it goes beyond its limit at any step, and the largest
-value over the limit. Of each pool: how many of its runs raise any alarm.
+value over the limit. Of each pool: how many of its runs raise an alarm. `saturated` does not count there: it says that a view
+taught little, which is true of a view from far away, and no fault.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ def main(out: Path, study: Path) -> None:
     pools = {}
     for pool in dict.fromkeys(run["pool"] for run in found):
         inside = [run for run in found if run["pool"] == pool]
-        pools[pool] = {"runs": len(inside), "alarms": sum(max(run["signs"].values()) > 1 for run in inside)}
+        alarms = [run for run in inside if any(value > 1 for name, value in run["signs"].items() if name != "saturated")]
+        pools[pool] = {"runs": len(inside), "alarms": len(alarms)}
     made = {"command": command_line(), "versions": versions(), "runs": len(found), "signs": signs, "pools": pools}
     write_json(out, made | {"rocks": len({run["rock"] for run in found})})
     print(json.dumps(made, indent=1))

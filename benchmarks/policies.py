@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mgs.active.directional import Views, gains, squared_weights
+from mgs.active.directional import Views, gains
 from mgs.active.outlook import Outlook
 
 
@@ -28,21 +28,6 @@ def poses_alone(outlook: Outlook) -> np.ndarray:
     return gains(middle, lam, 3, 0.1, alike(outlook.taken), alike(outlook.candidates), alike(outlook.dome().positions))
 
 
-def trained_d(outlook: Outlook) -> np.ndarray:
-    """`directional-d` by what poses see of the Gaussians as they are fitted, instead of before any training."""
-
-    def views(frames: list[int]) -> Views:
-        seen = [squared_weights(outlook.information(i))[: len(outlook.points)] for i in frames]
-        return Views(outlook.positions[frames], np.stack(seen))
-
-    return gains(outlook.points, float(outlook.prior_lam[0]), 2, 0.3, views(outlook.visited), views(outlook.left))
-
-
 def without_opacity(F: np.ndarray, H: np.ndarray, lam: np.ndarray) -> float:
     """`d-optimal` of all parameters but the opacities (column 10), which POp-GS leaves out of its score."""
     return float(np.log1p(F / (H + lam))[:, :10].mean(dtype=np.float64))
-
-
-def colours_alone(F: np.ndarray, H: np.ndarray, lam: np.ndarray) -> float:
-    """`d-optimal` of the colours alone (columns 0 to 2)."""
-    return float(np.log1p(F / (H + lam))[:, :3].mean(dtype=np.float64))
