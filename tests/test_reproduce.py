@@ -261,7 +261,13 @@ def test_differences_are_paired_by_rock():
     assert [p["ahead"] for p in pairs] == [0, 0, 3, 3, 0, 0]
     assert [p["p"] for p in pairs] == pytest.approx([*[0.25] * 4, 1, 0.25])
     assert [p["p_holm"] for p in pairs] == pytest.approx([1.0] * 6)
+    reach = curve_statistics(found, runs)["test_psnr"]["reach"]  # curves rise by 0.5 dB an image
+    assert [reach[policy]["images"] for policy in ("uniform", "directional-i")] == pytest.approx([5.6, 5.2])
+    assert reach["d-optimal"]["images"] is None
+    assert [reach[policy]["rocks"] for policy in ("d-optimal", "uniform", "random")] == [0, 3, 3]
     text = statistics_markdown(curve_statistics(found, runs))
+    assert "| d-optimal | 34.50 | 31.50 | – | – |" in text
+    assert "| uniform | 34.80 | 31.80 | 5.6 | 5.6 |" in text
     assert "| d-optimal − uniform | full frame | -0.30 [-0.30, -0.30] | 0 of 3 | 0.25 | 1 | -0.30, 0 of 1 |" in text
 
 

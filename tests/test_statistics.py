@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mgs.study.statistics import MOST_ROCKS, area, holm, interval, permutation_p
+from mgs.study.statistics import MOST_ROCKS, area, holm, images_to_reach, interval, permutation_p
 
 numbers = st.floats(-10, 10, allow_nan=False).map(lambda x: round(x, 3))
 
@@ -73,3 +73,10 @@ def test_holm_rejects_as_the_step_down_procedure_does(p_values, alpha):
     adjusted = holm(p_values)
     assert {k for k, p in enumerate(adjusted) if p <= alpha} == rejected
     assert all(a >= p for a, p in zip(adjusted, p_values, strict=True))
+
+
+def test_a_level_is_reached_between_two_points_or_never():
+    assert images_to_reach([4, 5, 7], [20, 21, 23], 22) == pytest.approx(6)
+    assert images_to_reach([4, 5, 7], [20, 21, 23], 20) == 4
+    assert images_to_reach([4, 5, 7], [20, 19, 23], 19.5) == 4
+    assert images_to_reach([4, 5, 7], [20, 21, 23], 23.1) is None

@@ -17,7 +17,7 @@ from mgs.study import reproduce
 from mgs.study.reproduce import ORACLE, Preset, Run
 from mgs.study.reproduce_figures import curves_figure, pools_figure, seeds_figure
 from mgs.study.reproduce_tables import pools_markdown, seeds_markdown, statistics_markdown, table_markdown
-from mgs.study.statistics import area, holm, interval, permutation_p
+from mgs.study.statistics import area, holm, images_to_reach, interval, permutation_p
 from mgs.study.sweep import cell_folder, found
 
 Found = Mapping[str, Mapping[str, Any]]
@@ -98,8 +98,9 @@ def curve_rows(found: Found, runs: Sequence[Run]) -> Rows:
 def curve_statistics(found: Found, runs: Sequence[Run]) -> dict[str, Any]:
     """For each of MEASURES the area under PSNR(images) by policy and rock, and the tests of pairs (`reproduce.pairs_of`).
 
-    A pair also has, in "elsewhere", its differences on rocks of the scenes that are not in `reproduce.DEVELOPED_ON`; None where
-    there are none.
+    In "reach", how many images a policy needs for what `random` has with all of them, the mean over the rocks on which it gets
+    there, and how many these are; without `random` there is none. A pair also has, in "elsewhere", its differences on rocks of
+    the scenes that are not in `reproduce.DEVELOPED_ON`; None where there are none.
     """
     result: dict[str, Any] = {}
     elsewhere = {run.rock.index for run in runs if run.rock.scene not in reproduce.DEVELOPED_ON}
@@ -119,8 +120,20 @@ def curve_statistics(found: Found, runs: Sequence[Run]) -> dict[str, Any]:
         means = {policy: summary(list(values.values())) for policy, values in areas.items()}
         by_index = {policy: [values[k] for k in sorted(values)] for policy, values in areas.items()}
         pairs = [pair | {"p_holm": p} for pair, p in zip(pairs, corrected, strict=True)]
-        result[key] = {"area": means, "area_by_rock": by_index, "pairs": pairs}
+        result[key] = {"area": means, "area_by_rock": by_index, "reach": _reach(found, runs, key), "pairs": pairs}
     return result
+
+
+def _reach(found: Found, runs: Sequence[Run], key: str) -> dict[str, dict[str, Any]]:
+    """By policy, the entry "reach" of `curve_statistics`."""
+    levels = {run.rock.index: found[run.name][key][-1] for run in runs if run.label == "random"}
+    needed: dict[str, list[float]] = {}
+    for run in runs:
+        if run.rock.index in levels:
+            own, curve = needed.setdefault(run.label, []), found[run.name]
+            images = images_to_reach(curve["images"], curve[key], levels[run.rock.index])
+            own += [] if images is None else [images]
+    return {policy: {"images": float(np.mean(own)) if own else None, "rocks": len(own)} for policy, own in needed.items()}
 
 
 def largest_gap(taken: Sequence[int], frames: int) -> float:

@@ -60,7 +60,10 @@ def _cell(key: str, value: Any) -> str:
 def statistics_markdown(statistics: Mapping[str, Any]) -> str:
     """Areas under PSNR(images) of each policy, and the tests of the pairs, first over the full frame, then inside the rock."""
     full, rock = statistics["test_psnr"], statistics["test_psnr_mask"]
-    areas = [[policy, *(f"{of['area'][policy]['mean']:.2f}" for of in (full, rock))] for policy in full["area"]]
+    areas = [
+        [policy, *(f"{of['area'][policy]['mean']:.2f}" for of in (full, rock)), *(_reach(of, policy) for of in (full, rock))]
+        for policy in full["area"]
+    ]
     pairs = []
     for what, pair in [("full frame", pair) for pair in full["pairs"]] + [("rock", pair) for pair in rock["pairs"]]:
         p_values = ["–" if pair[p] is None else f"{pair[p]:.2g}" for p in ("p", "p_holm")]
@@ -70,7 +73,19 @@ def statistics_markdown(statistics: Mapping[str, Any]) -> str:
         pairs.append([f"{pair['policy']} − {pair['other']}", what, *cells])
     heading = ["pair", "PSNR of", "difference of areas (dB)", "ahead on rocks", "p", "p, Holm"]
     heading.append("on scenes that chose no setting")
-    return f"{markdown(['policy', 'area, full frame (dB)', 'area, rock (dB)'], areas)}\n{markdown(heading, pairs)}"
+    return f"{markdown(AREA_COLUMNS, areas)}\n{markdown(heading, pairs)}"
+
+
+AREA_COLUMNS = ("policy", "area, full frame (dB)", "area, rock (dB)", "images for what random ends with", "the same, rock")
+
+
+def _reach(of: Mapping[str, Any], policy: str) -> str:
+    """How many images a policy needs for what `random` has at the end, and on how many rocks it gets there, if not on all."""
+    found = of["reach"].get(policy)
+    if found is None or found["images"] is None:
+        return "–"
+    rocks = len(of["area_by_rock"][policy])
+    return f"{found['images']:.1f}" + (f" ({found['rocks']} of {rocks} rocks)" if found["rocks"] < rocks else "")
 
 
 def _ahead(pair: Mapping[str, Any]) -> str:

@@ -21,6 +21,20 @@ def area(images: Sequence[float], values: Sequence[float]) -> float:
     return float(np.trapezoid(values, images) / (images[-1] - images[0]))
 
 
+def images_to_reach(images: Sequence[float], values: Sequence[float], level: float) -> float | None:
+    """Number of images at which a curve first reaches a level, on straight lines between its points; None if it never does.
+
+    images: numbers of images, rising.
+    """
+    for k, value in enumerate(values):
+        if value >= level:
+            if k == 0:
+                return float(images[0])
+            share = (level - values[k - 1]) / (value - values[k - 1])
+            return float(images[k - 1] + share * (images[k] - images[k - 1]))
+    return None
+
+
 def interval(numbers: Sequence[float]) -> tuple[float, float] | None:
     """Student's t interval of 95 % of the mean of independent numbers, (low, high); None for fewer than two of them."""
     if len(numbers) < 2:
