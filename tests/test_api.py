@@ -71,5 +71,5 @@ def test_the_whole_way_from_python(dataset, prior, tmp_path, capsys):
     information = mgs.fisher(state.gaussians, frames[0].camera)
     assert information.shape == (tiny.POINTS, 11)
     assert isinstance(information, np.ndarray)
-    with pytest.raises(mgs.InputError, match="not empty"):
+    with pytest.raises(mgs.InputError, match="holds a run"):
         mgs.run_nbv(dataset, tmp_path / "run", prior=prior)

@@ -230,7 +230,7 @@ def test_the_command(runs, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert "cannot be written" in refused(capsys, ["report", runs[0], "--html", tmp_path / "file/page.html"], tmp_path)
     assert "is a folder" in refused(capsys, ["report", runs[0], "--html", tmp_path], tmp_path)
-    assert "no such file" in refused(capsys, ["report", tmp_path, "--html", tmp_path / "x.html"], tmp_path)
+    assert "holds no run" in refused(capsys, ["report", tmp_path, "--html", tmp_path / "x.html"], tmp_path)
 
 
 @pytest.fixture(scope="module")

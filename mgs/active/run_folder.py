@@ -110,7 +110,7 @@ def holds_run(out: Path) -> bool:
     """Whether a folder holds a run that can be read. A dataset has a config.json, too, but no settings of a run."""
     try:
         read_config(out)
-    except InputError:
+    except (InputError, OSError):  # OSError: not even the name can be looked up
         return False
     return True
 
