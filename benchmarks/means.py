@@ -82,10 +82,12 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
             for means, colour, marker in zip(MEANS, ("#0072B2", "#009E73", "#D55E00"), "os^", strict=True):
                 shown = [r for r in records if (r["views"], r["means"]) == (views, means)]
                 line = {"color": colour, "marker": marker, "label": means}
-                noises = [f"{r['noise']}" for r in shown]
-                axes[0, column].plot(noises, [r["psnr_inside"] for r in shown], **line)
-                if measured:
-                    axes[1, column].plot(noises, [1000 * r["distance_after"] for r in shown], **line)
+                noisy = [r for r in shown if r["noise"] != "hull"]  # no line leads to the hull, which is another prior
+                for some, style in ((noisy, line), ([r for r in shown if r not in noisy], line | {"label": None})):
+                    noises = [f"{r['noise']}" for r in some]
+                    axes[0, column].plot(noises, [r["psnr_inside"] for r in some], **style)
+                    if measured:
+                        axes[1, column].plot(noises, [1000 * r["distance_after"] for r in some], **style)
             axes[0, column].set_title(f"{views} views")
             axes[-1, column].set(xlabel="noise of the prior's points (spacings), or its hull")
         axes[0, 0].set(ylabel="PSNR inside, test views (dB)")

@@ -27,6 +27,7 @@ from mgs.plotting import STYLE, new_figure, save_figure
 from mgs.provenance import command_line, versions
 from mgs.splat import reference  # imported before any constant is replaced
 from mgs.study.chart.core import Call, Scene, error, gradient, image, information, oracle, scene
+from mgs.study.chart.drawing import COLOURS
 
 SMALL = 150, (96, 72)
 """Number of Gaussians, and size of the image, of the scene on which errors are measured."""
@@ -183,26 +184,21 @@ def chart(path: Path, rows: list[dict[str, Any]]) -> None:
     """Times over that of the core as it is, against errors."""
     import matplotlib
 
-    with matplotlib.rc_context(STYLE):
-        save_figure(drawn(rows), path)
-
-
-def drawn(rows: list[dict[str, Any]]) -> Any:
-    """The figure of `chart`."""
-    figure = new_figure(11, 4.6)
-    axes = figure.subplots(1, 3, sharey=True)
     titles = {"image": "image", "gradient": "image and gradient", "diagonal": "exact Fisher information"}
-    for ax, (what, title) in zip(axes, titles.items(), strict=True):
-        for number, row in enumerate(rows):
-            low, middle, high = row["ratios"][TIMED[what]]
-            style = {"marker": "ov^<>sDPX*"[number % 10], "color": f"C{number % 7}", "label": row["name"]}
-            error = [[middle - low], [high - middle]]
-            ax.errorbar(middle, row["errors"][what], xerr=error, linestyle="none", elinewidth=0.8, markersize=6, **style)
-        ax.axvline(1, color="0.8", linewidth=0.8, zorder=0)
-        ax.set(yscale="log", title=title, xlabel="time over that of the core as it is")
-    axes[0].set_ylabel("largest error over largest entry")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize="small", frameon=False)
-    return figure
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(11, 4.6)
+        axes = figure.subplots(1, 3, sharey=True)
+        for ax, (what, title) in zip(axes, titles.items(), strict=True):
+            for number, row in enumerate(rows):
+                low, middle, high = row["ratios"][TIMED[what]]
+                style = {"marker": "ov^<>sDPX*"[number % 10], "color": COLOURS[number % 7], "label": row["name"]}
+                error = [[middle - low], [high - middle]]
+                ax.errorbar(middle, row["errors"][what], xerr=error, linestyle="none", elinewidth=0.8, markersize=6, **style)
+            ax.axvline(1, color="0.8", linewidth=0.8, zorder=0)
+            ax.set(yscale="log", title=title, xlabel="time over that of the core as it is")
+        axes[0].set_ylabel("largest error over largest entry")
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=9, frameon=False)
+        save_figure(figure, path)
 
 
 def main(prefix: str) -> None:

@@ -31,7 +31,7 @@ that of divisions; every vector instruction in the time of an FMA; all its bytes
 
 SUPPLIES = ("L2", "L3", "memory", "addresses")
 """Where the bytes of arrays may come from; "addresses": every number or packet that a lane reads or writes by itself comes from
-another line of L3. From where they do come only hardware counters tell."""
+another line of L3. Only hardware counters could tell where they really come from."""
 
 BOUND = 0.5
 """A kernel is called bound by a limit that alone takes at least this share of its time."""

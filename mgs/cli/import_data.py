@@ -34,7 +34,9 @@ def import_data(
     ] = None,
     test_every: Annotated[
         int | None,
-        typer.Option(min=2, help="Set every so manieth image apart as a test view, by name from the first on; 8 is usual."),
+        typer.Option(
+            min=2, metavar="N", help="Set every Nth image apart as a test view, by name, from the first on; 8 is usual."
+        ),
     ] = None,
     split: Annotated[str, typer.Option(help="Which split of NeRF-synthetic data to import: train, val or test.")] = "train",
 ) -> None:

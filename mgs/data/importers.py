@@ -93,7 +93,8 @@ class Source:
         return replace(self, shots=shots, sparse=self.sparse and self.sparse.scaled(unit), unit="m")
 
     def set_apart(self, every: int) -> tuple[Source, Source]:
-        """The data without every so manieth shot by name, from the first on, and these alone, without points: test views.
+        """The data in two parts: all shots but every Nth by name, counted from the first; and these, the test views, without
+        points. every: N.
 
         Raises InputError where one of the two would have no shots.
         """

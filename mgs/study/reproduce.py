@@ -19,7 +19,7 @@ from mgs.study.sweep import Cell, names_of
 SCENES = ("boulder", "contact-binary", "low-sun", "pebbles", "strata")
 
 DEVELOPED_ON = ("boulder", "contact-binary")
-"""Scenes on whose rocks of seed 0 the settings of policies were chosen: what holds on the others is no luck of that choice."""
+"""Scenes on whose rocks of seed 0 the settings of policies were chosen; the other scenes had no part in that choice."""
 
 SEEDS = 4
 """Seed views of a run, as in the paper."""
