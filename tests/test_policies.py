@@ -134,7 +134,7 @@ def test_blocks_are_the_log_determinant_of_the_posterior(jacobians):
 
 
 def test_rounding_below_zero_counts_as_no_information():
-    assert criteria.block_log_determinant(-1e-6 * np.eye(11)[None], LAM) == 0
+    assert criteria.block_log_determinant(-np.eye(11)[None], LAM) == 0
 
 
 def test_angle_spreads_over_a_dome():

@@ -55,8 +55,12 @@ def paper(outlook: Outlook) -> Array:
 
 
 def _sum(outlook: Outlook, estimator: str) -> NDArray[np.float64]:
-    """Information of the views taken, by an estimator, summed."""
-    return np.sum([outlook.estimate(i, estimator) for i in outlook.visited], axis=0, dtype=np.float64)
+    """Information of the views taken, by an estimator, summed; that of one view is in memory at a time."""
+    first, *others = outlook.visited
+    total = np.array(outlook.estimate(first, estimator), np.float64)
+    for i in others:
+        total += outlook.estimate(i, estimator)
+    return total
 
 
 OUTLOOK_POLICIES: dict[str, Policy] = {
