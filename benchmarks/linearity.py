@@ -8,18 +8,23 @@ not fitted, with J delta from one forward-mode derivative, for moves delta of tw
   a time, and of the means, as if they were free, times a factor;
 - the move that one added view really causes when the fit goes on with it.
 
+The same draws are also made in other coordinates (`COORDINATES`): to first order they are the same moves, with the same J delta
+and the same information; beyond that the image may be more or less linear in them.
+
 Models: fitted to four views spread evenly in azimuth for few and for many passes.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import expit
+from scipy.special import logit as log_odds
 
 from mgs import runtime
 from mgs.active.criteria import MEAN_STD, PIXEL_NOISE, regularisation
@@ -48,14 +53,47 @@ ACROSS = "mean across the view"
 """Moves of means without their part along the axis of the camera, for each view those of its own."""
 
 
+def _opacity(logit: np.ndarray, delta: np.ndarray) -> np.ndarray:
+    opacity = expit(logit)
+    return np.asarray(log_odds(np.clip(opacity + opacity * (1 - opacity) * delta, LEAST, 1 - LEAST)))
+
+
+def _optical_depth(logit: np.ndarray, delta: np.ndarray) -> np.ndarray:
+    depth = np.logaddexp(0, logit)  # -log(1 - opacity)
+    return np.log(np.expm1(np.maximum(depth + expit(logit) * delta, LEAST)))
+
+
+def _power(exponent: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """A power of the size s, of which the logarithm is given."""
+    return lambda log_size, delta: log_size + np.log(np.maximum(1 + exponent * delta, LEAST)) / exponent
+
+
+COORDINATES = {
+    "opacity itself": ("logit_opacities", _opacity),
+    "optical depth": ("logit_opacities", _optical_depth),
+    "scale itself": ("log_scales", _power(1)),
+    "scale squared": ("log_scales", _power(2)),
+    "one over scale": ("log_scales", _power(-1)),
+}
+"""Other coordinates of a parameter: which one, and (its value, a move delta that is small) -> its value where the other
+coordinate moves by its first-order share of delta."""
+
+LEAST = 1e-3
+"""Least value of a coordinate that must be positive, and of what is left of a size."""
+
+
 def departure(
-    model: Gaussians, move: dict[str, np.ndarray], cameras: Sequence[Camera], cache: ListCache
+    model: Gaussians,
+    move: dict[str, np.ndarray],
+    cameras: Sequence[Camera],
+    cache: ListCache,
+    linear_move: dict[str, np.ndarray] | None = None,
 ) -> tuple[float, float]:
     """|h(theta + delta) - h(theta) - J delta| / |J delta| over the images of the cameras together; and the root mean square
-    change |J delta| of a pixel value."""
+    change |J delta| of a pixel value. linear_move: the delta of J delta, where it is not the move itself."""
     moved = replace(model, **{name: (getattr(model, name) + d).astype(np.float32) for name, d in move.items()})
     # The change that was really made, after rounding.
-    delta = {name: getattr(moved, name) - getattr(model, name) for name in move}
+    delta = linear_move or {name: getattr(moved, name) - getattr(model, name) for name in move}
     away, along, count = 0.0, 0.0, 0
     for camera in cameras:
         h0, h1 = (np.asarray(render(g, camera, cache=cache).rgb, np.float64) for g in (model, moved))
@@ -106,6 +144,13 @@ def study(root: Path) -> list[dict[str, Any]]:
             for name, move in moves.items():
                 ratio, size = departure(model, {k: factor * v for k, v in move.items()}, judged, cache)
                 records.append({"passes": passes, "move": f"draw, {name}", "factor": factor, "departure": ratio, "rms": size})
+                print(records[-1], flush=True)
+            for coordinate, (name, values) in COORDINATES.items():
+                delta = (factor * whole[name]).astype(np.float32)
+                move = {name: values(getattr(model, name).astype(np.float64), delta) - getattr(model, name)}
+                ratio, size = departure(model, move, judged, cache, {name: delta})
+                row = f"draw, {coordinate}"
+                records.append({"passes": passes, "move": row, "factor": factor, "departure": ratio, "rms": size})
                 print(records[-1], flush=True)
             found = [departure(model, {"means": factor * across(free, camera)}, [camera], cache) for camera in judged]
             ratio, size = np.mean(found, axis=0)

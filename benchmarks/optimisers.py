@@ -2,35 +2,36 @@
 
 Fits N Gaussians to 12 views of a dataset, spread evenly in azimuth, from the prior (cold), and goes on from such a fit with one
 more view (warm). Every point is a fit of its own, since rates fall over the length of a fit. Compared are the rows of
-`mgs.active.optimisers.OPTIMISERS` and Levenberg-Marquardt steps, solved by conjugate gradients with exact curvature products,
-which are made here only. Measured are the objective, PSNR inside the rock over the dataset's test views, seconds, and work in
-passes: one is a render with gradients of every view. Writes PREFIX.json, and PREFIX_N.png for each number of Gaussians. Let
-nothing else run.
+`mgs.active.optimisers.OPTIMISERS` and those of `second_order.py`, which the fit does not have. Measured are the objective, PSNR
+inside the rock over the dataset's test views, seconds, and work in passes: one is a render with gradients of every view. The
+seconds of optimisers that the fit does not have are more than they would be there, where a step is recorded once and replayed.
+Fits of fewer than 50,000 Gaussians are measured at more lengths. Writes PREFIX.json, and PREFIX_N.png for each number of
+Gaussians; what PREFIX.json has for the first numbers is not measured again. Let nothing else run.
 """
 
 from __future__ import annotations
 
+import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
+import second_order
 
 from mgs import runtime
 from mgs.active.criteria import regularisation
 from mgs.active.fitting import fit
-from mgs.active.objective import Objective, dot, objective, plus
+from mgs.active.objective import Objective, objective
 from mgs.active.optimisers import INFORMATION_PASSES, OPTIMISERS
 from mgs.active.pose_policies import seed_views
 from mgs.active.settings import RATES, TrainSettings
 from mgs.data.dataset import load_dataset, target_of
 from mgs.files import write_json
-from mgs.gaussians import LEARNED, Gaussians
+from mgs.gaussians import Gaussians
 from mgs.plotting import STYLE, new_figure, save_figure
 from mgs.prior.build import build_prior
 from mgs.prior.initial import initial_gaussians
@@ -49,13 +50,16 @@ ROWS = {
     "Adam, rates chosen for it": ("adam", FAST_RATES),
     "natural gradient": ("natural", RATES),
 }
-LENGTHS = (5, 10, 20, 40)
-"""Passes of the fits."""
-LM_STEPS, LM_CG, LM_DAMPING = 5, 8, 300.0
-"""Levenberg-Marquardt: steps, iterations of conjugate gradients in each, and first damping, a factor of the prior's lam."""
-CURVATURE_COST = 1.5
-"""Passes that a product with the curvature costs: one derivative in forward mode and one in reverse mode for each view, where a
-gradient takes one in reverse mode and the render."""
+LENGTHS, LONG_LENGTHS, LM_STEPS = (5, 10, 20, 40), (100, 400), (5, 20)
+"""Passes of the fits, those of small models only, and steps of Levenberg-Marquardt with large models and with small ones."""
+LARGE = 50_000
+"""Gaussians from which on a model is large."""
+BY_LENGTH = {
+    "natural gradient, 11x11 blocks": second_order.natural_by_blocks,
+    "natural gradient, colours solved": second_order.natural_colours_solved,
+}
+BY_STEP = {"Levenberg-Marquardt, CG": False, "the same, preconditioned by blocks": True}
+"""Rows of `second_order.py`: those whose rates fall over the length of a fit; Levenberg-Marquardt, with and without blocks."""
 
 
 class _Case:
@@ -95,40 +99,11 @@ class _Case:
         return found
 
 
-def levenberg_marquardt(goal: Objective, model: Gaussians) -> Iterator[tuple[float, Gaussians]]:
-    """Steps (J^T J + (1 + mu) lam)^-1 g, kept where they lower the objective; mu falls after good steps and rises after bad
-    ones. Gives the work so far, passes, and the model."""
-    work, mu, phi = 1.0, LM_DAMPING, goal.phi(model)
-    for _ in range(LM_STEPS):
-        gradient, lams = goal.gradient(model), list(goal.prior.lam.values())
-        damped = [mi.TensorXf(d.array + mu * lam, d.shape) for d, lam in zip(goal.diagonal(model), lams, strict=True)]
-        x, residual = [dr.zeros(mi.TensorXf, g.shape) for g in gradient], [-g for g in gradient]
-        z = [r / d for r, d in zip(residual, damped, strict=True)]
-        direction, rz = z, dot(residual, z)
-        for _ in range(LM_CG):
-            product = goal.curvature_times(model, direction)
-            product = [p + mi.TensorXf(mu * lam * v.array, v.shape) for p, v, lam in zip(product, direction, lams, strict=True)]
-            step = rz / dot(direction, product)
-            x, residual = plus(x, step, direction), plus(residual, -step, product)
-            z = [r / d for r, d in zip(residual, damped, strict=True)]
-            before, rz = rz, dot(residual, z)
-            direction = plus(z, rz / before, direction)
-            dr.eval(x, residual, direction)
-        expected = 0.5 * (dot(residual, x) - dot(gradient, x))
-        values = plus([getattr(model, name) for name in LEARNED], 1.0, x)
-        moved = Gaussians(model.means, **dict(zip(LEARNED, values, strict=True)))
-        work += 2 + 0.4 + CURVATURE_COST * LM_CG  # gradient, diagonal, objective
-        found = goal.phi(moved)
-        gain = (phi - found) / expected
-        if gain > 0.05:
-            model, phi = moved, found
-        mu *= 1 / 3 if gain > 0.75 else 3 if gain < 0.4 else 1
-        yield work, model
-
-
 def study(case: _Case) -> list[dict[str, Any]]:
     """One record per fit: number of Gaussians, whether warm, which row, passes of work, seconds, objective, PSNR."""
     records = []
+    small = case.gaussians < LARGE
+    lengths = LENGTHS + LONG_LENGTHS if small else LENGTHS
 
     def record(begin: str, row: str, work: float, seconds: float, goal: Objective, model: Gaussians) -> None:
         which = {"gaussians": case.gaussians, "start": begin, "row": row, "passes": work, "seconds": seconds}
@@ -141,19 +116,30 @@ def study(case: _Case) -> list[dict[str, Any]]:
     for begin, model, views in (("cold", case.start, case.taken), ("warm", before, case.added)):
         goal = case.objective(views)
         for row, (optimiser, rates) in ROWS.items():
-            for passes in LENGTHS:
+            for passes in lengths:
                 began = time.perf_counter()
                 found = case.fitted(model, views, optimiser, rates, passes)
                 seconds = time.perf_counter() - began
                 extra = -(-passes // INFORMATION_PASSES) if OPTIMISERS[optimiser].uses_information else 0
                 record(begin, row, passes + extra, seconds, goal, found)
-        seconds, began = 0.0, time.perf_counter()
-        for work, moved in levenberg_marquardt(goal, as_drjit(model)):
-            numpy = Gaussians(*(np.asarray(getattr(moved, f.name)) for f in fields(moved)))
-            seconds += time.perf_counter() - began
-            record(begin, "Levenberg-Marquardt, CG", work, seconds, goal, numpy)
-            began = time.perf_counter()  # judging took time that is not the optimiser's
+        for row, passes_of in BY_LENGTH.items():
+            for passes in lengths:
+                *_, (work, seconds, found) = timed(passes_of(goal, as_drjit(model), passes))
+                record(begin, row, work, seconds, goal, found())
+        for row, by_blocks in BY_STEP.items():
+            steps = second_order.levenberg_marquardt(goal, as_drjit(model), LM_STEPS[small], by_blocks)
+            for work, seconds, found in timed(steps):
+                record(begin, row, work, seconds, goal, found())
     return records
+
+
+def timed(steps: Iterator[tuple[float, Gaussians]]) -> Iterator[tuple[float, float, Callable[[], Gaussians]]]:
+    """Work, seconds spent in the steps themselves, and what gives the model with NumPy fields, after each step."""
+    seconds, began = 0.0, time.perf_counter()
+    for work, model in steps:
+        seconds += time.perf_counter() - began
+        yield work, seconds, lambda model=model: Gaussians(*(np.array(getattr(model, f.name)) for f in fields(model)))
+        began = time.perf_counter()  # judging took time that is not the optimiser's
 
 
 def draw(path: Path, records: list[dict[str, Any]]) -> None:
@@ -161,7 +147,7 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
     import matplotlib
     from matplotlib.ticker import NullFormatter
 
-    colours = ("#D55E00", "#E69F00", "#0072B2", "#009E73")
+    colours = ("#D55E00", "#E69F00", "#0072B2", "#56B4E9", "#CC79A7", "#009E73", "#000000")
     columns = [("passes", "phi"), ("seconds", "phi"), ("passes", "psnr_inside"), ("seconds", "psnr_inside")]
     names = {"passes": "work (passes)", "seconds": "seconds", "phi": "objective", "psnr_inside": "PSNR inside, test views (dB)"}
     with matplotlib.rc_context(STYLE):
@@ -174,7 +160,7 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
                     axis.plot([r[x] for r in shown], [r[y] for r in shown], "o-", color=colour, markersize=3, label=row)
                 axis.set(xscale="log", yscale="log" if y == "phi" else "linear", ylabel=f"{names[y]}, {begin}")
                 most = max(r[x] for r in records)
-                axis.set_xticks([tick for tick in (1, 2, 5, 10, 20, 40) if min(r[x] for r in records) <= tick <= most])
+                axis.set_xticks([tick for tick in (5, 10, 20, 40, 100, 400) if min(r[x] for r in records) <= tick <= most])
                 axis.xaxis.set_major_formatter("{x:g}")
                 axis.xaxis.set_minor_formatter(NullFormatter())
                 if y == "phi":
@@ -189,13 +175,14 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
 def main(prefix: Path, given: list[str]) -> None:
     """Measure, write, draw."""
     runtime.start()
-    records: list[dict[str, Any]] = []
+    path = prefix.with_suffix(".json")
+    records: list[dict[str, Any]] = json.loads(path.read_text())["records"] if path.is_file() else []
     for root, gaussians in (case.rsplit(":", 1) for case in given):
-        found = study(_Case(Path(root), int(gaussians)))
-        draw(prefix.with_name(f"{prefix.name}_{gaussians}.png"), found)
-        records += found
-    made = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
-    write_json(prefix.with_suffix(".json"), made | {"records": records})
+        if not any(r["gaussians"] == int(gaussians) for r in records):
+            records += study(_Case(Path(root), int(gaussians)))
+        draw(prefix.with_name(f"{prefix.name}_{gaussians}.png"), [r for r in records if r["gaussians"] == int(gaussians)])
+        made = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
+        write_json(path, made | {"records": records})
 
 
 if __name__ == "__main__":

@@ -4,6 +4,9 @@ From each of four states of a dataset (4 views spread evenly in azimuth; 4, 6 an
 4,000 passes, and every other view is scored by each criterion that looks at the fitted model. Compared with the ranking after
 the longest fit: Kendall's tau; and regret, the share of the longest fit's best score that is lost if the shorter fit chooses.
 
+What could a run know of this when its fit stops? Measured for that are tau with the ranking after half as many passes, in a fit
+of that length, and the Newton decrease, by which the objective is predicted to fall yet (`mgs.active.convergence`).
+
 Writes PREFIX.json, and PREFIX.png. States that are in PREFIX.json already are not computed again.
 """
 
@@ -17,8 +20,10 @@ from typing import Any
 import numpy as np
 
 from mgs import runtime
+from mgs.active.convergence import CG_ITERATIONS
 from mgs.active.criteria import CRITERIA, regularisation
 from mgs.active.fitting import fit
+from mgs.active.objective import newton_decrease, objective
 from mgs.active.pose_policies import seed_views
 from mgs.active.settings import TrainSettings
 from mgs.data.dataset import Dataset, load_dataset, target_of
@@ -31,10 +36,12 @@ from mgs.prior.initial import initial_gaussians
 from mgs.prior.settings import PriorSettings
 from mgs.provenance import command_line, versions
 from mgs.seeds import generator
-from mgs.splat import ListCache, fisher, groups
+from mgs.splat import ListCache, as_drjit, fisher, groups
 
 STATES = {"4 even": 4, "4 random": 4, "6 random": 6, "8 random": 8}
-PASSES = (5, 10, 20, 40, 100, 300, 1000, 4000)
+PASSES = (5, 10, 20, 40, 100, 200, 400, 1000, 4000)
+HALVES = {2 * passes: passes for passes in PASSES if 2 * passes in PASSES}
+"""Lengths of a fit of which half is there, too."""
 GAUSSIANS = 10_000
 FITTED = [name for name, criterion in CRITERIA.items() if criterion.at == "fitted" and name != "e-optimal"]
 """Criteria compared. e-optimal is 0 while any parameter stays unobserved, so it ranks nothing here."""
@@ -69,28 +76,30 @@ def study(root: Path, state: str) -> list[dict[str, Any]]:
     frames = [dataset.frames[i] for i in taken]
     start, by_kind = initial_gaussians(prior, frames)[0], {kind: float(lam[c][0]) for kind, c in groups(0).items()}
     cameras, targets = [frame.camera for frame in frames], [target_of(frame) for frame in frames]
-    records = []
+    goal, records = objective(start, cameras, targets, start, by_kind, cache), []
     for passes in PASSES:
         found = fit(start, cameras, targets, TrainSettings(passes=passes, tolerance=0.0), cache=cache, start=start, lam=by_kind)
         values = scores(found.gaussians, taken, dataset, lam, cache)
         record = {"dataset": str(root), "state": state, "views": taken, "passes": passes, "loss": found.loss, "scores": values}
-        records.append(record)
+        model = as_drjit(found.gaussians)
+        decrease = newton_decrease(goal, model, CG_ITERATIONS)[-1] / goal.phi(model)
+        records.append(record | {"predicted_decrease": decrease})
         print(root, state, passes, f"loss {found.loss:.4g}", flush=True)
     return records
 
 
 def compared(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Kendall's tau and regret of each record against the longest fit of its state, by criterion."""
+    """Kendall's tau and regret of each record against the longest fit of its state, by criterion; and what a run could know:
+    "tau_half", tau with the fit of half the length, where there is one, and "predicted_decrease"."""
     found = []
     for record in records:
-        longest = max(
-            (r for r in records if (r["dataset"], r["state"]) == (record["dataset"], record["state"])),
-            key=lambda r: r["passes"],
-        )
+        of_state = {r["passes"]: r for r in records if (r["dataset"], r["state"]) == (record["dataset"], record["state"])}
+        half = of_state.get(HALVES.get(record["passes"], 0))
         for name in FITTED:
-            mine, end = np.array(record["scores"][name]), np.array(longest["scores"][name])
-            row = {key: record[key] for key in ("dataset", "state", "passes")} | {"criterion": name}
-            found.append(row | agreement(mine, end))
+            mine, end = (np.array(r["scores"][name]) for r in (record, of_state[max(of_state)]))
+            row = {key: record[key] for key in ("dataset", "state", "passes", "predicted_decrease")} | {"criterion": name}
+            known = {} if half is None else {"tau_half": agreement(np.array(half["scores"][name]), mine)["tau"]}
+            found.append(row | agreement(mine, end) | known)
     return found
 
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mgs.active import criteria, policies, pose_policies
+from mgs.colour import SH_C0
 from mgs.seeds import generator
 
 GROUPS = {"colour": slice(0, 3), "scale": slice(3, 6), "rotation": slice(6, 10), "opacity": slice(10, 11)}
@@ -178,6 +179,23 @@ def test_what_the_outlook_policies_ask_for():
     gradients, lam = models["loss-gradient"], np.full(11, 1e-6)
     expected = [criteria.d_optimal(gradients[i], gradients[0], lam) for i in (1, 2, 3)]
     assert policies.policy_named("paper")(outlook) == pytest.approx(expected)
+
+
+def test_cover_and_completeness_look_at_what_was_not_observed():
+    """Two points of a surface, which count by what a candidate sees of them: the first was observed from +X, of the second the
+    view knows less than the prior does."""
+    points = np.array([[0.0, 0, 0], [0, 0, 1e-9]])
+    positions = np.array([[4.0, 0, 0], [0, 4, 0], [-4, 0, 0], [4, 0, 0]])
+    enough = LAM[0] / SH_C0**2
+    seen = np.array([[10 * enough, 0.5 * enough], [1, 0], [3, 1], [0, 2]])
+    surface_H = np.outer(seen[0] * SH_C0**2, np.ones(11))
+    outlook = outlook_of({}, None, positions=positions, points=points, surface_H=surface_H, seen=lambda view: seen[view])
+    assert policies.policy_named("cover")(outlook) == pytest.approx([0.5, 1, 1])
+    assert policies.policy_named("completeness")(outlook) == pytest.approx([0, 1, 2])
+    both = outlook_of({}, None, positions=positions, points=points, visited=[0, 2], left=[1], seen=lambda view: seen[view])
+    assert policies.policy_named("cover")(both) == pytest.approx([0.5])
+    blind = outlook_of({}, None, positions=positions, points=points, left=[1], seen=lambda view: np.zeros(2))
+    assert policies.policy_named("cover")(blind) == 0
 
 
 def test_random_differs_between_rounds_and_repeats_between_runs():

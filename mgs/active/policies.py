@@ -10,11 +10,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mgs.active.criteria import CRITERIA, Array, Criterion, block_log_determinant, d_optimal
+from mgs.active.criteria import CRITERIA, Array, Criterion, block_log_determinant, d_optimal, observed
 from mgs.active.criteria import i_optimal as i_optimality
 from mgs.active.outlook import Outlook, Policy
 from mgs.active.policy_file import in_file, load
 from mgs.active.pose_policies import POSE_POLICIES
+from mgs.colour import SH_C0
 from mgs.errors import InputError
 
 PAPER_LAM = 1e-6
@@ -54,6 +55,38 @@ def paper(outlook: Outlook) -> Array:
     return np.array([d_optimal(outlook.estimate(i, "loss-gradient"), H, lam) for i in outlook.left])
 
 
+def cover(outlook: Outlook) -> Array:
+    """COVER ("Coverage Optimization for Camera View Selection", 2026): from how far off the surface was seen that a view sees.
+
+    For each Gaussian (1 - cos)/2 of the angle between the candidate's direction and the nearest one from which it was
+    `observed`, or 1 where it never was; then the mean over what the candidate sees, by squared blending weights. In [0, 1].
+    The paper counts a view for all that lies in its frustum, hidden or not, and rounds directions to bins.
+    """
+    points, least = outlook.points, outlook.prior_lam[0] / SH_C0**2
+    taken = [(_directions(points, outlook.positions[i]), outlook.seen(i) > least) for i in outlook.visited]
+    scores = []
+    for i in outlook.left:
+        here, seen = _directions(points, outlook.positions[i]), outlook.seen(i)
+        apart = np.ones(len(points))
+        for there, known in taken:
+            apart = np.where(known, np.minimum(apart, (1 - (here * there).sum(1)) / 2), apart)
+        scores.append((apart * seen).sum() / max(seen.sum(), 1e-12))
+    return np.array(scores)
+
+
+def _directions(points: Array, position: Array) -> Array:
+    """[N,3] unit vectors from a camera to points."""
+    offset = points - position
+    return np.asarray(offset / np.linalg.norm(offset, axis=1, keepdims=True))
+
+
+def completeness(outlook: Outlook) -> Array:
+    """ActiveSplat's completeness (2024), the part of a view that no view has shown: here, where a prior knows the surface, the
+    squared blending weights of its Gaussians that are not `observed`. Zero once all are, as with `coverage`."""
+    unknown = ~observed(outlook.surface_H, outlook.prior_lam)
+    return np.array([outlook.seen(i)[unknown].sum() for i in outlook.left])
+
+
 def _sum(outlook: Outlook, estimator: str) -> NDArray[np.float64]:
     """Information of the views taken, by an estimator, summed; that of one view is in memory at a time."""
     first, *others = outlook.visited
@@ -69,6 +102,8 @@ OUTLOOK_POLICIES: dict[str, Policy] = {
     "paper": paper,
     "directional-d": directional_d,
     "directional-i": directional_i,
+    "cover": cover,
+    "completeness": completeness,
 }
 """Policies that are told all that there is, by name. A program may add its own (docs/howto/policy.md)."""
 

@@ -38,6 +38,8 @@ POLICY_STYLE: dict[str, tuple[str, str | tuple[int, int, int]]] = {
     "i-optimal": ("#7755dd", "d"),
     "block-d": ("#bbbb77", (4, 1, 0)),
     "angle": ("#553355", (6, 1, 0)),
+    "cover": ("#000066", "8"),
+    "completeness": ("#8888ee", "H"),
 }
 """Colour and marker of each policy, the same in every figure. The first seven colours are those of Okabe and Ito; the others
 were chosen so that colour-blind people can tell them all apart. The markers tell them apart in grey."""

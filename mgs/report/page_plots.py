@@ -19,7 +19,7 @@ from mgs.report.figures import axis_names, line_styles
 SYMBOLS: dict[str | tuple[int, int, int], str] = {
     "o": "circle", "s": "square", "^": "triangle-up", "D": "diamond", "v": "triangle-down", "P": "cross", "X": "x",
     "p": "pentagon", "*": "star", "<": "triangle-left", ">": "triangle-right", "h": "hexagon", "d": "diamond-tall",
-    (4, 1, 0): "star-diamond", (6, 1, 0): "hexagram",
+    (4, 1, 0): "star-diamond", (6, 1, 0): "hexagram", "8": "octagon", "H": "hexagon2",
 }  # fmt: skip
 """Matplotlib's markers, as `mgs.report.figures.POLICY_STYLE` has them -> Plotly's."""
 

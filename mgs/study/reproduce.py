@@ -25,7 +25,8 @@ SEEDS = 4
 """Seed views of a run, as in the paper."""
 
 POLICIES = (
-    "paper", "d-optimal", "directional-i", "directional-d", "fisherrf", "coverage", "farthest", "uniform", "random",
+    "paper", "d-optimal", "directional-i", "directional-d", "fisherrf", "cover", "coverage", "completeness", "farthest",
+    "uniform", "random",
 )  # fmt: skip
 """Policies that are compared over rocks."""
 
