@@ -2,6 +2,7 @@
 
 import csv
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -118,6 +119,33 @@ def test_a_policy_of_ones_own_is_compared_over_rocks(quick, tmp_path, capsys):
         "mine.py:first",
         "coverage",
     }
+
+
+def test_rocks_of_ones_own_take_the_place_of_the_others(quick, tmp_path, capsys, monkeypatch):
+    rendered = []
+
+    def seen(root, out, scene, seed, orbit, test_views, preset, mesh):
+        rendered.append((scene, Path(mesh).name, len(rendered)))
+        return ellipsoids(root, out, scene, seed, orbit, test_views, preset)
+
+    monkeypatch.setattr(tasks, "make_dataset", seen)
+    out, meshes = tmp_path / "out", [tmp_path / "one.ply", tmp_path / "two.glb"]
+    for mesh in meshes:
+        mesh.write_text(mesh.name)
+    given = [part for mesh in meshes for part in ("--mesh", mesh)]
+    said = done(capsys, out, "--only", "curves", *given)
+    assert [(scene, name) for scene, name, _ in rendered] == [("boulder", "one.ply"), ("boulder", "two.glb")]
+    assert "curves 0/8 dataset/one-" in said
+    assert {row["scene"] for row in rows_of(out / "results/curves_by_rock.csv")} == {"one", "two"}
+    command = "mgs reproduce --preset quick --only curves --rocks 2 --mesh one.ply --mesh two.glb"
+    assert {row["command"] for row in rows_of(out / "results/curves.csv")} == {command}
+    assert "--rocks 3: curves can have 1 to 2" in refused(capsys, ["reproduce", out, "--rocks", 3, *given], out)
+    twice = ["reproduce", out, "--mesh", meshes[0], "--mesh", tmp_path / "out/../one.ply"]
+    assert "one.ply: there is one of this name already" in refused(capsys, twice, out)
+    meshes[0].write_text("another rock")
+    again = done(capsys, out, "--only", "curves", *given)
+    assert "dataset/one-" in again, "another file is another rock"
+    assert "/two-" not in again
 
 
 def test_a_prior_is_built_once_and_whole(tmp_path, monkeypatch):
@@ -435,6 +463,11 @@ def test_every_run_of_every_result_has_its_own_cell():
         (["--policy", "angle", "--policy", "angle"], "--policy angle: there is one of this name already"),
         (["--policy", "block-d", "--only", "table1"], "--policy block-d: is for curves and pools, and --only leaves both out"),
         (["--policy", "none.py:f"], "none.py"),
+        (["--mesh", "none.glb"], "none.glb: cannot be read (No such file or directory)"),
+        (
+            ["--mesh", "none.glb", "--only", "table1"],
+            "--mesh none.glb: is for results over many rocks, and --only leaves them out",
+        ),
         (["--batch", "0"], "should be greater than or equal to 1"),
         (["--batch", "5", "--only", "curves"], "--batch 5: is for table1 and figures, and --only leaves both out"),
     ],

@@ -15,12 +15,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from table_makers import benchmarks, core, studies
+from table_makers import benchmarks, core, fits, studies
 from table_makers.studies import NOT_RUN
 
 ROOT = Path(__file__).parent.parent
 MARK = re.compile(r"<!-- (?:table: (?P<name>\S+)|end of table) -->")
-TABLES = benchmarks.TABLES | core.TABLES | studies.TABLES
+TABLES = benchmarks.TABLES | core.TABLES | fits.TABLES | studies.TABLES
 
 
 def rewritten(page: str, docs: Path) -> str:

@@ -181,7 +181,7 @@ def objective(
     cameras: Sequence[Camera],
     targets: Sequence[np.ndarray],
     start: Gaussians | None = None,
-    lam: Mapping[str, float] | None = None,
+    lam: Mapping[str, float | np.ndarray] | None = None,
     cache: ListCache | None = None,
     means: str = "frozen",
     normals: np.ndarray | None = None,
@@ -202,10 +202,17 @@ def objective(
     # A copy: Dr.Jit uses NumPy's memory in place, and a recorded step takes parameters and start for the same array for ever
     # if they were in the same memory when it was recorded (Dr.Jit 1.5).
     start = as_drjit(Gaussians(*(np.array(getattr(start, f.name), np.float32) for f in fields(start))))
-    values = {name: dr.opaque(mi.Float, float((lam or {}).get(kind, 0.0))) for name, kind in learned(means).items()}
+    values = {name: _filled((lam or {}).get(kind, 0.0), getattr(start, name).shape) for name, kind in learned(means).items()}
     directions = None if unit is None else mi.TensorXf(padded(unit))
     prior = Prior(start, values, dr.opaque(mi.Float, 1 / max(len(photos), 1)), directions)
     return Objective(photos, prior, cache or ListCache())
+
+
+def _filled(lam: float | np.ndarray, shape: tuple[int, ...]) -> Any:
+    """A lam as Float, of one number or of as many as a parameter of that shape has."""
+    if np.ndim(lam) == 0:
+        return dr.opaque(mi.Float, float(lam))
+    return mi.Float(padded(np.broadcast_to(lam, shape).astype(np.float32)).ravel())
 
 
 def _photo(camera: Camera, target: np.ndarray) -> Photo:

@@ -32,6 +32,10 @@ def reproduce(
         list[str] | None,
         typer.Option(help="One policy more in curves and pools: a name, or FILE.py:FUNCTION. May be given several times."),
     ] = None,
+    mesh: Annotated[
+        list[Path] | None,
+        typer.Option(help="A rock of your own for results over many rocks, instead of mgs's. May be given several times."),
+    ] = None,
     batch: Annotated[
         int, typer.Option(min=1, help="Of Table I and the figures: views that are chosen before the model is fitted again.")
     ] = 1,
@@ -52,12 +56,13 @@ def reproduce(
     from mgs import runtime
     from mgs.errors import InputError, row_named
     from mgs.files import check_writable
-    from mgs.study import reproduce as study
+    from mgs.study import reproduce_asked as asked
+    from mgs.study.reproduce import PRESETS
 
-    names = study.results_of(only)
-    size = study.with_policies(row_named(study.PRESETS, preset, "--preset"), names, policy or [])
-    size = study.with_batch(size, names, batch)
-    counts = {name: study.rocks_of(name, size, rocks) for name in names}
+    names = asked.results_of(only)
+    size = asked.with_policies(row_named(PRESETS, preset, "--preset"), names, policy or [])
+    size = asked.with_meshes(asked.with_batch(size, names, batch), names, mesh or [])
+    counts = {name: asked.rocks_of(name, size, rocks) for name in names}
     if scheduler is not None and workers != 1:
         raise InputError("--workers starts workers here, and --scheduler uses those of a scheduler; give one of them")
     check_preset(check_writable(out), preset)
@@ -82,7 +87,8 @@ def _make(
     many = f" --rocks {count}" if result.rocks(size) > 1 else ""
     own = "".join(f" --policy {_from_here(policy)}" for policy in size.own_policies if name in ("curves", "pools"))
     batch = f" --batch {size.table.batch}" if size.table.batch > 1 and name in ("table1", "figures") else ""
-    command = f"mgs reproduce --preset {preset} --only {name}{many}{own}{batch}"
+    meshes = "".join(f" --mesh {mesh.name}" for mesh in size.meshes)
+    command = f"mgs reproduce --preset {preset} --only {name}{many}{own}{meshes}{batch}"
     task = bar.add_task(name, total=None)
 
     def tell(cell: str, done: int, total: int) -> None:

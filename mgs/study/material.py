@@ -17,13 +17,15 @@ if TYPE_CHECKING:
     from mgs.synth.scene_file import SceneFile
 
 
-def made_dataset(folder: Path, scene: str | SceneFile, preset: Preset, seed: int = 0, test_views: int = 0) -> Dataset:
+def made_dataset(
+    folder: Path, scene: str | SceneFile, preset: Preset, seed: int = 0, test_views: int = 0, mesh: str | None = None
+) -> Dataset:
     """The dataset of a scene, as `mgs synth-orbit` renders it: read where it is there, else rendered. Raises InputError as
     `mgs.synth.rendering.synthesise` and `mgs.data.dataset.load_dataset`."""
     from mgs.synth.rendering import synthesise  # which needs a variant of Mitsuba
 
     if not (folder / "transforms.json").is_file():
-        synthesise(folder, scene, preset, seed, test_views=test_views)
+        synthesise(folder, scene, preset, seed, mesh, test_views=test_views)
     return load_dataset(folder)
 
 

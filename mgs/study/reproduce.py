@@ -5,16 +5,15 @@ A cell is a dataset, a prior or a run; cells that several results need are done 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from mgs.active import policy_file
-from mgs.active.inputs import policy_record
-from mgs.active.policies import policy_named
-from mgs.errors import InputError
+from mgs.active.inputs import file_digest, policy_record
 from mgs.study.statistics import MOST_ROCKS
-from mgs.study.sweep import Cell, names_of
+from mgs.study.sweep import Cell
 
 SCENES = ("boulder", "contact-binary", "low-sun", "pebbles", "strata")
 
@@ -103,7 +102,9 @@ class Preset:
     seed_rocks: int = 5
     pool_rocks: int = 3
     own_policies: tuple[str, ...] = ()
-    """Policies of the user's own that the curves and the pools compare, too (`with_policies`)."""
+    """Policies of the user's own that the curves and the pools compare, too (`mgs.study.reproduce_asked`)."""
+    meshes: tuple[Path, ...] = ()
+    """Rocks of the user's own, which then take the place of the procedural ones (`mgs.study.reproduce_asked`)."""
 
     @property
     def policies(self) -> tuple[str, ...]:
@@ -119,24 +120,38 @@ PRESETS = {
 
 @dataclass(frozen=True)
 class Rock:
-    """A scene, and the seed of the rock in it. index: its place among the rocks, also the seed of the runs on it."""
+    """A scene, and the seed of the rock in it; or a mesh, called by its file's name, in MESH_SCENE. index: its place among the
+    rocks, also the seed of the runs on it."""
 
     scene: str
     seed: int
     index: int = 0
+    mesh: Path | None = None
 
     @property
     def name(self) -> str:
-        """As it is called in tables and folders."""
-        return f"{self.scene}-{self.seed}"
+        """As it is called in folders."""
+        return f"{self.scene}-{self.seed if self.mesh is None else file_digest(self.mesh)[:8]}"
+
+    def made_of(self) -> dict[str, Any]:
+        """What the task that renders is told of it."""
+        if self.mesh is None:
+            return {"scene": self.scene, "seed": self.seed}
+        return {"scene": MESH_SCENE, "seed": self.seed, "mesh": str(self.mesh)}
+
+
+MESH_SCENE = "boulder"
 
 
 TABLE_ROCK = Rock("boulder", 0)
 """The rock of Table I."""
 
 
-def rocks(count: int) -> list[Rock]:
-    """The first so many rocks: the scenes in turn, with seeds from 1 on. On those of seed 0 the policies were developed."""
+def rocks(preset: Preset, count: int) -> list[Rock]:
+    """The first so many rocks: the scenes in turn, with seeds from 1 on. On those of seed 0 the policies were developed. Where
+    the preset has meshes, these instead."""
+    if preset.meshes:
+        return [Rock(mesh.stem, 0, k, mesh) for k, mesh in enumerate(preset.meshes[:count])]
     return [Rock(SCENES[k % len(SCENES)], 1 + k // len(SCENES), k) for k in range(count)]
 
 
@@ -163,7 +178,7 @@ class Run:
         shape = "-".join([pool["orbit"], *map(str, distances), f"{frames}x{size.width}x{size.height}"])
         views = {"test_views": size.test_views}
         preset = {"width": size.width, "height": size.height, "frames": frames, "spp": size.spp}
-        where = {"scene": self.rock.scene, "seed": self.rock.seed, "orbit": pool["orbit"]}
+        where = self.rock.made_of() | {"orbit": pool["orbit"]}
         where |= {"distances": list(distances)} if distances else {}
         cells = [Cell(f"dataset/{self.rock.name}/{shape}", "mgs.study.tasks:make_dataset", where | views | {"preset": preset})]
         survey = cells[0].name  # the prior is of the whole flight
@@ -246,7 +261,7 @@ def table_runs(preset: Preset) -> dict[str, Run]:
 
 def curve_runs(preset: Preset, count: int) -> list[Run]:
     """PSNR(images): every policy on every rock."""
-    return [Run(rock, preset.rocks, policy) for rock in rocks(count) for policy in preset.policies]
+    return [Run(rock, preset.rocks, policy) for rock in rocks(preset, count) for policy in preset.policies]
 
 
 def seed_runs(preset: Preset, count: int) -> list[Run]:
@@ -254,7 +269,7 @@ def seed_runs(preset: Preset, count: int) -> list[Run]:
     total = SEEDS + preset.rocks.budget
     return [
         Run(rock, preset.rocks, policy, seeds=seeds, budget=total - seeds)
-        for rock in rocks(count)
+        for rock in rocks(preset, count)
         for policy in SEED_POLICIES
         for seeds in SEED_COUNTS
     ]
@@ -265,7 +280,7 @@ def pool_runs(preset: Preset, count: int) -> list[Run]:
     return [
         Run(rock, preset.rocks, policy, draw=draw, pool=pool)
         for pool in POOLS
-        for rock in rocks(count)
+        for rock in rocks(preset, count)
         for policy in preset.policies
         for draw in range(DRAWS if policy == "random" else 1)
     ]
@@ -273,7 +288,7 @@ def pool_runs(preset: Preset, count: int) -> list[Run]:
 
 def oracle_runs(preset: Preset, count: int) -> list[Run]:
     """The oracle on every pool of so many rocks."""
-    return [Run(rock, preset.rocks, ORACLE, pool=pool) for pool in POOLS for rock in rocks(count)]
+    return [Run(rock, preset.rocks, ORACLE, pool=pool) for pool in POOLS for rock in rocks(preset, count)]
 
 
 MOST_POOL_ROCKS = 10
@@ -315,60 +330,9 @@ RESULTS = {
 """Every result by its name, in the order in which they are made."""
 
 
-def results_of(only: str | None) -> list[str]:
-    """The results to make: those named, with commas between, or all that are not optional. In the order of RESULTS.
-
-    Raises InputError for a name that is none.
-    """
-    if only is None:
-        return [name for name, result in RESULTS.items() if not result.optional]
-    return names_of(only, RESULTS)
-
-
-def rocks_of(name: str, preset: Preset, asked: int | None) -> int:
-    """How many rocks a result has: as many as asked for, but Table I has one. Raises InputError if out of range."""
-    default, most = RESULTS[name].rocks(preset), RESULTS[name].most
-    if asked is None or default == 1:
-        return default
-    if not 1 <= asked <= most:
-        raise InputError(f"--rocks {asked}: {name} can have 1 to {most}")
-    return asked
-
-
 def cells_of(name: str, preset: Preset, count: int) -> list[Cell]:
     """The cells of a result over so many rocks, each once."""
     return list({cell.name: cell for run in RESULTS[name].runs(preset, count) for cell in run.cells()}.values())
-
-
-def with_policies(preset: Preset, names: list[str], policies: Sequence[str]) -> Preset:
-    """A preset whose curves and pools compare these policies, too: names, or FILE.py:FUNCTION.
-
-    names: the results to make. Raises InputError where none of them compares policies over rocks, where there is no such
-    policy, where it is compared anyway, and where two would have the same name in tables.
-    """
-    labels = list(POLICIES)
-    for policy in policies:
-        if not {"curves", "pools"} & set(names):
-            raise InputError(f"--policy {policy}: is for curves and pools, and --only leaves both out")
-        if policy in POLICIES:
-            raise InputError(f"--policy {policy}: is compared anyway")
-        if policy_file.label(policy) in labels:
-            raise InputError(f"--policy {policy}: there is one of this name already; leave it out, or rename its file")
-        labels.append(policy_file.label(policy))
-        policy_named(policy)
-    return replace(preset, own_policies=tuple(policy_file.absolute(policy) for policy in policies))
-
-
-def with_batch(preset: Preset, names: list[str], batch: int) -> Preset:
-    """A preset whose Table I, and so its figures, has runs that choose so many views before they fit again.
-
-    names: the results to make. Raises InputError where neither is among them.
-    """
-    if batch == 1:
-        return preset
-    if not {"table1", "figures"} & set(names):
-        raise InputError(f"--batch {batch}: is for table1 and figures, and --only leaves both out")
-    return replace(preset, table=replace(preset.table, batch=batch))
 
 
 def pairs_of(policies: Iterable[str]) -> tuple[tuple[str, str], ...]:

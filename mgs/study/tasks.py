@@ -43,13 +43,14 @@ def make_dataset(
     test_views: int,
     preset: dict[str, int],
     distances: Sequence[float] = (1,),
+    mesh: str | None = None,
 ) -> dict[str, Any]:
-    """Render a scene's rock of that seed from an orbit of that kind. preset: fields of `mgs.synth.rendering.Preset`;
-    distances: of `mgs.synth.scene_file.Orbit`."""
+    """Render a scene's rock of that seed, or a mesh in its place, from an orbit of that kind. preset: fields of
+    `mgs.synth.rendering.Preset`; distances: of `mgs.synth.scene_file.Orbit`."""
     loaded = load_scene_file(scene)
     flight = loaded.orbit.model_copy(update={"kind": orbit, "distances": tuple(distances)})
     settings = loaded.model_copy(update={"orbit": flight})
-    return {"frames": len(made_dataset(out / "dataset", settings, Preset(**preset), seed, test_views))}
+    return {"frames": len(made_dataset(out / "dataset", settings, Preset(**preset), seed, test_views, mesh))}
 
 
 def make_arc(root: Path, out: Path, ring: str, every: int) -> dict[str, Any]:
