@@ -7,7 +7,7 @@ the longest fit: Kendall's tau; and regret, the share of the longest fit's best 
 What could a run know of this when its fit stops? Measured for that are tau with the ranking after half as many passes, in a fit
 of that length, and the Newton decrease, by which the objective is predicted to fall yet (`mgs.active.convergence`).
 
-Writes PREFIX.json, and PREFIX.png. States that are in PREFIX.json already are not computed again.
+Writes PREFIX.json, and PREFIX.png. Fits that are in PREFIX.json already are not made again.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from mgs.seeds import generator
 from mgs.splat import ListCache, as_drjit, fisher, groups
 
 STATES = {"4 even": 4, "4 random": 4, "6 random": 6, "8 random": 8}
-PASSES = (5, 10, 20, 40, 100, 200, 400, 1000, 4000)
+PASSES = (5, 10, 20, 40, 50, 100, 150, 300, 500, 1000, 4000)
 HALVES = {2 * passes: passes for passes in PASSES if 2 * passes in PASSES}
 """Lengths of a fit of which half is there, too."""
 GAUSSIANS = 10_000
@@ -67,8 +67,8 @@ def scores(model: Gaussians, taken: list[int], dataset: Dataset, lam: np.ndarray
     return found
 
 
-def study(root: Path, state: str) -> list[dict[str, Any]]:
-    """One record per number of passes: loss and scores."""
+def study(root: Path, state: str, lengths: list[int]) -> list[dict[str, Any]]:
+    """One record per number of passes: loss, scores, and the share of the objective by which it is predicted to fall yet."""
     dataset, cache, lam = load_dataset(root), ListCache(), regularisation(groups(0))
     prior, _ = build_prior(dataset, PriorSettings(gaussians=GAUSSIANS))
     positions = np.array([frame.camera.position for frame in dataset.frames])
@@ -77,7 +77,7 @@ def study(root: Path, state: str) -> list[dict[str, Any]]:
     start, by_kind = initial_gaussians(prior, frames)[0], {kind: float(lam[c][0]) for kind, c in groups(0).items()}
     cameras, targets = [frame.camera for frame in frames], [target_of(frame) for frame in frames]
     goal, records = objective(start, cameras, targets, start, by_kind, cache), []
-    for passes in PASSES:
+    for passes in lengths:
         found = fit(start, cameras, targets, TrainSettings(passes=passes, tolerance=0.0), cache=cache, start=start, lam=by_kind)
         values = scores(found.gaussians, taken, dataset, lam, cache)
         record = {"dataset": str(root), "state": state, "views": taken, "passes": passes, "loss": found.loss, "scores": values}
@@ -97,7 +97,7 @@ def compared(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
         half = of_state.get(HALVES.get(record["passes"], 0))
         for name in FITTED:
             mine, end = (np.array(r["scores"][name]) for r in (record, of_state[max(of_state)]))
-            row = {key: record[key] for key in ("dataset", "state", "passes", "predicted_decrease")} | {"criterion": name}
+            row = {key: record.get(key) for key in ("dataset", "state", "passes", "predicted_decrease")} | {"criterion": name}
             known = {} if half is None else {"tau_half": agreement(np.array(half["scores"][name]), mine)["tau"]}
             found.append(row | agreement(mine, end) | known)
     return found
@@ -132,8 +132,9 @@ def main(prefix: Path, roots: list[Path]) -> None:
     records = json.loads(path.read_text())["records"] if path.is_file() else []
     for state in STATES:
         for root in roots:
-            if not any((r["dataset"], r["state"]) == (str(root), state) for r in records):
-                records += study(root, state)
+            done = [r["passes"] for r in records if (r["dataset"], r["state"]) == (str(root), state)]
+            if left := [passes for passes in PASSES if passes not in done]:
+                records += study(root, state, left)
                 made = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
                 write_json(path, made | {"rows": compared(records), "records": records})
     rows = compared(records)
