@@ -1,6 +1,8 @@
 """The objective of the fit, with frozen and with learned means: value, gradient, curvature and predicted decrease against the
 float64 oracle."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -133,6 +135,26 @@ def test_a_start_in_the_memory_of_the_model_is_kept_apart(case):
     other = Gaussians(model.means, model.log_scales, model.quats, model.logit_opacities, model.sh - 0.2)
     moved = fit(model, [camera], [target], settings, start=other, lam={"colour": 1.0}).gaussians
     assert np.allclose(moved.sh - model.sh, -0.01, rtol=0.02)
+
+
+def test_a_lam_for_each_degree_of_the_colours():
+    """Of images without weight, so that the prior is all there is."""
+    from mgs.active.fitting import fit
+    from mgs.active.settings import TrainSettings
+
+    start = surface_gaussians(50).with_degree(2)
+    camera, unseen = surface_camera(start, 24, 20), np.zeros((20, 24, 4), np.float32)
+    model = replace(start, sh=start.sh + np.linspace(-0.5, 0.5, start.sh.size, dtype=np.float32).reshape(start.sh.shape))
+    lam = np.repeat([1.0, 4.0, 9.0], [1, 3, 5])[None, :, None]
+    goal = objective(start, [camera], [unseen], lam={"colour": lam})
+    away = model.sh - start.sh
+    assert goal.phi(as_drjit(model)) == pytest.approx(0.5 * (lam * away**2).sum(), rel=1e-5)
+    assert np.allclose(np.asarray(goal.gradient(as_drjit(model))[0]), lam * away, rtol=1e-5)
+    blind = replace(start, logit_opacities=np.full(50, -40, np.float32))  # no information but the prior's
+    assert np.allclose(np.asarray(goal.diagonal(as_drjit(blind))[0]), np.broadcast_to(lam, away.shape))
+    found = fit(model, [camera], [unseen], TrainSettings(passes=40, rates={"colour": 0.2}), start=start, lam={"colour": lam})
+    assert found.losses[0] == pytest.approx((lam * away**2).sum() / unseen[..., :3].size, rel=1e-5)
+    assert found.loss < 0.05 * found.losses[0]
 
 
 @pytest.mark.parametrize(

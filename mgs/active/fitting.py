@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mgs.active.objective import Objective, Prior, objective, watched
+from mgs.active.objective import Objective, Prior, objective, watched, weighted_squares
 from mgs.active.optimisers import INFORMATION_PASSES, OPTIMISERS
 from mgs.active.settings import TrainSettings
 from mgs.active.stopping import StopReason, stop_reason
@@ -113,7 +113,7 @@ def _step(
         away = prior.along(name, value - getattr(prior.start, name))
         pull = prior.lam[name] * prior.share
         gradient = prior.along(name, slope) + mi.TensorXf(pull * away.array, away.shape)
-        loss += dr.sum(dr.square(away.array)) * pull / len(target)
+        loss += weighted_squares(pull, away.array) / len(target)
         is_offset = away.shape != value.shape  # learned in the place of a mean
         found, after = OPTIMISERS[optimiser].step(away if is_offset else value, gradient, known, kept_before, rate, step)
         moved[name] = value + prior.across(name, found - away) if is_offset else found

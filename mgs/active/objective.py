@@ -65,8 +65,9 @@ class Photo:
 
 @dataclass
 class Prior:
-    """What holds the parameters near their start: for each of the learned arrays its lam, Float. share: 1 / number of images,
-    Float, the part of the prior that goes with one image. normals: where means move along them, TensorXf [N,3].
+    """What holds the parameters near their start: for each of the learned arrays its lam, Float, of one number or of one for
+    each parameter. share: 1 / number of images, Float, the part of the prior that goes with one image. normals: where means
+    move along them, TensorXf [N,3].
     """
 
     start: Gaussians
@@ -108,7 +109,7 @@ class Objective:
 
     def loss(self, model: Gaussians) -> float:
         """2 Phi over the number of pixel values: the mean squared error of the images plus the prior's part."""
-        penalty = sum(lam * self.prior.share * dr.sum(dr.square(d.array)) for d, lam in self.pulls(model))
+        penalty = sum(weighted_squares(lam * self.prior.share, d.array) for d, lam in self.pulls(model))
         errors = []
         for photo in self.photos:
             rgb = render(model, photo.camera, cache=self.cache).rgb.array
@@ -206,6 +207,11 @@ def objective(
     directions = None if unit is None else mi.TensorXf(padded(unit))
     prior = Prior(start, values, dr.opaque(mi.Float, 1 / max(len(photos), 1)), directions)
     return Objective(photos, prior, cache or ListCache())
+
+
+def weighted_squares(lam: Any, away: Any) -> Any:
+    """Sum of lam times the square of distances, Float [1]; lam: of one number, or of one for each distance."""
+    return lam * dr.sum(dr.square(away)) if len(lam) == 1 else dr.sum(lam * dr.square(away))
 
 
 def _filled(lam: float | np.ndarray, shape: tuple[int, ...]) -> Any:
