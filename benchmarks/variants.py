@@ -51,21 +51,22 @@ def block_size(width: int, height: int) -> None:
     put(BLOCK_X=width, BLOCK_Y=height, PIXELS=width * height, CENTRE=width // 2)
 
 
-def rows_of_alphas(position: str, each_pixel: bool) -> Callable[..., Any]:
-    """`mgs.splat.walking.block_rows` with the offset of a block in another precision ("Float", "Float64"), or with an exp2 at
-    every pixel instead of three in a row."""
+def rows_of_alphas(position: str, each_pixel: bool, one_by_one: bool = False) -> Callable[..., Any]:
+    """`mgs.splat.walking.block_rows` with the offset of a block in another precision ("Float", "Float64"), with an exp2 at
+    every pixel instead of three in a row, or with each row made when it is asked for."""
     import mitsuba as mi
 
     from mgs.splat import walking
 
     wide, size, middle = getattr(mi, position), walking.BLOCK_X, walking.CENTRE
 
-    def rows(lane: Any, s: Any) -> list[Any]:
+    def rows(lane: Any, s: Any) -> Any:
         real = type(s.white_x)
         dx, dy = wide(lane.left) - wide(s.mean_x), wide(lane.top) - wide(s.mean_y)
         corner, down, slant = real(wide(s.white_x) * (dx - wide(s.shear) * dy)), real(dy), s.white_x * real(s.shear)
-        bend, made = walking.exp2(-2 * s.white_x * s.white_x), []
-        for j in range(walking.BLOCK_Y):
+        bend = walking.exp2(-2 * s.white_x * s.white_x)
+
+        def made(j: int) -> Any:
             eta, first = s.white_y * (down + j), dr.fma(-slant, real(j), corner)
             xi = [dr.fma(s.white_x, real(i), first) for i in range(size)]
             row = dr.fma(-eta, eta, s.log2_opacity)
@@ -77,15 +78,79 @@ def rows_of_alphas(position: str, each_pixel: bool) -> Callable[..., Any]:
                     ratio = walking.exp2(dr.select(dr.fma(-xi[middle], xi[middle], row) > -120, step, -120))
                     for i in columns:
                         raw[i], ratio = raw[i + sign] * ratio, ratio * bend
-            made.append(walking.Row(eta, xi, raw))
-        return made
+            return walking.Row(eta, xi, raw)
+
+        return Lazily(made, walking.BLOCK_Y) if one_by_one else [made(j) for j in range(walking.BLOCK_Y)]
 
     return rows
+
+
+class Lazily:
+    """A list whose entries are made when they are first asked for."""
+
+    def __init__(self, make: Callable[[int], Any], length: int) -> None:
+        self.make, self.length, self.made = make, length, dict[int, Any]()
+
+    def __getitem__(self, index: int) -> Any:
+        if index >= self.length:
+            raise IndexError(index)
+        if index not in self.made:
+            self.made[index] = self.make(index)
+        return self.made[index]
 
 
 def each_pixel_alone() -> None:
     """An exp2 at every pixel, instead of three in a row."""
     put(block_rows=rows_of_alphas("Float64", each_pixel=True))
+
+
+def rows_one_by_one() -> None:
+    """Each row of a block made just before it is drawn."""
+    put(block_rows=rows_of_alphas("Float64", each_pixel=False, one_by_one=True))
+
+
+def by_minimum() -> None:
+    """Dr.Jit's minimum in place of a select for the largest alpha."""
+    from mgs.splat import constants
+
+    def blend(raw: Any, T: Any) -> tuple[Any, Any, Any, Any]:
+        alpha = dr.select(raw >= constants.ALPHA_MIN, dr.minimum(raw, constants.ALPHA_MAX), 0)
+        after = dr.fma(-alpha, T, T)
+        room = after > constants.TRANSMITTANCE_MIN
+        alpha = dr.select(room, alpha, 0)
+        return alpha, alpha * T, dr.select(room, after, -dr.abs(T)), room
+
+    put(blend=blend)
+
+
+def local_arrays() -> None:
+    """What a lane's pixels carry along in arrays of its own, in memory, instead of in variables of the loop."""
+    import mitsuba as mi
+
+    from mgs.splat import walking
+
+    def walk(lists: Any, packed: Any, lane: Any, pixels: Any, visit: Any) -> tuple[Any, Any]:
+        width, state = len(pixels[0]), dr.alloc_local(mi.Float, len(pixels) * len(pixels[0]))
+
+        def read(state: Any) -> list[list[Any]]:
+            return [[state[width * k + i] for i in range(width)] for k in range(len(pixels))]
+
+        def write(state: Any, values: Any) -> None:
+            for k, value in enumerate(value for pixel in values for value in pixel):
+                state[k] = value
+
+        def body(i: Any, state: Any, alive: Any) -> Any:
+            splat = walking.unpack(packed, dr.gather(mi.UInt32, lists.splat, i))
+            values, alive = visit(i, splat, walking.block_rows(lane, splat), read(state))
+            write(state, values)
+            return i + 1, state, (i + 1 < lane.end) & alive
+
+        write(state, pixels)
+        start = mi.UInt32(lane.start)
+        pair, state, _ = dr.while_loop((start, state, start < lane.end), lambda i, state, alive: alive, body)
+        return pair, read(state)
+
+    put(_walk_until_done=walk)
 
 
 def single_positions() -> None:
@@ -132,6 +197,9 @@ VARIANTS: dict[str, tuple[Callable[[], None], float | None]] = {
     "as it is": (lambda: None, None),
     "an exp2 at every pixel": (each_pixel_alone, None),
     "Dr.Jit's exp2": (partial(put, exp2=dr.exp2), None),
+    "rows one by one": (rows_one_by_one, None),
+    "pixels in local arrays": (local_arrays, None),
+    "Dr.Jit's minimum": (by_minimum, None),
     "positions in single precision": (single_positions, None),
     "projection in single precision": (single_projection, None),
     "blocks of 8x2": (partial(block_size, 8, 2), None),

@@ -36,6 +36,7 @@ PAIRS = (
     ("directional-i", "farthest"),
     ("paper", "coverage"),
     ("d-optimal", "coverage"),
+    ("cover", "fisherrf"),
 )
 """Pairs of policies, named before they were measured over rocks, whose difference is tested. The last two are what the paper
 compares."""

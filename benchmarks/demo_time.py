@@ -1,0 +1,57 @@
+"""What the demo takes, stage by stage, in two versions of mgs. `python benchmarks/demo_time.py OUT.json WORK OLD NEW`
+
+OLD, NEW: folders of two checkouts (`git worktree add`), with the packages of this environment. Each does `mgs demo` in an empty
+folder below WORK, in turn, ROUNDS times; seconds are those of its own headings. The versions do not do the same: the old one
+has three policies and no test views. Let nothing else run.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from whole_runs import PROGRAM
+
+from mgs import runtime
+from mgs.files import write_json
+from mgs.provenance import command_line, versions
+
+ROUNDS = 2
+HEADING = re.compile(r"^(\d/5) (.*?)\s+(\d+) s\b|done in (\d+) s")
+
+
+def stages(checkout: Path, out: Path) -> list[tuple[str, float]]:
+    """Run the demo of a checkout in an empty folder; the stages by their headings, and seconds of each."""
+    shutil.rmtree(out, ignore_errors=True)
+    environment = os.environ | {"PYTHONPATH": str(checkout.resolve()), "COLUMNS": "160"}
+    command = [sys.executable, "-P", "-c", PROGRAM, "demo", str(out)]
+    said = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True).stdout
+    marks: list[tuple[str, float]] = []
+    for line in said.splitlines():
+        if found := HEADING.search(line):
+            marks.append((f"{found[1]} {found[2]}" if found[1] else "done", float(found[3] or found[4])))
+    return [(name, after - before) for (name, before), (_, after) in itertools.pairwise(marks)]
+
+
+def main(out: Path, work: Path, old: Path, new: Path) -> None:
+    """Measure, write after every run."""
+    runtime.start()
+    records: list[dict[str, Any]] = []
+    for turn in range(ROUNDS):
+        for version, checkout in (("old", old), ("new", new)):
+            found = stages(checkout, work / version)
+            records.append({"version": version, "round": turn, "stages": found})
+            print(records[-1], flush=True)
+            write_json(
+                out, {"command": command_line(), "machine": runtime.processor(), "versions": versions(), "records": records}
+            )
+
+
+if __name__ == "__main__":
+    main(*map(Path, sys.argv[1:]))
