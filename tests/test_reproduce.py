@@ -2,6 +2,10 @@
 
 import csv
 import json
+import os
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -200,6 +204,44 @@ def test_what_a_timed_run_raises_comes_through(quick, tmp_path):
     run = Run(Rock("boulder", 1), SIZE, "nonsense", budget=1, timed=True)
     with pytest.raises(InputError, match="--policy nonsense: unknown"):
         run_cells(tmp_path, run.cells(), silent)
+
+
+def linger(path):
+    """A task that takes long, and says which process it is in."""
+    path.write_text(str(os.getpid()))
+    time.sleep(60)
+
+
+LINGERING = """
+import sys
+from pathlib import Path
+from test_reproduce import linger
+from mgs.study.tasks import in_own_process
+if __name__ == "__main__":
+    in_own_process(linger, Path("cell"), Path(sys.argv[1]))
+"""
+
+
+def test_a_study_that_is_killed_leaves_no_process_behind(tmp_path):
+    program, said = tmp_path / "program.py", tmp_path / "pid"
+    program.write_text(LINGERING)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    study = subprocess.Popen([sys.executable, str(program), str(said)], env=environment)
+    try:
+        wait_for(lambda: said.is_file() and said.read_text())
+    finally:
+        study.kill()
+        study.wait()
+    own = Path("/proc") / said.read_text()
+    wait_for(lambda: not own.exists() or "zombie" in (own / "status").read_text())
+
+
+def wait_for(come):
+    """Until something has come to be, for half a minute at most."""
+    until = time.monotonic() + 30
+    while not come():
+        assert time.monotonic() < until, "in vain"
+        time.sleep(0.1)
 
 
 def timed(root, out, dataset, prior, settings):

@@ -38,8 +38,8 @@ PAIRS = (
     ("d-optimal", "coverage"),
     ("cover", "fisherrf"),
 )
-"""Pairs of policies, named before they were measured over rocks, whose difference is tested. The last two are what the paper
-compares."""
+"""Pairs of policies, named before they were measured over rocks, whose difference is tested. `paper`, `d-optimal` and
+`coverage` are what the paper compares, and COVER's authors compare it with FisherRF."""
 
 LEADER = "directional-i"
 """The policy whose difference from every other is told for each pool."""

@@ -6,13 +6,15 @@ OUT/dataset, a prior in OUT/prior, a run in OUT/run. Other cells are named by th
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 from mgs.active.nbv import resume_nbv, run_nbv
@@ -139,10 +141,19 @@ def in_own_process(task: Callable[..., dict[str, Any]], out: Path, *arguments: A
 def _send(sender: Connection, task: Callable[..., dict[str, Any]], *arguments: Any) -> None:
     """Do a task in this process, which was started for it, and send what it returns or raises. Ctrl-C ends it silently."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    Thread(target=_end_with_parent, daemon=True).start()
     try:
         sender.send(task(*arguments))
     except Exception as error:
         sender.send(error)
+
+
+def _end_with_parent() -> None:
+    """End this process when the one that started it has ended. If that was killed, this one would work on, for no one."""
+    parent = parent_process()
+    assert parent
+    parent.join()
+    os._exit(1)
 
 
 def _timed(root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]) -> dict[str, Any]:
