@@ -90,14 +90,19 @@ def study(root: Path, state: str, lengths: list[int]) -> list[dict[str, Any]]:
 
 def compared(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Kendall's tau and regret of each record against the longest fit of its state, by criterion; and what a run could know:
-    "tau_half", tau with the fit of half the length, where there is one, and "predicted_decrease"."""
+    "tau_half", tau with the fit of half the length, where there is one, and "predicted_decrease", against the "found_decrease",
+    the share of the objective by which the longest fit is lower."""
     found = []
     for record in records:
         of_state = {r["passes"]: r for r in records if (r["dataset"], r["state"]) == (record["dataset"], record["state"])}
-        half = of_state.get(HALVES.get(record["passes"], 0))
+        half, longest = of_state.get(HALVES.get(record["passes"], 0)), of_state[max(of_state)]
+        decrease = {
+            "predicted_decrease": record.get("predicted_decrease"),
+            "found_decrease": 1 - longest["loss"] / record["loss"],
+        }
         for name in FITTED:
-            mine, end = (np.array(r["scores"][name]) for r in (record, of_state[max(of_state)]))
-            row = {key: record.get(key) for key in ("dataset", "state", "passes", "predicted_decrease")} | {"criterion": name}
+            mine, end = (np.array(r["scores"][name]) for r in (record, longest))
+            row = {key: record[key] for key in ("dataset", "state", "passes")} | decrease | {"criterion": name}
             known = {} if half is None else {"tau_half": agreement(np.array(half["scores"][name]), mine)["tau"]}
             found.append(row | agreement(mine, end) | known)
     return found

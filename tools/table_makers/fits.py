@@ -29,12 +29,21 @@ def stops(data: dict[str, Any]) -> str:
     for criterion in dict.fromkeys(r["criterion"] for r in known):
         for passes in sorted({r["passes"] for r in known}):
             of = [r for r in known if (r["criterion"], r["passes"]) == (criterion, passes)]
-            half, end, decrease = (sum(r[key] for r in of) / len(of) for key in ("tau_half", "tau", "predicted_decrease"))
+            half, end, predicted, fell = (
+                sum(r[key] for r in of) / len(of) for key in ("tau_half", "tau", "predicted_decrease", "found_decrease")
+            )
             settled = [r for r in of if r["tau_half"] >= SETTLED]
             wrong = sum(r["tau"] < SETTLED for r in settled)
-            cells = [f"{100 * decrease:.2g} %", f"{half:.2f}", f"{end:.2f}", f"{wrong} of {len(settled)}"]
+            cells = [
+                f"{100 * predicted:.0f} %",
+                f"{100 * fell:.0f} %",
+                f"{half:.2f}",
+                f"{end:.2f}",
+                f"{wrong} of {len(settled)}",
+            ]
             rows.append([f"{criterion}, {passes} passes", *cells])
-    heading = ["", "predicted decrease", "tau with half the passes", "with the longest fit", f"at least {SETTLED:g}, wrongly"]
+    heading = ["", "Phi will fall by, predicted", "found", "tau with half the passes", "with 4,000 passes"]
+    heading.append(f"of those with at least {SETTLED:g} at half, below it in the end")
     return markdown(heading, rows) + made_by(data)
 
 
