@@ -53,7 +53,7 @@ TABLE_POLICIES = (
 """Rows of Table I; what the paper compares comes first, because the table is written as its rows are done."""
 
 SLOW_POLICIES = ("block-d",)
-"""Further rows, which take longest: at the paper's size a choice by 11x11 blocks takes more than a minute."""
+"""Further rows, which take longest: at the paper's size a choice by 11x11 blocks takes a third of a minute."""
 
 ALL_VIEWS, FEWER, AS_3DGS = "all views", "coverage, fewer images", "all views, as 3DGS"
 """Rows of Table I that are no policies: `uniform` until no frame is left; as the paper counts, 54 images against 50; and a fit
