@@ -5,8 +5,9 @@ more view (warm). Every point is a fit of its own, since rates fall over the len
 `mgs.active.optimisers.OPTIMISERS` and those of `second_order.py`, which the fit does not have. Measured are the objective, PSNR
 inside the rock over the dataset's test views, seconds, and work in passes: one is a render with gradients of every view. The
 seconds of optimisers that the fit does not have are more than they would be there, where a step is recorded once and replayed.
-Fits of fewer than 50,000 Gaussians are measured at more lengths. Writes PREFIX.json, and PREFIX_N.png for each number of
-Gaussians; what PREFIX.json has for the first numbers is not measured again. Let nothing else run.
+Fits of fewer than 50,000 Gaussians are measured at more lengths (the longest only with optimisers that the fit has). Writes
+PREFIX.json, and PREFIX_N.png for each number of Gaussians; what PREFIX.json has for the first numbers is not measured again. Let
+nothing else run.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ LENGTHS, LONG_LENGTHS, LM_STEPS = (5, 10, 20, 40), (100, 400), (5, 20)
 LARGE = 50_000
 """Gaussians from which on a model is large."""
 BY_LENGTH = {
-    "natural gradient, 11x11 blocks": second_order.natural_by_blocks,
+    "natural gradient, steps cut as wholes": second_order.natural_cut_whole,
+    "the same, 11x11 blocks": second_order.natural_by_blocks,
     "natural gradient, colours solved": second_order.natural_colours_solved,
 }
 BY_STEP = {"Levenberg-Marquardt, CG": False, "the same, preconditioned by blocks": True}
@@ -123,7 +125,7 @@ def study(case: _Case) -> list[dict[str, Any]]:
                 extra = -(-passes // INFORMATION_PASSES) if OPTIMISERS[optimiser].uses_information else 0
                 record(begin, row, passes + extra, seconds, goal, found)
         for row, passes_of in BY_LENGTH.items():
-            for passes in lengths:
+            for passes in lengths[:-1] if small else lengths:
                 *_, (work, seconds, found) = timed(passes_of(goal, as_drjit(model), passes))
                 record(begin, row, work, seconds, goal, found())
         for row, by_blocks in BY_STEP.items():
@@ -147,7 +149,7 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
     import matplotlib
     from matplotlib.ticker import NullFormatter
 
-    colours = ("#D55E00", "#E69F00", "#0072B2", "#56B4E9", "#CC79A7", "#009E73", "#000000")
+    colours = ("#D55E00", "#E69F00", "#0072B2", "#56B4E9", "#7755DD", "#CC79A7", "#009E73", "#000000")
     columns = [("passes", "phi"), ("seconds", "phi"), ("passes", "psnr_inside"), ("seconds", "psnr_inside")]
     names = {"passes": "work (passes)", "seconds": "seconds", "phi": "objective", "psnr_inside": "PSNR inside, test views (dB)"}
     with matplotlib.rc_context(STYLE):

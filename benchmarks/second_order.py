@@ -21,8 +21,7 @@ from mgs.colour import SH_C0
 from mgs.gaussians import LEARNED, Gaussians
 from mgs.memory import padded
 from mgs.seeds import generator
-from mgs.splat import groups
-from mgs.splat.information import block
+from mgs.splat import fisher, groups
 
 LM_CG, LM_DAMPING = 8, 300.0
 """Levenberg-Marquardt: iterations of conjugate gradients in each step, and first damping, a factor of the prior's lam."""
@@ -89,7 +88,7 @@ def blocks(goal: Objective, model: Gaussians) -> np.ndarray:
     """[N,11,11] the diagonal blocks of J^T J, summed over the images."""
     total = np.zeros((len(model), 11, 11))
     for photo in goal.photos:
-        total += block(model, photo.camera, None, goal.cache)
+        total += fisher(model, photo.camera, "block", cache=goal.cache)
     return total
 
 
@@ -129,7 +128,8 @@ def _damped_step(goal: Objective, model: Gaussians, damping: np.ndarray, by_bloc
 
 def natural_by_blocks(goal: Objective, model: Gaussians, passes: int) -> Iterator[tuple[float, Gaussians]]:
     """The natural gradient of `mgs.active.optimisers` with 11x11 blocks as its metric: the diagonal that it has there, and
-    beyond that the correlations of each Gaussian's parameters, those of all images together."""
+    beyond that the correlations of each Gaussian's parameters, those of all images together. A Gaussian's step is cut as a
+    whole, so that it keeps its direction: cut one by one, steps against the correlations make the objective rise."""
 
     def metric(now: Gaussians) -> Callable[[np.ndarray], np.ndarray]:
         whole = blocks(goal, now) + np.diag(lam_of(goal))
@@ -138,29 +138,51 @@ def natural_by_blocks(goal: Objective, model: Gaussians, passes: int) -> Iterato
         inverse = np.linalg.inv(whole / (std[:, :, None] * std[:, None, :]))
         return lambda m: np.einsum("nij,nj->ni", inverse, m / largest) / largest
 
-    yield from _natural(goal, model, passes, metric, BLOCK_COST + 1, colours=False)
+    yield from _natural(goal, model, passes, metric, BLOCK_COST + 1, cut=_as_a_whole)
+
+
+def natural_cut_whole(goal: Objective, model: Gaussians, passes: int) -> Iterator[tuple[float, Gaussians]]:
+    """The same with the diagonal alone, to tell what the blocks do from what the cut does."""
+    yield from _natural(goal, model, passes, _diagonal(goal), 1, cut=_as_a_whole)
 
 
 def natural_colours_solved(goal: Objective, model: Gaussians, passes: int) -> Iterator[tuple[float, Gaussians]]:
     """The natural gradient as it is, and every COLOUR_PASSES passes all colours at once: while the rest stays as it is they
     are a linear least squares problem, at whose solution the gradient of the rest is that of variable projection."""
+    yield from _natural(goal, model, passes, _diagonal(goal), 1, colours=True)
 
+
+Metric = Callable[[Gaussians], Callable[[np.ndarray], np.ndarray]]
+"""(model) -> what a gradient [N,11] is turned into a step by."""
+
+
+def _diagonal(goal: Objective) -> Metric:
     def metric(now: Gaussians) -> Callable[[np.ndarray], np.ndarray]:
         largest = NATURAL_OVERLAP * joined(goal.largest_diagonal(now))
         return lambda m: m / largest
 
-    yield from _natural(goal, model, passes, metric, 1, colours=True)
+    return metric
+
+
+def _one_by_one(step: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    return np.clip(step, -rate, rate)
+
+
+def _as_a_whole(step: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    return step / np.maximum(np.abs(step) / rate, 1).max(axis=1, keepdims=True)
 
 
 def _natural(
     goal: Objective,
     model: Gaussians,
     passes: int,
-    metric: Callable[[Gaussians], Callable[[np.ndarray], np.ndarray]],
+    metric: Metric,
     cost: float,
-    colours: bool,
+    colours: bool = False,
+    cut: Callable[[np.ndarray, np.ndarray], np.ndarray] = _one_by_one,
 ) -> Iterator[tuple[float, Gaussians]]:
-    """Passes with one step on each image. metric(model) gives what a gradient is multiplied with; cost: passes it takes."""
+    """Passes with one step on each image. cost: of the metric, passes; colours: whether they are solved; cut(step, rates)
+    shortens steps that are longer than the rates."""
     alone = [replace(goal, photos=[photo]) for photo in goal.photos]
     others = lam_of(goal) * (1 - 1 / len(alone))  # the prior goes with each image by its share
     start = joined([getattr(goal.prior.start, name) for name in LEARNED])
@@ -174,7 +196,7 @@ def _natural(
             away = joined([getattr(model, name) for name in LEARNED]) - start
             gradient = joined(alone[i].gradient(model)) - others * away
             momentum = NATURAL_BETA * momentum + (1 - NATURAL_BETA) * gradient
-            model = moved(model, np.clip(-times(momentum), -rate, rate))
+            model = moved(model, cut(-times(momentum), rate))
         work += 1
         if colours and (done + 1) % COLOUR_PASSES == 0:
             model = _with_best_colours(goal, model)
