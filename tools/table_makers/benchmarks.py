@@ -258,6 +258,18 @@ def criteria(data: dict[str, Any]) -> str:
     return markdown(heading, ranked) + made_by(data | {"command": command})
 
 
+def fitted_degree(data: dict[str, Any]) -> str:
+    """Runs with colours of several degrees in the fit: means over the rocks."""
+    rows = []
+    for degree in dict.fromkeys(r["degree"] for r in data["records"]):
+        for policy in dict.fromkeys(r["policy"] for r in data["records"]):
+            of = [r for r in data["records"] if (r["degree"], r["policy"]) == (degree, policy)]
+            keys = ("psnr", "psnr_mask", "degree_0_psnr", "degree_0_psnr_mask")
+            rows.append([f"{degree}, {policy}", *(f"{_mean(r[key] for r in of):.2f}" for key in keys)])
+    same = ["the same views fitted with degree 0", "rock"]
+    return markdown(["degree of the fit, policy", "test views (dB)", "rock", *same], rows) + made_by(data)
+
+
 def _mean(values: Iterable[float]) -> float:
     numbers = list(values)
     return sum(numbers) / len(numbers)
@@ -269,6 +281,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "prior-errors": ("benchmarks/prior_errors", prior_errors),
     "prior-scenes": ("benchmarks/prior_errors", prior_scenes),
     "criteria": ("benchmarks/criteria", criteria),
+    "fitted-degree": ("benchmarks/fitted_degree", fitted_degree),
     "demo": ("benchmarks/demo", demo),
     "demo-report": ("benchmarks/demo", demo_report),
     "flights": ("benchmarks/flights", flights),

@@ -65,6 +65,24 @@ def noise_ranking(data: dict[str, Any]) -> str:
     return markdown(heading, rows) + made_by(data)
 
 
+def assumed_noise(data: dict[str, Any]) -> str:
+    """What another assumed noise does to runs: means over the rocks, and differences from the default."""
+    records, keys = data["records"], ("psnr", "psnr_mask")
+    usual = {r["dataset"]: r for r in records if r["where"] == "as it is"}
+    rows = []
+    for where, fit_noise, score_noise in dict.fromkeys((r["where"], r["fit"], r["score"]) for r in records):
+        of = [r for r in records if (r["where"], r["fit"], r["score"]) == (where, fit_noise, score_noise)]
+        means = [sum(r[key] for r in of) / len(of) for key in keys]
+        more = [sum(r[key] - usual[r["dataset"]][key] for r in of) / len(of) for key in keys]
+        cells = [f"{mean:.2f} ({difference:+.2f})" for mean, difference in zip(means, more, strict=True)]
+        residuals = [r["residual"] for r in of]
+        cells.append(f"{min(residuals):.3f} to {max(residuals):.3f}")
+        noise = score_noise if where == "in the score" else fit_noise
+        rows.append([f"{noise:g} {where}" if where != "as it is" else f"{noise:g}, as it is", *cells])
+    heading = ["noise assumed", "test views (dB)", "rock", "residual of new images, median of a run"]
+    return markdown(heading, rows) + made_by(data)
+
+
 def truth(data: dict[str, Any]) -> str:
     """PSNR on test views of fits to several truths, judged by two of them."""
     judges = [(judge, part) for judge in ("alpha", "mask") for part in ("", ", inside")]
@@ -192,6 +210,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "ranking": ("benchmarks/ranking", ranking),
     "stops": ("benchmarks/ranking", stops),
     "noise-ranking": ("benchmarks/noise_ranking", noise_ranking),
+    "assumed-noise": ("benchmarks/assumed_noise", assumed_noise),
     "truth": ("benchmarks/truth", truth),
     "linearity": ("benchmarks/linearity", linearity),
     "residual": ("benchmarks/residual", residual),
