@@ -6,8 +6,8 @@ more view (warm). Every point is a fit of its own, since rates fall over the len
 inside the rock over the dataset's test views, seconds, and work in passes: one is a render with gradients of every view. The
 seconds of optimisers that the fit does not have are more than they would be there, where a step is recorded once and replayed.
 Fits of fewer than 50,000 Gaussians are measured at more lengths (the longest only with optimisers that the fit has). Writes
-PREFIX.json, and PREFIX_N.png for each number of Gaussians; what PREFIX.json has for the first numbers is not measured again. Let
-nothing else run.
+PREFIX.json, and PREFIX_N.png for each number of Gaussians; numbers of Gaussians that PREFIX.json has are not measured again.
+Let nothing else run.
 """
 
 from __future__ import annotations
