@@ -23,7 +23,9 @@ from mgs.files import write_json
 from mgs.provenance import command_line, versions
 
 ROUNDS = 2
-HEADING = re.compile(r"^(\d/5) (.*?)\s+(\d+) s\b|done in (\d+) s")
+HEADING = re.compile(r"^(\d)/5 (?:next best views: ([\w-]+))?.*\s(\d+) s\b|done in (\d+) s")
+STAGES = {"1": "dataset", "2": "prior", "3": "run and its measure", "4": "maps of information", "5": "report"}
+"""What the demo does below its numbered headings."""
 
 
 def stages(checkout: Path, out: Path) -> list[tuple[str, float]]:
@@ -35,7 +37,8 @@ def stages(checkout: Path, out: Path) -> list[tuple[str, float]]:
     marks: list[tuple[str, float]] = []
     for line in said.splitlines():
         if found := HEADING.search(line):
-            marks.append((f"{found[1]} {found[2]}" if found[1] else "done", float(found[3] or found[4])))
+            policy = f": {found[2]}" if found[2] else ""
+            marks.append((STAGES.get(found[1], "end") + policy, float(found[3] or found[4])))
     return [(name, after - before) for (name, before), (_, after) in itertools.pairwise(marks)]
 
 

@@ -231,6 +231,16 @@ def two_versions(data: dict[str, Any]) -> str:
     return markdown([*heading, f"a fitted model: the {seen:.0%} that are seen (new) over all (old)"], rows) + made_by(data)
 
 
+def demo_time(data: dict[str, Any]) -> str:
+    """Seconds of the demo's stages in two versions: those of each round."""
+    found: dict[str, dict[str, list[str]]] = {}
+    for record in data["records"]:
+        for stage, seconds in [*record["stages"], ["sum", sum(seconds for _, seconds in record["stages"])]]:
+            found.setdefault(stage, {}).setdefault(record["version"], []).append(f"{seconds:.0f}")
+    rows = [[stage, *(", ".join(times.get(version, ["–"])) for version in ("old", "new"))] for stage, times in found.items()]
+    return markdown(["stage", "commit 55789c2, s", "now, s"], sorted(rows, key=lambda row: row[0] == "sum")) + made_by(data)
+
+
 def whole_runs(data: dict[str, Any]) -> str:
     """Seconds of whole runs by stage, against the older version, and what their models are like on the test views."""
     rows = []
@@ -313,6 +323,7 @@ def planning(data: dict[str, Any]) -> str:
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "planning": ("benchmarks/planning", planning),
     "versions": ("benchmarks/versions", two_versions),
+    "demo-time": ("benchmarks/demo_time", demo_time),
     "whole-runs": ("benchmarks/whole_runs", whole_runs),
     "paper-size": ("benchmarks/whole_runs", paper_size),
     "data-samples": ("benchmarks/data_samples", data_samples),
