@@ -6,8 +6,8 @@ more view (warm). Every point is a fit of its own, since rates fall over the len
 inside the rock over the dataset's test views, seconds, and work in passes: one is a render with gradients of every view. The
 seconds of optimisers that the fit does not have are more than they would be there, where a step is recorded once and replayed.
 Fits of fewer than 50,000 Gaussians are measured at more lengths (the longest only with optimisers that the fit has). Writes
-PREFIX.json, and PREFIX_N.png for each number of Gaussians; numbers of Gaussians that PREFIX.json has are not measured again.
-Let nothing else run.
+PREFIX.json, and PREFIX_N.png for each number of Gaussians; rows that PREFIX.json has are not measured again. Let nothing else
+run.
 """
 
 from __future__ import annotations
@@ -60,8 +60,12 @@ BY_LENGTH = {
     "the same, 11x11 blocks": second_order.natural_by_blocks,
     "natural gradient, colours solved": second_order.natural_colours_solved,
 }
-BY_STEP = {"Levenberg-Marquardt, CG": False, "the same, preconditioned by blocks": True}
-"""Rows of `second_order.py`: those whose rates fall over the length of a fit; Levenberg-Marquardt, with and without blocks."""
+BY_STEP = {
+    "Levenberg-Marquardt, CG": {},
+    "the same, preconditioned by blocks": {"by_blocks": True},
+    "the same, in opacity and scale squared": {"straighter": True},
+}
+"""Rows of `second_order.py`: those whose rates fall over the length of a fit; Levenberg-Marquardt, as it is and changed."""
 
 
 class _Case:
@@ -101,11 +105,16 @@ class _Case:
         return found
 
 
-def study(case: _Case) -> list[dict[str, Any]]:
-    """One record per fit: number of Gaussians, whether warm, which row, passes of work, seconds, objective, PSNR."""
-    records = []
+def study(case: _Case, done: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """One record per fit: number of Gaussians, whether warm, which row, passes of work, seconds, objective, PSNR. Rows that are
+    among the records that are done are left out."""
+    records: list[dict[str, Any]] = []
+    measured = {record["row"] for record in done if record["gaussians"] == case.gaussians}
     small = case.gaussians < LARGE
     lengths = LENGTHS + LONG_LENGTHS if small else LENGTHS
+
+    def left(rows: dict[str, Any]) -> list[str]:
+        return [row for row in rows if row not in measured]
 
     def record(begin: str, row: str, work: float, seconds: float, goal: Objective, model: Gaussians) -> None:
         which = {"gaussians": case.gaussians, "start": begin, "row": row, "passes": work, "seconds": seconds}
@@ -117,19 +126,20 @@ def study(case: _Case) -> list[dict[str, Any]]:
     before = case.fitted(case.start, case.taken, "natural", RATES, TrainSettings().passes)
     for begin, model, views in (("cold", case.start, case.taken), ("warm", before, case.added)):
         goal = case.objective(views)
-        for row, (optimiser, rates) in ROWS.items():
+        for row in left(ROWS):
+            optimiser, rates = ROWS[row]
             for passes in lengths:
                 began = time.perf_counter()
                 found = case.fitted(model, views, optimiser, rates, passes)
                 seconds = time.perf_counter() - began
                 extra = -(-passes // INFORMATION_PASSES) if OPTIMISERS[optimiser].uses_information else 0
                 record(begin, row, passes + extra, seconds, goal, found)
-        for row, passes_of in BY_LENGTH.items():
+        for row in left(BY_LENGTH):
             for passes in lengths[:-1] if small else lengths:
-                *_, (work, seconds, found) = timed(passes_of(goal, as_drjit(model), passes))
+                *_, (work, seconds, found) = timed(BY_LENGTH[row](goal, as_drjit(model), passes))
                 record(begin, row, work, seconds, goal, found())
-        for row, by_blocks in BY_STEP.items():
-            steps = second_order.levenberg_marquardt(goal, as_drjit(model), LM_STEPS[small], by_blocks)
+        for row in left(BY_STEP):
+            steps = second_order.levenberg_marquardt(goal, as_drjit(model), LM_STEPS[small], **BY_STEP[row])
             for work, seconds, found in timed(steps):
                 record(begin, row, work, seconds, goal, found())
     return records
@@ -149,7 +159,7 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
     import matplotlib
     from matplotlib.ticker import NullFormatter
 
-    colours = ("#D55E00", "#E69F00", "#0072B2", "#56B4E9", "#7755DD", "#CC79A7", "#009E73", "#000000")
+    colours = ("#D55E00", "#E69F00", "#0072B2", "#56B4E9", "#7755DD", "#CC79A7", "#009E73", "#000000", "#888888")
     columns = [("passes", "phi"), ("seconds", "phi"), ("passes", "psnr_inside"), ("seconds", "psnr_inside")]
     names = {"passes": "work (passes)", "seconds": "seconds", "phi": "objective", "psnr_inside": "PSNR inside, test views (dB)"}
     with matplotlib.rc_context(STYLE):
@@ -180,8 +190,7 @@ def main(prefix: Path, given: list[str]) -> None:
     path = prefix.with_suffix(".json")
     records: list[dict[str, Any]] = json.loads(path.read_text())["records"] if path.is_file() else []
     for root, gaussians in (case.rsplit(":", 1) for case in given):
-        if not any(r["gaussians"] == int(gaussians) for r in records):
-            records += study(_Case(Path(root), int(gaussians)))
+        records += study(_Case(Path(root), int(gaussians)), records)
         draw(prefix.with_name(f"{prefix.name}_{gaussians}.png"), [r for r in records if r["gaussians"] == int(gaussians)])
         made = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
         write_json(path, made | {"records": records})

@@ -140,8 +140,8 @@ def main(prefix: Path, roots: list[Path]) -> None:
             done = [r["passes"] for r in records if (r["dataset"], r["state"]) == (str(root), state)]
             if left := [passes for passes in PASSES if passes not in done]:
                 records += study(root, state, left)
-                made = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
-                write_json(path, made | {"rows": compared(records), "records": records})
+            made = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
+            write_json(path, made | {"rows": compared(records), "records": records})
     rows = compared(records)
     for passes in PASSES:
         for name in FITTED:

@@ -12,6 +12,7 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from linearity import COORDINATES
 
 from mgs.active.fitting import COLOUR_MIN
 from mgs.active.objective import Objective, Vector
@@ -92,13 +93,16 @@ def blocks(goal: Objective, model: Gaussians) -> np.ndarray:
     return total
 
 
-def levenberg_marquardt(goal: Objective, model: Gaussians, steps: int, by_blocks: bool) -> Iterator[tuple[float, Gaussians]]:
+def levenberg_marquardt(
+    goal: Objective, model: Gaussians, steps: int, by_blocks: bool = False, straighter: bool = False
+) -> Iterator[tuple[float, Gaussians]]:
     """Steps (J^T J + (1 + mu) lam)^-1 g by conjugate gradients, kept where they lower the objective; mu falls after good steps
-    and rises after bad ones. The preconditioner is the diagonal of that matrix, or its 11x11 blocks."""
+    and rises after bad ones. by_blocks: the preconditioner is not the diagonal of that matrix, but its 11x11 blocks.
+    straighter: steps are made in opacities and squared scales, in which images are more nearly linear (`linearity.py`)."""
     work, mu, phi = 1.0, LM_DAMPING, goal.phi(model)
     for _ in range(steps):
         move, expected = _damped_step(goal, model, mu * lam_of(goal), by_blocks)
-        candidate = moved(model, move)
+        candidate = moved(model, _straighter(model, move) if straighter else move)
         work += 1 + (BLOCK_COST if by_blocks else 1) + 0.4 + CURVATURE_COST * LM_CG  # gradient, preconditioner, objective
         found = goal.phi(candidate)
         gain = (phi - found) / expected
@@ -106,6 +110,15 @@ def levenberg_marquardt(goal: Objective, model: Gaussians, steps: int, by_blocks
             model, phi = candidate, found
         mu *= 1 / 3 if gain > 0.75 else 3 if gain < 0.4 else 1
         yield work, model
+
+
+def _straighter(model: Gaussians, move: np.ndarray) -> np.ndarray:
+    """The move that is the same to first order, but straight in opacities and squared scales."""
+    columns, bent = dict(zip(LEARNED, groups(0).values(), strict=True)), move.copy()
+    for name, values in (COORDINATES["opacity itself"], COORDINATES["scale squared"]):
+        now, c = np.asarray(getattr(model, name), np.float64).reshape(len(model), -1), columns[name]
+        bent[:, c] = values(now, move[:, c]) - now
+    return bent
 
 
 def _damped_step(goal: Objective, model: Gaussians, damping: np.ndarray, by_blocks: bool) -> tuple[np.ndarray, float]:

@@ -26,7 +26,7 @@ def stops(data: dict[str, Any]) -> str:
     """What a run could know of its ranking when its fit stops, and what the ranking is worth: means over the states, and in how
     many states it would have been said to have settled that had not."""
     rows, known = [], [r for r in data["rows"] if "tau_half" in r]
-    for criterion in dict.fromkeys(r["criterion"] for r in known):
+    for criterion in ("d-optimal", "fisherrf", "a-optimal"):
         for passes in sorted({r["passes"] for r in known}):
             of = [r for r in known if (r["criterion"], r["passes"]) == (criterion, passes)]
             half, end, predicted, fell = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,9 +24,21 @@ def made_by(data: dict[str, Any]) -> str:
     command, machine, versions = data["command"], data.get("machine"), data["versions"]
     if not command.startswith("mgs "):
         command = f"python benchmarks/{command}"
+    command = _as_a_loop(command)
     cores = f" on {_threads(machine['threads'])} ({machine['cpu']}, {machine['simd_width']} float32 lanes)" if machine else ""
     commit = f" ({versions['commit']})" if "commit" in versions else ""
     return f"\n`{command}`{cores}; mgs {versions['mgs']}{commit}, Mitsuba {versions['mitsuba']}, Dr.Jit {versions['drjit']}.\n"
+
+
+def _as_a_loop(command: str) -> str:
+    """A command whose last words are the same for several rocks of a study, as a loop over the rocks."""
+    rocks = re.findall(r" \S+/cells/dataset/([\w-]+)/\S+:\S+", command)
+    words = command.split()
+    patterns = {word.replace(rock, "$r") for word, rock in zip(words[len(words) - len(rocks) :], rocks, strict=True)}
+    if len(rocks) < 2 or len(patterns) > 1:
+        return command
+    first = " ".join(words[: len(words) - len(rocks)])
+    return f"{first} $(for r in {' '.join(rocks)}; do echo {patterns.pop()}; done)"
 
 
 def _threads(number: int) -> str:
