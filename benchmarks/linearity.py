@@ -55,7 +55,8 @@ ACROSS = "mean across the view"
 
 def _opacity(logit: np.ndarray, delta: np.ndarray) -> np.ndarray:
     opacity = expit(logit)
-    return np.asarray(log_odds(np.clip(opacity + opacity * (1 - opacity) * delta, LEAST, 1 - LEAST)))
+    low, high = np.minimum(opacity, LEAST), np.maximum(opacity, 1 - LEAST)
+    return np.asarray(log_odds(np.clip(opacity + opacity * (1 - opacity) * delta, low, high)))
 
 
 def _optical_depth(logit: np.ndarray, delta: np.ndarray) -> np.ndarray:
@@ -75,8 +76,8 @@ COORDINATES = {
     "scale squared": ("log_scales", _power(2)),
     "one over scale": ("log_scales", _power(-1)),
 }
-"""Other coordinates of a parameter: which one, and (its value, a move delta that is small) -> its value where the other
-coordinate moves by its first-order share of delta."""
+"""By name: the parameter, and f(value, delta) -> the parameter's new value when the other coordinate moves by its derivative
+times delta; to first order that is value + delta."""
 
 LEAST = 1e-3
 """Least value of a coordinate that must be positive, and of what is left of a size."""

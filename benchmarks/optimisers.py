@@ -57,13 +57,13 @@ LARGE = 50_000
 """Gaussians from which on a model is large."""
 BY_LENGTH = {
     "natural gradient, steps cut as wholes": second_order.natural_cut_whole,
-    "the same, 11x11 blocks": second_order.natural_by_blocks,
+    "natural gradient, 11x11 blocks, steps cut as wholes": second_order.natural_by_blocks,
     "natural gradient, colours solved": second_order.natural_colours_solved,
 }
 BY_STEP = {
     "Levenberg-Marquardt, CG": {},
-    "the same, preconditioned by blocks": {"by_blocks": True},
-    "the same, in opacity and scale squared": {"straighter": True},
+    "Levenberg-Marquardt, CG preconditioned by blocks": {"by_blocks": True},
+    "Levenberg-Marquardt, CG, in opacity and scale squared": {"straighter": True},
 }
 """Rows of `second_order.py`: those whose rates fall over the length of a fit; Levenberg-Marquardt, as it is and changed."""
 
@@ -172,7 +172,9 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
                     axis.plot([r[x] for r in shown], [r[y] for r in shown], "o-", color=colour, markersize=3, label=row)
                 axis.set(xscale="log", yscale="log" if y == "phi" else "linear", ylabel=f"{names[y]}, {begin}")
                 most = max(r[x] for r in records)
-                axis.set_xticks([tick for tick in (5, 10, 20, 40, 100, 400) if min(r[x] for r in records) <= tick <= most])
+                axis.set_xticks(
+                    [tick for tick in (1, 2, 5, 10, 20, 40, 100, 400) if min(r[x] for r in records) <= tick <= most]
+                )
                 axis.xaxis.set_major_formatter("{x:g}")
                 axis.xaxis.set_minor_formatter(NullFormatter())
                 if y == "phi":

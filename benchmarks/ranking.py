@@ -91,7 +91,7 @@ def study(root: Path, state: str, lengths: list[int]) -> list[dict[str, Any]]:
 def compared(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Kendall's tau and regret of each record against the longest fit of its state, by criterion; and what a run could know:
     "tau_half", tau with the fit of half the length, where there is one, and "predicted_decrease", against the "found_decrease",
-    the share of the objective by which the longest fit is lower."""
+    the share by which the loss of the longest fit is lower (`mgs.active.fitting.Fit`)."""
     found = []
     for record in records:
         of_state = {r["passes"]: r for r in records if (r["dataset"], r["state"]) == (record["dataset"], record["state"])}
@@ -140,8 +140,8 @@ def main(prefix: Path, roots: list[Path]) -> None:
             done = [r["passes"] for r in records if (r["dataset"], r["state"]) == (str(root), state)]
             if left := [passes for passes in PASSES if passes not in done]:
                 records += study(root, state, left)
-            made = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
-            write_json(path, made | {"rows": compared(records), "records": records})
+                made = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
+                write_json(path, made | {"rows": compared(records), "records": records})
     rows = compared(records)
     for passes in PASSES:
         for name in FITTED:

@@ -185,15 +185,16 @@ def test_cover_and_completeness_look_at_what_was_not_observed():
     """Two points of a surface, which count by what a candidate sees of them: the first was observed from +X, of the second the
     view knows less than the prior does."""
     points = np.array([[0.0, 0, 0], [0, 0, 1e-9]])
-    positions = np.array([[4.0, 0, 0], [0, 4, 0], [-4, 0, 0], [4, 0, 0]])
+    positions = np.array([[4.0, 0, 0], [0, 4, 0], [0, -4, 0], [4, 0, 0]])
     enough = LAM[0] / SH_C0**2
     seen = np.array([[10 * enough, 0.5 * enough], [1, 0], [3, 1], [0, 2]])
     surface_H = np.outer(seen[0] * SH_C0**2, np.ones(11))
     outlook = outlook_of({}, None, positions=positions, points=points, surface_H=surface_H, seen=lambda view: seen[view])
-    assert policies.policy_named("cover")(outlook) == pytest.approx([0.5, 1, 1])
+    assert policies.policy_named("cover")(outlook) == pytest.approx([0.5, (3 * 0.5 + 1) / 4, 1])
     assert policies.policy_named("completeness")(outlook) == pytest.approx([0, 1, 2])
+    positions[1] = 4 * np.array([np.cos(0.5), np.sin(0.5), 0])  # nearer to the first view than to the second
     both = outlook_of({}, None, positions=positions, points=points, visited=[0, 2], left=[1], seen=lambda view: seen[view])
-    assert policies.policy_named("cover")(both) == pytest.approx([0.5])
+    assert policies.policy_named("cover")(both) == pytest.approx([(1 - np.cos(0.5)) / 2])
     blind = outlook_of({}, None, positions=positions, points=points, left=[1], seen=lambda view: np.zeros(2))
     assert policies.policy_named("cover")(blind) == 0
 

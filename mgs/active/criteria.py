@@ -135,8 +135,8 @@ def block_log_determinant(H: Array, lam: Array) -> float:
     """1/l sum over the Gaussians of log det(I + Lambda^-1/2 H Lambda^-1/2), Lambda = diag(lam): what the images say about them.
 
     H: [N,P,P] blocks of J^T J, so correlations between the parameters of one Gaussian count, those between Gaussians do not.
-    The difference of two such values is Eq. 7 for blocks. Eigenvalues that rounding has made negative count as 0, where they
-    are so large that no Cholesky factor exists.
+    The difference of two such values is Eq. 7 for blocks. Where rounding has made an eigenvalue -1 or less, so that there is no
+    Cholesky factor, all negative eigenvalues of those BLOCKS_AT_ONCE blocks count as 0.
     """
     whitening, total = 1 / np.sqrt(np.multiply.outer(lam, lam)), 0.0
     for first in range(0, len(H), BLOCKS_AT_ONCE):

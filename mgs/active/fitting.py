@@ -137,9 +137,9 @@ def fit(
     cameras, and a target of each: [H,W,3] linear RGB, the rock in front of black; or [H,W,4], in which the last channel is the
     weight of the pixel, 1 where its colour is known and 0 where it is not (`mgs.data.dataset.Frame.target`).
     start: where the prior holds the parameters; the Gaussians given, by default. lam: the prior's information about each kind
-    of parameter (`mgs.gaussians.learned`), (pixel value / unit of the parameter)^2: one number, or an array that broadcasts to
-    the parameter's shape (as for colours, another for each degree); by default there is none. normals: [N,3], of any length but
-    0, the directions of means that move along them; read only then.
+    of parameter (`mgs.gaussians.learned`), (pixel value / unit of the parameter)^2: one number, or but for means an array that
+    broadcasts to the parameter's shape (for colours, say, another number for each degree); by default there is none. normals:
+    [N,3], of any length but 0, the directions of means that move along them; read only then.
     Starts with fresh buffers of the optimiser, so the result depends on its arguments alone, bitwise. on_pass(done, most)
     reports. Stops as `mgs.active.stopping.stop_reason` says. Raises InputError where a parameter of the Gaussians given is not
     finite, the optimiser is unknown, `start` is of another shape, or means are to move without normals or without a rate.

@@ -56,21 +56,25 @@ def paper(outlook: Outlook) -> Array:
 
 
 def cover(outlook: Outlook) -> Array:
-    """COVER ("Coverage Optimization for Camera View Selection", 2026): from how far off the surface was seen that a view sees.
+    """COVER ("Coverage Optimization for Camera View Selection", 2026): how far the direction of a view is from those from which
+    the surface that it sees was observed before.
 
     For each Gaussian (1 - cos)/2 of the angle between the candidate's direction and the nearest one from which it was
     `observed`, or 1 where it never was; then the mean over what the candidate sees, by squared blending weights. In [0, 1].
     The paper counts a view for all that lies in its frustum, hidden or not, and rounds directions to bins.
     """
-    points, least = outlook.points, outlook.prior_lam[0] / SH_C0**2
-    taken = [(_directions(points, outlook.positions[i]), outlook.seen(i) > least) for i in outlook.visited]
+    least = outlook.prior_lam[0] / SH_C0**2
+    taken = [(outlook.positions[i], outlook.seen(i) > least) for i in outlook.visited]
     scores = []
     for i in outlook.left:
-        here, seen = _directions(points, outlook.positions[i]), outlook.seen(i)
-        apart = np.ones(len(points))
-        for there, known in taken:
-            apart = np.where(known, np.minimum(apart, (1 - (here * there).sum(1)) / 2), apart)
-        scores.append((apart * seen).sum() / max(seen.sum(), 1e-12))
+        weights = outlook.seen(i)
+        some = np.flatnonzero(weights)
+        points, weights = outlook.points[some], weights[some]
+        here, apart = _directions(points, outlook.positions[i]), np.ones(len(some))
+        for position, known in taken:
+            angle = (1 - (here * _directions(points, position)).sum(1)) / 2
+            apart = np.where(known[some], np.minimum(apart, angle), apart)
+        scores.append((apart * weights).sum() / max(weights.sum(), 1e-12))
     return np.array(scores)
 
 

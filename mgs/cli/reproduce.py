@@ -80,14 +80,16 @@ def _make(
 ) -> list[Path]:
     """Do the cells of a result over so many rocks, telling of each that begins, and write it. Returns its files."""
     from mgs.study import reproduce as study
+    from mgs.study import reproduce_asked as asked
     from mgs.study.reproduce_results import WRITERS, known_runs
     from mgs.study.sweep import run_cells
 
     result = study.RESULTS[name]
+    over_rocks = name in asked.over_rocks()
     many = f" --rocks {count}" if result.rocks(size) > 1 else ""
     own = "".join(f" --policy {_from_here(policy)}" for policy in size.own_policies if name in ("curves", "pools"))
     batch = f" --batch {size.table.batch}" if size.table.batch > 1 and name in ("table1", "figures") else ""
-    meshes = "".join(f" --mesh {mesh.name}" for mesh in size.meshes)
+    meshes = "".join(f" --mesh {mesh.file.name}" for mesh in size.meshes if over_rocks)
     command = f"mgs reproduce --preset {preset} --only {name}{many}{own}{meshes}{batch}"
     task = bar.add_task(name, total=None)
 

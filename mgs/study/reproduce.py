@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mgs.active import policy_file
-from mgs.active.inputs import file_digest, policy_record
+from mgs.active.inputs import policy_record
 from mgs.study.statistics import MOST_ROCKS
 from mgs.study.sweep import Cell
 
@@ -93,6 +93,14 @@ class Size:
 
 
 @dataclass(frozen=True)
+class Mesh:
+    """A file with a rock, and its hash when the study began (`mgs.active.inputs.file_digest`)."""
+
+    file: Path
+    digest: str
+
+
+@dataclass(frozen=True)
 class Preset:
     """How large a reproduction is. table: of Table I. rocks: of the results over many rocks. How many rocks the curves, the
     study of seeds and that of pools have."""
@@ -104,7 +112,7 @@ class Preset:
     pool_rocks: int = 3
     own_policies: tuple[str, ...] = ()
     """Policies of the user's own that the curves and the pools compare, too (`mgs.study.reproduce_asked`)."""
-    meshes: tuple[Path, ...] = ()
+    meshes: tuple[Mesh, ...] = ()
     """Rocks of the user's own, which then take the place of the procedural ones (`mgs.study.reproduce_asked`)."""
 
     @property
@@ -127,21 +135,22 @@ class Rock:
     scene: str
     seed: int
     index: int = 0
-    mesh: Path | None = None
+    mesh: Mesh | None = None
 
     @property
     def name(self) -> str:
         """As it is called in folders."""
-        return f"{self.scene}-{self.seed if self.mesh is None else file_digest(self.mesh)[:8]}"
+        return f"{self.scene}-{self.seed if self.mesh is None else self.mesh.digest[:8]}"
 
     def made_of(self) -> dict[str, Any]:
         """What the task that renders is told of it."""
         if self.mesh is None:
             return {"scene": self.scene, "seed": self.seed}
-        return {"scene": MESH_SCENE, "seed": self.seed, "mesh": str(self.mesh)}
+        return {"scene": MESH_SCENE, "seed": self.seed, "mesh": str(self.mesh.file)}
 
 
 MESH_SCENE = "boulder"
+"""The scene whose ground, light and orbits a mesh is given."""
 
 
 TABLE_ROCK = Rock("boulder", 0)
@@ -152,7 +161,7 @@ def rocks(preset: Preset, count: int) -> list[Rock]:
     """The first so many rocks: the scenes in turn, with seeds from 1 on. On those of seed 0 the policies were developed. Where
     the preset has meshes, these instead."""
     if preset.meshes:
-        return [Rock(mesh.stem, 0, k, mesh) for k, mesh in enumerate(preset.meshes[:count])]
+        return [Rock(mesh.file.stem, 0, k, mesh) for k, mesh in enumerate(preset.meshes[:count])]
     return [Rock(SCENES[k % len(SCENES)], 1 + k // len(SCENES), k) for k in range(count)]
 
 

@@ -11,7 +11,7 @@ from mgs.active.inputs import file_digest
 from mgs.active.policies import policy_named
 from mgs.errors import InputError
 from mgs.study import reproduce
-from mgs.study.reproduce import Preset
+from mgs.study.reproduce import Mesh, Preset
 from mgs.study.statistics import MOST_ROCKS
 from mgs.study.sweep import names_of
 
@@ -28,12 +28,18 @@ def results_of(only: str | None) -> list[str]:
 
 def rocks_of(name: str, preset: Preset, asked: int | None) -> int:
     """How many rocks a result has: as many as asked for, but Table I has one. Raises InputError if out of range."""
-    default, most = reproduce.RESULTS[name].rocks(preset), min(reproduce.RESULTS[name].most, len(preset.meshes) or MOST_ROCKS)
-    if asked is None or default == 1:
-        return default
+    result = reproduce.RESULTS[name]
+    if asked is None or name not in over_rocks():
+        return result.rocks(preset)
+    most = len(preset.meshes) or result.most
     if not 1 <= asked <= most:
         raise InputError(f"--rocks {asked}: {name} can have 1 to {most}")
     return asked
+
+
+def over_rocks() -> list[str]:
+    """The results over many rocks."""
+    return [name for name in reproduce.RESULTS if name not in ("table1", "figures")]
 
 
 def with_policies(preset: Preset, names: list[str], policies: Sequence[str]) -> Preset:
@@ -58,18 +64,19 @@ def with_policies(preset: Preset, names: list[str], policies: Sequence[str]) -> 
 def with_meshes(preset: Preset, names: list[str], meshes: Sequence[Path]) -> Preset:
     """A preset whose results over many rocks are over these meshes instead.
 
-    names: the results to make. Raises InputError where none of them is over many rocks, a file cannot be read, or two have the
-    same name.
+    names: the results to make. Raises InputError where none of them is over many rocks, a file cannot be read, two have the
+    same name, or they are more than MOST_ROCKS.
     """
     if not meshes:
         return preset
-    if not any(reproduce.RESULTS[name].rocks(preset) > 1 for name in names):
+    if len(meshes) > MOST_ROCKS:
+        raise InputError(f"--mesh: {len(meshes)} files; differences are tested over {MOST_ROCKS} rocks at most, leave some out")
+    if not set(names) & set(over_rocks()):
         raise InputError(f"--mesh {meshes[0]}: is for results over many rocks, and --only leaves them out")
     for k, mesh in enumerate(meshes):
-        file_digest(mesh)
         if mesh.stem in [other.stem for other in meshes[:k]]:
             raise InputError(f"--mesh {mesh}: there is one of this name already; leave it out, or rename its file")
-    found, count = tuple(mesh.resolve() for mesh in meshes), len(meshes)
+    found, count = tuple(Mesh(mesh.resolve(), file_digest(mesh)) for mesh in meshes), len(meshes)
     return replace(preset, meshes=found, curve_rocks=count, seed_rocks=count, pool_rocks=count)
 
 
