@@ -16,6 +16,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from versions import commit
 from whole_runs import PROGRAM
 
 from mgs import runtime
@@ -51,9 +52,8 @@ def main(out: Path, work: Path, old: Path, new: Path) -> None:
             found = stages(checkout, work / version)
             records.append({"version": version, "round": turn, "stages": found})
             print(records[-1], flush=True)
-            write_json(
-                out, {"command": command_line(), "machine": runtime.processor(), "versions": versions(), "records": records}
-            )
+            made = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
+            write_json(out, made | {"old": commit(old), "new": commit(new), "records": records})
 
 
 if __name__ == "__main__":

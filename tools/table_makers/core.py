@@ -238,7 +238,8 @@ def demo_time(data: dict[str, Any]) -> str:
         for stage, seconds in [*record["stages"], ["sum", sum(seconds for _, seconds in record["stages"])]]:
             found.setdefault(stage, {}).setdefault(record["version"], []).append(f"{seconds:.0f}")
     rows = [[stage, *(", ".join(times.get(version, ["–"])) for version in ("old", "new"))] for stage, times in found.items()]
-    return markdown(["stage", "commit 55789c2, s", "now, s"], sorted(rows, key=lambda row: row[0] == "sum")) + made_by(data)
+    heading = ["stage", *(f"commit {data[which]}, s" for which in ("old", "new"))]
+    return markdown(heading, sorted(rows, key=lambda row: row[0] == "sum")) + made_by(data)
 
 
 def whole_runs(data: dict[str, Any]) -> str:
