@@ -32,7 +32,7 @@ from mgs.study.chart.drawing import COLOURS
 SMALL = 150, (96, 72)
 """Number of Gaussians, and size of the image, of the scene on which errors are measured."""
 
-ROUNDS, REPEATS = 5, 9
+ROUNDS, REPEATS = 4, 9
 
 TIMED = {"image": "forward_warm", "gradient": "gradient_warm", "diagonal": "fisher_exact"}
 """What is timed, by what is computed; `forward_cold` is kept beside them."""
