@@ -163,7 +163,7 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
     columns = [("passes", "phi"), ("seconds", "phi"), ("passes", "psnr_inside"), ("seconds", "psnr_inside")]
     names = {"passes": "work (passes)", "seconds": "seconds", "phi": "objective", "psnr_inside": "PSNR inside, test views (dB)"}
     with matplotlib.rc_context(STYLE):
-        figure = new_figure(10.4, 5.4)
+        figure = new_figure(10.4, 5.8)
         axes = figure.subplots(2, 4, sharex="col")
         for line, begin in zip(axes, ("cold", "warm"), strict=True):
             for axis, (x, y) in zip(line, columns, strict=True):
@@ -182,7 +182,7 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
                     axis.yaxis.set_minor_formatter("{x:.0f}")
         for axis, (x, _) in zip(axes[1], columns, strict=True):
             axis.set(xlabel=names[x])
-        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
         save_figure(figure, path)
 
 
