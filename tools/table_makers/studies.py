@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -138,6 +139,16 @@ def oracle(data: dict[str, Any]) -> str:
     return markdown([f"{data['rocks']} rocks: over random, dB (share)", *pools], lines) + made_by(data)
 
 
+def lunar(data: dict[str, Any]) -> str:
+    """The area under PSNR(images) on each of two meshes."""
+    samples = [f"sample {number}" for number in re.findall(r"--mesh \w*?(\d+)\.", data["command"])]
+    keys = {"test_psnr": "full frame", "test_psnr_mask": "rock"}
+    policies = data["test_psnr"]["area_by_rock"]
+    rows = [[policy, *(f"{area:.2f}" for key in keys for area in data[key]["area_by_rock"][policy])] for policy in policies]
+    heading = [f"{sample}, {part} (dB)" for part in keys.values() for sample in samples]
+    return markdown(["policy", *heading], rows) + made_by(data)
+
+
 def clean_alarms(data: dict[str, Any]) -> str:
     """How often each detector speaks in runs in which nothing is wrong."""
     rows = []
@@ -163,6 +174,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "paper-size-table1": ("results/paper-size/table1", reproduced("table1")),
     "ablations": ("results/ablations/pools", ablations),
     "linear-look": ("results/linear-look/pools", ablations),
+    "lunar": ("results/lunar/statistics", lunar),
     "clean-alarms": ("benchmarks/clean_alarms", clean_alarms),
     "oracle": ("results/oracle/pools", oracle),
     **{f"chart-{name}": ("results/chart/chart", chart(name)) for name in CHART_TABLES},
