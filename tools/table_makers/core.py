@@ -324,6 +324,7 @@ def planning(data: dict[str, Any]) -> str:
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "planning": ("benchmarks/planning", planning),
     "versions": ("benchmarks/versions", two_versions),
+    "demo-time": ("benchmarks/demo_time", demo_time),
     "whole-runs": ("benchmarks/whole_runs", whole_runs),
     "paper-size": ("benchmarks/whole_runs", paper_size),
     "data-samples": ("benchmarks/data_samples", data_samples),
