@@ -304,7 +304,7 @@ class Loop:
         return fisher(self.start, camera)[: self.stations.on_surface, : len(self.prior_lam)]
 
     def learn(self, state: State, planned: State) -> State:
-        """Read the images of the views that are planned beyond a state, fit to convergence on all so far, sum their information
+        """Read the images of the views that are planned beyond a state, fit to all so far, sum their information
         at the new model. What the fit says goes into the last of the planned steps."""
         *steps, known = planned.steps
         step, taken, new = known["step"], planned.taken, planned.taken[len(state.taken) :]
