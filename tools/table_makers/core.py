@@ -92,6 +92,30 @@ def _limits(limits: dict[str, Any]) -> str:
     )
 
 
+def roofline_bounds(data: dict[str, Any]) -> str:
+    """For whole operations the time of their kernels, and what it would be if each took as long as its nearest limit asks."""
+    kernels, rows = {row["name"]: row for row in data["kernels"]}, []
+    for operation, names in KERNELS_OF.items():
+        measured = sum(kernels[name]["seconds"] for name in names)
+        nearest = sum(kernels[name]["seconds"] * min(max(kernels[name]["shares"].values()), 1) for name in names)
+        rows.append([operation, f"{1e3 * nearest:.1f}", f"{1e3 * measured:.1f}", f"{measured / nearest:.1f}"])
+    return markdown(["", "by the nearest limits, ms", "kernels, ms", "ratio"], rows) + made_by(data)
+
+
+KERNELS_OF = {
+    "draw a view never seen before": ("projection", "packing", "block lists", "forward"),
+    "draw a view seen before": ("projection", "forward"),
+    "image and gradient": ("projection", "forward", "adjoint: walk", "adjoint: add up", "sums to gradient"),
+    "exact Fisher diagonal": (
+        "projection", "exact Fisher: walk 1", "exact Fisher: walk 2", "exact Fisher: add up", "sums to exact Fisher",
+    ),
+    "exact 11x11 blocks": (
+        "projection", "block Fisher: walk 1", "block Fisher: walk 2", "block Fisher: add up", "sums to block Fisher",
+    ),
+}  # fmt: skip
+"""The kernels of each operation that `mgs bench splat` times."""
+
+
 def roofline_work(data: dict[str, Any]) -> str:
     """Operations and bytes of each kernel, counted, and the lanes that are busy."""
     rows = []
@@ -325,6 +349,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "planning": ("benchmarks/planning", planning),
     "versions": ("benchmarks/versions", two_versions),
     "demo-time": ("benchmarks/demo_time", demo_time),
+    "roofline-bounds": ("benchmarks/roofline", roofline_bounds),
     "whole-runs": ("benchmarks/whole_runs", whole_runs),
     "paper-size": ("benchmarks/whole_runs", paper_size),
     "data-samples": ("benchmarks/data_samples", data_samples),
