@@ -83,6 +83,20 @@ def assumed_noise(data: dict[str, Any]) -> str:
     return markdown(heading, rows) + made_by(data)
 
 
+def surface(data: dict[str, Any]) -> str:
+    """PSNR and how much of a surface a model is, with the backing and without, and with what else could keep it one."""
+    rows = []
+    for what in dict.fromkeys(r["what"] for r in data["records"]):
+        cells = []
+        for backing in dict.fromkeys(r["backing"] for r in data["records"]):
+            r = next(r for r in data["records"] if (r["what"], r["backing"]) == (what, backing))
+            cells += [f"{r['psnr']:.2f}, {r['psnr_inside']:.2f}"]
+            cells += [", ".join(f"{100 * r[key]:.1f} %" for key in ("too_deep", "see_through"))]
+        rows.append([what, *cells])
+    heading = ["", "all on the surface: PSNR, inside (dB)", "too deep, see-through"]
+    return markdown([*heading, "a third behind: PSNR, inside", "too deep, see-through"], rows) + made_by(data)
+
+
 def truth(data: dict[str, Any]) -> str:
     """PSNR on test views of fits to several truths, judged by two of them."""
     judges = [(judge, part) for judge in ("alpha", "mask") for part in ("", ", inside")]
@@ -213,6 +227,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "stops": ("benchmarks/ranking", stops),
     "noise-ranking": ("benchmarks/noise_ranking", noise_ranking),
     "assumed-noise": ("benchmarks/assumed_noise", assumed_noise),
+    "surface": ("benchmarks/surface", surface),
     "truth": ("benchmarks/truth", truth),
     "linearity": ("benchmarks/linearity", linearity),
     "residual": ("benchmarks/residual", residual),
