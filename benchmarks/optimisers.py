@@ -53,6 +53,8 @@ ROWS = {
 }
 LENGTHS, LONG_LENGTHS, LM_STEPS = (5, 10, 20, 40), (100, 400), (5, 20)
 """Passes of the fits, those of small models only, and steps of Levenberg-Marquardt with large models and with small ones."""
+FOR_THE_END, FIRST_PASSES, LAST_STEPS, LAST_DAMPING = "natural gradient, then Levenberg-Marquardt", 40, 5, 1.0
+"""A row: a fit of so many passes by the natural gradient, and steps of Levenberg-Marquardt from there on, hardly damped."""
 LARGE = 50_000
 """Gaussians from which on a model is large."""
 BY_LENGTH = {
@@ -134,6 +136,13 @@ def study(case: _Case, done: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 seconds = time.perf_counter() - began
                 extra = -(-passes // INFORMATION_PASSES) if OPTIMISERS[optimiser].uses_information else 0
                 record(begin, row, passes + extra, seconds, goal, found)
+        for row in left({FOR_THE_END: None}):
+            began = time.perf_counter()
+            near = as_drjit(case.fitted(model, views, "natural", RATES, FIRST_PASSES))
+            first = time.perf_counter() - began
+            extra = FIRST_PASSES + -(-FIRST_PASSES // INFORMATION_PASSES)
+            for work, seconds, found in timed(second_order.levenberg_marquardt(goal, near, LAST_STEPS, damping=LAST_DAMPING)):
+                record(begin, row, extra + work, first + seconds, goal, found())
         for row in left(BY_LENGTH):
             for passes in lengths[:-1] if small else lengths:
                 *_, (work, seconds, found) = timed(BY_LENGTH[row](goal, as_drjit(model), passes))
@@ -159,7 +168,7 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
     import matplotlib
     from matplotlib.ticker import NullFormatter
 
-    colours = ("#D55E00", "#E69F00", "#0072B2", "#56B4E9", "#7755DD", "#CC79A7", "#009E73", "#000000", "#888888")
+    colours = ("#D55E00", "#E69F00", "#0072B2", "#56B4E9", "#7755DD", "#CC79A7", "#009E73", "#000000", "#888888", "#770000")
     columns = [("passes", "phi"), ("seconds", "phi"), ("passes", "psnr_inside"), ("seconds", "psnr_inside")]
     names = {"passes": "work (passes)", "seconds": "seconds", "phi": "objective", "psnr_inside": "PSNR inside, test views (dB)"}
     with matplotlib.rc_context(STYLE):

@@ -94,12 +94,18 @@ def blocks(goal: Objective, model: Gaussians) -> np.ndarray:
 
 
 def levenberg_marquardt(
-    goal: Objective, model: Gaussians, steps: int, by_blocks: bool = False, straighter: bool = False
+    goal: Objective,
+    model: Gaussians,
+    steps: int,
+    by_blocks: bool = False,
+    straighter: bool = False,
+    damping: float = LM_DAMPING,
 ) -> Iterator[tuple[float, Gaussians]]:
     """Steps (J^T J + (1 + mu) lam)^-1 g by conjugate gradients, kept where they lower the objective; mu falls after good steps
     and rises after bad ones. by_blocks: the preconditioner is not the diagonal of that matrix, but its 11x11 blocks.
-    straighter: steps are made in opacities and squared scales, in which images are more nearly linear (`linearity.py`)."""
-    work, mu, phi = 1.0, LM_DAMPING, goal.phi(model)
+    straighter: steps are made in opacities and squared scales, in which images are more nearly linear (`linearity.py`).
+    damping: the first mu."""
+    work, mu, phi = 1.0, damping, goal.phi(model)
     for _ in range(steps):
         move, expected = _damped_step(goal, model, mu * lam_of(goal), by_blocks)
         candidate = moved(model, _straighter(model, move) if straighter else move)

@@ -139,6 +139,21 @@ def oracle(data: dict[str, Any]) -> str:
     return markdown([f"{data['rocks']} rocks: over random, dB (share)", *pools], lines) + made_by(data)
 
 
+def directional_noise(data: dict[str, Any]) -> str:
+    """By how much a policy of the user's own is behind the leader, at the end and over the whole curve."""
+    rows = [row | {"policy": what} for row in data["rows"] if ".py:" in row["policy"] for what in NOISE_COLUMNS]
+    return matrix(rows, f"{LEADER} over it (dB)", lambda row: led(row, NOISE_COLUMNS[row["policy"]])) + made_by(data)
+
+
+NOISE_COLUMNS = {
+    "last model, full frame": "test_psnr_led",
+    "last model, rock": "test_psnr_mask_led",
+    "whole curve, full frame": "test_psnr_area_led",
+    "whole curve, rock": "test_psnr_mask_area_led",
+}
+"""Rows of that table, and the differences that they are of."""
+
+
 def lunar(data: dict[str, Any]) -> str:
     """The area under PSNR(images) on each of two meshes."""
     samples = [f"sample {number}" for number in re.findall(r"--mesh \w*?(\d+)\.", data["command"])]
@@ -174,6 +189,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "paper-size-table1": ("results/paper-size/table1", reproduced("table1")),
     "ablations": ("results/ablations/pools", ablations),
     "linear-look": ("results/linear-look/pools", ablations),
+    "directional-noise": ("results/directional-noise/pools", directional_noise),
     "lunar": ("results/lunar/statistics", lunar),
     "clean-alarms": ("benchmarks/clean_alarms", clean_alarms),
     "oracle": ("results/oracle/pools", oracle),
