@@ -9,7 +9,9 @@ of parameter (`mgs.study.chart.core.error`), on SMALL. Let nothing else run.
 
 from __future__ import annotations
 
+import os
 import sys
+import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -47,13 +49,15 @@ def put(**values: Any) -> None:
 
 
 def block_size(width: int, height: int) -> None:
-    """Blocks of other pixels."""
-    put(BLOCK_X=width, BLOCK_Y=height, PIXELS=width * height, CENTRE=width // 2)
+    """Blocks of other pixels. Beyond 8x4 alphas cannot be carried from a block's centre to its corners."""
+    put(BLOCK_X=width, BLOCK_Y=height, PIXELS=width * height, CENTRE=width // 2, MIDDLE=height // 2)
+    if width > 8:
+        each_pixel_alone()
 
 
 def rows_of_alphas(position: str, each_pixel: bool, one_by_one: bool = False) -> Callable[..., Any]:
     """`mgs.splat.walking.block_rows` with the offset of a block in another precision ("Float", "Float64"), with an exp2 at
-    every pixel instead of three in a row, or with each row made when it is asked for."""
+    every pixel or three in every row, or with each row made when it is asked for."""
     import mitsuba as mi
 
     from mgs.splat import walking
@@ -100,8 +104,13 @@ class Lazily:
 
 
 def each_pixel_alone() -> None:
-    """An exp2 at every pixel, instead of three in a row."""
+    """An exp2 at every pixel."""
     put(block_rows=rows_of_alphas("Float64", each_pixel=True))
+
+
+def row_by_row() -> None:
+    """Three exp2 in every row: ratios of alphas are not carried from row to row."""
+    put(block_rows=rows_of_alphas("Float64", each_pixel=False))
 
 
 def rows_one_by_one() -> None:
@@ -117,8 +126,7 @@ def by_minimum() -> None:
         alpha = dr.select(raw >= constants.ALPHA_MIN, dr.minimum(raw, constants.ALPHA_MAX), 0)
         after = dr.fma(-alpha, T, T)
         room = after > constants.TRANSMITTANCE_MIN
-        alpha = dr.select(room, alpha, 0)
-        return alpha, alpha * T, dr.select(room, after, -dr.abs(T)), room
+        return alpha, dr.select(room, alpha * T, 0), dr.select(room, after, -dr.abs(T)), room
 
     put(blend=blend)
 
@@ -129,7 +137,7 @@ def local_arrays() -> None:
 
     from mgs.splat import walking
 
-    def walk(lists: Any, packed: Any, lane: Any, pixels: Any, visit: Any) -> tuple[Any, Any]:
+    def walk(lists: Any, packed: Any, lane: Any, pixels: Any, visit: Any, together: int) -> tuple[Any, Any]:
         width, state = len(pixels[0]), dr.alloc_local(mi.Float, len(pixels) * len(pixels[0]))
 
         def read(state: Any) -> list[list[Any]]:
@@ -140,10 +148,10 @@ def local_arrays() -> None:
                 state[k] = value
 
         def body(i: Any, state: Any, alive: Any) -> Any:
-            splat = walking.unpack(packed, dr.gather(mi.UInt32, lists.splat, i))
-            values, alive = visit(i, splat, walking.block_rows(lane, splat), read(state))
+            pairs = [walking.drawn(lists, packed, lane, i, k) for k in range(together)]
+            values, alive = visit(i, pairs, read(state))
             write(state, values)
-            return i + 1, state, (i + 1 < lane.end) & alive
+            return i + together, state, (i + together < lane.end) & alive
 
         write(state, pixels)
         start = mi.UInt32(lane.start)
@@ -188,16 +196,31 @@ class Renamed:
         return getattr(mi, self.names.get(name, name))
 
 
+def llvms_order() -> None:
+    """Instructions in the order that LLVM's machine scheduler gives them. Kernels that are kept on the disk would be those in
+    the usual order, so others are kept elsewhere."""
+    runtime._keep_order = lambda: None
+    os.environ["HOME"] = tempfile.mkdtemp()
+    runtime.start()
+
+
 def least_alpha(value: float) -> None:
     """A footprint that ends where alpha falls below another value."""
     put(ALPHA_MIN=value, LOG2_INV_ALPHA_MIN=-np.log2(value))
 
 
+LLVMS_ORDER = "instructions in LLVM's order"
+
 VARIANTS: dict[str, tuple[Callable[[], None], float | None]] = {
     "as it is": (lambda: None, None),
     "an exp2 at every pixel": (each_pixel_alone, None),
     "Dr.Jit's exp2": (partial(put, exp2=dr.exp2), None),
+    "three exp2 in every row": (row_by_row, None),
     "rows one by one": (rows_one_by_one, None),
+    "one splat at a time": (partial(put, TOGETHER=1), None),
+    "three splats at a time": (partial(put, TOGETHER=3), None),
+    "pixels in any order": (partial(put, in_order=lambda x, before: x), None),
+    LLVMS_ORDER: (lambda: None, None),
     "pixels in local arrays": (local_arrays, None),
     "Dr.Jit's minimum": (by_minimum, None),
     "positions in single precision": (single_positions, None),
@@ -275,7 +298,8 @@ def main(prefix: str) -> None:
     runs: dict[str, list[dict[str, float]]] = {name: [] for name in VARIANTS}
     for turn in range(ROUNDS):
         for name in VARIANTS:
-            runs[name].append(in_new_process(measure, name, turn == 0))
+            start = llvms_order if name == LLVMS_ORDER else runtime.start
+            runs[name].append(in_new_process(measure, name, turn == 0, initializer=start))
             print(name, runs[name][-1], flush=True)
     rows = []
     for name, found in runs.items():

@@ -142,6 +142,7 @@ def start() -> None:
         mi.set_variant(VARIANT)
     else:
         _check_variant()
+    _keep_order()
     _checked.add(mi.variant())
 
 
@@ -154,6 +155,24 @@ def _choose_libllvm() -> None:
     library = find_libllvm()
     if "/" in library.path:
         os.environ[LIBRARY_VARIABLE] = library.path
+
+
+ORDER_OPTION = b"-enable-misched=false"
+"""Option of LLVM with which it keeps the order of a kernel's instructions."""
+
+
+def _keep_order() -> None:
+    """Tell the libLLVM that Dr.Jit uses to leave the order of instructions as it is. One that does not know the option, or was
+    told before, says nothing and goes on as it was. What kernels compute does not depend on it.
+
+    The kernels of `mgs.splat` are long pieces of straight code, written so that one pixel is finished before the next one needs
+    registers. LLVM's machine scheduler would mix the pixels again, and keep on the stack what no longer fits into registers:
+    they then take up to a third more time (docs/splatting.md, What was tried).
+    """
+    with contextlib.suppress(InputError):
+        library = ctypes.CDLL(find_libllvm().path)
+        arguments = (ctypes.c_char_p * 2)(b"mgs", ORDER_OPTION)
+        library.LLVMParseCommandLineOptions(len(arguments), arguments, None)
 
 
 def _check_libllvm() -> None:

@@ -14,13 +14,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mgs.bench.core import WARM_UP, gradient, surface_camera, surface_gaussians
+from mgs.bench.core import WARM_UP, gradient, pairs_in_an_iteration, surface_camera, surface_gaussians
 from mgs.bench.machine import machine_limits
 from mgs.bench.work import Work, count_work
 from mgs.camera import Camera
 from mgs.gaussians import Gaussians
 from mgs.memory import padded
-from mgs.splat import ListCache, as_drjit, blocks, fisher, kernels
+from mgs.splat import ListCache, as_drjit, blocks, fisher, kernels, render
 from mgs.splat.blocks import BlockLists
 from mgs.splat.projection import camera_array, project, project64
 from mgs.splat.walking import AT_ONCE, pack
@@ -82,9 +82,10 @@ def kernel_row(name: str, unit: str, kernel: Kernel, lists: BlockLists) -> dict[
     """What is known of one kernel: "name"; "seconds"; "each", the `Work` of a lane for one `unit`: of its loop for one
     iteration; "useful" and "executed", the `Work` of all busy lanes, and of all lanes.
 
-    A kernel's first loop follows the block lists where there is a lane for each block, and all pairs count: that a block skips
-    the rest of its list once its pixels are finished is left out, and so is the second loop, which then writes zeros. Else it
-    follows the pairs of each splat, AT_ONCE in an iteration. Of memory that is cleared only the bytes are known.
+    A kernel's first loop follows the block lists where there is a lane for each block, `pairs_in_an_iteration`, and all pairs
+    count: that a block skips the rest of its list once its pixels are finished is left out, and so is the second loop, which
+    then writes zeros. Else it follows the pairs of each splat, AT_ONCE in an iteration. Of memory that is cleared only the
+    bytes are known.
     """
     if kernel.kind != "JIT":
         cleared = Work(bytes=kernel.size)
@@ -96,7 +97,7 @@ def kernel_row(name: str, unit: str, kernel: Kernel, lists: BlockLists) -> dict[
     walks = kernel.size == len(lists.block)
     start, end = (lists.start, lists.end) if walks else (lists.slot_start, lists.slot_end)
     length, loop = np.asarray(end).astype(np.int64) - np.asarray(start), counted.loops[0]
-    busy, every = trips(length if walks else -(-length // AT_ONCE), counted.width)
+    busy, every = trips(-(-length // (pairs_in_an_iteration(counted) if walks else AT_ONCE)), counted.width)
     useful, executed = counted.straight * kernel.size + loop * busy, counted.straight * lanes + loop * every
     return _row(name, kernel.seconds, unit, loop, useful, executed)
 
@@ -106,16 +107,15 @@ def _row(name: str, seconds: float, unit: str, each: Work, useful: Work, execute
     return {"name": name, "seconds": seconds, "unit": unit} | works
 
 
-def step_row(name: str, found: list[Kernel], lists: BlockLists) -> dict[str, Any]:
-    """The kernels of a step whose work grows with the number of Gaussians, together: as `kernel_row`, with the useful work of
-    a Gaussian for "each", and "own_seconds", the time of what Dr.Jit brings compiled: sorts, prefix sums and copies, whose work
+def step_row(name: str, unit: str, count: int, found: list[Kernel], lists: BlockLists) -> dict[str, Any]:
+    """The kernels of a step whose work grows with the `count` of some unit, together: as `kernel_row`, with the useful work of
+    a unit for "each", and "own_seconds", the time of what Dr.Jit brings compiled: sorts, prefix sums and copies, whose work
     is not counted."""
     rows = [kernel_row(name, "", kernel, lists) for kernel in found if kernel.kind in ("JIT", "Memset")]
     useful, executed = (sum((Work(**row[key]) for row in rows), Work()) for key in ("useful", "executed"))
     seconds = sum(kernel.seconds for kernel in found)
     own = seconds - sum(row["seconds"] for row in rows)
-    each = useful * (1 / len(lists.place))
-    return _row(name, seconds, "Gaussian", each, useful, executed) | {"own_seconds": own}
+    return _row(name, seconds, unit, useful * (1 / count), useful, executed) | {"own_seconds": own}
 
 
 def operation_rows(operation: str, found: list[Kernel], lists: BlockLists) -> list[dict[str, Any]]:
@@ -129,7 +129,9 @@ def operation_rows(operation: str, found: list[Kernel], lists: BlockLists) -> li
             continue
         what, unit = ("clear memory", "byte") if kernel.kind == "Memset" else ("add up", f"{AT_ONCE} pairs of a splat")
         if kernel in walks:
-            what, unit = "walk" if len(walks) == 1 else f"walk {1 + walks.index(kernel)}", "pair"
+            what = "walk" if len(walks) == 1 else f"walk {1 + walks.index(kernel)}"
+            together = pairs_in_an_iteration(count_work(kernel.ir))
+            unit = "pair" if together == 1 else f"{together} pairs of a block"
         rows.append(kernel_row(operation if len(found) == 1 else f"{operation}: {what}", unit, kernel, lists))
     return rows
 
@@ -141,7 +143,8 @@ def after_loops(found: list[Kernel]) -> list[Kernel]:
 
 
 def roofline_rows(gaussians: Gaussians, camera: Camera, repeats: int, report: Callable[[str], None]) -> list[dict[str, Any]]:
-    """A row for each kernel that draws or differentiates, and one for each step that grows with the number of Gaussians.
+    """A row for each kernel that draws or differentiates, and one for each step that grows with the number of Gaussians or of
+    pixels.
 
     report(what) is called before each operation.
     """
@@ -157,6 +160,7 @@ def roofline_rows(gaussians: Gaussians, camera: Camera, repeats: int, report: Ca
     dr.eval(out, d_out, weights)
     walks = {
         "forward": lambda: kernels.forward(lists, packed, False),
+        "forward: alpha and depth": lambda: kernels.forward(lists, packed, True),
         "jvp": lambda: kernels.jvp(lists, packed, tangents),
         "adjoint": lambda: kernels.adjoint(lists, packed, out, d_out, False, False),
         "exact Fisher": lambda: kernels.fisher(lists, packed, background, False),
@@ -165,9 +169,11 @@ def roofline_rows(gaussians: Gaussians, camera: Camera, repeats: int, report: Ca
     steps = {
         "projection": lambda: project(device, place),
         "packing": lambda: pack(splats, lists.place),
+        "lists tested, and packing": lambda: cache.get(camera, splats)[1],
         "block lists": lambda: blocks.build(splats, camera.width, camera.height),
     }
     wholes = {
+        "pixels in order": lambda: render(device, camera, cache=cache).rgb,
         "sums to gradient": lambda: gradient(device, camera, weights, cache),
         "sums to exact Fisher": lambda: fisher(device, camera, "exact", cache=cache),
         "sums to block Fisher": lambda: fisher(device, camera, "block", cache=cache),
@@ -179,7 +185,8 @@ def roofline_rows(gaussians: Gaussians, camera: Camera, repeats: int, report: Ca
         if name in walks:
             rows += operation_rows(name, found, lists)
         else:
-            rows.append(step_row(name, found if name in steps else after_loops(found), lists))
+            of = ("pixel", camera.width * camera.height) if name == "pixels in order" else ("Gaussian", len(gaussians))
+            rows.append(step_row(name, *of, found if name in steps else after_loops(found), lists))
     return rows
 
 

@@ -28,6 +28,7 @@ from mgs.splat.walking import (
     Lane,
     Row,
     blend,
+    in_order,
     lanes,
     pack_parts,
     recorded_sizes,
@@ -46,15 +47,12 @@ def _pixel_sums(lists: BlockLists, packed: Any, lane: Lane, T: list[Any], number
     count = len(numbers(unpack(packed, mi.UInt32(0))))
     pixels = [[t, *(dr.zeros(type(packed), len(lists.block)) for _ in range(count))] for t in T]
 
-    def visit(_: Any, splat: Splats, rows: list[Row], pixels: Any) -> Any:
-        new, alive = [], mi.Bool(False)
-        for pixel, (T, *sums) in enumerate(pixels):
-            _, w, after, room = blend(rows[pixel // BLOCK_X].raw_alpha[pixel % BLOCK_X], T)
-            new.append([after, *(dr.fma(n, w, s) for n, s in zip(numbers(splat), sums, strict=True))])
-            alive |= room
-        return new, alive
+    def draw(of_splat: list[Any], raw: Any, _xi: Any, _eta: Any, pixel: list[Any]) -> list[Any]:
+        T, *sums = pixel
+        _, w, after, _ = blend(raw, T)
+        return [after, *(dr.fma(n, w, s) for n, s in zip(of_splat, sums, strict=True))]
 
-    return walk(lists, packed, lane, pixels, visit)
+    return walk(lists, packed, lane, pixels, draw, lambda _, splat: numbers(splat))
 
 
 @frozen(recorded_sizes)
@@ -127,39 +125,27 @@ def jvp(lists: BlockLists, packed: Any, packed_tangents: Any) -> tuple[Any, ...]
     lane, T = lanes(lists)
     pixels = [[t, *(dr.zeros(mi.Float, len(lists.block)) for _ in range(5))] for t in T]
 
-    def visit(i: Any, splat: Splats, rows: list[Row], pixels: Any) -> Any:
-        place = dr.gather(mi.UInt32, lists.splat, i)
-        (one, by_xi, by_eta, xi_xi), (xi_eta, eta_eta, d_depth, _), (*d_colour, _) = (
+    def start(pair: Any, splat: Splats) -> tuple[list[Any], list[Any], list[Any]]:
+        place = dr.gather(mi.UInt32, lists.splat, pair)
+        (*first, xi_xi), (xi_eta, eta_eta, d_depth, _), (*d_colour, _) = (
             dr.gather(mi.Vector4f, packed_tangents, place * 3 + part) for part in range(3)
         )
-        numbers, tangents = [*splat.colour, splat.depth], [*d_colour, d_depth]
-        new, alive = [], mi.Bool(False)
-        for j, row in enumerate(rows):
-            constant, linear = dr.fma(dr.fma(eta_eta, row.eta, by_eta), row.eta, one), dr.fma(xi_eta, row.eta, by_xi)
-            for x, (raw, xi) in enumerate(zip(row.raw_alpha, row.xi, strict=True)):
-                transmittance, d_alpha_so_far, *sums = pixels[j * BLOCK_X + x]
-                alpha, w, after, room = blend(raw, transmittance)
-                d_log_alpha = dr.fma(dr.fma(xi_xi, xi, linear), xi, constant)
-                d_alpha = dr.select(raw <= ALPHA_MAX, alpha * d_log_alpha, 0)
-                dw = dr.fma(d_alpha, transmittance, -alpha * d_alpha_so_far)
-                sums = [dr.fma(n, dw, dr.fma(w, dn, s)) for n, dn, s in zip(numbers, tangents, sums, strict=True)]
-                new.append([after, d_alpha_so_far + dw, *sums])
-                alive |= room
-        return new, alive
+        return [*first, xi_xi, xi_eta, eta_eta], [*splat.colour, splat.depth], [*d_colour, d_depth]
 
-    pixels = walk(lists, packed, lane, pixels, visit)
+    def draw(of_splat: tuple[list[Any], list[Any], list[Any]], raw: Any, xi: Any, eta: Any, pixel: list[Any]) -> list[Any]:
+        (one, by_xi, by_eta, xi_xi, xi_eta, eta_eta), numbers, tangents = of_splat
+        transmittance, d_alpha_so_far, *sums = pixel
+        alpha, w, after, room = blend(raw, transmittance)
+        constant, linear = dr.fma(dr.fma(eta_eta, eta, by_eta), eta, one), dr.fma(xi_eta, eta, by_xi)
+        d_log_alpha = dr.fma(dr.fma(xi_xi, xi, linear), xi, constant)
+        alpha = dr.select(room, alpha, 0)
+        d_alpha = dr.select(raw <= ALPHA_MAX, alpha * d_log_alpha, 0)
+        dw = dr.fma(d_alpha, transmittance, -alpha * d_alpha_so_far)
+        sums = [dr.fma(n, dw, dr.fma(w, dn, s)) for n, dn, s in zip(numbers, tangents, sums, strict=True)]
+        return [after, d_alpha_so_far + dw, *sums]
+
+    pixels = walk(lists, packed, lane, pixels, draw, start)
     return _store_pixels(lists, [[without_denormals(x) for x in (*rgb, alpha, z)] for _, alpha, *rgb, z in pixels])
-
-
-def _begin_pixel() -> None:
-    """Tell Dr.Jit that the operations of another pixel begin (that a new scope does). It changes no result.
-
-    Within one scope Dr.Jit writes operations in the order in which the loop's results need them: first the alphas and
-    transmittances of all 32 pixels, and at the end what is summed from them. What lies between leaves the registers for the
-    stack. With a scope for each pixel, the Fisher kernel finishes one before the next, and takes a tenth less CPU time for the
-    exact diagonal (measured with AVX-512). The forward and adjoint kernels gained nothing from it.
-    """
-    dr.detail.new_scope(dr.backend_v(mi.Float))
 
 
 def _slopes(colours: list[Any], behind: list[Any], alpha: Any, w: Any, after: Any, free: Any, last: Any = None) -> list[Any]:
@@ -208,12 +194,13 @@ def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, ...], d_out: tuple[A
         pixels.append([T[pixel], sum(v * d for v, d in zip(values, slopes, strict=True))])
     count = ADJOINT_SUMS[means]
 
-    def visit(_: Any, splat: Splats, rows: list[Row], pixels: Any) -> Any:
+    def visit(splat: Splats, rows: list[Row], pixels: Any) -> Any:
         new, alive = [], mi.Bool(False)
         sums, (r, g, b) = [mi.Float(0)] * 10, splat.colour
         for j, row in enumerate(rows):
             m0, m1, m2 = mi.Float(0), mi.Float(0), mi.Float(0)
             for x, (raw, xi) in enumerate(zip(row.raw_alpha, row.xi, strict=True)):
+                raw = in_order(raw, [*sums[:4], m0, m1, m2] if x else sums if j else [])
                 transmittance, behind = pixels[j * BLOCK_X + x]
                 dr_, dg, db, *others = dL[j * BLOCK_X + x]
                 alpha, w, after, room = blend(raw, transmittance)
@@ -314,7 +301,7 @@ def fisher(lists: BlockLists, packed: Any, background: Any, cross: bool, means: 
     squared, mixed = fisher_moments(cross, means)
     count = fisher_sums(cross, means)
 
-    def visit(_: Any, splat: Splats, rows: list[Row], pixels: Any) -> Any:
+    def visit(splat: Splats, rows: list[Row], pixels: Any) -> Any:
         new, alive = [], mi.Bool(False)
         sums = [mi.Float(0)] * count
         for j, row in enumerate(rows):
@@ -322,7 +309,7 @@ def fisher(lists: BlockLists, packed: Any, background: Any, cross: bool, means: 
             cross_m = [[mi.Float(0)] * 3 for _ in range(3)]
             for x, (raw, xi) in enumerate(zip(row.raw_alpha, row.xi, strict=True)):
                 pixel = j * BLOCK_X + x
-                _begin_pixel()
+                raw = in_order(raw, [sums[0], *m, *(c for a in cross_m for c in a)] if x else sums if j else [])
                 transmittance, *behind = pixels[pixel]
                 alpha, w, after, room = blend(raw, transmittance)
                 behind = [dr.fma(-c, w, s) for c, s in zip(splat.colour, behind, strict=True)]
@@ -364,7 +351,7 @@ def removal(lists: BlockLists, packed: Any, background: Any) -> Any:
     behind = [[dr.fma(dr.abs(t), b, c) for c, b in zip(rgb, background, strict=True)] for t, *rgb in pixels]
     dr.eval(behind)
 
-    def visit(_: Any, splat: Splats, rows: list[Row], pixels: Any) -> Any:
+    def visit(splat: Splats, rows: list[Row], pixels: Any) -> Any:
         new, alive, total = [], mi.Bool(False), mi.Float(0)
         for pixel, (transmittance, *behind) in enumerate(pixels):
             alpha, w, after, room = blend(rows[pixel // BLOCK_X].raw_alpha[pixel % BLOCK_X], transmittance)

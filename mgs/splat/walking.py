@@ -12,7 +12,7 @@ Gaussians or over the image. Symbols are those of docs/notation.md.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -124,29 +124,31 @@ def exp2(x: Any) -> Any:
     """
     integer, bits = (mi.Int64, 52) if type(x) is mi.Float64 else (mi.Int32, 23)
     x = dr.select(x > -120, x, -120)
-    whole = dr.round(x)
-    part = x - whole
+    shifted = x + 1.5 * 2.0**bits  # so large that its last bit is 1: x is rounded, and its whole part stands in the last bits
+    part = x - (shifted - 1.5 * 2.0**bits)
     value = type(x)(EXP2[-1])
     for coefficient in EXP2[-2::-1]:
         value = dr.fma(value, part, coefficient)
-    return dr.reinterpret_array(type(x), dr.reinterpret_array(integer, value) + (integer(whole) << bits))
+    exponent = dr.reinterpret_array(integer, shifted) << bits
+    return dr.reinterpret_array(type(x), dr.reinterpret_array(integer, value) + exponent)
 
 
-CENTRE = BLOCK_X // 2
-"""Column of a block at which `block_rows` computes alpha with `exp2`; it goes on from there to both sides."""
+CENTRE, MIDDLE = BLOCK_X // 2, BLOCK_Y // 2
+"""Column and row of a block from which `block_rows` goes on to its other pixels."""
 
 
 def block_rows(lane: Lane, s: Splats) -> list[Row]:
     """xi, eta and alpha = 2^(log2_opacity - xi^2 - eta^2) of one splat on all pixels of a lane's block.
 
-    Along a row the exponent is quadratic in x. So the ratio of neighbouring alphas changes by a constant factor from pixel to
-    pixel, and alphas follow from one another by multiplication: three exp2 for a row of eight pixels, for rounding errors
-    four times as large.
+    The exponent is quadratic in x and y. So along a row the ratio of neighbouring alphas changes by a constant factor from
+    pixel to pixel, and from row to row these ratios change by a constant factor, too. Alphas follow from one another by
+    multiplication: nine exp2 for 32 pixels, for rounding errors up to ten times as large.
 
-    Going outwards from the row's centre, nothing underflows that is drawn: EPS2D keeps white_x below 1.6, so where a pixel of
-    the row is drawn, alpha at the centre is at least 2^-100. It can be smaller in a row that the splat does not reach. There
-    `exp2` returns too much, 2^-120, so the ratios are set to 2^-120 too, and all alphas of the row stay far below the
-    threshold.
+    Nothing underflows that is drawn. Every splat in a block's list reaches the rectangle of the block's pixel centres: there
+    the exponent is somewhere at least -log2(255) (`Footprints`). From a pixel to the next (xi, eta) moves by at most 1.56,
+    because EPS2D widens every footprint, and the centre of a row is at most 5 pixels from any point of the rectangle. So the
+    exponent at the centre of a row is at least -(2.83 + 5 * 1.56)^2 = -113, and no ratio is beyond 2^(+-36). Between a centre
+    and a pixel that is drawn the exponent is nowhere less, as it is concave.
 
     The offset of the block's first pixel from the splat is computed in double: far along a slanted needle, xi is a small
     difference of large numbers.
@@ -155,23 +157,28 @@ def block_rows(lane: Lane, s: Splats) -> list[Row]:
     dx, dy = mi.Float64(lane.left) - s.mean_x, mi.Float64(lane.top) - s.mean_y
     corner, down = real(mi.Float64(s.white_x) * (dx - s.shear * dy)), real(dy)
     slant, bend = s.white_x * real(s.shear), exp2(-2 * s.white_x * s.white_x)  # bend: the constant factor of the ratios
-    rows = []
+    middle = [dr.fma(s.white_x, real(CENTRE), dr.fma(-slant, real(j), corner)) for j in range(BLOCK_Y)]
+    ratios = {}  # of the alphas beside the centre of each row to the one at the centre, to the right (-1) and to the left (1)
+    for side in (-1, 1):
+        ratio = [exp2(s.white_x * dr.fma(real(2 * side), middle[MIDDLE], -s.white_x))] * BLOCK_Y
+        for way, rows in ((-1, range(MIDDLE + 1, BLOCK_Y)), (1, range(MIDDLE - 1, -1, -1))):
+            turn = exp2(2 * side * way * s.white_x * slant)  # the constant factor from row to row
+            for j in rows:
+                ratio[j] = ratio[j + way] * turn
+        ratios[side] = ratio
+    made = []
     for j in range(BLOCK_Y):
         eta = s.white_y * (down + j)
         first = dr.fma(-slant, real(j), corner)
         xi = [dr.fma(s.white_x, real(i), first) for i in range(BLOCK_X)]
-        row = dr.fma(-eta, eta, s.log2_opacity)
-        middle = xi[CENTRE]
-        power = dr.fma(-middle, middle, row)
-        raw = [exp2(power)] * BLOCK_X
-        for columns, sign in ((range(CENTRE + 1, BLOCK_X), -1), (range(CENTRE - 1, -1, -1), 1)):
-            step = s.white_x * dr.fma(real(2 * sign), middle, -s.white_x)
-            ratio = exp2(dr.select(power > -120, step, -120))
+        raw = [exp2(dr.fma(-xi[CENTRE], xi[CENTRE], dr.fma(-eta, eta, s.log2_opacity)))] * BLOCK_X
+        for side, columns in ((-1, range(CENTRE + 1, BLOCK_X)), (1, range(CENTRE - 1, -1, -1))):
+            ratio = ratios[side][j]
             for i in columns:
-                raw[i] = raw[i + sign] * ratio
+                raw[i] = raw[i + side] * ratio
                 ratio = ratio * bend
-        rows.append(Row(eta, xi, raw))
-    return rows
+        made.append(Row(eta, xi, raw))
+    return made
 
 
 def blend(raw: Any, T: Any) -> tuple[Any, Any, Any, Any]:
@@ -183,32 +190,69 @@ def blend(raw: Any, T: Any) -> tuple[Any, Any, Any, Any]:
 
     Thresholds are comparisons and selects. dr.minimum and dr.maximum must propagate NaN, which takes five instructions.
     """
-    alpha = dr.select(raw >= ALPHA_MIN, dr.select(raw <= ALPHA_MAX, raw, ALPHA_MAX), 0)
+    alpha = dr.select(raw >= ALPHA_MIN, dr.select(raw < ALPHA_MAX, raw, ALPHA_MAX), 0)
     after = dr.fma(-alpha, T, T)
     room = after > TRANSMITTANCE_MIN
-    alpha = dr.select(room, alpha, 0)
-    return alpha, alpha * T, dr.select(room, after, -dr.abs(T)), room
+    return alpha, dr.select(room, alpha * T, 0), dr.select(room, after, -dr.abs(T)), room
 
 
-def walk(lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], visit: Callable[..., Any]) -> list[list[Any]]:
+def in_order(x: Any, before: list[Any]) -> Any:
+    """x, a Float or Float64, unchanged; the compiler computes what follows from it after the Floats in `before`.
+
+    A kernel's operations are compiled in the order in which its results need them (see `mgs.runtime`). In a loop these are
+    first the state of all 32 pixels, and at the end what is summed over them: what lies between would leave the registers for
+    the stack. If a pixel depends on the sums over those before it, it is finished first. The dependence costs nothing: it is a
+    bit that LLVM knows to be zero and leaves out, and Dr.Jit does not.
+    """
+    if not before:
+        return x
+    bits = mi.UInt32(0)
+    for value in before:
+        bits |= dr.reinterpret_array(mi.UInt32, value)
+    integer = mi.UInt64 if type(x) is mi.Float64 else mi.UInt32
+    return dr.reinterpret_array(type(x), dr.reinterpret_array(integer, x) | integer((bits & 1) >> 1))
+
+
+TOGETHER = 2
+"""How many splats `walk` draws in one iteration. It reads and writes the state of the pixels, for which there are too few
+registers, once for all of them. With more than two, what they share no longer fits into the registers."""
+
+
+def walk(lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], draw: Callable[..., Any], start: Any) -> Any:
     """Go through each lane's list front to back, until it ends or all pixels of the block are finished.
 
-    pixels: what each of the 32 pixels carries along, in lists. visit(pair, splat, rows, pixels) -> (pixels, alive) draws one
-    splat; pair: UInt32, its number in the lists; alive: mask of lanes with a pixel that is not finished. Returns the pixels'
-    state at the end.
+    pixels: what each of the 32 pixels carries along, in lists, T of `blend` first. start(pair, splat) is called once for each
+    pair (UInt32, its number in the lists) and its splat; draw(started, raw, xi, eta, pixel) -> pixel draws the splat on one
+    pixel, given what `start` returned, and raw alpha, xi and eta of the pixel. Returns the pixels' state at the end.
 
     The numbers of one pixel stay together in the list, since the compiler keeps that order: it finishes each pixel before the
     next one needs registers.
     """
-    return _walk_until_done(lists, packed, lane, pixels, visit)[1]
+
+    def visit(i: Any, drawn: list[tuple[Any, Splats, list[Row]]], pixels: Any) -> Any:
+        started = [(start(pair, splat), rows) for pair, splat, rows in drawn]
+        new: list[list[Any]] = []
+        most: Any = None  # the largest transmittance of the pixels so far; of a finished one it is negative
+        for number, pixel in enumerate(pixels):
+            for of_splat, rows in started:
+                row, x = rows[number // BLOCK_X], number % BLOCK_X
+                raw = in_order(row.raw_alpha[x], [] if most is None else [mi.Float(most)])
+                pixel = draw(of_splat, raw, row.xi[x], row.eta, pixel)
+            new.append(pixel)
+            most = pixel[0] if most is None else dr.select(most > pixel[0], most, pixel[0])
+        return new, most > 0
+
+    return _walk_until_done(lists, packed, lane, pixels, visit, TOGETHER)[1]
 
 
 def walk_and_store(
     lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], visit: Callable[..., Any], count: int
 ) -> Any:
-    """As `walk`, but visit(pair, splat, rows, pixels) -> (pixels, alive, sums) also returns `count` numbers, Float: sums over
-    the pixels of the pair. Returns these sums of all pairs, in the order of the lists, each pair's rounded up to whole packets
-    of four; they are 0 for pairs that no lane visited, because their block's pixels were all finished.
+    """Go through each lane's list as `walk` does, and store sums over the pixels of each pair.
+
+    visit(splat, rows, pixels) -> (pixels, alive, sums) draws one splat; alive: mask of lanes with a pixel that is not finished;
+    sums: `count` numbers, Float. Returns the sums of all pairs, in the order of the lists, each pair's rounded up to whole
+    packets of four; they are 0 for pairs that no lane visited, because their block's pixels were all finished.
 
     A lane writes to its own list's pairs, one after the other, so no atomic operations are needed, and a line of the cache is
     full before it is left.
@@ -221,8 +265,9 @@ def walk_and_store(
         for i in range(packets):
             dr.scatter(stored, mi.Vector4f(*padded[4 * i : 4 * i + 4]), pair * packets + i, mode=dr.ReduceMode.NoConflicts)
 
-    def visit_and_store(pair: Any, *others: Any) -> tuple[Any, Any]:
-        pixels, alive, sums = visit(pair, *others)
+    def visit_and_store(pair: Any, drawn: list[tuple[Any, Splats, list[Row]]], pixels: Any) -> tuple[Any, Any]:
+        ((_, splat, rows),) = drawn
+        pixels, alive, sums = visit(splat, rows, pixels)
         store(pair, sums)
         return pixels, alive
 
@@ -230,20 +275,36 @@ def walk_and_store(
         store(pair, [mi.Float(0)] * count)
         return (pair + 1,)
 
-    left, _ = _walk_until_done(lists, packed, lane, pixels, visit_and_store)
+    left, _ = _walk_until_done(lists, packed, lane, pixels, visit_and_store, 1)
     dr.while_loop((left,), lambda pair: pair < lane.end, store_zeros)
     return stored
 
 
+def drawn(lists: BlockLists, packed: Any, lane: Lane, first: Any, k: int) -> tuple[Any, Splats, list[Row]]:
+    """The k-th pair after the first, its splat, and the rows of the lane's block under it. After a lane's last pair comes
+    the first one again, as a splat that draws nothing."""
+    if k == 0:
+        pair, splat = first, unpack(packed, dr.gather(mi.UInt32, lists.splat, first))
+    else:
+        there = first + k < lane.end
+        pair = dr.select(there, first + k, first)
+        splat = unpack(packed, dr.gather(mi.UInt32, lists.splat, pair))
+        nothing = {"white_x": 0, "white_y": 0, "log2_opacity": -200}
+        splat = replace(splat, **{name: dr.select(there, getattr(splat, name), value) for name, value in nothing.items()})
+    return pair, splat, block_rows(lane, splat)
+
+
 def _walk_until_done(
-    lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], visit: Callable[..., Any]
+    lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], visit: Callable[..., Any], together: int
 ) -> tuple[Any, list[list[Any]]]:
-    """The loop of `walk`. Returns the first pair that was not visited, and the pixels' state."""
+    """The loop of `walk`. Returns the first pair that was not visited, and the pixels' state.
+
+    visit(pair, drawn, pixels) -> (pixels, alive); drawn: what `drawn` returns, of so many pairs from that one on.
+    """
 
     def body(i: Any, pixels: Any, alive: Any) -> Any:
-        splat = unpack(packed, dr.gather(mi.UInt32, lists.splat, i))
-        pixels, alive = visit(i, splat, block_rows(lane, splat), pixels)
-        return i + 1, pixels, (i + 1 < lane.end) & alive
+        pixels, alive = visit(i, [drawn(lists, packed, lane, i, k) for k in range(together)], pixels)
+        return i + together, pixels, (i + together < lane.end) & alive
 
     start = mi.UInt32(lane.start)
     pair, pixels, _ = dr.while_loop((start, pixels, start < lane.end), lambda i, pixels, alive: alive, body)

@@ -102,15 +102,16 @@ def roofline_bounds(data: dict[str, Any]) -> str:
     return markdown(["", "by the nearest limits, ms", "kernels, ms", "ratio"], rows) + made_by(data)
 
 
+BEFORE, DRAWN = ("projection", "lists tested, and packing"), ("forward: alpha and depth", "pixels in order")
 KERNELS_OF = {
-    "draw a view never seen before": ("projection", "packing", "block lists", "forward"),
-    "draw a view seen before": ("projection", "forward"),
-    "image and gradient": ("projection", "forward", "adjoint: walk", "adjoint: add up", "sums to gradient"),
+    "draw a view never seen before": ("projection", "packing", "block lists", *DRAWN),
+    "draw a view seen before": (*BEFORE, *DRAWN),
+    "image and gradient": (*BEFORE, *DRAWN, "adjoint: walk", "adjoint: add up", "sums to gradient"),
     "exact Fisher diagonal": (
-        "projection", "exact Fisher: walk 1", "exact Fisher: walk 2", "exact Fisher: add up", "sums to exact Fisher",
+        *BEFORE, "exact Fisher: walk 1", "exact Fisher: walk 2", "exact Fisher: add up", "sums to exact Fisher",
     ),
     "exact 11x11 blocks": (
-        "projection", "block Fisher: walk 1", "block Fisher: walk 2", "block Fisher: add up", "sums to block Fisher",
+        *BEFORE, "block Fisher: walk 1", "block Fisher: walk 2", "block Fisher: add up", "sums to block Fisher",
     ),
 }  # fmt: skip
 """The kernels of each operation that `mgs bench splat` times."""
