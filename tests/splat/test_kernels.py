@@ -13,6 +13,7 @@ from mgs.splat import ListCache, as_drjit, kernels, walking
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y
 from mgs.splat.projection import camera_array, project
 from mgs.splat.walking import CENTRE, exp2, in_order
+
 from .scenes import make_camera, make_gaussians
 
 
@@ -90,7 +91,7 @@ if sys.argv[1] == "llvm":
     runtime._keep_order = lambda: None
 runtime.start()
 from mgs.splat import fisher, render
-from .scenes import make_camera, make_gaussians
+from splat.scenes import make_camera, make_gaussians
 gaussians, camera = make_gaussians(40, 1), make_camera()
 images = [np.asarray(render(gaussians, camera).rgb), fisher(gaussians, camera)]
 print(hashlib.sha256(b"".join(image.tobytes() for image in images)).hexdigest())
