@@ -87,11 +87,10 @@ def camera_array(camera: Camera) -> Any:
     return mi.Float64(padded(numbers, np.float64))
 
 
-def _camera_parts(array: Any) -> tuple[Any, Any, list[Any], list[Any], Any]:
-    """Of a `camera_array`: rows of the rotation, translation, [fx, fy, cx, cy], the four bounds, position."""
-    c = [dr.gather(mi.Float64, array, mi.UInt32(i)) for i in range(23)]
-    R = [mi.Vector3d(*c[3 * i : 3 * i + 3]) for i in range(3)]
-    return R, mi.Vector3d(*c[9:12]), c[12:16], c[16:20], mi.Vector3d(*c[20:23])
+def _numbers(array: Any, first: int, end: int) -> list[Any]:
+    """Some numbers of a `camera_array`, each as an array of its own: what a kernel reads once for all Gaussians. Each is copied
+    in memory, which takes a microsecond."""
+    return [dr.gather(mi.Float64, array, mi.UInt32(i)) for i in range(first, end)]
 
 
 def rotation_columns(quats: Any) -> list[Any]:
@@ -115,7 +114,7 @@ def sh_basis(means: Any, camera: Any, coefficients: int) -> list[Any]:
 
     means: Vector3d, world, metres; camera: `camera_array`. Returns K arrays Float64 [N], in the order and signs of 3DGS.
     """
-    offset = means - _camera_parts(camera)[4]
+    offset = means - mi.Vector3d(*_numbers(camera, 20, 23))
     directions = offset * dr.rsqrt(dr.maximum(dr.squared_norm(offset), 1e-24))
     return dr.sh_eval(directions, round(coefficients**0.5) - 1)
 
@@ -137,7 +136,8 @@ def axes2d(mean: Any, quats: Any, camera: Any) -> tuple[Any, list[Any], Any]:
     the image of each of the three local axes (unit vectors), pixels per metre, three Vector2d;
     the mask of centres in front of the near plane.
     """
-    R, t, (fx, fy, cx, cy), (x0, x1, y0, y1), _ = _camera_parts(camera)
+    R, t = [mi.Vector3d(*_numbers(camera, 3 * i, 3 * i + 3)) for i in range(3)], mi.Vector3d(*_numbers(camera, 9, 12))
+    fx, fy, cx, cy, x0, x1, y0, y1 = _numbers(camera, 12, 20)
     x, y, z = (dr.dot(row, mean) + t[i] for i, row in enumerate(R))
     visible = z > NEAR
     z = dr.select(visible, z, 1)
