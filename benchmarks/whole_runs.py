@@ -17,6 +17,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from versions import commit
+
 from mgs import runtime
 from mgs.data.dataset import load_dataset
 from mgs.files import write_json
@@ -93,10 +95,8 @@ def main(out: Path, work: Path, old: Path, new: Path, datasets: list[str]) -> No
     records = []
     for dataset, gaussians, budget in (given.rsplit(":", 2) for given in datasets):
         records += study(work / Path(dataset).parent.name, {"old": old, "new": new}, Path(dataset), gaussians, budget)
-    asked = ["git", "-C", str(old), "rev-parse", "--short", "HEAD"]
-    commit = subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
     made = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
-    write_json(out, made | {"old": commit, "records": records})
+    write_json(out, made | {"old": commit(old), "new": commit(new), "records": records})
 
 
 if __name__ == "__main__":

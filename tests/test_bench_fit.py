@@ -14,6 +14,7 @@ from mgs.report.evaluation import evaluate
 def root(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bench") / "dataset"
     synthetic.write_dataset(folder)
+    synthetic.write_dataset(folder / "test")
     return folder
 
 
@@ -40,6 +41,8 @@ def test_the_figures_are_those_of_the_fits(root, small):
     figures = found["figures"]
     assert (figures["psnr_held_out"], figures["psnr_inside_10k"]) == (means["psnr"], means["psnr_inside"])
     assert figures["psnr_inside_20k"] == found["held_out"][400]["psnr_inside"] != means["psnr_inside"]
+    tests = case.dataset.test_views().frames
+    assert found["test"][200] == evaluate(fitted.gaussians, [], [], test_frames=tests, spacing=case.prior.spacing)["test"]
     end = found["end"]
     assert end["phi"] == case.phi(fitted.gaussians)
     longer = case.fit(case.start, case.taken, TrainSettings(passes=3 * fitted.passes, tolerance=0.0))
@@ -53,11 +56,13 @@ def test_passes_are_those_of_the_first_fit_that_reaches_the_objective(root, smal
     case = bench._case(bench.load_dataset(root), 200, "even", 4)
     found = bench.passes_to(case, case.start)
     assert found["share"] == found["tried"][-1]["passes"] / 2
+    assert found["share_of_seconds"] == found["tried"][-1]["seconds"] / found["old"]["seconds"]
     assert found["tried"][-1]["phi"] <= found["old"]["phi"]
     assert all(one["phi"] > found["old"]["phi"] for one in found["tried"][:-1])
     monkeypatch.setattr(bench, "OLD_PASSES", 60)
     monkeypatch.setattr(bench, "TRIED_PASSES", (1,))
-    assert bench.passes_to(case, case.start)["share"] is None
+    missed = bench.passes_to(case, case.start)
+    assert missed["share"] is missed["share_of_seconds"] is None
 
 
 def test_a_ranking_agrees_with_itself(root, small, monkeypatch):

@@ -17,13 +17,13 @@ N = 60
 LAM = {"colour": 0.02, "scale": 0.05, "rotation": 0.1, "opacity": 0.01, "mean": 30.0}
 
 
-@pytest.fixture(scope="module", params=["frozen", "normal", "free"])
+@pytest.fixture(scope="module", params=[("frozen", 0.0), ("normal", 0.0), ("free", 0.0), ("frozen", 0.3), ("free", 2.0)])
 def case(request):
     """Objective, model, and from the oracle: Jacobian [M,P], residual [M], weights [M], lam [P] and distance to the start [P].
 
-    Parameters are ordered as `learned` has them, one array after the other.
+    Parameters are ordered as `learned` has them, one array after the other. Where alpha has a weight it is a fourth channel.
     """
-    means = request.param
+    means, alpha_weight = request.param
     start = surface_gaussians(N)
     start.log_scales += 0.9
     rng = np.random.default_rng(5)
@@ -43,17 +43,20 @@ def case(request):
     cameras = [
         Camera(first.K, 24, 20, look_at(distance * np.array([np.cos(a), np.sin(a), 0.4]), [0, 0, 0.4])) for a in (0.3, 2.0)
     ]
-    truths = [rng.uniform(0, 1, (20, 24, 3)).astype(np.float32) for _ in cameras]
+    channels = 4 if alpha_weight else 3
+    truths = [rng.uniform(0, 1, (20, 24, channels)).astype(np.float32) for _ in cameras]
     weights = [(rng.uniform(size=(20, 24, 1)) > 0.2).astype(np.float32) for _ in cameras]
-    targets = [np.dstack([t, w]) for t, w in zip(truths, weights, strict=True)]
-    goal = objective(model, cameras, targets, start, LAM, means=means, normals=normals)
+    targets = [np.dstack([t[..., :3], w, t[..., 3:]]) for t, w in zip(truths, weights, strict=True)]
+    goal = objective(model, cameras, targets, start, LAM, means=means, normals=normals, alpha_weight=alpha_weight)
     columns = np.split(np.arange(11 + directions.shape[1]), (3, 6, 10, 11))
     rows = []
     for camera in cameras:
-        J = reference.jacobian(model, camera, means=means, normals=normals)
-        rows.append(np.concatenate([J[..., c].reshape(20 * 24 * 3, -1) for c in columns], 1))
-    images = [reference.render(model, camera)["rgb"] for camera in cameras]
-    residual = np.concatenate([(i - t).ravel() for i, t in zip(images, truths, strict=True)])
+        J = reference.jacobian(model, camera, means=means, normals=normals, alpha_weight=alpha_weight)
+        rows.append(np.concatenate([J[..., c].reshape(20 * 24 * channels, -1) for c in columns], 1))
+    images = [reference.render(model, camera) for camera in cameras]
+    images = [np.dstack([i["rgb"], i["alpha"]])[..., :channels] for i in images]
+    scale = np.sqrt([1.0, 1.0, 1.0, alpha_weight])[:channels]
+    residual = np.concatenate([((i - t) * scale).ravel() for i, t in zip(images, truths, strict=True)])
     weight = np.concatenate([np.broadcast_to(w, t.shape).ravel() for w, t in zip(weights, truths, strict=True)])
     changes = [(getattr(model, name) - getattr(start, name)).ravel() for name in learned()] + [offsets.ravel()]
     lam = np.concatenate([np.full(change.size, LAM[kind]) for change, kind in zip(changes, LAM, strict=True)])
@@ -155,6 +158,16 @@ def test_a_lam_for_each_degree_of_the_colours():
     found = fit(model, [camera], [unseen], TrainSettings(passes=40, rates={"colour": 0.2}), start=start, lam={"colour": lam})
     assert found.losses[0] == pytest.approx((lam * away**2).sum() / unseen[..., :3].size, rel=1e-5)
     assert found.loss < 0.05 * found.losses[0]
+
+
+def test_a_weight_for_alpha_needs_alpha():
+    start = surface_gaussians(50)
+    camera, target = surface_camera(start, 24, 20), np.zeros((20, 24, 4), np.float32)
+    goal = objective(start, [camera], [target], alpha_weight=0.1)
+    with pytest.raises(InputError, match="target: has 4 channels, and with a weight for alpha it needs 5, alpha as the last"):
+        goal.phi(as_drjit(start))
+    with_alpha = objective(start, [camera], [np.dstack([target, target[..., 0]])])
+    assert with_alpha.photos[0].size == (24, 20, 3), "without a weight alpha is not read"
 
 
 @pytest.mark.parametrize(

@@ -165,7 +165,7 @@ def test_work_of_the_kernels_is_what_their_authors_meant():
     assert whole.divisions == forward.divisions == 0
     out = kernels.forward(lists, packed, False)
     dr.eval(out)
-    walk = next(k for k in run_kernels(lambda: kernels.adjoint(lists, packed, out, out, False, False), 1) if k.ir)
+    walk = next(k for k in run_kernels(lambda: kernels.adjoint(lists, packed, out, out, False, 3), 1) if k.ir)
     adjoint, zeros = count_work(walk.ir).loops
     assert adjoint.bytes == 4 + 48 + 2 * 16
     assert (zeros.bytes, zeros.flops) == (2 * 16, 0)

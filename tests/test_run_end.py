@@ -130,6 +130,7 @@ def test_a_run_of_a_version_that_did_not_say_why_it_ended(loaded, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        (["--alpha-weight", "-1"], "--alpha-weight -1.0: Input should be greater than or equal to 0"),
         (["--stop-gain", "0"], "--stop-gain 0.0: Input should be greater than 0"),
         (["--stop-gain", "nan"], "--stop-gain nan: Input should be"),
         (["--stop-uncertainty", "1"], "--stop-uncertainty 1.0: Input should be less than 1"),

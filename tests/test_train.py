@@ -54,6 +54,22 @@ def test_fit_lowers_the_loss_a_hundredfold_and_reports_it(truth, cameras, target
     assert np.array_equal(found.gaussians.means, truth.means)
 
 
+def test_alpha_as_a_channel_makes_alpha_right(truth, cameras, targets):
+    """A black model in front of black: what it covers cannot be told from colours, and can from alpha."""
+    black = Gaussians(truth.means, truth.log_scales, truth.quats, truth.logit_opacities, np.full_like(truth.sh, -2.0))
+    start = Gaussians(black.means, black.log_scales, black.quats, np.zeros_like(black.logit_opacities), black.sh)
+    alphas = [np.asarray(render(black, camera).alpha) for camera in cameras]
+    with_alpha = [np.dstack([np.zeros((*a.shape, 3)), np.ones_like(a), a]) for a in alphas]
+
+    def error(weight):
+        settings = TrainSettings(passes=20, tolerance=0.0, alpha_weight=weight)
+        found = fit(start, cameras, with_alpha, settings).gaussians
+        drawn = [np.asarray(render(found, camera).alpha) for camera in cameras]
+        return float(np.mean([np.abs(d - a).mean() for d, a in zip(drawn, alphas, strict=True)]))
+
+    assert error(1.0) < 0.3 * error(0.0)
+
+
 def test_one_step_is_adam_on_the_gradient_of_the_summed_squared_error(truth, cameras, targets):
     """The first Adam step moves each parameter by its rate times g / (|g| + epsilon): against finite differences."""
     from mgs.active.optimisers import ADAM_EPSILON

@@ -51,7 +51,8 @@ def remaining_decrease(
     means, kinds = settings.train.means, groups(0, settings.train.means)
     by_kind = lam_by_kind(settings.regularisation(kinds), kinds)
     targets = Deferred(range(len(frames)), lambda k: without_gain(target_of(frames[k]), gains[k]))
-    goal = objective(gaussians, cameras, targets, start, by_kind, None, means, initial_normals(prior))
+    weight = settings.train.alpha_weight
+    goal = objective(gaussians, cameras, targets, start, by_kind, None, means, initial_normals(prior), weight)
     model = as_drjit(gaussians)
     phi = goal.phi(model)
     share = newton_decrease(goal, model, CG_ITERATIONS, progress)[-1] / max(phi, 1e-30)

@@ -27,7 +27,7 @@ from mgs.splat import ListCache, as_drjit
 from mgs.splat.blocks import BlockLists
 from mgs.splat.projection import project
 from mgs.splat.recording import frozen
-from mgs.splat.rendering import composite_rgb
+from mgs.splat.rendering import composite_channels
 
 
 @dataclass(frozen=True)
@@ -99,12 +99,12 @@ def _step(
 ) -> tuple[Gaussians, list[list[Any]], Any]:
     """One step of the optimiser on one image and its share of the prior. Returns parameters, buffers, loss before the step.
 
-    buffers, rates: for each of the learned arrays; packed: the Gaussians' splats, packed for the lists; size: (width, height);
-    t: UInt32, step number from 1; target, weight: Float [H*W*3]; information: see `mgs.active.optimisers.Optimiser`.
+    buffers, rates: for each of the learned arrays; packed: the Gaussians' splats, packed for the lists; size: that of a
+    `Photo`; t: UInt32, step number from 1; target, weight: Float [H*W*C]; information: see `mgs.active.optimisers.Optimiser`.
     """
     copy = watched(gaussians, prior)
-    rgb = composite_rgb(project(copy, camera), packed, lists, *size)
-    error = (rgb.array - target) * weight
+    drawn = composite_channels(project(copy, camera), packed, lists, *size)
+    error = (drawn.array - target) * weight
     loss = dr.mean(dr.square(error))
     dr.backward(0.5 * dr.sum(dr.square(error)))
     step, moved, kept = mi.Float(t), {}, []
@@ -135,14 +135,16 @@ def fit(
     """Fit Gaussians to images: lower Phi (`mgs.active.objective`). Their means stay unless `settings.means` says otherwise.
 
     cameras, and a target of each: [H,W,3] linear RGB, the rock in front of black; or [H,W,4], in which the last channel is the
-    weight of the pixel, 1 where its colour is known and 0 where it is not (`mgs.data.dataset.Frame.target`).
+    weight of the pixel, 1 where its colour is known and 0 where it is not; or [H,W,5], in which alpha comes after the weight
+    (`mgs.data.dataset.target_of`). With an `alpha_weight` in the settings it must be there.
     start: where the prior holds the parameters; the Gaussians given, by default. lam: the prior's information about each kind
     of parameter (`mgs.gaussians.learned`), (pixel value / unit of the parameter)^2: one number, or but for means an array that
     broadcasts to the parameter's shape (for colours, say, another number for each degree); by default there is none. normals:
     [N,3], of any length but 0, the directions of means that move along them; read only then.
     Starts with fresh buffers of the optimiser, so the result depends on its arguments alone, bitwise. on_pass(done, most)
     reports. Stops as `mgs.active.stopping.stop_reason` says. Raises InputError where a parameter of the Gaussians given is not
-    finite, the optimiser is unknown, `start` is of another shape, or means are to move without normals or without a rate.
+    finite, the optimiser is unknown, `start` is of another shape, means are to move without normals or without a rate, or
+    alpha has a weight and a target has no alpha.
     """
     settings = settings or TrainSettings()
     optimiser = row_named(OPTIMISERS, settings.optimiser, "optimiser")
@@ -150,7 +152,7 @@ def fit(
     if missing := [kind for kind in kinds if kind not in settings.rates]:
         raise InputError(f"train.rates: has no rate of {missing[0]}, which is learned; give one, metres")
     model = as_drjit(gaussians)
-    goal = objective(gaussians, cameras, targets, start, lam, cache, settings.means, normals)
+    goal = objective(gaussians, cameras, targets, start, lam, cache, settings.means, normals, settings.alpha_weight)
     shapes = [away.shape for away, _ in goal.pulls(model)]
     buffers = [[dr.zeros(mi.TensorXf, shape) for _ in range(optimiser.buffers)] for shape in shapes]
     information: list[Any] = [None] * len(shapes)

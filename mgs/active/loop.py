@@ -361,7 +361,7 @@ class Loop:
         return replace(self.start, sh=self.stations.initial([self.frames[i] for i in taken]).sh)
 
     def targets(self, taken: list[int], gains: np.ndarray | None = None) -> Sequence[np.ndarray]:
-        """What the model is fitted to in these frames, each [H,W,4] as `target_of`; colours divided by `gains` [V,3]."""
+        """What the model is fitted to in these frames, each as `target_of` has it; colours divided by `gains` [V,3]."""
         if gains is None:
             return Deferred(taken, self.image)
         return Deferred(range(len(taken)), lambda k: without_gain(self.image(taken[k]), gains[k]))

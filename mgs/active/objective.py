@@ -9,6 +9,9 @@ with lam = (sigma / tau)^2 (`mgs.active.criteria.regularisation`). Its curvature
 is the matrix whose diagonal the criteria use: the model that is fitted and the one whose information is measured are the same.
 With lam = 0 it is maximum likelihood, the paper's Eq. 2 up to a constant.
 
+Alpha may be a fourth channel, with noise of its own, sigma_alpha: its squared differences then count alpha_weight =
+(sigma / sigma_alpha)^2 times. What a camera sees of alpha is the outline of the rock.
+
 The means are frozen by default, as in the paper. Where they are "free", all three coordinates are parameters like the others.
 Where they move along the "normal", the parameter is one offset per Gaussian, metres: how far its mean lies from its start,
 along a given normal.
@@ -31,12 +34,12 @@ from mgs.camera import Camera
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians, learned
 from mgs.memory import IMAGE_BYTES, Deferred, kept_within, padded
-from mgs.splat import ListCache, as_drjit, fisher, groups, render
+from mgs.splat import ListCache, as_drjit, fisher, groups
 from mgs.splat.blocks import BlockLists
 from mgs.splat.information import unit_normals
 from mgs.splat.projection import camera_array, project, rows_as_vectors
-from mgs.splat.recording import frozen
-from mgs.splat.rendering import composite_rgb
+from mgs.splat.recording import frozen, one_at_a_time
+from mgs.splat.rendering import composite_channels, splats_and_lists
 
 Vector = list[Any]
 """A number for every learned parameter: a TensorXf for each array of `mgs.gaussians.learned`, of its shape; for means that move
@@ -45,7 +48,8 @@ along their normals the shape is [N]."""
 
 @dataclass(frozen=True)
 class Photo:
-    """An image to fit to: its camera, the same for the kernels, its pixels and their weights, mi.Float [H*W*3]."""
+    """An image to fit to: its camera, the same for the kernels, and mi.Float [H*W*C] its pixels, of C channels, and what their
+    differences are multiplied by."""
 
     camera: Camera
     array: Any
@@ -53,9 +57,9 @@ class Photo:
     weights: Any
 
     @property
-    def size(self) -> tuple[int, int]:
-        """Width and height, pixels."""
-        return self.camera.width, self.camera.height
+    def size(self) -> tuple[int, int, int]:
+        """Width and height, pixels, and the number of channels: 3, or with alpha 4."""
+        return self.camera.width, self.camera.height, len(self.pixels) // (self.camera.width * self.camera.height)
 
     @property
     def nbytes(self) -> int:
@@ -101,19 +105,21 @@ class Prior:
 class Objective:
     """Phi of this module's docstring, for some images. Models are Gaussians with TensorXf fields.
 
-    photos: those beyond IMAGE_BYTES are made anew from their target at every use."""
+    photos: those beyond IMAGE_BYTES are made anew from their target at every use. alpha_weight: as in the module's docstring; 0
+    where alpha is no channel."""
 
     photos: Sequence[Photo]
     prior: Prior
     cache: ListCache
+    alpha_weight: float = 0.0
 
     def loss(self, model: Gaussians) -> float:
         """2 Phi over the number of pixel values: the mean squared error of the images plus the prior's part."""
         penalty = sum(weighted_squares(lam * self.prior.share, d.array) for d, lam in self.pulls(model))
         errors = []
         for photo in self.photos:
-            rgb = render(model, photo.camera, cache=self.cache).rgb.array
-            errors.append(dr.mean(dr.square((rgb - photo.pixels) * photo.weights)) + penalty / len(photo.pixels))
+            drawn = _drawn(model, photo, self.cache)
+            errors.append(dr.mean(dr.square((drawn - photo.pixels) * photo.weights)) + penalty / len(photo.pixels))
             dr.eval(errors[-1])  # or it would hold the image until the last one is done
         return float(np.mean([float(error[0]) for error in errors]))
 
@@ -163,7 +169,7 @@ class Objective:
         """The exact Fisher information of one image."""
         means = self.prior.means
         normals = np.asarray(self.prior.normals) if means == "normal" else None
-        found = fisher(model, photo.camera, cache=self.cache, means=means, normals=normals)
+        found = fisher(model, photo.camera, cache=self.cache, means=means, normals=normals, alpha_weight=self.alpha_weight)
         columns = zip(self.pulls(model), groups(model.sh_degree, means).values(), strict=True)
         return [mi.TensorXf(padded(found[:, c]).reshape(d.shape)) for (d, _), c in columns]
 
@@ -186,17 +192,22 @@ def objective(
     cache: ListCache | None = None,
     means: str = "frozen",
     normals: np.ndarray | None = None,
+    alpha_weight: float = 0.0,
 ) -> Objective:
-    """The objective of `mgs.active.fitting.fit`, from the same arguments; means: the setting of that name.
+    """The objective of `mgs.active.fitting.fit`, from the same arguments; means, alpha_weight: the settings of these names.
 
-    Raises InputError where the start or the normals do not fit the Gaussians, or `means` is not a name in `mgs.splat.MEANS`.
+    Raises InputError where the start or the normals do not fit the Gaussians, `means` is not a name in `mgs.splat.MEANS`, or
+    alpha has a weight and a target has no alpha.
     """
     groups(gaussians.sh_degree, means)  # raises where the name is unknown
     unit = unit_normals(len(gaussians), normals) if means == "normal" else None
     if len(cameras) != len(targets):
         raise ValueError(f"there are {len(cameras)} cameras, but {len(targets)} targets")
-    photo = kept_within(IMAGE_BYTES, lambda i: _photo(cameras[i], np.asarray(targets[i], np.float32)), lambda p: p.nbytes)
-    photos = Deferred(range(len(cameras)), photo)
+
+    def photo(i: int) -> Photo:
+        return _photo(cameras[i], np.asarray(targets[i], np.float32), alpha_weight)
+
+    photos = Deferred(range(len(cameras)), kept_within(IMAGE_BYTES, photo, lambda p: p.nbytes))
     start = gaussians if start is None else start
     if start.sh.shape != gaussians.sh.shape:
         raise InputError(f"start: has colours of shape {start.sh.shape}, expected {gaussians.sh.shape}, that of the Gaussians")
@@ -206,7 +217,7 @@ def objective(
     values = {name: _filled((lam or {}).get(kind, 0.0), getattr(start, name).shape) for name, kind in learned(means).items()}
     directions = None if unit is None else mi.TensorXf(padded(unit))
     prior = Prior(start, values, dr.opaque(mi.Float, 1 / max(len(photos), 1)), directions)
-    return Objective(photos, prior, cache or ListCache())
+    return Objective(photos, prior, cache or ListCache(), alpha_weight)
 
 
 def weighted_squares(lam: Any, away: Any) -> Any:
@@ -221,11 +232,23 @@ def _filled(lam: float | np.ndarray, shape: tuple[int, ...]) -> Any:
     return mi.Float(padded(np.broadcast_to(lam, shape).astype(np.float32)).ravel())
 
 
-def _photo(camera: Camera, target: np.ndarray) -> Photo:
-    """target: as `fit` takes it."""
-    rgb = target[..., :3]
-    weights = np.broadcast_to(target[..., 3:] if target.shape[-1] == 4 else np.ones((), np.float32), rgb.shape)
-    return Photo(camera, camera_array(camera), *(mi.Float(padded(a).ravel()) for a in (rgb, weights)))
+def _photo(camera: Camera, target: np.ndarray, alpha_weight: float) -> Photo:
+    """target: as `fit` takes it. Raises InputError where alpha has a weight and the target has none."""
+    pixels, channels = target[..., :3], target.shape[-1]
+    weights = np.broadcast_to(target[..., 3:4] if channels > 3 else np.ones((), np.float32), pixels.shape)
+    if alpha_weight:
+        if channels < 5:
+            raise InputError(f"target: has {channels} channels, and with a weight for alpha it needs 5, alpha as the last")
+        pixels = np.dstack([pixels, target[..., 4]])
+        weights = np.dstack([weights, np.float32(np.sqrt(alpha_weight)) * weights[..., 0]])
+    return Photo(camera, camera_array(camera), *(mi.Float(padded(a).ravel()) for a in (pixels, weights)))
+
+
+@one_at_a_time
+def _drawn(model: Gaussians, photo: Photo, cache: ListCache) -> Any:
+    """The pixels of an image as the model has them, Float [H*W*C]. Raises InputError as `mgs.splat.render`."""
+    splats, lists, packed = splats_and_lists(model, photo.camera, cache)
+    return composite_channels(splats, packed, lists, *photo.size).array
 
 
 def newton_decrease(
@@ -292,8 +315,8 @@ def _image_gradient(
 ) -> Vector:
     """The derivative of half the summed squared error of one image."""
     copy = watched(model, prior)
-    rgb = composite_rgb(project(copy, camera), packed, lists, *size)
-    dr.backward(0.5 * dr.sum(dr.square((rgb.array - target) * weight)))
+    drawn = composite_channels(project(copy, camera), packed, lists, *size)
+    dr.backward(0.5 * dr.sum(dr.square((drawn.array - target) * weight)))
     return _gradients(copy, prior)
 
 
@@ -305,12 +328,12 @@ def _image_curvature(
     copy = watched(model, prior)
     for name, tangent in zip(prior.lam, vector, strict=True):
         dr.set_grad(getattr(copy, name), prior.across(name, tangent))
-    rgb = composite_rgb(project(copy, camera), packed, lists, *size)
-    dr.forward_to(rgb)
-    along = dr.detach(dr.grad(rgb).array) * dr.square(weight)
+    drawn = composite_channels(project(copy, camera), packed, lists, *size)
+    dr.forward_to(drawn)
+    along = dr.detach(dr.grad(drawn).array) * dr.square(weight)
     copy = watched(model, prior)
-    rgb = composite_rgb(project(copy, camera), packed, lists, *size)
-    dr.backward(dr.sum(rgb.array * along))
+    drawn = composite_channels(project(copy, camera), packed, lists, *size)
+    dr.backward(dr.sum(drawn.array * along))
     return _gradients(copy, prior)
 
 

@@ -82,6 +82,9 @@ class TrainSettings(BaseModel):
     rates: dict[str, Annotated[float, Field(ge=0, allow_inf_nan=False)]] = RATES
     """Learning rate of each kind of parameter; kinds left out take those of RATES. A rate of 0 leaves a kind as it is. That of
     `mean`, metres, is read only where means are learned, and must be there then; `mgs nbv` sets it (`with_spacing`)."""
+    alpha_weight: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)] = 0.0
+    """(sigma_rgb / sigma_alpha)^2, with which alpha is a fourth channel of a pixel; 0: it is none. The criteria leave it out:
+    it would tell no pose from another (docs/fit.md)."""
     decay: Positive = 0.1
     """The rates fall by this factor over `passes`."""
     seed: Annotated[int, Field(ge=0)] = 0
@@ -179,7 +182,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 OPTIONS = (
     "policy", "nearest", "travel", "estimator", "budget", "batch", "stop_gain", "stop_uncertainty", "seeds", "seed", "lam",
-    "pixel_noise", "evaluate_every", "means", "optimiser", "exposure", "passes", "warm_passes",
+    "pixel_noise", "evaluate_every", "means", "optimiser", "alpha_weight", "exposure", "passes", "warm_passes",
 )  # fmt: skip
 """Settings that `mgs nbv` has an option for, of the same name."""
 

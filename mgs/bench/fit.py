@@ -1,7 +1,7 @@
 """What the fit of a dataset comes to: accuracy of the model, and how near the end a fit is when it stops, beside targets.
 
 Everything is measured on twelve views spread evenly in azimuth, or on states of four to eight views, with the settings that
-`mgs nbv` has by default. Times are of the fits alone, in this process.
+`mgs nbv` has by default. Times are of the fits alone, in this process; let nothing else run.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ TARGETS = {
     "ranking_tau": ("at least", 0.95),
     "ranking_regret": ("at most", 0.02),
     "predicted_over_found_decrease": ("within a factor of", 2.0),
-    "passes_to_old_objective_cold": ("at most", 1 / 3),
-    "passes_to_old_objective_warm": ("at most", 1 / 10),
+    "seconds_to_old_objective_cold": ("at most", 1 / 3),
+    "seconds_to_old_objective_warm": ("at most", 1 / 10),
 }
 """What this project asks of itself for the dataset of the demo, by the names in "figures" of `bench_fit`."""
 
@@ -90,13 +90,15 @@ class _Case:
 def bench_fit(root: Path, report: Callable[[str], None]) -> dict[str, Any]:
     """Measure everything in TARGETS on one dataset, which needs depth. report(what) is told before each part.
 
-    Returns "figures" by the names of TARGETS, and what they were made from. Raises InputError as `load_dataset`.
+    Returns "figures" by the names of TARGETS, and what they were made from; "test", the same metrics as "held_out", over the
+    test views, where the dataset has some. Raises InputError as `load_dataset`.
     """
     dataset = load_dataset(root)
     report(f"accuracy of {' and '.join(f'{n:,}' for n in SIZES)} Gaussians on {VIEWS} views")
     cases = {n: _case(dataset, n, "even", VIEWS) for n in SIZES}
     fits = {n: case.fit(case.start, case.taken, TrainSettings()) for n, case in cases.items()}
     means = {n: _held_out(cases[n], fits[n].gaussians) for n in SIZES}
+    tests = {n: _on_test_views(cases[n], fits[n].gaussians) for n in SIZES}
     small, large = SIZES
     case, stopped = cases[small], fits[small]
     report("the end of the fit: predicted and found")
@@ -115,10 +117,10 @@ def bench_fit(root: Path, report: Callable[[str], None]) -> dict[str, Any]:
         "ranking_tau": float(np.mean([r["tau"] for r in ranking])),
         "ranking_regret": float(np.mean([r["regret"] for r in ranking])),
         "predicted_over_found_decrease": end["predicted"] / end["found"],
-        "passes_to_old_objective_cold": cold["share"],
-        "passes_to_old_objective_warm": warm["share"],
+        "seconds_to_old_objective_cold": cold["share_of_seconds"],
+        "seconds_to_old_objective_warm": warm["share_of_seconds"],
     }
-    return {"figures": figures, "held_out": means, "end": end, "cold": cold, "warm": warm, "ranking": ranking}
+    return {"figures": figures, "held_out": means, "test": tests, "end": end, "cold": cold, "warm": warm, "ranking": ranking}
 
 
 def _lam_by_kind() -> dict[str, float]:
@@ -150,6 +152,15 @@ def _held_out(case: _Case, model: Gaussians) -> dict[str, Any]:
     return found
 
 
+def _on_test_views(case: _Case, model: Gaussians) -> dict[str, Any]:
+    """Mean metrics over the test views; none where the dataset has none."""
+    tests = case.dataset.test_views()
+    if tests is None:
+        return {}
+    found: dict[str, Any] = evaluate(model, [], [], test_frames=tests.frames, spacing=case.prior.spacing)["test"]
+    return found
+
+
 def _end_of_fit(case: _Case, stopped: Fit) -> dict[str, Any]:
     """Phi where the fit stopped, the decrease that is predicted from there, and the one that a longer fit finds."""
     goal = case.objective(case.taken)
@@ -166,8 +177,9 @@ def _end_of_fit(case: _Case, stopped: Fit) -> dict[str, Any]:
 def passes_to(case: _Case, model: Gaussians) -> dict[str, Any]:
     """How many passes a fit needs to reach the objective that the first version's rates reach in OLD_PASSES passes.
 
-    Returns "share", the fewest of TRIED_PASSES that reach it over OLD_PASSES (None where none does), and of every fit its
-    passes, objective and seconds.
+    Returns "share", the fewest of TRIED_PASSES that reach it over OLD_PASSES, and "share_of_seconds", the time that they take
+    over that of OLD_PASSES, both None where none reaches it; and of every fit its passes, objective and seconds. A short fit
+    comes before those that are timed, so that none of them compiles kernels.
     """
 
     def timed(train: TrainSettings) -> dict[str, Any]:
@@ -175,14 +187,18 @@ def passes_to(case: _Case, model: Gaussians) -> dict[str, Any]:
         found = case.fit(model, case.taken, train)
         return {"passes": train.passes, "seconds": time.perf_counter() - began, "phi": case.phi(found.gaussians)}
 
+    for optimiser in ("adam", "natural"):
+        timed(TrainSettings(optimiser=optimiser, passes=1))
     old = timed(TrainSettings(optimiser="adam", passes=OLD_PASSES, tolerance=0.0, rates=OLD_RATES))
     tried: list[dict[str, Any]] = []
     for passes in TRIED_PASSES:
         tried.append(timed(TrainSettings(passes=passes, tolerance=0.0)))
         if tried[-1]["phi"] <= old["phi"]:
             break
-    reached = tried[-1]["phi"] <= old["phi"]
-    return {"old": old, "tried": tried, "share": tried[-1]["passes"] / OLD_PASSES if reached else None}
+    last = tried[-1]
+    reached = last["phi"] <= old["phi"]
+    shares = {"share": last["passes"] / OLD_PASSES, "share_of_seconds": last["seconds"] / old["seconds"]}
+    return {"old": old, "tried": tried, **{name: value if reached else None for name, value in shares.items()}}
 
 
 def _ranking(case: _Case) -> dict[str, float]:

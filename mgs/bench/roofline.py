@@ -162,7 +162,7 @@ def roofline_rows(gaussians: Gaussians, camera: Camera, repeats: int, report: Ca
         "forward": lambda: kernels.forward(lists, packed, False),
         "forward: alpha and depth": lambda: kernels.forward(lists, packed, True),
         "jvp": lambda: kernels.jvp(lists, packed, tangents),
-        "adjoint": lambda: kernels.adjoint(lists, packed, out, d_out, False, False),
+        "adjoint": lambda: kernels.adjoint(lists, packed, out, d_out, False, 3),
         "exact Fisher": lambda: kernels.fisher(lists, packed, background, False),
         "block Fisher": lambda: kernels.fisher(lists, packed64, background, True),
     }

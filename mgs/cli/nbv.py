@@ -95,6 +95,12 @@ def nbv(
         str, typer.Option(help="What the means may do: frozen (stay), normal (move along the prior's normals), or free.")
     ] = "frozen",
     optimiser: Annotated[str, typer.Option(help="Optimiser of the fit: natural or adam.")] = "natural",
+    alpha_weight: Annotated[
+        float,
+        typer.Option(
+            metavar="WEIGHT", help="How much a pixel's alpha counts in the fit, beside its colours: 0.1 to 0.3, or not."
+        ),
+    ] = 0.0,
     rate: Annotated[
         list[str] | None,
         typer.Option(
@@ -147,7 +153,9 @@ def nbv(
         return
     if (dataset is None) == (capture is None) or out is None:
         raise InputError("nbv: give a DATASET or --capture SCENE, and --out RUN; or --resume RUN")
-    train: dict[str, Any] = {"means": means, "optimiser": optimiser, "rates": pairs("--rate", rate)}
+    train: dict[str, Any] = {
+        "means": means, "optimiser": optimiser, "alpha_weight": alpha_weight, "rates": pairs("--rate", rate),
+    }  # fmt: skip
     if passes is not None:
         train["passes"] = passes
     settings: dict[str, Any] = {

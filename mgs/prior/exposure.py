@@ -67,9 +67,9 @@ def solve_gains(colours: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def without_gain(target: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """A target [H,W,4], colours and the weight of the pixel (`mgs.data.dataset.target_of`), with its colours divided by the
-    gains [3] of the three channels; float32."""
-    return target / np.append(gain, 1).astype(np.float32)
+    """A target [H,W,C], colours and what `mgs.data.dataset.target_of` has beside them, with its colours divided by the gains
+    [3] of the three channels; float32."""
+    return target / np.append(gain, np.ones(target.shape[-1] - 3)).astype(np.float32)
 
 
 def exposure_of(prior: Prior) -> Callable[[Sequence[Frame]], np.ndarray]:

@@ -174,11 +174,12 @@ ADJOINT_SUMS = {False: 8, True: 10}
 
 
 @frozen(recorded_sizes)
-def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, ...], d_out: tuple[Any, ...], means: bool, whole: bool) -> Any:
+def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, ...], d_out: tuple[Any, ...], means: bool, channels: int) -> Any:
     """What `splat_gradient` needs to make the gradient of each splat: sums over pixels, to be read through `sums_by_splat`.
 
-    out, d_out: the output of `forward`, and the gradient dL of a loss with respect to it. Without `whole` the loss depends on
-    red, green and blue alone; of alpha and depth nothing is read then, and the sum for depth is 0.
+    out, d_out: the output of `forward`, and the gradient dL of a loss with respect to it. channels: on how many of red, green,
+    blue, alpha and depth, in this order, the loss depends, at least 3; of the others nothing is read, and without depth its
+    sum is 0.
     Sums: w dL for red, green, blue and depth (4). With s the derivative of the loss by ln alpha at the pixel: s times 1, xi^2,
     xi eta, eta^2 (4), and, if means have gradients, s times xi, eta (2).
     """
@@ -187,8 +188,8 @@ def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, ...], d_out: tuple[A
     for pixel in range(PIXELS):
         places = lists.block * PIXELS + pixel
         rgba, d_rgba = (list(dr.gather(mi.Vector4f, a[0], places)) for a in (out, d_out))
-        values, slopes = (rgba, d_rgba) if whole else (rgba[:3], d_rgba[:3])
-        if whole:
+        values, slopes = rgba[:channels], d_rgba[:channels]
+        if channels == 5:
             values, slopes = ([*v, dr.gather(mi.Float, a[1], places)] for v, a in ((rgba, out), (d_rgba, d_out)))
         dL.append(slopes)
         pixels.append([T[pixel], sum(v * d for v, d in zip(values, slopes, strict=True))])
@@ -204,9 +205,9 @@ def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, ...], d_out: tuple[A
                 transmittance, behind = pixels[j * BLOCK_X + x]
                 dr_, dg, db, *others = dL[j * BLOCK_X + x]
                 alpha, w, after, room = blend(raw, transmittance)
-                c = b * db
-                if others:  # of alpha and depth
-                    c = dr.fma(b, db, dr.fma(splat.depth, others[1], others[0]))
+                c = dr.fma(b, db, others[0]) if others else b * db  # the first of the others is that of alpha
+                if len(others) == 2:
+                    c = dr.fma(splat.depth, others[1], c)
                     sums[3] = dr.fma(w, others[1], sums[3])
                 c = dr.fma(r, dr_, dr.fma(g, dg, c))
                 behind = dr.fma(-c, w, behind)

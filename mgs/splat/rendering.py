@@ -160,20 +160,21 @@ class _Rasterise(dr.CustomOp):
     """Compositing as an operation of Dr.Jit's AD: splats -> red, green, blue, alpha, depth times alpha, Float [H*W] each.
 
     Its derivative is written by hand: Dr.Jit's own would have to store the state of every pixel before every splat.
-    packed, lists: of these splats; places: from `_block_major`; means: whether mean_x and mean_y have gradients; whole: whether
-    alpha and depth are wanted, too. Otherwise they are left out.
+    packed, lists: of these splats; places: from `_block_major`; means: whether mean_x and mean_y have gradients; channels: how
+    many of the outputs are wanted, from red on, at least 3. The others are left out.
     """
 
-    def eval(self, splats: Splats, packed: Any, lists: BlockLists, places: Any, means: bool, whole: bool) -> Any:
-        self.splats, self.packed, self.lists, self.places, self.means, self.whole = splats, packed, lists, places, means, whole
-        self.out = kernels.forward(lists, packed, whole)
+    def eval(self, splats: Splats, packed: Any, lists: BlockLists, places: Any, means: bool, channels: int) -> Any:
+        self.splats, self.packed, self.lists, self.places = splats, packed, lists, places
+        self.means, self.channels = means, channels
+        self.out = kernels.forward(lists, packed, channels == 5)
         return self._in_order(self.out)
 
     def _in_order(self, out: tuple[Any, ...]) -> Any:
         """The output of a kernel, block by block, as arrays of pixels row by row."""
         pixel = dr.gather(mi.Vector4f, out[0], self.places, mode=dr.ReduceMode.NoConflicts)
-        if not self.whole:
-            return tuple(pixel)[:3]
+        if self.channels < 5:
+            return tuple(pixel)[: self.channels]
         return *pixel, dr.gather(mi.Float, out[1], self.places, mode=dr.ReduceMode.NoConflicts)
 
     def forward(self) -> None:
@@ -187,7 +188,7 @@ class _Rasterise(dr.CustomOp):
         d_out = tuple(dr.zeros(mi.Float, len(out)) for out in self.out)
         for array, value in zip(d_out, (mi.Vector4f(r, g, b, alpha), *depth), strict=True):
             dr.scatter(array, value, self.places, mode=dr.ReduceMode.NoConflicts)
-        placed = kernels.adjoint(self.lists, self.packed, self.out, d_out, self.means, self.whole)
+        placed = kernels.adjoint(self.lists, self.packed, self.out, d_out, self.means, self.channels)
         sums = sums_by_splat(self.lists, placed, kernels.ADJOINT_SUMS[self.means])
         self.set_grad_in("splats", kernels.splat_gradient(sums, self.splats))
 
@@ -297,7 +298,7 @@ def composite(splats: Splats, packed: Any, lists: BlockLists, width: int, height
 
     packed: the splats' numbers from `walking.pack`; lists: their block lists; width, height: pixels.
     """
-    r, g, b, alpha, weighted = _rasterised(splats, packed, lists, width, height, True)
+    r, g, b, alpha, weighted = _rasterised(splats, packed, lists, width, height, 5)
     rgb = mi.Color3f(r, g, b) + (1 - alpha) * background
     expected = dr.select(alpha > 0, weighted / dr.select(alpha > 0, alpha, 1), 0)
     alpha = alpha + 0  # a variable that nothing else depends on: forward-mode AD clears the others when it is done
@@ -305,15 +306,17 @@ def composite(splats: Splats, packed: Any, lists: BlockLists, width: int, height
     return Image(mi.TensorXf(dr.ravel(rgb), (*shape, 3)), mi.TensorXf(alpha, shape), mi.TensorXf(expected, shape))
 
 
-def composite_rgb(splats: Splats, packed: Any, lists: BlockLists, width: int, height: int) -> Any:
-    """The colours of `composite` over black, TensorXf [H,W,3], differentiable in the splats' fields.
+def composite_channels(splats: Splats, packed: Any, lists: BlockLists, width: int, height: int, channels: int) -> Any:
+    """The colours of `composite` over black and, with four channels instead of three, alpha: TensorXf [H,W,channels],
+    differentiable in the splats' fields.
 
-    It is what a fit needs, and takes less time: neither alpha nor depth is summed, nor differentiated.
+    It is what a fit needs, and takes less time: depth is neither summed nor differentiated, alpha only where it is wanted.
     """
-    rgb = mi.Color3f(*_rasterised(splats, packed, lists, width, height, False))
-    return mi.TensorXf(dr.ravel(rgb), (height, width, 3))
+    pixels = _rasterised(splats, packed, lists, width, height, channels)
+    vectors = mi.Color3f(*pixels) if channels == 3 else mi.Vector4f(*pixels)
+    return mi.TensorXf(dr.ravel(vectors), (height, width, channels))
 
 
-def _rasterised(splats: Splats, packed: Any, lists: BlockLists, width: int, height: int, whole: bool) -> Any:
+def _rasterised(splats: Splats, packed: Any, lists: BlockLists, width: int, height: int, channels: int) -> Any:
     """The outputs of `_Rasterise` for an image of this size, with gradients of the means where these are enabled."""
-    return dr.custom(_Rasterise, splats, packed, lists, _block_major(width, height), dr.grad_enabled(splats.mean_x), whole)
+    return dr.custom(_Rasterise, splats, packed, lists, _block_major(width, height), dr.grad_enabled(splats.mean_x), channels)

@@ -36,8 +36,9 @@ def without_denormals(x: Any) -> Any:
 
 
 def recorded_sizes(lists: BlockLists, *others: Any) -> tuple[int, ...]:
-    """What a recorded kernel holds as constants (see `frozen`): the lengths of its lists, and its arguments that are flags."""
-    return len(lists.splat), len(lists.slot_start), len(lists.block), *(x for x in others if isinstance(x, bool))
+    """What a recorded kernel holds as constants (see `frozen`): the lengths of its lists, and its arguments that are flags or
+    plain numbers."""
+    return len(lists.splat), len(lists.slot_start), len(lists.block), *(x for x in others if isinstance(x, int))
 
 
 def pack(s: Splats, place: Any) -> Any:

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mgs.splat import Image, as_drjit, reference, render
-from mgs.splat.rendering import composite_rgb, splats_and_lists
+from mgs.splat.rendering import composite_channels, splats_and_lists
 
 from .scenes import PARAMETERS, calm, compare, double, make_camera, make_gaussians, margins
 
@@ -153,15 +153,17 @@ def test_gradient_of_any_loss(loss):
 
 
 @pytest.mark.parametrize("means", [False, True])
-def test_colours_alone_have_the_same_image_and_derivatives(means):
-    """What fits draw (`composite_rgb`): the colours of `render` over black bit for bit, its gradients and tangents."""
+@pytest.mark.parametrize("channels", [3, 4])
+def test_some_channels_alone_have_the_same_image_and_derivatives(means, channels):
+    """What fits draw (`composite_channels`): the colours of `render` over black bit for bit, its alpha, gradients, tangents."""
     camera, gaussians = make_camera(), make_gaussians(60, 3, 1, log_scales=(-5.0, -1.5))
-    weights = mi.TensorXf(image_weights(camera)["rgb"].astype(np.float32))
+    weights = image_weights(camera)
+    weights = mi.TensorXf(np.dstack([weights["rgb"], weights["alpha"]])[..., :channels].astype(np.float32))
     wanted = PARAMETERS if means else PARAMETERS[1:]
 
     def alone(watched):
         splats, lists, packed = splats_and_lists(watched, camera, None)
-        return composite_rgb(splats, packed, lists, camera.width, camera.height)
+        return composite_channels(splats, packed, lists, camera.width, camera.height, channels)
 
     def derivatives(draw):
         """Image, tangent along the parameters' own values, and gradients by them."""
@@ -182,8 +184,14 @@ def test_colours_alone_have_the_same_image_and_derivatives(means):
                 results += [dr.grad(getattr(watched, name)) for name in wanted]
         return [np.asarray(result) for result in results]
 
-    expected, found = derivatives(lambda watched: render(watched, camera).rgb), derivatives(alone)
-    np.testing.assert_array_equal(found[0], expected[0])
+    def together(watched):
+        image = render(watched, camera)
+        rgba = mi.Vector4f(*mi.Color3f(dr.unravel(mi.Color3f, image.rgb.array)), image.alpha.array)
+        return image.rgb if channels == 3 else mi.TensorXf(dr.ravel(rgba), (camera.height, camera.width, 4))
+
+    expected, found = derivatives(together), derivatives(alone)
+    np.testing.assert_array_equal(found[0][..., :3], expected[0][..., :3])
+    assert np.abs(found[0] - expected[0]).max() < 1e-6  # alpha: 1 - T, not the sum of the weights
     for name, a, b in zip(("tangent", *wanted), found[1:], expected[1:], strict=True):
         assert compare(a, b)[0] < 1e-5, name
 

@@ -86,15 +86,17 @@ def assumed_noise(data: dict[str, Any]) -> str:
 def surface(data: dict[str, Any]) -> str:
     """PSNR and how much of a surface a model is, with the backing and without, and with what else could keep it one."""
     rows = []
-    for what in dict.fromkeys(r["what"] for r in data["records"]):
+    for what in dict.fromkeys(r["what"] for r in data["means"]):
         cells = []
-        for backing in dict.fromkeys(r["backing"] for r in data["records"]):
-            r = next(r for r in data["records"] if (r["what"], r["backing"]) == (what, backing))
+        for backing in dict.fromkeys(r["backing"] for r in data["means"]):
+            r = next(r for r in data["means"] if (r["what"], r["backing"]) == (what, backing))
             cells += [f"{r['psnr']:.2f}, {r['psnr_inside']:.2f}"]
             cells += [", ".join(f"{100 * r[key]:.1f} %" for key in ("too_deep", "see_through"))]
-        rows.append([what, *cells])
+        (low, high), (least, most) = r["gain"], r["gain_inside"]  # with the backing, which comes last
+        rows.append([what, *cells, f"{low:+.2f} to {high:+.2f}", f"{least:+.2f} to {most:+.2f}"])
     heading = ["", "all on the surface: PSNR, inside (dB)", "too deep, see-through"]
-    return markdown([*heading, "a third behind: PSNR, inside", "too deep, see-through"], rows) + made_by(data)
+    heading += ["a third behind: PSNR, inside", "too deep, see-through", "gain by rock", "gain inside"]
+    return markdown(heading, rows) + made_by(data)
 
 
 def truth(data: dict[str, Any]) -> str:
@@ -182,8 +184,20 @@ def fit(data: dict[str, Any]) -> str:
     for name, (bound, target) in FIT_TARGETS.items():
         value = data["figures"][name]
         measured = "not reached" if value is None else f"{value:.3g}"
-        rows.append([FIT_FIGURES[name], measured, f"{bound} {target:.3g}"])
-    return markdown(["figure", "measured", "asked for"], rows) + made_by(data)
+        n, key = ON_TEST_VIEWS.get(name, (0, ""))
+        test = f"{data['test'][str(n)][key]:.3g}" if key else "–"
+        rows.append([FIT_FIGURES[name], measured, test, f"{bound} {target:.3g}"])
+    return markdown(["figure", "measured", "the same on the test views", "asked for"], rows) + made_by(data)
+
+
+ON_TEST_VIEWS = {
+    "psnr_held_out": (10_000, "psnr"),
+    "psnr_inside_10k": (10_000, "psnr_inside"),
+    "psnr_inside_20k": (20_000, "psnr_inside"),
+    "too_deep_3_spacings": (10_000, "too_deep_3"),
+    "see_through": (10_000, "see_through"),
+}
+"""Number of Gaussians and metric of the figures that are measured on the test views, too."""
 
 
 FIT_FIGURES = {
@@ -195,8 +209,8 @@ FIT_FIGURES = {
     "ranking_tau": "Kendall's tau of the ranking with that of a fit ten times as long",
     "ranking_regret": "regret of the view chosen, share of the best gain",
     "predicted_over_found_decrease": "predicted decrease of Phi over the one found",
-    "passes_to_old_objective_cold": "passes to the Phi of 400 passes of Adam, over 400, from the prior",
-    "passes_to_old_objective_warm": "the same with one view added",
+    "seconds_to_old_objective_cold": "time to the Phi of 400 passes of Adam, over the time of these, from the prior",
+    "seconds_to_old_objective_warm": "the same with one view added",
 }
 """What is said of each figure of `mgs bench fit`."""
 
@@ -215,11 +229,15 @@ def means(data: dict[str, Any]) -> str:
 
 def residual(data: dict[str, Any]) -> str:
     """Quality against the weights of pixels in the fit."""
-    rows = [
-        [f"{r['power']:g}, {r['background']}", *(f"{r[key]:.2f}" for key in ("psnr", "psnr_mask", "psnr_inside"))]
-        for r in data["records"]
-    ]
-    return markdown(["power, background", "full frame", "mask", "inside"], rows) + made_by(data)
+    keys, rows = ("psnr", "psnr_mask", "psnr_inside"), []
+    linear = data["records"][0]
+    for r in data["records"]:
+        cells = []
+        for key in keys:
+            gains = [a - b for a, b in zip(r["each"][key], linear["each"][key], strict=True)]
+            cells.append(f"{r[key]:.2f}" if r is linear else f"{r[key]:.2f} ({min(gains):+.2f} to {max(gains):+.2f})")
+        rows.append([r["name"], r["background"], *cells])
+    return markdown(["weight of a pixel", "background", "full frame", "mask", "inside"], rows) + made_by(data)
 
 
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
