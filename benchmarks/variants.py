@@ -1,9 +1,10 @@
 """Variants of the core that were tried, those that lost too: speed against accuracy. `python benchmarks/variants.py PREFIX`
 
 Writes PREFIX.json and PREFIX.png. Every variant replaces constants or functions of `mgs.splat` in a process of its own. Timed
-are an image, an image with its gradient, and the exact Fisher information, of 100,000 Gaussians at 640x480, in rounds in which
-each variant has its turn; a ratio is the median over the rounds of the variant's time over that of the core as it is. Errors
-are the largest over all entries, relative to the largest entry of the float64 oracle (`mgs.splat.reference`), of the worst kind
+are an image of a view never seen before and of one seen before, an image with its gradient, the exact Fisher information and its
+blocks, of 100,000 Gaussians at 640x480, in rounds in which each variant has its turn. A ratio is the fastest of the variant's
+rounds over the fastest of the core as it is: on a host that others use, too, these were disturbed least; spread is the slowest
+round of the core as it is over its fastest. Errors are the largest over all entries, relative to the largest entry of the float64 oracle (`mgs.splat.reference`), of the worst kind
 of parameter (`mgs.study.chart.core.error`), on SMALL. Let nothing else run.
 """
 
@@ -34,18 +35,25 @@ from mgs.study.chart.drawing import COLOURS
 SMALL = 150, (96, 72)
 """Number of Gaussians, and size of the image, of the scene on which errors are measured."""
 
-ROUNDS, REPEATS = 4, 9
+ROUNDS, REPEATS = 6, 9
 
 TIMED = {"image": "forward_warm", "gradient": "gradient_warm", "diagonal": "fisher_exact"}
-"""What is timed, by what is computed; `forward_cold` is kept beside them."""
+"""What is timed, by what errors are measured of."""
+OPERATIONS = ("forward_cold", "forward_warm", "gradient_warm", "fisher_exact", "fisher_block")
+"""All that is timed (`mgs.bench.core.time_core`)."""
 
 
 def put(**values: Any) -> None:
-    """Replace names of `mgs.splat` in every module that has them, but not in the oracle. Before the first kernel."""
+    """Replace names of `mgs.splat` in every module that has them, but not in the oracle. Before the first kernel. Raises
+    ValueError where no module has a name: what was meant would stay as it is."""
+    missing = set(values)
     for name, module in list(sys.modules.items()):
         if name.startswith(("mgs.splat", "mgs.bench")) and module is not reference:
             for key in values.keys() & vars(module).keys():
                 setattr(module, key, values[key])
+                missing.discard(key)
+    if missing:
+        raise ValueError(f"no module has {', '.join(sorted(missing))}")
 
 
 def block_size(width: int, height: int) -> None:
@@ -244,7 +252,7 @@ def measure(name: str, with_errors: bool) -> dict[str, float]:
     change, least = VARIANTS[name]
     change()
     where, small = scene(100_000, (640, 480)), scene(*SMALL)
-    found = time_core(where.gaussians[seen(where, least)], where.camera, REPEATS, blocks=False)
+    found = time_core(where.gaussians[seen(where, least)], where.camera, REPEATS)
     if with_errors:
         for what in TIMED:
             found[f"error_{what}"] = error(in_full(small, least, what), oracle(what, small), what)
@@ -281,10 +289,8 @@ def chart(path: Path, rows: list[dict[str, Any]]) -> None:
         axes = figure.subplots(1, 3, sharey=True)
         for ax, (what, title) in zip(axes, titles.items(), strict=True):
             for number, row in enumerate(rows):
-                low, middle, high = row["ratios"][TIMED[what]]
                 style = {"marker": "ov^<>sDPX*"[number % 10], "color": COLOURS[number % 7], "label": row["name"]}
-                error = [[middle - low], [high - middle]]
-                ax.errorbar(middle, row["errors"][what], xerr=error, linestyle="none", elinewidth=0.8, markersize=6, **style)
+                ax.plot(row["ratios"][TIMED[what]], row["errors"][what], linestyle="none", markersize=6, **style)
             ax.axvline(1, color="0.8", linewidth=0.8, zorder=0)
             ax.set(yscale="log", title=title, xlabel="time over that of the core as it is")
         axes[0].set_ylabel("largest error over largest entry")
@@ -303,13 +309,13 @@ def main(prefix: str) -> None:
             print(name, runs[name][-1], flush=True)
     rows = []
     for name, found in runs.items():
-        ratios = {
-            key: [run[key] / base[key] for run, base in zip(found, runs["as it is"], strict=True)]
-            for key in ("forward_cold", *TIMED.values())
-        }
-        between = {key: [min(r), float(np.median(r)), max(r)] for key, r in ratios.items()}
-        rows.append({"name": name, "ratios": between, "errors": {what: found[0][f"error_{what}"] for what in TIMED}})
-    made = {"command": command_line(), "machine": runtime.processor(), "versions": versions(), "rounds": ROUNDS, "rows": rows}
+        ratios = {key: min(run[key] for run in found) / min(run[key] for run in runs["as it is"]) for key in OPERATIONS}
+        rows.append({"name": name, "ratios": ratios, "errors": {what: found[0][f"error_{what}"] for what in TIMED}})
+    spread = {
+        key: max(run[key] for run in base) / min(run[key] for run in base) for key in OPERATIONS for base in [runs["as it is"]]
+    }
+    made = {"command": command_line(), "machine": runtime.processor(), "versions": versions(), "rounds": ROUNDS}
+    made |= {"spread": spread, "rows": rows}
     write_json(Path(f"{prefix}.json"), made)
     chart(Path(f"{prefix}.png"), rows)
 

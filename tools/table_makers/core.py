@@ -154,13 +154,14 @@ def variants(data: dict[str, Any]) -> str:
     """Times of variants of the core over that of the core as it is, and their errors."""
     rows = []
     for row in data["rows"]:
-        times = [
-            f"{middle:.2f} ({low:.2f} to {high:.2f})"
-            for low, middle, high in (row["ratios"][key] for key in ("forward_warm", "gradient_warm", "fisher_exact"))
-        ]
+        times = [f"{row['ratios'][key]:.2f}" for key in OPERATIONS]
         rows.append([row["name"], *times, *(short(value) for value in row["errors"].values())])
-    heading = ["", "image", "image and gradient", "exact Fisher", "error of the image", "gradient", "Fisher"]
-    return markdown(heading, rows) + made_by(data)
+    rows.append(
+        [f"slowest over fastest of {data['rounds']} rounds, as it is", *(f"{data['spread'][key]:.2f}" for key in OPERATIONS)]
+    )
+    rows[-1] += ["–"] * 3
+    heading = ["", "new view", "view seen before", "image and gradient", "exact Fisher", "blocks"]
+    return markdown([*heading, "error of the image", "gradient", "Fisher"], rows) + made_by(data)
 
 
 def unseen(data: dict[str, Any]) -> str:
