@@ -73,10 +73,10 @@ def record(root: Path, name: str, background: str) -> dict[str, Any]:
         target[..., 3] *= weigh(target[..., :3].mean(-1))
     rock = [frame.mask() for frame in frames]
     scale = np.sqrt(np.mean(np.concatenate([t[..., 3][r] for t, r in zip(targets, rock, strict=True)]) ** 2))
-    for target in targets:
+    for frame, target in zip(frames, targets, strict=True):
         target[..., 3] /= scale
         if background == "one":
-            target[target[..., 4] == 0, 3] = 1.0
+            target[frame.target()[0][..., 3] == 0, 3] = 1.0
     settings, cameras = TrainSettings(tolerance=0.0), [frame.camera for frame in frames]
     model = fit(start, cameras, targets, settings, cache=ListCache(), start=start, lam=lam).gaussians
     means = evaluate(model, [], [], test_frames=dataset.test_views().frames)["test"]

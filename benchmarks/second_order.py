@@ -165,11 +165,6 @@ def natural_cut_whole(goal: Objective, model: Gaussians, passes: int) -> Iterato
     yield from _natural(goal, model, passes, _diagonal(goal), 1, cut=_as_a_whole)
 
 
-def natural(goal: Objective, model: Gaussians, passes: int) -> Iterator[tuple[float, Gaussians]]:
-    """The natural gradient as the fit has it, for objectives that the fit does not have."""
-    yield from _natural(goal, model, passes, _diagonal(goal), 1)
-
-
 def natural_colours_solved(goal: Objective, model: Gaussians, passes: int) -> Iterator[tuple[float, Gaussians]]:
     """The natural gradient as it is, and every COLOUR_PASSES passes all colours at once: while the rest stays as it is they
     are a linear least squares problem, at whose solution the gradient of the rest is that of variable projection."""

@@ -61,7 +61,7 @@ def record(root: Path, backing: float, what: str, weight: float, factors: Mappin
     start = thinner(start, factors["thinner"]) if "thinner" in factors else start
     taus = {kind: tau * factors.get(kind, 1.0) for kind, tau in PRIOR_STD.items()}
     lam = lam_by_kind(regularisation(groups(0), prior_std=taus), groups(0))
-    cameras, targets = [frame.camera for frame in frames], [target_of(frame) for frame in frames]
+    cameras, targets = [frame.camera for frame in frames], [target_of(frame, True) for frame in frames]
     settings = TrainSettings(alpha_weight=weight, tolerance=0.0)
     model = fit(start, cameras, targets, settings, cache=cache, start=start, lam=lam).gaussians
     tests = dataset.test_views()

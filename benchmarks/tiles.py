@@ -65,7 +65,7 @@ def main(prefix: str, n: int = 100_000) -> None:
         prepared[name] = lists, packed, kernels.forward(lists, packed, True)
     operations = {
         "forward": lambda lists, packed, out: kernels.forward(lists, packed, True),
-        "adjoint": lambda lists, packed, out: kernels.adjoint(lists, packed, out, out, False, True),
+        "adjoint": lambda lists, packed, out: kernels.adjoint(lists, packed, out, out, False, 5),
         "exact Fisher": lambda lists, packed, out: kernels.fisher(lists, packed, black, False),
     }
     seconds = {name: {setting: [] for setting in settings} for name in operations}

@@ -35,7 +35,7 @@ VIEWS, GAUSSIANS = 12, 10_000
 
 
 def target(frame: Frame, truth: str) -> np.ndarray:
-    """Colour, weight and alpha of the frame's pixels, as `target_of` has them."""
+    """[H,W,4], colour and weight of the frame's pixels."""
     if truth == "alpha":
         return target_of(frame)
     of_mask = target_of(replace(frame, rock_path=None))

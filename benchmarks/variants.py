@@ -1,11 +1,12 @@
 """Variants of the core that were tried, those that lost too: speed against accuracy. `python benchmarks/variants.py PREFIX`
 
 Writes PREFIX.json and PREFIX.png. Every variant replaces constants or functions of `mgs.splat` in a process of its own. Timed
-are an image of a view never seen before and of one seen before, an image with its gradient, the exact Fisher information and its
-blocks, of 100,000 Gaussians at 640x480, in rounds in which each variant has its turn. A ratio is the fastest of the variant's
-rounds over the fastest of the core as it is: on a host that others use, too, these were disturbed least; spread is the slowest
-round of the core as it is over its fastest. Errors are the largest over all entries, relative to the largest entry of the float64 oracle (`mgs.splat.reference`), of the worst kind
-of parameter (`mgs.study.chart.core.error`), on SMALL. Let nothing else run.
+are an image of a view never seen before and of one seen before, an image with its gradient, the exact Fisher information and
+its blocks, of 100,000 Gaussians at 640x480, in rounds in which each variant has its turn. A ratio is the fastest of the
+variant's rounds over the fastest of the core as it is: on a host that others use, too, these were disturbed least; spread is
+the slowest round of the core as it is over its fastest. Errors are the largest over all entries, relative to the largest entry
+of the float64 oracle (`mgs.splat.reference`), of the worst kind of parameter (`mgs.study.chart.core.error`), on SMALL. Let
+nothing else run.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from mgs.study.chart.drawing import COLOURS
 SMALL = 150, (96, 72)
 """Number of Gaussians, and size of the image, of the scene on which errors are measured."""
 
-ROUNDS, REPEATS = 6, 9
+ROUNDS, REPEATS = 4, 9
 
 TIMED = {"image": "forward_warm", "gradient": "gradient_warm", "diagonal": "fisher_exact"}
 """What is timed, by what errors are measured of."""
@@ -156,7 +157,7 @@ def local_arrays() -> None:
                 state[k] = value
 
         def body(i: Any, state: Any, alive: Any) -> Any:
-            pairs = [walking.drawn(lists, packed, lane, i, k) for k in range(together)]
+            pairs = [walking.pair_at(lists, packed, lane, i, k) for k in range(together)]
             values, alive = visit(i, pairs, read(state))
             write(state, values)
             return i + together, state, (i + together < lane.end) & alive
@@ -175,7 +176,11 @@ def single_positions() -> None:
 
     from mgs.splat import walking
 
+    exact = walking.unpack
+
     def unpack(packed: Any, place: Any) -> Any:
+        if type(packed) is mi.Float64:  # blocks: packed in double
+            return exact(packed, place)
         (mean_x, mean_y, shear, white_x), (white_y, log2_opacity, *_), (*colour, _), (depth, *_) = (
             dr.gather(mi.Vector4f, packed, place * 4 + i) for i in range(4)
         )
@@ -205,11 +210,26 @@ class Renamed:
 
 
 def llvms_order() -> None:
-    """Instructions in the order that LLVM's machine scheduler gives them. Kernels that are kept on the disk would be those in
-    the usual order, so others are kept elsewhere."""
+    """Start with instructions in the order that LLVM's machine scheduler gives them."""
     runtime._keep_order = lambda: None
-    os.environ["HOME"] = tempfile.mkdtemp()
     runtime.start()
+
+
+def in_llvms_order(call: Callable[..., Any], *arguments: Any) -> Any:
+    """As `in_new_process`, in LLVM's order of instructions. Kernels that Dr.Jit keeps on the disk may be in either order, so
+    this process has a folder of its own for them."""
+    with tempfile.TemporaryDirectory() as folder:
+        before = os.environ.get(KERNELS)
+        os.environ[KERNELS] = folder
+        try:
+            return in_new_process(call, *arguments, initializer=llvms_order)
+        finally:
+            os.environ.pop(KERNELS)
+            os.environ |= {} if before is None else {KERNELS: before}
+
+
+KERNELS = "DRJIT_CACHE_DIR"
+"""Environment variable that names the folder in which Dr.Jit keeps compiled kernels."""
 
 
 def least_alpha(value: float) -> None:
@@ -227,7 +247,7 @@ VARIANTS: dict[str, tuple[Callable[[], None], float | None]] = {
     "rows one by one": (rows_one_by_one, None),
     "one splat at a time": (partial(put, TOGETHER=1), None),
     "three splats at a time": (partial(put, TOGETHER=3), None),
-    "pixels in any order": (partial(put, in_order=lambda x, before: x), None),
+    "pixels mixed by the compiler": (partial(put, computed_after=lambda x, before: x), None),
     LLVMS_ORDER: (lambda: None, None),
     "pixels in local arrays": (local_arrays, None),
     "Dr.Jit's minimum": (by_minimum, None),
@@ -304,8 +324,8 @@ def main(prefix: str) -> None:
     runs: dict[str, list[dict[str, float]]] = {name: [] for name in VARIANTS}
     for turn in range(ROUNDS):
         for name in VARIANTS:
-            start = llvms_order if name == LLVMS_ORDER else runtime.start
-            runs[name].append(in_new_process(measure, name, turn == 0, initializer=start))
+            process = in_llvms_order if name == LLVMS_ORDER else in_new_process
+            runs[name].append(process(measure, name, turn == 0))
             print(name, runs[name][-1], flush=True)
     rows = []
     for name, found in runs.items():

@@ -79,7 +79,8 @@ def scenes(folder: Path, run: Path) -> tuple[list[Path], dict[str, float]]:
 
 def measure(checkout: Path, paths: list[Path]) -> dict[str, float]:
     """Seconds by operation, of one process of the version in a checkout."""
-    environment = os.environ | {"PYTHONPATH": str(checkout.resolve())}
+    kernels = paths[0].parent / checkout.name  # the same code, compiled by the two versions, may differ
+    environment = os.environ | {"PYTHONPATH": str(checkout.resolve()), "DRJIT_CACHE_DIR": str(kernels)}
     arguments = [sys.executable, "-c", WORKER, *map(str, paths)]
     done = subprocess.run(arguments, cwd=checkout, env=environment, capture_output=True, text=True, check=True)
     found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])

@@ -57,7 +57,7 @@ def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
 def masked_squares(rendered: np.ndarray, target: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Squared differences [K,3], (linear RGB)², of the pixels of a mask [H,W] whose colour is known.
 
-    rendered: [H,W,3]. target: colour and weight as `mgs.data.dataset.target_of`; a weight of 0 means not known.
+    rendered: [H,W,3]. target: [H,W,4], colour and weight, or more (`mgs.data.dataset.target_of`); of weight 0 it is not known.
     """
     return np.square(rendered - target[..., :3])[mask & (target[..., 3] > 0)]
 

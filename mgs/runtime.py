@@ -169,7 +169,7 @@ def _keep_order() -> None:
     registers. LLVM's machine scheduler would mix the pixels again, and keep on the stack what no longer fits into registers:
     they then take up to a third more time (docs/splatting.md, What was tried).
     """
-    with contextlib.suppress(InputError):
+    with contextlib.suppress(InputError, AttributeError, OSError):
         library = ctypes.CDLL(find_libllvm().path)
         arguments = (ctypes.c_char_p * 2)(b"mgs", ORDER_OPTION)
         library.LLVMParseCommandLineOptions(len(arguments), arguments, None)

@@ -12,10 +12,11 @@ from PIL import Image
 from mgs.camera import Camera, look_at, opencv_from_opengl
 from mgs.colour import linear_from_srgb
 from mgs.data.check import check_dataset
-from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
+from mgs.data.dataset import Dataset, Frame, load_dataset, target_of, write_transforms
 from mgs.data.rock_image import boundary, write_rock_image
 from mgs.errors import InputError
 from mgs.images import write_exr, write_png
+from mgs.prior.exposure import without_gain
 from mgs.synth.orbit import intrinsics
 
 W, H = 40, 30
@@ -141,6 +142,10 @@ def test_the_target_of_a_mask_has_no_weight_along_its_outline(folder):
     assert 40 < differs.sum() < 150
     np.testing.assert_array_equal(weight, np.where(differs, 0, 1))
     np.testing.assert_array_equal(frame.masked_rgb(), rgba[..., :3])
+    np.testing.assert_array_equal(target_of(frame), np.dstack([rgba[..., :3], weight]))
+    np.testing.assert_array_equal(target_of(frame, True), np.dstack([rgba[..., :3], weight, rgba[..., 3]]))
+    halved = without_gain(target_of(frame, True), np.array([2.0, 2.0, 2.0]))
+    np.testing.assert_array_equal(halved, np.dstack([rgba[..., :3] / 2, weight, rgba[..., 3]]))
     rgba, weight = replace(frame, mask_path=None).target()
     np.testing.assert_array_equal(rgba, np.dstack([frame.rgb(), np.ones((H, W))]))
     np.testing.assert_array_equal(weight, 1)

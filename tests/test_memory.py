@@ -91,7 +91,7 @@ def test_a_run_holds_few_images_at_once_and_finds_the_same(
     for name, budget in (("kept", 1 << 30), ("read again", 0)):
         for module in (loop, objective, stations):
             monkeypatch.setattr(module, "IMAGE_BYTES", budget)
-        monkeypatch.setattr(loop, "target_of", lambda frame: live.watch(TARGET_OF(frame)))
+        monkeypatch.setattr(loop, "target_of", lambda *frame: live.watch(TARGET_OF(*frame)))
         gc.collect()
         live.now = live.most = 0
         settings = {"policy": "uniform", "seeds": 6, "budget": 3, "evaluate_every": 1}

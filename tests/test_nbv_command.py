@@ -14,6 +14,7 @@ from refusals import refused
 from rich.console import Console
 
 from mgs.active import criteria, loop, nbv, pose_policies, run_folder
+from mgs.active.convergence import remaining_decrease
 from mgs.active.run_folder import load_run
 from mgs.active.settings import TrainSettings
 from mgs.cli.app import main
@@ -330,6 +331,29 @@ def test_options_of_the_choice_and_the_end_reach_the_run(dataset, prior, tmp_pat
     assert stop.value.code == 0
     found = run_folder.read_settings(tmp_path / "run")
     assert (found.nearest, found.travel, found.batch, found.stop_gain, found.stop_uncertainty) == (5, 2.5, 3, 0.01, 0.2)
+
+
+def test_alpha_as_a_channel_reaches_every_fit_and_the_resumed_run(dataset, prior, tmp_path):
+    def run(name, *options):
+        with pytest.raises(SystemExit) as stop:
+            main(["nbv", *map(str, options), "--out" if options else "--resume", str(tmp_path / name)])
+        assert stop.value.code == 0
+        return run_folder.read_settings(tmp_path / name), run_folder.read_checkpoint(tmp_path / name)
+
+    given = [dataset, "--prior", prior, "--passes", 2, "--policy", "uniform"]
+    settings, plain = run("plain", *given, "--budget", 1)
+    with_alpha, whole = run("whole", *given, "--budget", 1, "--alpha-weight", 0.5)
+    assert (settings.train.alpha_weight, with_alpha.train.alpha_weight) == (0, 0.5)
+    assert (whole.gaussians.logit_opacities != plain.gaussians.logit_opacities).any()
+    run("begun", *given, "--budget", 0, "--alpha-weight", 0.5)
+    config = tmp_path / "begun/config.json"
+    config.write_text(config.read_text().replace('"budget": 0', '"budget": 1'))
+    _, begun = run("begun")
+    assert begun.taken == whole.taken
+    assert (tmp_path / "begun/gaussians.ply").read_bytes() == (tmp_path / "whole/gaussians.ply").read_bytes()
+    frames = [load_dataset(dataset).frames[i] for i in whole.taken]
+    phi = [remaining_decrease(whole.gaussians, s, load_prior(prior), frames)["phi"] for s in (settings, with_alpha)]
+    assert phi[1] > phi[0] > 0
 
 
 def test_settings_of_the_fit_are_read_as_older_runs_wrote_them():

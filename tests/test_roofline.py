@@ -282,6 +282,8 @@ def result():
 
 def test_every_kernel_has_its_place(result, tmp_path, monkeypatch):
     rows = {row["name"]: row for row in result["kernels"]}
+    assert {"forward: alpha and depth", "lists tested, and packing", "pixels row by row"} <= rows.keys()
+    assert rows["pixels row by row"]["unit"] == "pixel"
     steps = ["projection", "packing", "block lists", "sums to gradient", "sums to exact Fisher", "sums to block Fisher"]
     assert {"forward", "jvp", "adjoint: walk", "adjoint: add up", "block Fisher: add up", *steps} <= rows.keys()
     assert any(name.startswith("exact Fisher: walk") for name in rows)

@@ -50,8 +50,8 @@ def remaining_decrease(
     start = replace(of_seeds, sh=of_all.sh)  # as in the loop: means of the seeds' start, colours of all frames
     means, kinds = settings.train.means, groups(0, settings.train.means)
     by_kind = lam_by_kind(settings.regularisation(kinds), kinds)
-    targets = Deferred(range(len(frames)), lambda k: without_gain(target_of(frames[k]), gains[k]))
     weight = settings.train.alpha_weight
+    targets = Deferred(range(len(frames)), lambda k: without_gain(target_of(frames[k], weight > 0), gains[k]))
     goal = objective(gaussians, cameras, targets, start, by_kind, None, means, initial_normals(prior), weight)
     model = as_drjit(gaussians)
     phi = goal.phi(model)

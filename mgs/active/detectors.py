@@ -57,9 +57,9 @@ class ViewSigns:
 def before_fit(target: np.ndarray, mask: np.ndarray, rendered: np.ndarray, alpha: np.ndarray, margin: int) -> Before:
     """The signs of a view and the Gaussians before any training.
 
-    target: colour and weight (`mgs.data.dataset.target_of`); mask: bool [H,W]; rendered: [H,W,3] linear RGB and alpha
-    [H,W], which count as drawn from 0.5 up. margin: pixels, of `outline_margin`: a pixel disagrees if it is drawn and farther
-    than that outside the mask, or not drawn and farther inside.
+    target: [H,W,4], colour and weight, or more (`mgs.data.dataset.target_of`); mask: bool [H,W]; rendered: [H,W,3] linear RGB
+    and alpha [H,W], which count as drawn from 0.5 up. margin: pixels, of `outline_margin`: a pixel disagrees if it is drawn and
+    farther than that outside the mask, or not drawn and farther inside.
     """
     drawn = alpha >= 0.5
     either = int((mask | drawn).sum())

@@ -135,8 +135,8 @@ def fit(
     """Fit Gaussians to images: lower Phi (`mgs.active.objective`). Their means stay unless `settings.means` says otherwise.
 
     cameras, and a target of each: [H,W,3] linear RGB, the rock in front of black; or [H,W,4], in which the last channel is the
-    weight of the pixel, 1 where its colour is known and 0 where it is not; or [H,W,5], in which alpha comes after the weight
-    (`mgs.data.dataset.target_of`). With an `alpha_weight` in the settings it must be there.
+    weight of the pixel, 1 where its colour is known and 0 where it is not; or [H,W,5], in which alpha comes after the weight,
+    which counts for it, too (`mgs.data.dataset.target_of`). Where the settings' `alpha_weight` is not 0, alpha must be there.
     start: where the prior holds the parameters; the Gaussians given, by default. lam: the prior's information about each kind
     of parameter (`mgs.gaussians.learned`), (pixel value / unit of the parameter)^2: one number, or but for means an array that
     broadcasts to the parameter's shape (for colours, say, another number for each degree); by default there is none. normals:

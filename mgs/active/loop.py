@@ -147,7 +147,8 @@ class Loop:
         appearance = {kind: columns for kind, columns in stations.groups.items() if kind != "mean"}
         self.prior_lam = criteria.regularisation(appearance, settings.pixel_noise, settings.prior_std)
         self.lam = settings.regularisation(stations.groups)
-        self.image = kept_within(IMAGE_BYTES, lambda i: target_of(self.frames[i]), lambda image: image.nbytes)
+        with_alpha = settings.train.alpha_weight > 0
+        self.image = kept_within(IMAGE_BYTES, lambda i: target_of(self.frames[i], with_alpha), lambda image: image.nbytes)
         cameras = {frame.name: inputs.camera_digest(frame.camera) for frame in self.frames}
         self.made_from = {"prior": stations.prior, "cameras": cameras, **inputs.policy_record(settings.policy)}
         self.seeds = pose_policies.seed_views(self.positions, self.centre, settings.seeds)

@@ -48,8 +48,8 @@ along their normals the shape is [N]."""
 
 @dataclass(frozen=True)
 class Photo:
-    """An image to fit to: its camera, the same for the kernels, and mi.Float [H*W*C] its pixels, of C channels, and what their
-    differences are multiplied by."""
+    """An image to fit to: its camera, the same for the kernels, its pixels, mi.Float [H*W*C] of C = 3 channels, or 4 with
+    alpha, and by what differences to them are multiplied, mi.Float [H*W*C]."""
 
     camera: Camera
     array: Any
@@ -196,8 +196,8 @@ def objective(
 ) -> Objective:
     """The objective of `mgs.active.fitting.fit`, from the same arguments; means, alpha_weight: the settings of these names.
 
-    Raises InputError where the start or the normals do not fit the Gaussians, `means` is not a name in `mgs.splat.MEANS`, or
-    alpha has a weight and a target has no alpha.
+    Raises InputError where the start or the normals do not fit the Gaussians, or `means` is not a name in `mgs.splat.MEANS`.
+    Where alpha has a weight and a target has no alpha, it is raised by whatever reads that target first.
     """
     groups(gaussians.sh_degree, means)  # raises where the name is unknown
     unit = unit_normals(len(gaussians), normals) if means == "normal" else None

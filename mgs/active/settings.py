@@ -84,7 +84,7 @@ class TrainSettings(BaseModel):
     `mean`, metres, is read only where means are learned, and must be there then; `mgs nbv` sets it (`with_spacing`)."""
     alpha_weight: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)] = 0.0
     """(sigma_rgb / sigma_alpha)^2, with which alpha is a fourth channel of a pixel; 0: it is none. The criteria leave it out:
-    it would tell no pose from another (docs/fit.md)."""
+    with a weight up to 1 they chose the same views (docs/fit.md)."""
     decay: Positive = 0.1
     """The rates fall by this factor over `passes`."""
     seed: Annotated[int, Field(ge=0)] = 0

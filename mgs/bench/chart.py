@@ -83,7 +83,11 @@ COLOURS = {"forward": "#0072b2", "jvp": "#56b4e9", "adjoint": "#d55e00", "exact 
 MARKERS = {
     "walk 1": "v",
     "add up": "s",
+    "alpha and depth": "<",
+    "alpha and depth: walk": "<",
     "projection": "*",
+    "lists tested, and packing": "p",
+    "pixels row by row": "h",
     "block lists": "P",
     "sums to gradient": "X",
     "sums to exact Fisher": "D",

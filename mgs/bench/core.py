@@ -214,8 +214,8 @@ def flops_per_pair(call: Callable[[], Any], lanes: int) -> float:
 
 
 def pairs_in_an_iteration(walk: KernelWork) -> int:
-    """How many (splat, block) pairs the loop of a kernel draws in one iteration, that walks through block lists. One that
-    stores sums draws one, and has a second loop for those that are left."""
+    """How many (splat, block) pairs the first loop of a walk draws in one iteration. A walk that stores sums draws one; it is
+    known by its second loop, which writes zeros."""
     return 1 if len(walk.loops) > 1 else TOGETHER
 
 

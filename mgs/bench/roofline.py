@@ -153,16 +153,17 @@ def roofline_rows(gaussians: Gaussians, camera: Camera, repeats: int, report: Ca
     dr.eval(device, splats, splats64)
     lists, packed = cache.get(camera, splats)
     packed64, tangents = pack(splats64, lists.place), kernels.pack_tangents(splats, splats, lists.place)
-    out = kernels.forward(lists, packed, False)
+    out, whole = kernels.forward(lists, packed, False), kernels.forward(lists, packed, True)
     noise = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
-    d_out = (mi.Float(padded(np.resize(noise, len(out[0])))),)
+    d_out, d_whole = (tuple(mi.Float(padded(np.resize(noise, len(a)))) for a in arrays) for arrays in (out, whole))
     weights, background = mi.TensorXf(noise), mi.Color3f(*(dr.opaque(mi.Float, 0.0) for _ in range(3)))
-    dr.eval(out, d_out, weights)
+    dr.eval(out, whole, d_out, d_whole, weights)
     walks = {
         "forward": lambda: kernels.forward(lists, packed, False),
         "forward: alpha and depth": lambda: kernels.forward(lists, packed, True),
         "jvp": lambda: kernels.jvp(lists, packed, tangents),
         "adjoint": lambda: kernels.adjoint(lists, packed, out, d_out, False, 3),
+        "adjoint: alpha and depth": lambda: kernels.adjoint(lists, packed, whole, d_whole, False, 5),
         "exact Fisher": lambda: kernels.fisher(lists, packed, background, False),
         "block Fisher": lambda: kernels.fisher(lists, packed64, background, True),
     }
@@ -173,7 +174,7 @@ def roofline_rows(gaussians: Gaussians, camera: Camera, repeats: int, report: Ca
         "block lists": lambda: blocks.build(splats, camera.width, camera.height),
     }
     wholes = {
-        "pixels in order": lambda: render(device, camera, cache=cache).rgb,
+        "pixels row by row": lambda: render(device, camera, cache=cache).rgb,
         "sums to gradient": lambda: gradient(device, camera, weights, cache),
         "sums to exact Fisher": lambda: fisher(device, camera, "exact", cache=cache),
         "sums to block Fisher": lambda: fisher(device, camera, "block", cache=cache),
@@ -185,7 +186,7 @@ def roofline_rows(gaussians: Gaussians, camera: Camera, repeats: int, report: Ca
         if name in walks:
             rows += operation_rows(name, found, lists)
         else:
-            of = ("pixel", camera.width * camera.height) if name == "pixels in order" else ("Gaussian", len(gaussians))
+            of = ("pixel", camera.width * camera.height) if name == "pixels row by row" else ("Gaussian", len(gaussians))
             rows.append(step_row(name, *of, found if name in steps else after_loops(found), lists))
     return rows
 

@@ -97,9 +97,7 @@ def nbv(
     optimiser: Annotated[str, typer.Option(help="Optimiser of the fit: natural or adam.")] = "natural",
     alpha_weight: Annotated[
         float,
-        typer.Option(
-            metavar="WEIGHT", help="How much a pixel's alpha counts in the fit, beside its colours: 0.1 to 0.3, or not."
-        ),
+        typer.Option(metavar="WEIGHT", help="Weight of a pixel's alpha in the fit, (sigma_rgb / sigma_alpha)^2; 0: none."),
     ] = 0.0,
     rate: Annotated[
         list[str] | None,

@@ -311,10 +311,10 @@ def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:
     return False
 
 
-def target_of(frame: Frame) -> np.ndarray:
-    """What a frame is fitted to: [H,W,5], the colour, the weight and the alpha of `Frame.target`. Raises InputError where the
-    mask is empty: a fit to black would hide the rock."""
+def target_of(frame: Frame, with_alpha: bool = False) -> np.ndarray:
+    """What a frame is fitted to: [H,W,4], the colour and the weight of `Frame.target`, or [H,W,5], alpha after them. Raises
+    InputError where the mask is empty: a fit to black would hide the rock."""
     if not frame.mask().any():
         raise InputError(f"{frame.mask_path}: the rock mask of frame {frame.name} is empty; correct it, or remove the frame")
     rgba, weight = frame.target()
-    return np.dstack([rgba[..., :3], weight, rgba[..., 3]])
+    return np.dstack([rgba[..., :3], weight, *([rgba[..., 3]] if with_alpha else [])])

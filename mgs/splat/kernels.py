@@ -28,7 +28,7 @@ from mgs.splat.walking import (
     Lane,
     Row,
     blend,
-    in_order,
+    computed_after,
     lanes,
     pack_parts,
     recorded_sizes,
@@ -201,7 +201,7 @@ def adjoint(lists: BlockLists, packed: Any, out: tuple[Any, ...], d_out: tuple[A
         for j, row in enumerate(rows):
             m0, m1, m2 = mi.Float(0), mi.Float(0), mi.Float(0)
             for x, (raw, xi) in enumerate(zip(row.raw_alpha, row.xi, strict=True)):
-                raw = in_order(raw, [*sums[:4], m0, m1, m2] if x else sums if j else [])
+                raw = computed_after(raw, [*sums[:4], m0, m1, m2] if x else sums if j else [])
                 transmittance, behind = pixels[j * BLOCK_X + x]
                 dr_, dg, db, *others = dL[j * BLOCK_X + x]
                 alpha, w, after, room = blend(raw, transmittance)
@@ -310,7 +310,7 @@ def fisher(lists: BlockLists, packed: Any, background: Any, cross: bool, means: 
             cross_m = [[mi.Float(0)] * 3 for _ in range(3)]
             for x, (raw, xi) in enumerate(zip(row.raw_alpha, row.xi, strict=True)):
                 pixel = j * BLOCK_X + x
-                raw = in_order(raw, [sums[0], *m, *(c for a in cross_m for c in a)] if x else sums if j else [])
+                raw = computed_after(raw, [sums[0], *m, *(c for a in cross_m for c in a)] if x else sums if j else [])
                 transmittance, *behind = pixels[pixel]
                 alpha, w, after, room = blend(raw, transmittance)
                 behind = [dr.fma(-c, w, s) for c, s in zip(splat.colour, behind, strict=True)]

@@ -125,7 +125,7 @@ def exp2(x: Any) -> Any:
     """
     integer, bits = (mi.Int64, 52) if type(x) is mi.Float64 else (mi.Int32, 23)
     x = dr.select(x > -120, x, -120)
-    shifted = x + 1.5 * 2.0**bits  # so large that its last bit is 1: x is rounded, and its whole part stands in the last bits
+    shifted = x + 1.5 * 2.0**bits  # so large that its last bit is worth 1: x rounded to a whole number is in the last bits
     part = x - (shifted - 1.5 * 2.0**bits)
     value = type(x)(EXP2[-1])
     for coefficient in EXP2[-2::-1]:
@@ -149,7 +149,9 @@ def block_rows(lane: Lane, s: Splats) -> list[Row]:
     the exponent is somewhere at least -log2(255) (`Footprints`). From a pixel to the next (xi, eta) moves by at most 1.56,
     because EPS2D widens every footprint, and the centre of a row is at most 5 pixels from any point of the rectangle. So the
     exponent at the centre of a row is at least -(2.83 + 5 * 1.56)^2 = -113, and no ratio is beyond 2^(+-36). Between a centre
-    and a pixel that is drawn the exponent is nowhere less, as it is concave.
+    and a pixel that is drawn the exponent is nowhere below the lower of the two, as it is concave. Lists are made in single
+    precision: a splat with its centre millions of pixels away may miss the block, and where an exponent says so, nothing of
+    it is drawn in that row.
 
     The offset of the block's first pixel from the splat is computed in double: far along a slanted needle, xi is a small
     difference of large numbers.
@@ -172,7 +174,8 @@ def block_rows(lane: Lane, s: Splats) -> list[Row]:
         eta = s.white_y * (down + j)
         first = dr.fma(-slant, real(j), corner)
         xi = [dr.fma(s.white_x, real(i), first) for i in range(BLOCK_X)]
-        raw = [exp2(dr.fma(-xi[CENTRE], xi[CENTRE], dr.fma(-eta, eta, s.log2_opacity)))] * BLOCK_X
+        power = dr.fma(-xi[CENTRE], xi[CENTRE], dr.fma(-eta, eta, s.log2_opacity))
+        raw = [dr.select(power > -120, exp2(power), 0)] * BLOCK_X
         for side, columns in ((-1, range(CENTRE + 1, BLOCK_X)), (1, range(CENTRE - 1, -1, -1))):
             ratio = ratios[side][j]
             for i in columns:
@@ -185,9 +188,10 @@ def block_rows(lane: Lane, s: Splats) -> list[Row]:
 def blend(raw: Any, T: Any) -> tuple[Any, Any, Any, Any]:
     """Draw one splat on one pixel. raw: its alpha before thresholds; T: the transmittance in front of it.
 
-    Returns alpha (0 where the splat is not drawn), the weight w = alpha T, the transmittance behind the splat, and the mask of
-    pixels that are not finished. A finished pixel keeps its transmittance with a minus sign: every later splat then leaves
-    less than TRANSMITTANCE_MIN, so none is drawn, and the pixel's alpha is still known.
+    Returns alpha (0 below ALPHA_MIN; of a finished pixel it means nothing), the weight w = alpha T (0 where the splat is not
+    drawn), the transmittance behind the splat, and the mask of pixels that are not finished. A finished pixel keeps its
+    transmittance with a minus sign: every later splat then leaves less than TRANSMITTANCE_MIN, so none is drawn, and the
+    pixel's alpha is still known.
 
     Thresholds are comparisons and selects. dr.minimum and dr.maximum must propagate NaN, which takes five instructions.
     """
@@ -197,7 +201,7 @@ def blend(raw: Any, T: Any) -> tuple[Any, Any, Any, Any]:
     return alpha, dr.select(room, alpha * T, 0), dr.select(room, after, -dr.abs(T)), room
 
 
-def in_order(x: Any, before: list[Any]) -> Any:
+def computed_after(x: Any, before: list[Any]) -> Any:
     """x, a Float or Float64, unchanged; the compiler computes what follows from it after the Floats in `before`.
 
     A kernel's operations are compiled in the order in which its results need them (see `mgs.runtime`). In a loop these are
@@ -215,8 +219,8 @@ def in_order(x: Any, before: list[Any]) -> Any:
 
 
 TOGETHER = 2
-"""How many splats `walk` draws in one iteration. It reads and writes the state of the pixels, for which there are too few
-registers, once for all of them. With more than two, what they share no longer fits into the registers."""
+"""How many splats `walk` draws in one iteration. The state of the pixels does not fit into the registers, and so is read and
+written once an iteration instead of once a splat."""
 
 
 def walk(lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], draw: Callable[..., Any], start: Any) -> Any:
@@ -237,7 +241,7 @@ def walk(lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], dr
         for number, pixel in enumerate(pixels):
             for of_splat, rows in started:
                 row, x = rows[number // BLOCK_X], number % BLOCK_X
-                raw = in_order(row.raw_alpha[x], [] if most is None else [mi.Float(most)])
+                raw = computed_after(row.raw_alpha[x], [] if most is None else [mi.Float(most)])
                 pixel = draw(of_splat, raw, row.xi[x], row.eta, pixel)
             new.append(pixel)
             most = pixel[0] if most is None else dr.select(most > pixel[0], most, pixel[0])
@@ -281,7 +285,7 @@ def walk_and_store(
     return stored
 
 
-def drawn(lists: BlockLists, packed: Any, lane: Lane, first: Any, k: int) -> tuple[Any, Splats, list[Row]]:
+def pair_at(lists: BlockLists, packed: Any, lane: Lane, first: Any, k: int) -> tuple[Any, Splats, list[Row]]:
     """The k-th pair after the first, its splat, and the rows of the lane's block under it. After a lane's last pair comes
     the first one again, as a splat that draws nothing."""
     if k == 0:
@@ -298,13 +302,14 @@ def drawn(lists: BlockLists, packed: Any, lane: Lane, first: Any, k: int) -> tup
 def _walk_until_done(
     lists: BlockLists, packed: Any, lane: Lane, pixels: list[list[Any]], visit: Callable[..., Any], together: int
 ) -> tuple[Any, list[list[Any]]]:
-    """The loop of `walk`. Returns the first pair that was not visited, and the pixels' state.
+    """The loop of `walk`. Returns the pair after the last one that was visited, and the pixels' state.
 
-    visit(pair, drawn, pixels) -> (pixels, alive); drawn: what `drawn` returns, of so many pairs from that one on.
+    visit(pair, drawn, pixels) -> (pixels, alive); drawn: what `pair_at` returns, of so
+    many pairs from that one on.
     """
 
     def body(i: Any, pixels: Any, alive: Any) -> Any:
-        pixels, alive = visit(i, [drawn(lists, packed, lane, i, k) for k in range(together)], pixels)
+        pixels, alive = visit(i, [pair_at(lists, packed, lane, i, k) for k in range(together)], pixels)
         return i + together, pixels, (i + together < lane.end) & alive
 
     start = mi.UInt32(lane.start)

@@ -102,11 +102,12 @@ def roofline_bounds(data: dict[str, Any]) -> str:
     return markdown(["", "by the nearest limits, ms", "kernels, ms", "ratio"], rows) + made_by(data)
 
 
-BEFORE, DRAWN = ("projection", "lists tested, and packing"), ("forward: alpha and depth", "pixels in order")
+BEFORE, DRAWN = ("projection", "lists tested, and packing"), ("forward: alpha and depth", "pixels row by row")
+ADJOINT = ("adjoint: alpha and depth: walk", "adjoint: alpha and depth: add up")
 KERNELS_OF = {
     "draw a view never seen before": ("projection", "packing", "block lists", *DRAWN),
     "draw a view seen before": (*BEFORE, *DRAWN),
-    "image and gradient": (*BEFORE, *DRAWN, "adjoint: walk", "adjoint: add up", "sums to gradient"),
+    "image and gradient": (*BEFORE, *DRAWN, *ADJOINT, "sums to gradient"),
     "exact Fisher diagonal": (
         *BEFORE, "exact Fisher: walk 1", "exact Fisher: walk 2", "exact Fisher: add up", "sums to exact Fisher",
     ),
@@ -162,6 +163,15 @@ def variants(data: dict[str, Any]) -> str:
     rows[-1] += ["–"] * 3
     heading = ["", "new view", "view seen before", "image and gradient", "exact Fisher", "blocks"]
     return markdown([*heading, "error of the image", "gradient", "Fisher"], rows) + made_by(data)
+
+
+def machine_code(data: dict[str, Any]) -> str:
+    """Instructions of the loops that draw, of each kernel, for one pair."""
+    rows = []
+    for kernel in data["counts"]["as it is"]:
+        found = [ways[kernel] for ways in data["counts"].values()]
+        rows.append([kernel, *(f"{c['instructions']:,.0f} ({c['loads']:,.0f}, {c['stores']:,.0f})" for c in found)])
+    return markdown(["instructions of a pair (loads, stores of the stack)", *data["counts"]], rows) + made_by(data)
 
 
 def unseen(data: dict[str, Any]) -> str:
@@ -364,6 +374,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "roofline": ("benchmarks/roofline", roofline),
     "roofline-million": ("benchmarks/roofline_million", roofline_short),
     "variants": ("benchmarks/variants", variants),
+    "machine-code": ("benchmarks/machine_code", machine_code),
     "unseen": ("benchmarks/unseen", unseen),
     "roofline-work": ("benchmarks/roofline", roofline_work),
     "scaling": ("benchmarks/scaling", scaling),
