@@ -5,8 +5,8 @@ are an image of a view never seen before and of one seen before, an image with i
 its blocks, of 100,000 Gaussians at 640x480, in rounds in which each variant has its turn. A ratio is the fastest of the
 variant's rounds over the fastest of the core as it is: on a host that others use, too, these were disturbed least; spread is
 the slowest round of the core as it is over its fastest. Errors are the largest over all entries, relative to the largest entry
-of the float64 oracle (`mgs.splat.reference`), of the worst kind of parameter (`mgs.study.chart.core.error`), on SMALL. Let
-nothing else run.
+of the float64 oracle (`mgs.splat.reference`), of the worst kind of parameter (`mgs.study.chart.core.error`), on SMALL. Whether
+the order of instructions matters to Mitsuba's own kernels is told by the peer of `mgs bench splat`. Let nothing else run.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 from unseen import UNSEEN
 
 from mgs import runtime
-from mgs.bench.core import in_new_process, time_core
+from mgs.bench.core import in_new_process, time_core, time_volprim
 from mgs.files import write_json
 from mgs.plotting import STYLE, new_figure, save_figure
 from mgs.provenance import command_line, versions
@@ -273,6 +273,8 @@ def measure(name: str, with_errors: bool) -> dict[str, float]:
     change()
     where, small = scene(100_000, (640, 480)), scene(*SMALL)
     found = time_core(where.gaussians[seen(where, least)], where.camera, REPEATS)
+    if with_errors and name in ("as it is", LLVMS_ORDER):
+        found |= time_volprim(where.gaussians, where.camera, 3)
     if with_errors:
         for what in TIMED:
             found[f"error_{what}"] = error(in_full(small, least, what), oracle(what, small), what)
@@ -335,7 +337,8 @@ def main(prefix: str) -> None:
         key: max(run[key] for run in base) / min(run[key] for run in base) for key in OPERATIONS for base in [runs["as it is"]]
     }
     made = {"command": command_line(), "machine": runtime.processor(), "versions": versions(), "rounds": ROUNDS}
-    made |= {"spread": spread, "rows": rows}
+    peer = {name: {k: v for k, v in runs[name][0].items() if k.startswith("volprim")} for name in ("as it is", LLVMS_ORDER)}
+    made |= {"spread": spread, "rows": rows, "peer": peer}
     write_json(Path(f"{prefix}.json"), made)
     chart(Path(f"{prefix}.png"), rows)
 

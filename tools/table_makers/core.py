@@ -161,6 +161,9 @@ def variants(data: dict[str, Any]) -> str:
         [f"slowest over fastest of {data['rounds']} rounds, as it is", *(f"{data['spread'][key]:.2f}" for key in OPERATIONS)]
     )
     rows[-1] += ["–"] * 3
+    ours, theirs = data["peer"].values()
+    ratio = [theirs[key] / ours[key] for key in ("volprim_forward", "volprim_gradient")]
+    rows.append(["Mitsuba's volprim, instructions in LLVM's order", "–", *(f"{r:.2f}" for r in ratio), *["–"] * 5])
     heading = ["", "new view", "view seen before", "image and gradient", "exact Fisher", "blocks"]
     return markdown([*heading, "error of the image", "gradient", "Fisher"], rows) + made_by(data)
 
