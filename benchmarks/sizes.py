@@ -1,8 +1,7 @@
 """Large models and images: `python benchmarks/sizes.py OUT.json`. Let nothing else run.
 
-Seconds of each operation of the core and the most memory that it takes (`mgs.bench.core.scaling_point`), for each of SIZES in a
-process of its own. Block Fisher information is left out from MOST_WITH_BLOCKS Gaussians on: it has 121 numbers each, of which
-there are several copies at a time.
+Seconds of each operation of the core and the most memory that Dr.Jit holds (`mgs.bench.core.scaling_point`), for each of SIZES
+in a process of its own.
 """
 
 from __future__ import annotations
@@ -21,8 +20,6 @@ from mgs.provenance import command_line, versions
 SIZES = ((1_000_000, 1920, 1080), (1_000_000, 3840, 2160), (10_000_000, 1280, 960))
 """Numbers of Gaussians, and width and height of the image."""
 
-MOST_WITH_BLOCKS = 5_000_000
-
 REPEATS = 3
 
 
@@ -31,8 +28,7 @@ def main(out: Path) -> None:
     runtime.start()
     made: dict[str, Any] = {"command": command_line(), "machine": runtime.processor(), "versions": versions(), "sizes": []}
     for n, width, height in SIZES:
-        blocks = n <= MOST_WITH_BLOCKS
-        found = in_new_process(scaling_point, n, width, height, dr.thread_count(), REPEATS, blocks)
+        found = in_new_process(scaling_point, n, width, height, dr.thread_count(), REPEATS, True)
         made["sizes"].append({"n": n, "width": width, "height": height} | found)
         print(made["sizes"][-1], flush=True)
     write_json(out, made)

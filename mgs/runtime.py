@@ -167,7 +167,7 @@ def _keep_order() -> None:
 
     The kernels of `mgs.splat` are long pieces of straight code, written so that one pixel is finished before the next one needs
     registers. LLVM's machine scheduler would mix the pixels again, and keep on the stack what no longer fits into registers:
-    they then take up to a third more time (docs/splatting.md, What was tried).
+    up to a seventh more instructions (docs/splatting.md, What was tried).
     """
     with contextlib.suppress(InputError, AttributeError, OSError):
         library = ctypes.CDLL(find_libllvm().path)
