@@ -85,6 +85,7 @@ MARKERS = {
     "add up": "s",
     "alpha and depth": "<",
     "alpha and depth: walk": "<",
+    "alpha and depth: add up": "d",
     "projection": "*",
     "lists tested, and packing": "p",
     "pixels row by row": "h",
