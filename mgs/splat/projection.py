@@ -88,8 +88,8 @@ def camera_array(camera: Camera) -> Any:
 
 
 def _numbers(array: Any, first: int, end: int) -> list[Any]:
-    """Some numbers of a `camera_array`, each as an array of its own, which a kernel reads once for all Gaussians. Each is copied
-    in memory, so only those that are needed are asked for."""
+    """Some numbers of a `camera_array`, each as an array of its own, which a kernel reads once for all Gaussians. Each is
+    copied in memory, so only those that are needed are asked for."""
     return [dr.gather(mi.Float64, array, mi.UInt32(i)) for i in range(first, end)]
 
 

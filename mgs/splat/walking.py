@@ -206,8 +206,9 @@ def computed_after(x: Any, before: list[Any]) -> Any:
 
     A kernel's operations are compiled in the order in which its results need them (see `mgs.runtime`). In a loop these are
     first the state of all 32 pixels, and at the end what is summed over them: what lies between would leave the registers for
-    the stack. If a pixel depends on the sums over those before it, it is finished first. The dependence costs nothing: it is a
-    bit that LLVM knows to be zero and leaves out, and Dr.Jit does not.
+    the stack. If each pixel depends on the sums over the pixels before it, these are finished first. The dependence costs
+    nothing: what is added to x is a bit that is always zero. Dr.Jit does not see that, and so keeps the order; LLVM does, and
+    leaves the addition out.
     """
     if not before:
         return x
@@ -294,7 +295,7 @@ def pair_at(lists: BlockLists, packed: Any, lane: Lane, first: Any, k: int) -> t
         there = first + k < lane.end
         pair = dr.select(there, first + k, first)
         splat = unpack(packed, dr.gather(mi.UInt32, lists.splat, pair))
-        nothing = {"white_x": 0, "white_y": 0, "log2_opacity": -200}
+        nothing = {"white_x": 0, "white_y": 0, "log2_opacity": -200}  # an alpha far below ALPHA_MIN in every pixel
         splat = replace(splat, **{name: dr.select(there, getattr(splat, name), value) for name, value in nothing.items()})
     return pair, splat, block_rows(lane, splat)
 
