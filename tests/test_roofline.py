@@ -24,7 +24,7 @@ from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.splat import ListCache, as_drjit, kernels
 from mgs.splat.projection import camera_array, project
-from mgs.splat.walking import PIXELS
+from mgs.splat.walking import PIXELS, computed_after
 
 KERNEL = """
 define void @drjit_1(i64 %start, i64 %end, i32 %thread_id, ptr noalias %params) #0 {
@@ -147,6 +147,29 @@ def test_the_reader_understands_what_drjit_writes_today():
     assert (loop.flops, loop.divisions, loop.bytes) == (5 * 3, 5, 0)
     assert loop.state_bytes == 2 * 4 * (5 + 1) + 4  # five numbers, the counter, and x
     assert (found.straight.flops, found.straight.bytes) == (4, 4 + 4)
+
+
+@pytest.mark.parametrize("real", [mi.Float, mi.Float64])
+def test_bits_that_are_always_zero_are_not_counted(real):
+    """LLVM leaves them out. Bits that may be set count: x & 1 is an operation, and to add it another."""
+    x, y = real(dr.arange(mi.Float, 64) + 1), dr.arange(mi.Float, 64) + 2
+    dr.eval(x, y)
+    integer = mi.UInt32 if real is mi.Float else mi.UInt64
+
+    def straight(change):
+        def call():
+            before = [y * 2, y * y]
+            return change(x, before) + 1, *before
+
+        return count_work(compiled(call).ir).straight
+
+    def with_last_bit(x, before):
+        return dr.reinterpret_array(real, dr.reinterpret_array(integer, x) | integer(dr.reinterpret_array(mi.UInt32, y) & 1))
+
+    plain, changed = straight(lambda x, before: x), straight(with_last_bit)
+    assert straight(computed_after) == plain
+    extended = 1 + 2 + 2  # in double: x & 1, its extension, and the addition, where 64 bits count twice
+    assert changed.instructions == plain.instructions + (2 if real is mi.Float else extended)
 
 
 def test_work_of_the_kernels_is_what_their_authors_meant():

@@ -25,6 +25,9 @@ FREE = ("alloca", "phi", "getelementptr", "bitcast", "insert", "extract", "shuff
 """Beginnings of the operations that are not counted: they name values and addresses or spread a constant over the lanes,
 become part of an FMA (a change of sign), or occur once in a loop (what reduces a mask to one bit)."""
 
+BITWISE = ("and", "or", "lshr", "zext", "bitcast")
+"""Operations that count for nothing where their result is not used."""
+
 FLOPS = {"fadd": 1, "fsub": 1, "fmul": 1, "fdiv": 1, "sqrt": 1, "rcp": 1, "rsqrt": 1, "fma": 2}
 """Floating-point operations; all others have none. `rcp` and `rsqrt` are the processor's approximations."""
 
@@ -71,10 +74,11 @@ class KernelWork:
 def count_work(ir: str) -> KernelWork:
     """Count the work of a kernel. ir: its LLVM IR, as Dr.Jit's kernel history holds it.
 
-    A loop that runs a constant number of times, as one that fills a local array, counts as if it were written out.
+    A loop that runs a constant number of times, as one that fills a local array, counts as if it were written out. What only
+    computes bits that are always zero does not count (`_without_zero_bits`).
     Raises ValueError if ir holds no kernel, or one with a loop inside a loop, whose iterations have no common number.
     """
-    lines = _kernel_lines(ir)
+    lines = _without_zero_bits(_kernel_lines(ir))
     step = re.search(r"= add i64 %index, (\d+)", "\n".join(lines))
     if step is None:
         raise ValueError("no kernel of Dr.Jit in this code")
@@ -101,6 +105,41 @@ def _kernel_lines(ir: str) -> list[str]:
     lines = [line.partition(", !")[0] for line in ir.splitlines()]
     start = next((i for i, line in enumerate(lines) if line.startswith("define void @drjit_")), len(lines))
     return lines[start + 1 : lines.index("}", start) if start < len(lines) else None]
+
+
+def _without_zero_bits(lines: list[str]) -> list[str]:
+    """The lines without those that LLVM drops because they compute (x & 1) >> 1, which is always zero, or add that to a number:
+    so `mgs.splat.walking.computed_after` puts pixels in order."""
+    ones: set[str] = set()
+    odd: set[str] = set()
+    zeros: set[str] = set()
+    kept = []
+    for line in lines:
+        name, operation, rest = _parts(line)
+        used = re.findall(r"%[\w.]+", rest)
+        if re.search(r"undef, i\d+ 1, i32 0$", rest) or (operation == "shufflevector" and used[0] in ones):
+            ones.add(name)
+        elif operation == "and" and ones & set(used):
+            odd.add(name)
+        elif (operation == "lshr" and used[0] in odd and used[1] in ones) or (operation == "zext" and used[0] in zeros):
+            zeros.add(name)
+        elif operation == "or" and zeros & set(used):
+            (other,) = set(used) - zeros
+            kind = rest.strip().partition(" %")[0]
+            line = f"    {name} = bitcast {kind} {other} to {kind}"
+        kept.append(line)
+    return _without_unused(kept)
+
+
+def _without_unused(lines: list[str]) -> list[str]:
+    """The lines without those whose result, a bitwise operation on numbers, no other line reads."""
+    while True:
+        read = {name for line in lines for name in re.findall(r"%[\w.]+", _parts(line)[2])}
+        found = [(line, _parts(line)) for line in lines]
+        kept = [line for line, (name, operation, _) in found if not (operation in BITWISE and name not in read)]
+        if len(kept) == len(lines):
+            return lines
+        lines = kept
 
 
 def _loops(lines: list[str]) -> tuple[list[tuple[int, int]], dict[tuple[int, int], int]]:
