@@ -1,18 +1,42 @@
-"""Memory: results that are kept while there is room for them, sequences whose items are made when asked for, and arrays for
-Dr.Jit."""
+"""Memory: whether there is enough, results that are kept while there is room, sequences whose items are made when asked for,
+and arrays for Dr.Jit."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, TypeVar, overload
 
 import numpy as np
+
+from mgs.errors import InputError
 
 Value = TypeVar("Value")
 
 IMAGE_BYTES = 1 << 30
 """Most memory for arrays of one kind that are kept to be used again, bytes. Of images, as targets of a fit, these are 218 of
 640x480, or five of 12 megapixels. All others are read or computed again at every use."""
+
+
+LITTLE = 1 << 30
+"""Bytes up to which `check_room` does not ask: asking takes some of the time of a small image."""
+
+MEMORY_FILE = Path("/proc/meminfo")
+"""Where Linux says how much memory can be taken without swapping."""
+
+
+def check_room(needed: float, what: str, instead: str) -> None:
+    """Raises InputError where so many bytes for `what` are more than the system has to spare, with what to do `instead`: it
+    would end the process without a word. Systems that do not say what they have to spare are trusted."""
+    if needed <= LITTLE:
+        return
+    try:
+        found = re.search(r"MemAvailable:\s*(\d+) kB", MEMORY_FILE.read_text(encoding="ascii"))
+    except OSError:
+        return
+    if found and needed > (spare := 1024 * int(found[1])):
+        raise InputError(f"{what} may take {needed / 2**30:,.1f} GiB, and {spare / 2**30:,.1f} GiB are free; {instead}")
 
 
 PADDING = 64

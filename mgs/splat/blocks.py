@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mgs.errors import InputError
+from mgs.memory import check_room
 from mgs.splat.projection import Splats
 
 BLOCK_X, BLOCK_Y = 8, 4
@@ -138,7 +139,7 @@ def build(splats: Splats, width: int, height: int, older: BlockLists | None = No
 
     Pairs are made splat by splat, front to back, and then sorted by block; as the sort is stable, each block's list is front to
     back too. Whether a splat touches a block is decided by its ellipse, not by a bounding box.
-    Raises InputError for more than MAX_PAIRS pairs, before memory is taken for them.
+    Raises InputError for more than MAX_PAIRS pairs, and where there is no room for them, before memory is taken for them.
     """
     blocks_x, blocks_y = -(-width // BLOCK_X), -(-height // BLOCK_Y)
     foot = footprints(splats)
@@ -273,7 +274,8 @@ def _pairs(foot: Footprints, order: Any, place: Any, blocks_x: int, blocks_y: in
 
 
 def _total(counts: Any, most: int, what: str) -> int:
-    """Sum of UInt32 counts, each at most `most`; in 64 bits where 32 might not hold it. Raises InputError beyond MAX_PAIRS."""
+    """Sum of UInt32 counts, each at most `most`; in 64 bits where 32 might not hold it. Raises InputError beyond MAX_PAIRS, and
+    as `check_room`."""
     if len(counts) == 0:
         return 0
     total = int(dr.sum(counts if len(counts) * most < 1 << 32 else mi.UInt64(counts))[0])
@@ -283,6 +285,8 @@ def _total(counts: Any, most: int, what: str) -> int:
             f"{total * PAIR_BYTES / 2**30:,.1f} GiB, and {MAX_PAIRS:,} are the most; draw fewer or smaller Gaussians, "
             "or a smaller image"
         )
+    what = f"view: {total:,} pairs of a Gaussian and one of its {what} ({BLOCK_X}x{BLOCK_Y} pixels)"
+    check_room(total * PAIR_BYTES, what, "draw fewer or smaller Gaussians, or a smaller image")
     return total
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.errors import InputError, row_named
 from mgs.gaussians import LEARNED, Gaussians
-from mgs.memory import padded
+from mgs.memory import check_room, padded
 from mgs.seeds import derive_seed
 from mgs.splat import kernels
 from mgs.splat.derivatives import (
@@ -49,6 +49,9 @@ ALPHA_WEIGHT_MAX = 1e12
 
 MAX_SUMS = 1 << 31
 """Most sums of all (splat, block) pairs of a view, since kernels index them with 31 bits."""
+
+BLOCK_BYTES = 1800
+"""Peak memory of a view's blocks for each Gaussian, SH degree 0, apart from its pairs: 1,700 measured."""
 
 EXACT = ("exact", "block")
 """The estimators that know the means and alpha."""
@@ -86,7 +89,8 @@ def fisher(
     turn as the model is fitted, and information summed over views must be about one and the same direction.
     alpha_weight: the ratio of noise variances (sigma_rgb / sigma_alpha)^2, up to 1e12, with which a pixel's alpha is observed
     beside its colour; 0: it is not.
-    Raises InputError for an unknown estimator, where `render` does, for blocks of 2^31 numbers or more, for unusable means,
+    Raises InputError for an unknown estimator, where `render` does, for blocks of 2^31 numbers or more or that memory has no
+    room for, for unusable means,
     normals or alpha_weight, which only the estimators `exact` and `block` know, and with means for too many pairs (`MAX_SUMS`).
     """
     compute = row_named(ESTIMATORS, estimator, "estimator")
@@ -106,6 +110,9 @@ def fisher(
             f"fisher: blocks of {n:,} Gaussians of SH degree {gaussians.sh_degree} would take {n * size * size / 2**28:.1f} "
             "GiB, and 8 are the most; take fewer Gaussians, a lower degree, or the estimator `exact`"
         )
+    if estimator == "block":
+        of_degree = BLOCK_BYTES * (size / 11) ** 2
+        check_room(n * of_degree, f"fisher: blocks of {n:,} Gaussians", "take fewer Gaussians, or the estimator `exact`")
     return compute(as_drjit(gaussians), camera, background, cache, **options)
 
 

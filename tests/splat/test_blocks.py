@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mgs import memory
 from mgs.camera import MAX_PIXELS, MAX_SIDE
 from mgs.errors import InputError
 from mgs.gaussians import MAX_GAUSSIANS, Gaussians
-from mgs.splat import ListCache, as_drjit, blocks, fisher, kernels, reference, render, walking
+from mgs.splat import ListCache, as_drjit, blocks, fisher, information, kernels, reference, render, walking
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, REORDERED, RESHAPED, TILE, build, changes, depth_order, footprints
 from mgs.splat.projection import camera_array, project
 from mgs.splat.walking import PIXELS, packet_count
@@ -306,6 +307,34 @@ def test_a_view_has_a_bounded_number_of_pairs(monkeypatch):
     for call in (render, fisher):
         with pytest.raises(InputError, match=f"view: {count:,} pairs .* {count - 1:,} are the most; draw fewer or smaller"):
             call(g, camera)
+
+
+def test_what_memory_has_no_room_for_is_refused(monkeypatch, tmp_path):
+    """Before it is taken; what fits is drawn as ever, and a system that says nothing is trusted."""
+    camera, g = make_camera(), make_gaussians(60, 3)
+    count = len(pairs_of(lists_of(g, camera)[0]))
+    spare = tmp_path / "meminfo"
+    monkeypatch.setattr(memory, "MEMORY_FILE", spare)
+    monkeypatch.setattr(memory, "LITTLE", 0)
+    whole = np.asarray(render(g, camera).rgb)
+    for room, call, said in (
+        (count * blocks.PAIR_BYTES // 2, render, f"view: {count:,} pairs .* GiB are free; draw fewer or smaller"),
+        (
+            60 * information.BLOCK_BYTES // 2,
+            fisher_of_blocks,
+            "fisher: blocks of 60 Gaussians may take .* take fewer Gaussians",
+        ),
+    ):
+        spare.write_text(f"MemTotal:  9 kB\nMemAvailable:  {room // 1024} kB\n")
+        with pytest.raises(InputError, match=said):
+            call(g, camera)
+    spare.write_text("MemAvailable:  1000000 kB\n")
+    np.testing.assert_array_equal(np.asarray(render(g, camera).rgb), whole)
+    fisher_of_blocks(g, camera)
+
+
+def fisher_of_blocks(gaussians, camera):
+    return fisher(gaussians, camera, "block")
 
 
 def test_places_in_buffers_stay_below_31_bits():
