@@ -19,6 +19,7 @@ from own_data import photographs
 
 from mgs import runtime
 from mgs.active.nbv import run_nbv
+from mgs.active.settings import COLOURS_ALONE
 from mgs.data.importers import import_source, read_source
 from mgs.files import write_json
 from mgs.prior.build import build_prior, save_prior
@@ -47,7 +48,7 @@ def records(data: Path, work: Path, stops: float) -> list[dict[str, Any]]:
     true, rows = json.loads((data / "truth.json").read_text())["gains"], []
     for exposure in (False, True):
         out = work / f"run{exposure}"
-        state = run_nbv(work / "d", out, policy="uniform", seeds=VIEWS, budget=0, exposure=exposure)
+        state = run_nbv(work / "d", out, policy="uniform", seeds=VIEWS, budget=0, exposure=exposure, train=COLOURS_ALONE)
         metrics = evaluate_run(out, pictures=False)["held_out"]
         row = {"stops": stops, "exposure": exposure}
         row |= {key: metrics[key] for key in ("psnr_mask", "psnr_mask_corrected")}

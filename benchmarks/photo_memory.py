@@ -108,7 +108,20 @@ def commands(folder: Path, count: int) -> list[tuple[str, list[str | Path]]]:
     """The stations that photographs go through: (what the table calls it, its command line), in the order to run them."""
     photos, small, prior = (folder / f"{name}{count}" for name in ("photos", "small", "prior"))
     full, size = folder / f"full{count}", ["--gaussians", "4000"]
-    run = ["--policy", "uniform", "--passes", "1", "--warm-passes", "1", "--seeds", str(count), "--budget", "0"]
+    run = [
+        "--alpha-weight",
+        "0",
+        "--policy",
+        "uniform",
+        "--passes",
+        "1",
+        "--warm-passes",
+        "1",
+        "--seeds",
+        str(count),
+        "--budget",
+        "0",
+    ]
     return [
         ("mgs import", ["import", photos, "--out", folder / f"imported{count}"]),
         ("mgs import --downscale 4", ["import", photos, "--out", small, "--downscale", "4"]),

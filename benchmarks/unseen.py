@@ -26,6 +26,7 @@ import numpy as np
 from mgs import runtime
 from mgs.active import objective
 from mgs.active.nbv import run_nbv
+from mgs.active.settings import COLOURS_ALONE
 from mgs.camera import Camera
 from mgs.data.dataset import load_dataset
 from mgs.files import write_json
@@ -79,12 +80,13 @@ def study(work: Path, root: Path, gaussians: int, budget: int) -> list[dict[str,
     if not prior.is_dir():
         save_prior(prior, build_prior(dataset, PriorSettings(gaussians=gaussians))[0])
     shutil.rmtree(work / "warm-up", ignore_errors=True)
-    run_nbv(root, work / "warm-up", prior=prior, policy="uniform", budget=1)  # compiles the kernels
+    given = {"prior": prior, "policy": "uniform", "train": COLOURS_ALONE}
+    run_nbv(root, work / "warm-up", budget=1, **given)  # compiles the kernels
     for limit in LIMITS:
         run = work / "run"
         shutil.rmtree(run, ignore_errors=True)
         with nullcontext() if limit is None else LeavingOut(limit):
-            state = run_nbv(root, run, prior=prior, policy="uniform", budget=budget, evaluate_every=budget)
+            state = run_nbv(root, run, budget=budget, evaluate_every=budget, **given)
         least = -1.0 if limit is None else limit
         seen = [(fisher(state.gaussians, dataset.frames[i].camera) > least).any(axis=1).mean() for i in state.taken[:8]]
         last = state.steps[-1]

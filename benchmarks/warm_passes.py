@@ -14,6 +14,7 @@ from typing import Any
 
 from mgs import runtime
 from mgs.active.nbv import resume_nbv, run_nbv
+from mgs.active.settings import COLOURS_ALONE
 from mgs.data.dataset import load_dataset
 from mgs.files import write_json
 from mgs.prior.build import build_prior, save_prior
@@ -31,7 +32,7 @@ def study(work: Path, root: Path, gaussians: int, budget: int) -> list[dict[str,
         save_prior(prior, build_prior(load_dataset(root), PriorSettings(gaussians=gaussians))[0])
     for passes in PASSES:
         run = work / f"{passes}-passes"
-        given = {"policy": "uniform", "budget": budget, "warm_passes": passes, "evaluate_every": 1}
+        given = {"policy": "uniform", "budget": budget, "warm_passes": passes, "evaluate_every": 1, "train": COLOURS_ALONE}
         state = resume_nbv(run) if (run / "config.json").is_file() else run_nbv(root, run, prior=prior, **given)
         seconds = {key: sum(step["seconds"].get(key, 0) for step in state.steps) for key in state.steps[-1]["seconds"]}
         del seconds["evaluate"]

@@ -36,13 +36,16 @@ main()
 EVALUATE = "evaluate"
 """The stage that only measures the model."""
 
+COLOURS = ["--alpha-weight", "0"]
+"""So that the new version fits what the old one does."""
+
 RUNS = {
     "old, d-optimal": ("old", ["--policy", "d-optimal"]),
-    "d-optimal": ("new", ["--policy", "d-optimal"]),
-    "d-optimal, 5 at a time": ("new", ["--policy", "d-optimal", "--batch", "5"]),
-    "coverage, 5 at a time": ("new", ["--policy", "coverage", "--batch", "5"]),
-    "uniform, 5 at a time": ("new", ["--policy", "uniform", "--batch", "5"]),
-    "directional-i, all at once": ("new", ["--policy", "directional-i", "--batch", "BUDGET"]),
+    "d-optimal": ("new", [*COLOURS, "--policy", "d-optimal"]),
+    "d-optimal, 5 at a time": ("new", [*COLOURS, "--policy", "d-optimal", "--batch", "5"]),
+    "coverage, 5 at a time": ("new", [*COLOURS, "--policy", "coverage", "--batch", "5"]),
+    "uniform, 5 at a time": ("new", [*COLOURS, "--policy", "uniform", "--batch", "5"]),
+    "directional-i, all at once": ("new", [*COLOURS, "--policy", "directional-i", "--batch", "BUDGET"]),
 }
 """Runs by name: which version, and its options."""
 

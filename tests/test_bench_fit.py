@@ -7,6 +7,7 @@ import synthetic
 
 from mgs.active.settings import TrainSettings
 from mgs.bench import fit as bench
+from mgs.metrics import agreement
 from mgs.report.evaluation import evaluate
 
 
@@ -50,6 +51,7 @@ def test_the_figures_are_those_of_the_fits(root, small):
     assert figures["predicted_over_found_decrease"] == end["predicted"] / end["found"] > 0
     assert figures["ranking_tau"] == pytest.approx(sum(state["tau"] for state in found["ranking"]) / 2)
     assert [state["views"] for state in found["ranking"]] == [3, 4]
+    assert found["ranking_tau_half"] == pytest.approx(sum(state["tau_half"] for state in found["ranking"]) / 2)
 
 
 def test_passes_are_those_of_the_first_fit_that_reaches_the_objective(root, small, monkeypatch):
@@ -68,4 +70,8 @@ def test_passes_are_those_of_the_first_fit_that_reaches_the_objective(root, smal
 def test_a_ranking_agrees_with_itself(root, small, monkeypatch):
     monkeypatch.setattr(bench, "LONGER", 1)
     case = bench._case(bench.load_dataset(root), 200, "random", 4)
-    assert bench._ranking(case) == {"views": 4, "tau": pytest.approx(1), "regret": 0}
+    found = bench._ranking(case)
+    shorter = case.fit(case.start, case.taken, TrainSettings(passes=TrainSettings().passes // 2, tolerance=0.0))
+    stopped = case.fit(case.start, case.taken, TrainSettings())
+    scores = [bench._scores(case, model.gaussians) for model in (shorter, stopped)]
+    assert found == {"views": 4, "tau_half": agreement(*scores)["tau"], "tau": pytest.approx(1), "regret": 0}

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mgs.active.nbv import start_run
-from mgs.active.settings import PRESETS, NbvSettings, TrainSettings, with_preset
+from mgs.active.settings import ALPHA_WEIGHT, COLOURS_ALONE, PRESETS, NbvSettings, TrainSettings, with_defaults
 from mgs.cli.app import app, main
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
@@ -82,6 +82,7 @@ def test_commands_of_points_say_what_was_measured(name):
         said, made = parsed(point.command("DATA", "PRIOR", chosen.seeds)), point.settings(chosen.seeds)
         train = made.pop("train")
         rates = dict(pair.split("=") for pair in said["rate"] or [])
+        assert said["alpha_weight"] == 0
         assert {key: said[key] for key in (*made, "passes", "optimiser")} == made | {
             k: train[k] for k in ("passes", "optimiser")
         }
@@ -114,10 +115,16 @@ def test_presets_are_points_of_the_chart_and_of_the_study_of_other_scenes():
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_preset_gives_defaults_and_what_is_given_wins(name):
     row = PRESETS[name]
-    assert with_preset(row, {})["train"] == {"passes": row.passes}
-    found = with_preset(row, {"warm_passes": 7, "train": {"passes": 9, "optimiser": "adam"}})
-    assert found == {"warm_passes": 7, "train": {"passes": 9, "optimiser": "adam"}}
-    assert with_preset(row, {"train": TrainSettings(optimiser="adam")})["train"] == {"passes": row.passes, "optimiser": "adam"}
+    usual = {"passes": row.passes, "alpha_weight": ALPHA_WEIGHT}
+    assert with_defaults({}, row)["train"] == usual
+    given = {"passes": 9, "optimiser": "adam", "alpha_weight": 0.0}
+    assert with_defaults({"warm_passes": 7, "train": given}, row) == {"warm_passes": 7, "train": given}
+    assert with_defaults({"train": TrainSettings(optimiser="adam")}, row)["train"] == usual | {"optimiser": "adam"}
+
+
+def test_a_run_without_a_preset_fits_alpha_too_unless_it_says_not_to():
+    assert with_defaults({"budget": 3}) == {"budget": 3, "train": {"alpha_weight": ALPHA_WEIGHT}}
+    assert with_defaults({"train": COLOURS_ALONE})["train"] == COLOURS_ALONE == {"alpha_weight": 0.0}
 
 
 def test_a_run_with_a_preset_writes_what_it_came_to(dataset, prior, tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ from rich.console import Console
 from mgs.active import criteria, loop, nbv, pose_policies, run_folder
 from mgs.active.convergence import remaining_decrease
 from mgs.active.run_folder import load_run
-from mgs.active.settings import TrainSettings
+from mgs.active.settings import ALPHA_WEIGHT, TrainSettings
 from mgs.cli.app import main
 from mgs.cli.nbv import print_run, start_and_print
 from mgs.data.dataset import load_dataset
@@ -52,7 +52,7 @@ def test_the_datasets_own_prior_is_the_default(dataset, tmp_path):
 def test_every_setting_of_the_fit_is_written_down_and_the_root_seed_reaches_it(dataset, tmp_path):
     prior = tiny.write_prior(tmp_path / "prior")
     settings, _ = started(dataset, tmp_path / "run", prior, budget=2, seed=7)
-    assert settings["train"] == TrainSettings(seed=7).model_dump()
+    assert settings["train"] == TrainSettings(seed=7, alpha_weight=ALPHA_WEIGHT).model_dump()
     assert settings["train"]["seed"] == settings["seed"] == 7
 
 

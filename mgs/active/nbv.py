@@ -13,7 +13,7 @@ from mgs import runtime
 from mgs.active import loop
 from mgs.active.policy_file import absolute
 from mgs.active.run_folder import DATASET, State, check_same_frames, check_settings, holds_run, read_settings, start
-from mgs.active.settings import PRESETS, NbvSettings, validated, with_preset
+from mgs.active.settings import PRESETS, NbvSettings, validated, with_defaults
 from mgs.active.stations import real_stations
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.errors import InputError, row_named
@@ -96,7 +96,7 @@ def start_run(
     if prior is None and gaussians is None and (dataset / "prior/prior.json").is_file():
         prior = dataset / "prior"
     row = None if preset is None else row_named(PRESETS, preset, "--preset")
-    settings = settings if row is None else with_preset(row, settings)
+    settings = with_defaults(settings, row)
     where = out / "prior" if prior is None else Path(prior)
     given = validated(NbvSettings, {"dataset": dataset.resolve(), "prior": where.resolve(), **settings})
     loaded = load_dataset(dataset) if capture is None else None

@@ -27,6 +27,13 @@ PASSES, WARM_PASSES = 10, 5
 More cost more and overfit. Chosen constants (docs/speed-accuracy.md)."""
 
 
+ALPHA_WEIGHT = 0.1
+"""`TrainSettings.alpha_weight` of a run that says nothing of it. A chosen constant (docs/nbv.md, An opaque surface)."""
+
+COLOURS_ALONE = {"alpha_weight": 0.0}
+"""Values of `TrainSettings` with which colours alone are fitted, as in the paper. All studies of this project do so."""
+
+
 @dataclass(frozen=True)
 class Preset:
     """A point of the chart of speed against accuracy (docs/speed-accuracy.md): defaults that give way to what is given."""
@@ -83,8 +90,8 @@ class TrainSettings(BaseModel):
     """Learning rate of each kind of parameter; kinds left out take those of RATES. A rate of 0 leaves a kind as it is. That of
     `mean`, metres, is read only where means are learned, and must be there then; `mgs nbv` sets it (`with_spacing`)."""
     alpha_weight: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)] = 0.0
-    """(sigma_rgb / sigma_alpha)^2, with which alpha is a fourth channel of a pixel; 0: it is none. The criteria leave it out:
-    with a weight up to 1 they chose the same views (docs/fit.md)."""
+    """(sigma_rgb / sigma_alpha)^2, with which alpha is a fourth channel of a pixel; 0: it is none. Runs have ALPHA_WEIGHT by
+    default. The criteria leave it out: with a weight up to 1 they chose the same views (docs/fit.md)."""
     decay: Positive = 0.1
     """The rates fall by this factor over `passes`."""
     seed: Annotated[int, Field(ge=0)] = 0
@@ -171,11 +178,14 @@ class NbvSettings(BaseModel):
         return self.model_copy(update={"train": train, "prior_std": {"mean": MEAN_STD * spacing} | self.prior_std})
 
 
-def with_preset(preset: Preset, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of NbvSettings with the defaults of a preset in them. What `values` holds stays as it is."""
+def with_defaults(values: Mapping[str, Any], preset: Preset | None = None) -> dict[str, Any]:
+    """Fields of NbvSettings with ALPHA_WEIGHT and the defaults of a preset in them. What `values` holds stays as it is."""
     train = values.get("train", {})
     given = train.model_dump(exclude_unset=True) if isinstance(train, TrainSettings) else train
-    return {"warm_passes": preset.warm_passes, **values, "train": {"passes": preset.passes, **given}}
+    with_alpha = {"alpha_weight": ALPHA_WEIGHT, **given}
+    if preset is None:
+        return {**values, "train": with_alpha}
+    return {"warm_passes": preset.warm_passes, **values, "train": {"passes": preset.passes, **with_alpha}}
 
 
 Model = TypeVar("Model", bound=BaseModel)

@@ -96,6 +96,7 @@ def bench(
     elif kind is Kind.fit:
         result = bench_fit(dataset or Path("demo/dataset"), report)
         _print_figures(console, result["figures"], FIT_TARGETS)
+        console.print(f"Kendall's tau of the ranking with that of half the passes: {result['ranking_tau_half']:.3f}")
     elif kind is Kind.roofline:
         result = bench_roofline(gaussians or 100_000, 640, 480, repeats, report)
         _print_roofline(console, result)

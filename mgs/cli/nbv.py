@@ -9,7 +9,7 @@ import typer
 
 from mgs.active.criteria import PIXEL_NOISE, PRIOR_STD
 from mgs.active.policies import policy_names
-from mgs.active.settings import PASSES, PRESETS, RATES, WARM_PASSES
+from mgs.active.settings import ALPHA_WEIGHT, PASSES, PRESETS, RATES, WARM_PASSES
 from mgs.active.stopping import fit_line, why_ended
 
 if TYPE_CHECKING:
@@ -97,8 +97,11 @@ def nbv(
     optimiser: Annotated[str, typer.Option(help="Optimiser of the fit: natural or adam.")] = "natural",
     alpha_weight: Annotated[
         float,
-        typer.Option(metavar="WEIGHT", help="Weight of a pixel's alpha in the fit, (sigma_rgb / sigma_alpha)^2; 0: none."),
-    ] = 0.0,
+        typer.Option(
+            metavar="WEIGHT",
+            help="Weight of a pixel's alpha in the fit, (sigma_rgb / sigma_alpha)^2; 0: none, as in the paper.",
+        ),
+    ] = ALPHA_WEIGHT,
     rate: Annotated[
         list[str] | None,
         typer.Option(

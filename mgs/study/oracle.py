@@ -12,7 +12,7 @@ from typing import Any
 from mgs.active.loop import Loop, Progress, Stations
 from mgs.active.nbv import start_run
 from mgs.active.run_folder import State, read_checkpoint, read_settings, write_checkpoint
-from mgs.active.settings import NbvSettings
+from mgs.active.settings import COLOURS_ALONE, NbvSettings
 from mgs.active.stations import psnr_measure, real_stations
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.prior.build import load_prior
@@ -50,7 +50,8 @@ def run_oracle(root: Path, out: Path, dataset: str, prior: str, settings: dict[s
     run = out / "run"
     if not (run / "config.json").is_file():
         where = cell_folder(root, prior) / "prior"
-        start_run(dataset_of(root, dataset), run, prior=where, policy="random", evaluate_every=1, **settings)
+        given = {"policy": "random", "evaluate_every": 1, "train": COLOURS_ALONE, **settings}
+        start_run(dataset_of(root, dataset), run, prior=where, **given)
     state = choose_all(run)
     return {key: [step[key] for step in state.steps] for key in CURVES} | {"taken": state.taken}
 

@@ -243,7 +243,7 @@ class Run:
         *_, cell = self.cells()
         options = " ".join(f"--{key} {value}" for key, value in self.settings().items())
         dataset, prior = f"cells/{cell.arguments['dataset']}/dataset", f"cells/{cell.arguments['prior']}/prior"
-        return f"mgs nbv {dataset} --prior {prior} --out RUN {options}"
+        return f"mgs nbv {dataset} --prior {prior} --out RUN --alpha-weight 0 {options}"
 
 
 ORACLE, FREE_FIT = "oracle", "free-fit"

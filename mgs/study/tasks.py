@@ -19,6 +19,7 @@ from typing import Any
 
 from mgs.active.nbv import resume_nbv, run_nbv
 from mgs.active.run_folder import State
+from mgs.active.settings import COLOURS_ALONE
 from mgs.data.dataset import TEST_FOLDER, load_dataset, write_transforms
 from mgs.errors import InputError
 from mgs.files import atomic_folder
@@ -104,7 +105,7 @@ def run_or_resume(root: Path, out: Path, dataset: str, prior: str, settings: dic
     run = out / "run"
     if (run / "config.json").is_file():
         return resume_nbv(run)
-    return run_nbv(dataset_of(root, dataset), run, prior=cell_folder(root, prior) / "prior", **settings)
+    return run_nbv(dataset_of(root, dataset), run, prior=cell_folder(root, prior) / "prior", train=COLOURS_ALONE, **settings)
 
 
 def time_policy(root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]) -> dict[str, Any]:

@@ -229,16 +229,38 @@ OPERATIONS = {
 
 
 def lanes(data: dict[str, Any]) -> str:
-    """Seconds of the core with AVX-512 and with AVX2, and the ratios of the rounds."""
-    wide, narrow = data["lanes"]["AVX-512"], data["lanes"]["AVX2"]
+    """Seconds of the core by the registers that it uses, and their ratios to the first: of the fastest, and of the rounds."""
+    first, *others = data["fastest"]
     rows = []
     for key, name in OPERATIONS.items():
-        low, median, high = data["ratios"][key]
-        rows.append([name, f"{1e3 * wide[key]:.1f}", f"{1e3 * narrow[key]:.1f}", f"{median:.2f} ({low:.2f} to {high:.2f})"])
+        row = [name, f"{1e3 * data['fastest'][first][key]:.1f}"]
+        for other in others:
+            best, rounds = data["fastest"][other][key], data["ratios"][other][key]
+            row.append(f"{1e3 * best:.1f}, {best / data['fastest'][first][key]:.2f} ({min(rounds):.2f} to {max(rounds):.2f})")
+        rows.append(row)
     for key, name in {"error_image": "largest error of an image", "error_fisher": "of exact Fisher information"}.items():
-        rows.append([name, short(wide[key], 2), short(narrow[key], 2), ""])
-    heading = ["100,000 Gaussians, 640x480", "AVX-512 (ms)", "AVX2 (ms)", f"ratio, median of {data['rounds']} rounds (range)"]
-    return markdown(heading, rows) + made_by(data)
+        rows.append([name, *(short(found[key], 2) for found in data["fastest"].values())])
+    columns = [f"{other}: ms, ratio of the fastest of {data['rounds']} rounds (range)" for other in others]
+    return markdown(["100,000 Gaussians, 640x480", f"{first}, fastest (ms)", *columns], rows) + made_by(data)
+
+
+def wasted(data: dict[str, Any]) -> str:
+    """What walks do in vain, and what registers of each size could leave out of it."""
+    widths = list(data["lanes"])
+    rows = [
+        [
+            f"pixels evaluated and not drawn, of {data['pairs']:,} pairs of 32",
+            *[f"{data['pixels_not_drawn']:.0%}"] * len(widths),
+        ],
+        ["rows of a block that its splat does not reach", *[f"{data['rows_not_reached']:.0%}"] * len(widths)],
+    ]
+    for key, name in {
+        "rows_no_lane_reaches": "rows that no lane's splat reaches: could be left out",
+        "pairs_merged": "pairs whose splat another lane draws at the same time: sums could be merged",
+        "lanes_waiting": "lanes that wait for the longest list of their register",
+    }.items():
+        rows.append([name, *(f"{data['lanes'][width][key]:.1%}" for width in widths)])
+    return markdown(["share of all", *(f"registers of {width} lanes" for width in widths)], rows) + made_by(data)
 
 
 def sizes(data: dict[str, Any]) -> str:
@@ -370,6 +392,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "data-samples": ("benchmarks/data_samples", data_samples),
     "later-passes": ("benchmarks/warm_passes", later_passes),
     "lanes": ("benchmarks/lanes", lanes),
+    "wasted": ("benchmarks/wasted", wasted),
     "sizes": ("benchmarks/sizes", sizes),
     "splat": ("benchmarks/splat", splat),
     "splat-short": ("benchmarks/splat", splat_short),

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mgs.active.settings import PASSES, PRESETS, RATES, WARM_PASSES
+from mgs.active.settings import COLOURS_ALONE, PASSES, PRESETS, RATES, WARM_PASSES
 from mgs.data.dataset import load_dataset
 from mgs.study.chart.pareto import pareto_front
 from mgs.study.chart.plan import DENSITY, SCENE, Data, Plan, synthetic
@@ -52,7 +52,7 @@ class Point:
         return "-".join([*parts, *(["half"] if self.half else [])])
 
     def settings(self, seeds: int) -> dict[str, Any]:
-        """The arguments of `mgs.active.nbv.run_nbv`."""
+        """The arguments of `mgs.active.nbv.run_nbv`, but for COLOURS_ALONE."""
         seeds = seeds if self.policy else self.images
         rates = {} if self.learned == "all" else {kind: 0.0 for kind in RATES if kind not in self.learned.split("+")}
         train = {"passes": self.passes, "optimiser": self.optimiser, "rates": rates}
@@ -63,7 +63,7 @@ class Point:
         """The command line that makes this model again."""
         given = self.settings(seeds)
         train = given.pop("train")
-        options = {**given, "passes": train["passes"], "optimiser": train["optimiser"]}
+        options = {**given, "passes": train["passes"], "optimiser": train["optimiser"], "alpha_weight": 0}
         words = ["mgs", "nbv", dataset, "--prior", prior, "--out", "RUN"]
         for name, value in options.items():
             words += [f"--{name.replace('_', '-')}", str(value)]
@@ -132,9 +132,11 @@ def measure(
     from mgs.active.nbv import run_nbv
     from mgs.active.run_folder import State
 
+    given = settings | {"train": settings["train"] | COLOURS_ALONE}
+
     def run() -> State:
         shutil.rmtree(out / "run", ignore_errors=True)
-        return run_nbv(root / dataset, out / "run", prior=root / prior, **settings)
+        return run_nbv(root / dataset, out / "run", prior=root / prior, **given)
 
     state, times = timed(run, repeats)
     shutil.rmtree(out / "run")

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from mgs.active.criteria import d_optimal
 from mgs.active.run_folder import read_checkpoint
+from mgs.active.settings import COLOURS_ALONE
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
@@ -215,7 +216,8 @@ def make_states(root: Path, out: Path, dataset: str, prior: str, seeds: int) -> 
 
     for folder in out.iterdir():  # what an interrupted call left
         shutil.rmtree(folder)
-    state = run_nbv(root / dataset, out / "run", prior=root / prior, seeds=seeds, budget=max(STATES), on_step=keep)
+    given: dict[str, Any] = {"seeds": seeds, "budget": max(STATES), "train": COLOURS_ALONE}
+    state = run_nbv(root / dataset, out / "run", prior=root / prior, on_step=keep, **given)
     return {"taken": state.taken}
 
 

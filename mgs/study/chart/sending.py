@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mgs.active.criteria import PIXEL_NOISE
+from mgs.active.settings import COLOURS_ALONE
 from mgs.data.dataset import load_dataset
 from mgs.gaussians import Gaussians
 from mgs.study.chart.pareto import pareto_front
@@ -115,7 +116,7 @@ def measure(root: Path, out: Path, dataset: str, prior: str, images: int, preset
 
     data, run = load_dataset(root / dataset), out / "run"
     shutil.rmtree(run, ignore_errors=True)  # what an interrupted call left
-    state = run_nbv(root / dataset, run, prior=root / prior, seeds=images, budget=0)
+    state = run_nbv(root / dataset, run, prior=root / prior, seeds=images, budget=0, train=COLOURS_ALONE)
     settings = read_settings(run)
     stations = real_stations(data, load_prior(root / prior), settings)
     lam, model = settings.regularisation(stations.groups), as_matrix(state.gaussians)
