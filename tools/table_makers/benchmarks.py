@@ -170,6 +170,38 @@ def local_density(data: dict[str, Any]) -> str:
     return markdown(heading, rows) + made_by(data)
 
 
+def evidence_kinds(data: dict[str, Any]) -> str:
+    """PSNR on test views with all parameters, without a kind, and with those of each Gaussian that the evidence pays for."""
+    rows = []
+    for scene in data["scenes"]:
+        of = {r["what"]: r for r in scene["kinds"]}
+        name = f"{_rock(scene['dataset'])}, {of['all']['gaussians']:,} Gaussians, {scene['views']} views"
+        most = of["all"]["parameters"]
+        cells = [f"{r['psnr_inside']:.2f}, {r['psnr']:.2f} ({r['parameters'] / most:.0%})" for r in of.values()]
+        rows.append([name, *cells, ", ".join(f"{share:.0%}" for share in of["by evidence"]["shares"].values())])
+    shares = ", ".join(data["scenes"][0]["kinds"][0]["shares"])
+    return markdown(["rock", *of, f"by evidence, Gaussians that learn {shares}"], rows) + made_by(data)
+
+
+def evidence_degrees(data: dict[str, Any]) -> str:
+    """PSNR inside the rock with colours of degree 1 against degree 0, by the prior of their coefficients, and the prior that
+    rules without test views choose."""
+    rows = []
+    for scene in data["scenes"]:
+        zero, *others = scene["degrees"]
+        for what in dict.fromkeys(r["what"] for r in others):
+            of = [r for r in others if r["what"] == what]
+            shares = ["" if what == "all" else f" ({r['shares']['degree 1']:.0%})" for r in of]
+            cells = [f"{r['psnr_inside'] - zero['psnr_inside']:+.2f}{share}" for r, share in zip(of, shares, strict=True)]
+            chosen = [max([zero, *of], key=lambda r: r["evidence"]) if "evidence" in what or what == "all" else {}]
+            chosen.insert(0, min([zero, *of], key=lambda r: r["left_out_error"]) if what == "all" else {})
+            named = [f"{r.get('tau', 'degree 0')}" if r else "" for r in chosen]
+            name = f"{_rock(scene['dataset'])}, {scene['views']} views: {what}"
+            rows.append([name, f"{zero['psnr_inside']:.2f}", *cells, *named])
+    taus = [f"tau {tau:g}" for tau in dict.fromkeys(r["tau"] for r in data["scenes"][0]["degrees"][1:])]
+    return markdown(["rock: Gaussians of degree 1", "degree 0, dB", *taus, "tau by views left out", "tau by evidence"], rows)
+
+
 def _rock(dataset: str) -> str:
     """The scene that a dataset of the commands here is of, by its path."""
     parts = Path(dataset).parts
@@ -277,6 +309,8 @@ def _mean(values: Iterable[float]) -> float:
 
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "local-density": ("benchmarks/local_density", local_density),
+    "evidence-kinds": ("benchmarks/evidence", evidence_kinds),
+    "evidence-degrees": ("benchmarks/evidence", evidence_degrees),
     "uncertainty": ("benchmarks/uncertainty", uncertainty),
     "prior-errors": ("benchmarks/prior_errors", prior_errors),
     "prior-scenes": ("benchmarks/prior_errors", prior_scenes),
