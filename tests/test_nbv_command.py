@@ -341,9 +341,10 @@ def test_alpha_as_a_channel_reaches_every_fit_and_the_resumed_run(dataset, prior
         return run_folder.read_settings(tmp_path / name), run_folder.read_checkpoint(tmp_path / name)
 
     given = [dataset, "--prior", prior, "--passes", 2, "--policy", "uniform"]
-    settings, plain = run("plain", *given, "--budget", 1)
+    settings, plain = run("plain", *given, "--budget", 1, "--alpha-weight", 0)
     with_alpha, whole = run("whole", *given, "--budget", 1, "--alpha-weight", 0.5)
-    assert (settings.train.alpha_weight, with_alpha.train.alpha_weight) == (0, 0.5)
+    usual, _ = run("usual", *given, "--budget", 0)
+    assert [s.train.alpha_weight for s in (settings, with_alpha, usual)] == [0, 0.5, ALPHA_WEIGHT]
     assert (whole.gaussians.logit_opacities != plain.gaussians.logit_opacities).any()
     run("begun", *given, "--budget", 0, "--alpha-weight", 0.5)
     config = tmp_path / "begun/config.json"

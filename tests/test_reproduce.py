@@ -15,6 +15,7 @@ from refusals import occupied, refused
 
 from mgs.active.nbv import run_nbv
 from mgs.active.run_folder import read_checkpoint
+from mgs.active.settings import COLOURS_ALONE
 from mgs.cli.app import main
 from mgs.data.dataset import TEST_FOLDER, load_dataset
 from mgs.errors import InputError
@@ -465,7 +466,7 @@ def test_a_run_that_was_killed_goes_on(quick, tmp_path):
     folder.mkdir(parents=True)
     (folder / ".run.1.part").mkdir()
     where = cell_folder(tmp_path, cell.arguments["prior"]) / "prior"
-    first = {**run.settings(), "budget": 2, "evaluate_every": 1}
+    first = {**run.settings(), "budget": 2, "evaluate_every": 1, "train": COLOURS_ALONE}
 
     def stop(state):
         if len(state.steps) == 2:

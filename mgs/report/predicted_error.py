@@ -141,7 +141,7 @@ def _without(fold: int, frames: Sequence[Frame], prior: Prior, settings: NbvSett
     start, cache = initial_gaussians(prior, kept)[0], ListCache()
     columns = groups(start.sh_degree)
     by_kind = lam_by_kind(settings.regularisation(columns), columns)
-    targets = [target_of(frame) for frame in kept]
+    targets = [target_of(frame, settings.train.alpha_weight > 0) for frame in kept]
     model = fit(start, [f.camera for f in kept], targets, settings.train, cache=cache, start=start, lam=by_kind).gaussians
     H = np.stack([fisher(model, frame.camera, cache=cache) for frame in kept]).sum(axis=0, dtype=np.float64)
     return predictor(model, H, kept, settings), [frame for i, frame in enumerate(frames) if i % FOLDS == fold]

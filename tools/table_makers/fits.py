@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mgs.bench.fit import TARGETS as FIT_TARGETS
+from mgs.study.statistics import interval
 from table_makers.markdown import made_by, markdown
 
 
@@ -155,6 +156,25 @@ def alpha_faults(data: dict[str, Any]) -> str:
     return markdown(heading, rows) + made_by(data)
 
 
+def alpha_policies(data: dict[str, Any]) -> str:
+    """Policies with alpha in the fit and without, and by how much each is ahead of even spacing either way."""
+    records = data["records"]
+    found = {(r["rock"], r["policy"], r["alpha_weight"] > 0): r["test_psnr"] for r in records}
+    rocks = list(dict.fromkeys(r["rock"] for r in records))
+    rows = []
+    for policy in dict.fromkeys(r["policy"] for r in records):
+        means = [sum(found[rock, policy, alpha] for rock in rocks) / len(rocks) for alpha in (False, True)]
+        gains = [found[rock, policy, True] - found[rock, policy, False] for rock in rocks]
+        row = [policy, *(f"{mean:.2f}" for mean in means), f"{min(gains):+.2f} to {max(gains):+.2f}"]
+        for alpha in (False, True):
+            ahead = [found[rock, policy, alpha] - found[rock, "uniform", alpha] for rock in rocks]
+            low, high = interval(ahead) or (0.0, 0.0)
+            row.append("" if policy == "uniform" else f"{sum(ahead) / len(ahead):+.2f} [{low:+.2f}, {high:+.2f}]")
+        rows.append(row)
+    heading = [f"{len(rocks)} rocks", "colours alone (dB)", "with alpha (dB)", "gain by rock"]
+    return markdown([*heading, "over even spacing, colours alone", "the same, with alpha"], rows) + made_by(data)
+
+
 def prior_std(data: dict[str, Any]) -> str:
     """Quality and shape of the surface against the prior's standard deviations."""
     rows = []
@@ -281,6 +301,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "truth": ("benchmarks/truth", truth),
     "linearity": ("benchmarks/linearity", linearity),
     "alpha-faults": ("benchmarks/alpha_faults", alpha_faults),
+    "alpha-policies": ("benchmarks/alpha_policies", alpha_policies),
     "residual": ("benchmarks/residual", residual),
     "prior-std": ("benchmarks/prior_std", prior_std),
     "inset": ("benchmarks/inset", inset),
