@@ -196,6 +196,26 @@ def uncertainty(data: dict[str, Any]) -> str:
     return markdown([*heading, "in the interval of 90 % (thirds)", "CRPS over a constant's"], rows) + made_by(data)
 
 
+def uncertainty_rocks(data: dict[str, Any]) -> str:
+    """The same rock by rock, of what the criteria assume and of all terms: means over the runs on it."""
+    of_rocks: dict[str, list[dict[str, Any]]] = {}
+    for record in data["records"]:
+        of_rocks.setdefault(Path(record["run"]).parent.name, []).extend(r for r in record["rows"] if r["views"] == "test")
+    rows = []
+    for prediction in (data["records"][0]["rows"][0]["prediction"], "all"):
+        for rock, found in of_rocks.items():
+            of = [row for row in found if row["prediction"] == prediction]
+            area = {name: _mean(row["ause"]["mae"][name] for row in of) for name in ("ause", "perfect", "constant")}
+            closed = (area["constant"] - area["ause"]) / (area["constant"] - area["perfect"])
+            held = [" and ".join(f"{100 * row['held']['0.9'][k]:.0f}" for row in of) for k in range(4)]
+            ranks = f"{_mean(row['spearman'] for row in of):.2f}"
+            cells = [f"{area['ause']:.2f} ({area['perfect']:.2f}; {area['constant']:.2f})", f"{closed:.0%}", ranks]
+            rows.append([f"{prediction}: {rock}", *cells, *held])
+    heading = ["prediction: rock", "AUSE of absolute errors (perfect; constant)", "gap closed", "Spearman"]
+    parts = ["in the interval of 90 %, in %", "lowest third", "middle", "highest"]
+    return markdown([*heading, *parts], rows)
+
+
 PRIORS = {
     "exact": "exact depth and poses",
     "survey, exact poses": "of `mgs survey --poses exact`: noisy depth",
@@ -278,6 +298,7 @@ def _mean(values: Iterable[float]) -> float:
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "local-density": ("benchmarks/local_density", local_density),
     "uncertainty": ("benchmarks/uncertainty", uncertainty),
+    "uncertainty-rocks": ("benchmarks/uncertainty", uncertainty_rocks),
     "prior-errors": ("benchmarks/prior_errors", prior_errors),
     "prior-scenes": ("benchmarks/prior_errors", prior_scenes),
     "criteria": ("benchmarks/criteria", criteria),
