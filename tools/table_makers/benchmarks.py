@@ -275,7 +275,9 @@ def criteria(data: dict[str, Any]) -> str:
     spearman = [f"Spearman, {len(names)} {kind}s" for kind, names in kinds.items()]
     heading = ["score", *spearman, "all", "of the ceiling", "regret, rings, dB", "domes", "all"]
     command = re.sub(r"(out/states/\S+ )+", "out/states/* ", data["command"])  # their names are many
-    return markdown(heading, ranked) + made_by(data | {"command": command})
+    apart = [state["largest_difference"] for state in states.values() if "largest_difference" in state]
+    note = f"\nPSNR measured anew differs from that of `OLD.json` by {max(apart):.3f} dB at most.\n" if apart else ""
+    return markdown(heading, ranked) + note + made_by(data | {"command": command.replace("out/criteria-before", "OLD")})
 
 
 def fitted_degree(data: dict[str, Any]) -> str:
