@@ -1,6 +1,6 @@
 """Which score predicts what a view is really worth?
 
-    python benchmarks/criteria.py OUT.json RUN... [--orders N] [--policy P]...
+    python benchmarks/criteria.py OUT.json RUN... [--orders N] [--policy P]... [--gains OLD.json]
 
 The last state of each run is a state to choose from: `mgs nbv --budget 0` leaves that of the seeds alone, `--policy random
 --budget 4` another. Every candidate is really taken: the model is fitted on with its image, and the gain is the rise of the
@@ -15,6 +15,10 @@ since they speak of Pearson's correlation.
 
 OUT.json is written after each fit. The same command goes on where it was interrupted; with more runs, orders or policies it
 adds what is missing.
+
+With `--gains OLD.json` the gains are those of an earlier file, which a version or a processor measured whose last digits were
+others, and only the scores are made anew, all of them. So that the states are the same ones is checked: they must have the
+same candidates, and the model as it is, and after a fit with the first candidate and with the last, must come out within SAME.
 """
 
 from __future__ import annotations
@@ -42,6 +46,9 @@ if TYPE_CHECKING:
     from mgs.active.loop import Loop
 
 METRIC = "psnr_mask"
+
+SAME = 0.02
+"""By how much PSNR measured anew may differ from that of an earlier file, dB. Fits in other orders differ by more."""
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -93,11 +100,29 @@ class Bench:
         return float(self.stations.measure(fit.gaussians, taken)[self.metric])
 
 
-def study(out: Path, runs: Sequence[Path], orders: int, policies: Sequence[str]) -> dict[str, Any]:
-    """Measure what OUT.json does not hold yet; returns its contents. Raises InputError if it is of other states of the runs."""
+def earlier(bench: Bench, record: dict[str, Any], old: dict[str, Any]) -> dict[str, Any]:
+    """The entries of a state whose gains are those of an earlier record: `psnr`, and what was `measured_anew` to check them.
+
+    Raises InputError where that is of another state.
+    """
+    names = record["candidates"]
+    anew = {"start": bench.measured(None, 0)} | {names[k]: bench.measured(bench.left[k], 0) for k in (0, -1)}
+    before = {name: old["psnr"][name] if name == "start" else old["psnr"][name][0] for name in anew if name in old["psnr"]}
+    apart = max(abs(anew[name] - before.get(name, np.inf)) for name in anew)
+    if apart > SAME or any(old[key] != record[key] for key in ("metric", "candidates", "images")):
+        raise InputError(f"--gains: are of another state of {bench.run} (PSNR differs by {apart:.3f} dB); leave them out")
+    return {"psnr": old["psnr"], "measured_anew": anew, "largest_difference": apart}
+
+
+def study(out: Path, runs: Sequence[Path], orders: int, policies: Sequence[str], gains: Path | None = None) -> dict[str, Any]:
+    """Measure what OUT.json does not hold yet; returns its contents. gains: an earlier file, see the module. Raises InputError
+    if either is of other states of the runs."""
     from mgs.provenance import command_line, versions
 
     found = read_json(out) if out.is_file() else {"states": {}}
+    if gains is not None:
+        old = read_json(gains)
+        found["gains_of"] = {key: old[key] for key in ("command", "versions")}
     found |= {"command": command_line(), "versions": versions()}
     for run in runs:
         bench = Bench(run)
@@ -110,6 +135,9 @@ def study(out: Path, runs: Sequence[Path], orders: int, policies: Sequence[str])
         if missing:
             record["scores"] |= bench.scores(missing)
             write_json(out, found)
+        if gains is not None and not record["psnr"] and str(run) in old["states"]:
+            record |= earlier(bench, record, old["states"][str(run)])
+            print(f"{run}: PSNR measured anew differs by {record['largest_difference']:.4f} dB at most", flush=True)
         psnr = record["psnr"]
         if "start" not in psnr:
             psnr["start"] = bench.measured(None, 0)
@@ -179,10 +207,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
     parser.add_argument("--orders", type=int, default=1, help="fits of each candidate, in different orders of the images")
     parser.add_argument("--policy", action="append", help="FILE.py:FUNCTION, beside all names")
+    parser.add_argument("--gains", type=Path, metavar="OLD.json", help="an earlier file, from which the gains are taken")
     given = parser.parse_args(arguments)
     runtime.start()
     try:
-        found = study(given.out, given.runs, given.orders, [*policy_names(), *(given.policy or [])])
+        found = study(given.out, given.runs, given.orders, [*policy_names(), *(given.policy or [])], given.gains)
     except InputError as error:
         raise SystemExit(f"error: {error}") from None
     print(table(found, given.runs))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mgs.active.directional import Views, gains
+from mgs.active.directional import Views, gains, squared_weights
 from mgs.active.outlook import Outlook
 
 
@@ -26,6 +26,22 @@ def poses_alone(outlook: Outlook) -> np.ndarray:
 
     middle, lam = outlook.centre[None], float(outlook.prior_lam[0])
     return gains(middle, lam, 3, 0.1, alike(outlook.taken), alike(outlook.candidates), alike(outlook.dome().positions))
+
+
+def trained_gaussians(outlook: Outlook) -> np.ndarray:
+    """`directional-i` that measures on the fitted Gaussians what the views taken and the candidates see, not on the prior's.
+
+    Their shapes and opacities are those of the last fit. What the dome sees is still measured on the prior's: of the fitted
+    model a policy is told what the dataset's own poses see, and no others.
+    """
+
+    def fitted(frames: list[int]) -> Views:
+        on_surface = slice(len(outlook.points))  # not those behind it
+        seen = [squared_weights(outlook.estimate(i, "exact"))[on_surface] for i in frames]
+        return Views(outlook.positions[frames], np.stack(seen))
+
+    lam = float(outlook.prior_lam[0])
+    return gains(outlook.points, lam, 3, 0.1, fitted(outlook.visited), fitted(outlook.left), outlook.dome())
 
 
 def without_opacity(F: np.ndarray, H: np.ndarray, lam: np.ndarray) -> float:

@@ -68,6 +68,25 @@ def test_another_state_is_refused(benchmark, run, tmp_path):
         benchmark.study(tmp_path / "out.json", [run], 1, ["farthest"])
 
 
+def test_gains_of_an_earlier_file(benchmark, run, tmp_path):
+    """Its gains are taken where the states are the same but for the last digits; scores are of the states as they are."""
+    old = benchmark.study(tmp_path / "old.json", [run], 2, ["farthest", "uniform"])
+    state = old["states"][str(run)]
+    state |= {"model": "with other last digits", "scores": {"uniform": [0.0] * 5}}
+    (tmp_path / "old.json").write_text(json.dumps(old))
+    found = benchmark.study(tmp_path / "new.json", [run], 2, ["uniform", "coverage"], tmp_path / "old.json")
+    new = found["states"][str(run)]
+    assert new["psnr"] == state["psnr"]
+    assert new["result"]["gains"] == state["result"]["gains"]
+    assert new["largest_difference"] == 0
+    assert set(new["scores"]) == {"uniform", "coverage", "(farthest)"}
+    assert np.ptp(new["scores"]["uniform"]) > 0
+    state["psnr"]["start"] += 0.03
+    (tmp_path / "old.json").write_text(json.dumps(old))
+    with pytest.raises(InputError, match=r"--gains: are of another state of .* \(PSNR differs by 0.030 dB\); leave them out"):
+        benchmark.study(tmp_path / "other.json", [run], 2, ["uniform"], tmp_path / "old.json")
+
+
 def test_what_is_compared(benchmark):
     """A perfect score, its opposite, one that knows nothing, whose choice is the farthest view; and two orders."""
     psnr = {"start": 20.0, "a": [20.1, 20.2], "b": [20.4, 20.3], "c": [20.2, 20.6]}

@@ -225,7 +225,29 @@ def uncertainty(data: dict[str, Any]) -> str:
         crps = sum(row["crps"] / row["crps_constant"] for row in found) / len(found)
         rows.append([prediction, *cells, f"{crps:.2f}"])
     heading = ["prediction", "AUSE of absolute errors (perfect; constant)", "of squared errors", "Spearman", "Pearson"]
-    return markdown([*heading, "in the interval of 90 % (thirds)", "CRPS over a constant's"], rows) + made_by(data)
+    heading += ["in the interval of 90 % (thirds)", "CRPS over a constant's"]
+    command = re.sub(r"(out/calibrated/\S+ ?)+", "out/calibrated/*/d*", data["command"])  # their names are many
+    return markdown(heading, rows) + made_by(data | {"command": command})
+
+
+def uncertainty_rocks(data: dict[str, Any]) -> str:
+    """The same rock by rock, of what the criteria assume and of all terms: means over runs; shares in intervals of each run."""
+    of_rocks: dict[str, list[dict[str, Any]]] = {}
+    for record in data["records"]:
+        of_rocks.setdefault(Path(record["run"]).parent.name, []).extend(r for r in record["rows"] if r["views"] == "test")
+    rows = []
+    for prediction in (data["records"][0]["rows"][0]["prediction"], "all"):
+        for rock, found in of_rocks.items():
+            of = [row for row in found if row["prediction"] == prediction]
+            ause = {name: _mean(row["ause"]["mae"][name] for row in of) for name in ("ause", "perfect", "constant")}
+            closed, promised = (1 - ause[name] / ause["constant"] for name in ("ause", "perfect"))
+            held = [", ".join(f"{100 * row['held']['0.9'][k]:.1f}" for row in of) for k in range(4)]
+            rows.append(
+                [f"{rock}: {prediction}", f"{closed:.0%} ({promised:.0%})", f"{_mean(r['spearman'] for r in of):.2f}", *held]
+            )
+    policies = ", ".join(dict.fromkeys(record["policy"] for record in data["records"]))
+    heading = ["rock: prediction", "gap closed (promised)", "Spearman", f"% in the interval of 90 % ({policies})"]
+    return markdown([*heading, "lowest third", "middle third", "highest third"], rows)
 
 
 PRIORS = {
@@ -280,14 +302,18 @@ def criteria(data: dict[str, Any]) -> str:
             continue
         values = [_mean(numbers) for numbers in found]
         regrets = [_mean(states[s]["result"]["regret"][policy] for s in names) for names in sets]
-        cells = [*(f"{value:.2f}" for value in values), f"{values[-1] / ceilings[-1]:.2f}", *(f"{r:.2f}" for r in regrets)]
+        even = _mean(states[s]["result"]["spearman"][policy] for s in states if s.endswith("-even"))
+        cells = [*(f"{value:.2f}" for value in (*values, even, values[-1] / ceilings[-1])), *(f"{r:.2f}" for r in regrets)]
         rows.append((values[-1], [Path(policy).name, *cells]))
     ranked = [row for _, row in sorted(rows, key=lambda row: -row[0])]
-    ranked.append(["(ceiling)", *(f"{value:.2f}" for value in ceilings), "1", "", "", ""])
+    even = _mean(states[s]["result"]["ceiling"] for s in states if s.endswith("-even"))
+    ranked.append(["(ceiling)", *(f"{value:.2f}" for value in (*ceilings, even)), "1", "", "", ""])
     spearman = [f"Spearman, {len(names)} {kind}s" for kind, names in kinds.items()]
-    heading = ["score", *spearman, "all", "of the ceiling", "regret, rings, dB", "domes", "all"]
+    heading = ["score", *spearman, "all", "from 4 even views", "of the ceiling", "regret, rings, dB", "domes", "all"]
     command = re.sub(r"(out/states/\S+ )+", "out/states/* ", data["command"])  # their names are many
-    return markdown(heading, ranked) + made_by(data | {"command": command})
+    apart = [state["largest_difference"] for state in states.values() if "largest_difference" in state]
+    note = f"\nPSNR measured anew differs from that of `OLD.json` by {max(apart):.3f} dB at most.\n" if apart else ""
+    return markdown(heading, ranked) + note + made_by(data | {"command": command.replace("out/criteria-before", "OLD")})
 
 
 def fitted_degree(data: dict[str, Any]) -> str:
@@ -312,6 +338,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "evidence-kinds": ("benchmarks/evidence", evidence_kinds),
     "evidence-degrees": ("benchmarks/evidence", evidence_degrees),
     "uncertainty": ("benchmarks/uncertainty", uncertainty),
+    "uncertainty-rocks": ("benchmarks/uncertainty", uncertainty_rocks),
     "prior-errors": ("benchmarks/prior_errors", prior_errors),
     "prior-scenes": ("benchmarks/prior_errors", prior_scenes),
     "criteria": ("benchmarks/criteria", criteria),

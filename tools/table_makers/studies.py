@@ -139,13 +139,13 @@ def oracle(data: dict[str, Any]) -> str:
     return markdown([f"{data['rocks']} rocks: over random, dB (share)", *pools], lines) + made_by(data)
 
 
-def directional_noise(data: dict[str, Any]) -> str:
+def own_policy(data: dict[str, Any]) -> str:
     """By how much a policy of the user's own is behind the leader, at the end and over the whole curve."""
-    rows = [row | {"policy": what} for row in data["rows"] if ".py:" in row["policy"] for what in NOISE_COLUMNS]
-    return matrix(rows, f"{LEADER} over it (dB)", lambda row: led(row, NOISE_COLUMNS[row["policy"]])) + made_by(data)
+    rows = [row | {"policy": what} for row in data["rows"] if ".py:" in row["policy"] for what in LED_COLUMNS]
+    return matrix(rows, f"{LEADER} over it (dB)", lambda row: led(row, LED_COLUMNS[row["policy"]])) + made_by(data)
 
 
-NOISE_COLUMNS = {
+LED_COLUMNS = {
     "last model, full frame": "test_psnr_led",
     "last model, rock": "test_psnr_mask_led",
     "whole curve, full frame": "test_psnr_area_led",
@@ -188,8 +188,9 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     **{f"reproduce-{name}": (f"results/reproduce/{name}", reproduced(name)) for name in REPRODUCED},
     "paper-size-table1": ("results/paper-size/table1", reproduced("table1")),
     "ablations": ("results/ablations/pools", ablations),
+    "trained-gaussians": ("benchmarks/trained_gaussians", own_policy),
     "linear-look": ("results/linear-look/pools", ablations),
-    "directional-noise": ("results/directional-noise/pools", directional_noise),
+    "directional-noise": ("results/directional-noise/pools", own_policy),
     "lunar": ("results/lunar/statistics", lunar),
     "clean-alarms": ("benchmarks/clean_alarms", clean_alarms),
     "oracle": ("results/oracle/pools", oracle),
