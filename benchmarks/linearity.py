@@ -215,7 +215,7 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
         )
     )
     with matplotlib.rc_context(STYLE):
-        figure = new_figure(7.2, 3.1)
+        figure = new_figure(7.2, 3.4)
         for axis, passes in zip(figure.subplots(1, 2, sharey=True), PASSES, strict=True):
             for kind, colour in colours.items():
                 rows = [r for r in records if (r["passes"], r["move"]) == (passes, f"draw, {kind}")]
@@ -223,11 +223,12 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
             for move, marker in zip(ADDED.values(), ("x", "+"), strict=True):
                 real = [r["departure"] for r in records if (r["passes"], r["move"]) == (passes, move)]
                 axis.plot([1.0] * len(real), real, marker, linestyle="", color="#000000", label=move)
-            axis.set(xscale="log", yscale="log", ylim=(0.2, 40), xlabel="size of the draw (posterior standard deviations)")
+            axis.set(xscale="log", yscale="log", ylim=(0.2, 12), xlabel="size of the draw (posterior standard deviations)")
             axis.set_title(f"after {passes} passes")
             axis.axhline(1, color="#888888", linewidth=0.8)
         figure.axes[0].set(ylabel="departure from linear")
-        figure.axes[0].legend(ncols=3, loc="upper right", columnspacing=0.8, handlelength=1.2)
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, ncols=5, loc="outside upper center", columnspacing=0.8, handlelength=1.2)
         save_figure(figure, path)
 
 
