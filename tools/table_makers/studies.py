@@ -181,6 +181,7 @@ def clean_alarms(data: dict[str, Any]) -> str:
 TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "stability": ("results/stress/verdicts", stability),
     "stability-world": ("results/stress/world", stability),
+    "stability-full": ("results/stress-full/verdicts", stability),
     "parsimony": ("results/parsimony/parsimony", parsimony),
     "parsimony-verdict": ("results/parsimony/parsimony", parsimony_verdict),
     "parsimony-rules": ("results/parsimony/parsimony", parsimony_rules),
