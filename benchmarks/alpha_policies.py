@@ -28,10 +28,10 @@ def main(out: Path, work: Path, *rocks: str) -> None:
         dataset, _, prior = rock.partition(":")
         for policy in POLICIES:
             for weight in (0.0, ALPHA_WEIGHT):
-                run = work / f"{Path(dataset).parts[-3]}-{policy}-{weight:g}"
+                run = work / f"{dataset.replace('/', '-')}-{policy}-{weight:g}"
                 given = {"policy": policy, "budget": BUDGET, "evaluate_every": BUDGET, "train": {"alpha_weight": weight}}
-                finished = (run / "config.json").is_file()
-                state = resume_nbv(run) if finished else run_nbv(dataset, run, prior=prior, **given)
+                begun = (run / "config.json").is_file()
+                state = resume_nbv(run) if begun else run_nbv(dataset, run, prior=prior, **given)
                 found = {key: state.steps[-1][key] for key in ("test_psnr", "test_psnr_mask")}
                 records.append({"rock": rock, "policy": policy, "alpha_weight": weight} | found)
                 print(records[-1], flush=True)

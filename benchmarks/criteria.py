@@ -109,7 +109,10 @@ def earlier(bench: Bench, record: dict[str, Any], old: dict[str, Any]) -> dict[s
     anew = {"start": bench.measured(None, 0)} | {names[k]: bench.measured(bench.left[k], 0) for k in (0, -1)}
     before = {name: old["psnr"][name] if name == "start" else old["psnr"][name][0] for name in anew if name in old["psnr"]}
     apart = max(abs(anew[name] - before.get(name, np.inf)) for name in anew)
-    if apart > SAME or any(old[key] != record[key] for key in ("metric", "candidates", "images")):
+    for key in ("metric", "candidates", "images"):
+        if old[key] != record[key]:
+            raise InputError(f"--gains: are of another state of {bench.run} ({key} differ); leave them out")
+    if apart > SAME:
         raise InputError(f"--gains: are of another state of {bench.run} (PSNR differs by {apart:.3f} dB); leave them out")
     return {"psnr": old["psnr"], "measured_anew": anew, "largest_difference": apart}
 

@@ -2,7 +2,7 @@
 
 OLD, NEW: folders of two checkouts (`git worktree add`), with the packages of this environment. Each does `mgs demo` in an empty
 folder below WORK, in turn, ROUNDS times; seconds are those of its own headings. The versions do not do the same: the old one
-has three policies and no test views. Let nothing else run.
+has three policies, no test views, and fits colours alone. Let nothing else run.
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ from mgs.cli.app import app, main
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.prior.settings import PriorSettings
+from mgs.study import oracle, tasks
 from mgs.study.chart import core, fit, plan, presets, scoring, sending, study, subject, timing
 from mgs.study.chart.pareto import pareto_front
 from mgs.study.chart.tables import chart_table
@@ -120,6 +121,41 @@ def test_a_preset_gives_defaults_and_what_is_given_wins(name):
     given = {"passes": 9, "optimiser": "adam", "alpha_weight": 0.0}
     assert with_defaults({"warm_passes": 7, "train": given}, row) == {"warm_passes": 7, "train": given}
     assert with_defaults({"train": TrainSettings(optimiser="adam")}, row)["train"] == usual | {"optimiser": "adam"}
+
+
+class Begun(Exception):
+    """A run began with these settings."""
+
+
+def test_studies_fit_colours_alone(dataset, prior, tmp_path, monkeypatch):
+    """What they begin runs with, wherever they begin them."""
+
+    def begin(*_, train, **__):
+        raise Begun(train["alpha_weight"])
+
+    monkeypatch.setattr("mgs.active.nbv.run_nbv", begin)
+    monkeypatch.setattr(tasks, "run_nbv", begin)
+    monkeypatch.setattr(oracle, "start_run", begin)
+    for module in (tasks, oracle):
+        monkeypatch.setattr(module, "dataset_of", lambda root, name: dataset)
+    settings, where = {"train": {"passes": 2}}, (tmp_path, tmp_path / "out", dataset, prior)
+    (tmp_path / "out").mkdir()
+    for call in (
+        lambda: fit.measure(tmp_path, tmp_path / "out", dataset, dataset, prior, settings, 1),
+        lambda: scoring.make_states(*where, 3),
+        lambda: sending.measure(*where, 3, "quick"),
+        lambda: tasks.run_or_resume(*where, {}),
+        lambda: tasks.run_or_resume(*where, settings),
+        lambda: oracle.run_oracle(*where, settings),
+    ):
+        with pytest.raises(Begun) as begun:
+            call()
+        assert begun.value.args == (0,)
+
+
+def test_what_is_no_table_of_settings_is_left_to_be_refused():
+    for wrong in (None, "fast", 3):
+        assert with_defaults({"train": wrong}) == {"train": wrong}
 
 
 def test_a_run_without_a_preset_fits_alpha_too_unless_it_says_not_to():

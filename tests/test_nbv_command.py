@@ -333,6 +333,19 @@ def test_options_of_the_choice_and_the_end_reach_the_run(dataset, prior, tmp_pat
     assert (found.nearest, found.travel, found.batch, found.stop_gain, found.stop_uncertainty) == (5, 2.5, 3, 0.01, 0.2)
 
 
+def test_without_masks_alpha_has_no_weight_by_default(dataset, prior, tmp_path):
+    """A frame with neither mask nor alpha shows nothing but rock: its alpha is 1 everywhere, which no camera measured."""
+    assert started(dataset, tmp_path / "masked", prior, budget=1)[0]["train"]["alpha_weight"] == ALPHA_WEIGHT
+    made = json.loads((dataset / "transforms.json").read_text())
+    for frame in made["frames"]:
+        frame.pop("mask_path", None)
+        frame.pop("rock_file_path", None)
+    (dataset / "transforms.json").write_text(json.dumps(made))
+    assert started(dataset, tmp_path / "bare", prior, budget=1)[0]["train"]["alpha_weight"] == 0
+    given = started(dataset, tmp_path / "given", prior, budget=1, train={"alpha_weight": 0.3})
+    assert given[0]["train"]["alpha_weight"] == 0.3
+
+
 def test_alpha_as_a_channel_reaches_every_fit_and_the_resumed_run(dataset, prior, tmp_path):
     def run(name, *options):
         with pytest.raises(SystemExit) as stop:

@@ -2,8 +2,8 @@
 
 Every sign is larger where things are worse. `mgs nbv` prints a line when a sign goes beyond its limit, and keeps all of them in
 steps.jsonl. A fit that diverges ends the run with a line of its own (`mgs.active.stopping`), and means that are frozen have no
-drift. The limits are chosen by good runs of `mgs nbv` and of `mgs stress --preset quick` (docs/stability.md): 1.4 to 4 times
-the largest value that was seen there, or, where a comment says so, by something else.
+drift. The limits are chosen by good runs of `mgs nbv` (of colours alone) and of `mgs stress --preset quick`
+(docs/stability.md): 1.4 to 4 times the largest value that was seen there, or, where a comment says so, by something else.
 """
 
 from __future__ import annotations

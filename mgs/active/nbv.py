@@ -13,7 +13,7 @@ from mgs import runtime
 from mgs.active import loop
 from mgs.active.policy_file import absolute
 from mgs.active.run_folder import DATASET, State, check_same_frames, check_settings, holds_run, read_settings, start
-from mgs.active.settings import PRESETS, NbvSettings, validated, with_defaults
+from mgs.active.settings import ALPHA_WEIGHT, PRESETS, NbvSettings, validated, with_defaults
 from mgs.active.stations import real_stations
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.errors import InputError, row_named
@@ -80,7 +80,7 @@ def start_run(
     many `gaussians` (`mgs.prior.settings.PriorSettings`; by default, as many as the images can tell apart); of an on-demand
     dataset it is built of its survey. preset: a row of `mgs.active.settings.PRESETS`, whose values are the defaults of what is
     not given. settings: fields of `mgs.active.settings.NbvSettings`; the budget is 50 views, or all candidates where they are
-    fewer.
+    fewer; where `train` does not name alpha_weight, it is ALPHA_WEIGHT, or 0 where frames have neither mask nor alpha.
     Leaves no folder behind where it fails. Raises InputError where the output folder is not empty, a setting is wrong, the
     dataset is too small for it, the dataset, the scene or the prior is missing or damaged, or the cameras are so near to the
     prior that it would not be drawn.
@@ -96,10 +96,11 @@ def start_run(
     if prior is None and gaussians is None and (dataset / "prior/prior.json").is_file():
         prior = dataset / "prior"
     row = None if preset is None else row_named(PRESETS, preset, "--preset")
-    settings = with_defaults(settings, row)
+    loaded = load_dataset(dataset) if capture is None else None
+    outlined = loaded is None or all(frame.mask_path or frame.rock_path for frame in loaded.frames)
+    settings = with_defaults(settings, row, ALPHA_WEIGHT if outlined else 0.0)
     where = out / "prior" if prior is None else Path(prior)
     given = validated(NbvSettings, {"dataset": dataset.resolve(), "prior": where.resolve(), **settings})
-    loaded = load_dataset(dataset) if capture is None else None
     count = _candidates(capture) if capture is not None else len(loaded or ())
     own_seed = "seed" in given.train.model_fields_set
     resolved: dict[str, Any] = {"policy": absolute(given.policy)}

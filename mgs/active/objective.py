@@ -10,7 +10,7 @@ is the matrix whose diagonal the criteria use: the model that is fitted and the 
 With lam = 0 it is maximum likelihood, the paper's Eq. 2 up to a constant.
 
 Alpha may be a fourth channel, with noise of its own, sigma_alpha: its squared differences then count alpha_weight =
-(sigma / sigma_alpha)^2 times. What a camera sees of alpha is the outline of the rock.
+(sigma / sigma_alpha)^2 times. What a camera sees of alpha is the outline of the rock. The criteria leave it out.
 
 The means are frozen by default, as in the paper. Where they are "free", all three coordinates are parameters like the others.
 Where they move along the "normal", the parameter is one offset per Gaussian, metres: how far its mean lies from its start,

@@ -28,10 +28,12 @@ More cost more and overfit. Chosen constants (docs/speed-accuracy.md)."""
 
 
 ALPHA_WEIGHT = 0.1
-"""`TrainSettings.alpha_weight` of a run that says nothing of it. A chosen constant (docs/nbv.md, An opaque surface)."""
+"""`TrainSettings.alpha_weight` of a run that says nothing of it, where all frames have a mask or alpha. A chosen constant
+(docs/nbv.md, An opaque surface)."""
 
 COLOURS_ALONE = {"alpha_weight": 0.0}
-"""Values of `TrainSettings` with which colours alone are fitted, as in the paper. All studies of this project do so."""
+"""Values of `TrainSettings` with which colours alone are fitted, as in the paper. All studies of this project do so, but for
+those of alpha itself."""
 
 
 @dataclass(frozen=True)
@@ -178,11 +180,15 @@ class NbvSettings(BaseModel):
         return self.model_copy(update={"train": train, "prior_std": {"mean": MEAN_STD * spacing} | self.prior_std})
 
 
-def with_defaults(values: Mapping[str, Any], preset: Preset | None = None) -> dict[str, Any]:
-    """Fields of NbvSettings with ALPHA_WEIGHT and the defaults of a preset in them. What `values` holds stays as it is."""
+def with_defaults(
+    values: Mapping[str, Any], preset: Preset | None = None, alpha_weight: float = ALPHA_WEIGHT
+) -> dict[str, Any]:
+    """Fields of NbvSettings with this alpha_weight and the defaults of a preset in them. What `values` holds stays as it is."""
     train = values.get("train", {})
     given = train.model_dump(exclude_unset=True) if isinstance(train, TrainSettings) else train
-    with_alpha = {"alpha_weight": ALPHA_WEIGHT, **given}
+    if not isinstance(given, Mapping):
+        return dict(values)  # what is wrong with it is for `validated` to say
+    with_alpha = {"alpha_weight": alpha_weight, **given}
     if preset is None:
         return {**values, "train": with_alpha}
     return {"warm_passes": preset.warm_passes, **values, "train": {"passes": preset.passes, **with_alpha}}

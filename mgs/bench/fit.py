@@ -1,7 +1,7 @@
 """What the fit of a dataset comes to: accuracy of the model, and how near the end a fit is when it stops, beside targets.
 
 Everything is measured on twelve views spread evenly in azimuth, or on states of four to eight views, with the settings that
-`mgs nbv` has by default. Times are of the fits alone, in this process; let nothing else run.
+`mgs nbv` has by default, but of colours alone. Times are of the fits alone, in this process; let nothing else run.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class _Case:
     cache: ListCache
 
     def fit(self, model: Gaussians, views: Sequence[int], train: TrainSettings) -> Fit:
-        """A fit as `mgs nbv` does it, from some model to some views."""
+        """A fit as `mgs nbv --alpha-weight 0` does it, from some model to some views."""
         cameras, targets = self._images(views)
         return fit(model, cameras, targets, train, cache=self.cache, start=self.start, lam=_lam_by_kind())
 

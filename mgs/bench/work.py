@@ -121,9 +121,12 @@ def _without_zero_bits(lines: list[str]) -> list[str]:
             ones.add(name)
         elif operation == "and" and ones & set(used):
             odd.add(name)
-        elif (operation == "lshr" and used[0] in odd and used[1] in ones) or (operation == "zext" and used[0] in zeros):
+        elif operation == "lshr":
+            if len(used) == 2 and used[0] in odd and used[1] in ones:
+                zeros.add(name)
+        elif operation in ("zext", "or") and used and set(used) <= zeros:
             zeros.add(name)
-        elif operation == "or" and zeros & set(used):
+        elif operation == "or" and len(used) == 2 and zeros & set(used):
             (other,) = set(used) - zeros
             kind = rest.strip().partition(" %")[0]
             line = f"    {name} = bitcast {kind} {other} to {kind}"

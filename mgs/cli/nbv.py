@@ -96,12 +96,13 @@ def nbv(
     ] = "frozen",
     optimiser: Annotated[str, typer.Option(help="Optimiser of the fit: natural or adam.")] = "natural",
     alpha_weight: Annotated[
-        float,
+        float | None,
         typer.Option(
             metavar="WEIGHT",
-            help="Weight of a pixel's alpha in the fit, (sigma_rgb / sigma_alpha)^2; 0: none, as in the paper.",
+            help="Weight of a pixel's alpha in the fit, (sigma_rgb / sigma_alpha)^2; 0: none, as in the paper. Default: "
+            f"{ALPHA_WEIGHT}, or 0 where frames have neither mask nor alpha.",
         ),
-    ] = ALPHA_WEIGHT,
+    ] = None,
     rate: Annotated[
         list[str] | None,
         typer.Option(
@@ -155,10 +156,9 @@ def nbv(
     if (dataset is None) == (capture is None) or out is None:
         raise InputError("nbv: give a DATASET or --capture SCENE, and --out RUN; or --resume RUN")
     train: dict[str, Any] = {
-        "means": means, "optimiser": optimiser, "alpha_weight": alpha_weight, "rates": pairs("--rate", rate),
+        "means": means, "optimiser": optimiser, "rates": pairs("--rate", rate),
     }  # fmt: skip
-    if passes is not None:
-        train["passes"] = passes
+    train |= {name: value for name, value in {"passes": passes, "alpha_weight": alpha_weight}.items() if value is not None}
     settings: dict[str, Any] = {
         "policy": policy, "nearest": nearest, "travel": travel, "batch": batch, "stop_gain": stop_gain,
         "stop_uncertainty": stop_uncertainty, "seeds": seeds, "seed": seed, "estimator": estimator, "lam": lam,

@@ -50,7 +50,7 @@ def run_oracle(root: Path, out: Path, dataset: str, prior: str, settings: dict[s
     run = out / "run"
     if not (run / "config.json").is_file():
         where = cell_folder(root, prior) / "prior"
-        given = {"policy": "random", "evaluate_every": 1, "train": COLOURS_ALONE, **settings}
+        given = {"policy": "random", "evaluate_every": 1, **settings, "train": {**COLOURS_ALONE, **settings.get("train", {})}}
         start_run(dataset_of(root, dataset), run, prior=where, **given)
     state = choose_all(run)
     return {key: [step[key] for step in state.steps] for key in CURVES} | {"taken": state.taken}

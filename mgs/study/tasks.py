@@ -105,7 +105,8 @@ def run_or_resume(root: Path, out: Path, dataset: str, prior: str, settings: dic
     run = out / "run"
     if (run / "config.json").is_file():
         return resume_nbv(run)
-    return run_nbv(dataset_of(root, dataset), run, prior=cell_folder(root, prior) / "prior", train=COLOURS_ALONE, **settings)
+    given = {**settings, "train": {**COLOURS_ALONE, **settings.get("train", {})}}
+    return run_nbv(dataset_of(root, dataset), run, prior=cell_folder(root, prior) / "prior", **given)
 
 
 def time_policy(root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]) -> dict[str, Any]:

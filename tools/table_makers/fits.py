@@ -170,9 +170,13 @@ def alpha_policies(data: dict[str, Any]) -> str:
             ahead = [found[rock, policy, alpha] - found[rock, "uniform", alpha] for rock in rocks]
             low, high = interval(ahead) or (0.0, 0.0)
             row.append("" if policy == "uniform" else f"{sum(ahead) / len(ahead):+.2f} [{low:+.2f}, {high:+.2f}]")
+        of_uniform = [found[rock, "uniform", True] - found[rock, "uniform", False] for rock in rocks]
+        changes = [gain - other for gain, other in zip(gains, of_uniform, strict=True)]
+        low, high = interval(changes) or (0.0, 0.0)
+        row.append("" if policy == "uniform" else f"{sum(changes) / len(changes):+.2f} [{low:+.2f}, {high:+.2f}]")
         rows.append(row)
     heading = [f"{len(rocks)} rocks", "colours alone (dB)", "with alpha (dB)", "gain by rock"]
-    return markdown([*heading, "over even spacing, colours alone", "the same, with alpha"], rows) + made_by(data)
+    return markdown([*heading, "over even spacing, colours alone", "the same, with alpha", "change"], rows) + made_by(data)
 
 
 def prior_std(data: dict[str, Any]) -> str:
