@@ -38,8 +38,9 @@ class Image:
     depth: Any
 
 
-REMEMBERED = 1 << 16
-"""For how many cameras a `ListCache` remembers when they were used last, at a few hundred bytes each."""
+REMEMBERED = 1 << 10
+"""For how many cameras a `ListCache` remembers when they were used last, at a few hundred bytes each: a run that sees new
+cameras at every step soon grows no more."""
 
 
 class ListCache:
