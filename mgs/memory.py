@@ -28,15 +28,24 @@ MEMORY_FILE = Path("/proc/meminfo")
 
 def check_room(needed: float, what: str, instead: str) -> None:
     """Raises InputError where so many bytes for `what` are more than the system has to spare, with what to do `instead`: it
-    would end the process without a word. Systems that do not say what they have to spare are trusted."""
-    if needed <= LITTLE:
+    would end the process without a word. Systems that do not say what they have to spare are trusted. Memory that Dr.Jit keeps
+    for its next arrays is given back before anything is refused."""
+    if needed <= LITTLE or needed <= _spare():
         return
+    import drjit as dr  # here, since most who need this module need no Dr.Jit
+
+    dr.flush_malloc_cache()
+    if needed > (spare := _spare()):
+        raise InputError(f"{what} may take {needed / 2**30:,.1f} GiB, and {spare / 2**30:,.1f} GiB are free; {instead}")
+
+
+def _spare() -> float:
+    """Bytes that the system has to spare; infinity where it does not say."""
     try:
         found = re.search(r"MemAvailable:\s*(\d+) kB", MEMORY_FILE.read_text(encoding="ascii"))
     except OSError:
-        return
-    if found and needed > (spare := 1024 * int(found[1])):
-        raise InputError(f"{what} may take {needed / 2**30:,.1f} GiB, and {spare / 2**30:,.1f} GiB are free; {instead}")
+        return float("inf")
+    return 1024.0 * int(found[1]) if found else float("inf")
 
 
 PADDING = 64

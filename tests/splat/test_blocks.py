@@ -333,6 +333,16 @@ def test_what_memory_has_no_room_for_is_refused(monkeypatch, tmp_path):
     fisher_of_blocks(g, camera)
 
 
+def test_what_drjit_keeps_for_later_is_given_back_before_anything_is_refused(monkeypatch):
+    given_back = []
+    monkeypatch.setattr(dr, "flush_malloc_cache", lambda: given_back.append(True))
+    monkeypatch.setattr(memory, "_spare", lambda: 3e9 if given_back else 1e9)
+    memory.check_room(2e9, "much", "take less")
+    assert given_back == [True]
+    with pytest.raises(InputError, match=r"more may take 3\.7 GiB, and 2\.8 GiB are free; take less"):
+        memory.check_room(4e9, "more", "take less")
+
+
 def fisher_of_blocks(gaussians, camera):
     return fisher(gaussians, camera, "block")
 
