@@ -1,6 +1,6 @@
 """Tables of docs/benchmarks/*.json.
 
-Most of these files say which command wrote them; demo.json and policies.json are demo/report/table.json after `make demo`, and
+Most of these files say which command wrote them; demo.json is demo/report/table.json after `make demo`, and
 docs/nbv.md has the commands of flights.json.
 """
 
@@ -219,13 +219,14 @@ def uncertainty(data: dict[str, Any]) -> str:
         cells = [f"{sum(values) / len(values):.2f}" for values in areas]
         cells = [f"{a} ({p}; {c})" for a, p, c in (cells[:3], cells[3:])]
         cells += [f"{sum(row[key] for row in found) / len(found):.2f}" for key in ("spearman", "pearson")]
-        whole = sum(row["held"]["0.9"][0] for row in found) / len(found)
-        thirds = [share for row in found for share in row["held"]["0.9"][1:]]
-        cells += [f"{100 * whole:.0f} % ({100 * min(thirds):.0f} to {100 * max(thirds):.0f})"]
+        for share in ("0.5", "0.9"):
+            whole = sum(row["held"][share][0] for row in found) / len(found)
+            thirds = [held for row in found for held in row["held"][share][1:]]
+            cells += [f"{100 * whole:.0f} % ({100 * min(thirds):.0f} to {100 * max(thirds):.0f})"]
         crps = sum(row["crps"] / row["crps_constant"] for row in found) / len(found)
         rows.append([prediction, *cells, f"{crps:.2f}"])
     heading = ["prediction", "AUSE of absolute errors (perfect; constant)", "of squared errors", "Spearman", "Pearson"]
-    heading += ["in the interval of 90 % (thirds)", "CRPS over a constant's"]
+    heading += ["in the interval of 50 % (thirds)", "of 90 %", "CRPS over a constant's"]
     command = re.sub(r"(out/calibrated/\S+ ?)+", "out/calibrated/*/d*", data["command"])  # their names are many
     return markdown(heading, rows) + made_by(data | {"command": command})
 
@@ -313,7 +314,7 @@ def criteria(data: dict[str, Any]) -> str:
     command = re.sub(r"(out/states/\S+ )+", "out/states/* ", data["command"])  # their names are many
     apart = [state["largest_difference"] for state in states.values() if "largest_difference" in state]
     note = f"\nPSNR measured anew differs from that of `OLD.json` by {max(apart):.3f} dB at most.\n" if apart else ""
-    return markdown(heading, ranked) + note + made_by(data | {"command": command.replace("out/criteria-before", "OLD")})
+    return markdown(heading, ranked) + note + made_by(data | {"command": command.replace("out/OLD", "OLD")})
 
 
 def fitted_degree(data: dict[str, Any]) -> str:
@@ -346,7 +347,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "demo": ("benchmarks/demo", demo),
     "demo-report": ("benchmarks/demo", demo_report),
     "flights": ("benchmarks/flights", flights),
-    "policies": ("benchmarks/policies", policies),
+    "policies": ("benchmarks/demo", policies),
     "hutchinson": ("benchmarks/hutchinson", hutchinson),
     "render-settings": ("benchmarks/render_settings", render_settings),
     "lambda-ranking": ("benchmarks/lambda_ranking", lambda_ranking),
