@@ -7,6 +7,7 @@ In the states of benchmarks/ranking.py `d-optimal` ranks every other view, as it
   ratio of the variances of the noise, (sigma_rgb / sigma_alpha)^2.
 - "alpha in lambda": the prior's mesh says at every pose what is opaque, so what alpha says there is known before any image: its
   information at all poses of the dataset is added to lambda, and no view adds more of it.
+- "alpha in the fit": models that were fitted to alpha, too, as runs are by default; the score leaves it out.
 
 Compared with the default: Kendall's tau; and regret, the share of the best score (as the default has it) that is lost.
 """
@@ -22,7 +23,7 @@ import numpy as np
 from ranking import GAUSSIANS, STATES, views_of
 
 from mgs import runtime
-from mgs.active.criteria import d_optimal, regularisation
+from mgs.active.criteria import d_optimal, lam_by_kind, regularisation
 from mgs.active.fitting import fit
 from mgs.active.settings import TrainSettings
 from mgs.data.dataset import Dataset, load_dataset, target_of
@@ -38,6 +39,7 @@ from mgs.splat import ListCache, fisher, groups
 SIGMAS = (0.005, 0.01, 0.02, 0.04, 0.08)
 DEFAULT = 0.02
 WEIGHTS = (0.03, 0.3, 1.0, 10.0, 100.0)
+FIT_WEIGHTS = (0.03, 0.1, 0.3, 1.0)
 
 
 def information(model: Gaussians, dataset: Dataset, cache: ListCache, weight: float = 0.0) -> np.ndarray:
@@ -63,7 +65,7 @@ def assumptions(dataset: Dataset, state: str) -> Iterator[tuple[str, float, list
     targets = [target_of(frame) for frame in frames]
     for sigma in SIGMAS:
         lam = regularisation(groups(0), sigma)
-        by_kind = {kind: float(lam[columns][0]) for kind, columns in groups(0).items()}
+        by_kind = lam_by_kind(lam, groups(0))
         model = fit(start, cameras, targets, TrainSettings(), cache=cache, start=start, lam=by_kind).gaussians
         F = information(model, dataset, cache)
         yield "sigma", sigma, scored(F, taken, lam)
@@ -74,6 +76,12 @@ def assumptions(dataset: Dataset, state: str) -> Iterator[tuple[str, float, list
         observed = information(model, dataset, cache, weight)
         yield "alpha in F", weight, scored(observed, taken, lam)
         yield "alpha in lambda", weight, scored(F, taken, lam + (observed - F).sum(axis=0))
+    by_kind = lam_by_kind(lam, groups(0))
+    with_alpha = [target_of(frame, with_alpha=True) for frame in frames]
+    for weight in FIT_WEIGHTS:
+        train = TrainSettings(alpha_weight=weight)
+        model = fit(start, cameras, with_alpha, train, cache=cache, start=start, lam=by_kind).gaussians
+        yield "alpha in the fit", weight, scored(information(model, dataset, cache), taken, lam)
 
 
 def study(root: Path, state: str) -> list[dict[str, Any]]:

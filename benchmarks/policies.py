@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
+from mgs.active.criteria import d_optimal
 from mgs.active.directional import Views, gains, squared_weights
 from mgs.active.outlook import Outlook
+from mgs.active.policies import PAPER_LAM
 
 
 def linear_look(outlook: Outlook) -> np.ndarray:
@@ -47,3 +52,57 @@ def trained_gaussians(outlook: Outlook) -> np.ndarray:
 def without_opacity(F: np.ndarray, H: np.ndarray, lam: np.ndarray) -> float:
     """`d-optimal` of all parameters but the opacities (column 10), which POp-GS leaves out of its score."""
     return float(np.log1p(F / (H + lam))[:, :10].mean(dtype=np.float64))
+
+
+def _of_kind(kind: str) -> Callable[[np.ndarray, np.ndarray, np.ndarray], float]:
+    """`d-optimal` of one kind of parameters alone."""
+
+    def score(F: np.ndarray, H: np.ndarray, lam: np.ndarray) -> float:
+        from mgs.splat import groups
+
+        return float(np.log1p(F / (H + lam))[:, groups(0)[kind]].mean(dtype=np.float64))
+
+    return score
+
+
+colour_alone, scale_alone = _of_kind("colour"), _of_kind("scale")
+rotation_alone, opacity_alone = _of_kind("rotation"), _of_kind("opacity")
+
+
+def _by_loss(outlook: Outlook, estimator: str, lam: np.ndarray) -> np.ndarray:
+    """Eq. 7 of an estimator, for the views taken too."""
+    H = sum(outlook.estimate(i, estimator).astype(np.float64) for i in outlook.visited)
+    return np.array([d_optimal(outlook.estimate(i, estimator), H, lam) for i in outlook.left])
+
+
+def paper_black(outlook: Outlook) -> np.ndarray:
+    """`paper` with another loss: the mean squared colour, so the difference from black."""
+    return _by_loss(outlook, _squared_gradient("loss-black", lambda rgb: rgb * (2 / len(rgb.array))), _one_lam(outlook))
+
+
+def paper_mean(outlook: Outlook) -> np.ndarray:
+    """`paper` with a third loss: the mean colour itself."""
+    return _by_loss(outlook, _squared_gradient("loss-mean", lambda rgb: rgb * 0 + 1 / len(rgb.array)), _one_lam(outlook))
+
+
+def paper_scaled(outlook: Outlook) -> np.ndarray:
+    """`paper` with lambdas that have units, and are to its information what those of `d-optimal` are to the exact: a mean loss
+    has far smaller gradients than pixels have, and one lambda of 1e-6 swamps them."""
+    means = [np.mean([outlook.estimate(i, name).mean() for i in outlook.visited]) for name in ("loss-gradient", "exact")]
+    return _by_loss(outlook, "loss-gradient", outlook.lam * float(means[0] / means[1]))
+
+
+def _one_lam(outlook: Outlook) -> np.ndarray:
+    return np.full_like(outlook.lam, PAPER_LAM)
+
+
+def _squared_gradient(name: str, image_gradient: Callable[[Any], Any]) -> str:
+    """Add the squared gradient of a scalar loss to the estimators, and return its name. image_gradient: of the loss."""
+    from mgs.splat import ESTIMATORS
+    from mgs.splat.information import _gradient
+
+    def estimator(gaussians: Any, camera: Any, background: Any, cache: Any) -> np.ndarray:
+        return _gradient(gaussians, image_gradient, camera, background, cache) ** 2
+
+    ESTIMATORS.setdefault(name, estimator)
+    return name

@@ -2,7 +2,8 @@
 
 The paper expects that after a single seed the gain of a view is near zero where it sees only unobserved Gaussians, so that
 the drone stays pinned near its first image. Prints and draws Eq. 7 of every candidate against its azimuth from the seed, with
-the exact diagonal of J^T J and with squared gradients of one scalar loss per image (Eq. 7 to the letter).
+the exact diagonal of J^T J, with Hutchinson's estimate of it, with the exact 11x11 blocks, and with squared gradients of one
+scalar loss per image (Eq. 7 to the letter).
 """
 
 from __future__ import annotations
@@ -17,7 +18,10 @@ from mgs.active import criteria, pose_policies, run_folder
 from mgs.data.dataset import load_dataset
 from mgs.prior.build import load_prior
 
-ESTIMATORS = {"exact": "exact $J^TJ$", "loss-gradient": "squared gradient of a scalar loss"}
+ESTIMATORS = {
+    "exact": "exact $J^TJ$", "hutchinson": "Hutchinson's estimate", "block": "exact blocks",
+    "loss-gradient": "squared gradient of a scalar loss",
+}  # fmt: skip
 
 
 def main(run: Path, out: Path) -> None:
@@ -41,6 +45,10 @@ def main(run: Path, out: Path) -> None:
             return fisher(state.gaussians, frames[i].camera, estimator=estimator).astype(np.float64)
 
         H = information(state.taken[0])
+        if estimator == "block":
+            before = criteria.block_log_determinant(H, lam)
+            gains[estimator] = np.array([criteria.block_log_determinant(H + information(i), lam) - before for i in left])
+            continue
         means[estimator] = float(H.mean())
         scaled = lam * means[estimator] / means["exact"]  # lambda in the units of a mean loss, which it would swamp otherwise
         gains[estimator] = np.array([criteria.d_optimal(information(i), H, scaled) for i in left])
@@ -59,7 +67,7 @@ def draw(out: Path, away: np.ndarray, gains: dict[str, np.ndarray]) -> None:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(4.8, 2.8), dpi=150, layout="constrained")
         axis = figure.subplots()
-        for (estimator, values), colour in zip(gains.items(), ("#0072B2", "#D55E00"), strict=True):
+        for (estimator, values), colour in zip(gains.items(), ("#0072B2", "#56B4E9", "#009E73", "#D55E00"), strict=True):
             axis.plot(away, values / values.max(), "o-", color=colour, label=ESTIMATORS[estimator])
         axis.set(
             xlabel="azimuth from the seed (degrees)",

@@ -49,10 +49,11 @@ def _ply_names(coefficients: int) -> list[str]:
     )
 
 
-def write_ply(path: str | Path, gaussians: Gaussians) -> None:
+def write_ply(path: str | Path, gaussians: Gaussians, marks: Mapping[str, np.ndarray] | None = None) -> None:
     """Write Gaussians (NumPy fields) as a binary PLY in the layout of 3DGS; the file appears complete.
 
-    It opens in any splat viewer. The colours stay linear RGB, which viewers that expect sRGB show too dark.
+    It opens in any splat viewer. The colours stay linear RGB, which viewers that expect sRGB show too dark. marks: {name: [N]
+    bool}, further properties of the vertices, bytes of 0 or 1, which `read_ply` and viewers pass over.
     Raises InputError as `mgs.files.atomic_path`.
     """
     g, n = gaussians, len(gaussians)
@@ -61,9 +62,12 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
     columns = np.concatenate(
         [g.means, np.zeros((n, 3)), g.sh[:, 0, :], rest, np.reshape(g.logit_opacities, (n, 1)), g.log_scales, g.quats], axis=1
     ).astype(np.float32)
-    vertices = np.empty(n, dtype=[(name, "f4") for name in names])
+    marks = marks or {}
+    vertices = np.empty(n, dtype=[(name, "f4") for name in names] + [(name, "u1") for name in marks])
     for i, name in enumerate(names):
         vertices[name] = columns[:, i]
+    for name, mask in marks.items():
+        vertices[name] = mask
     with atomic_path(path) as temporary:
         PlyData([PlyElement.describe(vertices, "vertex")], comments=[LINEAR_COMMENT]).write(str(temporary))
 

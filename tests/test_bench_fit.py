@@ -35,7 +35,7 @@ def test_the_figures_are_those_of_the_fits(root, small):
     found = bench.bench_fit(root, said.append)
     assert found["figures"].keys() == bench.TARGETS.keys()
     assert len(said) == 4
-    case = bench._case(bench.load_dataset(root), 200, "even", 4)
+    case = bench._case(bench.load_dataset(root), 200, "even", 4, 0.1)
     fitted = case.fit(case.start, case.taken, TrainSettings())
     names = [case.dataset.frames[i].name for i in case.taken]
     means = evaluate(fitted.gaussians, case.dataset.frames, names, spacing=case.prior.spacing)["held_out"]
@@ -55,7 +55,7 @@ def test_the_figures_are_those_of_the_fits(root, small):
 
 
 def test_passes_are_those_of_the_first_fit_that_reaches_the_objective(root, small, monkeypatch):
-    case = bench._case(bench.load_dataset(root), 200, "even", 4)
+    case = bench._case(bench.load_dataset(root), 200, "even", 4, 0.1)
     found = bench.passes_to(case, case.start)
     assert found["share"] == found["tried"][-1]["passes"] / 2
     assert found["share_of_seconds"] == found["tried"][-1]["seconds"] / found["old"]["seconds"]
@@ -67,9 +67,19 @@ def test_passes_are_those_of_the_first_fit_that_reaches_the_objective(root, smal
     assert missed["share"] is missed["share_of_seconds"] is None
 
 
+def test_alpha_is_part_of_the_fit_and_of_its_objective(root):
+    dataset = bench.load_dataset(root)
+    models = {}
+    for weight in (0.0, 0.1):
+        case = bench._case(dataset, 200, "even", 4, weight)
+        models[weight] = case.fit(case.start, case.taken, TrainSettings()).gaussians
+        assert case.objective(case.taken).alpha_weight == weight
+    assert models[0.0] != models[0.1]
+
+
 def test_a_ranking_agrees_with_itself(root, small, monkeypatch):
     monkeypatch.setattr(bench, "LONGER", 1)
-    case = bench._case(bench.load_dataset(root), 200, "random", 4)
+    case = bench._case(bench.load_dataset(root), 200, "random", 4, 0.0)
     found = bench._ranking(case)
     shorter = case.fit(case.start, case.taken, TrainSettings(passes=TrainSettings().passes // 2, tolerance=0.0))
     stopped = case.fit(case.start, case.taken, TrainSettings())

@@ -272,6 +272,7 @@ def test_every_command_that_reads_a_run_reads_this_one(captured, tmp_path):
     command("report", captured, "--out", tmp_path / "report")
     command("report", captured, "--html", tmp_path / "page.html")
     command("prune", captured)
+    command("refit", captured)
     assert there(dataset) == before
     assert not any("no run has taken" in problem for problem in check_dataset(dataset).problems)
     assert not any("no run has taken" in problem for problem in check_dataset(dataset.survey()).problems)

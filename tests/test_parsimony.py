@@ -124,19 +124,24 @@ def row(asked, learned=parsimony.ALL, degree=0, psnr=25.0, parameters=100, predi
 
 def rows(auto=26.0, parameters=200):
     fixed = [row("100", psnr=25, parameters=110), row("200", psnr=26.05, parameters=220), row("400", psnr=26.1, parameters=440)]
-    chosen = [row("auto", psnr=auto, parameters=parameters, predictive=3)]
+    lean = {key: value for key, value in row("auto", "auto", psnr=auto, parameters=parameters).items() if key != "evidence"}
+    chosen = [row("auto", psnr=25.5, parameters=500, predictive=3), lean]
     chosen += [row("auto", learned, psnr=20 + i, predictive=i) for i, learned in enumerate(parsimony.LEARNED) if i < 3]
-    return fixed + chosen + [row("auto", degree=degree, psnr=27 - degree, evidence=2 * degree) for degree in (1, 2)]
+    degrees = [row("auto", degree=degree, psnr=27 - degree, parameters=1000, evidence=2 * degree) for degree in (1, 2)]
+    return fixed + chosen + degrees
 
 
 def test_the_verdict_compares_with_the_smallest_that_is_as_good():
     found = parsimony.verdict(rows())
     assert (found["best"], found["auto"], found["smallest"], found["parameters"]) == (26.1, 26.0, 220, 200)
     assert found["loss"] == pytest.approx(0.1)
+    assert found["number"] == 25.5
     assert found["small"]
     assert not parsimony.verdict(rows(parameters=221))["small"]
     assert not parsimony.verdict(rows(auto=25.9))["close"]
     assert parsimony.verdict(rows(auto=26.03))["close"]
+    kinds = [*rows(), row("auto", "+ opacity", psnr=26.05, parameters=90)]  # fewer kinds of parameters are a fixed choice, too
+    assert parsimony.verdict(kinds)["smallest"] == 90
     assert found["chosen"]["learned by predictive"] == {"value": parsimony.ALL, "loss": 0.0}
     assert found["chosen"]["degree by evidence"] == {"value": 2, "loss": 1.0}
     assert found["chosen"]["gaussians by next_error"] == found["chosen"]["gaussians by psnr_inside"]
@@ -147,7 +152,7 @@ def test_every_need_of_a_cell_is_a_cell():
     for size in parsimony.PRESETS.values():
         cells = parsimony.cells_of(size)
         names = [cell.name for cell in cells]
-        assert len(set(names)) == len(names) == len(size.scenes) * (1 + 2 * (len(size.counts) + 1) + 5 + 1)
+        assert len(set(names)) == len(names) == len(size.scenes) * (1 + 2 * (len(size.counts) + 1) + 5 + 2)
         assert all(set(cell.needs) <= set(names) for cell in cells)
         assert all(isinstance(cell, Cell) for cell in cells)
 
@@ -179,15 +184,20 @@ def test_the_command_does_the_study_and_goes_on(tmp_path, capsys, monkeypatch):
     found = json.loads((out / "parsimony.json").read_text())
     with open(out / "parsimony.csv") as file:
         table = list(csv.DictReader(file))
-    assert len(table) == len(found["rows"]) == 7
+    assert len(table) == len(found["rows"]) == 8
     assert imread(out / "parsimony.png").shape[1] == 2000
     by = {(one["asked"], one["learned"], one["degree"]): one for one in found["rows"]}
     assert by["60", parsimony.ALL, 0]["parameters"] == 60 * 11
     assert by["auto", "colour", 0]["parameters"] == 3 * by["auto", "colour", 0]["gaussians"]
     assert by["auto", parsimony.ALL, 1]["parameters"] == (12 + 8) * by["auto", parsimony.ALL, 0]["gaussians"]
     assert by["200", parsimony.ALL, 0]["psnr_inside"] > by["60", parsimony.ALL, 0]["psnr_inside"]
+    lean = by["auto", "auto", 0]
+    assert 3 * lean["gaussians"] <= lean["parameters"] < by["auto", parsimony.ALL, 0]["parameters"]
+    assert set(found["scenes"]["boulder"]["lean"]["shares"]) == {"colour", "scale", "rotation", "opacity"}
+    assert found["scenes"]["boulder"]["auto"] == lean["psnr_inside"]
     for one in found["rows"]:
-        assert np.isfinite([one["psnr"], one["next_error"], one["predictive"], one["evidence"], one["seconds"]]).all()
+        known = ["psnr", "seconds", *(["next_error", "predictive", "evidence"] if one is not lean else [])]
+        assert np.isfinite([one[key] for key in known]).all()
     for one in found["scenes"]["boulder"]["pruned"]:
         assert one["actual"] <= one["noise"] * PIXEL_NOISE
     assert "boulder" in capsys.readouterr().out

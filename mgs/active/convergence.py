@@ -8,20 +8,15 @@ of g^T (J^T J + lam)^-1 g, exact where images are linear in the parameters.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from mgs.active.criteria import lam_by_kind
+from mgs.active.evidence import last_images
 from mgs.active.objective import newton_decrease, objective
 from mgs.active.settings import NbvSettings
-from mgs.data.dataset import Frame, target_of
+from mgs.data.dataset import Frame
 from mgs.gaussians import Gaussians
-from mgs.memory import Deferred
 from mgs.prior.build import Prior
-from mgs.prior.exposure import exposure_of, without_gain
-from mgs.prior.initial import initial_gaussians, initial_normals
 from mgs.splat import as_drjit, groups
 
 CG_ITERATIONS = 20
@@ -44,15 +39,11 @@ def remaining_decrease(
     Returns "phi" (`mgs.active.objective`, squared pixel values); "predicted_decrease", the Newton decrease after CG_ITERATIONS,
     a share of phi; and "converged", whether that is at most CONVERGED_SHARE. Raises InputError where a frame cannot be read.
     """
-    cameras = [frame.camera for frame in frames]
-    gains = exposure_of(prior)(frames) if settings.exposure else np.ones((len(frames), 3))
-    of_seeds, of_all = initial_gaussians(prior, frames[: settings.seeds])[0], initial_gaussians(prior, frames, gains=gains)[0]
-    start = replace(of_seeds, sh=of_all.sh)  # as in the loop: means of the seeds' start, colours of all frames
-    means, kinds = settings.train.means, groups(0, settings.train.means)
+    images, train = last_images(settings, prior, frames), settings.train
+    kinds = groups(0, train.means)
     by_kind = lam_by_kind(settings.regularisation(kinds), kinds)
-    weight = settings.train.alpha_weight
-    targets = Deferred(range(len(frames)), lambda k: without_gain(target_of(frames[k], weight > 0), gains[k]))
-    goal = objective(gaussians, cameras, targets, start, by_kind, None, means, initial_normals(prior), weight)
+    given = images.cameras, images.targets, images.start(range(len(images))), by_kind
+    goal = objective(gaussians, *given, None, train.means, images.normals, train.alpha_weight)
     model = as_drjit(gaussians)
     phi = goal.phi(model)
     share = newton_decrease(goal, model, CG_ITERATIONS, progress)[-1] / max(phi, 1e-30)

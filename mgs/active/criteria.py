@@ -32,6 +32,10 @@ PRUNE_NOISE = PIXEL_NOISE / 5
 """rms change of a pixel value that pruning a model may make (`mgs prune`), linear RGB: so much less than the noise that it
 costs about a tenth of a decibel (docs/parsimony.md). A chosen constant."""
 
+LEARN_LOSS = 0.05
+"""By how much the objective of a fit may rise where parameters are left out that the images hardly pay for (`mgs refit`), dB:
+on views that were not fitted that costs about as much (docs/parsimony.md). A chosen constant."""
+
 PRIOR_STD = {"colour": 1.0, "scale": 0.125, "rotation": 0.0625, "opacity": 2.0}
 """tau: how far each parameter may plausibly lie from its start before any image is seen, in the parameter's own unit:
 colour 1 SH unit (0.28 linear RGB: albedo and shading of a rock), scale 0.125 (13 %), quaternion 0.0625 (about 7 degrees),

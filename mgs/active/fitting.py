@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mgs.active.objective import Objective, Prior, objective, watched, weighted_squares
+from mgs.active.objective import Objective, Prior, filled, objective, watched, weighted_squares
 from mgs.active.optimisers import INFORMATION_PASSES, OPTIMISERS
 from mgs.active.settings import TrainSettings
 from mgs.active.stopping import StopReason, stop_reason
@@ -131,6 +131,7 @@ def fit(
     start: Gaussians | None = None,
     lam: Mapping[str, float | np.ndarray] | None = None,
     normals: np.ndarray | None = None,
+    learns: Mapping[str, np.ndarray] | None = None,
 ) -> Fit:
     """Fit Gaussians to images: lower Phi (`mgs.active.objective`). Their means stay unless `settings.means` says otherwise.
 
@@ -140,7 +141,9 @@ def fit(
     start: where the prior holds the parameters; the Gaussians given, by default. lam: the prior's information about each kind
     of parameter (`mgs.gaussians.learned`), (pixel value / unit of the parameter)^2: one number, or but for means an array that
     broadcasts to the parameter's shape (for colours, say, another number for each degree); by default there is none. normals:
-    [N,3], of any length but 0, the directions of means that move along them; read only then.
+    [N,3], of any length but 0, the directions of means that move along them; read only then. learns: for kinds of parameters
+    that not all Gaussians learn, which do: a mask that broadcasts to what is learned, [N] for a mean that moves along its
+    normal. The others stay as they are given.
     Starts with fresh buffers of the optimiser, so the result depends on its arguments alone, bitwise. on_pass(done, most)
     reports. Stops as `mgs.active.stopping.stop_reason` says. Raises InputError where a parameter of the Gaussians given is not
     finite, the optimiser is unknown, `start` is of another shape, means are to move without normals or without a rate, or
@@ -154,13 +157,14 @@ def fit(
     model = as_drjit(gaussians)
     goal = objective(gaussians, cameras, targets, start, lam, cache, settings.means, normals, settings.alpha_weight)
     shapes = [away.shape for away, _ in goal.pulls(model)]
+    masks = [filled((learns or {}).get(kind, 1.0), shape) for kind, shape in zip(kinds, shapes, strict=True)]
     buffers = [[dr.zeros(mi.TensorXf, shape) for _ in range(optimiser.buffers)] for shape in shapes]
     information: list[Any] = [None] * len(shapes)
     rng = generator(settings.seed, "train/order")
     losses, kept, stop = [goal.loss(model)], model, StopReason.PASS_LIMIT
     for done in range(settings.passes):
         fall = settings.decay ** (done / max(settings.passes - 1, 1))
-        rates = [dr.opaque(mi.Float, settings.rates[kind] * fall) for kind in kinds]
+        rates = [dr.opaque(mi.Float, settings.rates[kind] * fall) * mask for kind, mask in zip(kinds, masks, strict=True)]
         if optimiser.uses_information and done % INFORMATION_PASSES == 0:
             information = goal.largest_diagonal(model)
         order = rng.permutation(len(goal.photos))

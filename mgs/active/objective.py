@@ -214,7 +214,7 @@ def objective(
     # A copy: Dr.Jit uses NumPy's memory in place, and a recorded step takes parameters and start for the same array for ever
     # if they were in the same memory when it was recorded (Dr.Jit 1.5).
     start = as_drjit(Gaussians(*(np.array(getattr(start, f.name), np.float32) for f in fields(start))))
-    values = {name: _filled((lam or {}).get(kind, 0.0), getattr(start, name).shape) for name, kind in learned(means).items()}
+    values = {name: filled((lam or {}).get(kind, 0.0), getattr(start, name).shape) for name, kind in learned(means).items()}
     directions = None if unit is None else mi.TensorXf(padded(unit))
     prior = Prior(start, values, dr.opaque(mi.Float, 1 / max(len(photos), 1)), directions)
     return Objective(photos, prior, cache or ListCache(), alpha_weight)
@@ -225,11 +225,11 @@ def weighted_squares(lam: Any, away: Any) -> Any:
     return lam * dr.sum(dr.square(away)) if len(lam) == 1 else dr.sum(lam * dr.square(away))
 
 
-def _filled(lam: float | np.ndarray, shape: tuple[int, ...]) -> Any:
-    """A lam as Float, of one number or of as many as a parameter of that shape has."""
-    if np.ndim(lam) == 0:
-        return dr.opaque(mi.Float, float(lam))
-    return mi.Float(padded(np.broadcast_to(lam, shape).astype(np.float32)).ravel())
+def filled(values: float | np.ndarray, shape: tuple[int, ...]) -> Any:
+    """A number as Float, or an array that broadcasts to a shape as Float of as many numbers as the shape has."""
+    if np.ndim(values) == 0:
+        return dr.opaque(mi.Float, float(values))
+    return mi.Float(padded(np.broadcast_to(values, shape).astype(np.float32)).ravel())
 
 
 def _photo(camera: Camera, target: np.ndarray, alpha_weight: float) -> Photo:

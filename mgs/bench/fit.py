@@ -1,14 +1,14 @@
 """What the fit of a dataset comes to: accuracy of the model, and how near the end a fit is when it stops, beside targets.
 
 Everything is measured on twelve views spread evenly in azimuth, or on states of four to eight views, with the settings that
-`mgs nbv` has by default, but of colours alone. Times are of the fits alone, in this process; let nothing else run.
+`mgs nbv` has by default. Times are of the fits alone, in this process; let nothing else run.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from mgs.active.criteria import d_optimal, lam_by_kind, regularisation
 from mgs.active.fitting import Fit, fit
 from mgs.active.objective import Objective, newton_decrease, objective
 from mgs.active.pose_policies import seed_views
-from mgs.active.settings import TrainSettings
+from mgs.active.settings import ALPHA_WEIGHT, TrainSettings
 from mgs.data.dataset import Dataset, load_dataset, target_of
 from mgs.gaussians import Gaussians
 from mgs.metrics import agreement
@@ -60,23 +60,26 @@ TARGETS = {
 
 @dataclass(frozen=True)
 class _Case:
-    """A dataset, a prior, and the views to fit to, with what fits of them need."""
+    """A dataset, a prior, and the views to fit to, with what fits of them need; alpha_weight: of `TrainSettings`."""
 
     dataset: Dataset
     prior: Prior
     taken: list[int]
     start: Gaussians
     cache: ListCache
+    alpha_weight: float
 
     def fit(self, model: Gaussians, views: Sequence[int], train: TrainSettings) -> Fit:
-        """A fit as `mgs nbv --alpha-weight 0` does it, from some model to some views."""
+        """A fit as `mgs nbv` does it, from some model to some views."""
         cameras, targets = self._images(views)
+        train = train.model_copy(update={"alpha_weight": self.alpha_weight})
         return fit(model, cameras, targets, train, cache=self.cache, start=self.start, lam=_lam_by_kind())
 
     def objective(self, views: Sequence[int]) -> Objective:
         """What such a fit lowers."""
         cameras, targets = self._images(views)
-        return objective(self.start, cameras, targets, self.start, _lam_by_kind(), self.cache)
+        lam, weight = _lam_by_kind(), self.alpha_weight
+        return objective(self.start, cameras, targets, self.start, lam, self.cache, alpha_weight=weight)
 
     def phi(self, model: Gaussians) -> float:
         """Phi of a model at the views taken."""
@@ -84,11 +87,12 @@ class _Case:
 
     def _images(self, views: Sequence[int]) -> tuple[list[Any], list[np.ndarray]]:
         frames = [self.dataset.frames[i] for i in views]
-        return [frame.camera for frame in frames], [target_of(frame) for frame in frames]
+        return [frame.camera for frame in frames], [target_of(frame, self.alpha_weight > 0) for frame in frames]
 
 
-def bench_fit(root: Path, report: Callable[[str], None]) -> dict[str, Any]:
-    """Measure everything in TARGETS on one dataset, which needs depth. report(what) is told before each part.
+def bench_fit(root: Path, report: Callable[[str], None], alpha_weight: float = ALPHA_WEIGHT) -> dict[str, Any]:
+    """Measure everything in TARGETS on one dataset, which needs depth, and alpha where that has a weight. report(what) is told
+    before each part.
 
     Returns "figures" by the names of TARGETS, and what they were made from; "ranking_tau_half", the mean "tau_half" of
     `_ranking`, which has no target; "test", the same metrics as "held_out", over the
@@ -96,7 +100,7 @@ def bench_fit(root: Path, report: Callable[[str], None]) -> dict[str, Any]:
     """
     dataset = load_dataset(root)
     report(f"accuracy of {' and '.join(f'{n:,}' for n in SIZES)} Gaussians on {VIEWS} views")
-    cases = {n: _case(dataset, n, "even", VIEWS) for n in SIZES}
+    cases = {n: _case(dataset, n, "even", VIEWS, alpha_weight) for n in SIZES}
     fits = {n: case.fit(case.start, case.taken, TrainSettings()) for n, case in cases.items()}
     means = {n: _held_out(cases[n], fits[n].gaussians) for n in SIZES}
     tests = {n: _on_test_views(cases[n], fits[n].gaussians) for n in SIZES}
@@ -108,7 +112,7 @@ def bench_fit(root: Path, report: Callable[[str], None]) -> dict[str, Any]:
     cold = passes_to(case, case.start)
     warm = passes_to(_one_more(case), stopped.gaussians)
     report(f"ranking of candidates from {len(STATES)} states")
-    ranking = [_ranking(_case(dataset, small, how, count)) for how, count in STATES]
+    ranking = [_ranking(_case(dataset, small, how, count, alpha_weight)) for how, count in STATES]
     figures = {
         "psnr_held_out": means[small]["psnr"],
         "psnr_inside_10k": means[small]["psnr_inside"],
@@ -130,7 +134,7 @@ def _lam_by_kind() -> dict[str, float]:
     return lam_by_kind(regularisation(groups(0)), groups(0))
 
 
-def _case(dataset: Dataset, gaussians: int, how: str, count: int) -> _Case:
+def _case(dataset: Dataset, gaussians: int, how: str, count: int, alpha_weight: float) -> _Case:
     """Views spread evenly in azimuth, or drawn at random, and the Gaussians that they start from."""
     prior, _ = build_prior(dataset, PriorSettings(gaussians=gaussians))
     positions = np.array([frame.camera.position for frame in dataset.frames])
@@ -139,13 +143,13 @@ def _case(dataset: Dataset, gaussians: int, how: str, count: int) -> _Case:
     else:
         taken = sorted(generator(0, f"bench/fit/{count}").choice(len(positions), count, replace=False).tolist())
     start = initial_gaussians(prior, [dataset.frames[i] for i in taken])[0]
-    return _Case(dataset, prior, taken, start, ListCache())
+    return _Case(dataset, prior, taken, start, ListCache(), alpha_weight)
 
 
 def _one_more(case: _Case) -> _Case:
     """The same with one more view: the first that was not taken."""
     added = next(i for i in range(len(case.dataset)) if i not in case.taken)
-    return _Case(case.dataset, case.prior, [*case.taken, added], case.start, case.cache)
+    return replace(case, taken=[*case.taken, added])
 
 
 def _held_out(case: _Case, model: Gaussians) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from mgs.cli.nbv import nbv
 from mgs.cli.parsimony import parsimony
 from mgs.cli.prior import prior
 from mgs.cli.prune import prune
+from mgs.cli.refit import refit
 from mgs.cli.render import render
 from mgs.cli.report import report
 from mgs.cli.reproduce import reproduce
@@ -52,6 +53,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "view": view,
     "render": render,
     "prune": prune,
+    "refit": refit,
     "demo": demo,
     "bench": bench,
     "reproduce": reproduce,

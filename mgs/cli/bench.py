@@ -8,6 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
+from mgs.active.settings import ALPHA_WEIGHT
+
 
 class Kind(StrEnum):
     """What to measure."""
@@ -23,6 +25,7 @@ OF = {
     "--gaussians": (Kind.splat, Kind.scaling, Kind.roofline),
     "--repeats": (Kind.splat, Kind.scaling, Kind.roofline),
     "--dataset": (Kind.fit,),
+    "--alpha-weight": (Kind.fit,),
 }
 """What the options are for."""
 
@@ -49,6 +52,9 @@ def bench(
         ),
     ] = None,
     dataset: Annotated[Path | None, typer.Option(help="fit only: the dataset, with depth. Default: demo/dataset.")] = None,
+    alpha_weight: Annotated[
+        float | None, typer.Option(help=f"fit only: as of `mgs nbv`. Default: {ALPHA_WEIGHT}; 0 fits colours alone.")
+    ] = None,
 ) -> None:
     """Time rendering, gradients and Fisher information on Gaussians of a rock in an image of 640x480 pixels; or, `fit`, measure
     how accurate the fit of a dataset is and how near its end it stops.
@@ -62,7 +68,8 @@ def bench(
     from mgs.files import check_writable, write_json
     from mgs.provenance import command_line, versions
 
-    given = {"--chart": chart, "--gaussians": gaussians, "--repeats": repeats, "--dataset": dataset}
+    given: dict[str, Any] = {"--chart": chart, "--gaussians": gaussians, "--repeats": repeats, "--dataset": dataset}
+    given["--alpha-weight"] = alpha_weight
     for option, value in given.items():
         if value is not None and kind not in OF[option]:
             raise InputError(f"{option}: is for {' and '.join(OF[option])}, not for {kind.value}; leave it out")
@@ -94,7 +101,8 @@ def bench(
         _print_splat(console, result)
         _print_figures(console, result["figures"], SPLAT_TARGETS)
     elif kind is Kind.fit:
-        result = bench_fit(dataset or Path("demo/dataset"), report)
+        weight = ALPHA_WEIGHT if alpha_weight is None else alpha_weight
+        result = bench_fit(dataset or Path("demo/dataset"), report, weight)
         _print_figures(console, result["figures"], FIT_TARGETS)
         console.print(f"Kendall's tau of the ranking with that of half the passes: {result['ranking_tau_half']:.3f}")
     elif kind is Kind.roofline:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-POLICIES = ("d-optimal", "directional-i", "uniform", "random")
+POLICIES = ("d-optimal", "paper", "directional-i", "uniform", "random")
 
 GAUSSIANS = 10_000
 """About one Gaussian per pixel of the rock at 320x240."""
@@ -26,7 +26,7 @@ def demo(
     ),
     seed: Annotated[int, typer.Option(min=0, help="Root seed.")] = 0,
 ) -> None:
-    """The whole way in minutes: render a rock orbit, build the prior, choose views by four policies, compare, draw."""
+    """The whole way in minutes: render a rock orbit, build the prior, choose views by five policies, compare, draw."""
     import time
 
     from rich.console import Console

@@ -13,7 +13,7 @@ def parsimony(
         "parsimony"
     ),
     preset: Annotated[
-        str, typer.Option(help="quick: four scenes of small images, minutes. full: the same of 320x240, hours.")
+        str, typer.Option(help="quick: six scenes of small images, ten minutes. full: the same of 320x240, half an hour.")
     ] = "quick",
 ) -> None:
     """Chart quality and cost against the number of Gaussians, what is learned, and the SH degree, with the automatic choice

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from mgs.active.criteria import PRUNE_NOISE
 from mgs.active.run_folder import load_run
-from mgs.data.dataset import Frame
-from mgs.gaussians import Gaussians
-from mgs.report.evaluation import evaluate
+from mgs.report.refitting import mean_psnr, other_views
 from mgs.splat_ply import write_ply
 
 PRUNED = "gaussians_pruned.ply"
@@ -43,14 +41,7 @@ def prune_run(run: str | Path, noise: float = PRUNE_NOISE, say: Callable[[str], 
     found = prune(gaussians, cameras, noise)
     smaller = gaussians[found.kept]
     say("comparing")
-    tests = dataset.test_views()
-    frames = tests.frames if tests else [frame for frame in dataset.with_images(trained) if frame.name not in trained]
-    psnr = (_psnr(gaussians, frames), _psnr(smaller, frames)) if frames else None
+    views, frames = other_views(dataset, trained)
+    psnr = (mean_psnr(gaussians, frames), mean_psnr(smaller, frames)) if frames else None
     write_ply(Path(run) / PRUNED, smaller)
-    where = "test" if tests else "held out"
-    return PrunedRun(len(gaussians), len(smaller), found.predicted, found.actual, where, psnr)
-
-
-def _psnr(gaussians: Gaussians, frames: Sequence[Frame]) -> float:
-    """Mean PSNR over views, full frame, dB."""
-    return float(evaluate(gaussians, frames, ())["all"]["psnr"])
+    return PrunedRun(len(gaussians), len(smaller), found.predicted, found.actual, views, psnr)

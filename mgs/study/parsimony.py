@@ -27,6 +27,7 @@ from mgs.files import read_json
 from mgs.study.sweep import Cell, cell_folder, run_cells
 
 AUTO = "auto"
+"""The number of Gaussians of `mgs prior`; of what is learned, and of the SH degree, what `mgs refit` chooses."""
 
 LEARNED = {
     "colour": ("colour",),
@@ -45,8 +46,15 @@ PRUNE_NOISE = (0.1, 0.2, 0.5)
 RULES = {"psnr_inside": 1, "next_error": -1, "predictive": 1, "evidence": 1}
 """Columns of a row by which a model may be chosen, the first with the test views in view; 1: more is better, -1: less."""
 
-SCENES = ("boulder", "strata", "pebbles", "contact-binary")
-"""On the first two the constants of the rules were chosen, on the others they are tested."""
+GREY = (0.2, 0.2, 0.2)
+VARIANTS: dict[str, dict[str, Any]] = {
+    "shining boulder": {"specular": 0.5, "roughness": 0.3},
+    "plain boulder": {"colours": (GREY, GREY), "dust": GREY},
+}
+"""Boulders of which some keys of [rock] in the scene file are others."""
+
+SCENES = ("boulder", "strata", "pebbles", "contact-binary", *VARIANTS)
+"""On the first two the constants of the rule for N were chosen, on the others it is tested."""
 
 CLOSE = 0.1
 """dB: models whose quality differs by less count as equally good."""
@@ -76,7 +84,7 @@ PRESETS = {
 
 def _cell(name: str, task: str, needs: Sequence[str], **arguments: Any) -> Cell:
     """A cell of a task of this module. Fits are done alone, as their seconds are reported."""
-    return Cell(name, f"mgs.study.parsimony:{task}", arguments, tuple(needs), alone=task == "fit_and_judge")
+    return Cell(name, f"mgs.study.parsimony:{task}", arguments, tuple(needs), alone=task.startswith("fit"))
 
 
 def fit_name(scene: str, gaussians: int | str, learned: str, degree: int) -> str:
@@ -103,6 +111,8 @@ def cells_of(size: Preset) -> list[Cell]:
             cells.append(_cell(fit_name(scene, n, learned, degree), "fit_and_judge", [f"prior/{scene}/{n}"], **arguments))
         best = fit_name(scene, AUTO, ALL, 0)
         cells.append(_cell(f"prune/{scene}", "prune_and_judge", [best], scene=scene, fit=best))
+        needs, arguments = [f"prior/{scene}/{AUTO}"], {"scene": scene, "views": size.views, "seeds": size.seeds}
+        cells.append(_cell(f"lean/{scene}", "fit_lean_and_judge", needs, **arguments))
     return cells
 
 
@@ -112,8 +122,11 @@ def make_dataset(
     """A task: the data set of a scene, in the cell's folder "data"."""
     from mgs.study.material import made_dataset
     from mgs.synth import rendering
+    from mgs.synth.scene_file import load_scene_file
 
-    made_dataset(out / "data", scene, rendering.Preset(width, height, frames, spp), seed, tests)
+    loaded = load_scene_file("boulder" if scene in VARIANTS else scene)
+    loaded = loaded.model_copy(update={"rock": loaded.rock.model_copy(update=VARIANTS.get(scene, {}))})
+    made_dataset(out / "data", loaded, rendering.Preset(width, height, frames, spp), seed, tests)
     return {}
 
 
@@ -142,7 +155,8 @@ def fit_and_judge(
     root: Path, out: Path, scene: str, gaussians: int | str, learned: str, degree: int, views: int, seeds: int
 ) -> Any:
     """A task: fit views one after the other; what the test views, the next views and the evidence say of the model."""
-    from mgs.active.criteria import PIXEL_NOISE, lam_by_kind
+    from mgs.active.criteria import PIXEL_NOISE
+    from mgs.active.evidence import fit_lam, regularisation
     from mgs.active.fitting import fit
     from mgs.active.objective import objective
     from mgs.active.settings import RATES, NbvSettings, TrainSettings
@@ -158,8 +172,8 @@ def fit_and_judge(
     prior, cache, columns = load_prior(kept), ListCache(), groups(degree)
     train = TrainSettings(rates={kind: rate if kind in LEARNED[learned] else 0.0 for kind, rate in RATES.items()})
     settings = NbvSettings(dataset=folder, prior=kept, train=train)
-    lam = settings.regularisation(columns)
-    by_kind = lam_by_kind(lam, columns)
+    lam = regularisation(settings, degree)
+    by_kind = fit_lam(lam, degree)
     positions = np.array([frame.camera.position for frame in dataset.frames])
     frames = [dataset.frames[i] for i in views_in_order(positions, prior.points.mean(0), views, seeds)]
     cameras, targets = [frame.camera for frame in frames], [target_of(frame) for frame in frames]
@@ -167,9 +181,7 @@ def fit_and_judge(
     def start_of(count: int) -> Gaussians:
         """The Gaussians before training, in the colours of the first `count` frames, as the loop of `mgs nbv` has them."""
         of_seeds, coloured = (initial_gaussians(prior, frames[:k])[0] for k in (seeds, count))
-        sh = np.zeros((len(of_seeds), (degree + 1) ** 2, 3), np.float32)
-        sh[:, :1] = coloured.sh
-        return replace(of_seeds, sh=sh)
+        return replace(of_seeds, sh=coloured.sh).with_degree(degree)
 
     start = model = start_of(seeds)
     fitted, following, seconds, passes = list[float](), list[float](), 0.0, 0
@@ -196,6 +208,35 @@ def fit_and_judge(
         "next_error": float(np.mean(following)),
         "predictive": float(np.mean([log_likelihood(*pair) for pair in zip(following, fitted, strict=True)])),
         "evidence": float(-phi / PIXEL_NOISE**2 - 0.5 * np.log1p(H / lam[learned_columns]).sum()),
+    }
+
+
+def fit_lean_and_judge(root: Path, out: Path, scene: str, views: int, seeds: int) -> Any:
+    """A task: `mgs.active.evidence.lean_fit` to as many views, with the automatic number of Gaussians."""
+    from mgs.active.evidence import last_images, lean_fit
+    from mgs.active.settings import NbvSettings, TrainSettings
+    from mgs.data.dataset import load_dataset
+    from mgs.prior.build import load_prior
+    from mgs.splat import ListCache
+
+    folder, kept = cell_folder(root, f"dataset/{scene}") / "data", cell_folder(root, f"prior/{scene}/{AUTO}") / "prior"
+    dataset, prior = load_dataset(folder), load_prior(kept)
+    settings = NbvSettings(dataset=folder, prior=kept, seeds=seeds, train=TrainSettings())
+    positions = np.array([frame.camera.position for frame in dataset.frames])
+    frames = [dataset.frames[i] for i in views_in_order(positions, prior.points.mean(0), views, seeds)]
+    images, began = last_images(settings, prior, frames), time.perf_counter()
+    found = lean_fit(images, settings, cache=ListCache())
+    assert found.left_out is not None
+    whole = _quality(found.whole, dataset)
+    return _quality(found.gaussians, dataset) | {
+        "whole": whole,
+        "gaussians": len(found.gaussians),
+        "parameters": found.parameters,
+        "seconds": time.perf_counter() - began,
+        "degree": found.gaussians.sh_degree,
+        "directional_gain": found.left_out.gain,
+        "directional_error": found.left_out.error,
+        "shares": {kind: float(mask.mean()) for kind, mask in found.learned.items()},
     }
 
 
@@ -244,25 +285,28 @@ def prune_and_judge(root: Path, out: Path, scene: str, fit: str) -> Any:
 def run_study(root: Path, size: Preset, report: Callable[[str, int, int], None]) -> dict[str, Any]:
     """Do all cells that are not done, and return what they say: "rows", one for each fit, and "scenes", `verdict` of each."""
     found = run_cells(root, cells_of(size), report)
-    rows = []
+    rows: list[dict[str, Any]] = []
     for scene in size.scenes:
         for cell in cells_of(size):
             if cell.name.startswith(f"fit/{scene}/"):
                 asked = {key: cell.arguments[key] for key in ("scene", "learned", "degree")}
                 numbers = {key: value for key, value in found[cell.name].items() if key != "views"}
                 rows.append(asked | {"asked": str(cell.arguments["gaussians"])} | numbers)
+        numbers = {key: value for key, value in found[f"lean/{scene}"].items() if not isinstance(value, dict)}
+        rows.append({"scene": scene, "learned": AUTO, "asked": AUTO, **numbers})
     scenes = {scene: verdict([row for row in rows if row["scene"] == scene]) for scene in size.scenes}
     for scene in size.scenes:
         scenes[scene] |= {"prior": found[f"prior/{scene}/{AUTO}"], "pruned": found[f"prune/{scene}"]["rows"]}
+        scenes[scene] |= {"lean": found[f"lean/{scene}"]}
     return {"rows": rows, "scenes": scenes}
 
 
 def axes_of(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
     """The rows of one scene that differ in one thing alone: fixed "gaussians", "learned", "degree", in order."""
-    plain = [row for row in rows if row["learned"] == ALL and row["degree"] == 0]
+    plain = [row for row in rows if row["learned"] != AUTO and row["degree"] == 0]
     return {
         "gaussians": [row for row in plain if row["asked"] != AUTO],
-        "learned": sorted((row for row in rows if row["asked"] == AUTO and row["degree"] == 0), key=_kinds),
+        "learned": sorted((row for row in plain if row["asked"] == AUTO), key=_kinds),
         "degree": sorted((row for row in rows if row["asked"] == AUTO and row["learned"] == ALL), key=lambda r: r["degree"]),
     }
 
@@ -272,15 +316,17 @@ def _kinds(row: dict[str, Any]) -> int:
 
 
 def verdict(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """What the rows of one scene say of the automatic choice.
+    """What the rows of one scene say of the automatic choice, of N, of what is learned, and of the SH degree.
 
-    best: the largest PSNR inside the rock of the fixed choices, dB. auto, loss: that of the automatic choice, and how far it is
-    below the best. parameters: of the automatic choice; smallest: the fewest of a fixed choice within CLOSE of the best. close,
-    small: whether the loss is at most CLOSE, and the parameters at most the smallest. chosen: for each axis and each rule the
-    value that the rule would choose, and its loss against the best of the axis, dB.
+    best: the largest PSNR inside the rock of a fixed choice, dB: of N, all being learned, or of kinds or a degree, with the
+    automatic N. number: that of the automatic N, all being learned. auto, loss: that of the automatic choice of everything, and
+    how far it is below the best. parameters: of the automatic choice; smallest: the fewest of a fixed choice within CLOSE of
+    the best. close, small: whether the loss is at most CLOSE, and the parameters at most the smallest. chosen: for each axis and
+    each rule the value that the rule would choose, and its loss against the best of the axis, dB.
     """
-    auto = next(row for row in rows if row["asked"] == AUTO and row["learned"] == ALL and row["degree"] == 0)
-    fixed = [row for row in rows if row["asked"] != AUTO]
+    auto = next(row for row in rows if row["learned"] == AUTO)
+    number = next(row for row in rows if row["asked"] == AUTO and row["learned"] == ALL and row["degree"] == 0)
+    fixed = [row for row in rows if row not in (auto, number)]
     best = max(row["psnr_inside"] for row in fixed)
     smallest = min(row["parameters"] for row in fixed if row["psnr_inside"] >= best - CLOSE)
     chosen = {}
@@ -292,6 +338,7 @@ def verdict(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     loss = best - auto["psnr_inside"]
     return {
         "best": best,
+        "number": number["psnr_inside"],
         "auto": auto["psnr_inside"],
         "loss": loss,
         "parameters": auto["parameters"],

@@ -1,6 +1,6 @@
 """Tables of docs/benchmarks/*.json.
 
-Most of these files say which command wrote them; demo.json and policies.json are demo/report/table.json after `make demo`, and
+Most of these files say which command wrote them; demo.json is demo/report/table.json after `make demo`, and
 docs/nbv.md has the commands of flights.json.
 """
 
@@ -346,7 +346,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "demo": ("benchmarks/demo", demo),
     "demo-report": ("benchmarks/demo", demo_report),
     "flights": ("benchmarks/flights", flights),
-    "policies": ("benchmarks/policies", policies),
+    "policies": ("benchmarks/demo", policies),
     "hutchinson": ("benchmarks/hutchinson", hutchinson),
     "render-settings": ("benchmarks/render_settings", render_settings),
     "lambda-ranking": ("benchmarks/lambda_ranking", lambda_ranking),

@@ -55,7 +55,7 @@ SETTLED = 0.95
 def noise_ranking(data: dict[str, Any]) -> str:
     """Agreement of rankings under other assumptions with the default's, over the states."""
     rows, names = [], {"sigma": "sigma = {:g}", "alpha in F": "alpha in F, weight {:g}"}
-    names["alpha in lambda"] = "alpha in lambda, weight {:g}"
+    names |= {what: f"{what}, weight {{:g}}" for what in ("alpha in lambda", "alpha in the fit")}
     for assumption, name in names.items():
         for number in dict.fromkeys(r["number"] for r in data["records"] if r["assumption"] == assumption):
             of = [r for r in data["records"] if (r["assumption"], r["number"]) == (assumption, number)]
@@ -312,6 +312,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "warm-colours": ("benchmarks/warm_colours", warm_colours),
     "optimisers": ("benchmarks/optimisers", optimisers),
     "fit": ("benchmarks/fit", fit),
+    "fit-colours": ("benchmarks/fit_colours", fit),
     "means": ("benchmarks/means", means),
 }
 """By name: the file, seen from docs/ and without `.json`, and what makes the table of its contents."""

@@ -31,7 +31,10 @@ def parsimony(data: dict[str, Any]) -> str:
     for r in data["rows"]:
         n = f"{r['gaussians']:,}" + (" (auto)" if r["asked"] == "auto" else "")
         cells = [n, r["learned"], str(r["degree"]), f"{r['parameters']:,}", f"{r['psnr_inside']:.2f}", f"{r['psnr']:.2f}"]
-        cells += [f"{1e3 * math.sqrt(r['next_error']):.1f}", f"{r['predictive']:.2f}", f"{r['evidence'] / 1e3:,.0f}"]
+        if r["learned"] == "auto":  # it is fitted to all views at once
+            cells += ["", "", ""]
+        else:
+            cells += [f"{1e3 * math.sqrt(r['next_error']):.1f}", f"{r['predictive']:.2f}", f"{r['evidence'] / 1e3:,.0f}"]
         rows.append([r["scene"], *cells, f"{r['seconds']:.0f}"])
     heading = [
         "scene", "N", "learned", "SH", "parameters", "PSNR inside", "PSNR", "rms of the next view, 1e-3", "predictive",
@@ -41,15 +44,39 @@ def parsimony(data: dict[str, Any]) -> str:
 
 
 def parsimony_verdict(data: dict[str, Any]) -> str:
-    """The automatic number of Gaussians beside fixed ones."""
+    """What is chosen automatically, the number of Gaussians alone and everything, beside fixed numbers."""
     rows = []
     for scene, one in data["scenes"].items():
-        cells = [f"{round(one[key], 2) + 0.0:.2f}" for key in ("best", "auto", "loss")] + [
-            f"{one[key]:,}" for key in ("parameters", "smallest")
-        ]
+        number = next(r for r in data["rows"] if r["scene"] == scene and r["asked"] == "auto" and r["learned"] == "+ rotation")
+        cells = [
+            f"{one['best']:.2f}", f"{one['number']:.2f}, {number['parameters']:,}", f"{one['auto']:.2f}, {one['parameters']:,}",
+            f"{round(one['loss'], 2) + 0.0:.2f}", f"{one['smallest']:,}",
+        ]  # fmt: skip
         rows.append([scene, *cells, " and ".join("yes" if one[key] else "no" for key in ("close", "small"))])
     heading = [
-        "scene", "best fixed, dB", "automatic", "loss", "parameters", "smallest fixed within 0.1 dB", "close, and no larger",
+        "scene", "best fixed, dB", "automatic number: dB, parameters", "all automatic: dB, parameters", "loss",
+        "smallest fixed within 0.1 dB, parameters", "close, and no larger",
+    ]  # fmt: skip
+    return markdown(heading, rows) + made_by(data)
+
+
+def parsimony_lean(data: dict[str, Any]) -> str:
+    """What `mgs refit` chooses, and why."""
+    rows = []
+    for scene, one in data["scenes"].items():
+        lean, of = one["lean"], [r for r in data["rows"] if r["scene"] == scene and r["asked"] == "auto"]
+        by_degree = {r["degree"]: r["psnr_inside"] for r in of if r["learned"] == "+ rotation"}
+        whole = next(r for r in of if r["learned"] == "+ rotation" and r["degree"] == 0)
+        shares = [f"{lean['shares'][kind]:.0%}" if kind in lean["shares"] else "" for kind in ("opacity", "scale", "rotation")]
+        rows.append([
+            scene, *shares, f"{lean['directional_gain']:+.2f} ± {lean['directional_error']:.2f}", str(lean["degree"]),
+            f"{by_degree[1] - by_degree[0]:+.2f}", f"{lean['shares'].get('directional', 0):.0%}",
+            *(f"{one['psnr_inside']:.2f}, {one['psnr']:.2f}" for one in (lean["whole"], lean)),
+            f"{lean['parameters'] / whole['parameters']:.0%}",
+        ])  # fmt: skip
+    heading = [
+        "scene", "learn opacity", "scale", "rotation", "degree 1 on views left out, dB", "degree chosen",
+        "degree 1 on test views, dB", "learn it", "learning all: inside, full frame, dB", "chosen", "parameters",
     ]  # fmt: skip
     return markdown(heading, rows) + made_by(data)
 
@@ -75,12 +102,12 @@ def parsimony_prune(data: dict[str, Any]) -> str:
     """How much pruning leaves of the automatic model, and what it changes."""
     rows = []
     for scene, one in data["scenes"].items():
-        before = next(r["gaussians"] for r in data["rows"] if r["scene"] == scene and r["asked"] == "auto")
+        before = one["prior"]["gaussians"]
         for p in one["pruned"]:
             left = f"{p['gaussians']:,} of {before:,} ({p['gaussians'] / before:.0%})"
             change = [f"{1e3 * p[key]:.2f}" for key in ("predicted", "actual")]
             ratio = f"{(p['actual'] / p['predicted']) ** 2:.2f}" if p["predicted"] else ""
-            rows.append([f"{scene}, {p['noise']:g} sigma", left, *change, ratio, f"{p['psnr_inside'] - one['auto']:+.2f}"])
+            rows.append([f"{scene}, {p['noise']:g} sigma", left, *change, ratio, f"{p['psnr_inside'] - one['number']:+.2f}"])
     heading = [
         "scene, noise",
         "Gaussians left",
@@ -184,6 +211,9 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "stability-full": ("results/stress-full/verdicts", stability),
     "parsimony": ("results/parsimony/parsimony", parsimony),
     "parsimony-verdict": ("results/parsimony/parsimony", parsimony_verdict),
+    "parsimony-verdict-full": ("results/parsimony-full/parsimony", parsimony_verdict),
+    "parsimony-lean": ("results/parsimony/parsimony", parsimony_lean),
+    "parsimony-lean-full": ("results/parsimony-full/parsimony", parsimony_lean),
     "parsimony-rules": ("results/parsimony/parsimony", parsimony_rules),
     "parsimony-prune": ("results/parsimony/parsimony", parsimony_prune),
     **{f"reproduce-{name}": (f"results/reproduce/{name}", reproduced(name)) for name in REPRODUCED},

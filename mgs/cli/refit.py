@@ -1,0 +1,60 @@
+"""`mgs refit`: a run's model with no more parameters than its views pay for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mgs.active.criteria import LEARN_LOSS
+
+
+def refit(
+    run: Annotated[Path, typer.Argument(help="Folder that `mgs nbv` wrote.")],
+    learn: Annotated[
+        str,
+        typer.Option(help="auto: each Gaussian learns the kinds of parameters that the evidence pays for; all: all of them."),
+    ] = "auto",
+    sh: Annotated[
+        str,
+        typer.Option(help="SH degree of the colours. auto: 1 where that foretells views left out better than 0 does."),
+    ] = "auto",
+    loss: Annotated[
+        float, typer.Option(help="By how much the objective of the fit may rise where parameters are left out, dB.")
+    ] = LEARN_LOSS,
+) -> None:
+    """Fit the views of a run once more, with no more parameters than they pay for; write RUN/gaussians_refitted.ply.
+
+    What pays is decided without a test view: which kinds of parameters a Gaussian learns by the evidence, the marginal
+    likelihood of the images, and by --loss; the SH degree by views that are left out. Parameters that are not learned keep the
+    prior's values, and are marked in the file. The run itself stays as it is.
+    """
+    from rich.console import Console
+
+    from mgs import runtime
+    from mgs.report.refitting import REFITTED, refit_run
+
+    runtime.start()
+    console, asked = Console(highlight=False), {"learn": learn, "sh": sh, "loss": loss}
+    with console.status("reading") as status:
+        found = refit_run(run, say=status.update, **asked)  # type: ignore[arg-type]
+    for line in lines(found):
+        console.print(line, soft_wrap=True)
+    console.print(f"wrote {run / REFITTED}", soft_wrap=True)
+
+
+def lines(found: Any) -> list[str]:
+    """What a `mgs.report.refitting.RefittedRun` is told as."""
+    said = [f"{found.after:,} parameters are learned, {found.after / found.before:.0%} of the run's {found.before:,}"]
+    said.append("learned by: " + ", ".join(f"{kind} {share:.0%}" for kind, share in found.shares.items()) + " of the Gaussians")
+    if found.left_out:
+        change = f"{found.left_out.gain:+.2f} dB, standard error {found.left_out.error:.2f}"
+        said.append(f"SH degree {found.sh_degree}: on neighbouring views left out together, degree 1 gains {change}")
+    if found.psnr:
+        own, whole, lean = found.psnr
+        said.append(
+            f"PSNR on the {found.views} views: {lean:.2f} dB, {whole:.2f} dB where all parameters are fitted in the same way; "
+            f"of the run's own model {own:.2f} dB"
+        )
+    return said

@@ -1,0 +1,311 @@
+"""A model with no more parameters than its images pay for: the evidence, the choice of a degree, and a run fitted anew."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import synthetic
+from hypothesis import given
+from hypothesis import strategies as st
+from plyfile import PlyData
+from scipy.stats import multivariate_normal
+
+from mgs.active import evidence
+from mgs.active.evidence import (
+    BLOCKS,
+    DIRECTIONAL,
+    Images,
+    LeftOut,
+    Worth,
+    kinds,
+    lean_fit,
+    paying,
+    regularisation,
+    worth,
+)  # fmt: skip
+from mgs.active.fitting import fit
+from mgs.active.nbv import run_nbv
+from mgs.active.run_folder import load_run
+from mgs.active.settings import NbvSettings, TrainSettings
+from mgs.bench.core import surface_camera, surface_gaussians
+from mgs.camera import Camera, look_at
+from mgs.cli.app import main
+from mgs.errors import InputError
+from mgs.gaussians import LEARNED
+from mgs.report.refitting import REFITTED, refit_run
+from mgs.splat import render
+from mgs.splat_ply import read_ply, write_ply
+
+VIEWS = 8
+
+
+def model(n=500):
+    """A closed surface, of degree 0."""
+    gaussians = surface_gaussians(n)
+    gaussians.logit_opacities[:] = 4.0
+    gaussians.log_scales += 0.7
+    return gaussians
+
+
+def cameras_around(gaussians, views=VIEWS):
+    first = surface_camera(gaussians, 40, 32)
+    distance = np.linalg.norm(first.position)
+    angles = 2 * np.pi * np.arange(views) / views
+    eyes = [distance * np.array([np.cos(a), np.sin(a), 0.4]) for a in angles]
+    return [Camera(first.K, 40, 32, look_at(eye, [0, 0, 0.4])) for eye in eyes]
+
+
+def images_of(truth, start, noise=0.002, views=VIEWS):
+    """What the truth looks like, with noise, and where a fit starts."""
+    rng, cameras = np.random.default_rng(0), cameras_around(truth, views)
+    targets = [np.asarray(render(truth, camera).rgb) for camera in cameras]
+    noisy = [target + rng.normal(0, noise, target.shape) for target in targets]
+    known = [np.dstack([target, np.ones(target.shape[:2])]).astype(np.float32) for target in noisy]
+    return Images(cameras, known, lambda of: start, range(views))
+
+
+def settings(tmp_path, **train):
+    return NbvSettings(dataset=tmp_path, prior=tmp_path, train=TrainSettings(**train))
+
+
+@given(st.integers(1, 6), st.floats(0.01, 3), st.floats(0.05, 4), st.integers(0, 10**6))
+def test_the_gain_is_the_logarithm_of_the_ratio_of_two_marginal_likelihoods(pixels, sigma, tau, seed):
+    """In a linear model with one parameter it is exact: pixels = slope * parameter + noise, against noise alone."""
+    rng = np.random.default_rng(seed)
+    slope = rng.normal(size=pixels)
+    seen = slope * rng.normal(0, tau) + rng.normal(0, sigma, pixels)
+    lam = (sigma / tau) ** 2
+    precision = slope @ slope + lam
+    away = (slope @ seen) / precision  # the most probable parameter
+    noise = sigma**2 * np.eye(pixels)
+    with_it = multivariate_normal(np.zeros(pixels), noise + tau**2 * np.outer(slope, slope)).logpdf(seen)
+    without = multivariate_normal(np.zeros(pixels), noise).logpdf(seen)
+    found = worth(np.array([[away]]), np.array([[precision]]), np.array([lam]), sigma, {"one": slice(0, 1)}, 1.0)
+    assert found.gain["one"][0] == pytest.approx(with_it - without, rel=1e-6, abs=1e-6)
+    at_start, at_end = seen @ seen / 2, np.square(seen - slope * away).sum() / 2 + lam * away**2 / 2
+    assert found.rise["one"][0] == pytest.approx(at_start - at_end, rel=1e-6, abs=1e-9)
+
+
+@given(st.integers(1, 40), st.floats(0, 3), st.integers(0, 10**6))
+def test_what_pays_least_is_left_out_as_long_as_it_is_allowed(n, loss, seed):
+    rng, sizes = np.random.default_rng(seed), {"scale": 3, "opacity": 1}
+    gain = {kind: rng.normal(1, 1, n) for kind in sizes}
+    rise = {kind: rng.gamma(1, 1, n) for kind in sizes}
+    found = Worth(gain, rise, 10.0, np.zeros(n, bool))
+    kept = paying(found, sizes, loss)
+    assert not any(kept[kind][gain[kind] <= 0].any() for kind in sizes)
+    left_out = {kind: (gain[kind] > 0) & ~kept[kind] for kind in sizes}
+    spent = sum(rise[kind][left_out[kind]].sum() for kind in sizes)
+    allowed = 10.0 * (10 ** (loss / 10) - 1)
+    assert spent <= allowed + 1e-9
+    per_number = {kind: gain[kind] / size for kind, size in sizes.items()}
+    most = max((per_number[kind][left_out[kind]].max() for kind in sizes if left_out[kind].any()), default=-np.inf)
+    others = [(per_number[kind][i], rise[kind][i]) for kind in sizes for i in np.flatnonzero(kept[kind])]
+    assert all(each >= most for each, _ in others)
+    if others:
+        assert spent + min(others)[1] > allowed - 1e-9
+    everything = paying(found, sizes, 0.0)
+    assert all(np.array_equal(everything[kind], gain[kind] > 0) for kind in sizes)
+
+
+@pytest.mark.parametrize("optimiser", ["natural", "adam"])
+def test_only_those_gaussians_learn_a_kind_that_are_asked_to(optimiser):
+    start = model()
+    cameras = cameras_around(start, 3)
+    targets = [np.full((32, 40, 3), 0.3, np.float32)] * 3
+    train = TrainSettings(passes=3, optimiser=optimiser)
+    some = np.arange(len(start)) % 3 == 0
+    found = fit(start, cameras, targets, train, learns={"scale": some[:, None], "opacity": some}).gaussians
+    whole = fit(start, cameras, targets, train).gaussians
+    assert np.array_equal(found.log_scales[~some], start.log_scales[~some])
+    assert np.array_equal(found.logit_opacities[~some], start.logit_opacities[~some])
+    moved = (whole.log_scales != start.log_scales).any(axis=1)
+    assert moved.sum() > 100
+    assert np.array_equal((found.log_scales != start.log_scales).any(axis=1), moved & some)
+    everyone = {"scale": np.ones((len(start), 1), bool), "colour": np.ones((len(start), 1, 1), bool)}
+    assert fit(start, cameras, targets, train, learns=everyone).gaussians == whole
+
+
+def test_scales_are_learned_where_they_are_wrong(tmp_path):
+    truth = model()
+    wrong = np.arange(len(truth)) % 10 == 0
+    start = dataclasses.replace(truth, log_scales=truth.log_scales + 0.3 * wrong[:, None].astype(np.float32))
+    told = []
+    found = lean_fit(images_of(truth, start), settings(tmp_path), sh="0", say=told.append)
+    scale, colour = found.learned["scale"], found.learned["colour"]
+    assert scale[wrong & colour].mean() > 2 * scale[~wrong & colour].mean()
+    assert found.left_out is None
+    assert set(found.learned) == {"colour", "scale", "rotation", "opacity"}
+    for kind, name in zip(("scale", "rotation", "opacity"), LEARNED[1:], strict=True):
+        held = ~found.learned[kind]
+        assert np.array_equal(getattr(found.gaussians, name)[held], getattr(start, name)[held])
+    sizes = {"colour": 3, "scale": 3, "rotation": 4, "opacity": 1}
+    assert found.parameters == sum(int(found.learned[kind].sum()) * size for kind, size in sizes.items())
+    assert told == ["fitting all parameters", "fitting what the images pay for"]
+    everything = lean_fit(images_of(truth, start), settings(tmp_path), learn="all", sh="0")
+    assert found.parameters < everything.parameters == 11 * colour.sum()
+    assert found.whole == everything.whole == everything.gaussians
+    more = lean_fit(images_of(truth, start), settings(tmp_path), sh="0", loss=0.0)
+    assert found.parameters < more.parameters < everything.parameters
+
+
+def test_what_no_image_sees_is_not_learned(tmp_path):
+    truth = model()
+    hidden = np.arange(len(truth)) >= 450
+    truth.means[hidden, 2] += 1000.0  # high above all views
+    found = lean_fit(images_of(truth, truth), settings(tmp_path), sh="0")
+    assert not any(mask[hidden].any() for mask in found.learned.values())
+
+
+@pytest.mark.parametrize(("shine", "degree"), [(0.0, 0), (0.3, 1)])
+def test_colours_have_a_degree_where_the_truth_has_one(tmp_path, shine, degree):
+    start = model()
+    truth = start.with_degree(1)
+    truth.sh[:, 1:] = shine * np.random.default_rng(1).normal(size=(1, 3, 1))  # all of them shine in the same direction
+    found = lean_fit(images_of(truth, start), settings(tmp_path), learn="all")
+    assert found.gaussians.sh_degree == degree
+    assert found.left_out.pays == bool(degree)
+    assert (found.left_out.gain > 0.5) == bool(degree)
+    if degree:
+        assert 0.3 < found.learned[DIRECTIONAL].mean() <= 1
+        assert not found.gaussians.sh[~found.learned[DIRECTIONAL], 1:].any()
+
+
+def test_few_views_leave_no_choice_of_a_degree(tmp_path):
+    start = model()
+    found = lean_fit(images_of(start, start, views=BLOCKS - 1), settings(tmp_path))
+    assert (found.gaussians.sh_degree, found.left_out) == (0, None)
+
+
+def test_a_gain_within_its_own_error_does_not_pay():
+    assert LeftOut(0.2, 0.1).pays
+    assert not LeftOut(0.1, 0.2).pays
+    assert not LeftOut(-0.2, 0.1).pays
+
+
+def test_each_view_is_left_out_once_with_its_neighbours(tmp_path, monkeypatch):
+    start = model(60)
+    images, fitted, judged = images_of(start, start), [], []
+    images = dataclasses.replace(images, order=[3, 1, 0, 2, 5, 4, 7, 6])
+    monkeypatch.setattr(evidence, "fitted", lambda images, views, *_: fitted.append(list(views)) or start)
+    monkeypatch.setattr(evidence, "_squared_error", lambda model, camera, target, cache: judged.append(camera) or 1.0)
+    evidence.directional_gain(images, settings(tmp_path), None)
+    left = [sorted(set(range(VIEWS)) - set(views)) for views in fitted[::2]]
+    assert left == [[1, 3], [0, 2], [4, 5], [6, 7]]
+    assert fitted[::2] == fitted[1::2]
+    assert judged[::2] == [images.cameras[i] for i in images.order]
+
+
+def test_lambda_of_each_kind(tmp_path):
+    lam, of = regularisation(settings(tmp_path), 2), kinds(2)
+    assert of == {
+        "colour": slice(0, 3), DIRECTIONAL: slice(3, 27), "scale": slice(27, 30), "rotation": slice(30, 34),
+        "opacity": slice(34, 35),
+    }  # fmt: skip
+    assert np.allclose(lam[of["colour"]], 0.02**2)
+    assert np.allclose(lam[of[DIRECTIONAL]], (0.02 / 0.03) ** 2)
+    assert np.allclose(lam[of["opacity"]], 0.01**2)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    root = tmp_path_factory.mktemp("refit")
+    synthetic.write_dataset(root / "data/test", synthetic.orbit_cameras(3, 48, 36, altitude=2.0))
+    data = synthetic.write_dataset(root / "data", synthetic.orbit_cameras(12, 48, 36))
+    run_nbv(data.root, root / "run", gaussians=400, budget=2, policy="uniform")
+    return root / "run"
+
+
+def test_a_run_is_refitted_beside_its_model(run, capsys):
+    before = {file.name: file.read_bytes() for file in run.iterdir() if file.is_file()}
+    with pytest.raises(SystemExit) as exit_:
+        main(["refit", str(run)])
+    assert exit_.value.code == 0
+    said = capsys.readouterr().out
+    after = {file.name: file.read_bytes() for file in run.iterdir() if file.is_file()}
+    refitted = after.pop(REFITTED)
+    assert after == before
+    vertices = PlyData.read(str(run / REFITTED))["vertex"].data
+    marks = {name: vertices[name].astype(bool) for name in vertices.dtype.names if name.startswith("learned_")}
+    assert {"learned_colour", "learned_scale", "learned_rotation", "learned_opacity"} <= set(marks)
+    columns = {"colour": 3, "directional": 9, "scale": 3, "rotation": 4, "opacity": 1}
+    parameters = sum(int(mask.sum()) * columns[name.removeprefix("learned_")] for name, mask in marks.items())
+    assert f"{parameters:,} parameters are learned" in said
+    assert 1200 <= parameters < 4400
+    model, whole = read_ply(run / REFITTED), load_run(run)[0]
+    assert np.array_equal(model.means, whole.means)
+    assert len(np.unique(model.logit_opacities[~marks["learned_opacity"]])) <= 2  # the prior's, on the surface and behind it
+    assert "PSNR on the test views" in said
+    found = refit_run(run)
+    assert (run / REFITTED).read_bytes() == refitted
+    assert found.after == parameters
+    assert found.before == 4400
+    own, whole, lean = found.psnr
+    assert lean > whole - 0.3
+    assert f"{lean:.2f} dB, {whole:.2f} dB where all" in said
+    assert f"own model {own:.2f} dB" in said
+
+
+def test_the_images_of_the_last_fit_are_those_of_the_run(run):
+    from mgs.active.convergence import remaining_decrease
+    from mgs.active.evidence import last_images
+    from mgs.active.run_folder import read_settings
+    from mgs.prior.build import load_prior
+
+    whole, dataset, taken, _ = load_run(run)
+    by_name, given = {frame.name: frame for frame in dataset.frames}, read_settings(run)
+    frames = [by_name[name] for name in taken]
+    images = last_images(given, load_prior(given.prior), frames)
+    positions = np.array([images.cameras[i].position for i in images.order])
+    around = np.unwrap(np.arctan2(positions[:, 1], positions[:, 0]))
+    assert (np.diff(around) > 0).all()
+    assert around[-1] - around[0] < 2 * np.pi
+    assert remaining_decrease(whole, given, load_prior(given.prior), frames)["phi"] > 0
+    assert np.array_equal(images.start(range(len(images))).means, whole.means)
+
+
+@pytest.mark.parametrize("means", ["normal", "free"])
+def test_a_run_that_learns_means_is_refitted_too(run, tmp_path, means):
+    data = run.parent / "data"
+    run_nbv(data, tmp_path / "run", gaussians=150, budget=1, policy="uniform", train={"means": means}, exposure=True)
+    found = refit_run(tmp_path / "run", sh="0")
+    assert found.before == 150 * {"normal": 12, "free": 14}[means]
+    vertices = PlyData.read(str(tmp_path / "run" / REFITTED))["vertex"].data
+    held = vertices["learned_mean"] == 0
+    assert 0 < held.mean() < 1
+    assert held.mean() == pytest.approx(1 - found.shares["mean"])
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--learn", "some"], "--learn some: is unknown; choose one of all, auto"),
+        (["--sh", "1"], "--sh 1: is unknown; choose one of 0, auto"),
+        (["--learn", "all", "--sh", "0"], "is what the run itself fitted; leave out one of them"),
+        (["--loss", "-1"], "--loss -1.0: must be from 0 to 10 dB"),
+        (["--loss", "nan"], "--loss nan: must be from 0 to 10 dB"),
+    ],
+)
+def test_what_cannot_be_chosen_is_one_line(run, capsys, options, said):
+    with pytest.raises(SystemExit) as exit_:
+        main(["refit", str(run), *options])
+    assert exit_.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_prior_that_is_gone_is_one_line(run, tmp_path):
+    import shutil
+
+    shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns(REFITTED))
+    config = (tmp_path / "run/config.json").read_text().replace(str(run / "prior"), str(tmp_path / "nowhere"))
+    (tmp_path / "run/config.json").write_text(config)
+    with pytest.raises(InputError, match="nowhere"):
+        refit_run(tmp_path / "run")
+    assert not (tmp_path / "run" / REFITTED).exists()
+
+
+def test_marks_are_passed_over_where_a_file_is_read(tmp_path):
+    gaussians = model(20)
+    write_ply(tmp_path / "marked.ply", gaussians, {"learned_scale": np.arange(20) < 5})
+    assert read_ply(tmp_path / "marked.ply") == gaussians
+    assert PlyData.read(str(tmp_path / "marked.ply"))["vertex"].data["learned_scale"].sum() == 5
