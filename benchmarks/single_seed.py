@@ -65,7 +65,7 @@ def draw(out: Path, away: np.ndarray, gains: dict[str, np.ndarray]) -> None:
     from mgs.plotting import STYLE
 
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(4.8, 2.8), dpi=150, layout="constrained")
+        figure = Figure(figsize=(4.8, 3.2), dpi=150, layout="constrained")
         axis = figure.subplots()
         for (estimator, values), colour in zip(gains.items(), ("#0072B2", "#56B4E9", "#009E73", "#D55E00"), strict=True):
             axis.plot(away, values / values.max(), "o-", color=colour, label=ESTIMATORS[estimator])
@@ -75,7 +75,7 @@ def draw(out: Path, away: np.ndarray, gains: dict[str, np.ndarray]) -> None:
             ylim=(0, None),
             xticks=range(-180, 181, 60),
         )
-        axis.legend()
+        figure.legend(loc="outside lower center", ncols=2)
         figure.savefig(out)
 
 

@@ -113,6 +113,36 @@ def test_two_workers_of_which_one_is_killed_find_what_a_serial_run_finds(tmp_pat
         assert files[0] == files[1]
 
 
+def real_run(root, out, data, policy, killed=False):
+    """A task: `mgs nbv`; its process is killed after the first choice of the first attempt, if asked for."""
+    from mgs.active.inputs import array_digest
+    from mgs.active.nbv import resume_nbv, run_nbv
+
+    first, run = not (out / "run").exists(), out / "run"
+
+    def on_step(state):
+        if killed and first and len(state.steps) == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    given = {"gaussians": 150, "seeds": 2, "budget": 3, "policy": policy}
+    state = run_nbv(data, run, on_step=on_step, **given) if first else resume_nbv(run)
+    arrays = [*vars(state.gaussians).values(), state.H, state.surface]
+    return {"taken": state.taken, "arrays": array_digest(arrays), "losses": [step["loss"] for step in state.steps]}
+
+
+def test_real_runs_of_two_workers_are_bit_for_bit_those_of_a_serial_run(tmp_path):
+    import synthetic
+
+    data = synthetic.write_dataset(tmp_path / "data", synthetic.orbit_cameras(8, 48, 36)).root
+    cells = [Cell(p, "test_sweep:real_run", {"data": str(data), "policy": p}) for p in ("d-optimal", "random")]
+    cells.append(Cell("killed", "test_sweep:real_run", {"data": str(data), "policy": "d-optimal", "killed": True}))
+    parallel = run_cells(tmp_path / "parallel", cells, silent, workers=2)
+    serial = run_cells(tmp_path / "serial", cells[:2], silent)
+    assert {name: parallel[name] for name in serial} == serial
+    assert parallel["killed"] == serial["d-optimal"] != serial["random"]
+    assert len(serial["d-optimal"]["taken"]) == 5
+
+
 @pytest.fixture(scope="module")
 def scheduler():
     """Address of a Dask scheduler with two worker processes."""

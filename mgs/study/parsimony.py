@@ -321,8 +321,8 @@ def verdict(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     best: the largest PSNR inside the rock of a fixed choice, dB: of N, all being learned, or of kinds or a degree, with the
     automatic N. number: that of the automatic N, all being learned. auto, loss: that of the automatic choice of everything, and
     how far it is below the best. parameters: of the automatic choice; smallest: the fewest of a fixed choice within CLOSE of
-    the best. close, small: whether the loss is at most CLOSE, and the parameters at most the smallest. chosen: for each axis and
-    each rule the value that the rule would choose, and its loss against the best of the axis, dB.
+    the best. close, small: whether the loss is at most CLOSE, and the parameters at most the smallest. chosen: for each axis
+    and each rule the value that the rule would choose, and its loss against the best of the axis, dB.
     """
     auto = next(row for row in rows if row["learned"] == AUTO)
     number = next(row for row in rows if row["asked"] == AUTO and row["learned"] == ALL and row["degree"] == 0)

@@ -219,13 +219,14 @@ def uncertainty(data: dict[str, Any]) -> str:
         cells = [f"{sum(values) / len(values):.2f}" for values in areas]
         cells = [f"{a} ({p}; {c})" for a, p, c in (cells[:3], cells[3:])]
         cells += [f"{sum(row[key] for row in found) / len(found):.2f}" for key in ("spearman", "pearson")]
-        whole = sum(row["held"]["0.9"][0] for row in found) / len(found)
-        thirds = [share for row in found for share in row["held"]["0.9"][1:]]
-        cells += [f"{100 * whole:.0f} % ({100 * min(thirds):.0f} to {100 * max(thirds):.0f})"]
+        for share in ("0.5", "0.9"):
+            whole = sum(row["held"][share][0] for row in found) / len(found)
+            thirds = [held for row in found for held in row["held"][share][1:]]
+            cells += [f"{100 * whole:.0f} % ({100 * min(thirds):.0f} to {100 * max(thirds):.0f})"]
         crps = sum(row["crps"] / row["crps_constant"] for row in found) / len(found)
         rows.append([prediction, *cells, f"{crps:.2f}"])
     heading = ["prediction", "AUSE of absolute errors (perfect; constant)", "of squared errors", "Spearman", "Pearson"]
-    heading += ["in the interval of 90 % (thirds)", "CRPS over a constant's"]
+    heading += ["in the interval of 50 % (thirds)", "of 90 %", "CRPS over a constant's"]
     command = re.sub(r"(out/calibrated/\S+ ?)+", "out/calibrated/*/d*", data["command"])  # their names are many
     return markdown(heading, rows) + made_by(data | {"command": command})
 

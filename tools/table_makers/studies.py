@@ -81,6 +81,19 @@ def parsimony_lean(data: dict[str, Any]) -> str:
     return markdown(heading, rows) + made_by(data)
 
 
+def left_out(data: dict[str, Any]) -> str:
+    """What degree 1 gains on test views and on views left out."""
+    rows = []
+    for one in data["records"]:
+        cells = [f"{one['psnr'][1] - one['psnr'][0]:+.2f}"]
+        for name in ("blocks", "between"):
+            found = one[name]
+            cells += [f"{found['gain']:+.2f} ({found['error']:.2f})", "degree 1" if found["pays"] else "degree 0"]
+        rows.append([f"{one['rock']}, {one['material']}", str(one["views"]), *cells])
+    heading = ["rock", "views", "gain on test views, dB", "on blocks left out, dB", "asks for", "between, dB", "asks for"]
+    return markdown(heading, rows) + made_by(data)
+
+
 def parsimony_rules(data: dict[str, Any]) -> str:
     """What each rule would choose along each axis, and what that loses."""
     rows = []
@@ -212,6 +225,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "parsimony": ("results/parsimony/parsimony", parsimony),
     "parsimony-verdict": ("results/parsimony/parsimony", parsimony_verdict),
     "parsimony-verdict-full": ("results/parsimony-full/parsimony", parsimony_verdict),
+    "left-out": ("benchmarks/left_out", left_out),
     "parsimony-lean": ("results/parsimony/parsimony", parsimony_lean),
     "parsimony-lean-full": ("results/parsimony-full/parsimony", parsimony_lean),
     "parsimony-rules": ("results/parsimony/parsimony", parsimony_rules),
