@@ -314,7 +314,7 @@ def criteria(data: dict[str, Any]) -> str:
     command = re.sub(r"(out/states/\S+ )+", "out/states/* ", data["command"])  # their names are many
     apart = [state["largest_difference"] for state in states.values() if "largest_difference" in state]
     note = f"\nPSNR measured anew differs from that of `OLD.json` by {max(apart):.3f} dB at most.\n" if apart else ""
-    return markdown(heading, ranked) + note + made_by(data | {"command": command.replace("out/criteria-before", "OLD")})
+    return markdown(heading, ranked) + note + made_by(data | {"command": command.replace("out/OLD", "OLD")})
 
 
 def fitted_degree(data: dict[str, Any]) -> str:
