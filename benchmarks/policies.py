@@ -86,10 +86,21 @@ def paper_mean(outlook: Outlook) -> np.ndarray:
 
 
 def paper_scaled(outlook: Outlook) -> np.ndarray:
-    """`paper` with lambdas that have units, and are to its information what those of `d-optimal` are to the exact: a mean loss
-    has far smaller gradients than pixels have, and one lambda of 1e-6 swamps them."""
+    """`paper` with the lambdas of `d-optimal`, which have units, times one number: the ratio of the mean entries of its
+    information and of the exact. A mean loss has far smaller gradients than pixels have, and one lambda of 1e-6 swamps them."""
     means = [np.mean([outlook.estimate(i, name).mean() for i in outlook.visited]) for name in ("loss-gradient", "exact")]
     return _by_loss(outlook, "loss-gradient", outlook.lam * float(means[0] / means[1]))
+
+
+def paper_small_lam(outlook: Outlook) -> np.ndarray:
+    """`paper` with one lambda that is as small for its information as 1e-6 is for the exact."""
+    means = [np.mean([outlook.estimate(i, name).mean() for i in outlook.visited]) for name in ("loss-gradient", "exact")]
+    return _by_loss(outlook, "loss-gradient", _one_lam(outlook) * float(means[0] / means[1]))
+
+
+def exact_one_lam(outlook: Outlook) -> np.ndarray:
+    """`d-optimal` with the one lambda of `paper`."""
+    return _by_loss(outlook, "exact", _one_lam(outlook))
 
 
 def _one_lam(outlook: Outlook) -> np.ndarray:

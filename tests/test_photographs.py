@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from scipy.ndimage import binary_dilation
@@ -278,6 +278,8 @@ def test_a_refused_cloud_leaves_a_picture(
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(lambda v: np.linalg.norm(v) > 0.1))
+@example([0.0, 2.0**-24, -1.0])
+@example([0.0, 0.0, -1.0])
 def test_upright_is_the_rotation_that_turns_up_to_z(vector: list[float]) -> None:
     up = unit_up(vector)
     turn = upright(up)

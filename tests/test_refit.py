@@ -160,7 +160,8 @@ def test_what_no_image_sees_is_not_learned(tmp_path):
 @pytest.mark.parametrize(("shine", "degree"), [(0.0, 0), (0.3, 1)])
 def test_colours_have_a_degree_where_the_truth_has_one(tmp_path, shine, degree):
     start = model()
-    truth = start.with_degree(1)
+    truth = start.with_degree(1)  # with colours of its own
+    start.sh *= 0.8  # so that there is something to learn
     truth.sh[:, 1:] = shine * np.random.default_rng(1).normal(size=(1, 3, 1))  # all of them shine in the same direction
     found = lean_fit(images_of(truth, start), settings(tmp_path), learn="all")
     assert found.gaussians.sh_degree == degree
@@ -281,7 +282,7 @@ def test_a_run_that_learns_means_is_refitted_too(run, tmp_path, means):
     [
         (["--learn", "some"], "--learn some: is unknown; choose one of all, auto"),
         (["--sh", "1"], "--sh 1: is unknown; choose one of 0, auto"),
-        (["--learn", "all", "--sh", "0"], "is what the run itself fitted; leave out one of them"),
+        (["--learn", "all", "--sh", "0"], "leaves nothing to choose; leave out one of them"),
         (["--loss", "-1"], "--loss -1.0: must be from 0 to 10 dB"),
         (["--loss", "nan"], "--loss nan: must be from 0 to 10 dB"),
     ],

@@ -32,9 +32,13 @@ PRUNE_NOISE = PIXEL_NOISE / 5
 """rms change of a pixel value that pruning a model may make (`mgs prune`), linear RGB: so much less than the noise that it
 costs about a tenth of a decibel (docs/parsimony.md). A chosen constant."""
 
+DIRECTIONAL_STD = 0.03
+"""tau of colour coefficients of degrees above 0, where that of degree 0 is 1 (`PRIOR_STD`): a rock looks
+almost the same from all sides. A chosen constant (docs/parsimony.md)."""
+
 LEARN_LOSS = 0.05
 """By how much the objective of a fit may rise where parameters are left out that the images hardly pay for (`mgs refit`), dB:
-on views that were not fitted that costs about as much (docs/parsimony.md). A chosen constant."""
+on views that were not fitted that costs as much, or twice that (docs/parsimony.md). A chosen constant."""
 
 PRIOR_STD = {"colour": 1.0, "scale": 0.125, "rotation": 0.0625, "opacity": 2.0}
 """tau: how far each parameter may plausibly lie from its start before any image is seen, in the parameter's own unit:

@@ -12,8 +12,8 @@ objective of the fit, should not rise by more than is allowed: without the param
 
 Whether colours depend on the direction at all, so have spherical harmonics of degree 1, is no question to the images that are
 fitted: they lie on the orbit, and what is wanted is how the rock looks from elsewhere. It is chosen by blocked
-cross-validation (Roberts et al. 2017): neighbouring views are left out together, so that the others have to foretell views
-that lie beyond them.
+cross-validation (Roberts et al. 2017): views that are neighbours in azimuth are left out together, so that the others have to
+foretell views that lie beyond them.
 """
 
 from __future__ import annotations
@@ -25,14 +25,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mgs.active.criteria import LEARN_LOSS
+from mgs.active.criteria import DIRECTIONAL_STD, LEARN_LOSS
 from mgs.active.fitting import fit
 from mgs.active.objective import Vector, objective
 from mgs.active.pose_policies import azimuths
 from mgs.active.settings import NbvSettings
+from mgs.active.stopping import StopReason
 from mgs.camera import Camera
 from mgs.data.dataset import Frame, target_of
 from mgs.data.up import upright
+from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.memory import Deferred
 from mgs.prior.build import Prior
@@ -42,10 +44,6 @@ from mgs.splat import ListCache, as_drjit, groups, render
 
 DIRECTIONAL = "directional"
 """What the colour coefficients of degrees above 0 are called beside the other kinds of parameters."""
-
-DIRECTIONAL_STD = 0.03
-"""tau of colour coefficients of degrees above 0, where that of degree 0 is 1 (`mgs.active.criteria.PRIOR_STD`): a rock looks
-almost the same from all sides. A chosen constant (docs/parsimony.md)."""
 
 BLOCKS = 4
 """Blocks of neighbouring views, each of which is left out of the fit once."""
@@ -58,9 +56,10 @@ Mask = NDArray[np.bool_]
 class Images:
     """What a model is fitted to, and from where.
 
-    cameras, targets: as in `mgs.active.fitting.fit`, with weights. start(views): the Gaussians before any training, of degree
-    0, in the colours of these views, indices. order: [V] views, so that neighbours follow each other. normals: [N,3], read
-    only where means move along them."""
+    cameras: V of them. targets: one of each, [H,W,4] with the weights of the pixels, or [H,W,5] with alpha after them, as in
+    `mgs.active.fitting.fit`. start(views): the Gaussians before any training, of degree 0, in the colours of these views,
+    indices. order: [V] indices of the views, so that neighbours in azimuth follow each other. normals: [N,3], read only where
+    means move along them."""
 
     cameras: Sequence[Camera]
     targets: Sequence[np.ndarray]
@@ -76,7 +75,8 @@ class Images:
 class LeftOut:
     """What degree 1 does to the squared error of views that were left out, dB; above 0 where it is the better model.
 
-    gain: the mean over the views; error: its standard error."""
+    gain: the mean over the views; error: its standard error, as if views of one block, which share their fits, were
+    independent."""
 
     gain: float
     error: float
@@ -158,14 +158,16 @@ class Worth:
 
 
 def worth(away: Array, precision: Array, lam: Array, sigma: float, of: Mapping[str, slice], phi: float) -> Worth:
-    """What parameters are worth, by the formulas of this module.
+    """What parameters are worth by the formulas of this module: nothing, where the images say nothing of the kind.
 
-    away: [N,P] how far each is from its start; precision: [N,P] the diagonal of J^T J + lam; lam: [P]; sigma: noise of a pixel,
-    linear RGB; of: columns by kind; phi: as in `Worth`."""
+    away: [N,P] how far each is from its start; precision: [N,P] the diagonal of J^T J + lam, in which all pixels count; lam:
+    [P]; sigma: noise of a pixel, linear RGB; of: columns by kind; phi: as in `Worth`."""
     rise = 0.5 * precision * np.square(away)
     gain = rise / sigma**2 - 0.5 * np.log(precision / lam)
-    gains, rises = ({kind: part[:, columns].sum(axis=1) for kind, columns in of.items()} for part in (gain, rise))
-    return Worth(gains, rises, phi, np.asarray((precision <= lam).all(axis=1)))
+    told = {kind: (precision > lam)[:, columns].any(axis=1) for kind, columns in of.items()}  # not only by the prior
+    gains = {kind: np.where(told[kind], gain[:, columns].sum(axis=1), 0.0) for kind, columns in of.items()}
+    rises = {kind: rise[:, columns].sum(axis=1) for kind, columns in of.items()}
+    return Worth(gains, rises, phi, ~np.any(list(told.values()), axis=0))
 
 
 def paying(found: Worth, sizes: Mapping[str, int], loss: float) -> dict[str, Mask]:
@@ -192,8 +194,8 @@ def lean_fit(
     Where sh is "auto", colours are of degree 1 if that pays on views left out (`LeftOut`), or else of degree 0, as with fewer
     views than BLOCKS. A first fit learns everything. A last fit, from the start, then learns of every Gaussian what is
     `paying`, of these kinds: DIRECTIONAL and, where learn is "auto", opacity, scale, rotation and a mean that is learned.
-    Colour of degree 0 is always learned, but by Gaussians that no image sees. loss: as in `paying`. say(stage) is called as a
-    stage starts. Raises InputError as `mgs.active.fitting.fit`.
+    Colour of degree 0 is always learned, but by Gaussians that no image sees; kinds of which the run has a rate of 0 never are.
+    loss: as in `paying`. say(stage) is called as a stage starts. Raises InputError as `fitted`.
     """
     cache, views = cache or ListCache(), range(len(images))
     left_out = directional_gain(images, settings, cache, say) if sh == "auto" and len(images) >= BLOCKS else None
@@ -202,8 +204,9 @@ def lean_fit(
     whole = fitted(images, views, settings, degree, cache)
     found, of = _worth(whole, images, settings, cache), kinds(degree, settings.train.means)
     sizes = {kind: columns.stop - columns.start for kind, columns in of.items()}
-    asked = {kind for kind in of if kind == DIRECTIONAL or (learn == "auto" and kind != "colour")}
-    kept = dict.fromkeys(of, ~found.unseen)
+    rates = settings.train.rates | {DIRECTIONAL: settings.train.rates["colour"]}
+    asked = {kind for kind in of if rates[kind] > 0 and (kind == DIRECTIONAL or (learn == "auto" and kind != "colour"))}
+    kept = {kind: ~found.unseen & (rates[kind] > 0) for kind in of}
     if asked:
         kept |= paying(found, {kind: size for kind, size in sizes.items() if kind in asked}, loss)
     say("fitting what the images pay for")
@@ -257,12 +260,16 @@ def fitted(
     cache: ListCache,
     kept: Mapping[str, Mask] | None = None,
 ) -> Gaussians:
-    """The Gaussians after a fit to some views, from the start. kept: as in `LeanModel.learned`; without it, all is learned."""
+    """The Gaussians after a fit to some views, from the start. kept: as in `LeanModel.learned`; without it, all is learned.
+    Raises InputError as `mgs.active.fitting.fit`, and where the fit diverges."""
     start, train = images.start(views).with_degree(degree), settings.train
     by_kind = fit_lam(regularisation(settings, degree), degree, train.means)
     learns = None if kept is None else _by_array(kept, start.sh.shape[1], train.means)
     cameras, targets = [images.cameras[i] for i in views], Deferred(views, lambda i: images.targets[i])
-    return fit(start, cameras, targets, train, None, cache, start, by_kind, images.normals, learns).gaussians
+    found = fit(start, cameras, targets, train, None, cache, start, by_kind, images.normals, learns)
+    if found.stop_reason == StopReason.DIVERGED:
+        raise InputError(f"refit: a fit diverged, its loss rose to {found.losses[-1]:.3g}; lower `train.rates` of the run")
+    return found.gaussians
 
 
 def _by_array(kept: Mapping[str, Mask], coefficients: int, means: str) -> dict[str, np.ndarray]:

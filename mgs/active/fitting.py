@@ -142,8 +142,8 @@ def fit(
     of parameter (`mgs.gaussians.learned`), (pixel value / unit of the parameter)^2: one number, or but for means an array that
     broadcasts to the parameter's shape (for colours, say, another number for each degree); by default there is none. normals:
     [N,3], of any length but 0, the directions of means that move along them; read only then. learns: for kinds of parameters
-    that not all Gaussians learn, which do: a mask that broadcasts to what is learned, [N] for a mean that moves along its
-    normal. The others stay as they are given.
+    that not all Gaussians learn, which do: a mask that broadcasts to what is learned ([N], [N,1] or, of colours, [N,K,1]).
+    The others stay as they are given, but for colours below COLOUR_MIN.
     Starts with fresh buffers of the optimiser, so the result depends on its arguments alone, bitwise. on_pass(done, most)
     reports. Stops as `mgs.active.stopping.stop_reason` says. Raises InputError where a parameter of the Gaussians given is not
     finite, the optimiser is unknown, `start` is of another shape, means are to move without normals or without a rate, or

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from mgs.active.settings import ALPHA_WEIGHT
+from mgs.active.settings import ALPHA_WEIGHT, TrainSettings, validated
 
 
 class Kind(StrEnum):
@@ -101,7 +101,8 @@ def bench(
         _print_splat(console, result)
         _print_figures(console, result["figures"], SPLAT_TARGETS)
     elif kind is Kind.fit:
-        weight = ALPHA_WEIGHT if alpha_weight is None else alpha_weight
+        asked = {"alpha_weight": ALPHA_WEIGHT if alpha_weight is None else alpha_weight}
+        weight = validated(TrainSettings, asked).alpha_weight
         result = bench_fit(dataset or Path("demo/dataset"), report, weight)
         _print_figures(console, result["figures"], FIT_TARGETS)
         console.print(f"Kendall's tau of the ranking with that of half the passes: {result['ranking_tau_half']:.3f}")

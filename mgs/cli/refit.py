@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mgs.active.criteria import LEARN_LOSS
+
+if TYPE_CHECKING:
+    from mgs.report.refitting import RefittedRun
 
 
 def refit(
@@ -18,7 +21,7 @@ def refit(
     ] = "auto",
     sh: Annotated[
         str,
-        typer.Option(help="SH degree of the colours. auto: 1 where that foretells views left out better than 0 does."),
+        typer.Option(help="SH degree of the colours: 0, or auto: 1 where that foretells views left out better."),
     ] = "auto",
     loss: Annotated[
         float, typer.Option(help="By how much the objective of the fit may rise where parameters are left out, dB.")
@@ -44,17 +47,22 @@ def refit(
     console.print(f"wrote {run / REFITTED}", soft_wrap=True)
 
 
-def lines(found: Any) -> list[str]:
-    """What a `mgs.report.refitting.RefittedRun` is told as."""
+def lines(found: RefittedRun) -> list[str]:
+    """The lines that the command prints."""
     said = [f"{found.after:,} parameters are learned, {found.after / found.before:.0%} of the run's {found.before:,}"]
     said.append("learned by: " + ", ".join(f"{kind} {share:.0%}" for kind, share in found.shares.items()) + " of the Gaussians")
     if found.left_out:
-        change = f"{found.left_out.gain:+.2f} dB, standard error {found.left_out.error:.2f}"
-        said.append(f"SH degree {found.sh_degree}: on neighbouring views left out together, degree 1 gains {change}")
+        more = "more" if found.left_out.pays else "not more"
+        gain = f"{found.left_out.gain:+.3f} dB, {more} than its standard error of {found.left_out.error:.3f}"
+        said.append(f"SH degree {found.sh_degree}: on views left out, neighbours together, degree 1 gains {gain}")
+    else:
+        said.append("SH degree 0: no other was tried")
     if found.psnr:
         own, whole, lean = found.psnr
         said.append(
             f"PSNR on the {found.views} views: {lean:.2f} dB, {whole:.2f} dB where all parameters are fitted in the same way; "
             f"of the run's own model {own:.2f} dB"
         )
+    else:
+        said.append("PSNR: there are no views on which to compare the models")
     return said

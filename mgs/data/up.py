@@ -53,8 +53,9 @@ def unit_up(vector: Sequence[float] | np.ndarray) -> Up:
 def upright(up: Up) -> np.ndarray:
     """The rotation [3,3] that turns the direction `up` to +Z by the shortest way; exactly the identity for +Z."""
     x, y, z = up
-    if z < -1 + 1e-12:
-        return np.diag([1.0, -1.0, -1.0])
+    if z < -1 + 1e-12:  # there is no one shortest way: half a turn about x first, and what is then left
+        half_turn = np.diag([1.0, -1.0, -1.0])
+        return np.asarray(upright((x, -y, -z)) @ half_turn)
     across = np.array([[x * x, x * y, 0.0], [x * y, y * y, 0.0], [0.0, 0.0, 0.0]]) / (1 + z)
     return np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [x, y, z]]) - across
 

@@ -323,3 +323,17 @@ def _draw(
         if progress:
             progress(done, len(frames))
         write_comparison(path, frame.masked_rgb(), render_view(gaussians, frame.camera)[0], value)
+
+
+def other_views(dataset: Dataset, taken: Sequence[str]) -> tuple[str, Sequence[Frame]]:
+    """The views on which two models of a run are compared: ("test", the test views) where the dataset has some, or else ("held
+    out", those never taken). taken: names of frames."""
+    tests = dataset.test_views()
+    if tests:
+        return "test", tests.frames
+    return "held out", [frame for frame in dataset.with_images(taken) if frame.name not in taken]
+
+
+def mean_psnr(gaussians: Gaussians, frames: Sequence[Frame]) -> float:
+    """Mean PSNR over views, full frame, dB."""
+    return float(evaluate(gaussians, frames, ())["all"]["psnr"])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mgs.active.criteria import PRUNE_NOISE
 from mgs.active.run_folder import load_run
-from mgs.report.refitting import mean_psnr, other_views
+from mgs.report.evaluation import mean_psnr, other_views
 from mgs.splat_ply import write_ply
 
 PRUNED = "gaussians_pruned.ply"

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from mgs.active import inputs
 from mgs.active.criteria import LEARN_LOSS
-from mgs.active.run_folder import load_run, read_settings
-from mgs.data.dataset import Dataset, Frame
+from mgs.active.run_folder import load_run, read_checkpoint, read_settings
+from mgs.active.settings import TrainSettings
 from mgs.errors import InputError
-from mgs.gaussians import Gaussians
+from mgs.files import check_writable
 from mgs.prior.build import load_prior
-from mgs.report.evaluation import evaluate
+from mgs.report.evaluation import mean_psnr, other_views
 from mgs.splat_ply import write_ply
 
 if TYPE_CHECKING:
@@ -30,7 +31,9 @@ LARGEST_LOSS = 10.0
 
 @dataclass(frozen=True)
 class RefittedRun:
-    """before, after: number of learned parameters. shares: {kind: share of the Gaussians that learned it}. left_out: as in
+    """What `refit_run` found.
+
+    before, after: number of learned parameters. shares: {kind: share of the Gaussians that learned it}. left_out: as in
     `mgs.active.evidence.LeanModel`. sh_degree: of the model. views: "test" or "held out"; psnr: on these, of the run's own
     model, of one fitted like this one that learns everything, and of this one, dB, None where there are none."""
 
@@ -66,12 +69,16 @@ def refit_run(
         if value not in known:
             raise InputError(f"{option} {value}: is unknown; choose one of {', '.join(known)}")
     if (learn, sh) == ("all", "0"):
-        raise InputError("refit: --learn all --sh 0 is what the run itself fitted; leave out one of them")
+        raise InputError("refit: --learn all --sh 0 leaves nothing to choose; leave out one of them")
     run = Path(run)
+    check_writable(run / REFITTED)
     gaussians, dataset, taken, _ = load_run(run)
-    settings = read_settings(run)
+    settings, state = read_settings(run), read_checkpoint(run)
+    assert state is not None  # the model was read from it
+    prior = load_prior(settings.prior)
+    inputs.check(run, state, settings, dataset, inputs.prior_digest(prior), say)
     by_name = {frame.name: frame for frame in dataset.frames}
-    images = last_images(settings, load_prior(settings.prior), [by_name[name] for name in taken])
+    images = last_images(settings, prior, [by_name[name] for name in taken])
     found = lean_fit(images, settings, learn, sh, loss, say=say)
     say("comparing")
     views, frames = other_views(dataset, taken)
@@ -80,27 +87,13 @@ def refit_run(
     psnr = (own, whole, lean) if frames else None
     marks = {f"learned_{kind}": mask for kind, mask in found.learned.items()}
     write_ply(run / REFITTED, found.gaussians, marks)
-    before = len(gaussians) * parameters_of_each(settings.train.means)
+    before = len(gaussians) * parameters_of_each(settings.train)
     shares = {kind: float(mask.mean()) for kind, mask in found.learned.items()}
     return RefittedRun(before, found.parameters, shares, found.left_out, found.gaussians.sh_degree, views, psnr)
 
 
-def parameters_of_each(means: str) -> int:
-    """How many parameters of a Gaussian a run learns. means: a name in `mgs.splat.MEANS`."""
+def parameters_of_each(train: TrainSettings) -> int:
+    """How many parameters of a Gaussian a run learns: those of the kinds whose rate is not 0."""
     from mgs.splat import groups
 
-    return max(columns.stop for columns in groups(0, means).values())
-
-
-def other_views(dataset: Dataset, taken: Sequence[str]) -> tuple[str, Sequence[Frame]]:
-    """The views on which two models of a run are compared: ("test", the test views) where the dataset has some, or else ("held
-    out", those never taken). taken: names of frames."""
-    tests = dataset.test_views()
-    if tests:
-        return "test", tests.frames
-    return "held out", [frame for frame in dataset.with_images(taken) if frame.name not in taken]
-
-
-def mean_psnr(gaussians: Gaussians, frames: Sequence[Frame]) -> float:
-    """Mean PSNR over views, full frame, dB."""
-    return float(evaluate(gaussians, frames, ())["all"]["psnr"])
+    return sum(of.stop - of.start for kind, of in groups(0, train.means).items() if train.rates[kind] > 0)

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from mgs.active.criteria import DIRECTIONAL_STD
 from mgs.files import read_json
 from mgs.study.sweep import Cell, cell_folder, run_cells
 
@@ -106,8 +107,9 @@ def cells_of(size: Preset) -> list[Cell]:
         fits += [(AUTO, learned, 0) for learned in LEARNED if learned != ALL]
         fits += [(AUTO, ALL, degree) for degree in DEGREES if degree]
         for n, learned, degree in fits:
-            arguments = {"scene": scene, "gaussians": n, "learned": learned, "degree": degree}
+            arguments: dict[str, Any] = {"scene": scene, "gaussians": n, "learned": learned, "degree": degree}
             arguments |= {"views": size.views, "seeds": size.seeds}
+            arguments |= {"directional_std": DIRECTIONAL_STD} if degree else {}
             cells.append(_cell(fit_name(scene, n, learned, degree), "fit_and_judge", [f"prior/{scene}/{n}"], **arguments))
         best = fit_name(scene, AUTO, ALL, 0)
         cells.append(_cell(f"prune/{scene}", "prune_and_judge", [best], scene=scene, fit=best))
@@ -152,9 +154,18 @@ def views_in_order(positions: np.ndarray, centre: np.ndarray, views: int, seeds:
 
 
 def fit_and_judge(
-    root: Path, out: Path, scene: str, gaussians: int | str, learned: str, degree: int, views: int, seeds: int
+    root: Path,
+    out: Path,
+    scene: str,
+    gaussians: int | str,
+    learned: str,
+    degree: int,
+    views: int,
+    seeds: int,
+    directional_std: float = DIRECTIONAL_STD,
 ) -> Any:
-    """A task: fit views one after the other; what the test views, the next views and the evidence say of the model."""
+    """A task: fit views one after the other; what the test views, the next views and the evidence say of the model.
+    directional_std: tau of colours of degrees above 0, which is a constant; named so that a result of another is not taken."""
     from mgs.active.criteria import PIXEL_NOISE
     from mgs.active.evidence import fit_lam, regularisation
     from mgs.active.fitting import fit
