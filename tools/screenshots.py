@@ -12,6 +12,7 @@ from typing import Any
 
 from PIL import Image
 
+from mgs.cli.demo import POLICIES
 from mgs.report.page import write_page
 
 IMAGES = Path(__file__).parent.parent / "docs/images"
@@ -30,7 +31,7 @@ def save(picture: Image.Image, name: str) -> None:
 def report(browser: Any, demo: Path, folder: Path) -> None:
     """The page of the demo's runs: its step by step on a desk, light, and the comparison on a phone, dark."""
     page = folder / "page.html"
-    write_page(page, [demo / policy for policy in ("d-optimal", "coverage", "random")])
+    write_page(page, [demo / policy for policy in POLICIES])
     shots = []
     for width, height, scheme, section in ((1100, 1180, "light", "steps"), (390, 1180, "dark", "compare")):
         tab = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme).new_page()

@@ -249,6 +249,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "linear-look": ("results/linear-look/pools", ablations),
     "directional-noise": ("results/directional-noise/pools", own_policy),
     "lunar": ("results/lunar/statistics", lunar),
+    "clean-alarms-alpha": ("benchmarks/clean_alarms_alpha", clean_alarms),
     "clean-alarms": ("benchmarks/clean_alarms", clean_alarms),
     "oracle": ("results/oracle/pools", oracle),
     **{f"chart-{name}": ("results/chart/chart", chart(name)) for name in CHART_TABLES},
