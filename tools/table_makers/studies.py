@@ -196,6 +196,24 @@ def own_policy(data: dict[str, Any]) -> str:
     return matrix(rows, f"{LEADER} over it (dB)", lambda row: led(row, LED_COLUMNS[row["policy"]])) + made_by(data)
 
 
+def small_lambda(data: dict[str, Any]) -> str:
+    """Runs of `benchmarks/small_lambda.py` over those of d-optimal: mean, least and largest difference."""
+    records, rows = data["records"], []
+    base = {(r["rock"], r["pool"]): r for r in records if r["policy"] == "d-optimal"}
+    for policy in dict.fromkeys(r["policy"] for r in records):
+        of, cells = [r for r in records if r["policy"] == policy], []
+        for key in ("test_psnr", "test_psnr_mask", "test_psnr_area", "test_psnr_mask_area"):
+            more = [r[key] - base[r["rock"], r["pool"]][key] for r in of]
+            mean, least, most = sum(more) / len(more), min(more), max(more)
+            is_base = policy == "d-optimal"
+            cells.append(
+                f"{sum(r[key] for r in of) / len(of):.2f}" if is_base else f"{mean:+.2f} ({least:+.2f} to {most:+.2f})"
+            )
+        rows.append([policy, *cells])
+    heading = ["policy", "last model, full frame (dB)", "rock", "whole curve, full frame", "rock"]
+    return markdown(heading, rows) + made_by(data)
+
+
 LED_COLUMNS = {
     "last model, full frame": "test_psnr_led",
     "last model, rock": "test_psnr_mask_led",
@@ -245,6 +263,7 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "curves-short": ("results/reproduce/curves", curves_short),
     "paper-size-table1": ("results/paper-size/table1", reproduced("table1")),
     "ablations": ("results/ablations/pools", ablations),
+    "small-lambda": ("benchmarks/small_lambda", small_lambda),
     "trained-gaussians": ("benchmarks/trained_gaussians", own_policy),
     "linear-look": ("results/linear-look/pools", ablations),
     "directional-noise": ("results/directional-noise/pools", own_policy),
