@@ -1,9 +1,11 @@
-"""What the assumed noise of a pixel does to a whole run. `python benchmarks/assumed_noise.py OUT.json DATASET:PRIOR...`
+"""What the assumed noise of a pixel does to a whole run. `python benchmarks/assumed_noise.py
+OUT.json DATASET:PRIOR...`
 
-The noise sigma_e is assumed to be 0.02. It says how strongly a fit holds parameters to the prior, and how much information a
-score takes a pixel for. Runs of `d-optimal`, four seeds and eight views, in which the fit, the score or both assume another
-noise; and what can be measured of it while a run goes on: by how much an image differs from the model that has not seen it yet
-(`residual` of steps.jsonl). PSNR over the test views. Records that are in OUT.json are not made again.
+The noise sigma_e is assumed to be 0.02. It says how strongly a fit holds parameters to the prior,
+and how much information a score takes a pixel for. Runs of `d-optimal`, four seeds and eight views,
+in which the fit, the score or both assume another noise; and what can be measured of it while a run
+goes on: by how much an image differs from the model that has not seen it yet (`residual` of
+steps.jsonl). PSNR over the test views. Records that are in OUT.json are not made again.
 """
 
 from __future__ import annotations
@@ -17,14 +19,14 @@ from typing import Any
 import numpy as np
 
 from mgs import runtime
-from mgs.active.criteria import PIXEL_NOISE
-from mgs.active.loop import Loop
-from mgs.active.settings import NbvSettings
-from mgs.active.stations import psnr_measure, real_stations
 from mgs.data.dataset import load_dataset
 from mgs.files import write_json
+from mgs.policy.criteria import PIXEL_NOISE
 from mgs.prior.build import load_prior
 from mgs.provenance import command_line, versions
+from mgs.run.loop import Loop
+from mgs.run.settings import NbvSettings
+from mgs.run.stations import psnr_measure, real_stations
 from mgs.splat import ListCache
 from mgs.study.material import test_views_of
 
@@ -38,9 +40,12 @@ ASSUMED += [("in both", noise, noise) for noise in NOISES]
 
 
 def record(dataset_path: Path, prior_path: Path, of_fit: float, of_score: float) -> dict[str, Any]:
-    """One run: PSNR of its last model, full frame and inside the mask, and the median of its residuals."""
+    """One run: PSNR of its last model, full frame and inside the mask, and the median of its
+    residuals."""
     dataset, prior = load_dataset(dataset_path), load_prior(prior_path)
-    settings = NbvSettings(dataset=dataset_path, prior=prior_path, seeds=SEEDS, budget=BUDGET, pixel_noise=of_fit)
+    settings = NbvSettings(
+        dataset=dataset_path, prior=prior_path, seeds=SEEDS, budget=BUDGET, pixel_noise=of_fit
+    )
     scored = settings.model_copy(update={"pixel_noise": of_score})
     stations = real_stations(dataset, prior, settings)
     with tempfile.TemporaryDirectory() as folder:
@@ -69,7 +74,11 @@ def main(out: Path, given: list[str]) -> None:
                 continue
             records.append(known | record(Path(dataset), Path(prior), of_fit, of_score))
             print(records[-1], flush=True)
-            made = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
+            made = {
+                "command": command_line(),
+                "machine": runtime.processor(),
+                "versions": versions(),
+            }
             write_json(out, made | {"records": records})
 
 

@@ -1,9 +1,11 @@
-"""What the backing is worth: `python benchmarks/backing.py DATASET PREFIX` writes PREFIX.json and PREFIX.png.
+"""What the backing is worth: `python benchmarks/backing.py DATASET PREFIX` writes PREFIX.json and
+PREFIX.png.
 
-Fits models of several sizes, with and without Gaussians behind the surface, to 12 views spread evenly in azimuth, and
-measures on the test views: PSNR inside the rock (pixels at least two from its silhouette), and the shares of those pixels
-whose expected depth is more than 5 cm or more than 3 spacings too deep, or whose opacity is below 0.9. The dataset needs
-exact depth.
+Fits models of several sizes, with and without Gaussians behind the surface, to 12 views spread
+evenly in azimuth, and
+measures on the test views: PSNR inside the rock (pixels at least two from its silhouette), and the
+shares of those pixels whose expected depth is more than 5 cm or more than 3 spacings too deep, or
+whose opacity is below 0.9. The dataset needs exact depth.
 """
 
 from __future__ import annotations
@@ -17,16 +19,16 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 
 from mgs import runtime
-from mgs.active.criteria import lam_by_kind, regularisation
-from mgs.active.fitting import fit
-from mgs.active.pose_policies import seed_views
-from mgs.active.settings import TrainSettings
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import Frame, load_dataset, target_of
 from mgs.files import write_json
+from mgs.fit.fitting import fit
+from mgs.fit.settings import TrainSettings
 from mgs.gaussians import Gaussians
 from mgs.metrics import psnr
 from mgs.plotting import STYLE, new_figure, save_figure
+from mgs.policy.criteria import lam_by_kind, regularisation
+from mgs.policy.poses import seed_views
 from mgs.prior.build import build_prior
 from mgs.prior.initial import initial_gaussians
 from mgs.prior.settings import PriorSettings
@@ -49,20 +51,29 @@ def measure(gaussians: Gaussians, frames: Sequence[Frame], spacing: float) -> di
     for frame in frames:
         image, depth = render(gaussians, frame.camera, cache=cache), frame.depth()
         inside = binary_erosion(frame.mask(), iterations=2)
-        truth, rendered = srgb_from_linear(frame.target()[0][..., :3]), srgb_from_linear(np.asarray(image.rgb))
+        truth, rendered = (
+            srgb_from_linear(frame.target()[0][..., :3]),
+            srgb_from_linear(np.asarray(image.rgb)),
+        )
         decibels.append(psnr(rendered, truth, inside))
         behind, alpha = (np.asarray(image.depth) - depth)[inside], np.asarray(image.alpha)[inside]
         pixels.append(np.stack([behind > DEEP, behind > 3 * spacing, alpha < OPAQUE], 1))
     shares = np.concatenate(pixels).mean(0)
     names = ("too_deep", "three_spacings_deep", "see_through")
-    return {"psnr_inside": float(np.mean(decibels))} | dict(zip(names, shares.tolist(), strict=True))
+    return {"psnr_inside": float(np.mean(decibels))} | dict(
+        zip(names, shares.tolist(), strict=True)
+    )
 
 
 def study(root: Path) -> list[dict[str, Any]]:
     """One record per model: its size, backing, passes, and what `measure` says of it."""
     dataset = load_dataset(root)
     tests = dataset.test_views().frames
-    frames, cache, lam = dataset.frames, ListCache(), lam_by_kind(regularisation(groups(0)), groups(0))
+    frames, cache, lam = (
+        dataset.frames,
+        ListCache(),
+        lam_by_kind(regularisation(groups(0)), groups(0)),
+    )
     positions = np.array([frame.camera.position for frame in frames])
     settings = [(n, backing, PASSES[0]) for n in SIZES for backing in BACKINGS]
     settings += [(10_000, backing, PASSES[1]) for backing in BACKINGS]
@@ -73,10 +84,15 @@ def study(root: Path) -> list[dict[str, Any]]:
         chosen = [frames[i] for i in taken]
         start = initial_gaussians(prior, chosen)[0]
         train = TrainSettings(passes=passes, tolerance=0.0)
-        cameras, targets = [frame.camera for frame in chosen], [target_of(frame) for frame in chosen]
+        cameras, targets = (
+            [frame.camera for frame in chosen],
+            [target_of(frame) for frame in chosen],
+        )
         fitted = fit(start, cameras, targets, train, cache=cache, start=start, lam=lam).gaussians
         found = measure(fitted, tests, prior.spacing)
-        records.append({"gaussians": n, "backing": backing, "passes": passes, "spacing": prior.spacing} | found)
+        records.append(
+            {"gaussians": n, "backing": backing, "passes": passes, "spacing": prior.spacing} | found
+        )
         print(records[-1], flush=True)
     return records
 
@@ -96,7 +112,9 @@ def draw(path: Path, records: Sequence[dict[str, Any]]) -> None:
                 shown = [r for r in records if r["backing"] == backing and r["passes"] == PASSES[0]]
                 name = "all on the surface" if backing == 0 else "a third behind it"
                 values = [scale * r[key] for r in shown]
-                axis.plot([r["gaussians"] for r in shown], values, color=colour, marker=marker, label=name)
+                axis.plot(
+                    [r["gaussians"] for r in shown], values, color=colour, marker=marker, label=name
+                )
             axis.set(xscale="log", xlabel="Gaussians, on the surface and behind it", ylabel=label)
             axis.set_xticks(SIZES, labels=[f"{size:,}" for size in SIZES])
             axis.minorticks_off()
@@ -109,7 +127,12 @@ def main(root: Path, prefix: Path) -> None:
     """Measure, write, draw."""
     runtime.start()
     records = study(root)
-    result = {"command": command_line(), "machine": runtime.processor(), "versions": versions(), "records": records}
+    result = {
+        "command": command_line(),
+        "machine": runtime.processor(),
+        "versions": versions(),
+        "records": records,
+    }
     write_json(prefix.with_suffix(".json"), result)
     draw(prefix.with_suffix(".png"), records)
 

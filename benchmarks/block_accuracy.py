@@ -2,9 +2,10 @@
 
     python benchmarks/block_accuracy.py docs/benchmarks/block_accuracy [SCENES]
 
-Writes PREFIX.png and PREFIX.json. Random scenes of 16 Gaussians (sizes, anisotropy, opacities and backgrounds far apart), each
-entry above 1e-6 of its scene's largest against the float64 oracle. Diagonal entries are sums of squares; the others are sums
-of either sign, as small beside sqrt(H_ii H_jj) as chance makes them.
+Writes PREFIX.png and PREFIX.json. Random scenes of 16 Gaussians (sizes, anisotropy, opacities and
+backgrounds far apart), each entry above 1e-6 of its scene's largest against the float64 oracle.
+Diagonal entries are sums of squares; the others are sums of either sign, as small beside sqrt(H_ii
+H_jj) as chance makes them.
 """
 
 import sys
@@ -34,7 +35,8 @@ TOLERANCE = 1e-3
 FLOOR = 1e-6
 """Entries below this share of the scene's largest are left out."""
 LEAST_MARGIN = 3e-5
-"""No pixel of a scene is nearer to a decision than this relative error of alpha: float32 must not decide otherwise."""
+"""No pixel of a scene is nearer to a decision than this relative error of alpha: float32 must not
+decide otherwise."""
 
 
 def make_camera() -> Camera:
@@ -43,8 +45,11 @@ def make_camera() -> Camera:
     return Camera(K, *SIZE, look_at((2.0, 0.4, 1.1), (0.0, 0.0, 0.0)))
 
 
-def random_scene(seed: int, log_scales: tuple[float, float], logits: tuple[float, float]) -> Gaussians:
-    """N Gaussians around the origin, with a wide one whose alpha is clamped in the middle and one with colours clamped at 0."""
+def random_scene(
+    seed: int, log_scales: tuple[float, float], logits: tuple[float, float]
+) -> Gaussians:
+    """N Gaussians around the origin, with a wide one whose alpha is clamped in the middle and one
+    with colours clamped at 0."""
     rng = np.random.default_rng([seed, N, 0])
     parts = (
         rng.uniform(-0.6, 0.6, (N, 3)),
@@ -64,7 +69,10 @@ def entries(camera: Camera, rng: np.random.Generator) -> tuple[np.ndarray, np.nd
     scale, stretch, logit = rng.uniform(-5, -0.5), rng.uniform(0.1, 6), rng.uniform(-2, 20)
     background = tuple(rng.choice([0, 1, rng.uniform()], 3))
     seed = int(rng.integers(2**31))
-    candidates = (random_scene(seed + 1000 * i, (scale - stretch, scale), (logit - 4, logit)) for i in range(200))
+    candidates = (
+        random_scene(seed + 1000 * i, (scale - stretch, scale), (logit - 4, logit))
+        for i in range(200)
+    )
     gaussians = next(g for g in candidates if reference.margins(g, camera).min() > LEAST_MARGIN)
     expected = reference.fisher_block(gaussians, camera, background)
     error = np.abs(fisher(gaussians, camera, "block", background) - expected)
@@ -87,7 +95,11 @@ def main(prefix: str, scenes: int = 1500) -> None:
         "worst_relative_error": worst.max(),
         "scenes_beyond_tolerance": int((worst >= TOLERANCE).sum()),
         "entries_beyond_tolerance": int((error >= TOLERANCE).sum()),
-        "error_over_sqrt_HiiHjj": {"median": np.median(of_bound), "p99": np.quantile(of_bound, 0.99), "max": of_bound.max()},
+        "error_over_sqrt_HiiHjj": {
+            "median": np.median(of_bound),
+            "p99": np.quantile(of_bound, 0.99),
+            "max": of_bound.max(),
+        },
         "versions": versions(),
     }
     write_json(f"{prefix}.json", summary)
@@ -98,10 +110,14 @@ def main(prefix: str, scenes: int = 1500) -> None:
         figure = new_figure(4.6, 3.4)
         axis = figure.subplots()
         for label, of, colour in (("largest", np.max, "#d55e00"), ("median", np.median, "#0072b2")):
-            drawn = [of(error[part == i]) if (part == i).any() else np.nan for i in range(1, len(BINS))]
+            drawn = [
+                of(error[part == i]) if (part == i).any() else np.nan for i in range(1, len(BINS))
+            ]
             axis.loglog(middle, drawn, "o-", color=colour, ms=3, label=label)
         axis.axhline(TOLERANCE, color="#999999", ls="--", label="asked for")
-        axis.set(xlabel=r"$|H_{ij}|\;/\;\sqrt{H_{ii} H_{jj}}$", ylabel=r"relative error of $H_{ij}$")
+        axis.set(
+            xlabel=r"$|H_{ij}|\;/\;\sqrt{H_{ii} H_{jj}}$", ylabel=r"relative error of $H_{ij}$"
+        )
         axis.legend()
         save_figure(figure, f"{prefix}.png")
 

@@ -1,9 +1,12 @@
-"""What are more samples a pixel of the data worth to a model? `python benchmarks/data_samples.py OUT.json WORK [SCENE]`
+"""What are more samples a pixel of the data worth to a model? `python benchmarks/data_samples.py
+OUT.json WORK [SCENE]`
 
-A dataset of 16 frames of 320x240 is rendered with each number of samples, as `mgs synth-orbit --spp` does, denoised; 10,000
-Gaussians are fitted to all of its frames, at default settings, from one and the same prior. All models are judged on the test
-views of one dataset with REFERENCE samples a pixel, and on those of their own, as a user would judge them. Seconds are those of
-rendering the frames, from the dataset's config.json; let nothing else run if they are to count. The datasets are kept in WORK.
+A dataset of 16 frames of 320x240 is rendered with each number of samples, as `mgs synth-orbit
+--spp` does, denoised; 10,000 Gaussians are fitted to all of its frames, at default settings, from
+one and the same prior. All models are judged on the test views of one dataset with REFERENCE
+samples a pixel, and on those of their own, as a user would judge them. Seconds are those of
+rendering the frames, from the dataset's config.json; let nothing else run if they are to count. The
+datasets are kept in WORK.
 """
 
 from __future__ import annotations
@@ -13,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from mgs import runtime
-from mgs.active.criteria import lam_by_kind, regularisation
-from mgs.active.fitting import fit
-from mgs.active.settings import TrainSettings
 from mgs.data.dataset import load_dataset, target_of
 from mgs.files import read_json, write_json
+from mgs.fit.fitting import fit
+from mgs.fit.settings import TrainSettings
+from mgs.policy.criteria import lam_by_kind, regularisation
 from mgs.prior.build import build_prior
 from mgs.prior.initial import initial_gaussians
 from mgs.prior.settings import PriorSettings
@@ -43,9 +46,15 @@ def main(out: Path, work: Path, scene: str = "boulder") -> None:
         dataset = load_dataset(work / str(samples))
         frames = dataset.frames
         start, _ = initial_gaussians(prior, frames)
-        cameras, targets = [frame.camera for frame in frames], [target_of(frame) for frame in frames]
+        cameras, targets = (
+            [frame.camera for frame in frames],
+            [target_of(frame) for frame in frames],
+        )
         model = fit(start, cameras, targets, TrainSettings(), start=start, lam=lam).gaussians
-        record: dict[str, Any] = {"samples": samples, "seconds": read_json(work / f"{samples}/config.json")["timings"]}
+        record: dict[str, Any] = {
+            "samples": samples,
+            "seconds": read_json(work / f"{samples}/config.json")["timings"],
+        }
         for name, tests in (("reference", judges), ("own", dataset.test_views().frames)):
             found = evaluate(model, [], [], test_frames=tests)["test"]
             record |= {f"{name}_{key}": found[key] for key in ("psnr", "psnr_mask", "ssim")}

@@ -2,8 +2,8 @@
 
     python benchmarks/hutchinson.py docs/benchmarks/hutchinson
 
-Writes PREFIX.png and PREFIX.json. Scene: 1,000 Gaussians of a rock at 64x48; relative L2 error over all 11,000 entries, each
-of five seeds; a fit of the slope over 1 to 256 probes, expected -1/2.
+Writes PREFIX.png and PREFIX.json. Scene: 1,000 Gaussians of a rock at 64x48; relative L2 error over
+all 11,000 entries, each of five seeds; a fit of the slope over 1 to 256 probes, expected -1/2.
 """
 
 import sys
@@ -35,7 +35,9 @@ def main(prefix: str) -> None:
     errors = [
         [
             float(
-                np.linalg.norm(hutchinson(device, camera, (0, 0, 0), cache, probes=k, seed=seed) - exact)
+                np.linalg.norm(
+                    hutchinson(device, camera, (0, 0, 0), cache, probes=k, seed=seed) - exact
+                )
                 / np.linalg.norm(exact)
             )
             for k in PROBES
@@ -59,7 +61,13 @@ def main(prefix: str) -> None:
         axis = figure.subplots()
         for row in errors:
             axis.loglog(PROBES, row, ".", color="#999999", ms=5)
-        axis.loglog(PROBES, mean, "o-", color="#0072b2", label=f"mean of {len(errors)} seeds, slope {slope:.2f}")
+        axis.loglog(
+            PROBES,
+            mean,
+            "o-",
+            color="#0072b2",
+            label=f"mean of {len(errors)} seeds, slope {slope:.2f}",
+        )
         axis.loglog(PROBES, mean[0] / np.sqrt(PROBES), "--", color="#d55e00", label=r"$1/\sqrt{k}$")
         axis.set(xlabel="probes k", ylabel=r"relative $L_2$ error of diag($J^\top J$)")
         axis.legend()

@@ -1,8 +1,11 @@
-"""How far below the prior's surface should Gaussians lie? `python benchmarks/inset.py OUT.json DATASET...`
+"""How far below the prior's surface should Gaussians lie? `python benchmarks/inset.py OUT.json
+DATASET...`
 
-Fits Gaussians to 12 views spread evenly in azimuth, as `mgs nbv` does it, from several depths below the surface, in pixels, and
-judges on the test views: PSNR, in the full frame, in the mask and wholly inside the rock; median error of the depth inside, and
-its median with the sign, positive where the model lies behind the true surface. Datasets need exact depth, and test views.
+Fits Gaussians to 12 views spread evenly in azimuth, as `mgs nbv` does it, from several depths below
+the surface, in pixels, and
+judges on the test views: PSNR, in the full frame, in the mask and wholly inside the rock; median
+error of the depth inside, and its median with the sign, positive where the model lies behind the
+true surface. Datasets need exact depth, and test views.
 """
 
 from __future__ import annotations
@@ -14,13 +17,13 @@ from typing import Any
 import numpy as np
 
 from mgs import runtime
-from mgs.active.criteria import regularisation
-from mgs.active.fitting import fit
-from mgs.active.pose_policies import seed_views
 from mgs.data.dataset import Dataset, load_dataset, target_of
 from mgs.errors import InputError
 from mgs.files import write_json
+from mgs.fit.fitting import fit
 from mgs.gaussians import Gaussians
+from mgs.policy.criteria import regularisation
+from mgs.policy.poses import seed_views
 from mgs.prior.build import build_prior
 from mgs.prior.initial import INSET, initial_gaussians, pixel_on
 from mgs.prior.settings import PriorSettings
@@ -35,7 +38,8 @@ INSETS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 
 
 def bias(model: Gaussians, tests: Dataset) -> float:
-    """Median of rendered less true depth over the pixels inside the rock in all test views, metres."""
+    """Median of rendered less true depth over the pixels inside the rock in all test views,
+    metres."""
     found = []
     for frame in tests.frames:
         _, alpha, depth = render_view(model, frame.camera)
@@ -50,20 +54,46 @@ def study(root: Path) -> list[dict[str, Any]]:
     dataset = load_dataset(root)
     tests = dataset.test_views()
     if tests is None:
-        raise InputError(f"{root}: has no test views; make it with `mgs synth-orbit --test-views 12`")
-    lam = {kind: float(regularisation(groups(0))[columns][0]) for kind, columns in groups(0).items()}
+        raise InputError(
+            f"{root}: has no test views; make it with `mgs synth-orbit --test-views 12`"
+        )
+    lam = {
+        kind: float(regularisation(groups(0))[columns][0]) for kind, columns in groups(0).items()
+    }
     records = []
     for n in SIZES:
         prior, _ = build_prior(dataset, PriorSettings(gaussians=n))
-        taken = seed_views(np.array([frame.camera.position for frame in dataset.frames]), prior.points.mean(0), VIEWS)
+        taken = seed_views(
+            np.array([frame.camera.position for frame in dataset.frames]),
+            prior.points.mean(0),
+            VIEWS,
+        )
         frames = [dataset.frames[i] for i in taken]
-        cameras, targets = [frame.camera for frame in frames], [target_of(frame) for frame in frames]
+        cameras, targets = (
+            [frame.camera for frame in frames],
+            [target_of(frame) for frame in frames],
+        )
         for inset in INSETS:
             start = initial_gaussians(prior, frames, inset)[0]
             model = fit(start, cameras, targets, cache=ListCache(), start=start, lam=lam).gaussians
             found = evaluate(model, tests.frames, ())["all"]
-            kept = {key: found[key] for key in ("psnr", "psnr_mask", "psnr_inside", "ssim_mask", "depth_error", "see_through")}
-            about = {"gaussians": n, "inset": inset, "spacing": prior.spacing, "pixel": pixel_on(prior, cameras)}
+            kept = {
+                key: found[key]
+                for key in (
+                    "psnr",
+                    "psnr_mask",
+                    "psnr_inside",
+                    "ssim_mask",
+                    "depth_error",
+                    "see_through",
+                )
+            }
+            about = {
+                "gaussians": n,
+                "inset": inset,
+                "spacing": prior.spacing,
+                "pixel": pixel_on(prior, cameras),
+            }
             records.append(about | {"bias": bias(model, tests)} | kept)
             print(root, records[-1], flush=True)
     return records

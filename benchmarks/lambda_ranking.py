@@ -1,8 +1,10 @@
-"""How the ranking of candidates depends on lambda: `python benchmarks/lambda_ranking.py RUN PREFIX`.
+"""How the ranking of candidates depends on lambda: `python benchmarks/lambda_ranking.py RUN
+PREFIX`.
 
-Scores every candidate of a run's last state by Eq. 7 with the default lambda (one number per kind of parameter, see
-`mgs.active.criteria.regularisation`) times 10^-8 ... 10^8, and with a single number for all parameters, as in the paper; prints
-Spearman's rank correlation with the default's ranking and which view would be chosen, and writes PREFIX.json and PREFIX.png.
+Scores every candidate of a run's last state by Eq. 7 with the default lambda (one number per kind
+of parameter, see `mgs.policy.criteria.regularisation`) times 10^-8 ... 10^8, and with a single
+number for all parameters, as in the paper; prints Spearman's rank correlation with the default's
+ranking and which view would be chosen, and writes PREFIX.json and PREFIX.png.
 """
 
 from __future__ import annotations
@@ -14,9 +16,10 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from mgs import runtime
-from mgs.active import criteria, run_folder
 from mgs.data.dataset import load_dataset
 from mgs.files import write_json
+from mgs.policy import criteria
+from mgs.run import folder as run_folder
 
 FACTORS = 10.0 ** np.arange(-8, 9)
 SINGLE = 10.0 ** np.arange(-12, 3)
@@ -35,7 +38,10 @@ def main(run: Path, prefix: str) -> None:
     frames = load_dataset(settings.dataset).frames
     left = [i for i in range(len(frames)) if i not in state.taken]
     default = criteria.regularisation(groups(0), settings.pixel_noise, settings.prior_std)
-    kinds = {"default times": [(f, f * default) for f in FACTORS], "single": [(s, np.full_like(default, s)) for s in SINGLE]}
+    kinds = {
+        "default times": [(f, f * default) for f in FACTORS],
+        "single": [(s, np.full_like(default, s)) for s in SINGLE],
+    }
     scores = {kind: np.empty((len(rows), len(left))) for kind, rows in kinds.items()}
     reference = np.empty(len(left))
     for column, i in enumerate(left):
@@ -43,15 +49,30 @@ def main(run: Path, prefix: str) -> None:
         reference[column] = criteria.d_optimal(F, state.H, default)
         for kind, rows in kinds.items():
             scores[kind][:, column] = [criteria.d_optimal(F, state.H, lam) for _, lam in rows]
-    print(f"{len(state.taken)} images, {len(left)} candidates; default chooses {frames[left[int(reference.argmax())]].name}")
+    print(
+        f"{len(state.taken)} images, {len(left)} candidates; default chooses {frames[left[int(reference.argmax())]].name}"
+    )
     curves, found = {}, []
     for kind, rows in kinds.items():
-        values, correlations = [value for value, _ in rows], [spearmanr(row, reference).statistic for row in scores[kind]]
+        values, correlations = (
+            [value for value, _ in rows],
+            [spearmanr(row, reference).statistic for row in scores[kind]],
+        )
         curves[kind] = values, correlations
         for value, correlation, row in zip(values, correlations, scores[kind], strict=True):
             best = frames[left[int(row.argmax())]].name
-            print(f"{kind:14} {value:7.0e}  Spearman {correlation:+.3f}  chooses {best}  gain {row.max():.4g}")
-            found.append({"kind": kind, "value": value, "spearman": correlation, "chosen": best, "gain": row.max()})
+            print(
+                f"{kind:14} {value:7.0e}  Spearman {correlation:+.3f}  chooses {best}  gain {row.max():.4g}"
+            )
+            found.append(
+                {
+                    "kind": kind,
+                    "value": value,
+                    "spearman": correlation,
+                    "chosen": best,
+                    "gain": row.max(),
+                }
+            )
     write_json(f"{prefix}.json", {"command": command_line(), "rows": found, "versions": versions()})
     draw(Path(f"{prefix}.png"), curves)
 
@@ -67,7 +88,10 @@ def draw(out: Path, curves: dict[str, tuple[list[float], list[float]]]) -> None:
 
         figure = Figure(figsize=(6.4, 2.8), dpi=150, layout="constrained")
         axes = figure.subplots(1, 2, sharey=True)
-        labels = r"$\lambda$ over the default (per kind of parameter)", r"one $\lambda$ for all parameters"
+        labels = (
+            r"$\lambda$ over the default (per kind of parameter)",
+            r"one $\lambda$ for all parameters",
+        )
         for axis, (values, correlations), label in zip(axes, curves.values(), labels, strict=True):
             axis.semilogx(values, correlations, "o-", color="#0072B2")
             axis.set(xlabel=label)

@@ -1,15 +1,22 @@
-"""Does the choice of views depend on the noise that is assumed? `python benchmarks/noise_ranking.py OUT.json DATASET...`
+"""Does the choice of views depend on the noise that is assumed? `python benchmarks/noise_ranking.py
+OUT.json DATASET...`
 
-In the states of benchmarks/ranking.py `d-optimal` ranks every other view, as it does by default, and with other assumptions:
+In the states of benchmarks/ranking.py `d-optimal` ranks every other view, as it does by default,
+and with other assumptions:
 
-- "sigma": another standard deviation of the pixels' noise. Lambda changes with it, in the fit and in the score.
-- "alpha in F": alpha as a fourth channel of every pixel, for the views taken and for the candidates alike. The weight is the
+- "sigma": another standard deviation of the pixels' noise. Lambda changes with it, in the fit and
+in the score.
+- "alpha in F": alpha as a fourth channel of every pixel, for the views taken and for the candidates
+alike. The weight is the
   ratio of the variances of the noise, (sigma_rgb / sigma_alpha)^2.
-- "alpha in lambda": the prior's mesh says at every pose what is opaque, so what alpha says there is known before any image: its
+- "alpha in lambda": the prior's mesh says at every pose what is opaque, so what alpha says there is
+known before any image: its
   information at all poses of the dataset is added to lambda, and no view adds more of it.
-- "alpha in the fit": models that were fitted to alpha, too, as runs are by default; the score leaves it out.
+- "alpha in the fit": models that were fitted to alpha, too, as runs are by default; the score
+leaves it out.
 
-Compared with the default: Kendall's tau; and regret, the share of the best score (as the default has it) that is lost.
+Compared with the default: Kendall's tau; and regret, the share of the best score (as the default
+has it) that is lost.
 """
 
 from __future__ import annotations
@@ -23,13 +30,13 @@ import numpy as np
 from ranking import GAUSSIANS, STATES, views_of
 
 from mgs import runtime
-from mgs.active.criteria import d_optimal, lam_by_kind, regularisation
-from mgs.active.fitting import fit
-from mgs.active.settings import TrainSettings
 from mgs.data.dataset import Dataset, load_dataset, target_of
 from mgs.files import write_json
+from mgs.fit.fitting import fit
+from mgs.fit.settings import TrainSettings
 from mgs.gaussians import Gaussians
 from mgs.metrics import agreement
+from mgs.policy.criteria import d_optimal, lam_by_kind, regularisation
 from mgs.prior.build import build_prior
 from mgs.prior.initial import initial_gaussians
 from mgs.prior.settings import PriorSettings
@@ -42,7 +49,9 @@ WEIGHTS = (0.03, 0.3, 1.0, 10.0, 100.0)
 FIT_WEIGHTS = (0.03, 0.1, 0.3, 1.0)
 
 
-def information(model: Gaussians, dataset: Dataset, cache: ListCache, weight: float = 0.0) -> np.ndarray:
+def information(
+    model: Gaussians, dataset: Dataset, cache: ListCache, weight: float = 0.0
+) -> np.ndarray:
     """F of every frame [V,N,11], float64, with alpha observed by this weight."""
     return np.array(
         [fisher(model, frame.camera, cache=cache, alpha_weight=weight) for frame in dataset.frames],
@@ -57,16 +66,21 @@ def scored(F: np.ndarray, taken: list[int], lam: np.ndarray) -> list[float]:
 
 
 def assumptions(dataset: Dataset, state: str) -> Iterator[tuple[str, float, list[float]]]:
-    """Scores of the candidates in a state under each assumption: its name, its number, and the scores."""
+    """Scores of the candidates in a state under each assumption: its name, its number, and the
+    scores."""
     cache, (prior, _) = ListCache(), build_prior(dataset, PriorSettings(gaussians=GAUSSIANS))
-    taken = views_of(state, np.array([frame.camera.position for frame in dataset.frames]), prior.points.mean(0))
+    taken = views_of(
+        state, np.array([frame.camera.position for frame in dataset.frames]), prior.points.mean(0)
+    )
     frames = [dataset.frames[i] for i in taken]
     start, cameras = initial_gaussians(prior, frames)[0], [frame.camera for frame in frames]
     targets = [target_of(frame) for frame in frames]
     for sigma in SIGMAS:
         lam = regularisation(groups(0), sigma)
         by_kind = lam_by_kind(lam, groups(0))
-        model = fit(start, cameras, targets, TrainSettings(), cache=cache, start=start, lam=by_kind).gaussians
+        model = fit(
+            start, cameras, targets, TrainSettings(), cache=cache, start=start, lam=by_kind
+        ).gaussians
         F = information(model, dataset, cache)
         yield "sigma", sigma, scored(F, taken, lam)
         if sigma == DEFAULT:
@@ -80,19 +94,33 @@ def assumptions(dataset: Dataset, state: str) -> Iterator[tuple[str, float, list
     with_alpha = [target_of(frame, with_alpha=True) for frame in frames]
     for weight in FIT_WEIGHTS:
         train = TrainSettings(alpha_weight=weight)
-        model = fit(start, cameras, with_alpha, train, cache=cache, start=start, lam=by_kind).gaussians
+        model = fit(
+            start, cameras, with_alpha, train, cache=cache, start=start, lam=by_kind
+        ).gaussians
         yield "alpha in the fit", weight, scored(information(model, dataset, cache), taken, lam)
 
 
 def study(root: Path, state: str) -> list[dict[str, Any]]:
     """One record per assumption: scores, and how they compare with the default's."""
     found = list(assumptions(load_dataset(root), state))
-    default = next(np.array(scores) for name, number, scores in found if (name, number) == ("sigma", DEFAULT))
+    default = next(
+        np.array(scores) for name, number, scores in found if (name, number) == ("sigma", DEFAULT)
+    )
     records = []
     for name, number, scores in found:
         mine = np.array(scores)
-        record = {"dataset": str(root), "state": state, "assumption": name, "number": number, "scores": scores}
-        records.append(record | agreement(mine, default) | {"same": int(mine.argmax()) == int(default.argmax())})
+        record = {
+            "dataset": str(root),
+            "state": state,
+            "assumption": name,
+            "number": number,
+            "scores": scores,
+        }
+        records.append(
+            record
+            | agreement(mine, default)
+            | {"same": int(mine.argmax()) == int(default.argmax())}
+        )
     return records
 
 
@@ -104,8 +132,12 @@ def main(out: Path, roots: list[Path]) -> None:
     write_json(out, made | {"records": records})
     for key in dict.fromkeys((record["assumption"], record["number"]) for record in records):
         of = [record for record in records if (record["assumption"], record["number"]) == key]
-        tau, regret, same = (np.mean([record[name] for record in of]) for name in ("tau", "regret", "same"))
-        print(f"{key[0]:16} {key[1]:7g}  tau {tau:.2f}  regret {regret:.2%}  the same view {same:.0%}")
+        tau, regret, same = (
+            np.mean([record[name] for record in of]) for name in ("tau", "regret", "same")
+        )
+        print(
+            f"{key[0]:16} {key[1]:7g}  tau {tau:.2f}  regret {regret:.2%}  the same view {same:.0%}"
+        )
 
 
 if __name__ == "__main__":

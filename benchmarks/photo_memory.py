@@ -1,8 +1,10 @@
-"""Most memory that each station takes for photographs of 12 megapixels: `python benchmarks/photo_memory.py OUT.json`.
+"""Most memory that each station takes for photographs of 12 megapixels: `python
+benchmarks/photo_memory.py OUT.json`.
 
-The scene is a ball whose colour changes with height alone, seen by a ring of cameras at one height: all of them see the same
-image. So one JPEG and one mask stand for any number of photographs, by hard links, as a nerfstudio capture with distortion and
-points. Every station is a process of its own; what is reported is its largest resident set.
+The scene is a ball whose colour changes with height alone, seen by a ring of cameras at one height:
+all of them see the same image. So one JPEG and one mask stand for any number of photographs, by
+hard links, as a nerfstudio capture with distortion and points. Every station is a process of its
+own; what is reported is its largest resident set.
 """
 
 from __future__ import annotations
@@ -61,16 +63,35 @@ def capture(folder: Path, image: Path, mask: Path, count: int) -> None:
         os.link(image, folder / f"images/{k:03d}.jpg")
         os.link(mask, folder / f"masks/{k:03d}.png")
         pose = opengl_from_opencv(camera.world_to_camera).tolist()
-        frames.append({"file_path": f"images/{k:03d}.jpg", "mask_path": f"masks/{k:03d}.png", "transform_matrix": pose})
+        frames.append(
+            {
+                "file_path": f"images/{k:03d}.jpg",
+                "mask_path": f"masks/{k:03d}.png",
+                "transform_matrix": pose,
+            }
+        )
     K = cameras[0].K
-    lens = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": WIDTH, "h": HEIGHT, "k1": DISTORTION}
-    write_json(folder / "transforms.json", {**lens, "ply_file_path": "points.ply", "frames": frames})
+    lens = {
+        "fl_x": K[0, 0],
+        "fl_y": K[1, 1],
+        "cx": K[0, 2],
+        "cy": K[1, 2],
+        "w": WIDTH,
+        "h": HEIGHT,
+        "k1": DISTORTION,
+    }
+    write_json(
+        folder / "transforms.json", {**lens, "ply_file_path": "points.ply", "frames": frames}
+    )
     points = np.random.default_rng(1).standard_normal((4000, 3))
-    trimesh.PointCloud(points / np.linalg.norm(points, axis=1, keepdims=True)).export(folder / "points.ply")
+    trimesh.PointCloud(points / np.linalg.norm(points, axis=1, keepdims=True)).export(
+        folder / "points.ply"
+    )
 
 
 def dataset(folder: Path, image: Path, mask: Path | None, count: int) -> None:
-    """What a capture without distortion would be imported as, at full size; mask None: without masks."""
+    """What a capture without distortion would be imported as, at full size; mask None: without
+    masks."""
     frames = []
     for k, camera in enumerate(ring(count)):
         paths = folder / f"images/{k:03d}.png", folder / f"masks/{k:03d}.png"
@@ -78,10 +99,14 @@ def dataset(folder: Path, image: Path, mask: Path | None, count: int) -> None:
             if source is not None:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 os.link(source, path)
-        frames.append(Frame(f"{k:03d}", camera, float(k), paths[0], mask_path=paths[1] if mask else None))
+        frames.append(
+            Frame(f"{k:03d}", camera, float(k), paths[0], mask_path=paths[1] if mask else None)
+        )
     write_transforms(folder, frames)
     points = np.random.default_rng(1).standard_normal((4000, 3))
-    trimesh.PointCloud(points / np.linalg.norm(points, axis=1, keepdims=True)).export(folder / "sparse.ply")
+    trimesh.PointCloud(points / np.linalg.norm(points, axis=1, keepdims=True)).export(
+        folder / "sparse.ply"
+    )
 
 
 WATCHED = """
@@ -94,18 +119,23 @@ finally:
     lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     Path(sys.argv[1]).write_text(lines["VmHWM"].split()[0])
 """
-"""A program that runs `mgs` and writes the largest resident set of its process, kB, into a file. getrusage is of no use here: a
-process starts with the number of the one that started it."""
+"""A program that runs `mgs` and writes the largest resident set of its process, kB, into a file.
+getrusage is of no use here: a process starts with the number of the one that started it."""
 
 
 def peak(note: Path, *command: str | Path) -> float:
     """Largest resident set of `mgs COMMAND`, GB. note: a file to write."""
-    subprocess.run([sys.executable, "-c", WATCHED, str(note), *map(str, command)], stdout=subprocess.DEVNULL, check=True)
+    subprocess.run(
+        [sys.executable, "-c", WATCHED, str(note), *map(str, command)],
+        stdout=subprocess.DEVNULL,
+        check=True,
+    )
     return int(note.read_text()) * 1024 / 1e9
 
 
 def commands(folder: Path, count: int) -> list[tuple[str, list[str | Path]]]:
-    """The stations that photographs go through: (what the table calls it, its command line), in the order to run them."""
+    """The stations that photographs go through: (what the table calls it, its command line), in the
+    order to run them."""
     photos, small, prior = (folder / f"{name}{count}" for name in ("photos", "small", "prior"))
     full, size = folder / f"full{count}", ["--gaussians", "4000"]
     run = [
@@ -126,7 +156,10 @@ def commands(folder: Path, count: int) -> list[tuple[str, list[str | Path]]]:
         ("mgs import", ["import", photos, "--out", folder / f"imported{count}"]),
         ("mgs import --downscale 4", ["import", photos, "--out", small, "--downscale", "4"]),
         ("mgs prior --from hull", ["prior", full, "--from", "hull", "--out", prior, *size]),
-        ("mgs prior --from points", ["prior", full, "--from", "points", "--out", folder / f"points{count}", *size]),
+        (
+            "mgs prior --from points",
+            ["prior", full, "--from", "points", "--out", folder / f"points{count}", *size],
+        ),
         ("mgs dataset masks", ["dataset", "masks", folder / f"bare{count}", "--prior", prior]),
         ("mgs nbv", ["nbv", small, "--prior", prior, "--out", folder / f"run{count}", *run]),
     ]
@@ -149,9 +182,23 @@ def main(out: Path) -> None:
             for count, (name, command) in zip(COUNTS, station, strict=True):
                 if name == "mgs import" and count != COUNTS[0]:
                     continue  # takes minutes to write, and --downscale reads and undistorts as many pixels
-                rows.append({"station": name, "photographs": count, "gigabytes": peak(folder / "note", *command)})
+                rows.append(
+                    {
+                        "station": name,
+                        "photographs": count,
+                        "gigabytes": peak(folder / "note", *command),
+                    }
+                )
                 print(rows[-1], flush=True)
-    write_json(out, {"command": command_line(), "machine": runtime.processor(), "versions": versions(), "records": rows})
+    write_json(
+        out,
+        {
+            "command": command_line(),
+            "machine": runtime.processor(),
+            "versions": versions(),
+            "records": rows,
+        },
+    )
 
 
 if __name__ == "__main__":

@@ -1,11 +1,14 @@
-"""Seconds to plan a flight by the directional criteria. `python benchmarks/planning.py OUT.json BUDGET DATASET:PRIOR...`
+"""Seconds to plan a flight by the directional criteria. `python benchmarks/planning.py OUT.json
+BUDGET DATASET:PRIOR...`
 
-A plan is BUDGET views beyond four seeds, chosen one after another by `directional-i` or `directional-d`; it needs poses and a
-prior, no image. It is made by gains that are brought up to date with every view (`mgs.active.pool_gains`), as `mgs nbv` does
-it; by gains that are computed anew for every choice (`mgs.active.directional.gains`); and anew for every k-th Gaussian alone.
-Are the choices the same, and what does the whole plan bring? Seconds are those of the choices, after one pass over the poses
-has measured what they see, and without a first plan of one view, in which kernels are compiled; the shortest, gains brought up
-to date, are timed three times, and the median counts. Let nothing else run.
+A plan is BUDGET views beyond four seeds, chosen one after another by `directional-i` or
+`directional-d`; it needs poses and a prior, no image. It is made by gains that are brought up to
+date with every view (`mgs.policy.pool_gains`), as `mgs nbv` does it; by gains that are computed
+anew for every choice (`mgs.policy.directional.gains`); and anew for every k-th Gaussian alone. Are
+the choices the same, and what does the whole plan bring? Seconds are those of the choices, after
+one pass over the poses has measured what they see, and without a first plan of one view, in which
+kernels are compiled; the shortest, gains brought up to date, are timed three times, and the median
+counts. Let nothing else run.
 """
 
 from __future__ import annotations
@@ -19,19 +22,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mgs import runtime
-from mgs.active import directional
-from mgs.active.criteria import regularisation
-from mgs.active.directional import Views
-from mgs.active.pose_policies import seed_views
-from mgs.active.settings import NbvSettings
-from mgs.active.sight import Sight
 from mgs.data.dataset import load_dataset
 from mgs.files import write_json
+from mgs.policy import directional
+from mgs.policy.criteria import regularisation
+from mgs.policy.directional import Views
+from mgs.policy.poses import seed_views
+from mgs.policy.visibility import Visibility
 from mgs.prior.build import load_prior
 from mgs.provenance import command_line, versions
+from mgs.run.settings import NbvSettings
 
 CRITERIA = {"directional-i": (3, 0.1), "directional-d": (2, 0.3)}
-"""Degree and tau of `mgs.active.policies`."""
+"""Degree and tau of `mgs.policy.registry`."""
 
 COUNTS = (1024, 4096, 16384)
 """About so many Gaussians, where there are more."""
@@ -70,7 +73,9 @@ def pool_of(dataset: Path, prior_folder: Path) -> Pool:
     centre, points = prior.points.mean(axis=0), np.asarray(start.means[:n])
     settings = NbvSettings(dataset=dataset, prior=prior_folder)
     lam = float(regularisation(groups(0), settings.pixel_noise, settings.prior_std)[0])
-    sight = Sight(cameras, lambda camera: fisher(start, camera, cache=cache)[:n], points, centre, lam)
+    sight = Visibility(
+        cameras, lambda camera: fisher(start, camera, cache=cache)[:n], points, centre, lam
+    )
     return Pool(points, sight.pool(), sight.dome(), lam, seed_views(sight.positions, centre, SEEDS))
 
 
@@ -88,7 +93,7 @@ def anew(pool: Pool, criterion: str) -> Callable[[list[int], list[int]], np.ndar
 
 def updated(pool: Pool, criterion: str) -> Callable[[list[int], list[int]], np.ndarray]:
     """The same, brought up to date."""
-    from mgs.active.pool_gains import pool_gains
+    from mgs.policy.pool_gains import pool_gains
 
     degree, tau = CRITERIA[criterion]
     gains = pool_gains(pool.points, pool.lam, lambda: pool.poses, lambda: pool.dome)
@@ -98,8 +103,11 @@ def updated(pool: Pool, criterion: str) -> Callable[[list[int], list[int]], np.n
 Gains = Callable[[Pool, str], Callable[[list[int], list[int]], np.ndarray]]
 
 
-def planned(pool: Pool, criterion: str, budget: int, method: Gains) -> tuple[list[int], float, list[np.ndarray]]:
-    """The views, with the seeds; the seconds of their choice; the gains of the candidates before each choice."""
+def planned(
+    pool: Pool, criterion: str, budget: int, method: Gains
+) -> tuple[list[int], float, list[np.ndarray]]:
+    """The views, with the seeds; the seconds of their choice; the gains of the candidates before
+    each choice."""
     taken, found = list(pool.seeds), []
     began = time.perf_counter()
     gains = method(pool, criterion)
@@ -115,15 +123,28 @@ def compared(pool: Pool, criterion: str, budget: int) -> list[dict[str, Any]]:
     reference, seconds, truth = planned(pool, criterion, budget, anew)
     whole = worth(pool, criterion, reference)
     planned(pool, criterion, 1, updated)
-    ways = [("updated", pool, updated), *((f"{count}", pool.some(count), anew) for count in COUNTS if count < len(pool.points))]
+    ways = [
+        ("updated", pool, updated),
+        *((f"{count}", pool.some(count), anew) for count in COUNTS if count < len(pool.points)),
+    ]
     rows = [{"way": "anew", "gaussians": len(pool.points), "seconds": seconds}]
     for way, part, method in ways:
-        plans = [planned(part, criterion, budget, method) for _ in range(REPEATS if way == "updated" else 1)]
+        plans = [
+            planned(part, criterion, budget, method)
+            for _ in range(REPEATS if way == "updated" else 1)
+        ]
         plan, took, found = sorted(plans, key=lambda plan: plan[1])[len(plans) // 2]
-        row = {"way": way, "gaussians": len(part.points), "seconds": took, "worth": worth(pool, criterion, plan) / whole}
+        row = {
+            "way": way,
+            "gaussians": len(part.points),
+            "seconds": took,
+            "worth": worth(pool, criterion, plan) / whole,
+        }
         row |= {"kept": len(set(plan) & set(reference)) - SEEDS, "same": plan == reference}
         if way == "updated" and plan == reference:  # gains of a part of the Gaussians are smaller
-            row["largest_difference"] = max(float(np.abs(a / b - 1).max()) for a, b in zip(found, truth, strict=True))
+            row["largest_difference"] = max(
+                float(np.abs(a / b - 1).max()) for a, b in zip(found, truth, strict=True)
+            )
         rows.append(row)
     for row in rows:
         print(criterion, row, flush=True)
@@ -131,14 +152,18 @@ def compared(pool: Pool, criterion: str, budget: int) -> list[dict[str, Any]]:
 
 
 def worth(pool: Pool, criterion: str, taken: list[int]) -> float:
-    """What the chosen views of a plan bring by the criterion, all Gaussians counted: the sum of their gains."""
+    """What the chosen views of a plan bring by the criterion, all Gaussians counted: the sum of
+    their gains."""
     degree, tau = CRITERIA[criterion]
     prior, dome = np.diag(directional.precision(degree, tau, pool.lam)), pool.dome
 
     def part(some: slice) -> float:
         points = pool.points[some]
         seeds, plan = (
-            prior + directional.information(points, Views(pool.poses.positions[v], pool.poses.seen[v][:, some]), degree)
+            prior
+            + directional.information(
+                points, Views(pool.poses.positions[v], pool.poses.seen[v][:, some]), degree
+            )
             for v in (pool.seeds, taken)
         )
         if criterion == "directional-d":
@@ -161,7 +186,13 @@ def main(out: Path, budget: int, cases: list[str]) -> None:
         for criterion in CRITERIA:
             found = compared(pool, criterion, budget)
             rows += [
-                {"dataset": dataset, "criterion": criterion, "poses": len(pool.poses.positions), "looking": looking, **row}
+                {
+                    "dataset": dataset,
+                    "criterion": criterion,
+                    "poses": len(pool.poses.positions),
+                    "looking": looking,
+                    **row,
+                }
                 for row in found
             ]
             write_json(out, {"command": command_line(), "budget": budget, "rows": rows, **made})

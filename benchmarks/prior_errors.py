@@ -1,8 +1,11 @@
-"""How far priors are from the true rock: `python benchmarks/prior_errors.py OUT.json WORK DATASET...`
+"""How far priors are from the true rock: `python benchmarks/prior_errors.py OUT.json WORK
+DATASET...`
 
-The datasets are of `mgs synth-orbit`, which leaves the true rock in them. Of each the prior is built of its exact depth, and of
-a survey (`mgs survey`): noisy depth and estimated poses. Of the first dataset also of a survey with exact poses, and of depth
-that was made worse on purpose. WORK: a folder for the surveys; one that is there is not flown again.
+The datasets are of `mgs synth-orbit`, which leaves the true rock in them. Of each the prior is
+built of its exact depth, and of a survey (`mgs survey`): noisy depth and estimated poses. Of the
+first dataset also of a survey with exact poses, and of depth
+that was made worse on purpose. WORK: a folder for the surveys; one that is there is not flown
+again.
 """
 
 from __future__ import annotations
@@ -42,7 +45,9 @@ NUMBERS = (
 
 def measured(dataset: Path, **settings: Any) -> dict[str, Any]:
     """What a prior of a dataset says of itself, and its error."""
-    numbers = build_prior(load_dataset(dataset), PriorSettings(gaussians=GAUSSIANS, **settings))[0].numbers
+    numbers = build_prior(load_dataset(dataset), PriorSettings(gaussians=GAUSSIANS, **settings))[
+        0
+    ].numbers
     return {key: numbers[key] for key in (*NUMBERS, "truth")}
 
 
@@ -66,7 +71,12 @@ def main(out: Path, work: Path, datasets: list[Path]) -> None:
     def record(dataset: Path, what: str, found: dict[str, Any]) -> None:
         rows.append({"scene": dataset.name, "prior": what, **found})
         truth = found["truth"]
-        print(dataset.name, what, {key: truth[key] for key in ("accuracy", "completeness", "hausdorff")}, flush=True)
+        print(
+            dataset.name,
+            what,
+            {key: truth[key] for key in ("accuracy", "completeness", "hausdorff")},
+            flush=True,
+        )
 
     for dataset in datasets:
         record(dataset, "exact", measured(dataset))
@@ -78,8 +88,16 @@ def main(out: Path, work: Path, datasets: list[Path]) -> None:
                 record(dataset, option, measured(dataset, **settings))
         folder = work / dataset.name
         errors = survey(dataset, folder, exact=False)["error"]
-        record(dataset, "survey", measured(folder) | {"trajectory": {stage: errors[stage]["ate_rms"] for stage in STAGES}})
-    write_json(out, {"command": command_line(), "gaussians": GAUSSIANS, "rows": rows, "versions": versions()})
+        record(
+            dataset,
+            "survey",
+            measured(folder)
+            | {"trajectory": {stage: errors[stage]["ate_rms"] for stage in STAGES}},
+        )
+    write_json(
+        out,
+        {"command": command_line(), "gaussians": GAUSSIANS, "rows": rows, "versions": versions()},
+    )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
-"""Which samples per pixel, with or without denoising? PSNR against a 1024-sample reference over CPU seconds per frame.
+"""Which samples per pixel, with or without denoising? PSNR against a 1024-sample reference over CPU
+seconds per frame.
 
     python benchmarks/render_settings.py docs/benchmarks
 
-Two views of the default scene (sunlit and shaded), 640x480. At the rock's outline (the pixels that it covers in part) the
-picture of the rock alone is compared, in front of black, and so is the image times the binary mask. Writes render_settings.json
-and render_settings.png; with --plot-only, draws the figure again from the JSON.
+Two views of the default scene (sunlit and shaded), 640x480. At the rock's outline (the pixels that
+it covers in part) the picture of the rock alone is compared, in front of black, and so is the image
+times the binary mask. Writes render_settings.json and render_settings.png; with --plot-only, draws
+the figure again from the JSON.
 """
 
 from __future__ import annotations
@@ -44,8 +46,15 @@ def measure() -> dict:
     scene = Scene(settings, rock, cameras[0], 0)
 
     def reference(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        parts = [scene.render(cameras[index], 64, 1000 + i, denoise=False) for i in range(REFERENCE_SPP // 64)]
-        return np.mean([part.rgb for part in parts], axis=0), np.mean([part.rock for part in parts], axis=0), parts[0].mask
+        parts = [
+            scene.render(cameras[index], 64, 1000 + i, denoise=False)
+            for i in range(REFERENCE_SPP // 64)
+        ]
+        return (
+            np.mean([part.rgb for part in parts], axis=0),
+            np.mean([part.rock for part in parts], axis=0),
+            parts[0].mask,
+        )
 
     truth = {index: reference(index) for index in VIEWS}
     exposure = ROCK_EXPOSURE / np.mean([rgb[mask].mean() for rgb, _, mask in truth.values()])
@@ -70,7 +79,9 @@ def measure() -> dict:
                         "psnr": psnr(image, expected),
                         "psnr_rock": psnr(image, expected, mask),
                         "psnr_outline": psnr(shown(rendered.rock[..., :3]), alone, outline),
-                        "psnr_outline_image_times_mask": psnr(image * mask[..., None], alone, outline),
+                        "psnr_outline_image_times_mask": psnr(
+                            image * mask[..., None], alone, outline
+                        ),
                     }
                 )
             rows.append(
@@ -94,7 +105,8 @@ def measure() -> dict:
 
 
 def plot(data: dict, path: Path) -> None:
-    """PSNR of the rock's pixels over CPU seconds of all cores together, so that other work on the machine does not count."""
+    """PSNR of the rock's pixels over CPU seconds of all cores together, so that other work on the
+    machine does not count."""
     import matplotlib
 
     from mgs.plotting import STYLE, new_figure, save_figure
@@ -102,12 +114,22 @@ def plot(data: dict, path: Path) -> None:
     with matplotlib.rc_context(STYLE):
         figure = new_figure(6.4, 4, dpi=130)
         axes = figure.subplots()
-        for denoise, label, colour in ((True, "denoised (albedo and normal guides)", "#0072B2"), (False, "plain", "#D55E00")):
+        for denoise, label, colour in (
+            (True, "denoised (albedo and normal guides)", "#0072B2"),
+            (False, "plain", "#D55E00"),
+        ):
             rows = [row for row in data["settings"] if row["denoise"] == denoise]
             x, y = [row["cpu_seconds"] for row in rows], [row["psnr_rock"] for row in rows]
             axes.plot(x, y, "o-", color=colour, label=label)
             for row, at in zip(rows, zip(x, y, strict=True), strict=True):
-                axes.annotate(str(row["spp"]), at, textcoords="offset points", xytext=(0, 7), ha="center", fontsize=8)
+                axes.annotate(
+                    str(row["spp"]),
+                    at,
+                    textcoords="offset points",
+                    xytext=(0, 7),
+                    ha="center",
+                    fontsize=8,
+                )
         axes.set(
             xscale="log",
             xlabel="CPU seconds per frame (all cores together)",
@@ -121,7 +143,9 @@ def plot(data: dict, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("out", type=Path)
     parser.add_argument("--plot-only", action="store_true")
     arguments = parser.parse_args()

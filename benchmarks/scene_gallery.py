@@ -1,7 +1,8 @@
-"""The pictures of docs/data.md: a strip of frames per scene, from datasets in a folder, the outline of a rock, the four orbits.
+"""The pictures of docs/data.md: a strip of frames per scene, from datasets in a folder, the outline
+of a rock, the four orbits.
 
-for s in boulder contact-binary strata low-sun pebbles; do mgs synth-orbit out/$s --scene $s --frames 8; done
-python benchmarks/scene_gallery.py out docs/images
+for s in boulder contact-binary strata low-sun pebbles; do mgs synth-orbit out/$s --scene $s
+--frames 8; done python benchmarks/scene_gallery.py out docs/images
 """
 
 from __future__ import annotations
@@ -30,12 +31,16 @@ def strip(folder: Path, columns: int = 4) -> Image.Image:
     picture = Image.new("RGB", (columns * WIDTH, height))
     for i, frame in enumerate(chosen):
         with Image.open(frame.image_path) as image:
-            picture.paste(image.convert("RGB").resize((WIDTH, height), Image.Resampling.LANCZOS), (i * WIDTH, 0))
+            picture.paste(
+                image.convert("RGB").resize((WIDTH, height), Image.Resampling.LANCZOS),
+                (i * WIDTH, 0),
+            )
     return picture
 
 
 def draw_outline(folder: Path, size: int = 56, zoom: int = 5) -> Image.Image:
-    """The left edge of the rock in the first frame: image times mask, and the rock alone, each in front of black and white."""
+    """The left edge of the rock in the first frame: image times mask, and the rock alone, each in
+    front of black and white."""
     frame = load_dataset(folder).frames[0]
     (rgba, _), mask = frame.target(), frame.mask()
     column = np.flatnonzero(mask.any(0))[0]
@@ -52,22 +57,35 @@ def draw_outline(folder: Path, size: int = 56, zoom: int = 5) -> Image.Image:
 
 
 def draw_orbits(path: Path, frames: int = 60) -> None:
-    """The four orbits of the default scene: camera centres, coloured by the order in which they are flown."""
+    """The four orbits of the default scene: camera centres, coloured by the order in which they are
+    flown."""
     settings = load_scene_file("boulder").orbit
     figure = plt.figure(figsize=(10, 2.7), constrained_layout=True)
     for i, kind in enumerate(ORBITS):
-        x, y, z = orbit_positions(settings.model_copy(update={"kind": kind}), frames, np.array([0, 0, 0.6])).T
+        x, y, z = orbit_positions(
+            settings.model_copy(update={"kind": kind}), frames, np.array([0, 0, 0.6])
+        ).T
         axes = figure.add_subplot(1, 4, i + 1, projection="3d")
         axes.plot(x, y, z, color="0.75", linewidth=0.8)
         axes.scatter(x, y, z, c=np.arange(frames), s=8, cmap="viridis", depthshade=False)
         axes.scatter(0, 0, 0.6, color="saddlebrown", s=60)
-        axes.set(title=kind, xlim=(-4, 4), ylim=(-4, 4), zlim=(0, 4), xticks=[-4, 0, 4], yticks=[-4, 0, 4], zticks=[0, 2, 4])
+        axes.set(
+            title=kind,
+            xlim=(-4, 4),
+            ylim=(-4, 4),
+            zlim=(0, 4),
+            xticks=[-4, 0, 4],
+            yticks=[-4, 0, 4],
+            zticks=[0, 2, 4],
+        )
         axes.set_box_aspect((2, 2, 1))
     figure.savefig(path, dpi=110)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("datasets", type=Path)
     parser.add_argument("out", type=Path)
     arguments = parser.parse_args()

@@ -1,7 +1,9 @@
-"""Optimisers that the fit does not have, for `benchmarks/optimisers.py`: what more curvature than a diagonal would win.
+"""Optimisers that the fit does not have, for `benchmarks/optimisers.py`: what more curvature than a
+diagonal would win.
 
-Vectors are [N,11] float64, a row for each Gaussian, columns as in `mgs.splat.groups(0)`. Each optimiser gives the work it has
-done so far, in passes (one is a render with gradients of every view), and the model, after every step or pass.
+Vectors are [N,11] float64, a row for each Gaussian, columns as in `mgs.splat.groups(0)`. Each
+optimiser gives the work it has done so far, in passes (one is a render with gradients of every
+view), and the model, after every step or pass.
 """
 
 from __future__ import annotations
@@ -14,23 +16,24 @@ import mitsuba as mi
 import numpy as np
 from linearity import COORDINATES
 
-from mgs.active.fitting import COLOUR_MIN
-from mgs.active.objective import Objective, Vector
-from mgs.active.optimisers import INFORMATION_PASSES, NATURAL_BETA, NATURAL_OVERLAP
-from mgs.active.settings import RATES, TrainSettings
 from mgs.colour import SH_C0
+from mgs.fit.fitting import COLOUR_MIN
+from mgs.fit.objective import Objective, Vector
+from mgs.fit.optimisers import INFORMATION_PASSES, NATURAL_BETA, NATURAL_OVERLAP
+from mgs.fit.settings import RATES, TrainSettings
 from mgs.gaussians import LEARNED, Gaussians
 from mgs.memory import padded
 from mgs.seeds import generator
 from mgs.splat import fisher, groups
 
 LM_CG, LM_DAMPING = 8, 300.0
-"""Levenberg-Marquardt: iterations of conjugate gradients in each step, and first damping, a factor of the prior's lam."""
+"""Levenberg-Marquardt: iterations of conjugate gradients in each step, and first damping, a factor
+of the prior's lam."""
 COLOUR_CG, COLOUR_PASSES = 4, 5
 """Colours solved: iterations of conjugate gradients, and passes from one solution to the next."""
 CURVATURE_COST = 1.5
-"""Passes that a product with the curvature costs: one derivative in forward mode and one in reverse mode for each view, where a
-gradient takes one in reverse mode and the render."""
+"""Passes that a product with the curvature costs: one derivative in forward mode and one in reverse
+mode for each view, where a gradient takes one in reverse mode and the render."""
 BLOCK_COST = 2.5
 """Passes that the blocks of all views cost, against gradients of all views (`mgs bench splat`)."""
 
@@ -38,7 +41,7 @@ COLOUR = groups(0)["colour"]
 
 
 def joined(vector: Vector) -> np.ndarray:
-    """A vector of `mgs.active.objective` as [N,11]."""
+    """A vector of `mgs.fit.objective` as [N,11]."""
     parts = [np.asarray(part, np.float64) for part in vector]
     return np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
 
@@ -47,12 +50,17 @@ def apart(matrix: np.ndarray, model: Gaussians) -> Vector:
     """The way back, in the shapes of the model's parameters."""
     shapes = [getattr(model, name).shape for name in LEARNED]
     columns = zip(shapes, groups(0).values(), strict=True)
-    return [mi.TensorXf(padded(matrix[:, c].astype(np.float32)).ravel(), shape) for shape, c in columns]
+    return [
+        mi.TensorXf(padded(matrix[:, c].astype(np.float32)).ravel(), shape) for shape, c in columns
+    ]
 
 
 def moved(model: Gaussians, move: np.ndarray) -> Gaussians:
-    """The model moved by [N,11], colours within their bound (`mgs.active.fitting.COLOUR_MIN`)."""
-    values = {name: getattr(model, name) + step for name, step in zip(LEARNED, apart(move, model), strict=True)}
+    """The model moved by [N,11], colours within their bound (`mgs.fit.fitting.COLOUR_MIN`)."""
+    values = {
+        name: getattr(model, name) + step
+        for name, step in zip(LEARNED, apart(move, model), strict=True)
+    }
     least = (COLOUR_MIN - 0.5) / SH_C0
     values["sh"] = mi.TensorXf(dr.maximum(values["sh"].array, least), values["sh"].shape)
     dr.eval(values)
@@ -101,15 +109,20 @@ def levenberg_marquardt(
     straighter: bool = False,
     damping: float = LM_DAMPING,
 ) -> Iterator[tuple[float, Gaussians]]:
-    """Steps (J^T J + (1 + mu) lam)^-1 g by conjugate gradients, kept where they lower the objective; mu falls after good steps
-    and rises after bad ones. by_blocks: the preconditioner is not the diagonal of that matrix, but its 11x11 blocks.
-    straighter: steps are made in opacities and squared scales, in which images are more nearly linear (`linearity.py`).
+    """Steps (J^T J + (1 + mu) lam)^-1 g by conjugate gradients, kept where they lower the
+    objective; mu falls after good steps
+    and rises after bad ones. by_blocks: the preconditioner is not the diagonal of that matrix, but
+    its 11x11 blocks.
+    straighter: steps are made in opacities and squared scales, in which images are more nearly
+    linear (`linearity.py`).
     damping: the first mu."""
     work, mu, phi = 1.0, damping, goal.phi(model)
     for _ in range(steps):
         move, expected = _damped_step(goal, model, mu * lam_of(goal), by_blocks)
         candidate = moved(model, _straighter(model, move) if straighter else move)
-        work += 1 + (BLOCK_COST if by_blocks else 1) + 0.4 + CURVATURE_COST * LM_CG  # gradient, preconditioner, objective
+        work += (
+            1 + (BLOCK_COST if by_blocks else 1) + 0.4 + CURVATURE_COST * LM_CG
+        )  # gradient, preconditioner, objective
         found = goal.phi(candidate)
         gain = (phi - found) / expected
         if gain > 0.05:
@@ -127,8 +140,11 @@ def _straighter(model: Gaussians, move: np.ndarray) -> np.ndarray:
     return bent
 
 
-def _damped_step(goal: Objective, model: Gaussians, damping: np.ndarray, by_blocks: bool) -> tuple[np.ndarray, float]:
-    """One such step, damping [11] being mu lam, and by how much it lowers Phi where images are linear."""
+def _damped_step(
+    goal: Objective, model: Gaussians, damping: np.ndarray, by_blocks: bool
+) -> tuple[np.ndarray, float]:
+    """One such step, damping [11] being mu lam, and by how much it lowers Phi where images are
+    linear."""
     gradient = joined(goal.gradient(model))
     if by_blocks:
         inverse = np.linalg.inv(blocks(goal, model) + np.diag(lam_of(goal) + damping))
@@ -145,10 +161,14 @@ def _damped_step(goal: Objective, model: Gaussians, damping: np.ndarray, by_bloc
     return x, 0.5 * float(((residual - gradient) * x).sum())
 
 
-def natural_by_blocks(goal: Objective, model: Gaussians, passes: int) -> Iterator[tuple[float, Gaussians]]:
-    """The natural gradient of `mgs.active.optimisers` with 11x11 blocks as its metric: the diagonal that it has there, and
-    beyond that the correlations of each Gaussian's parameters, those of all images together. A Gaussian's step is cut as a
-    whole, so that it keeps its direction: cut one by one, steps against the correlations make the objective rise."""
+def natural_by_blocks(
+    goal: Objective, model: Gaussians, passes: int
+) -> Iterator[tuple[float, Gaussians]]:
+    """The natural gradient of `mgs.fit.optimisers` with 11x11 blocks as its metric: the diagonal
+    that it has there, and beyond that the correlations of each Gaussian's parameters, those of all
+    images together. A Gaussian's step is cut as a
+    whole, so that it keeps its direction: cut one by one, steps against the correlations make the
+    objective rise."""
 
     def metric(now: Gaussians) -> Callable[[np.ndarray], np.ndarray]:
         whole = blocks(goal, now) + np.diag(lam_of(goal))
@@ -160,14 +180,19 @@ def natural_by_blocks(goal: Objective, model: Gaussians, passes: int) -> Iterato
     yield from _natural(goal, model, passes, metric, BLOCK_COST + 1, cut=_as_a_whole)
 
 
-def natural_cut_whole(goal: Objective, model: Gaussians, passes: int) -> Iterator[tuple[float, Gaussians]]:
+def natural_cut_whole(
+    goal: Objective, model: Gaussians, passes: int
+) -> Iterator[tuple[float, Gaussians]]:
     """The same with the diagonal alone, to tell what the blocks do from what the cut does."""
     yield from _natural(goal, model, passes, _diagonal(goal), 1, cut=_as_a_whole)
 
 
-def natural_colours_solved(goal: Objective, model: Gaussians, passes: int) -> Iterator[tuple[float, Gaussians]]:
-    """The natural gradient as it is, and every COLOUR_PASSES passes all colours at once: while the rest stays as it is they
-    are a linear least squares problem, at whose solution the gradient of the rest is that of variable projection."""
+def natural_colours_solved(
+    goal: Objective, model: Gaussians, passes: int
+) -> Iterator[tuple[float, Gaussians]]:
+    """The natural gradient as it is, and every COLOUR_PASSES passes all colours at once: while the
+    rest stays as it is they are a linear least squares problem, at whose solution the gradient of
+    the rest is that of variable projection."""
     yield from _natural(goal, model, passes, _diagonal(goal), 1, colours=True)
 
 
@@ -200,13 +225,20 @@ def _natural(
     colours: bool = False,
     cut: Callable[[np.ndarray, np.ndarray], np.ndarray] = _one_by_one,
 ) -> Iterator[tuple[float, Gaussians]]:
-    """Passes with one step on each image. cost: of the metric, passes; colours: whether they are solved; cut(step, rates)
-    shortens steps that are longer than the rates."""
+    """Passes with one step on each image. cost: of the metric, passes; colours: whether they are
+    solved; cut(step, rates) shortens steps that are longer than the rates."""
     alone = [replace(goal, photos=[photo]) for photo in goal.photos]
     others = lam_of(goal) * (1 - 1 / len(alone))  # the prior goes with each image by its share
     start = joined([getattr(goal.prior.start, name) for name in LEARNED])
-    rates = np.concatenate([np.full(c.stop - c.start, RATES[kind]) for kind, c in groups(0).items()])
-    rng, momentum, work, decay = generator(0, "train/order"), np.zeros_like(start), 0.0, TrainSettings().decay
+    rates = np.concatenate(
+        [np.full(c.stop - c.start, RATES[kind]) for kind, c in groups(0).items()]
+    )
+    rng, momentum, work, decay = (
+        generator(0, "train/order"),
+        np.zeros_like(start),
+        0.0,
+        TrainSettings().decay,
+    )
     for done in range(passes):
         rate = rates * decay ** (done / max(passes - 1, 1))
         if done % INFORMATION_PASSES == 0:
@@ -231,7 +263,9 @@ def _with_best_colours(goal: Objective, model: Gaussians) -> Gaussians:
         whole[:, COLOUR] = v
         return joined(goal.curvature_times(model, apart(whole, model)))[:, COLOUR]
 
-    gradient, diagonal = (joined(found)[:, COLOUR] for found in (goal.gradient(model), goal.diagonal(model)))
+    gradient, diagonal = (
+        joined(found)[:, COLOUR] for found in (goal.gradient(model), goal.diagonal(model))
+    )
     move = np.zeros((len(model), 11))
     move[:, COLOUR] = conjugate_gradients(product, -gradient, lambda r: r / diagonal, COLOUR_CG)[0]
     return moved(model, move)

@@ -1,7 +1,7 @@
 """Large models and images: `python benchmarks/sizes.py OUT.json`. Let nothing else run.
 
-Seconds of each operation of the core and the most memory that Dr.Jit holds (`mgs.bench.core.scaling_point`), for each of SIZES
-in a process of its own.
+Seconds of each operation of the core and the most memory that Dr.Jit holds
+(`mgs.bench.core.scaling_point`), for each of SIZES in a process of its own.
 """
 
 from __future__ import annotations
@@ -26,7 +26,12 @@ REPEATS = 3
 def main(out: Path) -> None:
     """Measure and write."""
     runtime.start()
-    made: dict[str, Any] = {"command": command_line(), "machine": runtime.processor(), "versions": versions(), "sizes": []}
+    made: dict[str, Any] = {
+        "command": command_line(),
+        "machine": runtime.processor(),
+        "versions": versions(),
+        "sizes": [],
+    }
     for n, width, height in SIZES:
         found = in_new_process(scaling_point, n, width, height, dr.thread_count(), REPEATS, True)
         made["sizes"].append({"n": n, "width": width, "height": height} | found)

@@ -1,8 +1,10 @@
-"""Draw docs/images/splatting.png: one Gaussian, its blocks, the lanes that own them, and the seven sums of the Fisher pass.
+"""Draw docs/images/splatting.png: one Gaussian, its blocks, the lanes that own them, and the seven
+sums of the Fisher pass.
 
     .venv/bin/python benchmarks/splatting_figure.py docs/images/splatting.png
 
-Everything drawn is read from the kernels' own data structures for a rock of 3,000 Gaussians at 160x120.
+Everything drawn is read from the kernels' own data structures for a rock of 3,000 Gaussians at
+160x120.
 """
 
 import sys
@@ -67,16 +69,26 @@ def footprint_panel(axis, image, camera, gaussians, j, blocks, blocks_x) -> None
     level = 2 * np.log(255 * p.opacities[j])
     values, vectors = np.linalg.eigh(p.cov2d[j])
     angle = np.linspace(0, 2 * np.pi, 200)
-    rim = p.means2d[j] + (np.stack([np.cos(angle), np.sin(angle)], 1) * np.sqrt(level * values)) @ vectors.T
-    axis.imshow(srgb_from_linear(image), extent=(0, camera.width, camera.height, 0), interpolation="nearest")
+    rim = (
+        p.means2d[j]
+        + (np.stack([np.cos(angle), np.sin(angle)], 1) * np.sqrt(level * values)) @ vectors.T
+    )
+    axis.imshow(
+        srgb_from_linear(image), extent=(0, camera.width, camera.height, 0), interpolation="nearest"
+    )
     for b in blocks:
         corner = (b % blocks_x * BLOCK_X, b // blocks_x * BLOCK_Y)
-        axis.add_patch(Rectangle(corner, BLOCK_X, BLOCK_Y, fill=True, fc=ORANGE, ec="white", alpha=0.45))
+        axis.add_patch(
+            Rectangle(corner, BLOCK_X, BLOCK_Y, fill=True, fc=ORANGE, ec="white", alpha=0.45)
+        )
     axis.plot(*rim.T, color="white", lw=2.6)
     axis.plot(*rim.T, color=BLUE, lw=1.4)
     x, y = p.means2d[j]
     axis.set(xlim=(x - 26, x + 26), ylim=(y + 20, y - 20), xlabel="pixels")
-    axis.set_title(f"1  project: one footprint (alpha = 1/255)\ntouches {len(blocks)} blocks of 8x4 pixels", fontsize=9)
+    axis.set_title(
+        f"1  project: one footprint (alpha = 1/255)\ntouches {len(blocks)} blocks of 8x4 pixels",
+        fontsize=9,
+    )
 
 
 def lists_panel(axis, lengths, block, blocks_x, camera) -> None:
@@ -86,7 +98,9 @@ def lists_panel(axis, lengths, block, blocks_x, camera) -> None:
         axis.axvline(edge, color="white", lw=0.8, ls=":")
     for edge in range(BLOCK_Y * TILE, camera.height, BLOCK_Y * TILE):
         axis.axhline(edge, color="white", lw=0.8, ls=":")
-    shown = axis.imshow(grid.reshape(-1, blocks_x), extent=(0, camera.width, camera.height, 0), cmap="viridis")
+    shown = axis.imshow(
+        grid.reshape(-1, blocks_x), extent=(0, camera.width, camera.height, 0), cmap="viridis"
+    )
     axis.figure.colorbar(shown, ax=axis, shrink=0.75, label="splats in the list")
     axis.set(xlabel="pixels")
     axis.set_title("2  list: for each block its splats,\nfront to back (dotted: tiles)", fontsize=9)
@@ -94,9 +108,17 @@ def lists_panel(axis, lengths, block, blocks_x, camera) -> None:
 
 def lanes_panel(axis, lengths) -> None:
     packet = np.arange(len(lengths)) // 16
-    axis.bar(np.arange(len(lengths)), lengths, width=1.0, color=np.where(packet % 2 == 0, BLUE, "#56b4e9"))
+    axis.bar(
+        np.arange(len(lengths)),
+        lengths,
+        width=1.0,
+        color=np.where(packet % 2 == 0, BLUE, "#56b4e9"),
+    )
     axis.set(xlabel="lane (colours: packets of 16)", ylabel="list length")
-    axis.set_title("3  walk: one lane a block, tile by tile, in it\nlongest first: packets end together", fontsize=9)
+    axis.set_title(
+        "3  walk: one lane a block, tile by tile, in it\nlongest first: packets end together",
+        fontsize=9,
+    )
 
 
 def sums_panels(figure, gaussians, camera, j) -> None:

@@ -1,10 +1,13 @@
-"""What keeps a model a surface? `python benchmarks/surface.py PREFIX DATASET...` writes PREFIX.json and PREFIX.png.
+"""What keeps a model a surface? `python benchmarks/surface.py PREFIX DATASET...` writes PREFIX.json
+and PREFIX.png.
 
-Fits of 10,000 Gaussians to 12 views spread evenly in azimuth, with and without the backing, and with what else could keep a
-model opaque: alpha as a fourth channel of a pixel, with several weights (sigma_rgb / sigma_alpha)^2; opacities held to the
-prior more tightly, or not learned; Gaussians ten times thinner, as in 2D Gaussian splatting. Measured on the test views, drawn
-whole as any viewer does: PSNR in the full frame and inside the rock, and what `backing.py` measures. Means over the datasets,
-which need exact depth and test views.
+Fits of 10,000 Gaussians to 12 views spread evenly in azimuth, with and without the backing, and
+with what else could keep a
+model opaque: alpha as a fourth channel of a pixel, with several weights (sigma_rgb /
+sigma_alpha)^2; opacities held to the prior more tightly, or not learned; Gaussians ten times
+thinner, as in 2D Gaussian splatting. Measured on the test views, drawn
+whole as any viewer does: PSNR in the full frame and inside the rock, and what `backing.py`
+measures. Means over the datasets, which need exact depth and test views.
 """
 
 from __future__ import annotations
@@ -19,19 +22,19 @@ import numpy as np
 from backing import measure
 
 from mgs import runtime
-from mgs.active.criteria import PRIOR_STD, lam_by_kind, regularisation
-from mgs.active.fitting import fit
-from mgs.active.pose_policies import seed_views
-from mgs.active.settings import TrainSettings
-from mgs.active.stations import psnr_measure
 from mgs.data.dataset import load_dataset, target_of
 from mgs.files import write_json
+from mgs.fit.fitting import fit
+from mgs.fit.settings import TrainSettings
 from mgs.gaussians import Gaussians
 from mgs.plotting import STYLE, new_figure, save_figure
+from mgs.policy.criteria import PRIOR_STD, lam_by_kind, regularisation
+from mgs.policy.poses import seed_views
 from mgs.prior.build import build_prior
 from mgs.prior.initial import initial_gaussians
 from mgs.prior.settings import PriorSettings
 from mgs.provenance import command_line, versions
+from mgs.run.stations import psnr_measure
 from mgs.splat import ListCache, groups
 
 VIEWS, GAUSSIANS = 12, 10_000
@@ -51,7 +54,9 @@ def thinner(start: Gaussians, factor: float) -> Gaussians:
     return replace(start, log_scales=scales)
 
 
-def record(root: Path, backing: float, what: str, weight: float, factors: Mapping[str, float]) -> dict[str, Any]:
+def record(
+    root: Path, backing: float, what: str, weight: float, factors: Mapping[str, float]
+) -> dict[str, Any]:
     """One fit, and what it is like on the test views."""
     dataset, cache = load_dataset(root), ListCache()
     prior, _ = build_prior(dataset, PriorSettings(gaussians=GAUSSIANS, backing=backing))
@@ -61,24 +66,43 @@ def record(root: Path, backing: float, what: str, weight: float, factors: Mappin
     start = thinner(start, factors["thinner"]) if "thinner" in factors else start
     taus = {kind: tau * factors.get(kind, 1.0) for kind, tau in PRIOR_STD.items()}
     lam = lam_by_kind(regularisation(groups(0), prior_std=taus), groups(0))
-    cameras, targets = [frame.camera for frame in frames], [target_of(frame, True) for frame in frames]
+    cameras, targets = (
+        [frame.camera for frame in frames],
+        [target_of(frame, True) for frame in frames],
+    )
     settings = TrainSettings(alpha_weight=weight, tolerance=0.0)
     model = fit(start, cameras, targets, settings, cache=cache, start=start, lam=lam).gaussians
     tests = dataset.test_views()
-    found = measure(model, tests.frames, prior.spacing) | {"psnr": psnr_measure(tests, ListCache())(model, [])["psnr"]}
-    return {"dataset": root.as_posix(), "backing": backing, "what": what, "alpha_weight": weight} | found
+    found = measure(model, tests.frames, prior.spacing) | {
+        "psnr": psnr_measure(tests, ListCache())(model, [])["psnr"]
+    }
+    return {
+        "dataset": root.as_posix(),
+        "backing": backing,
+        "what": what,
+        "alpha_weight": weight,
+    } | found
 
 
 def means(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The records of each setting as one, numbers as means over the datasets; "gain" and "gain_inside": least and most by which
-    PSNR is above that of weight 0 on the same dataset, dB."""
-    plain = {(r["dataset"], r["backing"]): r for r in records if r["what"].startswith("alpha") and not r["alpha_weight"]}
+    """The records of each setting as one, numbers as means over the datasets; "gain" and
+    "gain_inside": least and most by which PSNR is above that of weight 0 on the same dataset,
+    dB."""
+    plain = {
+        (r["dataset"], r["backing"]): r
+        for r in records
+        if r["what"].startswith("alpha") and not r["alpha_weight"]
+    }
     together: dict[tuple[float, str], list[dict[str, Any]]] = {}
     for r in records:
         together.setdefault((r["backing"], r["what"]), []).append(r)
     rows = []
     for same in together.values():
-        row = {key: float(np.mean([r[key] for r in same])) for key, value in same[0].items() if isinstance(value, float)}
+        row = {
+            key: float(np.mean([r[key] for r in same]))
+            for key, value in same[0].items()
+            if isinstance(value, float)
+        }
         for name, key in (("gain", "psnr"), ("gain_inside", "psnr_inside")):
             gains = [r[key] - plain[r["dataset"], r["backing"]][key] for r in same]
             row[name] = [min(gains), max(gains)]
@@ -98,14 +122,28 @@ def draw(path: Path, records: list[dict[str, Any]]) -> None:
             line = [r for r in of if r["what"].startswith("alpha")]
             name = "all on the surface" if backing == 0 else "a third behind it"
             x, y = "too_deep", "psnr_inside"
-            axis.plot([100 * r[x] for r in line], [r[y] for r in line], "o-", color=colour, label=f"{name}, alpha weight")
+            axis.plot(
+                [100 * r[x] for r in line],
+                [r[y] for r in line],
+                "o-",
+                color=colour,
+                label=f"{name}, alpha weight",
+            )
             for r in line:
                 axis.annotate(
-                    f"{r['alpha_weight']:g}", (100 * r[x], r[y]), xytext=(4, 4), textcoords="offset points", fontsize=8
+                    f"{r['alpha_weight']:g}",
+                    (100 * r[x], r[y]),
+                    xytext=(4, 4),
+                    textcoords="offset points",
+                    fontsize=8,
                 )
             for r, marker in zip((r for r in of if r not in line), "sv*", strict=True):
                 axis.plot(100 * r[x], r[y], marker, color=colour, label=f"{name}, {r['what']}")
-        axis.set(xlabel="pixels more than 5 cm too deep (%)", ylabel="PSNR inside the rock, test views (dB)", xscale="log")
+        axis.set(
+            xlabel="pixels more than 5 cm too deep (%)",
+            ylabel="PSNR inside the rock, test views (dB)",
+            xscale="log",
+        )
         axis.xaxis.set_major_formatter("{x:g}")
         figure.legend(loc="outside right center", fontsize=8)
         save_figure(figure, path)
@@ -115,7 +153,9 @@ def main(prefix: Path, roots: list[Path]) -> None:
     """Measure, write, draw."""
     runtime.start()
     records = []
-    tried = [(f"alpha, weight {weight:g}", weight, {}) for weight in WEIGHTS] + [(k, 0.0, v) for k, v in OTHERS.items()]
+    tried = [(f"alpha, weight {weight:g}", weight, {}) for weight in WEIGHTS] + [
+        (k, 0.0, v) for k, v in OTHERS.items()
+    ]
     for root in roots:
         for backing in BACKINGS:
             for what, weight, factors in tried:

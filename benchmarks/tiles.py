@@ -1,10 +1,12 @@
-"""How much the order of memory is worth: time of the kernels against the size of the tiles they are walked in.
+"""How much the order of memory is worth: time of the kernels against the size of the tiles they are
+walked in.
 
     python benchmarks/tiles.py docs/benchmarks/tiles [GAUSSIANS]
 
-Writes PREFIX.png and PREFIX.json. The scene of `mgs bench splat`, 100,000 Gaussians at 640x480, warm lists. One tile for the
-whole image is walking by length of the lists alone; "splats anywhere" is that with the splats where the user had them in
-memory. Medians of rounds in which every setting takes its turn.
+Writes PREFIX.png and PREFIX.json. The scene of `mgs bench splat`, 100,000 Gaussians at 640x480,
+warm lists. One tile for the whole image is walking by length of the lists alone; "splats anywhere"
+is that with the splats where the user had them in memory. Medians of rounds in which every setting
+takes its turn.
 """
 
 import sys
@@ -43,9 +45,17 @@ def anywhere(lists: blocks.BlockLists) -> blocks.BlockLists:
     start, end = (np.asarray(a).astype(np.int64)[place] for a in (lists.slot_start, lists.slot_end))
     moved_end = np.cumsum(end - start)
     moved_start, pair = moved_end - (end - start), np.asarray(lists.pair).copy()
-    pair[: moved_end[-1]] = pair[np.repeat(start - moved_start, end - start) + np.arange(moved_end[-1])]
+    pair[: moved_end[-1]] = pair[
+        np.repeat(start - moved_start, end - start) + np.arange(moved_end[-1])
+    ]
     splat = np.argsort(place)[np.asarray(lists.splat)]
-    arrays = {"place": np.arange(len(place)), "splat": splat, "pair": pair, "slot_start": moved_start, "slot_end": moved_end}
+    arrays = {
+        "place": np.arange(len(place)),
+        "splat": splat,
+        "pair": pair,
+        "slot_start": moved_start,
+        "slot_end": moved_end,
+    }
     return replace(lists, **{name: mi.UInt32(values) for name, values in arrays.items()})
 
 
@@ -77,8 +87,12 @@ def main(prefix: str, n: int = 100_000) -> None:
                 dr.sync_thread()
                 if i >= WARM_UP:
                     seconds[name][setting].append(time.perf_counter() - start)
-    median = {name: {str(k): float(np.median(v)) for k, v in row.items()} for name, row in seconds.items()}
-    relative = {name: {k: v / row[str(chosen)] for k, v in row.items()} for name, row in median.items()}
+    median = {
+        name: {str(k): float(np.median(v)) for k, v in row.items()} for name, row in seconds.items()
+    }
+    relative = {
+        name: {k: v / row[str(chosen)] for k, v in row.items()} for name, row in median.items()
+    }
     for name, row in relative.items():
         print(f"{name:14}", "  ".join(f"{k}: {v:.2f}" for k, v in row.items()))
     found = {
@@ -93,11 +107,19 @@ def main(prefix: str, n: int = 100_000) -> None:
     with matplotlib.rc_context(STYLE):
         figure = new_figure(4.6, 3.4)
         axis = figure.subplots()
-        for (name, row), colour in zip(relative.items(), ("#0072b2", "#d55e00", "#009e73"), strict=True):
-            axis.semilogx(TILES, [row[str(t)] for t in TILES], "o-", base=2, color=colour, label=name)
+        for (name, row), colour in zip(
+            relative.items(), ("#0072b2", "#d55e00", "#009e73"), strict=True
+        ):
+            axis.semilogx(
+                TILES, [row[str(t)] for t in TILES], "o-", base=2, color=colour, label=name
+            )
             axis.axhline(row["splats anywhere"], color=colour, ls=":")
         axis.plot([], [], ":", color="#444444", label="splats anywhere in memory")
-        axis.set(xlabel="blocks across a tile (128: the whole image)", ylabel=f"time, relative to {chosen}", ylim=(0.9, 2.15))
+        axis.set(
+            xlabel="blocks across a tile (128: the whole image)",
+            ylabel=f"time, relative to {chosen}",
+            ylim=(0.9, 2.15),
+        )
         axis.set_xticks(TILES, [str(t) for t in TILES])
         axis.legend(fontsize=8)
         save_figure(figure, f"{prefix}.png")

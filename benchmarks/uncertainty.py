@@ -1,6 +1,7 @@
 """How well do runs predict their errors? `python benchmarks/uncertainty.py OUT.json RUN...`
 
-Collects what `mgs diagnose RUN --calibrate` finds in several finished runs, and makes it where it is not there yet.
+Collects what `mgs diagnose RUN --calibrate` finds in several finished runs, and makes it where it
+is not there yet.
 """
 
 from __future__ import annotations
@@ -24,7 +25,15 @@ def main(out: Path, *runs: Path) -> None:
             calibrate_run(run)
         records.append(read_json(made))
         print(run, flush=True)
-    write_json(out, {"command": command_line(), "machine": runtime.processor(), "versions": versions(), "records": records})
+    write_json(
+        out,
+        {
+            "command": command_line(),
+            "machine": runtime.processor(),
+            "versions": versions(),
+            "records": records,
+        },
+    )
 
 
 if __name__ == "__main__":

@@ -1,12 +1,15 @@
-"""Variants of the core that were tried, those that lost too: speed against accuracy. `python benchmarks/variants.py PREFIX`
+"""Variants of the core that were tried, those that lost too: speed against accuracy. `python
+benchmarks/variants.py PREFIX`
 
-Writes PREFIX.json and PREFIX.png. Every variant replaces constants or functions of `mgs.splat` in a process of its own. Timed
-are an image of a view never seen before and of one seen before, an image with its gradient, the exact Fisher information and
-its blocks, of 100,000 Gaussians at 640x480, in rounds in which each variant has its turn. A ratio is the fastest of the
-variant's rounds over the fastest of the core as it is: on a host that others use, too, these were disturbed least; spread is
-the slowest round of the core as it is over its fastest. Errors are the largest over all entries, relative to the largest entry
-of the float64 oracle (`mgs.splat.reference`), of the worst kind of parameter (`mgs.study.chart.core.error`), on SMALL. Whether
-the order of instructions matters to Mitsuba's own kernels is told by the peer of `mgs bench splat`. Let nothing else run.
+Writes PREFIX.json and PREFIX.png. Every variant replaces constants or functions of `mgs.splat` in a
+process of its own. Timed are an image of a view never seen before and of one seen before, an image
+with its gradient, the exact Fisher information and its blocks, of 100,000 Gaussians at 640x480, in
+rounds in which each variant has its turn. A ratio is the fastest of the variant's rounds over the
+fastest of the core as it is: on a host that others use, too, these were disturbed least; spread is
+the slowest round of the core as it is over its fastest. Errors are the largest over all entries,
+relative to the largest entry of the float64 oracle (`mgs.splat.reference`), of the worst kind of
+parameter (`mgs.study.chart.core.error`), on SMALL. Whether the order of instructions matters to
+Mitsuba's own kernels is told by the peer of `mgs bench splat`. Let nothing else run.
 """
 
 from __future__ import annotations
@@ -45,7 +48,8 @@ OPERATIONS = ("forward_cold", "forward_warm", "gradient_warm", "fisher_exact", "
 
 
 def put(**values: Any) -> None:
-    """Replace names of `mgs.splat` in every module that has them, but not in the oracle. Before the first kernel. Raises
+    """Replace names of `mgs.splat` in every module that has them, but not in the oracle. Before the
+    first kernel. Raises
     ValueError where no module has a name: what was meant would stay as it is."""
     missing = set(values)
     for name, module in list(sys.modules.items()):
@@ -58,15 +62,17 @@ def put(**values: Any) -> None:
 
 
 def block_size(width: int, height: int) -> None:
-    """Blocks of other pixels. Beyond 8x4 alphas cannot be carried from a block's centre to its corners."""
+    """Blocks of other pixels. Beyond 8x4 alphas cannot be carried from a block's centre to its
+    corners."""
     put(BLOCK_X=width, BLOCK_Y=height, PIXELS=width * height, CENTRE=width // 2, MIDDLE=height // 2)
     if width > 8:
         each_pixel_alone()
 
 
 def rows_of_alphas(position: str, each_pixel: bool, one_by_one: bool = False) -> Callable[..., Any]:
-    """`mgs.splat.walking.block_rows` with the offset of a block in another precision ("Float", "Float64"), with an exp2 at
-    every pixel or three in every row, or with each row made when it is asked for."""
+    """`mgs.splat.walking.block_rows` with the offset of a block in another precision ("Float",
+    "Float64"), with an exp2 at every pixel or three in every row, or with each row made when it is
+    asked for."""
     import mitsuba as mi
 
     from mgs.splat import walking
@@ -76,24 +82,40 @@ def rows_of_alphas(position: str, each_pixel: bool, one_by_one: bool = False) ->
     def rows(lane: Any, s: Any) -> Any:
         real = type(s.white_x)
         dx, dy = wide(lane.left) - wide(s.mean_x), wide(lane.top) - wide(s.mean_y)
-        corner, down, slant = real(wide(s.white_x) * (dx - wide(s.shear) * dy)), real(dy), s.white_x * real(s.shear)
+        corner, down, slant = (
+            real(wide(s.white_x) * (dx - wide(s.shear) * dy)),
+            real(dy),
+            s.white_x * real(s.shear),
+        )
         bend = walking.exp2(-2 * s.white_x * s.white_x)
 
         def made(j: int) -> Any:
             eta, first = s.white_y * (down + j), dr.fma(-slant, real(j), corner)
             xi = [dr.fma(s.white_x, real(i), first) for i in range(size)]
             row = dr.fma(-eta, eta, s.log2_opacity)
-            raw = [walking.exp2(dr.fma(-x, x, row)) for x in (xi if each_pixel else xi[middle : middle + 1])]
+            raw = [
+                walking.exp2(dr.fma(-x, x, row))
+                for x in (xi if each_pixel else xi[middle : middle + 1])
+            ]
             if not each_pixel:
                 raw = raw * size
-                for columns, sign in ((range(middle + 1, size), -1), (range(middle - 1, -1, -1), 1)):
+                for columns, sign in (
+                    (range(middle + 1, size), -1),
+                    (range(middle - 1, -1, -1), 1),
+                ):
                     step = s.white_x * dr.fma(real(2 * sign), xi[middle], -s.white_x)
-                    ratio = walking.exp2(dr.select(dr.fma(-xi[middle], xi[middle], row) > -120, step, -120))
+                    ratio = walking.exp2(
+                        dr.select(dr.fma(-xi[middle], xi[middle], row) > -120, step, -120)
+                    )
                     for i in columns:
                         raw[i], ratio = raw[i + sign] * ratio, ratio * bend
             return walking.Row(eta, xi, raw)
 
-        return Lazily(made, walking.BLOCK_Y) if one_by_one else [made(j) for j in range(walking.BLOCK_Y)]
+        return (
+            Lazily(made, walking.BLOCK_Y)
+            if one_by_one
+            else [made(j) for j in range(walking.BLOCK_Y)]
+        )
 
     return rows
 
@@ -141,12 +163,15 @@ def by_minimum() -> None:
 
 
 def local_arrays() -> None:
-    """What a lane's pixels carry along in arrays of its own, in memory, instead of in variables of the loop."""
+    """What a lane's pixels carry along in arrays of its own, in memory, instead of in variables of
+    the loop."""
     import mitsuba as mi
 
     from mgs.splat import walking
 
-    def walk(lists: Any, packed: Any, lane: Any, pixels: Any, visit: Any, together: int) -> tuple[Any, Any]:
+    def walk(
+        lists: Any, packed: Any, lane: Any, pixels: Any, visit: Any, together: int
+    ) -> tuple[Any, Any]:
         width, state = len(pixels[0]), dr.alloc_local(mi.Float, len(pixels) * len(pixels[0]))
 
         def read(state: Any) -> list[list[Any]]:
@@ -164,7 +189,9 @@ def local_arrays() -> None:
 
         write(state, pixels)
         start = mi.UInt32(lane.start)
-        pair, state, _ = dr.while_loop((start, state, start < lane.end), lambda i, state, alive: alive, body)
+        pair, state, _ = dr.while_loop(
+            (start, state, start < lane.end), lambda i, state, alive: alive, body
+        )
         return pair, read(state)
 
     put(_walk_until_done=walk)
@@ -193,7 +220,9 @@ def single_projection() -> None:
     """Projection, and the way from sums to entries, in single precision."""
     from mgs.splat import derivatives, information, projection
 
-    names = {f"{kind}64": kind for kind in ("Float", "Int", "UInt")} | {f"Vector{k}d": f"Vector{k}f" for k in (2, 3, 4)}
+    names = {f"{kind}64": kind for kind in ("Float", "Int", "UInt")} | {
+        f"Vector{k}d": f"Vector{k}f" for k in (2, 3, 4)
+    }
     projection.mi = derivatives.mi = information.mi = Renamed(**names)
 
 
@@ -216,8 +245,8 @@ def llvms_order() -> None:
 
 
 def in_llvms_order(call: Callable[..., Any], *arguments: Any) -> Any:
-    """As `in_new_process`, in LLVM's order of instructions. Kernels that Dr.Jit keeps on the disk may be in either order, so
-    this process has a folder of its own for them."""
+    """As `in_new_process`, in LLVM's order of instructions. Kernels that Dr.Jit keeps on the disk
+    may be in either order, so this process has a folder of its own for them."""
     with tempfile.TemporaryDirectory() as folder:
         before = os.environ.get(KERNELS)
         os.environ[KERNELS] = folder
@@ -264,7 +293,8 @@ VARIANTS: dict[str, tuple[Callable[[], None], float | None]] = {
     "without what is not seen": (lambda: None, UNSEEN),
     "without what is hardly seen": (lambda: None, 1e-3),
 }
-"""By name: what is replaced, and where Gaussians are left out, the information (`unseen.UNSEEN`) below which they are."""
+"""By name: what is replaced, and where Gaussians are left out, the information (`unseen.UNSEEN`)
+below which they are."""
 
 
 def measure(name: str, with_errors: bool) -> dict[str, float]:
@@ -291,7 +321,11 @@ def seen(where: Scene, least: float | None) -> np.ndarray:
 def in_full(where: Scene, least: float | None, what: str) -> np.ndarray:
     """An image, a gradient or information of the Gaussians that are drawn; zeros for the others."""
     calls: dict[str, Callable[[Scene], Call]]
-    calls = {"image": image, "gradient": gradient, "diagonal": partial(information, estimator="exact")}
+    calls = {
+        "image": image,
+        "gradient": gradient,
+        "diagonal": partial(information, estimator="exact"),
+    }
     drawn = seen(where, least)
     found = calls[what](replace(where, gaussians=where.gaussians[drawn]))()
     if what == "image":
@@ -305,18 +339,37 @@ def chart(path: Path, rows: list[dict[str, Any]]) -> None:
     """Times over that of the core as it is, against errors."""
     import matplotlib
 
-    titles = {"image": "image", "gradient": "image and gradient", "diagonal": "exact Fisher information"}
+    titles = {
+        "image": "image",
+        "gradient": "image and gradient",
+        "diagonal": "exact Fisher information",
+    }
     with matplotlib.rc_context(STYLE):
         figure = new_figure(11, 4.6)
         axes = figure.subplots(1, 3, sharey=True)
         for ax, (what, title) in zip(axes, titles.items(), strict=True):
             for number, row in enumerate(rows):
-                style = {"marker": "ov^<>sDPX*"[number % 10], "color": COLOURS[number % 7], "label": row["name"]}
-                ax.plot(row["ratios"][TIMED[what]], row["errors"][what], linestyle="none", markersize=6, **style)
+                style = {
+                    "marker": "ov^<>sDPX*"[number % 10],
+                    "color": COLOURS[number % 7],
+                    "label": row["name"],
+                }
+                ax.plot(
+                    row["ratios"][TIMED[what]],
+                    row["errors"][what],
+                    linestyle="none",
+                    markersize=6,
+                    **style,
+                )
             ax.axvline(1, color="0.8", linewidth=0.8, zorder=0)
             ax.set(yscale="log", title=title, xlabel="time over that of the core as it is")
         axes[0].set_ylabel("largest error over largest entry")
-        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=9, frameon=False)
+        figure.legend(
+            *axes[0].get_legend_handles_labels(),
+            loc="outside right center",
+            fontsize=9,
+            frameon=False,
+        )
         save_figure(figure, path)
 
 
@@ -331,13 +384,32 @@ def main(prefix: str) -> None:
             print(name, runs[name][-1], flush=True)
     rows = []
     for name, found in runs.items():
-        ratios = {key: min(run[key] for run in found) / min(run[key] for run in runs["as it is"]) for key in OPERATIONS}
-        rows.append({"name": name, "ratios": ratios, "errors": {what: found[0][f"error_{what}"] for what in TIMED}})
+        ratios = {
+            key: min(run[key] for run in found) / min(run[key] for run in runs["as it is"])
+            for key in OPERATIONS
+        }
+        rows.append(
+            {
+                "name": name,
+                "ratios": ratios,
+                "errors": {what: found[0][f"error_{what}"] for what in TIMED},
+            }
+        )
     spread = {
-        key: max(run[key] for run in base) / min(run[key] for run in base) for key in OPERATIONS for base in [runs["as it is"]]
+        key: max(run[key] for run in base) / min(run[key] for run in base)
+        for key in OPERATIONS
+        for base in [runs["as it is"]]
     }
-    made = {"command": command_line(), "machine": runtime.processor(), "versions": versions(), "rounds": ROUNDS}
-    peer = {name: {k: v for k, v in runs[name][0].items() if k.startswith("volprim")} for name in ("as it is", LLVMS_ORDER)}
+    made = {
+        "command": command_line(),
+        "machine": runtime.processor(),
+        "versions": versions(),
+        "rounds": ROUNDS,
+    }
+    peer = {
+        name: {k: v for k, v in runs[name][0].items() if k.startswith("volprim")}
+        for name in ("as it is", LLVMS_ORDER)
+    }
     made |= {"spread": spread, "rows": rows, "peer": peer}
     write_json(Path(f"{prefix}.json"), made)
     chart(Path(f"{prefix}.png"), rows)

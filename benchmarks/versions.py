@@ -1,12 +1,13 @@
 """Two versions of mgs on one machine, in turn. `python benchmarks/versions.py OUT.json OLD NEW RUN`
 
-OLD, NEW: folders of two checkouts (`git worktree add`), with the packages of this environment. Each round starts a process for
-either version, which times the operations of `mgs.bench.core.time_core` on the same 100,000 Gaussians in 640x480, and draws
-1,000 of them in 64x48. Compared are the medians of the rounds, and the fastest of either version: on a host that others use,
-too, rounds differ by more than the versions do, and the fastest are those that were disturbed least. What it is worth to leave
-out what an image does not see (`benchmarks/unseen.py`): RUN is the folder of a run. The old version draws its model whole in
-the first view of its dataset, and the new one without what that view does not see; told is the difference that this makes to
-the image. Let nothing else run.
+OLD, NEW: folders of two checkouts (`git worktree add`), with the packages of this environment. Each
+round starts a process for either version, which times the operations of `mgs.bench.core.time_core`
+on the same 100,000 Gaussians in 640x480, and draws 1,000 of them in 64x48. Compared are the medians
+of the rounds, and the fastest of either version: on a host that others use, too, rounds differ by
+more than the versions do, and the fastest are those that were disturbed least. What it is worth to
+leave out what an image does not see (`benchmarks/unseen.py`): RUN is the folder of a run. The old
+version draws its model whole in the first view of its dataset, and the new one without what that
+view does not see; told is the difference that this makes to the image. Let nothing else run.
 """
 
 from __future__ import annotations
@@ -29,9 +30,21 @@ from mgs.provenance import command_line, versions
 
 ROUNDS = 16
 
-TARGETS = {"forward_warm": 0.6, "forward_cold": 0.5, "gradient_warm": 0.6, "fisher_exact": 0.6, "tiny": 1.0}
-CULLED_TARGETS = {"forward_warm": 0.35, "forward_cold": 0.4, "gradient_warm": 0.35, "fisher_exact": 0.35}
-"""Time over that of commit 55789c2 that this project asks of itself, with all Gaussians and without those not seen."""
+TARGETS = {
+    "forward_warm": 0.6,
+    "forward_cold": 0.5,
+    "gradient_warm": 0.6,
+    "fisher_exact": 0.6,
+    "tiny": 1.0,
+}
+CULLED_TARGETS = {
+    "forward_warm": 0.35,
+    "forward_cold": 0.4,
+    "gradient_warm": 0.35,
+    "fisher_exact": 0.35,
+}
+"""Time over that of commit 55789c2 that this project asks of itself, with all Gaussians and without
+those not seen."""
 
 WORKER = """
 import json, sys
@@ -56,22 +69,35 @@ print(json.dumps({key: found[key] for key in found if not key.endswith(("pairs",
 
 
 def scenes(folder: Path, run: Path) -> tuple[list[Path], dict[str, float]]:
-    """Write the scenes: arrays of the Gaussians and of a camera; the model of a run comes last, whole and without what is not
-    seen. Also how many are seen, and what the others are to the image, dB."""
-    from mgs.active.run_folder import read_settings
+    """Write the scenes: arrays of the Gaussians and of a camera; the model of a run comes last,
+    whole and without what is not seen. Also how many are seen, and what the others are to the
+    image, dB."""
     from mgs.bench.core import surface_camera, surface_gaussians
     from mgs.data.dataset import load_dataset
+    from mgs.run.folder import read_settings
     from mgs.splat import as_drjit, fisher, render
     from mgs.splat_ply import read_ply
 
-    large, small, whole = surface_gaussians(100_000), surface_gaussians(1_000), read_ply(run / "gaussians.ply")
+    large, small, whole = (
+        surface_gaussians(100_000),
+        surface_gaussians(1_000),
+        read_ply(run / "gaussians.ply"),
+    )
     first = load_dataset(read_settings(run).dataset).frames[0].camera
     seen = whole[(fisher(whole, first) > UNSEEN).any(axis=1)]
     images = [np.asarray(render(as_drjit(model), first).rgb) for model in (whole, seen)]
-    cameras, paths = [surface_camera(large, 640, 480), surface_camera(small, 64, 48), first, first], []
+    cameras, paths = (
+        [surface_camera(large, 640, 480), surface_camera(small, 64, 48), first, first],
+        [],
+    )
     for model, view in zip((large, small, whole, seen), cameras, strict=True):
         paths.append(folder / f"{len(paths)}.npz")
-        arrays = {"K": view.K, "width": view.width, "height": view.height, "world_to_camera": view.world_to_camera}
+        arrays = {
+            "K": view.K,
+            "width": view.width,
+            "height": view.height,
+            "world_to_camera": view.world_to_camera,
+        }
         np.savez(paths[-1], **asdict(model), **arrays)
     psnr = float(-10 * np.log10(np.mean((images[0] - images[1]) ** 2)))
     return paths, {"gaussians": len(whole), "seen": len(seen), "psnr": psnr}
@@ -79,10 +105,17 @@ def scenes(folder: Path, run: Path) -> tuple[list[Path], dict[str, float]]:
 
 def measure(checkout: Path, paths: list[Path]) -> dict[str, float]:
     """Seconds by operation, of one process of the version in a checkout."""
-    kernels = paths[0].parent / checkout.name  # the same code, compiled by the two versions, may differ
-    environment = os.environ | {"PYTHONPATH": str(checkout.resolve()), "DRJIT_CACHE_DIR": str(kernels)}
+    kernels = (
+        paths[0].parent / checkout.name
+    )  # the same code, compiled by the two versions, may differ
+    environment = os.environ | {
+        "PYTHONPATH": str(checkout.resolve()),
+        "DRJIT_CACHE_DIR": str(kernels),
+    }
     arguments = [sys.executable, "-c", WORKER, *map(str, paths)]
-    done = subprocess.run(arguments, cwd=checkout, env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        arguments, cwd=checkout, env=environment, capture_output=True, text=True, check=True
+    )
     found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
     return found
 
@@ -103,9 +136,22 @@ def main(out: Path, old: Path, new: Path, run: Path) -> None:
             for name, checkout, model in (("old", old, whole), ("new", new, seen)):
                 runs[name].append(measure(checkout, [large, small, model]))
                 print(name, runs[name][-1], flush=True)
-    medians = {name: {key: float(np.median([run[key] for run in found])) for key in found[0]} for name, found in runs.items()}
-    made: dict[str, Any] = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
-    made |= {"old": commit(old), "new": commit(new), "rounds": ROUNDS, "seconds": medians, "culled": culled}
+    medians = {
+        name: {key: float(np.median([run[key] for run in found])) for key in found[0]}
+        for name, found in runs.items()
+    }
+    made: dict[str, Any] = {
+        "command": command_line(),
+        "machine": runtime.processor(),
+        "versions": versions(),
+    }
+    made |= {
+        "old": commit(old),
+        "new": commit(new),
+        "rounds": ROUNDS,
+        "seconds": medians,
+        "culled": culled,
+    }
     made |= {
         "targets": TARGETS | {f"culled {key}": value for key, value in CULLED_TARGETS.items()},
         "ratios": {},
@@ -114,7 +160,9 @@ def main(out: Path, old: Path, new: Path, run: Path) -> None:
     for key in medians["new"]:
         ratios = [b[key] / a[key] for a, b in zip(runs["old"], runs["new"], strict=True)]
         made["ratios"][key] = [min(ratios), float(np.median(ratios)), max(ratios)]
-        made["fastest"][key] = {name: min(run[key] for run in found) for name, found in runs.items()}
+        made["fastest"][key] = {
+            name: min(run[key] for run in found) for name, found in runs.items()
+        }
     write_json(out, made)
 
 

@@ -1,10 +1,12 @@
 """What the walks do in vain, and what could be saved of it: `python benchmarks/wasted.py OUT.json`.
 
-A register draws the lists of as many blocks as it has lanes, the k-th pair of each at the same time. Counted on the scene of
-`mgs bench splat`, with nothing timed: pixels that a pair evaluates and does not draw (alpha below 1/255); rows of a block that
-a splat does not reach, and those that none of the splats reaches which the register draws at that time, so that it could leave
-them out; pairs whose splat another lane draws at that time, so that their sums could be merged before they are stored; and
-lanes that wait for the longest list of their register. That pixels are finished early is left out.
+A register draws the lists of as many blocks as it has lanes, the k-th pair of each at the same
+time. Counted on the scene of `mgs bench splat`, with nothing timed: pixels that a pair evaluates
+and does not draw (alpha below 1/255); rows of a block that a splat does not reach, and those that
+none of the splats reaches which the register draws at that time, so that it could leave them out;
+pairs whose splat another lane draws at that time, so that their sums could be merged before they
+are stored; and lanes that wait for the longest list of their register. That pixels are finished
+early is left out.
 """
 
 from __future__ import annotations
@@ -29,10 +31,16 @@ GAUSSIANS, WIDTH, HEIGHT = 100_000, 640, 480
 LANES = (16, 8)
 
 
-def drawn_pixels(splats: Splats, lists: BlockLists, lane: np.ndarray, pair: np.ndarray) -> np.ndarray:
-    """[M, BLOCK_Y, BLOCK_X] which pixels of its block each pair draws. lane: [M] whose list it is in; pair: [M] its number."""
+def drawn_pixels(
+    splats: Splats, lists: BlockLists, lane: np.ndarray, pair: np.ndarray
+) -> np.ndarray:
+    """[M, BLOCK_Y, BLOCK_X] which pixels of its block each pair draws. lane: [M] whose list it is
+    in; pair: [M] its number."""
     gaussian = np.argsort(np.asarray(lists.place))[np.asarray(lists.splat)[pair]]
-    block, across = np.asarray(lists.block).astype(np.int64)[lane], int(np.asarray(lists.blocks_x)[0])
+    block, across = (
+        np.asarray(lists.block).astype(np.int64)[lane],
+        int(np.asarray(lists.blocks_x)[0]),
+    )
     mean_x, mean_y, shear, white_x, white_y, log2_opacity = (
         np.asarray(getattr(splats, name), np.float64)[gaussian]
         for name in ("mean_x", "mean_y", "shear", "white_x", "white_y", "log2_opacity")
@@ -46,8 +54,11 @@ def drawn_pixels(splats: Splats, lists: BlockLists, lane: np.ndarray, pair: np.n
     return drawn
 
 
-def counted(lists: BlockLists, rows: np.ndarray, lane: np.ndarray, pair: np.ndarray, lanes: int) -> dict[str, float]:
-    """What registers of so many lanes could leave out. rows: [M, BLOCK_Y] which rows each pair reaches."""
+def counted(
+    lists: BlockLists, rows: np.ndarray, lane: np.ndarray, pair: np.ndarray, lanes: int
+) -> dict[str, float]:
+    """What registers of so many lanes could leave out. rows: [M, BLOCK_Y] which rows each pair
+    reaches."""
     start, end = (np.asarray(a).astype(np.int64) for a in (lists.start, lists.end))
     register, turn = lane // lanes, pair - start[lane]
     padded = np.pad(end - start, (0, -len(start) % lanes)).reshape(-1, lanes)

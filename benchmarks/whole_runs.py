@@ -1,10 +1,12 @@
-"""Whole runs of two versions of mgs, stage by stage. `python benchmarks/whole_runs.py OUT.json WORK OLD NEW DATASET:N:BUDGET`
+"""Whole runs of two versions of mgs, stage by stage. `python benchmarks/whole_runs.py OUT.json WORK
+OLD NEW DATASET:N:BUDGET`
 
-OLD, NEW: folders of two checkouts (`git worktree add`), with the packages of this environment. For every dataset, each version
-builds its own prior of N Gaussians, then runs choose BUDGET views beyond four seeds. The runs are kept in WORK, below the name
-of the folder that the dataset lies in; one that has ended is not made again. Seconds of a stage are summed over all steps;
-measuring the model is not counted. All models are measured on the test views, by the version that runs this program. Let
-nothing else run.
+OLD, NEW: folders of two checkouts (`git worktree add`), with the packages of this environment. For
+every dataset, each version builds its own prior of N Gaussians, then runs choose BUDGET views
+beyond four seeds. The runs are kept in WORK, below the name of the folder that the dataset lies in;
+one that has ended is not made again. Seconds of a stage are summed over all steps; measuring the
+model is not counted. All models are measured on the test views, by the version that runs this
+program. Let nothing else run.
 """
 
 from __future__ import annotations
@@ -45,7 +47,10 @@ RUNS = {
     "d-optimal, 5 at a time": ("new", [*COLOURS, "--policy", "d-optimal", "--batch", "5"]),
     "coverage, 5 at a time": ("new", [*COLOURS, "--policy", "coverage", "--batch", "5"]),
     "uniform, 5 at a time": ("new", [*COLOURS, "--policy", "uniform", "--batch", "5"]),
-    "directional-i, all at once": ("new", [*COLOURS, "--policy", "directional-i", "--batch", "BUDGET"]),
+    "directional-i, all at once": (
+        "new",
+        [*COLOURS, "--policy", "directional-i", "--batch", "BUDGET"],
+    ),
 }
 """Runs by name: which version, and its options."""
 
@@ -60,7 +65,8 @@ def mgs(checkout: Path, *arguments: Any) -> float:
 
 
 def record(run: Path, dataset: Path) -> dict[str, Any]:
-    """Seconds by stage of a run that has ended, its fits' passes, and what its model is like on the test views."""
+    """Seconds by stage of a run that has ended, its fits' passes, and what its model is like on the
+    test views."""
     steps = [json.loads(line) for line in (run / "steps.jsonl").read_text().splitlines()]
     stages: dict[str, float] = {}
     for step in steps:
@@ -72,10 +78,18 @@ def record(run: Path, dataset: Path) -> dict[str, Any]:
     tests = load_dataset(dataset).test_views().frames
     measured = evaluate(read_ply(run / "gaussians.ply"), [], [], test_frames=tests)["test"]
     quality = {key: measured[key] for key in ("psnr", "psnr_mask", "ssim")}
-    return {"images": steps[-1]["images"], "fits": len(fits), "passes": passes, "seconds": stages, **quality}
+    return {
+        "images": steps[-1]["images"],
+        "fits": len(fits),
+        "passes": passes,
+        "seconds": stages,
+        **quality,
+    }
 
 
-def study(work: Path, checkouts: dict[str, Path], dataset: Path, gaussians: str, budget: str) -> list[dict[str, Any]]:
+def study(
+    work: Path, checkouts: dict[str, Path], dataset: Path, gaussians: str, budget: str
+) -> list[dict[str, Any]]:
     """A record for each of RUNS."""
     records = []
     for name, (version, options) in RUNS.items():
@@ -84,7 +98,18 @@ def study(work: Path, checkouts: dict[str, Path], dataset: Path, gaussians: str,
             mgs(checkouts[version], "prior", dataset, "--gaussians", gaussians, "--out", prior)
         if not (folder / "gaussians.ply").is_file():
             given = [budget if option == "BUDGET" else option for option in options]
-            mgs(checkouts[version], "nbv", dataset, "--prior", prior, "--budget", budget, *given, "--out", folder)
+            mgs(
+                checkouts[version],
+                "nbv",
+                dataset,
+                "--prior",
+                prior,
+                "--budget",
+                budget,
+                *given,
+                "--out",
+                folder,
+            )
         found = {"gaussians": int(gaussians), "run": name, **record(folder, dataset)}
         total = sum(found["seconds"].values())
         print(f"{dataset} {name}: {total:.0f} s, {found['psnr']:.2f} dB", flush=True)
@@ -97,7 +122,13 @@ def main(out: Path, work: Path, old: Path, new: Path, datasets: list[str]) -> No
     runtime.start()
     records = []
     for dataset, gaussians, budget in (given.rsplit(":", 2) for given in datasets):
-        records += study(work / Path(dataset).parent.name, {"old": old, "new": new}, Path(dataset), gaussians, budget)
+        records += study(
+            work / Path(dataset).parent.name,
+            {"old": old, "new": new},
+            Path(dataset),
+            gaussians,
+            budget,
+        )
     made = {"command": command_line(), "machine": runtime.processor(), "versions": versions()}
     write_json(out, made | {"old": commit(old), "new": commit(new), "records": records})
 

@@ -1,13 +1,15 @@
 """mgs: active Gaussian splatting with exact Fisher information, on Mitsuba 3 and Dr.Jit.
 
-`import mgs` loads nothing else: each public name is loaded when it is first used, and Mitsuba's variant is set (`llvm_ad_rgb`,
-where none is set) when something first computes with it.
+`import mgs` loads nothing else: each public name is loaded when it is first used, and Mitsuba's
+variant is set (`llvm_ad_rgb`, where none is set) when something first computes with it.
 
-Arrays: everything takes and gives NumPy arrays, with one exception. `render` and `jvp` give Dr.Jit tensors, because
-`dr.backward` has to find the way back from an image to the Gaussians; `numpy.asarray` turns them into arrays. Gaussians may
-have NumPy or Dr.Jit fields wherever they are taken (`as_drjit`).
+Arrays: everything takes and gives NumPy arrays, with one exception. `render` and `jvp` give Dr.Jit
+tensors, because `dr.backward` has to find the way back from an image to the Gaussians;
+`numpy.asarray` turns them into arrays. Gaussians may have NumPy or Dr.Jit fields wherever they are
+taken (`as_drjit`).
 
-Lengths are metres, the world is +Z up, cameras are OpenCV's (x right, y down, z forward), colours are linear RGB.
+Lengths are metres, the world is +Z up, cameras are OpenCV's (x right, y down, z forward), colours
+are linear RGB.
 """
 
 from __future__ import annotations

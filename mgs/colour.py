@@ -1,4 +1,5 @@
-"""Colour. Inside the program it is linear RGB, in PNG files sRGB, and in Gaussians spherical harmonics of linear RGB."""
+"""Colour. Inside the program it is linear RGB, in PNG files sRGB, and in Gaussians spherical
+harmonics of linear RGB."""
 
 from __future__ import annotations
 
@@ -6,12 +7,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 SH_C0 = 0.28209479177387814
-"""Value of the spherical harmonic of degree 0, 1 / (2 sqrt(pi)). A Gaussian whose only coefficient is sh0 has the colour
+"""Value of the spherical harmonic of degree 0, 1 / (2 sqrt(pi)). A Gaussian whose only coefficient
+is sh0 has the colour
 0.5 + SH_C0 sh0: 3DGS adds 0.5, so that zero coefficients are grey."""
 
 
 def srgb_from_linear(linear: ArrayLike) -> NDArray[np.float32]:
-    """Linear RGB of any shape -> sRGB of the same shape (IEC 61966-2-1). Values outside [0,1] are clipped first."""
+    """Linear RGB of any shape -> sRGB of the same shape (IEC 61966-2-1). Values outside [0,1] are
+    clipped first."""
     c = np.clip(np.asarray(linear, np.float32), 0, 1)
     return np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055).astype(np.float32)
 

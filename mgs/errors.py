@@ -16,7 +16,8 @@ class InputError(ValueError):
 
 
 def row_named(table: Mapping[str, Row], name: str, what: str) -> Row:
-    """The row of a table that has this name. what: how the user calls the choice, as in --preset, for the message.
+    """The row of a table that has this name. what: how the user calls the choice, as in --preset,
+    for the message.
 
     Raises InputError, which lists the names of the table, where there is none.
     """

@@ -1,7 +1,8 @@
 """Reading and writing files and folders so that nothing is ever half-written.
 
-Output goes to a temporary name in the same folder and is renamed when it is complete. A process that is killed meanwhile leaves
-the temporary file behind, but never an incomplete file under the real name.
+Output goes to a temporary name in the same folder and is renamed when it is complete. A process
+that is killed meanwhile leaves the temporary file behind, but never an incomplete file under the
+real name.
 """
 
 from __future__ import annotations
@@ -24,10 +25,13 @@ from mgs.errors import InputError
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Context manager that gives a temporary path beside `path`, with the same suffix, for the block to write to.
+    """Context manager that gives a temporary path beside `path`, with the same suffix, for the
+    block to write to.
 
-    After the block it is renamed to `path`; if the block fails it is deleted. Folders that are missing above it are made.
-    Raises InputError if it cannot be written: no permission, a file where a folder is needed, a full disk.
+    After the block it is renamed to `path`; if the block fails it is deleted. Folders that are
+    missing above it are made.
+    Raises InputError if it cannot be written: no permission, a file where a folder is needed, a
+    full disk.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
@@ -44,11 +48,14 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 def _not_writable(path: Path, error: OSError) -> InputError:
     """The InputError for a path that cannot be written, out of what the operating system said."""
-    return InputError(f"{path}: cannot be written ({error.strerror or error}); choose a place you may write to, with room")
+    return InputError(
+        f"{path}: cannot be written ({error.strerror or error}); choose a place you may write to, with room"
+    )
 
 
 def check_writable(path: str | Path) -> Path:
-    """Check that a file or folder could be written at `path`, and return it as a Path. Nothing is made.
+    """Check that a file or folder could be written at `path`, and return it as a Path. Nothing is
+    made.
 
     Commands call it before long work. Raises InputError if it could not be written.
     """
@@ -63,7 +70,8 @@ def check_writable(path: str | Path) -> Path:
 
 @contextmanager
 def reading(path: Path, what: str = "file") -> Iterator[None]:
-    """Context manager around the reading of `path`: an OSError in its block becomes an InputError of one line.
+    """Context manager around the reading of `path`: an OSError in its block becomes an InputError
+    of one line.
 
     The line says that there is no such `what`, or why it cannot be read.
     """
@@ -72,11 +80,14 @@ def reading(path: Path, what: str = "file") -> Iterator[None]:
     except FileNotFoundError:
         raise InputError(f"{path}: no such {what}") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); give a file that can be read") from None
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror or error}); give a file that can be read"
+        ) from None
 
 
 def copy_file(source: Path, path: Path) -> None:
-    """Copy a file; the copy appears complete. Raises InputError if the source cannot be read or the copy cannot be written."""
+    """Copy a file; the copy appears complete. Raises InputError if the source cannot be read or the
+    copy cannot be written."""
     with reading(source):
         data = source.read_bytes()
     with atomic_path(path) as temporary:
@@ -84,15 +95,16 @@ def copy_file(source: Path, path: Path) -> None:
 
 
 def fingerprint(path: str | Path) -> dict[str, str]:
-    """Name (without folders) and SHA-256 hash of a file, by which it can be recognised later. Raises OSError."""
+    """Name (without folders) and SHA-256 hash of a file, by which it can be recognised later.
+    Raises OSError."""
     return {"name": Path(path).name, "sha256": hashlib.sha256(Path(path).read_bytes()).hexdigest()}
 
 
 def write_json(path: str | Path, data: Any) -> None:
     """Write data as JSON, indented, in UTF-8; the file appears complete.
 
-    Raises ValueError for NaN and infinities, for which JSON has no notation (write None instead), and InputError as
-    `atomic_path`.
+    Raises ValueError for NaN and infinities, for which JSON has no notation (write None instead),
+    and InputError as `atomic_path`.
     """
     text = json.dumps(data, indent=2, allow_nan=False)
     with atomic_path(path) as temporary:
@@ -100,9 +112,11 @@ def write_json(path: str | Path, data: Any) -> None:
 
 
 def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
-    """Write records as CSV, in UTF-8; the file appears complete. Returns its path. Raises InputError as `atomic_path`.
+    """Write records as CSV, in UTF-8; the file appears complete. Returns its path. Raises
+    InputError as `atomic_path`.
 
-    Columns are all keys, in the order in which they are met; what a record lacks, and None, is written as nothing.
+    Columns are all keys, in the order in which they are met; what a record lacks, and None, is
+    written as nothing.
     """
     columns = list(dict.fromkeys(key for row in rows for key in row))
     with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
@@ -113,14 +127,19 @@ def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
 
 
 def read_json(path: str | Path) -> Any:
-    """Contents of a JSON file. Raises InputError if it is missing, cannot be read or is not valid JSON."""
+    """Contents of a JSON file. Raises InputError if it is missing, cannot be read or is not valid
+    JSON."""
     path = Path(path)
     with reading(path):
         data = path.read_bytes()
     try:
-        return json.loads(data.decode("utf-8-sig"))  # some tools begin a file with a byte-order mark
+        return json.loads(
+            data.decode("utf-8-sig")
+        )  # some tools begin a file with a byte-order mark
     except (ValueError, RecursionError) as error:  # RecursionError: nested too deeply for Python
-        raise InputError(f"{path}: not valid JSON ({error}); the file is damaged, write it again") from None
+        raise InputError(
+            f"{path}: not valid JSON ({error}); the file is damaged, write it again"
+        ) from None
 
 
 def check_new_folder(path: str | Path) -> Path:
@@ -137,8 +156,8 @@ def check_new_folder(path: str | Path) -> Path:
 
 
 def new_folder(path: str | Path) -> Path:
-    """Make an output folder, and the folders above it; an empty one that exists is used. Raises InputError as
-    `check_new_folder`."""
+    """Make an output folder, and the folders above it; an empty one that exists is used. Raises
+    InputError as `check_new_folder`."""
     path = check_new_folder(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -149,10 +168,11 @@ def new_folder(path: str | Path) -> Path:
 
 @contextmanager
 def folder_or_nothing(path: str | Path) -> Iterator[Path]:
-    """Context manager that makes a new folder for its block. If the block fails, everything is again as before.
+    """Context manager that makes a new folder for its block. If the block fails, everything is
+    again as before.
 
-    That means: the folder and the parents that were made for it are removed, or, if there was an empty folder, it is emptied.
-    Raises InputError as `new_folder`.
+    That means: the folder and the parents that were made for it are removed, or, if there was an
+    empty folder, it is emptied. Raises InputError as `new_folder`.
     """
     path = check_new_folder(path)
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
@@ -173,10 +193,11 @@ def folder_or_nothing(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """Context manager that gives a temporary folder beside `path` for its block to fill; after the block it becomes `path`.
+    """Context manager that gives a temporary folder beside `path` for its block to fill; after the
+    block it becomes `path`.
 
-    So a folder named `path` is always complete, even if the process is killed; what a killed one left is removed here. Raises
-    InputError as `new_folder`.
+    So a folder named `path` is always complete, even if the process is killed; what a killed one
+    left is removed here. Raises InputError as `new_folder`.
     """
     path = check_new_folder(path).resolve()
     for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
@@ -191,7 +212,8 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
 
 def _is_running(process: str) -> bool:
-    """Whether there is another process of this id, or the text is none. (In a container every process may have the same id.)"""
+    """Whether there is another process of this id, or the text is none. (In a container every
+    process may have the same id.)"""
     try:
         if int(process) == os.getpid():
             return False
@@ -207,9 +229,9 @@ def _is_running(process: str) -> bool:
 def locked(folder: str | Path) -> Iterator[None]:
     """Context manager: while its block runs, no other process gets the lock of the same folder.
 
-    Raises InputError, naming the process, if another one holds the lock, and if the folder cannot be written. The lock is kept
-    by the operating system, on the file FOLDER/.lock. It ends when the process ends, also when that is killed: a file .lock
-    that is left over locks nothing.
+    Raises InputError, naming the process, if another one holds the lock, and if the folder cannot
+    be written. The lock is kept by the operating system, on the file FOLDER/.lock. It ends when the
+    process ends, also when that is killed: a file .lock that is left over locks nothing.
     """
     path = Path(folder) / ".lock"
     try:
@@ -225,7 +247,8 @@ def locked(folder: str | Path) -> Iterator[None]:
 
 
 def _lock(path: Path) -> TextIO:
-    """Open and lock the file, and write this process's id into it. Raises InputError if another process has locked it."""
+    """Open and lock the file, and write this process's id into it. Raises InputError if another
+    process has locked it."""
     while True:  # until the file that is locked is the one that stands under this name
         with ExitStack() as closed_on_failure:
             file = closed_on_failure.enter_context(open(path, "a+", encoding="ascii"))
@@ -233,12 +256,16 @@ def _lock(path: Path) -> TextIO:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 file.seek(0)
-                raise InputError(f"{path.parent}: process {file.read()} works on it; wait until it has ended") from None
+                raise InputError(
+                    f"{path.parent}: process {file.read()} works on it; wait until it has ended"
+                ) from None
             try:
                 ours = os.path.samestat(os.fstat(file.fileno()), os.stat(path))
             except FileNotFoundError:
                 ours = False
-            if ours:  # the process that had the lock before may have removed the file after we opened it
+            if (
+                ours
+            ):  # the process that had the lock before may have removed the file after we opened it
                 file.truncate(0)
                 print(os.getpid(), end="", file=file, flush=True)
                 closed_on_failure.pop_all()

@@ -1,5 +1,5 @@
-"""Memory: whether there is enough, results that are kept while there is room, sequences whose items are made when asked for,
-and arrays for Dr.Jit."""
+"""Memory: whether there is enough, results that are kept while there is room, sequences whose items
+are made when asked for, and arrays for Dr.Jit."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from mgs.errors import InputError
 Value = TypeVar("Value")
 
 IMAGE_BYTES = 1 << 30
-"""Most memory for arrays of one kind that are kept to be used again, bytes. Of images, as targets of a fit, these are 218 of
-640x480, or five of 12 megapixels. All others are read or computed again at every use."""
+"""Most memory for arrays of one kind that are kept to be used again, bytes. Of images, as targets
+of a fit, these are 218 of 640x480, or five of 12 megapixels. All others are read or computed again
+at every use."""
 
 
 LITTLE = 1 << 30
@@ -27,16 +28,19 @@ MEMORY_FILE = Path("/proc/meminfo")
 
 
 def check_room(needed: float, what: str, instead: str) -> None:
-    """Raises InputError where so many bytes for `what` are more than the system has to spare, with what to do `instead`: it
-    would end the process without a word. Systems that do not say what they have to spare are trusted. Memory that Dr.Jit keeps
-    for its next arrays is given back before anything is refused."""
+    """Raises InputError where so many bytes for `what` are more than the system has to spare, with
+    what to do `instead`: it would end the process without a word. Systems that do not say what they
+    have to spare are trusted. Memory that Dr.Jit keeps for its next arrays is given back before
+    anything is refused."""
     if needed <= LITTLE or needed <= _spare():
         return
     import drjit as dr  # here, since most who need this module need no Dr.Jit
 
     dr.flush_malloc_cache()
     if needed > (spare := _spare()):
-        raise InputError(f"{what} may take {needed / 2**30:,.1f} GiB, and {spare / 2**30:,.1f} GiB are free; {instead}")
+        raise InputError(
+            f"{what} may take {needed / 2**30:,.1f} GiB, and {spare / 2**30:,.1f} GiB are free; {instead}"
+        )
 
 
 def _spare() -> float:
@@ -49,21 +53,25 @@ def _spare() -> float:
 
 
 PADDING = 64
-"""Numbers that a kernel may read beyond the end of an array: it takes as many at once as fit into a register, 16 at most."""
+"""Numbers that a kernel may read beyond the end of an array: it takes as many at once as fit into a
+register, 16 at most."""
 
 
 ALIGNMENT = 64
-"""Bytes. Dr.Jit compiles one kernel for arrays whose addresses are multiples of this, and another where one is not."""
+"""Bytes. Dr.Jit compiles one kernel for arrays whose addresses are multiples of this, and another
+where one is not."""
 
 
 def padded(values: Any, dtype: Any = np.float32) -> np.ndarray:
-    """A copy of an array, of this type and contiguous, that begins at a multiple of ALIGNMENT, and behind which more of its
-    memory follows.
+    """A copy of an array, of this type and contiguous, that begins at a multiple of ALIGNMENT, and
+    behind which more of its memory follows.
 
-    Every array that Dr.Jit is to take over from NumPy must be one. Dr.Jit 1.5 does not copy it, and its kernels read a few
-    numbers beyond the end: where the memory ends there, which depends on sizes and on chance, the process dies. And where an
-    array happened to begin would decide which of two kernels is needed: with a hundred arrays, hardly ever one that was
-    compiled before.
+    Every array that Dr.Jit is to take over from NumPy must be one. Dr.Jit 1.5 does not copy it, and
+    its kernels read a few
+    numbers beyond the end: where the memory ends there, which depends on sizes and on chance, the
+    process dies. And where an
+    array happened to begin would decide which of two kernels is needed: with a hundred arrays,
+    hardly ever one that was compiled before.
     """
     values = np.asarray(values)
     memory = np.empty(values.size + PADDING + ALIGNMENT, dtype)
@@ -73,11 +81,15 @@ def padded(values: Any, dtype: Any = np.float32) -> np.ndarray:
     return copy
 
 
-def kept_within(budget: int, make: Callable[[int], Value], size: Callable[[Value], int]) -> Callable[[int], Value]:
-    """The function `make`, which keeps its results while their sizes sum to no more than `budget` bytes.
+def kept_within(
+    budget: int, make: Callable[[int], Value], size: Callable[[Value], int]
+) -> Callable[[int], Value]:
+    """The function `make`, which keeps its results while their sizes sum to no more than `budget`
+    bytes.
 
-    What comes later is made anew at every call. A fit goes through its images again and again in changing orders: a cache that
-    drops what was used longest ago (LRU) would then mostly drop what is needed next.
+    What comes later is made anew at every call. A fit goes through its images again and again in
+    changing orders: a cache that drops what was used longest ago (LRU) would then mostly drop what
+    is needed next.
     """
     kept: dict[int, Value] = {}
     held = 0
@@ -96,7 +108,8 @@ def kept_within(budget: int, make: Callable[[int], Value], size: Callable[[Value
 
 
 class Deferred(Sequence[Value]):
-    """A sequence of the results of get(key) for each of `keys`, called anew whenever an item is asked for."""
+    """A sequence of the results of get(key) for each of `keys`, called anew whenever an item is
+    asked for."""
 
     def __init__(self, keys: Sequence[int], get: Callable[[int], Value]) -> None:
         self.keys, self.get = keys, get

@@ -1,4 +1,5 @@
-"""How good a rendered view is: as an image (PSNR and SSIM, of sRGB values in [0,1]), and as a surface (alpha and depth).
+"""How good a rendered view is: as an image (PSNR and SSIM, of sRGB values in [0,1]), and as a
+surface (alpha and depth).
 
 And how well two rankings agree.
 """
@@ -13,8 +14,8 @@ from mgs.colour import srgb_from_linear
 from mgs.errors import InputError
 
 PSNR_LIMIT = 100.0
-"""Largest PSNR that is reported, dB: equal images, whose PSNR is infinite, have this one. For comparison: rounding to 8 bits is
-an error of 59 dB."""
+"""Largest PSNR that is reported, dB: equal images, whose PSNR is infinite, have this one. For
+comparison: rounding to 8 bits is an error of 59 dB."""
 
 SSIM_SIGMA = 1.5
 """Standard deviation of the Gaussian window of SSIM, pixels (Wang et al. 2004)."""
@@ -22,27 +23,39 @@ SSIM_SIGMA = 1.5
 SSIM_WINDOW = 11
 """Width and height of that window, pixels (Wang et al. 2004)."""
 
-METRICS = ("psnr", "ssim", "psnr_mask", "ssim_mask", "psnr_inside", "psnr_corrected", "psnr_mask_corrected")
-"""Names of the numbers that `compare` gives, as in metrics.json. PSNR is in dB. They are over the whole image; with `_mask`,
-over the rock's mask; with `_inside`, over the pixels that the rock covers wholly, so without its outline. With `_corrected`,
-the render is first brought to the exposure and the white balance of the truth (`colour_corrected`)."""
+METRICS = (
+    "psnr",
+    "ssim",
+    "psnr_mask",
+    "ssim_mask",
+    "psnr_inside",
+    "psnr_corrected",
+    "psnr_mask_corrected",
+)
+"""Names of the numbers that `compare` gives, as in metrics.json. PSNR is in dB. They are over the
+whole image; with `_mask`, over the rock's mask; with `_inside`, over the pixels that the rock
+covers wholly, so without its outline. With `_corrected`, the render is first brought to the
+exposure and the white balance of the truth (`colour_corrected`)."""
 
 SPACINGS = (1, 3, 10)
-"""How far behind the true surface a pixel must be drawn to count as too deep, in spacings of the prior's samples. One spacing
-is about what the Gaussians resolve; at ten, the pixel shows another part of the rock."""
+"""How far behind the true surface a pixel must be drawn to count as too deep, in spacings of the
+prior's samples. One spacing is about what the Gaussians resolve; at ten, the pixel shows another
+part of the rock."""
 
 OPAQUE = 0.9
 """A pixel wholly on the rock counts as see-through where the model's alpha is below this."""
 
 SURFACE_METRICS = ("alpha_mae", "depth_error", *(f"too_deep_{k}" for k in SPACINGS), "see_through")
-"""Names of the numbers that `compare_surface` gives, as in metrics.json. `depth_error` is in metres, the others are shares."""
+"""Names of the numbers that `compare_surface` gives, as in metrics.json. `depth_error` is in
+metres, the others are shares."""
 
 
 def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio of two images, dB: -10 log10 of the mean squared error over pixels and channels.
+    """Peak signal-to-noise ratio of two images, dB: -10 log10 of the mean squared error over pixels
+    and channels.
 
-    a, b: [H,W,3] sRGB in [0,1]; mask: [H,W] bool, if given only its pixels count. At most PSNR_LIMIT, and NaN if the mask is
-    empty. Raises InputError if the shapes differ.
+    a, b: [H,W,3] sRGB in [0,1]; mask: [H,W] bool, if given only its pixels count. At most
+    PSNR_LIMIT, and NaN if the mask is empty. Raises InputError if the shapes differ.
     """
     _check_same_shape(a, b)
     squares = (np.asarray(a, np.float64) - b) ** 2
@@ -55,19 +68,22 @@ def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
 
 
 def masked_squares(rendered: np.ndarray, target: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Squared differences [K,3], (linear RGB)², of the pixels of a mask [H,W] whose colour is known.
+    """Squared differences [K,3], (linear RGB)², of the pixels of a mask [H,W] whose colour is
+    known.
 
-    rendered: [H,W,3]. target: [H,W,4], colour and weight, or more (`mgs.data.dataset.target_of`); of weight 0 it is not known.
+    rendered: [H,W,3]. target: [H,W,4], colour and weight, or more (`mgs.data.dataset.target_of`);
+    of weight 0 it is not known.
     """
     return np.square(rendered - target[..., :3])[mask & (target[..., 3] > 0)]
 
 
 def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Structural similarity of two images (Wang et al. 2004, computed by scikit-image), mean over pixels and channels.
+    """Structural similarity of two images (Wang et al. 2004, computed by scikit-image), mean over
+    pixels and channels.
 
-    a, b: [H,W,3] sRGB in [0,1]. Without a mask the mean leaves out the image's border, where the window does not fit; with a
-    mask, [H,W] bool, it is over all pixels of the mask, and NaN if that is empty. Raises InputError if the shapes differ or the
-    images are smaller than the window.
+    a, b: [H,W,3] sRGB in [0,1]. Without a mask the mean leaves out the image's border, where the
+    window does not fit; with a mask, [H,W] bool, it is over all pixels of the mask, and NaN if that
+    is empty. Raises InputError if the shapes differ or the images are smaller than the window.
     """
     return _mean_ssim(*_similarity(a, b), mask)
 
@@ -80,12 +96,15 @@ def _mean_ssim(mean: float, similarity: np.ndarray, mask: np.ndarray | None) -> 
 
 
 def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
-    """Mean structural similarity of two images without their border, and that of every pixel and channel [H,W,3]."""
+    """Mean structural similarity of two images without their border, and that of every pixel and
+    channel [H,W,3]."""
     from skimage.metrics import structural_similarity
 
     _check_same_shape(a, b)
     if min(a.shape[:2]) < SSIM_WINDOW:
-        raise InputError(f"SSIM needs images of at least {SSIM_WINDOW}x{SSIM_WINDOW} pixels, not {a.shape[1]}x{a.shape[0]}")
+        raise InputError(
+            f"SSIM needs images of at least {SSIM_WINDOW}x{SSIM_WINDOW} pixels, not {a.shape[1]}x{a.shape[0]}"
+        )
     mean, similarity = structural_similarity(
         np.asarray(a, np.float64),
         np.asarray(b, np.float64),
@@ -100,11 +119,13 @@ def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def colour_corrected(truth: np.ndarray, rendered: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """A render times a gain per channel: those that bring it nearest to the truth in the pixels of a mask, in least squares.
+    """A render times a gain per channel: those that bring it nearest to the truth in the pixels of
+    a mask, in least squares.
 
-    truth, rendered: [H,W,3] linear RGB; mask: [H,W] bool. The error that is left is none of exposure or white balance. Because
-    the gains are taken from the truth, what is measured of it says less than PSNR does, and has a name of its own.
-    A channel that is black in the mask keeps its values.
+    truth, rendered: [H,W,3] linear RGB; mask: [H,W] bool. The error that is left is none of
+    exposure or white balance. Because the gains are taken from the truth, what is measured of it
+    says less than PSNR does, and has a name of its own. A channel that is black in the mask keeps
+    its values.
     """
     a, b = truth[mask].astype(np.float64), rendered[mask].astype(np.float64)
     squares = (b * b).sum(axis=0)
@@ -114,14 +135,20 @@ def colour_corrected(truth: np.ndarray, rendered: np.ndarray, mask: np.ndarray) 
 
 def _check_same_shape(a: np.ndarray, b: np.ndarray) -> None:
     if a.shape != b.shape:
-        raise InputError(f"images of {a.shape} and {b.shape} cannot be compared; render at the size of the dataset")
+        raise InputError(
+            f"images of {a.shape} and {b.shape} cannot be compared; render at the size of the dataset"
+        )
 
 
-def compare(truth: np.ndarray, rendered: np.ndarray, mask: np.ndarray, weight: np.ndarray) -> dict[str, float]:
+def compare(
+    truth: np.ndarray, rendered: np.ndarray, mask: np.ndarray, weight: np.ndarray
+) -> dict[str, float]:
     """The METRICS of one view, over the pixels whose truth is known.
 
-    truth: [H,W,4], linear RGB premultiplied by alpha, and alpha; rendered: [H,W,3] linear RGB; mask: [H,W] bool, the rock;
-    weight: [H,W], 0 where the truth is not known (`mgs.data.dataset.Frame.target`). Raises InputError as `psnr` and `ssim`.
+    truth: [H,W,4], linear RGB premultiplied by alpha, and alpha; rendered: [H,W,3] linear RGB;
+    mask: [H,W] bool, the rock;
+    weight: [H,W], 0 where the truth is not known (`mgs.data.dataset.Frame.target`). Raises
+    InputError as `psnr` and `ssim`.
     """
     a, b, known = srgb_from_linear(truth[..., :3]), srgb_from_linear(rendered), weight > 0
     whole = None if known.all() else known
@@ -149,16 +176,20 @@ def compare_surface(
     true_depth: np.ndarray | None = None,
     spacing: float | None = None,
 ) -> dict[str, float]:
-    """Those of the SURFACE_METRICS of one view for which the data has a truth; NaN where it has no pixel to measure.
+    """Those of the SURFACE_METRICS of one view for which the data has a truth; NaN where it has no
+    pixel to measure.
 
-    truth, mask, weight: as in `compare`; alpha, depth: [H,W] of the render, its expected z-depth in metres. fractional: whether
-    the truth's alpha is a share of each pixel, and not only a mask; true_depth: [H,W] metres, 0 where unknown; spacing: of the
-    prior's samples, metres.
+    truth, mask, weight: as in `compare`; alpha, depth: [H,W] of the render, its expected z-depth in
+    metres. fractional: whether the truth's alpha is a share of each pixel, and not only a mask;
+    true_depth: [H,W] metres, 0 where unknown; spacing: of the prior's samples, metres.
 
-    - alpha_mae: mean absolute error of alpha over the pixels whose truth is known; only where `fractional`.
-    - depth_error: median absolute error of depth inside the mask, metres; only with a true depth. A pixel where nothing is
+    - alpha_mae: mean absolute error of alpha over the pixels whose truth is known; only where
+    `fractional`.
+    - depth_error: median absolute error of depth inside the mask, metres; only with a true depth. A
+    pixel where nothing is
       drawn counts as infinitely deep; NaN where the median is infinite.
-    - too_deep_1, too_deep_3, too_deep_10: share of the same pixels that are deeper than the truth by more than so many
+    - too_deep_1, too_deep_3, too_deep_10: share of the same pixels that are deeper than the truth
+    by more than so many
       spacings; only with a true depth and a spacing.
     - see_through: share of the pixels that the rock covers wholly whose alpha is below OPAQUE.
     """
@@ -183,9 +214,12 @@ def _mean(values: np.ndarray) -> float:
 
 
 def agreement(mine: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """How well scores of candidates [C] agree with reference scores: Kendall's `tau`, 0 where one of them is constant; and
-    `regret`, the share of the best reference score that is lost by taking our best."""
-    from scipy.stats import kendalltau  # imported here, because it takes half a second and few programs rank
+    """How well scores of candidates [C] agree with reference scores: Kendall's `tau`, 0 where one
+    of them is constant; and `regret`, the share of the best reference score that is lost by taking
+    our best."""
+    from scipy.stats import (
+        kendalltau,
+    )  # imported here, because it takes half a second and few programs rank
 
     constant = np.ptp(mine) == 0 or np.ptp(reference) == 0
     tau = 0.0 if constant else float(kendalltau(mine, reference).statistic)

@@ -53,13 +53,16 @@ def save_figure(figure: Figure, path: str | Path) -> None:
     """
     kind = Path(path).suffix.lower()[1:]
     if kind not in FORMATS:
-        raise InputError(f"{path}: figures are written as {', '.join(FORMATS)}; choose another ending")
+        raise InputError(
+            f"{path}: figures are written as {', '.join(FORMATS)}; choose another ending"
+        )
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format=kind)
 
 
 def crop(mask: np.ndarray, margin: float = 0.06) -> tuple[slice, slice]:
-    """The rows and columns of an image that hold its mask [H,W] with a margin around it; all of them if the mask is empty.
+    """The rows and columns of an image that hold its mask [H,W] with a margin around it; all of
+    them if the mask is empty.
 
     margin: a share of the image's height and width.
     """

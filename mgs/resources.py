@@ -17,11 +17,14 @@ def resource_folder(name: str) -> Path:
     for root in (_PACKAGE, _PACKAGE.parent):
         if (root / name).is_dir():
             return root / name
-    raise InputError(f"mgs: the folder {name!r} is missing from the installation; install mgs again")
+    raise InputError(
+        f"mgs: the folder {name!r} is missing from the installation; install mgs again"
+    )
 
 
 def scene_path(scene: str | Path) -> Path:
-    """Path of a scene's TOML file. scene: such a path, or the name of a scene that comes with mgs, as in "boulder".
+    """Path of a scene's TOML file. scene: such a path, or the name of a scene that comes with mgs,
+    as in "boulder".
 
     Raises InputError if there is no such file or name.
     """
@@ -33,5 +36,7 @@ def scene_path(scene: str | Path) -> Path:
     path = folder / f"{scene}.toml"
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
-        raise InputError(f"scene {str(scene)!r}: unknown; choose one of {known}, or give the path of a .toml file")
+        raise InputError(
+            f"scene {str(scene)!r}: unknown; choose one of {known}, or give the path of a .toml file"
+        )
     return path

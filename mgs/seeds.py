@@ -1,4 +1,5 @@
-"""Random numbers. A run has one root seed, and every part of the program derives its own seed from it by a name of its own.
+"""Random numbers. A run has one root seed, and every part of the program derives its own seed from
+it by a name of its own.
 
 So a new part, which draws under a new name, changes the draws of no other.
 """
@@ -11,7 +12,8 @@ import numpy as np
 
 
 def derive_seed(root: int, name: str) -> int:
-    """The seed of one part of the program, 32 bits: from the SHA-256 hash of the root seed and the part's name."""
+    """The seed of one part of the program, 32 bits: from the SHA-256 hash of the root seed and the
+    part's name."""
     return int.from_bytes(hashlib.sha256(f"{root}/{name}".encode()).digest()[:4], "little")
 
 

@@ -1,9 +1,9 @@
-"""Gaussians on disk, as PLY files. The layout of 3DGS is written and read; the compressed one of SuperSplat and PlayCanvas is
-only read.
+"""Gaussians on disk, as PLY files. The layout of 3DGS is written and read; the compressed one of
+SuperSplat and PlayCanvas is only read.
 
-The layout of 3DGS has one vertex per Gaussian: x y z; nx ny nz (zero); f_dc_0..2, the coefficients of degree 0; f_rest_*, those
-of higher degrees, all of red, then all of green, then all of blue; opacity (its logit); scale_0..2 (natural logarithms);
-rot_0..3 (quaternion w x y z).
+The layout of 3DGS has one vertex per Gaussian: x y z; nx ny nz (zero); f_dc_0..2, the coefficients
+of degree 0; f_rest_*, those of higher degrees, all of red, then all of green, then all of blue;
+opacity (its logit); scale_0..2 (natural logarithms); rot_0..3 (quaternion w x y z).
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from mgs.files import atomic_path, reading
 from mgs.gaussians import Gaussians
 
 LINEAR_COMMENT = "mgs: colours are linear RGB"
-"""A comment in the header of the PLY files that mgs writes, because the layout itself cannot say what its colours are. Most
-other tools train on sRGB values as they are, so the colours in their files must be blended as sRGB."""
+"""A comment in the header of the PLY files that mgs writes, because the layout itself cannot say
+what its colours are. Most other tools train on sRGB values as they are, so the colours in their
+files must be blended as sRGB."""
 
 CHUNK = 256
 """Number of consecutive splats of a compressed PLY that share one row of its element `chunk`."""
@@ -33,14 +34,16 @@ PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 """Properties of a splat in a compressed PLY: one 32-bit word each."""
 
 VECTOR_BITS = ((21, 11), (11, 10), (0, 11))
-"""Where x, y and z lie in the word of a packed position or scale: the lowest bit, and the number of bits."""
+"""Where x, y and z lie in the word of a packed position or scale: the lowest bit, and the number of
+bits."""
 
 TO_ASCII = bytes(byte if byte < 128 else ord("?") for byte in range(256))
 """Table for `bytes.translate` that replaces every byte that is not ASCII by a question mark."""
 
 
 def _ply_names(coefficients: int) -> list[str]:
-    """Names of the properties of the 3DGS layout, in their order. coefficients: spherical harmonics per colour channel, K."""
+    """Names of the properties of the 3DGS layout, in their order. coefficients: spherical harmonics
+    per colour channel, K."""
     rest = 3 * (coefficients - 1)
     return (
         ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -49,32 +52,48 @@ def _ply_names(coefficients: int) -> list[str]:
     )
 
 
-def write_ply(path: str | Path, gaussians: Gaussians, marks: Mapping[str, np.ndarray] | None = None) -> None:
-    """Write Gaussians (NumPy fields) as a binary PLY in the layout of 3DGS; the file appears complete.
+def write_ply(
+    path: str | Path, gaussians: Gaussians, marks: Mapping[str, np.ndarray] | None = None
+) -> None:
+    """Write Gaussians (NumPy fields) as a binary PLY in the layout of 3DGS; the file appears
+    complete.
 
-    It opens in any splat viewer. The colours stay linear RGB, which viewers that expect sRGB show too dark. marks: {name: [N]
-    bool}, further properties of the vertices, bytes of 0 or 1, which `read_ply` and viewers pass over.
-    Raises InputError as `mgs.files.atomic_path`.
+    It opens in any splat viewer. The colours stay linear RGB, which viewers that expect sRGB show
+    too dark. marks: {name: [N] bool}, further properties of the vertices, bytes of 0 or 1, which
+    `read_ply` and viewers pass over. Raises InputError as `mgs.files.atomic_path`.
     """
     g, n = gaussians, len(gaussians)
     names = _ply_names(g.sh.shape[1])
     rest = np.transpose(g.sh[:, 1:, :], (0, 2, 1)).reshape(n, -1)
     columns = np.concatenate(
-        [g.means, np.zeros((n, 3)), g.sh[:, 0, :], rest, np.reshape(g.logit_opacities, (n, 1)), g.log_scales, g.quats], axis=1
+        [
+            g.means,
+            np.zeros((n, 3)),
+            g.sh[:, 0, :],
+            rest,
+            np.reshape(g.logit_opacities, (n, 1)),
+            g.log_scales,
+            g.quats,
+        ],
+        axis=1,
     ).astype(np.float32)
     marks = marks or {}
-    vertices = np.empty(n, dtype=[(name, "f4") for name in names] + [(name, "u1") for name in marks])
+    vertices = np.empty(
+        n, dtype=[(name, "f4") for name in names] + [(name, "u1") for name in marks]
+    )
     for i, name in enumerate(names):
         vertices[name] = columns[:, i]
     for name, mask in marks.items():
         vertices[name] = mask
     with atomic_path(path) as temporary:
-        PlyData([PlyElement.describe(vertices, "vertex")], comments=[LINEAR_COMMENT]).write(str(temporary))
+        PlyData([PlyElement.describe(vertices, "vertex")], comments=[LINEAR_COMMENT]).write(
+            str(temporary)
+        )
 
 
 def ply_colour_space(path: str | Path) -> str:
-    """The space in which the colours of a PLY are to be blended: "linear" for files of mgs (by their LINEAR_COMMENT), otherwise
-    "srgb". Raises OSError if the file cannot be read."""
+    """The space in which the colours of a PLY are to be blended: "linear" for files of mgs (by
+    their LINEAR_COMMENT), otherwise "srgb". Raises OSError if the file cannot be read."""
     with Path(path).open("rb") as file:
         for line in file:
             if line.strip() == f"comment {LINEAR_COMMENT}".encode():
@@ -85,16 +104,19 @@ def ply_colour_space(path: str | Path) -> str:
 
 
 def read_ply(path: str | Path) -> Gaussians:
-    """Read a PLY in the layout of 3DGS (binary or ASCII, spherical harmonics of degree 0 to 3), or a compressed one.
+    """Read a PLY in the layout of 3DGS (binary or ASCII, spherical harmonics of degree 0 to 3), or
+    a compressed one.
 
-    Properties are found by their names, so their order does not matter, nor do other properties. Colours are taken as they are:
-    see `ply_colour_space`. Raises InputError if the file is missing, is not a PLY, lacks a property, or holds values that
-    `Gaussians.check` refuses.
+    Properties are found by their names, so their order does not matter, nor do other properties.
+    Colours are taken as they are: see `ply_colour_space`. Raises InputError if the file is missing,
+    is not a PLY, lacks a property, or holds values that `Gaussians.check` refuses.
     """
     path = Path(path)
     ply = _parse(path)
     if "vertex" not in ply:
-        raise InputError(f"{path}: not a 3DGS PLY, it has no vertices; export it with a splatting tool")
+        raise InputError(
+            f"{path}: not a 3DGS PLY, it has no vertices; export it with a splatting tool"
+        )
     vertices = ply["vertex"].data
     if any(name in vertices.dtype.names for name in PACKED):
         columns = _decompress(path, ply)
@@ -124,24 +146,41 @@ def _parse_any_comment(path: Path) -> PlyData:
         return PlyData.read(str(path))
     except UnicodeDecodeError:
         header, mark, body = path.read_bytes().partition(b"end_header")
-    with NamedTemporaryFile(suffix=".ply") as copy:  # plyfile is slow where it does not read from disk
+    with NamedTemporaryFile(
+        suffix=".ply"
+    ) as copy:  # plyfile is slow where it does not read from disk
         copy.write(header.translate(TO_ASCII) + mark + body)
         copy.flush()
         return PlyData.read(copy.name)
 
 
 def _from_columns(path: Path, columns: Mapping[str, np.ndarray], n: int) -> Gaussians:
-    """Gaussians from the properties of the 3DGS layout, an array [n] each. Raises InputError if one is missing or is a list."""
+    """Gaussians from the properties of the 3DGS layout, an array [n] each. Raises InputError if one
+    is missing or is a list."""
     rest = sum(re.fullmatch("f_rest_[0-9]+", name) is not None for name in columns)
     coefficients = 1 + rest // 3
     if rest % 3 or coefficients not in (1, 4, 9, 16):
-        raise InputError(f"{path}: {rest} f_rest properties fit no SH degree from 0 to 3; expected 0, 9, 24 or 45")
-    missing = [name for name in _ply_names(coefficients) if name not in columns and name not in ("nx", "ny", "nz")]
+        raise InputError(
+            f"{path}: {rest} f_rest properties fit no SH degree from 0 to 3; expected 0, 9, 24 or 45"
+        )
+    missing = [
+        name
+        for name in _ply_names(coefficients)
+        if name not in columns and name not in ("nx", "ny", "nz")
+    ]
     if missing:
-        raise InputError(f"{path}: not a 3DGS PLY, property {missing[0]!r} is missing; export it with a splatting tool")
-    lists = [name for name in _ply_names(coefficients) if name in columns and columns[name].dtype.kind == "O"]
+        raise InputError(
+            f"{path}: not a 3DGS PLY, property {missing[0]!r} is missing; export it with a splatting tool"
+        )
+    lists = [
+        name
+        for name in _ply_names(coefficients)
+        if name in columns and columns[name].dtype.kind == "O"
+    ]
     if lists:
-        raise InputError(f"{path}: not a 3DGS PLY, property {lists[0]!r} is a list; export it with a splatting tool")
+        raise InputError(
+            f"{path}: not a 3DGS PLY, property {lists[0]!r} is a list; export it with a splatting tool"
+        )
 
     def stack(*names: str) -> np.ndarray:
         with np.errstate(over="ignore"):  # an overflow gives infinity, which the caller refuses
@@ -163,10 +202,12 @@ def _from_columns(path: Path, columns: Mapping[str, np.ndarray], n: int) -> Gaus
 def _decompress(path: Path, ply: PlyData) -> dict[str, np.ndarray]:
     """The properties of the 3DGS layout, an array [n] each, from a compressed PLY.
 
-    Such files are written by PlayCanvas' splat-transform (`.compressed.ply`). A splat has four 32-bit words (PACKED). A number
-    in them is a fraction, 0 to 1, of the way from the least to the largest value that the number has within its chunk of 256
-    splats; these two are in the element `chunk`. Older files do not have them for colours, whose range is then 0 to 1.
-    Raises InputError if an element or a property is missing, is of another type, or the elements' sizes do not fit together.
+    Such files are written by PlayCanvas' splat-transform (`.compressed.ply`). A splat has four
+    32-bit words (PACKED). A number in them is a fraction, 0 to 1, of the way from the least to the
+    largest value that the number has within its chunk of 256 splats; these two are in the element
+    `chunk`. Older files do not have them for colours, whose range is then 0 to 1. Raises InputError
+    if an element or a property is missing, is of another type, or the elements' sizes do not fit
+    together.
     """
     vertices, n = ply["vertex"].data, len(ply["vertex"].data)
     chunks = ply["chunk"].data if "chunk" in ply else np.empty(0, [])
@@ -175,10 +216,18 @@ def _decompress(path: Path, ply: PlyData) -> dict[str, np.ndarray]:
     ranges = [*"xyz", "scale_x", "scale_y", "scale_z", *("rgb" if coloured else "")]
     wanted = [(chunks, f"{end}_{name}", "f") for name in ranges for end in ("min", "max")]
     for table, name, kind in wanted + [(vertices, name, "u") for name in PACKED]:
-        if name not in (table.dtype.names or ()) or table.dtype[name].kind != kind or table.dtype[name].itemsize < 4:
-            raise InputError(f"{path}: a compressed PLY without a usable {name!r}; export it again, or uncompressed")
+        if (
+            name not in (table.dtype.names or ())
+            or table.dtype[name].kind != kind
+            or table.dtype[name].itemsize < 4
+        ):
+            raise InputError(
+                f"{path}: a compressed PLY without a usable {name!r}; export it again, or uncompressed"
+            )
     if len(chunks) * CHUNK < n:
-        raise InputError(f"{path}: {len(chunks)} chunks are too few for {n} splats, {CHUNK} to a chunk; export it again")
+        raise InputError(
+            f"{path}: {len(chunks)} chunks are too few for {n} splats, {CHUNK} to a chunk; export it again"
+        )
     chunk = np.arange(n) // CHUNK
 
     def share(word: str, lowest: int, bits: int) -> np.ndarray:
@@ -195,32 +244,45 @@ def _decompress(path: Path, ply: PlyData) -> dict[str, np.ndarray]:
     for i, channel in enumerate("rgb"):
         value = share("packed_color", 24 - 8 * i, 8)
         columns[f"f_dc_{i}"] = ((within(channel, value) if coloured else value) - 0.5) / SH_C0
-    # Opacities are stored in steps of 1/255. Those stored as 0 and 1 would have infinite logits, so they are moved inside by a
+    # Opacities are stored in steps of 1/255. Those stored as 0 and 1 would have infinite logits, so
+    # they are moved inside by a
     # quarter of a step: the middle of the half step of opacities that were rounded to them.
     columns["opacity"] = logit(np.clip(share("packed_color", 0, 8), 0.25 / 255, 1 - 0.25 / 255))
-    three = np.stack([np.sqrt(2) * (share("packed_rotation", lowest, 10) - 0.5) for lowest in (20, 10, 0)], 1)
-    columns |= {f"rot_{i}": column for i, column in enumerate(_unit_quats(vertices["packed_rotation"] >> 30, three).T)}
+    three = np.stack(
+        [np.sqrt(2) * (share("packed_rotation", lowest, 10) - 0.5) for lowest in (20, 10, 0)], 1
+    )
+    columns |= {
+        f"rot_{i}": column
+        for i, column in enumerate(_unit_quats(vertices["packed_rotation"] >> 30, three).T)
+    }
     return columns | _decompress_sh(path, ply, n)
 
 
 def _unit_quats(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Unit quaternions wxyz [N,4] from the index of the largest component [N], which is positive, and the other three [N,3]."""
+    """Unit quaternions wxyz [N,4] from the index of the largest component [N], which is positive,
+    and the other three [N,3]."""
     place = np.arange(4)
     quats = np.take_along_axis(others, np.minimum(place - (place > largest[:, None]), 2), 1)
-    return np.where(place == largest[:, None], np.sqrt(np.maximum(1 - (others**2).sum(1), 0))[:, None], quats)
+    return np.where(
+        place == largest[:, None], np.sqrt(np.maximum(1 - (others**2).sum(1), 0))[:, None], quats
+    )
 
 
 def _decompress_sh(path: Path, ply: PlyData, n: int) -> dict[str, np.ndarray]:
-    """The properties f_rest_* of a compressed PLY, an array [n] each; none if it has only colours of degree 0.
+    """The properties f_rest_* of a compressed PLY, an array [n] each; none if it has only colours
+    of degree 0.
 
-    They are bytes, which divide the range -4 to 4 into 256 steps. A byte stands for the middle of its step; 0 and 255 stand for
+    They are bytes, which divide the range -4 to 4 into 256 steps. A byte stands for the middle of
+    its step; 0 and 255 stand for
     -4 and 4. Raises InputError if the element `sh` is not n rows of bytes.
     """
     if "sh" not in ply:
         return {}
     table = ply["sh"].data
     if len(table) != n or any(table.dtype[name] != np.uint8 for name in table.dtype.names):
-        raise InputError(f"{path}: a compressed PLY whose element 'sh' is not {n} rows of bytes; export it again")
+        raise InputError(
+            f"{path}: a compressed PLY whose element 'sh' is not {n} rows of bytes; export it again"
+        )
     values = (np.arange(256) + 0.5) / 32 - 4
     values[[0, 255]] = -4, 4
     return {name: values[table[name]] for name in table.dtype.names}

@@ -1,16 +1,18 @@
 """`mgs_splat`: Gaussian splatting as a Mitsuba integrator.
 
-    scene = mi.load_dict({"type": "scene", "sensor": {...}, "integrator": {"type": "mgs_splat", "filename": "splats.ply"}})
-    params = mi.traverse(scene)  # integrator.means, .log_scales, .quats, .logit_opacities, .sh
-    image = mi.render(scene, params)
+    scene = mi.load_dict({"type": "scene", "sensor": {...}, "integrator": {"type": "mgs_splat",
+    "filename": "splats.ply"}}) params = mi.traverse(scene)  # integrator.means, .log_scales,
+    .quats, .logit_opacities, .sh image = mi.render(scene, params)
 
-Properties: `filename`, a 3DGS PLY; `colour_space`, "linear" or "srgb", in which its colours are blended (default: linear for
-files of mgs, srgb for other tools'); `background`, RGB behind the Gaussians in that space (default black); `depth`, a boolean:
-append the expected z-depth in metres as an AOV (default false). The image is linear, as Mitsuba's images are. The film decides
-about alpha (`pixel_format` rgb or rgba). Shapes, emitters, the sampler and the film's reconstruction filter play no part: a
-pixel is the value at its centre.
+Properties: `filename`, a 3DGS PLY; `colour_space`, "linear" or "srgb", in which its colours are
+blended (default: linear for files of mgs, srgb for other tools'); `background`, RGB behind the
+Gaussians in that space (default black); `depth`, a boolean: append the expected z-depth in metres
+as an AOV (default false). The image is linear, as Mitsuba's images are. The film decides about
+alpha (`pixel_format` rgb or rgba). Shapes, emitters, the sampler and the film's reconstruction
+filter play no part: a pixel is the value at its centre.
 
-Derivatives, in reverse and in forward mode, reach every parameter on which they are enabled. Not differentiated: the sensor.
+Derivatives, in reverse and in forward mode, reach every parameter on which they are enabled. Not
+differentiated: the sensor.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ from mgs.splat_ply import ply_colour_space, read_ply
 
 
 class MgsSplat(mi.CppADIntegrator):
-    """Draws Gaussians, which are its own parameters: Mitsuba has no Python shapes that could hold them."""
+    """Draws Gaussians, which are its own parameters: Mitsuba has no Python shapes that could hold
+    them."""
 
     def __init__(self, props: Any) -> None:
         super().__init__(props)
@@ -40,7 +43,9 @@ class MgsSplat(mi.CppADIntegrator):
         self.gaussians = as_drjit(read_ply(path))
         self.colour_space = props.get("colour_space", ply_colour_space(path))
         if self.colour_space not in ("linear", "srgb"):
-            raise InputError(f"mgs_splat: colour_space {self.colour_space!r} is unknown; choose linear or srgb")
+            raise InputError(
+                f"mgs_splat: colour_space {self.colour_space!r} is unknown; choose linear or srgb"
+            )
         self.background = props.get("background", 0.0)
         as_colour(self.background)
         self.depth = props.get("depth", False)
@@ -61,11 +66,18 @@ class MgsSplat(mi.CppADIntegrator):
         return ["depth.z"] if self.depth else []
 
     def render(
-        self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
+        self,
+        scene: Any,
+        sensor: Any = 0,
+        seed: Any = 0,
+        spp: int = 0,
+        develop: bool = True,
+        evaluate: bool = True,
     ) -> Any:
         """The sensor's image through its film, TensorXf [H,W,C]; `seed` and `spp` change nothing.
 
-        Raises InputError for a sensor that is not `perspective`, or a parameter that `mgs.splat.rendering` refuses.
+        Raises InputError for a sensor that is not `perspective`, or a parameter that
+        `mgs.splat.rendering` refuses.
         """
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         film = sensor.film()
@@ -77,7 +89,9 @@ class MgsSplat(mi.CppADIntegrator):
             dr.eval(developed)
         return developed
 
-    def render_backward(self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> None:
+    def render_backward(
+        self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
+    ) -> None:
         """Take the gradient of an image back to the parameters."""
         with dr.resume_grad():
             image = self.render(scene, sensor)
@@ -85,18 +99,27 @@ class MgsSplat(mi.CppADIntegrator):
             dr.enqueue(dr.ADMode.Backward, image)
             dr.traverse(dr.ADMode.Backward)
 
-    def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
+    def render_forward(
+        self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
+    ) -> Any:
         """How the image changes along the gradients set on the parameters, TensorXf [H,W,C]."""
         with dr.resume_grad():
-            return dr.forward_to(self.render(scene, sensor), flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+            return dr.forward_to(
+                self.render(scene, sensor), flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
+            )
 
     def _channels(self, image: Any, film: Any) -> Any:
-        """What an image block of this film holds: R G B, A where the film asks for it, filter weight, AOVs. [H,W,C]."""
+        """What an image block of this film holds: R G B, A where the film asks for it, filter
+        weight, AOVs. [H,W,C]."""
         rgb = image.rgb
         if self.colour_space == "srgb":
             rgb = mi.TensorXf(mi.math.srgb_to_linear(rgb.array), rgb.shape)
         alpha = [image.alpha] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
-        rest = [*alpha, dr.ones(mi.TensorXf, image.alpha.shape), *([image.depth] if self.depth else [])]
+        rest = [
+            *alpha,
+            dr.ones(mi.TensorXf, image.alpha.shape),
+            *([image.depth] if self.depth else []),
+        ]
         return dr.concat([rgb, *(channel[..., None] for channel in rest)], axis=2)
 
     def to_string(self) -> str:

@@ -1,4 +1,5 @@
-"""Shared test set-up: the variant is set once, before any test module that imports kernels; and a tiny dataset to spoil."""
+"""Shared test set-up: the variant is set once, before any test module that imports kernels; and a
+tiny dataset to spoil."""
 
 import importlib
 import shutil
@@ -10,7 +11,9 @@ from hypothesis import settings
 from mgs import runtime
 
 runtime.start()
-settings.register_profile("mgs", deadline=None)  # no test is timed: the machine may be busy, and a first call loads libraries
+settings.register_profile(
+    "mgs", deadline=None
+)  # no test is timed: the machine may be busy, and a first call loads libraries
 settings.load_profile("mgs")
 
 import tiny  # noqa: E402
@@ -35,7 +38,8 @@ def prior(tmp_path):
 
 @pytest.fixture(scope="module")
 def coarse_arena():
-    """A ground of few vertices and texels: how fine it is decides most of a scene's cost and nothing that is tested."""
+    """A ground of few vertices and texels: how fine it is decides most of a scene's cost and
+    nothing that is tested."""
     from mgs.synth import arena
 
     with pytest.MonkeyPatch.context() as patched:

@@ -12,7 +12,9 @@ from mgs.cli.app import main
 def listing(root: Path) -> dict[str, bytes | None]:
     """Every file under a folder with its content, every folder with None."""
     paths = (root, *root.rglob("*")) if root.exists() else ()
-    return {str(path.relative_to(root)): path.read_bytes() if path.is_file() else None for path in paths}
+    return {
+        str(path.relative_to(root)): path.read_bytes() if path.is_file() else None for path in paths
+    }
 
 
 def refused(capsys, arguments: list, out: Path | None = None) -> str:

@@ -1,4 +1,5 @@
-"""The public names of `mgs`: there, lazy, typed; and the whole way from Python without a console."""
+"""The public names of `mgs`: there, lazy, typed; and the whole way from Python without a
+console."""
 
 import subprocess
 import sys
@@ -28,7 +29,9 @@ def test_what_is_no_public_name_is_an_attribute_error():
 
 def test_importing_loads_nothing_and_leaves_the_variant_alone():
     program = "import sys, mgs; assert not {'mitsuba', 'drjit', 'numpy'} & set(sys.modules); mgs.render; import mitsuba as mi"
-    subprocess.run([sys.executable, "-c", f"{program}; assert mi.variant() is None"], check=True, timeout=60)
+    subprocess.run(
+        [sys.executable, "-c", f"{program}; assert mi.variant() is None"], check=True, timeout=60
+    )
 
 
 def test_no_module_hides_behind_a_function_of_its_name():
@@ -39,12 +42,23 @@ def test_no_module_hides_behind_a_function_of_its_name():
         for path in folder.glob("*.py"):
             if path.stem != "__init__" and path.stem != "__main__":
                 found = getattr(module, path.stem, None)
-                assert found is None or found.__class__.__name__ == "module", f"{package}.{path.stem}"
+                assert found is None or found.__class__.__name__ == "module", (
+                    f"{package}.{path.stem}"
+                )
 
 
 def test_type_checkers_see_the_names(tmp_path):
-    (tmp_path / "program.py").write_text("import mgs\n\nreveal_type(mgs.render)\nreveal_type(mgs.Camera.position)\nmgs.rendr\n")
-    command = [sys.executable, "-m", "mypy", "--follow-imports=silent", "--no-incremental", str(tmp_path / "program.py")]
+    (tmp_path / "program.py").write_text(
+        "import mgs\n\nreveal_type(mgs.render)\nreveal_type(mgs.Camera.position)\nmgs.rendr\n"
+    )
+    command = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--follow-imports=silent",
+        "--no-incremental",
+        str(tmp_path / "program.py"),
+    ]
     said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300).stdout
     assert "gaussians: mgs.gaussians.Gaussians, camera: mgs.camera.Camera" in said
     assert 'Module has no attribute "rendr"' in said

@@ -1,4 +1,5 @@
-"""Every kind of bad input, through the real command line: one line that says what is wrong, exit code 2, nothing left over."""
+"""Every kind of bad input, through the real command line: one line that says what is wrong, exit
+code 2, nothing left over."""
 
 from __future__ import annotations
 
@@ -91,7 +92,10 @@ DATASETS: dict[str, tuple[Change, str]] = {
         "transforms.json",
     ),
     "truncated transforms.json": (truncate("transforms.json"), "transforms.json"),
-    "transforms.json of another shape": (lambda root: (root / "transforms.json").write_text("[1, 2]"), "no frames"),
+    "transforms.json of another shape": (
+        lambda root: (root / "transforms.json").write_text("[1, 2]"),
+        "no frames",
+    ),
     "no frames": (edit_transforms(lambda data: data.update(frames=[])), "no frames"),
     "no intrinsics": (edit_transforms(no_intrinsics), "intrinsics"),
     "focal length 0": (edit_transforms(lambda data: data.update(fl_x=0)), "focal"),
@@ -109,7 +113,10 @@ DATASETS: dict[str, tuple[Change, str]] = {
     "fisheye": (set_header(camera_model="OPENCV_FISHEYE"), "mgs import"),
     "fisheye in one frame": (set_frame(camera_model="OPENCV_FISHEYE"), "mgs import"),
     "camera model that is no text": (set_header(camera_model=[1]), "mgs import"),
-    "frame twice": (edit_transforms(lambda data: data["frames"].append(data["frames"][0])), "kf_0000"),
+    "frame twice": (
+        edit_transforms(lambda data: data["frames"].append(data["frames"][0])),
+        "kf_0000",
+    ),
     "name twice": (same_name, "kf_0000"),
     "file_path that is a number": (set_frame(file_path=5), "frame 2"),
     "file_path null": (set_frame(file_path=None), "frame 2"),
@@ -126,21 +133,37 @@ DATASETS: dict[str, tuple[Change, str]] = {
 
 PIXELS: dict[str, tuple[Change, str]] = {
     "truncated image": (truncate("images/kf_0000.png"), "kf_0000.png"),
-    "image that is text": (lambda root: (root / "images/kf_0000.png").write_text("no pixels"), "kf_0000.png"),
+    "image that is text": (
+        lambda root: (root / "images/kf_0000.png").write_text("no pixels"),
+        "kf_0000.png",
+    ),
     "image of the wrong size": (wrong_size, "7x5"),
     "mask of the wrong size": (small_mask, "7x5"),
     "truncated depth": (truncate("depth/kf_0000.exr"), "kf_0000.exr"),
 }
-"""Broken pixels, found when a frame is used: `mgs nbv` uses frame 0 as a seed, `mgs prior` every depth."""
+"""Broken pixels, found when a frame is used: `mgs nbv` uses frame 0 as a seed, `mgs prior` every
+depth."""
 
 SURVEYS: dict[str, tuple[Change, str]] = {
     "truncated depth": (truncate("depth/kf_0005.exr"), "kf_0005.exr"),
     "neither depth nor masks in transforms.json": (
-        edit_transforms(lambda data: [frame.pop(key) for frame in data["frames"] for key in ("depth_file_path", "mask_path")]),
+        edit_transforms(
+            lambda data: [
+                frame.pop(key)
+                for frame in data["frames"]
+                for key in ("depth_file_path", "mask_path")
+            ]
+        ),
         "has no depth images and no points (sparse.ply) and no masks",
     ),
-    "no return in any pixel": (every_depth(lambda path: np.zeros((tiny.HEIGHT, tiny.WIDTH))), "return"),
-    "NaN in every pixel": (every_depth(lambda path: np.full((tiny.HEIGHT, tiny.WIDTH), np.nan)), "return"),
+    "no return in any pixel": (
+        every_depth(lambda path: np.zeros((tiny.HEIGHT, tiny.WIDTH))),
+        "return",
+    ),
+    "NaN in every pixel": (
+        every_depth(lambda path: np.full((tiny.HEIGHT, tiny.WIDTH), np.nan)),
+        "return",
+    ),
 }
 """Depths from which no prior can be built."""
 
@@ -157,7 +180,9 @@ def test_broken_dataset(capsys, dataset, tmp_path, command, case):
 def test_broken_pixels(capsys, dataset, prior, tmp_path, case):
     change, named = PIXELS[case]
     change(dataset)
-    line = refused(capsys, ["nbv", dataset, "--out", tmp_path / "out", "--prior", prior, "--budget", 1])
+    line = refused(
+        capsys, ["nbv", dataset, "--out", tmp_path / "out", "--prior", prior, "--budget", 1]
+    )
     assert named in line
     assert not (tmp_path / "out/steps.jsonl").exists()
 
@@ -167,14 +192,26 @@ def test_broken_pixels(capsys, dataset, prior, tmp_path, case):
 def test_survey_without_a_rock(capsys, dataset, tmp_path, command, case):
     change, named = SURVEYS[case]
     change(dataset)
-    arguments = [command, dataset, "--out", tmp_path / "out", *(["--budget", 1] if command == "nbv" else [])]
+    arguments = [
+        command,
+        dataset,
+        "--out",
+        tmp_path / "out",
+        *(["--budget", 1] if command == "nbv" else []),
+    ]
     assert named in refused(capsys, arguments, tmp_path / "out")
 
 
 @pytest.mark.parametrize("command", ["nbv", "prior"])
 def test_ground_without_a_rock(capsys, tmp_path, command):
     synthetic.write_dataset(tmp_path / "plain", rocks=[])
-    arguments = [command, tmp_path / "plain", "--out", tmp_path / "out", *(["--budget", 1] if command == "nbv" else [])]
+    arguments = [
+        command,
+        tmp_path / "plain",
+        "--out",
+        tmp_path / "out",
+        *(["--budget", 1] if command == "nbv" else []),
+    ]
     assert "no rock" in refused(capsys, arguments, tmp_path / "out")
 
 
@@ -204,12 +241,17 @@ def test_nbv_settings(capsys, dataset, prior, tmp_path, case):
 @pytest.mark.parametrize("count", [0, 1, -5])
 def test_too_few_gaussians(capsys, dataset, tmp_path, command, count):
     arguments = [command, dataset, "--out", tmp_path / "out", "--gaussians", count]
-    assert "Gaussians" in refused(capsys, arguments + (["--budget", 1] if command == "nbv" else []), tmp_path / "out")
+    assert "Gaussians" in refused(
+        capsys, arguments + (["--budget", 1] if command == "nbv" else []), tmp_path / "out"
+    )
 
 
 MESHES: dict[str, tuple[str, str]] = {
     "no faces": ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "faces"),
-    "NaN vertices": ("v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n", "NaN"),
+    "NaN vertices": (
+        "v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n",
+        "NaN",
+    ),
     "not a mesh": ("this is no mesh", "mesh.obj"),
 }
 
@@ -252,8 +294,14 @@ SCENES: dict[str, tuple[str, str]] = {
     "rock wholly buried": ("[rock]\nburied = 1", "rock.buried"),
     "detail coarser than the rock": ("[rock]\ndetail = 2", "rock.detail"),
     "detail of a slip": ("[rock]\ndetail = 1e-9", "rock.detail"),
-    "cameras under the ground": ("[orbit]\nkind = 'rings'\nelevations = [-60, -20]", "orbit.elevations"),
-    "rock behind its dust": ("[rock]\ndetail = 0.1\nburied = 0.999\n[orbit]\naltitude = 0\n[arena]\nstones = 0", "altitude"),
+    "cameras under the ground": (
+        "[orbit]\nkind = 'rings'\nelevations = [-60, -20]",
+        "orbit.elevations",
+    ),
+    "rock behind its dust": (
+        "[rock]\ndetail = 0.1\nburied = 0.999\n[orbit]\naltitude = 0\n[arena]\nstones = 0",
+        "altitude",
+    ),
 }
 
 
@@ -261,7 +309,16 @@ SCENES: dict[str, tuple[str, str]] = {
 def test_scene_files(capsys, tmp_path, case):
     text, named = SCENES[case]
     (tmp_path / "mine.toml").write_text(text)
-    arguments = ["synth-orbit", tmp_path / "out", "--scene", tmp_path / "mine.toml", "--frames", 1, "--size", "16x12"]
+    arguments = [
+        "synth-orbit",
+        tmp_path / "out",
+        "--scene",
+        tmp_path / "mine.toml",
+        "--frames",
+        1,
+        "--size",
+        "16x12",
+    ]
     assert named in refused(capsys, arguments, tmp_path / "out")
 
 
@@ -322,7 +379,8 @@ def test_run_whose_dataset_is_gone(capsys, dataset, prior, tmp_path, command):
 
 
 @pytest.mark.parametrize(
-    ("views", "named"), [("kf_9999", "kf_9999"), ("kf_0000,nothing", "nothing"), (",", "--views"), ("", "--views")]
+    ("views", "named"),
+    [("kf_9999", "kf_9999"), ("kf_0000,nothing", "nothing"), (",", "--views"), ("", "--views")],
 )
 def test_diagnose_of_views_that_are_not_there(capsys, dataset, prior, tmp_path, views, named):
     run = tiny.write_run(tmp_path / "run", dataset, prior)
@@ -337,8 +395,14 @@ SPLATS: dict[str, tuple[Change, str]] = {
     "missing": (lambda path: path.unlink(), "no such file"),
     "truncated": (lambda path: path.write_bytes(path.read_bytes()[:-100]), "not a readable"),
     "not a PLY": (lambda path: path.write_text("no splats"), "not a readable"),
-    "no opacity": (lambda path: path.write_bytes(path.read_bytes().replace(b"opacity", b"opaaaaa")), "opacity"),
-    "NaN": (lambda path: path.write_bytes(path.read_bytes()[:-4] + np.float32(np.nan).tobytes()), "quats"),
+    "no opacity": (
+        lambda path: path.write_bytes(path.read_bytes().replace(b"opacity", b"opaaaaa")),
+        "opacity",
+    ),
+    "NaN": (
+        lambda path: path.write_bytes(path.read_bytes()[:-4] + np.float32(np.nan).tobytes()),
+        "quats",
+    ),
 }
 
 

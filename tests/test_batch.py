@@ -1,4 +1,5 @@
-"""Batches: views that are chosen together, before their images are read; on stand-ins (tests/tiny.py), then by the command."""
+"""Batches: views that are chosen together, before their images are read; on stand-ins
+(tests/tiny.py), then by the command."""
 
 from __future__ import annotations
 
@@ -11,19 +12,32 @@ import pytest
 import tiny
 from refusals import refused
 
-import mgs.active.inputs
 import mgs.data.dataset
-from mgs.active import criteria, loop, policies, run_folder
-from mgs.active.stopping import StopReason
+import mgs.run.inputs
 from mgs.cli.app import main
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
+from mgs.fit.stopping import StopReason
+from mgs.policy import criteria
+from mgs.policy import registry as policies
 from mgs.report.writing import write_report
+from mgs.run import folder as run_folder
+from mgs.run import loop
 from mgs.study import tasks
 
 OF_A_FIT = {"uncertainty", "iterations", "loss", "stop_reason"}
-AT_THE_MODEL = {"d-optimal", "t-optimal", "a-optimal", "e-optimal", "fisherrf", "i-optimal", "block-d", "paper"}
-"""Policies that look at the fitted model; the others look at poses, and at the surface before any training."""
+AT_THE_MODEL = {
+    "d-optimal",
+    "t-optimal",
+    "a-optimal",
+    "e-optimal",
+    "fisherrf",
+    "i-optimal",
+    "block-d",
+    "paper",
+}
+"""Policies that look at the fitted model; the others look at poses, and at the surface before any
+training."""
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +46,9 @@ def loaded(tmp_path_factory):
 
 
 def run(out: Path, dataset, stations=None, **values) -> run_folder.State:
-    return loop.run(out, tiny.start(out, dataset, **values), dataset, stations or tiny.stations(), tiny.silent)
+    return loop.run(
+        out, tiny.start(out, dataset, **values), dataset, stations or tiny.stations(), tiny.silent
+    )
 
 
 def lines(out: Path) -> list[dict]:
@@ -68,15 +84,20 @@ def test_a_step_is_a_view_and_the_last_of_a_batch_has_its_fit(loaded, tmp_path):
     assert [step["frame"] for step in steps[1:]] == state.taken[3:]
     assert [set(step) >= OF_A_FIT for step in steps] == [True, False, True, False, True, True]
     assert all(OF_A_FIT & set(step) in (set(), OF_A_FIT) for step in steps)
-    assert ["psnr" in step for step in steps] == [True, False, False, False, True, False], "step 3 lies in the second batch"
+    assert ["psnr" in step for step in steps] == [True, False, False, False, True, False], (
+        "step 3 lies in the second batch"
+    )
     covered = [step["coverage"] for step in steps]
-    whole = sum(tiny.fisher(tiny.initial([]), loaded.frames[i].camera).astype(float) for i in state.taken)
+    whole = sum(
+        tiny.fisher(tiny.initial([]), loaded.frames[i].camera).astype(float) for i in state.taken
+    )
     assert covered[-1] == criteria.coverage(whole, criteria.regularisation(tiny.GROUPS))
     assert covered == sorted(covered)
 
 
 def test_a_batch_is_chosen_greedily_at_one_model(loaded, tmp_path):
-    """Each view of a batch has the largest gain, given the information that the ones before it have about the same model."""
+    """Each view of a batch has the largest gain, given the information that the ones before it have
+    about the same model."""
     seeds = run(tmp_path / "seeds", loaded, budget=0)
     state = run(tmp_path / "run", loaded, budget=3, batch=3)
     H, lam, taken = seeds.H, criteria.regularisation(tiny.GROUPS), list(seeds.taken)
@@ -88,7 +109,9 @@ def test_a_batch_is_chosen_greedily_at_one_model(loaded, tmp_path):
         assert (step["frame"], step["information_gain"]) == (left[best], gains[best])
         H, taken = H + F[best], [*taken, left[best]]
     after = sum(tiny.fisher(state.gaussians, loaded.frames[i].camera).astype(float) for i in taken)
-    np.testing.assert_allclose(state.H, after, err_msg="after the fit nothing of the prediction is left")
+    np.testing.assert_allclose(
+        state.H, after, err_msg="after the fit nothing of the prediction is left"
+    )
 
 
 @pytest.mark.parametrize("room", [1 << 30, 0], ids=["kept", "no room"])
@@ -100,9 +123,18 @@ def test_a_batch_measures_each_candidate_once_if_there_is_room(loaded, tmp_path,
         return tiny.fisher(gaussians, camera)
 
     monkeypatch.setattr(loop, "IMAGE_BYTES", room)
-    state = run(tmp_path / "run", loaded, replace(tiny.stations(), fisher=fisher, exact=tiny.fisher), budget=6, batch=3)
+    state = run(
+        tmp_path / "run",
+        loaded,
+        replace(tiny.stations(), fisher=fisher, exact=tiny.fisher),
+        budget=6,
+        batch=3,
+    )
     assert state.taken == run(tmp_path / "as before", loaded, budget=6, batch=3).taken
-    left, taken = 9 + 6, 3 + 6 + 9  # candidates of two batches; views whose information is summed after three fits
+    left, taken = (
+        9 + 6,
+        3 + 6 + 9,
+    )  # candidates of two batches; views whose information is summed after three fits
     again = 0 if room else (8 + 7) + (5 + 4) + 6
     assert len(measured) == left + taken + again
     assert len(set(measured)) == left + taken
@@ -115,7 +147,9 @@ def test_what_a_pose_sees_of_the_surface_is_measured_once_for_all_choices(loaded
         measured.append(camera.key)
         return tiny.fisher(gaussians, camera)
 
-    run(tmp_path / "run", loaded, replace(tiny.stations(), exact=exact), policy="coverage", budget=4)
+    run(
+        tmp_path / "run", loaded, replace(tiny.stations(), exact=exact), policy="coverage", budget=4
+    )
     taken, candidates = 3 + 4, 12 - 3
     assert len(measured) == taken + candidates
 
@@ -127,9 +161,17 @@ def test_the_policies_that_look_at_the_model_are_known():
 @pytest.mark.parametrize("policy", policies.policy_names())
 @pytest.mark.parametrize("nearest", [None, 3])
 def test_a_batch_counts_as_taken_for_every_policy(loaded, tmp_path, policy, nearest):
-    """Where the fit changes nothing that a policy looks at, a batch has the views that are chosen one by one."""
-    stations = tiny.stations() if policy not in AT_THE_MODEL else tiny.stations(fit=lambda g, *rest: tiny.Fit(g, 0.1, 1))
-    runs = [run(tmp_path / str(k), loaded, stations, policy=policy, nearest=nearest, batch=k) for k in (1, 3)]
+    """Where the fit changes nothing that a policy looks at, a batch has the views that are chosen
+    one by one."""
+    stations = (
+        tiny.stations()
+        if policy not in AT_THE_MODEL
+        else tiny.stations(fit=lambda g, *rest: tiny.Fit(g, 0.1, 1))
+    )
+    runs = [
+        run(tmp_path / str(k), loaded, stations, policy=policy, nearest=nearest, batch=k)
+        for k in (1, 3)
+    ]
     assert runs[0].taken == runs[1].taken
     for one, other in zip(*(state.steps[1:] for state in runs), strict=True):
         assert one["score"] == pytest.approx(other["score"], rel=1e-5, abs=1e-9)
@@ -140,11 +182,13 @@ def test_no_image_is_read_before_the_batch_is_complete(loaded, tmp_path, monkeyp
     opened: set[str] = set()
     places = [
         (mgs.data.dataset, "read_png"), (mgs.data.dataset, "read_mask"), (mgs.data.dataset, "read_exr"),
-        (mgs.active.inputs, "file_digest"),
+        (mgs.run.inputs, "file_digest"),
     ]  # fmt: skip
     for module, name in places:
         function = getattr(module, name)
-        monkeypatch.setattr(module, name, lambda path, f=function: opened.add(Path(path).stem) or f(path))
+        monkeypatch.setattr(
+            module, name, lambda path, f=function: opened.add(Path(path).stem) or f(path)
+        )
     at_choice = []
     choose = loop.Loop.choose
 
@@ -198,7 +242,11 @@ def test_a_batch_is_closed_before_a_view_that_would_tell_little(loaded, tmp_path
 def test_a_batch_whose_fit_diverges_is_named_by_its_last_step(loaded, tmp_path):
     def fit(gaussians, start, cameras, *rest):
         found = tiny.fit(gaussians, start, cameras, *rest)
-        return found if len(cameras) < 7 else replace(found, losses=(0.1, 0.5), stop_reason=StopReason.DIVERGED)
+        return (
+            found
+            if len(cameras) < 7
+            else replace(found, losses=(0.1, 0.5), stop_reason=StopReason.DIVERGED)
+        )
 
     with pytest.raises(InputError, match=r"the fit of step 4 diverged.*; steps 0 to 2 are kept"):
         run(tmp_path / "run", loaded, tiny.stations(fit=fit), batch=2)
@@ -206,7 +254,9 @@ def test_a_batch_whose_fit_diverges_is_named_by_its_last_step(loaded, tmp_path):
 
 
 def test_a_batch_of_no_views_is_one_line(dataset, prior, tmp_path, capsys):
-    said = refused(capsys, ["nbv", dataset, "--prior", prior, "--out", tmp_path / "run", "--batch", "0"])
+    said = refused(
+        capsys, ["nbv", dataset, "--prior", prior, "--out", tmp_path / "run", "--batch", "0"]
+    )
     assert "--batch 0: Input should be greater than or equal to 1" in said
     assert not (tmp_path / "run").exists()
 
@@ -238,7 +288,11 @@ def test_table_report_and_page_of_a_run_in_batches(dataset, prior, tmp_path, cap
         shown = capsys.readouterr()
         assert stop.value.code == 0, shown.err
         if arguments[0] == "nbv":
-            rows = [line.split() for line in shown.out.splitlines() if line.split() and line.split()[0].isdigit()]
+            rows = [
+                line.split()
+                for line in shown.out.splitlines()
+                if line.split() and line.split()[0].isdigit()
+            ]
             assert [row[0] for row in rows] == ["0", "1", "2", "3"]
             assert ["pass-limit" in row for row in rows] == [True, False, True, True]
     assert len(write_report(tmp_path / "again", [out])) == 7

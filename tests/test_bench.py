@@ -1,4 +1,5 @@
-"""What `mgs bench` records: views never seen before, memory of one point alone, exponents, the command line."""
+"""What `mgs bench` records: views never seen before, memory of one point alone, exponents, the
+command line."""
 
 from __future__ import annotations
 
@@ -18,10 +19,12 @@ from mgs.files import read_json
 
 
 def points(most: int = 1_000_000) -> list[dict]:
-    """Records of a machine on which N brings pairs ~ N^0.5 and time ~ pairs^1.4, pixels pairs ~ pixels^0.5 and time ~ pairs,
-    both time ~ pairs^0.9."""
+    """Records of a machine on which N brings pairs ~ N^0.5 and time ~ pairs^1.4, pixels pairs ~
+    pixels^0.5 and time ~ pairs, both time ~ pairs^0.9."""
     numbers = [n for n in (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000) if n <= most]
-    rows = [("gaussians", n, 307_200, 2, n**0.5, n**0.7 if n >= most // 100 else 1.0) for n in numbers]
+    rows = [
+        ("gaussians", n, 307_200, 2, n**0.5, n**0.7 if n >= most // 100 else 1.0) for n in numbers
+    ]
     rows += [("pixels", 100_000, 4**i, 2, 2.0**i, 2.0**i) for i in range(4)]
     rows += [("both", n, 3 * n, 2, float(n), n**0.9 if n >= most // 100 else 1.0) for n in numbers]
     rows += [("threads", 100_000, 307_200, t, 1.0, 1 / t) for t in (1, 2)]
@@ -62,7 +65,9 @@ def test_the_chart_shows_the_records(tmp_path, monkeypatch, threads):
     assert path == tmp_path / "chart.png"
     forward = [axis.lines[0].get_xydata() for axis in figure.axes[:4]]
     for found, (sweep, key) in zip(
-        forward, (("gaussians", "n"), ("pixels",) * 2, ("threads",) * 2, ("both", "pairs")), strict=True
+        forward,
+        (("gaussians", "n"), ("pixels",) * 2, ("threads",) * 2, ("both", "pairs")),
+        strict=True,
     ):
         expected = [(p[key], 1e3 * p["forward_warm"]) for p in records if p["sweep"] == sweep]
         np.testing.assert_allclose(found, expected)
@@ -105,7 +110,9 @@ def test_cold_means_a_view_never_seen_before(monkeypatch):
     centre = (gaussians.means.min(axis=0) + gaussians.means.max(axis=0)) / 2
     for other in seen:
         assert np.array_equal(other.K, camera.K)
-        np.testing.assert_allclose(other.world_to_camera @ [*centre, 1], camera.world_to_camera @ [*centre, 1], atol=1e-6)
+        np.testing.assert_allclose(
+            other.world_to_camera @ [*centre, 1], camera.world_to_camera @ [*centre, 1], atol=1e-6
+        )
         assert other.position[2] == pytest.approx(camera.position[2])
 
 
@@ -137,8 +144,14 @@ def test_the_json_holds_the_command_as_typed(monkeypatch, capsys, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (["splat", "--chart", "x.png"], "--chart: is for scaling and roofline, not for splat; leave it out"),
-        (["fit", "--gaussians", 5000], "--gaussians: is for splat and scaling and roofline, not for fit"),
+        (
+            ["splat", "--chart", "x.png"],
+            "--chart: is for scaling and roofline, not for splat; leave it out",
+        ),
+        (
+            ["fit", "--gaussians", 5000],
+            "--gaussians: is for splat and scaling and roofline, not for fit",
+        ),
         (["fit", "--repeats", 5], "--repeats: is for"),
         (["roofline", "--dataset", "demo/dataset"], "--dataset: is for fit, not for roofline"),
     ],

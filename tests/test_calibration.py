@@ -1,4 +1,5 @@
-"""Predicted errors: their terms against the oracle, and the measures of calibration on errors whose truth is known."""
+"""Predicted errors: their terms against the oracle, and the measures of calibration on errors whose
+truth is known."""
 
 import numpy as np
 import pytest
@@ -6,12 +7,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from splat.scenes import calm, make_camera, make_gaussians
 
-from mgs.active import run_folder
 from mgs.data.dataset import Dataset, Frame
 from mgs.errors import InputError
 from mgs.images import write_png
 from mgs.report import calibration, predicted_error
-from mgs.report.calibration import Calibration, ause, ause_of_constant, crps, fit_calibration, judged, sparsification
+from mgs.report.calibration import (
+    Calibration,
+    ause,
+    ause_of_constant,
+    crps,
+    fit_calibration,
+    judged,
+    sparsification,
+)
+from mgs.run import folder as run_folder
 from mgs.splat import reference
 
 N = 20_000
@@ -27,11 +36,15 @@ def known(seed=0, n=N):
 @pytest.mark.parametrize("degree", [0, 1])
 def test_parameter_variance_is_that_of_the_oracles_jacobian(degree):
     camera = make_camera((20, 14))
-    gaussians = calm(lambda seed: make_gaussians(6, seed, degree, log_scales=(-2.5, -1.0)), camera, 3)
+    gaussians = calm(
+        lambda seed: make_gaussians(6, seed, degree, log_scales=(-2.5, -1.0)), camera, 3
+    )
     J = reference.jacobian(gaussians, camera)
     variance = np.random.default_rng(1).uniform(0.01, 0.1, J.shape[-2:])
     expected = (np.square(J) * variance).sum(axis=(2, 3))
-    found = predicted_error.parameter_variance(gaussians, camera, variance, np.random.default_rng(2), draws=2000)
+    found = predicted_error.parameter_variance(
+        gaussians, camera, variance, np.random.default_rng(2), draws=2000
+    )
     expected = expected.reshape(found.shape)
     seen = expected > 1e-3 * expected.max()
     ratio = found[seen] / expected[seen]
@@ -42,13 +55,17 @@ def test_parameter_variance_is_that_of_the_oracles_jacobian(degree):
 def test_residual_variance_is_the_weighted_mean_over_pixels(tmp_path):
     camera = make_camera((20, 14))
     gaussians = calm(lambda seed: make_gaussians(5, seed, log_scales=(-2.5, -1.5)), camera, 5)
-    write_png(tmp_path / "truth.png", np.random.default_rng(0).random((14, 20, 3)).astype(np.float32))
+    write_png(
+        tmp_path / "truth.png", np.random.default_rng(0).random((14, 20, 3)).astype(np.float32)
+    )
     frame = Frame("truth", camera, 0.0, tmp_path / "truth.png", None, None)
     found = predicted_error.residual_variance(gaussians, [frame, frame])
     weights = np.stack(  # of each Gaussian: the image in which it alone is white, by the oracle
         [reference.render(one_white(gaussians, j), camera)["rgb"][..., 0] for j in range(5)]
     )
-    error = np.square(reference.render(gaussians, camera)["rgb"] - frame.target()[0][..., :3]).mean(-1)
+    error = np.square(reference.render(gaussians, camera)["rgb"] - frame.target()[0][..., :3]).mean(
+        -1
+    )
     expected = (weights * error).sum((1, 2)) / weights.sum((1, 2))
     np.testing.assert_allclose(found, expected, rtol=1e-4)
 
@@ -77,7 +94,12 @@ def test_a_sigma_half_as_large_and_one_that_knows_nothing_are_found_out():
     errors, sigma = known()
     half = judged(errors, sigma / 2, calibration.NORMAL, np.random.default_rng(1))
     assert half["held"]["0.9"][0] < 0.7
-    shuffled = judged(errors, np.random.default_rng(2).permutation(sigma), calibration.NORMAL, np.random.default_rng(1))
+    shuffled = judged(
+        errors,
+        np.random.default_rng(2).permutation(sigma),
+        calibration.NORMAL,
+        np.random.default_rng(1),
+    )
     area = shuffled["ause"]["mae"]
     assert abs(area["ause"] - area["constant"]) < 0.05
     assert abs(shuffled["spearman"]) < 0.05
@@ -95,7 +117,9 @@ def test_calibration_finds_the_weights_of_the_terms():
     assert found.weights["idle"] < 0.15
     assert found.widths[0.9] == pytest.approx(calibration.NORMAL[0.9], rel=0.03)
     sigma = found.sigma({"a": a, "b": b, "idle": idle})
-    assert float(np.mean(np.abs(errors) <= found.widths[0.9] * sigma)) == pytest.approx(0.9, abs=1e-3)
+    assert float(np.mean(np.abs(errors) <= found.widths[0.9] * sigma)) == pytest.approx(
+        0.9, abs=1e-3
+    )
 
 
 @given(st.floats(1e-8, 1e8), st.floats(1e-8, 1e8))
@@ -103,8 +127,13 @@ def test_calibration_does_not_depend_on_units(unit, scale):
     rng = np.random.default_rng(0)
     term = rng.uniform(0.1, 2, 500)
     errors = np.sqrt(term) * rng.standard_normal(500)
-    plain, scaled = fit_calibration({"t": term}, errors), fit_calibration({"t": scale * term}, unit * errors)
-    np.testing.assert_allclose(scaled.sigma({"t": scale * term}), unit * plain.sigma({"t": term}), rtol=1e-3)
+    plain, scaled = (
+        fit_calibration({"t": term}, errors),
+        fit_calibration({"t": scale * term}, unit * errors),
+    )
+    np.testing.assert_allclose(
+        scaled.sigma({"t": scale * term}), unit * plain.sigma({"t": term}), rtol=1e-3
+    )
 
 
 def test_exact_fits_do_not_break_the_calibration():
@@ -136,19 +165,27 @@ def test_crps_against_the_integral_that_defines_it():
 
 def test_sigma_of_maps_has_their_shape():
     terms = {"parameters": np.full((4, 5, 3), 2.0)}
-    np.testing.assert_allclose(Calibration({"parameters": 2.0, "noise": 5.0}, {}).sigma(terms), np.full((4, 5, 3), 3.0))
+    np.testing.assert_allclose(
+        Calibration({"parameters": 2.0, "noise": 5.0}, {}).sigma(terms), np.full((4, 5, 3), 3.0)
+    )
 
 
 @pytest.mark.parametrize(
     ("trained", "means", "said"),
     [
-        (["a"] * 5, "frozen", "has 5 images; --calibrate leaves out a third of them, and needs 6 or more"),
+        (
+            ["a"] * 5,
+            "frozen",
+            "has 5 images; --calibrate leaves out a third of them, and needs 6 or more",
+        ),
         (list("abcdefg"), "free", "learns means"),
         (list("abcdefgh"), "frozen", "was trained on all views there are"),
     ],
 )
 def test_runs_that_cannot_be_calibrated(trained, means, said, tmp_path):
-    dataset = Dataset(tmp_path, tuple(Frame(name, make_camera(), 0.0, None, None, None) for name in "abcdefgh"))
+    dataset = Dataset(
+        tmp_path, tuple(Frame(name, make_camera(), 0.0, None, None, None) for name in "abcdefgh")
+    )
     settings = run_folder.NbvSettings(
         dataset="d", prior="p", train={"means": means, "rates": {"mean": 1}}, prior_std={"mean": 1}
     )

@@ -1,4 +1,5 @@
-"""On-demand datasets: images that exist only once a run has taken them, and runs that are otherwise like any other."""
+"""On-demand datasets: images that exist only once a run has taken them, and runs that are otherwise
+like any other."""
 
 from __future__ import annotations
 
@@ -13,8 +14,6 @@ from pathlib import Path
 import pytest
 from refusals import listing, occupied, refused
 
-from mgs.active import nbv
-from mgs.active.inputs import prior_digest
 from mgs.cli.app import main
 from mgs.data.check import check_dataset
 from mgs.data.dataset import FILES, load_dataset
@@ -23,6 +22,8 @@ from mgs.prior.build import build_prior, prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.report.evaluation import read_comparison
 from mgs.report.tables import table_columns, table_numbers
+from mgs.run import nbv
+from mgs.run.inputs import prior_digest
 from mgs.synth import arena, rendering
 from mgs.synth.capture import capture_of
 from mgs.synth.rendering import PoseNoise, Preset, synthesise
@@ -53,7 +54,8 @@ def struck(path, image):
 rendering.write_png = struck
 main()
 """
-"""The program, which kills itself before it writes the PNG file of that number, a mask or an image of a captured frame."""
+"""The program, which kills itself before it writes the PNG file of that number, a mask or an image
+of a captured frame."""
 
 
 pytestmark = pytest.mark.usefixtures("coarse_arena")
@@ -79,7 +81,9 @@ def poses(root):
 @pytest.fixture(scope="module")
 def prior(root, full):
     """A prior of few Gaussians."""
-    return save_prior(root / "prior", prior_from_mesh(full.root / "rock.glb", PriorSettings(gaussians=300)))
+    return save_prior(
+        root / "prior", prior_from_mesh(full.root / "rock.glb", PriorSettings(gaussians=300))
+    )
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +133,9 @@ def taken(run: Path) -> list[str]:
 
 
 def same_files(frame, other) -> bool:
-    return [path.read_bytes() for path in files(frame)] == [path.read_bytes() for path in files(other)]
+    return [path.read_bytes() for path in files(frame)] == [
+        path.read_bytes() for path in files(other)
+    ]
 
 
 def test_only_test_views_are_rendered_in_advance(full, poses):
@@ -137,8 +143,17 @@ def test_only_test_views_are_rendered_in_advance(full, poses):
     assert [frame.name for frame in poses.frames] == [frame.name for frame in full.frames]
     for ours, theirs in zip(poses.test_views().frames, full.test_views().frames, strict=True):
         assert same_files(ours, theirs)
-    inside = {path.relative_to(poses.root).parts[0] for path in poses.root.rglob("*") if path.is_file()}
-    assert inside == {"transforms.json", "config.json", "contact_sheet.png", "rock.glb", "survey", "test"}
+    inside = {
+        path.relative_to(poses.root).parts[0] for path in poses.root.rglob("*") if path.is_file()
+    }
+    assert inside == {
+        "transforms.json",
+        "config.json",
+        "contact_sheet.png",
+        "rock.glb",
+        "survey",
+        "test",
+    }
 
 
 def test_an_interrupted_dataset_goes_on_as_what_it_was_begun(poses, tmp_path):
@@ -148,17 +163,31 @@ def test_an_interrupted_dataset_goes_on_as_what_it_was_begun(poses, tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        synthesise(tmp_path / "again", SCENE, TINY, seed=3, test_views=2, on_demand=True, progress=stop)
+        synthesise(
+            tmp_path / "again", SCENE, TINY, seed=3, test_views=2, on_demand=True, progress=stop
+        )
     with pytest.raises(InputError, match="unfinished dataset of other settings"):
         synthesise(tmp_path / "again", SCENE, TINY, seed=3, test_views=2)
     again = synthesise(tmp_path / "again", SCENE, TINY, seed=3, test_views=2, on_demand=True)
-    ours, theirs = ({k: v for k, v in listing(d.root).items() if k != "config.json"} for d in (again, poses))
+    ours, theirs = (
+        {k: v for k, v in listing(d.root).items() if k != "config.json"} for d in (again, poses)
+    )
     assert ours == theirs  # config.json has timings
 
 
 def test_the_command_says_what_it_rendered(tmp_path, capsys):
     (tmp_path / "mine.toml").write_text(TOML)
-    command("synth-orbit", tmp_path / "out", "--on-demand", "--scene", tmp_path / "mine.toml", "--frames", 3, "--size", "32x24")
+    command(
+        "synth-orbit",
+        tmp_path / "out",
+        "--on-demand",
+        "--scene",
+        tmp_path / "mine.toml",
+        "--frames",
+        3,
+        "--size",
+        "32x24",
+    )
     said = capsys.readouterr().out
     assert "3 frames, none rendered" in " ".join(said.split())
     assert "contact_sheet" not in said
@@ -183,12 +212,21 @@ def test_a_mesh_seen_from_noisy_poses_is_captured_from_the_true_ones(full, tmp_p
     """Of a scene whose poses are told with noise, the images are those of the true poses."""
     mesh, noise = shutil.copy(full.root / "rock.glb", tmp_path), PoseNoise(0.01, 0.2)
     both = [
-        synthesise(tmp_path / name, SCENE, Preset(32, 24, 4, 2), mesh=mesh, pose_noise=noise, on_demand=name == "poses")
+        synthesise(
+            tmp_path / name,
+            SCENE,
+            Preset(32, 24, 4, 2),
+            mesh=mesh,
+            pose_noise=noise,
+            on_demand=name == "poses",
+        )
         for name in ("full", "poses")
     ]
     capture_of(both[1])(both[1].frames[2])
     assert same_files(both[1].frames[2], both[0].frames[2])
-    assert (tmp_path / "poses/true_poses.json").read_bytes() == (tmp_path / "full/true_poses.json").read_bytes()
+    assert (tmp_path / "poses/true_poses.json").read_bytes() == (
+        tmp_path / "full/true_poses.json"
+    ).read_bytes()
     (tmp_path / "rock.glb").write_bytes(b"another")
     with pytest.raises(InputError, match=r"rock\.glb: has changed since .*poses was made of it"):
         capture_of(both[1])(both[1].frames[3])
@@ -216,7 +254,9 @@ def test_the_run_is_that_on_the_whole_dataset(whole, captured):
     assert (captured / "gaussians.ply").read_bytes() == (whole / "gaussians.ply").read_bytes()
     differ = {"seconds", "psnr", "psnr_mask", "held_out_psnr", "held_out_psnr_mask"}
     for ours, theirs in zip(steps(captured), steps(whole), strict=True):
-        assert {k: v for k, v in ours.items() if k not in differ} == {k: v for k, v in theirs.items() if k not in differ}
+        assert {k: v for k, v in ours.items() if k not in differ} == {
+            k: v for k, v in theirs.items() if k not in differ
+        }
         assert not any(key.startswith("held_out") for key in ours)
         assert "test_psnr" in ours
 
@@ -226,19 +266,30 @@ def test_an_image_that_was_never_chosen_never_exists(captured):
     assert sorted(there(dataset)) == sorted(taken(captured))
     never = next(frame for frame in dataset.frames if frame.name not in taken(captured))
     for read in (never.rgb, never.mask, never.depth, never.target):
-        with pytest.raises(InputError, match=rf"does not exist, since no run has taken frame {never.name} .* `mgs nbv`"):
+        with pytest.raises(
+            InputError,
+            match=rf"does not exist, since no run has taken frame {never.name} .* `mgs nbv`",
+        ):
             read()
 
 
 @pytest.mark.parametrize("png", [4, 8])
 def test_killed_while_it_captures_and_resumed(captured, poses, prior, fresh, tmp_path, png):
-    """Killed with SIGKILL inside the second seed, and inside the first chosen view: two PNG files of each frame are written by
-    that function. The same choices, the same model, the same images."""
+    """Killed with SIGKILL inside the second seed, and inside the first chosen view: two PNG files
+    of each frame are written by that function. The same choices, the same model, the same
+    images."""
     out, program = tmp_path / "run", STRUCK.format(files=png, rows=arena.ROWS, texels=arena.TEXELS)
     arguments = ["nbv", fresh.root, "--prior", prior, "--out", out, *RUN]
-    process = subprocess.run([sys.executable, "-c", program, *map(str, arguments)], capture_output=True, text=True)
+    process = subprocess.run(
+        [sys.executable, "-c", program, *map(str, arguments)], capture_output=True, text=True
+    )
     assert process.returncode == -signal.SIGKILL, process.stderr
-    done = {path: path.stat().st_mtime_ns for frame in fresh.frames if rendering.is_done(frame) for path in files(frame)}
+    done = {
+        path: path.stat().st_mtime_ns
+        for frame in fresh.frames
+        if rendering.is_done(frame)
+        for path in files(frame)
+    }
     assert len(done) == 4 * ((png - 1) // 2)
     command("nbv", "--resume", out)
     assert taken(out) == taken(captured)
@@ -275,9 +326,13 @@ def test_every_command_that_reads_a_run_reads_this_one(captured, tmp_path):
     command("refit", captured)
     assert there(dataset) == before
     assert not any("no run has taken" in problem for problem in check_dataset(dataset).problems)
-    assert not any("no run has taken" in problem for problem in check_dataset(dataset.survey()).problems)
+    assert not any(
+        "no run has taken" in problem for problem in check_dataset(dataset.survey()).problems
+    )
     never = {frame.name for frame in dataset.frames} - set(taken(captured))
-    assert {path.stem for path in (captured / "diagnostics").glob("*.png")} == never  # maps of a pose need no image
+    assert {
+        path.stem for path in (captured / "diagnostics").glob("*.png")
+    } == never  # maps of a pose need no image
     middle = dataset.test_views().frames[1]
     truth, _ = read_comparison(captured / "renders/test" / f"{middle.name}.png", middle.camera)
     assert truth.any()
@@ -289,20 +344,29 @@ def test_every_command_that_reads_a_run_reads_this_one(captured, tmp_path):
 
 
 def test_errors_are_judged_on_test_views_alone(poses, prior, fresh, tmp_path):
-    """The calibration takes the views that the run has seen, and of those it has not only the ones with images."""
+    """The calibration takes the views that the run has seen, and of those it has not only the ones
+    with images."""
     run = tmp_path / "run"
     command("nbv", fresh.root, "--prior", prior, "--out", run, *RUN[:2], "--budget", 3, *RUN[4:])
     command("diagnose", run, "--calibrate")
-    assert json.loads((run / "diagnostics/uncertainty.json").read_text())["views"] == {"folds": 6, "test": 2}
+    assert json.loads((run / "diagnostics/uncertainty.json").read_text())["views"] == {
+        "folds": 6,
+        "test": 2,
+    }
 
 
 def test_runs_that_share_a_dataset_can_be_compared(prior, fresh, tmp_path, monkeypatch):
-    """A frame that another run took is not rendered again. Without test views the report shows a frame that both have taken."""
+    """A frame that another run took is not rendered again. Without test views the report shows a
+    frame that both have taken."""
     shutil.rmtree(fresh.root / "test")
     runs = [tmp_path / policy for policy in ("farthest", "d-optimal")]
     command("nbv", fresh.root, "--prior", prior, "--policy", "farthest", "--out", runs[0], *RUN)
     take, rendered = rendering.Photographer.take, []
-    monkeypatch.setattr(rendering.Photographer, "take", lambda self, frame: (rendered.append(frame.name), take(self, frame)))
+    monkeypatch.setattr(
+        rendering.Photographer,
+        "take",
+        lambda self, frame: (rendered.append(frame.name), take(self, frame)),
+    )
     command("nbv", fresh.root, "--prior", prior, "--out", runs[1], *RUN)
     assert rendered == [name for name in taken(runs[1]) if name not in taken(runs[0])]
     for run in runs:
@@ -327,7 +391,9 @@ def test_one_command_does_all_of_it(small, tmp_path, capsys):
     command("nbv", "--capture", tmp_path / "mine.toml", "--out", run, "--gaussians", 300, *RUN)
     dataset = load_dataset(run / "dataset")
     assert sorted(there(dataset)) == sorted(taken(run))
-    assert json.loads((run / "config.json").read_text())["settings"]["dataset"] == str((run / "dataset").resolve())
+    assert json.loads((run / "config.json").read_text())["settings"]["dataset"] == str(
+        (run / "dataset").resolve()
+    )
     assert json.loads((run / "prior/prior.json").read_text())["from"] == "depth"
     said = capsys.readouterr().out
     assert "test views (1)" in said
@@ -352,24 +418,38 @@ def test_bad_scenes_and_options_are_refused(small, poses, prior, tmp_path, capsy
     (tmp_path / "bad.toml").write_text("[rock]\nsiez = 1\n")
     out = ["--out", tmp_path / "out"]
     assert "nosuch" in refused(capsys, ["nbv", "--capture", "nosuch", *out], tmp_path)
-    assert "rock.siez" in refused(capsys, ["nbv", "--capture", tmp_path / "bad.toml", *out], tmp_path)
-    assert "give a DATASET or --capture" in refused(capsys, ["nbv", poses.root, "--capture", "boulder", *out], tmp_path)
-    assert "--capture out" in refused(capsys, ["nbv", "--resume", tmp_path, "--capture", "boulder"], tmp_path)
+    assert "rock.siez" in refused(
+        capsys, ["nbv", "--capture", tmp_path / "bad.toml", *out], tmp_path
+    )
+    assert "give a DATASET or --capture" in refused(
+        capsys, ["nbv", poses.root, "--capture", "boulder", *out], tmp_path
+    )
+    assert "--capture out" in refused(
+        capsys, ["nbv", "--resume", tmp_path, "--capture", "boulder"], tmp_path
+    )
     assert "--budget 6 exceeds its 5" in refused(
         capsys, ["nbv", "--capture", "boulder", "--seeds", 3, "--budget", 6, *out], tmp_path
     )
-    assert "not empty" in refused(capsys, ["nbv", "--capture", "boulder", "--out", occupied(tmp_path / "in")], tmp_path)
-    assert "no such prior" in refused(capsys, ["nbv", "--capture", "boulder", "--prior", tmp_path / "no", *out], tmp_path)
+    assert "not empty" in refused(
+        capsys, ["nbv", "--capture", "boulder", "--out", occupied(tmp_path / "in")], tmp_path
+    )
+    assert "no such prior" in refused(
+        capsys, ["nbv", "--capture", "boulder", "--prior", tmp_path / "no", *out], tmp_path
+    )
 
 
 def test_what_an_on_demand_dataset_lacks_is_said(poses, fresh, prior, tmp_path, capsys):
     line = refused(capsys, ["prior", fresh.root, "--gaussians", 300], fresh.root)
     assert "no run has taken frame kf_0000" in line
     assert "folder survey" in line
-    assert "no run has taken frame kf_0000" in refused(capsys, ["survey", fresh.root, "--out", tmp_path / "s"], fresh.root)
+    assert "no run has taken frame kf_0000" in refused(
+        capsys, ["survey", fresh.root, "--out", tmp_path / "s"], fresh.root
+    )
     shutil.rmtree(fresh.root / "survey")
     out = tmp_path / "run"
-    assert "give one with --prior" in refused(capsys, ["nbv", fresh.root, "--out", out, *RUN], fresh.root)
+    assert "give one with --prior" in refused(
+        capsys, ["nbv", fresh.root, "--out", out, *RUN], fresh.root
+    )
     assert not out.exists()
 
 
@@ -377,7 +457,10 @@ def test_what_an_on_demand_dataset_lacks_is_said(poses, fresh, prior, tmp_path, 
     ("spoil", "said"),
     [
         (lambda root: (root / "config.json").unlink(), r"config\.json: no such file"),
-        (lambda root: (root / "config.json").write_text("{}"), "is not of `mgs synth-orbit --on-demand`"),
+        (
+            lambda root: (root / "config.json").write_text("{}"),
+            "is not of `mgs synth-orbit --on-demand`",
+        ),
         (
             lambda root: edit(root, lambda frame: frame.update(file_path="images/kf_9.png")),
             "kf_9 is not one of the scene's",
@@ -409,4 +492,9 @@ def edit(root: Path, change) -> None:
 
 def move(root: Path) -> None:
     """Move the first camera by a millimetre."""
-    edit(root, lambda frame: frame["transform_matrix"][0].__setitem__(3, frame["transform_matrix"][0][3] + 1e-3))
+    edit(
+        root,
+        lambda frame: frame["transform_matrix"][0].__setitem__(
+            3, frame["transform_matrix"][0][3] + 1e-3
+        ),
+    )

@@ -1,5 +1,6 @@
-"""Two captures of the kinds that people have: a toy on a table, and the front of a building, which is seen from one side and
-without any ground. Both are made here, with outliers, noise, parts without points, and a tilted world of unknown scale."""
+"""Two captures of the kinds that people have: a toy on a table, and the front of a building, which
+is seen from one side and without any ground. Both are made here, with outliers, noise, parts
+without points, and a tilted world of unknown scale."""
 
 from __future__ import annotations
 
@@ -50,10 +51,18 @@ def table() -> trimesh.Trimesh:
 
 
 def building() -> trimesh.Trimesh:
-    """A front 6 m wide and 4 m high that faces -y: a wall with windows that stand out, two columns, a porch, a cornice."""
-    boxes = [((6, 0.6, 4), (0, 0.3, 2)), ((6.4, 0.9, 0.3), (0, 0.15, 4.1)), ((1.6, 0.7, 0.3), (0, -0.3, 2.3))]
+    """A front 6 m wide and 4 m high that faces -y: a wall with windows that stand out, two columns,
+    a porch, a cornice."""
+    boxes = [
+        ((6, 0.6, 4), (0, 0.3, 2)),
+        ((6.4, 0.9, 0.3), (0, 0.15, 4.1)),
+        ((1.6, 0.7, 0.3), (0, -0.3, 2.3)),
+    ]
     boxes += [((0.8, 0.2, 1.2), (x, -0.1, z)) for x in (-2.1, 2.1) for z in (1.1, 3)]
-    parts = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(place)) for size, place in boxes]
+    parts = [
+        trimesh.creation.box(size, trimesh.transformations.translation_matrix(place))
+        for size, place in boxes
+    ]
     for x in (-0.65, 0.65):
         column = trimesh.creation.cylinder(0.14, 2.2, sections=32)
         column.vertices += [x, -0.5, 1.1]
@@ -62,7 +71,8 @@ def building() -> trimesh.Trimesh:
 
 
 def albedo(x: np.ndarray) -> np.ndarray:
-    """Colour of points [...,3]: a pattern that fades out and comes back, so that whole parts have no feature to be found on."""
+    """Colour of points [...,3]: a pattern that fades out and comes back, so that whole parts have
+    no feature to be found on."""
     strength = 0.45 * np.clip(0.8 + np.sin(1.7 * x[..., :1] + 2.3 * x[..., 2:]), 0, 1)
     pattern = np.sign(np.sin(19 * x) * np.sin(23 * x[..., [1, 2, 0]] + 1))
     return 0.5 + strength * pattern
@@ -82,7 +92,10 @@ def orbit(count: int, target: tuple[float, float, float], radius: float) -> list
 def arc(count: int, target: tuple[float, float, float], distance: float) -> list[Camera]:
     """Cameras at the height of a head, on an arc of 80 degrees in front (-y) of the target."""
     angles = np.radians(np.linspace(-40, 40, count))
-    eyes = [np.array([target[0] + distance * np.sin(a), target[1] - distance * np.cos(a), 1.7]) for a in angles]
+    eyes = [
+        np.array([target[0] + distance * np.sin(a), target[1] - distance * np.cos(a), 1.7])
+        for a in angles
+    ]
     return _cameras(eyes, target)
 
 
@@ -94,15 +107,30 @@ def _cameras(eyes: list[np.ndarray], target: tuple[float, float, float]) -> list
 KINDS = (("images", "png"), ("depth", "exr"), ("masks", "png"))
 
 
-def write(root: Path, thing: trimesh.Trimesh, around: trimesh.Trimesh | None, cameras: list[Camera], grain: float) -> Dataset:
-    """A dataset of exact images, depth and masks of `thing`, with `around` beside it. grain: length of the pattern, metres."""
-    own, whole = (_depth(mesh) for mesh in (thing, thing if around is None else trimesh.util.concatenate([thing, around])))
+def write(
+    root: Path,
+    thing: trimesh.Trimesh,
+    around: trimesh.Trimesh | None,
+    cameras: list[Camera],
+    grain: float,
+) -> Dataset:
+    """A dataset of exact images, depth and masks of `thing`, with `around` beside it. grain: length
+    of the pattern, metres."""
+    own, whole = (
+        _depth(mesh)
+        for mesh in (thing, thing if around is None else trimesh.util.concatenate([thing, around]))
+    )
     frames = []
     for k, camera in enumerate(cameras):
         depth, name = whole(camera), f"{k:03d}"
         mask = (depth > 0) & np.isclose(own(camera), depth, rtol=1e-4)
-        frame = Frame(name, camera, float(k), *(root / f"{kind}/{name}.{end}" for kind, end in KINDS))
-        write_png(root / f"images/{name}.png", np.where(depth[..., None] > 0, albedo(camera.unproject(depth) / grain), 0.05))
+        frame = Frame(
+            name, camera, float(k), *(root / f"{kind}/{name}.{end}" for kind, end in KINDS)
+        )
+        write_png(
+            root / f"images/{name}.png",
+            np.where(depth[..., None] > 0, albedo(camera.unproject(depth) / grain), 0.05),
+        )
         write_exr(root / f"depth/{name}.exr", {"Z": depth.astype(np.float32)})
         write_png(root / f"masks/{name}.png", mask)
         frames.append(frame)
@@ -112,11 +140,17 @@ def write(root: Path, thing: trimesh.Trimesh, around: trimesh.Trimesh | None, ca
 
 
 def _depth(mesh: trimesh.Trimesh) -> Callable[[Camera], np.ndarray]:
-    return mesh_depth(Mesh(np.asarray(mesh.vertices, float), np.asarray(mesh.faces), np.ones(len(mesh.faces), bool)))
+    return mesh_depth(
+        Mesh(
+            np.asarray(mesh.vertices, float), np.asarray(mesh.faces), np.ones(len(mesh.faces), bool)
+        )
+    )
 
 
 @pytest.fixture(scope="module")
-def capture(photographs: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+def capture(
+    photographs: ModuleType, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str], Path]:
     """A capture by its name, as photographs and a COLMAP model in text; made once."""
     folder = tmp_path_factory.mktemp("captures")
 
@@ -134,7 +168,8 @@ def capture(photographs: ModuleType, tmp_path_factory: pytest.TempPathFactory) -
 
 
 def prior_of(source: Path, out: Path, masks: bool) -> tuple[Dataset, Prior, np.ndarray]:
-    """The dataset of a capture, its prior, and how far the prior's points are from the true surface, metres."""
+    """The dataset of a capture, its prior, and how far the prior's points are from the true
+    surface, metres."""
     found, truth = read_source(source), read_json(source / "truth.json")
     up = found.up_or_estimate()[0]
     assert angle_between(up, unit_up(truth["up"])) < 2
@@ -142,7 +177,11 @@ def prior_of(source: Path, out: Path, masks: bool) -> tuple[Dataset, Prior, np.n
     prior, _ = build_prior(dataset, PriorSettings(gaussians=1500, backing=0))
     assert trimesh.Trimesh(prior.mesh.vertices, prior.mesh.faces).is_watertight
     true = read_mesh(source / "truth.ply")
-    return dataset, prior, distances_to_mesh(prior.points, true.vertices, true.faces) / truth["scale"]
+    return (
+        dataset,
+        prior,
+        distances_to_mesh(prior.points, true.vertices, true.faces) / truth["scale"],
+    )
 
 
 @pytest.mark.parametrize("masks", [True, False])
@@ -165,6 +204,8 @@ def test_the_front_of_a_building(capture: Callable[[str], Path], tmp_path: Path)
     assert distance.mean() < 0.06  # a pixel is 42 mm
     assert np.quantile(distance, 0.9) < 0.15
     scale = read_json(capture("building") / "truth.json")["scale"]
-    assert prior.numbers["sampled_area"] / scale**2 > 12  # most of the front, which is 24 square metres, has points
+    assert (
+        prior.numbers["sampled_area"] / scale**2 > 12
+    )  # most of the front, which is 24 square metres, has points
     masked = make_masks(dataset, prior.mesh, 0.1)
     assert all(0.2 < frame.mask().mean() < 0.95 for frame in masked.frames)

@@ -1,4 +1,5 @@
-"""`mgs chart`: fronts, commands of rows, quantisers, cheaper scores, presets; and a whole chart of a tiny rock."""
+"""`mgs chart`: fronts, commands of rows, quantisers, cheaper scores, presets; and a whole chart of
+a tiny rock."""
 
 import csv
 import json
@@ -13,12 +14,13 @@ import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mgs.active.nbv import start_run
-from mgs.active.settings import ALPHA_WEIGHT, COLOURS_ALONE, PRESETS, NbvSettings, TrainSettings, with_defaults
 from mgs.cli.app import app, main
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
+from mgs.fit.settings import ALPHA_WEIGHT, COLOURS_ALONE, TrainSettings
 from mgs.prior.settings import PriorSettings
+from mgs.run.nbv import start_run
+from mgs.run.settings import PRESETS, NbvSettings, with_defaults
 from mgs.study import oracle, tasks
 from mgs.study.chart import core, fit, plan, presets, scoring, sending, study, subject, timing
 from mgs.study.chart.pareto import pareto_front
@@ -47,7 +49,9 @@ def test_times_are_ratios_to_a_reference_that_is_timed_beside_each_call(monkeypa
     """A machine that becomes four times as slow: the ratio stays."""
     slowness = iter([1, 1, 4, 4])
     cost = {"reference": 0.5, "work": 2.0}
-    monkeypatch.setattr(timing, "_clock", lambda call: ((name := call()), cost[name] * (s := next(slowness)), 2 * s))
+    monkeypatch.setattr(
+        timing, "_clock", lambda call: ((name := call()), cost[name] * (s := next(slowness)), 2 * s)
+    )
     result, times = timing.timed(lambda: "work", 2, lambda: "reference")
     assert result == "work"
     assert times["ratio"] == times["ratio_low"] == times["ratio_high"] == 4
@@ -80,7 +84,10 @@ def parsed(line):
 def test_commands_of_points_say_what_was_measured(name):
     chosen = plan.PLANS[name]
     for point in {p for points in fit.factors(chosen, True).values() for p in points}:
-        said, made = parsed(point.command("DATA", "PRIOR", chosen.seeds)), point.settings(chosen.seeds)
+        said, made = (
+            parsed(point.command("DATA", "PRIOR", chosen.seeds)),
+            point.settings(chosen.seeds),
+        )
         train = made.pop("train")
         rates = dict(pair.split("=") for pair in said["rate"] or [])
         assert said["alpha_weight"] == 0
@@ -88,15 +95,19 @@ def test_commands_of_points_say_what_was_measured(name):
             k: train[k] for k in ("passes", "optimiser")
         }
         assert {kind: float(rate) for kind, rate in rates.items()} == train["rates"]
-        assert NbvSettings(dataset="DATA", prior="PRIOR", **made, train=train).train_at(1).passes == min(
-            point.warm_passes, point.passes
-        )
+        assert NbvSettings(dataset="DATA", prior="PRIOR", **made, train=train).train_at(
+            1
+        ).passes == min(point.warm_passes, point.passes)
 
 
 def test_points_of_different_settings_have_different_cells():
     points = {p for points in fit.factors(plan.PLANS["full"], True).values() for p in points}
     assert len({point.name for point in points}) == len(points)
-    cells = [c for kind in plan.KINDS for c in study.cells_of(kind, *_full(), plan.synthetic(plan.PLANS["full"], "boulder"), 3)]
+    cells = [
+        c
+        for kind in plan.KINDS
+        for c in study.cells_of(kind, *_full(), plan.synthetic(plan.PLANS["full"], "boulder"), 3)
+    ]
     by_name = {cell.name: cell for cell in cells}
     assert all(by_name[cell.name] == cell for cell in cells)
     assert all(need in by_name for cell in cells for need in cell.needs)
@@ -119,8 +130,13 @@ def test_a_preset_gives_defaults_and_what_is_given_wins(name):
     usual = {"passes": row.passes, "alpha_weight": ALPHA_WEIGHT}
     assert with_defaults({}, row)["train"] == usual
     given = {"passes": 9, "optimiser": "adam", "alpha_weight": 0.0}
-    assert with_defaults({"warm_passes": 7, "train": given}, row) == {"warm_passes": 7, "train": given}
-    assert with_defaults({"train": TrainSettings(optimiser="adam")}, row)["train"] == usual | {"optimiser": "adam"}
+    assert with_defaults({"warm_passes": 7, "train": given}, row) == {
+        "warm_passes": 7,
+        "train": given,
+    }
+    assert with_defaults({"train": TrainSettings(optimiser="adam")}, row)["train"] == usual | {
+        "optimiser": "adam"
+    }
 
 
 class Begun(Exception):
@@ -133,7 +149,7 @@ def test_studies_fit_colours_alone(dataset, prior, tmp_path, monkeypatch):
     def begin(*_, train, **__):
         raise Begun(train["alpha_weight"])
 
-    monkeypatch.setattr("mgs.active.nbv.run_nbv", begin)
+    monkeypatch.setattr("mgs.run.nbv.run_nbv", begin)
     monkeypatch.setattr(tasks, "run_nbv", begin)
     monkeypatch.setattr(oracle, "start_run", begin)
     for module in (tasks, oracle):
@@ -160,7 +176,9 @@ def test_what_is_no_table_of_settings_is_left_to_be_refused():
 
 def test_a_run_without_a_preset_fits_alpha_too_unless_it_says_not_to():
     assert with_defaults({"budget": 3}) == {"budget": 3, "train": {"alpha_weight": ALPHA_WEIGHT}}
-    assert with_defaults({"train": COLOURS_ALONE})["train"] == COLOURS_ALONE == {"alpha_weight": 0.0}
+    assert (
+        with_defaults({"train": COLOURS_ALONE})["train"] == COLOURS_ALONE == {"alpha_weight": 0.0}
+    )
 
 
 def test_a_run_with_a_preset_writes_what_it_came_to(dataset, prior, tmp_path, monkeypatch):
@@ -168,7 +186,9 @@ def test_a_run_with_a_preset_writes_what_it_came_to(dataset, prior, tmp_path, mo
     settings = json.loads((tmp_path / "run/config.json").read_text())["settings"]
     assert settings["train"]["passes"] == PRESETS["fast"].passes
     assert settings["warm_passes"] == 4
-    with pytest.raises(InputError, match="--preset 'best': unknown; choose one of fast, balanced, accurate"):
+    with pytest.raises(
+        InputError, match="--preset 'best': unknown; choose one of fast, balanced, accurate"
+    ):
         start_run(dataset, tmp_path / "other", prior=prior, preset="best")
     asked = []
 
@@ -176,7 +196,7 @@ def test_a_run_with_a_preset_writes_what_it_came_to(dataset, prior, tmp_path, mo
         asked.append(given)
         raise InputError("enough")
 
-    monkeypatch.setattr("mgs.active.nbv.build_prior", build)
+    monkeypatch.setattr("mgs.run.nbv.build_prior", build)
     for options in ({"preset": "accurate"}, {"preset": "accurate", "gaussians": 50}):
         with pytest.raises(InputError, match="enough"):
             start_run(dataset, tmp_path / "built", seeds=3, **options)
@@ -215,7 +235,8 @@ def test_what_is_received_is_half_a_step_off_at_most(row, other, factor):
 
 
 def test_steps_follow_the_information_of_a_gaussian():
-    """Where all numbers of a Gaussian have information in proportion, a power of two for each Gaussian gives the steps."""
+    """Where all numbers of a Gaussian have information in proportion, a power of two for each
+    Gaussian gives the steps."""
     seen, column = np.array([[1.0], [4], [16]]), np.array([[1.0, 9]])
     steps, told = sending.step_of_gaussian(seen * column, np.zeros(2))
     assert steps == pytest.approx(1 / np.sqrt(seen * column))
@@ -232,7 +253,12 @@ class FakeState:
     """A state whose candidates gain what is in `gains`."""
 
     def __init__(self, gains, old):
-        self.gains, self.old_scores, self.left, self.taken = gains, np.array(old, float), list(range(len(gains))), []
+        self.gains, self.old_scores, self.left, self.taken = (
+            gains,
+            np.array(old, float),
+            list(range(len(gains))),
+            [],
+        )
         self.lam, self.asked = np.ones(1), []
 
     def summed(self, views, **how):
@@ -273,14 +299,21 @@ def test_the_verdict_on_presets(monkeypatch):
     points = fit.crossed_runs(chosen)
     other = next(p for p in points if p not in fit.preset_points(chosen).values())
     run = {"ratio": 1.0, "ratio_low": 1.0, "ratio_high": 1.0, "psnr": 30.0}
-    found = {f"prior/{scene}-{1 / d:g}": {"gaussians": 9} for scene in plan.OTHER_SCENES for d in chosen.densities}
+    found = {
+        f"prior/{scene}-{1 / d:g}": {"gaussians": 9}
+        for scene in plan.OTHER_SCENES
+        for d in chosen.densities
+    }
     for scene, best in zip(plan.OTHER_SCENES, (30.05, 30.5), strict=True):
         found |= {f"fit/{scene}/{p.name}": run for p in points}
         found[f"fit/{scene}/{other.name}"] = run | {"psnr": best}
     rows = presets.rows(chosen, study.Path("OUT"), found, 1.0)
     assert [row["holds"] for row in rows] == [True] * 3 + [False] * 3
     assert rows[-1]["loss"] == pytest.approx(0.5)
-    assert (rows[-1]["best_passes"], rows[-1]["best_warm_passes"]) == (other.passes, other.warm_passes)
+    assert (rows[-1]["best_passes"], rows[-1]["best_warm_passes"]) == (
+        other.passes,
+        other.warm_passes,
+    )
     assert all(parsed(row["command"])["passes"] for row in rows)
 
 
@@ -298,14 +331,27 @@ TINY = replace(
 
 @pytest.fixture
 def small_study(dataset, tmp_path, monkeypatch):
-    """A plan of few points on the tiny dataset, with a prior that is there already and a reference that costs nothing."""
+    """A plan of few points on the tiny dataset, with a prior that is there already and a reference
+    that costs nothing."""
     tiny.write_dataset(dataset / "test", frames=3)
     point = fit.Point(4, passes=2)
-    some = {"crossed": [point, replace(point, learned="colour")], "crossed, run": list(fit.preset_points(TINY).values())[:1]}
+    some = {
+        "crossed": [point, replace(point, learned="colour")],
+        "crossed, run": list(fit.preset_points(TINY).values())[:1],
+    }
     monkeypatch.setitem(plan.PLANS, "quick", TINY)
     monkeypatch.setattr(fit, "factors", lambda plan, halves: some)
     monkeypatch.setattr(scoring, "STATES", (2, 3))
-    few = ("exact", "block", "size 1/2", "1/2 of Gaussians", "incremental", "stale 2", "lazy 2", "directional-d")
+    few = (
+        "exact",
+        "block",
+        "size 1/2",
+        "1/2 of Gaussians",
+        "incremental",
+        "stale 2",
+        "lazy 2",
+        "directional-d",
+    )
     known = scoring.variants
     monkeypatch.setattr(scoring, "variants", lambda plan: {name: known(plan)[name] for name in few})
     monkeypatch.setattr(timing, "_reference", lambda: lambda: sum(range(1000)))
@@ -368,4 +414,7 @@ def test_an_unknown_chart_is_refused(capsys, tmp_path):
     with pytest.raises(SystemExit) as ended:
         main(["chart", str(tmp_path / "out"), "--only", "fit,speed"])
     assert ended.value.code == 2
-    assert "--only 'speed': unknown; choose some of fit,scoring,core,bytes,presets" in capsys.readouterr().err
+    assert (
+        "--only 'speed': unknown; choose some of fit,scoring,core,bytes,presets"
+        in capsys.readouterr().err
+    )

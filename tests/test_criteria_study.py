@@ -9,8 +9,8 @@ import pytest
 import tiny
 
 import mgs
-from mgs.active.policies import policy_names
 from mgs.errors import InputError
+from mgs.policy.registry import policy_names
 
 ROOT = Path(__file__).parent.parent
 
@@ -30,7 +30,14 @@ def run(tmp_path_factory):
     root = tmp_path_factory.mktemp("study")
     tiny.write_dataset(root / "data", frames=8)
     tiny.write_dataset(root / "data/test", frames=3)
-    mgs.run_nbv(root / "data", root / "run", prior=tiny.write_prior(root / "prior"), budget=0, seeds=3, train={"passes": 3})
+    mgs.run_nbv(
+        root / "data",
+        root / "run",
+        prior=tiny.write_prior(root / "prior"),
+        budget=0,
+        seeds=3,
+        train={"passes": 3},
+    )
     return root / "run"
 
 
@@ -53,7 +60,9 @@ def test_an_interrupted_study_ends_as_another(benchmark, run, tmp_path, monkeypa
     with pytest.raises(KeyboardInterrupt):
         benchmark.study(tmp_path / "again.json", [run], 2, ["random"])
     again = benchmark.study(tmp_path / "again.json", [run], 2, policy_names())
-    assert len(calls) == 1 + 2 * 5 + 1  # the start, five candidates in two orders, and the one that was interrupted
+    assert (
+        len(calls) == 1 + 2 * 5 + 1
+    )  # the start, five candidates in two orders, and the one that was interrupted
     assert again == json.loads((tmp_path / "again.json").read_text())
     assert again["states"] == whole["states"]
     text = benchmark.table(again, [run])
@@ -64,17 +73,22 @@ def test_another_state_is_refused(benchmark, run, tmp_path):
     found = benchmark.study(tmp_path / "out.json", [run], 1, ["farthest"])
     found["states"][str(run)]["model"] = "another"
     (tmp_path / "out.json").write_text(json.dumps(found))
-    with pytest.raises(InputError, match=r"holds another state of .*run than its last one; write to a new file"):
+    with pytest.raises(
+        InputError, match=r"holds another state of .*run than its last one; write to a new file"
+    ):
         benchmark.study(tmp_path / "out.json", [run], 1, ["farthest"])
 
 
 def test_gains_of_an_earlier_file(benchmark, run, tmp_path):
-    """Its gains are taken where the states are the same but for the last digits; scores are of the states as they are."""
+    """Its gains are taken where the states are the same but for the last digits; scores are of the
+    states as they are."""
     old = benchmark.study(tmp_path / "old.json", [run], 2, ["farthest", "uniform"])
     state = old["states"][str(run)]
     state |= {"model": "with other last digits", "scores": {"uniform": [0.0] * 5}}
     (tmp_path / "old.json").write_text(json.dumps(old))
-    found = benchmark.study(tmp_path / "new.json", [run], 2, ["uniform", "coverage"], tmp_path / "old.json")
+    found = benchmark.study(
+        tmp_path / "new.json", [run], 2, ["uniform", "coverage"], tmp_path / "old.json"
+    )
     new = found["states"][str(run)]
     assert new["psnr"] == state["psnr"]
     assert new["result"]["gains"] == state["result"]["gains"]
@@ -83,12 +97,16 @@ def test_gains_of_an_earlier_file(benchmark, run, tmp_path):
     assert np.ptp(new["scores"]["uniform"]) > 0
     state["psnr"]["start"] += 0.03
     (tmp_path / "old.json").write_text(json.dumps(old))
-    with pytest.raises(InputError, match=r"--gains: are of another state of .* \(PSNR differs by 0.030 dB\); leave them out"):
+    with pytest.raises(
+        InputError,
+        match=r"--gains: are of another state of .* \(PSNR differs by 0.030 dB\); leave them out",
+    ):
         benchmark.study(tmp_path / "other.json", [run], 2, ["uniform"], tmp_path / "old.json")
 
 
 def test_what_is_compared(benchmark):
-    """A perfect score, its opposite, one that knows nothing, whose choice is the farthest view; and two orders."""
+    """A perfect score, its opposite, one that knows nothing, whose choice is the farthest view; and
+    two orders."""
     psnr = {"start": 20.0, "a": [20.1, 20.2], "b": [20.4, 20.3], "c": [20.2, 20.6]}
     scores = {"good": [1, 2, 3], "bad": [3, 2, 1], "none": [0, 0, 0], "(farthest)": [1, 5, 2]}
     record = {"candidates": ["a", "b", "c"], "psnr": psnr, "scores": scores}

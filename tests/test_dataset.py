@@ -36,13 +36,17 @@ def _sphere(camera):
 def _write(root, count=6, depth_scale=1.0):
     frames = []
     for i, azimuth in enumerate(np.linspace(0, 2 * np.pi, count, endpoint=False)):
-        camera = Camera(K, W, H, look_at([4 * np.cos(azimuth), 4 * np.sin(azimuth), 1.5], [0, 0, 0]))
+        camera = Camera(
+            K, W, H, look_at([4 * np.cos(azimuth), 4 * np.sin(azimuth), 1.5], [0, 0, 0])
+        )
         frame = Frame(
             f"kf_{i:04d}", camera, 0.5 * i, root / f"images/kf_{i:04d}.png", root / f"depth/kf_{i:04d}.exr",
             root / f"masks/kf_{i:04d}.png",
         )  # fmt: skip
         depth, mask = _sphere(camera)
-        write_png(frame.image_path, np.random.default_rng(i).uniform(0, 1, (H, W, 3)).astype(np.float32))
+        write_png(
+            frame.image_path, np.random.default_rng(i).uniform(0, 1, (H, W, 3)).astype(np.float32)
+        )
         write_exr(frame.depth_path, {"Z": depth * depth_scale})
         write_png(frame.mask_path, mask)
         frames.append(frame)
@@ -82,7 +86,9 @@ def test_transforms_are_nerfstudios(folder):
     pose = np.array(data["frames"][1]["transform_matrix"])
     np.testing.assert_allclose(-pose[:3, 2], -pose[:3, 3] / np.linalg.norm(pose[:3, 3]), atol=1e-9)
     assert pose[2, 1] > 0  # its y is up
-    np.testing.assert_allclose(load_dataset(folder).frames[1].camera.world_to_camera, opencv_from_opengl(pose))
+    np.testing.assert_allclose(
+        load_dataset(folder).frames[1].camera.world_to_camera, opencv_from_opengl(pose)
+    )
 
 
 def test_frames_come_in_order_of_time_and_may_have_their_own_intrinsics(folder):
@@ -98,7 +104,8 @@ def test_frames_come_in_order_of_time_and_may_have_their_own_intrinsics(folder):
 
 
 def _with_rock_images(folder):
-    """The dataset with an image of the rock alone for every frame: alpha of multiples of 1/255 that agrees with the mask."""
+    """The dataset with an image of the rock alone for every frame: alpha of multiples of 1/255 that
+    agrees with the mask."""
     frames = []
     for i, frame in enumerate(load_dataset(folder).frames):
         rng, mask = np.random.default_rng(i), frame.mask()
@@ -114,7 +121,8 @@ def _with_rock_images(folder):
 
 
 def test_the_target_is_the_rock_premultiplied(folder):
-    """What was written comes back: alpha exactly, colour to the step of 8 bits; the file is sRGB with straight alpha."""
+    """What was written comes back: alpha exactly, colour to the step of 8 bits; the file is sRGB
+    with straight alpha."""
     written = _with_rock_images(folder)
     for frame, (_, expected) in zip(load_dataset(folder).frames, written, strict=True):
         rgba, weight = frame.target()
@@ -143,7 +151,9 @@ def test_the_target_of_a_mask_has_no_weight_along_its_outline(folder):
     np.testing.assert_array_equal(weight, np.where(differs, 0, 1))
     np.testing.assert_array_equal(frame.masked_rgb(), rgba[..., :3])
     np.testing.assert_array_equal(target_of(frame), np.dstack([rgba[..., :3], weight]))
-    np.testing.assert_array_equal(target_of(frame, True), np.dstack([rgba[..., :3], weight, rgba[..., 3]]))
+    np.testing.assert_array_equal(
+        target_of(frame, True), np.dstack([rgba[..., :3], weight, rgba[..., 3]])
+    )
     halved = without_gain(target_of(frame, True), np.array([2.0, 2.0, 2.0]))
     np.testing.assert_array_equal(halved, np.dstack([rgba[..., :3] / 2, weight, rgba[..., 3]]))
     rgba, weight = replace(frame, mask_path=None).target()
@@ -187,8 +197,14 @@ NAN = np.full((4, 4), np.nan).tolist()
         (_set_pose("left"), "frame 2"),
         (lambda d: d["frames"][1].pop("transform_matrix"), "frame 1 lacks"),
         (lambda d: d["frames"][1].update(file_path="images/none.png"), "does not exist"),
-        (lambda d: d["frames"][1].update(rock_file_path="rock/none.png"), "rock_file_path rock/none.png does not exist"),
-        (lambda d: d["frames"][1].update(rock_file_path=["a"]), "frame 1 has a rock_file_path that is no text"),
+        (
+            lambda d: d["frames"][1].update(rock_file_path="rock/none.png"),
+            "rock_file_path rock/none.png does not exist",
+        ),
+        (
+            lambda d: d["frames"][1].update(rock_file_path=["a"]),
+            "frame 1 has a rock_file_path that is no text",
+        ),
     ],
 )
 def test_bad_transforms(folder, change, message):
@@ -251,7 +267,8 @@ def test_check_passes_a_sound_dataset(tmp_path):
 
 
 def test_check_finds_wrong_depth_units_and_wrong_axes(tmp_path):
-    """Depth 30 % too large, or OpenCV poses in an OpenGL file: neighbouring views contradict one another."""
+    """Depth 30 % too large, or OpenCV poses in an OpenGL file: neighbouring views contradict one
+    another."""
     dataset = _write(tmp_path / "far", count=12, depth_scale=1.3)
     assert any("see through" in problem for problem in check_dataset(dataset).problems)
     folder = _write(tmp_path / "axes", count=12).root
@@ -262,7 +279,9 @@ def test_check_finds_wrong_depth_units_and_wrong_axes(tmp_path):
             frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ flip).tolist()
 
     _edit(folder, change)
-    assert any("share no point" in problem for problem in check_dataset(load_dataset(folder)).problems)
+    assert any(
+        "share no point" in problem for problem in check_dataset(load_dataset(folder)).problems
+    )
 
 
 def test_check_lists_every_problem(folder):
@@ -270,9 +289,16 @@ def test_check_lists_every_problem(folder):
     frames[0].image_path.write_bytes(b"")
     write_png(frames[1].mask_path, np.zeros((H, W), bool))
     write_exr(frames[2].depth_path, {"Z": np.zeros((H, W), np.float32)})
-    _edit(folder, lambda d: d["frames"][4].update(transform_matrix=d["frames"][3]["transform_matrix"]))
+    _edit(
+        folder, lambda d: d["frames"][4].update(transform_matrix=d["frames"][3]["transform_matrix"])
+    )
     problems = "\n".join(check_dataset(load_dataset(folder)).problems)
-    for expected in ("not a readable image", "mask is empty", "most of the mask has no depth", "same pose as kf_0003"):
+    for expected in (
+        "not a readable image",
+        "mask is empty",
+        "most of the mask has no depth",
+        "same pose as kf_0003",
+    ):
         assert expected in problems
 
 
@@ -293,4 +319,7 @@ def test_check_compares_rock_images_with_masks(folder):
         f"kf_0003.png: is {W + 1}x{H}, but transforms.json says {W}x{H}; correct either",
         "kf_0004.png: not a readable image; give a PNG or JPEG, or write it again if it is damaged",
     ]
-    assert [str(frame.rock_path) in problem for frame, problem in zip(frames[1:5], problems, strict=True)] == [True] * 4
+    assert [
+        str(frame.rock_path) in problem
+        for frame, problem in zip(frames[1:5], problems, strict=True)
+    ] == [True] * 4

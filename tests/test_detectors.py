@@ -1,4 +1,5 @@
-"""Detectors: each fires on what it is for, none on a good run, and what they say is kept, printed and reported."""
+"""Detectors: each fires on what it is for, none on a good run, and what they say is kept, printed
+and reported."""
 
 import shutil
 from dataclasses import replace
@@ -10,8 +11,17 @@ import synthetic
 import tiny
 from rich.console import Console
 
-from mgs.active import loop, run_folder
-from mgs.active.detectors import (
+from mgs.cli.nbv import resume_and_print
+from mgs.data.dataset import load_dataset, target_of, write_transforms
+from mgs.fit.settings import TrainSettings
+from mgs.images import write_png
+from mgs.prior.build import build_prior, save_prior
+from mgs.prior.settings import PriorSettings
+from mgs.report.page_facts import measured, read_shown
+from mgs.report.runs import read_run
+from mgs.run import folder as run_folder
+from mgs.run import loop
+from mgs.run.detectors import (
     DETECTORS,
     Before,
     ViewSigns,
@@ -22,15 +32,7 @@ from mgs.active.detectors import (
     step_signs,
     view_signs,
 )
-from mgs.active.nbv import run_nbv
-from mgs.active.settings import TrainSettings
-from mgs.cli.nbv import resume_and_print
-from mgs.data.dataset import load_dataset, target_of, write_transforms
-from mgs.images import write_png
-from mgs.prior.build import build_prior, save_prior
-from mgs.prior.settings import PriorSettings
-from mgs.report.page_facts import measured, read_shown
-from mgs.report.runs import read_run
+from mgs.run.nbv import run_nbv
 from mgs.splat import render
 
 FITS = Before(outline=0.001, offset=0.01, exposure=0.01)
@@ -78,9 +80,13 @@ def test_a_warning_comes_once_and_again_after_it_was_over():
 
 def test_signs_that_a_step_cannot_tell_are_left_out():
     assert set(step_signs([], [1.0], 1.0, [], 0.0)) == {"means"}
-    back = step_signs([], [1.0, 1.2, 1.1, 1.0], 1.0, [], 0.0)  # of a warm fit: lower than before, but not than at its start
+    back = step_signs(
+        [], [1.0, 1.2, 1.1, 1.0], 1.0, [], 0.0
+    )  # of a warm fit: lower than before, but not than at its start
     assert back["unconverged"] == 0
-    assert {"unconverged", "worse"}.isdisjoint(step_signs([], [1.0, float("nan"), 1.0, 1.0], 1.0, [], 0.0))
+    assert {"unconverged", "worse"}.isdisjoint(
+        step_signs([], [1.0, float("nan"), 1.0, 1.0], 1.0, [], 0.0)
+    )
 
 
 @pytest.mark.parametrize("views", [1, 2, 3, 4])
@@ -96,7 +102,9 @@ def seen(mask, alpha, margin, rendered=0.5, truth=0.5):
 def test_the_outline_is_the_share_of_pixels_that_disagree_by_more_than_the_margin():
     mask = np.zeros((8, 20), bool)
     mask[:, 5:15] = True
-    alpha = np.where((np.arange(20) >= 8) & (np.arange(20) < 18), 0.9, 0.2) * np.ones((8, 1))  # 3 pixels to the right
+    alpha = np.where((np.arange(20) >= 8) & (np.arange(20) < 18), 0.9, 0.2) * np.ones(
+        (8, 1)
+    )  # 3 pixels to the right
     assert seen(mask, alpha, 1).outline == pytest.approx(4 / 13)
     assert seen(mask, alpha, 2).outline == pytest.approx(2 / 13)
     assert seen(mask, alpha, 3).outline == 0
@@ -106,7 +114,9 @@ def test_the_outline_is_the_share_of_pixels_that_disagree_by_more_than_the_margi
 
 def test_the_exposure_is_the_factor_that_the_prior_lacks():
     whole = np.ones((4, 5))
-    assert seen(whole > 0, whole, 1, rendered=0.25, truth=0.5).exposure == pytest.approx(np.log(0.501 / 0.251))
+    assert seen(whole > 0, whole, 1, rendered=0.25, truth=0.5).exposure == pytest.approx(
+        np.log(0.501 / 0.251)
+    )
     half_grey = np.where(np.arange(5) < 2, 0.9, 0.5)[None, :, None] * np.ones((4, 1, 3))
     assert seen(whole > 0, whole, 1, rendered=half_grey).exposure == 0
     assert seen(whole > 0, 0 * whole, 1).exposure == 0
@@ -115,11 +125,18 @@ def test_the_exposure_is_the_factor_that_the_prior_lacks():
 def test_the_margin_is_a_pixel_and_the_size_of_a_gaussian(rock):
     frame = load_dataset(rock).frames[0]
     model = tiny.initial([])
-    small, large = (replace(model, log_scales=model.log_scales * 0 + np.log(size)) for size in (1e-6, 0.1))
+    small, large = (
+        replace(model, log_scales=model.log_scales * 0 + np.log(size)) for size in (1e-6, 0.1)
+    )
     depth = np.median(frame.camera.project(model.means)[1])
     assert outline_margin(small, frame.camera) == 2
-    assert outline_margin(large, frame.camera) == 1 + int(np.ceil(0.1 * frame.camera.K[0, 0] / depth))
-    behind = replace(model, means=(frame.camera.position - 5 * (frame.camera.camera_to_world[:3, 2]) + 0 * model.means))
+    assert outline_margin(large, frame.camera) == 1 + int(
+        np.ceil(0.1 * frame.camera.K[0, 0] / depth)
+    )
+    behind = replace(
+        model,
+        means=(frame.camera.position - 5 * (frame.camera.camera_to_world[:3, 2]) + 0 * model.means),
+    )
     assert outline_margin(behind, frame.camera) == 1
 
 
@@ -161,8 +178,10 @@ def test_a_side_that_no_seed_saw_is_no_drift_of_the_exposure(rock, tmp_path):
     assert not any("exposure" in warning for warning in said), said
 
 
-def test_a_run_that_is_stopped_too_early_says_so_in_the_console_in_its_steps_and_on_the_page(rock, tmp_path):
-    from mgs.active.nbv import start_run
+def test_a_run_that_is_stopped_too_early_says_so_in_the_console_in_its_steps_and_on_the_page(
+    rock, tmp_path
+):
+    from mgs.run.nbv import start_run
 
     start_run(rock, tmp_path / "run", budget=1, seeds=5, train=TrainSettings(passes=3).model_dump())
     console = Console(record=True, width=300)
@@ -181,7 +200,10 @@ def test_a_prior_in_the_wrong_place_is_said_before_anything_else_is_known(rock, 
     prior = load_prior(rock / "prior")
     save_prior(tmp_path / "prior", replace(prior, points=prior.points + np.array([0.4, 0, 0])))
     state = run_nbv(rock, tmp_path / "run", prior=tmp_path / "prior", budget=0, seeds=5)
-    assert any("the prior's outline and the masks disagree" in warning for warning in state.steps[0]["warnings"])
+    assert any(
+        "the prior's outline and the masks disagree" in warning
+        for warning in state.steps[0]["warnings"]
+    )
 
 
 def test_a_loop_without_renders_has_no_signs(dataset, tmp_path):
@@ -197,7 +219,10 @@ def wrong_pose(frames):
 
     pose = frames[2].camera.world_to_camera.copy()
     pose[:3] = Rotation.from_euler("y", 3, degrees=True).as_matrix() @ pose[:3]
-    return [replace(f, camera=replace(f.camera, world_to_camera=pose)) if k == 2 else f for k, f in enumerate(frames)]
+    return [
+        replace(f, camera=replace(f.camera, world_to_camera=pose)) if k == 2 else f
+        for k, f in enumerate(frames)
+    ]
 
 
 def drifting_exposure(frames):
@@ -239,7 +264,9 @@ def test_a_spoiled_capture_raises_the_alarm_that_is_meant_for_it(rock, tmp_path,
     root = tmp_path / "dataset"
     shutil.copytree(rock, root)
     write_transforms(root, spoil(list(load_dataset(root).frames)))
-    state = run_nbv(root, tmp_path / "run", prior=rock / "prior", policy="uniform", budget=5, seeds=5)
+    state = run_nbv(
+        root, tmp_path / "run", prior=rock / "prior", policy="uniform", budget=5, seeds=5
+    )
     said = [warning for line in state.steps for warning in line.get("warnings", [])]
     assert any(words in warning for warning in said), said
     others = {word for name, (_, word) in SPOILED.items() if name != fault} - {words}
@@ -247,18 +274,26 @@ def test_a_spoiled_capture_raises_the_alarm_that_is_meant_for_it(rock, tmp_path,
 
 
 def test_new_images_are_held_against_the_model_before_them(rock, tmp_path):
-    before, after = (run_nbv(rock, tmp_path / f"{budget}", budget=budget, seeds=4) for budget in (1, 2))
+    before, after = (
+        run_nbv(rock, tmp_path / f"{budget}", budget=budget, seeds=4) for budget in (1, 2)
+    )
     assert ["residual" in line for line in after.steps] == [False, True, True]
     frame = load_dataset(rock).frames[after.taken[-1]]
     target = target_of(frame)
     known = frame.mask() & (target[..., 3] > 0)
     wrong = np.asarray(render(before.gaussians, frame.camera).rgb) - target[..., :3]
-    assert after.steps[-1]["residual"] == pytest.approx(np.sqrt(np.mean(wrong[known] ** 2)), rel=1e-4)
+    assert after.steps[-1]["residual"] == pytest.approx(
+        np.sqrt(np.mean(wrong[known] ** 2)), rel=1e-4
+    )
 
 
 def test_an_image_of_which_no_colour_is_known_has_no_residual():
     one = SimpleNamespace(mask=lambda: np.ones((2, 3), bool))
-    run = SimpleNamespace(stations=SimpleNamespace(look=lambda *_: (np.zeros((2, 3, 3)), None)), frames=[one], cameras=[None])
+    run = SimpleNamespace(
+        stations=SimpleNamespace(look=lambda *_: (np.zeros((2, 3, 3)), None)),
+        frames=[one],
+        cameras=[None],
+    )
     target = np.full((2, 3, 4), 0.5)
     assert loop.Loop.residual(run, None, [0], [target]) == {"residual": 0.5}
     target[..., 3] = 0

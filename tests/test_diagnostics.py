@@ -1,4 +1,5 @@
-"""Maps of information: the scalars against their formulas, the maps against a direct composite, the files read back."""
+"""Maps of information: the scalars against their formulas, the maps against a direct composite, the
+files read back."""
 
 import numpy as np
 import pytest
@@ -6,16 +7,28 @@ import tiny
 from PIL import Image
 from plyfile import PlyData
 
-from mgs.active import criteria, loop, run_folder
 from mgs.camera import Camera, look_at
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import read_exr
+from mgs.policy import criteria
 from mgs.report import diagnostics
+from mgs.run import folder as run_folder
+from mgs.run import loop
 from mgs.splat import groups
 
-CHANNELS = {"R", "G", "B", "A", "Z", "fisher.colour", "fisher.scale", "fisher.rotation", "fisher.opacity"} | {
+CHANNELS = {
+    "R",
+    "G",
+    "B",
+    "A",
+    "Z",
+    "fisher.colour",
+    "fisher.scale",
+    "fisher.rotation",
+    "fisher.opacity",
+} | {
     "information",
     "uncertainty",
     "unobserved",
@@ -37,11 +50,14 @@ def test_scalars_follow_their_formulas():
     j = 3
     expected = sum(0.5 * np.log((H[j, k] + lam[k]) / lam[k]) for k in range(11))
     assert scalars["information"][j] == pytest.approx(expected)
-    assert scalars["uncertainty"][j] == pytest.approx(np.mean([lam[k] / (H[j, k] + lam[k]) for k in range(11)]))
+    assert scalars["uncertainty"][j] == pytest.approx(
+        np.mean([lam[k] / (H[j, k] + lam[k]) for k in range(11)])
+    )
 
 
 def two_in_a_row() -> tuple[Gaussians, Camera]:
-    """Two Gaussians, 20 pixels wide, one 2 m and one 3 m before the camera; the near one is half transparent."""
+    """Two Gaussians, 20 pixels wide, one 2 m and one 3 m before the camera; the near one is half
+    transparent."""
     K = np.array([[40.0, 0, 16.5], [0, 40.0, 12.5], [0, 0, 1]])
     camera = Camera(K, 33, 25, look_at((0, -2, 0), (0, 0, 0)))
     means = np.array([[0, 0, 0], [0, 1, 0]], np.float32)
@@ -56,9 +72,14 @@ def two_in_a_row() -> tuple[Gaussians, Camera]:
 
 
 def test_maps_are_means_over_what_a_pixel_shows():
-    """At the centre the weights are 1/2 and nearly 1/2, so the map is the mean of the two values, whatever their magnitude."""
+    """At the centre the weights are 1/2 and nearly 1/2, so the map is the mean of the two values,
+    whatever their magnitude."""
     gaussians, camera = two_in_a_row()
-    scalars = {"information": np.array([1e-4, 3e-4]), "large": np.array([4e6, 0]), "flat": np.array([7.0, 7.0])}
+    scalars = {
+        "information": np.array([1e-4, 3e-4]),
+        "large": np.array([4e6, 0]),
+        "flat": np.array([7.0, 7.0]),
+    }
     maps = diagnostics.view_maps(gaussians, camera, scalars)
     near, far = 0.5, 0.5 * (1 / (1 + np.exp(-9.0)))
     assert maps["A"][12, 16] == pytest.approx(near + far, abs=1e-3)
@@ -96,7 +117,13 @@ def run(tmp_path_factory):
 
 def test_files(run):
     written = diagnostics.diagnose_run(run, ["kf_0001", "kf_0007"])
-    assert [path.name for path in written] == ["information.ply", "kf_0001.exr", "kf_0001.png", "kf_0007.exr", "kf_0007.png"]
+    assert [path.name for path in written] == [
+        "information.ply",
+        "kf_0001.exr",
+        "kf_0001.png",
+        "kf_0007.exr",
+        "kf_0007.png",
+    ]
     channels = read_exr(run / "diagnostics/kf_0007.exr")
     assert set(channels) == CHANNELS
     assert {values.shape for values in channels.values()} == {(tiny.HEIGHT, tiny.WIDTH)}
@@ -122,5 +149,7 @@ def test_views(run):
     assert not {frame.name for frame in chosen} & set(trained)
     everything = [frame.name for frame in frames]
     assert len(diagnostics.choose_views(frames, everything, None)) == diagnostics.VIEWS
-    with pytest.raises(InputError, match="kf_9999: no such frame; the dataset has kf_0000 to kf_0011"):
+    with pytest.raises(
+        InputError, match="kf_9999: no such frame; the dataset has kf_0000 to kf_0011"
+    ):
         diagnostics.diagnose_run(run, ["kf_9999"])

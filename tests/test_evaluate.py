@@ -20,7 +20,16 @@ from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_exr, write_png
-from mgs.metrics import METRICS, OPAQUE, PSNR_LIMIT, SPACINGS, SURFACE_METRICS, compare_surface, psnr, ssim
+from mgs.metrics import (
+    METRICS,
+    OPAQUE,
+    PSNR_LIMIT,
+    SPACINGS,
+    SURFACE_METRICS,
+    compare_surface,
+    psnr,
+    ssim,
+)
 from mgs.report import evaluation
 from mgs.report.evaluation import evaluate, evaluate_run, read_comparison, write_comparison
 
@@ -50,17 +59,25 @@ def test_psnr_inside_a_mask(images):
 
 
 def test_ssim_follows_its_definition(images):
-    """Wang et al. 2004 at one pixel: an 11 x 11 Gaussian window with sigma 1.5, K1 = 0.01, K2 = 0.03."""
+    """Wang et al. 2004 at one pixel: an 11 x 11 Gaussian window with sigma 1.5, K1 = 0.01, K2 =
+    0.03."""
     a, b = images
     y, x = 12, 15
     one = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
     window = np.outer(one, one)[..., None] / np.outer(one, one).sum()
     p, q = (image[y - 5 : y + 6, x - 5 : x + 6] for image in (a, b))
     mean_p, mean_q = (window * p).sum((0, 1)), (window * q).sum((0, 1))
-    var_p, var_q = (window * p * p).sum((0, 1)) - mean_p**2, (window * q * q).sum((0, 1)) - mean_q**2
+    var_p, var_q = (
+        (window * p * p).sum((0, 1)) - mean_p**2,
+        (window * q * q).sum((0, 1)) - mean_q**2,
+    )
     cov = (window * p * q).sum((0, 1)) - mean_p * mean_q
     c1, c2 = 0.01**2, 0.03**2
-    expected = (2 * mean_p * mean_q + c1) * (2 * cov + c2) / ((mean_p**2 + mean_q**2 + c1) * (var_p + var_q + c2))
+    expected = (
+        (2 * mean_p * mean_q + c1)
+        * (2 * cov + c2)
+        / ((mean_p**2 + mean_q**2 + c1) * (var_p + var_q + c2))
+    )
     mask = np.zeros(a.shape[:2], bool)
     mask[y, x] = True
     assert ssim(a, b, mask) == pytest.approx(expected.mean(), abs=1e-12)
@@ -93,8 +110,15 @@ def grey(n: int = 1) -> Gaussians:
 
 
 @pytest.mark.parametrize(("pixels", "most"), [(4_000_000, 4), (1, 1)])
-def test_views_are_measured_beside_each_other_but_large_ones_alone(tmp_path, monkeypatch, pixels, most):
-    dataset, lock, active, seen = write_dataset(tmp_path / "data", orbit_cameras(8)), threading.Lock(), [0], []
+def test_views_are_measured_beside_each_other_but_large_ones_alone(
+    tmp_path, monkeypatch, pixels, most
+):
+    dataset, lock, active, seen = (
+        write_dataset(tmp_path / "data", orbit_cameras(8)),
+        threading.Lock(),
+        [0],
+        [],
+    )
 
     def measured(frame, rendered, spacing, folder):
         with lock:
@@ -107,14 +131,17 @@ def test_views_are_measured_beside_each_other_but_large_ones_alone(tmp_path, mon
 
     monkeypatch.setattr(evaluation, "_measured", measured)
     monkeypatch.setattr(evaluation, "PIXELS_AT_ONCE", pixels)
-    result = evaluate(grey(), dataset.frames, (), renderer=lambda gaussians, camera: (np.zeros(1),) * 3)
+    result = evaluate(
+        grey(), dataset.frames, (), renderer=lambda gaussians, camera: (np.zeros(1),) * 3
+    )
     assert [view["psnr"] for view in result["views"]] == list(range(8)), "in their order"
     assert len(seen) == 8
     assert (max(seen) == 1) if most == 1 else (1 < max(seen) <= most)
 
 
 def test_what_a_renderer_returns_is_freed_by_the_thread_that_draws(tmp_path, monkeypatch):
-    """Memory of Dr.Jit that another thread frees while the next view is drawn stops both for ever, now and then."""
+    """Memory of Dr.Jit that another thread frees while the next view is drawn stops both for ever,
+    now and then."""
     dataset, freed = write_dataset(tmp_path / "data", orbit_cameras(8)), []
 
     def renderer(gaussians, camera):
@@ -133,12 +160,17 @@ def test_what_a_renderer_returns_is_freed_by_the_thread_that_draws(tmp_path, mon
 
 
 def test_evaluate(tmp_path):
-    """A model that renders one grey: each metric is that of the grey image, and the averages leave out what was trained on."""
+    """A model that renders one grey: each metric is that of the grey image, and the averages leave
+    out what was trained on."""
     dataset = write_dataset(tmp_path / "data", orbit_cameras(4))
 
     def renderer(gaussians, camera):
         shape = (camera.height, camera.width)
-        return np.full((*shape, 3), 0.2, np.float32), np.ones(shape, np.float32), np.ones(shape, np.float32)
+        return (
+            np.full((*shape, 3), 0.2, np.float32),
+            np.ones(shape, np.float32),
+            np.ones(shape, np.float32),
+        )
 
     calls = []
     result = evaluate(
@@ -149,7 +181,12 @@ def test_evaluate(tmp_path):
         pictures=tmp_path / "renders",
         progress=lambda done, total: calls.append((done, total)),
     )
-    assert [view["name"] for view in result["views"]] == ["kf_0000", "kf_0001", "kf_0002", "kf_0003"]
+    assert [view["name"] for view in result["views"]] == [
+        "kf_0000",
+        "kf_0001",
+        "kf_0002",
+        "kf_0003",
+    ]
     assert [view["trained"] for view in result["views"]] == [False, True, False, False]
     assert (result["images"], result["all"]["count"], result["held_out"]["count"]) == (1, 4, 3)
     truth = srgb_from_linear(dataset.frames[2].masked_rgb())
@@ -171,7 +208,8 @@ def test_evaluate(tmp_path):
 
 
 def random_view(rng, shape=(6, 5)):
-    """Truth [H,W,4] with alphas of 0, 1 and between, weight, mask, true depth with holes, and a render's alpha and depth."""
+    """Truth [H,W,4] with alphas of 0, 1 and between, weight, mask, true depth with holes, and a
+    render's alpha and depth."""
     alpha = rng.choice([0.0, 0.3, 1.0], shape)
     truth = np.dstack([np.zeros((*shape, 3)), alpha])
     weight, mask = rng.choice([0.0, 1.0], shape, p=[0.2, 0.8]), alpha > 0.2
@@ -184,7 +222,9 @@ def random_view(rng, shape=(6, 5)):
 def test_surface_metrics_follow_their_definitions(seed, spacing):
     """Against sums over single pixels."""
     truth, weight, mask, true_depth, alpha, depth = random_view(np.random.default_rng(seed))
-    found = compare_surface(truth, alpha, depth, mask, weight, fractional=True, true_depth=true_depth, spacing=spacing)
+    found = compare_surface(
+        truth, alpha, depth, mask, weight, fractional=True, true_depth=true_depth, spacing=spacing
+    )
     assert tuple(found) == SURFACE_METRICS
     errors, see_through, behind = [], [], []
     for at in np.ndindex(mask.shape):
@@ -196,12 +236,16 @@ def test_surface_metrics_follow_their_definitions(seed, spacing):
         if mask[at] and true_depth[at] > 0:
             behind.append(depth[at] - true_depth[at] if alpha[at] > 0 else math.inf)
     assert found["alpha_mae"] == pytest.approx(np.mean(errors))
-    assert found["see_through"] == pytest.approx(np.mean(see_through) if see_through else math.nan, nan_ok=True)
+    assert found["see_through"] == pytest.approx(
+        np.mean(see_through) if see_through else math.nan, nan_ok=True
+    )
     for k in SPACINGS:
         expected = np.mean([b > k * spacing for b in behind]) if behind else math.nan
         assert found[f"too_deep_{k}"] == pytest.approx(expected, nan_ok=True)
     median = np.median(np.abs(behind)) if behind else math.nan
-    assert found["depth_error"] == pytest.approx(median if median < math.inf else math.nan, nan_ok=True)
+    assert found["depth_error"] == pytest.approx(
+        median if median < math.inf else math.nan, nan_ok=True
+    )
 
 
 def test_a_surface_is_measured_as_far_as_the_truth_is_known():
@@ -220,7 +264,14 @@ def test_a_surface_is_measured_as_far_as_the_truth_is_known():
 def test_where_nothing_is_drawn_the_model_is_infinitely_deep():
     truth, mask, nothing = np.ones((2, 2, 4)), np.ones((2, 2), bool), np.zeros((2, 2))
     found = compare_surface(
-        truth, nothing, nothing, mask, np.ones((2, 2)), fractional=True, true_depth=np.full((2, 2), 3.0), spacing=0.1
+        truth,
+        nothing,
+        nothing,
+        mask,
+        np.ones((2, 2)),
+        fractional=True,
+        true_depth=np.full((2, 2), 3.0),
+        spacing=0.1,
     )
     assert math.isnan(found.pop("depth_error"))
     assert set(found.values()) == {1.0}
@@ -234,10 +285,21 @@ def test_test_views_are_measured_and_drawn_apart(tmp_path):
 
     def renderer(gaussians, camera):
         shape = (camera.height, camera.width)
-        return np.full((*shape, 3), 0.2, np.float32), np.ones(shape, np.float32), np.ones(shape, np.float32)
+        return (
+            np.full((*shape, 3), 0.2, np.float32),
+            np.ones(shape, np.float32),
+            np.ones(shape, np.float32),
+        )
 
     def measured(frames, test_frames=(), pictures=None):
-        return evaluate(grey(), frames, ["kf_0001"], test_frames=test_frames, renderer=renderer, pictures=pictures)
+        return evaluate(
+            grey(),
+            frames,
+            ["kf_0001"],
+            test_frames=test_frames,
+            renderer=renderer,
+            pictures=pictures,
+        )
 
     result, without, alone = (
         measured(dataset.frames, tests.frames, tmp_path / "out"),
@@ -248,7 +310,9 @@ def test_test_views_are_measured_and_drawn_apart(tmp_path):
     assert result["test"] == alone["all"]
     assert result["test"]["count"] == 3
     assert result["test_views"] == [view | {"trained": False} for view in alone["views"]]
-    assert {path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.png")} == {
+    assert {
+        path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.png")
+    } == {
         *(f"kf_000{i}.png" for i in range(4)),
         *(f"test/kf_000{i}.png" for i in range(3)),
     }
@@ -256,13 +320,22 @@ def test_test_views_are_measured_and_drawn_apart(tmp_path):
 
 def test_evaluate_a_perfect_model_and_nothing_held_out(tmp_path):
     dataset = write_dataset(tmp_path, orbit_cameras(2))
-    truths = {id(frame.camera): (frame.masked_rgb(), 1.0 * frame.mask(), frame.depth()) for frame in dataset.frames}
+    truths = {
+        id(frame.camera): (frame.masked_rgb(), 1.0 * frame.mask(), frame.depth())
+        for frame in dataset.frames
+    }
     result = evaluate(
-        grey(), dataset.frames, ["kf_0000", "kf_0001"], spacing=1e-9, renderer=lambda g, camera: truths[id(camera)]
+        grey(),
+        dataset.frames,
+        ["kf_0000", "kf_0001"],
+        spacing=1e-9,
+        renderer=lambda g, camera: truths[id(camera)],
     )
     assert result["all"]["psnr"] == result["all"]["psnr_mask"] == PSNR_LIMIT
     assert result["all"]["ssim"] == pytest.approx(1)
-    surface = [name for name in SURFACE_METRICS if name != "alpha_mae"]  # a mask does not say which share of a pixel is rock
+    surface = [
+        name for name in SURFACE_METRICS if name != "alpha_mae"
+    ]  # a mask does not say which share of a pixel is rock
     assert [result["all"][name] for name in surface] == [0] * len(surface)
     assert result["held_out"] == {"count": 0} | dict.fromkeys([*METRICS, *surface])
     assert "test" not in result
@@ -281,8 +354,12 @@ def test_comparison_picture(tmp_path):
     assert picture[strip + 40, 128 + 50, 0] == pytest.approx(expected, abs=2 / 255)
     assert picture[strip + 40, 128 + 10].max() == 0
     camera = orbit_cameras(1)[0]
-    for written, read in zip((truth, rendered), read_comparison(tmp_path / "a.png", camera), strict=True):
-        np.testing.assert_allclose(srgb_from_linear(read), srgb_from_linear(written), atol=0.51 / 255)
+    for written, read in zip(
+        (truth, rendered), read_comparison(tmp_path / "a.png", camera), strict=True
+    ):
+        np.testing.assert_allclose(
+            srgb_from_linear(read), srgb_from_linear(written), atol=0.51 / 255
+        )
     with pytest.raises(InputError, match="not a comparison of 60x48"):
         read_comparison(tmp_path / "a.png", orbit_cameras(1, 60)[0])
 
@@ -301,7 +378,9 @@ def work(monkeypatch):
     calls = []
     for name in ("compare", "write_comparison"):
         function = getattr(evaluation, name)
-        monkeypatch.setattr(evaluation, name, lambda *given, f=function, n=name: calls.append(n) or f(*given))
+        monkeypatch.setattr(
+            evaluation, name, lambda *given, f=function, n=name: calls.append(n) or f(*given)
+        )
 
     def done():
         counts = calls.count("compare"), calls.count("write_comparison")
@@ -325,7 +404,10 @@ def test_what_is_known_of_a_model_is_not_measured_again(dataset, prior, tmp_path
     assert "alpha_mae" not in first["all"]
     assert again(pictures=False) == first
     assert work() == (0, 0)
-    assert said[2:] == [left_out, f"kept {run}/metrics.json, measured before on this very model and dataset"]
+    assert said[2:] == [
+        left_out,
+        f"kept {run}/metrics.json, measured before on this very model and dataset",
+    ]
     drawn = again()
     assert drawn == first | {"pictures": True} == json.loads((run / "metrics.json").read_text())
     assert work() == (0, 12)
@@ -343,7 +425,9 @@ def test_what_is_known_of_a_model_is_not_measured_again(dataset, prior, tmp_path
     assert listing(run / "renders") == pictures
 
 
-@pytest.mark.parametrize(("other", "measured"), [({"commit": "1234567"}, 0), ({"mitsuba": "0.1"}, 12)])
+@pytest.mark.parametrize(
+    ("other", "measured"), [({"commit": "1234567"}, 0), ({"mitsuba": "0.1"}, 12)]
+)
 def test_another_commit_keeps_the_metrics_and_another_version_does_not(
     dataset, prior, tmp_path, work, monkeypatch, other, measured
 ):
@@ -365,10 +449,28 @@ def brighten(path):
     ("what", "change"),
     [
         ("model", lambda run, dataset: brighten(run / "checkpoint.npz")),
-        ("image", lambda run, dataset: write_png(dataset / "images/kf_0003.png", np.ones((tiny.HEIGHT, tiny.WIDTH, 3)))),
-        ("mask", lambda run, dataset: write_png(dataset / "masks/kf_0003.png", np.ones((tiny.HEIGHT, tiny.WIDTH), bool))),
-        ("depth", lambda run, dataset: write_exr(dataset / "depth/kf_0003.exr", {"Z": np.ones((12, 16), np.float32)})),
-        ("spacing", lambda run, dataset: write_json(run.parent / "prior/prior.json", {"spacing": 0.01})),
+        (
+            "image",
+            lambda run, dataset: write_png(
+                dataset / "images/kf_0003.png", np.ones((tiny.HEIGHT, tiny.WIDTH, 3))
+            ),
+        ),
+        (
+            "mask",
+            lambda run, dataset: write_png(
+                dataset / "masks/kf_0003.png", np.ones((tiny.HEIGHT, tiny.WIDTH), bool)
+            ),
+        ),
+        (
+            "depth",
+            lambda run, dataset: write_exr(
+                dataset / "depth/kf_0003.exr", {"Z": np.ones((12, 16), np.float32)}
+            ),
+        ),
+        (
+            "spacing",
+            lambda run, dataset: write_json(run.parent / "prior/prior.json", {"spacing": 0.01}),
+        ),
         ("older version", lambda run, dataset: write_json(run / "metrics.json", {"images": 3})),
         ("damaged", lambda run, dataset: (run / "metrics.json").write_text("{")),
     ],
@@ -410,16 +512,26 @@ def test_a_run_is_measured_on_the_test_views_of_its_dataset(dataset, prior, tmp_
 
 @pytest.mark.parametrize(
     ("numbers", "said"),
-    [(None, "is not there"), ({"spacing": "wide"}, InputError), ({"spacing": -1}, InputError), ([], InputError)],
+    [
+        (None, "is not there"),
+        ({"spacing": "wide"}, InputError),
+        ({"spacing": -1}, InputError),
+        ([], InputError),
+    ],
 )
-def test_without_the_priors_spacing_nothing_is_called_too_deep(dataset, prior, tmp_path, numbers, said):
+def test_without_the_priors_spacing_nothing_is_called_too_deep(
+    dataset, prior, tmp_path, numbers, said
+):
     run, lines = tiny.write_run(tmp_path / "run", dataset, prior), []
     if numbers is None:
         prior.rename(tmp_path / "elsewhere")
         found = evaluate_run(run, pictures=False, say=lines.append)["all"]
         assert "depth_error" in found
         assert not [name for name in found if name.startswith("too_deep")]
-        assert lines[1] == f"{prior}: is not there, so the shares that are too deep, in its spacings, are left out"
+        assert (
+            lines[1]
+            == f"{prior}: is not there, so the shares that are too deep, in its spacings, are left out"
+        )
         return
     write_json(prior / "prior.json", numbers)
     with pytest.raises(said, match=r"prior\.json: spacing must be positive metres"):

@@ -1,4 +1,5 @@
-"""Exposure that differs between images: the gains are found, fits with them are as good, and what is measured is named."""
+"""Exposure that differs between images: the gains are found, fits with them are as good, and what
+is measured is named."""
 
 from __future__ import annotations
 
@@ -15,8 +16,6 @@ from PIL import ExifTags, Image
 sys.path.insert(0, str(Path(__file__).parent))
 import synthetic
 
-from mgs.active.nbv import resume_nbv, run_nbv
-from mgs.active.run_folder import State, read_checkpoint
 from mgs.cli.app import main
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.files import read_json
@@ -27,6 +26,8 @@ from mgs.prior.exposure import DARK, GAIN_STD, RATIO_STD, SATURATED, solve_gains
 from mgs.prior.settings import PriorSettings
 from mgs.report.evaluation import evaluate_run
 from mgs.report.tables import markdown_table, table_numbers
+from mgs.run.folder import State, read_checkpoint
+from mgs.run.nbv import resume_nbv, run_nbv
 
 
 def normalised(gains: np.ndarray) -> np.ndarray:
@@ -41,27 +42,38 @@ def shown(rng: np.random.Generator, views: int, samples: int, gains: np.ndarray)
 
 
 def slow_gains(colours: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """`solve_gains` from its definition: a row of a least-squares problem for each pair of images, and for each image."""
+    """`solve_gains` from its definition: a row of a least-squares problem for each pair of images,
+    and for each image."""
     found, one = [], np.eye(len(colours))
     for channel in range(3):
         rows, values = [row / GAIN_STD for row in one], [0.0] * len(one)
         for i in range(len(colours)):
             for j in range(i):
-                both = [s for s in range(colours.shape[1]) if np.nan_to_num(colours[[i, j], s], nan=9).max() <= SATURATED]
+                both = [
+                    s
+                    for s in range(colours.shape[1])
+                    if np.nan_to_num(colours[[i, j], s], nan=9).max() <= SATURATED
+                ]
                 count = weights[i, both] @ weights[j, both]
                 if count == 0:
                     continue
-                means = [(weights[i, both] * weights[j, both]) @ colours[k, both] / count for k in (i, j)]
+                means = [
+                    (weights[i, both] * weights[j, both]) @ colours[k, both] / count for k in (i, j)
+                ]
                 if np.min(means) >= DARK:
                     rows.append(np.sqrt(count) / RATIO_STD * (one[i] - one[j]))
-                    values.append(np.sqrt(count) / RATIO_STD * np.log(means[0][channel] / means[1][channel]))
+                    values.append(
+                        np.sqrt(count) / RATIO_STD * np.log(means[0][channel] / means[1][channel])
+                    )
         found.append(np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)[0])
     return normalised(np.exp(np.array(found).T))
 
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), views=st.integers(1, 7))
-def test_gains_are_the_least_squares_solution_of_the_ratios_of_all_pairs(seed: int, views: int) -> None:
+def test_gains_are_the_least_squares_solution_of_the_ratios_of_all_pairs(
+    seed: int, views: int
+) -> None:
     rng = np.random.default_rng(seed)
     gains = np.exp(rng.normal(0, 0.3, (views, 3)))
     colours = shown(rng, views, 90, gains) * rng.lognormal(0, 0.2, (views, 90, 1))
@@ -101,7 +113,10 @@ def test_a_corrected_render_is_the_nearest_of_all_that_differ_by_gains(seed: int
 
     for factor in (0.99, 1.01):
         assert (error(factor * corrected) >= error(corrected)).all()
-    assert np.allclose(colour_corrected(truth, truth * [0.5, 2, 1.3], mask), truth if mask.any() else truth * [0.5, 2, 1.3])
+    assert np.allclose(
+        colour_corrected(truth, truth * [0.5, 2, 1.3], mask),
+        truth if mask.any() else truth * [0.5, 2, 1.3],
+    )
     assert np.array_equal(colour_corrected(truth, 0 * rendered, mask), 0 * rendered)
 
 
@@ -113,7 +128,11 @@ def rock(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of constant exposure, dark enough for gains of up to 1.3, and its prior."""
     root = tmp_path_factory.mktemp("rock") / "dataset"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(synthetic, "albedo", lambda x: 0.3 + 0.2 * np.sin(6 * x[..., [1, 2, 0]] + np.array([0, 1, 2])))
+        patch.setattr(
+            synthetic,
+            "albedo",
+            lambda x: 0.3 + 0.2 * np.sin(6 * x[..., [1, 2, 0]] + np.array([0, 1, 2])),
+        )
         dataset = synthetic.write_dataset(root, synthetic.orbit_cameras(16, 64, 48))
     save_prior(root / "prior", build_prior(dataset, PriorSettings(gaussians=600))[0])
     return root
@@ -123,7 +142,9 @@ def gain_of(dataset: Dataset) -> np.ndarray:
     """Up to 0.3 stops more or less of exposure, and a white balance of a third of that."""
     rng = np.random.default_rng(5)
     count = len(dataset)
-    return 2.0 ** (rng.uniform(-0.3, 0.3, (count, 1)) + rng.uniform(-0.1, 0.1, (count, 3)) * [1, 0, 1])
+    return 2.0 ** (
+        rng.uniform(-0.3, 0.3, (count, 1)) + rng.uniform(-0.1, 0.1, (count, 3)) * [1, 0, 1]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -143,25 +164,35 @@ RUN = {"policy": "uniform", "seeds": 4, "budget": 4}
 
 
 @pytest.fixture(scope="module")
-def runs(rock: Path, varied: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[State, Path]]:
+def runs(
+    rock: Path, varied: Path, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, tuple[State, Path]]:
     """Runs of constant exposure, and of differing exposure without and with the setting."""
     folder = tmp_path_factory.mktemp("runs")
     made = {}
-    for name, root, exposure in (("constant", rock, False), ("without", varied, False), ("with", varied, True)):
+    for name, root, exposure in (
+        ("constant", rock, False),
+        ("without", varied, False),
+        ("with", varied, True),
+    ):
         state = run_nbv(root, folder / name, exposure=exposure, evaluate_every=4, **RUN)
         evaluate_run(folder / name, pictures=False)
         made[name] = state, folder / name
     return made
 
 
-def test_a_run_finds_the_gains_of_its_images(runs: dict[str, tuple[State, Path]], varied: Path) -> None:
+def test_a_run_finds_the_gains_of_its_images(
+    runs: dict[str, tuple[State, Path]], varied: Path
+) -> None:
     state, out = runs["with"]
     dataset = load_dataset(varied)
     true = dict(zip([frame.name for frame in dataset.frames], gain_of(dataset), strict=True))
     for line in state.steps:
         names = list(line["exposure"])
         assert names == [dataset.frames[i].name for i in state.taken[: line["images"]]]
-        found, expected = (normalised(np.array([of[name] for name in names])) for of in (line["exposure"], true))
+        found, expected = (
+            normalised(np.array([of[name] for name in names])) for of in (line["exposure"], true)
+        )
         assert np.abs(np.log(found / expected)).max() < 0.03
         assert np.allclose(np.log(list(line["exposure"].values())).mean(axis=0), 0, atol=1e-12)
     assert read_json(out / "config.json")["settings"]["exposure"] is True
@@ -181,13 +212,20 @@ def test_a_fit_with_gains_is_nearly_as_good_as_one_of_constant_exposure_and_with
     assert not any("corrected" in key for key in runs["constant"][0].steps[-1])
 
 
-def test_the_alarm_of_exposure_is_silent_where_gains_explain_it(runs: dict[str, tuple[State, Path]]) -> None:
-    said = {name: [w for line in state.steps for w in line.get("warnings", [])] for name, (state, _) in runs.items()}
+def test_the_alarm_of_exposure_is_silent_where_gains_explain_it(
+    runs: dict[str, tuple[State, Path]],
+) -> None:
+    said = {
+        name: [w for line in state.steps for w in line.get("warnings", [])]
+        for name, (state, _) in runs.items()
+    }
     assert any("exposure drifts" in warning for warning in said["without"])
     assert not any("exposure drifts" in warning for warning in said["with"] + said["constant"])
 
 
-def test_an_interrupted_run_goes_on_bit_for_bit(varied: Path, runs: dict[str, tuple[State, Path]], tmp_path: Path) -> None:
+def test_an_interrupted_run_goes_on_bit_for_bit(
+    varied: Path, runs: dict[str, tuple[State, Path]], tmp_path: Path
+) -> None:
     class Killed(Exception):
         pass
 
@@ -217,7 +255,9 @@ def test_the_table_has_the_corrected_columns_only_where_a_run_estimated_exposure
     runs: dict[str, tuple[State, Path]],
 ) -> None:
     for name, there in (("with", True), ("without", False)):
-        assert ("exposure fitted to each view" in markdown_table(table_numbers([runs[name][1]]))) == there
+        assert (
+            "exposure fitted to each view" in markdown_table(table_numbers([runs[name][1]]))
+        ) == there
 
 
 # What photographs say themselves
@@ -236,7 +276,11 @@ def photograph(path: Path, time: float | None, speed: int = 100, number: float =
 def test_stops_of_exif_are_those_of_time_speed_and_aperture(tmp_path: Path) -> None:
     stops = exif_exposure(photograph(tmp_path / "a.jpg", 0.01))
     assert stops is not None
-    for change, expected in (({"time": 0.02}, 1), ({"time": 0.01, "speed": 400}, 2), ({"time": 0.01, "number": 4.0}, -2)):
+    for change, expected in (
+        ({"time": 0.02}, 1),
+        ({"time": 0.01, "speed": 400}, 2),
+        ({"time": 0.01, "number": 4.0}, -2),
+    ):
         found = exif_exposure(photograph(tmp_path / "b.jpg", **change))
         assert found == pytest.approx(stops + expected, abs=1e-5)
     assert exif_exposure(photograph(tmp_path / "c.jpg", None)) is None
@@ -255,11 +299,15 @@ def test_an_import_tells_of_exposure_that_differs(
     frames = []
     (tmp_path / "src/images").mkdir(parents=True)
     for k, frame in enumerate(load_dataset(rock).frames[:8]):
-        image = photograph(tmp_path / f"src/images/{frame.name}.jpg", 0.01 * 2 ** (0.5 * (k % 2) * differs))
+        image = photograph(
+            tmp_path / f"src/images/{frame.name}.jpg", 0.01 * 2 ** (0.5 * (k % 2) * differs)
+        )
         frames.append(replace(frame, image_path=image, depth_path=None, mask_path=None))
     write_transforms(tmp_path / "src", frames)
     with pytest.raises(SystemExit) as exit_:
         main(["import", str(tmp_path / "src"), "--out", str(tmp_path / "out")])
     assert not exit_.value.code
-    said = "exposure differs by up to 0.5 stops between photographs" in " ".join(capfd.readouterr().err.split())
+    said = "exposure differs by up to 0.5 stops between photographs" in " ".join(
+        capfd.readouterr().err.split()
+    )
     assert said == differs

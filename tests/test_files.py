@@ -54,7 +54,10 @@ def test_what_the_disk_says_is_one_line(tmp_path, number):
 
 
 def test_records_with_other_keys_share_one_csv(tmp_path):
-    assert write_csv(tmp_path / "a.csv", [{"a": 1, "b": None}, {"c": "x, y", "a": 0.5}]) == tmp_path / "a.csv"
+    assert (
+        write_csv(tmp_path / "a.csv", [{"a": 1, "b": None}, {"c": "x, y", "a": 0.5}])
+        == tmp_path / "a.csv"
+    )
     assert (tmp_path / "a.csv").read_bytes() == b'a,b,c\n1,,\n0.5,,"x, y"\n'
 
 
@@ -64,7 +67,9 @@ def test_an_unknown_row_is_named_with_those_there_are():
         row_named({"a": 1, "b": 2}, "c", "--it")
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's device that is always full")
+@pytest.mark.skipif(
+    not Path("/dev/full").exists(), reason="needs Linux's device that is always full"
+)
 @pytest.mark.parametrize(
     ("name", "write"),
     [
@@ -119,7 +124,9 @@ def test_what_cannot_be_read_is_named_with_its_cause(tmp_path, case, name):
 
 def test_a_picture_that_is_none_is_named_alone(tmp_path):
     (tmp_path / "a.png").write_text("no pixels")
-    with pytest.raises(InputError, match=f"^{tmp_path / 'a.png'}: not a readable image; give a PNG or JPEG"):
+    with pytest.raises(
+        InputError, match=f"^{tmp_path / 'a.png'}: not a readable image; give a PNG or JPEG"
+    ):
         read_png(tmp_path / "a.png")
 
 
@@ -189,7 +196,12 @@ def test_an_atomic_folder_appears_whole(tmp_path, there):
 def test_what_a_killed_process_left_of_an_atomic_folder_is_removed(tmp_path):
     with subprocess.Popen([sys.executable, "-c", ""]) as ended:
         pass
-    for owner, name in ((ended.pid, "out"), (os.getpid(), "out"), (ended.pid, "other"), ("mine", "out")):
+    for owner, name in (
+        (ended.pid, "out"),
+        (os.getpid(), "out"),
+        (ended.pid, "other"),
+        ("mine", "out"),
+    ):
         (tmp_path / f".{name}.{owner}.part/images").mkdir(parents=True)
     other = os.getppid()  # which runs
     (tmp_path / f".out.{other}.part").mkdir()
@@ -201,19 +213,25 @@ def test_what_a_killed_process_left_of_an_atomic_folder_is_removed(tmp_path):
 
 
 def encode_png(samples, bits, colour, palette=None, transparent=None):
-    """A PNG of samples [H,W,C], byte by byte from its specification; palette [K,3], transparent: the bytes of tRNS."""
+    """A PNG of samples [H,W,C], byte by byte from its specification; palette [K,3], transparent:
+    the bytes of tRNS."""
     big = samples.reshape(len(samples), -1).astype(">u2")
     if bits == 16:
         rows = [row.tobytes() for row in big]
     else:
         digits = (big[..., None] >> np.arange(bits)[::-1]) & 1
-        rows = [row.tobytes() for row in np.packbits(digits.reshape(len(big), -1).astype(bool), axis=1)]
+        rows = [
+            row.tobytes() for row in np.packbits(digits.reshape(len(big), -1).astype(bool), axis=1)
+        ]
     header = struct.pack(">IIBBBBB", samples.shape[1], samples.shape[0], bits, colour, 0, 0, 0)
     chunks = [(b"IHDR", header)]
     chunks += [] if palette is None else [(b"PLTE", palette.astype(np.uint8).tobytes())]
     chunks += [] if transparent is None else [(b"tRNS", transparent)]
     chunks += [(b"IDAT", zlib.compress(b"".join(b"\0" + row for row in rows))), (b"IEND", b"")]
-    parts = [struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks]
+    parts = [
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
+    ]
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
@@ -226,7 +244,8 @@ PNGS = [
     *((bits, GREY, True) for bits in (1, 8)),
     *((bits, RGB, True) for bits in (8, 16)),
 ]
-"""Every kind of PNG: bits per sample, colour type, and whether a colour (or colours of the palette) stands for transparent."""
+"""Every kind of PNG: bits per sample, colour type, and whether a colour (or colours of the palette)
+stands for transparent."""
 
 
 @pytest.mark.parametrize(("bits", "colour", "transparent"), PNGS)
@@ -238,7 +257,9 @@ def test_every_kind_of_png(tmp_path, bits, colour, transparent):
         palette = rng.integers(0, 256, (levels, 3))
         alphas = rng.integers(0, 256, levels) if transparent else np.full(levels, 255)
         expected = np.dstack([palette[samples[..., 0]], alphas[samples[..., 0]]])
-        data = encode_png(samples, bits, colour, palette, bytes(alphas.tolist()) if transparent else None)
+        data = encode_png(
+            samples, bits, colour, palette, bytes(alphas.tolist()) if transparent else None
+        )
     else:
         scaled = samples * full // (levels - 1)
         rgb = scaled[..., :3] if colour in (RGB, RGBA) else np.repeat(scaled[..., :1], 3, axis=-1)
@@ -252,7 +273,9 @@ def test_every_kind_of_png(tmp_path, bits, colour, transparent):
     rgba = read_rgba(tmp_path / "a.png")
     assert rgba.dtype == (np.uint16 if bits == 16 else np.uint8)
     np.testing.assert_array_equal(rgba, expected)
-    np.testing.assert_allclose(read_png(tmp_path / "a.png"), linear_from_srgb(expected[..., :3] / full), atol=1e-6)
+    np.testing.assert_allclose(
+        read_png(tmp_path / "a.png"), linear_from_srgb(expected[..., :3] / full), atol=1e-6
+    )
     grey = expected[..., :3] @ [0.299, 0.587, 0.114] / full
     sure = np.abs(grey - 0.5) > 1e-3
     np.testing.assert_array_equal(read_mask(tmp_path / "a.png")[sure], (grey > 0.5)[sure])
@@ -262,7 +285,9 @@ def test_every_kind_of_png(tmp_path, bits, colour, transparent):
 def test_a_transparent_grey_that_no_library_reads_right_is_refused(tmp_path, bits):
     samples = np.arange(4).reshape(2, 2, 1)
     (tmp_path / "a.png").write_bytes(encode_png(samples, bits, GREY, transparent=b"\0\1"))
-    with pytest.raises(InputError, match=f"a.png: a grey of {bits} bits that stands for transparent"):
+    with pytest.raises(
+        InputError, match=f"a.png: a grey of {bits} bits that stands for transparent"
+    ):
         read_png(tmp_path / "a.png")
 
 
@@ -274,22 +299,30 @@ def test_jpeg(tmp_path, mode):
     Image.fromarray(values).save(tmp_path / "a.jpg", quality=100, subsampling=0)
     rgba = read_rgba(tmp_path / "a.jpg")
     assert (rgba[..., 3] == 255).all()
-    np.testing.assert_allclose(rgba[..., :3], values if mode == "RGB" else np.dstack([values] * 3), atol=3)
+    np.testing.assert_allclose(
+        rgba[..., :3], values if mode == "RGB" else np.dstack([values] * 3), atol=3
+    )
 
 
 @pytest.mark.parametrize(
-    ("mode", "name"), [("CMYK", "a.jpg"), ("CMYK", "a.tif"), ("I", "a.tif"), ("F", "a.tif"), ("I;16", "a.tif")]
+    ("mode", "name"),
+    [("CMYK", "a.jpg"), ("CMYK", "a.tif"), ("I", "a.tif"), ("F", "a.tif"), ("I;16", "a.tif")],
 )
 def test_pixels_that_are_neither_grey_nor_rgb_of_8_or_16_bits_are_refused(tmp_path, mode, name):
     Image.new(mode, (4, 3)).save(tmp_path / name)
     for read in (read_png, read_rgba, read_mask):
-        with pytest.raises(InputError, match=f"{name}: pixels of kind {mode} are not supported; convert it to grey or RGB"):
+        with pytest.raises(
+            InputError,
+            match=f"{name}: pixels of kind {mode} are not supported; convert it to grey or RGB",
+        ):
             read(tmp_path / name)
 
 
 @pytest.mark.parametrize("colour", [GREY, RGB])
 def test_half_a_16_bit_png_is_refused(tmp_path, colour):
-    data = encode_png(np.random.default_rng(0).integers(0, 65536, (40, 50, CHANNELS[colour])), 16, colour)
+    data = encode_png(
+        np.random.default_rng(0).integers(0, 65536, (40, 50, CHANNELS[colour])), 16, colour
+    )
     (tmp_path / "a.png").write_bytes(data[: len(data) // 2])
     with pytest.raises(InputError, match="not a readable image"):
         read_png(tmp_path / "a.png")
@@ -308,7 +341,9 @@ with locked(sys.argv[1]):
 @contextmanager
 def holder(folder):
     command = [sys.executable, "-c", HOLDER, str(folder)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout.readline() == "locked\n"
         yield process
 
@@ -317,7 +352,10 @@ def holder(folder):
 def test_one_process_at_a_time_works_on_a_folder(tmp_path, end):
     with holder(tmp_path) as process:
         for _ in range(2):  # being refused changes nothing
-            with pytest.raises(InputError, match=f"process {process.pid} works on it; wait until"), locked(tmp_path):
+            with (
+                pytest.raises(InputError, match=f"process {process.pid} works on it; wait until"),
+                locked(tmp_path),
+            ):
                 pass
         if end == "killed":
             process.send_signal(signal.SIGKILL)
@@ -328,7 +366,8 @@ def test_one_process_at_a_time_works_on_a_folder(tmp_path, end):
 
 
 def test_a_lock_that_its_owner_removed_is_no_lock(tmp_path, monkeypatch):
-    """Opened while another process had it, taken after that one had removed it: a third would find no lock there."""
+    """Opened while another process had it, taken after that one had removed it: a third would find
+    no lock there."""
     flock, calls = fcntl.flock, []
 
     def slow(file, operation):
@@ -340,7 +379,10 @@ def test_a_lock_that_its_owner_removed_is_no_lock(tmp_path, monkeypatch):
     monkeypatch.setattr(fcntl, "flock", slow)
     with locked(tmp_path):
         assert (tmp_path / ".lock").is_file()
-        with pytest.raises(InputError, match=f"process {os.getpid()} works on it"), locked(tmp_path):
+        with (
+            pytest.raises(InputError, match=f"process {os.getpid()} works on it"),
+            locked(tmp_path),
+        ):
             pass
     assert len(calls) == 3
 
@@ -355,8 +397,14 @@ def test_a_png_holds_the_pixels_and_is_packed_fast(tmp_path):
     write_png(tmp_path / "display.png", pixels / 255, linear=False)
     write_png(tmp_path / "bytes.png", pixels)
     write_png(tmp_path / "mask.png", pixels[..., 0] > 99)
-    for name, expected in (("display", pixels), ("bytes", pixels), ("mask", np.where(pixels[..., 0] > 99, 255, 0))):
+    for name, expected in (
+        ("display", pixels),
+        ("bytes", pixels),
+        ("mask", np.where(pixels[..., 0] > 99, 255, 0)),
+    ):
         content = (tmp_path / f"{name}.png").read_bytes()
         with Image.open(tmp_path / f"{name}.png") as image:
             assert np.array_equal(np.asarray(image), expected)
-        assert content[content.index(b"IDAT") + 4 :].startswith(b"\x78\x01")  # zlib's header of its fastest level
+        assert content[content.index(b"IDAT") + 4 :].startswith(
+            b"\x78\x01"
+        )  # zlib's header of its fastest level

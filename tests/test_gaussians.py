@@ -44,7 +44,14 @@ def test_gaussians_are_equal_where_every_number_is(name):
 
 
 @pytest.mark.parametrize(
-    "change", [{"width": 17}, {"height": 13}, {"K": np.diag([20.0, 21.0, 1.0])}, {"world_to_camera": np.eye(4)}, {}]
+    "change",
+    [
+        {"width": 17},
+        {"height": 13},
+        {"K": np.diag([20.0, 21.0, 1.0])},
+        {"world_to_camera": np.eye(4)},
+        {},
+    ],
 )
 def test_cameras_are_equal_where_every_number_is(change):
     other = Camera(**{**vars(VIEW), **change})

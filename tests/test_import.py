@@ -1,4 +1,5 @@
-"""Importing other people's data: cameras to 1e-9, the same pixels, distortion undone, bad input in one line."""
+"""Importing other people's data: cameras to 1e-9, the same pixels, distortion undone, bad input in
+one line."""
 
 from __future__ import annotations
 
@@ -40,7 +41,9 @@ def _import(source: Path, out: Path, **options: Any) -> Dataset:
 def _same_cameras(a: Dataset, b: Dataset) -> None:
     assert [frame.name for frame in a.frames] == [frame.name for frame in b.frames]
     for one, other in zip(a.frames, b.frames, strict=True):
-        assert np.allclose(one.camera.world_to_camera, other.camera.world_to_camera, atol=1e-9, rtol=0)
+        assert np.allclose(
+            one.camera.world_to_camera, other.camera.world_to_camera, atol=1e-9, rtol=0
+        )
         assert np.allclose(one.camera.K, other.camera.K, atol=1e-9, rtol=0)
         assert (one.camera.width, one.camera.height) == (other.camera.width, other.camera.height)
 
@@ -62,7 +65,9 @@ def test_a_dataset_imports_as_itself(dataset: Dataset, tmp_path: Path) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
-def test_any_camera_and_any_pixels_survive_export_and_import(data: st.DataObject, tmp_path_factory) -> None:
+def test_any_camera_and_any_pixels_survive_export_and_import(
+    data: st.DataObject, tmp_path_factory
+) -> None:
     root = tmp_path_factory.mktemp("any")
     number = st.floats(-1, 1)
     frames = []
@@ -70,9 +75,15 @@ def test_any_camera_and_any_pixels_survive_export_and_import(data: st.DataObject
         width, height = data.draw(st.integers(1, 9)), data.draw(st.integers(1, 9))
         fx, fy = data.draw(st.floats(0.1, 1e4)), data.draw(st.floats(0.1, 1e4))
         K = np.array([[fx, 0, data.draw(number) * 10], [0, fy, data.draw(number) * 10], [0, 0, 1]])
-        eye = np.array([data.draw(number), data.draw(number), data.draw(number)]) * 100 + [0, 0, 200]
+        eye = np.array([data.draw(number), data.draw(number), data.draw(number)]) * 100 + [
+            0,
+            0,
+            200,
+        ]
         camera = Camera(K, width, height, look_at(eye, [data.draw(number), data.draw(number), 0]))
-        pixels = np.random.default_rng(data.draw(st.integers(0, 99))).integers(0, 256, (height, width, 3))
+        pixels = np.random.default_rng(data.draw(st.integers(0, 99))).integers(
+            0, 256, (height, width, 3)
+        )
         path = root / f"images/kf_{k:04d}.png"
         write_png(path, pixels / 255, linear=False)
         frames.append(Frame(path.stem, camera, data.draw(st.floats(0, 1e6)) + k * 1e7, path))
@@ -89,7 +100,9 @@ def test_colmap_export_and_import(dataset: Dataset, tmp_path: Path, binary: bool
     synthetic.write_colmap(dataset, tmp_path / "colmap", binary)
     copy = _import(tmp_path / "colmap", tmp_path / "copy")
     _same_cameras(dataset, copy)
-    assert all(np.array_equal(a.rgb(), b.rgb()) for a, b in zip(dataset.frames, copy.frames, strict=True))
+    assert all(
+        np.array_equal(a.rgb(), b.rgb()) for a, b in zip(dataset.frames, copy.frames, strict=True)
+    )
 
 
 def test_a_prior_from_sparse_points(dataset: Dataset, tmp_path: Path) -> None:
@@ -103,7 +116,9 @@ def test_a_prior_from_sparse_points(dataset: Dataset, tmp_path: Path) -> None:
 
 def _soft(mask: np.ndarray, full: int) -> np.ndarray:
     """A mask as an alpha with a soft edge, 0 to `full`."""
-    return np.round(cv2.GaussianBlur(mask.astype(np.float64), (5, 5), 1) * full).astype(np.uint8 if full == 255 else np.uint16)
+    return np.round(cv2.GaussianBlur(mask.astype(np.float64), (5, 5), 1) * full).astype(
+        np.uint8 if full == 255 else np.uint16
+    )
 
 
 def _with_alpha(dataset: Dataset, kind: str) -> list[np.ndarray]:
@@ -122,7 +137,9 @@ def _with_alpha(dataset: Dataset, kind: str) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("kind", ["8 bit", "16 bit"])
-def test_a_soft_alpha_becomes_images_of_the_rock_alone(dataset: Dataset, tmp_path: Path, kind: str) -> None:
+def test_a_soft_alpha_becomes_images_of_the_rock_alone(
+    dataset: Dataset, tmp_path: Path, kind: str
+) -> None:
     images = _with_alpha(dataset, kind)
     copy = _import(dataset.root, tmp_path / "copy")
     assert not [problem for problem in check_dataset(copy).problems if "contradicts" in problem]
@@ -130,10 +147,15 @@ def test_a_soft_alpha_becomes_images_of_the_rock_alone(dataset: Dataset, tmp_pat
         straight = pixels / np.iinfo(pixels.dtype).max
         rgba, weight = frame.target()
         assert np.abs(rgba[..., 3] - straight[..., 3]).max() <= 0.5 / 255 + 1e-6
-        assert np.abs(rgba[..., :3] - linear_from_srgb(straight[..., :3]) * straight[..., 3:]).max() < 6e-3
+        assert (
+            np.abs(rgba[..., :3] - linear_from_srgb(straight[..., :3]) * straight[..., 3:]).max()
+            < 6e-3
+        )
         assert weight.all()
         assert np.array_equal(frame.mask(), straight[..., 3] >= 0.5)
-        assert np.abs(frame.rgb() - linear_from_srgb(straight[..., :3])).max() < 5e-3  # as it was, whatever alpha says
+        assert (
+            np.abs(frame.rgb() - linear_from_srgb(straight[..., :3])).max() < 5e-3
+        )  # as it was, whatever alpha says
     again = _import(copy.root, tmp_path / "again")
     for one, other in zip(copy.frames, again.frames, strict=True):
         assert one.rock_path is not None
@@ -146,7 +168,10 @@ def test_without_a_soft_alpha_that_gives_the_mask_there_are_no_images_of_the_roc
     dataset: Dataset, tmp_path: Path, case: str
 ) -> None:
     _with_alpha(dataset, "binary" if case == "binary" else "8 bit")
-    options = {"masks": {"masks": dataset.root / "masks"}, "mesh": {"mesh": dataset.root / "rock.glb"}}.get(case, {})
+    options = {
+        "masks": {"masks": dataset.root / "masks"},
+        "mesh": {"mesh": dataset.root / "rock.glb"},
+    }.get(case, {})
     if case == "mask files":
         data = read_json(dataset.root / "transforms.json")
         for frame, record in zip(dataset.frames, data["frames"], strict=True):
@@ -160,8 +185,11 @@ def test_without_a_soft_alpha_that_gives_the_mask_there_are_no_images_of_the_roc
 
 
 def test_a_soft_alpha_is_undistorted_without_a_fringe(dataset: Dataset, tmp_path: Path) -> None:
-    """A grey rock over transparent black: resampled straight, its rim would turn dark; premultiplied, it stays grey."""
-    data = read_json(dataset.root / "transforms.json") | dict(zip(("k1", "k2"), DISTORTION, strict=False))
+    """A grey rock over transparent black: resampled straight, its rim would turn dark;
+    premultiplied, it stays grey."""
+    data = read_json(dataset.root / "transforms.json") | dict(
+        zip(("k1", "k2"), DISTORTION, strict=False)
+    )
     for frame, record in zip(dataset.frames, data["frames"], strict=True):
         del record["mask_path"]
         alpha = _soft(frame.mask(), 255)
@@ -204,10 +232,13 @@ DISTORTION = np.array([-0.15, 0.04, 0.002, -0.003, 0.0])
 
 
 def _distorted(camera: Camera) -> np.ndarray:
-    """What a lens with DISTORTION sees of a pattern in the plane z = 1 of the camera: albedo at the undistorted rays."""
+    """What a lens with DISTORTION sees of a pattern in the plane z = 1 of the camera: albedo at the
+    undistorted rays."""
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     shift = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    rays = cv2.undistortPoints(np.stack([u, v], -1).reshape(-1, 1, 2), camera.K - shift, DISTORTION).reshape(*u.shape, 2)
+    rays = cv2.undistortPoints(
+        np.stack([u, v], -1).reshape(-1, 1, 2), camera.K - shift, DISTORTION
+    ).reshape(*u.shape, 2)
     return synthetic.albedo(np.dstack([rays, np.ones_like(u)]))
 
 
@@ -259,12 +290,18 @@ def test_images_of_16_bits(dataset: Dataset, tmp_path: Path) -> None:
         cv2.imwrite(str(frame.image_path), written[..., [2, 1, 0, 3]])
     write_json(dataset.root / "transforms.json", data)
     frame = _import(dataset.root, tmp_path / "copy").frames[0]
-    assert np.abs(cv2.imread(str(frame.image_path))[..., ::-1] - written[..., :3] / 257).max() <= 0.5
+    assert (
+        np.abs(cv2.imread(str(frame.image_path))[..., ::-1] - written[..., :3] / 257).max() <= 0.5
+    )
     assert np.array_equal(frame.mask(), written[..., 3] >= 32768)
 
 
-@pytest.mark.parametrize("kind", ["plain", "alpha", "grey", "palette", "16 bit", "jpeg", "distorted"])
-def test_only_an_image_that_stays_as_it_is_is_copied(dataset: Dataset, tmp_path: Path, kind: str) -> None:
+@pytest.mark.parametrize(
+    "kind", ["plain", "alpha", "grey", "palette", "16 bit", "jpeg", "distorted"]
+)
+def test_only_an_image_that_stays_as_it_is_is_copied(
+    dataset: Dataset, tmp_path: Path, kind: str
+) -> None:
     path = dataset.frames[0].image_path
     with Image.open(path) as image:
         pixels = np.asarray(image)
@@ -276,7 +313,10 @@ def test_only_an_image_that_stays_as_it_is_is_copied(dataset: Dataset, tmp_path:
     elif kind == "16 bit":
         cv2.imwrite(str(path), pixels.astype(np.uint16)[..., ::-1] * 257)
     elif kind == "distorted":
-        write_json(dataset.root / "transforms.json", read_json(dataset.root / "transforms.json") | {"k1": -0.1})
+        write_json(
+            dataset.root / "transforms.json",
+            read_json(dataset.root / "transforms.json") | {"k1": -0.1},
+        )
     else:
         Image.fromarray(pixels).save(path, compress_level=9)  # other bytes than ours would be
     copy = _import(dataset.root, tmp_path / "copy").frames[0]
@@ -284,7 +324,9 @@ def test_only_an_image_that_stays_as_it_is_is_copied(dataset: Dataset, tmp_path:
     assert np.array_equal(copy.rgb(), replace(copy, image_path=path).rgb()) == (kind != "distorted")
 
 
-def test_missing_images_are_skipped_and_counted(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_images_are_skipped_and_counted(
+    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for frame in dataset.frames[:3]:
         frame.image_path.unlink()
     with pytest.raises(SystemExit) as exit_:
@@ -297,9 +339,14 @@ def test_missing_images_are_skipped_and_counted(dataset: Dataset, tmp_path: Path
     assert "5 frames" in output.out
 
 
-def test_images_are_set_apart_as_test_views(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_images_are_set_apart_as_test_views(
+    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     arguments = ["import", str(dataset.root), "--out", str(tmp_path / "out"), "--test-every", "3"]
-    for part in ("transforms.json", "test/transforms.json"):  # the second time it had been interrupted before its end
+    for part in (
+        "transforms.json",
+        "test/transforms.json",
+    ):  # the second time it had been interrupted before its end
         with pytest.raises(SystemExit) as stop:
             main(arguments)
         assert stop.value.code == 0, capsys.readouterr().err
@@ -327,7 +374,9 @@ def test_images_are_set_apart_as_test_views(dataset: Dataset, tmp_path: Path, ca
     assert "--test-every 3 of 1 images leaves none to choose from" in capsys.readouterr().err
 
 
-def test_a_named_cloud_that_is_not_there_is_said(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_named_cloud_that_is_not_there_is_said(
+    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = dataset.root / "transforms.json"
     for cloud, said in (("sparse_pc.ply", 1), (None, 0)):
         write_json(path, read_json(path) | {"ply_file_path": cloud})
@@ -336,7 +385,9 @@ def test_a_named_cloud_that_is_not_there_is_said(dataset: Dataset, tmp_path: Pat
         output = capsys.readouterr()
         assert exit_.value.code == 0
         text = "".join(output.err.split())  # a long path is broken into lines
-        assert (f"{dataset.root / 'sparse_pc.ply'},donotexist;importedwithoutthem" in text) == bool(said), text
+        assert (f"{dataset.root / 'sparse_pc.ply'},donotexist;importedwithoutthem" in text) == bool(
+            said
+        ), text
         assert " 0 points" in " ".join(output.out.split())
         assert not (tmp_path / str(said) / "sparse.ply").exists()
 
@@ -352,7 +403,9 @@ def test_masks_by_projecting_a_mesh_or_from_files(dataset: Dataset, tmp_path: Pa
     with pytest.raises(SystemExit):
         main([*options, str(tmp_path / "files"), "--masks", str(dataset.root / "masks")])
     projected, given, none = (load_dataset(tmp_path / name) for name in ("mesh", "files", "data"))
-    for a, b, original, plain in zip(projected.frames, given.frames, dataset.frames, none.frames, strict=True):
+    for a, b, original, plain in zip(
+        projected.frames, given.frames, dataset.frames, none.frames, strict=True
+    ):
         true = original.mask()
         assert np.array_equal(b.mask(), true)
         assert plain.mask_path is None
@@ -368,11 +421,23 @@ def test_masks_may_be_named_as_colmap_names_them(tmp_path: Path) -> None:
     for path in list((root / "masks").iterdir()):
         path.rename(path.with_name(f"{path.name}.png"))
     imported = import_source(read_source(root), tmp_path / "out", masks=root / "masks")
-    assert all(np.array_equal(frame.mask(), mask) for frame, mask in zip(imported.frames, true, strict=True))
+    assert all(
+        np.array_equal(frame.mask(), mask)
+        for frame, mask in zip(imported.frames, true, strict=True)
+    )
 
 
 def test_a_prior_of_a_given_mesh(dataset: Dataset, tmp_path: Path) -> None:
-    options = ["prior", str(dataset.root), "--mesh", str(dataset.root / "rock.glb"), "--gaussians", "300", "--backing", "0"]
+    options = [
+        "prior",
+        str(dataset.root),
+        "--mesh",
+        str(dataset.root / "rock.glb"),
+        "--gaussians",
+        "300",
+        "--backing",
+        "0",
+    ]
     with pytest.raises(SystemExit) as exit_:
         main([*options, "--out", str(tmp_path / "prior")])
     assert exit_.value.code == 0
@@ -436,7 +501,9 @@ def _cloud(vertices: str) -> Callable[[Path], Path]:
         _edit(root, lambda data: data.update(ply_file_path="points.ply"))
         columns = "".join(f"property float {name}\n" for name in "xyz")
         count = len(vertices.splitlines())
-        (root / "points.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex {count}\n{columns}end_header\n{vertices}")
+        (root / "points.ply").write_text(
+            f"ply\nformat ascii 1.0\nelement vertex {count}\n{columns}end_header\n{vertices}"
+        )
         return root
 
     return make
@@ -459,58 +526,160 @@ def _truncate(model: Path) -> None:
 BAD: dict[str, tuple[Callable[[Path], Path], list[str], str]] = {
     "missing": (lambda root: root / "nowhere", [], "no such file or folder"),
     "empty folder": (_empty, [], "holds no transforms.json"),
-    "no frames": (lambda root: _edit(root, lambda data: data.update(frames=[])), [], "lists no frames"),
-    "no intrinsics": (lambda root: _edit(root, lambda data: data.pop("fl_x")), [], "no usable intrinsics"),
-    "fisheye": (lambda root: _edit(root, lambda data: data.update(camera_model="OPENCV_FISHEYE")), [], "not supported"),
+    "no frames": (
+        lambda root: _edit(root, lambda data: data.update(frames=[])),
+        [],
+        "lists no frames",
+    ),
+    "no intrinsics": (
+        lambda root: _edit(root, lambda data: data.pop("fl_x")),
+        [],
+        "no usable intrinsics",
+    ),
+    "fisheye": (
+        lambda root: _edit(root, lambda data: data.update(camera_model="OPENCV_FISHEYE")),
+        [],
+        "not supported",
+    ),
     "k4": (lambda root: _edit(root, lambda data: data.update(k4=0.1)), [], "has k4"),
-    "nan distortion": (lambda root: _edit(root, lambda data: data.update(k1=float("nan"))), [], "not finite"),
-    "nan pose": (lambda root: _edit(root, _first("transform_matrix", [[float("nan")] * 4] * 4)), [], "not finite"),
-    "singular pose": (lambda root: _edit(root, _first("transform_matrix", [[0.0] * 4] * 4)), [], "correct the pose"),
-    "short pose": (lambda root: _edit(root, _first("transform_matrix", [[1.0] * 4] * 2)), [], "no 4x4 matrix"),
-    "duplicate frames": (lambda root: _edit(root, _first("file_path", "images/kf_0001.png")), [], "more than once"),
-    "wrong size": (lambda root: _edit(root, lambda data: data.update(w=100)), [], "is 64x48, but its camera is 100x48"),
-    "a folder for depth": (lambda root: _edit(root, _first("depth_file_path", "depth")), [], "depth: cannot be read (Is a dir"),
-    "no depth file": (lambda root: _edit(root, _first("depth_file_path", "depth/none.exr")), [], "no such EXR"),
+    "nan distortion": (
+        lambda root: _edit(root, lambda data: data.update(k1=float("nan"))),
+        [],
+        "not finite",
+    ),
+    "nan pose": (
+        lambda root: _edit(root, _first("transform_matrix", [[float("nan")] * 4] * 4)),
+        [],
+        "not finite",
+    ),
+    "singular pose": (
+        lambda root: _edit(root, _first("transform_matrix", [[0.0] * 4] * 4)),
+        [],
+        "correct the pose",
+    ),
+    "short pose": (
+        lambda root: _edit(root, _first("transform_matrix", [[1.0] * 4] * 2)),
+        [],
+        "no 4x4 matrix",
+    ),
+    "duplicate frames": (
+        lambda root: _edit(root, _first("file_path", "images/kf_0001.png")),
+        [],
+        "more than once",
+    ),
+    "wrong size": (
+        lambda root: _edit(root, lambda data: data.update(w=100)),
+        [],
+        "is 64x48, but its camera is 100x48",
+    ),
+    "a folder for depth": (
+        lambda root: _edit(root, _first("depth_file_path", "depth")),
+        [],
+        "depth: cannot be read (Is a dir",
+    ),
+    "no depth file": (
+        lambda root: _edit(root, _first("depth_file_path", "depth/none.exr")),
+        [],
+        "no such EXR",
+    ),
     "image path a number": (lambda root: _edit(root, _first("file_path", 5)), [], "frame 0"),
     "image path empty": (lambda root: _edit(root, _first("file_path", "")), [], "frame 0"),
-    "no rock file": (lambda root: _edit(root, _first("rock_file_path", "rock/none.png")), [], "no such image"),
+    "no rock file": (
+        lambda root: _edit(root, _first("rock_file_path", "rock/none.png")),
+        [],
+        "no such image",
+    ),
     "mask path a list": (lambda root: _edit(root, _first("mask_path", ["a"])), [], "frame 0"),
     "nan time": (lambda root: _edit(root, _first("timestamp", float("nan"))), [], "frame 0"),
     "time of words": (lambda root: _edit(root, _first("timestamp", "noon")), [], "frame 0"),
-    "infinite width": (lambda root: _edit(root, lambda data: data.update(w=float("inf"))), [], "frame 0"),
-    "unit of words": (lambda root: _edit(root, lambda data: data.update(depth_unit_scale_factor="mm")), [], "depth_unit"),
+    "infinite width": (
+        lambda root: _edit(root, lambda data: data.update(w=float("inf"))),
+        [],
+        "frame 0",
+    ),
+    "unit of words": (
+        lambda root: _edit(root, lambda data: data.update(depth_unit_scale_factor="mm")),
+        [],
+        "depth_unit",
+    ),
     "no images": (_no_images, [], "none of the 8 images"),
     "truncated image": (_truncated_image, [], "not a readable image"),
     "corrupt JPEG": (_corrupt_jpeg, [], "kf_0000.jpg: not a readable image"),
-    "up of words": (lambda root: _edit(root, lambda data: data.update(up="skyward")), [], "up: must be three finite numbers"),
+    "up of words": (
+        lambda root: _edit(root, lambda data: data.update(up="skyward")),
+        [],
+        "up: must be three finite numbers",
+    ),
     "angle of view of 0": (
         lambda root: _edit(root, lambda data: (data.pop("fl_x"), data.update(camera_angle_x=0))),
         [],
         "no usable intrinsics",
     ),
-    "no points in the cloud": (_cloud(""), [], "points.ply: has values that are not finite, or fewer than two different"),
-    "all points in one place": (_cloud("1 2 3\n" * 500), [], "points.ply: has values that are not finite, or fewer than two"),
-    "no model in sparse": (lambda root: _colmap(root, shutil.rmtree), [], "COLMAP model (cameras, images and points3D"),
+    "no points in the cloud": (
+        _cloud(""),
+        [],
+        "points.ply: has values that are not finite, or fewer than two different",
+    ),
+    "all points in one place": (
+        _cloud("1 2 3\n" * 500),
+        [],
+        "points.ply: has values that are not finite, or fewer than two",
+    ),
+    "no model in sparse": (
+        lambda root: _colmap(root, shutil.rmtree),
+        [],
+        "COLMAP model (cameras, images and points3D",
+    ),
     "truncated colmap": (lambda root: _colmap(root, _truncate), [], "not a readable COLMAP model"),
-    "no mask": (lambda root: synthetic.write_dataset(root).root, ["--masks", "."], "no mask for image"),
-    "one mask missing": (lambda root: _mask(root, Path.unlink), ["--masks", "{source}/masks"], "no mask for image kf_0000.png"),
+    "no mask": (
+        lambda root: synthetic.write_dataset(root).root,
+        ["--masks", "."],
+        "no mask for image",
+    ),
+    "one mask missing": (
+        lambda root: _mask(root, Path.unlink),
+        ["--masks", "{source}/masks"],
+        "no mask for image kf_0000.png",
+    ),
     "one mask of another size": (
         lambda root: _mask(root, lambda path: write_png(path, np.ones((24, 32), bool))),
         ["--masks", "{source}/masks"],
         "kf_0000.png: is 32x24, but its camera is 64x48",
     ),
-    "no mask folder": (lambda root: synthetic.write_dataset(root).root, ["--masks", "none"], "none: no such folder"),
-    "no mesh": (lambda root: synthetic.write_dataset(root).root, ["--mesh", "none.glb"], "no such mesh"),
-    "both masks": (lambda root: synthetic.write_dataset(root).root, ["--mesh", "a.glb", "--masks", "b"], "give one of them"),
+    "no mask folder": (
+        lambda root: synthetic.write_dataset(root).root,
+        ["--masks", "none"],
+        "none: no such folder",
+    ),
+    "no mesh": (
+        lambda root: synthetic.write_dataset(root).root,
+        ["--mesh", "none.glb"],
+        "no such mesh",
+    ),
+    "both masks": (
+        lambda root: synthetic.write_dataset(root).root,
+        ["--mesh", "a.glb", "--masks", "b"],
+        "give one of them",
+    ),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_one_line_and_leaves_nothing(case: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_line_and_leaves_nothing(
+    case: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     make, options, message = BAD[case]
     source = make(tmp_path / "src")
     with pytest.raises(SystemExit) as exit_:
-        main(["import", str(source), "--out", str(tmp_path / "out"), *(option.format(source=source) for option in options)])
+        main(
+            [
+                "import",
+                str(source),
+                "--out",
+                str(tmp_path / "out"),
+                *(option.format(source=source) for option in options),
+            ]
+        )
     error = capfd.readouterr().err.strip()
     assert exit_.value.code == 2
     assert message in error
@@ -527,7 +696,17 @@ def test_a_mesh_is_said_to_be_turned_only_where_it_could_be_read(
     said = {}
     for mesh in (tmp_path / "broken.glb", dataset.root / "rock.glb"):
         with pytest.raises(SystemExit):
-            main([command, str(dataset.root), "--out", str(tmp_path / "out"), "--mesh", str(mesh), *options])
+            main(
+                [
+                    command,
+                    str(dataset.root),
+                    "--out",
+                    str(tmp_path / "out"),
+                    "--mesh",
+                    str(mesh),
+                    *options,
+                ]
+            )
         said[mesh.stem] = "turned from +Y up" in capfd.readouterr().out.replace("\n", " ")
     assert said == {"broken": False, "rock": True}
 
@@ -537,6 +716,8 @@ def test_an_empty_mask_in_every_frame_is_one_line(dataset: Dataset) -> None:
 
     empty = dataset.root / "masks/empty.png"
     write_png(empty, np.zeros((48, 64), bool))
-    blind = Dataset(dataset.root, tuple(replace(frame, mask_path=empty) for frame in dataset.frames))
+    blind = Dataset(
+        dataset.root, tuple(replace(frame, mask_path=empty) for frame in dataset.frames)
+    )
     with pytest.raises(InputError, match="masks are black in every frame"):
         build_prior(blind, PriorSettings(gaussians=100, backing=0))

@@ -36,7 +36,8 @@ def strike(path, *arguments, **options):
 importers.write_png = strike
 main()
 """
-"""The program, which sends itself a signal when it has written three images, and all of the fourth frame but its image."""
+"""The program, which sends itself a signal when it has written three images, and all of the fourth
+frame but its image."""
 
 
 def _imported(arguments: list[str]) -> None:
@@ -49,7 +50,10 @@ def _imported(arguments: list[str]) -> None:
 def source(tmp_path: Path) -> Path:
     """Eight distorted frames with depth."""
     root = synthetic.write_dataset(tmp_path / "data").root
-    write_json(root / "transforms.json", read_json(root / "transforms.json") | {"k1": -0.15, "k2": 0.04, "p1": 0.002})
+    write_json(
+        root / "transforms.json",
+        read_json(root / "transforms.json") | {"k1": -0.15, "k2": 0.04, "p1": 0.002},
+    )
     return root
 
 
@@ -60,12 +64,24 @@ def many(source: Path) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("blow", "code"), [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGTERM, -signal.SIGTERM), (signal.SIGINT, 130)]
+    ("blow", "code"),
+    [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGTERM, -signal.SIGTERM), (signal.SIGINT, 130)],
 )
-def test_struck_in_the_middle_and_given_again(many: list[str], tmp_path: Path, blow: int, code: int, monkeypatch) -> None:
-    """A real process, a real signal; then the same folder, bit for bit, and no finished frame read again."""
+def test_struck_in_the_middle_and_given_again(
+    many: list[str], tmp_path: Path, blow: int, code: int, monkeypatch
+) -> None:
+    """A real process, a real signal; then the same folder, bit for bit, and no finished frame read
+    again."""
     out = tmp_path / "out"
-    program = [sys.executable, "-c", STRUCK.format(blow=int(blow)), "import", *many, "--out", str(out)]
+    program = [
+        sys.executable,
+        "-c",
+        STRUCK.format(blow=int(blow)),
+        "import",
+        *many,
+        "--out",
+        str(out),
+    ]
     # A shell starts what runs in the background deaf to SIGINT.
     hearing = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     process = subprocess.run(program, capture_output=True, text=True, preexec_fn=hearing)
@@ -78,7 +94,9 @@ def test_struck_in_the_middle_and_given_again(many: list[str], tmp_path: Path, b
     kept = {path: path.stat().st_mtime_ns for path in (out / "images").glob("kf_*")}
 
     read, load = [], importers.read_rgba
-    monkeypatch.setattr(importers, "read_rgba", lambda path: (read.append(path.stem), load(path))[1])
+    monkeypatch.setattr(
+        importers, "read_rgba", lambda path: (read.append(path.stem), load(path))[1]
+    )
     _imported([*many, "--out", str(out)])
     assert read == [f"kf_{k:04d}" for k in range(3, 8)]
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
@@ -111,14 +129,21 @@ def test_an_unfinished_import_of_something_else_is_refused(
     capsys.readouterr()
     other = synthetic.write_dataset(tmp_path / "other").root
     trimesh.creation.icosphere(subdivisions=2).export(tmp_path / "ball.ply")
-    for arguments in ([source], [other], [source, "--masks", f"{source}/masks"], [source, "--mesh", tmp_path / "ball.ply"]):
+    for arguments in (
+        [source],
+        [other],
+        [source, "--masks", f"{source}/masks"],
+        [source, "--mesh", tmp_path / "ball.ply"],
+    ):
         line = refused(capsys, ["import", *arguments, "--out", out], out)
         assert "unfinished dataset of other settings or sources" in line
     write_json(source / "transforms.json", read_json(source / "transforms.json") | {"cx": 30.0})
     assert "unfinished dataset" in refused(capsys, ["import", *many, "--out", out], out)
 
 
-def test_a_frame_whose_files_changed_is_made_again(source: Path, many: list[str], tmp_path: Path, monkeypatch) -> None:
+def test_a_frame_whose_files_changed_is_made_again(
+    source: Path, many: list[str], tmp_path: Path, monkeypatch
+) -> None:
     out, image = tmp_path / "out", source / "images/kf_0000.png"
     _stopped([*many, "--out", str(out)], monkeypatch)
     write_png(image, np.full((48, 64, 3), 0.5))
@@ -127,7 +152,9 @@ def test_a_frame_whose_files_changed_is_made_again(source: Path, many: list[str]
     assert listing(out) == listing(tmp_path / "whole")
 
 
-def test_a_damaged_image_in_the_middle_keeps_the_frames_before(source: Path, many: list[str], tmp_path: Path, capsys) -> None:
+def test_a_damaged_image_in_the_middle_keeps_the_frames_before(
+    source: Path, many: list[str], tmp_path: Path, capsys
+) -> None:
     out, image = tmp_path / "out", source / "images/kf_0004.png"
     whole = image.read_bytes()
     image.write_bytes(whole[:100])

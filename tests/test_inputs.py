@@ -1,4 +1,5 @@
-"""A resumed run goes on from what it was made from: the prior, the poses and the files of the frames taken."""
+"""A resumed run goes on from what it was made from: the prior, the poses and the files of the
+frames taken."""
 
 from __future__ import annotations
 
@@ -13,11 +14,12 @@ import pytest
 import tiny
 from PIL import Image
 
-from mgs.active import loop, run_folder
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.images import write_exr
+from mgs.run import folder as run_folder
+from mgs.run import loop
 
 
 def retouch(path: Path) -> None:
@@ -38,14 +40,19 @@ def nudge(root: Path, name: str, **values) -> None:
 
 
 SPOILT = {
-    "image": (lambda root: retouch(root / "images/kf_0004.png"), r"images/kf_0004\.png has changed since .*run took it"),
+    "image": (
+        lambda root: retouch(root / "images/kf_0004.png"),
+        r"images/kf_0004\.png has changed since .*run took it",
+    ),
     "mask": (lambda root: retouch(root / "masks/kf_0008.png"), r"masks/kf_0008\.png has changed"),
     "rock": (
         lambda root: nudge(root, "kf_0004", rock_file_path="images/kf_0000.png"),
         r"images/kf_0000\.png has changed",
     ),
     "depth": (
-        lambda root: write_exr(root / "depth/kf_0000.exr", {"Z": np.zeros((tiny.HEIGHT, tiny.WIDTH), np.float32)}),
+        lambda root: write_exr(
+            root / "depth/kf_0000.exr", {"Z": np.zeros((tiny.HEIGHT, tiny.WIDTH), np.float32)}
+        ),
         r"depth/kf_0000\.exr has changed",
     ),
     "no mask": (
@@ -56,9 +63,13 @@ SPOILT = {
         lambda root: nudge(root, "kf_0005", x=1e-6),
         r"transforms\.json: the pose or the intrinsics of frame kf_0005 have",
     ),
-    "intrinsics": (lambda root: nudge(root, "kf_0005", fl_x=16.1), "the intrinsics of frame kf_0005 have changed"),
+    "intrinsics": (
+        lambda root: nudge(root, "kf_0005", fl_x=16.1),
+        "the intrinsics of frame kf_0005 have changed",
+    ),
 }
-"""What may change between a run and its resumption, and how it is named. Of 12 frames on a circle 0, 4 and 8 are the seeds."""
+"""What may change between a run and its resumption, and how it is named. Of 12 frames on a circle
+0, 4 and 8 are the seeds."""
 
 
 @pytest.fixture
@@ -66,7 +77,13 @@ def half_done(tmp_path):
     """A dataset of its own and a run of three steps of six."""
     root = tiny.write_dataset(tmp_path / "dataset")
     settings = tiny.start(tmp_path / "run", load_dataset(root))
-    loop.run(tmp_path / "run", settings.model_copy(update={"budget": 2}), load_dataset(root), tiny.stations(), tiny.silent)
+    loop.run(
+        tmp_path / "run",
+        settings.model_copy(update={"budget": 2}),
+        load_dataset(root),
+        tiny.stations(),
+        tiny.silent,
+    )
     return root, tmp_path / "run"
 
 
@@ -74,7 +91,14 @@ def resume(root: Path, out: Path, **parts) -> tuple[run_folder.State, list[str]]
     """The last state of a resumed run, and what was said on the way."""
     said: list[str] = []
     stations = tiny.stations(**parts)
-    return loop.run(out, run_folder.read_settings(out), load_dataset(root), stations, tiny.silent, say=said.append), said
+    return loop.run(
+        out,
+        run_folder.read_settings(out),
+        load_dataset(root),
+        stations,
+        tiny.silent,
+        say=said.append,
+    ), said
 
 
 @pytest.mark.parametrize("what", SPOILT)

@@ -15,9 +15,17 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 GROUPS = PROJECT["dependency-groups"]
 EXTRAS = PROJECT["project"]["optional-dependencies"]
 WANTED = (
-    PROJECT["project"]["dependencies"] + EXTRAS["view"] + GROUPS["dev"] + GROUPS["docs"] + PROJECT["build-system"]["requires"]
+    PROJECT["project"]["dependencies"]
+    + EXTRAS["view"]
+    + GROUPS["dev"]
+    + GROUPS["docs"]
+    + PROJECT["build-system"]["requires"]
 )
-LINES = [line for line in (ROOT / "requirements.lock").read_text().splitlines() if not line.startswith("#")]
+LINES = [
+    line
+    for line in (ROOT / "requirements.lock").read_text().splitlines()
+    if not line.startswith("#")
+]
 
 
 def test_every_line_is_one_version():
@@ -27,7 +35,9 @@ def test_every_line_is_one_version():
 
 @pytest.mark.parametrize("wanted", WANTED)
 def test_what_the_package_asks_for_is_locked(wanted):
-    locked = {canonicalize_name(name): version for name, version in (line.split("==") for line in LINES)}
+    locked = {
+        canonicalize_name(name): version for name, version in (line.split("==") for line in LINES)
+    }
     requirement = Requirement(wanted)
     version = locked.get(canonicalize_name(requirement.name))
     assert version is not None, f"{requirement.name} is not in requirements.lock; run `make lock`"
@@ -36,7 +46,8 @@ def test_what_the_package_asks_for_is_locked(wanted):
 
 @pytest.mark.parametrize("line", LINES)
 def test_what_is_locked_installs_on_the_lowest_python(line):
-    """The first version of the oldest Python that the package supports: distributions ship early ones (Debian 12: 3.11.2)."""
+    """The first version of the oldest Python that the package supports: distributions ship early
+    ones (Debian 12: 3.11.2)."""
     lowest = PROJECT["project"]["requires-python"].removeprefix(">=") + ".0"
     try:
         found = metadata(line.split("==")[0])

@@ -1,4 +1,5 @@
-"""Means that are learned, along the prior's normals or freely: steps, what they repair, and runs of `mgs nbv`."""
+"""Means that are learned, along the prior's normals or freely: steps, what they repair, and runs of
+`mgs nbv`."""
 
 from __future__ import annotations
 
@@ -10,20 +11,22 @@ import pytest
 import tiny
 from refusals import refused
 
-from mgs.active import run_folder, stations
-from mgs.active.convergence import remaining_decrease
-from mgs.active.criteria import MEAN_STD
-from mgs.active.fitting import fit
-from mgs.active.nbv import resume_nbv, run_nbv, start_run
-from mgs.active.objective import objective
-from mgs.active.settings import MEAN_RATE, NbvSettings, TrainSettings
 from mgs.camera import Camera, look_at
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
+from mgs.fit.fitting import fit
+from mgs.fit.objective import objective
+from mgs.fit.settings import MEAN_RATE, TrainSettings
 from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
+from mgs.policy.criteria import MEAN_STD
 from mgs.prior.build import load_prior
 from mgs.prior.initial import initial_normals
+from mgs.report.convergence import remaining_decrease
 from mgs.rotation import quat_from_normals
+from mgs.run import folder as run_folder
+from mgs.run import stations
+from mgs.run.nbv import resume_nbv, run_nbv, start_run
+from mgs.run.settings import NbvSettings
 from mgs.splat import MEANS, as_drjit, fisher, groups, render
 
 N, SPACING = 300, (4 * np.pi / 300) ** 0.5
@@ -38,7 +41,8 @@ def normals() -> np.ndarray:
 
 
 def ball(offsets: np.ndarray | float = 0.0) -> Gaussians:
-    """A speckled unit sphere of flat, opaque Gaussians, each off the surface by its offset [N], metres."""
+    """A speckled unit sphere of flat, opaque Gaussians, each off the surface by its offset [N],
+    metres."""
     n = normals()
     return Gaussians(
         means=(n * (1 + np.broadcast_to(offsets, N))[:, None]).astype(np.float32),
@@ -52,7 +56,9 @@ def ball(offsets: np.ndarray | float = 0.0) -> Gaussians:
 @pytest.fixture(scope="module")
 def cameras() -> list[Camera]:
     K = np.array([[60.0, 0, 24], [0, 60.0, 20], [0, 0, 1]])
-    eyes = [(3 * np.cos(a), 3 * np.sin(a), z) for z in (-1.2, 1.2) for a in np.arange(5) * 2 * np.pi / 5]
+    eyes = [
+        (3 * np.cos(a), 3 * np.sin(a), z) for z in (-1.2, 1.2) for a in np.arange(5) * 2 * np.pi / 5
+    ]
     return [Camera(K, 48, 40, look_at(eye, (0, 0, 0))) for eye in eyes]
 
 
@@ -62,10 +68,18 @@ def targets(cameras) -> list[np.ndarray]:
 
 
 def settings(means: str, rate: float = MEAN_RATE * SPACING, **values) -> TrainSettings:
-    return TrainSettings(means=means, rates={"mean": rate}, **({"passes": 8, "tolerance": 0.0} | values))
+    return TrainSettings(
+        means=means, rates={"mean": rate}, **({"passes": 8, "tolerance": 0.0} | values)
+    )
 
 
-LAM = {"colour": 4e-4, "scale": 1.6e-3, "rotation": 1.6e-3, "opacity": 1e-4, "mean": (0.02 / (MEAN_STD * SPACING)) ** 2}
+LAM = {
+    "colour": 4e-4,
+    "scale": 1.6e-3,
+    "rotation": 1.6e-3,
+    "opacity": 1e-4,
+    "mean": (0.02 / (MEAN_STD * SPACING)) ** 2,
+}
 
 
 def test_the_names_are_those_of_the_information():
@@ -75,9 +89,22 @@ def test_the_names_are_those_of_the_information():
 def test_frozen_is_the_default_and_looks_at_nothing_else(cameras, targets):
     start = ball(0.05)
     plain = fit(
-        start, cameras, targets, TrainSettings(passes=3), start=start, lam={k: v for k, v in LAM.items() if k != "mean"}
+        start,
+        cameras,
+        targets,
+        TrainSettings(passes=3),
+        start=start,
+        lam={k: v for k, v in LAM.items() if k != "mean"},
     )
-    told = fit(start, cameras, targets, settings("frozen", passes=3), start=start, lam=LAM, normals=normals())
+    told = fit(
+        start,
+        cameras,
+        targets,
+        settings("frozen", passes=3),
+        start=start,
+        lam=LAM,
+        normals=normals(),
+    )
     assert plain.gaussians == told.gaussians
     assert plain.losses == told.losses
     assert np.array_equal(plain.gaussians.means, start.means)
@@ -86,7 +113,8 @@ def test_frozen_is_the_default_and_looks_at_nothing_else(cameras, targets):
 
 @pytest.mark.parametrize("means", MOVING)
 def test_one_step_is_natural_on_the_gradient_of_the_objective(cameras, targets, means):
-    """Against a tenth of the gradient over four times the information, at most by the rate; the second time replayed."""
+    """Against a tenth of the gradient over four times the information, at most by the rate; the
+    second time replayed."""
     start, rng = ball(0.02), np.random.default_rng(1)
     for _ in range(2):
         begun = ball(0.02 + 0.01 * rng.standard_normal(N))
@@ -95,7 +123,9 @@ def test_one_step_is_natural_on_the_gradient_of_the_objective(cameras, targets, 
         model = as_drjit(begun)
         g, d = (np.asarray(part(model)[-1]) for part in (goal.gradient, goal.diagonal))
         expected = np.clip(-0.1 * g / (4 * d), -0.002, 0.002)
-        moved = fit(begun, cameras[:1], targets[:1], train, start=start, lam=LAM, normals=3 * normals()).gaussians
+        moved = fit(
+            begun, cameras[:1], targets[:1], train, start=start, lam=LAM, normals=3 * normals()
+        ).gaussians
         step = moved.means.astype(np.float64) - begun.means
         if means == "normal":
             along = (step * normals()).sum(1)
@@ -114,7 +144,9 @@ def test_what_no_image_sees_goes_back_to_its_start(cameras, means):
     lam = dict.fromkeys(LAM, 100.0)
     train = settings(means, 0.004, optimiser="adam", passes=40, decay=1e-2)
     found = fit(begun, cameras, black, train, start=start, lam=lam, normals=normals())
-    assert found.losses[0] == pytest.approx(100 * N * 0.05**2 / sum(b[..., :3].size for b in black), rel=1e-3)
+    assert found.losses[0] == pytest.approx(
+        100 * N * 0.05**2 / sum(b[..., :3].size for b in black), rel=1e-3
+    )
     assert np.allclose(found.gaussians.means, start.means, atol=2e-3)
 
 
@@ -123,12 +155,24 @@ def test_displaced_means_move_back_to_the_surface(cameras, targets, means):
     offsets = 0.4 * SPACING * np.random.default_rng(3).standard_normal(N)
     start = ball(offsets)
     frozen, moved = (
-        fit(start, cameras, targets, settings(mode, passes=10), start=start, lam=LAM, normals=normals())
+        fit(
+            start,
+            cameras,
+            targets,
+            settings(mode, passes=10),
+            start=start,
+            lam=LAM,
+            normals=normals(),
+        )
         for mode in ("frozen", means)
     )
-    seen = sum(fisher(start, camera)[:, 0] for camera in cameras) > 0.3  # some begin behind their neighbours
+    seen = (
+        sum(fisher(start, camera)[:, 0] for camera in cameras) > 0.3
+    )  # some begin behind their neighbours
     assert seen.sum() > 0.8 * N
-    before, after = (np.abs(np.linalg.norm(g.means, axis=1)[seen] - 1) for g in (start, moved.gaussians))
+    before, after = (
+        np.abs(np.linalg.norm(g.means, axis=1)[seen] - 1) for g in (start, moved.gaussians)
+    )
     assert np.median(after) < 0.4 * np.median(before)
     assert (after**2).mean() < 0.5 * (before**2).mean()
     assert moved.loss < 0.5 * frozen.loss
@@ -138,7 +182,16 @@ def test_displaced_means_move_back_to_the_surface(cameras, targets, means):
 def test_a_fit_repeats_bitwise(cameras, targets, means):
     start = ball(0.05)
     first, again = (
-        fit(start, cameras, targets, settings(means, passes=3), start=start, lam=LAM, normals=normals()) for _ in range(2)
+        fit(
+            start,
+            cameras,
+            targets,
+            settings(means, passes=3),
+            start=start,
+            lam=LAM,
+            normals=normals(),
+        )
+        for _ in range(2)
     )
     assert first.gaussians == again.gaussians
     assert first.losses == again.losses
@@ -160,7 +213,12 @@ def files(tmp_path_factory):
 
 
 def options(files, means: str, **values):
-    return {"prior": files[1], "budget": 2, "seeds": 3, "train": {"means": means, "passes": 3}} | values
+    return {
+        "prior": files[1],
+        "budget": 2,
+        "seeds": 3,
+        "train": {"means": means, "passes": 3},
+    } | values
 
 
 @pytest.fixture(scope="module", params=MOVING)
@@ -175,20 +233,33 @@ def test_units_are_spacings_of_the_prior_unless_given(files, tmp_path):
     assert made.prior_std["mean"] == MEAN_STD * 0.5
     assert made.train.rates["mean"] == MEAN_RATE * 0.5
     assert run_folder.read_settings(tmp_path / "run") == made
-    given = options(files, "normal", prior_std={"mean": 0.3}, train={"means": "normal", "rates": {"mean": 0.01}})
+    given = options(
+        files, "normal", prior_std={"mean": 0.3}, train={"means": "normal", "rates": {"mean": 0.01}}
+    )
     own = start_run(files[0], tmp_path / "own", **given)
     assert (own.prior_std["mean"], own.train.rates["mean"]) == (0.3, 0.01)
-    assert "mean" not in start_run(files[0], tmp_path / "frozen", **options(files, "frozen")).prior_std
+    assert (
+        "mean" not in start_run(files[0], tmp_path / "frozen", **options(files, "frozen")).prior_std
+    )
 
 
 def test_criteria_see_the_means_and_coverage_does_not(files, whole):
     means, out, state = whole
-    made, prior, frames = run_folder.read_settings(out), load_prior(files[1]), load_dataset(files[0]).frames
+    made, prior, frames = (
+        run_folder.read_settings(out),
+        load_prior(files[1]),
+        load_dataset(files[0]).frames,
+    )
     facing = initial_normals(prior)
-    H = sum(fisher(state.gaussians, frames[i].camera, means=means, normals=facing).astype(float) for i in state.taken)
+    H = sum(
+        fisher(state.gaussians, frames[i].camera, means=means, normals=facing).astype(float)
+        for i in state.taken
+    )
     np.testing.assert_array_equal(state.H, H)
     assert state.H.shape[1] == 11 + MEANS[means]
-    assert made.regularisation(groups(0, means))[11:] == pytest.approx((0.02 / (MEAN_STD * prior.spacing)) ** 2)
+    assert made.regularisation(groups(0, means))[11:] == pytest.approx(
+        (0.02 / (MEAN_STD * prior.spacing)) ** 2
+    )
     assert state.surface.shape == (len(prior.points), 11)
     frozen = run_nbv(files[0], out.parent / "frozen", **options(files, "frozen", budget=0))
     assert frozen.steps[0]["coverage"] == state.steps[0]["coverage"]
@@ -196,7 +267,9 @@ def test_criteria_see_the_means_and_coverage_does_not(files, whole):
     assert np.abs(moved).max() > 1e-3
     sideways = moved - (moved * facing).sum(1, keepdims=True) * facing
     assert (np.abs(sideways).max() < 1e-6) == (means == "normal")
-    share = remaining_decrease(state.gaussians, made, prior, [frames[i] for i in state.taken])["predicted_decrease"]
+    share = remaining_decrease(state.gaussians, made, prior, [frames[i] for i in state.taken])[
+        "predicted_decrease"
+    ]
     assert 0 < share < 1
 
 
@@ -230,14 +303,25 @@ def test_policies_choose_with_learned_means(files, tmp_path, policy):
     ("given", "message"),
     [
         (["--means", "loose"], "--means loose: Input should be 'frozen', 'normal' or 'free'"),
-        (["--means", "free", "--estimator", "hutchinson"], "--means free: --estimator hutchinson knows nothing of means"),
-        (["--means", "free", "--policy", "paper"], "--means free: --policy paper knows nothing of means"),
-        (["--means", "normal", "--prior-std", "mean=0"], "--prior-std mean=0.0: Input should be greater than or equal to"),
+        (
+            ["--means", "free", "--estimator", "hutchinson"],
+            "--means free: --estimator hutchinson knows nothing of means",
+        ),
+        (
+            ["--means", "free", "--policy", "paper"],
+            "--means free: --policy paper knows nothing of means",
+        ),
+        (
+            ["--means", "normal", "--prior-std", "mean=0"],
+            "--prior-std mean=0.0: Input should be greater than or equal to",
+        ),
     ],
 )
 def test_bad_options_are_one_line(files, tmp_path, capsys, given, message):
     out = tmp_path / "run"
-    assert message in refused(capsys, ["nbv", files[0], "--prior", files[1], "--budget", "1", "--out", out, *given])
+    assert message in refused(
+        capsys, ["nbv", files[0], "--prior", files[1], "--budget", "1", "--out", out, *given]
+    )
     assert not out.exists()
 
 
@@ -251,7 +335,10 @@ def test_means_that_changed_since_the_start_are_one_line(files, whole, capsys):
         said = refused(capsys, ["nbv", "--resume", out], out)
     finally:
         (out / "config.json").write_text(json.dumps(config))
-    assert f"{out / 'config.json'}: settings.train.means has changed since {out} was started; restore it" in said
+    assert (
+        f"{out / 'config.json'}: settings.train.means has changed since {out} was started; restore it"
+        in said
+    )
 
 
 def test_diagnostics_and_viewer_read_such_a_run(files, whole):
@@ -259,9 +346,14 @@ def test_diagnostics_and_viewer_read_such_a_run(files, whole):
     from mgs.view.subject import SCALARS, read_subject
 
     means, out, state = whole
-    assert (out / "diagnostics/information.ply") in diagnose_run(out, [load_dataset(files[0]).frames[0].name])
+    assert (out / "diagnostics/information.ply") in diagnose_run(
+        out, [load_dataset(files[0]).frames[0].name]
+    )
     found = read_subject(out)
     assert set(found.scalars) == set(SCALARS)
     lam = run_folder.read_settings(out).regularisation(groups(0, means))
     assert found.scalars["information"] == pytest.approx(0.5 * np.log1p(state.H / lam).sum(1))
-    assert all(getattr(found.gaussians, name).shape == getattr(state.gaussians, name).shape for name in LEARNED)
+    assert all(
+        getattr(found.gaussians, name).shape == getattr(state.gaussians, name).shape
+        for name in LEARNED
+    )

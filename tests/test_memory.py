@@ -1,4 +1,5 @@
-"""Memory is bounded: images beyond a budget are read again, nothing of a result changes. And none is read beyond its end."""
+"""Memory is bounded: images beyond a budget are read again, nothing of a result changes. And none
+is read beyond its end."""
 
 from __future__ import annotations
 
@@ -19,13 +20,14 @@ sys.path.insert(0, str(Path(__file__).parent))
 import synthetic
 
 import mgs
-from mgs.active import loop, objective, stations
-from mgs.active.nbv import run_nbv
 from mgs.data.dataset import Dataset, Frame, load_dataset
 from mgs.data.importers import import_source, read_source
+from mgs.fit import objective
 from mgs.memory import PADDING, Deferred, kept_within, padded
 from mgs.prior.build import build_prior, save_prior
 from mgs.prior.settings import PriorSettings
+from mgs.run import loop, stations
+from mgs.run.nbv import run_nbv
 
 
 def test_results_are_kept_while_there_is_room_and_made_anew_beyond() -> None:
@@ -107,7 +109,9 @@ def test_a_run_holds_few_images_at_once_and_finds_the_same(
 TARGET_OF = loop.target_of
 
 
-def test_stations_before_a_run_hold_few_images_at_once(rock: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stations_before_a_run_hold_few_images_at_once(
+    rock: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from mgs.data import importers
     from mgs.data.masks import make_masks
     from mgs.data.meshes import read_mesh
@@ -151,8 +155,14 @@ print("drawn")
 
 
 def test_memory_that_ends_with_an_array_is_not_read_beyond():
-    """A process of its own, since Dr.Jit would end it: it takes arrays of NumPy as they are, and reads beyond their end."""
-    done = subprocess.run([sys.executable, "-c", AT_THE_END], cwd=Path(__file__).parent, capture_output=True, text=True)
+    """A process of its own, since Dr.Jit would end it: it takes arrays of NumPy as they are, and
+    reads beyond their end."""
+    done = subprocess.run(
+        [sys.executable, "-c", AT_THE_END],
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+    )
     assert done.stdout == "drawn\n", (done.returncode, done.stderr)
 
 
@@ -163,7 +173,10 @@ def test_a_padded_array_is_the_same_with_memory_behind_it(shape):
     assert np.array_equal(copy, values)
     assert copy.flags.c_contiguous
     memory = copy.base if copy.base.base is None else copy.base.base
-    assert memory.ctypes.data + memory.nbytes >= copy.ctypes.data + (copy.size + PADDING) * copy.itemsize
+    assert (
+        memory.ctypes.data + memory.nbytes
+        >= copy.ctypes.data + (copy.size + PADDING) * copy.itemsize
+    )
     assert padded([1, 2]).dtype == np.float32
 
 
@@ -172,10 +185,14 @@ def test_one_kernel_serves_arrays_wherever_numpy_puts_them():
     kernels = set()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         for size in (100, 1001, 10_007, 100_003):
-            kept = [np.empty(size + k, np.float32) for k in range(3)]  # so that the next ones lie elsewhere
+            kept = [
+                np.empty(size + k, np.float32) for k in range(3)
+            ]  # so that the next ones lie elsewhere
             arrays = [mi.Float(padded(np.ones(size), np.float32)) for _ in kept]
             dr.eval(arrays[0] * arrays[1] + arrays[2])
-            kernels |= {entry["hash"] for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT}
+            kernels |= {
+                entry["hash"] for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT
+            }
     assert len(kernels) == 1
 
 

@@ -1,4 +1,5 @@
-"""The loop alone, on NumPy stand-ins for its stations (tests/tiny.py); the real stations meet in test_end_to_end.py."""
+"""The loop alone, on NumPy stand-ins for its stations (tests/tiny.py); the real stations meet in
+test_end_to_end.py."""
 
 from __future__ import annotations
 
@@ -14,10 +15,13 @@ import numpy as np
 import pytest
 import tiny
 
-from mgs.active import criteria, loop, policies, run_folder
-from mgs.active.stopping import StopReason
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
+from mgs.fit.stopping import StopReason
+from mgs.policy import criteria
+from mgs.policy import registry as policies
+from mgs.run import folder as run_folder
+from mgs.run import loop
 from mgs.splat_ply import read_ply
 
 
@@ -56,19 +60,30 @@ def test_run_writes_what_it_did(dataset, tmp_path, policy):
     config = json.loads((tmp_path / "run/config.json").read_text())
     assert config["settings"]["policy"] == policy
     assert {"mgs", "python", "mitsuba", "drjit", "numpy"} == set(config["versions"]) - {"commit"}
-    np.testing.assert_array_equal(read_ply(tmp_path / "run/gaussians.ply").means, state.gaussians.means)
+    np.testing.assert_array_equal(
+        read_ply(tmp_path / "run/gaussians.ply").means, state.gaussians.means
+    )
 
 
 def test_d_optimal_takes_the_best_candidate_at_every_step(dataset, tmp_path):
     state = run(tmp_path / "run", dataset, budget=1)
     before = loop.run(
-        tmp_path / "seeds", tiny.start(tmp_path / "seeds", dataset, budget=0), dataset, tiny.stations(), tiny.silent
+        tmp_path / "seeds",
+        tiny.start(tmp_path / "seeds", dataset, budget=0),
+        dataset,
+        tiny.stations(),
+        tiny.silent,
     )
     lam = criteria.regularisation(tiny.GROUPS)
-    H = sum(tiny.fisher(before.gaussians, dataset.frames[i].camera).astype(float) for i in before.taken)
+    H = sum(
+        tiny.fisher(before.gaussians, dataset.frames[i].camera).astype(float) for i in before.taken
+    )
     np.testing.assert_allclose(before.H, H)
     left = [i for i in range(len(dataset)) if i not in before.taken]
-    gains = [criteria.d_optimal(tiny.fisher(before.gaussians, dataset.frames[i].camera), H, lam) for i in left]
+    gains = [
+        criteria.d_optimal(tiny.fisher(before.gaussians, dataset.frames[i].camera), H, lam)
+        for i in left
+    ]
     assert state.taken[-1] == left[int(np.argmax(gains))]
     assert state.steps[-1]["score"] == state.steps[-1]["information_gain"] == max(gains)
 
@@ -92,13 +107,15 @@ def test_coverage_is_of_the_surface_and_does_not_depend_on_training(dataset, tmp
 
 
 def test_fits_start_in_the_colours_of_all_images_taken(dataset, tmp_path):
-    """Before every fit the prior's colours are those of all frames taken, and the model moves with them; the surface that is
-    scored, and the means, stay those of the seeds."""
+    """Before every fit the prior's colours are those of all frames taken, and the model moves with
+    them; the surface that is scored, and the means, stay those of the seeds."""
     handed, drawn = [], []
 
     def initial(frames):
         g = tiny.initial(frames)
-        return replace(g, sh=g.sh + np.float32(len(frames)), means=g.means + np.float32(len(frames)))
+        return replace(
+            g, sh=g.sh + np.float32(len(frames)), means=g.means + np.float32(len(frames))
+        )
 
     def fit(gaussians, start, *others):
         handed.append((gaussians, start))
@@ -111,35 +128,45 @@ def test_fits_start_in_the_colours_of_all_images_taken(dataset, tmp_path):
     for step, (model, start) in enumerate(handed):
         np.testing.assert_array_equal(start.sh, initial([None] * (3 + step)).sh)
         np.testing.assert_array_equal(start.means, initial([None] * 3).means)
-        expected = start if step == 0 else replace(drawn[step - 1], sh=drawn[step - 1].sh + np.float32(1))
+        expected = (
+            start if step == 0 else replace(drawn[step - 1], sh=drawn[step - 1].sh + np.float32(1))
+        )
         np.testing.assert_allclose(model.sh, expected.sh, atol=1e-5)
         np.testing.assert_array_equal(model.means, start.means)
 
 
 def test_a_tie_goes_to_the_farthest_camera(dataset, tmp_path):
-    """Where every view sees everything, coverage has nothing to say after the seeds: the views must spread all the same."""
-    stations = tiny.stations(fisher=lambda gaussians, camera: np.ones((tiny.POINTS, 11), np.float32))
+    """Where every view sees everything, coverage has nothing to say after the seeds: the views must
+    spread all the same."""
+    stations = tiny.stations(
+        fisher=lambda gaussians, camera: np.ones((tiny.POINTS, 11), np.float32)
+    )
     state = run(tmp_path / "run", dataset, stations, policy="coverage", seeds=1, budget=3)
     assert [step["score"] for step in state.steps[1:]] == [0, 0, 0]
     assert sorted(state.taken) == [0, 3, 6, 9]
 
 
 @pytest.mark.parametrize("policy", policies.policy_names())
-def test_candidate_images_are_never_read_before_they_are_chosen(dataset, tmp_path, monkeypatch, policy):
-    """Every image that is opened is logged; at each choice the opened ones must be exactly those taken."""
-    import mgs.active.inputs
+def test_candidate_images_are_never_read_before_they_are_chosen(
+    dataset, tmp_path, monkeypatch, policy
+):
+    """Every image that is opened is logged; at each choice the opened ones must be exactly those
+    taken."""
     import mgs.data.dataset
+    import mgs.run.inputs
 
     opened: set[str] = set()
     places = [
         (mgs.data.dataset, "read_png"),
         (mgs.data.dataset, "read_mask"),
         (mgs.data.dataset, "read_exr"),
-        (mgs.active.inputs, "file_digest"),
+        (mgs.run.inputs, "file_digest"),
     ]
     for module, name in places:
         function = getattr(module, name)
-        monkeypatch.setattr(module, name, lambda path, f=function: opened.add(Path(path).stem) or f(path))
+        monkeypatch.setattr(
+            module, name, lambda path, f=function: opened.add(Path(path).stem) or f(path)
+        )
     at_choice = []
     choose = loop.Loop.choose
 
@@ -169,7 +196,8 @@ def test_poisoned_candidates_do_not_change_the_choice(tmp_path):
 
 
 def test_one_candidate_in_memory_at_a_time(dataset, tmp_path):
-    """Streaming: when the next candidate's information is asked for, the previous one has been let go."""
+    """Streaming: when the next candidate's information is asked for, the previous one has been let
+    go."""
     import weakref
 
     alive: list[weakref.ref] = []
@@ -185,7 +213,10 @@ def test_one_candidate_in_memory_at_a_time(dataset, tmp_path):
 
 
 def test_random_depends_on_the_seed_only(dataset, tmp_path):
-    taken = [run(tmp_path / str(i), dataset, policy="random", seed=seed).taken for i, seed in enumerate((1, 1, 2))]
+    taken = [
+        run(tmp_path / str(i), dataset, policy="random", seed=seed).taken
+        for i, seed in enumerate((1, 1, 2))
+    ]
     assert taken[0] == taken[1]
     assert taken[0] != taken[2]
 
@@ -217,10 +248,20 @@ def uninterrupted(dataset, tmp_path_factory):
 
 
 @pytest.mark.parametrize(("moment", "count"), MOMENTS)
-def test_killed_at_any_moment_then_resumed_takes_the_same_views(dataset, tmp_path, uninterrupted, moment, count):
+def test_killed_at_any_moment_then_resumed_takes_the_same_views(
+    dataset, tmp_path, uninterrupted, moment, count
+):
     whole, ply, steps = uninterrupted
     out = tmp_path / "run"
-    command = [sys.executable, tiny.__file__, str(dataset.root), str(out), "d-optimal", moment, str(count)]
+    command = [
+        sys.executable,
+        tiny.__file__,
+        str(dataset.root),
+        str(out),
+        "d-optimal",
+        moment,
+        str(count),
+    ]
     process = subprocess.run(command, capture_output=True, text=True)
     assert process.returncode == -signal.SIGKILL, process.stderr
     half = run_folder.read_checkpoint(out)
@@ -249,13 +290,23 @@ def test_interrupted_by_the_keyboard_then_resumed(dataset, tmp_path, uninterrupt
     with pytest.raises(KeyboardInterrupt):
         run(out, dataset, tiny.stations(fit=fit), seed=3)
     assert len(lines(out)) == 3
-    assert loop.run(out, run_folder.read_settings(out), dataset, tiny.stations(), tiny.silent).taken == uninterrupted[0].taken
+    assert (
+        loop.run(out, run_folder.read_settings(out), dataset, tiny.stations(), tiny.silent).taken
+        == uninterrupted[0].taken
+    )
 
 
 @pytest.mark.parametrize(
-    ("broken", "named"), [(0, "the fit to the seeds"), (1, "the fit of step 1 .*step 0 is kept"), (3, "steps 0 to 2 are kept")]
+    ("broken", "named"),
+    [
+        (0, "the fit to the seeds"),
+        (1, "the fit of step 1 .*step 0 is kept"),
+        (3, "steps 0 to 2 are kept"),
+    ],
 )
-def test_a_fit_that_diverges_ends_the_run_which_can_go_on(dataset, tmp_path, uninterrupted, broken, named):
+def test_a_fit_that_diverges_ends_the_run_which_can_go_on(
+    dataset, tmp_path, uninterrupted, broken, named
+):
     def fit(gaussians, start, cameras, *rest):
         found = tiny.fit(gaussians, start, cameras, *rest)
         if len(cameras) < 3 + broken:
@@ -320,7 +371,10 @@ def test_damaged_or_missing_runs_are_told_apart(dataset, tmp_path):
         run_folder.read_settings(out)
 
 
-@pytest.mark.parametrize(("values", "message"), [({"seeds": 13}, "fewer than 13 seeds"), ({"budget": 10}, "9 candidates")])
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [({"seeds": 13}, "fewer than 13 seeds"), ({"budget": 10}, "9 candidates")],
+)
 def test_counts_are_checked_before_anything_is_written(dataset, tmp_path, values, message):
     with pytest.raises(InputError, match=message):
         tiny.start(tmp_path / "run", dataset, **values)

@@ -13,17 +13,20 @@ import tiny
 from refusals import refused
 from rich.console import Console
 
-from mgs.active import criteria, loop, nbv, pose_policies, run_folder
-from mgs.active.convergence import remaining_decrease
-from mgs.active.run_folder import load_run
-from mgs.active.settings import ALPHA_WEIGHT, TrainSettings
 from mgs.cli.app import main
 from mgs.cli.nbv import print_run, start_and_print
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import locked, write_json
+from mgs.fit.settings import ALPHA_WEIGHT, TrainSettings
 from mgs.images import write_png
+from mgs.policy import criteria
+from mgs.policy import poses as pose_policies
 from mgs.prior.build import load_prior, save_prior
+from mgs.report.convergence import remaining_decrease
+from mgs.run import folder as run_folder
+from mgs.run import loop, nbv
+from mgs.run.folder import load_run
 from mgs.splat import fisher
 
 
@@ -58,7 +61,10 @@ def test_every_setting_of_the_fit_is_written_down_and_the_root_seed_reaches_it(d
 
 @pytest.mark.parametrize(("frames", "budget"), [(12, 8), (4, 0), (60, 50)])
 def test_the_default_budget_is_50_or_all_candidates(tmp_path, frames, budget):
-    dataset, prior = tiny.write_dataset(tmp_path / "orbit", frames=frames), tiny.write_prior(tmp_path / "prior")
+    dataset, prior = (
+        tiny.write_dataset(tmp_path / "orbit", frames=frames),
+        tiny.write_prior(tmp_path / "prior"),
+    )
     assert started(dataset, tmp_path / "run", prior)[0]["budget"] == budget
     with pytest.raises(InputError, match=f"exceeds its {frames - 4} candidates"):
         started(dataset, tmp_path / "more", prior, budget=frames - 3)
@@ -70,8 +76,13 @@ def blacken(dataset: Path, *frames: int) -> None:
         write_png(dataset / f"masks/kf_{i:04d}.png", np.zeros((tiny.HEIGHT, tiny.WIDTH), bool))
 
 
-@pytest.mark.parametrize(("frames", "images", "named"), [(range(12), 0, "kf_0000"), ([4], 0, "kf_0004"), ([6], 4, "kf_0006")])
-def test_a_frame_without_rock_is_refused_before_it_is_fitted_to(dataset, tmp_path, frames, images, named):
+@pytest.mark.parametrize(
+    ("frames", "images", "named"),
+    [(range(12), 0, "kf_0000"), ([4], 0, "kf_0004"), ([6], 4, "kf_0006")],
+)
+def test_a_frame_without_rock_is_refused_before_it_is_fitted_to(
+    dataset, tmp_path, frames, images, named
+):
     """Of 12 frames on a circle 0, 4 and 8 are seeds; `farthest` takes 2 first, then 6."""
     blacken(dataset, *frames)
     fits = []
@@ -89,7 +100,7 @@ def test_a_frame_without_rock_is_refused_before_it_is_fitted_to(dataset, tmp_pat
 
 def test_a_mean_over_no_view_is_left_out(dataset, tmp_path):
     """Held-out frames without rock: no line of steps.jsonl holds NaN, which is no JSON."""
-    from mgs.active.stations import psnr_measure
+    from mgs.run.stations import psnr_measure
     from mgs.splat import ListCache
 
     loaded, model = load_dataset(dataset), tiny.initial([])
@@ -106,7 +117,10 @@ def test_a_mean_over_no_view_is_left_out(dataset, tmp_path):
     tiny.write_dataset(dataset / "test", frames=3)
     tested = psnr_measure(loaded, ListCache())(model, [0, 4, 8])
     assert list(tested) == ["psnr", "held_out_psnr", "test_psnr", "test_psnr_mask"]
-    assert tested["test_psnr"] == psnr_measure(load_dataset(dataset / "test"), ListCache())(model, [])["psnr"]
+    assert (
+        tested["test_psnr"]
+        == psnr_measure(load_dataset(dataset / "test"), ListCache())(model, [])["psnr"]
+    )
 
 
 def test_a_quality_that_could_not_be_measured_is_a_dash(dataset, tmp_path):
@@ -121,7 +135,9 @@ def test_a_quality_that_could_not_be_measured_is_a_dash(dataset, tmp_path):
     assert f"test views {text}\nviews trained on {text}" in console.export_text()
 
 
-@pytest.mark.parametrize("name", ["kf_{}", "DJI_20231105103211_000{}_W_some_flight", "frame {} of the [second] flight"])
+@pytest.mark.parametrize(
+    "name", ["kf_{}", "DJI_20231105103211_000{}_W_some_flight", "frame {} of the [second] flight"]
+)
 @pytest.mark.parametrize("width", [80, 200])
 def test_names_and_numbers_are_readable_at_80_columns(tmp_path, name, width):
     line = {
@@ -131,7 +147,12 @@ def test_names_and_numbers_are_readable_at_80_columns(tmp_path, name, width):
     steps = [line, line | {"step": 1, "name": name.format(5), "score": 1.234e-05}]
     console = Console(record=True, width=width)
     metrics = {"all": {"count": 0}, "held_out": {"count": 0}}
-    print_run(tmp_path, nbv.State(tiny.initial([]), np.zeros(0), np.zeros(0), [0], steps), metrics, console)
+    print_run(
+        tmp_path,
+        nbv.State(tiny.initial([]), np.zeros(0), np.zeros(0), [0], steps),
+        metrics,
+        console,
+    )
     shown = console.export_text().splitlines()[:-1]
     assert max(len(text) for text in shown) <= width
     for i in (0, 1, 2, 3, 5):
@@ -154,7 +175,9 @@ def test_demo_does_not_show_another_seeds_results(tmp_path, capsys, made):
     assert not (tmp_path / "demo/prior").exists()
 
 
-@pytest.mark.parametrize("train", [{"speed": 1}, {"passes": "many"}, {"rates": [0.1, 0.2]}, {"decay": float("nan")}])
+@pytest.mark.parametrize(
+    "train", [{"speed": 1}, {"passes": "many"}, {"rates": [0.1, 0.2]}, {"decay": float("nan")}]
+)
 def test_damaged_settings_of_the_fit_are_one_line_on_resume(dataset, tmp_path, capsys, train):
     prior = tiny.write_prior(tmp_path / "prior")
     tiny.start(tmp_path / "run", load_dataset(dataset), prior=prior)
@@ -205,7 +228,9 @@ def test_a_replaced_prior_is_one_line_on_resume(dataset, prior, tmp_path, capsys
     prior.rename(tmp_path / "kept")
     save_prior(prior, other)
     capsys.readouterr()
-    assert f"{prior}: is not the prior that {run} was started on" in refused(capsys, ["nbv", "--resume", run], run)
+    assert f"{prior}: is not the prior that {run} was started on" in refused(
+        capsys, ["nbv", "--resume", run], run
+    )
     prior.rename(tmp_path / "other")
     (tmp_path / "kept").rename(prior)
     with pytest.raises(SystemExit) as stop:
@@ -215,7 +240,8 @@ def test_a_replaced_prior_is_one_line_on_resume(dataset, prior, tmp_path, capsys
 
 @pytest.mark.parametrize("command", [["nbv", "--resume"], ["eval"]])
 def test_one_process_at_a_time_works_on_a_run(dataset, prior, tmp_path, capsys, command):
-    """A second one would take the other's half-written files for those of a killed process, and remove them."""
+    """A second one would take the other's half-written files for those of a killed process, and
+    remove them."""
     run = tiny.write_run(tmp_path / "run", dataset, prior)
     with locked(run):
         (run / ".checkpoint.1.part.npz").write_bytes(b"half")
@@ -226,7 +252,8 @@ def test_one_process_at_a_time_works_on_a_run(dataset, prior, tmp_path, capsys, 
 
 
 def test_a_run_appears_whole_or_not_at_all(dataset, tmp_path, monkeypatch):
-    """Killed while its prior is built, the same command works again: the folder takes its name when all of it is there."""
+    """Killed while its prior is built, the same command works again: the folder takes its name when
+    all of it is there."""
     there, start = [], run_folder.start
 
     def watched(out, *rest):
@@ -244,7 +271,10 @@ SETTINGS = {
     "budget": (-1, "settings.budget: Input should be greater than or equal to 0"),
     "seeds": ("four", "settings.seeds: Input should be a valid integer"),
     "speed": (1, "settings.speed: Extra inputs are not permitted"),
-    "prior_std": ({"color": 1.0}, "settings.prior_std: must be a number for each of colour, scale, rotation, opacity"),
+    "prior_std": (
+        {"color": 1.0},
+        "settings.prior_std: must be a number for each of colour, scale, rotation, opacity",
+    ),
 }
 
 
@@ -262,7 +292,9 @@ def test_a_damaged_setting_is_named_with_its_file(dataset, prior, tmp_path, caps
     assert "--" not in said
 
 
-@pytest.mark.parametrize("values", [{"pixel_noise": float("inf")}, {"prior_std": {"colour": float("inf")}}])
+@pytest.mark.parametrize(
+    "values", [{"pixel_noise": float("inf")}, {"prior_std": {"colour": float("inf")}}]
+)
 def test_scales_of_lambda_are_finite(dataset, tmp_path, values):
     with pytest.raises(InputError, match="finite"):
         started(dataset, tmp_path / "run", tiny.write_prior(tmp_path / "prior"), **values)
@@ -271,21 +303,32 @@ def test_scales_of_lambda_are_finite(dataset, tmp_path, values):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--estimator", "block"], "--estimator block: gives no diagonal, or is unknown; choose one of exact, hutchinson"),
+        (
+            ["--estimator", "block"],
+            "--estimator block: gives no diagonal, or is unknown; choose one of exact, hutchinson",
+        ),
         (["--estimator", "guess"], "--estimator guess: gives no diagonal, or is unknown"),
         (["--optimiser", "hope"], "--optimiser 'hope': unknown; choose one of natural, adam"),
         (["--lam", "0"], "--lam 0.0: Input should be greater than or equal to"),
         (["--rate", "colour"], "--rate colour: expected KIND=NUMBER, as in --rate colour=0.01"),
         (["--rate", "colour=-1"], "--rate colour=-1.0: Input should be greater than or equal to 0"),
-        (["--rate", "hue=1"], "--rate {'hue': 1.0}: must be a number for each of colour, scale, rotation, opacity"),
+        (
+            ["--rate", "hue=1"],
+            "--rate {'hue': 1.0}: must be a number for each of colour, scale, rotation, opacity",
+        ),
         (["--prior-std", "scale=inf"], "--prior-std scale=inf: Input should be a finite number"),
-        (["--pixel-noise", "1e-200"], "--pixel-noise 1e-200: Input should be greater than or equal to 0.000001"),
+        (
+            ["--pixel-noise", "1e-200"],
+            "--pixel-noise 1e-200: Input should be greater than or equal to 0.000001",
+        ),
         (["--passes", "0"], "--passes 0: Input should be greater than or equal to 1"),
     ],
 )
 def test_bad_options_are_one_line(dataset, prior, tmp_path, capsys, options, message):
     out = tmp_path / "run"
-    assert message in refused(capsys, ["nbv", dataset, "--prior", prior, "--budget", "1", "--out", out, *options])
+    assert message in refused(
+        capsys, ["nbv", dataset, "--prior", prior, "--budget", "1", "--out", out, *options]
+    )
     assert not out.exists()
 
 
@@ -293,16 +336,26 @@ def test_bad_options_are_one_line(dataset, prior, tmp_path, capsys, options, mes
     ("values", "message"),
     [
         ({"optimizer": "adam"}, "setting optimizer = 'adam': Extra inputs are not permitted"),
-        ({"train": {"tolerance": -1}}, "setting train.tolerance = -1: Input should be greater than or equal to 0"),
+        (
+            {"train": {"tolerance": -1}},
+            "setting train.tolerance = -1: Input should be greater than or equal to 0",
+        ),
     ],
 )
-def test_settings_without_an_option_are_named_by_their_key(dataset, prior, tmp_path, values, message):
+def test_settings_without_an_option_are_named_by_their_key(
+    dataset, prior, tmp_path, values, message
+):
     with pytest.raises(InputError, match=message):
         started(dataset, tmp_path / "run", prior, budget=1, **values)
 
 
 def test_a_seed_of_the_fit_is_kept(dataset, prior, tmp_path):
-    assert started(dataset, tmp_path / "run", prior, budget=1, seed=3, train={"seed": 7})[0]["train"]["seed"] == 7
+    assert (
+        started(dataset, tmp_path / "run", prior, budget=1, seed=3, train={"seed": 7})[0]["train"][
+            "seed"
+        ]
+        == 7
+    )
 
 
 def test_options_of_the_criterion_and_the_fit_reach_the_run(dataset, prior, tmp_path):
@@ -310,15 +363,29 @@ def test_options_of_the_criterion_and_the_fit_reach_the_run(dataset, prior, tmp_
     options = "--estimator loss-gradient --lam 1e-6 --budget 1 --seeds 3 --passes 2"
     options += " --rate colour=0.1 --rate opacity=0 --prior-std scale=2"
     with pytest.raises(SystemExit) as stop:
-        main(["nbv", str(dataset), "--prior", str(prior), "--out", str(tmp_path / "run"), *options.split()])
+        main(
+            [
+                "nbv",
+                str(dataset),
+                "--prior",
+                str(prior),
+                "--out",
+                str(tmp_path / "run"),
+                *options.split(),
+            ]
+        )
     assert stop.value.code == 0
     state = run_folder.read_checkpoint(tmp_path / "run")
     settings = run_folder.read_settings(tmp_path / "run")
     assert settings.train.rates == {"colour": 0.1, "scale": 0.04, "rotation": 0.02, "opacity": 0}
     assert settings.prior_std == criteria.PRIOR_STD | {"scale": 2.0}
-    np.testing.assert_array_equal(state.gaussians.logit_opacities[0], state.gaussians.logit_opacities)
+    np.testing.assert_array_equal(
+        state.gaussians.logit_opacities[0], state.gaussians.logit_opacities
+    )
     cameras = [load_dataset(dataset).frames[i].camera for i in state.taken]
-    paper = sum(fisher(state.gaussians, camera, "loss-gradient").astype(np.float64) for camera in cameras)
+    paper = sum(
+        fisher(state.gaussians, camera, "loss-gradient").astype(np.float64) for camera in cameras
+    )
     np.testing.assert_array_equal(state.H, paper)
     exact = sum(fisher(state.gaussians, camera).astype(np.float64) for camera in cameras)
     assert np.abs(state.H - exact).max() > 0.5 * exact.max()
@@ -327,15 +394,35 @@ def test_options_of_the_criterion_and_the_fit_reach_the_run(dataset, prior, tmp_
 def test_options_of_the_choice_and_the_end_reach_the_run(dataset, prior, tmp_path):
     options = "--budget 0 --passes 1 --nearest 5 --travel 2.5 --batch 3 --stop-gain 0.01 --stop-uncertainty 0.2"
     with pytest.raises(SystemExit) as stop:
-        main(["nbv", str(dataset), "--prior", str(prior), "--out", str(tmp_path / "run"), *options.split()])
+        main(
+            [
+                "nbv",
+                str(dataset),
+                "--prior",
+                str(prior),
+                "--out",
+                str(tmp_path / "run"),
+                *options.split(),
+            ]
+        )
     assert stop.value.code == 0
     found = run_folder.read_settings(tmp_path / "run")
-    assert (found.nearest, found.travel, found.batch, found.stop_gain, found.stop_uncertainty) == (5, 2.5, 3, 0.01, 0.2)
+    assert (found.nearest, found.travel, found.batch, found.stop_gain, found.stop_uncertainty) == (
+        5,
+        2.5,
+        3,
+        0.01,
+        0.2,
+    )
 
 
 def test_without_masks_alpha_has_no_weight_by_default(dataset, prior, tmp_path):
-    """A frame with neither mask nor alpha shows nothing but rock: its alpha is 1 everywhere, which no camera measured."""
-    assert started(dataset, tmp_path / "masked", prior, budget=1)[0]["train"]["alpha_weight"] == ALPHA_WEIGHT
+    """A frame with neither mask nor alpha shows nothing but rock: its alpha is 1 everywhere, which
+    no camera measured."""
+    assert (
+        started(dataset, tmp_path / "masked", prior, budget=1)[0]["train"]["alpha_weight"]
+        == ALPHA_WEIGHT
+    )
     made = json.loads((dataset / "transforms.json").read_text())
     for frame in made["frames"]:
         frame.pop("mask_path", None)
@@ -349,9 +436,18 @@ def test_without_masks_alpha_has_no_weight_by_default(dataset, prior, tmp_path):
 def test_alpha_as_a_channel_reaches_every_fit_and_the_resumed_run(dataset, prior, tmp_path):
     def run(name, *options):
         with pytest.raises(SystemExit) as stop:
-            main(["nbv", *map(str, options), "--out" if options else "--resume", str(tmp_path / name)])
+            main(
+                [
+                    "nbv",
+                    *map(str, options),
+                    "--out" if options else "--resume",
+                    str(tmp_path / name),
+                ]
+            )
         assert stop.value.code == 0
-        return run_folder.read_settings(tmp_path / name), run_folder.read_checkpoint(tmp_path / name)
+        return run_folder.read_settings(tmp_path / name), run_folder.read_checkpoint(
+            tmp_path / name
+        )
 
     given = [dataset, "--prior", prior, "--passes", 2, "--policy", "uniform"]
     settings, plain = run("plain", *given, "--budget", 1, "--alpha-weight", 0)
@@ -364,9 +460,14 @@ def test_alpha_as_a_channel_reaches_every_fit_and_the_resumed_run(dataset, prior
     config.write_text(config.read_text().replace('"budget": 0', '"budget": 1'))
     _, begun = run("begun")
     assert begun.taken == whole.taken
-    assert (tmp_path / "begun/gaussians.ply").read_bytes() == (tmp_path / "whole/gaussians.ply").read_bytes()
+    assert (tmp_path / "begun/gaussians.ply").read_bytes() == (
+        tmp_path / "whole/gaussians.ply"
+    ).read_bytes()
     frames = [load_dataset(dataset).frames[i] for i in whole.taken]
-    phi = [remaining_decrease(whole.gaussians, s, load_prior(prior), frames)["phi"] for s in (settings, with_alpha)]
+    phi = [
+        remaining_decrease(whole.gaussians, s, load_prior(prior), frames)["phi"]
+        for s in (settings, with_alpha)
+    ]
     assert phi[1] > phi[0] > 0
 
 
@@ -378,7 +479,8 @@ def test_settings_of_the_fit_are_read_as_older_runs_wrote_them():
 
 
 def test_the_documented_policy_of_ones_own(dataset, tmp_path, monkeypatch):
-    """The criterion in docs/howto/policy.md is started, run, and read back where nobody registered it."""
+    """The criterion in docs/howto/policy.md is started, run, and read back where nobody registered
+    it."""
     name = "least-known"
     monkeypatch.setitem(criteria.CRITERIA, name, None)  # so that it is gone again at the end
     monkeypatch.setitem(pose_policies.POSE_POLICIES, "highest", None)
@@ -390,14 +492,26 @@ def test_the_documented_policy_of_ones_own(dataset, tmp_path, monkeypatch):
     own = criteria.CRITERIA[name]
     counted = criteria.Criterion(lambda *given: scores.append(own.score(*given)) or scores[-1])
     monkeypatch.setitem(criteria.CRITERIA, name, counted)
-    state = loop.run(tmp_path / "run", run_folder.read_settings(tmp_path / "run"), loaded, tiny.stations(), tiny.silent)
+    state = loop.run(
+        tmp_path / "run",
+        run_folder.read_settings(tmp_path / "run"),
+        loaded,
+        tiny.stations(),
+        tiny.silent,
+    )
     assert len(scores) == len(loaded) - 4
     assert state.steps[-1]["score"] == max(scores) > 0
 
     monkeypatch.undo()
     assert load_run(tmp_path / "run")[3] == name
     with pytest.raises(InputError, match=f"--policy {name}: unknown; choose one of d-optimal"):
-        loop.run(tmp_path / "run", run_folder.read_settings(tmp_path / "run"), loaded, tiny.stations(), tiny.silent)
+        loop.run(
+            tmp_path / "run",
+            run_folder.read_settings(tmp_path / "run"),
+            loaded,
+            tiny.stations(),
+            tiny.silent,
+        )
 
 
 @pytest.mark.parametrize("moved", ["dataset", "prior"])
@@ -416,19 +530,29 @@ def test_what_a_run_was_made_from_has_moved(dataset, prior, tmp_path, capsys, mo
 def test_a_run_that_is_there_is_not_begun_again(dataset, prior, tmp_path, capsys):
     run = tiny.write_run(tmp_path / "run", dataset, prior)
     said = refused(capsys, ["nbv", dataset, "--prior", prior, "--out", run], run)
-    assert f"{run}: holds a run; `mgs nbv --resume {run}` goes on with it; for another, choose a new folder" in said
+    assert (
+        f"{run}: holds a run; `mgs nbv --resume {run}` goes on with it; for another, choose a new folder"
+        in said
+    )
 
 
-@pytest.mark.parametrize("option", ["--budget 9", "--policy random", "--exposure", "--prior-std colour=1"])
+@pytest.mark.parametrize(
+    "option", ["--budget 9", "--policy random", "--exposure", "--prior-std colour=1"]
+)
 def test_resume_takes_no_other_setting(dataset, prior, tmp_path, capsys, option):
     run = tiny.write_run(tmp_path / "run", dataset, prior)
     said = refused(capsys, ["nbv", "--resume", run, *option.split()], run)
-    assert f"nbv: {option.split()[0]}: --resume takes its settings from {run / 'config.json'}; change it there" in said
+    assert (
+        f"nbv: {option.split()[0]}: --resume takes its settings from {run / 'config.json'}; change it there"
+        in said
+    )
 
 
 def test_a_dataset_is_not_taken_for_a_run(dataset, prior, tmp_path, capsys):
     (tmp_path / "other").mkdir()
     (tmp_path / "other/config.json").write_text('{"scene": {}}')
-    said = refused(capsys, ["nbv", dataset, "--prior", prior, "--out", tmp_path / "other"], tmp_path)
+    said = refused(
+        capsys, ["nbv", dataset, "--prior", prior, "--out", tmp_path / "other"], tmp_path
+    )
     assert "not empty" in said
     assert "--resume" not in said

@@ -1,15 +1,15 @@
-"""The objective of the fit, with frozen and with learned means: value, gradient, curvature and predicted decrease against the
-float64 oracle."""
+"""The objective of the fit, with frozen and with learned means: value, gradient, curvature and
+predicted decrease against the float64 oracle."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from mgs.active.objective import newton_decrease, objective
 from mgs.bench.core import surface_camera, surface_gaussians
 from mgs.camera import Camera, look_at
 from mgs.errors import InputError
+from mgs.fit.objective import newton_decrease, objective
 from mgs.gaussians import Gaussians, learned
 from mgs.splat import as_drjit, reference
 
@@ -17,11 +17,16 @@ N = 60
 LAM = {"colour": 0.02, "scale": 0.05, "rotation": 0.1, "opacity": 0.01, "mean": 30.0}
 
 
-@pytest.fixture(scope="module", params=[("frozen", 0.0), ("normal", 0.0), ("free", 0.0), ("frozen", 0.3), ("free", 2.0)])
+@pytest.fixture(
+    scope="module",
+    params=[("frozen", 0.0), ("normal", 0.0), ("free", 0.0), ("frozen", 0.3), ("free", 2.0)],
+)
 def case(request):
-    """Objective, model, and from the oracle: Jacobian [M,P], residual [M], weights [M], lam [P] and distance to the start [P].
+    """Objective, model, and from the oracle: Jacobian [M,P], residual [M], weights [M], lam [P] and
+    distance to the start [P].
 
-    Parameters are ordered as `learned` has them, one array after the other. Where alpha has a weight it is a fourth channel.
+    Parameters are ordered as `learned` has them, one array after the other. Where alpha has a
+    weight it is a fourth channel.
     """
     means, alpha_weight = request.param
     start = surface_gaussians(N)
@@ -41,25 +46,40 @@ def case(request):
     first = surface_camera(start, 24, 20)
     distance = np.linalg.norm(first.position)
     cameras = [
-        Camera(first.K, 24, 20, look_at(distance * np.array([np.cos(a), np.sin(a), 0.4]), [0, 0, 0.4])) for a in (0.3, 2.0)
+        Camera(
+            first.K, 24, 20, look_at(distance * np.array([np.cos(a), np.sin(a), 0.4]), [0, 0, 0.4])
+        )
+        for a in (0.3, 2.0)
     ]
     channels = 4 if alpha_weight else 3
     truths = [rng.uniform(0, 1, (20, 24, channels)).astype(np.float32) for _ in cameras]
     weights = [(rng.uniform(size=(20, 24, 1)) > 0.2).astype(np.float32) for _ in cameras]
     targets = [np.dstack([t[..., :3], w, t[..., 3:]]) for t, w in zip(truths, weights, strict=True)]
-    goal = objective(model, cameras, targets, start, LAM, means=means, normals=normals, alpha_weight=alpha_weight)
+    goal = objective(
+        model, cameras, targets, start, LAM, means=means, normals=normals, alpha_weight=alpha_weight
+    )
     columns = np.split(np.arange(11 + directions.shape[1]), (3, 6, 10, 11))
     rows = []
     for camera in cameras:
-        J = reference.jacobian(model, camera, means=means, normals=normals, alpha_weight=alpha_weight)
+        J = reference.jacobian(
+            model, camera, means=means, normals=normals, alpha_weight=alpha_weight
+        )
         rows.append(np.concatenate([J[..., c].reshape(20 * 24 * channels, -1) for c in columns], 1))
     images = [reference.render(model, camera) for camera in cameras]
     images = [np.dstack([i["rgb"], i["alpha"]])[..., :channels] for i in images]
     scale = np.sqrt([1.0, 1.0, 1.0, alpha_weight])[:channels]
-    residual = np.concatenate([((i - t) * scale).ravel() for i, t in zip(images, truths, strict=True)])
-    weight = np.concatenate([np.broadcast_to(w, t.shape).ravel() for w, t in zip(weights, truths, strict=True)])
-    changes = [(getattr(model, name) - getattr(start, name)).ravel() for name in learned()] + [offsets.ravel()]
-    lam = np.concatenate([np.full(change.size, LAM[kind]) for change, kind in zip(changes, LAM, strict=True)])
+    residual = np.concatenate(
+        [((i - t) * scale).ravel() for i, t in zip(images, truths, strict=True)]
+    )
+    weight = np.concatenate(
+        [np.broadcast_to(w, t.shape).ravel() for w, t in zip(weights, truths, strict=True)]
+    )
+    changes = [(getattr(model, name) - getattr(start, name)).ravel() for name in learned()] + [
+        offsets.ravel()
+    ]
+    lam = np.concatenate(
+        [np.full(change.size, LAM[kind]) for change, kind in zip(changes, LAM, strict=True)]
+    )
     away = np.concatenate(changes).astype(np.float64)
     return goal, as_drjit(model), np.concatenate(rows), residual, weight, lam, away
 
@@ -100,7 +120,9 @@ def test_the_largest_diagonal_is_that_of_one_image(case):
     goal, model, J, _, _, lam, _ = case
     each = (J.reshape(2, -1, J.shape[1]) ** 2).sum(1)  # two images
     expected = each.max(0) + lam / 2
-    assert np.allclose(flat(goal.largest_diagonal(model)), expected, rtol=1e-3, atol=1e-5 * expected.max())
+    assert np.allclose(
+        flat(goal.largest_diagonal(model)), expected, rtol=1e-3, atol=1e-5 * expected.max()
+    )
 
 
 def test_the_newton_decrease_grows_to_that_of_a_dense_solve(case):
@@ -110,9 +132,13 @@ def test_the_newton_decrease_grows_to_that_of_a_dense_solve(case):
     expected = 0.5 * g @ np.linalg.solve(A, g)
     found = newton_decrease(goal, model, 40)
     assert (np.diff(found[:8]) > 0).all()
-    assert (np.diff(found) > -5e-3 * expected).all()  # single precision loses the conjugacy in the end
+    assert (
+        np.diff(found) > -5e-3 * expected
+    ).all()  # single precision loses the conjugacy in the end
     assert found[-1] == pytest.approx(expected, rel=0.01)
-    assert found[0] < 0.9 * expected  # it takes more than one iteration: the parameters are correlated
+    assert (
+        found[0] < 0.9 * expected
+    )  # it takes more than one iteration: the parameters are correlated
 
 
 def test_at_a_minimum_nothing_is_predicted_to_be_gained(case):
@@ -125,9 +151,10 @@ def test_at_a_minimum_nothing_is_predicted_to_be_gained(case):
 
 
 def test_a_start_in_the_memory_of_the_model_is_kept_apart(case):
-    """Dr.Jit takes two arrays in one memory for one when it records: a later fit would then be pulled to the wrong start."""
-    from mgs.active.fitting import fit
-    from mgs.active.settings import TrainSettings
+    """Dr.Jit takes two arrays in one memory for one when it records: a later fit would then be
+    pulled to the wrong start."""
+    from mgs.fit.fitting import fit
+    from mgs.fit.settings import TrainSettings
 
     goal, _, *_ = case
     camera = goal.photos[0].camera
@@ -135,27 +162,44 @@ def test_a_start_in_the_memory_of_the_model_is_kept_apart(case):
     target = np.zeros((20, 24, 4), np.float32)  # of weight 0: the prior alone moves the parameters
     settings = TrainSettings(optimiser="adam", passes=1, rates=(0.01, 0, 0, 0))
     fit(model, [camera], [target], settings, start=model, lam={"colour": 1.0})
-    other = Gaussians(model.means, model.log_scales, model.quats, model.logit_opacities, model.sh - 0.2)
+    other = Gaussians(
+        model.means, model.log_scales, model.quats, model.logit_opacities, model.sh - 0.2
+    )
     moved = fit(model, [camera], [target], settings, start=other, lam={"colour": 1.0}).gaussians
     assert np.allclose(moved.sh - model.sh, -0.01, rtol=0.02)
 
 
 def test_a_lam_for_each_degree_of_the_colours():
     """Of images without weight, so that the prior is all there is."""
-    from mgs.active.fitting import fit
-    from mgs.active.settings import TrainSettings
+    from mgs.fit.fitting import fit
+    from mgs.fit.settings import TrainSettings
 
     start = surface_gaussians(50).with_degree(2)
     camera, unseen = surface_camera(start, 24, 20), np.zeros((20, 24, 4), np.float32)
-    model = replace(start, sh=start.sh + np.linspace(-0.5, 0.5, start.sh.size, dtype=np.float32).reshape(start.sh.shape))
+    model = replace(
+        start,
+        sh=start.sh
+        + np.linspace(-0.5, 0.5, start.sh.size, dtype=np.float32).reshape(start.sh.shape),
+    )
     lam = np.repeat([1.0, 4.0, 9.0], [1, 3, 5])[None, :, None]
     goal = objective(start, [camera], [unseen], lam={"colour": lam})
     away = model.sh - start.sh
     assert goal.phi(as_drjit(model)) == pytest.approx(0.5 * (lam * away**2).sum(), rel=1e-5)
     assert np.allclose(np.asarray(goal.gradient(as_drjit(model))[0]), lam * away, rtol=1e-5)
-    blind = replace(start, logit_opacities=np.full(50, -40, np.float32))  # no information but the prior's
-    assert np.allclose(np.asarray(goal.diagonal(as_drjit(blind))[0]), np.broadcast_to(lam, away.shape))
-    found = fit(model, [camera], [unseen], TrainSettings(passes=40, rates={"colour": 0.2}), start=start, lam={"colour": lam})
+    blind = replace(
+        start, logit_opacities=np.full(50, -40, np.float32)
+    )  # no information but the prior's
+    assert np.allclose(
+        np.asarray(goal.diagonal(as_drjit(blind))[0]), np.broadcast_to(lam, away.shape)
+    )
+    found = fit(
+        model,
+        [camera],
+        [unseen],
+        TrainSettings(passes=40, rates={"colour": 0.2}),
+        start=start,
+        lam={"colour": lam},
+    )
     assert found.losses[0] == pytest.approx((lam * away**2).sum() / unseen[..., :3].size, rel=1e-5)
     assert found.loss < 0.05 * found.losses[0]
 
@@ -164,7 +208,10 @@ def test_a_weight_for_alpha_needs_alpha():
     start = surface_gaussians(50)
     camera, target = surface_camera(start, 24, 20), np.zeros((20, 24, 4), np.float32)
     goal = objective(start, [camera], [target], alpha_weight=0.1)
-    with pytest.raises(InputError, match="target: has 4 channels, and with a weight for alpha it needs 5, alpha as the last"):
+    with pytest.raises(
+        InputError,
+        match="target: has 4 channels, and with a weight for alpha it needs 5, alpha as the last",
+    ):
         goal.phi(as_drjit(start))
     with_alpha = objective(start, [camera], [np.dstack([target, target[..., 0]])])
     assert with_alpha.photos[0].size == (24, 20, 3), "without a weight alpha is not read"

@@ -1,4 +1,5 @@
-"""Outputs that cannot be written and options that are wrong, through the real command line: known before any work."""
+"""Outputs that cannot be written and options that are wrong, through the real command line: known
+before any work."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ from mgs.splat_ply import write_ply
 
 
 def read_only(tmp_path: Path) -> Path:
-    """A folder nobody may write to: root is not held back by permissions, so for root it is the kernel's own."""
+    """A folder nobody may write to: root is not held back by permissions, so for root it is the
+    kernel's own."""
     if os.geteuid() == 0:
         return Path("/proc/mgs")
     folder = tmp_path / "locked"
@@ -68,11 +70,16 @@ def test_a_file_where_a_run_keeps_its_pictures(capsys, dataset, prior, tmp_path,
 def test_a_report_under_a_file(capsys, dataset, prior, tmp_path, out):
     run = tiny.write_run(tmp_path / "run", dataset, prior)
     a_file(tmp_path / "file")
-    assert "cannot be written" in refused(capsys, ["report", run, "--out", tmp_path / out], tmp_path)
+    assert "cannot be written" in refused(
+        capsys, ["report", run, "--out", tmp_path / out], tmp_path
+    )
 
 
 @pytest.mark.parametrize("option", ["--json", "--chart"])
-@pytest.mark.parametrize(("make", "named"), [(lambda path: a_file(path) / "x", "cannot be written"), (occupied, "is a folder")])
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [(lambda path: a_file(path) / "x", "cannot be written"), (occupied, "is a folder")],
+)
 def test_bench_knows_before_it_measures_that_it_cannot_write(capsys, tmp_path, option, make, named):
     assert named in refused(capsys, ["bench", "scaling", option, make(tmp_path / "out")])
 
@@ -96,7 +103,9 @@ def test_a_prior_that_fails_leaves_all_as_it_was(capsys, dataset, tmp_path, exis
         out.mkdir(parents=True)
     before = listing(tmp_path)
     refused(capsys, ["prior", dataset, "--out", out, "--gaussians", 1])
-    refused(capsys, ["prior", dataset, "--out", out, "--mesh", tmp_path / "none.glb", "--gaussians", 9])
+    refused(
+        capsys, ["prior", dataset, "--out", out, "--mesh", tmp_path / "none.glb", "--gaussians", 9]
+    )
     refused(capsys, ["nbv", dataset, "--out", out, "--gaussians", 1, "--budget", 1])
     assert listing(tmp_path) == before
 
@@ -105,11 +114,16 @@ def test_a_prior_that_fails_leaves_all_as_it_was(capsys, dataset, tmp_path, exis
     ("command", "option", "files"),
     [
         ("prior", ["--gaussians", "60"], {"mesh.ply", "points.ply", "prior.json", "prior.png"}),
-        ("survey", ["--poses", "exact"], {"cloud.ply", "survey.json", "survey.png", "transforms.json", "rock.glb"}),
+        (
+            "survey",
+            ["--poses", "exact"],
+            {"cloud.ply", "survey.json", "survey.png", "transforms.json", "rock.glb"},
+        ),
     ],
 )
 def test_a_result_appears_whole(tmp_path, monkeypatch, command, option, files):
-    """Nothing under its name while its picture is drawn, from the other files; all of it afterwards."""
+    """Nothing under its name while its picture is drawn, from the other files; all of it
+    afterwards."""
     from mgs.prior import figure as prior_figure
     from mgs.survey import figure as survey_figure
 
@@ -182,5 +196,9 @@ def test_a_paragraph_of_a_help_text_is_one_line_in_a_wide_terminal(capsys, monke
     monkeypatch.setenv("COLUMNS", "400")
     with pytest.raises(SystemExit):
         main(["diagnose", "--help"])
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if "Writes into RUN/diagnostics" in line]
+    (line,) = [
+        line
+        for line in capsys.readouterr().out.splitlines()
+        if "Writes into RUN/diagnostics" in line
+    ]
     assert "coloured by its information." in line

@@ -1,4 +1,5 @@
-"""The report page: what stands in it, from runs that are finished, unfinished, unmeasured; and in a real browser."""
+"""The report page: what stands in it, from runs that are finished, unfinished, unmeasured; and in a
+real browser."""
 
 import json
 import re
@@ -12,8 +13,6 @@ import tiny
 from browser import chromium, opened
 from refusals import refused
 
-from mgs.active import loop
-from mgs.active.run_folder import read_checkpoint, read_settings
 from mgs.camera import Camera
 from mgs.data.dataset import load_dataset
 from mgs.files import write_json
@@ -21,19 +20,36 @@ from mgs.report import page_pictures
 from mgs.report.evaluation import evaluate_run
 from mgs.report.page import write_page
 from mgs.report.page_plots import corners_at
+from mgs.run import loop
+from mgs.run.folder import read_checkpoint, read_settings
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """Two runs on stand-in stations: one finished and measured, one stopped two steps before its end."""
-    root = tmp_path_factory.mktemp("a <b> & c")  # what a page must escape, in an address and in text
+    """Two runs on stand-in stations: one finished and measured, one stopped two steps before its
+    end."""
+    root = tmp_path_factory.mktemp(
+        "a <b> & c"
+    )  # what a page must escape, in an address and in text
     dataset = load_dataset(tiny.write_dataset(root / "data"))
     for policy, budget in (("d-optimal", 3), ("random", 1)):
         settings = tiny.start(root / policy, dataset, policy=policy, budget=3, evaluate_every=1)
-        stations = tiny.stations(measure=lambda gaussians, taken: {"psnr": float(len(taken)), "test": {"lpips": 0.25}})
-        loop.run(root / policy, settings.model_copy(update={"budget": budget}), dataset, stations, tiny.silent)
+        stations = tiny.stations(
+            measure=lambda gaussians, taken: {"psnr": float(len(taken)), "test": {"lpips": 0.25}}
+        )
+        loop.run(
+            root / policy,
+            settings.model_copy(update={"budget": budget}),
+            dataset,
+            stations,
+            tiny.silent,
+        )
     metrics = evaluate_run(root / "d-optimal", pictures=False)
-    fit = {"phi": 1.0, "predicted_decrease": 0.004, "converged": True}  # stand-ins have no objective to measure it by
+    fit = {
+        "phi": 1.0,
+        "predicted_decrease": 0.004,
+        "converged": True,
+    }  # stand-ins have no objective to measure it by
     write_json(root / "d-optimal/metrics.json", metrics | {"fit": fit})
     (root / "d-optimal/diagnostics").mkdir()
     (root / "d-optimal/diagnostics/kf_0001.exr").write_bytes(b"")
@@ -61,7 +77,9 @@ class Parsed(HTMLParser):
         values = dict(attrs)
         self.inside.append((tag, values.get("id")))
         self.links += [values["href"]] if tag == "a" else []
-        self.loaded += [values["src"]] if values.get("src") else [values["href"]] if tag == "link" else []
+        self.loaded += (
+            [values["src"]] if values.get("src") else [values["href"]] if tag == "link" else []
+        )
 
     def handle_endtag(self, tag):
         while self.inside and self.inside.pop()[0] != tag:
@@ -92,13 +110,22 @@ def test_the_page_says_what_the_files_say(page, runs):
     assert gain["y"] == [step["information_gain"] for step in steps[1:]]
     assert len(both["y"]) == 1
     assert plots["Surface coverage (Fig. 3)"][0]["y"] == [100 * step["coverage"] for step in steps]
-    assert plots["test lpips after each step"][1]["y"] == [0.25, 0.25]  # a metric of which the page was told nothing
+    assert plots["test lpips after each step"][1]["y"] == [
+        0.25,
+        0.25,
+    ]  # a metric of which the page was told nothing
     views = data["runs"][0]["views"]
     taken = [*steps[0]["seed_names"], *(step["name"] for step in steps[1:])]
     assert [view["name"] for view in views] == taken
     psnr = {view["name"]: f"{view['psnr']:.2f} dB" for view in metrics["views"]}
-    assert [view["pictures"][1]["caption"] for view in views] == [f"render, {psnr[name]}" for name in taken]
-    assert {key for view in views for key in dict(view["facts"])} >= {"information gain", "surface coverage", "PSNR (dB)"}
+    assert [view["pictures"][1]["caption"] for view in views] == [
+        f"render, {psnr[name]}" for name in taken
+    ]
+    assert {key for view in views for key in dict(view["facts"])} >= {
+        "information gain",
+        "surface coverage",
+        "PSNR (dB)",
+    }
     for one in data["runs"]:
         for view in one["views"]:
             for picture in view["pictures"]:
@@ -111,7 +138,12 @@ def test_the_page_says_what_the_files_say(page, runs):
 def test_links_lead_to_the_files(page, runs):
     links = Parsed(page.read_text()).links
     assert all((page.parent / unquote(link)).is_file() for link in links)
-    assert {link.rsplit("/", 1)[-1] for link in links} >= {"gaussians.ply", "kf_0001.exr", "config.json", "metrics.json"}
+    assert {link.rsplit("/", 1)[-1] for link in links} >= {
+        "gaussians.ply",
+        "kf_0001.exr",
+        "config.json",
+        "metrics.json",
+    }
     assert sum(link.endswith("gaussians.ply") for link in links) == 2
 
 
@@ -129,12 +161,17 @@ def test_the_page_is_the_same_every_time_and_names_are_escaped(page, runs, tmp_p
 
 
 def test_uncertainty_falls_with_every_view(runs, monkeypatch):
-    """The maps before and after a view are those of the exact information of the views until then, as written out here."""
-    from mgs.active.criteria import regularisation
+    """The maps before and after a view are those of the exact information of the views until then,
+    as written out here."""
+    from mgs.policy.criteria import regularisation
     from mgs.splat import fisher, groups
 
     run, shown = runs[0], {}
-    monkeypatch.setattr(page_pictures.Album, "add_uncertainty", lambda self, name, values, alpha: shown.update({name: values}))
+    monkeypatch.setattr(
+        page_pictures.Album,
+        "add_uncertainty",
+        lambda self, name, values, alpha: shown.update({name: values}),
+    )
     state, dataset = read_checkpoint(run), load_dataset(read_settings(run).dataset)
     frames = [dataset.frames[i] for i in state.taken]
     album = page_pictures.new_album(frames, 10)
@@ -152,7 +189,9 @@ def test_uncertainty_falls_with_every_view(runs, monkeypatch):
     seen = after > 0
     least = (lam / (H + lam)).mean(axis=1).min()
     assert after[seen].min() >= least - 1e-5
-    np.testing.assert_array_equal(shown[f"before/{frames[0].name}/a"] > 0.99, shown[f"before/{frames[0].name}/a"] > 0)
+    np.testing.assert_array_equal(
+        shown[f"before/{frames[0].name}/a"] > 0.99, shown[f"before/{frames[0].name}/a"] > 0
+    )
 
 
 def test_pictures_stay_within_their_share(monkeypatch, runs):
@@ -184,7 +223,11 @@ def test_what_is_not_there_is_left_out(runs, tmp_path):
     write_page(tmp_path / "with.html", [run])
     data = json.loads(Parsed((tmp_path / "with.html").read_text()).data)
     assert data["pictures"]
-    assert not any("psnr" in key for view in data["runs"][0]["views"] for key in view["pictures"][1]["caption"].split())
+    assert not any(
+        "psnr" in key
+        for view in data["runs"][0]["views"]
+        for key in view["pictures"][1]["caption"].split()
+    )
     (run / "gaussians.ply").unlink()
     write_page(tmp_path / "without.html", [run])
     parsed = Parsed((tmp_path / "without.html").read_text())
@@ -198,7 +241,8 @@ def test_what_is_not_there_is_left_out(runs, tmp_path):
 
 
 def test_test_views_are_compared_and_their_metrics_shown(runs, tmp_path):
-    """Those of the dataset's folder `test`, under names that cannot be mistaken for those of its own views."""
+    """Those of the dataset's folder `test`, under names that cannot be mistaken for those of its
+    own views."""
     run = shutil.copytree(runs[0], tmp_path / "run")
     config = json.loads((run / "config.json").read_text())
     shutil.copytree(config["settings"]["dataset"], tmp_path / "data")
@@ -207,11 +251,15 @@ def test_test_views_are_compared_and_their_metrics_shown(runs, tmp_path):
     (run / "config.json").write_text(json.dumps(config))
     metrics = json.loads((run / "metrics.json").read_text())
     view = {"name": "kf_0001", "trained": False, "psnr": 12.345, "psnr_mask": 10.5, "ssim": 0.5}
-    (run / "metrics.json").write_text(json.dumps(metrics | {"test": {"count": 1, "psnr": 12.345}, "test_views": [view]}))
+    (run / "metrics.json").write_text(
+        json.dumps(metrics | {"test": {"count": 1, "psnr": 12.345}, "test_views": [view]})
+    )
     write_page(tmp_path / "page.html", [run])
     parsed = Parsed((tmp_path / "page.html").read_text())
     data = json.loads(parsed.data)
-    tests = {view["view"]: view["sides"] for view in data["compared"] if view["view"].startswith("test/")}
+    tests = {
+        view["view"]: view["sides"] for view in data["compared"] if view["view"].startswith("test/")
+    }
     assert list(tests) == ["test/kf_0000", "test/kf_0001", "test/kf_0002"]
     assert tests["test/kf_0001"][1]["label"] == "d-optimal, 12.35 dB"
     assert tests["test/kf_0000"][1]["label"] == "d-optimal"
@@ -225,12 +273,18 @@ def test_the_command(runs, tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         main(["report", str(runs[1]), "--html", str(tmp_path / "page.html")])
     assert stop.value.code == 0
-    assert re.search(r"wrote .*page\.html \(\d+\.\d MB\)", capsys.readouterr().out.replace("\n", ""))
+    assert re.search(
+        r"wrote .*page\.html \(\d+\.\d MB\)", capsys.readouterr().out.replace("\n", "")
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
     (tmp_path / "file").write_text("")
-    assert "cannot be written" in refused(capsys, ["report", runs[0], "--html", tmp_path / "file/page.html"], tmp_path)
+    assert "cannot be written" in refused(
+        capsys, ["report", runs[0], "--html", tmp_path / "file/page.html"], tmp_path
+    )
     assert "is a folder" in refused(capsys, ["report", runs[0], "--html", tmp_path], tmp_path)
-    assert "holds no run" in refused(capsys, ["report", tmp_path, "--html", tmp_path / "x.html"], tmp_path)
+    assert "holds no run" in refused(
+        capsys, ["report", tmp_path, "--html", tmp_path / "x.html"], tmp_path
+    )
 
 
 @pytest.fixture(scope="module")
@@ -241,7 +295,8 @@ def browser():
 
 @pytest.mark.parametrize(("width", "height", "scheme"), [(1280, 900, "light"), (390, 844, "dark")])
 def test_the_page_in_a_browser(browser, page, width, height, scheme):
-    """Loads without a network and without errors, fits the width, draws its plots, and its controls do what they say."""
+    """Loads without a network and without errors, fits the width, draws its plots, and its controls
+    do what they say."""
     with opened(browser, page.as_uri(), width, height, scheme) as (tab, wrong):
         assert tab.evaluate("document.documentElement.scrollWidth") <= width
         background = tab.evaluate("getComputedStyle(document.body).backgroundColor")
@@ -252,7 +307,9 @@ def test_the_page_in_a_browser(browser, page, width, height, scheme):
         tab.wait_for_selector("#orbit-0 canvas")
 
         def shown():
-            return tab.locator("#pictures img").evaluate_all("all => all.map(i => [i.alt, i.naturalWidth, i.complete])")
+            return tab.locator("#pictures img").evaluate_all(
+                "all => all.map(i => [i.alt, i.naturalWidth, i.complete])"
+            )
 
         def fact(name):
             return tab.locator(f"#facts dt:text-is('{name}') + dd").inner_text()
@@ -263,7 +320,9 @@ def test_the_page_in_a_browser(browser, page, width, height, scheme):
         for _ in range(3):
             tab.keyboard.press("ArrowRight")
         assert fact("taken as") == "step 1"
-        tab.wait_for_function("[...document.querySelectorAll('#pictures img')].every(i => i.complete && i.naturalWidth)")
+        tab.wait_for_function(
+            "[...document.querySelectorAll('#pictures img')].every(i => i.complete && i.naturalWidth)"
+        )
         assert all(fact("view") in alt for alt, *_ in shown())
         marked = tab.evaluate("document.getElementById('orbit-0').data.at(-1).x[0]")
         assert marked == pytest.approx(tab.evaluate("data.runs[0].views[3].eye[0]"))
@@ -275,7 +334,11 @@ def test_the_page_in_a_browser(browser, page, width, height, scheme):
         divider.scroll_into_view_if_needed()
         box = divider.bounding_box()
         tab.mouse.click(box["x"] + 0.25 * box["width"], box["y"] + 0.5 * box["height"])
-        at = float(tab.evaluate("getComputedStyle(document.getElementById('divider')).getPropertyValue('--at')").strip("%"))
+        at = float(
+            tab.evaluate(
+                "getComputedStyle(document.getElementById('divider')).getPropertyValue('--at')"
+            ).strip("%")
+        )
         assert at == pytest.approx(25, abs=3)
         before = tab.locator("#compare-b").get_attribute("src")
         tab.locator("#compare-right").select_option("2")

@@ -9,7 +9,8 @@ import pytest
 import synthetic
 
 import mgs
-from mgs.active import criteria, pose_policies
+from mgs.policy import criteria
+from mgs.policy import poses as pose_policies
 from mgs.splat import ESTIMATORS
 from mgs.synth import arena
 
@@ -29,7 +30,8 @@ def pages():
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """What the how-to pages take for granted: the demo, photos with depth, a COLMAP model, masks, and a mesh of the rock."""
+    """What the how-to pages take for granted: the demo, photos with depth, a COLMAP model, masks,
+    and a mesh of the rock."""
     folder = tmp_path_factory.mktemp("readers")
     dataset = synthetic.write_dataset(folder / "demo/dataset", synthetic.orbit_cameras(14, 48, 36))
     prior, _ = mgs.build_prior(dataset, mgs.PriorSettings(gaussians=300))
@@ -43,8 +45,12 @@ def data(tmp_path_factory):
 
 @pytest.fixture
 def as_before():
-    """Rows that a page adds to the tables are gone at the end, and so is the module that it writes."""
-    tables = [(table, dict(table)) for table in (criteria.CRITERIA, pose_policies.POSE_POLICIES, ESTIMATORS)]
+    """Rows that a page adds to the tables are gone at the end, and so is the module that it
+    writes."""
+    tables = [
+        (table, dict(table))
+        for table in (criteria.CRITERIA, pose_policies.POSE_POLICIES, ESTIMATORS)
+    ]
     yield
     for table, rows in tables:
         table.clear()
@@ -62,7 +68,9 @@ def test_the_tutorial_prints_what_it_shows(pages, tmp_path):
 
 @pytest.mark.parametrize("page", HOWTO, ids=lambda page: page.stem)
 def test_a_how_to_page_can_be_followed(pages, data, as_before, monkeypatch, page):
-    monkeypatch.setattr(arena, "TEXELS", 64)  # of the ground's texture, which costs much and is not looked at
+    monkeypatch.setattr(
+        arena, "TEXELS", 64
+    )  # of the ground's texture, which costs much and is not looked at
     said = pages.follow(page, data)
     assert pages.stale(said) == []
     assert len(said) >= 3
@@ -93,7 +101,9 @@ def test_what_a_page_shows_is_found_to_be_stale_and_made_anew(pages, tmp_path):
     sys.modules.pop("mine")
     assert [one.printed for one in said] == ["", "2\n", "not shown\n"]
     assert pages.stale(said) == ["line 14: shows\n3\nbut this was printed:\n2\n"]
-    assert pages.rewritten(page.read_text(), said) == page.read_text().replace("text\n3\n", "text\n2\n")
+    assert pages.rewritten(page.read_text(), said) == page.read_text().replace(
+        "text\n3\n", "text\n2\n"
+    )
 
 
 def test_a_command_that_fails_is_told(pages, tmp_path):

@@ -8,17 +8,17 @@ import pytest
 import synthetic
 from matplotlib.image import imread
 
-from mgs.active.criteria import PIXEL_NOISE, PRIOR_STD
-from mgs.active.nbv import run_nbv
-from mgs.active.run_folder import read_checkpoint
 from mgs.camera import Camera, look_at
 from mgs.cli.app import main
 from mgs.data.meshes import Mesh
 from mgs.errors import InputError
+from mgs.policy.criteria import PIXEL_NOISE, PRIOR_STD
 from mgs.prior.build import build_prior, prior_from_mesh
 from mgs.prior.resolution import PIXELS_PER_SAMPLE, resolution
 from mgs.prior.settings import PriorSettings
 from mgs.report.evaluation import evaluate_run
+from mgs.run.folder import read_checkpoint
+from mgs.run.nbv import run_nbv
 from mgs.splat_ply import read_ply
 from mgs.study import parsimony
 from mgs.study.sweep import Cell
@@ -29,7 +29,9 @@ def square(side=20):
     x, y = (grid.ravel() / side - 0.5 for grid in np.mgrid[: side + 1, : side + 1])
     i, j = (grid.ravel() for grid in np.mgrid[:side, :side])
     a = i * (side + 1) + j
-    faces = np.concatenate([np.stack([a, a + side + 1, a + 1], 1), np.stack([a + 1, a + side + 1, a + side + 2], 1)])
+    faces = np.concatenate(
+        [np.stack([a, a + side + 1, a + 1], 1), np.stack([a + 1, a + side + 1, a + side + 2], 1)]
+    )
     return Mesh(np.stack([x, y, 0 * x], 1), faces, np.ones(len(faces), bool))
 
 
@@ -50,7 +52,9 @@ def test_a_flat_square_asks_for_one_sample_in_so_many_pixels():
 def test_twice_the_focal_length_or_half_the_distance_is_four_times_the_samples():
     mesh = square()
     once = resolution(mesh, [camera_above(2.0)]).samples
-    assert resolution(mesh, [camera_above(2.0, focal=200)]).samples == pytest.approx(4 * once, abs=4)
+    assert resolution(mesh, [camera_above(2.0, focal=200)]).samples == pytest.approx(
+        4 * once, abs=4
+    )
     assert resolution(mesh, [camera_above(1.0)]).samples == pytest.approx(4 * once, abs=4)
 
 
@@ -58,9 +62,17 @@ def test_only_cameras_count_that_see_the_face():
     mesh = square()
     alone = resolution(mesh, [camera_above(2.0)])
     assert resolution(mesh, [camera_above(2.0), camera_above(-0.5)]) == alone  # from below
-    assert resolution(mesh, [camera_above(2.0), camera_above(0.5, x=50)]) == alone  # beside the image
-    near = resolution(mesh, [camera_above(2.0), camera_above(0.2, focal=400)])  # sees the middle alone
-    assert alone.samples < near.samples < resolution(mesh, [camera_above(0.2, focal=400, size=4000)]).samples
+    assert (
+        resolution(mesh, [camera_above(2.0), camera_above(0.5, x=50)]) == alone
+    )  # beside the image
+    near = resolution(
+        mesh, [camera_above(2.0), camera_above(0.2, focal=400)]
+    )  # sees the middle alone
+    assert (
+        alone.samples
+        < near.samples
+        < resolution(mesh, [camera_above(0.2, focal=400, size=4000)]).samples
+    )
     with pytest.raises(InputError, match="give --gaussians N"):
         resolution(mesh, [camera_above(-2.0)])
 
@@ -86,14 +98,25 @@ def test_a_prior_takes_its_number_from_the_pixels(data, tmp_path, capsys, asked)
     assert 1.4 / 52.8 < pixel < 2.6 / 52.8  # between the nearest and the farthest point of the rock
     said = capsys.readouterr().out
     assert f"{numbers['n'] + numbers['backed']:,} Gaussians, since the closest pixel covers" in said
-    double, _ = build_prior(write_data(tmp_path / "double", (96, 72)), PriorSettings(gaussians="auto"))
+    double, _ = build_prior(
+        write_data(tmp_path / "double", (96, 72)), PriorSettings(gaussians="auto")
+    )
     assert len(double.points) / numbers["n"] == pytest.approx(4, rel=0.15)
 
 
 def test_a_given_mesh_takes_its_number_from_the_pixels_too(data, tmp_path, capsys):
     synthetic.rock_mesh().export(tmp_path / "rock.ply")
     with pytest.raises(SystemExit):
-        main(["prior", str(data.root), "--out", str(tmp_path / "p"), "--mesh", str(tmp_path / "rock.ply")])
+        main(
+            [
+                "prior",
+                str(data.root),
+                "--out",
+                str(tmp_path / "p"),
+                "--mesh",
+                str(tmp_path / "rock.ply"),
+            ]
+        )
     assert "resolution" in json.loads((tmp_path / "p/prior.json").read_text())
     with pytest.raises(InputError, match="a density counts by the voxels of a cloud"):
         prior_from_mesh(tmp_path / "rock.ply", PriorSettings(density=0.5))
@@ -115,7 +138,9 @@ def test_views_are_spread_evenly_from_the_first_on():
     assert sorted(order) == list(range(0, 24, 2))
 
 
-def row(asked, learned=parsimony.ALL, degree=0, psnr=25.0, parameters=100, predictive=1.0, evidence=1.0):
+def row(
+    asked, learned=parsimony.ALL, degree=0, psnr=25.0, parameters=100, predictive=1.0, evidence=1.0
+):
     return {
         "scene": "boulder", "asked": asked, "learned": learned, "degree": degree, "psnr_inside": psnr, "parameters": parameters,
         "gaussians": parameters // 11, "predictive": predictive, "evidence": evidence, "seconds": 1.0, "next_error": 1 / psnr,
@@ -123,24 +148,47 @@ def row(asked, learned=parsimony.ALL, degree=0, psnr=25.0, parameters=100, predi
 
 
 def rows(auto=26.0, parameters=200):
-    fixed = [row("100", psnr=25, parameters=110), row("200", psnr=26.05, parameters=220), row("400", psnr=26.1, parameters=440)]
-    lean = {key: value for key, value in row("auto", "auto", psnr=auto, parameters=parameters).items() if key != "evidence"}
+    fixed = [
+        row("100", psnr=25, parameters=110),
+        row("200", psnr=26.05, parameters=220),
+        row("400", psnr=26.1, parameters=440),
+    ]
+    lean = {
+        key: value
+        for key, value in row("auto", "auto", psnr=auto, parameters=parameters).items()
+        if key != "evidence"
+    }
     chosen = [row("auto", psnr=25.5, parameters=500, predictive=3), lean]
-    chosen += [row("auto", learned, psnr=20 + i, predictive=i) for i, learned in enumerate(parsimony.LEARNED) if i < 3]
-    degrees = [row("auto", degree=degree, psnr=27 - degree, parameters=1000, evidence=2 * degree) for degree in (1, 2)]
+    chosen += [
+        row("auto", learned, psnr=20 + i, predictive=i)
+        for i, learned in enumerate(parsimony.LEARNED)
+        if i < 3
+    ]
+    degrees = [
+        row("auto", degree=degree, psnr=27 - degree, parameters=1000, evidence=2 * degree)
+        for degree in (1, 2)
+    ]
     return fixed + chosen + degrees
 
 
 def test_the_verdict_compares_with_the_smallest_that_is_as_good():
     found = parsimony.verdict(rows())
-    assert (found["best"], found["auto"], found["smallest"], found["parameters"]) == (26.1, 26.0, 220, 200)
+    assert (found["best"], found["auto"], found["smallest"], found["parameters"]) == (
+        26.1,
+        26.0,
+        220,
+        200,
+    )
     assert found["loss"] == pytest.approx(0.1)
     assert found["number"] == 25.5
     assert found["small"]
     assert not parsimony.verdict(rows(parameters=221))["small"]
     assert not parsimony.verdict(rows(auto=25.9))["close"]
     assert parsimony.verdict(rows(auto=26.03))["close"]
-    kinds = [*rows(), row("auto", "+ opacity", psnr=26.05, parameters=90)]  # fewer kinds of parameters are a fixed choice, too
+    kinds = [
+        *rows(),
+        row("auto", "+ opacity", psnr=26.05, parameters=90),
+    ]  # fewer kinds of parameters are a fixed choice, too
     assert parsimony.verdict(kinds)["smallest"] == 90
     assert found["chosen"]["learned by predictive"] == {"value": parsimony.ALL, "loss": 0.0}
     assert found["chosen"]["degree by evidence"] == {"value": 2, "loss": 1.0}
@@ -152,7 +200,11 @@ def test_every_need_of_a_cell_is_a_cell():
     for size in parsimony.PRESETS.values():
         cells = parsimony.cells_of(size)
         names = [cell.name for cell in cells]
-        assert len(set(names)) == len(names) == len(size.scenes) * (1 + 2 * (len(size.counts) + 1) + 5 + 2)
+        assert (
+            len(set(names))
+            == len(names)
+            == len(size.scenes) * (1 + 2 * (len(size.counts) + 1) + 5 + 2)
+        )
         assert all(set(cell.needs) <= set(names) for cell in cells)
         assert all(isinstance(cell, Cell) for cell in cells)
 
@@ -189,14 +241,26 @@ def test_the_command_does_the_study_and_goes_on(tmp_path, capsys, monkeypatch):
     by = {(one["asked"], one["learned"], one["degree"]): one for one in found["rows"]}
     assert by["60", parsimony.ALL, 0]["parameters"] == 60 * 11
     assert by["auto", "colour", 0]["parameters"] == 3 * by["auto", "colour", 0]["gaussians"]
-    assert by["auto", parsimony.ALL, 1]["parameters"] == (12 + 8) * by["auto", parsimony.ALL, 0]["gaussians"]
+    assert (
+        by["auto", parsimony.ALL, 1]["parameters"]
+        == (12 + 8) * by["auto", parsimony.ALL, 0]["gaussians"]
+    )
     assert by["200", parsimony.ALL, 0]["psnr_inside"] > by["60", parsimony.ALL, 0]["psnr_inside"]
     lean = by["auto", "auto", 0]
     assert 3 * lean["gaussians"] <= lean["parameters"] < by["auto", parsimony.ALL, 0]["parameters"]
-    assert set(found["scenes"]["boulder"]["lean"]["shares"]) == {"colour", "scale", "rotation", "opacity"}
+    assert set(found["scenes"]["boulder"]["lean"]["shares"]) == {
+        "colour",
+        "scale",
+        "rotation",
+        "opacity",
+    }
     assert found["scenes"]["boulder"]["auto"] == lean["psnr_inside"]
     for one in found["rows"]:
-        known = ["psnr", "seconds", *(["next_error", "predictive", "evidence"] if one is not lean else [])]
+        known = [
+            "psnr",
+            "seconds",
+            *(["next_error", "predictive", "evidence"] if one is not lean else []),
+        ]
         assert np.isfinite([one[key] for key in known]).all()
     for one in found["scenes"]["boulder"]["pruned"]:
         assert one["actual"] <= one["noise"] * PIXEL_NOISE
@@ -218,8 +282,14 @@ def test_a_run_is_pruned_beside_its_model(data, tmp_path, capsys):
         "colour": 1200, "scale": 1200, "rotation": 1600, "opacity": 400
     }  # fmt: skip
     H = read_checkpoint(run).H
-    assert informed["colour"]["informed"] == (H[:, :3] > (PIXEL_NOISE / PRIOR_STD["colour"]) ** 2).sum()
-    assert informed["rotation"]["informed"] == (H[:, 6:10] > (PIXEL_NOISE / PRIOR_STD["rotation"]) ** 2).sum()
+    assert (
+        informed["colour"]["informed"]
+        == (H[:, :3] > (PIXEL_NOISE / PRIOR_STD["colour"]) ** 2).sum()
+    )
+    assert (
+        informed["rotation"]["informed"]
+        == (H[:, 6:10] > (PIXEL_NOISE / PRIOR_STD["rotation"]) ** 2).sum()
+    )
     assert 0 < informed["rotation"]["informed"] < 1600
     whole = (run / "gaussians.ply").read_bytes()
     with pytest.raises(SystemExit) as exit_:

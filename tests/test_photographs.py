@@ -1,4 +1,5 @@
-"""From photographs without depth to a prior: hull, points, both; up, units, masks of the prior; and what cannot be used."""
+"""From photographs without depth to a prior: hull, points, both; up, units, masks of the prior; and
+what cannot be used."""
 
 from __future__ import annotations
 
@@ -50,13 +51,19 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 def exact(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An orbit around a rock with texture for features to be found on."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(synthetic, "albedo", lambda x: 0.5 + 0.4 * np.sign(np.sin(19 * x) * np.sin(23 * x[..., [1, 2, 0]] + 1)))
+        patch.setattr(
+            synthetic,
+            "albedo",
+            lambda x: 0.5 + 0.4 * np.sign(np.sin(19 * x) * np.sin(23 * x[..., [1, 2, 0]] + 1)),
+        )
         cameras = synthetic.orbit_cameras(24, 96, 72)
         return synthetic.write_dataset(tmp_path_factory.mktemp("exact") / "data", cameras).root
 
 
 @pytest.fixture(scope="module")
-def data(exact: Path, photographs: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+def data(
+    exact: Path, photographs: ModuleType, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str], Path]:
     """The data of a kind, made once."""
     folder, made = tmp_path_factory.mktemp("data"), set()
 
@@ -71,7 +78,9 @@ def data(exact: Path, photographs: ModuleType, tmp_path_factory: pytest.TempPath
 
 def bare(dataset: Dataset) -> Dataset:
     """The dataset with no masks and no depth, on disk too."""
-    frames = tuple(replace(frame, mask_path=None, rock_path=None, depth_path=None) for frame in dataset.frames)
+    frames = tuple(
+        replace(frame, mask_path=None, rock_path=None, depth_path=None) for frame in dataset.frames
+    )
     write_transforms(dataset.root, frames, dataset.up, dataset.unit)
     return replace(dataset, frames=frames)
 
@@ -87,7 +96,9 @@ def lattice(count: int, radius: float = 3.0) -> list[Camera]:
     z = 1 - (2 * np.arange(count) + 1) / count
     angle = np.pi * (1 + 5**0.5) * np.arange(count)
     across = np.sqrt(1 - z**2)
-    eyes = synthetic.CENTRE + radius * np.stack([across * np.cos(angle), across * np.sin(angle), z], 1)
+    eyes = synthetic.CENTRE + radius * np.stack(
+        [across * np.cos(angle), across * np.sin(angle), z], 1
+    )
     K = np.array([[90.0, 0, 48], [0, 90.0, 36], [0, 0, 1]])
     return [Camera(K, 96, 72, look_at(eye, synthetic.CENTRE)) for eye in eyes]
 
@@ -97,7 +108,10 @@ def floating(root: Path, cameras: list[Camera]) -> Dataset:
     dataset = synthetic.write_dataset(root, cameras, depth=False)
     for frame in dataset.frames:
         directions = frame.camera.unproject(np.ones((72, 96))) - frame.camera.position
-        o, d = (frame.camera.position - synthetic.CENTRE) / synthetic.AXES, directions / synthetic.AXES
+        o, d = (
+            (frame.camera.position - synthetic.CENTRE) / synthetic.AXES,
+            directions / synthetic.AXES,
+        )
         assert frame.mask_path is not None
         write_png(frame.mask_path, (d @ o) ** 2 > (d * d).sum(-1) * (o @ o - 1))
     return dataset
@@ -112,7 +126,9 @@ def test_the_hull_of_a_convex_body_seen_from_all_sides_is_that_body(tmp_path: Pa
     body = trimesh.Trimesh(found.mesh.vertices, found.mesh.faces, process=False)
     volume = 4 / 3 * np.pi * synthetic.AXES.prod()
     assert body.is_watertight
-    assert 0.95 < body.volume / volume < 1.05  # the least of many outlines of whole pixels is a fraction of a pixel inside
+    assert (
+        0.95 < body.volume / volume < 1.05
+    )  # the least of many outlines of whole pixels is a fraction of a pixel inside
     assert np.abs(synthetic.level(found.mesh.vertices)).max() < 0.2
     assert np.nanmin(found.agreement) > 0.97
     for frame in dataset.frames:
@@ -126,10 +142,15 @@ def test_a_finer_grid_gives_the_same_hull(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(hull, "COARSE", 40)
     fine = visual_hull(dataset.frames)
     assert fine.cell < 0.7 * coarse.cell
-    assert distances_to_mesh(coarse.mesh.vertices, fine.mesh.vertices, fine.mesh.faces).max() < coarse.cell
+    assert (
+        distances_to_mesh(coarse.mesh.vertices, fine.mesh.vertices, fine.mesh.faces).max()
+        < coarse.cell
+    )
 
 
-def test_large_masks_are_carved_with_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_masks_are_carved_with_in_blocks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     dataset = floating(tmp_path / "d", lattice(16))
     whole = visual_hull(dataset.frames)
     monkeypatch.setattr(hull, "MOST_PIXELS", 96 * 72 // 4)
@@ -137,7 +158,10 @@ def test_large_masks_are_carved_with_in_blocks(tmp_path: Path, monkeypatch: pyte
     assert {view.distance.shape for view in views} == {(36, 48)}
     blocks = visual_hull(dataset.frames)
     pixel = 3.0 / 90
-    assert distances_to_mesh(blocks.mesh.vertices, whole.mesh.vertices, whole.mesh.faces).max() < 1.5 * pixel
+    assert (
+        distances_to_mesh(blocks.mesh.vertices, whole.mesh.vertices, whole.mesh.faces).max()
+        < 1.5 * pixel
+    )
 
 
 def test_a_frame_whose_mask_does_not_fit_is_named(tmp_path: Path) -> None:
@@ -146,7 +170,9 @@ def test_a_frame_whose_mask_does_not_fit_is_named(tmp_path: Path) -> None:
     wrong[:5, :5] = True
     assert dataset.frames[7].mask_path is not None
     write_png(dataset.frames[7].mask_path, wrong)
-    with pytest.raises(InputError, match=r"share no point of space \(at best 1 of 12 frames, such as kf_0007"):
+    with pytest.raises(
+        InputError, match=r"share no point of space \(at best 1 of 12 frames, such as kf_0007"
+    ):
         visual_hull(dataset.frames)
 
 
@@ -156,7 +182,9 @@ def test_masks_of_scattered_pixels_are_one_line(tmp_path: Path) -> None:
     for k, frame in enumerate(dataset.frames):
         assert frame.mask_path is not None
         write_png(frame.mask_path, np.random.default_rng(k).random((72, 96)) < 0.01)
-    with pytest.raises(InputError, match=r"share no point of space \(at best \d+ of 12 frames, such as kf_"):
+    with pytest.raises(
+        InputError, match=r"share no point of space \(at best \d+ of 12 frames, such as kf_"
+    ):
         visual_hull(dataset.frames)
 
 
@@ -165,10 +193,14 @@ def test_masks_of_scattered_pixels_are_one_line(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["colmap-binary", "colmap-text", "nerfstudio"])
 @pytest.mark.parametrize("masks", [True, False])
-def test_real_clouds_give_the_rock(data: Callable[[str], Path], tmp_path: Path, kind: str, masks: bool) -> None:
+def test_real_clouds_give_the_rock(
+    data: Callable[[str], Path], tmp_path: Path, kind: str, masks: bool
+) -> None:
     source = read_source(data(kind))
     up, _ = source.up_or_estimate()
-    dataset = import_source(source, tmp_path / "d", masks=data(kind) / "masks" if masks else None, up=up)
+    dataset = import_source(
+        source, tmp_path / "d", masks=data(kind) / "masks" if masks else None, up=up
+    )
     prior, cloud = build_prior(dataset, PriorSettings(gaussians=600, backing=0))
     rock, scale = read_mesh(data(kind) / "truth.ply"), read_json(data(kind) / "truth.json")["scale"]
     distance = distances_to_mesh(prior.points, rock.vertices, rock.faces) / scale
@@ -184,7 +216,9 @@ def test_real_clouds_give_the_rock(data: Callable[[str], Path], tmp_path: Path, 
     assert np.array_equal(prior.points, again.points)
 
 
-def test_tracks_and_errors_are_kept_and_wrong_points_are_left_out(data: Callable[[str], Path], tmp_path: Path) -> None:
+def test_tracks_and_errors_are_kept_and_wrong_points_are_left_out(
+    data: Callable[[str], Path], tmp_path: Path
+) -> None:
     source = read_source(data("colmap-binary"))
     import_source(source, tmp_path / "d")
     cloud = read_cloud(tmp_path / "d/sparse.ply")
@@ -203,7 +237,9 @@ def test_points_of_any_ply_can_be_given(data: Callable[[str], Path], tmp_path: P
     dataset = import_source(read_source(data("nerf-synthetic")), tmp_path / "d")
     scale = read_json(data("nerf-synthetic") / "truth.json")["scale"]
     sphere = np.random.default_rng(0).standard_normal((3000, 3))
-    points = synthetic.CENTRE + synthetic.AXES * sphere / np.linalg.norm(sphere, axis=1, keepdims=True)
+    points = synthetic.CENTRE + synthetic.AXES * sphere / np.linalg.norm(
+        sphere, axis=1, keepdims=True
+    )
     trimesh.PointCloud(scale * points[points[:, 2] > 0]).export(tmp_path / "cloud.ply")
     assert run("prior", dataset.root, "--points", tmp_path / "cloud.ply", "--gaussians", "300") == 0
     prior = load_prior(dataset.root / "prior")
@@ -243,7 +279,9 @@ def test_a_cloud_without_views_is_taken_to_be_seen_by_the_nearest_cameras() -> N
 
 def test_a_cloud_survives_its_file(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
-    cloud = SparseCloud(rng.random((9, 3)), rng.random((9, 3)), rng.integers(2, 9, 9).astype(float), rng.random(9))
+    cloud = SparseCloud(
+        rng.random((9, 3)), rng.random((9, 3)), rng.integers(2, 9, 9).astype(float), rng.random(9)
+    )
     write_cloud(tmp_path / "c.ply", cloud)
     read = read_cloud(tmp_path / "c.ply")
     for name in ("points", "views", "track", "error"):
@@ -253,7 +291,10 @@ def test_a_cloud_survives_its_file(tmp_path: Path) -> None:
 def test_of_points_in_the_same_place_one_is_kept(tmp_path: Path) -> None:
     """As where a program wrote a vertex for each corner of each face."""
     points = np.random.default_rng(4).random((50, 3)).astype(np.float32)
-    write_cloud(tmp_path / "c.ply", SparseCloud(np.concatenate([points, points[::-1], points]), track=np.arange(150.0)))
+    write_cloud(
+        tmp_path / "c.ply",
+        SparseCloud(np.concatenate([points, points[::-1], points]), track=np.arange(150.0)),
+    )
     read = read_cloud(tmp_path / "c.ply")
     assert np.array_equal(read.points, points)
     assert read.track is not None
@@ -263,7 +304,9 @@ def test_of_points_in_the_same_place_one_is_kept(tmp_path: Path) -> None:
 def test_a_refused_cloud_leaves_a_picture(
     data: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    dataset = import_source(read_source(data("colmap-binary")), tmp_path / "d", masks=data("colmap-binary") / "masks")
+    dataset = import_source(
+        read_source(data("colmap-binary")), tmp_path / "d", masks=data("colmap-binary") / "masks"
+    )
     far = SparseCloud(np.random.default_rng(0).uniform(5, 6, (300, 3)))
     write_cloud(tmp_path / "far.ply", far)
     assert run("prior", dataset.root, "--points", tmp_path / "far.ply", "--gaussians", "300") == 2
@@ -294,7 +337,9 @@ def test_upright_leaves_a_world_with_z_up_as_it_is() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), altitude=st.floats(0.2, 5), arc=st.floats(1.0, 6.28))
-def test_up_is_found_in_a_turned_world_of_cameras_held_nearly_level(seed: int, altitude: float, arc: float) -> None:
+def test_up_is_found_in_a_turned_world_of_cameras_held_nearly_level(
+    seed: int, altitude: float, arc: float
+) -> None:
     rng = np.random.default_rng(seed)
     turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
     turn *= np.linalg.det(turn)
@@ -302,7 +347,10 @@ def test_up_is_found_in_a_turned_world_of_cameras_held_nearly_level(seed: int, a
     for angle in np.linspace(0, arc, 20):
         pose = look_at([3 * np.cos(angle), 3 * np.sin(angle), altitude], [0, 0, 0])
         roll = np.radians(rng.normal(0, 2))
-        pose[:3] = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]]) @ pose[:3]
+        pose[:3] = (
+            np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
+            @ pose[:3]
+        )
         pose[:3, :3] = pose[:3, :3] @ turn.T
         cameras.append(Camera(np.diag([50.0, 50.0, 1.0]), 64, 48, pose))
     up = turn @ [0, 0, 1]
@@ -312,7 +360,7 @@ def test_up_is_found_in_a_turned_world_of_cameras_held_nearly_level(seed: int, a
 def test_policies_measure_azimuths_about_the_up_axis(tmp_path: Path) -> None:
     import tiny
 
-    from mgs.active import loop
+    from mgs.run import loop
 
     taken = []
     turn = np.linalg.qr(np.random.default_rng(4).standard_normal((3, 3)))[0]
@@ -329,14 +377,22 @@ def test_policies_measure_azimuths_about_the_up_axis(tmp_path: Path) -> None:
         turned = load_dataset(root)
         assert np.allclose(turned.up, rotation[:, 2])
         run_settings = tiny.start(tmp_path / f"run-{name}", turned, policy="uniform")
-        state = loop.run(tmp_path / f"run-{name}", run_settings, turned, tiny.stations(up=turned.up), tiny.silent)
+        state = loop.run(
+            tmp_path / f"run-{name}", run_settings, turned, tiny.stations(up=turned.up), tiny.silent
+        )
         taken.append(state.taken)
-    # Azimuths start from another direction in the tilted world, so the views may be shifted, but their gaps are the same.
-    gaps = [sorted(np.diff(sorted([*views, views[0] + 12]))) for views in ([sorted(t)[0:] for t in taken])]
+    # Azimuths start from another direction in the tilted world, so the views may be shifted, but
+    # their gaps are the same.
+    gaps = [
+        sorted(np.diff(sorted([*views, views[0] + 12])))
+        for views in ([sorted(t)[0:] for t in taken])
+    ]
     assert gaps[0] == gaps[1]
 
 
-def test_the_unit_scales_cameras_and_points_to_metres(data: Callable[[str], Path], tmp_path: Path) -> None:
+def test_the_unit_scales_cameras_and_points_to_metres(
+    data: Callable[[str], Path], tmp_path: Path
+) -> None:
     source = data("colmap-binary")
     assert run("import", source, "--out", tmp_path / "raw") == 0
     assert run("import", source, "--out", tmp_path / "metres", "--unit", str(1 / 0.37)) == 0
@@ -352,7 +408,9 @@ def test_lengths_of_unknown_unit_are_not_called_metres(
     data: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run("import", data("nerf-synthetic"), "--out", tmp_path / "d", "--up", "0,0,2") == 0
-    assert "up is (0, 0, 1): as --up says; lengths are in units" in " ".join(capsys.readouterr().out.split())
+    assert "up is (0, 0, 1): as --up says; lengths are in units" in " ".join(
+        capsys.readouterr().out.split()
+    )
     assert run("prior", tmp_path / "d", "--gaussians", "300", "--up", "0,1,0") == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "prior from hull: the dataset has masks" in said
@@ -374,11 +432,25 @@ def test_a_smaller_image_is_the_mean_of_its_blocks_and_rays_stay() -> None:
     assert np.abs(shown[4, 5] - pixels[12:15, 15:18].reshape(-1, 4).mean(0)).max() <= 0.5
     assert np.array_equal(undo(pixels, False)[4, 5], pixels[13, 16])
     # The centre of a block is the middle of its pixels.
-    assert np.allclose(small.unproject(np.ones((15, 21)))[4, 5], camera.unproject(np.ones((47, 65)))[13, 16])
+    assert np.allclose(
+        small.unproject(np.ones((15, 21)))[4, 5], camera.unproject(np.ones((47, 65)))[13, 16]
+    )
 
 
 def test_downscaled_import(data: Callable[[str], Path], tmp_path: Path) -> None:
-    assert run("import", data("rgbd"), "--masks", data("rgbd") / "masks", "--out", tmp_path / "d", "--downscale", "2") == 0
+    assert (
+        run(
+            "import",
+            data("rgbd"),
+            "--masks",
+            data("rgbd") / "masks",
+            "--out",
+            tmp_path / "d",
+            "--downscale",
+            "2",
+        )
+        == 0
+    )
     frame = load_dataset(tmp_path / "d").frames[0]
     assert frame.rgb().shape == (36, 48, 3)
     assert frame.depth().shape == frame.mask().shape == (36, 48)
@@ -403,7 +475,9 @@ def test_a_phone_held_upright(exact: Path, tmp_path: Path, orientation: int) -> 
             image.transpose(back).save(turned / f"images/{frame.name}.png", exif=exif)
     write_json(turned / "transforms.json", records)
     copy = import_source(read_source(turned), tmp_path / "copy")
-    assert all(np.array_equal(a.rgb(), b.rgb()) for a, b in zip(dataset.frames, copy.frames, strict=True))
+    assert all(
+        np.array_equal(a.rgb(), b.rgb()) for a, b in zip(dataset.frames, copy.frames, strict=True)
+    )
 
 
 # Masks of the prior
@@ -428,7 +502,9 @@ def test_outlines_move_to_where_the_colour_changes() -> None:
 
     v, u = np.mgrid[:80, :100]
     disc = np.hypot(v - 40, u - 50) < 25
-    rgb = np.where(disc[..., None], [0.6, 0.2, 0.1], [0.1, 0.3, 0.6]) + 0.02 * np.random.default_rng(0).random((80, 100, 3))
+    rgb = np.where(
+        disc[..., None], [0.6, 0.2, 0.1], [0.1, 0.3, 0.6]
+    ) + 0.02 * np.random.default_rng(0).random((80, 100, 3))
     rough = np.hypot(v - 41, u - 48) < 23
     refined = refined_mask(rough, rgb, 6)
     assert (refined ^ disc).sum() < 0.1 * (rough ^ disc).sum()
@@ -463,7 +539,9 @@ def _apart(root: Path, data: Callable[[str], Path]) -> list[str | Path]:
 
 
 def _black(root: Path, data: Callable[[str], Path]) -> list[str | Path]:
-    dataset = import_source(read_source(data("colmap-binary")), root, masks=data("colmap-binary") / "masks")
+    dataset = import_source(
+        read_source(data("colmap-binary")), root, masks=data("colmap-binary") / "masks"
+    )
     for frame in dataset.frames:
         assert frame.mask_path is not None
         write_png(frame.mask_path, np.zeros((frame.camera.height, frame.camera.width), bool))
@@ -508,13 +586,25 @@ REFUSED: dict[str, tuple[Callable[[Path, Callable[[str], Path]], list[Any]], lis
     "black masks, hull": (_black, ["--from", "hull"], "the masks are black in every frame"),
     "poses that do not fit": (_unfit, [], "poses and masks do not fit"),
     "no object": (_no_object, [], "points lie in one cluster above the ground; give masks"),
-    "nothing": (_nothing, [], "import with --masks DIR for --from hull, or give --points CLOUD.ply, or give --mesh MESH"),
+    "nothing": (
+        _nothing,
+        [],
+        "import with --masks DIR for --from hull, or give --points CLOUD.ply, or give --mesh MESH",
+    ),
     "hull without masks": (_nothing, ["--from", "hull"], "has no masks; "),
-    "depth without depth": (_few, ["--from", "depth"], "has no depth images; take --from hull, or import data with depth"),
+    "depth without depth": (
+        _few,
+        ["--from", "depth"],
+        "has no depth images; take --from hull, or import data with depth",
+    ),
     "no such source": (_nothing, ["--from", "dreams"], "choose one of depth, mesh, points, hull"),
     "mesh without mesh": (_nothing, ["--from", "mesh"], "give --mesh MESH"),
     "mesh and hull": (_both, [], "give one of them"),
-    "noise on a hull": (_alpha, ["--prior-noise", "0.1"], "--prior-noise shape a mesh that is built of a cloud, but a hull"),
+    "noise on a hull": (
+        _alpha,
+        ["--prior-noise", "0.1"],
+        "--prior-noise shape a mesh that is built of a cloud, but a hull",
+    ),
     "no such cloud": (_no_object, ["--points", "none.ply"], "none.ply: no such point cloud"),
     "up of words": (_few, ["--up", "skyward"], "--up 'skyward': expected auto, or three numbers"),
     "up of zeros": (_few, ["--up", "0,0,0"], "--up '0,0,0': expected auto, or three numbers"),
@@ -544,7 +634,9 @@ def test_a_world_in_which_nothing_would_be_drawn_is_one_line(
     capfd.readouterr()
     assert run("nbv", tmp_path / "d", "--out", tmp_path / "run", "--budget", "1") == 2
     error = capfd.readouterr().err.strip()
-    assert "m from it, and nothing nearer than 0.01 is drawn; import the data with --unit M" in error
+    assert (
+        "m from it, and nothing nearer than 0.01 is drawn; import the data with --unit M" in error
+    )
     assert "\n" not in error
     assert not (tmp_path / "run").exists()
 

@@ -1,4 +1,5 @@
-"""The Mitsuba integrator `mgs_splat`: the same image and derivatives as the API, through every perspective sensor."""
+"""The Mitsuba integrator `mgs_splat`: the same image and derivatives as the API, through every
+perspective sensor."""
 
 import subprocess
 import sys
@@ -44,19 +45,31 @@ def ply(tmp_path_factory):
 
 
 def sensor_dict(film: dict | None = None, **options) -> dict:
-    film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "pixel_format": "rgb", "rfilter": {"type": "box"}} | (
-        film or {}
-    )
+    film = {
+        "type": "hdrfilm",
+        "width": WIDTH,
+        "height": HEIGHT,
+        "pixel_format": "rgb",
+        "rfilter": {"type": "box"},
+    } | (film or {})
     to_world = mi.ScalarTransform4f().look_at(origin=EYE, target=TARGET, up=[0, 0, 1])
     return {"type": "perspective", "fov": FOV, "to_world": to_world, "film": film} | options
 
 
 def load(ply, sensor: dict | None = None, **options):
     integrator = {"type": "mgs_splat", "filename": str(ply)} | options
-    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor or sensor_dict()})
+    return mi.load_dict(
+        {"type": "scene", "integrator": integrator, "sensor": sensor or sensor_dict()}
+    )
 
 
-def camera(axis: str = "x", ppo=(0.0, 0.0), crop=(0, 0, WIDTH, HEIGHT), width: int = WIDTH, height: int = HEIGHT) -> Camera:
+def camera(
+    axis: str = "x",
+    ppo=(0.0, 0.0),
+    crop=(0, 0, WIDTH, HEIGHT),
+    width: int = WIDTH,
+    height: int = HEIGHT,
+) -> Camera:
     """The equivalent camera, from the definitions of Mitsuba's documentation, in float64."""
     extent = {
         "x": width,
@@ -67,13 +80,19 @@ def camera(axis: str = "x", ppo=(0.0, 0.0), crop=(0, 0, WIDTH, HEIGHT), width: i
     }[axis]
     focal = 0.5 * extent / np.tan(np.radians(FOV / 2))
     left, top, columns, rows = crop
-    K = [[focal, 0, (0.5 - ppo[0]) * width - left], [0, focal, (0.5 - ppo[1]) * height - top], [0, 0, 1]]
+    K = [
+        [focal, 0, (0.5 - ppo[0]) * width - left],
+        [0, focal, (0.5 - ppo[1]) * height - top],
+        [0, 0, 1],
+    ]
     return Camera(np.array(K), columns, rows, LOOK_AT)
 
 
 AXES = ["x", "y", "smaller", "larger", "diagonal"]
 CROP = (11, 5, 41, 30)
-CROPPED = dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), CROP, strict=True))
+CROPPED = dict(
+    zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), CROP, strict=True)
+)
 PPO = {"principal_point_offset_x": 0.13, "principal_point_offset_y": -0.07}
 TALL = {"width": 40, "height": 64}
 SENSORS = [
@@ -81,21 +100,29 @@ SENSORS = [
     *(({"fov_axis": axis}, TALL, {"axis": axis, "crop": (0, 0, 40, 64)} | TALL) for axis in AXES),
     (PPO, {}, {"ppo": (0.13, -0.07)}),
     ({}, CROPPED, {"crop": CROP}),
-    (PPO | {"fov_axis": "diagonal"}, CROPPED, {"ppo": (0.13, -0.07), "axis": "diagonal", "crop": CROP}),
+    (
+        PPO | {"fov_axis": "diagonal"},
+        CROPPED,
+        {"ppo": (0.13, -0.07), "axis": "diagonal", "crop": CROP},
+    ),
     ({}, {"rfilter": {"type": "gaussian"}}, {}),
 ]
 
 
 @pytest.mark.parametrize(("options", "film", "expected"), SENSORS)
 def test_same_image_as_the_api(ply, options, film, expected):
-    """Every fov axis on wide and tall films, principal point, crop window; a film's filter changes nothing.
+    """Every fov axis on wide and tall films, principal point, crop window; a film's filter changes
+    nothing.
 
-    Bitwise the same through the sensor's camera. Mitsuba keeps a sensor in float32, so the camera defined in float64 differs by
-    1e-7 of the focal length, and the image by little more than its own rounding.
+    Bitwise the same through the sensor's camera. Mitsuba keeps a sensor in float32, so the camera
+    defined in float64 differs by 1e-7 of the focal length, and the image by little more than its
+    own rounding.
     """
     scene = load(ply, sensor_dict(film, **options))
     image = np.asarray(mi.render(scene))
-    np.testing.assert_array_equal(image, np.asarray(render(read_ply(ply), camera_from_sensor(scene.sensors()[0])).rgb))
+    np.testing.assert_array_equal(
+        image, np.asarray(render(read_ply(ply), camera_from_sensor(scene.sensors()[0])).rgb)
+    )
     truth = np.asarray(render(read_ply(ply), camera(**expected)).rgb)
     assert truth.max() > 0.3
     np.testing.assert_allclose(image, truth, atol=4e-6)
@@ -111,7 +138,9 @@ def test_camera_has_the_rays_of_the_sensor(options, film, expected):
     v, u = np.mgrid[: found.height, : found.width] + 0.5
     position = np.stack([u.ravel() / found.width, v.ravel() / found.height]).astype(np.float32)
     rays, _ = sensor.sample_ray(0, 0, mi.Point2f(position), mi.Point2f(0))
-    directions = (found.unproject(np.ones((found.height, found.width))) - found.position).reshape(-1, 3)
+    directions = (found.unproject(np.ones((found.height, found.width))) - found.position).reshape(
+        -1, 3
+    )
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     np.testing.assert_allclose(np.asarray(rays.d).T, directions, atol=2e-6)
 
@@ -119,7 +148,9 @@ def test_camera_has_the_rays_of_the_sensor(options, film, expected):
 def test_alpha_depth_and_background(ply):
     """An rgba film gets alpha, `depth` an AOV after it, `background` shows through."""
     background = (0.1, 0.2, 0.3)
-    scene = load(ply, sensor_dict({"pixel_format": "rgba"}), depth=True, background=list(background))
+    scene = load(
+        ply, sensor_dict({"pixel_format": "rgba"}), depth=True, background=list(background)
+    )
     image = np.asarray(mi.render(scene))
     truth = render(read_ply(ply), camera(), background)
     assert image.shape == (HEIGHT, WIDTH, 5)
@@ -130,23 +161,30 @@ def test_alpha_depth_and_background(ply):
 
 
 def test_colours_in_display_space(ply):
-    """A PLY of another tool is blended in sRGB; the image is linear all the same, and gradients flow through the conversion."""
+    """A PLY of another tool is blended in sRGB; the image is linear all the same, and gradients
+    flow through the conversion."""
     scene = load(ply, colour_space="srgb")
     params = mi.traverse(scene)
     dr.enable_grad(params["integrator.sh"])
     image = mi.render(scene, params)
     blended = np.asarray(render(read_ply(ply), camera()).rgb)
     np.testing.assert_allclose(
-        np.asarray(image), np.where(blended > 1, np.asarray(image), linear_from_srgb(blended)), atol=4e-6
+        np.asarray(image),
+        np.where(blended > 1, np.asarray(image), linear_from_srgb(blended)),
+        atol=4e-6,
     )
     dr.backward(dr.sum(image, axis=None))
 
     model = as_drjit(read_ply(ply))
     dr.enable_grad(model.sh)
     rgb = render(model, camera()).rgb.array
-    dr.backward(dr.sum(dr.select(rgb <= 0.04045, rgb / 12.92, dr.power((rgb + 0.055) / 1.055, 2.4))))
+    dr.backward(
+        dr.sum(dr.select(rgb <= 0.04045, rgb / 12.92, dr.power((rgb + 0.055) / 1.055, 2.4)))
+    )
     truth = np.asarray(dr.grad(model.sh))
-    assert np.linalg.norm(np.asarray(dr.grad(params["integrator.sh"])) - truth) <= 1e-5 * np.linalg.norm(truth)
+    assert np.linalg.norm(
+        np.asarray(dr.grad(params["integrator.sh"])) - truth
+    ) <= 1e-5 * np.linalg.norm(truth)
     assert load(ply).integrator().colour_space == "linear"
 
 
@@ -160,7 +198,8 @@ def test_traverse_lists_the_parameters(ply):
 
 
 def test_a_changed_parameter_changes_the_image(ply):
-    """Also another number of Gaussians: the block lists of the first image must not serve the second."""
+    """Also another number of Gaussians: the block lists of the first image must not serve the
+    second."""
     scene = load(ply)
     params = mi.traverse(scene)
     first = np.asarray(mi.render(scene, params)).copy()
@@ -173,9 +212,13 @@ def test_a_changed_parameter_changes_the_image(ply):
     np.testing.assert_allclose(second, np.asarray(render(other, camera()).rgb), atol=1e-6)
 
 
-@pytest.mark.parametrize(("pixel_format", "depth", "film"), [("rgb", False, {}), ("rgba", False, {}), ("rgba", True, CROPPED)])
+@pytest.mark.parametrize(
+    ("pixel_format", "depth", "film"),
+    [("rgb", False, {}), ("rgba", False, {}), ("rgba", True, CROPPED)],
+)
 def test_gradients_are_those_of_the_api(ply, pixel_format, depth, film):
-    """Of every parameter, means included, through colour, and through alpha and depth where the film has them."""
+    """Of every parameter, means included, through colour, and through alpha and depth where the
+    film has them."""
     scene = load(ply, sensor_dict({"pixel_format": pixel_format} | film), depth=depth)
     params = mi.traverse(scene)
     for name in NAMES:
@@ -215,10 +258,18 @@ def test_adam_lowers_a_loss(ply):
     scene = load(ply)
     params = mi.traverse(scene)
     target = mi.render(scene)
-    learned = ["integrator.sh", "integrator.log_scales", "integrator.logit_opacities", "integrator.means", "integrator.quats"]
+    learned = [
+        "integrator.sh",
+        "integrator.log_scales",
+        "integrator.logit_opacities",
+        "integrator.means",
+        "integrator.quats",
+    ]
     rng = np.random.default_rng(2)
     for key in learned:
-        params[key] = mi.TensorXf(np.asarray(params[key]) + 0.05 * rng.normal(size=params[key].shape).astype(np.float32))
+        params[key] = mi.TensorXf(
+            np.asarray(params[key]) + 0.05 * rng.normal(size=params[key].shape).astype(np.float32)
+        )
     params.update()
     optimiser = mi.ad.Adam(lr=0.01, params={key: params[key] for key in learned})
     losses = []
@@ -233,7 +284,10 @@ def test_adam_lowers_a_loss(ply):
 
 def test_samples_and_seeds_change_nothing(ply):
     scene = load(ply)
-    images = [np.asarray(mi.render(scene, spp=spp, seed=seed)).tobytes() for spp, seed in ((1, 0), (1, 7), (16, 0))]
+    images = [
+        np.asarray(mi.render(scene, spp=spp, seed=seed)).tobytes()
+        for spp, seed in ((1, 0), (1, 7), (16, 0))
+    ]
     assert len(set(images)) == 1
 
 
@@ -253,11 +307,20 @@ BAD_FILES = [
     ({}, "mgs_splat: `filename` is missing or no string; name a 3DGS PLY"),
     ({"filename": 5}, "mgs_splat: `filename` is missing or no string; name a 3DGS PLY"),
     ({"filename": "PLY", "depth": "false"}, "mgs_splat: depth 'false' must be a boolean"),
-    ({"filename": "PLY", "background": "white"}, "background white: must be one or three numbers, linear RGB, up to 1,000,000"),
-    ({"filename": "PLY", "background": [0.0, float("nan"), 0.0]}, "must be one or three numbers, linear RGB, up to 1,000,000"),
+    (
+        {"filename": "PLY", "background": "white"},
+        "background white: must be one or three numbers, linear RGB, up to 1,000,000",
+    ),
+    (
+        {"filename": "PLY", "background": [0.0, float("nan"), 0.0]},
+        "must be one or three numbers, linear RGB, up to 1,000,000",
+    ),
     ({"filename": "nowhere.ply"}, "nowhere.ply: no such file; give a 3DGS PLY"),
     ({"filename": __file__}, "export it again"),
-    ({"filename": "PLY", "colour_space": "Lab"}, "mgs_splat: colour_space 'Lab' is unknown; choose linear or srgb"),
+    (
+        {"filename": "PLY", "colour_space": "Lab"},
+        "mgs_splat: colour_space 'Lab' is unknown; choose linear or srgb",
+    ),
 ]
 
 
@@ -275,13 +338,19 @@ def test_bad_files(ply, options, message):
 
 @pytest.mark.parametrize(
     ("sensor", "name"),
-    [({"type": "orthographic"}, "OrthographicCamera"), ({"type": "thinlens", "aperture_radius": 0.1}, "ThinLensCamera")],
+    [
+        ({"type": "orthographic"}, "OrthographicCamera"),
+        ({"type": "thinlens", "aperture_radius": 0.1}, "ThinLensCamera"),
+    ],
 )
 def test_bad_sensors(ply, sensor, name):
     with pytest.raises(RuntimeError) as error:
         mi.render(load(ply), sensor=mi.load_dict(sensor))
     assert isinstance(error.value.__cause__, InputError)
-    assert str(error.value.__cause__) == f"sensor: {name} has no pinhole; splatting needs a `perspective` sensor"
+    assert (
+        str(error.value.__cause__)
+        == f"sensor: {name} has no pinhole; splatting needs a `perspective` sensor"
+    )
 
 
 def test_a_mirrored_sensor(ply):
@@ -313,12 +382,21 @@ def moving(params, tangents, t) -> None:
 
 @pytest.mark.parametrize("space", ["linear", "srgb"])
 def test_forward_mode_against_differences(ply, space):
-    """`dr.forward` through `mi.render` and `render_forward` itself: the oracle's central differences in float64, of colour,
-    alpha and depth, in pixels where float32 takes the same decisions as float64."""
-    scene = load(ply, sensor_dict({"pixel_format": "rgba"}), depth=True, colour_space=space, background=[0.2, 0.1, 0.3])
+    """`dr.forward` through `mi.render` and `render_forward` itself: the oracle's central
+    differences in float64, of colour, alpha and depth, in pixels where float32 takes the same
+    decisions as float64."""
+    scene = load(
+        ply,
+        sensor_dict({"pixel_format": "rgba"}),
+        depth=True,
+        colour_space=space,
+        background=[0.2, 0.1, 0.3],
+    )
     params, model = mi.traverse(scene), gaussians()
     rng = np.random.default_rng(4)
-    tangents = {name: rng.normal(size=getattr(model, name).shape).astype(np.float32) for name in NAMES}
+    tangents = {
+        name: rng.normal(size=getattr(model, name).shape).astype(np.float32) for name in NAMES
+    }
     t = mi.Float(0)
     dr.enable_grad(t)
     moving(params, tangents, t)
@@ -329,7 +407,12 @@ def test_forward_mode_against_differences(ply, space):
 
     sensor_camera, ends = camera_from_sensor(scene.sensors()[0]), []
     for sign in (+1, -1):
-        moved = Gaussians(*(getattr(model, name).astype(np.float64) + sign * 1e-6 * tangents[name] for name in NAMES))
+        moved = Gaussians(
+            *(
+                getattr(model, name).astype(np.float64) + sign * 1e-6 * tangents[name]
+                for name in NAMES
+            )
+        )
         drawn = reference.render(moved, sensor_camera, (0.2, 0.1, 0.3))
         rgb = drawn["rgb"]
         if space == "srgb":
@@ -344,7 +427,8 @@ def test_forward_mode_against_differences(ply, space):
 
 
 def test_forward_mode_goes_along_the_gradients_that_are_set(ply):
-    """`render_forward` gives `jvp` along them. A parameter without gradients does not change; without any the result is 0."""
+    """`render_forward` gives `jvp` along them. A parameter without gradients does not change;
+    without any the result is 0."""
     scene = load(ply)
     params = mi.traverse(scene)
     assert not np.any(scene.integrator().render_forward(scene, params))
@@ -370,7 +454,9 @@ def test_registered_at_import(ply, program, tmp_path):
     """Before or after the variant is set; from any folder."""
     load_it = f"print(mi.load_dict({{'type': 'mgs_splat', 'filename': {str(ply)!r}}}))"
     lines = f"import mitsuba as mi\nVARIANT = {mi.variant()!r}\n{program}\n{load_it}"
-    done = subprocess.run([sys.executable, "-c", lines], cwd=tmp_path, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", lines], cwd=tmp_path, capture_output=True, text=True
+    )
     assert done.stdout.strip() == "MgsSplat[60 Gaussians, SH degree 1]", done.stderr
 
 
@@ -382,5 +468,7 @@ def test_the_documented_example(tmp_path, monkeypatch):
     write_ply("splats.ply", gaussians())
     variables: dict = {}
     exec(program, variables)
-    first = np.mean(np.asarray(variables["target"]) ** 2)  # The target is half the image, so this is the loss of the start.
+    first = np.mean(
+        np.asarray(variables["target"]) ** 2
+    )  # The target is half the image, so this is the loss of the start.
     assert variables["loss"].array[0] < 0.3 * first

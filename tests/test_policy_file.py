@@ -9,13 +9,16 @@ import pytest
 import tiny
 
 import mgs
-from mgs.active import criteria, loop, policy_file, pose_policies
-from mgs.active.nbv import start_run
-from mgs.active.policies import policy_named
-from mgs.active.settings import NbvSettings
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
+from mgs.policy import criteria
+from mgs.policy import from_file as policy_file
+from mgs.policy import poses as pose_policies
+from mgs.policy.registry import policy_named
 from mgs.report.runs import read_run
+from mgs.run import loop
+from mgs.run.nbv import start_run
+from mgs.run.settings import NbvSettings
 
 FUNCTIONS = """
 from __future__ import annotations
@@ -37,10 +40,10 @@ def surface(surface_F, surface_H, prior_lam):
 def draw(rng, candidates):
     return rng.random(len(candidates))
 
-def everything(outlook, seen, seen_taken, points, candidate, centre):
-    assert seen.shape == (len(outlook.left), len(points))
-    assert seen_taken.shape == (len(outlook.visited), len(points))
-    assert len(outlook.dome().positions) == len(outlook.dome().seen)
+def everything(context, seen, seen_taken, points, candidate, centre):
+    assert seen.shape == (len(context.left), len(points))
+    assert seen_taken.shape == (len(context.visited), len(points))
+    assert len(context.dome().positions) == len(context.dome().seen)
     return float(candidate[2] - centre[2])
 
 def wrong(F, photos):
@@ -77,7 +80,10 @@ def run(out, dataset, **values):
     return loop.run(out, settings, dataset, tiny.stations(), tiny.silent)
 
 
-@pytest.mark.parametrize(("function", "same"), [("poses", "farthest"), ("information", "d-optimal"), ("surface", "coverage")])
+@pytest.mark.parametrize(
+    ("function", "same"),
+    [("poses", "farthest"), ("information", "d-optimal"), ("surface", "coverage")],
+)
 def test_a_function_is_told_what_it_asks_for(dataset, file, tmp_path, function, same):
     loaded = load_dataset(dataset)
     ours = run(tmp_path / "ours", loaded, policy=f"{file}:{function}")
@@ -100,7 +106,10 @@ def test_draws_do_not_depend_on_the_folder_of_the_file(dataset, file, tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere/mine.py").write_text(FUNCTIONS)
     paths = (file, tmp_path / "elsewhere/mine.py")
-    runs = [run(tmp_path / f"run{i}", load_dataset(dataset), policy=f"{path}:draw") for i, path in enumerate(paths)]
+    runs = [
+        run(tmp_path / f"run{i}", load_dataset(dataset), policy=f"{path}:draw")
+        for i, path in enumerate(paths)
+    ]
     assert runs[0].taken == runs[1].taken
 
 
@@ -109,17 +118,28 @@ def test_draws_do_not_depend_on_the_folder_of_the_file(dataset, file, tmp_path):
     [
         ("mine.py:nothing", r"has no function nothing"),
         ("mine.py:number", r"has no function number"),
-        ("mine.py:wrong", r"asks for photos, which is not known here; what can be asked for is F, "),
+        (
+            "mine.py:wrong",
+            r"asks for photos, which is not known here; what can be asked for is F, ",
+        ),
         ("missing.py:poses", r"no such file .*missing\.py; correct the path"),
         ("bad.py:poses", r"line 2 of .*bad\.py failed: SyntaxError"),
-        ("worse.py:poses", r"line 3 of .*worse\.py failed: ModuleNotFoundError: No module named 'nothing_like_it'"),
+        (
+            "worse.py:poses",
+            r"line 3 of .*worse\.py failed: ModuleNotFoundError: No module named 'nothing_like_it'",
+        ),
     ],
 )
 def test_a_policy_that_cannot_be_loaded_is_one_line(dataset, file, tmp_path, name, message):
     (tmp_path / "bad.py").write_text("x = 1\ndef (:\n")
     (tmp_path / "worse.py").write_text("\n\nimport nothing_like_it\n")
     with pytest.raises(InputError, match=message) as found:
-        mgs.run_nbv(dataset, tmp_path / "run", prior=tiny.write_prior(tmp_path / "prior"), policy=str(tmp_path / name))
+        mgs.run_nbv(
+            dataset,
+            tmp_path / "run",
+            prior=tiny.write_prior(tmp_path / "prior"),
+            policy=str(tmp_path / name),
+        )
     assert "\n" not in str(found.value)
     assert not (tmp_path / "run").exists()
 
@@ -147,11 +167,17 @@ def test_a_run_goes_on_with_the_same_file_only(dataset, file, tmp_path, monkeypa
     run(tmp_path / "half", load_dataset(dataset), policy=f"{file}:poses", budget=1)
     assert read_run(tmp_path / "half").policy == "mine.py:poses"
     file.write_text(FUNCTIONS + "\n")
-    settings = NbvSettings(dataset=dataset, prior=dataset, budget=2, seeds=3, policy=f"{file}:poses")
-    with pytest.raises(InputError, match=r"mine\.py:poses: its file has changed since .*half was started"):
+    settings = NbvSettings(
+        dataset=dataset, prior=dataset, budget=2, seeds=3, policy=f"{file}:poses"
+    )
+    with pytest.raises(
+        InputError, match=r"mine\.py:poses: its file has changed since .*half was started"
+    ):
         loop.run(tmp_path / "half", settings, load_dataset(dataset), tiny.stations(), tiny.silent)
     file.write_text(FUNCTIONS)
-    state = loop.run(tmp_path / "half", settings, load_dataset(dataset), tiny.stations(), tiny.silent)
+    state = loop.run(
+        tmp_path / "half", settings, load_dataset(dataset), tiny.stations(), tiny.silent
+    )
     assert len(state.taken) == 5
 
 
@@ -163,14 +189,20 @@ def test_names_in_files_and_in_tables():
 
 
 def test_moves_can_be_limited_to_the_nearest_poses(dataset, tmp_path):
-    """Twelve poses on a circle, of which 0, 4 and 8 are seeds: from 8 the two nearest are 7 and 9."""
+    """Twelve poses on a circle, of which 0, 4 and 8 are seeds: from 8 the two nearest are 7 and
+    9."""
     loaded = load_dataset(dataset)
     state = run(tmp_path / "run", loaded, policy="farthest", nearest=2, budget=6)
     positions = np.array([frame.camera.position for frame in loaded.frames])
     assert state.taken[3] in (7, 9)
     for step in range(3, 9):
         left = [i for i in range(12) if i not in state.taken[:step]]
-        near = [left[k] for k in pose_policies.nearest_poses(positions[left], positions[state.taken[step - 1]], 2)]
+        near = [
+            left[k]
+            for k in pose_policies.nearest_poses(
+                positions[left], positions[state.taken[step - 1]], 2
+            )
+        ]
         assert len(near) == 2
         assert state.taken[step] in near
     free = run(tmp_path / "free", loaded, policy="farthest", budget=6)
@@ -181,18 +213,24 @@ def test_moves_can_be_limited_to_the_nearest_poses(dataset, tmp_path):
 def test_the_nearest_poses():
     positions = np.array([[0.0, 0, 0], [3, 0, 0], [1, 0, 0], [-1, 0, 0], [9, 0, 0]])
     assert pose_policies.nearest_poses(positions, np.zeros(3), 1) == [0]
-    assert pose_policies.nearest_poses(positions, np.zeros(3), 2) == [0, 2]  # of equal distances the first
+    assert pose_policies.nearest_poses(positions, np.zeros(3), 2) == [
+        0,
+        2,
+    ]  # of equal distances the first
     assert pose_policies.nearest_poses(positions, np.zeros(3), 3) == [0, 2, 3]
     assert pose_policies.nearest_poses(positions, np.zeros(3), 9) == [0, 1, 2, 3, 4]
 
 
 def test_nearest_zero_is_refused(dataset, tmp_path):
     with pytest.raises(InputError, match="--nearest 0: "):
-        mgs.run_nbv(dataset, tmp_path / "run", prior=tiny.write_prior(tmp_path / "prior"), nearest=0)
+        mgs.run_nbv(
+            dataset, tmp_path / "run", prior=tiny.write_prior(tmp_path / "prior"), nearest=0
+        )
 
 
 def test_criteria_are_the_same_through_an_outlook(dataset, tmp_path):
-    """The score of a step is that of the function itself, on the information of the state before it."""
+    """The score of a step is that of the function itself, on the information of the state before
+    it."""
     loaded = load_dataset(dataset)
     state = run(tmp_path / "run", loaded, policy="fisherrf", budget=1)
     seeds = run(tmp_path / "seeds", loaded, policy="fisherrf", budget=0)

@@ -34,7 +34,9 @@ X, Y, Z = np.eye(3)
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return synthetic.write_dataset(tmp_path_factory.mktemp("orbit"), synthetic.orbit_cameras(12, 96, 72))
+    return synthetic.write_dataset(
+        tmp_path_factory.mktemp("orbit"), synthetic.orbit_cameras(12, 96, 72)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -44,13 +46,17 @@ def built(dataset: Dataset):
 
 def _ball(centre=(0.0, 0.0, 0.5), radius=0.5) -> Mesh:
     ball = trimesh.creation.icosphere(subdivisions=4, radius=radius)
-    return Mesh(np.asarray(ball.vertices) + centre, np.asarray(ball.faces), np.ones(len(ball.faces), bool))
+    return Mesh(
+        np.asarray(ball.vertices) + centre, np.asarray(ball.faces), np.ones(len(ball.faces), bool)
+    )
 
 
 def test_fused_cloud_lies_on_the_surfaces(dataset: Dataset) -> None:
     cloud = fuse_frames(dataset.frames)
     on_rock = ((cloud.points - synthetic.CENTRE) / synthetic.AXES) ** 2
-    distance = np.minimum(np.abs(cloud.points[:, 2]), np.abs(np.sqrt(on_rock.sum(1)) - 1) * synthetic.AXES.min())
+    distance = np.minimum(
+        np.abs(cloud.points[:, 2]), np.abs(np.sqrt(on_rock.sum(1)) - 1) * synthetic.AXES.min()
+    )
     # A voxel averages points of a curved patch, or of ground and rock where they meet.
     assert np.quantile(distance, 0.99) < 0.2 * cloud.voxel
     assert distance.max() < cloud.voxel
@@ -74,9 +80,14 @@ def test_ground_plane_of_a_tilted_noisy_floor(dataset: Dataset) -> None:
     rng = np.random.default_rng(0)
     normal = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
     xy = rng.uniform(-2, 2, (20_000, 2))
-    points = np.column_stack([xy, (0.3 - xy @ normal[:2]) / normal[2]]) + 0.004 * rng.standard_normal((20_000, 1)) * normal
+    points = (
+        np.column_stack([xy, (0.3 - xy @ normal[:2]) / normal[2]])
+        + 0.004 * rng.standard_normal((20_000, 1)) * normal
+    )
     rock = rng.uniform([-0.3, -0.3, 0.4], [0.3, 0.3, 1.0], (5_000, 3))
-    cloud = Cloud(np.concatenate([points, rock]), np.tile([0, 0, 1.0], (25_000, 1)), 0.002, 0.0, 25_000)
+    cloud = Cloud(
+        np.concatenate([points, rock]), np.tile([0, 0, 1.0], (25_000, 1)), 0.002, 0.0, 25_000
+    )
     plane = ground_plane(cloud, dataset.frames, seed=2)
     assert plane.normal @ normal > np.cos(np.radians(0.1))
     assert plane.offset == pytest.approx(0.3, abs=1e-3)
@@ -85,8 +96,13 @@ def test_ground_plane_of_a_tilted_noisy_floor(dataset: Dataset) -> None:
 
 def test_largest_cluster_wins() -> None:
     rng = np.random.default_rng(3)
-    large, small = rng.uniform(0, 1, (3000, 3)), np.array([3.0, 0, 0]) + rng.uniform(0, 0.3, (300, 3))
-    inside, eps, count = rock_cluster(np.concatenate([small, large]), 0.05, np.array([3.0, 0.0, 0.0]))
+    large, small = (
+        rng.uniform(0, 1, (3000, 3)),
+        np.array([3.0, 0, 0]) + rng.uniform(0, 0.3, (300, 3)),
+    )
+    inside, eps, count = rock_cluster(
+        np.concatenate([small, large]), 0.05, np.array([3.0, 0.0, 0.0])
+    )
     assert count == 2
     assert inside[300:].mean() > 0.99
     assert not inside[:300].any()
@@ -95,8 +111,13 @@ def test_largest_cluster_wins() -> None:
 
 def test_what_stands_up_is_the_rock_not_a_long_low_rise_of_the_ground() -> None:
     rng = np.random.default_rng(6)
-    rise, rock = rng.uniform([3, 0, 0.02], [5, 2, 0.05], (6000, 3)), rng.uniform([0, 0, 0.02], [0.6, 0.6, 0.5], (2500, 3))
-    inside, _, _ = rock_cluster(np.concatenate([rise, rock]), 0.05, np.zeros(3), weight=lambda points: points[:, 2])
+    rise, rock = (
+        rng.uniform([3, 0, 0.02], [5, 2, 0.05], (6000, 3)),
+        rng.uniform([0, 0, 0.02], [0.6, 0.6, 0.5], (2500, 3)),
+    )
+    inside, _, _ = rock_cluster(
+        np.concatenate([rise, rock]), 0.05, np.zeros(3), weight=lambda points: points[:, 2]
+    )
     assert inside[6000:].mean() > 0.99
     assert not inside[:6000].any()
 
@@ -192,7 +213,8 @@ def test_visible_is_the_near_side() -> None:
 
 @pytest.mark.parametrize("far", [0.0, 1e6])
 def test_depth_of_a_box_is_exact(far: float) -> None:
-    """Against the slabs of the box in closed form; float32 even a thousand kilometres from the origin."""
+    """Against the slabs of the box in closed form; float32 even a thousand kilometres from the
+    origin."""
     size, middle = np.array([1.0, 0.7, 0.5]), np.array([far, -far, 0.3])
     box = trimesh.creation.box(size)
     K = np.array([[80.0, 0, 30.2], [0, 75.0, 25.9], [0, 0, 1]])
@@ -205,7 +227,9 @@ def test_depth_of_a_box_is_exact(far: float) -> None:
     assert found.shape == (48, 64)
     assert 300 < (found > 0).sum() < 2000
     assert np.array_equal((found > 0)[~grazing], (near < away)[~grazing])
-    assert np.allclose(found[(near < away) & (found > 0)], near[(near < away) & (found > 0)], rtol=2e-6, atol=0)
+    assert np.allclose(
+        found[(near < away) & (found > 0)], near[(near < away) & (found > 0)], rtol=2e-6, atol=0
+    )
 
 
 def test_depth_of_an_ellipsoid_agrees_with_ray_casting() -> None:
@@ -214,14 +238,17 @@ def test_depth_of_an_ellipsoid_agrees_with_ray_casting() -> None:
     found = mesh_depth(Mesh(rock.vertices, rock.faces, np.ones(len(rock.faces), bool)))(camera)
     lifted = camera.world_to_camera.copy()
     lifted[:3, 3] -= lifted[:3, :3] @ (10 * Z)  # rock and camera, off the ground
-    true, mask, _ = synthetic.cast(Camera(camera.K, 64, 48, lifted), [(synthetic.CENTRE + 10 * Z, synthetic.AXES)])
+    true, mask, _ = synthetic.cast(
+        Camera(camera.K, 64, 48, lifted), [(synthetic.CENTRE + 10 * Z, synthetic.AXES)]
+    )
     both = mask & (found > 0)
     assert (mask ^ (found > 0)).sum() < 5
     assert np.quantile(np.abs(found - true)[both], 0.95) < 1e-3  # facets in place of the ellipsoid
 
 
 def test_depth_of_a_mesh_that_comes_within_a_micrometre_of_the_camera_plane() -> None:
-    """The sheet x = z - 0.5 of the camera's frame, from z = 1e-6 to 4; a splat of its nearest point would fill any image."""
+    """The sheet x = z - 0.5 of the camera's frame, from z = 1e-6 to 4; a splat of its nearest point
+    would fill any image."""
     camera = Camera(np.array([[800.0, 0, 320], [0, 800.0, 240], [0, 0, 1]]), 640, 480, np.eye(4))
     corners = np.array([[z - 0.5, y, z] for z in (1e-6, 4.0) for y in (-9.0, 9.0)])
     found = mesh_depth(Mesh(corners, np.array([[0, 1, 2], [2, 1, 3]]), np.ones(2, bool)))(camera)
@@ -242,12 +269,15 @@ def test_prior_is_near_the_truth(built) -> None:
     assert truth["visible_within_2_spacing"] == 1
     assert truth["visible_share"] > 0.98
     assert trimesh.Trimesh(prior.mesh.vertices, prior.mesh.faces).is_watertight
-    # All but the flat base is seen, and no less of the ellipsoid is sampled than stands above the ground.
+    # All but the flat base is seen, and no less of the ellipsoid is sampled than stands above the
+    # ground.
     height = rock.plane.height(prior.mesh.vertices[prior.mesh.faces[~prior.mesh.seen]].mean(1))
     assert np.abs(height).max() < 1e-6
     analytic = (prior.points - synthetic.CENTRE) / synthetic.AXES**2
     analytic /= np.linalg.norm(analytic, axis=1, keepdims=True)
-    assert np.quantile(np.einsum("nk,nk->n", analytic, prior.normals), 0.01) > np.cos(np.radians(10))
+    assert np.quantile(np.einsum("nk,nk->n", analytic, prior.normals), 0.01) > np.cos(
+        np.radians(10)
+    )
 
 
 def test_error_to_truth_sees_a_wrong_prior(built, dataset: Dataset) -> None:
@@ -255,19 +285,31 @@ def test_error_to_truth_sees_a_wrong_prior(built, dataset: Dataset) -> None:
 
     prior, rock = built
     moved = Mesh(prior.mesh.vertices + 0.05 * Z, prior.mesh.faces, prior.mesh.seen)
-    error = error_to_truth(prior.points + 0.05 * Z, prior.spacing, moved, dataset.root / "rock.glb", dataset.frames, rock, 0)
+    error = error_to_truth(
+        prior.points + 0.05 * Z,
+        prior.spacing,
+        moved,
+        dataset.root / "rock.glb",
+        dataset.frames,
+        rock,
+        0,
+    )
     assert 0.02 < error["accuracy"] < 0.05
     assert error["hausdorff"] == pytest.approx(0.05, abs=0.02)
 
 
-def test_error_to_truth_of_a_dataset_of_an_older_mgs(built, dataset: Dataset, tmp_path: Path) -> None:
+def test_error_to_truth_of_a_dataset_of_an_older_mgs(
+    built, dataset: Dataset, tmp_path: Path
+) -> None:
     """Its rock.glb is +Z up and without the mark of today's."""
     from mgs.prior.truth import error_to_truth
 
     prior, rock = built
     synthetic.rock_mesh().export(tmp_path / "rock.glb")
     old, new = (
-        error_to_truth(prior.points, prior.spacing, prior.mesh, root / "rock.glb", dataset.frames, rock, 0)
+        error_to_truth(
+            prior.points, prior.spacing, prior.mesh, root / "rock.glb", dataset.frames, rock, 0
+        )
         for root in (tmp_path, dataset.root)
     )
     assert old == new
@@ -286,11 +328,18 @@ def test_prior_round_trip_and_determinism(built, dataset: Dataset, tmp_path: Pat
     assert trimesh.load(tmp_path / "prior/mesh.ply").is_watertight
 
 
-def test_command_writes_everything(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_writes_everything(
+    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as exit_:
         main(["prior", str(dataset.root), "--out", str(tmp_path / "p"), "--gaussians", "500"])
     assert exit_.value.code == 0
-    assert {path.name for path in (tmp_path / "p").iterdir()} == {"mesh.ply", "points.ply", "prior.json", "prior.png"}
+    assert {path.name for path in (tmp_path / "p").iterdir()} == {
+        "mesh.ply",
+        "points.ply",
+        "prior.json",
+        "prior.png",
+    }
     numbers = json.loads((tmp_path / "p/prior.json").read_text())
     assert (numbers["n"], numbers["backed"]) == (333, 167)
     assert 0.8 < numbers["seen_by_seeds"] < 1
@@ -365,7 +414,11 @@ def _plain(root: Path) -> Path:
     [
         (_flat, [], "no rock in the cloud"),
         (_twins, [], "equally large and equally near"),
-        (_no_depth, [], "has no depth images and no points (sparse.ply) and no masks; import data with depth, or"),
+        (
+            _no_depth,
+            [],
+            "has no depth images and no points (sparse.ply) and no masks; import data with depth, or",
+        ),
         (_no_return, [], "no depth image has a return"),
         (_truncated_depth, [], "kf_0003.exr: not a readable EXR"),
         (_small_depth, [], "is 10x10"),
@@ -400,7 +453,8 @@ def test_bad_input_is_one_line_and_leaves_nothing(
 
 
 def test_one_frame_with_depth_gives_what_it_saw(tmp_path: Path) -> None:
-    """Its cloud is open on the far side: Poisson closes it, and only what the frame saw is sampled."""
+    """Its cloud is open on the far side: Poisson closes it, and only what the frame saw is
+    sampled."""
     dataset = load_dataset(_one_frame(tmp_path / "data"))
     prior, _ = build_prior(dataset, PriorSettings(gaussians=200, backing=0))
     assert trimesh.Trimesh(prior.mesh.vertices, prior.mesh.faces).is_watertight
@@ -452,7 +506,9 @@ def test_a_dataset_is_loaded_before_anything_is_written(tmp_path: Path) -> None:
 
 def test_error_grows_with_noise_holes_and_a_coarse_poisson(built, dataset: Dataset) -> None:
     def error(**options) -> dict[str, float]:
-        return build_prior(dataset, PriorSettings(gaussians=1500, backing=0, **options))[0].numbers["truth"]
+        return build_prior(dataset, PriorSettings(gaussians=1500, backing=0, **options))[0].numbers[
+            "truth"
+        ]
 
     exact = built[0].numbers["truth"]
     assert exact["chamfer"] < error(noise=0.01)["chamfer"] < error(noise=0.04)["chamfer"]

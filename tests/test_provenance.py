@@ -27,7 +27,9 @@ def test_the_command_that_is_recorded_is_the_one_that_was_typed(monkeypatch, typ
 def test_a_checkout_tells_its_commit(monkeypatch, tmp_path):
     def git(*words):
         who = ["-c", "user.name=nobody", "-c", "user.email=nobody@example.org"]
-        done = subprocess.run(["git", "-C", tmp_path, *who, *words], check=True, capture_output=True, text=True)
+        done = subprocess.run(
+            ["git", "-C", tmp_path, *who, *words], check=True, capture_output=True, text=True
+        )
         return done.stdout.strip()
 
     def told():

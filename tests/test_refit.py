@@ -1,4 +1,5 @@
-"""A model with no more parameters than its images pay for: the evidence, the choice of a degree, and a run fitted anew."""
+"""A model with no more parameters than its images pay for: the evidence, the choice of a degree,
+and a run fitted anew."""
 
 import dataclasses
 
@@ -10,8 +11,15 @@ from hypothesis import strategies as st
 from plyfile import PlyData
 from scipy.stats import multivariate_normal
 
-from mgs.active import evidence
-from mgs.active.evidence import (
+from mgs.bench.core import surface_camera, surface_gaussians
+from mgs.camera import Camera, look_at
+from mgs.cli.app import main
+from mgs.errors import InputError
+from mgs.fit.fitting import fit
+from mgs.fit.settings import TrainSettings
+from mgs.gaussians import LEARNED
+from mgs.report import evidence
+from mgs.report.evidence import (
     BLOCKS,
     DIRECTIONAL,
     Images,
@@ -23,16 +31,10 @@ from mgs.active.evidence import (
     regularisation,
     worth,
 )  # fmt: skip
-from mgs.active.fitting import fit
-from mgs.active.nbv import run_nbv
-from mgs.active.run_folder import load_run
-from mgs.active.settings import NbvSettings, TrainSettings
-from mgs.bench.core import surface_camera, surface_gaussians
-from mgs.camera import Camera, look_at
-from mgs.cli.app import main
-from mgs.errors import InputError
-from mgs.gaussians import LEARNED
 from mgs.report.refitting import REFITTED, refit_run
+from mgs.run.folder import load_run
+from mgs.run.nbv import run_nbv
+from mgs.run.settings import NbvSettings
 from mgs.splat import render
 from mgs.splat_ply import read_ply, write_ply
 
@@ -69,8 +71,11 @@ def settings(tmp_path, **train):
 
 
 @given(st.integers(1, 6), st.floats(0.01, 3), st.floats(0.05, 4), st.integers(0, 10**6))
-def test_the_gain_is_the_logarithm_of_the_ratio_of_two_marginal_likelihoods(pixels, sigma, tau, seed):
-    """In a linear model with one parameter it is exact: pixels = slope * parameter + noise, against noise alone."""
+def test_the_gain_is_the_logarithm_of_the_ratio_of_two_marginal_likelihoods(
+    pixels, sigma, tau, seed
+):
+    """In a linear model with one parameter it is exact: pixels = slope * parameter + noise, against
+    noise alone."""
     rng = np.random.default_rng(seed)
     slope = rng.normal(size=pixels)
     seen = slope * rng.normal(0, tau) + rng.normal(0, sigma, pixels)
@@ -78,9 +83,18 @@ def test_the_gain_is_the_logarithm_of_the_ratio_of_two_marginal_likelihoods(pixe
     precision = slope @ slope + lam
     away = (slope @ seen) / precision  # the most probable parameter
     noise = sigma**2 * np.eye(pixels)
-    with_it = multivariate_normal(np.zeros(pixels), noise + tau**2 * np.outer(slope, slope)).logpdf(seen)
+    with_it = multivariate_normal(np.zeros(pixels), noise + tau**2 * np.outer(slope, slope)).logpdf(
+        seen
+    )
     without = multivariate_normal(np.zeros(pixels), noise).logpdf(seen)
-    found = worth(np.array([[away]]), np.array([[precision]]), np.array([lam]), sigma, {"one": slice(0, 1)}, 1.0)
+    found = worth(
+        np.array([[away]]),
+        np.array([[precision]]),
+        np.array([lam]),
+        sigma,
+        {"one": slice(0, 1)},
+        1.0,
+    )
     assert found.gain["one"][0] == pytest.approx(with_it - without, rel=1e-6, abs=1e-6)
     at_start, at_end = seen @ seen / 2, np.square(seen - slope * away).sum() / 2 + lam * away**2 / 2
     assert found.rise["one"][0] == pytest.approx(at_start - at_end, rel=1e-6, abs=1e-9)
@@ -99,8 +113,13 @@ def test_what_pays_least_is_left_out_as_long_as_it_is_allowed(n, loss, seed):
     allowed = 10.0 * (10 ** (loss / 10) - 1)
     assert spent <= allowed + 1e-9
     per_number = {kind: gain[kind] / size for kind, size in sizes.items()}
-    most = max((per_number[kind][left_out[kind]].max() for kind in sizes if left_out[kind].any()), default=-np.inf)
-    others = [(per_number[kind][i], rise[kind][i]) for kind in sizes for i in np.flatnonzero(kept[kind])]
+    most = max(
+        (per_number[kind][left_out[kind]].max() for kind in sizes if left_out[kind].any()),
+        default=-np.inf,
+    )
+    others = [
+        (per_number[kind][i], rise[kind][i]) for kind in sizes for i in np.flatnonzero(kept[kind])
+    ]
     assert all(each >= most for each, _ in others)
     if others:
         assert spent + min(others)[1] > allowed - 1e-9
@@ -115,21 +134,28 @@ def test_only_those_gaussians_learn_a_kind_that_are_asked_to(optimiser):
     targets = [np.full((32, 40, 3), 0.3, np.float32)] * 3
     train = TrainSettings(passes=3, optimiser=optimiser)
     some = np.arange(len(start)) % 3 == 0
-    found = fit(start, cameras, targets, train, learns={"scale": some[:, None], "opacity": some}).gaussians
+    found = fit(
+        start, cameras, targets, train, learns={"scale": some[:, None], "opacity": some}
+    ).gaussians
     whole = fit(start, cameras, targets, train).gaussians
     assert np.array_equal(found.log_scales[~some], start.log_scales[~some])
     assert np.array_equal(found.logit_opacities[~some], start.logit_opacities[~some])
     moved = (whole.log_scales != start.log_scales).any(axis=1)
     assert moved.sum() > 100
     assert np.array_equal((found.log_scales != start.log_scales).any(axis=1), moved & some)
-    everyone = {"scale": np.ones((len(start), 1), bool), "colour": np.ones((len(start), 1, 1), bool)}
+    everyone = {
+        "scale": np.ones((len(start), 1), bool),
+        "colour": np.ones((len(start), 1, 1), bool),
+    }
     assert fit(start, cameras, targets, train, learns=everyone).gaussians == whole
 
 
 def test_scales_are_learned_where_they_are_wrong(tmp_path):
     truth = model()
     wrong = np.arange(len(truth)) % 10 == 0
-    start = dataclasses.replace(truth, log_scales=truth.log_scales + 0.3 * wrong[:, None].astype(np.float32))
+    start = dataclasses.replace(
+        truth, log_scales=truth.log_scales + 0.3 * wrong[:, None].astype(np.float32)
+    )
     told = []
     found = lean_fit(images_of(truth, start), settings(tmp_path), sh="0", say=told.append)
     scale, colour = found.learned["scale"], found.learned["colour"]
@@ -140,7 +166,9 @@ def test_scales_are_learned_where_they_are_wrong(tmp_path):
         held = ~found.learned[kind]
         assert np.array_equal(getattr(found.gaussians, name)[held], getattr(start, name)[held])
     sizes = {"colour": 3, "scale": 3, "rotation": 4, "opacity": 1}
-    assert found.parameters == sum(int(found.learned[kind].sum()) * size for kind, size in sizes.items())
+    assert found.parameters == sum(
+        int(found.learned[kind].sum()) * size for kind, size in sizes.items()
+    )
     assert told == ["fitting all parameters", "fitting what the images pay for"]
     everything = lean_fit(images_of(truth, start), settings(tmp_path), learn="all", sh="0")
     assert found.parameters < everything.parameters == 11 * colour.sum()
@@ -162,7 +190,9 @@ def test_colours_have_a_degree_where_the_truth_has_one(tmp_path, shine, degree):
     start = model()
     truth = start.with_degree(1)  # with colours of its own
     start.sh *= 0.8  # so that there is something to learn
-    truth.sh[:, 1:] = shine * np.random.default_rng(1).normal(size=(1, 3, 1))  # all of them shine in the same direction
+    truth.sh[:, 1:] = shine * np.random.default_rng(1).normal(
+        size=(1, 3, 1)
+    )  # all of them shine in the same direction
     found = lean_fit(images_of(truth, start), settings(tmp_path), learn="all")
     assert found.gaussians.sh_degree == degree
     assert found.left_out.pays == bool(degree)
@@ -188,8 +218,14 @@ def test_each_view_is_left_out_once_with_its_neighbours(tmp_path, monkeypatch):
     start = model(60)
     images, fitted, judged = images_of(start, start), [], []
     images = dataclasses.replace(images, order=[3, 1, 0, 2, 5, 4, 7, 6])
-    monkeypatch.setattr(evidence, "fitted", lambda images, views, *_: fitted.append(list(views)) or start)
-    monkeypatch.setattr(evidence, "_squared_error", lambda model, camera, target, cache: judged.append(camera) or 1.0)
+    monkeypatch.setattr(
+        evidence, "fitted", lambda images, views, *_: fitted.append(list(views)) or start
+    )
+    monkeypatch.setattr(
+        evidence,
+        "_squared_error",
+        lambda model, camera, target, cache: judged.append(camera) or 1.0,
+    )
     evidence.directional_gain(images, settings(tmp_path), None)
     left = [sorted(set(range(VIEWS)) - set(views)) for views in fitted[::2]]
     assert left == [[1, 3], [0, 2], [4, 5], [6, 7]]
@@ -227,15 +263,23 @@ def test_a_run_is_refitted_beside_its_model(run, capsys):
     refitted = after.pop(REFITTED)
     assert after == before
     vertices = PlyData.read(str(run / REFITTED))["vertex"].data
-    marks = {name: vertices[name].astype(bool) for name in vertices.dtype.names if name.startswith("learned_")}
+    marks = {
+        name: vertices[name].astype(bool)
+        for name in vertices.dtype.names
+        if name.startswith("learned_")
+    }
     assert {"learned_colour", "learned_scale", "learned_rotation", "learned_opacity"} <= set(marks)
     columns = {"colour": 3, "directional": 9, "scale": 3, "rotation": 4, "opacity": 1}
-    parameters = sum(int(mask.sum()) * columns[name.removeprefix("learned_")] for name, mask in marks.items())
+    parameters = sum(
+        int(mask.sum()) * columns[name.removeprefix("learned_")] for name, mask in marks.items()
+    )
     assert f"{parameters:,} parameters are learned" in said
     assert 1200 <= parameters < 4400
     model, whole = read_ply(run / REFITTED), load_run(run)[0]
     assert np.array_equal(model.means, whole.means)
-    assert len(np.unique(model.logit_opacities[~marks["learned_opacity"]])) <= 2  # the prior's, on the surface and behind it
+    assert (
+        len(np.unique(model.logit_opacities[~marks["learned_opacity"]])) <= 2
+    )  # the prior's, on the surface and behind it
     assert "PSNR on the test views" in said
     found = refit_run(run)
     assert (run / REFITTED).read_bytes() == refitted
@@ -248,10 +292,10 @@ def test_a_run_is_refitted_beside_its_model(run, capsys):
 
 
 def test_the_images_of_the_last_fit_are_those_of_the_run(run):
-    from mgs.active.convergence import remaining_decrease
-    from mgs.active.evidence import last_images
-    from mgs.active.run_folder import read_settings
     from mgs.prior.build import load_prior
+    from mgs.report.convergence import remaining_decrease
+    from mgs.report.evidence import last_images
+    from mgs.run.folder import read_settings
 
     whole, dataset, taken, _ = load_run(run)
     by_name, given = {frame.name: frame for frame in dataset.frames}, read_settings(run)
@@ -268,7 +312,15 @@ def test_the_images_of_the_last_fit_are_those_of_the_run(run):
 @pytest.mark.parametrize("means", ["normal", "free"])
 def test_a_run_that_learns_means_is_refitted_too(run, tmp_path, means):
     data = run.parent / "data"
-    run_nbv(data, tmp_path / "run", gaussians=150, budget=1, policy="uniform", train={"means": means}, exposure=True)
+    run_nbv(
+        data,
+        tmp_path / "run",
+        gaussians=150,
+        budget=1,
+        policy="uniform",
+        train={"means": means},
+        exposure=True,
+    )
     found = refit_run(tmp_path / "run", sh="0")
     assert found.before == 150 * {"normal": 12, "free": 14}[means]
     vertices = PlyData.read(str(tmp_path / "run" / REFITTED))["vertex"].data
@@ -298,7 +350,11 @@ def test_a_prior_that_is_gone_is_one_line(run, tmp_path):
     import shutil
 
     shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns(REFITTED))
-    config = (tmp_path / "run/config.json").read_text().replace(str(run / "prior"), str(tmp_path / "nowhere"))
+    config = (
+        (tmp_path / "run/config.json")
+        .read_text()
+        .replace(str(run / "prior"), str(tmp_path / "nowhere"))
+    )
     (tmp_path / "run/config.json").write_text(config)
     with pytest.raises(InputError, match="nowhere"):
         refit_run(tmp_path / "run")

@@ -1,4 +1,5 @@
-"""Figures and tables from run folders: right numbers, right picture sizes, and a clear line where a file is missing."""
+"""Figures and tables from run folders: right numbers, right picture sizes, and a clear line where a
+file is missing."""
 
 import io
 import json
@@ -18,20 +19,20 @@ from rich.console import Console
 from skimage.color import rgb2lab
 
 from mgs import plotting
-from mgs.active import loop
-from mgs.active.policies import policy_names
-from mgs.active.run_folder import load_run
 from mgs.cli import printing
 from mgs.cli.app import main
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import write_json
+from mgs.policy.registry import policy_names
 from mgs.report import figures, tables, writing
 from mgs.report.evaluation import evaluate
 from mgs.report.figures import POLICY_STYLE
 from mgs.report.page_plots import SYMBOLS
 from mgs.report.runs import evaluated_runs, read_run
+from mgs.run import loop
+from mgs.run.folder import load_run
 
 
 def flat(camera, grey):
@@ -68,7 +69,9 @@ def write_runs(root):
             dataset,
             tiny.stations(
                 measure=lambda gaussians, taken: {
-                    f"{views}psnr{mask}": len(taken) * (1 + len(views + mask)) for views in sets for mask in ("", "_mask")
+                    f"{views}psnr{mask}": len(taken) * (1 + len(views + mask))
+                    for views in sets
+                    for mask in ("", "_mask")
                 }
             ),
             tiny.silent,
@@ -100,7 +103,11 @@ def test_run_folder(runs):
 def drawn(monkeypatch):
     """{file name: figure} of every figure that is saved."""
     found, save = {}, plotting.save_figure
-    monkeypatch.setattr(figures, "save_figure", lambda figure, path: (found.update({path.name: figure}), save(figure, path)))
+    monkeypatch.setattr(
+        figures,
+        "save_figure",
+        lambda figure, path: (found.update({path.name: figure}), save(figure, path)),
+    )
     return found
 
 
@@ -126,26 +133,46 @@ def test_report_writes_every_figure(runs, tmp_path, drawn):
             picture.load()
             assert picture.size == tuple(drawn[path.name].canvas.get_width_height())
         assert path.stat().st_size < 400_000
-    assert {path.name for path in (tmp_path / "report").iterdir()} == {path.name for path in written}
+    assert {path.name for path in (tmp_path / "report").iterdir()} == {
+        path.name for path in written
+    }
     assert json.loads((tmp_path / "report/table.json").read_text()) == tables.table_numbers(runs)
 
     read = {run.policy: run for run in map(read_run, runs)}
     steps = {policy: run.steps for policy, run in read.items()}
-    gains = {policy: [(s["step"], s["information_gain"]) for s in lines[1:]] for policy, lines in steps.items()}
+    gains = {
+        policy: [(s["step"], s["information_gain"]) for s in lines[1:]]
+        for policy, lines in steps.items()
+    }
     assert curves(drawn["gain.png"].axes[0]) == gains
-    covered = {policy: [(s["images"], 100 * s["coverage"]) for s in lines] for policy, lines in steps.items()}
+    covered = {
+        policy: [(s["images"], 100 * s["coverage"]) for s in lines]
+        for policy, lines in steps.items()
+    }
     assert curves(drawn["coverage.png"].axes[0]) == covered
     for axis, key in zip(drawn["psnr.png"].axes, ("psnr", "psnr_mask"), strict=True):
-        assert curves(axis) == {policy: [(s["images"], s[key]) for s in lines] for policy, lines in steps.items()}
+        assert curves(axis) == {
+            policy: [(s["images"], s[key]) for s in lines] for policy, lines in steps.items()
+        }
     positions = np.array([camera.position[:2] for camera in tiny.orbit()])
     for axis, run in zip(drawn["orbit.png"].axes, read.values(), strict=False):
         shown = {points.get_label(): points.get_offsets() for points in axis.collections}
-        for label, frames in (("candidate", range(tiny.FRAMES)), ("seed", run.seeds), ("chosen", run.chosen)):
+        for label, frames in (
+            ("candidate", range(tiny.FRAMES)),
+            ("seed", run.seeds),
+            ("chosen", run.chosen),
+        ):
             np.testing.assert_allclose(shown[label], positions[list(frames)], atol=1e-9)
-    shown = {axis.get_title().split("\n")[0]: axis for axis in drawn["comparison.png"].axes if axis.images}
+    shown = {
+        axis.get_title().split("\n")[0]: axis
+        for axis in drawn["comparison.png"].axes
+        if axis.images
+    }
     assert list(shown) == ["truth", "d-optimal", "random", ""]
     for policy, grey in (("d-optimal", 0.3), ("random", 0.2)):
-        np.testing.assert_allclose(shown[policy].images[0].get_array(), srgb_from_linear(np.float64(grey)), atol=1 / 255)
+        np.testing.assert_allclose(
+            shown[policy].images[0].get_array(), srgb_from_linear(np.float64(grey)), atol=1 / 255
+        )
 
 
 def test_figures_are_written_as_asked_for(runs, tmp_path, capsys):
@@ -154,13 +181,21 @@ def test_figures_are_written_as_asked_for(runs, tmp_path, capsys):
     assert stop.value.code == 0
     assert "left out" not in capsys.readouterr().out
     names = {path.name for path in (tmp_path / "report").iterdir()}
-    assert names == {*(f"{name}.pdf" for name in ("orbit", "gain", "coverage", "comparison", "psnr")), "table.md", "table.json"}
+    assert names == {
+        *(f"{name}.pdf" for name in ("orbit", "gain", "coverage", "comparison", "psnr")),
+        "table.md",
+        "table.json",
+    }
     assert (tmp_path / "report/gain.pdf").read_bytes().startswith(b"%PDF")
     figures.gain_figure(tmp_path / "gain.svg", {"random": [0.2, 0.1]})
     assert "<svg" in (tmp_path / "gain.svg").read_text()
-    with pytest.raises(InputError, match=r"gain\.eps: figures are written as png, pdf, svg; choose another ending"):
+    with pytest.raises(
+        InputError, match=r"gain\.eps: figures are written as png, pdf, svg; choose another ending"
+    ):
         figures.gain_figure(tmp_path / "gain.eps", {"random": [0.2, 0.1]})
-    assert "--figures eps: unknown; choose one of png, pdf, svg" in refused(capsys, ["report", *runs, "--figures", "eps"])
+    assert "--figures eps: unknown; choose one of png, pdf, svg" in refused(
+        capsys, ["report", *runs, "--figures", "eps"]
+    )
     page = ["--html", tmp_path / "page.html", "--figures", "pdf"]
     assert "--html alone writes no figures" in refused(capsys, ["report", *runs, *page])
 
@@ -175,7 +210,10 @@ def test_a_figure_that_is_left_out_is_named(runs, tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         main(["report", *map(str, copies), "--out", str(tmp_path / "report")])
     assert stop.value.code == 0
-    assert "PSNR against images is left out: it needs that all runs were made with --evaluate-every" in capsys.readouterr().out
+    assert (
+        "PSNR against images is left out: it needs that all runs were made with --evaluate-every"
+        in capsys.readouterr().out
+    )
     assert not (tmp_path / "report/psnr.png").exists()
 
 
@@ -196,9 +234,18 @@ def test_table(request, sets):
     run = read_run(runs[1])
     positions = [tiny.orbit()[i].position for i in run.seeds + run.chosen]
     path = pytest.approx(sum(np.linalg.norm(b - a) for a, b in pairwise(positions)))
-    known = {"policy": "random", "images": 8, "coverage": 100 * last["coverage"], "path": path, "unit": "m"}
+    known = {
+        "policy": "random",
+        "images": 8,
+        "coverage": 100 * last["coverage"],
+        "path": path,
+        "unit": "m",
+    }
     assert rows[1] == means | known
-    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in tables.markdown_table(rows).splitlines()]
+    lines = [
+        [cell.strip() for cell in line.split("|")[1:-1]]
+        for line in tables.markdown_table(rows).splitlines()
+    ]
     assert len(lines) == 4
     row = dict(zip(lines[0], lines[3], strict=True))
     assert row["policy"] == "random"
@@ -209,7 +256,9 @@ def test_table(request, sets):
     assert len(row) == 10 + 4 * ("test" in sets)
     nobody_knows = tables.markdown_table([row | {"unit": "unit"} for row in rows])
     assert "| path (unit) |" in nobody_knows
-    older = [{key: value for key, value in row.items() if key not in ("path", "unit")} for row in rows]
+    older = [
+        {key: value for key, value in row.items() if key not in ("path", "unit")} for row in rows
+    ]
     assert "path" not in tables.markdown_table(older)
     if "test" in sets:
         assert lines[0][2] == "PSNR, test views (dB)"
@@ -234,22 +283,38 @@ def test_a_report_shows_test_views_where_there_are_some(tested, tmp_path, drawn)
     writing.write_report(tmp_path / "report", tested)
     lines = {run.policy: run.steps for run in map(read_run, tested)}
     axes = drawn["psnr.png"].axes
-    assert [axis.get_ylabel() for axis in axes] == ["PSNR, test views (dB)", "PSNR, test views, rock only (dB)"]
+    assert [axis.get_ylabel() for axis in axes] == [
+        "PSNR, test views (dB)",
+        "PSNR, test views, rock only (dB)",
+    ]
     for axis, key in zip(axes, ("test_psnr", "test_psnr_mask"), strict=True):
-        assert curves(axis) == {policy: [(s["images"], s[key]) for s in steps] for policy, steps in lines.items()}
+        assert curves(axis) == {
+            policy: [(s["images"], s[key]) for s in steps] for policy, steps in lines.items()
+        }
     metrics = json.loads((tested[0] / "metrics.json").read_text())
-    shown = {axis.get_title().split("\n")[0]: axis for axis in drawn["comparison.png"].axes if axis.images}
+    shown = {
+        axis.get_title().split("\n")[0]: axis
+        for axis in drawn["comparison.png"].axes
+        if axis.images
+    }
     assert shown["truth"].get_title() == "truth\nkf_0001"
     assert f"{metrics['test_views'][1]['psnr']:.2f} dB" in shown["d-optimal"].get_title()
     assert "trained" not in shown["d-optimal"].get_title()
 
 
-def test_a_run_that_was_not_measured_on_the_test_views_is_compared_on_the_others(tested, tmp_path, drawn):
+def test_a_run_that_was_not_measured_on_the_test_views_is_compared_on_the_others(
+    tested, tmp_path, drawn
+):
     run = shutil.copytree(tested[1], tmp_path / "random")
     metrics = json.loads((run / "metrics.json").read_text())
-    write_json(run / "metrics.json", {key: value for key, value in metrics.items() if not key.startswith("test")})
+    write_json(
+        run / "metrics.json",
+        {key: value for key, value in metrics.items() if not key.startswith("test")},
+    )
     lines = [json.loads(line) for line in (run / "steps.jsonl").read_text().splitlines()]
-    kept = [{key: value for key, value in line.items() if not key.startswith("test")} for line in lines]
+    kept = [
+        {key: value for key, value in line.items() if not key.startswith("test")} for line in lines
+    ]
     (run / "steps.jsonl").write_text("".join(json.dumps(line) + "\n" for line in kept))
     writing.write_report(tmp_path / "report", [tested[0], run])
     assert drawn["psnr.png"].axes[0].get_ylabel() == "PSNR, all views (dB)"
@@ -260,7 +325,11 @@ def test_a_run_that_was_not_measured_on_the_test_views_is_compared_on_the_others
 
 def test_runs_of_one_policy_are_told_apart_by_their_folders(runs, tmp_path):
     other = shutil.copytree(runs[1], tmp_path / "again")
-    assert list(evaluated_runs([*runs, other])) == ["d-optimal", "random (random)", "random (again)"]
+    assert list(evaluated_runs([*runs, other])) == [
+        "d-optimal",
+        "random (random)",
+        "random (again)",
+    ]
     with pytest.raises(InputError, match="same policy and folder name"):
         evaluated_runs([runs[1], runs[1]])
 
@@ -269,7 +338,9 @@ def test_runs_that_cannot_be_compared(runs, tmp_path):
     other = shutil.copytree(runs[1], tmp_path / "other")
     metrics = json.loads((other / "metrics.json").read_text())
     (other / "metrics.json").write_text(json.dumps(metrics | {"images": 7}))
-    with pytest.raises(InputError, match="not evaluated since its last step; measure it with `mgs eval"):
+    with pytest.raises(
+        InputError, match="not evaluated since its last step; measure it with `mgs eval"
+    ):
         writing.write_report(tmp_path / "report", [runs[0], other])
     (other / "metrics.json").write_text(json.dumps(metrics))
     config = json.loads((other / "config.json").read_text())
@@ -284,9 +355,12 @@ def test_runs_that_cannot_be_compared(runs, tmp_path):
 
 
 def test_pictures_of_an_earlier_model_are_not_shown(runs, tmp_path):
-    """A run that went on was measured without pictures: those that are there are of fewer images than the caption says."""
+    """A run that went on was measured without pictures: those that are there are of fewer images
+    than the caption says."""
     run = shutil.copytree(runs[0], tmp_path / "run")
-    write_json(run / "metrics.json", json.loads((run / "metrics.json").read_text()) | {"pictures": False})
+    write_json(
+        run / "metrics.json", json.loads((run / "metrics.json").read_text()) | {"pictures": False}
+    )
     with pytest.raises(InputError, match="no picture of this model; draw it with `mgs eval"):
         writing.write_report(tmp_path / "report", [run])
 
@@ -300,7 +374,8 @@ def test_missing_and_damaged_files(runs, tmp_path):
     for damaged, cause in {"": "no JSON", "{": "no JSON", "{}\n": "seeds: Field required"}.items():
         (tmp_path / "steps.jsonl").write_text(damaged)
         with pytest.raises(
-            InputError, match=rf"steps\.jsonl: line 1 is damaged \({cause}\); write the file anew with `mgs nbv --r"
+            InputError,
+            match=rf"steps\.jsonl: line 1 is damaged \({cause}\); write the file anew with `mgs nbv --r",
         ):
             read_run(tmp_path)
     (tmp_path / "steps.jsonl").write_text((runs[0] / "steps.jsonl").read_text())
@@ -308,16 +383,25 @@ def test_missing_and_damaged_files(runs, tmp_path):
         tables.table_numbers([tmp_path])
 
 
-DAMAGED = [(key, value) for key in ("coverage", "images", "information_gain", "frame") for value in (None, "a", ...)]
+DAMAGED = [
+    (key, value)
+    for key in ("coverage", "images", "information_gain", "frame")
+    for value in (None, "a", ...)
+]
 
 
-@pytest.mark.parametrize(("key", "value"), [*DAMAGED, ("ended", "gain"), ("ended", {"reason": "tired", "views": 1})])
+@pytest.mark.parametrize(
+    ("key", "value"), [*DAMAGED, ("ended", "gain"), ("ended", {"reason": "tired", "views": 1})]
+)
 def test_a_damaged_line(runs, tmp_path, key, value):
     run = shutil.copytree(runs[0], tmp_path / "run")
     lines = [json.loads(line) for line in (run / "steps.jsonl").read_text().splitlines()]
     lines[2] = {k: v for k, v in (lines[2] | {key: value}).items() if v is not ...}
     (run / "steps.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    with pytest.raises(InputError, match=rf"steps\.jsonl: line 3 is damaged \({key}\b.*: .*anew with `mgs nbv --resume"):
+    with pytest.raises(
+        InputError,
+        match=rf"steps\.jsonl: line 3 is damaged \({key}\b.*: .*anew with `mgs nbv --resume",
+    ):
         writing.write_report(tmp_path / "report", [run])
 
 
@@ -326,7 +410,10 @@ def test_a_damaged_line(runs, tmp_path, key, value):
     [
         (lambda config: config.pop("settings"), "has no settings"),
         (lambda config: config["settings"].pop("policy"), "settings.policy: Field required"),
-        (lambda config: config["settings"].update(budget="many"), "settings.budget: Input should be a valid integer"),
+        (
+            lambda config: config["settings"].update(budget="many"),
+            "settings.budget: Input should be a valid integer",
+        ),
     ],
 )
 def test_a_damaged_config(runs, tmp_path, change, named):
@@ -356,12 +443,17 @@ def test_an_unfinished_run(runs, tmp_path):
         with pytest.raises(InputError, match=re.escape(expected)):
             writing.write_report(tmp_path / "report", [runs[1], run])
     (run / "steps.jsonl").write_text("".join(lines))
-    with pytest.raises(InputError, match=r"run: has all 8 views, but no gaussians\.ply; write it with `mgs nbv --resume"):
+    with pytest.raises(
+        InputError,
+        match=r"run: has all 8 views, but no gaussians\.ply; write it with `mgs nbv --resume",
+    ):
         writing.write_report(tmp_path / "report", [run])
     assert not (tmp_path / "report").exists()
 
 
-@pytest.mark.parametrize("metrics", [{}, [], 1, {"all": {}}, {"images": 8, "all": {}, "held_out": {}, "views": [{}]}])
+@pytest.mark.parametrize(
+    "metrics", [{}, [], 1, {"all": {}}, {"images": 8, "all": {}, "held_out": {}, "views": [{}]}]
+)
 def test_damaged_metrics(runs, tmp_path, metrics):
     run = shutil.copytree(runs[0], tmp_path / "run")
     write_json(run / "metrics.json", metrics)
@@ -398,8 +490,13 @@ def test_comparison_is_cropped_to_the_rock():
     assert plotting.crop(np.zeros((4, 4), bool)) == (slice(None), slice(None))
 
 
-@pytest.mark.parametrize("labels", [["d-optimal"], ["random (a folder of a long name)"], ["random (a)", "random (b)", "mine"]])
-@pytest.mark.parametrize("title", ["kf_0001", "DJI_20231105103211_0004_W_some_flight_over_some_rock_with_a_long_name"])
+@pytest.mark.parametrize(
+    "labels",
+    [["d-optimal"], ["random (a folder of a long name)"], ["random (a)", "random (b)", "mine"]],
+)
+@pytest.mark.parametrize(
+    "title", ["kf_0001", "DJI_20231105103211_0004_W_some_flight_over_some_rock_with_a_long_name"]
+)
 def test_no_word_of_a_comparison_is_cut_off_or_written_over(tmp_path, monkeypatch, labels, title):
     drawn = []
     monkeypatch.setattr(figures, "save_figure", lambda figure, path: drawn.append(figure))
@@ -411,7 +508,9 @@ def test_no_word_of_a_comparison_is_cut_off_or_written_over(tmp_path, monkeypatc
     figure = drawn[0]
     with rc_context(plotting.STYLE):
         FigureCanvasAgg(figure).draw()
-    texts = [text for axis in figure.axes for text in (axis.title, *axis.texts)] + [figure.axes[-1].xaxis.label]
+    texts = [text for axis in figure.axes for text in (axis.title, *axis.texts)] + [
+        figure.axes[-1].xaxis.label
+    ]
     boxes = [text.get_window_extent() for text in texts if text.get_text()]
     assert len(boxes) == 3 + len(labels)
     for box in boxes:
@@ -427,7 +526,9 @@ def test_no_word_of_a_comparison_is_cut_off_or_written_over(tmp_path, monkeypatc
 def test_no_word_of_an_orbit_is_cut_off_or_written_over(tmp_path, monkeypatch, runs, name):
     drawn = []
     monkeypatch.setattr(figures, "save_figure", lambda figure, path: drawn.append(figure))
-    figures.orbit_figure(tmp_path / "a.png", np.eye(3), None, {f"{name} {i}": ([0], [1]) for i in range(runs)})
+    figures.orbit_figure(
+        tmp_path / "a.png", np.eye(3), None, {f"{name} {i}": ([0], [1]) for i in range(runs)}
+    )
     figure, *axes = drawn[0], *drawn[0].axes[:runs]
     with rc_context(plotting.STYLE):
         FigureCanvasAgg(figure).draw()
@@ -449,7 +550,10 @@ def test_a_legend_covers_no_line(tmp_path, monkeypatch, runs):
     curve = ([4, 5, 6], [0.1, 0.2, 0.3])
     figures.gain_figure(tmp_path / "a.png", dict.fromkeys(labels, curve[1]))
     figures.coverage_figure(tmp_path / "a.png", dict.fromkeys(labels, curve))
-    figures.psnr_figure(tmp_path / "a.png", {what: dict.fromkeys(labels, curve) for what in ("test views", "rock only")})
+    figures.psnr_figure(
+        tmp_path / "a.png",
+        {what: dict.fromkeys(labels, curve) for what in ("test views", "rock only")},
+    )
     assert len(drawn) == 3
     for figure in drawn:
         with rc_context(plotting.STYLE):
@@ -466,19 +570,38 @@ def test_a_legend_covers_no_line(tmp_path, monkeypatch, runs):
 
 @pytest.mark.parametrize(
     "labels",
-    [list(POLICY_STYLE), ["mine", "d-optimal", "yours"], ["random (a)", "random (b)"], [f"mine-{i}" for i in range(15)]],
+    [
+        list(POLICY_STYLE),
+        ["mine", "d-optimal", "yours"],
+        ["random (a)", "random (b)"],
+        [f"mine-{i}" for i in range(15)],
+    ],
 )
 def test_every_line_of_a_figure_looks_different(labels):
     styles = figures.line_styles(labels)
     assert [style["label"] for style in styles] == labels
-    assert len({(style["color"], style["marker"], style["linestyle"]) for style in styles}) == len(labels)
+    assert len({(style["color"], style["marker"], style["linestyle"]) for style in styles}) == len(
+        labels
+    )
 
 
 SEEN = {
     "normal": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
-    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
-    "tritanopia": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+    "protanopia": [
+        [0.152286, 1.052583, -0.204868],
+        [0.114503, 0.786281, 0.099216],
+        [-0.003882, -0.048116, 1.051998],
+    ],
+    "deuteranopia": [
+        [0.367322, 0.860646, -0.227968],
+        [0.280085, 0.672501, 0.047413],
+        [-0.011820, 0.042940, 0.968881],
+    ],
+    "tritanopia": [
+        [1.255528, -0.076749, -0.178779],
+        [-0.078411, 0.930809, 0.147602],
+        [0.004733, 0.691367, 0.303900],
+    ],
 }
 """Linear RGB as colour-blind people see it (Machado, Oliveira, Fernandes 2009)."""
 
@@ -488,7 +611,9 @@ def test_every_policy_has_a_colour_and_a_marker_of_its_own(eyes):
     assert set(POLICY_STYLE) >= set(policy_names())
     colours, markers = zip(*POLICY_STYLE.values(), strict=True)
     assert len(set(markers)) == len(markers) == len({SYMBOLS[marker] for marker in markers})
-    linear = linear_from_srgb(np.array([to_rgb(colour) for colour in colours])) @ np.array(SEEN[eyes]).T
+    linear = (
+        linear_from_srgb(np.array([to_rgb(colour) for colour in colours])) @ np.array(SEEN[eyes]).T
+    )
     seen = rgb2lab(srgb_from_linear(np.clip(linear, 0, 1)))
     apart = np.linalg.norm(seen[:, None] - seen[None], axis=2) + 100 * np.eye(len(seen))
     assert apart.min() > 9  # a difference of 2 is just seen where patches touch
@@ -500,14 +625,22 @@ def test_a_policy_keeps_its_style_whatever_it_is_compared_with():
     assert (ours["color"], ours["marker"]) == POLICY_STYLE["random"]
 
 
-@pytest.mark.parametrize("name", ["random (a [second] run in a folder with a long name)", "random" * 20, "d-optimal"])
+@pytest.mark.parametrize(
+    "name", ["random (a [second] run in a folder with a long name)", "random" * 20, "d-optimal"]
+)
 def test_a_long_name_cuts_no_number_and_is_not_cut(name):
     console = Console(width=80, record=True, file=io.StringIO())
-    values = dict(zip(printing.SHOWN[False], (30.09, 0.9426, 29.56, 0.9362, 27.54, 0.7538), strict=True))
+    values = dict(
+        zip(printing.SHOWN[False], (30.09, 0.9426, 29.56, 0.9362, 27.54, 0.7538), strict=True)
+    )
     row = {"images": 12, "coverage": 100.0} | values
     printing.print_table(console, [{"policy": name} | row, {"policy": "random"} | row])
     text = console.export_text()
-    assert all(text.count(tables.table_cell(key, value)) == 2 for key, value in row.items() if key != "images")
+    assert all(
+        text.count(tables.table_cell(key, value)) == 2
+        for key, value in row.items()
+        if key != "images"
+    )
     assert "…" not in text
     assert any(name in line for line in text.splitlines())
     assert max(len(line) for line in text.splitlines() if name not in line) <= 80

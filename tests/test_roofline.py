@@ -1,4 +1,5 @@
-"""`mgs bench roofline`: counts of work in LLVM IR, limits of the machine, and what is made of both."""
+"""`mgs bench roofline`: counts of work in LLVM IR, limits of the machine, and what is made of
+both."""
 
 from __future__ import annotations
 
@@ -104,16 +105,29 @@ define internal fastcc void @scatter_add_4xf32(<8 x ptr> %p, <8 x i1> %m, [4 x <
 
 
 def test_the_work_of_a_kernel_is_counted():
-    """Straight: f1 is loaded, two numbers of the array filled, d4 stored, a number added to in place.
+    """Straight: f1 is loaded, two numbers of the array filled, d4 stored, a number added to in
+    place.
 
-    Loop: a gathered number and a packet of four; four numbers added to; two variables (4 and 8 bytes) read and written; one
-    number of the array read and written; a copy of its 8 bytes a lane; and f1, which was made before, read.
+    Loop: a gathered number and a packet of four; four numbers added to; two variables (4 and 8
+    bytes) read and written; one number of the array read and written; a copy of its 8 bytes a lane;
+    and f1, which was made before, read.
     """
     found = count_work(KERNEL)
     assert (found.width, len(found.loops)) == (8, 1)
     assert found.straight == Work(bytes=4 + 8 + 2 * 4, state_bytes=2 * 4, addresses=2)
-    instructions = 1 + 1 + 1 + 1 + 2 + 2 + 1  # icmp, fma, fdiv, select, fpext and fadd on doubles, add
-    loop = Work(3, 1, 1, 0, instructions, 4 + 16 + 2 * 16, state_bytes=2 * (4 + 8) + 2 * 4 + 2 * 8 + 4, addresses=3)
+    instructions = (
+        1 + 1 + 1 + 1 + 2 + 2 + 1
+    )  # icmp, fma, fdiv, select, fpext and fadd on doubles, add
+    loop = Work(
+        3,
+        1,
+        1,
+        0,
+        instructions,
+        4 + 16 + 2 * 16,
+        state_bytes=2 * (4 + 8) + 2 * 4 + 2 * 8 + 4,
+        addresses=3,
+    )
     assert found.loops[0] == loop
     assert loop * 2 + loop == loop * 3
 
@@ -129,7 +143,9 @@ def test_what_is_no_kernel_is_refused():
 
 def compiled(call):
     """The only kernel with lanes that a call starts."""
-    (kernel,) = [kernel for kernel in run_kernels(call, 1) if kernel.kind == "JIT" and kernel.size > 1]
+    (kernel,) = [
+        kernel for kernel in run_kernels(call, 1) if kernel.kind == "JIT" and kernel.size > 1
+    ]
     return kernel
 
 
@@ -140,7 +156,9 @@ def test_the_reader_understands_what_drjit_writes_today():
     def body(i, values):
         return i + 1, [dr.fma(v, x, 0.5) / v for v in values]
 
-    kernel = compiled(lambda: sum(dr.while_loop((dr.zeros(mi.UInt32, 64), [x] * 5), lambda i, _: i < n, body)[1]))
+    kernel = compiled(
+        lambda: sum(dr.while_loop((dr.zeros(mi.UInt32, 64), [x] * 5), lambda i, _: i < n, body)[1])
+    )
     found = count_work(kernel.ir)
     (loop,) = found.loops
     assert kernel.size == 64
@@ -151,7 +169,8 @@ def test_the_reader_understands_what_drjit_writes_today():
 
 @pytest.mark.parametrize("real", [mi.Float, mi.Float64])
 def test_bits_that_are_always_zero_are_not_counted(real):
-    """LLVM leaves them out. Bits that may be set count: x & 1 is an operation, and to add it another."""
+    """LLVM leaves them out. Bits that may be set count: x & 1 is an operation, and to add it
+    another."""
     x, y = real(dr.arange(mi.Float, 64) + 1), dr.arange(mi.Float, 64) + 2
     dr.eval(x, y)
     integer = mi.UInt32 if real is mi.Float else mi.UInt64
@@ -164,23 +183,31 @@ def test_bits_that_are_always_zero_are_not_counted(real):
         return count_work(compiled(call).ir).straight
 
     def with_last_bit(x, before):
-        return dr.reinterpret_array(real, dr.reinterpret_array(integer, x) | integer(dr.reinterpret_array(mi.UInt32, y) & 1))
+        return dr.reinterpret_array(
+            real, dr.reinterpret_array(integer, x) | integer(dr.reinterpret_array(mi.UInt32, y) & 1)
+        )
 
     plain, changed = straight(lambda x, before: x), straight(with_last_bit)
     assert straight(computed_after) == plain
-    extended = 1 + 2 + 2  # in double: x & 1, its extension, and the addition, where 64 bits count twice
+    extended = (
+        1 + 2 + 2
+    )  # in double: x & 1, its extension, and the addition, where 64 bits count twice
     assert changed.instructions == plain.instructions + (2 if real is mi.Float else extended)
 
 
 def test_work_of_the_kernels_is_what_their_authors_meant():
-    """A pair is read as an index and a splat of 64 bytes, without depth 48; the adjoint writes two packets of sums. Forward
-    draws two pairs at a time. Of each pixel it carries six numbers, without alpha and depth four."""
+    """A pair is read as an index and a splat of 64 bytes, without depth 48; the adjoint writes two
+    packets of sums. Forward draws two pairs at a time. Of each pixel it carries six numbers,
+    without alpha and depth four."""
     gaussians = core.surface_gaussians(500)
     camera = core.surface_camera(gaussians, 184, 92)
     device = as_drjit(gaussians)
     splats = project(device, camera_array(camera))
     lists, packed = ListCache().get(camera, splats)
-    (whole,), (forward,) = (count_work(compiled(lambda w=w: kernels.forward(lists, packed, w)).ir).loops for w in (True, False))
+    (whole,), (forward,) = (
+        count_work(compiled(lambda w=w: kernels.forward(lists, packed, w)).ir).loops
+        for w in (True, False)
+    )
     assert (whole.bytes, forward.bytes) == (2 * (4 + 64), 2 * (4 + 48))
     assert (whole.addresses, forward.addresses) == (2 * (1 + 4), 2 * (1 + 3))
     assert 2 * 6 * 4 * PIXELS <= whole.state_bytes < 2 * 7 * 4 * PIXELS
@@ -188,7 +215,11 @@ def test_work_of_the_kernels_is_what_their_authors_meant():
     assert whole.divisions == forward.divisions == 0
     out = kernels.forward(lists, packed, False)
     dr.eval(out)
-    walk = next(k for k in run_kernels(lambda: kernels.adjoint(lists, packed, out, out, False, 3), 1) if k.ir)
+    walk = next(
+        k
+        for k in run_kernels(lambda: kernels.adjoint(lists, packed, out, out, False, 3), 1)
+        if k.ir
+    )
     adjoint, zeros = count_work(walk.ir).loops
     assert adjoint.bytes == 4 + 48 + 2 * 16
     assert (zeros.bytes, zeros.flops) == (2 * 16, 0)
@@ -215,10 +246,26 @@ LIMITS = {
 
 
 def test_shares_of_the_limits():
-    work = Work(flops=10e9, flops64=5e9, divisions=1e9, divisions64=1e9, instructions=20e9, bytes=8e9, state_bytes=12e9)
+    work = Work(
+        flops=10e9,
+        flops64=5e9,
+        divisions=1e9,
+        divisions64=1e9,
+        instructions=20e9,
+        bytes=8e9,
+        state_bytes=12e9,
+    )
     work = replace(work, addresses=3e8)
     share = limit_shares({"seconds": 2.0, "executed": vars(work)}, LIMITS)
-    expected = {"FMA": 0.1, "division": 0.375, "instructions": 0.2, "L1": 0.05, "L2": 0.04, "L3": 0.1, "memory": 0.4}
+    expected = {
+        "FMA": 0.1,
+        "division": 0.375,
+        "instructions": 0.2,
+        "L1": 0.05,
+        "L2": 0.04,
+        "L3": 0.1,
+        "memory": 0.4,
+    }
     expected["addresses"] = 0.3
     assert share == pytest.approx(expected)
 
@@ -251,7 +298,12 @@ def cache_folder(folder, levels):
 
 
 def test_sizes_of_caches_are_read(tmp_path, monkeypatch):
-    levels = [("1", "Data", "48K"), ("1", "Instruction", "32K"), ("2", "Unified", "2048K"), ("3", "Unified", "32768K")]
+    levels = [
+        ("1", "Data", "48K"),
+        ("1", "Instruction", "32K"),
+        ("2", "Unified", "2048K"),
+        ("3", "Unified", "32768K"),
+    ]
     monkeypatch.setattr(machine, "CACHES", cache_folder(tmp_path, levels))
     assert machine.cache_sizes() == {"L1": 48 << 10, "L2": 2 << 20, "L3": 32 << 20}
 
@@ -265,24 +317,41 @@ def test_a_system_that_does_not_tell_is_refused(tmp_path, monkeypatch, capsys):
 
 
 def test_rates_are_those_of_the_work_that_the_timed_kernels_do(monkeypatch):
-    """With a kernel that takes a second, a rate is the number of operations that are in its code."""
+    """With a kernel that takes a second, a rate is the number of operations that are in its
+    code."""
     calls = []
     monkeypatch.setattr(machine, "kernel_seconds", lambda call: calls.append(call) or 1.0)
     lanes = 1 << 16
-    assert machine.peak_flops() == lanes * 64 * (flops := count_work(compiled(calls.pop()).ir).loops[0]).flops
+    assert (
+        machine.peak_flops()
+        == lanes * 64 * (flops := count_work(compiled(calls.pop()).ir).loops[0]).flops
+    )
     assert flops.flops == 2 * 8 * 16
-    assert machine.peak_flops(mi.Float64) == lanes * 64 * count_work(compiled(calls.pop()).ir).loops[0].flops64
-    assert machine.division_rate(mi.Float) == lanes * 4 * count_work(compiled(calls.pop()).ir).loops[0].divisions
+    assert (
+        machine.peak_flops(mi.Float64)
+        == lanes * 64 * count_work(compiled(calls.pop()).ir).loops[0].flops64
+    )
+    assert (
+        machine.division_rate(mi.Float)
+        == lanes * 4 * count_work(compiled(calls.pop()).ir).loops[0].divisions
+    )
     reads = machine.address_rate(1 << 16)
-    assert reads == (1 << 18) * count_work(compiled(calls.pop()).ir).straight.addresses == 16 * (1 << 18)
+    assert (
+        reads
+        == (1 << 18) * count_work(compiled(calls.pop()).ir).straight.addresses
+        == 16 * (1 << 18)
+    )
     found = machine.local_bandwidth(4096)
     counter = 2 * 4
-    assert found == lanes / 16 * 64 * (count_work(compiled(calls.pop()).ir).loops[0].state_bytes - counter)
+    assert found == lanes / 16 * 64 * (
+        count_work(compiled(calls.pop()).ir).loops[0].state_bytes - counter
+    )
     assert found == lanes / 16 * 64 * (4096 // 64) * 8
 
 
 def test_a_bandwidth_is_bytes_over_seconds(monkeypatch):
-    """Each time the clock is read a second has passed. Two arrays of 4 KB are read, one is written."""
+    """Each time the clock is read a second has passed. Two arrays of 4 KB are read, one is
+    written."""
     monkeypatch.setattr(machine.time, "perf_counter", itertools.count().__next__)
     monkeypatch.setattr(machine, "SECONDS", 1e-4)
     rounds = round(20e9 * 1e-4 / (12 * 1024))
@@ -305,10 +374,28 @@ def result():
 
 def test_every_kernel_has_its_place(result, tmp_path, monkeypatch):
     rows = {row["name"]: row for row in result["kernels"]}
-    assert {"forward: alpha and depth", "lists tested, and packing", "pixels row by row"} <= rows.keys()
+    assert {
+        "forward: alpha and depth",
+        "lists tested, and packing",
+        "pixels row by row",
+    } <= rows.keys()
     assert rows["pixels row by row"]["unit"] == "pixel"
-    steps = ["projection", "packing", "block lists", "sums to gradient", "sums to exact Fisher", "sums to block Fisher"]
-    assert {"forward", "jvp", "adjoint: walk", "adjoint: add up", "block Fisher: add up", *steps} <= rows.keys()
+    steps = [
+        "projection",
+        "packing",
+        "block lists",
+        "sums to gradient",
+        "sums to exact Fisher",
+        "sums to block Fisher",
+    ]
+    assert {
+        "forward",
+        "jvp",
+        "adjoint: walk",
+        "adjoint: add up",
+        "block Fisher: add up",
+        *steps,
+    } <= rows.keys()
     assert any(name.startswith("exact Fisher: walk") for name in rows)
     for row in rows.values():
         assert row["seconds"] > 0
@@ -318,14 +405,21 @@ def test_every_kernel_has_its_place(result, tmp_path, monkeypatch):
     walk = rows["forward"]
     executed = walk["executed"]["flops"] + walk["executed"]["flops64"]
     assert walk["gflops"] == pytest.approx(executed / walk["seconds"] / 1e9)
-    assert walk["intensity"] < walk["array_intensity"] == pytest.approx(executed / walk["executed"]["bytes"])
+    assert (
+        walk["intensity"]
+        < walk["array_intensity"]
+        == pytest.approx(executed / walk["executed"]["bytes"])
+    )
     assert (walk["unit"], rows["projection"]["unit"], rows["adjoint: add up"]["unit"]) == (
         "2 pairs of a block",
         "Gaussian",
         "4 pairs of a splat",
     )
     assert rows["block lists"]["own_seconds"] > 0
-    assert rows["sums to block Fisher"]["each"]["flops64"] > rows["sums to exact Fisher"]["each"]["flops64"]
+    assert (
+        rows["sums to block Fisher"]["each"]["flops64"]
+        > rows["sums to exact Fisher"]["each"]["flops64"]
+    )
 
 
 def test_the_chart_has_the_kernels_and_the_roofs(result, tmp_path, monkeypatch):
@@ -333,8 +427,14 @@ def test_the_chart_has_the_kernels_and_the_roofs(result, tmp_path, monkeypatch):
     monkeypatch.setattr("mgs.bench.chart.save_figure", lambda figure, path: drawn.append(figure))
     roofline_figure(tmp_path / "roof.png", result)
     (axes,) = drawn[0].axes
-    named = {line.get_label(): line.get_xydata()[0] for line in axes.lines if not line.get_label().startswith("_")}
-    expected = {row["name"]: (row["intensity"], row["gflops"]) for row in result["kernels"] if row["gflops"]}
+    named = {
+        line.get_label(): line.get_xydata()[0]
+        for line in axes.lines
+        if not line.get_label().startswith("_")
+    }
+    expected = {
+        row["name"]: (row["intensity"], row["gflops"]) for row in result["kernels"] if row["gflops"]
+    }
     assert named.keys() == expected.keys()
     for name, point in expected.items():
         np.testing.assert_allclose(named[name], point)
@@ -351,9 +451,20 @@ def test_the_chart_has_the_kernels_and_the_roofs(result, tmp_path, monkeypatch):
 
 def test_the_command_prints_writes_and_draws(result, tmp_path, monkeypatch, capsys):
     asked = []
-    monkeypatch.setattr(roofline, "bench_roofline", lambda *arguments: asked.append(arguments[:4]) or result)
+    monkeypatch.setattr(
+        roofline, "bench_roofline", lambda *arguments: asked.append(arguments[:4]) or result
+    )
     json, chart = tmp_path / "roof.json", tmp_path / "roof.png"
-    arguments = ["bench", "roofline", "--gaussians", "1000", "--json", str(json), "--chart", str(chart)]
+    arguments = [
+        "bench",
+        "roofline",
+        "--gaussians",
+        "1000",
+        "--json",
+        str(json),
+        "--chart",
+        str(chart),
+    ]
     monkeypatch.setattr("sys.argv", ["mgs", *arguments])
     with pytest.raises(SystemExit) as stop:
         main()

@@ -1,4 +1,5 @@
-"""Why a run ends: the rules alone, then the loop on stand-ins (tests/tiny.py), then what people are told."""
+"""Why a run ends: the rules alone, then the loop on stand-ins (tests/tiny.py), then what people are
+told."""
 
 from __future__ import annotations
 
@@ -12,15 +13,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from refusals import refused
 
-from mgs.active import criteria, loop, run_folder
-from mgs.active.settings import NbvSettings
-from mgs.active.stopping import run_end, why_ended
 from mgs.cli.app import main
 from mgs.data.dataset import load_dataset
 from mgs.files import write_json
+from mgs.policy import criteria
 from mgs.report.page_facts import read_shown
 from mgs.report.runs import check_finished, read_run
 from mgs.report.tables import markdown_table, table_numbers
+from mgs.run import folder as run_folder
+from mgs.run import loop
+from mgs.run.ending import run_end, why_ended
+from mgs.run.settings import NbvSettings
 
 
 @pytest.fixture(scope="module")
@@ -29,14 +32,18 @@ def loaded(tmp_path_factory):
 
 
 def run(out: Path, dataset, stations=None, **values) -> run_folder.State:
-    return loop.run(out, tiny.start(out, dataset, **values), dataset, stations or tiny.stations(), tiny.silent)
+    return loop.run(
+        out, tiny.start(out, dataset, **values), dataset, stations or tiny.stations(), tiny.silent
+    )
 
 
 def resume(out: Path, dataset, stations=None, **changes) -> run_folder.State:
     """Go on with a run, with some of its settings changed in its config.json."""
     config = json.loads((out / "config.json").read_text())
     write_json(out / "config.json", config | {"settings": config["settings"] | changes})
-    return loop.run(out, run_folder.read_settings(out), dataset, stations or tiny.stations(), tiny.silent)
+    return loop.run(
+        out, run_folder.read_settings(out), dataset, stations or tiny.stations(), tiny.silent
+    )
 
 
 def never(*arguments):
@@ -46,17 +53,28 @@ def never(*arguments):
 NUMBERS = st.floats(1e-3, 1 - 1e-3)
 
 
-@given(views=st.integers(0, 5), uncertainty=NUMBERS, gain=NUMBERS, limits=st.tuples(st.none() | NUMBERS, st.none() | NUMBERS))
+@given(
+    views=st.integers(0, 5),
+    uncertainty=NUMBERS,
+    gain=NUMBERS,
+    limits=st.tuples(st.none() | NUMBERS, st.none() | NUMBERS),
+)
 def test_the_first_rule_that_holds_is_the_reason(views, uncertainty, gain, limits):
-    settings = NbvSettings(dataset=".", prior=".", budget=3, stop_uncertainty=limits[0], stop_gain=limits[1])
+    settings = NbvSettings(
+        dataset=".", prior=".", budget=3, stop_uncertainty=limits[0], stop_gain=limits[1]
+    )
     found = run_end(settings, views, uncertainty, {"name": "kf_0001", "information_gain": gain})
     holds = {
         "budget": views >= 3,
         "uncertainty": limits[0] is not None and uncertainty <= limits[0],
         "gain": limits[1] is not None and gain < limits[1],
     }
-    assert (found and found["reason"]) == next((reason for reason, held in holds.items() if held), None)
-    known = run_end(settings, views, uncertainty, found)  # what was recorded is enough to find the same again
+    assert (found and found["reason"]) == next(
+        (reason for reason, held in holds.items() if held), None
+    )
+    known = run_end(
+        settings, views, uncertainty, found
+    )  # what was recorded is enough to find the same again
     assert known == found
     unknown = run_end(settings, views, uncertainty, None)
     assert unknown == (None if found is None or found["reason"] == "gain" else found)
@@ -87,18 +105,34 @@ def test_a_run_stops_before_it_takes_a_view_that_would_tell_little(loaded, tmp_p
     assert state.taken == whole.taken[:5]
     assert len(fits) == 3, "the seeds and two views"
     next_name = loaded.frames[whole.taken[5]].name
-    ended = {"reason": "gain", "views": 2, "name": next_name, "information_gain": gains[2], "limit": limit}
+    ended = {
+        "reason": "gain",
+        "views": 2,
+        "name": next_name,
+        "information_gain": gains[2],
+        "limit": limit,
+    }
     lines = [json.loads(line) for line in (tmp_path / "run/steps.jsonl").read_text().splitlines()]
     assert ["ended" in line for line in lines] == [False, False, True]
-    assert lines[-1]["ended"] == run_folder.read_checkpoint(tmp_path / "run").steps[-1]["ended"] == ended
+    assert (
+        lines[-1]["ended"]
+        == run_folder.read_checkpoint(tmp_path / "run").steps[-1]["ended"]
+        == ended
+    )
     assert next_name not in state.inputs["files"]
     assert whole.steps[-1]["ended"] == {"reason": "budget", "views": 5}
 
 
 @pytest.mark.parametrize("rule", ["gain", "uncertainty", "budget"])
-def test_resuming_a_run_that_has_ended_does_nothing_until_its_rule_is_changed(loaded, tmp_path, rule):
+def test_resuming_a_run_that_has_ended_does_nothing_until_its_rule_is_changed(
+    loaded, tmp_path, rule
+):
     whole = run(tmp_path / "whole", loaded)
-    key, other = {"gain": ("stop_gain", None), "uncertainty": ("stop_uncertainty", None), "budget": ("budget", 5)}[rule]
+    key, other = {
+        "gain": ("stop_gain", None),
+        "uncertainty": ("stop_uncertainty", None),
+        "budget": ("budget", 5),
+    }[rule]
     numbers = whole.steps[2]["uncertainty"], whole.steps[3]["uncertainty"]
     assert numbers[0] > numbers[1]
     gain = (whole.steps[2]["information_gain"] + whole.steps[3]["information_gain"]) / 2
@@ -119,18 +153,28 @@ def test_resuming_a_run_that_has_ended_does_nothing_until_its_rule_is_changed(lo
 def test_a_run_of_a_version_that_did_not_say_why_it_ended(loaded, tmp_path):
     out = tmp_path / "run"
     state = run(out, loaded, budget=1)
-    steps = [{key: value for key, value in step.items() if key not in ("ended", "uncertainty")} for step in state.steps]
+    steps = [
+        {key: value for key, value in step.items() if key not in ("ended", "uncertainty")}
+        for step in state.steps
+    ]
     run_folder.write_checkpoint(
-        out, run_folder.State(state.gaussians, state.H, state.surface, state.taken, steps, state.inputs)
+        out,
+        run_folder.State(state.gaussians, state.H, state.surface, state.taken, steps, state.inputs),
     )
     check_finished(read_run(out))
-    assert resume(out, loaded, tiny.stations(fit=never, fisher=never)).steps[-1]["ended"] == {"reason": "budget", "views": 1}
+    assert resume(out, loaded, tiny.stations(fit=never, fisher=never)).steps[-1]["ended"] == {
+        "reason": "budget",
+        "views": 1,
+    }
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--alpha-weight", "-1"], "--alpha-weight -1.0: Input should be greater than or equal to 0"),
+        (
+            ["--alpha-weight", "-1"],
+            "--alpha-weight -1.0: Input should be greater than or equal to 0",
+        ),
         (["--stop-gain", "0"], "--stop-gain 0.0: Input should be greater than 0"),
         (["--stop-gain", "nan"], "--stop-gain nan: Input should be"),
         (["--stop-uncertainty", "1"], "--stop-uncertainty 1.0: Input should be less than 1"),
@@ -139,7 +183,9 @@ def test_a_run_of_a_version_that_did_not_say_why_it_ended(loaded, tmp_path):
 )
 def test_bad_limits_are_one_line(dataset, prior, tmp_path, capsys, options, message):
     out = tmp_path / "run"
-    assert message in refused(capsys, ["nbv", dataset, "--prior", prior, "--budget", "1", "--out", out, *options])
+    assert message in refused(
+        capsys, ["nbv", dataset, "--prior", prior, "--budget", "1", "--out", out, *options]
+    )
     assert not out.exists()
 
 
@@ -151,7 +197,9 @@ def mgs(capsys, *arguments) -> str:
     return shown.out
 
 
-def test_one_line_says_why_a_run_ended_when_it_ends_when_it_is_resumed_and_in_the_report(dataset, prior, tmp_path, capsys):
+def test_one_line_says_why_a_run_ended_when_it_ends_when_it_is_resumed_and_in_the_report(
+    dataset, prior, tmp_path, capsys
+):
     start = ["nbv", dataset, "--prior", prior, "--budget", "2", "--passes", "1"]
     shown = mgs(capsys, *start, "--out", tmp_path / "early", "--stop-gain", "1e3")
     ended = json.loads((tmp_path / "early/steps.jsonl").read_text().splitlines()[-1])["ended"]
@@ -160,17 +208,34 @@ def test_one_line_says_why_a_run_ended_when_it_ends_when_it_is_resumed_and_in_th
     assert shown.count(line) == 1
     assert mgs(capsys, "nbv", "--resume", tmp_path / "early").count(line) == 1
     mgs(capsys, *start, "--out", tmp_path / "whole", "--policy", "random")
-    left = mgs(capsys, *start, "--out", tmp_path / "known", "--policy", "uniform", "--stop-uncertainty", "0.99")
-    assert "of the prior's variance is left after 0 chosen views, no more than --stop-uncertainty 0.99" in left
+    left = mgs(
+        capsys,
+        *start,
+        "--out",
+        tmp_path / "known",
+        "--policy",
+        "uniform",
+        "--stop-uncertainty",
+        "0.99",
+    )
+    assert (
+        "of the prior's variance is left after 0 chosen views, no more than --stop-uncertainty 0.99"
+        in left
+    )
     for name in ("early", "whole", "known"):
         mgs(capsys, "eval", tmp_path / name)
     runs = [tmp_path / name for name in ("early", "whole", "known")]
     shown = mgs(capsys, "report", *runs, "--out", tmp_path / "report")
     rows = table_numbers(runs)
     assert f"d-optimal: a path of {rows[0]['path']:.2f} m; {line}\n" in shown
-    assert f"random: a path of {rows[1]['path']:.2f} m; the run has ended: its budget is spent, 2 chosen views\n" in shown
+    assert (
+        f"random: a path of {rows[1]['path']:.2f} m; the run has ended: its budget is spent, 2 chosen views\n"
+        in shown
+    )
     assert [row.get("ended") for row in rows] == ["gain", None, "uncertainty"]
-    table = [[cell.strip() for cell in row.split("|")[1:-1]] for row in markdown_table(rows).splitlines()]
+    table = [
+        [cell.strip() for cell in row.split("|")[1:-1]] for row in markdown_table(rows).splitlines()
+    ]
     assert [row[-1] for row in table] == ["ended by", "---:", "gain", "–", "uncertainty"]
     assert "ended by" not in markdown_table(table_numbers(runs[1:2]))
     shown_run = read_shown("early", read_run(tmp_path / "early"), load_dataset(dataset))

@@ -32,7 +32,8 @@ def test_facts_of_the_processor():
 
 
 def fake(monkeypatch, libraries: dict[str, int | None]) -> None:
-    """Pretend that these libraries are what the system has, in Dr.Jit's order; None: does not load."""
+    """Pretend that these libraries are what the system has, in Dr.Jit's order; None: does not
+    load."""
 
     def load(path: str) -> Libllvm:
         version = libraries.get(path)
@@ -51,7 +52,10 @@ def test_order(monkeypatch):
     fake(monkeypatch, {"old": 14, "broken": None, "good": 19})
     assert runtime.find_libllvm().path == "good"
     fake(monkeypatch, {"old": 15, "older": 14})
-    with pytest.raises(InputError, match=r"old: is version 15, older than 19; install version 19 or newer.*apt-get.*conda"):
+    with pytest.raises(
+        InputError,
+        match=r"old: is version 15, older than 19; install version 19 or newer.*apt-get.*conda",
+    ):
         runtime.find_libllvm()
     fake(monkeypatch, {})
     with pytest.raises(InputError, match="none found; install version 19"):
@@ -61,7 +65,9 @@ def test_order(monkeypatch):
 def test_an_explicit_choice_is_honoured(monkeypatch):
     fake(monkeypatch, {"good": 19, "old": 15})
     monkeypatch.setenv(runtime.LIBRARY_VARIABLE, "old")
-    with pytest.raises(InputError, match="is version 15, older than 19, but DRJIT_LIBLLVM_PATH names it"):
+    with pytest.raises(
+        InputError, match="is version 15, older than 19, but DRJIT_LIBLLVM_PATH names it"
+    ):
         runtime.find_libllvm()
     monkeypatch.setenv(runtime.LIBRARY_VARIABLE, "")
     assert runtime.find_libllvm().path == "good"
@@ -76,14 +82,20 @@ def test_versions_are_compared_as_numbers(tmp_path):
 
 @pytest.mark.parametrize(
     ("library", "message"),
-    [("/nowhere/libLLVM.so", "no such file"), (__file__, "does not load"), ("libm.so.6", "is another library")]
+    [
+        ("/nowhere/libLLVM.so", "no such file"),
+        (__file__, "does not load"),
+        ("libm.so.6", "is another library"),
+    ]
     + [(path, f"is version 1[0-8], older than {MIN_LLVM}") for path in OLD],
 )
 def test_bad_libraries_are_one_line_and_exit_code_2(library, message):
     """In a process of its own: an abort would show as a negative exit code."""
     code = "from mgs.cli.app import main; import sys; sys.argv = ['mgs', 'doctor']; main()"
     environment = {runtime.LIBRARY_VARIABLE: library, "PATH": "/usr/bin:/bin", "COLUMNS": "400"}
-    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
+    result = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60
+    )
     assert result.returncode == 2, result.stderr
     lines = [line for line in result.stdout.splitlines() if line.startswith("wrong:")]
     assert len(lines) == 1
@@ -94,7 +106,9 @@ def test_bad_libraries_are_one_line_and_exit_code_2(library, message):
 def test_start_raises_instead_of_aborting():
     code = "from mgs import runtime\ntry:\n    runtime.start()\nexcept runtime.InputError as error:\n    print(error)"
     environment = {runtime.LIBRARY_VARIABLE: OLD[0] if OLD else "/nowhere.so"}
-    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
+    result = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60
+    )
     assert result.returncode == 0, result.stderr
     assert result.stdout.startswith(f"libLLVM {environment[runtime.LIBRARY_VARIABLE]}: ")
     assert f"{runtime.LIBRARY_VARIABLE} names it" in result.stdout
@@ -106,11 +120,23 @@ def test_start_raises_instead_of_aborting():
         ("runtime.start(); print(mi.variant())", "llvm_ad_rgb"),
         ("mi.set_variant('llvm_ad_rgb'); runtime.start(); print(mi.variant())", "llvm_ad_rgb"),
         ("render(one, camera); print(mi.variant())", "llvm_ad_rgb"),
-        ("mi.set_variant('scalar_rgb')\ntry: runtime.start()\nexcept InputError as e: print(mi.variant(), e)", SCALAR),
-        ("mi.set_variant('scalar_rgb')\ntry: render(one, camera)\nexcept InputError as e: print(mi.variant(), e)", SCALAR),
+        (
+            "mi.set_variant('scalar_rgb')\ntry: runtime.start()\nexcept InputError as e: print(mi.variant(), e)",
+            SCALAR,
+        ),
+        (
+            "mi.set_variant('scalar_rgb')\ntry: render(one, camera)\nexcept InputError as e: print(mi.variant(), e)",
+            SCALAR,
+        ),
         ("mesh_depth(mesh)(camera); print(mi.variant())", "llvm_ad_rgb"),
-        ("mi.set_variant('scalar_rgb')\ntry: mesh_depth(mesh)\nexcept InputError as e: print(mi.variant(), e)", SCALAR),
-        ("mi.set_variant('scalar_rgb')\ntry: fisher(one, camera)\nexcept InputError as e: print(mi.variant(), e)", SCALAR),
+        (
+            "mi.set_variant('scalar_rgb')\ntry: mesh_depth(mesh)\nexcept InputError as e: print(mi.variant(), e)",
+            SCALAR,
+        ),
+        (
+            "mi.set_variant('scalar_rgb')\ntry: fisher(one, camera)\nexcept InputError as e: print(mi.variant(), e)",
+            SCALAR,
+        ),
         (
             "mi.set_variant('llvm_ad_spectral')\ntry: runtime.start()\nexcept InputError as e: print(e)",
             "llvm_ad_spectral is set",
@@ -132,5 +158,7 @@ one = Gaussians(*(np.ones(shape, np.float32) for shape in ((1, 3), (1, 3), (1, 4
 camera = Camera(np.diag([20.0, 20.0, 1.0]), 16, 12, np.eye(4))
 mesh = Mesh(np.eye(3) + [0, 0, 2], np.array([[0, 1, 2]]), np.ones(1, bool))
 """
-    done = subprocess.run([sys.executable, "-c", prepare + program], capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-c", prepare + program], capture_output=True, text=True, timeout=120
+    )
     assert printed in done.stdout, done.stderr

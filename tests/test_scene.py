@@ -23,11 +23,24 @@ K = np.array([[70.0, 0, 30.5], [0, 70.0, 27.25], [0, 0, 1]])
 
 
 def test_known_point_lands_on_its_pixel():
-    """A small bright ball off every axis, an off-centre principal point: the rendered centroid is the projection."""
+    """A small bright ball off every axis, an off-centre principal point: the rendered centroid is
+    the projection."""
     camera = Camera(K, 64, 48, look_at([3.0, -1.0, 1.5], [0.1, 0.2, 0.3]))
     point = np.array([0.25, -0.2, 0.45])
-    ball = {"type": "sphere", "center": point.tolist(), "radius": 0.05, "light": {"type": "area", "radiance": 1.0}}
-    scene = mi.load_dict({"type": "scene", "integrator": {"type": "direct"}, "sensor": sensor_dict(camera), "ball": ball})
+    ball = {
+        "type": "sphere",
+        "center": point.tolist(),
+        "radius": 0.05,
+        "light": {"type": "area", "radiance": 1.0},
+    }
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "direct"},
+            "sensor": sensor_dict(camera),
+            "ball": ball,
+        }
+    )
     image = np.array(mi.render(scene, spp=256)).sum(-1)
     v, u = np.mgrid[:48, :64] + 0.5
     centroid = np.array([(image * u).sum(), (image * v).sum()]) / image.sum()
@@ -35,11 +48,16 @@ def test_known_point_lands_on_its_pixel():
 
 
 def test_colour_and_depth_agree_on_the_silhouette():
-    """Path-traced albedo (Mitsuba's sensor) and the depth rays (NumPy camera) see the same rock after the sensor moved."""
+    """Path-traced albedo (Mitsuba's sensor) and the depth rays (NumPy camera) see the same rock
+    after the sensor moved."""
     rock = trimesh.creation.icosphere(3, 0.7)
     rock.apply_translation([0.1, 0, 0.5])
-    rock.visual = trimesh.visual.ColorVisuals(rock, vertex_colors=np.tile([255, 0, 0, 255], (len(rock.vertices), 1)))
-    cameras = [Camera(K, 64, 48, look_at(eye, [0, 0, 0.6])) for eye in ([3, 0, 1.5], [-1, 2.5, 2.0])]
+    rock.visual = trimesh.visual.ColorVisuals(
+        rock, vertex_colors=np.tile([255, 0, 0, 255], (len(rock.vertices), 1))
+    )
+    cameras = [
+        Camera(K, 64, 48, look_at(eye, [0, 0, 0.6])) for eye in ([3, 0, 1.5], [-1, 2.5, 2.0])
+    ]
     settings = SceneFile(arena=Arena(colour=(0.3, 0.3, 0.3), stones=0))
     scene = Scene(settings, rock, cameras[0], seed=0)
     for index, camera in enumerate(cameras):
@@ -52,7 +70,8 @@ def test_colour_and_depth_agree_on_the_silhouette():
 
 
 def test_texture_lies_on_the_rock_as_in_the_mesh(monkeypatch):
-    """Mitsuba's albedo at each pixel is the colour that the exported mesh has at that point (a flipped v would be noise)."""
+    """Mitsuba's albedo at each pixel is the colour that the exported mesh has at that point (a
+    flipped v would be noise)."""
     monkeypatch.setattr(arena, "ROWS", 60)  # the ground is not looked at
     monkeypatch.setattr(arena, "TEXELS", 64)
     rock = make_rock(Rock(detail=0.04), generator(0, "rock"))
@@ -72,9 +91,13 @@ def ball():
     """A red ball of radius 0.7 around (0.1, 0, 0.5) on grey ground, and a camera."""
     rock = trimesh.creation.icosphere(5, 0.7)
     rock.apply_translation([0.1, 0, 0.5])
-    rock.visual = trimesh.visual.ColorVisuals(rock, vertex_colors=np.tile([255, 0, 0, 255], (len(rock.vertices), 1)))
+    rock.visual = trimesh.visual.ColorVisuals(
+        rock, vertex_colors=np.tile([255, 0, 0, 255], (len(rock.vertices), 1))
+    )
     camera = Camera(K, 64, 48, look_at([3, 0, 1.5], [0, 0, 0.6]))
-    return Scene(SceneFile(arena=Arena(colour=(0.3, 0.3, 0.3), stones=0)), rock, camera, seed=0), camera
+    return Scene(
+        SceneFile(arena=Arena(colour=(0.3, 0.3, 0.3), stones=0)), rock, camera, seed=0
+    ), camera
 
 
 def test_the_image_is_that_of_the_inner_integrator_and_the_rock_a_part_of_it(ball):
@@ -90,7 +113,8 @@ def test_the_image_is_that_of_the_inner_integrator_and_the_rock_a_part_of_it(bal
 
 
 def test_light_of_rock_and_of_all_else_adds_up_to_the_image(ball):
-    """The layer of the ground, lit in the same scene by the same random numbers, is the rest of the image."""
+    """The layer of the ground, lit in the same scene by the same random numbers, is the rest of the
+    image."""
     scene, _ = ball
     image, rock, _ = render_layers(scene.scene, scene.path, 8, seed=1)
     ground = next(shape for shape in scene.scene.shapes() if shape.id() == "ground")
@@ -111,7 +135,14 @@ def test_coverage_is_the_area_that_the_outline_cuts_off(ball):
     centre = np.array([0.1, 0, 0.5]) - camera.position
     for dv in offset:
         for du in offset:
-            local = np.stack([(u + du - K[0, 2]) / K[0, 0], (v + dv - K[1, 2]) / K[1, 1], np.ones_like(u, float)], -1)
+            local = np.stack(
+                [
+                    (u + du - K[0, 2]) / K[0, 0],
+                    (v + dv - K[1, 2]) / K[1, 1],
+                    np.ones_like(u, float),
+                ],
+                -1,
+            )
             rays = local @ camera.world_to_camera[:3, :3]
             along = rays @ centre
             expected += along**2 > (rays**2).sum(-1) * (centre @ centre - 0.7**2)
@@ -123,7 +154,9 @@ def test_coverage_is_the_area_that_the_outline_cuts_off(ball):
     np.testing.assert_array_equal(np.round(alpha * 255), alpha * 255)
     assert (alpha[mask] > 0).all()
     assert (alpha[~mask] < 1).all()
-    np.testing.assert_array_equal(scene.coverage(camera, np.zeros_like(mask), np.zeros(mask.shape, np.float32)), 0)
+    np.testing.assert_array_equal(
+        scene.coverage(camera, np.zeros_like(mask), np.zeros(mask.shape, np.float32)), 0
+    )
     assert (depth[mask] > 0).all()
 
 
@@ -138,31 +171,45 @@ def test_lattice_is_even_and_has_the_centre():
 
 
 def test_a_rock_of_one_colour_keeps_it():
-    """Whatever share of the samples met it, its light is its colour times the coverage; and its continuation is its colour."""
+    """Whatever share of the samples met it, its light is its colour times the coverage; and its
+    continuation is its colour."""
     colour, coverage = np.array([0.1, 0.2, 0.4], np.float32), np.zeros((6, 7), np.float32)
     coverage[1:5, 2:6], coverage[0, 2:6] = 1, 0.25
     share = np.random.default_rng(0).binomial(4, coverage).astype(np.float32) / 4
     assert (share[0, 2:6] == 0).any()
     expected = coverage[..., None] * colour
-    np.testing.assert_allclose(with_coverage(share[..., None] * colour, share, coverage), expected, atol=1e-6)
-    np.testing.assert_allclose(continued(expected, coverage), np.broadcast_to(colour, expected.shape), atol=1e-5)
+    np.testing.assert_allclose(
+        with_coverage(share[..., None] * colour, share, coverage), expected, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        continued(expected, coverage), np.broadcast_to(colour, expected.shape), atol=1e-5
+    )
 
 
 def test_a_specular_rock_shines_where_it_mirrors_the_sun_and_nowhere_else():
-    """The highlight of a ball lies where its normal halves the angle between the sun and the camera."""
+    """The highlight of a ball lies where its normal halves the angle between the sun and the
+    camera."""
     camera = Camera(K, 64, 48, look_at([3, 0, 1.5], [0, 0, 0.6]))
     images = {}
     for specular in (0.0, 0.5):
         rock = trimesh.creation.icosphere(4, 0.7)
         rock.apply_translation([0, 0, 0.7])
         settings = SceneFile(rock=Rock(specular=specular, roughness=0.2), arena=Arena(stones=0))
-        images[specular] = Scene(settings, rock, camera, seed=0).render(camera, spp=16, seed=0, denoise=False)
+        images[specular] = Scene(settings, rock, camera, seed=0).render(
+            camera, spp=16, seed=0, denoise=False
+        )
     seen = images[0.0].mask & images[0.5].mask
     diffuse = images[0.0].rgb[seen].mean(-1)
     gained = images[0.5].rgb[seen].mean(-1) - diffuse
     sky = SceneFile().sky
     elevation, azimuth = np.radians([sky.sun_elevation, sky.sun_azimuth])
-    sun = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    sun = np.array(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ]
+    )
     points = camera.unproject(images[0.0].depth)[seen]
     normal, view = (points - [0, 0, 0.7]) / 0.7, camera.position - points
     half = sun + view / np.linalg.norm(view, axis=1, keepdims=True)
@@ -172,10 +219,13 @@ def test_a_specular_rock_shines_where_it_mirrors_the_sun_and_nowhere_else():
 
 
 def test_the_rock_alone_is_the_image_inside_and_its_own_colour_at_the_rim(ball):
-    """Against many samples: the denoised layer at its rim is far nearer to the truth than image times mask."""
+    """Against many samples: the denoised layer at its rim is far nearer to the truth than image
+    times mask."""
     scene, camera = ball
     rendered = scene.render(camera, 8, 0, denoise=True)
-    truth = np.mean([scene.render(camera, 64, 10 + i, denoise=False).rock for i in range(4)], axis=0)
+    truth = np.mean(
+        [scene.render(camera, 64, 10 + i, denoise=False).rock for i in range(4)], axis=0
+    )
     rgb, alpha = rendered.rock[..., :3], rendered.rock[..., 3]
     rim = (alpha > 0) & (alpha < 1)
     error = np.sqrt(((rgb - truth[..., :3])[rim] ** 2).mean())
@@ -184,7 +234,9 @@ def test_the_rock_alone_is_the_image_inside_and_its_own_colour_at_the_rim(ball):
     assert not rgb[alpha == 0].any()
     np.testing.assert_array_equal(rgb[alpha == 1], rendered.rgb[alpha == 1])
     green = rgb[rim][:, 1].sum() / rgb[rim][:, 0].sum()
-    assert green == pytest.approx(truth[rim][:, 1].sum() / truth[rim][:, 0].sum(), abs=0.02)  # no grey of the ground
+    assert green == pytest.approx(
+        truth[rim][:, 1].sum() / truth[rim][:, 0].sum(), abs=0.02
+    )  # no grey of the ground
 
 
 @pytest.mark.parametrize(

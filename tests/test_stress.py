@@ -1,4 +1,5 @@
-"""`mgs stress`: the rule of the verdicts both ways on made-up numbers, the faults, and a small run of the whole."""
+"""`mgs stress`: the rule of the verdicts both ways on made-up numbers, the faults, and a small run
+of the whole."""
 
 import csv
 import json
@@ -51,7 +52,9 @@ def test_a_verdict_follows_from_the_interval_alone(values, above, below):
 
 def test_the_interval_is_students():
     assert interval([1.0]) is None
-    assert interval([0.0, 2.0]) == pytest.approx((1 - 12.706, 1 + 12.706), abs=1e-3)  # t(0.975, 1) = 12.706, error 1
+    assert interval([0.0, 2.0]) == pytest.approx(
+        (1 - 12.706, 1 + 12.706), abs=1e-3
+    )  # t(0.975, 1) = 12.706, error 1
 
 
 @given(EFFECTS, st.floats(-100, 100))
@@ -96,9 +99,18 @@ def test_agreement_of_rankings():
 
 
 def fit_rows(kind, values):
-    """Rows of the experiment on convergence for two runs with these qualities after 1, 2, 3 ... passes."""
+    """Rows of the experiment on convergence for two runs with these qualities after 1, 2, 3 ...
+    passes."""
     return [
-        {"run": run, "fit": kind, "criterion": "d-optimal", "passes": p, "psnr_mask": v + 0.01 * run, "tau": 1.0, "regret": 0.0}
+        {
+            "run": run,
+            "fit": kind,
+            "criterion": "d-optimal",
+            "passes": p,
+            "psnr_mask": v + 0.01 * run,
+            "tau": 1.0,
+            "regret": 0.0,
+        }
         for run in (0, 1)
         for p, v in enumerate(values, 1)
     ]
@@ -116,7 +128,13 @@ def test_one_lambda_is_judged_by_its_worst_value():
     def rows(worst):
         exponents = range(-10, 3)
         return [
-            {"run": run, "what": "one lambda", "setting": 10.0**e, "regret": worst if e == 2 else 0.0, "tau": 1.0}
+            {
+                "run": run,
+                "what": "one lambda",
+                "setting": 10.0**e,
+                "regret": worst if e == 2 else 0.0,
+                "tau": 1.0,
+            }
             for run in "ab"
             for e in exponents
         ]
@@ -135,15 +153,30 @@ def test_memory_that_grows_is_told_from_memory_that_levels_off():
 
 
 def alarm_rows(sign_of_failed):
-    """Runs of three scenes: one clean, one failed by exposure, one harmless; the sign of the failed one is given."""
+    """Runs of three scenes: one clean, one failed by exposure, one harmless; the sign of the failed
+    one is given."""
     rows = []
     for scene in "abc":
         clean = {"scene": scene, "run": scene, "size": 6, "fault": "none", "failed": False}
         rows.append(clean | {"sign exposure": 0.01, "sign coverage": 0.05})
         rows.append(
-            {"scene": scene, "fault": "exposure", "failed": True, "sign exposure": sign_of_failed, "sign coverage": 0.05}
+            {
+                "scene": scene,
+                "fault": "exposure",
+                "failed": True,
+                "sign exposure": sign_of_failed,
+                "sign coverage": 0.05,
+            }
         )
-        rows.append({"scene": scene, "fault": "exposure", "failed": False, "sign exposure": 0.02, "sign coverage": 0.05})
+        rows.append(
+            {
+                "scene": scene,
+                "fault": "exposure",
+                "failed": False,
+                "sign exposure": 0.02,
+                "sign coverage": 0.05,
+            }
+        )
     return rows
 
 
@@ -157,7 +190,9 @@ def test_detectors_are_judged_both_ways():
     assert alarms.false_alarms(alarm_rows(0.8)) == [0.0] * 3
     noisy = [row | {"sign exposure": 0.9} for row in alarm_rows(0.8)]
     assert alarms.false_alarms(noisy) == [1.0] * 3
-    assert alarms.false_alarms(noisy + noisy) == [1.0] * 3, "a clean run of two experiments counts once"
+    assert alarms.false_alarms(noisy + noisy) == [1.0] * 3, (
+        "a clean run of two experiments counts once"
+    )
     curve = {(row["false alarms"], row["caught"]) for row in alarms.roc_curves(alarm_rows(0.8))}
     assert {(0.0, 1.0), (1.0, 1.0)} <= curve
 
@@ -167,7 +202,9 @@ def test_the_spread_of_models_is_that_of_their_pixels():
     assert spread.spread_of(images) == 0
     images[::2] = 0.2
     assert spread.spread_of(images) == pytest.approx(0.1)
-    assert spread.spread_of(images + np.linspace(0, 1, 100)[None, :, None]) == pytest.approx(0.1), "pixels may differ"
+    assert spread.spread_of(images + np.linspace(0, 1, 100)[None, :, None]) == pytest.approx(0.1), (
+        "pixels may differ"
+    )
 
 
 def test_every_claim_names_what_its_panels_and_bounds_need():
@@ -187,7 +224,9 @@ def root(tmp_path_factory):
     for name in ("ellipsoid-0", "ellipsoid-1"):
         out = cell_folder(folder, f"dataset/{name}")
         dataset = synthetic.write_dataset(out / "dataset", synthetic.orbit_cameras(10, 48, 36))
-        tests = synthetic.write_dataset(out / "dataset/test", synthetic.orbit_cameras(3, 48, 36, altitude=2.0))
+        tests = synthetic.write_dataset(
+            out / "dataset/test", synthetic.orbit_cameras(3, 48, 36, altitude=2.0)
+        )
         write_transforms(out / "dataset/test", tests.frames)
         save_prior(out / "prior", build_prior(dataset, PriorSettings(gaussians=300))[0])
     return folder
@@ -195,7 +234,9 @@ def root(tmp_path_factory):
 
 @pytest.fixture
 def frame(root):
-    return faults.captured(load_dataset(cell_folder(root, "dataset/ellipsoid-0") / "dataset").frames[0])
+    return faults.captured(
+        load_dataset(cell_folder(root, "dataset/ellipsoid-0") / "dataset").frames[0]
+    )
 
 
 @pytest.mark.parametrize("name", faults.IMAGE_FAULTS)
@@ -210,10 +251,16 @@ def test_a_fault_of_images_is_a_pure_function_that_grows_with_its_size(frame, na
             assert getattr(spoiled, field).shape == getattr(frame, field).shape
             assert np.isfinite(getattr(spoiled, field)).all()
         moved = np.abs(spoiled.camera.world_to_camera - frame.camera.world_to_camera).sum()
-        changed = [np.abs(a.astype(float) - b).sum() for a, b in ((spoiled.rgba, frame.rgba), (spoiled.z, frame.z))]
+        changed = [
+            np.abs(a.astype(float) - b).sum()
+            for a, b in ((spoiled.rgba, frame.rgba), (spoiled.z, frame.z))
+        ]
         changes.append(moved + sum(changed))
     assert 0 < changes[0] < changes[1] < changes[2]
-    assert all(np.array_equal(a, b) for a, b in zip(before, (frame.pixels, frame.rgba, frame.z, frame.rock), strict=True))
+    assert all(
+        np.array_equal(a, b)
+        for a, b in zip(before, (frame.pixels, frame.rgba, frame.z, frame.rock), strict=True)
+    )
 
 
 @pytest.mark.parametrize("name", faults.PRIOR_FAULTS)
@@ -259,7 +306,9 @@ def test_an_extreme_case_that_is_not_finite_would_be_found(root, monkeypatch):
     assert numbers._tried((model, lab.cameras[0], None))["finite"] == 1
     monkeypatch.setattr(numbers, "fisher", lambda *_: np.array([np.nan]))
     assert numbers._tried((model, lab.cameras[0], None))["finite"] == 0
-    spoiled = tiny.Gaussians(model.means * np.nan, model.log_scales, model.quats, model.logit_opacities, model.sh)
+    spoiled = tiny.Gaussians(
+        model.means * np.nan, model.log_scales, model.quats, model.logit_opacities, model.sh
+    )
     assert "NaN" in numbers._tried((spoiled, lab.cameras[0], None))["refused"]
 
 
@@ -269,23 +318,42 @@ CALLS = []
 def toy(root, out, scene, lift):
     """A task of one row per run."""
     CALLS.append(scene)
-    return {"rows": [{"run": f"{scene}, {k}", "kind": kind, "x": lift + k / 10} for k in (0, 1) for kind in ("a", "b")]}
+    return {
+        "rows": [
+            {"run": f"{scene}, {k}", "kind": kind, "x": lift + k / 10}
+            for k in (0, 1)
+            for kind in ("a", "b")
+        ]
+    }
 
 
 def test_a_run_writes_its_files_goes_on_and_keeps_earlier_experiments(tmp_path, monkeypatch):
     def experiment(name, lift):
         def cells(preset):
-            return [Cell(f"{name}/{scene}", "test_stress:toy", {"scene": scene, "lift": lift}) for scene in "ab"]
+            return [
+                Cell(f"{name}/{scene}", "test_stress:toy", {"scene": scene, "lift": lift})
+                for scene in "ab"
+            ]
 
         return Experiment("Is it so?", cells, (claim("above"),), (Panel("kind", "x", "kind", "x"),))
 
-    monkeypatch.setattr(registry, "EXPERIMENTS", {"one": experiment("one", 2.0), "two": experiment("two", 0.0)})
+    monkeypatch.setattr(
+        registry, "EXPERIMENTS", {"one": experiment("one", 2.0), "two": experiment("two", 0.0)}
+    )
     CALLS.clear()
     told = []
-    run = lambda names: registry.run_stress(tmp_path, PRESETS["quick"], names, "mgs stress", lambda *a: told.append(a))  # noqa: E731
+
+    def run(names):
+        return registry.run_stress(
+            tmp_path, PRESETS["quick"], names, "mgs stress", lambda *a: told.append(a)
+        )
+
     assert [e["name"] for e in run(["one"])["experiments"]] == ["one"]
     verdicts = run(["two"])
-    assert [(e["name"], e["claims"][0]["verdict"]) for e in verdicts["experiments"]] == [("one", "holds"), ("two", "fails")]
+    assert [(e["name"], e["claims"][0]["verdict"]) for e in verdicts["experiments"]] == [
+        ("one", "holds"),
+        ("two", "fails"),
+    ]
     assert json.loads((tmp_path / "verdicts.json").read_text()) == verdicts
     assert len(list(csv.DictReader((tmp_path / "stability.csv").read_text().splitlines()))) == 16
     assert "| one | it is so | **holds** | 2.05 (" in (tmp_path / "stability.md").read_text()
@@ -306,7 +374,10 @@ def test_cells_of_all_experiments_have_tasks_that_are_there_and_needs_that_are_m
                 assert callable(getattr(import_module(module), function))
                 assert set(cell.needs) <= set(datasets)
                 json.dumps(cell.arguments)
-    assert rock_cell("n", "m:f", PRESETS["quick"], "boulder", 0, x=1).arguments == {"scene": "boulder-0", "x": 1}
+    assert rock_cell("n", "m:f", PRESETS["quick"], "boulder", 0, x=1).arguments == {
+        "scene": "boulder-0",
+        "x": 1,
+    }
 
 
 @pytest.mark.parametrize(

@@ -32,10 +32,14 @@ def test_no_point_is_cut_off_and_a_row_is_aligned(names, bands, tmp_path, monkey
     def saved(figure, path):
         save_figure(figure, path)
         figures.append(figure)
-        fonts.update(axis.xaxis.label.get_fontname() for axis in figure.axes)  # of the style in force where it is saved
+        fonts.update(
+            axis.xaxis.label.get_fontname() for axis in figure.axes
+        )  # of the style in force where it is saved
 
     monkeypatch.setattr(picture, "save_figure", saved)
-    draw_experiment(tmp_path / "it.png", Experiment("?", lambda preset: [], (), PANELS), made_up(names))
+    draw_experiment(
+        tmp_path / "it.png", Experiment("?", lambda preset: [], (), PANELS), made_up(names)
+    )
     (figure,) = figures
     assert (tmp_path / "it.png").stat().st_size > 0
     for axis in figure.axes:
@@ -46,6 +50,8 @@ def test_no_point_is_cut_off_and_a_row_is_aligned(names, bands, tmp_path, monkey
             assert x.max() < box.x1 - radius
             assert y.min() > box.y0 + radius
             assert y.max() < box.y1 - radius
-    heights = {(round(box.y0), round(box.y1)) for box in (axis.get_window_extent() for axis in figure.axes)}
+    heights = {
+        (round(box.y0), round(box.y1)) for box in (axis.get_window_extent() for axis in figure.axes)
+    }
     assert len(heights) == bands
     assert fonts == {"STIXGeneral"}

@@ -1,4 +1,5 @@
-"""The experiments of `mgs stress` on light, material and sensor: a second sun, a specular rock, a noisy survey."""
+"""The experiments of `mgs stress` on light, material and sensor: a second sun, a specular rock, a
+noisy survey."""
 
 import json
 import shutil
@@ -9,12 +10,12 @@ import numpy as np
 import pytest
 import synthetic
 
-from mgs.active.nbv import run_nbv
-from mgs.active.pose_policies import seed_views
 from mgs.data.dataset import load_dataset, write_transforms
 from mgs.images import write_png
+from mgs.policy.poses import seed_views
 from mgs.prior.build import build_prior, save_prior
 from mgs.prior.settings import PriorSettings
+from mgs.run.nbv import run_nbv
 from mgs.study.stress import lab as labs
 from mgs.study.stress import registry, specular, sun, survey
 from mgs.study.stress.faults import captured
@@ -28,12 +29,14 @@ FRAMES = 10
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """A study's folder with a small rock as the cell of its dataset leaves it, and its variants: the same again, `later` half
-    as bright and metered so."""
+    """A study's folder with a small rock as the cell of its dataset leaves it, and its variants:
+    the same again, `later` half as bright and metered so."""
     folder = tmp_path_factory.mktemp("study")
     out = cell_folder(folder, "dataset/rock")
     dataset = synthetic.write_dataset(out / "dataset", synthetic.orbit_cameras(FRAMES, 64, 48))
-    tests = synthetic.write_dataset(out / "dataset/test", synthetic.orbit_cameras(3, 64, 48, altitude=2.0))
+    tests = synthetic.write_dataset(
+        out / "dataset/test", synthetic.orbit_cameras(3, 64, 48, altitude=2.0)
+    )
     write_transforms(out / "dataset/test", tests.frames)
     save_prior(out / "prior", build_prior(dataset, PriorSettings(gaussians=300))[0])
     record = {"exposure": 2.0, "scene": {"sky": {"sun_azimuth": 35.0}}}
@@ -52,7 +55,13 @@ def test_greedy_chooses_as_the_loop_does(root, tmp_path, policy):
     positions = np.array([camera.position for camera in lab.cameras])
     seeds = seed_views(positions, lab.prior.points.mean(0), 3)
     state = run_nbv(
-        cell / "dataset", tmp_path / "run", prior=cell / "prior", policy=policy, seeds=3, budget=3, train={"tolerance": 0.0}
+        cell / "dataset",
+        tmp_path / "run",
+        prior=cell / "prior",
+        policy=policy,
+        seeds=3,
+        budget=3,
+        train={"tolerance": 0.0},
     )
     assert greedy(lab, seeds, range(FRAMES), 3, policy) == state.taken
 
@@ -64,7 +73,9 @@ def test_greedy_refuses_what_needs_a_fit(root):
 
 def test_a_variant_is_the_scene_with_some_keys_changed(tmp_path, monkeypatch):
     made = []
-    monkeypatch.setattr(labs, "made_dataset", lambda out, scene, images, seed, tests: made.append((scene, images)))
+    monkeypatch.setattr(
+        labs, "made_dataset", lambda out, scene, images, seed, tests: made.append((scene, images))
+    )
     monkeypatch.setattr(labs, "made_prior", lambda *_, **settings: None)
     quick = PRESETS["quick"]
     cell = labs.variant_cell(quick, "strata", 3, "matt", {"rock": {"specular": 0.0}}, frames=5)
@@ -83,18 +94,29 @@ def test_the_second_half_of_the_flight_has_the_second_sun_at_the_first_exposure(
     both = sun.two_suns(lab, root, "rock", "rock-later")
     assert both.frames[: FRAMES // 2] == lab.frames[: FRAMES // 2]
     for before, after in zip(lab.frames[FRAMES // 2 :], both.frames[FRAMES // 2 :], strict=True):
-        np.testing.assert_allclose(after.rgb(), before.rgb(), atol=0.02)  # half as bright, at twice the exposure
-        np.testing.assert_allclose(after.target()[0][..., :3], before.target()[0][..., :3], atol=0.02)
+        np.testing.assert_allclose(
+            after.rgb(), before.rgb(), atol=0.02
+        )  # half as bright, at twice the exposure
+        np.testing.assert_allclose(
+            after.target()[0][..., :3], before.target()[0][..., :3], atol=0.02
+        )
         assert after.camera == before.camera
 
 
 def test_gains_take_out_an_exposure_that_differs(root):
     lab = open_lab(root, "rock")
     taken = lab.even(5)
-    darker = [sun.scaled(captured(f), np.full(3, 0.5)) if i == taken[2] else f for i, f in enumerate(lab.frames)]
+    darker = [
+        sun.scaled(captured(f), np.full(3, 0.5)) if i == taken[2] else f
+        for i, f in enumerate(lab.frames)
+    ]
     mended = sun.with_gains(lab.changed(frames=tuple(darker)), taken)
-    one, other = (mended.frames[i].rgb()[mended.frames[i].mask()].mean() for i in (taken[2], taken[0]))
-    same, same_other = (lab.frames[i].rgb()[lab.frames[i].mask()].mean() for i in (taken[2], taken[0]))
+    one, other = (
+        mended.frames[i].rgb()[mended.frames[i].mask()].mean() for i in (taken[2], taken[0])
+    )
+    same, same_other = (
+        lab.frames[i].rgb()[lab.frames[i].mask()].mean() for i in (taken[2], taken[0])
+    )
     assert one / other == pytest.approx(same / same_other, rel=0.1)
     left = next(i for i in range(FRAMES) if i not in taken)
     assert mended.frames[left] is darker[left]
@@ -130,13 +152,19 @@ def test_errors_are_told_by_the_angle_between_sun_and_camera(root):
     model = lab.fit(lab.even(4)).gaussians
     rows = specular.errors_by_angle(lab, model, range(FRAMES), 0.0)
     angles = [row["angle"] for row in rows]
-    assert angles[0] == pytest.approx(0, abs=3)  # the rock's middle is a little off the axis of the orbit
+    assert angles[0] == pytest.approx(
+        0, abs=3
+    )  # the rock's middle is a little off the axis of the orbit
     assert angles[FRAMES // 2] == pytest.approx(180, abs=3)
     assert {row["angle of sun"] % specular.BIN for row in rows} == {0}
     dark = replace(model, sh=model.sh - 10)
-    for row, frame in zip(specular.errors_by_angle(lab, dark, range(FRAMES), 0.0), lab.frames, strict=True):
+    for row, frame in zip(
+        specular.errors_by_angle(lab, dark, range(FRAMES), 0.0), lab.frames, strict=True
+    ):
         known = frame.mask() & (frame.target()[1] > 0)  # not the rim
-        assert row["rms"] == pytest.approx(np.sqrt((frame.rgb()[known] ** 2).mean()), rel=0.05)  # black against it
+        assert row["rms"] == pytest.approx(
+            np.sqrt((frame.rgb()[known] ** 2).mean()), rel=0.05
+        )  # black against it
 
 
 def test_a_specular_rock_is_measured_and_judged(root, monkeypatch, tmp_path):
@@ -147,11 +175,18 @@ def test_a_specular_rock_is_measured_and_judged(root, monkeypatch, tmp_path):
     rows = specular.specular(root, root, "rock", 1)["rows"]
     json.dumps(rows, allow_nan=False)
     fits = {(row["material"], row["views"], row["degree"]) for row in rows if "views" in row}
-    assert fits == {(specular.SHINY, v, d) for v in (4, FRAMES) for d in specular.DEGREES} | {("diffuse", 4, 0)}
+    assert fits == {(specular.SHINY, v, d) for v in (4, FRAMES) for d in specular.DEGREES} | {
+        ("diffuse", 4, 0)
+    }
     draw_experiment(tmp_path / "specular.png", specular.SPECULAR, rows)
-    assert specular.towards_the_sun(rows) == [pytest.approx(0)]  # both materials are the same images here
+    assert specular.towards_the_sun(rows) == [
+        pytest.approx(0)
+    ]  # both materials are the same images here
     shone = [
-        row | {"rms": row["rms"] + (row["material"] == "specular") * row["angle"]} if "rms" in row else row for row in rows
+        row | {"rms": row["rms"] + (row["material"] == "specular") * row["angle"]}
+        if "rms" in row
+        else row
+        for row in rows
     ]
     assert specular.towards_the_sun(shone)[0] > 60
 
@@ -178,7 +213,9 @@ def test_the_order_of_policies_is_compared_with_that_of_exact_data():
     assert survey.order(survey.USUAL)(rows((8, 7, 6, 5))) == [pytest.approx(-1)]
 
 
-def test_a_survey_has_measured_depth_and_estimated_poses_and_is_flown_once(root, tmp_path, monkeypatch):
+def test_a_survey_has_measured_depth_and_estimated_poses_and_is_flown_once(
+    root, tmp_path, monkeypatch
+):
     monkeypatch.setitem(survey.LEVELS, survey.USUAL, (0.1, 1))  # images so small bear no more noise
     lab = open_lab(root, "rock")
     exact, none = survey.surveyed(lab, root, tmp_path, survey.EXACT, 300)
@@ -195,7 +232,8 @@ def test_a_survey_has_measured_depth_and_estimated_poses_and_is_flown_once(root,
 
 
 def test_surveys_of_every_level_are_measured_and_judged(root, tmp_path, monkeypatch):
-    """Made-up qualities: each level costs 3 dB more than the one before, whichever policy chose the views."""
+    """Made-up qualities: each level costs 3 dB more than the one before, whichever policy chose the
+    views."""
     place = list(survey.LEVELS)
     asked = []
 
@@ -204,13 +242,17 @@ def test_surveys_of_every_level_are_measured_and_judged(root, tmp_path, monkeypa
 
     def qualities(level, seeds, count, policies):
         asked.append((level, tuple(policies), tuple(seeds), count))
-        return [{"policy": policy, "psnr": 40 - 3.0 * place.index(level) - k / 8} for k, policy in enumerate(policies)]
+        return [
+            {"policy": policy, "psnr": 40 - 3.0 * place.index(level) - k / 8}
+            for k, policy in enumerate(policies)
+        ]
 
     monkeypatch.setattr(survey, "surveyed", flown)
     monkeypatch.setattr(survey, "by_policy", qualities)
     rows = survey.survey(root, tmp_path, "rock", 2, 300)["rows"]
     assert {level: policies for level, policies, *_ in asked} == {
-        level: labs.POLICIES if level in survey.COMPARED else ("uniform",) for level in survey.LEVELS
+        level: labs.POLICIES if level in survey.COMPARED else ("uniform",)
+        for level in survey.LEVELS
     }
     assert len({seeds for *_, seeds, _ in asked}) == 2
     verdicts = [judged(claim, rows)["verdict"] for claim in survey.SURVEY.claims]

@@ -1,7 +1,9 @@
-"""The package's own imports, read from its sources: no cycle between modules, and rooms that import only from those below.
+"""The package's own imports, read from its sources: no cycle between modules, and rooms that import
+only from those below.
 
-A room is a module or a sub-package directly in mgs/. Every import counts, those inside functions and under TYPE_CHECKING too:
-the first are there to start quickly and the second for annotations, neither to close a circle.
+A room is a module or a sub-package directly in mgs/. Every import counts, those inside functions
+and under TYPE_CHECKING too: the first are there to start quickly and the second for annotations,
+neither to close a circle.
 """
 
 from __future__ import annotations
@@ -17,19 +19,26 @@ PACKAGE = "mgs"
 ROOMS = (
     "errors", "seeds", "runtime", "resources", "provenance", "colour", "rotation", "memory", "camera", "gaussians", "files",
     "images", "splat_ply", "metrics", "plotting",
-    "data", "synth", "survey", "prior", "splat", "active", "report", "view", "bench", "study", "cli", "__main__",
+    "data", "synth", "survey", "prior", "splat", "policy", "fit", "run", "report", "view", "bench", "study", "cli", "__main__",
 )  # fmt: skip
 """All rooms, lowest first: each may import from those before it, and from none after it."""
 
 
 def sources(root: Path, package: str) -> dict[str, Path]:
     """{dotted name: file} of every module of a package that lies in root."""
-    names = {path: path.relative_to(root).with_suffix("").parts for path in (root / package).rglob("*.py")}
-    return {".".join(parts[:-1] if parts[-1] == "__init__" else parts): path for path, parts in names.items()}
+    names = {
+        path: path.relative_to(root).with_suffix("").parts
+        for path in (root / package).rglob("*.py")
+    }
+    return {
+        ".".join(parts[:-1] if parts[-1] == "__init__" else parts): path
+        for path, parts in names.items()
+    }
 
 
 def imported(node: ast.AST, module: str, is_package: bool) -> list[str]:
-    """Dotted names that one statement may load: of `from a import b` both a and a.b, since b may be a module."""
+    """Dotted names that one statement may load: of `from a import b` both a and a.b, since b may be
+    a module."""
     if isinstance(node, ast.Import):
         return [alias.name for alias in node.names]
     if not isinstance(node, ast.ImportFrom):
@@ -43,30 +52,44 @@ def imported(node: ast.AST, module: str, is_package: bool) -> list[str]:
 
 
 def import_graph(root: Path, package: str) -> dict[str, set[str]]:
-    """{module: modules of the same package that it imports}; of names that hold one another, only the innermost module.
+    """{module: modules of the same package that it imports}; of names that hold one another, only
+    the innermost module.
 
-    The root of the package is left out as an import: Python loads it before any of its modules, whatever they import.
+    The root of the package is left out as an import: Python loads it before any of its modules,
+    whatever they import.
     """
     files, graph = sources(root, package), {}
     for module, path in files.items():
         graph[module] = set()
         for node in ast.walk(ast.parse(path.read_text())):
-            found = [name for name in imported(node, module, path.name == "__init__.py") if name in files]
-            inner = {name for name in found if not any(other.startswith(f"{name}.") for other in found)}
+            found = [
+                name for name in imported(node, module, path.name == "__init__.py") if name in files
+            ]
+            inner = {
+                name for name in found if not any(other.startswith(f"{name}.") for other in found)
+            }
             graph[module] |= inner - {package, module}
     return graph
 
 
 def room(module: str) -> str:
-    """What lies directly in the package: `splat` of `mgs.splat.blocks`; empty for the root of the package."""
+    """What lies directly in the package: `splat` of `mgs.splat.blocks`; empty for the root of the
+    package."""
     return module.partition(".")[2].partition(".")[0]
 
 
 def misplaced(graph: dict[str, set[str]], rooms: tuple[str, ...]) -> list[str]:
     """Imports from a room that does not lie below the importing one."""
     height = {name: i for i, name in enumerate(rooms)}
-    pairs = [(module, other) for module, others in graph.items() for other in others if room(module) != room(other)]
-    return sorted(f"{a} imports {b}" for a, b in pairs if height.get(room(a), len(rooms)) < height[room(b)])
+    pairs = [
+        (module, other)
+        for module, others in graph.items()
+        for other in others
+        if room(module) != room(other)
+    ]
+    return sorted(
+        f"{a} imports {b}" for a, b in pairs if height.get(room(a), len(rooms)) < height[room(b)]
+    )
 
 
 def cycle(graph: dict[str, set[str]]) -> list[str]:
@@ -104,7 +127,9 @@ def test_nothing_but_tests_imports_tests(folder):
         for node in ast.walk(ast.parse(path.read_text())):
             if not getattr(node, "level", 0):
                 roots = {name.partition(".")[0] for name in imported(node, "", False)}
-                assert not roots & tests, f"{path} line {node.lineno} imports {sorted(roots & tests)}"
+                assert not roots & tests, (
+                    f"{path} line {node.lineno} imports {sorted(roots & tests)}"
+                )
 
 
 @pytest.mark.parametrize(
@@ -121,8 +146,15 @@ def test_nothing_but_tests_imports_tests(folder):
     ],
 )
 def test_every_kind_of_import_is_seen(tmp_path, statement):
-    """A package of two rooms in which the lower one imports from the upper one, which imports it in turn."""
-    files = {"__init__": "", "low/__init__": "", "low/b": "from p.high.a import name", "high/__init__": "", "high/a": statement}
+    """A package of two rooms in which the lower one imports from the upper one, which imports it in
+    turn."""
+    files = {
+        "__init__": "",
+        "low/__init__": "",
+        "low/b": "from p.high.a import name",
+        "high/__init__": "",
+        "high/a": statement,
+    }
     for name, text in files.items():
         (tmp_path / f"p/{name}.py").parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / f"p/{name}.py").write_text(text)

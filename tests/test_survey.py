@@ -1,4 +1,5 @@
-"""The survey: sensor statistics, odometry, registration, loop closure and pose graph, against known truth."""
+"""The survey: sensor statistics, odometry, registration, loop closure and pose graph, against known
+truth."""
 
 from __future__ import annotations
 
@@ -47,7 +48,8 @@ ROCKS = [
         ((1.0, -0.6, 0.0), (0.25, 0.15, 0.35)),
     ]
 ]
-"""An orbit round one smooth ellipsoid looks the same from everywhere; stones around it pin the registration down."""
+"""An orbit round one smooth ellipsoid looks the same from everywhere; stones around it pin the
+registration down."""
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +64,8 @@ def survey(dataset: Dataset):
 
 
 def _wall(z: float, tilt: float = 0.0) -> tuple[np.ndarray, Camera]:
-    """Depth of a wall through the optical axis at z metres, turned by `tilt` radians, and its camera."""
+    """Depth of a wall through the optical axis at z metres, turned by `tilt` radians, and its
+    camera."""
     camera = Camera(np.array([[600.0, 0, 320], [0, 600.0, 240], [0, 0, 1]]), 640, 480, np.eye(4))
     x = (np.arange(640) + 0.5 - 320) / 600
     return np.broadcast_to(z / (1 - x * np.tan(tilt)), (480, 640)).copy(), camera
@@ -74,7 +77,9 @@ def test_axial_noise_grows_as_published(z: float) -> None:
     measured = noisy_depth(depth, camera, np.random.default_rng(0))
     error = (measured - depth)[measured > 0]
     assert len(error) > 0.99 * (depth.size - 2 * (640 + 480))
-    expected = np.hypot(AXIAL_FLOOR + AXIAL_GROWTH * (z - AXIAL_START) ** 2, QUANTUM * z * z / np.sqrt(12))
+    expected = np.hypot(
+        AXIAL_FLOOR + AXIAL_GROWTH * (z - AXIAL_START) ** 2, QUANTUM * z * z / np.sqrt(12)
+    )
     assert error.std() == pytest.approx(expected, rel=0.15)
     # A coarse step rounds z itself, so the mean may be off by a part of it, never by all.
     assert abs(error.mean()) < 0.5 * QUANTUM * z * z
@@ -97,7 +102,9 @@ def test_quantised_depth_is_on_its_steps() -> None:
     assert np.allclose(np.diff(levels[1:]), QUANTUM * 4, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("degrees", "least", "most"), [(30, 0, 0.01), (75, 0.3, 0.7), (84, 0.85, 1)])
+@pytest.mark.parametrize(
+    ("degrees", "least", "most"), [(30, 0, 0.01), (75, 0.3, 0.7), (84, 0.85, 1)]
+)
 def test_grazing_returns_are_lost(degrees: float, least: float, most: float) -> None:
     depth, camera = _wall(2.0, np.radians(degrees))
     depth = np.where((depth > 0) & (depth < 5), depth, 0)
@@ -144,7 +151,9 @@ def test_odometry_without_drift_is_exact_and_with_it_drifts() -> None:
     exact = drifting_odometry(truth, 0.0, np.random.default_rng(0))
     assert np.allclose(chain(truth[0], exact), truth, atol=1e-12)
     drift = [
-        trajectory_error(chain(truth[0], drifting_odometry(truth, d, np.random.default_rng(0))), truth)["ate_rms"]
+        trajectory_error(
+            chain(truth[0], drifting_odometry(truth, d, np.random.default_rng(0))), truth
+        )["ate_rms"]
         for d in (0.5, 1.0, 2.0)
     ]
     assert 0 < drift[0] < drift[1] < drift[2]
@@ -183,7 +192,11 @@ def _graph(truth: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[Edge]]:
     biased = steps.copy()
     bias = [Rotation.from_rotvec(np.radians(0.2) * pose[2, :3]).as_matrix() for pose in truth[1:]]
     biased[:, :3, :3] = steps[:, :3, :3] @ np.stack(bias)
-    return biased, chain(truth[0], biased), [Edge(k, k + 1, step, 1.0) for k, step in enumerate(biased)]
+    return (
+        biased,
+        chain(truth[0], biased),
+        [Edge(k, k + 1, step, 1.0) for k, step in enumerate(biased)],
+    )
 
 
 def test_a_loop_closure_spreads_the_error() -> None:
@@ -200,11 +213,20 @@ def test_a_loop_closure_spreads_the_error() -> None:
 def test_a_wrong_loop_is_outvoted() -> None:
     truth = _circle()
     steps, registered, edges = _graph(truth)
-    right = [Edge(i, 23 - j, np.linalg.inv(truth[i]) @ truth[23 - j], 1.0) for i in range(2) for j in range(2)]
+    right = [
+        Edge(i, 23 - j, np.linalg.inv(truth[i]) @ truth[23 - j], 1.0)
+        for i in range(2)
+        for j in range(2)
+    ]
     wrong_pose = np.linalg.inv(truth[2]) @ truth[23]
     wrong_pose[:3, 3] += [0.5, 0, 0]
-    optimised = optimise(registered, steps, edges, [*right, Edge(2, 23, wrong_pose, 1.0)], 1.0, 0.03)
-    assert trajectory_error(optimised, truth)["ate_rms"] < trajectory_error(registered, truth)["ate_rms"]
+    optimised = optimise(
+        registered, steps, edges, [*right, Edge(2, 23, wrong_pose, 1.0)], 1.0, 0.03
+    )
+    assert (
+        trajectory_error(optimised, truth)["ate_rms"]
+        < trajectory_error(registered, truth)["ate_rms"]
+    )
 
 
 def test_registration_and_loop_closure_beat_odometry(dataset: Dataset, survey) -> None:
@@ -228,10 +250,14 @@ def test_the_survey_repeats_by_seed(dataset: Dataset, survey) -> None:
 
 
 def test_a_featureless_orbit_falls_back_on_odometry(tmp_path: Path) -> None:
-    """From 45 degrees apart round a smooth ellipsoid registration slides; odometry must not be made worse by it."""
+    """From 45 degrees apart round a smooth ellipsoid registration slides; odometry must not be made
+    worse by it."""
     flat = synthetic.write_dataset(tmp_path)
     survey = fly(flat, SurveySettings(sensor=0.0, drift=1.0))
-    odometry, optimised = (trajectory_error(poses, survey.truth)["ate_rms"] for poses in (survey.odometry, survey.optimised))
+    odometry, optimised = (
+        trajectory_error(poses, survey.truth)["ate_rms"]
+        for poses in (survey.odometry, survey.optimised)
+    )
     assert sum(not edge.registered for edge in survey.edges) > 0
     assert optimised < 1.5 * odometry
 
@@ -243,7 +269,9 @@ def test_exact_poses_keep_the_truth(dataset: Dataset) -> None:
     assert not np.array_equal(survey.depths[0], dataset.frames[0].depth())
 
 
-def test_the_survey_is_a_dataset_and_gives_a_prior(dataset: Dataset, survey, tmp_path: Path) -> None:
+def test_the_survey_is_a_dataset_and_gives_a_prior(
+    dataset: Dataset, survey, tmp_path: Path
+) -> None:
     result = write_survey(tmp_path, dataset, survey)
     assert [frame.name for frame in result.frames] == [frame.name for frame in dataset.frames]
     assert np.allclose(result.frames[5].camera.camera_to_world, survey.optimised[5], atol=1e-9)
@@ -264,28 +292,47 @@ def test_files_of_one_name_in_different_folders_stay_apart(tmp_path: Path) -> No
         frame.mask_path.rename(tmp_path / "data/frames" / frame.name / "mask.png")
     folders = {frame.name: tmp_path / "data/frames" / frame.name for frame in dataset.frames}
     frames = [
-        replace(frame, mask_path=folders[frame.name] / "mask.png", rock_path=folders[frame.name] / "rock.png")
+        replace(
+            frame,
+            mask_path=folders[frame.name] / "mask.png",
+            rock_path=folders[frame.name] / "rock.png",
+        )
         for frame in dataset.frames
     ]
     write_transforms(dataset.root, frames)
     dataset = load_dataset(dataset.root)
-    result = write_survey(tmp_path / "survey", dataset, fly(dataset, SurveySettings(exact_poses=True)))
+    result = write_survey(
+        tmp_path / "survey", dataset, fly(dataset, SurveySettings(exact_poses=True))
+    )
     for surveyed, flown in zip(result.frames, dataset.frames, strict=True):
         assert np.array_equal(surveyed.mask(), flown.mask())
         assert np.array_equal(surveyed.rgb(), flown.rgb())
         assert np.array_equal(surveyed.target()[0], flown.target()[0])
 
 
-def test_command_writes_a_dataset_with_its_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    root = synthetic.write_dataset(tmp_path / "data", synthetic.orbit_cameras(12, 64, 48), ROCKS).root
+def test_command_writes_a_dataset_with_its_figure(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = synthetic.write_dataset(
+        tmp_path / "data", synthetic.orbit_cameras(12, 64, 48), ROCKS
+    ).root
     write_json(root / "config.json", {"scene": {"sensor": {"noise": 5.0, "drift": 0.5}}})
     with pytest.raises(SystemExit) as exit_:
         main(["survey", str(root), "--sensor-noise", "0.2"])
     assert exit_.value.code == 0
     out = root / "survey"
     settings = read_json(out / "survey.json")["settings"]
-    assert (settings["sensor"], settings["drift"]) == (0.2, 0.5)  # an option goes before the scene, the scene before 1
-    assert {path.name for path in out.iterdir()} >= {"transforms.json", "cloud.ply", "survey.json", "survey.png", "depth"}
+    assert (settings["sensor"], settings["drift"]) == (
+        0.2,
+        0.5,
+    )  # an option goes before the scene, the scene before 1
+    assert {path.name for path in out.iterdir()} >= {
+        "transforms.json",
+        "cloud.ply",
+        "survey.json",
+        "survey.png",
+        "depth",
+    }
     assert len(load_dataset(out)) == 12
     assert "after loop closure" in capsys.readouterr().out
 
@@ -341,7 +388,11 @@ def test_bad_input_is_one_line_and_leaves_nothing(
 def test_duplicate_frames_are_no_trouble(tmp_path: Path) -> None:
     """A hovering drone: the same pose twice."""
     dataset = synthetic.write_dataset(tmp_path, synthetic.orbit_cameras(12, 96, 72), ROCKS)
-    twice = (*dataset.frames[:2], replace(dataset.frames[1], name="again", timestamp=0.7), *dataset.frames[2:])
+    twice = (
+        *dataset.frames[:2],
+        replace(dataset.frames[1], name="again", timestamp=0.7),
+        *dataset.frames[2:],
+    )
     survey = fly(Dataset(tmp_path, twice), SurveySettings(sensor=0.0))
     assert np.isfinite(survey.optimised).all()
     assert np.linalg.norm(survey.optimised[1, :3, 3] - survey.optimised[2, :3, 3]) < 0.02

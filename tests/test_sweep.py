@@ -47,7 +47,10 @@ def test_cells_come_after_those_they_need_and_are_done_once(tmp_path):
     assert run_cells(tmp_path, cells, silent) == {"a/1": {"sum": 1}, "b": {"sum": 3}}
     assert CALLS == ["1", "b"]
     told = []
-    assert run_cells(tmp_path, cells, lambda *what: told.append(what)) == {"a/1": {"sum": 1}, "b": {"sum": 3}}
+    assert run_cells(tmp_path, cells, lambda *what: told.append(what)) == {
+        "a/1": {"sum": 1},
+        "b": {"sum": 3},
+    }
     assert CALLS == ["1", "b"]
     assert told == []
 
@@ -74,7 +77,8 @@ def test_the_result_of_another_question_is_refused(tmp_path):
 
 
 def add_slowly(root, out, x, killed=False):
-    """A task that takes part of a second; its process is killed in the middle of the first attempt, if asked for."""
+    """A task that takes part of a second; its process is killed in the middle of the first attempt,
+    if asked for."""
     begun = out / "begun"
     first = not begun.exists()
     begun.touch()
@@ -85,8 +89,13 @@ def add_slowly(root, out, x, killed=False):
 
 
 def write_process(root, out, **arguments):
-    """A task that finds its process, and whether another cell of the study had begun and not ended."""
-    others = [folder for folder in out.parent.iterdir() if folder != out and not (folder / "result.json").exists()]
+    """A task that finds its process, and whether another cell of the study had begun and not
+    ended."""
+    others = [
+        folder
+        for folder in out.parent.iterdir()
+        if folder != out and not (folder / "result.json").exists()
+    ]
     return {"pid": os.getpid(), "beside": [folder.name for folder in others]}
 
 
@@ -100,7 +109,9 @@ def test_two_workers_of_which_one_is_killed_find_what_a_serial_run_finds(tmp_pat
     killed = Cell("killed", "test_sweep:add_slowly", {"x": 7, "killed": True}, ("0",))
     last = Cell("last", "test_sweep:add", {"x": 1, "to": None}, ("killed", "3"))
     told = []
-    parallel = run_cells(tmp_path / "parallel", [*squares, killed, last], lambda *what: told.append(what), workers=2)
+    parallel = run_cells(
+        tmp_path / "parallel", [*squares, killed, last], lambda *what: told.append(what), workers=2
+    )
     (tmp_path / "serial/cells/killed").mkdir(parents=True)
     (tmp_path / "serial/cells/killed/begun").touch()
     serial = run_cells(tmp_path / "serial", [*squares, killed, last], silent)
@@ -109,14 +120,18 @@ def test_two_workers_of_which_one_is_killed_find_what_a_serial_run_finds(tmp_pat
     assert [name for name, _, _ in told][-1] == "last"
     assert len(told) == 6
     for name in serial:
-        files = [(tmp_path / kind / "cells" / name / "result.json").read_bytes() for kind in ("parallel", "serial")]
+        files = [
+            (tmp_path / kind / "cells" / name / "result.json").read_bytes()
+            for kind in ("parallel", "serial")
+        ]
         assert files[0] == files[1]
 
 
 def real_run(root, out, data, policy, killed=False):
-    """A task: `mgs nbv`; its process is killed after the first choice of the first attempt, if asked for."""
-    from mgs.active.inputs import array_digest
-    from mgs.active.nbv import resume_nbv, run_nbv
+    """A task: `mgs nbv`; its process is killed after the first choice of the first attempt, if
+    asked for."""
+    from mgs.run.inputs import array_digest
+    from mgs.run.nbv import resume_nbv, run_nbv
 
     first, run = not (out / "run").exists(), out / "run"
 
@@ -127,15 +142,28 @@ def real_run(root, out, data, policy, killed=False):
     given = {"gaussians": 150, "seeds": 2, "budget": 3, "policy": policy}
     state = run_nbv(data, run, on_step=on_step, **given) if first else resume_nbv(run)
     arrays = [*vars(state.gaussians).values(), state.H, state.surface]
-    return {"taken": state.taken, "arrays": array_digest(arrays), "losses": [step["loss"] for step in state.steps]}
+    return {
+        "taken": state.taken,
+        "arrays": array_digest(arrays),
+        "losses": [step["loss"] for step in state.steps],
+    }
 
 
 def test_real_runs_of_two_workers_are_bit_for_bit_those_of_a_serial_run(tmp_path):
     import synthetic
 
     data = synthetic.write_dataset(tmp_path / "data", synthetic.orbit_cameras(8, 48, 36)).root
-    cells = [Cell(p, "test_sweep:real_run", {"data": str(data), "policy": p}) for p in ("d-optimal", "random")]
-    cells.append(Cell("killed", "test_sweep:real_run", {"data": str(data), "policy": "d-optimal", "killed": True}))
+    cells = [
+        Cell(p, "test_sweep:real_run", {"data": str(data), "policy": p})
+        for p in ("d-optimal", "random")
+    ]
+    cells.append(
+        Cell(
+            "killed",
+            "test_sweep:real_run",
+            {"data": str(data), "policy": "d-optimal", "killed": True},
+        )
+    )
     parallel = run_cells(tmp_path / "parallel", cells, silent, workers=2)
     serial = run_cells(tmp_path / "serial", cells[:2], silent)
     assert {name: parallel[name] for name in serial} == serial
@@ -181,15 +209,23 @@ def surface(root, out):
 
 def test_workers_that_made_a_surface_end_in_silence(tmp_path):
     (tmp_path / "program.py").write_text(SURFACES)
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([os.path.dirname(__file__), os.getcwd()])}
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([os.path.dirname(__file__), os.getcwd()])
+    }
     command = [sys.executable, tmp_path / "program.py", tmp_path / "study"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=120, check=False
+    )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 def test_a_cell_that_must_be_alone_runs_here_and_beside_nothing(tmp_path, scheduler):
     alone = Cell("alone", "test_sweep:write_process", alone=True)
-    cells = [alone, Cell("a", "test_sweep:add_slowly", {"x": 1}), Cell("b", "test_sweep:write_process")]
+    cells = [
+        alone,
+        Cell("a", "test_sweep:add_slowly", {"x": 1}),
+        Cell("b", "test_sweep:write_process"),
+    ]
     results = run_cells(tmp_path, cells, silent, scheduler=scheduler)
     assert results["alone"] == {"pid": os.getpid(), "beside": []}
     assert results["b"]["pid"] != os.getpid()
@@ -215,12 +251,18 @@ def test_a_scheduler_that_does_not_answer_is_one_clear_line(tmp_path, address, m
         run_cells(tmp_path, [cell("a", x=1)], silent, scheduler=address)
 
 
-@pytest.mark.parametrize(("workers", "fault"), [(0, "has no worker"), (1, "has a worker with several threads")])
-def test_a_scheduler_whose_workers_will_not_do_is_one_clear_line(tmp_path, workers, fault, monkeypatch):
+@pytest.mark.parametrize(
+    ("workers", "fault"), [(0, "has no worker"), (1, "has a worker with several threads")]
+)
+def test_a_scheduler_whose_workers_will_not_do_is_one_clear_line(
+    tmp_path, workers, fault, monkeypatch
+):
     monkeypatch.setattr(sweep, "CONNECT_SECONDS", 1)
     options = {"processes": False, "dashboard_address": "127.0.0.1:0"}
     with (
-        LocalCluster(n_workers=workers, threads_per_worker=2, host="127.0.0.1", protocol="tcp://", **options) as cluster,
+        LocalCluster(
+            n_workers=workers, threads_per_worker=2, host="127.0.0.1", protocol="tcp://", **options
+        ) as cluster,
         pytest.raises(InputError, match=fault),
     ):
         run_cells(tmp_path, [cell("a", x=1)], silent, scheduler=cluster.scheduler_address)

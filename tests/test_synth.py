@@ -20,7 +20,15 @@ from mgs.files import locked, read_json
 from mgs.resources import resource_folder
 from mgs.rotation import WORLD_FROM_GLTF
 from mgs.seeds import generator
-from mgs.synth.rendering import ROCK_EXPOSURE, PoseNoise, Preset, _meter, dome_cameras, rock_cameras, synthesise
+from mgs.synth.rendering import (
+    ROCK_EXPOSURE,
+    PoseNoise,
+    Preset,
+    _meter,
+    dome_cameras,
+    rock_cameras,
+    synthesise,
+)
 from mgs.synth.rock import make_rock
 from mgs.synth.scene_file import ORBITS, Arena, Orbit, Rock, SceneFile, load_scene_file
 
@@ -64,7 +72,8 @@ def test_rock_is_in_frame_and_fills_it(dataset):
 
 
 def test_the_rock_alone_agrees_with_image_and_mask(dataset):
-    """Inside it is the image, outside it is empty, and at the rim its alpha is between; the mask is where a centre shows it."""
+    """Inside it is the image, outside it is empty, and at the rim its alpha is between; the mask is
+    where a centre shows it."""
     for frame in dataset.frames:
         rgba, weight = frame.target()
         alpha, mask = rgba[..., 3], frame.mask()
@@ -105,7 +114,9 @@ def test_test_views_are_a_dataset_of_their_own_and_change_nothing_else(dataset, 
     assert dataset.test_views() is None
     assert [frame.name for frame in views.frames] == ["tv_0000", "tv_0001", "tv_0002", "tv_0003"]
     assert not [problem for problem in check_dataset(views).problems if "tv_" in problem]
-    noisy = synthesise(tmp_path / "noisy", SCENE, TINY, seed=3, test_views=4, pose_noise=PoseNoise(0.01, 0.1)).test_views()
+    noisy = synthesise(
+        tmp_path / "noisy", SCENE, TINY, seed=3, test_views=4, pose_noise=PoseNoise(0.01, 0.1)
+    ).test_views()
     for a, b in zip(views.frames, noisy.frames, strict=True):
         assert a.camera == b.camera  # what models are judged by is exact
         assert a.rock_path.read_bytes() == b.rock_path.read_bytes()
@@ -135,7 +146,8 @@ def test_poses_on_disk_are_the_orbit(dataset):
 
 
 def test_same_seed_same_bytes_and_resume_and_pose_noise(dataset, tmp_path):
-    """An interrupted run that is completed gives the same files as one run; pose noise changes what is told and no pixel."""
+    """An interrupted run that is completed gives the same files as one run; pose noise changes what
+    is told and no pixel."""
     seen = []
 
     class Stop(Exception):
@@ -147,13 +159,22 @@ def test_same_seed_same_bytes_and_resume_and_pose_noise(dataset, tmp_path):
             raise Stop
 
     with pytest.raises(Stop):
-        synthesise(tmp_path / "again", SCENE, TINY, seed=3, pose_noise=PoseNoise(0.01, 0.1), progress=interrupt)
+        synthesise(
+            tmp_path / "again",
+            SCENE,
+            TINY,
+            seed=3,
+            pose_noise=PoseNoise(0.01, 0.1),
+            progress=interrupt,
+        )
     assert seen == [1, 2]
     assert not (tmp_path / "again/transforms.json").exists()
     (tmp_path / "again/images/.kf_0003.1.part.png").touch()
     with locked(tmp_path / "again"), pytest.raises(InputError, match="works on it"):
         synthesise(tmp_path / "again", SCENE, TINY, seed=3, pose_noise=PoseNoise(0.01, 0.1))
-    assert (tmp_path / "again/images/.kf_0003.1.part.png").exists()  # of that process, still at work
+    assert (
+        tmp_path / "again/images/.kf_0003.1.part.png"
+    ).exists()  # of that process, still at work
     again = synthesise(tmp_path / "again", SCENE, TINY, seed=3, pose_noise=PoseNoise(0.01, 0.1))
     truth = json.loads((again.root / "true_poses.json").read_text())["poses"]
     assert not list(again.root.rglob(".*"))
@@ -163,13 +184,17 @@ def test_same_seed_same_bytes_and_resume_and_pose_noise(dataset, tmp_path):
         assert a.rock_path.read_bytes() == b.rock_path.read_bytes()
         np.testing.assert_array_equal(a.depth(), b.depth())
         assert 0 < np.linalg.norm(a.camera.position - b.camera.position) < 0.06
-        np.testing.assert_allclose(opencv_from_opengl(truth[b.name]), a.camera.world_to_camera, atol=1e-12)
+        np.testing.assert_allclose(
+            opencv_from_opengl(truth[b.name]), a.camera.world_to_camera, atol=1e-12
+        )
     assert (dataset.root / "rock.glb").read_bytes() == (tmp_path / "again/rock.glb").read_bytes()
 
 
 def test_output_folder_that_is_not_empty(dataset, tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
-        patched.setattr("mgs.synth.rendering.make_rock", None)  # what is in the way is known before the rock is made
+        patched.setattr(
+            "mgs.synth.rendering.make_rock", None
+        )  # what is in the way is known before the rock is made
         with pytest.raises(InputError, match="not empty"):
             synthesise(dataset.root, SCENE, TINY, seed=3)
     (tmp_path / "config.json").write_text("{}")
@@ -207,7 +232,9 @@ def test_another_mesh_of_the_same_name_is_not_gone_on_with(tmp_path):
 
 def test_the_rock_of_a_dataset_given_back_as_mesh_is_the_same_scene(dataset, tmp_path):
     notes = []
-    again = synthesise(tmp_path / "again", SCENE, TINY, seed=3, mesh=dataset.root / "rock.glb", say=notes.append)
+    again = synthesise(
+        tmp_path / "again", SCENE, TINY, seed=3, mesh=dataset.root / "rock.glb", say=notes.append
+    )
     assert "rock.glb: +Y is up, as in all GLB files; scaled 1 times" in notes[0]
     for a, b in zip(dataset.frames, again.frames, strict=True):
         assert (a.mask() != b.mask()).mean() < 1e-3
@@ -241,7 +268,9 @@ def test_a_dark_rock_does_not_blow_out_the_ground(tmp_path):
     clipped = [(frame.rgb().max(-1) >= 1)[frame.depth() > 0].mean() for frame in dataset.frames]
     assert 0.05 < np.mean(clipped) < 0.25
     assert len(notes) == 1
-    assert "times lower than a rock so dark asks for: about 20% of rock and ground clips" in notes[0]
+    assert (
+        "times lower than a rock so dark asks for: about 20% of rock and ground clips" in notes[0]
+    )
 
 
 def test_the_exposure_of_other_rocks_is_that_of_the_rock_alone(tmp_path):
@@ -249,7 +278,9 @@ def test_the_exposure_of_other_rocks_is_that_of_the_rock_alone(tmp_path):
     small = Preset(width=32, height=24, frames=4, spp=64)
     usual = synthesise(tmp_path / "usual", SCENE, small, seed=3, say=notes.append)
     assert notes == []
-    assert np.mean([frame.rgb()[frame.mask()].mean() for frame in usual.frames]) == pytest.approx(ROCK_EXPOSURE, rel=0.05)
+    assert np.mean([frame.rgb()[frame.mask()].mean() for frame in usual.frames]) == pytest.approx(
+        ROCK_EXPOSURE, rel=0.05
+    )
 
 
 def test_rock_that_does_not_fit_the_frame(tmp_path):
@@ -289,20 +320,33 @@ def test_bad_options_leave_nothing_behind(tmp_path, capsys, options, message):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("scene", sorted(path.stem for path in resource_folder("scenes").glob("*.toml")))
+@pytest.mark.parametrize(
+    "scene", sorted(path.stem for path in resource_folder("scenes").glob("*.toml"))
+)
 def test_every_scene_frames_its_rock_on_every_orbit(scene):
     settings = load_scene_file(scene)
     rock = make_rock(settings.rock.model_copy(update={"detail": 0.06}), generator(0, "rock"))
     for kind in ORBITS:
-        flown = settings.model_copy(update={"orbit": settings.orbit.model_copy(update={"kind": kind})})
+        flown = settings.model_copy(
+            update={"orbit": settings.orbit.model_copy(update={"kind": kind})}
+        )
         cameras = rock_cameras(flown, Preset(640, 480, 36, 1), rock)
-        dome_cameras(flown, Preset(640, 480, 36, 1), rock, 60)  # would refuse a view without the whole rock
-        heights = [np.ptp(camera.project(rock.vertices[rock.vertices[:, 2] > 0])[0][:, 1]) / 480 for camera in cameras]
+        dome_cameras(
+            flown, Preset(640, 480, 36, 1), rock, 60
+        )  # would refuse a view without the whole rock
+        heights = [
+            np.ptp(camera.project(rock.vertices[rock.vertices[:, 2] > 0])[0][:, 1]) / 480
+            for camera in cameras
+        ]
         assert 0.35 < np.mean(heights) < 0.75
 
 
 def test_a_rock_that_renders_as_nan_is_refused():
-    image = SimpleNamespace(rgb=np.full((2, 2, 3), np.nan, np.float32), mask=np.ones((2, 2), bool), depth=np.ones((2, 2)))
+    image = SimpleNamespace(
+        rgb=np.full((2, 2, 3), np.nan, np.float32),
+        mask=np.ones((2, 2), bool),
+        depth=np.ones((2, 2)),
+    )
     scene = SimpleNamespace(render=lambda *_, **__: image)
     with pytest.raises(InputError, match="NaN or infinite in frame 0; repair its mesh"):
         _meter(scene, [None] * 4, 0, 1, False, print)

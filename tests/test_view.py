@@ -24,13 +24,13 @@ from PIL import Image
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from mgs.active import loop
-from mgs.active.run_folder import read_settings
 from mgs.camera import Camera, look_at
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset
 from mgs.gaussians import Gaussians
 from mgs.report.evaluation import evaluate_run
+from mgs.run import loop
+from mgs.run.folder import read_settings
 from mgs.splat import render
 from mgs.splat_ply import write_ply
 from mgs.view import layers
@@ -42,7 +42,9 @@ def steps(run, budget):
     """Let a run on stand-in stations go on to this many chosen views."""
     settings = read_settings(run)
     dataset = load_dataset(settings.dataset)
-    loop.run(run, settings.model_copy(update={"budget": budget}), dataset, tiny.stations(), tiny.silent)
+    loop.run(
+        run, settings.model_copy(update={"budget": budget}), dataset, tiny.stations(), tiny.silent
+    )
 
 
 @pytest.fixture(scope="module")
@@ -64,11 +66,20 @@ def test_a_run_is_read(run):
     assert [view.step for view in subject.taken] == [0, 0, 0, 1, 2]
     assert len(subject.views) == tiny.FRAMES
     assert subject.mesh is not None
-    assert layers.layers(subject) == ["colour", "alpha", "depth", "information", "uncertainty", "unobserved"]
+    assert layers.layers(subject) == [
+        "colour",
+        "alpha",
+        "depth",
+        "information",
+        "uncertainty",
+        "unobserved",
+    ]
     facts = dict(subject.taken[-1].facts)
     assert facts["images then"] == "5"
     assert facts["PSNR of the model here"].endswith(" dB")
-    assert "PSNR of the model here" in dict(next(v for v in subject.views if v.role == "candidate").facts)
+    assert "PSNR of the model here" in dict(
+        next(v for v in subject.views if v.role == "candidate").facts
+    )
 
 
 @pytest.mark.parametrize("space", ["linear", "srgb"])
@@ -80,8 +91,14 @@ def test_a_ply_is_read(run, tmp_path, space):
     subject = read_subject(path)
     assert (subject.space, subject.views, subject.mesh) == (space, [], None)
     assert layers.layers(subject) == ["colour", "alpha", "depth"]
-    expected = srgb_from_linear(subject.gaussians.rgb) if space == "linear" else np.clip(subject.gaussians.rgb, 0, 1)
-    np.testing.assert_allclose(layers.gaussian_colours(subject, "colour"), 255 * expected, atol=0.51)
+    expected = (
+        srgb_from_linear(subject.gaussians.rgb)
+        if space == "linear"
+        else np.clip(subject.gaussians.rgb, 0, 1)
+    )
+    np.testing.assert_allclose(
+        layers.gaussian_colours(subject, "colour"), 255 * expected, atol=0.51
+    )
 
 
 def test_what_the_kernel_draws(run):
@@ -107,7 +124,8 @@ def test_what_the_kernel_draws(run):
 
 
 def test_a_world_of_large_numbers_is_shown_smaller(run):
-    """Depth in a browser ends at 160: with 1,000 times the lengths of a run all would be behind that."""
+    """Depth in a browser ends at 160: with 1,000 times the lengths of a run all would be behind
+    that."""
     subject = read_subject(run)
     assert subject.scale == 1
     assert fitted(subject) is subject
@@ -115,29 +133,44 @@ def test_a_world_of_large_numbers_is_shown_smaller(run):
     g = subject.gaussians
     large = replace(
         subject,
-        gaussians=replace(g, means=1000 * g.means, log_scales=g.log_scales + np.float32(np.log(1000))),
-        views=[replace(view, frame=replace(view.frame, camera=view.frame.camera.scaled(1000))) for view in subject.views],
+        gaussians=replace(
+            g, means=1000 * g.means, log_scales=g.log_scales + np.float32(np.log(1000))
+        ),
+        views=[
+            replace(view, frame=replace(view.frame, camera=view.frame.camera.scaled(1000)))
+            for view in subject.views
+        ],
         mesh=replace(subject.mesh, vertices=1000 * subject.mesh.vertices),
     )
     shown = fitted(large)
     assert np.ptp(shown.mesh.vertices) == pytest.approx(shown.scale * np.ptp(large.mesh.vertices))
     for layer in ("colour", "depth", "uncertainty"):
         picture, depth, ends = layers.kernel_image(shown, shown.views[1].frame.camera, layer)
-        expected, _, (low, high) = layers.kernel_image(subject, subject.views[1].frame.camera, layer)
+        expected, _, (low, high) = layers.kernel_image(
+            subject, subject.views[1].frame.camera, layer
+        )
         np.testing.assert_allclose(picture, expected, atol=2)
         assert depth[depth < layers.FAR].max() < 2.5 * 40
-        assert ends == pytest.approx((1000 * low, 1000 * high) if layer == "depth" else (low, high), rel=1e-4)
+        assert ends == pytest.approx(
+            (1000 * low, 1000 * high) if layer == "depth" else (low, high), rel=1e-4
+        )
 
 
 def test_covariances_have_the_scales_and_the_axes(run):
     subject = read_subject(run)
     g = subject.gaussians
     values, vectors = np.linalg.eigh(layers.covariances(subject).astype(np.float64))
-    np.testing.assert_allclose(values, np.sort(np.exp(2 * g.log_scales.astype(np.float64)), axis=1), rtol=1e-4)
+    np.testing.assert_allclose(
+        values, np.sort(np.exp(2 * g.log_scales.astype(np.float64)), axis=1), rtol=1e-4
+    )
     assert vectors.shape == (len(g), 3, 3)
     flat = Gaussians(g.means, g.log_scales - np.array([0, 0, 3]), g.quats, g.logit_opacities, g.sh)
-    _, vectors = np.linalg.eigh(layers.covariances(SimpleNamespace(gaussians=flat)).astype(np.float64))
-    normals = g.means / np.linalg.norm(g.means, axis=1, keepdims=True)  # the stand-in's discs lie on a sphere
+    _, vectors = np.linalg.eigh(
+        layers.covariances(SimpleNamespace(gaussians=flat)).astype(np.float64)
+    )
+    normals = g.means / np.linalg.norm(
+        g.means, axis=1, keepdims=True
+    )  # the stand-in's discs lie on a sphere
     np.testing.assert_allclose(np.abs((vectors[:, :, 0] * normals).sum(1)), 1, atol=1e-4)
 
 
@@ -147,18 +180,25 @@ SIDES = st.integers(1, 5000)
 
 @given(POINTS, POINTS, st.floats(0.3, 2), SIDES, SIDES)
 def test_the_camera_of_a_window(eye, target, fov, width, height):
-    """What it looks at is in the middle of the image, and what lies at the rim of its field of view at the rim."""
+    """What it looks at is in the middle of the image, and what lies at the rim of its field of view
+    at the rim."""
     if np.linalg.norm(np.subtract(eye, target)) < 0.1:
         return
     pose = np.linalg.inv(look_at(eye, target))
     wxyz = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
-    handle = SimpleNamespace(image_width=width, image_height=height, fov=fov, wxyz=wxyz, position=np.array(eye))
+    handle = SimpleNamespace(
+        image_width=width, image_height=height, fov=fov, wxyz=wxyz, position=np.array(eye)
+    )
     camera = window_camera(handle)
     assert camera.width * camera.height <= 1e6 + camera.width + camera.height
     (pixel,), (z,) = camera.project([target])
-    np.testing.assert_allclose(pixel, [camera.width / 2, camera.height / 2], atol=1e-3 * camera.height)
+    np.testing.assert_allclose(
+        pixel, [camera.width / 2, camera.height / 2], atol=1e-3 * camera.height
+    )
     top = pose[:3, 3] + z * (pose[:3, 2] - np.tan(fov / 2) * pose[:3, 1])
-    np.testing.assert_allclose(camera.project([top])[0][0], [camera.width / 2, 0], atol=1e-3 * camera.height)
+    np.testing.assert_allclose(
+        camera.project([top])[0][0], [camera.width / 2, 0], atol=1e-3 * camera.height
+    )
     assert window_camera(SimpleNamespace(image_width=0, image_height=5)) is None
 
 
@@ -169,8 +209,12 @@ def test_refusals(capsys, run, dataset, prior, tmp_path, monkeypatch):
     assert "--port" in refused(capsys, ["view", run, "--port", "many"])
     (tmp_path / "file.ply").write_text("no PLY")
     assert "file.ply" in refused(capsys, ["view", tmp_path / "file.ply"])
-    assert "--follow needs the folder of a run" in refused(capsys, ["view", tmp_path / "file.ply", "--follow"])
-    assert "cannot be served there" in refused(capsys, ["view", run, "--host", "192.0.2.1"])  # of an example network, not ours
+    assert "--follow needs the folder of a run" in refused(
+        capsys, ["view", tmp_path / "file.ply", "--follow"]
+    )
+    assert "cannot be served there" in refused(
+        capsys, ["view", run, "--host", "192.0.2.1"]
+    )  # of an example network, not ours
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -185,11 +229,14 @@ def test_refusals(capsys, run, dataset, prior, tmp_path, monkeypatch):
 
 @contextmanager
 def viewing(*arguments):
-    """`mgs view ARGUMENTS` in a process of its own; gives its address. Ctrl-C must end it in peace."""
+    """`mgs view ARGUMENTS` in a process of its own; gives its address. Ctrl-C must end it in
+    peace."""
     command = [sys.executable, "-m", "mgs", "view", *map(str, arguments), "--port", "0"]
     # A shell starts what runs in the background deaf to SIGINT, which is what ends the viewer.
     hearing = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hearing)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hearing
+    )
     try:
         line, warned = process.stdout.readline(), False
         if "everyone who reaches this address" in line:
@@ -210,11 +257,15 @@ def test_a_window_that_is_closed_while_its_image_is_drawn_is_not_warned_of(run):
     from viser.infra._async_message_buffer import AsyncMessageBuffer
 
     said = "on a closed connection"
-    assert said in Path(sys.modules[AsyncMessageBuffer.__module__].__file__).read_text(), "viser words it otherwise now"
+    assert said in Path(sys.modules[AsyncMessageBuffer.__module__].__file__).read_text(), (
+        "viser words it otherwise now"
+    )
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
         viewer = Viewer(run, port=0)
-        warnings.warn(f"Queued a BackgroundImageMessage {said} (e.g. via a handle of a client)", stacklevel=1)
+        warnings.warn(
+            f"Queued a BackgroundImageMessage {said} (e.g. via a handle of a client)", stacklevel=1
+        )
         warnings.warn("another", stacklevel=1)
         viewer.close()
     assert [str(one.message) for one in heard] == ["another"]
@@ -254,9 +305,12 @@ SPLAT_CORNERS = """geometry => {
 def of_viser(message) -> bool:
     """Whether an error on the console is one that viser 1.1.1 makes by itself, with any Gaussians.
 
-    The corners of its squares have two coordinates each. three.js reads three of each, past the end of the last, and says that
-    the radius of what it read is NaN. The same complaint about anything else would be ours."""
-    return "Computed radius is NaN" in message.text and bool(message.args[1].evaluate(SPLAT_CORNERS))
+    The corners of its squares have two coordinates each. three.js reads three of each, past the end
+    of the last, and says that the radius of what it read is NaN. The same complaint about anything
+    else would be ours."""
+    return "Computed radius is NaN" in message.text and bool(
+        message.args[1].evaluate(SPLAT_CORNERS)
+    )
 
 
 WIDTH, HEIGHT = 1000, 640
@@ -269,7 +323,9 @@ def start_camera(subject) -> Camera:
     offset = first.position - centre
     focal = HEIGHT * first.K[1, 1] / first.height
     K = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
-    return Camera(K, WIDTH, HEIGHT, look_at(centre + 1.6 * offset + [0, 0, np.linalg.norm(offset)], centre))
+    return Camera(
+        K, WIDTH, HEIGHT, look_at(centre + 1.6 * offset + [0, 0, np.linalg.norm(offset)], centre)
+    )
 
 
 def screenshot(tab) -> np.ndarray:
@@ -277,7 +333,8 @@ def screenshot(tab) -> np.ndarray:
 
 
 def screen_becomes(tab, wanted, seconds=60.0) -> np.ndarray:
-    """A screenshot for which `wanted` is true; the last one if there is none until the time is up."""
+    """A screenshot for which `wanted` is true; the last one if there is none until the time is
+    up."""
     until = time.monotonic() + seconds
     while not wanted(picture := screenshot(tab)) and time.monotonic() < until:
         tab.wait_for_timeout(300)
@@ -307,17 +364,23 @@ def browser():
 
 
 def test_the_viewer_in_a_browser(browser, run):
-    """The screen shows the kernel's image of each layer, a click on a camera shows its frame, and a new step appears."""
+    """The screen shows the kernel's image of each layer, a click on a camera shows its frame, and a
+    new step appears."""
     subject = read_subject(run)
     camera = start_camera(subject)
     centre = camera.project(subject.gaussians.means)[0].mean(0)
     v, u = np.mgrid[:HEIGHT, :WIDTH]
-    inside = (np.abs(u - centre[0]) < 60) & (np.abs(v - centre[1]) < 60)  # where nothing else is drawn
+    inside = (np.abs(u - centre[0]) < 60) & (
+        np.abs(v - centre[1]) < 60
+    )  # where nothing else is drawn
 
     def off(picture):
         return np.abs(picture - expected)[inside].mean()
 
-    with viewing(run, "--follow") as address, opened(browser, address, WIDTH, HEIGHT, known=of_viser) as (tab, wrong):
+    with (
+        viewing(run, "--follow") as address,
+        opened(browser, address, WIDTH, HEIGHT, known=of_viser) as (tab, wrong),
+    ):
         tab.get_by_text(subject.title).wait_for()
         tab.get_by_label("Cameras", exact=True).first.uncheck(force=True)
         for layer in ("alpha", "uncertainty", "colour"):
@@ -335,8 +398,12 @@ def test_the_viewer_in_a_browser(browser, run):
         free = [
             (view, x, y)
             for view in subject.views
-            for (x, y), z in [[values[0] for values in camera.project([view.frame.camera.position])]]
-            if z > 0 and 30 < x < 600 and 250 < y < HEIGHT - 30  # neither under the panel nor under the notice of viser
+            for (x, y), z in [
+                [values[0] for values in camera.project([view.frame.camera.position])]
+            ]
+            if z > 0
+            and 30 < x < 600
+            and 250 < y < HEIGHT - 30  # neither under the panel nor under the notice of viser
         ]
         clicked, x, y = free[-1]
         tab.wait_for_timeout(1500)
@@ -354,7 +421,9 @@ def test_the_viewer_in_a_browser(browser, run):
         tab.get_by_text("surface coverage then").wait_for()
 
         tab.get_by_text("Look from there").click()
-        there = chosen.frame.camera.resized(round(chosen.frame.camera.width * HEIGHT / chosen.frame.camera.height))
+        there = chosen.frame.camera.resized(
+            round(chosen.frame.camera.width * HEIGHT / chosen.frame.camera.height)
+        )
         narrow = layers.kernel_image(subject, there, "colour")[0].astype(int)
         rows, columns = slice(260, 460), slice(WIDTH // 2 - 100, WIDTH // 2 + 50)
         shift = (WIDTH - there.width) // 2
@@ -388,7 +457,9 @@ def test_a_ply_in_a_browser_at_phone_width(browser, run, tmp_path):
             while True:
                 tab.wait_for_timeout(1500)
                 picture = drawn()
-                if (np.abs(picture - before).mean() < 0.01 and picture.std() > 5) or time.monotonic() > until:
+                if (
+                    np.abs(picture - before).mean() < 0.01 and picture.std() > 5
+                ) or time.monotonic() > until:
                     return picture
                 before = picture
 

@@ -1,4 +1,5 @@
-"""Reports of a world whose up axis is not +Z, and whose unit of length nobody knows: figures, page, maps, viewer."""
+"""Reports of a world whose up axis is not +Z, and whose unit of length nobody knows: figures, page,
+maps, viewer."""
 
 from __future__ import annotations
 
@@ -15,8 +16,6 @@ sys.path.insert(0, str(Path(__file__).parent))
 import tiny
 
 from mgs import plotting
-from mgs.active import loop
-from mgs.active.run_folder import load_run, read_settings
 from mgs.camera import Camera
 from mgs.data.dataset import load_dataset, write_transforms
 from mgs.data.up import PLUS_Z, unit_up, upright
@@ -27,6 +26,8 @@ from mgs.report.evaluation import evaluate
 from mgs.report.page import write_page
 from mgs.report.runs import up_of
 from mgs.report.writing import write_report
+from mgs.run import loop
+from mgs.run.folder import load_run, read_settings
 from mgs.view import layers
 from mgs.view.subject import read_subject
 
@@ -57,14 +58,18 @@ def make_run(root: Path, tilted: bool) -> Path:
         shape = camera.height, camera.width
         return np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
 
-    metrics = evaluate(gaussians, dataset.frames, trained, renderer=black, pictures=root / "run/renders")
+    metrics = evaluate(
+        gaussians, dataset.frames, trained, renderer=black, pictures=root / "run/renders"
+    )
     write_json(root / "run/metrics.json", {"policy": "uniform"} | metrics)
     return root / "run"
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    return [make_run(tmp_path_factory.mktemp(name), name == "tilted") for name in ("level", "tilted")]
+    return [
+        make_run(tmp_path_factory.mktemp(name), name == "tilted") for name in ("level", "tilted")
+    ]
 
 
 @pytest.fixture
@@ -72,7 +77,9 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, Figure]:
     """The last figure of each name that was saved."""
     found: dict[str, Figure] = {}
     for module in (figures, plotting):
-        monkeypatch.setattr(module, "save_figure", lambda figure, path: found.update({Path(path).name: figure}))
+        monkeypatch.setattr(
+            module, "save_figure", lambda figure, path: found.update({Path(path).name: figure})
+        )
     return found
 
 
@@ -80,7 +87,9 @@ def test_the_orbit_of_a_tilted_world_is_drawn_as_that_of_the_upright_one(
     runs: list[Path], drawn: dict[str, Figure], tmp_path: Path
 ) -> None:
     shown = []
-    for run, names in zip(runs, (("x (m)", "y (m)"), ("horizontal (unit)", "horizontal, across (unit)")), strict=True):
+    for run, names in zip(
+        runs, (("x (m)", "y (m)"), ("horizontal (unit)", "horizontal, across (unit)")), strict=True
+    ):
         write_report(tmp_path / "report", [run])
         axis = drawn["orbit.png"].axes[0]
         assert (axis.get_xlabel(), axis.get_ylabel()) == names
@@ -95,14 +104,24 @@ def test_the_page_draws_it_upright_too_and_names_the_unit(runs: list[Path], tmp_
     for run in runs:
         write_page(tmp_path / "page.html", [run])
         text = (tmp_path / "page.html").read_text()
-        data.append(json.loads(text.split('type="application/json">')[1].split("</script>")[0])["runs"][0])
+        data.append(
+            json.loads(text.split('type="application/json">')[1].split("</script>")[0])["runs"][0]
+        )
     level, tilted = data
     for one, other in zip(level["orbit"]["data"], tilted["orbit"]["data"], strict=True):
         for axis in "xyz":
-            np.testing.assert_allclose(np.array(other[axis], float), np.array(one[axis], float), atol=2e-4, err_msg=one["name"])
-    np.testing.assert_allclose([v["eye"] for v in tilted["views"]], [v["eye"] for v in level["views"]], atol=1e-9)
+            np.testing.assert_allclose(
+                np.array(other[axis], float),
+                np.array(one[axis], float),
+                atol=2e-4,
+                err_msg=one["name"],
+            )
+    np.testing.assert_allclose(
+        [v["eye"] for v in tilted["views"]], [v["eye"] for v in level["views"]], atol=1e-9
+    )
     titles = [
-        [orbit["layout"]["scene"][f"{a}axis"]["title"]["text"] for a in "xyz"] for orbit in (level["orbit"], tilted["orbit"])
+        [orbit["layout"]["scene"][f"{a}axis"]["title"]["text"] for a in "xyz"]
+        for orbit in (level["orbit"], tilted["orbit"])
     ]
     assert titles[0] == ["x (m)", "y (m)", "z (m)"]
     assert titles[1] == ["horizontal (unit)", "horizontal, across (unit)", "up (unit)"]
@@ -123,7 +142,9 @@ def test_the_viewer_knows_both(runs: list[Path]) -> None:
         assert f"3 {unit}" in layers.legend("depth", (1.0, 3.0), subject.unit)
 
 
-def test_the_axis_of_the_prior_goes_before_that_of_the_dataset(runs: list[Path], tmp_path: Path) -> None:
+def test_the_axis_of_the_prior_goes_before_that_of_the_dataset(
+    runs: list[Path], tmp_path: Path
+) -> None:
     dataset = load_dataset(read_settings(runs[1]).dataset)
     assert up_of(tmp_path, dataset) == dataset.up
     write_json(tmp_path / "prior.json", {"up": [0, 2, 0]})

@@ -1,6 +1,8 @@
-"""A rock of a few pixels: a dataset on disk and NumPy stand-ins for the stations of the loop, so the loop is tested alone.
+"""A rock of a few pixels: a dataset on disk and NumPy stand-ins for the stations of the loop, so
+the loop is tested alone.
 
-As a program, `python tiny.py DATASET OUT POLICY MOMENT COUNT` starts a run and kills itself (SIGKILL) at the COUNT-th MOMENT.
+As a program, `python tiny.py DATASET OUT POLICY MOMENT COUNT` starts a run and kills itself
+(SIGKILL) at the COUNT-th MOMENT.
 """
 
 from __future__ import annotations
@@ -13,17 +15,24 @@ from pathlib import Path
 
 import numpy as np
 
-from mgs.active import loop, run_folder
-from mgs.active.settings import NbvSettings, TrainSettings
-from mgs.active.stopping import StopReason
 from mgs.camera import Camera, look_at
 from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
+from mgs.fit.settings import TrainSettings
+from mgs.fit.stopping import StopReason
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_exr, write_png
 from mgs.rotation import quat_from_normals
+from mgs.run import folder as run_folder
+from mgs.run import loop
+from mgs.run.settings import NbvSettings
 
 FRAMES, POINTS, WIDTH, HEIGHT = 12, 40, 16, 12
-GROUPS = {"colour": slice(0, 3), "scale": slice(3, 6), "rotation": slice(6, 10), "opacity": slice(10, 11)}
+GROUPS = {
+    "colour": slice(0, 3),
+    "scale": slice(3, 6),
+    "rotation": slice(6, 10),
+    "opacity": slice(10, 11),
+}
 
 
 def orbit(frames: int = FRAMES) -> list[Camera]:
@@ -39,14 +48,23 @@ def write_dataset(root: Path, frames: int = FRAMES) -> Path:
     records = []
     for i, camera in enumerate(orbit(frames)):
         v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-        rays = np.stack([(u - camera.K[0, 2]) / camera.K[0, 0], (v - camera.K[1, 2]) / camera.K[1, 1], np.ones_like(u)], -1)
+        rays = np.stack(
+            [
+                (u - camera.K[0, 2]) / camera.K[0, 0],
+                (v - camera.K[1, 2]) / camera.K[1, 1],
+                np.ones_like(u),
+            ],
+            -1,
+        )
         directions = rays @ camera.camera_to_world[:3, :3].T
         a, b = (directions**2).sum(-1), directions @ camera.position
         root_term = b**2 - a * (camera.position @ camera.position - 1)
         mask = root_term > 0
         depth = np.where(mask, (-b - np.sqrt(np.maximum(root_term, 0))) / a, 0)
         points = camera.unproject(depth)
-        rgb = np.where(mask[..., None], 0.4 + 0.3 * np.sin(5 * points + [0, 1, 2]), 0).astype(np.float32)
+        rgb = np.where(mask[..., None], 0.4 + 0.3 * np.sin(5 * points + [0, 1, 2]), 0).astype(
+            np.float32
+        )
         name = f"kf_{i:04d}"
         paths = root / f"images/{name}.png", root / f"depth/{name}.exr", root / f"masks/{name}.png"
         frame = Frame(name, camera, 0.5 * i, *paths)
@@ -80,29 +98,46 @@ def initial(seed_frames: list[Frame]) -> Gaussians:
     n = _normals()
     quats = quat_from_normals(n).astype(np.float32)
     scales = np.full((POINTS, 3), -1.5, np.float32)
-    return Gaussians(n.astype(np.float32), scales, quats, np.zeros(POINTS, np.float32), sh_from_rgb(np.full((POINTS, 3), 0.5)))
+    return Gaussians(
+        n.astype(np.float32),
+        scales,
+        quats,
+        np.zeros(POINTS, np.float32),
+        sh_from_rgb(np.full((POINTS, 3), 0.5)),
+    )
 
 
 def _facing(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """How squarely each point of the sphere faces the camera, 0 where it is turned away."""
     to_camera = camera.position - gaussians.means
-    return np.maximum((gaussians.means * to_camera).sum(1) / np.linalg.norm(to_camera, axis=1) - 0.2, 0)
+    return np.maximum(
+        (gaussians.means * to_camera).sum(1) / np.linalg.norm(to_camera, axis=1) - 0.2, 0
+    )
 
 
 def fisher(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """Facing points are informative, brighter ones more so: the choice depends on the fitted model, as the real one does."""
+    """Facing points are informative, brighter ones more so: the choice depends on the fitted model,
+    as the real one does."""
     brightness = gaussians.rgb.mean(1)
-    return (_facing(gaussians, camera) ** 2 * brightness)[:, None].astype(np.float32) * np.linspace(1, 2, 11, dtype=np.float32)
+    return (_facing(gaussians, camera) ** 2 * brightness)[:, None].astype(np.float32) * np.linspace(
+        1, 2, 11, dtype=np.float32
+    )
 
 
 def estimate(gaussians: Gaussians, camera: Camera, estimator: str) -> np.ndarray:
-    """Of every estimator the same information, as blocks without correlations where blocks are asked for."""
+    """Of every estimator the same information, as blocks without correlations where blocks are
+    asked for."""
     F = fisher(gaussians, camera)
     return F[:, None] * np.eye(11, dtype=np.float32) if estimator == "block" else F
 
 
 def fit(
-    gaussians: Gaussians, start: Gaussians, cameras: list[Camera], targets: list[np.ndarray], train: TrainSettings, on_pass
+    gaussians: Gaussians,
+    start: Gaussians,
+    cameras: list[Camera],
+    targets: list[np.ndarray],
+    train: TrainSettings,
+    on_pass,
 ) -> Fit:
     """Each point's colour moves half way to the mean of its pixels."""
     on_pass(0, 1)
@@ -133,7 +168,9 @@ def stations(**replaced) -> loop.Stations:
 
 def start(out: Path, dataset: Dataset, **values) -> NbvSettings:
     """Begin a run folder with these settings over small defaults."""
-    settings = NbvSettings(**({"dataset": dataset.root, "prior": dataset.root, "budget": 5, "seeds": 3} | values))
+    settings = NbvSettings(
+        **({"dataset": dataset.root, "prior": dataset.root, "budget": 5, "seeds": 3} | values)
+    )
     run_folder.start(out, settings, dataset)
     return settings
 
@@ -145,18 +182,22 @@ def write_prior(out: Path) -> Path:
 
     n = _normals()
     mesh = Mesh(n[:3], np.array([[0, 1, 2]]), np.zeros(1, bool))
-    return save_prior(out, Prior(mesh, n, n, 0.5, 0.2, {"spacing": 0.5, "depth_tolerance": 0.2, "n": POINTS}))
+    return save_prior(
+        out, Prior(mesh, n, n, 0.5, 0.2, {"spacing": 0.5, "depth_tolerance": 0.2, "n": POINTS})
+    )
 
 
 def write_run(out: Path, root: Path, prior: Path) -> Path:
     """A run folder of the seeds alone, on the stand-ins."""
-    from mgs.active.inputs import prior_digest
     from mgs.prior.build import load_prior
     from mgs.prior.initial import initial_gaussians
+    from mgs.run.inputs import prior_digest
 
     dataset, known = load_dataset(root), load_prior(prior)
     settings = start(out, dataset, prior=prior, budget=2)
-    parts = stations(prior=prior_digest(known), initial=lambda frames: initial_gaussians(known, frames)[0])
+    parts = stations(
+        prior=prior_digest(known), initial=lambda frames: initial_gaussians(known, frames)[0]
+    )
     loop.run(out, settings.model_copy(update={"budget": 0}), dataset, parts, silent)
     return out
 
@@ -166,7 +207,8 @@ def silent(stage: str, done: int, total: int) -> None:
 
 
 def die_at(moment: str, count: int) -> loop.Stations:
-    """Stations of which one kills this process, as the system would, when it is called for the count-th time."""
+    """Stations of which one kills this process, as the system would, when it is called for the
+    count-th time."""
     calls = {"n": 0}
 
     def dying(function):
@@ -199,5 +241,9 @@ def die_at(moment: str, count: int) -> loop.Stations:
 
 if __name__ == "__main__":
     loaded, folder = load_dataset(sys.argv[1]), Path(sys.argv[2])
-    chosen = run_folder.read_settings(folder) if folder.exists() else start(folder, loaded, policy=sys.argv[3], seed=3)
+    chosen = (
+        run_folder.read_settings(folder)
+        if folder.exists()
+        else start(folder, loaded, policy=sys.argv[3], seed=3)
+    )
     loop.run(folder, chosen, loaded, die_at(sys.argv[4], int(sys.argv[5])), silent)

@@ -1,11 +1,14 @@
-"""Does what a page of docs/ tells its readers to do, and compares what is printed with what the page shows.
+"""Does what a page of docs/ tells its readers to do, and compares what is printed with what the
+page shows.
 
-    python tools/pages.py            # run docs/tutorial.md in a new folder; exit code 1 where it shows something else
-    python tools/pages.py --write    # the same, and write what was printed, and the pictures, into docs/
+    python tools/pages.py            # run docs/tutorial.md in a new folder; exit code 1 where it
+    shows something else python tools/pages.py --write    # the same, and write what was printed,
+    and the pictures, into docs/
 
-A page is read as its readers take it. Blocks of Python run one after another in one program, started in one folder. A block
-with a title is a file of that name. In a block marked `sh`, each line is a command: `mgs ...`, or `python FILE ...`. A block
-marked `text` shows what the block before it prints.
+A page is read as its readers take it. Blocks of Python run one after another in one program,
+started in one folder. A block with a title is a file of that name. In a block marked `sh`, each
+line is a command: `mgs ...`, or `python FILE ...`. A block marked `text` shows what the block
+before it prints.
 """
 
 from __future__ import annotations
@@ -28,18 +31,26 @@ from typing import Any
 ROOT = Path(__file__).parent.parent
 TUTORIAL = ROOT / "docs/tutorial.md"
 
-PICTURES = {"out/report/orbit.png": "tutorial_orbit.png", "out/report/comparison.png": "tutorial_comparison.png"}
+PICTURES = {
+    "out/report/orbit.png": "tutorial_orbit.png",
+    "out/report/comparison.png": "tutorial_comparison.png",
+}
 """Files that the tutorial writes, and their names in docs/images."""
 
-FENCE = re.compile(r'^```(?P<language>\w+)(?: title="(?P<title>[^"]+)")?\n(?P<body>.*?)^```$', re.MULTILINE | re.DOTALL)
+FENCE = re.compile(
+    r'^```(?P<language>\w+)(?: title="(?P<title>[^"]+)")?\n(?P<body>.*?)^```$',
+    re.MULTILINE | re.DOTALL,
+)
 
 TOLERANCE = 0.05
-"""Numbers with a decimal point are compared to this share: processors, and versions of LLVM, round differently."""
+"""Numbers with a decimal point are compared to this share: processors, and versions of LLVM, round
+differently."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block. line: of the page, where its body starts; start, end: the same in characters, and where it ends."""
+    """A fenced block. line: of the page, where its body starts; start, end: the same in characters,
+    and where it ends."""
 
     language: str
     title: str | None
@@ -63,7 +74,16 @@ def blocks(page: str) -> list[Block]:
     found = []
     for match in FENCE.finditer(page):
         start, end = match.span("body")
-        found.append(Block(match["language"], match["title"], match["body"], page.count("\n", 0, start) + 1, start, end))
+        found.append(
+            Block(
+                match["language"],
+                match["title"],
+                match["body"],
+                page.count("\n", 0, start) + 1,
+                start,
+                end,
+            )
+        )
     return found
 
 
@@ -74,11 +94,17 @@ def commands(block: Block) -> list[list[str]]:
 
 
 def follow(path: Path, folder: Path) -> list[Said]:
-    """Do what the page tells, in the folder: write its files, run its Python and its commands; returns what they printed.
+    """Do what the page tells, in the folder: write its files, run its Python and its commands;
+    returns what they printed.
 
-    Where one fails, its exception is raised; the traceback of Python on the page has the page's line numbers.
+    Where one fails, its exception is raised; the traceback of Python on the page has the page's
+    line numbers.
     """
-    found, variables, said = blocks(path.read_text(encoding="utf-8")), {"__name__": "__main__"}, list[Said]()
+    found, variables, said = (
+        blocks(path.read_text(encoding="utf-8")),
+        {"__name__": "__main__"},
+        list[Said](),
+    )
     with contextlib.chdir(folder), _importable(folder):
         for block, following in zip(found, [*found[1:], None], strict=True):
             shown = following if following is not None and following.language == "text" else None
@@ -86,7 +112,9 @@ def follow(path: Path, folder: Path) -> list[Said]:
                 if block.title is not None:
                     (folder / block.title).write_text(block.body, encoding="utf-8")
                 elif block.language == "python":
-                    exec(compile("\n" * (block.line - 1) + block.body, str(path), "exec"), variables)
+                    exec(
+                        compile("\n" * (block.line - 1) + block.body, str(path), "exec"), variables
+                    )
                 elif block.language == "sh":
                     for words in commands(block):
                         command(words)
@@ -107,7 +135,8 @@ def _importable(folder: Path) -> Iterator[None]:
 
 
 def command(words: list[str]) -> None:
-    """`mgs ...` or `python FILE ...`, in this process. Raises RuntimeError where it ends with an exit code."""
+    """`mgs ...` or `python FILE ...`, in this process. Raises RuntimeError where it ends with an
+    exit code."""
     before = sys.argv
     try:
         if words[0] == "mgs":
@@ -127,7 +156,8 @@ def command(words: list[str]) -> None:
 
 
 def alike(shown: str, printed: str) -> bool:
-    """Whether a page shows what is printed: words and whole numbers as they are, others within TOLERANCE."""
+    """Whether a page shows what is printed: words and whole numbers as they are, others within
+    TOLERANCE."""
     number = re.compile(r"-?\d+\.\d+(?:e[+-]?\d+)?")
     if number.sub("0.0", shown).split() != number.sub("0.0", printed).split():
         return False
@@ -157,12 +187,19 @@ def main(arguments: list[str]) -> int:
     with tempfile.TemporaryDirectory() as folder:
         said = follow(TUTORIAL, Path(folder))
         if "--write" in arguments:
-            TUTORIAL.write_text(rewritten(TUTORIAL.read_text(encoding="utf-8"), said), encoding="utf-8")
+            TUTORIAL.write_text(
+                rewritten(TUTORIAL.read_text(encoding="utf-8"), said), encoding="utf-8"
+            )
             for source, name in PICTURES.items():
                 shutil.copyfile(Path(folder) / source, ROOT / "docs/images" / name)
             return 0
     differences = stale(said)
-    print("\n".join([f"{os.path.relpath(TUTORIAL)}: {text}" for text in differences] or ["the tutorial prints what it shows"]))
+    print(
+        "\n".join(
+            [f"{os.path.relpath(TUTORIAL)}: {text}" for text in differences]
+            or ["the tutorial prints what it shows"]
+        )
+    )
     return int(bool(differences))
 
 

@@ -1,23 +1,27 @@
-"""Makes of an exact dataset what a photographer would have: photographs, and the files of the tools that find their cameras.
+"""Makes of an exact dataset what a photographer would have: photographs, and the files of the tools
+that find their cameras.
 
-    python tools/photographs.py DATASET OUT --kind colmap-binary     # or colmap-text, nerfstudio, nerf-synthetic, rgbd
-    python tools/photographs.py DATASET OUT --kind colmap-binary --exposure 0.3
+    python tools/photographs.py DATASET OUT --kind colmap-binary     # or colmap-text, nerfstudio,
+    nerf-synthetic, rgbd python tools/photographs.py DATASET OUT --kind colmap-binary --exposure 0.3
 
-DATASET is a folder of `mgs synth-orbit`. Its images are rendered, and its cameras and depth are exact; OUT holds the same rock
-as a stranger's data do, in the format of the kind:
+DATASET is a folder of `mgs synth-orbit`. Its images are rendered, and its cameras and depth are
+exact; OUT holds the same rock as a stranger's data do, in the format of the kind:
 
-- colmap-text, colmap-binary: JPEG files of a camera that was not held level, with lens distortion; a sparse model (sparse/0)
-  in a world that is turned, scaled and moved, with poses and points as wrong as the constants below say.
-- nerfstudio: the same photographs and world, as transforms.json with distortion, and the points as a PLY file without tracks.
+- colmap-text, colmap-binary: JPEG files of a camera that was not held level, with lens distortion;
+a sparse model (sparse/0)
+  in a world that is turned, scaled and moved, with poses and points as wrong as the constants below
+  say.
+- nerfstudio: the same photographs and world, as transforms.json with distortion, and the points as
+a PLY file without tracks.
 - nerf-synthetic: PNG files with alpha, exact poses in a world of another scale, no points.
 - rgbd: PNG files, noisy depth of 16 bits, exact poses in metres.
 
-With --exposure STOPS, the JPEG files of COLMAP and nerfstudio differ in exposure and white balance, and their EXIF has the
-times of exposure.
+With --exposure STOPS, the JPEG files of COLMAP and nerfstudio differ in exposure and white balance,
+and their EXIF has the times of exposure.
 
-Beside them OUT/masks has the true masks, OUT/truth.ply the true rock in the world of these data, and OUT/truth.json the
-similarity that leads from DATASET's world to it, and the gains of the images. No importer looks at these three. The same seed
-gives the same files.
+Beside them OUT/masks has the true masks, OUT/truth.ply the true rock in the world of these data,
+and OUT/truth.json the similarity that leads from DATASET's world to it, and the gains of the
+images. No importer looks at these three. The same seed gives the same files.
 """
 
 from __future__ import annotations
@@ -40,25 +44,31 @@ from mgs.images import LUMA, write_png
 from mgs.seeds import generator
 from mgs.survey.depth_sensor import noisy_depth
 
-# How wrong the data are. These numbers were fixed before the chain that reads such data was made, and are not tuned to it.
+# How wrong the data are. These numbers were fixed before the chain that reads such data was made,
+# and are not tuned to it.
 
 KEYPOINT_NOISE = 0.5
-"""Standard deviation of a keypoint's place, pixels along each axis. Points inherit it by triangulation."""
+"""Standard deviation of a keypoint's place, pixels along each axis. Points inherit it by
+triangulation."""
 OUTLIERS = 0.1
-"""Share of the points whose tracks are wrong matches: the point lies elsewhere on the ray of one of its cameras."""
+"""Share of the points whose tracks are wrong matches: the point lies elsewhere on the ray of one of
+its cameras."""
 OUTLIER_RANGE = (0.6, 1.6)
-"""Depth of such a point over the true one. Its track has two or three images, and an error of OUTLIER_ERROR."""
+"""Depth of such a point over the true one. Its track has two or three images, and an error of
+OUTLIER_ERROR."""
 OUTLIER_ERROR = (1.0, 3.9)
 """Mean reprojection error of a wrong point, pixels. COLMAP drops what exceeds 4."""
 MATCH_ANGLE = 45.0
 """Largest angle between two views in which a feature is recognised, degrees."""
 MATCH_SHARE = 0.7
-"""Share of the images, of those in which a feature could be recognised, that its track holds: the others are missing."""
+"""Share of the images, of those in which a feature could be recognised, that its track holds: the
+others are missing."""
 POINTS = 160
-"""Keypoints that are tried in each image, drawn with a probability that grows with the square of the image's gradient: plain
-parts of the surface have few points or none."""
+"""Keypoints that are tried in each image, drawn with a probability that grows with the square of
+the image's gradient: plain parts of the surface have few points or none."""
 POSITION_NOISE = 0.0005
-"""Standard deviation of a camera's estimated position along each axis, over its distance from the rock."""
+"""Standard deviation of a camera's estimated position along each axis, over its distance from the
+rock."""
 ROTATION_NOISE = 0.03
 """Standard deviation of its estimated rotation about each axis, degrees."""
 ROLL = 2.0
@@ -66,11 +76,13 @@ ROLL = 2.0
 DISTORTION = np.array([-0.10, 0.03, 0.001, -0.0007])
 """k1 k2 p1 p2 of the lens."""
 CROP = 1.2
-"""Focal length of the photographs over that of the dataset: the distorted and rolled image must not look beyond its rim."""
+"""Focal length of the photographs over that of the dataset: the distorted and rolled image must not
+look beyond its rim."""
 QUALITY = 92
 """Of the JPEG files."""
 WHITE_BALANCE = 1 / 3
-"""With --exposure, how far the gains of red and blue differ from that of green at most, over the largest exposure."""
+"""With --exposure, how far the gains of red and blue differ from that of green at most, over the
+largest exposure."""
 SHUTTER = 0.005
 """Time of an exposure with a gain of 1, seconds."""
 SCALE = 0.37
@@ -86,7 +98,8 @@ HALF = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 @dataclass(frozen=True)
 class World:
-    """A similarity: x of the dataset -> scale * rotation @ x + shift of the data that are written."""
+    """A similarity: x of the dataset -> scale * rotation @ x + shift of the data that are
+    written."""
 
     scale: float
     rotation: np.ndarray
@@ -118,7 +131,8 @@ def small_rotation(degrees: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Photograph:
-    """A frame as it was photographed. camera: the true one, of the undistorted lens, with its roll; distortion: k1 k2 p1 p2."""
+    """A frame as it was photographed. camera: the true one, of the undistorted lens, with its roll;
+    distortion: k1 k2 p1 p2."""
 
     frame: Frame
     camera: Camera
@@ -128,18 +142,26 @@ class Photograph:
         """Where the lens shows points [N,3] of the dataset's world: [N,2] pixels."""
         pose = self.camera.world_to_camera
         rotation = cv2.Rodrigues(pose[:3, :3])[0]
-        shown = cv2.projectPoints(points[:, None], rotation, pose[:3, 3], self.camera.K, self.distortion)[0]
-        return shown[:, 0]  # projectPoints takes K as it is: pixel centres at +0.5 where K has them there
+        shown = cv2.projectPoints(
+            points[:, None], rotation, pose[:3, 3], self.camera.K, self.distortion
+        )[0]
+        return shown[
+            :, 0
+        ]  # projectPoints takes K as it is: pixel centres at +0.5 where K has them there
 
     def resample(self, image: np.ndarray, method: int = cv2.INTER_CUBIC) -> np.ndarray:
         """An image of the frame, [H,W] or [H,W,C], as the lens shows it."""
         v, u = np.mgrid[: self.camera.height, : self.camera.width].astype(np.float64)
-        straight = cv2.undistortPoints(np.stack([u, v], -1).reshape(-1, 1, 2), self.camera.K - HALF, self.distortion)[:, 0]
+        straight = cv2.undistortPoints(
+            np.stack([u, v], -1).reshape(-1, 1, 2), self.camera.K - HALF, self.distortion
+        )[:, 0]
         rays = np.column_stack([straight, np.ones(len(straight))])
         turn = self.frame.camera.world_to_camera[:3, :3] @ self.camera.world_to_camera[:3, :3].T
         source = rays @ turn.T @ (self.frame.camera.K - HALF).T
         place = (source[:, :2] / source[:, 2:]).astype(np.float32).reshape(*u.shape, 2)
-        return cv2.remap(image, place[..., 0], place[..., 1], method, borderMode=cv2.BORDER_REPLICATE)
+        return cv2.remap(
+            image, place[..., 0], place[..., 1], method, borderMode=cv2.BORDER_REPLICATE
+        )
 
 
 def photograph(frame: Frame, rng: np.random.Generator) -> Photograph:
@@ -152,9 +174,12 @@ def photograph(frame: Frame, rng: np.random.Generator) -> Photograph:
 
 
 def estimated(camera: Camera, distance: float, rng: np.random.Generator) -> Camera:
-    """A camera as bundle adjustment finds it. distance: to the rock, in the units of the camera's world."""
+    """A camera as bundle adjustment finds it. distance: to the rock, in the units of the camera's
+    world."""
     pose = np.eye(4)
-    pose[:3, :3] = small_rotation(ROTATION_NOISE * rng.standard_normal(3)) @ camera.world_to_camera[:3, :3]
+    pose[:3, :3] = (
+        small_rotation(ROTATION_NOISE * rng.standard_normal(3)) @ camera.world_to_camera[:3, :3]
+    )
     position = camera.position + POSITION_NOISE * distance * rng.standard_normal(3)
     pose[:3, 3] = -pose[:3, :3] @ position
     return Camera(camera.K, camera.width, camera.height, pose)
@@ -162,8 +187,8 @@ def estimated(camera: Camera, distance: float, rng: np.random.Generator) -> Came
 
 @dataclass(frozen=True)
 class Point:
-    """A triangulated point: its place [3] in the dataset's world, colour [3] uint8, the images of its track and the keypoint in
-    each, pixels [T,2], and the mean reprojection error, pixels."""
+    """A triangulated point: its place [3] in the dataset's world, colour [3] uint8, the images of
+    its track and the keypoint in each, pixels [T,2], and the mean reprojection error, pixels."""
 
     place: np.ndarray
     colour: np.ndarray
@@ -173,13 +198,16 @@ class Point:
 
 
 def triangulated(photos: Sequence[Photograph], rng: np.random.Generator) -> list[Point]:
-    """The sparse points that features in the photographs give, with the errors that the constants of this file state."""
+    """The sparse points that features in the photographs give, with the errors that the constants
+    of this file state."""
     depths = [photo.frame.depth() for photo in photos]
     points: list[Point] = []
     for k, (photo, depth) in enumerate(zip(photos, depths, strict=True)):
         colours = np.round(srgb_from_linear(photo.frame.rgb()) * 255).astype(np.uint8)
         grey = cv2.GaussianBlur((colours @ LUMA).astype(np.float32), (0, 0), 1.0)
-        weight = (cv2.Sobel(grey, cv2.CV_64F, 1, 0) ** 2 + cv2.Sobel(grey, cv2.CV_64F, 0, 1) ** 2) * (depth > 0)
+        weight = (
+            cv2.Sobel(grey, cv2.CV_64F, 1, 0) ** 2 + cv2.Sobel(grey, cv2.CV_64F, 0, 1) ** 2
+        ) * (depth > 0)
         chosen = rng.choice(weight.size, POINTS, replace=False, p=(weight / weight.sum()).ravel())
         world = photo.frame.camera.unproject(depth).reshape(-1, 3)[chosen]
         for place, colour in zip(world, colours.reshape(-1, 3)[chosen], strict=True):
@@ -197,7 +225,8 @@ def _tracked(
     depths: list[np.ndarray],
     rng: np.random.Generator,
 ) -> Point | None:
-    """The point that the feature at `place`, found in photograph k, becomes; None where too few images hold it."""
+    """The point that the feature at `place`, found in photograph k, becomes; None where too few
+    images hold it."""
     views = np.stack([photo.camera.position - place for photo in photos])
     views /= np.linalg.norm(views, axis=1, keepdims=True)
     near = views @ views[k] > np.cos(np.radians(MATCH_ANGLE))
@@ -210,19 +239,30 @@ def _tracked(
         return None
     if rng.random() < OUTLIERS:
         kept = np.sort(rng.choice(track, min(len(track), int(rng.integers(2, 4))), replace=False))
-        wrong = photos[k].camera.position - views[k] * np.linalg.norm(photos[k].camera.position - place) * rng.uniform(
-            *OUTLIER_RANGE
-        )
+        wrong = photos[k].camera.position - views[k] * np.linalg.norm(
+            photos[k].camera.position - place
+        ) * rng.uniform(*OUTLIER_RANGE)
         keypoints = np.stack([photos[int(i)].pixels(wrong[None])[0] for i in kept])
         return Point(wrong, colour, kept, keypoints, float(rng.uniform(*OUTLIER_ERROR)))
     exact = np.stack([photos[i].pixels(place[None])[0] for i in track])
     noise = KEYPOINT_NOISE * rng.standard_normal(exact.shape)
     step = 1e-4 * np.linalg.norm(photos[k].camera.position - place)
-    jacobian = np.stack([photos[i].pixels(place + step * np.eye(3)) - exact[j] for j, i in enumerate(track)]) / step
+    jacobian = (
+        np.stack(
+            [photos[i].pixels(place + step * np.eye(3)) - exact[j] for j, i in enumerate(track)]
+        )
+        / step
+    )
     jacobian = jacobian.transpose(0, 2, 1).reshape(-1, 3)
     moved = np.linalg.lstsq(jacobian, noise.ravel(), rcond=None)[0]  # least squares, to first order
     residual = (noise.ravel() - jacobian @ moved).reshape(-1, 2)
-    return Point(place + moved, colour, np.array(track), exact + noise, float(np.linalg.norm(residual, axis=1).mean()))
+    return Point(
+        place + moved,
+        colour,
+        np.array(track),
+        exact + noise,
+        float(np.linalg.norm(residual, axis=1).mean()),
+    )
 
 
 def _shows(photo: Photograph, depth: np.ndarray, place: np.ndarray) -> bool:
@@ -230,18 +270,27 @@ def _shows(photo: Photograph, depth: np.ndarray, place: np.ndarray) -> bool:
     (u, v), z = (part[0] for part in photo.frame.camera.project(place[None]))
     x, y = photo.pixels(place[None])[0]
     inside = 0 <= x < photo.camera.width and 0 <= y < photo.camera.height and z > 0
-    return bool(inside and abs(depth[min(int(v), depth.shape[0] - 1), min(int(u), depth.shape[1] - 1)] / z - 1) < 0.01)
+    return bool(
+        inside
+        and abs(depth[min(int(v), depth.shape[0] - 1), min(int(u), depth.shape[1] - 1)] / z - 1)
+        < 0.01
+    )
 
 
 def exposures(count: int, stops: float, seed: int) -> np.ndarray:
-    """Gains [count,3] of images: an exposure of up to so many stops more or less, and a white balance, both evenly spread."""
+    """Gains [count,3] of images: an exposure of up to so many stops more or less, and a white
+    balance, both evenly spread."""
     rng = generator(seed, "photographs/exposure")
-    exposure, balance = rng.uniform(-stops, stops, (count, 1)), WHITE_BALANCE * rng.uniform(-stops, stops, (count, 3))
+    exposure, balance = (
+        rng.uniform(-stops, stops, (count, 1)),
+        WHITE_BALANCE * rng.uniform(-stops, stops, (count, 3)),
+    )
     return 2.0 ** (exposure + balance * [1, 0, 1])
 
 
 def write_photographs(photos: Sequence[Photograph], out: Path, gains: np.ndarray | None) -> None:
-    """The JPEG files and the true masks. gains: [V,3] of the images, linear RGB; None: all 1, and no EXIF."""
+    """The JPEG files and the true masks. gains: [V,3] of the images, linear RGB; None: all 1, and
+    no EXIF."""
     (out / "images").mkdir(parents=True)
     for k, photo in enumerate(photos):
         rgb, exif = photo.frame.rgb(), Image.Exif()
@@ -251,12 +300,26 @@ def write_photographs(photos: Sequence[Photograph], out: Path, gains: np.ndarray
                 ExifTags.Base.ExposureTime: SHUTTER * float(gains[k, 1]), ExifTags.Base.FNumber: 2.8,
                 ExifTags.Base.ISOSpeedRatings: 100,
             })  # fmt: skip
-        pixels = photo.resample(np.round(np.clip(srgb_from_linear(rgb), 0, 1) * 255).astype(np.uint8))
-        Image.fromarray(pixels).save(out / f"images/{photo.frame.name}.jpg", quality=QUALITY, exif=exif)
-        write_png(out / f"masks/{photo.frame.name}.png", photo.resample(photo.frame.mask().astype(np.float32)) >= 0.5)
+        pixels = photo.resample(
+            np.round(np.clip(srgb_from_linear(rgb), 0, 1) * 255).astype(np.uint8)
+        )
+        Image.fromarray(pixels).save(
+            out / f"images/{photo.frame.name}.jpg", quality=QUALITY, exif=exif
+        )
+        write_png(
+            out / f"masks/{photo.frame.name}.png",
+            photo.resample(photo.frame.mask().astype(np.float32)) >= 0.5,
+        )
 
 
-def write_colmap(photos: Sequence[Photograph], points: list[Point], world: World, out: Path, seed: int, binary: bool) -> None:
+def write_colmap(
+    photos: Sequence[Photograph],
+    points: list[Point],
+    world: World,
+    out: Path,
+    seed: int,
+    binary: bool,
+) -> None:
     """The sparse model, by pycolmap."""
     import pycolmap
 
@@ -264,7 +327,9 @@ def write_colmap(photos: Sequence[Photograph], points: list[Point], world: World
     first = photos[0].camera
     lens = [first.K[0, 0], first.K[1, 1], first.K[0, 2], first.K[1, 2], *DISTORTION]
     model.add_camera_with_trivial_rig(
-        pycolmap.Camera(model="OPENCV", width=first.width, height=first.height, params=lens, camera_id=1)
+        pycolmap.Camera(
+            model="OPENCV", width=first.width, height=first.height, params=lens, camera_id=1
+        )
     )
     keypoints: list[list[np.ndarray]] = [[] for _ in photos]
     places = []
@@ -274,9 +339,13 @@ def write_colmap(photos: Sequence[Photograph], points: list[Point], world: World
             keypoints[i].append(pixel)
     for k, photo in enumerate(photos):
         camera = world.camera(photo.camera)
-        pose = pycolmap.Rigid3d(estimated(camera, world.scale * _distance(photos), rng).world_to_camera[:3])
+        pose = pycolmap.Rigid3d(
+            estimated(camera, world.scale * _distance(photos), rng).world_to_camera[:3]
+        )
         held = np.array(keypoints[k]).reshape(-1, 2)
-        image = pycolmap.Image(name=f"{photo.frame.name}.jpg", keypoints=held, camera_id=1, image_id=k + 1)
+        image = pycolmap.Image(
+            name=f"{photo.frame.name}.jpg", keypoints=held, camera_id=1, image_id=k + 1
+        )
         model.add_image_with_trivial_frame(image, pose)
     for point, at in zip(points, places, strict=True):
         track = pycolmap.Track()
@@ -288,8 +357,11 @@ def write_colmap(photos: Sequence[Photograph], points: list[Point], world: World
     (model.write_binary if binary else model.write_text)(out / "sparse/0")
 
 
-def write_nerfstudio(photos: Sequence[Photograph], points: list[Point], world: World, out: Path, seed: int) -> None:
-    """transforms.json with the lens's distortion, and the points as nerfstudio writes them: x y z and colours, no tracks."""
+def write_nerfstudio(
+    photos: Sequence[Photograph], points: list[Point], world: World, out: Path, seed: int
+) -> None:
+    """transforms.json with the lens's distortion, and the points as nerfstudio writes them: x y z
+    and colours, no tracks."""
     from plyfile import PlyData, PlyElement
 
     rng, camera = generator(seed, "photographs/poses"), photos[0].camera
@@ -298,9 +370,15 @@ def write_nerfstudio(photos: Sequence[Photograph], points: list[Point], world: W
         "w": camera.width, "h": camera.height, **dict(zip(("k1", "k2", "p1", "p2"), DISTORTION, strict=True)),
         "ply_file_path": "sparse_pc.ply",
     }  # fmt: skip
-    poses = [estimated(world.camera(photo.camera), world.scale * _distance(photos), rng) for photo in photos]
+    poses = [
+        estimated(world.camera(photo.camera), world.scale * _distance(photos), rng)
+        for photo in photos
+    ]
     frames = [
-        {"file_path": f"images/{photo.frame.name}.jpg", "transform_matrix": opengl_from_opencv(pose.world_to_camera).tolist()}
+        {
+            "file_path": f"images/{photo.frame.name}.jpg",
+            "transform_matrix": opengl_from_opencv(pose.world_to_camera).tolist(),
+        }
         for photo, pose in zip(photos, poses, strict=True)
     ]
     _write_json(out / "transforms.json", header | {"frames": frames})
@@ -314,14 +392,17 @@ def write_nerfstudio(photos: Sequence[Photograph], points: list[Point], world: W
 
 
 def write_nerf_synthetic(dataset: Dataset, world: World, out: Path) -> None:
-    """transforms_train.json and PNG files with alpha; one focal length, square pixels, the principal point in the middle."""
+    """transforms_train.json and PNG files with alpha; one focal length, square pixels, the
+    principal point in the middle."""
     frames = []
     for k, frame in enumerate(dataset.frames):
         rgba = frame.target()[0]
         straight = rgba[..., :3] / np.where(rgba[..., 3:] > 0, rgba[..., 3:], 1)
         pixels = np.dstack([srgb_from_linear(straight), rgba[..., 3]])
         (out / "train").mkdir(parents=True, exist_ok=True)
-        Image.fromarray(np.round(np.clip(pixels, 0, 1) * 255).astype(np.uint8)).save(out / f"train/r_{k}.png")
+        Image.fromarray(np.round(np.clip(pixels, 0, 1) * 255).astype(np.uint8)).save(
+            out / f"train/r_{k}.png"
+        )
         write_png(out / f"masks/r_{k}.png", frame.mask())
         pose = opengl_from_opencv(world.camera(frame.camera).world_to_camera).tolist()
         frames.append({"file_path": f"./train/r_{k}", "rotation": 0.0, "transform_matrix": pose})
@@ -331,24 +412,38 @@ def write_nerf_synthetic(dataset: Dataset, world: World, out: Path) -> None:
 
 
 def write_rgbd(dataset: Dataset, out: Path, seed: int) -> None:
-    """transforms.json with noisy depth in millimetres (16-bit PNG), and PNG files; masks are written, but not named in it."""
+    """transforms.json with noisy depth in millimetres (16-bit PNG), and PNG files; masks are
+    written, but not named in it."""
     rng, camera, frames = generator(seed, "photographs/depth"), dataset.frames[0].camera, []
     for frame in dataset.frames:
         write_png(out / f"images/{frame.name}.png", frame.rgb())
         write_png(out / f"masks/{frame.name}.png", frame.mask())
         (out / "depth").mkdir(exist_ok=True)
         millimetres = np.round(1000 * noisy_depth(frame.depth(), frame.camera, rng))
-        cv2.imwrite(str(out / f"depth/{frame.name}.png"), np.clip(millimetres, 0, 65535).astype(np.uint16))
+        cv2.imwrite(
+            str(out / f"depth/{frame.name}.png"), np.clip(millimetres, 0, 65535).astype(np.uint16)
+        )
         pose = opengl_from_opencv(frame.camera.world_to_camera).tolist()
-        record = {"file_path": f"images/{frame.name}.png", "depth_file_path": f"depth/{frame.name}.png"}
+        record = {
+            "file_path": f"images/{frame.name}.png",
+            "depth_file_path": f"depth/{frame.name}.png",
+        }
         frames.append(record | {"transform_matrix": pose})
     K = camera.K
-    lens = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": camera.width, "h": camera.height}
+    lens = {
+        "fl_x": K[0, 0],
+        "fl_y": K[1, 1],
+        "cx": K[0, 2],
+        "cy": K[1, 2],
+        "w": camera.width,
+        "h": camera.height,
+    }
     _write_json(out / "transforms.json", {"camera_model": "OPENCV", **lens, "frames": frames})
 
 
 def make(root: Path, out: Path, kind: str, seed: int = 0, stops: float = 0.0) -> None:
-    """Write the data of a kind into a new folder. stops: of COLMAP and nerfstudio's images, by how much exposure differs."""
+    """Write the data of a kind into a new folder. stops: of COLMAP and nerfstudio's images, by how
+    much exposure differs."""
     dataset, rng = load_dataset(root), generator(seed, "photographs")
     out.mkdir(parents=True)
     world = World(SCALE, random_rotation(rng), SHIFT)
@@ -373,7 +468,12 @@ def make(root: Path, out: Path, kind: str, seed: int = 0, stops: float = 0.0) ->
         else:
             write_colmap(photos, points, world, out, seed, kind == "colmap-binary")
     _write_truth(
-        root, world, out, {} if gains is None else {f.name: g.tolist() for f, g in zip(dataset.frames, gains, strict=True)}
+        root,
+        world,
+        out,
+        {}
+        if gains is None
+        else {f.name: g.tolist() for f, g in zip(dataset.frames, gains, strict=True)},
     )
 
 
@@ -382,13 +482,22 @@ def _write_truth(root: Path, world: World, out: Path, gains: dict[str, list[floa
 
     if (root / "rock.glb").is_file():
         rock = read_rock(root / "rock.glb")
-        trimesh.Trimesh(world.points(rock.vertices), rock.faces, process=False).export(out / "truth.ply")
-    similarity = {"scale": world.scale, "rotation": world.rotation.tolist(), "shift": world.shift.tolist()}
-    _write_json(out / "truth.json", similarity | {"up": world.rotation[:, 2].tolist(), "gains": gains})
+        trimesh.Trimesh(world.points(rock.vertices), rock.faces, process=False).export(
+            out / "truth.ply"
+        )
+    similarity = {
+        "scale": world.scale,
+        "rotation": world.rotation.tolist(),
+        "shift": world.shift.tolist(),
+    }
+    _write_json(
+        out / "truth.json", similarity | {"up": world.rotation[:, 2].tolist(), "gains": gains}
+    )
 
 
 def _distance(photos: Sequence[Photograph]) -> float:
-    """About how far the cameras are from the rock, metres: from the point nearest to all of them, seen from outside."""
+    """About how far the cameras are from the rock, metres: from the point nearest to all of them,
+    seen from outside."""
     positions = np.stack([photo.camera.position for photo in photos])
     return float(np.median(np.linalg.norm(positions - positions.mean(0), axis=1)))
 
@@ -398,12 +507,20 @@ def _write_json(path: Path, data: dict) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Make the data that a photographer would have, of an exact dataset.")
+    parser = argparse.ArgumentParser(
+        description="Make the data that a photographer would have, of an exact dataset."
+    )
     parser.add_argument("dataset", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--kind", choices=KINDS, required=True)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--exposure", type=float, default=0.0, metavar="STOPS", help="let exposure differ by up to STOPS")
+    parser.add_argument(
+        "--exposure",
+        type=float,
+        default=0.0,
+        metavar="STOPS",
+        help="let exposure differ by up to STOPS",
+    )
     given = parser.parse_args()
     if given.exposure and given.kind in ("nerf-synthetic", "rgbd"):
         parser.error(f"--exposure is for photographs of colmap and nerfstudio, not {given.kind}")

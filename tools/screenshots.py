@@ -1,4 +1,5 @@
-"""Makes the screenshots of docs/images with a headless Chromium: `python tools/screenshots.py demo`, after `make demo`."""
+"""Makes the screenshots of docs/images with a headless Chromium: `python tools/screenshots.py
+demo`, after `make demo`."""
 
 from __future__ import annotations
 
@@ -17,24 +18,37 @@ from mgs.report.page import write_page
 
 IMAGES = Path(__file__).parent.parent / "docs/images"
 
-ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+ARGUMENTS = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+]
 """WebGL without a graphics card."""
 
 
 def save(picture: Image.Image, name: str) -> None:
     """Write a picture at two thirds of its size, which is enough to see what is where."""
-    small = picture.convert("RGB").resize((picture.width * 2 // 3, picture.height * 2 // 3), Image.Resampling.LANCZOS)
+    small = picture.convert("RGB").resize(
+        (picture.width * 2 // 3, picture.height * 2 // 3), Image.Resampling.LANCZOS
+    )
     small.save(IMAGES / name, optimize=True)
     print(f"wrote {IMAGES / name}")
 
 
 def report(browser: Any, demo: Path, folder: Path) -> None:
-    """The page of the demo's runs: its step by step on a desk, light, and the comparison on a phone, dark."""
+    """The page of the demo's runs: its step by step on a desk, light, and the comparison on a
+    phone, dark."""
     page = folder / "page.html"
     write_page(page, [demo / policy for policy in POLICIES])
     shots = []
-    for width, height, scheme, section in ((1100, 1180, "light", "steps"), (390, 1180, "dark", "compare")):
-        tab = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme).new_page()
+    for width, height, scheme, section in (
+        (1100, 1180, "light", "steps"),
+        (390, 1180, "dark", "compare"),
+    ):
+        tab = browser.new_context(
+            viewport={"width": width, "height": height}, color_scheme=scheme
+        ).new_page()
         tab.goto(page.as_uri())
         tab.locator("#step").fill("6")
         tab.evaluate(f"document.getElementById('{section}').scrollIntoView()")
@@ -48,7 +62,8 @@ def report(browser: Any, demo: Path, folder: Path) -> None:
 
 
 def viewer(browser: Any, demo: Path, folder: Path) -> None:
-    """The viewer of a run: a camera selected, with the colours of the model and with its uncertainty."""
+    """The viewer of a run: a camera selected, with the colours of the model and with its
+    uncertainty."""
     command = [sys.executable, "-m", "mgs", "view", str(demo / "d-optimal"), "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -57,7 +72,9 @@ def viewer(browser: Any, demo: Path, folder: Path) -> None:
         tab.goto(address)
         tab.get_by_label("View", exact=True).first.click()
         tab.get_by_role("option", name="kf_0028", exact=True).click()
-        for x in range(420, 520, 20):  # turns, so that the notice about software rendering has time to go, too
+        for x in range(
+            420, 520, 20
+        ):  # turns, so that the notice about software rendering has time to go, too
             tab.mouse.move(x, 500)
             tab.mouse.down()
         tab.mouse.up()

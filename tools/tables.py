@@ -1,10 +1,11 @@
-"""Tables of measured numbers in README.md and docs/*.md, made from docs/benchmarks/*.json and docs/results/*/*.json.
+"""Tables of measured numbers in README.md and docs/*.md, made from docs/benchmarks/*.json and
+docs/results/*/*.json.
 
     python tools/tables.py            # write them anew
     python tools/tables.py --check    # exit code 1 where one is not what its numbers say
 
-A table stands between `<!-- table: NAME -->` and `<!-- end of table -->`; NAME is a key of `TABLES`, whose rows are in
-tools/table_makers.
+A table stands between `<!-- table: NAME -->` and `<!-- end of table -->`; NAME is a key of
+`TABLES`, whose rows are in tools/table_makers.
 """
 
 from __future__ import annotations
@@ -33,9 +34,13 @@ def rewritten(page: str, docs: Path) -> str:
     for opening, closing in zip(marks[::2], marks[1::2], strict=False):
         name = opening["name"]
         if name is None or closing["name"] is not None:
-            raise ValueError(f"{opening[0]}, {closing[0]}: marks must come in pairs, `table: NAME` and `end of table`")
+            raise ValueError(
+                f"{opening[0]}, {closing[0]}: marks must come in pairs, `table: NAME` and `end of table`"
+            )
         if name not in TABLES:
-            raise ValueError(f"{opening[0]}: no such table; tools/tables.py has {', '.join(TABLES)}")
+            raise ValueError(
+                f"{opening[0]}: no such table; tools/tables.py has {', '.join(TABLES)}"
+            )
         file, make = TABLES[name]
         path = docs / f"{file}.json"
         missing = file in NOT_RUN and not path.is_file()
@@ -61,7 +66,10 @@ def main(arguments: Sequence[str], root: Path = ROOT) -> int:
             continue
         stale += 1
         if "--check" in arguments:
-            print(f"{path.relative_to(root)}: a table is stale; run `python tools/tables.py`", file=sys.stderr)
+            print(
+                f"{path.relative_to(root)}: a table is stale; run `python tools/tables.py`",
+                file=sys.stderr,
+            )
         else:
             path.write_text(new, encoding="utf-8")
             print(f"wrote {path.relative_to(root)}")

@@ -1,7 +1,8 @@
-"""Timings of the splatting kernels: beside Mitsuba's own splatting integrator, and as the work grows. All times are medians.
+"""Timings of the splatting kernels: beside Mitsuba's own splatting integrator, and as the work
+grows. All times are medians.
 
-Kernels are compiled, and memory is allocated, before anything is timed. Ratios of times are about the same on other machines;
-times are not.
+Kernels are compiled, and memory is allocated, before anything is timed. Ratios of times are about
+the same on other machines; times are not.
 """
 
 from __future__ import annotations
@@ -38,9 +39,10 @@ TARGETS = {
     "block_fisher_over_gradient": ("at most", 2.0),
     "tiny_forward_ms": ("at most", 5.0),
 }
-"""What this project asks of itself, by the names in "figures" of `bench_splat`: `mgs bench splat` prints them beside what was
-measured. *_speedup: time of Mitsuba's integrator over ours; *_over_gradient: time of the Fisher information over that of image
-and gradient; tiny_forward_ms: milliseconds."""
+"""What this project asks of itself, by the names in "figures" of `bench_splat`: `mgs bench splat`
+prints them beside what was measured. *_speedup: time of Mitsuba's integrator over ours;
+*_over_gradient: time of the Fisher information over that of image and gradient; tiny_forward_ms:
+milliseconds."""
 
 WARM_UP = 2
 """Number of calls before those that are timed: they compile kernels and allocate memory."""
@@ -49,8 +51,9 @@ WARM_UP = 2
 def surface_gaussians(n: int, seed: int = 0) -> Gaussians:
     """n flat Gaussians at random points on the surface of the default rock.
 
-    Their standard deviations are 0.8, 0.8 and 0.2 spacings (the square root of area / n), their opacity is 0.73 (logit 1),
-    their colours are random. These are the Gaussians for which the TARGETS were set.
+    Their standard deviations are 0.8, 0.8 and 0.2 spacings (the square root of area / n), their
+    opacity is 0.73 (logit 1), their colours are random. These are the Gaussians for which the
+    TARGETS were set.
     """
     import trimesh
 
@@ -71,21 +74,24 @@ def surface_gaussians(n: int, seed: int = 0) -> Gaussians:
 
 
 def surface_camera(gaussians: Gaussians, width: int, height: int) -> Camera:
-    """A camera with an image of width x height pixels, 25 degrees above the horizon and three radii away from the Gaussians,
-    which fill its image."""
+    """A camera with an image of width x height pixels, 25 degrees above the horizon and three radii
+    away from the Gaussians, which fill its image."""
     low, high = gaussians.means.min(axis=0), gaussians.means.max(axis=0)
     centre, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
     pose = look_at(centre + 3 * radius * np.array([np.cos(0.44), 0.0, np.sin(0.44)]), centre)
     x, y, z = (gaussians.means @ pose[:3, :3].T + pose[:3, 3]).T
     focal = 0.49 * min(width / np.abs(x / z).max(), height / np.abs(y / z).max())
-    return Camera(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), width, height, pose)
+    return Camera(
+        np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), width, height, pose
+    )
 
 
 def turned_cameras(camera: Camera, gaussians: Gaussians, count: int) -> list[Camera]:
-    """`count` other cameras: the camera turned about the vertical axis through the middle of the Gaussians, in even steps.
+    """`count` other cameras: the camera turned about the vertical axis through the middle of the
+    Gaussians, in even steps.
 
-    Intrinsics, distance and elevation stay the same, so that the number of (splat, block) pairs is similar (within 6 % for
-    100,000 Gaussians).
+    Intrinsics, distance and elevation stay the same, so that the number of (splat, block) pairs is
+    similar (within 6 % for 100,000 Gaussians).
     """
     to_centre = np.eye(4)
     to_centre[:3, 3] = -(gaussians.means.min(axis=0) + gaussians.means.max(axis=0)) / 2
@@ -99,8 +105,8 @@ def turned_cameras(camera: Camera, gaussians: Gaussians, count: int) -> list[Cam
 
 
 def median_seconds(call: Callable[[], Any], repeats: int) -> float:
-    """Median of the wall-clock seconds of `repeats` calls, after WARM_UP calls that do not count. What a call returns is
-    evaluated by Dr.Jit within its time."""
+    """Median of the wall-clock seconds of `repeats` calls, after WARM_UP calls that do not count.
+    What a call returns is evaluated by Dr.Jit within its time."""
     seconds = []
     for i in range(repeats + WARM_UP):
         start = time.perf_counter()
@@ -111,8 +117,11 @@ def median_seconds(call: Callable[[], Any], repeats: int) -> float:
     return float(np.median(seconds))
 
 
-def gradient(gaussians: Gaussians, camera: Camera, weights: Any, cache: ListCache | None) -> list[Any]:
-    """Render, then differentiate: gradients of a weighted sum of the image with respect to each of LEARNED.
+def gradient(
+    gaussians: Gaussians, camera: Camera, weights: Any, cache: ListCache | None
+) -> list[Any]:
+    """Render, then differentiate: gradients of a weighted sum of the image with respect to each of
+    LEARNED.
 
     weights: TensorXf [H,W,3]; cache: as `mgs.splat.render`.
     """
@@ -124,33 +133,44 @@ def gradient(gaussians: Gaussians, camera: Camera, weights: Any, cache: ListCach
     return gradients
 
 
-def time_core(gaussians: Gaussians, camera: Camera, repeats: int, blocks: bool = True) -> dict[str, float]:
+def time_core(
+    gaussians: Gaussians, camera: Camera, repeats: int, blocks: bool = True
+) -> dict[str, float]:
     """Seconds of each operation on these Gaussians (NumPy fields).
 
-    forward_cold: render a view that was never seen before, another one in each call, so that its block lists must be built. The
-    other operations see the same camera again, whose lists are kept: forward_warm, render; gradient_warm, `gradient`;
-    fisher_exact and, if `blocks`, fisher_block, `mgs.splat.fisher` with these estimators. Also pairs: the number of (splat,
-    block) pairs of the camera; list_bytes: memory of its lists, bytes.
+    forward_cold: render a view that was never seen before, another one in each call, so that its
+    block lists must be built. The
+    other operations see the same camera again, whose lists are kept: forward_warm, render;
+    gradient_warm, `gradient`; fisher_exact and, if `blocks`, fisher_block, `mgs.splat.fisher` with
+    these estimators. Also pairs: the number of (splat, block) pairs of the camera; list_bytes:
+    memory of its lists, bytes.
     """
     device, cache = as_drjit(gaussians), ListCache()
     new_views = iter(turned_cameras(camera, gaussians, repeats + WARM_UP))
-    weights = mi.TensorXf(padded(np.random.default_rng(0).normal(size=(camera.height, camera.width, 3))))
+    weights = mi.TensorXf(
+        padded(np.random.default_rng(0).normal(size=(camera.height, camera.width, 3)))
+    )
     dr.eval(device, weights)
     seconds = {
         "forward_cold": median_seconds(lambda: render(device, next(new_views)).rgb, repeats),
         "forward_warm": median_seconds(lambda: render(device, camera, cache=cache).rgb, repeats),
         "gradient_warm": median_seconds(lambda: gradient(device, camera, weights, cache), repeats),
-        "fisher_exact": median_seconds(lambda: fisher(device, camera, "exact", cache=cache), repeats),
+        "fisher_exact": median_seconds(
+            lambda: fisher(device, camera, "exact", cache=cache), repeats
+        ),
     }
     if blocks:
-        seconds["fisher_block"] = median_seconds(lambda: fisher(device, camera, "block", cache=cache), repeats)
+        seconds["fisher_block"] = median_seconds(
+            lambda: fisher(device, camera, "block", cache=cache), repeats
+        )
     lists, _ = cache.get(camera, project(device, camera_array(camera)))
     pairs = float(np.sum(np.asarray(lists.end).astype(np.int64) - np.asarray(lists.start)))
     return seconds | {"pairs": pairs, "list_bytes": float(cache.nbytes)}
 
 
 def volprim_scene(gaussians: Gaussians, camera: Camera) -> Any:
-    """The Gaussians as a scene of Mitsuba's own integrator for them, `volprim_rf_basic`, seen by the camera."""
+    """The Gaussians as a scene of Mitsuba's own integrator for them, `volprim_rf_basic`, seen by
+    the camera."""
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     forward = camera.world_to_camera[2, :3]
     return mi.load_dict(
@@ -161,7 +181,9 @@ def volprim_scene(gaussians: Gaussians, camera: Camera) -> Any:
                 "type": "perspective",
                 "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.K[0, 0]))),
                 "fov_axis": "x",
-                "to_world": mi.ScalarTransform4f().look_at(camera.position, camera.position + forward, [0, 0, 1]),
+                "to_world": mi.ScalarTransform4f().look_at(
+                    camera.position, camera.position + forward, [0, 0, 1]
+                ),
                 "film": {
                     "type": "hdrfilm",
                     "width": camera.width,
@@ -183,8 +205,8 @@ def volprim_scene(gaussians: Gaussians, camera: Camera) -> Any:
 
 
 def time_volprim(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
-    """Seconds of Mitsuba's own integrator for such Gaussians, `volprim_rf_basic`: volprim_forward, an image; volprim_gradient,
-    an image and the gradients of its sum."""
+    """Seconds of Mitsuba's own integrator for such Gaussians, `volprim_rf_basic`: volprim_forward,
+    an image; volprim_gradient, an image and the gradients of its sum."""
     scene = volprim_scene(gaussians, camera)
     parameters = mi.traverse(scene)
     names = ["gaussians.data", "gaussians.opacities", "gaussians.sh_coeffs"]
@@ -200,12 +222,16 @@ def time_volprim(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str
 
 
 def flops_per_pair(call: Callable[[], Any], lanes: int) -> float:
-    """Floating-point operations of a call for each (splat, block) pair, counted in the LLVM IR of the kernels that walk through
-    block lists: those with this number of lanes, that of the image's blocks, in their first loops. An FMA counts as two."""
+    """Floating-point operations of a call for each (splat, block) pair, counted in the LLVM IR of
+    the kernels that walk through
+    block lists: those with this number of lanes, that of the image's blocks, in their first loops.
+    An FMA counts as two."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         dr.eval(call())
-        found = [entry for entry in dr.kernel_history([dr.KernelType.JIT]) if entry["size"] == lanes]
+        found = [
+            entry for entry in dr.kernel_history([dr.KernelType.JIT]) if entry["size"] == lanes
+        ]
     total = 0.0
     for counted in (count_work(entry["ir"].getvalue()) for entry in found):
         for work in counted.loops[:1]:
@@ -214,17 +240,22 @@ def flops_per_pair(call: Callable[[], Any], lanes: int) -> float:
 
 
 def pairs_in_an_iteration(walk: KernelWork) -> int:
-    """How many (splat, block) pairs the first loop of a walk draws in one iteration. A walk that stores sums draws one; it is
-    known by its second loop, which writes zeros."""
+    """How many (splat, block) pairs the first loop of a walk draws in one iteration. A walk that
+    stores sums draws one; it is known by its second loop, which writes zeros."""
     return 1 if len(walk.loops) > 1 else TOGETHER
 
 
-def bench_splat(n: int, width: int, height: int, repeats: int, report: Callable[[str], None]) -> dict[str, Any]:
-    """Measure what `mgs bench splat` prints and writes: n Gaussians in an image of width x height pixels.
+def bench_splat(
+    n: int, width: int, height: int, repeats: int, report: Callable[[str], None]
+) -> dict[str, Any]:
+    """Measure what `mgs bench splat` prints and writes: n Gaussians in an image of width x height
+    pixels.
 
-    report(what) is called before each measurement. Returns "scene"; "seconds" of each operation; "figures", those of TARGETS;
-    "pairs" (splat, block); "pixel_splat_pairs_per_second"; "peak_gflops_measured" and "share_of_peak" that the kernels reach;
-    "list_megabytes" of a camera's block lists; "peak_memory_megabytes" of the process before Mitsuba's integrator is loaded.
+    report(what) is called before each measurement. Returns "scene"; "seconds" of each operation;
+    "figures", those of TARGETS; "pairs" (splat, block); "pixel_splat_pairs_per_second";
+    "peak_gflops_measured" and "share_of_peak" that the kernels reach; "list_megabytes" of a
+    camera's block lists; "peak_memory_megabytes" of the process before Mitsuba's integrator is
+    loaded.
     """
     gaussians = surface_gaussians(n)
     camera = surface_camera(gaussians, width, height)
@@ -270,20 +301,30 @@ def bench_splat(n: int, width: int, height: int, repeats: int, report: Callable[
     }
 
 
-def bench_scaling(repeats: int, report: Callable[[str], None], most: int = 1_000_000) -> list[dict[str, Any]]:
-    """Measure `scaling_point` along four sweeps; returns a record for each point. most: largest number N of Gaussians.
+def bench_scaling(
+    repeats: int, report: Callable[[str], None], most: int = 1_000_000
+) -> list[dict[str, Any]]:
+    """Measure `scaling_point` along four sweeps; returns a record for each point. most: largest
+    number N of Gaussians.
 
-    gaussians: N grows, at 640x480. pixels: the image grows, at N = 100,000. both: N and the number of pixels grow together,
-    with 640x480 at 100,000; a Gaussian then keeps its number of pairs, and only the number of all (splat, block) pairs grows.
-    threads: one, and all. A record holds "sweep", "n", "pixels", "threads" and what `scaling_point` returns. report(what) is
-    called before each point.
+    gaussians: N grows, at 640x480. pixels: the image grows, at N = 100,000. both: N and the number
+    of pixels grow together, with 640x480 at 100,000; a Gaussian then keeps its number of pairs, and
+    only the number of all (splat, block) pairs grows.
+    threads: one, and all. A record holds "sweep", "n", "pixels", "threads" and what `scaling_point`
+    returns. report(what) is called before each point.
     """
     threads = dr.thread_count()
     numbers = [n for n in (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000) if n <= most]
     points = [("gaussians", n, 640, 480, threads) for n in numbers]
     base = min(100_000, most)
-    points += [("pixels", base, w, h, threads) for w, h in ((160, 120), (320, 240), (640, 480), (1280, 960))]
-    points += [("both", n, round(640 * (n / 1e5) ** 0.5), round(480 * (n / 1e5) ** 0.5), threads) for n in numbers]
+    points += [
+        ("pixels", base, w, h, threads)
+        for w, h in ((160, 120), (320, 240), (640, 480), (1280, 960))
+    ]
+    points += [
+        ("both", n, round(640 * (n / 1e5) ** 0.5), round(480 * (n / 1e5) ** 0.5), threads)
+        for n in numbers
+    ]
     points += [("threads", base, 640, 480, t) for t in sorted({1, threads})]
     records = []
     for sweep, n, width, height, count in points:
@@ -293,18 +334,24 @@ def bench_scaling(repeats: int, report: Callable[[str], None], most: int = 1_000
     return records
 
 
-def scaling_point(n: int, width: int, height: int, threads: int, repeats: int, blocks: bool = True) -> dict[str, float]:
-    """What `time_core` returns, with this many threads, and peak_bytes: the most memory that Dr.Jit has held in this
-    process."""
+def scaling_point(
+    n: int, width: int, height: int, threads: int, repeats: int, blocks: bool = True
+) -> dict[str, float]:
+    """What `time_core` returns, with this many threads, and peak_bytes: the most memory that Dr.Jit
+    has held in this process."""
     dr.set_thread_count(threads)
     gaussians = surface_gaussians(n)
     seconds = time_core(gaussians, surface_camera(gaussians, width, height), repeats, blocks)
     return seconds | {"peak_bytes": float(dr.detail.malloc_watermark(dr.JitBackend.LLVM))}
 
 
-def in_new_process(call: Callable[..., Any], *arguments: Any, initializer: Callable[[], None] = runtime.start) -> Any:
-    """Call a function in a new process, after `initializer`, and return its result, so that nothing is left over from earlier
-    calls: no memory, no recorded kernel, no block list. The functions and the arguments must be picklable."""
+def in_new_process(
+    call: Callable[..., Any], *arguments: Any, initializer: Callable[[], None] = runtime.start
+) -> Any:
+    """Call a function in a new process, after `initializer`, and return its result, so that nothing
+    is left over from earlier
+    calls: no memory, no recorded kernel, no block list. The functions and the arguments must be
+    picklable."""
     spawn = multiprocessing.get_context("spawn")  # Dr.Jit's threads do not survive a fork
     with ProcessPoolExecutor(1, spawn, initializer=initializer) as pool:
         return pool.submit(call, *arguments).result()

@@ -1,7 +1,9 @@
-"""What the fit of a dataset comes to: accuracy of the model, and how near the end a fit is when it stops, beside targets.
+"""What the fit of a dataset comes to: accuracy of the model, and how near the end a fit is when it
+stops, beside targets.
 
-Everything is measured on twelve views spread evenly in azimuth, or on states of four to eight views, with the settings that
-`mgs nbv` has by default. Times are of the fits alone, in this process; let nothing else run.
+Everything is measured on twelve views spread evenly in azimuth, or on states of four to eight
+views, with the settings that `mgs nbv` has by default. Times are of the fits alone, in this
+process; let nothing else run.
 """
 
 from __future__ import annotations
@@ -14,18 +16,18 @@ from typing import Any
 
 import numpy as np
 
-from mgs.active.convergence import CG_ITERATIONS
-from mgs.active.criteria import d_optimal, lam_by_kind, regularisation
-from mgs.active.fitting import Fit, fit
-from mgs.active.objective import Objective, newton_decrease, objective
-from mgs.active.pose_policies import seed_views
-from mgs.active.settings import ALPHA_WEIGHT, TrainSettings
 from mgs.data.dataset import Dataset, load_dataset, target_of
+from mgs.fit.fitting import Fit, fit
+from mgs.fit.objective import Objective, newton_decrease, objective
+from mgs.fit.settings import ALPHA_WEIGHT, TrainSettings
 from mgs.gaussians import Gaussians
 from mgs.metrics import agreement
+from mgs.policy.criteria import d_optimal, lam_by_kind, regularisation
+from mgs.policy.poses import seed_views
 from mgs.prior.build import Prior, build_prior
 from mgs.prior.initial import initial_gaussians
 from mgs.prior.settings import PriorSettings
+from mgs.report.convergence import CG_ITERATIONS
 from mgs.report.evaluation import evaluate
 from mgs.seeds import generator
 from mgs.splat import ListCache, as_drjit, fisher, groups
@@ -33,15 +35,18 @@ from mgs.splat import ListCache, as_drjit, fisher, groups
 VIEWS = 12
 SIZES = (10_000, 20_000)
 STATES = (("even", 4), ("random", 4), ("random", 6), ("random", 8))
-"""States from which candidates are ranked: views spread evenly in azimuth, or drawn, and their number."""
+"""States from which candidates are ranked: views spread evenly in azimuth, or drawn, and their
+number."""
 LONGER = 10
 """How many times as many passes the fit has that stands for the end."""
 
 OLD_RATES = {"colour": 0.02, "scale": 0.02, "rotation": 0.01, "opacity": 0.05}
-"""Rates of the fit that times are compared with, Adam for OLD_PASSES passes: those of the first version of mgs."""
+"""Rates of the fit that times are compared with, Adam for OLD_PASSES passes: those of the first
+version of mgs."""
 OLD_PASSES = 400
 TRIED_PASSES = (40, 130)
-"""Lengths of a fit that are tried, until one reaches the objective of the fit that times are compared with."""
+"""Lengths of a fit that are tried, until one reaches the objective of the fit that times are
+compared with."""
 
 TARGETS = {
     "psnr_held_out": ("at least", 32.5),
@@ -55,12 +60,14 @@ TARGETS = {
     "seconds_to_old_objective_cold": ("at most", 1 / 3),
     "seconds_to_old_objective_warm": ("at most", 1 / 10),
 }
-"""What this project asks of itself for the dataset of the demo, by the names in "figures" of `bench_fit`."""
+"""What this project asks of itself for the dataset of the demo, by the names in "figures" of
+`bench_fit`."""
 
 
 @dataclass(frozen=True)
 class _Case:
-    """A dataset, a prior, and the views to fit to, with what fits of them need; alpha_weight: of `TrainSettings`."""
+    """A dataset, a prior, and the views to fit to, with what fits of them need; alpha_weight: of
+    `TrainSettings`."""
 
     dataset: Dataset
     prior: Prior
@@ -73,13 +80,17 @@ class _Case:
         """A fit as `mgs nbv` does it, from some model to some views."""
         cameras, targets = self._images(views)
         train = train.model_copy(update={"alpha_weight": self.alpha_weight})
-        return fit(model, cameras, targets, train, cache=self.cache, start=self.start, lam=_lam_by_kind())
+        return fit(
+            model, cameras, targets, train, cache=self.cache, start=self.start, lam=_lam_by_kind()
+        )
 
     def objective(self, views: Sequence[int]) -> Objective:
         """What such a fit lowers."""
         cameras, targets = self._images(views)
         lam, weight = _lam_by_kind(), self.alpha_weight
-        return objective(self.start, cameras, targets, self.start, lam, self.cache, alpha_weight=weight)
+        return objective(
+            self.start, cameras, targets, self.start, lam, self.cache, alpha_weight=weight
+        )
 
     def phi(self, model: Gaussians) -> float:
         """Phi of a model at the views taken."""
@@ -87,16 +98,20 @@ class _Case:
 
     def _images(self, views: Sequence[int]) -> tuple[list[Any], list[np.ndarray]]:
         frames = [self.dataset.frames[i] for i in views]
-        return [frame.camera for frame in frames], [target_of(frame, self.alpha_weight > 0) for frame in frames]
+        return [frame.camera for frame in frames], [
+            target_of(frame, self.alpha_weight > 0) for frame in frames
+        ]
 
 
-def bench_fit(root: Path, report: Callable[[str], None], alpha_weight: float = ALPHA_WEIGHT) -> dict[str, Any]:
-    """Measure everything in TARGETS on one dataset, which needs depth, and alpha where that has a weight. report(what) is told
-    before each part.
+def bench_fit(
+    root: Path, report: Callable[[str], None], alpha_weight: float = ALPHA_WEIGHT
+) -> dict[str, Any]:
+    """Measure everything in TARGETS on one dataset, which needs depth, and alpha where that has a
+    weight. report(what) is told before each part.
 
-    Returns "figures" by the names of TARGETS, and what they were made from; "ranking_tau_half", the mean "tau_half" of
-    `_ranking`, which has no target; "test", the same metrics as "held_out", over the
-    test views, where the dataset has some. Raises InputError as `load_dataset`.
+    Returns "figures" by the names of TARGETS, and what they were made from; "ranking_tau_half", the
+    mean "tau_half" of `_ranking`, which has no target; "test", the same metrics as "held_out", over
+    the test views, where the dataset has some. Raises InputError as `load_dataset`.
     """
     dataset = load_dataset(root)
     report(f"accuracy of {' and '.join(f'{n:,}' for n in SIZES)} Gaussians on {VIEWS} views")
@@ -135,13 +150,16 @@ def _lam_by_kind() -> dict[str, float]:
 
 
 def _case(dataset: Dataset, gaussians: int, how: str, count: int, alpha_weight: float) -> _Case:
-    """Views spread evenly in azimuth, or drawn at random, and the Gaussians that they start from."""
+    """Views spread evenly in azimuth, or drawn at random, and the Gaussians that they start
+    from."""
     prior, _ = build_prior(dataset, PriorSettings(gaussians=gaussians))
     positions = np.array([frame.camera.position for frame in dataset.frames])
     if how == "even":
         taken = seed_views(positions, prior.points.mean(0), count)
     else:
-        taken = sorted(generator(0, f"bench/fit/{count}").choice(len(positions), count, replace=False).tolist())
+        taken = sorted(
+            generator(0, f"bench/fit/{count}").choice(len(positions), count, replace=False).tolist()
+        )
     start = initial_gaussians(prior, [dataset.frames[i] for i in taken])[0]
     return _Case(dataset, prior, taken, start, ListCache(), alpha_weight)
 
@@ -155,7 +173,9 @@ def _one_more(case: _Case) -> _Case:
 def _held_out(case: _Case, model: Gaussians) -> dict[str, Any]:
     """Mean metrics over the views that were not fitted."""
     names = [case.dataset.frames[i].name for i in case.taken]
-    found: dict[str, Any] = evaluate(model, case.dataset.frames, names, spacing=case.prior.spacing)["held_out"]
+    found: dict[str, Any] = evaluate(model, case.dataset.frames, names, spacing=case.prior.spacing)[
+        "held_out"
+    ]
     return found
 
 
@@ -164,15 +184,20 @@ def _on_test_views(case: _Case, model: Gaussians) -> dict[str, Any]:
     tests = case.dataset.test_views()
     if tests is None:
         return {}
-    found: dict[str, Any] = evaluate(model, [], [], test_frames=tests.frames, spacing=case.prior.spacing)["test"]
+    found: dict[str, Any] = evaluate(
+        model, [], [], test_frames=tests.frames, spacing=case.prior.spacing
+    )["test"]
     return found
 
 
 def _end_of_fit(case: _Case, stopped: Fit) -> dict[str, Any]:
-    """Phi where the fit stopped, the decrease that is predicted from there, and the one that a longer fit finds."""
+    """Phi where the fit stopped, the decrease that is predicted from there, and the one that a
+    longer fit finds."""
     goal = case.objective(case.taken)
     at_stop = goal.phi(as_drjit(stopped.gaussians))
-    longer = case.fit(case.start, case.taken, TrainSettings(passes=LONGER * stopped.passes, tolerance=0.0))
+    longer = case.fit(
+        case.start, case.taken, TrainSettings(passes=LONGER * stopped.passes, tolerance=0.0)
+    )
     predicted = newton_decrease(goal, as_drjit(stopped.gaussians), CG_ITERATIONS)
     found = at_stop - goal.phi(as_drjit(longer.gaussians))
     return {
@@ -182,17 +207,23 @@ def _end_of_fit(case: _Case, stopped: Fit) -> dict[str, Any]:
 
 
 def passes_to(case: _Case, model: Gaussians) -> dict[str, Any]:
-    """How many passes a fit needs to reach the objective that the first version's rates reach in OLD_PASSES passes.
+    """How many passes a fit needs to reach the objective that the first version's rates reach in
+    OLD_PASSES passes.
 
-    Returns "share", the fewest of TRIED_PASSES that reach it over OLD_PASSES, and "share_of_seconds", the time that they take
-    over that of OLD_PASSES, both None where none reaches it; and of every fit its passes, objective and seconds. A short fit
-    comes before those that are timed, so that none of them compiles kernels.
+    Returns "share", the fewest of TRIED_PASSES that reach it over OLD_PASSES, and
+    "share_of_seconds", the time that they take over that of OLD_PASSES, both None where none
+    reaches it; and of every fit its passes, objective and seconds. A short fit comes before those
+    that are timed, so that none of them compiles kernels.
     """
 
     def timed(train: TrainSettings) -> dict[str, Any]:
         began = time.perf_counter()
         found = case.fit(model, case.taken, train)
-        return {"passes": train.passes, "seconds": time.perf_counter() - began, "phi": case.phi(found.gaussians)}
+        return {
+            "passes": train.passes,
+            "seconds": time.perf_counter() - began,
+            "phi": case.phi(found.gaussians),
+        }
 
     for optimiser in ("adam", "natural"):
         timed(TrainSettings(optimiser=optimiser, passes=1))
@@ -204,23 +235,39 @@ def passes_to(case: _Case, model: Gaussians) -> dict[str, Any]:
             break
     last = tried[-1]
     reached = last["phi"] <= old["phi"]
-    shares = {"share": last["passes"] / OLD_PASSES, "share_of_seconds": last["seconds"] / old["seconds"]}
-    return {"old": old, "tried": tried, **{name: value if reached else None for name, value in shares.items()}}
+    shares = {
+        "share": last["passes"] / OLD_PASSES,
+        "share_of_seconds": last["seconds"] / old["seconds"],
+    }
+    return {
+        "old": old,
+        "tried": tried,
+        **{name: value if reached else None for name, value in shares.items()},
+    }
 
 
 def _ranking(case: _Case) -> dict[str, float]:
-    """Kendall's tau and regret of the D-optimal ranking where the fit stops, against a fit of LONGER times the passes; and
-    "tau_half", what a run could know of that: tau with the ranking of a fit of half the passes."""
+    """Kendall's tau and regret of the D-optimal ranking where the fit stops, against a fit of
+    LONGER times the passes; and "tau_half", what a run could know of that: tau with the ranking of
+    a fit of half the passes."""
     stopped = case.fit(case.start, case.taken, TrainSettings())
     lengths = (max(stopped.passes // 2, 1), LONGER * stopped.passes)
-    half, longer = (case.fit(case.start, case.taken, TrainSettings(passes=n, tolerance=0.0)) for n in lengths)
+    half, longer = (
+        case.fit(case.start, case.taken, TrainSettings(passes=n, tolerance=0.0)) for n in lengths
+    )
     before, mine, end = (_scores(case, found.gaussians) for found in (half, stopped, longer))
-    return {"views": len(case.taken), "tau_half": agreement(before, mine)["tau"], **agreement(mine, end)}
+    return {
+        "views": len(case.taken),
+        "tau_half": agreement(before, mine)["tau"],
+        **agreement(mine, end),
+    }
 
 
 def _scores(case: _Case, model: Gaussians) -> np.ndarray:
     """Eq. 7 of every view that is not taken."""
     cameras, lam = [frame.camera for frame in case.dataset.frames], regularisation(groups(0))
-    H = np.stack([fisher(model, cameras[i], cache=case.cache) for i in case.taken]).sum(0, dtype=np.float64)
+    H = np.stack([fisher(model, cameras[i], cache=case.cache) for i in case.taken]).sum(
+        0, dtype=np.float64
+    )
     left = [i for i in range(len(cameras)) if i not in case.taken]
     return np.array([d_optimal(fisher(model, cameras[i], cache=case.cache), H, lam) for i in left])

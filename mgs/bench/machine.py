@@ -1,7 +1,8 @@
-"""What this machine reaches at most, measured: floating-point operations and divisions a second, and bytes a second from each
-cache. All with Dr.Jit's number of threads.
+"""What this machine reaches at most, measured: floating-point operations and divisions a second,
+and bytes a second from each cache. All with Dr.Jit's number of threads.
 
-No call that is timed is so short that starting it would count. Of several calls the fastest counts, since a limit is wanted.
+No call that is timed is so short that starting it would count. Of several calls the fastest counts,
+since a limit is wanted.
 """
 
 from __future__ import annotations
@@ -32,20 +33,25 @@ SECONDS = 0.005
 
 
 def cache_sizes() -> dict[str, int]:
-    """Bytes of "L1" (data), "L2" and "L3", those of one core, or shared. Raises InputError where the system does not tell."""
+    """Bytes of "L1" (data), "L2" and "L3", those of one core, or shared. Raises InputError where
+    the system does not tell."""
     sizes = {}
     for index in sorted(CACHES.glob("index*")):
-        level, kind, size = ((index / name).read_text().strip() for name in ("level", "type", "size"))
+        level, kind, size = (
+            (index / name).read_text().strip() for name in ("level", "type", "size")
+        )
         if kind != "Instruction":
             sizes[f"L{level}"] = int(size.rstrip("K")) * 1024
     if not {"L1", "L2", "L3"} <= sizes.keys():
-        raise InputError(f"{CACHES}: no sizes of three caches; the roofline needs Linux on a processor that tells them")
+        raise InputError(
+            f"{CACHES}: no sizes of three caches; the roofline needs Linux on a processor that tells them"
+        )
     return sizes
 
 
 def kernel_seconds(call: Callable[[], Any]) -> float:
-    """Seconds of the last kernel that a call starts, by Dr.Jit's own clock, without the time to record it: the fastest of
-    REPEATS calls."""
+    """Seconds of the last kernel that a call starts, by Dr.Jit's own clock, without the time to
+    record it: the fastest of REPEATS calls."""
     seconds = []
     for _ in range(REPEATS):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -56,11 +62,14 @@ def kernel_seconds(call: Callable[[], Any]) -> float:
     return min(seconds)
 
 
-def operation_rate(operation: Callable[[Any], Any], real: Any, lanes: int = 1 << 16, rounds: int = 64) -> float:
-    """How often a second an operation is done, in 8 independent chains for each SIMD lane, on registers.
+def operation_rate(
+    operation: Callable[[Any], Any], real: Any, lanes: int = 1 << 16, rounds: int = 64
+) -> float:
+    """How often a second an operation is done, in 8 independent chains for each SIMD lane, on
+    registers.
 
-    operation: a function of a number of type `real` (mi.Float or mi.Float64). A quarter of these lanes Dr.Jit often gives all
-    to one thread.
+    operation: a function of a number of type `real` (mi.Float or mi.Float64). A quarter of these
+    lanes Dr.Jit often gives all to one thread.
     """
 
     def body(i: Any, chains: list[Any]) -> Any:
@@ -71,12 +80,15 @@ def operation_rate(operation: Callable[[Any], Any], real: Any, lanes: int = 1 <<
     x = dr.arange(real, lanes) * (1 / lanes) + 1
     dr.eval(x)
     start = [x + i for i in range(8)]
-    seconds = kernel_seconds(lambda: sum(dr.while_loop((mi.UInt32(0), start), lambda i, _: i < rounds, body)[1]))
+    seconds = kernel_seconds(
+        lambda: sum(dr.while_loop((mi.UInt32(0), start), lambda i, _: i < rounds, body)[1])
+    )
     return 8 * 16 * lanes * rounds / seconds
 
 
 def peak_flops(real: Any = None) -> float:
-    """Floating-point operations a second of FMAs, each of which is two. real: their type, mi.Float if not given."""
+    """Floating-point operations a second of FMAs, each of which is two. real: their type, mi.Float
+    if not given."""
     real = real or mi.Float
     scale = dr.opaque(real, 0.999)
     return 2 * operation_rate(lambda value: dr.fma(value, scale, scale), real)
@@ -89,10 +101,12 @@ def division_rate(real: Any) -> float:
 
 
 def local_bandwidth(size: int, lanes: int = 1 << 12, rounds: int = 64) -> float:
-    """Bytes a second, read and written, of a local array of at most `size` bytes: every number of it is read, multiplied and
-    written back, again and again. It lies in the first cache if it is smaller than that.
+    """Bytes a second, read and written, of a local array of at most `size` bytes: every number of
+    it is read, multiplied and written back, again and again. It lies in the first cache if it is
+    smaller than that.
 
-    This is how kernels keep the state of their loops, and it takes whole registers, as NumPy's loops do not on all processors.
+    This is how kernels keep the state of their loops, and it takes whole registers, as NumPy's
+    loops do not on all processors.
     """
     count = size // WIDEST
     scale, end = dr.opaque(mi.Float, 0.999), dr.opaque(mi.UInt32, rounds)
@@ -112,7 +126,8 @@ def local_bandwidth(size: int, lanes: int = 1 << 12, rounds: int = 64) -> float:
 
 
 def stream_bandwidth(size: int) -> float:
-    """Bytes a second, read and written, of two arrays that together have `size` bytes for each thread: b += a, again and again.
+    """Bytes a second, read and written, of two arrays that together have `size` bytes for each
+    thread: b += a, again and again.
 
     One call of NumPy does this many times, in a loop in C, so the cost of the call does not count.
     """
@@ -133,15 +148,17 @@ def stream_bandwidth(size: int) -> float:
 
 
 def address_rate(size: int, lanes: int = 1 << 18) -> float:
-    """Numbers a second that are read at random addresses of an array of `size` bytes for each thread, in a kernel in which each
-    lane makes 16 such reads that do not wait for one another."""
+    """Numbers a second that are read at random addresses of an array of `size` bytes for each
+    thread, in a kernel in which each lane makes 16 such reads that do not wait for one another."""
     count, reads = size * dr.thread_count() // 4, 16
     array, seed = dr.arange(mi.Float, count), dr.opaque(mi.UInt32, 1)
     dr.eval(array)
 
     def call() -> Any:
         lane = dr.arange(mi.UInt32, lanes) * reads + seed
-        at = (dr.mul_hi((lane + i) * 2654435769, mi.UInt32(count)) for i in range(reads))  # a multiplicative hash (Knuth)
+        at = (
+            dr.mul_hi((lane + i) * 2654435769, mi.UInt32(count)) for i in range(reads)
+        )  # a multiplicative hash (Knuth)
         return sum(dr.gather(mi.Float, array, index) for index in at)
 
     return reads * lanes / kernel_seconds(call)
@@ -150,9 +167,10 @@ def address_rate(size: int, lanes: int = 1 << 18) -> float:
 def machine_limits(report: Callable[[str], None]) -> dict[str, Any]:
     """All limits of this machine; report(what) is called before each group of measurements.
 
-    "flops", "flops64": FMAs count twice; "divisions", "divisions64"; "bandwidth": bytes a second from "L1", "L2", "L3" and
-    "memory"; "addresses": numbers a second, read at random addresses of an array that L3 holds; "working_set": the bytes for
-    each thread with which each bandwidth was measured (addresses use that of L3); "cache_bytes" of `cache_sizes`.
+    "flops", "flops64": FMAs count twice; "divisions", "divisions64"; "bandwidth": bytes a second
+    from "L1", "L2", "L3" and "memory"; "addresses": numbers a second, read at random addresses of
+    an array that L3 holds; "working_set": the bytes for each thread with which each bandwidth was
+    measured (addresses use that of L3); "cache_bytes" of `cache_sizes`.
     """
     sizes, threads = cache_sizes(), dr.thread_count()
     sets = {
@@ -167,6 +185,8 @@ def machine_limits(report: Callable[[str], None]) -> dict[str, Any]:
         "divisions": division_rate(mi.Float), "divisions64": division_rate(mi.Float64),
     }  # fmt: skip
     report("bandwidth of the caches and of memory")
-    bandwidth = {"L1": local_bandwidth(sets["L1"])} | {name: stream_bandwidth(sets[name]) for name in ("L2", "L3", "memory")}
+    bandwidth = {"L1": local_bandwidth(sets["L1"])} | {
+        name: stream_bandwidth(sets[name]) for name in ("L2", "L3", "memory")
+    }
     rates["addresses"] = address_rate(sets["L3"])
     return rates | {"bandwidth": bandwidth, "working_set": sets, "cache_bytes": sizes}

@@ -1,8 +1,10 @@
-"""The work of a compiled kernel, counted in its LLVM IR, the code that Dr.Jit hands to LLVM. Nothing is measured here.
+"""The work of a compiled kernel, counted in its LLVM IR, the code that Dr.Jit hands to LLVM.
+Nothing is measured here.
 
-A kernel of Dr.Jit is one function, which takes one SIMD register of numbers after the other. An instruction on vectors so
-counts once for each lane. Most kernels are straight code. Those that follow lists have loops, and the counts of each, those of
-one iteration, are kept apart. Code that runs only under a condition counts as if it always ran.
+A kernel of Dr.Jit is one function, which takes one SIMD register of numbers after the other. An
+instruction on vectors so counts once for each lane. Most kernels are straight code. Those that
+follow lists have loops, and the counts of each, those of one iteration, are kept apart. Code that
+runs only under a condition counts as if it always ran.
 """
 
 from __future__ import annotations
@@ -21,28 +23,44 @@ SCATTERED = ("masked", "gather_", "scatter_", "reduce_")
 MEMORY = ("load", "store", "memcpy", *SCATTERED)
 """Beginnings of the operations that load and store; their bytes are counted."""
 
-FREE = ("alloca", "phi", "getelementptr", "bitcast", "insert", "extract", "shufflevector", "fneg", "vector")
-"""Beginnings of the operations that are not counted: they name values and addresses or spread a constant over the lanes,
-become part of an FMA (a change of sign), or occur once in a loop (what reduces a mask to one bit)."""
+FREE = (
+    "alloca",
+    "phi",
+    "getelementptr",
+    "bitcast",
+    "insert",
+    "extract",
+    "shufflevector",
+    "fneg",
+    "vector",
+)
+"""Beginnings of the operations that are not counted: they name values and addresses or spread a
+constant over the lanes, become part of an FMA (a change of sign), or occur once in a loop (what
+reduces a mask to one bit)."""
 
 BITWISE = ("and", "or", "lshr", "zext", "bitcast")
 """Operations that count for nothing where their result is not used."""
 
 FLOPS = {"fadd": 1, "fsub": 1, "fmul": 1, "fdiv": 1, "sqrt": 1, "rcp": 1, "rsqrt": 1, "fma": 2}
-"""Floating-point operations; all others have none. `rcp` and `rsqrt` are the processor's approximations."""
+"""Floating-point operations; all others have none. `rcp` and `rsqrt` are the processor's
+approximations."""
 
 
 @dataclass(frozen=True)
 class Work:
     """Operations and bytes of one lane.
 
-    flops, flops64: floating-point operations in single and in double precision; an FMA is two, a comparison none.
-    divisions, divisions64: how many of these are divisions or square roots, which take a processor much longer.
-    instructions: vector instructions other than loads and stores; one on 64-bit numbers fills two registers and counts twice.
+    flops, flops64: floating-point operations in single and in double precision; an FMA is two, a
+    comparison none.
+    divisions, divisions64: how many of these are divisions or square roots, which take a processor
+    much longer.
+    instructions: vector instructions other than loads and stores; one on 64-bit numbers fills two
+    registers and counts twice.
     bytes: loaded from arrays and stored in them.
-    state_bytes: of what a loop carries along. Read and written: its variables, and its local arrays at each access. Read:
-    what was computed before it, the same for all iterations.
-    addresses: at which a lane reads or writes arrays by itself, each perhaps in another line of the cache; a packet is one.
+    state_bytes: of what a loop carries along. Read and written: its variables, and its local arrays
+    at each access. Read: what was computed before it, the same for all iterations.
+    addresses: at which a lane reads or writes arrays by itself, each perhaps in another line of the
+    cache; a packet is one.
     """
 
     flops: float = 0
@@ -63,8 +81,8 @@ class Work:
 
 @dataclass(frozen=True)
 class KernelWork:
-    """Work of one lane of a kernel. straight: outside of loops. loops: of one iteration of each loop, in their order. width:
-    lanes of a register."""
+    """Work of one lane of a kernel. straight: outside of loops. loops: of one iteration of each
+    loop, in their order. width: lanes of a register."""
 
     straight: Work
     loops: tuple[Work, ...]
@@ -74,9 +92,10 @@ class KernelWork:
 def count_work(ir: str) -> KernelWork:
     """Count the work of a kernel. ir: its LLVM IR, as Dr.Jit's kernel history holds it.
 
-    A loop that runs a constant number of times, as one that fills a local array, counts as if it were written out. What only
-    computes bits that are always zero does not count (`_without_zero_bits`).
-    Raises ValueError if ir holds no kernel, or one with a loop inside a loop, whose iterations have no common number.
+    A loop that runs a constant number of times, as one that fills a local array, counts as if it
+    were written out. What only computes bits that are always zero does not count
+    (`_without_zero_bits`). Raises ValueError if ir holds no kernel, or one with a loop inside a
+    loop, whose iterations have no common number.
     """
     lines = _without_zero_bits(_kernel_lines(ir))
     step = re.search(r"= add i64 %index, (\d+)", "\n".join(lines))
@@ -90,7 +109,9 @@ def count_work(ir: str) -> KernelWork:
     for number, line in enumerate(lines):
         if line.endswith(":"):
             header = any(start == number for start, _ in loops)
-        found = reader.read(line, header) * next((n for (start, end), n in constant.items() if start <= number <= end), 1)
+        found = reader.read(line, header) * next(
+            (n for (start, end), n in constant.items() if start <= number <= end), 1
+        )
         inside = next((k for k, (start, end) in enumerate(loops) if start <= number <= end), None)
         if inside is None:
             straight += found
@@ -101,15 +122,18 @@ def count_work(ir: str) -> KernelWork:
 
 
 def _kernel_lines(ir: str) -> list[str]:
-    """Lines of the kernel's own function; those that it calls stand behind it. Metadata at the ends of lines are left out."""
+    """Lines of the kernel's own function; those that it calls stand behind it. Metadata at the ends
+    of lines are left out."""
     lines = [line.partition(", !")[0] for line in ir.splitlines()]
-    start = next((i for i, line in enumerate(lines) if line.startswith("define void @drjit_")), len(lines))
+    start = next(
+        (i for i, line in enumerate(lines) if line.startswith("define void @drjit_")), len(lines)
+    )
     return lines[start + 1 : lines.index("}", start) if start < len(lines) else None]
 
 
 def _without_zero_bits(lines: list[str]) -> list[str]:
-    """The lines without those that LLVM drops because they compute (x & 1) >> 1, which is always zero, or add that to a number:
-    so `mgs.splat.walking.computed_after` puts pixels in order."""
+    """The lines without those that LLVM drops because they compute (x & 1) >> 1, which is always
+    zero, or add that to a number: so `mgs.splat.walking.computed_after` puts pixels in order."""
     ones: set[str] = set()
     odd: set[str] = set()
     zeros: set[str] = set()
@@ -117,7 +141,9 @@ def _without_zero_bits(lines: list[str]) -> list[str]:
     for line in lines:
         name, operation, rest = _parts(line)
         used = re.findall(r"%[\w.]+", rest)
-        if re.search(r"undef, i\d+ 1, i32 0$", rest) or (operation == "shufflevector" and used[0] in ones):
+        if re.search(r"undef, i\d+ 1, i32 0$", rest) or (
+            operation == "shufflevector" and used[0] in ones
+        ):
             ones.add(name)
         elif operation == "and" and ones & set(used):
             odd.add(name)
@@ -139,21 +165,28 @@ def _without_unused(lines: list[str]) -> list[str]:
     while True:
         read = {name for line in lines for name in re.findall(r"%[\w.]+", _parts(line)[2])}
         found = [(line, _parts(line)) for line in lines]
-        kept = [line for line, (name, operation, _) in found if not (operation in BITWISE and name not in read)]
+        kept = [
+            line
+            for line, (name, operation, _) in found
+            if not (operation in BITWISE and name not in read)
+        ]
         if len(kept) == len(lines):
             return lines
         lines = kept
 
 
 def _loops(lines: list[str]) -> tuple[list[tuple[int, int]], dict[tuple[int, int], int]]:
-    """First and last line of each loop; and of each loop that runs a constant number of times, with this number.
+    """First and last line of each loop; and of each loop that runs a constant number of times, with
+    this number.
 
     A loop is a jump backwards, except for the jump to `body`, which goes on to the next register.
     """
     labels = {line[:-1]: i for i, line in enumerate(lines) if line.endswith(":")}
     loops, constant = [], {}
     for i, line in enumerate(lines):
-        for label in re.findall(r"label %([\w.]+)", line) if line.lstrip().startswith("br ") else []:
+        for label in (
+            re.findall(r"label %([\w.]+)", line) if line.lstrip().startswith("br ") else []
+        ):
             if label == "body" or labels[label] > i:
                 continue
             times = re.search(r"icmp ult i64 %[\w.]+, (\d+)$", lines[i - 1])
@@ -167,8 +200,8 @@ def _loops(lines: list[str]) -> tuple[list[tuple[int, int]], dict[tuple[int, int
 class _Reader:
     """Reads the lines of a kernel one after the other. width: lanes of a register.
 
-    It remembers which pointers lead to local arrays and to which place, which places lie in a register because they were just
-    read or written, and which vectors were made before a loop.
+    It remembers which pointers lead to local arrays and to which place, which places lie in a
+    register because they were just read or written, and which vectors were made before a loop.
     """
 
     def __init__(self, width: int) -> None:
@@ -178,9 +211,12 @@ class _Reader:
         self._before: dict[str, float] = {}
 
     def read(self, line: str, header: bool) -> Work:
-        """The work of one line. header: whether it stands in a loop's first block, where `phi` names the loop's variables."""
+        """The work of one line. header: whether it stands in a loop's first block, where `phi`
+        names the loop's variables."""
         name, operation, rest = _parts(line)
-        local = next((self._local[used] for used in re.findall(r"%[\w.]+", rest) if used in self._local), "")
+        local = next(
+            (self._local[used] for used in re.findall(r"%[\w.]+", rest) if used in self._local), ""
+        )
         if operation == "alloca" or (operation == "getelementptr" and local):
             self._local[name] = rest
         if operation == "phi" and header:
@@ -198,10 +234,13 @@ class _Reader:
         return Work() if operation.startswith(FREE) else self._arithmetic(operation, rest)
 
     def remember(self, line: str) -> None:
-        """Take note of the vector that a line before a loop makes. A constant that is spread over the lanes is none."""
+        """Take note of the vector that a line before a loop makes. A constant that is spread over
+        the lanes is none."""
         name, operation, rest = _parts(line)
         if name and operation not in ("shufflevector", "getelementptr", "fcmp", "icmp"):
-            kept = rest.rpartition(" to ")[2] if " to " in rest else rest.partition("i1>")[2] or rest
+            kept = (
+                rest.rpartition(" to ")[2] if " to " in rest else rest.partition("i1>")[2] or rest
+            )
             self._before[name] = self._bytes(kept)
 
     def taken_over(self, line: str) -> Work:
@@ -213,7 +252,11 @@ class _Reader:
     def _bits(self, text: str) -> list[int]:
         """Bits of a lane's number in each vector that the text names."""
         size = {"float": 32, "double": 64, "half": 16, "ptr": 64}
-        return [size.get(kind) or int(kind[1:]) for lanes, kind in VECTOR.findall(text) if int(lanes) == self.width]
+        return [
+            size.get(kind) or int(kind[1:])
+            for lanes, kind in VECTOR.findall(text)
+            if int(lanes) == self.width
+        ]
 
     def _bytes(self, text: str) -> int:
         """Bytes of a lane's number in the first vector that the text names; of a mask none."""
@@ -223,7 +266,11 @@ class _Reader:
         bits = self._bits(rest)
         if not bits:
             return Work()  # an operation on one number for all lanes
-        flops, divisions, instructions = FLOPS.get(operation, 0), operation in ("fdiv", "sqrt"), 1 + (max(bits) == 64)
+        flops, divisions, instructions = (
+            FLOPS.get(operation, 0),
+            operation in ("fdiv", "sqrt"),
+            1 + (max(bits) == 64),
+        )
         if bits[0] == 64:
             return Work(flops64=flops, divisions64=divisions, instructions=instructions)
         return Work(flops=flops, divisions=divisions, instructions=instructions)
@@ -241,7 +288,8 @@ class _Reader:
 
 
 def _parts(line: str) -> tuple[str, str, str]:
-    """Name of the result, operation and operands of a line; of a call the function's name is the operation."""
+    """Name of the result, operation and operands of a line; of a call the function's name is the
+    operation."""
     match = INSTRUCTION.match(line)
     if match is None:
         return "", "", ""

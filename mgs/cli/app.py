@@ -1,7 +1,7 @@
 """The program `mgs`: its commands, and how they end.
 
-Beside this file there is one for each command. Commands import what they need when they are called, so that `mgs --help` does
-not wait for Mitsuba.
+Beside this file there is one for each command. Commands import what they need when they are called,
+so that `mgs --help` does not wait for Mitsuba.
 """
 
 from __future__ import annotations
@@ -74,14 +74,18 @@ GOES_ON = {
     "parsimony": _AGAIN,
     "nbv": "`mgs nbv --resume RUN` continues a run whose folder is there",
 }
-"""What is printed after Ctrl-C, for the commands that can go on where they stopped. The others start anew."""
+"""What is printed after Ctrl-C, for the commands that can go on where they stopped. The others
+start anew."""
 
 app = typer.Typer(name="mgs", add_completion=False, pretty_exceptions_enable=False)
 
 
 def _help(docstring: str | None) -> str:
-    """A docstring with each paragraph in one line, so that the help screen breaks lines at the width of the terminal only."""
-    return "\n\n".join(" ".join(paragraph.split()) for paragraph in cleandoc(docstring or "").split("\n\n"))
+    """A docstring with each paragraph in one line, so that the help screen breaks lines at the
+    width of the terminal only."""
+    return "\n\n".join(
+        " ".join(paragraph.split()) for paragraph in cleandoc(docstring or "").split("\n\n")
+    )
 
 
 for name, command in COMMANDS.items():
@@ -98,17 +102,22 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _program(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop.")
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version and stop."
+        ),
     ] = False,
 ) -> None:
     """Active Gaussian splatting: exact Fisher information and next-best-view selection."""
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run a command and end the process. arguments: those of the command line, by default the process's own.
+    """Run a command and end the process. arguments: those of the command line, by default the
+    process's own.
 
-    Bad input and wrong options print one line, with exit code 2; an interruption prints one line, with exit code 130. Always
-    raises SystemExit, but for errors of the program itself, which pass through.
+    Bad input and wrong options print one line, with exit code 2; an interruption prints one line,
+    with exit code 130. Always raises SystemExit, but for errors of the program itself, which pass
+    through.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
@@ -116,7 +125,9 @@ def main(arguments: list[str] | None = None) -> None:
     except InputError as error:
         raise _stop(str(error), 2) from None
     except typer.TyperException as error:
-        raise _stop(" ".join(error.format_message().replace("Value error, ", "").split()), 2) from None
+        raise _stop(
+            " ".join(error.format_message().replace("Value error, ", "").split()), 2
+        ) from None
     except typer.Abort:
         raise _stop("stopped", 1) from None
     except Exception as error:
@@ -130,13 +141,15 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _from_interrupt(error: BaseException | None) -> bool:
-    """Whether Ctrl-C is the cause of an exception. If it comes during a call of Dr.Jit, that raises an exception of its own."""
+    """Whether Ctrl-C is the cause of an exception. If it comes during a call of Dr.Jit, that raises
+    an exception of its own."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
 
 
 def _stop(message: str, code: int) -> SystemExit:
-    """Print one line to the standard error, and return the exception that ends the process with this exit code."""
+    """Print one line to the standard error, and return the exception that ends the process with
+    this exit code."""
     print(f"mgs: {message}", file=sys.stderr)
     return SystemExit(code)

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from mgs.active.settings import ALPHA_WEIGHT, TrainSettings, validated
+from mgs.fit.settings import ALPHA_WEIGHT, TrainSettings
+from mgs.run.settings import validated
 
 
 class Kind(StrEnum):
@@ -39,27 +40,42 @@ def bench(
             "convergence of the fit of a dataset."
         ),
     ],
-    json: Annotated[Path | None, typer.Option(help="Write everything that is measured to this file.")] = None,
-    chart: Annotated[Path | None, typer.Option(help="scaling and roofline: draw the chart to this PNG.")] = None,
+    json: Annotated[
+        Path | None, typer.Option(help="Write everything that is measured to this file.")
+    ] = None,
+    chart: Annotated[
+        Path | None, typer.Option(help="scaling and roofline: draw the chart to this PNG.")
+    ] = None,
     gaussians: Annotated[
         int | None,
-        typer.Option(min=1000, help="splat, roofline: number of Gaussians [100000]; scaling: the largest number [1000000]."),
+        typer.Option(
+            min=1000,
+            help="splat, roofline: number of Gaussians [100000]; scaling: the largest number [1000000].",
+        ),
     ] = None,
     repeats: Annotated[
         int | None,
         typer.Option(
-            min=3, help="Number of calls of each operation; the median counts, in a roofline the fastest. Default: 9."
+            min=3,
+            help="Number of calls of each operation; the median counts, in a roofline the fastest. Default: 9.",
         ),
     ] = None,
-    dataset: Annotated[Path | None, typer.Option(help="fit only: the dataset, with depth. Default: demo/dataset.")] = None,
+    dataset: Annotated[
+        Path | None, typer.Option(help="fit only: the dataset, with depth. Default: demo/dataset.")
+    ] = None,
     alpha_weight: Annotated[
-        float | None, typer.Option(help=f"fit only: as of `mgs nbv`. Default: {ALPHA_WEIGHT}; 0 fits colours alone.")
+        float | None,
+        typer.Option(
+            help=f"fit only: as of `mgs nbv`. Default: {ALPHA_WEIGHT}; 0 fits colours alone."
+        ),
     ] = None,
 ) -> None:
-    """Time rendering, gradients and Fisher information on Gaussians of a rock in an image of 640x480 pixels; or, `fit`, measure
-    how accurate the fit of a dataset is and how near its end it stops.
+    """Time rendering, gradients and Fisher information on Gaussians of a rock in an image of
+    640x480 pixels; or, `fit`, measure how accurate the fit of a dataset is and how near its end it
+    stops.
 
-    Let nothing else run on the machine meanwhile. The JSON file also holds the command line, the machine and the versions.
+    Let nothing else run on the machine meanwhile. The JSON file also holds the command line, the
+    machine and the versions.
     """
     from rich.console import Console
 
@@ -68,14 +84,23 @@ def bench(
     from mgs.files import check_writable, write_json
     from mgs.provenance import command_line, versions
 
-    given: dict[str, Any] = {"--chart": chart, "--gaussians": gaussians, "--repeats": repeats, "--dataset": dataset}
+    given: dict[str, Any] = {
+        "--chart": chart,
+        "--gaussians": gaussians,
+        "--repeats": repeats,
+        "--dataset": dataset,
+    }
     given["--alpha-weight"] = alpha_weight
     for option, value in given.items():
         if value is not None and kind not in OF[option]:
-            raise InputError(f"{option}: is for {' and '.join(OF[option])}, not for {kind.value}; leave it out")
+            raise InputError(
+                f"{option}: is for {' and '.join(OF[option])}, not for {kind.value}; leave it out"
+            )
     repeats = repeats or 9
     if kind is Kind.scaling and gaussians is not None and gaussians < 3000:
-        raise InputError(f"--gaussians {gaussians}: scaling fits the growth with N, from 1000 up; give at least 3000")
+        raise InputError(
+            f"--gaussians {gaussians}: scaling fits the growth with N, from 1000 up; give at least 3000"
+        )
     for target in (json, chart):
         if target is not None:  # before minutes of measuring, not after them
             check_writable(target)
@@ -93,7 +118,9 @@ def bench(
     console = Console()
 
     def report(what: str) -> None:
-        console.print(f"timing {what}", style="dim")  # a line and no spinner, whose thread would be timed too
+        console.print(
+            f"timing {what}", style="dim"
+        )  # a line and no spinner, whose thread would be timed too
 
     result: dict[str, Any]
     if kind is Kind.splat:
@@ -105,7 +132,9 @@ def bench(
         weight = validated(TrainSettings, asked).alpha_weight
         result = bench_fit(dataset or Path("demo/dataset"), report, weight)
         _print_figures(console, result["figures"], FIT_TARGETS)
-        console.print(f"Kendall's tau of the ranking with that of half the passes: {result['ranking_tau_half']:.3f}")
+        console.print(
+            f"Kendall's tau of the ranking with that of half the passes: {result['ranking_tau_half']:.3f}"
+        )
     elif kind is Kind.roofline:
         result = bench_roofline(gaussians or 100_000, 640, 480, repeats, report)
         _print_roofline(console, result)
@@ -126,11 +155,16 @@ def bench(
 
 
 def _print_scaling(console: Any, result: dict[str, Any]) -> None:
-    """Print the exponents, a row for each quantity and a column for each thing that grows, and the linear fits of time."""
+    """Print the exponents, a row for each quantity and a column for each thing that grows, and the
+    linear fits of time."""
     from rich.table import Table
 
     rows = result["exponents"]
-    table = Table("exponent of", *next(iter(rows.values())), title=f"fits against N start at {result['exponents_from_n']:,}")
+    table = Table(
+        "exponent of",
+        *next(iter(rows.values())),
+        title=f"fits against N start at {result['exponents_from_n']:,}",
+    )
     for name, row in rows.items():
         table.add_row(name, *(f"{value:z.2f}" for value in row.values()))
     linear = result["linear_growth"]
@@ -150,16 +184,22 @@ def _print_roofline(console: Any, result: dict[str, Any]) -> None:
         return Table("kernel", *columns, *([last] if last else []))
 
     limits, rows = result["limits"], result["kernels"]
-    bandwidths = ", ".join(f"{name} {value / 1e9:.0f}" for name, value in limits["bandwidth"].items())
+    bandwidths = ", ".join(
+        f"{name} {value / 1e9:.0f}" for name, value in limits["bandwidth"].items()
+    )
     console.print(
         f"FMA {limits['flops'] / 1e9:.0f} Gflop/s, in double {limits['flops64'] / 1e9:.0f}; divisions "
         f"{limits['divisions'] / 1e9:.1f} billion a second, in double {limits['divisions64'] / 1e9:.1f}; addresses "
         f"{limits['addresses'] / 1e9:.2f} billion a second; GB/s: {bandwidths}"
     )
-    work = table("operations", "divisions", "instructions", "bytes", "state", "addresses", last="for each")
+    work = table(
+        "operations", "divisions", "instructions", "bytes", "state", "addresses", last="for each"
+    )
     for row in rows:
         each = row["each"]
-        counts = [each[a] + each[b] for a, b in (("flops", "flops64"), ("divisions", "divisions64"))]
+        counts = [
+            each[a] + each[b] for a, b in (("flops", "flops64"), ("divisions", "divisions64"))
+        ]
         counts += [each[key] for key in ("instructions", "bytes", "state_bytes", "addresses")]
         work.add_row(row["name"], *(f"{count:,.0f}" for count in counts), row["unit"])
     share = table(*rows[0]["shares"])
@@ -167,7 +207,11 @@ def _print_roofline(console: Any, result: dict[str, Any]) -> None:
     time = table("ms", "Gflop/s", "busy lanes", last="bound by")
     for row in rows:
         share.add_row(row["name"], *(f"{value:.0%}" for value in row["shares"].values()))
-        numbers = f"{1e3 * row['seconds']:.2f}", f"{row['gflops']:.1f}", f"{row['lanes_active']:.0%}"
+        numbers = (
+            f"{1e3 * row['seconds']:.2f}",
+            f"{row['gflops']:.1f}",
+            f"{row['lanes_active']:.0%}",
+        )
         time.add_row(row["name"], *numbers, row["verdict"])
     console.print(work, share, time)
 
@@ -189,7 +233,9 @@ def _print_splat(console: Any, result: dict[str, Any]) -> None:
     )
 
 
-def _print_figures(console: Any, figures: dict[str, float | None], targets: dict[str, tuple[str, float]]) -> None:
+def _print_figures(
+    console: Any, figures: dict[str, float | None], targets: dict[str, tuple[str, float]]
+) -> None:
     """Print each figure beside what is asked for; None is a goal that no attempt reached."""
     from rich.table import Table
 

@@ -13,20 +13,22 @@ GAUSSIANS = 10_000
 """About one Gaussian per pixel of the rock at 320x240."""
 
 TEST_VIEWS = 12
-"""Views on a dome around the rock, on which the policies are judged: enough to see it from all sides, and not many to
-render beside the 32 of the orbit."""
+"""Views on a dome around the rock, on which the policies are judged: enough to see it from all
+sides, and not many to render beside the 32 of the orbit."""
 
 BUDGET = 8
 """Views beyond the four seeds, the same for every policy."""
 
 
 def demo(
-    out: Annotated[Path, typer.Argument(help="Folder for everything; the same command again continues or shows it.")] = Path(
-        "demo"
-    ),
+    out: Annotated[
+        Path,
+        typer.Argument(help="Folder for everything; the same command again continues or shows it."),
+    ] = Path("demo"),
     seed: Annotated[int, typer.Option(min=0, help="Root seed.")] = 0,
 ) -> None:
-    """The whole way in minutes: render a rock orbit, build the prior, choose views by five policies, compare, draw."""
+    """The whole way in minutes: render a rock orbit, build the prior, choose views by five
+    policies, compare, draw."""
     import time
 
     from rich.console import Console
@@ -77,13 +79,15 @@ def demo(
 
 def check_seed(dataset: Path, runs: list[Path], seed: int) -> None:
     """Raises InputError where the dataset or a run is there already, of another seed."""
-    from mgs.active.run_folder import read_settings
     from mgs.errors import InputError
     from mgs.files import read_json
+    from mgs.run.folder import read_settings
 
     recorded = {run: read_settings(run).seed for run in runs if (run / "config.json").is_file()}
     if (dataset / "config.json").is_file():
         recorded[dataset] = read_json(dataset / "config.json").get("seed", seed)
     for folder, found in recorded.items():
         if found != seed:
-            raise InputError(f"{folder}: was made with --seed {found}, not {seed}; give that seed, or another folder")
+            raise InputError(
+                f"{folder}: was made with --seed {found}, not {seed}; give that seed, or another folder"
+            )

@@ -15,7 +15,8 @@ _PACKAGES = ("mgs", "mitsuba", "drjit", "numpy", "pyoidn", "pymeshlab")
 
 
 def doctor() -> None:
-    """Print versions, the libLLVM that is used, processor and memory; say what is wrong and how to mend it.
+    """Print versions, the libLLVM that is used, processor and memory; say what is wrong and how to
+    mend it.
 
     The exit code is 0 if all is well, and 2 if something prevents mgs from working.
     """
@@ -53,7 +54,13 @@ def _software() -> list[tuple[str, str, str]]:
     except ModuleNotFoundError:
         pass  # reported above
     except ImportError as error:
-        rows.append(("pymeshlab", "does not load", f"pymeshlab: {error}; install libGL (`apt-get install libgl1 libopengl0`)"))
+        rows.append(
+            (
+                "pymeshlab",
+                "does not load",
+                f"pymeshlab: {error}; install libGL (`apt-get install libgl1 libopengl0`)",
+            )
+        )
     return rows
 
 
@@ -62,8 +69,14 @@ def _machine() -> list[tuple[str, str, str]]:
     from mgs import runtime
 
     page, gib = os.sysconf("SC_PAGE_SIZE"), 1024**3
-    total, free = os.sysconf("SC_PHYS_PAGES") * page / gib, os.sysconf("SC_AVPHYS_PAGES") * page / gib
-    rows = [("cores", str(os.cpu_count()), ""), ("memory", f"{total:.1f} GiB, {free:.1f} GiB free", "")]
+    total, free = (
+        os.sysconf("SC_PHYS_PAGES") * page / gib,
+        os.sysconf("SC_AVPHYS_PAGES") * page / gib,
+    )
+    rows = [
+        ("cores", str(os.cpu_count()), ""),
+        ("memory", f"{total:.1f} GiB, {free:.1f} GiB free", ""),
+    ]
     try:
         library = runtime.find_libllvm()
     except InputError as error:
@@ -81,7 +94,8 @@ def _machine() -> list[tuple[str, str, str]]:
 
 
 def _resources() -> list[tuple[str, str, str]]:
-    """The folders of data files that come with mgs: (name, value, what is wrong with it or "") of each."""
+    """The folders of data files that come with mgs: (name, value, what is wrong with it or "") of
+    each."""
     from mgs.resources import resource_folder
 
     rows = []

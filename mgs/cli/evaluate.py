@@ -11,15 +11,19 @@ import typer
 def evaluate(
     run: Annotated[Path, typer.Argument(help="Folder that `mgs nbv` wrote.")],
     pictures: Annotated[
-        bool, typer.Option(help="Write truth, render and difference of every view, side by side, to RUN/renders.")
+        bool,
+        typer.Option(
+            help="Write truth, render and difference of every view, side by side, to RUN/renders."
+        ),
     ] = True,
 ) -> None:
-    """Measure the model on the test views, on all views, and on the views never trained on; write RUN/metrics.json, and renders
-    beside truth.
+    """Measure the model on the test views, on all views, and on the views never trained on; write
+    RUN/metrics.json, and renders beside truth.
 
     What is there already of this very model and dataset is kept, and not measured or drawn again.
-    The truth is the rock on black. PSNR and SSIM are over the full frame, and over the pixels of the rock only. metrics.json
-    also has the errors of alpha and depth, where the dataset has their truth.
+    The truth is the rock on black. PSNR and SSIM are over the full frame, and over the pixels of
+    the rock only. metrics.json also has the errors of alpha and depth, where the dataset has their
+    truth.
     """
     from rich.console import Console
     from rich.progress import Progress

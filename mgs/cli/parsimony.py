@@ -9,18 +9,23 @@ import typer
 
 
 def parsimony(
-    out: Annotated[Path, typer.Argument(help="Folder for everything; the same command again continues or shows it.")] = Path(
-        "parsimony"
-    ),
+    out: Annotated[
+        Path,
+        typer.Argument(help="Folder for everything; the same command again continues or shows it."),
+    ] = Path("parsimony"),
     preset: Annotated[
-        str, typer.Option(help="quick: six scenes of small images, ten minutes. full: the same of 320x240, half an hour.")
+        str,
+        typer.Option(
+            help="quick: six scenes of small images, ten minutes. full: the same of 320x240, half an hour."
+        ),
     ] = "quick",
 ) -> None:
-    """Chart quality and cost against the number of Gaussians, what is learned, and the SH degree, with the automatic choice
-    marked.
+    """Chart quality and cost against the number of Gaussians, what is learned, and the SH degree,
+    with the automatic choice marked.
 
-    Renders the scenes, fits each model view by view, and judges it on test views that no model sees. Writes parsimony.json,
-    parsimony.csv and parsimony.png. What was interrupted goes on when the same command is given again.
+    Renders the scenes, fits each model view by view, and judges it on test views that no model
+    sees. Writes parsimony.json, parsimony.csv and parsimony.png. What was interrupted goes on when
+    the same command is given again.
     """
     from rich.console import Console
 
@@ -38,7 +43,12 @@ def parsimony(
     console = Console(highlight=False)
     with cells_bar(console) as report:
         found = run_study(out, size, report)
-    about = {"command": command_line(), "preset": preset, "machine": runtime.processor(), "versions": versions()}
+    about = {
+        "command": command_line(),
+        "preset": preset,
+        "machine": runtime.processor(),
+        "versions": versions(),
+    }
     write_json(out / "parsimony.json", about | found)
     write_csv(out / "parsimony.csv", found["rows"])
     draw_parsimony(out / "parsimony.png", found)
@@ -50,9 +60,25 @@ def _table(scenes: dict[str, dict[str, Any]]) -> Any:
     """The verdicts, a row for each scene."""
     from rich.table import Table
 
-    table = Table("scene", "best fixed, dB", "automatic, dB", "parameters", "smallest fixed within 0.1 dB", "holds")
+    table = Table(
+        "scene",
+        "best fixed, dB",
+        "automatic, dB",
+        "parameters",
+        "smallest fixed within 0.1 dB",
+        "holds",
+    )
     for scene, one in scenes.items():
-        holds = "yes" if one["close"] and one["small"] else "no: " + ("too many parameters" if one["close"] else "worse")
-        numbers = (f"{one['best']:.2f}", f"{one['auto']:.2f}", f"{one['parameters']:,}", f"{one['smallest']:,}")
+        holds = (
+            "yes"
+            if one["close"] and one["small"]
+            else "no: " + ("too many parameters" if one["close"] else "worse")
+        )
+        numbers = (
+            f"{one['best']:.2f}",
+            f"{one['auto']:.2f}",
+            f"{one['parameters']:,}",
+            f"{one['smallest']:,}",
+        )
         table.add_row(scene, *numbers, holds)
     return table

@@ -14,10 +14,25 @@ GROUPS = {"test": "test", "all": "all", "held_out": "new"}
 """What a set of views is called in the headings of the printed table."""
 
 SHOWN = {
-    True: ("test.psnr", "test.ssim", "test.psnr_mask", "all.psnr", "held_out.psnr", "held_out.psnr_mask"),
-    False: ("all.psnr", "all.ssim", "held_out.psnr", "held_out.ssim", "held_out.psnr_mask", "held_out.ssim_mask"),
+    True: (
+        "test.psnr",
+        "test.ssim",
+        "test.psnr_mask",
+        "all.psnr",
+        "held_out.psnr",
+        "held_out.psnr_mask",
+    ),
+    False: (
+        "all.psnr",
+        "all.ssim",
+        "held_out.psnr",
+        "held_out.ssim",
+        "held_out.psnr_mask",
+        "held_out.ssim_mask",
+    ),
 }
-"""Columns of the printed table with and without test views: as many as fit into a line of 80 characters."""
+"""Columns of the printed table with and without test views: as many as fit into a line of 80
+characters."""
 
 
 def print_table(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -32,7 +47,11 @@ def print_table(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
     from mgs.report.tables import has_held_out, table_cell
 
     tested, new = any("test.psnr" in row for row in rows), has_held_out(rows)
-    keys = ("images", *(key for key in SHOWN[tested] if new or not key.startswith("held_out.")), "coverage")
+    keys = (
+        "images",
+        *(key for key in SHOWN[tested] if new or not key.startswith("held_out.")),
+        "coverage",
+    )
     names = [row["policy"] for row in rows]
 
     def table(heading: str, first: Sequence[str]) -> Table:
@@ -47,7 +66,10 @@ def print_table(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
         return made
 
     whole = table("policy", names)
-    if console.measure(whole, options=console.options.update(max_width=1 << 16)).maximum <= console.width:
+    if (
+        console.measure(whole, options=console.options.update(max_width=1 << 16)).maximum
+        <= console.width
+    ):
         console.print(whole)
         return
     numbers = [str(number) for number in range(1, len(rows) + 1)]
@@ -57,11 +79,14 @@ def print_table(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _heading(key: str, new: bool) -> str:
-    """A column's heading: the metric, and below it the set of views, and `rock` where the metric is inside its mask. new:
-    whether there are views that were not trained on; otherwise all are the runs' own."""
+    """A column's heading: the metric, and below it the set of views, and `rock` where the metric is
+    inside its mask. new: whether there are views that were not trained on; otherwise all are the
+    runs' own."""
     views, _, metric = key.partition(".")
     if not metric:
-        return {"coverage": "cover", "images": "n"}.get(key, key)  # short, so that the table fits 80 columns
+        return {"coverage": "cover", "images": "n"}.get(
+            key, key
+        )  # short, so that the table fits 80 columns
     name, _, mask = metric.partition("_")
     group = GROUPS[views] if new or views != "all" else "own"
     return f"{name.upper()}\n{group}" + ("\nrock" if mask else "")
@@ -69,17 +94,26 @@ def _heading(key: str, new: bool) -> str:
 
 @contextmanager
 def cells_bar(console: Console) -> Iterator[Callable[[str, int, int], None]]:
-    """Context manager: a bar of the cells of a study, and the function (name, done, total) that moves it."""
+    """Context manager: a bar of the cells of a study, and the function (name, done, total) that
+    moves it."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("reading", total=None)
-        yield lambda name, done, total: bar.update(task, description=name, completed=done, total=total)
+        yield lambda name, done, total: bar.update(
+            task, description=name, completed=done, total=total
+        )
 
 
 def parse_up(text: str) -> tuple[float, float, float] | None:
-    """The unit vector of an option like 0,0,1; None for auto. Raises InputError for anything else."""
+    """The unit vector of an option like 0,0,1; None for auto. Raises InputError for anything
+    else."""
     from mgs.data.up import unit_up
     from mgs.errors import InputError
 
@@ -88,7 +122,9 @@ def parse_up(text: str) -> tuple[float, float, float] | None:
     try:
         return unit_up([float(part) for part in text.split(",")])
     except (ValueError, InputError):
-        raise InputError(f"--up {text!r}: expected auto, or three numbers X,Y,Z that are not all zero, as in 0,0,1") from None
+        raise InputError(
+            f"--up {text!r}: expected auto, or three numbers X,Y,Z that are not all zero, as in 0,0,1"
+        ) from None
 
 
 def parse_gaussians(text: str | None) -> int | Literal["auto"] | None:

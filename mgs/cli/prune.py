@@ -7,19 +7,24 @@ from typing import Annotated
 
 import typer
 
-from mgs.active.criteria import PRUNE_NOISE
+from mgs.policy.criteria import PRUNE_NOISE
 
 
 def prune(
     run: Annotated[Path, typer.Argument(help="Folder that `mgs nbv` wrote.")],
     noise: Annotated[
-        float, typer.Option(help="How much the images that were taken may change: rms of a pixel value, linear RGB.")
+        float,
+        typer.Option(
+            help="How much the images that were taken may change: rms of a pixel value, linear RGB."
+        ),
     ] = PRUNE_NOISE,
 ) -> None:
-    """Leave out the Gaussians of a run without which its images hardly change; write RUN/gaussians_pruned.ply.
+    """Leave out the Gaussians of a run without which its images hardly change; write
+    RUN/gaussians_pruned.ply.
 
-    What the removal of each Gaussian changes is known exactly; what the removal of all of them together changes is measured,
-    and stays within --noise. Nothing is fitted again, and the run itself stays as it is.
+    What the removal of each Gaussian changes is known exactly; what the removal of all of them
+    together changes is measured, and stays within --noise. Nothing is fitted again, and the run
+    itself stays as it is.
     """
     from rich.console import Console
 
@@ -37,5 +42,7 @@ def prune(
     )
     if found.psnr:
         before, after = found.psnr
-        console.print(f"PSNR on the {found.views} views: {before:.2f} dB before, {after:.2f} dB after")
+        console.print(
+            f"PSNR on the {found.views} views: {before:.2f} dB before, {after:.2f} dB after"
+        )
     console.print(f"wrote {run / PRUNED}", soft_wrap=True)

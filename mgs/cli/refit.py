@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mgs.active.criteria import LEARN_LOSS
+from mgs.policy.criteria import LEARN_LOSS
 
 if TYPE_CHECKING:
     from mgs.report.refitting import RefittedRun
@@ -17,21 +17,30 @@ def refit(
     run: Annotated[Path, typer.Argument(help="Folder that `mgs nbv` wrote.")],
     learn: Annotated[
         str,
-        typer.Option(help="auto: each Gaussian learns the kinds of parameters that the evidence pays for; all: all of them."),
+        typer.Option(
+            help="auto: each Gaussian learns the kinds of parameters that the evidence pays for; all: all of them."
+        ),
     ] = "auto",
     sh: Annotated[
         str,
-        typer.Option(help="SH degree of the colours: 0, or auto: 1 where that foretells views left out better."),
+        typer.Option(
+            help="SH degree of the colours: 0, or auto: 1 where that foretells views left out better."
+        ),
     ] = "auto",
     loss: Annotated[
-        float, typer.Option(help="By how much the objective of the fit may rise where parameters are left out, dB.")
+        float,
+        typer.Option(
+            help="By how much the objective of the fit may rise where parameters are left out, dB."
+        ),
     ] = LEARN_LOSS,
 ) -> None:
-    """Fit the views of a run once more, with no more parameters than they pay for; write RUN/gaussians_refitted.ply.
+    """Fit the views of a run once more, with no more parameters than they pay for; write
+    RUN/gaussians_refitted.ply.
 
-    What pays is decided without a test view: which kinds of parameters a Gaussian learns by the evidence, the marginal
-    likelihood of the images, and by --loss; the SH degree by views that are left out. Parameters that are not learned keep the
-    prior's values, and are marked in the file. The run itself stays as it is.
+    What pays is decided without a test view: which kinds of parameters a Gaussian learns by the
+    evidence, the marginal likelihood of the images, and by --loss; the SH degree by views that are
+    left out. Parameters that are not learned keep the prior's values, and are marked in the file.
+    The run itself stays as it is.
     """
     from rich.console import Console
 
@@ -49,12 +58,20 @@ def refit(
 
 def lines(found: RefittedRun) -> list[str]:
     """The lines that the command prints."""
-    said = [f"{found.after:,} parameters are learned, {found.after / found.before:.0%} of the run's {found.before:,}"]
-    said.append("learned by: " + ", ".join(f"{kind} {share:.0%}" for kind, share in found.shares.items()) + " of the Gaussians")
+    said = [
+        f"{found.after:,} parameters are learned, {found.after / found.before:.0%} of the run's {found.before:,}"
+    ]
+    said.append(
+        "learned by: "
+        + ", ".join(f"{kind} {share:.0%}" for kind, share in found.shares.items())
+        + " of the Gaussians"
+    )
     if found.left_out:
         more = "more" if found.left_out.pays else "not more"
         gain = f"{found.left_out.gain:+.3f} dB, {more} than its standard error of {found.left_out.error:.3f}"
-        said.append(f"SH degree {found.sh_degree}: on views left out, neighbours together, degree 1 gains {gain}")
+        said.append(
+            f"SH degree {found.sh_degree}: on views left out, neighbours together, degree 1 gains {gain}"
+        )
     else:
         said.append("SH degree 0: no other was tried")
     if found.psnr:

@@ -19,13 +19,22 @@ class ColourSpace(StrEnum):
 
 def render(
     splats: Annotated[
-        Path, typer.Argument(help="3DGS PLY of SH degree 0 to 3, binary, ascii or compressed, of mgs or another tool.")
+        Path,
+        typer.Argument(
+            help="3DGS PLY of SH degree 0 to 3, binary, ascii or compressed, of mgs or another tool."
+        ),
     ],
-    cameras: Annotated[Path, typer.Option(help="transforms.json (nerfstudio), or the dataset folder that holds it.")],
+    cameras: Annotated[
+        Path,
+        typer.Option(help="transforms.json (nerfstudio), or the dataset folder that holds it."),
+    ],
     out: Annotated[Path, typer.Option(help="Folder to write, new or empty.")],
     width: Annotated[
         int | None,
-        typer.Option(min=1, help="Width of the images, pixels; the height follows. Default: the cameras' own."),
+        typer.Option(
+            min=1,
+            help="Width of the images, pixels; the height follows. Default: the cameras' own.",
+        ),
     ] = None,
     colour_space: Annotated[
         ColourSpace,
@@ -36,14 +45,22 @@ def render(
     ] = ColourSpace.auto,
     background: Annotated[
         tuple[float, float, float],
-        typer.Option(metavar="R G B", show_default="black", help="Colour behind the Gaussians, sRGB, each from 0 to 1."),
+        typer.Option(
+            metavar="R G B",
+            show_default="black",
+            help="Colour behind the Gaussians, sRGB, each from 0 to 1.",
+        ),
     ] = (0.0, 0.0, 0.0),
     exr: Annotated[
         bool,
-        typer.Option("--exr", help="Write an OpenEXR too: linear R G B, opacity A, expected z-depth Z in metres (0: nothing)."),
+        typer.Option(
+            "--exr",
+            help="Write an OpenEXR too: linear R G B, opacity A, expected z-depth Z in metres (0: nothing).",
+        ),
     ] = False,
 ) -> None:
-    """Draw a model of Gaussians through every camera of a transforms.json. The images it lists need not exist.
+    """Draw a model of Gaussians through every camera of a transforms.json. The images it lists need
+    not exist.
 
     Writes one PNG for each camera, with the name of the camera's image.
     """
@@ -57,14 +74,26 @@ def render(
     from mgs.splat_ply import ply_colour_space, read_ply
 
     if not all(0 <= value <= 1 for value in background):
-        raise InputError(f"--background {' '.join(map(str, background))}: must be three numbers from 0 to 1")
-    views = [(name, camera.resized(width) if width else camera) for name, camera in load_cameras(cameras)]
+        raise InputError(
+            f"--background {' '.join(map(str, background))}: must be three numbers from 0 to 1"
+        )
+    views = [
+        (name, camera.resized(width) if width else camera) for name, camera in load_cameras(cameras)
+    ]
     gaussians = read_ply(splats)
     space = ply_colour_space(splats) if colour_space is ColourSpace.auto else colour_space.value
     new_folder(out)
     runtime.start()
     with Progress(transient=True) as bar:
         task = bar.add_task("rendering", total=len(views))
-        draw_views(out, gaussians, views, space, background, exr, progress=lambda done, total: bar.update(task, completed=done))
+        draw_views(
+            out,
+            gaussians,
+            views,
+            space,
+            background,
+            exr,
+            progress=lambda done, total: bar.update(task, completed=done),
+        )
     degree = f"SH degree {gaussians.sh_degree}, colours in {'linear RGB' if space == 'linear' else 'sRGB'}"
     typer.echo(f"wrote {len(views)} views of {len(gaussians):,} Gaussians ({degree}) to {out}")

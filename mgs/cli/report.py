@@ -18,21 +18,30 @@ def report(
         ),
     ] = None,
     figures: Annotated[
-        str | None, typer.Option(metavar="png|pdf|svg", help="What the figures are written as.", show_default="png")
+        str | None,
+        typer.Option(
+            metavar="png|pdf|svg", help="What the figures are written as.", show_default="png"
+        ),
     ] = None,
     html: Annotated[
         Path | None,
-        typer.Option("--html", help="One page with everything, interactive; it opens from the disk and loads nothing."),
+        typer.Option(
+            "--html",
+            help="One page with everything, interactive; it opens from the disk and loads nothing.",
+        ),
     ] = None,
 ) -> None:
-    """Compare runs: draw the orbit, information gain, coverage, PSNR against images and one test view, and make a table.
+    """Compare runs: draw the orbit, information gain, coverage, PSNR against images and one test
+    view, and make a table.
 
-    Where the dataset has no test views, a view is drawn that the fewest runs were trained on, and PSNR is over all views.
+    Where the dataset has no test views, a view is drawn that the fewest runs were trained on, and
+    PSNR is over all views.
 
-    The figures are taken from the files of runs that are finished and measured by `mgs eval`; nothing is computed anew.
+    The figures are taken from the files of runs that are finished and measured by `mgs eval`;
+    nothing is computed anew.
 
-    The page of --html is made of what is there, also of an unfinished run: for its pictures, the model that the run folder
-    holds is drawn.
+    The page of --html is made of what is there, also of an unfinished run: for its pictures, the
+    model that the run folder holds is drawn.
     """
     from mgs.errors import InputError
     from mgs.files import check_writable
@@ -54,12 +63,12 @@ def _write_figures(runs: list[Path], out: Path, kind: str) -> None:
     """Write the figures and the table, print the table, and say what was left out."""
     from rich.console import Console
 
-    from mgs.active.stopping import why_ended
     from mgs.cli.printing import print_table
     from mgs.files import check_writable
     from mgs.report.runs import labelled_runs
     from mgs.report.tables import table_numbers
     from mgs.report.writing import write_report
+    from mgs.run.ending import why_ended
 
     check_writable(out / "table.md")  # before the figures are drawn, not after it
     written = write_report(out, runs, kind)
@@ -68,11 +77,15 @@ def _write_figures(runs: list[Path], out: Path, kind: str) -> None:
     for row, run in zip(rows, labelled_runs(runs).values(), strict=True):
         if run.ended:
             length = f"{row['path']:.2f} {row['unit']}"
-            typer.echo(f"{row['policy']}: a path of {length}; the run has ended: {why_ended(run.ended)}")
+            typer.echo(
+                f"{row['policy']}: a path of {length}; the run has ended: {why_ended(run.ended)}"
+            )
     for path in written:
         typer.echo(f"wrote {path}")
     if not any(path.stem == "psnr" for path in written):
-        typer.echo("PSNR against images is left out: it needs that all runs were made with --evaluate-every")
+        typer.echo(
+            "PSNR against images is left out: it needs that all runs were made with --evaluate-every"
+        )
 
 
 def _write_page(runs: list[Path], html: Path) -> None:
@@ -85,5 +98,7 @@ def _write_page(runs: list[Path], html: Path) -> None:
     runtime.start()
     with Progress(transient=True) as bar:
         task = bar.add_task("drawing", total=None)
-        size = write_page(html, runs, progress=lambda done, total: bar.update(task, completed=done, total=total))
+        size = write_page(
+            html, runs, progress=lambda done, total: bar.update(task, completed=done, total=total)
+        )
     typer.echo(f"wrote {html} ({size / 1e6:.1f} MB)")

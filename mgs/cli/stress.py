@@ -9,9 +9,10 @@ import typer
 
 
 def stress(
-    out: Annotated[Path, typer.Argument(help="Folder for everything; the same command again does what is left.")] = Path(
-        "out/stress"
-    ),
+    out: Annotated[
+        Path,
+        typer.Argument(help="Folder for everything; the same command again does what is left."),
+    ] = Path("out/stress"),
     preset: Annotated[
         str,
         typer.Option(
@@ -19,12 +20,16 @@ def stress(
         ),
     ] = "quick",
     workers: Annotated[int, typer.Option(min=1, help="Processes that do cells side by side.")] = 1,
-    only: Annotated[str | None, typer.Option(help="Names of experiments, separated by commas. Default: all.")] = None,
+    only: Annotated[
+        str | None, typer.Option(help="Names of experiments, separated by commas. Default: all.")
+    ] = None,
 ) -> None:
-    """Try to make the methods fail: experiments with a hypothesis each, and a verdict that follows from the numbers by a rule.
+    """Try to make the methods fail: experiments with a hypothesis each, and a verdict that follows
+    from the numbers by a rule.
 
-    Writes stability.csv (all numbers), verdicts.json, stability.md (the verdicts as a table) and a picture of each experiment.
-    An interrupted run goes on where it stopped when the same command is given again.
+    Writes stability.csv (all numbers), verdicts.json, stability.md (the verdicts as a table) and a
+    picture of each experiment. An interrupted run goes on where it stopped when the same command is
+    given again.
     """
     from rich.console import Console
 
@@ -46,7 +51,15 @@ def stress(
     with cells_bar(console) as report:
         verdicts = run_stress(out, size, names, command_line(), report, workers)
     for experiment in verdicts["experiments"]:
-        console.print(f"[bold]{experiment['name']}[/bold]: {experiment['question']}", soft_wrap=True)
+        console.print(
+            f"[bold]{experiment['name']}[/bold]: {experiment['question']}", soft_wrap=True
+        )
         for claim in experiment["claims"]:
-            console.print(f"  {claim['verdict']:8} {claim['hypothesis']} {effect(claim)}, {claim['runs']} runs", soft_wrap=True)
-    console.print(f"wrote {out}: verdicts.json, stability.csv, stability.md and a picture of each experiment", soft_wrap=True)
+            console.print(
+                f"  {claim['verdict']:8} {claim['hypothesis']} {effect(claim)}, {claim['runs']} runs",
+                soft_wrap=True,
+            )
+    console.print(
+        f"wrote {out}: verdicts.json, stability.csv, stability.md and a picture of each experiment",
+        soft_wrap=True,
+    )

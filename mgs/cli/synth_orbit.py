@@ -18,36 +18,72 @@ class Axis(StrEnum):
 
 
 def synth_orbit(
-    out: Annotated[Path, typer.Argument(help="Folder to write: new, empty, or left by an interrupted run.")],
-    scene: Annotated[str, typer.Option(help="Name of a scene that comes with mgs, or path of a .toml file.")] = "boulder",
-    orbit: Annotated[str | None, typer.Option(help="circle, rings, spiral or hemisphere. Default: the scene's.")] = None,
-    mesh: Annotated[Path | None, typer.Option(help="A real rock: textured GLB, OBJ or PLY, scaled to the scene.")] = None,
-    mesh_up: Annotated[
-        Axis | None, typer.Option(help="Axis of --mesh that points up. Default: y for GLB (its rule) and OBJ, z for others.")
+    out: Annotated[
+        Path, typer.Argument(help="Folder to write: new, empty, or left by an interrupted run.")
+    ],
+    scene: Annotated[
+        str, typer.Option(help="Name of a scene that comes with mgs, or path of a .toml file.")
+    ] = "boulder",
+    orbit: Annotated[
+        str | None, typer.Option(help="circle, rings, spiral or hemisphere. Default: the scene's.")
     ] = None,
-    preset: Annotated[str, typer.Option(help="quick: 32 frames of 320x240. paper: 100 frames of 640x480.")] = "quick",
-    spp: Annotated[int | None, typer.Option(min=1, help="Samples per pixel. Default: the preset's.")] = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="Number of frames. Default: the preset's.")] = None,
-    size: Annotated[str | None, typer.Option(help="Image size WIDTHxHEIGHT, pixels. Default: the preset's.")] = None,
+    mesh: Annotated[
+        Path | None,
+        typer.Option(help="A real rock: textured GLB, OBJ or PLY, scaled to the scene."),
+    ] = None,
+    mesh_up: Annotated[
+        Axis | None,
+        typer.Option(
+            help="Axis of --mesh that points up. Default: y for GLB (its rule) and OBJ, z for others."
+        ),
+    ] = None,
+    preset: Annotated[
+        str, typer.Option(help="quick: 32 frames of 320x240. paper: 100 frames of 640x480.")
+    ] = "quick",
+    spp: Annotated[
+        int | None, typer.Option(min=1, help="Samples per pixel. Default: the preset's.")
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="Number of frames. Default: the preset's.")
+    ] = None,
+    size: Annotated[
+        str | None, typer.Option(help="Image size WIDTHxHEIGHT, pixels. Default: the preset's.")
+    ] = None,
     test_views: Annotated[
-        int, typer.Option(min=0, help="Number of views on a dome around the rock, to judge models by; written to OUT/test.")
+        int,
+        typer.Option(
+            min=0,
+            help="Number of views on a dome around the rock, to judge models by; written to OUT/test.",
+        ),
     ] = 0,
     on_demand: Annotated[
         bool,
-        typer.Option("--on-demand", help="Render test views and a survey, but no frame: `mgs nbv OUT` renders those it takes."),
+        typer.Option(
+            "--on-demand",
+            help="Render test views and a survey, but no frame: `mgs nbv OUT` renders those it takes.",
+        ),
     ] = False,
-    pose_noise: Annotated[float, typer.Option(min=0, help="Noise on the positions in transforms.json, metres per axis.")] = 0.0,
-    rotation_noise: Annotated[float, typer.Option(min=0, help="Noise on the rotations there, degrees per axis.")] = 0.0,
-    seed: Annotated[int, typer.Option(min=0, help="Root seed: the same seed gives the same dataset, bit for bit.")] = 0,
+    pose_noise: Annotated[
+        float,
+        typer.Option(min=0, help="Noise on the positions in transforms.json, metres per axis."),
+    ] = 0.0,
+    rotation_noise: Annotated[
+        float, typer.Option(min=0, help="Noise on the rotations there, degrees per axis.")
+    ] = 0.0,
+    seed: Annotated[
+        int,
+        typer.Option(min=0, help="Root seed: the same seed gives the same dataset, bit for bit."),
+    ] = 0,
 ) -> None:
-    """Render a dataset with Mitsuba: an orbit around a rock, with photoreal images, depth, rock masks and exact poses.
+    """Render a dataset with Mitsuba: an orbit around a rock, with photoreal images, depth, rock
+    masks and exact poses.
 
-    Writes transforms.json (as nerfstudio has it), images/, depth/, masks/, rock/ (images of the rock alone, with alpha), the
-    true rock as rock.glb, config.json and contact_sheet.png. An interrupted run goes on where it stopped when the same command
-    is given again.
+    Writes transforms.json (as nerfstudio has it), images/, depth/, masks/, rock/ (images of the
+    rock alone, with alpha), the true rock as rock.glb, config.json and contact_sheet.png. An
+    interrupted run goes on where it stopped when the same command is given again.
 
-    With --on-demand it writes poses, test views and a survey (depth and masks, OUT/survey), and an image of a frame exists only
-    once a run of `mgs nbv` has taken it.
+    With --on-demand it writes poses, test views and a survey (depth and masks, OUT/survey), and an
+    image of a frame exists only once a run of `mgs nbv` has taken it.
     """
     from rich.console import Console
     from rich.progress import Progress
@@ -63,7 +99,9 @@ def synth_orbit(
     if orbit is not None:
         if orbit not in ORBITS:
             raise InputError(f"--orbit {orbit!r}: unknown; choose one of {', '.join(ORBITS)}")
-        settings = settings.model_copy(update={"orbit": settings.orbit.model_copy(update={"kind": orbit})})
+        settings = settings.model_copy(
+            update={"orbit": settings.orbit.model_copy(update={"kind": orbit})}
+        )
     if mesh_up is not None and mesh is None:
         raise InputError("--mesh-up: says how a mesh stands, but there is none; give --mesh too")
     given = {"spp": spp, "frames": frames, **_parse_size(size)}
@@ -86,7 +124,8 @@ def synth_orbit(
 
 
 def _parse_size(size: str | None) -> dict[str, int | None]:
-    """Width and height of an option like 320x240, {} if it was not given. Raises InputError for anything else."""
+    """Width and height of an option like 320x240, {} if it was not given. Raises InputError for
+    anything else."""
     import re
 
     from mgs.camera import MAX_PIXELS
@@ -97,5 +136,7 @@ def _parse_size(size: str | None) -> dict[str, int | None]:
     found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", size.lower(), re.ASCII)
     width, height = (int(side) for side in found.groups()) if found else (0, 0)
     if not 0 < width * height <= MAX_PIXELS:
-        raise InputError(f"--size {size!r}: expected WIDTHxHEIGHT, at most {MAX_PIXELS:,} pixels in all, as in 320x240")
+        raise InputError(
+            f"--size {size!r}: expected WIDTHxHEIGHT, at most {MAX_PIXELS:,} pixels in all, as in 320x240"
+        )
     return {"width": width, "height": height}

@@ -12,18 +12,32 @@ LOCAL = ("127.0.0.1", "localhost", "::1")
 
 
 def view(
-    subject: Annotated[Path, typer.Argument(metavar="RUN|SPLATS.ply", help="Folder that `mgs nbv` wrote, or a 3DGS PLY.")],
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to serve on; 0: any free one.")] = 8080,
+    subject: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN|SPLATS.ply", help="Folder that `mgs nbv` wrote, or a 3DGS PLY."
+        ),
+    ],
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port to serve on; 0: any free one.")
+    ] = 8080,
     host: Annotated[
-        str, typer.Option(help="Address to serve on. Any other than 127.0.0.1 can be reached by others.")
+        str,
+        typer.Option(
+            help="Address to serve on. Any other than 127.0.0.1 can be reached by others."
+        ),
     ] = "127.0.0.1",
-    follow: Annotated[bool, typer.Option("--follow", help="Show every new step of a run that goes on.")] = False,
+    follow: Annotated[
+        bool, typer.Option("--follow", help="Show every new step of a run that goes on.")
+    ] = False,
 ) -> None:
-    """Show a run or a model in the browser, to be turned by mouse, keyboard or touch: Gaussians, mesh and cameras.
+    """Show a run or a model in the browser, to be turned by mouse, keyboard or touch: Gaussians,
+    mesh and cameras.
 
-    While the camera moves, the browser draws the Gaussians, without view-dependent colour. While it rests, it shows the image
-    of the kernel. Layers: colour, alpha, depth, and of a run the information, the uncertainty, and what is unobserved. A click
-    on a camera shows its image and its numbers. Ctrl-C ends it.
+    While the camera moves, the browser draws the Gaussians, without view-dependent colour. While it
+    rests, it shows the image
+    of the kernel. Layers: colour, alpha, depth, and of a run the information, the uncertainty, and
+    what is unobserved. A click on a camera shows its image and its numbers. Ctrl-C ends it.
     """
     import time
 
@@ -34,7 +48,9 @@ def view(
     viewer = Viewer(subject, host, port, follow)
     try:
         if host not in LOCAL:
-            typer.echo(f"--host {host}: everyone who reaches this address can see the data and use the controls")
+            typer.echo(
+                f"--host {host}: everyone who reaches this address can see the data and use the controls"
+            )
         shown = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
         typer.echo(f"open http://{shown}:{viewer.port} in a browser; Ctrl-C ends it")
         while True:

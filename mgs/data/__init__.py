@@ -1,1 +1,2 @@
-"""Datasets on disk: reading, checking and importing them; meshes; and which points a camera sees."""
+"""Datasets on disk: reading, checking and importing them; meshes; and which points a camera
+sees."""

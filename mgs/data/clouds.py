@@ -1,4 +1,5 @@
-"""Clouds of points that other tools triangulated: what is known of each point, the file that keeps it, and any PLY file."""
+"""Clouds of points that other tools triangulated: what is known of each point, the file that keeps
+it, and any PLY file."""
 
 from __future__ import annotations
 
@@ -14,17 +15,18 @@ from mgs.errors import InputError
 from mgs.files import atomic_path, reading
 
 NEAREST_SHARE = 0.25
-"""Of the cameras that have a point in their image, this share, the nearest, are taken for those that saw it, where the cloud
-does not say which did."""
+"""Of the cameras that have a point in their image, this share, the nearest, are taken for those
+that saw it, where the cloud does not say which did."""
 
 
 @dataclass(frozen=True)
 class SparseCloud:
     """Triangulated points of the world.
 
-    points: [N,3]; views: [N,3] unit, the mean direction from each point to the cameras that saw it, or its normal; None where
-    nothing is known of them. track: [N] number of images that saw each, None where unknown. error: [N] mean reprojection error,
-    pixels, None where unknown.
+    points: [N,3]; views: [N,3] unit, the mean direction from each point to the cameras that saw it,
+    or its normal; None where
+    nothing is known of them. track: [N] number of images that saw each, None where unknown. error:
+    [N] mean reprojection error, pixels, None where unknown.
     """
 
     points: np.ndarray
@@ -38,11 +40,16 @@ class SparseCloud:
 
 
 def write_cloud(path: str | Path, cloud: SparseCloud) -> None:
-    """Write a cloud as a binary PLY: x y z, and nx ny nz (the views), track and error where there are such. Atomic."""
+    """Write a cloud as a binary PLY: x y z, and nx ny nz (the views), track and error where there
+    are such. Atomic."""
     columns = {name: cloud.points[:, k] for k, name in enumerate("xyz")}
     if cloud.views is not None:
         columns |= {name: cloud.views[:, k] for k, name in enumerate(("nx", "ny", "nz"))}
-    columns |= {name: value for name, value in (("track", cloud.track), ("error", cloud.error)) if value is not None}
+    columns |= {
+        name: value
+        for name, value in (("track", cloud.track), ("error", cloud.error))
+        if value is not None
+    }
     table = np.empty(len(cloud.points), [(name, "f4") for name in columns])
     for name, value in columns.items():
         table[name] = value
@@ -51,10 +58,12 @@ def write_cloud(path: str | Path, cloud: SparseCloud) -> None:
 
 
 def read_cloud(path: str | Path) -> SparseCloud:
-    """Read the points of any PLY file; nx ny nz, track and error are read where it has them. Of points in the same place the
+    """Read the points of any PLY file; nx ny nz, track and error are read where it has them. Of
+    points in the same place the
     first is kept: some programs write a vertex for each corner of each face.
 
-    Raises InputError if the file is missing, damaged, holds a value that is not finite, or has fewer than two points.
+    Raises InputError if the file is missing, damaged, holds a value that is not finite, or has
+    fewer than two points.
     """
     path = Path(path)
     with reading(path, "point cloud; give a PLY file"), path.open("rb") as file:
@@ -66,22 +75,32 @@ def read_cloud(path: str | Path) -> SparseCloud:
         views = None
         if {"nx", "ny", "nz"} <= set(names):
             views = np.stack([np.asarray(data[name], np.float64) for name in ("nx", "ny", "nz")], 1)
-        track, error = (np.asarray(data[name], np.float64) if name in names else None for name in ("track", "error"))
+        track, error = (
+            np.asarray(data[name], np.float64) if name in names else None
+            for name in ("track", "error")
+        )
     except (PlyParseError, KeyError, ValueError, TypeError, UnicodeDecodeError) as error_:
-        raise InputError(f"{path}: not a readable cloud ({error_}); give a PLY file with x y z, or import again") from None
+        raise InputError(
+            f"{path}: not a readable cloud ({error_}); give a PLY file with x y z, or import again"
+        ) from None
     first = np.sort(np.unique(points, axis=0, return_index=True)[1])
     points = points[first]
     views, track, error = (None if a is None else a[first] for a in (views, track, error))
-    if len(points) < 2 or not all(np.isfinite(a).all() for a in (points, views, track, error) if a is not None):
-        raise InputError(f"{path}: has values that are not finite, or fewer than two different points; make it again")
+    if len(points) < 2 or not all(
+        np.isfinite(a).all() for a in (points, views, track, error) if a is not None
+    ):
+        raise InputError(
+            f"{path}: has values that are not finite, or fewer than two different points; make it again"
+        )
     if views is not None and not np.linalg.norm(views, axis=1).all():
         views = None  # such as the normals of zeros that some programs write
     return SparseCloud(points, views, track, error)
 
 
 def views_of(cloud: SparseCloud, cameras: Sequence[Camera]) -> np.ndarray:
-    """The cloud's views [N,3]; where it has none, the mean unit direction to the nearest of the cameras that have the point in
-    their image, as a guess at those that saw it. Points that no camera has in its image look to the nearest camera."""
+    """The cloud's views [N,3]; where it has none, the mean unit direction to the nearest of the
+    cameras that have the point in their image, as a guess at those that saw it. Points that no
+    camera has in its image look to the nearest camera."""
     if cloud.views is not None:
         return cloud.views
     offset = np.stack([camera.position for camera in cameras])[None] - cloud.points[:, None]

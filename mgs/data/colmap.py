@@ -19,8 +19,8 @@ MODELS: dict[str, tuple[str, ...]] = {
     "OPENCV": ("k1", "k2", "p1", "p2"),
     "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-"""Distortion coefficients of each of COLMAP's camera models, in the order in which they follow focal lengths and principal
-point in COLMAP's list of parameters."""
+"""Distortion coefficients of each of COLMAP's camera models, in the order in which they follow
+focal lengths and principal point in COLMAP's list of parameters."""
 
 OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Coefficients of OpenCV's rational model, in OpenCV's order."""
@@ -29,14 +29,17 @@ OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 def is_model(folder: Path) -> bool:
     """Whether a folder holds the three files of a model."""
     return any(
-        all((folder / f"{name}.{kind}").is_file() for name in ("cameras", "images", "points3D")) for kind in ("bin", "txt")
+        all((folder / f"{name}.{kind}").is_file() for name in ("cameras", "images", "points3D"))
+        for kind in ("bin", "txt")
     )
 
 
 def read_model(model: Path) -> tuple[list[tuple[str, Camera, np.ndarray]], SparseCloud | None]:
-    """The images of a model, in the order of their names, and its points: ([(name, camera, distortion)], cloud).
+    """The images of a model, in the order of their names, and its points: ([(name, camera,
+    distortion)], cloud).
 
-    distortion: eight coefficients in OpenCV's order. Raises InputError where the model is damaged, or a lens is not supported.
+    distortion: eight coefficients in OpenCV's order. Raises InputError where the model is damaged,
+    or a lens is not supported.
     """
     import pycolmap
 
@@ -44,24 +47,33 @@ def read_model(model: Path) -> tuple[list[tuple[str, Camera, np.ndarray]], Spars
         reconstruction = pycolmap.Reconstruction(model)
     except Exception as error:  # pycolmap raises many types; each means a damaged model.
         reason = " ".join(str(error).split())[:120]
-        raise InputError(f"{model}: not a readable COLMAP model ({reason}); export it again") from None
+        raise InputError(
+            f"{model}: not a readable COLMAP model ({reason}); export it again"
+        ) from None
     images = []
     for image in sorted(reconstruction.images.values(), key=lambda image: image.name):
         lens = image.camera
         keys = MODELS.get(lens.model_name)
         if keys is None:
-            raise InputError(f"{model}: camera model {lens.model_name} is not supported; run COLMAP's image_undistorter first")
+            raise InputError(
+                f"{model}: camera model {lens.model_name} is not supported; run COLMAP's image_undistorter first"
+            )
         pose = np.eye(4)
         pose[:3] = image.cam_from_world().matrix()
         camera = Camera(lens.calibration_matrix(), lens.width, lens.height, pose)
         values = dict(zip(keys, lens.params[len(lens.params) - len(keys) :], strict=True))
-        images.append((image.name, camera, np.array([values.get(key, 0.0) for key in OPENCV_ORDER])))
+        images.append(
+            (image.name, camera, np.array([values.get(key, 0.0) for key in OPENCV_ORDER]))
+        )
     return images, _cloud(reconstruction)
 
 
 def _cloud(reconstruction: Any) -> SparseCloud | None:
-    """The triangulated points that some image saw. A reprojection error of -1 is COLMAP's word for unknown."""
-    centres = {image.image_id: image.projection_center() for image in reconstruction.images.values()}
+    """The triangulated points that some image saw. A reprojection error of -1 is COLMAP's word for
+    unknown."""
+    centres = {
+        image.image_id: image.projection_center() for image in reconstruction.images.values()
+    }
     points, views, tracks, errors = [], [], [], []
     for point in reconstruction.points3D.values():
         seen = {element.image_id for element in point.track.elements}
@@ -75,4 +87,9 @@ def _cloud(reconstruction: Any) -> SparseCloud | None:
         return None
     directions, known = np.stack(views), np.array(errors)
     directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
-    return SparseCloud(np.stack(points), directions, np.array(tracks, np.float64), known if (known >= 0).all() else None)
+    return SparseCloud(
+        np.stack(points),
+        directions,
+        np.array(tracks, np.float64),
+        known if (known >= 0).all() else None,
+    )

@@ -18,13 +18,16 @@ if TYPE_CHECKING:
 
 
 def mesh_depth(mesh: Mesh) -> Callable[[Camera], np.ndarray]:
-    """A function that gives the z-depth of the mesh in a camera: float32 [H,W], metres, 0 where no face is met.
+    """A function that gives the z-depth of the mesh in a camera: float32 [H,W], metres, 0 where no
+    face is met.
 
     One ray is cast through the centre of each pixel; it meets a face from either side.
     Raises InputError where no variant can be started (`mgs.runtime.start`).
     """
     runtime.start()
-    centre = mesh.vertices.mean(0)  # rays are cast in coordinates around it: float32 is finest near the origin
+    centre = mesh.vertices.mean(
+        0
+    )  # rays are cast in coordinates around it: float32 is finest near the origin
     shape = mi.Mesh("mesh", len(mesh.vertices), len(mesh.faces))
     params = mi.traverse(shape)
     params["vertex_positions"] = mi.Float(padded(mesh.vertices - centre).ravel())
@@ -35,11 +38,15 @@ def mesh_depth(mesh: Mesh) -> Callable[[Camera], np.ndarray]:
     def depth(camera: Camera) -> np.ndarray:
         rays = mi.Matrix3f(camera.camera_to_world[:3, :3] @ np.linalg.inv(camera.K))
         origin = mi.Point3f(*(camera.position - centre).tolist())
-        dr.make_opaque(rays, origin)  # a number that the compiler knows would cost a new kernel for every camera
+        dr.make_opaque(
+            rays, origin
+        )  # a number that the compiler knows would cost a new kernel for every camera
         pixel = dr.arange(mi.UInt32, camera.width * camera.height)
         row = pixel // camera.width
         column = pixel - row * camera.width
-        direction = rays @ mi.Vector3f(mi.Float(column) + 0.5, mi.Float(row) + 0.5, 1)  # of z-depth 1, so t is z-depth
+        direction = rays @ mi.Vector3f(
+            mi.Float(column) + 0.5, mi.Float(row) + 0.5, 1
+        )  # of z-depth 1, so t is z-depth
         hit = scene.ray_intersect_preliminary(mi.Ray3f(origin, direction))
         return dr.select(hit.is_valid(), hit.t, 0).numpy().reshape(camera.height, camera.width)
 

@@ -1,8 +1,10 @@
-"""The visual hull: the largest body that fits into the masks of all frames (Laurentini 1994), by space carving on a grid.
+"""The visual hull: the largest body that fits into the masks of all frames (Laurentini 1994), by
+space carving on a grid.
 
-A point of space has a value for each frame: how far its projection lies inside the mask's outline, in pixels, times the size
-of a pixel at the point. The least of these values is positive inside the hull, negative outside, and about the distance to
-the hull's surface near it; marching cubes find the surface between the nodes of the grid.
+A point of space has a value for each frame: how far its projection lies inside the mask's outline,
+in pixels, times the size of a pixel at the point. The least of these values is positive inside the
+hull, negative outside, and about the distance to the hull's surface near it; marching cubes find
+the surface between the nodes of the grid.
 """
 
 from __future__ import annotations
@@ -20,13 +22,14 @@ from mgs.data.meshes import Mesh
 from mgs.errors import InputError
 
 COARSE = 48
-"""Cells along an edge of the first grid. It is refined near the surface only, REFINEMENTS times, by two each time."""
+"""Cells along an edge of the first grid. It is refined near the surface only, REFINEMENTS times, by
+two each time."""
 
 REFINEMENTS = 2
 
 NEAR_SURFACE = 3.0
-"""Nodes of a refined grid whose interpolated value is less than this many of its cells are computed anew. The others are too
-far from the surface to change it."""
+"""Nodes of a refined grid whose interpolated value is less than this many of its cells are computed
+anew. The others are too far from the surface to change it."""
 
 ROW = 4096
 """Points are handed to OpenCV in rows of this length."""
@@ -38,15 +41,18 @@ MARGIN = 1.3
 """Half edge of the grid over the largest radius of the object that a mask shows."""
 
 LEAST_VIEWS = 3
-"""A point that fewer frames have in their image is outside: nothing says that it belongs to the object."""
+"""A point that fewer frames have in their image is outside: nothing says that it belongs to the
+object."""
 
 AGREEMENT = 0.8
-"""Least median share of a mask that the hull must fill. Where masks and poses fit, it is above 0.95."""
+"""Least median share of a mask that the hull must fill. Where masks and poses fit, it is above
+0.95."""
 
 
 @dataclass(frozen=True)
 class Hull:
-    """A visual hull. mesh: its surface, closed, in the world; cell: edge of the finest grid cells, in units of the world;
+    """A visual hull. mesh: its surface, closed, in the world; cell: edge of the finest grid cells,
+    in units of the world;
     agreement: for each frame the share of its mask that the hull fills."""
 
     mesh: Mesh
@@ -57,8 +63,9 @@ class Hull:
 def visual_hull(frames: Sequence[Frame], tell: Callable[[str], None] = lambda stage: None) -> Hull:
     """The visual hull of the masks of frames, smoothed by no more than half a cell.
 
-    Raises InputError if all masks are empty or full, if the masks share no point of space, or if the hull fills too little of
-    the masks because poses and masks do not fit; the message names frames.
+    Raises InputError if all masks are empty or full, if the masks share no point of space, or if
+    the hull fills too little of the masks because poses and masks do not fit; the message names
+    frames.
     """
     from skimage.measure import marching_cubes
 
@@ -70,7 +77,11 @@ def visual_hull(frames: Sequence[Frame], tell: Callable[[str], None] = lambda st
     if field.max() <= 0:
         kept = np.unravel_index(np.argmin(carved), carved.shape)
         point = (lo + edge / cells * np.array(kept))[None]
-        against = [frame.name for frame, view in zip(frames, views, strict=True) if not 0 < view(point)[0] < np.inf]
+        against = [
+            frame.name
+            for frame, view in zip(frames, views, strict=True)
+            if not 0 < view(point)[0] < np.inf
+        ]
         raise InputError(
             f"prior: the masks share no point of space (at best {len(against)} of {len(frames)} frames, such as {against[0]}, "
             "are against it); poses and masks do not fit, or the object moved; correct or remove frames"
@@ -96,13 +107,18 @@ class _View:
     distance: np.ndarray
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """How far inside the silhouette points [N,3] are, in units of the world; +inf where they are not in the image."""
+        """How far inside the silhouette points [N,3] are, in units of the world; +inf where they
+        are not in the image."""
         import cv2
 
         if len(points) == 0:
             return np.zeros(0)
         pixels, z = self.camera.project(points)
-        inside = (z > 0) & (pixels > 0).all(1) & (pixels < [self.camera.width, self.camera.height]).all(1)
+        inside = (
+            (z > 0)
+            & (pixels > 0).all(1)
+            & (pixels < [self.camera.width, self.camera.height]).all(1)
+        )
         padded = np.zeros((-(-len(points) // ROW) * ROW, 2), np.float32)
         padded[: len(points)] = np.where(inside[:, None], pixels - 0.5, 0)
         at = padded.reshape(-1, ROW, 2)  # OpenCV takes images of up to 32,767 rows
@@ -115,22 +131,38 @@ class _View:
 
 
 def _view(frame: Frame) -> _View:
-    """The view of a frame. All are kept in memory, so a mask of more than MOST_PIXELS is made smaller."""
-    camera, smaller = shrunk(frame.camera, lambda pixels, smooth: pixels, stride_for(frame.camera, MOST_PIXELS))
-    return _View(camera, _signed_distance(smaller(frame.mask().astype(np.uint8) * 255, True) >= 128))
+    """The view of a frame. All are kept in memory, so a mask of more than MOST_PIXELS is made
+    smaller."""
+    camera, smaller = shrunk(
+        frame.camera, lambda pixels, smooth: pixels, stride_for(frame.camera, MOST_PIXELS)
+    )
+    return _View(
+        camera, _signed_distance(smaller(frame.mask().astype(np.uint8) * 255, True) >= 128)
+    )
 
 
 def _signed_distance(mask: np.ndarray) -> np.ndarray:
-    """Distance [H,W] of pixel centres from the outline of a mask, pixels, positive inside, float32."""
-    inside = distance_transform_edt(mask) - 0.5 if not mask.all() else np.full(mask.shape, float(max(mask.shape)))
-    outside = distance_transform_edt(~mask) - 0.5 if mask.any() else np.full(mask.shape, float(max(mask.shape)))
+    """Distance [H,W] of pixel centres from the outline of a mask, pixels, positive inside,
+    float32."""
+    inside = (
+        distance_transform_edt(mask) - 0.5
+        if not mask.all()
+        else np.full(mask.shape, float(max(mask.shape)))
+    )
+    outside = (
+        distance_transform_edt(~mask) - 0.5
+        if mask.any()
+        else np.full(mask.shape, float(max(mask.shape)))
+    )
     return np.where(mask, inside, -outside).astype(np.float32)
 
 
 def _bounds(frames: Sequence[Frame]) -> tuple[np.ndarray, float]:
-    """(lowest corner [3], edge) of the cube to carve in: around the point nearest to the rays through the masks' centres.
+    """(lowest corner [3], edge) of the cube to carve in: around the point nearest to the rays
+    through the masks' centres.
 
-    Frames with an empty mask, and with one that fills the image, say nothing of it. Raises InputError if all are such.
+    Frames with an empty mask, and with one that fills the image, say nothing of it. Raises
+    InputError if all are such.
     """
     A, b, cones = np.zeros((3, 3)), np.zeros(3), []
     for frame in frames:
@@ -146,29 +178,39 @@ def _bounds(frames: Sequence[Frame]) -> tuple[np.ndarray, float]:
         A, b = A + across, b + across @ frame.camera.position
         cones.append((frame.camera, np.linalg.norm(pixels - middle, axis=1).max() / K[0, 0]))
     if not cones:
-        raise InputError("prior: every mask is empty or fills its image; give masks that are white on the object only")
+        raise InputError(
+            "prior: every mask is empty or fills its image; give masks that are white on the object only"
+        )
     centre = np.linalg.lstsq(A, b, rcond=1e-9)[0]
-    half = MARGIN * max(np.linalg.norm(camera.position - centre) * tangent for camera, tangent in cones)
+    half = MARGIN * max(
+        np.linalg.norm(camera.position - centre) * tangent for camera, tangent in cones
+    )
     return centre - half, float(2 * half)
 
 
 def _inside(views: Sequence[_View], points: np.ndarray, reach: float) -> np.ndarray:
-    """The least value of points [N,3] over the views, cut to +-reach, float32 [N]; -reach where fewer than LEAST_VIEWS have
-    the point in their image."""
+    """The least value of points [N,3] over the views, cut to +-reach, float32 [N]; -reach where
+    fewer than LEAST_VIEWS have the point in their image."""
     least, count = np.full(len(points), np.inf), np.zeros(len(points), int)
     left = np.arange(len(points))
     for view in views:
         value = view(points[left])
         count[left] += np.isfinite(value)
         least[left] = np.minimum(least[left], value)
-        left = left[least[left] > -reach]  # what is carved away deeper than this is far from the surface
+        left = left[
+            least[left] > -reach
+        ]  # what is carved away deeper than this is far from the surface
     carved = least <= -reach
-    return np.where(carved | (count < min(LEAST_VIEWS, len(views))), -reach, np.minimum(least, reach)).astype(np.float32)
+    return np.where(
+        carved | (count < min(LEAST_VIEWS, len(views))), -reach, np.minimum(least, reach)
+    ).astype(np.float32)
 
 
-def _first_grid(views: Sequence[_View], lo: np.ndarray, edge: float) -> tuple[np.ndarray, np.ndarray]:
-    """The values of the nodes of the coarse grid, and how many views carve each away, [n,n,n] with n = COARSE + 1; all views
-    where fewer than LEAST_VIEWS have the node in their image."""
+def _first_grid(
+    views: Sequence[_View], lo: np.ndarray, edge: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The values of the nodes of the coarse grid, and how many views carve each away, [n,n,n] with
+    n = COARSE + 1; all views where fewer than LEAST_VIEWS have the node in their image."""
     nodes = np.stack(np.meshgrid(*[np.arange(COARSE + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
     points = lo + edge / COARSE * nodes
     carved, count = np.zeros(len(points), int), np.zeros(len(points), int)
@@ -178,7 +220,9 @@ def _first_grid(views: Sequence[_View], lo: np.ndarray, edge: float) -> tuple[np
         count += np.isfinite(value)
     carved[count < min(LEAST_VIEWS, len(views))] = len(views)
     shape = (COARSE + 1,) * 3
-    return _inside(views, points, 2 * NEAR_SURFACE * edge / COARSE).reshape(shape), carved.reshape(shape)
+    return _inside(views, points, 2 * NEAR_SURFACE * edge / COARSE).reshape(shape), carved.reshape(
+        shape
+    )
 
 
 def _refined(field: np.ndarray) -> np.ndarray:
@@ -201,7 +245,8 @@ def _largest(field: np.ndarray) -> np.ndarray:
 
 
 def _checked_agreement(frames: Sequence[Frame], views: Sequence[_View], mesh: Mesh) -> np.ndarray:
-    """For each frame the share of its mask that the mesh fills. Raises InputError where the median is below AGREEMENT."""
+    """For each frame the share of its mask that the mesh fills. Raises InputError where the median
+    is below AGREEMENT."""
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
     depth = mesh_depth(mesh)

@@ -1,4 +1,5 @@
-"""Photographs without depth -> the surface of the object: of triangulated points, of the masks' visual hull, or of both."""
+"""Photographs without depth -> the surface of the object: of triangulated points, of the masks'
+visual hull, or of both."""
 
 from __future__ import annotations
 
@@ -35,26 +36,30 @@ LEAST_OVERLAP = 0.5
 """Least share of the cameras that must have in their image the point that all of them look at."""
 
 GAP = 4.0
-"""Where the surface of the hull is farther than this many distances between neighbours from every point of the cloud, the hull
-stands in for the points."""
+"""Where the surface of the hull is farther than this many distances between neighbours from every
+point of the cloud, the hull stands in for the points."""
 
 CELL_OF_SPACING = 0.5
-"""What the Poisson reconstruction takes for the distance between points, over that of the cloud: its cells are then 0.75 of it.
+"""What the Poisson reconstruction takes for the distance between points, over that of the cloud:
+its cells are then 0.75 of it.
 Measured: larger cells lose detail, and smaller ones gain nothing."""
 
 BEYOND_POINTS = 0.15
-"""A face farther than this from every point, over the extent of the points, closes the surface where nothing was seen, and is
-not sampled. With a hull or a ground plane there is no such need."""
+"""A face farther than this from every point, over the extent of the points, closes the surface
+where nothing was seen, and is not sampled. With a hull or a ground plane there is no such need."""
 
 
 ONE_SIDED = 0.5
-"""Least length of the mean normal of points that were seen from one side; it is 0 all around an object, and 1 of a wall."""
+"""Least length of the mean normal of points that were seen from one side; it is 0 all around an
+object, and 1 of a wall."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A surface that was built of photographs. mesh: closed, in the world. cell: how finely it is known, units of the world.
-    segmented: the cloud that it was built from, if there is one. numbers: what prior.json holds of how it was built."""
+    """A surface that was built of photographs. mesh: closed, in the world. cell: how finely it is
+    known, units of the world.
+    segmented: the cloud that it was built from, if there is one. numbers: what prior.json holds of
+    how it was built."""
 
     mesh: Mesh
     cell: float
@@ -63,9 +68,11 @@ class Surface:
 
 
 def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = None) -> str:
-    """What to build the prior of a dataset from: what was asked for, or by what the dataset holds: depth, points, masks.
+    """What to build the prior of a dataset from: what was asked for, or by what the dataset holds:
+    depth, points, masks.
 
-    points: a given cloud. Raises InputError where there is nothing to build it from, or not what was asked for.
+    points: a given cloud. Raises InputError where there is nothing to build it from, or not what
+    was asked for.
     """
     has = {
         "depth": any(frame.depth_path for frame in dataset.frames),
@@ -80,7 +87,9 @@ def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = 
     lacks = {"depth": "no depth images", "points": f"no points ({CLOUD})", "hull": "no masks"}
     if asked not in (None, *SOURCES):
         raise InputError(f"--from {asked!r}: is unknown; choose one of {', '.join(SOURCES)}")
-    missing = " and ".join(lacks.values()) if asked is None else lacks.get(asked, "no mesh of its own")
+    missing = (
+        " and ".join(lacks.values()) if asked is None else lacks.get(asked, "no mesh of its own")
+    )
     ways = {
         "depth": "import data with depth",
         "hull": "import with --masks DIR for --from hull",
@@ -93,8 +102,8 @@ def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = 
 
 
 def check_photographs(frames: Sequence[Frame]) -> None:
-    """Raises InputError where photographs without depth cannot show a surface: fewer than LEAST_PHOTOGRAPHS, or cameras that do
-    not look at one thing."""
+    """Raises InputError where photographs without depth cannot show a surface: fewer than
+    LEAST_PHOTOGRAPHS, or cameras that do not look at one thing."""
     if len(frames) < LEAST_PHOTOGRAPHS:
         raise InputError(
             f"prior: {len(frames)} photographs without depth are too few; take at least {LEAST_PHOTOGRAPHS}, from all sides"
@@ -115,12 +124,18 @@ def check_masks(frames: Sequence[Frame]) -> None:
 
 
 def surface_of(
-    dataset: Dataset, source: str, settings: PriorSettings, tell: Callable[[str], None], points: Path | None = None
+    dataset: Dataset,
+    source: str,
+    settings: PriorSettings,
+    tell: Callable[[str], None],
+    points: Path | None = None,
 ) -> Surface:
-    """The surface by the source "points" or "hull". points: the cloud's file, if not the dataset's own.
+    """The surface by the source "points" or "hull". points: the cloud's file, if not the dataset's
+    own.
 
-    With masks the hull bounds what points give, and closes it where there are none. Raises InputError as `check_photographs`,
-    `check_masks`, `visual_hull`, `read_cloud` and `segment_points`, and NoSurface where the surface cannot be closed.
+    With masks the hull bounds what points give, and closes it where there are none. Raises
+    InputError as `check_photographs`, `check_masks`, `visual_hull`, `read_cloud` and
+    `segment_points`, and NoSurface where the surface cannot be closed.
     """
     check_photographs(dataset.frames)
     check_masks(dataset.frames)
@@ -148,12 +163,17 @@ def surface_of(
         "cloud_spacing": spacing,
         "poisson_depth": depth,
     }
-    return Surface(mesh, spacing, segmented, numbers | ({} if hull is None else _hull_numbers(hull)))
+    return Surface(
+        mesh, spacing, segmented, numbers | ({} if hull is None else _hull_numbers(hull))
+    )
 
 
-def _closed(segmented: SegmentedCloud, hull: Hull | None, spacing: float, settings: PriorSettings) -> tuple[Mesh, int]:
-    """A closed mesh of the object's points, and the depth of the octree: bounded by the hull, or cut at the ground, or behind
-    what was seen from one side, and with the faces marked as not seen that close it far from every point."""
+def _closed(
+    segmented: SegmentedCloud, hull: Hull | None, spacing: float, settings: PriorSettings
+) -> tuple[Mesh, int]:
+    """A closed mesh of the object's points, and the depth of the octree: bounded by the hull, or
+    cut at the ground, or behind what was seen from one side, and with the faces marked as not seen
+    that close it far from every point."""
     points, normals = segmented.rock_points, segmented.rock_normals
     cell = CELL_OF_SPACING * spacing
     if segmented.plane is not None:
@@ -161,7 +181,10 @@ def _closed(segmented: SegmentedCloud, hull: Hull | None, spacing: float, settin
     if hull is not None:
         body, body_normals = _thinned(hull.mesh, spacing)
         gap = cKDTree(points).query(body)[0] > GAP * spacing
-        points, normals = np.concatenate([points, body[gap]]), np.concatenate([normals, body_normals[gap]])
+        points, normals = (
+            np.concatenate([points, body[gap]]),
+            np.concatenate([normals, body_normals[gap]]),
+        )
         mesh, depth = closed_poisson(points, normals, cell, settings.poisson_depth)
         return intersection(mesh, hull.mesh), depth
     try:
@@ -177,8 +200,9 @@ def _closed(segmented: SegmentedCloud, hull: Hull | None, spacing: float, settin
 
 
 def _back_of(points: np.ndarray, normals: np.ndarray, spacing: float) -> Plane | None:
-    """A plane behind points [N,3] that were seen from one side, such as those of a building's front: their surface is a sheet,
-    which closes where it is mirrored in this plane and cut at it. None where the normals [N,3] face all sides."""
+    """A plane behind points [N,3] that were seen from one side, such as those of a building's
+    front: their surface is a sheet, which closes where it is mirrored in this plane and cut at it.
+    None where the normals [N,3] face all sides."""
     towards = normals.mean(0)
     if np.linalg.norm(towards) < ONE_SIDED:
         return None
@@ -190,7 +214,9 @@ def _back_of(points: np.ndarray, normals: np.ndarray, spacing: float) -> Plane |
 def _thinned(mesh: Mesh, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     """Points of a mesh about so far apart, and their unit normals, [M,3]."""
     points, index = voxel_means(mesh.vertices, spacing)
-    normals = np.stack([np.bincount(index, mesh.vertex_normals[:, k], len(points)) for k in range(3)], 1)
+    normals = np.stack(
+        [np.bincount(index, mesh.vertex_normals[:, k], len(points)) for k in range(3)], 1
+    )
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     kept = length[:, 0] > 1e-6
     return points[kept], (normals / np.maximum(length, 1e-12))[kept]

@@ -1,4 +1,5 @@
-"""The surface: the rock's points -> a watertight mesh (Poisson reconstruction) -> evenly spread samples (blue noise)."""
+"""The surface: the rock's points -> a watertight mesh (Poisson reconstruction) -> evenly spread
+samples (blue noise)."""
 
 from __future__ import annotations
 
@@ -15,45 +16,59 @@ from mgs.errors import InputError
 from mgs.prior.segmentation import Plane
 
 POISSON_SCALE = 2.0
-"""Edge of the cube that Poisson reconstruction works in, over the extent of the points. Below the open underside of the points
-the surface bulges out; with pymeshlab's own value, 1.1, it leaves the cube there and is not closed."""
+"""Edge of the cube that Poisson reconstruction works in, over the extent of the points. Below the
+open underside of the points the surface bulges out; with pymeshlab's own value, 1.1, it leaves the
+cube there and is not closed."""
 
 POISSON_CELL = 1.5
-"""Largest edge of the finest cells of the reconstruction, over the cloud's voxel. Finer cells fit noise and take longer; half
-the edge gained nothing."""
+"""Largest edge of the finest cells of the reconstruction, over the cloud's voxel. Finer cells fit
+noise and take longer; half the edge gained nothing."""
 
 POISSON_DEPTHS = (5, 10)
-"""Least and largest depth of the octree that is chosen automatically. A caller may ask for 3 to 12; beyond, pymeshlab
-crashes."""
+"""Least and largest depth of the octree that is chosen automatically. A caller may ask for 3 to 12;
+beyond, pymeshlab crashes."""
 
 OVERSAMPLING = 5
 """Number of random candidates for each sample."""
 
 SAMPLE_BYTES = 3400
-"""Memory that sampling takes for each sample, bytes, most of it for pairs of candidates (measured: 3.3 to 3.5 kB for 10^5 to
-10^6 samples)."""
+"""Memory that sampling takes for each sample, bytes, most of it for pairs of candidates (measured:
+3.3 to 3.5 kB for 10^5 to 10^6 samples)."""
 
 
-def poisson_mesh(points: np.ndarray, normals: np.ndarray, voxel: float, plane: Plane, depth: int | None) -> tuple[Mesh, int]:
+def poisson_mesh(
+    points: np.ndarray, normals: np.ndarray, voxel: float, plane: Plane, depth: int | None
+) -> tuple[Mesh, int]:
     """A watertight mesh of the rock: its screened Poisson surface, cut flat at the ground plane.
 
-    points, normals: [M,3] of the rock, metres and unit vectors; voxel: distance between neighbouring points, metres; depth: of
-    the octree, None to choose it such that its finest cells have an edge of at most 1.5 voxels.
-    Poisson reconstruction closes the underside, where there are no points, with a bulge that no data supports. The cut replaces
-    the bulge by a flat base on the ground, which does not count as seen.
-    Returns (mesh, depth of the octree). Raises InputError if the depth is not within 3 to 12, or there is no closed surface
+    points, normals: [M,3] of the rock, metres and unit vectors; voxel: distance between
+    neighbouring points, metres; depth: of the octree, None to choose it such that its finest cells
+    have an edge of at most 1.5 voxels. Poisson reconstruction closes the underside, where there are
+    no points, with a bulge that no data supports. The cut replaces the bulge by a flat base on the
+    ground, which does not count as seen. Returns (mesh, depth of the octree). Raises InputError if
+    the depth is not within 3 to 12, or there is no closed surface
     above the ground. Sources: Kazhdan and Hoppe 2013, by pymeshlab; the cut by manifold3d.
     """
     solid, depth = _closed_solid(points, normals, voxel, depth, plane)
-    solid = max(solid.trim_by_plane(plane.normal, plane.offset).decompose(), key=lambda part: part.volume(), default=None)
+    solid = max(
+        solid.trim_by_plane(plane.normal, plane.offset).decompose(),
+        key=lambda part: part.volume(),
+        default=None,
+    )
     if solid is None or solid.is_empty():
-        raise InputError(f"prior: Poisson at depth {depth} gives nothing above the ground; give more frames, or --from hull")
+        raise InputError(
+            f"prior: Poisson at depth {depth} gives nothing above the ground; give more frames, or --from hull"
+        )
     mesh = _from_solid(solid)
-    base = (np.abs(plane.height(mesh.vertices)) < 1e-6 * np.ptp(mesh.vertices, axis=0).max())[mesh.faces].all(1)
+    base = (np.abs(plane.height(mesh.vertices)) < 1e-6 * np.ptp(mesh.vertices, axis=0).max())[
+        mesh.faces
+    ].all(1)
     return replace(mesh, seen=~base), depth
 
 
-def closed_poisson(points: np.ndarray, normals: np.ndarray, voxel: float, depth: int | None) -> tuple[Mesh, int]:
+def closed_poisson(
+    points: np.ndarray, normals: np.ndarray, voxel: float, depth: int | None
+) -> tuple[Mesh, int]:
     """The largest piece of the watertight screened Poisson surface of points all around an object.
 
     Arguments, result and errors as `poisson_mesh`, without the plane and the cut."""
@@ -62,10 +77,13 @@ def closed_poisson(points: np.ndarray, normals: np.ndarray, voxel: float, depth:
 
 
 def intersection(a: Mesh, b: Mesh) -> Mesh:
-    """The largest piece of what two watertight meshes have in common (manifold3d). Raises InputError if that is nothing."""
+    """The largest piece of what two watertight meshes have in common (manifold3d). Raises
+    InputError if that is nothing."""
     pieces = (_to_solid(a.vertices, a.faces) ^ _to_solid(b.vertices, b.faces)).decompose()
     if not pieces:
-        raise InputError("prior: the points and the hull of the masks have nothing in common; poses, points or masks are wrong")
+        raise InputError(
+            "prior: the points and the hull of the masks have nothing in common; poses, points or masks are wrong"
+        )
     return _from_solid(max(pieces, key=lambda part: part.volume()))
 
 
@@ -74,12 +92,17 @@ def _to_solid(vertices: np.ndarray, faces: np.ndarray) -> Any:
     import manifold3d
 
     # It takes only arrays that it could write to, so they are copied.
-    return manifold3d.Manifold(manifold3d.Mesh64(np.array(vertices, np.float64), np.array(faces, np.uint64)))
+    return manifold3d.Manifold(
+        manifold3d.Mesh64(np.array(vertices, np.float64), np.array(faces, np.uint64))
+    )
 
 
 def _from_solid(solid: Any) -> Mesh:
     cut = solid.to_mesh64()
-    vertices, faces = np.asarray(cut.vert_properties)[:, :3], np.asarray(cut.tri_verts).astype(np.int64)
+    vertices, faces = (
+        np.asarray(cut.vert_properties)[:, :3],
+        np.asarray(cut.tri_verts).astype(np.int64),
+    )
     return Mesh(vertices, faces, np.ones(len(faces), bool))
 
 
@@ -88,15 +111,18 @@ def _closed_solid(
 ) -> tuple[Any, int]:
     """The Poisson surface as a solid of manifold3d, and the depth of the octree.
 
-    Under an open cloud the surface may leave the cube. Then larger cubes are tried, at last with the points mirrored in the
-    ground plane too, which closes any surface that stands on it; the cells keep their size. Raises InputError if the depth is
-    not within 3 to 12, or none of that gives a closed surface.
+    Under an open cloud the surface may leave the cube. Then larger cubes are tried, at last with
+    the points mirrored in the ground plane too, which closes any surface that stands on it; the
+    cells keep their size. Raises InputError if the depth is not within 3 to 12, or none of that
+    gives a closed surface.
     """
     import manifold3d
     import pymeshlab
 
     if depth is not None and not 3 <= depth <= 12:
-        raise InputError(f"prior: Poisson depth {depth} is not within 3 to 12; correct --poisson-depth")
+        raise InputError(
+            f"prior: Poisson depth {depth} is not within 3 to 12; correct --poisson-depth"
+        )
     if depth is None:
         cells = POISSON_SCALE * float(np.ptp(points, axis=0).max()) / (POISSON_CELL * voxel)
         depth = int(np.clip(np.ceil(np.log2(cells)), *POISSON_DEPTHS))
@@ -107,7 +133,12 @@ def _closed_solid(
             normals - 2 * (normals @ plane.normal)[:, None] * plane.normal,
         )
         both = np.concatenate([points, image[0]]), np.concatenate([normals, image[1]])
-    for scale, finer, (p, n) in [(1, 0, (points, normals)), (2, 1, (points, normals)), (1, 0, both), (2, 1, both)]:
+    for scale, finer, (p, n) in [
+        (1, 0, (points, normals)),
+        (2, 1, (points, normals)),
+        (1, 0, both),
+        (2, 1, both),
+    ]:
         meshes = pymeshlab.MeshSet()
         meshes.add_mesh(pymeshlab.Mesh(p, v_normals_matrix=n))
         meshes.generate_surface_reconstruction_screened_poisson(
@@ -127,14 +158,17 @@ def _closed_solid(
 def sample_surface(
     mesh: Mesh, seed: int, *, count: int | None = None, spacing: float | None = None
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Samples of the part of a mesh that counts as seen, with about the same distance between all neighbours (blue noise).
+    """Samples of the part of a mesh that counts as seen, with about the same distance between all
+    neighbours (blue noise).
 
-    Give either count N, or spacing in metres: then N is the area divided by spacing^2, rounded. From 5 N random candidates,
-    points are taken one after the other unless they are nearer than a radius to one taken before (Poisson disks). The radius is
-    the largest that leaves at least N; of the few too many, those nearest to a neighbour are dropped.
+    Give either count N, or spacing in metres: then N is the area divided by spacing^2, rounded.
+    From 5 N random candidates, points are taken one after the other unless they are nearer than a
+    radius to one taken before (Poisson disks). The radius is the largest that leaves at least N; of
+    the few too many, those nearest to a neighbour are dropped.
     Returns (points [N,3], unit normals [N,3], spacing in metres: the square root of area / N).
-    Raises InputError for fewer than two samples, for more than the memory holds, and if float32, in which Gaussians are kept,
-    cannot tell neighbouring samples apart at their distance from the origin.
+    Raises InputError for fewer than two samples, for more than the memory holds, and if float32, in
+    which Gaussians are kept, cannot tell neighbouring samples apart at their distance from the
+    origin.
     """
     areas = np.where(mesh.seen, mesh.areas, 0.0)
     area = float(areas.sum())
@@ -171,13 +205,21 @@ def spread_first(points: np.ndarray, count: int, spacing: float) -> np.ndarray:
 
     points [N,3]: evenly spread, `spacing` metres apart.
     """
-    first = _blue_noise(points, count, spacing * np.sqrt(len(points) / count)) if count else np.zeros(0, int)
+    first = (
+        _blue_noise(points, count, spacing * np.sqrt(len(points) / count))
+        if count
+        else np.zeros(0, int)
+    )
     return np.concatenate([first, np.setdiff1d(np.arange(len(points)), first)])
 
 
 def _checked_count(samples: float) -> int:
-    """A number of samples, rounded. Raises InputError if it is below 2, or would take more memory than the machine has."""
-    needed, there = Decimal(samples) * SAMPLE_BYTES, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    """A number of samples, rounded. Raises InputError if it is below 2, or would take more memory
+    than the machine has."""
+    needed, there = (
+        Decimal(samples) * SAMPLE_BYTES,
+        os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"),
+    )
     if needed > there:
         raise InputError(
             f"prior: N = {Decimal(samples):.4g} samples take about {needed / 10**9:.3g} GB of memory, and this machine has "
@@ -185,12 +227,15 @@ def _checked_count(samples: float) -> int:
         )
     count = round(samples)
     if count < 2:
-        raise InputError(f"prior: {count} samples are too few for a model; ask for more Gaussians (or a smaller --spacing)")
+        raise InputError(
+            f"prior: {count} samples are too few for a model; ask for more Gaussians (or a smaller --spacing)"
+        )
     return count
 
 
 def _blue_noise(points: np.ndarray, count: int, spacing: float) -> np.ndarray:
-    """Choose `count` of the random points [N,3] in the way that `sample_surface` describes; returns their indices [count].
+    """Choose `count` of the random points [N,3] in the way that `sample_surface` describes; returns
+    their indices [count].
 
     About the largest possible radius is found by bisection; it is less than the spacing, metres.
     """
@@ -212,10 +257,12 @@ def _blue_noise(points: np.ndarray, count: int, spacing: float) -> np.ndarray:
 
 
 def _independent(pairs: np.ndarray, n: int) -> np.ndarray:
-    """Take 0, 1, ... n-1 in this order, leaving out each that forms one of the `pairs` [P,2] with one taken before.
+    """Take 0, 1, ... n-1 in this order, leaving out each that forms one of the `pairs` [P,2] with
+    one taken before.
 
-    Returns those taken. They are found in a few vectorised rounds. In each, a number is taken if no smaller one that is still
-    undecided forms a pair with it, and the partners of all numbers taken are left out.
+    Returns those taken. They are found in a few vectorised rounds. In each, a number is taken if no
+    smaller one that is still undecided forms a pair with it, and the partners of all numbers taken
+    are left out.
     """
     low, high = pairs.min(1), pairs.max(1)
     undecided, kept = np.ones(n, bool), np.zeros(n, bool)

@@ -1,7 +1,8 @@
-"""Are predicted errors true? Pure functions: errors and the standard deviations that were predicted for them, both [n].
+"""Are predicted errors true? Pure functions: errors and the standard deviations that were predicted
+for them, both [n].
 
-AUSE and the calibration follow the usual definitions for uncertainty maps (sparsification curves; probability integral
-transform; continuous ranked probability score of a normal distribution).
+AUSE and the calibration follow the usual definitions for uncertainty maps (sparsification curves;
+probability integral transform; continuous ranked probability score of a normal distribution).
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ NORMAL = {level: float(norm.ppf(0.5 + level / 2)) for level in LEVELS}
 
 
 def sparsification(errors: Array, sigma: Array) -> Array:
-    """Mean error of the pixels that are left when those of the largest sigma are left out, over the mean of all, [STEPS].
+    """Mean error of the pixels that are left when those of the largest sigma are left out, over the
+    mean of all, [STEPS].
 
     errors: [n], 0 or more. Where all errors are 0 the curve is 0.
     """
@@ -40,18 +42,22 @@ def sparsification(errors: Array, sigma: Array) -> Array:
     if total == 0:
         return np.zeros(STEPS)
     left_out = (np.arange(STEPS) * len(errors)) // STEPS
-    sums = np.concatenate([[0.0], np.cumsum(errors[np.argsort(-sigma, kind="stable")], dtype=np.float64)])
+    sums = np.concatenate(
+        [[0.0], np.cumsum(errors[np.argsort(-sigma, kind="stable")], dtype=np.float64)]
+    )
     curve: Array = (total - sums[left_out]) / (len(errors) - left_out) * (len(errors) / total)
     return curve
 
 
 def ause(errors: Array, sigma: Array) -> float:
-    """Area between the sparsification curve by sigma and the best one, by the errors themselves. errors: [n], 0 or more."""
+    """Area between the sparsification curve by sigma and the best one, by the errors themselves.
+    errors: [n], 0 or more."""
     return float((sparsification(errors, sigma) - sparsification(errors, errors)).mean())
 
 
 def ause_of_constant(errors: Array) -> float:
-    """AUSE of a sigma that tells no pixel from another, which leaves out pixels at random: its curve is 1 in the mean."""
+    """AUSE of a sigma that tells no pixel from another, which leaves out pixels at random: its
+    curve is 1 in the mean."""
     return float((1 - sparsification(errors, errors)).mean())
 
 
@@ -59,7 +65,8 @@ def ause_of_constant(errors: Array) -> float:
 class Calibration:
     """How terms of a predicted variance are weighed, and how wide intervals are.
 
-    weights: by the name of a term, and "noise", a variance. widths: half-width of the interval of each of LEVELS, in sigmas.
+    weights: by the name of a term, and "noise", a variance. widths: half-width of the interval of
+    each of LEVELS, in sigmas.
     """
 
     weights: Mapping[str, float]
@@ -73,10 +80,11 @@ class Calibration:
 
 
 def fit_calibration(terms: Mapping[str, Array], errors: Array) -> Calibration:
-    """Weights that make the errors most probable, if they are normal with the weighted sum of the terms as their variance.
+    """Weights that make the errors most probable, if they are normal with the weighted sum of the
+    terms as their variance.
 
-    terms: name -> [n], variances; errors: [n], signed. The widths are the quantiles of |error| / sigma, so that long tails do
-    not need to be normal.
+    terms: name -> [n], variances; errors: [n], signed. The widths are the quantiles of |error| /
+    sigma, so that long tails do not need to be normal.
     """
     columns = np.stack([*terms.values(), np.ones(len(errors))], axis=1).astype(np.float64)
     scale = np.maximum(columns.mean(axis=0), np.finfo(np.float32).tiny)
@@ -97,22 +105,34 @@ def fit_calibration(terms: Mapping[str, Array], errors: Array) -> Calibration:
     return Calibration(weights, {level: float(np.quantile(z, level)) for level in LEVELS})
 
 
-def judged(errors: Array, sigma: Array, widths: Mapping[float, float], rng: np.random.Generator) -> dict[str, Any]:
+def judged(
+    errors: Array, sigma: Array, widths: Mapping[float, float], rng: np.random.Generator
+) -> dict[str, Any]:
     """How well sigma [n] predicted the signed errors [n].
 
-    ause: for absolute and squared errors ("mae", "mse"), with that of a constant sigma, and of this sigma if it were perfect:
-    on errors drawn from it. spearman, pearson: of sigma with the absolute error. held: share of the errors inside the interval
-    of each of LEVELS, over all pixels and over thirds of them by sigma. crps: mean, of normal distributions, and that of one
+    ause: for absolute and squared errors ("mae", "mse"), with that of a constant sigma, and of this
+    sigma if it were perfect:
+    on errors drawn from it. spearman, pearson: of sigma with the absolute error. held: share of the
+    errors inside the interval
+    of each of LEVELS, over all pixels and over thirds of them by sigma. crps: mean, of normal
+    distributions, and that of one
     sigma for all. pit: shares of the probability integral transform in BINS bins.
     """
     drawn = sigma * rng.standard_normal(len(sigma))
     areas = {
-        name: {"ause": ause(of(errors), sigma), "constant": ause_of_constant(of(errors)), "perfect": ause(of(drawn), sigma)}
+        name: {
+            "ause": ause(of(errors), sigma),
+            "constant": ause_of_constant(of(errors)),
+            "perfect": ause(of(drawn), sigma),
+        }
         for name, of in (("mae", np.abs), ("mse", np.square))
     }
     z, order = errors / sigma, np.argsort(sigma, kind="stable")
     parts = (order, *np.array_split(order, 3))
-    held = {str(level): [float((np.abs(z[part]) <= width).mean()) for part in parts] for level, width in widths.items()}
+    held = {
+        str(level): [float((np.abs(z[part]) <= width).mean()) for part in parts]
+        for level, width in widths.items()
+    }
     rms = float(np.sqrt(np.square(errors).mean()))
     return {
         "count": len(errors), "rms": rms, "mean_sigma": float(np.sqrt(np.square(sigma).mean())), "ause": areas,
@@ -124,7 +144,7 @@ def judged(errors: Array, sigma: Array, widths: Mapping[float, float], rng: np.r
 
 
 def crps(errors: Array, sigma: Array) -> float:
-    """Mean continuous ranked probability score of normal distributions around 0, in the unit of the errors (the smaller, the
-    better)."""
+    """Mean continuous ranked probability score of normal distributions around 0, in the unit of the
+    errors (the smaller, the better)."""
     z = errors / sigma
     return float((sigma * (z * (2 * ndtr(z) - 1) + 2 * norm.pdf(z) - 1 / np.sqrt(np.pi))).mean())

@@ -1,21 +1,28 @@
-"""Maps of what the training views of a run say about its model, and where: for views (EXR, PNG) and for Gaussians (PLY).
+"""Maps of what the training views of a run say about its model, and where: for views (EXR, PNG) and
+for Gaussians (PLY).
 
-H [N,P] is the diagonal of the Fisher information, summed over the training views. lam [P] is the information of the prior
-about each parameter (`mgs.active.criteria.regularisation`). From these, every Gaussian has the following numbers, its
+H [N,P] is the diagonal of the Fisher information, summed over the training views. lam [P] is the
+information of the prior about each parameter (`mgs.policy.criteria.regularisation`). From these,
+every Gaussian has the following numbers, its
 *scalars*:
 
-- `fisher.colour`, `fisher.scale`, `fisher.rotation`, `fisher.opacity`, and `fisher.mean` where the run learns the means: the
-  sum of H over its parameters of that kind, in (pixel value / parameter)^2. The preview has no panel of the last.
-- `information`: 1/2 sum_k log(1 + H_k / lam_k) over its parameters k, in nats: what the training views say about it. All kinds
+- `fisher.colour`, `fisher.scale`, `fisher.rotation`, `fisher.opacity`, and `fisher.mean` where the
+run learns the means: the
+  sum of H over its parameters of that kind, in (pixel value / parameter)^2. The preview has no
+  panel of the last.
+- `information`: 1/2 sum_k log(1 + H_k / lam_k) over its parameters k, in nats: what the training
+views say about it. All kinds
   of parameters have the same unit here.
-- `uncertainty`: the mean over its parameters of lam_k / (H_k + lam_k): the variance that is left over the variance of the
+- `uncertainty`: the mean over its parameters of lam_k / (H_k + lam_k): the variance that is left
+over the variance of the
   prior. 1 means that nothing is known, 0 that everything is.
-- `unobserved`: 1 if no training view sees its place on the surface, otherwise 0, by the same rule as the coverage of a run
-  (`mgs.active.criteria.observed`). The rule looks at the information about the colours of the Gaussians before training,
-  because training hides some Gaussians behind others.
+- `unobserved`: 1 if no training view sees its place on the surface, otherwise 0, by the same rule
+as the coverage of a run
+  (`mgs.policy.criteria.observed`). The rule looks at the information about the colours of the
+  Gaussians before training, because training hides some Gaussians behind others.
 
-A map of a scalar v shows in each pixel the mean over the Gaussians that the pixel shows, with their blending weights w:
-sum w v / sum w; 0 in pixels that show none.
+A map of a scalar v shows in each pixel the mean over the Gaussians that the pixel shows, with their
+blending weights w: sum w v / sum w; 0 in pixels that show none.
 """
 
 from __future__ import annotations
@@ -26,7 +33,6 @@ from typing import Any
 
 import numpy as np
 
-from mgs.active import criteria, run_folder
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import Frame
@@ -34,6 +40,8 @@ from mgs.errors import InputError
 from mgs.files import atomic_path
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_exr
+from mgs.policy import criteria
+from mgs.run import folder as run_folder
 
 VIEWS = 3
 """Number of views that are drawn if none are named."""
@@ -46,16 +54,24 @@ DECADES = 4
 
 
 def gaussian_scalars(
-    H: np.ndarray, surface: np.ndarray, lam: np.ndarray, prior_lam: np.ndarray, groups: dict[str, slice]
+    H: np.ndarray,
+    surface: np.ndarray,
+    lam: np.ndarray,
+    prior_lam: np.ndarray,
+    groups: dict[str, slice],
 ) -> dict[str, np.ndarray]:
     """The scalars that the module's docstring lists, name -> [N].
 
-    H: [N,P] information of the training views about the fitted model, by the estimator of the run; surface: [S,P] their exact
-    information about the Gaussians on the surface before training (both as in `mgs.active.run_folder.State`). lam: [P] the
-    lambda that the run's criteria see; prior_lam: [P] information of the prior, which coverage is judged by. groups: columns of
-    each kind of parameter (`mgs.splat.groups`).
+    H: [N,P] information of the training views about the fitted model, by the estimator of the run;
+    surface: [S,P] their exact information about the Gaussians on the surface before training (both
+    as in `mgs.run.folder.State`). lam: [P] the lambda that the run's criteria see; prior_lam: [P]
+    information of the prior, which coverage is judged by. groups: columns of each kind of parameter
+    (`mgs.splat.groups`).
     """
-    scalars = {f"fisher.{name}": H[:, columns].sum(axis=1, dtype=np.float64) for name, columns in groups.items()}
+    scalars = {
+        f"fisher.{name}": H[:, columns].sum(axis=1, dtype=np.float64)
+        for name, columns in groups.items()
+    }
     scalars["information"] = 0.5 * np.log1p(H / lam).sum(axis=1)
     scalars["uncertainty"] = criteria.uncertainty(H, lam)
     unseen = ~criteria.observed(surface, prior_lam)
@@ -64,23 +80,33 @@ def gaussian_scalars(
     return scalars
 
 
-def view_maps(gaussians: Gaussians, camera: Camera, scalars: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The channels of one view, name -> float32 [H,W]: R G B (linear colour on black), A (opacity), Z (expected z-depth,
-    metres) and a map of each scalar.
+def view_maps(
+    gaussians: Gaussians, camera: Camera, scalars: dict[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """The channels of one view, name -> float32 [H,W]: R G B (linear colour on black), A (opacity),
+    Z (expected z-depth, metres) and a map of each scalar.
 
-    scalars: name -> [N]. They are drawn in place of the colours of the Gaussians, three at a time. The map of `unobserved` is 1
-    where unobserved Gaussians have more than half of the weight, otherwise 0.
+    scalars: name -> [N]. They are drawn in place of the colours of the Gaussians, three at a time.
+    The map of `unobserved` is 1 where unobserved Gaussians have more than half of the weight,
+    otherwise 0.
     """
     from mgs.splat import ListCache, render
 
     cache = ListCache()
     image = render(gaussians, camera, cache=cache)
     rgb, alpha = np.asarray(image.rgb), np.asarray(image.alpha)
-    maps = {"R": rgb[..., 0], "G": rgb[..., 1], "B": rgb[..., 2], "A": alpha, "Z": np.asarray(image.depth)}
+    maps = {
+        "R": rgb[..., 0],
+        "G": rgb[..., 1],
+        "B": rgb[..., 2],
+        "A": alpha,
+        "Z": np.asarray(image.depth),
+    }
     names, shown = list(scalars), np.where(alpha > 0, alpha, 1.0)
     for first in range(0, len(names), 3):
         three = names[first : first + 3]
-        # Divided by the largest value: float32 keeps its precision with colours of about 1, whatever the unit of the scalar.
+        # Divided by the largest value: float32 keeps its precision with colours of about 1,
+        # whatever the unit of the scalar.
         largest = [max(float(scalars[name].max(initial=0)), 1e-30) for name in three]
         values = np.zeros((len(gaussians), 3))
         for i, name in enumerate(three):
@@ -95,19 +121,30 @@ def view_maps(gaussians: Gaussians, camera: Camera, scalars: dict[str, np.ndarra
     return maps
 
 
-def write_information_ply(path: str | Path, gaussians: Gaussians, scalars: dict[str, np.ndarray]) -> None:
-    """Write a PLY with a vertex for each Gaussian: x y z, red green blue, and every scalar; the file appears complete.
+def write_information_ply(
+    path: str | Path, gaussians: Gaussians, scalars: dict[str, np.ndarray]
+) -> None:
+    """Write a PLY with a vertex for each Gaussian: x y z, red green blue, and every scalar; the
+    file appears complete.
 
-    The colours show the information, from 0 to its largest value (colour map viridis). Dots in names become underscores. It
-    opens in MeshLab and CloudCompare. scalars: name -> [N]. Raises InputError if the file cannot be written.
+    The colours show the information, from 0 to its largest value (colour map viridis). Dots in
+    names become underscores. It
+    opens in MeshLab and CloudCompare. scalars: name -> [N]. Raises InputError if the file cannot be
+    written.
     """
     import matplotlib
     from plyfile import PlyData, PlyElement
 
     information = scalars["information"]
-    rgb = matplotlib.colormaps["viridis"](information / max(float(information.max(initial=0)), 1e-30), bytes=True)[:, :3]
+    rgb = matplotlib.colormaps["viridis"](
+        information / max(float(information.max(initial=0)), 1e-30), bytes=True
+    )[:, :3]
     names = [name.replace(".", "_") for name in scalars]
-    layout = [(axis, "f4") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")] + [(name, "f4") for name in names]
+    layout = (
+        [(axis, "f4") for axis in "xyz"]
+        + [(c, "u1") for c in ("red", "green", "blue")]
+        + [(name, "f4") for name in names]
+    )
     vertices = np.empty(len(gaussians), dtype=layout)
     for i, axis in enumerate("xyz"):
         vertices[axis] = gaussians.means[:, i]
@@ -129,14 +166,18 @@ PANELS = {
     "information": ("information gained (nats)", "viridis"),
     "uncertainty": ("posterior / prior variance", "cividis"),
 }
-"""Panels of a preview: channel -> title and colour map. The colour maps are perceptually uniform."""
+"""Panels of a preview: channel -> title and colour map. The colour maps are perceptually
+uniform."""
 
 
-def write_preview(path: str | Path, maps: dict[str, np.ndarray], title: str, unit: str = "m") -> None:
-    """Write the preview of one view as a PNG: its render and the PANELS with colour bars, cropped to the model.
+def write_preview(
+    path: str | Path, maps: dict[str, np.ndarray], title: str, unit: str = "m"
+) -> None:
+    """Write the preview of one view as a PNG: its render and the PANELS with colour bars, cropped
+    to the model.
 
-    maps: as `view_maps` gives them, of all scalars; title: of the render; unit: what a length of 1 is called. Raises InputError
-    if the file cannot be written.
+    maps: as `view_maps` gives them, of all scalars; title: of the render; unit: what a length of 1
+    is called. Raises InputError if the file cannot be written.
     """
     import matplotlib
 
@@ -153,7 +194,9 @@ def write_preview(path: str | Path, maps: dict[str, np.ndarray], title: str, uni
         axes[0].set_title(title)
         for axis, (channel, (label, colours)) in zip(axes[1:], PANELS.items(), strict=True):
             values = np.ma.masked_where(~visible, maps[channel])[window]
-            shown = axis.imshow(values, cmap=_on_grey(colours), norm=_norm(channel, values), interpolation="nearest")
+            shown = axis.imshow(
+                values, cmap=_on_grey(colours), norm=_norm(channel, values), interpolation="nearest"
+            )
             axis.set_title(f"{label} ({unit})" if channel == "Z" else label)
             ticks = [0, 1] if channel == "unobserved" else None
             figure.colorbar(shown, ax=axis, shrink=0.85, aspect=16, pad=0.02, ticks=ticks)
@@ -170,8 +213,9 @@ def _on_grey(name: str) -> Any:
 
 
 def _norm(channel: str, values: np.ma.MaskedArray) -> Any:
-    """The scale of a channel's colours: logarithmic for Fisher information, which spans many powers of ten; from 0 to 1 for the
-    uncertainty and for `unobserved`; otherwise from the least to about the largest of the values [H,W] that are not masked."""
+    """The scale of a channel's colours: logarithmic for Fisher information, which spans many powers
+    of ten; from 0 to 1 for the uncertainty and for `unobserved`; otherwise from the least to about
+    the largest of the values [H,W] that are not masked."""
     from matplotlib.colors import LogNorm, Normalize
 
     data = values.compressed()
@@ -184,17 +228,22 @@ def _norm(channel: str, values: np.ma.MaskedArray) -> Any:
     return LogNorm(min(low, high / 2), high, clip=True)
 
 
-def choose_views(frames: Sequence[Frame], trained: Sequence[str], wanted: Sequence[str] | None) -> list[Frame]:
-    """The frames to draw: those named in `wanted`, or, without it, VIEWS frames spread evenly over those not trained on.
+def choose_views(
+    frames: Sequence[Frame], trained: Sequence[str], wanted: Sequence[str] | None
+) -> list[Frame]:
+    """The frames to draw: those named in `wanted`, or, without it, VIEWS frames spread evenly over
+    those not trained on.
 
-    trained: names of the frames that were trained on; if these are all, the choice is among all frames. Raises InputError for a
-    name that no frame has.
+    trained: names of the frames that were trained on; if these are all, the choice is among all
+    frames. Raises InputError for a name that no frame has.
     """
     if wanted:
         by_name = {frame.name: frame for frame in frames}
         for name in wanted:
             if name not in by_name:
-                raise InputError(f"--views {name}: no such frame; the dataset has {frames[0].name} to {frames[-1].name}")
+                raise InputError(
+                    f"--views {name}: no such frame; the dataset has {frames[0].name} to {frames[-1].name}"
+                )
         return [by_name[name] for name in wanted]
     pool = [frame for frame in frames if frame.name not in trained] or list(frames)
     spread = np.linspace(0, len(pool), min(VIEWS, len(pool)), endpoint=False).astype(int)
@@ -202,13 +251,16 @@ def choose_views(frames: Sequence[Frame], trained: Sequence[str], wanted: Sequen
 
 
 def diagnose_run(
-    run: str | Path, wanted: Sequence[str] | None = None, progress: Callable[[int, int], None] | None = None
+    run: str | Path,
+    wanted: Sequence[str] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
-    """Write the folder RUN/diagnostics: information.ply, and NAME.exr and NAME.png for each view. Returns the paths of the
-    files.
+    """Write the folder RUN/diagnostics: information.ply, and NAME.exr and NAME.png for each view.
+    Returns the paths of the files.
 
-    wanted: names of frames, see `choose_views`; progress: called as progress(views done, views in all). Raises InputError as
-    `mgs.active.run_folder.load_run` (no run, no finished step, a dataset that has changed), and for an unknown view.
+    wanted: names of frames, see `choose_views`; progress: called as progress(views done, views in
+    all). Raises InputError as `mgs.run.folder.load_run` (no run, no finished step, a dataset that
+    has changed), and for an unknown view.
     """
     from mgs.splat import groups
 
@@ -218,8 +270,12 @@ def diagnose_run(
     settings, state = run_folder.read_settings(run), run_folder.read_checkpoint(run)
     assert state is not None
     columns = groups(gaussians.sh_degree, settings.train.means)
-    prior_lam = criteria.regularisation(groups(gaussians.sh_degree), settings.pixel_noise, settings.prior_std)
-    scalars = gaussian_scalars(state.H, state.surface, settings.regularisation(columns), prior_lam, columns)
+    prior_lam = criteria.regularisation(
+        groups(gaussians.sh_degree), settings.pixel_noise, settings.prior_std
+    )
+    scalars = gaussian_scalars(
+        state.H, state.surface, settings.regularisation(columns), prior_lam, columns
+    )
     out = run / "diagnostics"
     write_information_ply(out / "information.ply", gaussians, scalars)
     written = [out / "information.ply"]
@@ -229,7 +285,9 @@ def diagnose_run(
         maps = view_maps(gaussians, frame.camera, scalars)
         write_exr(out / f"{frame.name}.exr", maps)
         seen = "trained on" if frame.name in trained else "never trained on"
-        if settings.estimator != "exact":  # then the maps are not in the units that their panels name
+        if (
+            settings.estimator != "exact"
+        ):  # then the maps are not in the units that their panels name
             seen += f"; by {settings.estimator}"
         write_preview(out / f"{frame.name}.png", maps, f"{frame.name}, {seen}", dataset.unit)
         written += [out / f"{frame.name}.exr", out / f"{frame.name}.png"]

@@ -1,8 +1,11 @@
-"""The pictures of the report page: truth, render, error and uncertainty of views, small enough to stand inside a page.
+"""The pictures of the report page: truth, render, error and uncertainty of views, small enough to
+stand inside a page.
 
-They show the model that a run folder holds now: that of its last finished step, or, where there is no checkpoint, its
-gaussians.ply. Models of earlier steps are not kept by a run. What does change from step to step is what was known: the maps of
-uncertainty are by the exact Fisher information, at that model, of the views taken until then.
+They show the model that a run folder holds now: that of its last finished step, or, where there is
+no checkpoint, its
+gaussians.ply. Models of earlier steps are not kept by a run. What does change from step to step is
+what was known: the maps of uncertainty are by the exact Fisher information, at that model, of the
+views taken until then.
 """
 
 from __future__ import annotations
@@ -15,16 +18,17 @@ from typing import Any
 
 import numpy as np
 
-from mgs.active.criteria import regularisation, uncertainty
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import Frame
 from mgs.gaussians import Gaussians
 from mgs.plotting import crop
+from mgs.policy.criteria import regularisation, uncertainty
 from mgs.report.diagnostics import VISIBLE, view_maps
 
 PIXELS = 40e6
-"""Most pixels of all pictures of a page together. At the 0.1 to 0.2 bytes that WebP takes for a pixel of a rock, they are 4 to
-8 MB. With more views or runs, the pictures become smaller instead of the page larger."""
+"""Most pixels of all pictures of a page together. At the 0.1 to 0.2 bytes that WebP takes for a
+pixel of a rock, they are 4 to 8 MB. With more views or runs, the pictures become smaller instead of
+the page larger."""
 
 WIDEST = 640
 """Most pixels across a picture."""
@@ -43,7 +47,8 @@ GREY = (232, 232, 232)
 class Album:
     """Pictures of equal size, by name, and the scale of the errors among them.
 
-    window: rows and columns of an image that are shown; width: of a picture, pixels, at most. pictures: name -> data URI.
+    window: rows and columns of an image that are shown; width: of a picture, pixels, at most.
+    pictures: name -> data URI.
     errors: name -> error map [h,w], until `finish` gives it colours.
     """
 
@@ -54,7 +59,9 @@ class Album:
 
     def add_colours(self, name: str, linear: np.ndarray) -> None:
         """A picture of linear RGB [H,W,3]."""
-        self.pictures[name] = data_uri(self._small(np.round(srgb_from_linear(linear) * 255).astype(np.uint8)))
+        self.pictures[name] = data_uri(
+            self._small(np.round(srgb_from_linear(linear) * 255).astype(np.uint8))
+        )
 
     def add_error(self, name: str, truth: np.ndarray, rendered: np.ndarray) -> None:
         """The mean absolute difference of the sRGB channels of two images, linear RGB [H,W,3]."""
@@ -62,15 +69,19 @@ class Album:
         self.errors[name] = self._small(difference).astype(np.float16)
 
     def add_uncertainty(self, name: str, values: np.ndarray, alpha: np.ndarray) -> None:
-        """A map of values in [0,1], [H,W], grey where the model's opacity alpha [H,W] is less than VISIBLE."""
+        """A map of values in [0,1], [H,W], grey where the model's opacity alpha [H,W] is less than
+        VISIBLE."""
         import matplotlib
 
-        colours = matplotlib.colormaps[UNCERTAINTY_COLOURS](np.clip(values, 0, 1), bytes=True)[..., :3].copy()
+        colours = matplotlib.colormaps[UNCERTAINTY_COLOURS](np.clip(values, 0, 1), bytes=True)[
+            ..., :3
+        ].copy()
         colours[alpha < VISIBLE] = GREY
         self.pictures[name] = data_uri(self._small(colours))
 
     def finish(self) -> float:
-        """Give the error maps their colours, on one scale from 0 to the returned value: 99.5 % of the pixels are below it."""
+        """Give the error maps their colours, on one scale from 0 to the returned value: 99.5 % of
+        the pixels are below it."""
         import matplotlib
 
         # A view can be all equal to the truth: the scale is then 0 to the smallest step of 8 bits.
@@ -78,12 +89,15 @@ class Album:
         limit = max(round(limit, 3), 1 / 255)
         for name, error in self.errors.items():
             shown = np.clip(error.astype(np.float32) / limit, 0, 1)
-            self.pictures[name] = data_uri(matplotlib.colormaps[ERROR_COLOURS](shown, bytes=True)[..., :3])
+            self.pictures[name] = data_uri(
+                matplotlib.colormaps[ERROR_COLOURS](shown, bytes=True)[..., :3]
+            )
         self.errors.clear()
         return limit
 
     def _small(self, image: np.ndarray) -> np.ndarray:
-        """The window of an image, uint8 [H,W,3] or float32 [H,W], at no more than the album's width."""
+        """The window of an image, uint8 [H,W,3] or float32 [H,W], at no more than the album's
+        width."""
         from PIL import Image
 
         picture = Image.fromarray(np.ascontiguousarray(image[self.window]))
@@ -98,12 +112,15 @@ def data_uri(pixels: np.ndarray) -> str:
     from PIL import Image
 
     file = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(file, format="WEBP", quality=QUALITY, method=4)
+    Image.fromarray(np.ascontiguousarray(pixels)).save(
+        file, format="WEBP", quality=QUALITY, method=4
+    )
     return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode("ascii")
 
 
 def new_album(frames: Sequence[Frame], count: int) -> Album:
-    """An empty album for `count` pictures of views of these frames, all cropped alike: to what any mask holds, with a margin.
+    """An empty album for `count` pictures of views of these frames, all cropped alike: to what any
+    mask holds, with a margin.
 
     Frames of different sizes are not cropped. Raises InputError if a mask cannot be read.
     """
@@ -124,11 +141,12 @@ def draw_taken(
     noise: tuple[float, dict[str, float]],
     drawn: Callable[[], None],
 ) -> None:
-    """Draw the views that a run has taken, in their order: for each, `truth/NAME`, `render/NAME/LABEL`, `error/...`, and
-    `before/...` and `after/...`, the uncertainty of the model seen from there before and after the view was taken.
+    """Draw the views that a run has taken, in their order: for each, `truth/NAME`,
+    `render/NAME/LABEL`, `error/...`, and `before/...` and `after/...`, the uncertainty of the model
+    seen from there before and after the view was taken.
 
-    noise: the settings `pixel_noise` and `prior_std` of the run. drawn: called after each view. Raises InputError if a file of
-    a frame cannot be read.
+    noise: the settings `pixel_noise` and `prior_std` of the run. drawn: called after each view.
+    Raises InputError if a file of a frame cannot be read.
     """
     from mgs.splat import fisher, groups
 
@@ -138,14 +156,20 @@ def draw_taken(
         before = uncertainty(H, lam)
         H += fisher(gaussians, frame.camera)
         maps = view_maps(gaussians, frame.camera, {"before": before, "after": uncertainty(H, lam)})
-        draw_render(album, f"{frame.name}/{label}", frame, np.stack([maps[channel] for channel in "RGB"], axis=-1))
+        draw_render(
+            album,
+            f"{frame.name}/{label}",
+            frame,
+            np.stack([maps[channel] for channel in "RGB"], axis=-1),
+        )
         for when in ("before", "after"):
             album.add_uncertainty(f"{when}/{frame.name}/{label}", maps[when], maps["A"])
         drawn()
 
 
 def draw_render(album: Album, name: str, frame: Frame, rendered: np.ndarray) -> None:
-    """Add `render/NAME`, `error/NAME`, and the frame's truth where it is not there yet. rendered: linear RGB [H,W,3]."""
+    """Add `render/NAME`, `error/NAME`, and the frame's truth where it is not there yet. rendered:
+    linear RGB [H,W,3]."""
     truth = frame.masked_rgb()
     if f"truth/{frame.name}" not in album.pictures:
         album.add_colours(f"truth/{frame.name}", truth)
@@ -154,7 +178,8 @@ def draw_render(album: Album, name: str, frame: Frame, rendered: np.ndarray) -> 
 
 
 def colour_scale(name: str) -> list[str]:
-    """Colours of a colour map from its low to its high end, as CSS writes them: for the legend of maps."""
+    """Colours of a colour map from its low to its high end, as CSS writes them: for the legend of
+    maps."""
     import matplotlib
 
     rows: Any = matplotlib.colormaps[name](np.linspace(0, 1, 16), bytes=True)

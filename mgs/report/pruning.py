@@ -1,4 +1,5 @@
-"""A smaller model of a run: pruned, and compared with the whole one on views that it was not fitted to."""
+"""A smaller model of a run: pruned, and compared with the whole one on views that it was not fitted
+to."""
 
 from __future__ import annotations
 
@@ -6,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from mgs.active.criteria import PRUNE_NOISE
-from mgs.active.run_folder import load_run
+from mgs.policy.criteria import PRUNE_NOISE
 from mgs.report.evaluation import mean_psnr, other_views
+from mgs.run.folder import load_run
 from mgs.splat_ply import write_ply
 
 PRUNED = "gaussians_pruned.ply"
@@ -16,8 +17,9 @@ PRUNED = "gaussians_pruned.ply"
 
 @dataclass(frozen=True)
 class PrunedRun:
-    """before, after: number of Gaussians. predicted, actual: rms change of the images that the model was fitted to, as in
-    `mgs.splat.pruning.Pruned`. views: "test" or "held out"; psnr: on these, before and after, dB, None where there are none."""
+    """before, after: number of Gaussians. predicted, actual: rms change of the images that the
+    model was fitted to, as in `mgs.splat.pruning.Pruned`. views: "test" or "held out"; psnr: on
+    these, before and after, dB, None where there are none."""
 
     before: int
     after: int
@@ -27,11 +29,15 @@ class PrunedRun:
     psnr: tuple[float, float] | None
 
 
-def prune_run(run: str | Path, noise: float = PRUNE_NOISE, say: Callable[[str], None] = lambda stage: None) -> PrunedRun:
-    """Prune the model of a run by what the views that it took see of it (`mgs.splat.pruning.prune`), and write RUN/PRUNED.
+def prune_run(
+    run: str | Path, noise: float = PRUNE_NOISE, say: Callable[[str], None] = lambda stage: None
+) -> PrunedRun:
+    """Prune the model of a run by what the views that it took see of it
+    (`mgs.splat.pruning.prune`), and write RUN/PRUNED.
 
-    The views on which both models are compared are the test views of the dataset, where it has some, or else those never taken.
-    say(stage) is called as a stage starts. Raises InputError as `load_run` and `prune`.
+    The views on which both models are compared are the test views of the dataset, where it has
+    some, or else those never taken. say(stage) is called as a stage starts. Raises InputError as
+    `load_run` and `prune`.
     """
     from mgs.splat.pruning import prune
 

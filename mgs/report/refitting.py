@@ -1,4 +1,5 @@
-"""A run's views fitted once more, with no more parameters than they pay for, and compared with the run's own model."""
+"""A run's views fitted once more, with no more parameters than they pay for, and compared with the
+run's own model."""
 
 from __future__ import annotations
 
@@ -7,18 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from mgs.active import inputs
-from mgs.active.criteria import LEARN_LOSS
-from mgs.active.run_folder import load_run, read_checkpoint, read_settings
-from mgs.active.settings import TrainSettings
 from mgs.errors import InputError
 from mgs.files import check_writable
+from mgs.fit.settings import TrainSettings
+from mgs.policy.criteria import LEARN_LOSS
 from mgs.prior.build import load_prior
 from mgs.report.evaluation import mean_psnr, other_views
+from mgs.run import inputs
+from mgs.run.folder import load_run, read_checkpoint, read_settings
 from mgs.splat_ply import write_ply
 
 if TYPE_CHECKING:
-    from mgs.active.evidence import LeftOut
+    from mgs.report.evidence import LeftOut
 
 REFITTED = "gaussians_refitted.ply"
 
@@ -33,9 +34,10 @@ LARGEST_LOSS = 10.0
 class RefittedRun:
     """What `refit_run` found.
 
-    before, after: number of learned parameters. shares: {kind: share of the Gaussians that learned it}. left_out: as in
-    `mgs.active.evidence.LeanModel`. sh_degree: of the model. views: "test" or "held out"; psnr: on these, of the run's own
-    model, of one fitted like this one that learns everything, and of this one, dB, None where there are none."""
+    before, after: number of learned parameters. shares: {kind: share of the Gaussians that learned
+    it}. left_out: as in `mgs.report.evidence.LeanModel`. sh_degree: of the model. views: "test" or
+    "held out"; psnr: on these, of the run's own model, of one fitted like this one that learns
+    everything, and of this one, dB, None where there are none."""
 
     before: int
     after: int
@@ -53,15 +55,17 @@ def refit_run(
     loss: float = LEARN_LOSS,
     say: Callable[[str], None] = lambda stage: None,
 ) -> RefittedRun:
-    """Fit the views that a run took once more (`mgs.active.evidence.lean_fit`), and write RUN/REFITTED.
+    """Fit the views that a run took once more (`mgs.report.evidence.lean_fit`), and write
+    RUN/REFITTED.
 
-    A vertex of the file has a byte for each kind of parameter, `learned_colour` and so on: 1 where it was learned; else the
-    prior's values stand there. The run itself stays as it is. Both models are compared on the test views of the dataset, where
-    it has some, or else on those never taken. say(stage) is called as a stage starts. Raises InputError as `load_run`, where
-    learn or sh is unknown or both leave nothing to choose, loss is not from 0 to LARGEST_LOSS, the prior is not there, and as
-    `lean_fit`.
+    A vertex of the file has a byte for each kind of parameter, `learned_colour` and so on: 1 where
+    it was learned; else the prior's values stand there. The run itself stays as it is. Both models
+    are compared on the test views of the dataset, where it has some, or else on those never taken.
+    say(stage) is called as a stage starts. Raises InputError as `load_run`, where learn or sh is
+    unknown or both leave nothing to choose, loss is not from 0 to LARGEST_LOSS, the prior is not
+    there, and as `lean_fit`.
     """
-    from mgs.active.evidence import last_images, lean_fit
+    from mgs.report.evidence import last_images, lean_fit
 
     if not 0 <= loss <= LARGEST_LOSS:
         raise InputError(f"--loss {loss}: must be from 0 to {LARGEST_LOSS:g} dB")
@@ -69,7 +73,9 @@ def refit_run(
         if value not in known:
             raise InputError(f"{option} {value}: is unknown; choose one of {', '.join(known)}")
     if (learn, sh) == ("all", "0"):
-        raise InputError("refit: --learn all --sh 0 leaves nothing to choose; leave out one of them")
+        raise InputError(
+            "refit: --learn all --sh 0 leaves nothing to choose; leave out one of them"
+        )
     run = Path(run)
     check_writable(run / REFITTED)
     gaussians, dataset, taken, _ = load_run(run)
@@ -89,11 +95,15 @@ def refit_run(
     write_ply(run / REFITTED, found.gaussians, marks)
     before = len(gaussians) * parameters_of_each(settings.train)
     shares = {kind: float(mask.mean()) for kind, mask in found.learned.items()}
-    return RefittedRun(before, found.parameters, shares, found.left_out, found.gaussians.sh_degree, views, psnr)
+    return RefittedRun(
+        before, found.parameters, shares, found.left_out, found.gaussians.sh_degree, views, psnr
+    )
 
 
 def parameters_of_each(train: TrainSettings) -> int:
     """How many parameters of a Gaussian a run learns: those of the kinds whose rate is not 0."""
     from mgs.splat import groups
 
-    return sum(of.stop - of.start for kind, of in groups(0, train.means).items() if train.rates[kind] > 0)
+    return sum(
+        of.stop - of.start for kind, of in groups(0, train.means).items() if train.rates[kind] > 0
+    )

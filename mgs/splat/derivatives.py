@@ -1,9 +1,12 @@
-"""How a pixel changes with each parameter of a Gaussian, up to what differs from pixel to pixel, and sums over pixels of it.
+"""How a pixel changes with each parameter of a Gaussian, up to what differs from pixel to pixel,
+and sums over pixels of it.
 
-The derivative of channel c of a pixel by any parameter is s_c q + w g_c. Here q, the derivative of ln alpha, is a polynomial of
-second order in xi and eta, and g_c that of the splat's colour; their coefficients depend on the Gaussian and the camera alone.
-So entries of the Fisher information are made from moments, which are sums over pixels of |s|^2 or w s_c times monomials of xi
-and eta, and from the sum of w^2 (`mgs.splat.kernels.fisher`). A polynomial is a dict {(a, b): coefficient of xi^a eta^b}, and
+The derivative of channel c of a pixel by any parameter is s_c q + w g_c. Here q, the derivative of
+ln alpha, is a polynomial of second order in xi and eta, and g_c that of the splat's colour; their
+coefficients depend on the Gaussian and the camera alone. So entries of the Fisher information are
+made from moments, which are sums over pixels of |s|^2 or w s_c times monomials of xi and eta, and
+from the sum of w^2 (`mgs.splat.kernels.fisher`). A polynomial is a dict {(a, b): coefficient of
+xi^a eta^b}, and
 moments are kept in dicts with the same keys. Symbols: docs/notation.md.
 """
 
@@ -21,7 +24,14 @@ from mgs.gaussians import Gaussians
 from mgs.memory import padded
 from mgs.splat.constants import LOG_SCALE_RANGE
 from mgs.splat.kernels import LN2, POWERS, log_alpha_tangent
-from mgs.splat.projection import axes2d, is_rotation, project64, rows_as_vectors, sh_basis, whitening
+from mgs.splat.projection import (
+    axes2d,
+    is_rotation,
+    project64,
+    rows_as_vectors,
+    sh_basis,
+    whitening,
+)
 
 Powers = tuple[int, int]
 Polynomial = Mapping[Powers, Any]
@@ -31,8 +41,9 @@ Polynomial = Mapping[Powers, Any]
 class Geometry:
     """How pixels depend on all parameters of a Gaussian but its mean; Dr.Jit arrays [N].
 
-    shape: for the 3 log-scales and the 4 numbers of the quaternion, the derivative of ln alpha, a polynomial in xi^2, xi eta
-    and eta^2. logit: the derivative of ln alpha by the opacity logit, 1 - opacity. basis: the K values of the spherical
+    shape: for the 3 log-scales and the 4 numbers of the quaternion, the derivative of ln alpha, a
+    polynomial in xi^2, xi eta and eta^2. logit: the derivative of ln alpha by the opacity logit, 1
+    - opacity. basis: the K values of the spherical
     harmonics. positive: for r, g, b 1, or 0 where the colour is clamped at 0 and has no derivative.
     """
 
@@ -44,8 +55,9 @@ class Geometry:
 
 @dataclass
 class ByMean:
-    """Derivatives as a mean moves along some direction, per metre: of ln alpha, a polynomial without a constant, and of the
-    splat's colour, for r, g, b. The last is 0 for SH degree 0, of which `colour` is an empty list."""
+    """Derivatives as a mean moves along some direction, per metre: of ln alpha, a polynomial
+    without a constant, and of the splat's colour, for r, g, b. The last is 0 for SH degree 0, of
+    which `colour` is an empty list."""
 
     log_alpha: Polynomial
     colour: list[Any]
@@ -53,8 +65,8 @@ class ByMean:
 
 @dataclass
 class Moments:
-    """Sums over pixels, Dr.Jit Float64 [N]: w2 is sum w^2; squared, moments with |s|^2; mixed, for r, g, b moments with w s_c,
-    or an empty list where they are not needed."""
+    """Sums over pixels, Dr.Jit Float64 [N]: w2 is sum w^2; squared, moments with |s|^2; mixed, for
+    r, g, b moments with w s_c, or an empty list where they are not needed."""
 
     w2: Any
     squared: Polynomial
@@ -62,12 +74,14 @@ class Moments:
 
 
 def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
-    """The derivatives of the footprint in closed form, in whitened coordinates x = (xi, eta), in which they are of order one.
+    """The derivatives of the footprint in closed form, in whitened coordinates x = (xi, eta), in
+    which they are of order one.
 
-    With s_i the standard deviation along local axis i and b_i the image of that axis in whitened pixels per metre, ln alpha
-    changes with log-scale i by 4 ln2^2 s_i^2 (b_i.x)^2, and with a rotation about local axis k by
-    4 ln2^2 (s_i^2 - s_j^2) (b_i.x) (b_j.x), where (i, j, k) is (0, 1, 2) or a cyclic shift of it. A change dq of a quaternion q
-    of norm n rotates the local axes by (2/n) Im(conj(q/n) dq).
+    With s_i the standard deviation along local axis i and b_i the image of that axis in whitened
+    pixels per metre, ln alpha changes with log-scale i by 4 ln2^2 s_i^2 (b_i.x)^2, and with a
+    rotation about local axis k by 4 ln2^2 (s_i^2 - s_j^2) (b_i.x) (b_j.x), where (i, j, k) is (0,
+    1, 2) or a cyclic shift of it. A change dq of a quaternion q of norm n rotates the local axes by
+    (2/n) Im(conj(q/n) dq).
     gaussians: TensorXf fields; camera: `camera_array`; splats: their projection.
     """
     mean, quats = (
@@ -92,7 +106,12 @@ def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
         turn.append(product((scales[i] - scales[j]) * (scales[i] + scales[j]), i, j))
     w, x, y, z = quats * dr.select(is_rotation(quats), 2 / dr.squared_norm(quats), 0)
     X, Y, Z = turn
-    by_quat = [-x * X - y * Y - z * Z, w * X - z * Y + y * Z, z * X + w * Y - x * Z, -y * X + x * Y + w * Z]
+    by_quat = [
+        -x * X - y * Y - z * Z,
+        w * X - z * Y + y * Z,
+        z * X + w * Y - x * Z,
+        -y * X + x * Y + w * Z,
+    ]
     transparency = dr.rcp(1 + dr.exp(mi.Float64(gaussians.logit_opacities.array)))
     basis = sh_basis(mean, camera, gaussians.sh.shape[1])
     positive = [dr.select(c > 0, mi.Float(1), 0) for c in (splats.red, splats.green, splats.blue)]
@@ -101,9 +120,11 @@ def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
 
 
 def by_means(gaussians: Gaussians, camera: Any) -> list[ByMean]:
-    """Derivatives by the coordinates x, y, z of the means, by Dr.Jit's forward AD of the projection.
+    """Derivatives by the coordinates x, y, z of the means, by Dr.Jit's forward AD of the
+    projection.
 
-    With a mean move the centre of its splat, its footprint (through the projection's Jacobian, as in `project64`) and, for
+    With a mean move the centre of its splat, its footprint (through the projection's Jacobian, as
+    in `project64`) and, for
     an SH degree above 0, its colour. gaussians: TensorXf fields; camera: `camera_array`.
     """
     columns = []
@@ -114,7 +135,9 @@ def by_means(gaussians: Gaussians, camera: Any) -> list[ByMean]:
             dr.enable_grad(means)
             dr.set_grad(means, mi.TensorXf(padded(np.tile(axis, (len(gaussians), 1)))))
             splats = project64(Gaussians(**{**values, "means": means}), camera)
-            dr.forward_to(splats, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)  # the opacity does not depend on the means
+            dr.forward_to(
+                splats, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
+            )  # the opacity does not depend on the means
             tangents, splats = dr.grad(splats), dr.detach(splats)
         polynomial = log_alpha_tangent(tangents, splats)
         del polynomial[0, 0]  # the part that comes from the opacity
@@ -125,13 +148,18 @@ def by_means(gaussians: Gaussians, camera: Any) -> list[ByMean]:
 def along_normals(columns: list[ByMean], normals: np.ndarray) -> ByMean:
     """Derivatives as the means move along unit normals, float64 [N,3], from those by x, y, z.
 
-    They are combined here, in double: rounded to float32, a normal that points to the camera would be turned a little to the
-    side, where a small splat is up to thousands of times as sensitive.
+    They are combined here, in double: rounded to float32, a normal that points to the camera would
+    be turned a little to the side, where a small splat is up to thousands of times as sensitive.
     """
     parts = [mi.Float64(padded(part, np.float64)) for part in normals.T]
-    polynomial = {powers: sum(n * c.log_alpha[powers] for n, c in zip(parts, columns, strict=True)) for powers in POWERS[1:]}
+    polynomial = {
+        powers: sum(n * c.log_alpha[powers] for n, c in zip(parts, columns, strict=True))
+        for powers in POWERS[1:]
+    }
     by_axis = zip(*(c.colour for c in columns), strict=True)
-    return ByMean(polynomial, [sum(n * g for n, g in zip(parts, channel, strict=True)) for channel in by_axis])
+    return ByMean(
+        polynomial, [sum(n * g for n, g in zip(parts, channel, strict=True)) for channel in by_axis]
+    )
 
 
 def weighted_sum(p: Polynomial, moments: Polynomial) -> Any:
@@ -152,14 +180,22 @@ def product_sum(p: Polynomial, q: Polynomial, moments: Polynomial) -> Any:
 
 
 def mean_product(mean: ByMean, q: Polynomial, sums: Moments) -> Any:
-    """The sum over pixels and channels of the derivative by a mean times s_c q, that by a parameter of the footprint."""
+    """The sum over pixels and channels of the derivative by a mean times s_c q, that by a parameter
+    of the footprint."""
     total = product_sum(mean.log_alpha, q, sums.squared)
-    return sum((g * weighted_sum(q, mixed) for g, mixed in zip(mean.colour, sums.mixed, strict=False)), total)
+    return sum(
+        (g * weighted_sum(q, mixed) for g, mixed in zip(mean.colour, sums.mixed, strict=False)),
+        total,
+    )
 
 
 def means_product(a: ByMean, b: ByMean, sums: Moments) -> Any:
     """The sum over pixels and channels of the product of the derivatives by two means."""
     total = product_sum(a.log_alpha, b.log_alpha, sums.squared)
     for g, h, mixed in zip(a.colour, b.colour, sums.mixed, strict=False):
-        total += h * weighted_sum(a.log_alpha, mixed) + g * weighted_sum(b.log_alpha, mixed) + g * h * sums.w2
+        total += (
+            h * weighted_sum(a.log_alpha, mixed)
+            + g * weighted_sum(b.log_alpha, mixed)
+            + g * h * sums.w2
+        )
     return total

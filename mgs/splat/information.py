@@ -1,10 +1,12 @@
-"""Fisher information that one view carries about each Gaussian, by one of several estimators (`ESTIMATORS`).
+"""Fisher information that one view carries about each Gaussian, by one of several estimators
+(`ESTIMATORS`).
 
-A pixel is taken as the rendered value plus noise of variance 1. The information is then J^T J, where J is the Jacobian of the
-rgb image, all pixels and channels, with respect to the parameters.
+A pixel is taken as the rendered value plus noise of variance 1. The information is then J^T J,
+where J is the Jacobian of the rgb image, all pixels and channels, with respect to the parameters.
 
-The P = 3K + 8 columns of a Gaussian: 3K spherical-harmonic coefficients (coefficient by coefficient, r g b in each), 3
-log-scales, 4 of the quaternion, 1 opacity logit. The means are frozen and have no columns, unless asked for (`MEANS`): then 1
+The P = 3K + 8 columns of a Gaussian: 3K spherical-harmonic coefficients (coefficient by
+coefficient, r g b in each), 3 log-scales, 4 of the quaternion, 1 opacity logit. The means are
+frozen and have no columns, unless asked for (`MEANS`): then 1
 or 3 more follow. Symbols: docs/notation.md.
 """
 
@@ -41,29 +43,42 @@ from mgs.splat.rendering import ListCache, as_colour, as_drjit, render, splats_a
 from mgs.splat.walking import pack, packet_count, sums_by_splat
 
 MEANS = {"frozen": 0, "normal": 1, "free": 3}
-"""What the means may do, and the number of their columns: stay; move along a given normal of each Gaussian (the offset, in
-metres); move freely (x, y, z in the world, metres)."""
+"""What the means may do, and the number of their columns: stay; move along a given normal of each
+Gaussian (the offset, in metres); move freely (x, y, z in the world, metres)."""
 
 ALPHA_WEIGHT_MAX = 1e12
-"""(linear RGB)^2. Largest (sigma_rgb / sigma_alpha)^2: beyond it, sums over pixels might leave float32."""
+"""(linear RGB)^2. Largest (sigma_rgb / sigma_alpha)^2: beyond it, sums over pixels might leave
+float32."""
 
 MAX_SUMS = 1 << 31
 """Most sums of all (splat, block) pairs of a view, since kernels index them with 31 bits."""
 
 BLOCK_BYTES = 1800
-"""Peak memory of a view's blocks for each Gaussian, SH degree 0, apart from its pairs: 1,700 measured."""
+"""Peak memory of a view's blocks for each Gaussian, SH degree 0, apart from its pairs: 1,700
+measured."""
 
 EXACT = ("exact", "block")
 """The estimators that know the means and alpha."""
 
 
 def groups(sh_degree: int, means: str = "frozen") -> dict[str, slice]:
-    """Columns of each group of parameters, for colours of this SH degree: "colour", "scale", "rotation", "opacity", and "mean"
-    if these are not frozen. Raises InputError if `means` is not a name in `MEANS`."""
+    """Columns of each group of parameters, for colours of this SH degree: "colour", "scale",
+    "rotation", "opacity", and "mean" if these are not frozen. Raises InputError if `means` is not a
+    name in `MEANS`."""
     of_mean = row_named(MEANS, means, "means")
-    sizes = {"colour": 3 * (sh_degree + 1) ** 2, "scale": 3, "rotation": 4, "opacity": 1, "mean": of_mean}
+    sizes = {
+        "colour": 3 * (sh_degree + 1) ** 2,
+        "scale": 3,
+        "rotation": 4,
+        "opacity": 1,
+        "mean": of_mean,
+    }
     ends = np.cumsum(list(sizes.values())).tolist()
-    return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True) if size}
+    return {
+        name: slice(end - size, end)
+        for (name, size), end in zip(sizes.items(), ends, strict=True)
+        if size
+    }
 
 
 @one_at_a_time
@@ -78,55 +93,73 @@ def fisher(
     alpha_weight: float = 0.0,
     **options: Any,
 ) -> np.ndarray:
-    """Fisher information that one view carries about each Gaussian: float32 [N,P], or [N,P,P] for the estimator `block`.
+    """Fisher information that one view carries about each Gaussian: float32 [N,P], or [N,P,P] for
+    the estimator `block`.
 
-    Entries are in (linear RGB / unit of the parameter)^2. The camera's image is not needed: the information depends on the
-    model and the pose alone. The array may be a view of a larger one (its rows are padded in memory).
-    gaussians, background, cache: as in `render`. estimator: a name in `ESTIMATORS`. options: `probes` and `seed` of
-    `hutchinson`; the others have none.
-    means: a name in `MEANS`; `groups` says which columns are whose. normals: [N,3], world, of any length but 0, the directions
-    in which `means="normal"` moves them; read only then. They are given, not taken from the Gaussians' own axes, since those
-    turn as the model is fitted, and information summed over views must be about one and the same direction.
-    alpha_weight: the ratio of noise variances (sigma_rgb / sigma_alpha)^2, up to 1e12, with which a pixel's alpha is observed
-    beside its colour; 0: it is not.
-    Raises InputError for an unknown estimator, where `render` does, for blocks of 2^31 numbers or more or that memory has no
-    room for, for unusable means,
-    normals or alpha_weight, which only the estimators `exact` and `block` know, and with means for too many pairs (`MAX_SUMS`).
+    Entries are in (linear RGB / unit of the parameter)^2. The camera's image is not needed: the
+    information depends on the model and the pose alone. The array may be a view of a larger one
+    (its rows are padded in memory).
+    gaussians, background, cache: as in `render`. estimator: a name in `ESTIMATORS`. options:
+    `probes` and `seed` of `hutchinson`; the others have none.
+    means: a name in `MEANS`; `groups` says which columns are whose. normals: [N,3], world, of any
+    length but 0, the directions in which `means="normal"` moves them; read only then. They are
+    given, not taken from the Gaussians' own axes, since those turn as the model is fitted, and
+    information summed over views must be about one and the same direction.
+    alpha_weight: the ratio of noise variances (sigma_rgb / sigma_alpha)^2, up to 1e12, with which a
+    pixel's alpha is observed beside its colour; 0: it is not.
+    Raises InputError for an unknown estimator, where `render` does, for blocks of 2^31 numbers or
+    more or that memory has no room for, for unusable means,
+    normals or alpha_weight, which only the estimators `exact` and `block` know, and with means for
+    too many pairs (`MAX_SUMS`).
     """
     compute = row_named(ESTIMATORS, estimator, "estimator")
     gaussians.check_shapes()
     n, size = len(gaussians), list(groups(gaussians.sh_degree, means).values())[-1].stop
     if not 0 <= alpha_weight <= ALPHA_WEIGHT_MAX:
-        raise InputError(f"fisher: alpha_weight {alpha_weight} must be from 0 to {ALPHA_WEIGHT_MAX:.0e}")
+        raise InputError(
+            f"fisher: alpha_weight {alpha_weight} must be from 0 to {ALPHA_WEIGHT_MAX:.0e}"
+        )
     if MEANS[means] or alpha_weight:
         if estimator not in EXACT:
-            raise InputError(f"fisher: the estimator {estimator!r} knows neither means nor alpha; use {' or '.join(EXACT)}")
+            raise InputError(
+                f"fisher: the estimator {estimator!r} knows neither means nor alpha; use {' or '.join(EXACT)}"
+            )
         unit = unit_normals(n, normals) if means == "normal" else None
         options |= {"means": means, "normals": unit, "alpha_weight": alpha_weight}
     if n == 0:
         return np.zeros((0, size, size) if estimator == "block" else (0, size), np.float32)
-    if estimator == "block" and n * (size * size + 3) >= 1 << 31:  # each row is written in packets of four numbers
+    if (
+        estimator == "block" and n * (size * size + 3) >= 1 << 31
+    ):  # each row is written in packets of four numbers
         raise InputError(
             f"fisher: blocks of {n:,} Gaussians of SH degree {gaussians.sh_degree} would take {n * size * size / 2**28:.1f} "
             "GiB, and 8 are the most; take fewer Gaussians, a lower degree, or the estimator `exact`"
         )
     if estimator == "block":
         of_degree = BLOCK_BYTES * (size / 11) ** 2
-        check_room(n * of_degree, f"fisher: blocks of {n:,} Gaussians", "take fewer Gaussians, or the estimator `exact`")
+        check_room(
+            n * of_degree,
+            f"fisher: blocks of {n:,} Gaussians",
+            "take fewer Gaussians, or the estimator `exact`",
+        )
     return compute(as_drjit(gaussians), camera, background, cache, **options)
 
 
 def unit_normals(n: int, normals: Any) -> np.ndarray:
     """Normals, float64 [N,3], of length 1. Raises InputError where they are missing or unusable."""
     if normals is None:
-        raise InputError("fisher: means='normal' needs normals [N,3], the direction in which each mean may move")
+        raise InputError(
+            "fisher: means='normal' needs normals [N,3], the direction in which each mean may move"
+        )
     values = np.asarray(normals, np.float64)
     if values.shape != (n, 3):
         raise InputError(f"fisher: normals have shape {values.shape}, expected {(n, 3)}")
     length = np.linalg.norm(values, axis=1, keepdims=True)
     bad = ~(np.isfinite(length) & (length > 0))
     if bad.any():
-        raise InputError(f"fisher: a normal is zero, NaN or infinite, first at Gaussian {np.argmax(bad)}; repair it")
+        raise InputError(
+            f"fisher: a normal is zero, NaN or infinite, first at Gaussian {np.argmax(bad)}; repair it"
+        )
     return values / length
 
 
@@ -140,14 +173,17 @@ def _sums(
     normals: np.ndarray | None,
     alpha_weight: float,
 ) -> tuple[Moments, Geometry, list[ByMean]]:
-    """The sums of `kernels.fisher`, and the derivatives that turn them into entries of the information, those by means apart.
+    """The sums of `kernels.fisher`, and the derivatives that turn them into entries of the
+    information, those by means apart.
 
     means, normals, alpha_weight: as in `exact`.
     """
     device = camera_array(camera)
     splats, lists, packed = splats_and_lists(gaussians, camera, cache)
     moving = means != "frozen"
-    cross = block or (moving and gaussians.sh_degree > 0)  # as a mean moves, SH of higher degree change colour, too
+    cross = block or (
+        moving and gaussians.sh_degree > 0
+    )  # as a mean moves, SH of higher degree change colour, too
     count = kernels.fisher_sums(cross, moving)
     room = 4 * packet_count(count)
     if len(lists.splat) * room >= MAX_SUMS:
@@ -165,7 +201,9 @@ def _sums(
     squared, mixed = kernels.fisher_moments(cross, moving)
     channels = [sums[len(squared) + c * len(mixed) :] for c in range(3)] if cross else []
     moments = Moments(
-        w2, dict(zip(squared, sums, strict=False)), [dict(zip(mixed, channel, strict=False)) for channel in channels]
+        w2,
+        dict(zip(squared, sums, strict=False)),
+        [dict(zip(mixed, channel, strict=False)) for channel in channels],
     )
     by_mean = by_means(gaussians, device) if moving else []
     if normals is not None:
@@ -182,12 +220,16 @@ def exact(
     normals: np.ndarray | None = None,
     alpha_weight: float = 0.0,
 ) -> np.ndarray:
-    """The diagonal of J^T J, exactly, for all parameters, in one pass over the image: seven sums per splat, and no Jacobian.
+    """The diagonal of J^T J, exactly, for all parameters, in one pass over the image: seven sums
+    per splat, and no Jacobian.
 
-    With means it takes 16 sums, or 34 for an SH degree above 0, of which colours depend on the mean. means, alpha_weight: as in
-    `fisher`. normals: float64 [N,3] of length 1 for means="normal", else None.
+    With means it takes 16 sums, or 34 for an SH degree above 0, of which colours depend on the
+    mean. means, alpha_weight: as in `fisher`. normals: float64 [N,3] of length 1 for
+    means="normal", else None.
     """
-    sums, g, by_mean = _sums(gaussians, camera, background, cache, False, means, normals, alpha_weight)
+    sums, g, by_mean = _sums(
+        gaussians, camera, background, cache, False, means, normals, alpha_weight
+    )
     columns_ = [sums.w2 * basis * basis * positive for basis in g.basis for positive in g.positive]
     columns_ += [dr.maximum(product_sum(m, m, sums.squared), 0) for m in g.shape]
     columns_.append(g.logit * g.logit * sums.squared[0, 0])
@@ -204,11 +246,14 @@ def block(
     normals: np.ndarray | None = None,
     alpha_weight: float = 0.0,
 ) -> np.ndarray:
-    """The diagonal blocks of J^T J, [N,P,P], exactly, in one pass over the image: 22 sums per splat, with means 34.
+    """The diagonal blocks of J^T J, [N,P,P], exactly, in one pass over the image: 22 sums per
+    splat, with means 34.
 
     means, normals, alpha_weight: as in `exact`.
     """
-    sums, g, by_mean = _sums(gaussians, camera, background, cache, True, means, normals, alpha_weight)
+    sums, g, by_mean = _sums(
+        gaussians, camera, background, cache, True, means, normals, alpha_weight
+    )
     dr.eval(g, by_mean)  # once, as several kernels may write the blocks
     colour = [(basis, c) for basis in g.basis for c in range(3)]
     k = len(colour)
@@ -223,7 +268,9 @@ def block(
         upper[i, k + 7] = scaled * sums.mixed[c][0, 0] * g.logit
         for j, mean in enumerate(by_mean):
             by_colour = [sums.w2 * mean.colour[c]] if mean.colour else []
-            upper[i, k + 8 + j] = scaled * sum(by_colour, weighted_sum(mean.log_alpha, sums.mixed[c]))
+            upper[i, k + 8 + j] = scaled * sum(
+                by_colour, weighted_sum(mean.log_alpha, sums.mixed[c])
+            )
     for i, m in enumerate(g.shape):
         for j in range(i, 7):
             upper[k + i, k + j] = product_sum(m, g.shape[j], sums.squared)
@@ -236,31 +283,49 @@ def block(
         for i, other in enumerate(by_mean[: j + 1]):
             upper[k + 8 + i, k + 8 + j] = means_product(other, mean, sums)
     size = k + 8 + len(by_mean)
-    both = {i * size + j: value for (i, j), value in upper.items()} | {j * size + i: value for (i, j), value in upper.items()}
+    both = {i * size + j: value for (i, j), value in upper.items()} | {
+        j * size + i: value for (i, j), value in upper.items()
+    }
     flat = _interleaved(both, size * size, len(gaussians))
     return flat.reshape(-1, size, size)
 
 
 def _gradient(
-    gaussians: Gaussians, image_gradient: Any, camera: Camera, background: Any, cache: ListCache | None
+    gaussians: Gaussians,
+    image_gradient: Any,
+    camera: Camera,
+    background: Any,
+    cache: ListCache | None,
 ) -> np.ndarray:
-    """J^T z of an image z, [N,P], by `dr.backward`. image_gradient(rgb) must return z, TensorXf [H,W,3]."""
+    """J^T z of an image z, [N,P], by `dr.backward`. image_gradient(rgb) must return z, TensorXf
+    [H,W,3]."""
     with dr.resume_grad():
         learned = {name: dr.copy(dr.detach(getattr(gaussians, name))) for name in LEARNED}
         dr.enable_grad(list(learned.values()))
-        rgb = render(Gaussians(dr.detach(gaussians.means), **learned), camera, background, cache).rgb
+        rgb = render(
+            Gaussians(dr.detach(gaussians.means), **learned), camera, background, cache
+        ).rgb
         dr.backward_from(dr.sum(rgb * image_gradient(dr.detach(rgb)), axis=None))
-        columns_ = [np.asarray(dr.grad(value)).reshape(len(gaussians), -1) for value in learned.values()]
+        columns_ = [
+            np.asarray(dr.grad(value)).reshape(len(gaussians), -1) for value in learned.values()
+        ]
     return np.concatenate(columns_, axis=1)
 
 
 def hutchinson(
-    gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None, probes: int = 8, seed: int = 0
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Any,
+    cache: ListCache | None,
+    probes: int = 8,
+    seed: int = 0,
 ) -> np.ndarray:
-    """Mean of (J^T z)^2 over `probes` images z of independent +1 and -1. Its expectation is diag(J^T J) (Hutchinson 1990).
+    """Mean of (J^T z)^2 over `probes` images z of independent +1 and -1. Its expectation is
+    diag(J^T J) (Hutchinson 1990).
 
-    Each camera has probes of its own, drawn from `seed` and the camera. With the same ones in every view the errors of
-    neighbouring views would be alike, and would add up in a sum over views. Raises InputError for less than one probe.
+    Each camera has probes of its own, drawn from `seed` and the camera. With the same ones in every
+    view the errors of neighbouring views would be alike, and would add up in a sum over views.
+    Raises InputError for less than one probe.
     """
     if int(probes) != probes or probes < 1:
         raise InputError(f"hutchinson: probes {probes} must be a whole number from 1 up")
@@ -269,33 +334,49 @@ def hutchinson(
     for probe in range(int(probes)):
         rng = np.random.default_rng(derive_seed(seed, f"hutchinson/{camera.key.hex()}/{probe}"))
         z = rng.choice(np.array([-1, 1], np.float32), (camera.height, camera.width, 3))
-        squared = _gradient(gaussians, lambda _, z=z: mi.TensorXf(padded(z)), camera, background, cache).astype(np.float64) ** 2
+        squared = (
+            _gradient(
+                gaussians, lambda _, z=z: mi.TensorXf(padded(z)), camera, background, cache
+            ).astype(np.float64)
+            ** 2
+        )
         total = squared if probe == 0 else total + squared
     return (total / probes).astype(np.float32)
 
 
-def loss_gradient(gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None) -> np.ndarray:
-    """The paper's Eq. 7 as it is written: the squared gradient of one scalar "dummy photometric loss" per image.
+def loss_gradient(
+    gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None
+) -> np.ndarray:
+    """The paper's Eq. 7 as it is written: the squared gradient of one scalar "dummy photometric
+    loss" per image.
 
-    The paper does not say which loss. Here it is the mean squared error against mid-grey, L = mean (rgb - 0.5)^2. The result is
-    not diag(J^T J), since gradients of different pixels cancel before they are squared.
+    The paper does not say which loss. Here it is the mean squared error against mid-grey, L = mean
+    (rgb - 0.5)^2. The result is not diag(J^T J), since gradients of different pixels cancel before
+    they are squared.
     """
-    return _gradient(gaussians, lambda rgb: (rgb - 0.5) * (2 / len(rgb.array)), camera, background, cache) ** 2
+    return (
+        _gradient(
+            gaussians, lambda rgb: (rgb - 0.5) * (2 / len(rgb.array)), camera, background, cache
+        )
+        ** 2
+    )
 
 
 SMALLEST = 1.2e-38
-"""Smallest normal float32. Entries smaller than this become 0: threads differ in how they flush denormals, and nothing else
-would differ between reruns."""
+"""Smallest normal float32. Entries smaller than this become 0: threads differ in how they flush
+denormals, and nothing else would differ between reruns."""
 
 PACKETS = 32
-"""How many packets of four columns one kernel writes. LLVM takes minutes to compile a kernel that writes all 56 x 56 columns of
-blocks of SH degree 3."""
+"""How many packets of four columns one kernel writes. LLVM takes minutes to compile a kernel that
+writes all 56 x 56 columns of blocks of SH degree 3."""
 
 
 def _interleaved(columns_: dict[int, Any], size: int, n: int) -> np.ndarray:
-    """NumPy float32 [N, size] from its columns, Dr.Jit arrays [N] by index; columns not given are 0.
+    """NumPy float32 [N, size] from its columns, Dr.Jit arrays [N] by index; columns not given are
+    0.
 
-    A kernel writes four columns at a time, so rows are padded to a multiple of four; the result is a view without the padding.
+    A kernel writes four columns at a time, so rows are padded to a multiple of four; the result is
+    a view without the padding.
     """
     packets = -(-size // 4)
     flat, row = dr.empty(mi.Float, n * packets * 4), dr.arange(mi.UInt32, n) * packets
@@ -314,5 +395,6 @@ ESTIMATORS: dict[str, Callable[..., np.ndarray]] = {
     "hutchinson": hutchinson,
     "loss-gradient": loss_gradient,
 }
-"""What `fisher` calls, by name: (gaussians with Dr.Jit fields, camera, background, cache, **options) -> NumPy [N,P], or [N,P,P]
-for `block`. A program may add its own (docs/howto/estimator.md)."""
+"""What `fisher` calls, by name: (gaussians with Dr.Jit fields, camera, background, cache,
+**options) -> NumPy [N,P], or [N,P,P] for `block`. A program may add its own
+(docs/howto/estimator.md)."""

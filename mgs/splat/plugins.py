@@ -1,7 +1,9 @@
-"""Importing this module makes the Mitsuba plugins of mgs known to Mitsuba: `import mgs.splat.plugins`.
+"""Importing this module makes the Mitsuba plugins of mgs known to Mitsuba: `import
+mgs.splat.plugins`.
 
-A plugin class belongs to one Mitsuba variant. So the files in `plugins/` are run for the variant that is set now, and again for
-every variant that is set later; the import may come before or after the variant is set.
+A plugin class belongs to one Mitsuba variant. So the files in `plugins/` are run for the variant
+that is set now, and again for every variant that is set later; the import may come before or after
+the variant is set.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ from mgs.resources import resource_folder
 
 
 def register(*_: Any) -> None:
-    """Run every file in `plugins/`, under the module name `mgs_plugins.<file>`, if the variant is differentiable and RGB.
+    """Run every file in `plugins/`, under the module name `mgs_plugins.<file>`, if the variant is
+    differentiable and RGB.
 
     Raises InputError where the installation lacks the folder.
     """

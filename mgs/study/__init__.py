@@ -1,1 +1,2 @@
-"""Studies: many runs and measurements of one question, as cells that are done once each, and what they say together."""
+"""Studies: many runs and measurements of one question, as cells that are done once each, and what
+they say together."""

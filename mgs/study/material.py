@@ -1,4 +1,5 @@
-"""What the cells of all studies begin with: a dataset and a prior, each made once and whole after an interruption."""
+"""What the cells of all studies begin with: a dataset and a prior, each made once and whole after
+an interruption."""
 
 from __future__ import annotations
 
@@ -18,10 +19,16 @@ if TYPE_CHECKING:
 
 
 def made_dataset(
-    folder: Path, scene: str | SceneFile, preset: Preset, seed: int = 0, test_views: int = 0, mesh: str | None = None
+    folder: Path,
+    scene: str | SceneFile,
+    preset: Preset,
+    seed: int = 0,
+    test_views: int = 0,
+    mesh: str | None = None,
 ) -> Dataset:
-    """The dataset of a scene, as `mgs synth-orbit` renders it: read where it is there, else rendered. Raises InputError as
-    `mgs.synth.rendering.synthesise` and `mgs.data.dataset.load_dataset`."""
+    """The dataset of a scene, as `mgs synth-orbit` renders it: read where it is there, else
+    rendered. Raises InputError as `mgs.synth.rendering.synthesise` and
+    `mgs.data.dataset.load_dataset`."""
     from mgs.synth.rendering import synthesise  # which needs a variant of Mitsuba
 
     if not (folder / "transforms.json").is_file():
@@ -30,8 +37,9 @@ def made_dataset(
 
 
 def made_prior(folder: Path, dataset: Path, **settings: Any) -> Prior:
-    """The prior of a dataset: read where it is there, else built. settings: of `mgs.prior.settings.PriorSettings`. Raises
-    InputError as `mgs.prior.build.build_prior` and `load_prior`."""
+    """The prior of a dataset: read where it is there, else built. settings: of
+    `mgs.prior.settings.PriorSettings`. Raises InputError as `mgs.prior.build.build_prior` and
+    `load_prior`."""
     if not (folder / "prior.json").is_file():  # which is written last
         shutil.rmtree(folder, ignore_errors=True)
         prior, _ = build_prior(load_dataset(dataset), PriorSettings(**settings))
@@ -44,5 +52,7 @@ def test_views_of(dataset: Dataset) -> Dataset:
     """Its test views. Raises InputError where it has none."""
     tests = dataset.test_views()
     if tests is None:
-        raise InputError(f"{dataset.root}: has no test views, by which models are judged; make them with `--test-views`")
+        raise InputError(
+            f"{dataset.root}: has no test views, by which models are judged; make them with `--test-views`"
+        )
     return tests

@@ -1,4 +1,5 @@
-"""The paper's results, and what it leaves open, each with the cells of work that it is made of: one table, RESULTS.
+"""The paper's results, and what it leaves open, each with the cells of work that it is made of: one
+table, RESULTS.
 
 A cell is a dataset, a prior or a run; cells that several results need are done once.
 """
@@ -10,15 +11,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mgs.active import policy_file
-from mgs.active.inputs import policy_record
+from mgs.policy import from_file as policy_file
+from mgs.run.inputs import policy_record
 from mgs.study.statistics import MOST_ROCKS
 from mgs.study.sweep import Cell
 
 SCENES = ("boulder", "contact-binary", "low-sun", "pebbles", "strata")
 
 DEVELOPED_ON = ("boulder", "contact-binary")
-"""Scenes on whose rocks of seed 0 the settings of policies were chosen; the other scenes had no part in that choice."""
+"""Scenes on whose rocks of seed 0 the settings of policies were chosen; the other scenes had no
+part in that choice."""
 
 SEEDS = 4
 """Seed views of a run, as in the paper."""
@@ -38,8 +40,9 @@ PAIRS = (
     ("d-optimal", "coverage"),
     ("cover", "fisherrf"),
 )
-"""Pairs of policies, named before they were measured over rocks, whose difference is tested. `paper`, `d-optimal` and
-`coverage` are what the paper compares, and COVER's authors compare it with FisherRF."""
+"""Pairs of policies, named before they were measured over rocks, whose difference is tested.
+`paper`, `d-optimal` and `coverage` are what the paper compares, and COVER's authors compare it with
+FisherRF."""
 
 LEADER = "directional-i"
 """The policy whose difference from every other is told for each pool."""
@@ -50,14 +53,16 @@ DRAWS = 3
 TABLE_POLICIES = (
     "paper", "d-optimal", "coverage", "uniform", "directional-i", "fisherrf", "farthest", "random", "directional-d",
 )  # fmt: skip
-"""Rows of Table I; what the paper compares comes first, because the table is written as its rows are done."""
+"""Rows of Table I; what the paper compares comes first, because the table is written as its rows
+are done."""
 
 SLOW_POLICIES = ("block-d",)
-"""Further rows, which take longest: at the paper's size a choice by 11x11 blocks takes a third of a minute."""
+"""Further rows, which take longest: at the paper's size a choice by 11x11 blocks takes a third of a
+minute."""
 
 ALL_VIEWS, FEWER, AS_3DGS = "all views", "coverage, fewer images", "all views, as 3DGS"
-"""Rows of Table I that are no policies: `uniform` until no frame is left; as the paper counts, 54 images against 50; and a fit
-that is not held to a surface (`mgs.study.free_fit`)."""
+"""Rows of Table I that are no policies: `uniform` until no frame is left; as the paper counts, 54
+images against 50; and a fit that is not held to a surface (`mgs.study.free_fit`)."""
 
 FEWER_IMAGES = 4
 """By how many images coverage has fewer there."""
@@ -70,8 +75,9 @@ POOLS: dict[str, dict[str, Any]] = {
     "five nearest": {"orbit": "circle", "nearest": 5},
     "mixed distances": {"orbit": "hemisphere", "distances": (1, 2, 3)},
 }
-"""Candidates to choose from. orbit, distances: as in `mgs.synth.scene_file.Orbit`; every: half of a ring of 3/2 as many frames,
-and of its other half one frame of so many; nearest: the setting of `mgs nbv`."""
+"""Candidates to choose from. orbit, distances: as in `mgs.synth.scene_file.Orbit`; every: half of a
+ring of 3/2 as many frames, and of its other half one frame of so many; nearest: the setting of `mgs
+nbv`."""
 
 SEED_COUNTS = (1, 2, 3, 4, 6, 8)
 SEED_POLICIES = ("d-optimal", "paper")
@@ -79,8 +85,8 @@ SEED_POLICIES = ("d-optimal", "paper")
 
 @dataclass(frozen=True)
 class Size:
-    """Images, in pixels; numbers of frames, samples per pixel, test views, Gaussians, views chosen beyond the seeds, and of
-    these, how many are chosen before the model is fitted again."""
+    """Images, in pixels; numbers of frames, samples per pixel, test views, Gaussians, views chosen
+    beyond the seeds, and of these, how many are chosen before the model is fitted again."""
 
     width: int
     height: int
@@ -94,7 +100,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Mesh:
-    """A file with a rock, and its hash when the study began (`mgs.active.inputs.file_digest`)."""
+    """A file with a rock, and its hash when the study began (`mgs.run.inputs.file_digest`)."""
 
     file: Path
     digest: str
@@ -102,8 +108,8 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Preset:
-    """How large a reproduction is. table: of Table I. rocks: of the results over many rocks. How many rocks the curves, the
-    study of seeds and that of pools have."""
+    """How large a reproduction is. table: of Table I. rocks: of the results over many rocks. How
+    many rocks the curves, the study of seeds and that of pools have."""
 
     table: Size
     rocks: Size
@@ -111,9 +117,11 @@ class Preset:
     seed_rocks: int = 5
     pool_rocks: int = 3
     own_policies: tuple[str, ...] = ()
-    """Policies of the user's own that the curves and the pools compare, too (`mgs.study.reproduce_asked`)."""
+    """Policies of the user's own that the curves and the pools compare, too
+    (`mgs.study.reproduce_asked`)."""
     meshes: tuple[Mesh, ...] = ()
-    """Rocks of the user's own, which then take the place of the procedural ones (`mgs.study.reproduce_asked`)."""
+    """Rocks of the user's own, which then take the place of the procedural ones
+    (`mgs.study.reproduce_asked`)."""
 
     @property
     def policies(self) -> tuple[str, ...]:
@@ -123,14 +131,18 @@ class Preset:
 
 PRESETS = {
     "quick": Preset(Size(320, 240, 32, 8, 12, 10_000, 8), Size(240, 180, 32, 8, 12, 5_000, 8)),
-    "paper": Preset(Size(640, 480, 100, 16, 24, 100_000, 50), Size(320, 240, 48, 8, 24, 10_000, 20), pool_rocks=5),
+    "paper": Preset(
+        Size(640, 480, 100, 16, 24, 100_000, 50),
+        Size(320, 240, 48, 8, 24, 10_000, 20),
+        pool_rocks=5,
+    ),
 }
 
 
 @dataclass(frozen=True)
 class Rock:
-    """A scene, and the seed of the rock in it; or a mesh, called by its file's name, in MESH_SCENE. index: its place among the
-    rocks, also the seed of the runs on it."""
+    """A scene, and the seed of the rock in it; or a mesh, called by its file's name, in MESH_SCENE.
+    index: its place among the rocks, also the seed of the runs on it."""
 
     scene: str
     seed: int
@@ -158,8 +170,8 @@ TABLE_ROCK = Rock("boulder", 0)
 
 
 def rocks(preset: Preset, count: int) -> list[Rock]:
-    """The first so many rocks: the scenes in turn, with seeds from 1 on. On those of seed 0 the policies were developed. Where
-    the preset has meshes, these instead."""
+    """The first so many rocks: the scenes in turn, with seeds from 1 on. On those of seed 0 the
+    policies were developed. Where the preset has meshes, these instead."""
     if preset.meshes:
         return [Rock(mesh.file.stem, 0, k, mesh) for k, mesh in enumerate(preset.meshes[:count])]
     return [Rock(SCENES[k % len(SCENES)], 1 + k // len(SCENES), k) for k in range(count)]
@@ -185,20 +197,45 @@ class Run:
         size, pool = self.size, POOLS[self.pool]
         frames = size.frames * 3 // 2 if "every" in pool else size.frames
         distances = pool.get("distances", ())
-        shape = "-".join([pool["orbit"], *map(str, distances), f"{frames}x{size.width}x{size.height}"])
+        shape = "-".join(
+            [pool["orbit"], *map(str, distances), f"{frames}x{size.width}x{size.height}"]
+        )
         views = {"test_views": size.test_views}
         preset = {"width": size.width, "height": size.height, "frames": frames, "spp": size.spp}
         where = self.rock.made_of() | {"orbit": pool["orbit"]}
         where |= {"distances": list(distances)} if distances else {}
-        cells = [Cell(f"dataset/{self.rock.name}/{shape}", "mgs.study.tasks:make_dataset", where | views | {"preset": preset})]
+        cells = [
+            Cell(
+                f"dataset/{self.rock.name}/{shape}",
+                "mgs.study.tasks:make_dataset",
+                where | views | {"preset": preset},
+            )
+        ]
         survey = cells[0].name  # the prior is of the whole flight
         prior = {"dataset": survey, "gaussians": size.gaussians, "seed": 0}
-        cells.append(Cell(f"prior/{self.rock.name}/{shape}-{size.gaussians}", "mgs.study.tasks:make_prior", prior, (survey,)))
+        cells.append(
+            Cell(
+                f"prior/{self.rock.name}/{shape}-{size.gaussians}",
+                "mgs.study.tasks:make_prior",
+                prior,
+                (survey,),
+            )
+        )
         if "every" in pool:
             arc = {"ring": survey, "every": pool["every"]}
-            cells.append(Cell(f"dataset/{self.rock.name}/arc-{shape}", "mgs.study.tasks:make_arc", arc, (survey,)))
+            cells.append(
+                Cell(
+                    f"dataset/{self.rock.name}/arc-{shape}",
+                    "mgs.study.tasks:make_arc",
+                    arc,
+                    (survey,),
+                )
+            )
         dataset, prior_name = cells[-1 if "every" in pool else 0].name, cells[1].name
-        task = OTHER_TASKS.get(self.policy, "mgs.study.tasks:time_policy" if self.timed else "mgs.study.tasks:run_policy")
+        task = OTHER_TASKS.get(
+            self.policy,
+            "mgs.study.tasks:time_policy" if self.timed else "mgs.study.tasks:run_policy",
+        )
         return [
             *cells,
             Cell(
@@ -218,7 +255,9 @@ class Run:
         shape = f"{size.frames}x{size.width}x{size.height}-{size.gaussians}"
         views = f"{self.seeds}+{settings['budget']}-{settings['seed']}"
         views += f"-by{settings['batch']}" if "batch" in settings else ""
-        version = "".join(f"-{digest[:8]}" for digest in policy_record(self.policy).values())  # of a policy's file
+        version = "".join(
+            f"-{digest[:8]}" for digest in policy_record(self.policy).values()
+        )  # of a policy's file
         return f"{kind}/{self.rock.name}/{self.pool.replace(' ', '-')}-{shape}/{self.label}{version}-{views}"
 
     @property
@@ -237,17 +276,22 @@ class Run:
         return {**policy, "seeds": self.seeds, "budget": budget, "seed": seed, **nearest}
 
     def command(self) -> str:
-        """The `mgs nbv` that does the same, in the study's folder. Those of OTHER_TASKS have none."""
+        """The `mgs nbv` that does the same, in the study's folder. Those of OTHER_TASKS have
+        none."""
         if self.policy in OTHER_TASKS:
             return ""
         *_, cell = self.cells()
         options = " ".join(f"--{key} {value}" for key, value in self.settings().items())
-        dataset, prior = f"cells/{cell.arguments['dataset']}/dataset", f"cells/{cell.arguments['prior']}/prior"
+        dataset, prior = (
+            f"cells/{cell.arguments['dataset']}/dataset",
+            f"cells/{cell.arguments['prior']}/prior",
+        )
         return f"mgs nbv {dataset} --prior {prior} --out RUN --alpha-weight 0 {options}"
 
 
 ORACLE, FREE_FIT = "oracle", "free-fit"
-"""The policy that looks at the truth, `mgs.study.oracle`, and a fit to all views, `mgs.study.free_fit`."""
+"""The policy that looks at the truth, `mgs.study.oracle`, and a fit to all views,
+`mgs.study.free_fit`."""
 
 OTHER_TASKS = {ORACLE: "mgs.study.oracle:run_oracle", FREE_FIT: "mgs.study.free_fit:time_free_fit"}
 """What does the cell of these, which are no policies of `mgs nbv`."""
@@ -271,7 +315,11 @@ def table_runs(preset: Preset) -> dict[str, Run]:
 
 def curve_runs(preset: Preset, count: int) -> list[Run]:
     """PSNR(images): every policy on every rock."""
-    return [Run(rock, preset.rocks, policy) for rock in rocks(preset, count) for policy in preset.policies]
+    return [
+        Run(rock, preset.rocks, policy)
+        for rock in rocks(preset, count)
+        for policy in preset.policies
+    ]
 
 
 def seed_runs(preset: Preset, count: int) -> list[Run]:
@@ -298,7 +346,11 @@ def pool_runs(preset: Preset, count: int) -> list[Run]:
 
 def oracle_runs(preset: Preset, count: int) -> list[Run]:
     """The oracle on every pool of so many rocks."""
-    return [Run(rock, preset.rocks, ORACLE, pool=pool) for pool in POOLS for rock in rocks(preset, count)]
+    return [
+        Run(rock, preset.rocks, ORACLE, pool=pool)
+        for pool in POOLS
+        for rock in rocks(preset, count)
+    ]
 
 
 MOST_POOL_ROCKS = 10
@@ -325,8 +377,13 @@ class Result:
 
 
 RESULTS = {
-    "table1": Result(lambda preset, _: list(table_runs(preset).values()), lambda preset: 1, grows=True),
-    "figures": Result(lambda preset, _: [table_runs(preset)[policy] for policy in FIGURE_POLICIES], lambda preset: 1),
+    "table1": Result(
+        lambda preset, _: list(table_runs(preset).values()), lambda preset: 1, grows=True
+    ),
+    "figures": Result(
+        lambda preset, _: [table_runs(preset)[policy] for policy in FIGURE_POLICIES],
+        lambda preset: 1,
+    ),
     "curves": Result(curve_runs, lambda preset: preset.curve_rocks),
     "seeds": Result(seed_runs, lambda preset: preset.seed_rocks),
     "pools": Result(pool_runs, lambda preset: preset.pool_rocks, most=MOST_POOL_ROCKS),
@@ -342,10 +399,15 @@ RESULTS = {
 
 def cells_of(name: str, preset: Preset, count: int) -> list[Cell]:
     """The cells of a result over so many rocks, each once."""
-    return list({cell.name: cell for run in RESULTS[name].runs(preset, count) for cell in run.cells()}.values())
+    return list(
+        {
+            cell.name: cell for run in RESULTS[name].runs(preset, count) for cell in run.cells()
+        }.values()
+    )
 
 
 def pairs_of(policies: Iterable[str]) -> tuple[tuple[str, str], ...]:
-    """The pairs of policies whose difference is tested: PAIRS, and those of the user's own policies with the same two."""
+    """The pairs of policies whose difference is tested: PAIRS, and those of the user's own policies
+    with the same two."""
     own = [policy for policy in policies if policy not in POLICIES]
     return (*PAIRS, *((policy, other) for policy in own for other in ("uniform", "farthest")))

@@ -1,4 +1,5 @@
-"""Figures of a reproduction. Each function takes rows of `mgs.study.reproduce_results` and writes one PNG."""
+"""Figures of a reproduction. Each function takes rows of `mgs.study.reproduce_results` and writes
+one PNG."""
 
 from __future__ import annotations
 
@@ -15,8 +16,8 @@ Rows = Sequence[dict[str, Any]]
 
 
 def curves_figure(path: Path, rows: Rows) -> None:
-    """PSNR on the test views against the number of images: means over the rocks, and the differences from `uniform`, with 95 %
-    intervals of their means as bands."""
+    """PSNR on the test views against the number of images: means over the rocks, and the
+    differences from `uniform`, with 95 % intervals of their means as bands."""
     import matplotlib
 
     policies = list(dict.fromkeys(row["policy"] for row in rows))
@@ -29,7 +30,9 @@ def curves_figure(path: Path, rows: Rows) -> None:
             left.plot(images, [row["test_psnr"] for row in of], **style)
             right.plot(images, [row["test_psnr_over_uniform"] for row in of], **style)
             if of[0]["rocks"] > 1:
-                low, high = ([row[f"test_psnr_over_uniform_{end}"] for row in of] for end in ("low", "high"))
+                low, high = (
+                    [row[f"test_psnr_over_uniform_{end}"] for row in of] for end in ("low", "high")
+                )
                 right.fill_between(images, low, high, color=style["color"], alpha=0.12, linewidth=0)
         count = rows[0]["rocks"]
         titles = (
@@ -44,7 +47,8 @@ def curves_figure(path: Path, rows: Rows) -> None:
 
 
 def seeds_figure(path: Path, rows: Rows) -> None:
-    """PSNR of the last model against the number of seeds, with 95 % intervals of the difference from four seeds."""
+    """PSNR of the last model against the number of seeds, with 95 % intervals of the difference
+    from four seeds."""
     import matplotlib
 
     policies = list(dict.fromkeys(row["policy"] for row in rows))
@@ -61,7 +65,8 @@ def seeds_figure(path: Path, rows: Rows) -> None:
 
 
 def pools_figure(path: Path, rows: Rows) -> None:
-    """The last model's PSNR on the test views over that of `random`, for each pool and policy, with 95 % intervals."""
+    """The last model's PSNR on the test views over that of `random`, for each pool and policy, with
+    95 % intervals."""
     import matplotlib
 
     pools = list(dict.fromkeys(row["pool"] for row in rows))
@@ -85,7 +90,9 @@ def _error_bars(axis: Any, x: Any, rows: Rows, key: str, style: dict[str, Any]) 
     means = np.array([row[key] for row in rows])
     bars = None
     if rows[0]["rocks"] > 1:
-        bars = np.abs(np.array([[row[f"{key}_{end}"] for row in rows] for end in ("low", "high")]) - means)
+        bars = np.abs(
+            np.array([[row[f"{key}_{end}"] for row in rows] for end in ("low", "high")]) - means
+        )
     axis.errorbar(x, means, bars, elinewidth=0.9, capsize=2, **style)
 
 

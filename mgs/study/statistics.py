@@ -1,4 +1,5 @@
-"""Statistics of paired differences, one for each rock: the rock is what is replicated, so draws and views are no samples."""
+"""Statistics of paired differences, one for each rock: the rock is what is replicated, so draws and
+views are no samples."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ MOST_ROCKS = 20
 
 
 def area(images: Sequence[float], values: Sequence[float]) -> float:
-    """Area under values(images) over the length of the axis: the mean of the curve, in the unit of the values.
+    """Area under values(images) over the length of the axis: the mean of the curve, in the unit of
+    the values.
 
     images: numbers of images, rising. A curve of one point is its value.
     """
@@ -22,7 +24,8 @@ def area(images: Sequence[float], values: Sequence[float]) -> float:
 
 
 def images_to_reach(images: Sequence[float], values: Sequence[float], level: float) -> float | None:
-    """Number of images at which a curve first reaches a level, on straight lines between its points; None if it never does.
+    """Number of images at which a curve first reaches a level, on straight lines between its
+    points; None if it never does.
 
     images: numbers of images, rising.
     """
@@ -36,7 +39,8 @@ def images_to_reach(images: Sequence[float], values: Sequence[float], level: flo
 
 
 def interval(numbers: Sequence[float]) -> tuple[float, float] | None:
-    """Student's t interval of 95 % of the mean of independent numbers, (low, high); None for fewer than two of them."""
+    """Student's t interval of 95 % of the mean of independent numbers, (low, high); None for fewer
+    than two of them."""
     if len(numbers) < 2:
         return None
     values = np.asarray(numbers, np.float64)
@@ -45,11 +49,12 @@ def interval(numbers: Sequence[float]) -> tuple[float, float] | None:
 
 
 def permutation_p(differences: Sequence[float]) -> float | None:
-    """Two-sided p-value of the exact paired permutation test: under the hypothesis that two policies are alike, each
-    difference could as well have the other sign. None for fewer than two differences; at most MOST_ROCKS of them.
+    """Two-sided p-value of the exact paired permutation test: under the hypothesis that two
+    policies are alike, each difference could as well have the other sign. None for fewer than two
+    differences; at most MOST_ROCKS of them.
 
-    The share of the 2^n sign flips whose mean is at least as far from 0 as the one observed, so 2 / 2^n at least (1 if all
-    differences are 0).
+    The share of the 2^n sign flips whose mean is at least as far from 0 as the one observed, so 2 /
+    2^n at least (1 if all differences are 0).
     """
     count = len(differences)
     if count < 2:
@@ -67,7 +72,8 @@ def permutation_p(differences: Sequence[float]) -> float | None:
 def holm(p_values: Sequence[float]) -> list[float]:
     """Holm's correction for several tests: the adjusted p-values, in the order given.
 
-    Whoever rejects all hypotheses whose adjusted value is at most alpha rejects a true one with a probability of at most alpha.
+    Whoever rejects all hypotheses whose adjusted value is at most alpha rejects a true one with a
+    probability of at most alpha.
     """
     order = sorted(range(len(p_values)), key=lambda k: p_values[k])
     adjusted, largest = [0.0] * len(p_values), 0.0

@@ -1,4 +1,5 @@
-"""The picture of a survey, survey.png: trajectories from above, position error of each frame, depth error, fused cloud."""
+"""The picture of a survey, survey.png: trajectories from above, position error of each frame, depth
+error, fused cloud."""
 
 from __future__ import annotations
 
@@ -16,10 +17,13 @@ COLOURS = {"odometry": "#d1495b", "registered": "#edae49", "optimised": "#00798c
 """Colour of each of the STAGES."""
 
 
-def draw_survey(path: str | Path, dataset: Dataset, survey: Survey, cloud: Cloud, numbers: dict[str, Any]) -> None:
+def draw_survey(
+    path: str | Path, dataset: Dataset, survey: Survey, cloud: Cloud, numbers: dict[str, Any]
+) -> None:
     """Write the picture of a survey of this dataset as a PNG; the file appears complete.
 
-    cloud: fused from the survey; numbers: from `mgs.survey.flight.survey_numbers`. Raises InputError if it cannot be written.
+    cloud: fused from the survey; numbers: from `mgs.survey.flight.survey_numbers`. Raises
+    InputError if it cannot be written.
     """
     import matplotlib
 
@@ -33,9 +37,24 @@ def draw_survey(path: str | Path, dataset: Dataset, survey: Survey, cloud: Cloud
         _trajectories(axes[0], survey)
         _errors(axes[1], survey, numbers)
         _depth_error(axes[2], dataset, survey, numbers)
-        axes[3].scatter(*points[::stride, :2].T, c=points[::stride, 2], s=0.4, cmap="viridis", linewidths=0, rasterized=True)
-        axes[3].set(xlim=around[0] + np.array([-reach, reach]), ylim=around[1] + np.array([-reach, reach]), aspect="equal")
-        axes[3].set(title=f"fused cloud from above: {len(cloud.points):,} points", xlabel="x, m", ylabel="y, m")
+        axes[3].scatter(
+            *points[::stride, :2].T,
+            c=points[::stride, 2],
+            s=0.4,
+            cmap="viridis",
+            linewidths=0,
+            rasterized=True,
+        )
+        axes[3].set(
+            xlim=around[0] + np.array([-reach, reach]),
+            ylim=around[1] + np.array([-reach, reach]),
+            aspect="equal",
+        )
+        axes[3].set(
+            title=f"fused cloud from above: {len(cloud.points):,} points",
+            xlabel="x, m",
+            ylabel="y, m",
+        )
         save_figure(figure, path)
 
 
@@ -43,7 +62,9 @@ def _trajectories(axis, survey: Survey) -> None:
     """The true flight and its estimates from above, and the frames that closed loops."""
     axis.plot(*survey.truth[:, :2, 3].T, color="0.6", lw=5, label="truth", solid_capstyle="round")
     for name, colour in COLOURS.items():
-        axis.plot(*getattr(survey, name)[:, :2, 3].T, ".-", color=colour, lw=1.2, ms=4, label=STAGES[name])
+        axis.plot(
+            *getattr(survey, name)[:, :2, 3].T, ".-", color=colour, lw=1.2, ms=4, label=STAGES[name]
+        )
     for k, loop in enumerate(survey.loops):
         ends = survey.optimised[[loop.i, loop.j], :2, 3]
         axis.plot(*ends.T, color="k", lw=1.5, label="loop closures" if k == 0 else None)

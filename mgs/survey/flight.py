@@ -1,7 +1,8 @@
 """The survey: a flight along the dataset's orbit with a noisy depth camera and drifting odometry.
 
-The measured depth images are registered to each other, which gives a consistent trajectory. The pose of the first frame is
-taken as known; all other poses are estimated. Poses are [4,4] camera-to-world, metres.
+The measured depth images are registered to each other, which gives a consistent trajectory. The
+pose of the first frame is taken as known; all other poses are estimated. Poses are [4,4]
+camera-to-world, metres.
 """
 
 from __future__ import annotations
@@ -18,24 +19,33 @@ from mgs.seeds import generator
 from mgs.survey.depth_sensor import SIGMA_FROM_MAD, noisy_depth
 from mgs.survey.fusion import focus
 from mgs.survey.odometry import agrees, chain, drifting_odometry
-from mgs.survey.registration import CLOSURE_OVERLAP, GRID, Edge, loop_candidates, optimise, register, registration_cloud
+from mgs.survey.registration import (
+    CLOSURE_OVERLAP,
+    GRID,
+    Edge,
+    loop_candidates,
+    optimise,
+    register,
+    registration_cloud,
+)
 
 STAGES = {
     "odometry": "odometry alone",
     "registered": "registered, before loop closure",
     "optimised": "after loop closure",
 }
-"""The three estimates of the trajectory that a `Survey` holds, in the order in which they are made: field -> what to call
-it."""
+"""The three estimates of the trajectory that a `Survey` holds, in the order in which they are made:
+field -> what to call it."""
 
 
 @dataclass(frozen=True)
 class SurveySettings:
     """What a survey is flown with.
 
-    sensor: factor on the noise of the depth camera, 0 measures exact depth; drift: factor on the errors of odometry;
-    exact_poses: no odometry and no registration, the poses are those flown; seed: root of every random draw.
-    Raises InputError if a factor is negative or not finite.
+    sensor: factor on the noise of the depth camera, 0 measures exact depth; drift: factor on the
+    errors of odometry;
+    exact_poses: no odometry and no registration, the poses are those flown; seed: root of every
+    random draw. Raises InputError if a factor is negative or not finite.
     """
 
     sensor: float = 1.0
@@ -45,16 +55,20 @@ class SurveySettings:
 
     def __post_init__(self) -> None:
         if not (0 <= self.sensor < np.inf and 0 <= self.drift < np.inf):
-            raise InputError("survey: --sensor-noise and --drift are factors of 0 or more; correct them")
+            raise InputError(
+                "survey: --sensor-noise and --drift are factors of 0 or more; correct them"
+            )
 
 
 @dataclass(frozen=True)
 class Survey:
     """What a flight of F frames gave.
 
-    truth: [F,4,4] poses as flown. odometry, registered, optimised: [F,4,4] poses as estimated, by the STAGES.
+    truth: [F,4,4] poses as flown. odometry, registered, optimised: [F,4,4] poses as estimated, by
+    the STAGES.
     depths: F depth images [H,W] as measured, metres, 0 = no return.
-    edges: the F - 1 registrations of consecutive frames. loops: the loop closures that were accepted.
+    edges: the F - 1 registrations of consecutive frames. loops: the loop closures that were
+    accepted.
     """
 
     truth: np.ndarray
@@ -66,20 +80,33 @@ class Survey:
     loops: list[Edge]
 
 
-def fly(dataset: Dataset, settings: SurveySettings, on_stage: Callable[[str, int, int], None] | None = None) -> Survey:
-    """Survey a dataset that has depth images. on_stage(name, done, total) is called as the work goes on.
+def fly(
+    dataset: Dataset,
+    settings: SurveySettings,
+    on_stage: Callable[[str, int, int], None] | None = None,
+) -> Survey:
+    """Survey a dataset that has depth images. on_stage(name, done, total) is called as the work
+    goes on.
 
-    Raises InputError if there are fewer than three frames, one has no depth image or too few returns to be registered.
+    Raises InputError if there are fewer than three frames, one has no depth image or too few
+    returns to be registered.
     """
     tell = on_stage or (lambda stage, done, total: None)
     frames = dataset.frames
     if len(frames) < 3:
-        raise InputError(f"{dataset.root}: {len(frames)} frames are too few for a survey; at least 3 are needed")
+        raise InputError(
+            f"{dataset.root}: {len(frames)} frames are too few for a survey; at least 3 are needed"
+        )
     depths = []
     for k, frame in enumerate(frames):
         tell("depth", k, len(frames))
         depths.append(
-            noisy_depth(frame.depth(), frame.camera, generator(settings.seed, f"survey/{frame.name}"), settings.sensor)
+            noisy_depth(
+                frame.depth(),
+                frame.camera,
+                generator(settings.seed, f"survey/{frame.name}"),
+                settings.sensor,
+            )
         )
     truth = np.stack([frame.camera.camera_to_world for frame in frames])
     if settings.exact_poses:
@@ -87,7 +114,9 @@ def fly(dataset: Dataset, settings: SurveySettings, on_stage: Callable[[str, int
     steps = drifting_odometry(truth, settings.drift, generator(settings.seed, "survey/odometry"))
     odometry = chain(truth[0], steps)
     grid = GRID * focus(frames).distance
-    clouds = [registration_cloud(frame, depth, grid) for frame, depth in zip(frames, depths, strict=True)]
+    clouds = [
+        registration_cloud(frame, depth, grid) for frame, depth in zip(frames, depths, strict=True)
+    ]
     edges = []
     for k in range(len(frames) - 1):
         tell("registration", k, len(frames) - 1)
@@ -100,7 +129,9 @@ def fly(dataset: Dataset, settings: SurveySettings, on_stage: Callable[[str, int
     candidates = loop_candidates(registered)
     for k, (i, j) in enumerate(candidates):
         tell("loop closure", k, len(candidates))
-        edge = register(clouds, i, j, np.linalg.inv(registered[i]) @ registered[j], grid, (4.0, 2.0, 1.0))
+        edge = register(
+            clouds, i, j, np.linalg.inv(registered[i]) @ registered[j], grid, (4.0, 2.0, 1.0)
+        )
         if edge.overlap >= CLOSURE_OVERLAP:
             loops.append(edge)
     optimised = optimise(registered, steps, edges, loops, settings.drift, grid)
@@ -108,10 +139,12 @@ def fly(dataset: Dataset, settings: SurveySettings, on_stage: Callable[[str, int
 
 
 def trajectory_error(poses: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    """Absolute trajectory error (Sturm et al. 2012) of poses [F,4,4] against the true ones [F,4,4], which share the first pose.
+    """Absolute trajectory error (Sturm et al. 2012) of poses [F,4,4] against the true ones [F,4,4],
+    which share the first pose.
 
-    ate_rms, ate_max: root mean square and largest distance of the positions, metres; rotation_rms: root mean square angle,
-    degrees; aligned_rms: as ate_rms, after the rigid motion that brings the two trajectories closest (Umeyama 1991).
+    ate_rms, ate_max: root mean square and largest distance of the positions, metres; rotation_rms:
+    root mean square angle, degrees; aligned_rms: as ate_rms, after the rigid motion that brings the
+    two trajectories closest (Umeyama 1991).
     """
     offset = np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1)
     turn = np.einsum("fki,fkj->fij", poses[:, :3, :3], truth[:, :3, :3])
@@ -131,10 +164,11 @@ def trajectory_error(poses: np.ndarray, truth: np.ndarray) -> dict[str, float]:
 def survey_numbers(dataset: Dataset, survey: Survey, settings: SurveySettings) -> dict[str, Any]:
     """What survey.json holds of a survey of this dataset, lengths in metres.
 
-    path_length: way flown; depth_error_on_rock: robust standard deviation of the measured depth's error within the rock's
-    masks; returns_lost: share of the pixels with true depth that have no measured one; steps_by_odometry: number of steps where
-    registration failed; registration_overlap: of every step; loops: [i, j, overlap] each; error: `trajectory_error` of each of
-    the STAGES.
+    path_length: way flown; depth_error_on_rock: robust standard deviation of the measured depth's
+    error within the rock's masks; returns_lost: share of the pixels with true depth that have no
+    measured one; steps_by_odometry: number of steps where registration failed;
+    registration_overlap: of every step; loops: [i, j, overlap] each; error: `trajectory_error` of
+    each of the STAGES.
     """
     error = [
         (measured - frame.depth())[(measured > 0) & frame.mask()]

@@ -1,4 +1,5 @@
-"""The folder that a survey is written to: itself a dataset, with estimated poses and measured depth."""
+"""The folder that a survey is written to: itself a dataset, with estimated poses and measured
+depth."""
 
 from __future__ import annotations
 
@@ -17,11 +18,13 @@ from mgs.survey.flight import Survey, SurveySettings, survey_numbers
 from mgs.survey.fusion import fuse_frames
 
 
-def save_survey(out: Path, dataset: Dataset, survey: Survey, settings: SurveySettings) -> dict[str, Any]:
+def save_survey(
+    out: Path, dataset: Dataset, survey: Survey, settings: SurveySettings
+) -> dict[str, Any]:
     """Write everything that a survey gave into the folder `out`, and return what survey.json holds.
 
-    That is the dataset of `write_survey`, its fused cloud cloud.ply, the numbers survey.json and the picture survey.png.
-    Raises InputError as `fuse_frames`, and if a file cannot be written.
+    That is the dataset of `write_survey`, its fused cloud cloud.ply, the numbers survey.json and
+    the picture survey.png. Raises InputError as `fuse_frames`, and if a file cannot be written.
     """
     numbers = survey_numbers(dataset, survey, settings)
     cloud = fuse_frames(write_survey(out, dataset, survey).frames)
@@ -35,9 +38,10 @@ def save_survey(out: Path, dataset: Dataset, survey: Survey, settings: SurveySet
 def write_survey(out: Path, dataset: Dataset, survey: Survey) -> Dataset:
     """Write a survey of a dataset as another dataset, into the folder `out`, and load it.
 
-    It has the images (the rock's too) and masks of the dataset surveyed, the depth images that were measured, the poses
-    that were estimated, and the true rock (rock.glb) if there is one. Where the dataset surveyed is on demand, as the survey
-    of an on-demand dataset is, no image is copied. Raises InputError if a file cannot be read or written.
+    It has the images (the rock's too) and masks of the dataset surveyed, the depth images that were
+    measured, the poses that were estimated, and the true rock (rock.glb) if there is one. Where the
+    dataset surveyed is on demand, as the survey of an on-demand dataset is, no image is copied.
+    Raises InputError if a file cannot be read or written.
     """
     frames = []
     for frame, pose, depth in zip(dataset.frames, survey.optimised, survey.depths, strict=True):
@@ -54,7 +58,11 @@ def write_survey(out: Path, dataset: Dataset, survey: Survey) -> Dataset:
         if rock and frame.rock_path:
             copy_file(frame.rock_path, rock)
         write_exr(measured, {"Z": depth})
-        frames.append(Frame(frame.name, estimated, frame.timestamp, image, measured, mask, rock, frame.on_demand))
+        frames.append(
+            Frame(
+                frame.name, estimated, frame.timestamp, image, measured, mask, rock, frame.on_demand
+            )
+        )
     truth = dataset.root / "rock.glb"
     if truth.is_file():
         copy_file(truth, out / "rock.glb")

@@ -1,7 +1,8 @@
 """Registration: from depth images, how the cameras of a flight stand to each other.
 
-Three steps: the point clouds of two frames are laid over each other (GICP), frames that see the same place again are found
-(loop closure), and all these relative poses together are reconciled (pose graph). Poses are [4,4] camera-to-world, metres.
+Three steps: the point clouds of two frames are laid over each other (GICP), frames that see the
+same place again are found (loop closure), and all these relative poses together are reconciled
+(pose graph). Poses are [4,4] camera-to-world, metres.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from mgs.survey.fusion import usable_depth
 from mgs.survey.odometry import step_deviation
 
 GRID = 0.007
-"""Edge of a cell of the grid on which the points of a frame are averaged, over the distance of the cameras from what they look
+"""Edge of a cell of the grid on which the points of a frame are averaged, over the distance of the
+cameras from what they look
 at: 3 cm at 4 m."""
 
 MATCH = 4.0
@@ -30,21 +32,23 @@ NEIGHBOURS = 40
 """Number of neighbours from which the covariance of each point is computed."""
 
 EDGE = 5
-"""Pixels are left out whose neighbourhood of EDGE x EDGE pixels spans two surfaces (`mgs.survey.fusion.usable_depth`). On
-silhouettes the sensor reports points that lie on neither of them ("flying pixels"). These move with the camera instead of
-standing still in the world, so they pull every measured motion towards zero: with them, the error of a step was twenty times
-larger."""
+"""Pixels are left out whose neighbourhood of EDGE x EDGE pixels spans two surfaces
+(`mgs.survey.fusion.usable_depth`). On silhouettes the sensor reports points that lie on neither of
+them ("flying pixels"). These move with the camera instead of
+standing still in the world, so they pull every measured motion towards zero: with them, the error
+of a step was twenty times larger."""
 
 RANGE = 1.6
-"""Depths are left out that are larger than this many times the lower quartile of the frame's depths: with the depth, the noise
-and the steps of the sensor grow."""
+"""Depths are left out that are larger than this many times the lower quartile of the frame's
+depths: with the depth, the noise and the steps of the sensor grow."""
 
 CLOSURE_GAP = 5
-"""Frames that are fewer than this many steps apart in the flight are neighbours, and do not close a loop."""
+"""Frames that are fewer than this many steps apart in the flight are neighbours, and do not close a
+loop."""
 
 CLOSURE_RANGE = 1.5
-"""Two frames may close a loop if their estimated positions are nearer to each other than this many median steps, plus
-CLOSURE_DRIFT times the way flown between them."""
+"""Two frames may close a loop if their estimated positions are nearer to each other than this many
+median steps, plus CLOSURE_DRIFT times the way flown between them."""
 
 CLOSURE_DRIFT = 0.02
 """Drift that registered poses may have, over the way flown."""
@@ -57,8 +61,9 @@ CLOSURE_OVERLAP = 0.5
 class Edge:
     """A measured relative pose, an edge of the pose graph.
 
-    i, j: numbers of the two frames; relative: [4,4] pose of camera j in the axes of camera i, metres; overlap: share of the
-    points of frame j that have a match in frame i; registered: False if the registration failed and `relative` is odometry's.
+    i, j: numbers of the two frames; relative: [4,4] pose of camera j in the axes of camera i,
+    metres; overlap: share of the points of frame j that have a match in frame i; registered: False
+    if the registration failed and `relative` is odometry's.
     """
 
     i: int
@@ -69,10 +74,11 @@ class Edge:
 
 
 def registration_cloud(frame: Frame, depth: np.ndarray, grid: float) -> tuple[Any, Any]:
-    """The points of a frame's depth image [H,W] in the axes of its camera, filtered and averaged on a grid of `grid` metres.
+    """The points of a frame's depth image [H,W] in the axes of its camera, filtered and averaged on
+    a grid of `grid` metres.
 
-    Returns them as small_gicp wants them: a cloud with covariances, and a search tree. Raises InputError if fewer than a
-    hundred pixels are left.
+    Returns them as small_gicp wants them: a cloud with covariances, and a search tree. Raises
+    InputError if fewer than a hundred pixels are left.
     """
     import small_gicp
 
@@ -82,22 +88,35 @@ def registration_cloud(frame: Frame, depth: np.ndarray, grid: float) -> tuple[An
     own = Camera(frame.camera.K, frame.camera.width, frame.camera.height, np.eye(4))
     points = own.unproject(z)[z > 0]
     if len(points) < 100:
-        raise InputError(f"survey: frame {frame.name} has only {len(points)} depth returns; it cannot be registered")
-    return small_gicp.preprocess_points(points, downsampling_resolution=grid, num_neighbors=NEIGHBOURS, num_threads=1)
+        raise InputError(
+            f"survey: frame {frame.name} has only {len(points)} depth returns; it cannot be registered"
+        )
+    return small_gicp.preprocess_points(
+        points, downsampling_resolution=grid, num_neighbors=NEIGHBOURS, num_threads=1
+    )
 
 
-def register(clouds: list, i: int, j: int, guess: np.ndarray, grid: float, reaches: tuple[float, ...]) -> Edge:
-    """Lay frame j over frame i by GICP (Segal et al. 2009, small_gicp), starting from the relative pose `guess` [4,4].
+def register(
+    clouds: list, i: int, j: int, guess: np.ndarray, grid: float, reaches: tuple[float, ...]
+) -> Edge:
+    """Lay frame j over frame i by GICP (Segal et al. 2009, small_gicp), starting from the relative
+    pose `guess` [4,4].
 
-    clouds: of all frames, by `registration_cloud`. reaches: factors on the distance of matches, MATCH; the registration runs
-    once for each, from the result of the one before.
+    clouds: of all frames, by `registration_cloud`. reaches: factors on the distance of matches,
+    MATCH; the registration runs once for each, from the result of the one before.
     """
     import small_gicp
 
     (target, tree), (source, _) = clouds[i], clouds[j]
     for reach in reaches:
         result = small_gicp.align(
-            target, source, tree, guess, max_correspondence_distance=reach * MATCH * grid, num_threads=1, max_iterations=60
+            target,
+            source,
+            tree,
+            guess,
+            max_correspondence_distance=reach * MATCH * grid,
+            num_threads=1,
+            max_iterations=60,
         )
         guess = result.T_target_source
     moved = source.points()[:, :3] @ guess[:3, :3].T + guess[:3, 3]
@@ -108,8 +127,8 @@ def register(clouds: list, i: int, j: int, guess: np.ndarray, grid: float, reach
 def loop_candidates(poses: np.ndarray) -> list[tuple[int, int]]:
     """Pairs of frames that may see the same place again.
 
-    They are no neighbours in the flight, and by their estimated poses [F,4,4] close together and within 30 degrees of looking
-    the same way.
+    They are no neighbours in the flight, and by their estimated poses [F,4,4] close together and
+    within 30 degrees of looking the same way.
     """
     position, axis = poses[:, :3, 3], poses[:, :3, 2]
     step = float(np.median(np.linalg.norm(np.diff(position, axis=0), axis=1)))
@@ -121,15 +140,22 @@ def loop_candidates(poses: np.ndarray) -> list[tuple[int, int]]:
 
 
 def optimise(
-    initial: np.ndarray, odometry: np.ndarray, edges: list[Edge], loops: list[Edge], drift: float, grid: float
+    initial: np.ndarray,
+    odometry: np.ndarray,
+    edges: list[Edge],
+    loops: list[Edge],
+    drift: float,
+    grid: float,
 ) -> np.ndarray:
-    """Reconcile all relative poses by pose graph optimisation (gtsam, Levenberg-Marquardt); the first pose stays where it is.
+    """Reconcile all relative poses by pose graph optimisation (gtsam, Levenberg-Marquardt); the
+    first pose stays where it is.
 
-    initial: poses [F,4,4] to start from, returned as they are if there are no loops. odometry: steps [F-1,4,4], with the
-    standard deviations of `step_deviation` for the factor `drift`. edges, loops: registrations of consecutive frames and
-    accepted loops; their standard deviations are a fifth of a grid cell (`grid`, metres), and the angle that moves a point 50
-    cells away by as much (measured: 6 mm and 0.08 degrees with cells of 30 mm). Loops have a Huber loss, so that a wrong one
-    has little weight. Returns poses [F,4,4].
+    initial: poses [F,4,4] to start from, returned as they are if there are no loops. odometry:
+    steps [F-1,4,4], with the standard deviations of `step_deviation` for the factor `drift`. edges,
+    loops: registrations of consecutive frames and accepted loops; their standard deviations are a
+    fifth of a grid cell (`grid`, metres), and the angle that moves a point 50
+    cells away by as much (measured: 6 mm and 0.08 degrees with cells of 30 mm). Loops have a Huber
+    loss, so that a wrong one has little weight. Returns poses [F,4,4].
     """
     import gtsam
 
@@ -139,7 +165,9 @@ def optimise(
     fine = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([0.2 / 50, 0.2 * grid], 3))
     robust = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(1.345), fine)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(initial[0]), gtsam.noiseModel.Constrained.All(6)))
+    graph.add(
+        gtsam.PriorFactorPose3(0, gtsam.Pose3(initial[0]), gtsam.noiseModel.Constrained.All(6))
+    )
     for k, pose in enumerate(initial):
         values.insert(k, gtsam.Pose3(pose))
     for k, step in enumerate(odometry):

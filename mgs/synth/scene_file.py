@@ -1,4 +1,5 @@
-"""Scene files: one readable TOML per scene, validated. Lengths in metres, angles in degrees, colours linear RGB."""
+"""Scene files: one readable TOML per scene, validated. Lengths in metres, angles in degrees,
+colours linear RGB."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ class _Strict(BaseModel):
 
 
 class Lobe(_Strict):
-    """One ellipsoid of the rock's body, before it is cut and weathered, in any unit: the whole rock is scaled to its size."""
+    """One ellipsoid of the rock's body, before it is cut and weathered, in any unit: the whole rock
+    is scaled to its size."""
 
     centre: tuple[float, float, float] = (0, 0, 0)
     radii: tuple[Positive, Positive, Positive] = (1, 1, 1)
@@ -59,7 +61,8 @@ class Rock(_Strict):
     dust: Colour = (0.42, 0.30, 0.20)
     """Dust on faces that look up."""
     specular: Fraction = 0.3
-    """Strength of the mirror-like reflection on top of the colour (Mitsuba's `principled`): 0 for none, 0.5 as of glass."""
+    """Strength of the mirror-like reflection on top of the colour (Mitsuba's `principled`): 0 for
+    none, 0.5 as of glass."""
     roughness: Annotated[float, Field(gt=0, le=1)] = 0.8
     """How far that reflection spreads: the smaller, the sharper the highlights."""
     detail: Positive = 0.011
@@ -105,7 +108,8 @@ class Orbit(_Strict):
 
     kind: OrbitKind = "circle"
     radius: Positive = 4.0
-    """Horizontal distance from the rock's axis (circle), or distance from its middle (the others)."""
+    """Horizontal distance from the rock's axis (circle), or distance from its middle (the
+    others)."""
     altitude: Annotated[float, Field(ge=0)] = 2.3
     """Height above the ground (circle)."""
     elevations: tuple[Elevation, Elevation] = (12, 65)
@@ -113,8 +117,8 @@ class Orbit(_Strict):
     turns: Positive = 3
     """Turns of the spiral, or number of rings."""
     distances: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1,)
-    """How far from the rock's middle the frames are in turn, as multiples of what they would be: (1, 2, 3) mixes near and far
-    views."""
+    """How far from the rock's middle the frames are in turn, as multiples of what they would be:
+    (1, 2, 3) mixes near and far views."""
 
 
 class Sensor(_Strict):
@@ -141,7 +145,8 @@ class SceneFile(_Strict):
 def load_scene_file(scene: str | Path) -> SceneFile:
     """Read a scene by its name (`boulder`) or path (`my.toml`).
 
-    Raises InputError where it does not exist, is not TOML, or has an unknown key or a value out of range.
+    Raises InputError where it does not exist, is not TOML, or has an unknown key or a value out of
+    range.
     """
     path = scene_path(scene)
     try:
@@ -152,22 +157,30 @@ def load_scene_file(scene: str | Path) -> SceneFile:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise InputError(f"{path}: unknown key {key!r}; choose one of {', '.join(_keys_beside(first['loc']))}") from None
-        raise InputError(f"{path}: {key}: {first['msg']} (is {first['input']!r}); correct it") from None
+            raise InputError(
+                f"{path}: unknown key {key!r}; choose one of {', '.join(_keys_beside(first['loc']))}"
+            ) from None
+        raise InputError(
+            f"{path}: {key}: {first['msg']} (is {first['input']!r}); correct it"
+        ) from None
 
 
 def _keys_beside(where: tuple[int | str, ...]) -> list[str]:
-    """The keys that may stand in a scene file beside the key at `where`, a path such as ("rock", "lobes", 0, "radius")."""
+    """The keys that may stand in a scene file beside the key at `where`, a path such as ("rock",
+    "lobes", 0, "radius")."""
     section: Any = SceneFile
     for part in where[:-1]:
-        if isinstance(part, str):  # a number is an index into a list, whose entries are all of one kind
+        if isinstance(
+            part, str
+        ):  # a number is an index into a list, whose entries are all of one kind
             kind = section.model_fields[part].annotation
             section = next(iter(get_args(kind)), kind)
     return list(section.model_fields)
 
 
 def sensor_of(dataset: Path) -> Sensor:
-    """The sensor settings of the scene that a dataset was rendered from; the default where it has no config.json.
+    """The sensor settings of the scene that a dataset was rendered from; the default where it has
+    no config.json.
 
     Raises InputError where config.json is damaged.
     """
@@ -176,4 +189,6 @@ def sensor_of(dataset: Path) -> Sensor:
     try:
         return Sensor.model_validate(recorded.get("scene", {}).get("sensor", {}))
     except (ValidationError, AttributeError):
-        raise InputError(f"{path}: its scene.sensor is damaged; correct it or give --sensor-noise and --drift") from None
+        raise InputError(
+            f"{path}: its scene.sensor is damaged; correct it or give --sensor-noise and --drift"
+        ) from None

@@ -1,7 +1,8 @@
 """The layers of the viewer, as colours of Gaussians and as images of the kernel.
 
-A browser draws Gaussians in sRGB, sorted as a whole and without spherical harmonics, so what it shows while the camera moves is
-an approximation. The kernel's images are the model as `mgs.render` draws it.
+A browser draws Gaussians in sRGB, sorted as a whole and without spherical harmonics, so what it
+shows while the camera moves is an approximation. The kernel's images are the model as `mgs.render`
+draws it.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from mgs.rotation import rotmat_from_quat
 from mgs.view.subject import SCALARS, Subject
 
 FAR = 160.0
-"""Depth of pixels that show no model, metres: what the browser draws over such a pixel is nearer. viser's images of depth end
-at 167 m."""
+"""Depth of pixels that show no model, metres: what the browser draws over such a pixel is nearer.
+viser's images of depth end at 167 m."""
 
 
 def layers(subject: Subject) -> list[str]:
@@ -33,8 +34,8 @@ def covariances(subject: Subject) -> np.ndarray:
 
 
 def gaussian_colours(subject: Subject, layer: str) -> np.ndarray:
-    """Colours of the Gaussians in a layer, sRGB uint8 [N,3]. Of alpha all are white; of depth, which is no property of a
-    Gaussian, all are grey."""
+    """Colours of the Gaussians in a layer, sRGB uint8 [N,3]. Of alpha all are white; of depth,
+    which is no property of a Gaussian, all are grey."""
     g = subject.gaussians
     assert g is not None
     if layer == "colour":
@@ -44,11 +45,15 @@ def gaussian_colours(subject: Subject, layer: str) -> np.ndarray:
     return np.full((len(g), 3), 255 if layer == "alpha" else 128, np.uint8)
 
 
-def kernel_image(subject: Subject, camera: Camera, layer: str) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-    """(sRGB uint8 [H,W,3], z-depth float32 [H,W], (low, high) of the colour scale) of a layer seen from a camera. Lengths are
-    those that are shown, but in the colour scale those of the world (`Subject.scale`).
+def kernel_image(
+    subject: Subject, camera: Camera, layer: str
+) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
+    """(sRGB uint8 [H,W,3], z-depth float32 [H,W], (low, high) of the colour scale) of a layer seen
+    from a camera. Lengths are those that are shown, but in the colour scale those of the world
+    (`Subject.scale`).
 
-    Behind the model it is black, and FAR away. Layers but colour and alpha are drawn where the opacity is at least VISIBLE.
+    Behind the model it is black, and FAR away. Layers but colour and alpha are drawn where the
+    opacity is at least VISIBLE.
     """
     g = subject.gaussians
     assert g is not None
@@ -73,8 +78,8 @@ def kernel_image(subject: Subject, camera: Camera, layer: str) -> tuple[np.ndarr
 
 
 def scale(subject: Subject, layer: str) -> tuple[float, float]:
-    """The values at the ends of the colour scale of a scalar: for the information from 0 to what 0.1 % of the Gaussians exceed,
-    so the same from everywhere; for the others from 0 to 1."""
+    """The values at the ends of the colour scale of a scalar: for the information from 0 to what
+    0.1 % of the Gaussians exceed, so the same from everywhere; for the others from 0 to 1."""
     if layer != "information":
         return 0.0, 1.0
     return 0.0, max(float(np.quantile(subject.scalars[layer], 0.999)), 1e-9)
@@ -94,7 +99,8 @@ def legend(layer: str, ends: tuple[float, float], unit: str) -> str:
 
 
 def painted(values: np.ndarray, low: float, high: float, colours: str) -> np.ndarray:
-    """Values of any shape -> sRGB uint8 of that shape and 3, by matplotlib's colour map of this name, clipped at its ends."""
+    """Values of any shape -> sRGB uint8 of that shape and 3, by matplotlib's colour map of this
+    name, clipped at its ends."""
     import matplotlib
 
     share = np.clip((np.asarray(values, np.float64) - low) / max(high - low, 1e-12), 0, 1)

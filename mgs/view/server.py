@@ -1,7 +1,9 @@
-"""The viewer: a local web server (viser) that shows a subject, and draws the kernel's own image where a camera rests.
+"""The viewer: a local web server (viser) that shows a subject, and draws the kernel's own image
+where a camera rests.
 
-viser calls back from threads of its own. These only note what is wanted; everything is computed in `Viewer.tick`, which the
-thread that made the viewer calls again and again, because Mitsuba's variant belongs to a thread.
+viser calls back from threads of its own. These only note what is wanted; everything is computed in
+`Viewer.tick`, which the thread that made the viewer calls again and again, because Mitsuba's
+variant belongs to a thread.
 """
 
 from __future__ import annotations
@@ -53,9 +55,12 @@ BLACK = np.zeros((2, 2, 3), np.uint8)
 
 
 def check_address(host: str, port: int) -> None:
-    """Raises InputError if no server can listen there: the port is taken or not allowed, or the host is not this machine."""
+    """Raises InputError if no server can listen there: the port is taken or not allowed, or the
+    host is not this machine."""
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM
+        )[0]
         with socket.socket(family, kind, protocol) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
@@ -68,7 +73,8 @@ def check_address(host: str, port: int) -> None:
 
 @dataclass
 class _Client:
-    """A browser window: its handle, its own copy of the Gaussians, when its camera last moved, and what was drawn for it."""
+    """A browser window: its handle, its own copy of the Gaussians, when its camera last moved, and
+    what was drawn for it."""
 
     handle: Any
     splats: Any
@@ -81,22 +87,28 @@ class _Client:
 class Viewer:
     """Serves a run folder or a PLY, until `close`. `tick` has to be called again and again.
 
-    follow: look every FOLLOW seconds for a new step of the run. Raises InputError as `read_subject` and `check_address`, and if
-    viser is not installed.
+    follow: look every FOLLOW seconds for a new step of the run. Raises InputError as `read_subject`
+    and `check_address`, and if viser is not installed.
     """
 
-    def __init__(self, path: str | Path, host: str = "127.0.0.1", port: int = 8080, follow: bool = False) -> None:
+    def __init__(
+        self, path: str | Path, host: str = "127.0.0.1", port: int = 8080, follow: bool = False
+    ) -> None:
         self.path, self.follow = Path(path), follow
         self.stamp = self._stamp()
         self.subject = read_subject(path, follow)
         try:
             import viser
         except ImportError:
-            raise InputError("mgs view: needs viser, which is not installed; `pip install viser`") from None
+            raise InputError(
+                "mgs view: needs viser, which is not installed; `pip install viser`"
+            ) from None
         check_address(host, port)
         # A window may be closed while its image is drawn; viser then warns that nobody gets it.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-        with redirect_stdout(StringIO()):  # viser greets, and names every window; the command says what is needed
+        with redirect_stdout(
+            StringIO()
+        ):  # viser greets, and names every window; the command says what is needed
             self.server = viser.ViserServer(host, port, label="mgs", verbose=False)
         self.port = self.server.get_port()
         if port not in (0, self.port):  # taken since the check: viser then goes on to the next
@@ -157,11 +169,16 @@ class Viewer:
         if subject.mesh is not None:
             mesh = subject.mesh
             self.mesh = server.scene.add_mesh_simple(
-                "/mesh", mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), color=(150, 160, 175), visible=False
+                "/mesh",
+                mesh.vertices.astype(np.float32),
+                mesh.faces.astype(np.uint32),
+                color=(150, 160, 175),
+                visible=False,
             )
 
     def _extent(self) -> tuple[np.ndarray, float]:
-        """Middle of the subject, metres, and its size: the radius that holds 95 % of the Gaussians, or the mesh."""
+        """Middle of the subject, metres, and its size: the radius that holds 95 % of the Gaussians,
+        or the mesh."""
         subject = self.subject
         points = subject.gaussians.means if subject.gaussians is not None else None
         if points is None or len(points) == 0:
@@ -175,10 +192,14 @@ class Viewer:
         gui = self.server.gui
         self.title = gui.add_markdown("")
         self.layer: Any = gui.add_dropdown(
-            "Layer", layers.layers(self.subject), hint="What is drawn: by the kernel, and by the browser"
+            "Layer",
+            layers.layers(self.subject),
+            hint="What is drawn: by the kernel, and by the browser",
         )
         self.legend = gui.add_markdown("")
-        self.exact = gui.add_checkbox("Exact at rest", True, hint="The kernel's own image while the camera rests")
+        self.exact = gui.add_checkbox(
+            "Exact at rest", True, hint="The kernel's own image while the camera rests"
+        )
         self.gaussians = gui.add_checkbox("Gaussians", True)
         for control in (self.layer, self.exact, self.gaussians):
             control.on_update(lambda _: self._again())
@@ -188,9 +209,13 @@ class Viewer:
         if not self.subject.views:
             return
         self.group = self.server.scene.add_frame("/cameras", show_axes=False)
-        self.cameras = gui.add_checkbox("Cameras", True, hint="Orange: seeds; green: chosen; grey: candidates")
+        self.cameras = gui.add_checkbox(
+            "Cameras", True, hint="Orange: seeds; green: chosen; grey: candidates"
+        )
         self.cameras.on_update(lambda _: setattr(self.group, "visible", self.cameras.value))
-        self.view: Any = gui.add_dropdown("View", [view.frame.name for view in self.subject.views], hint="Or click a camera")
+        self.view: Any = gui.add_dropdown(
+            "View", [view.frame.name for view in self.subject.views], hint="Or click a camera"
+        )
         self.view.on_update(lambda _: self.select(self.view.value))
         look = gui.add_button("Look from there")
         look.on_click(lambda event: self._look(event.client))
@@ -228,7 +253,11 @@ class Viewer:
         if len(way) > 1:
             segments = np.stack([way[:-1], way[1:]], axis=1).astype(np.float32)
             scene.add_line_segments(
-                "/cameras/way", segments, colors=COLOURS["chosen"], thickness=LINE, thickness_units="screen"
+                "/cameras/way",
+                segments,
+                colors=COLOURS["chosen"],
+                thickness=LINE,
+                thickness_units="screen",
             )
 
     def _show_camera(self, view: View, size: float) -> None:
@@ -256,14 +285,17 @@ class Viewer:
             self.view.value = name  # which selects it
 
     def select(self, name: str) -> None:
-        """Show the image of a view and what is known about it; where the image cannot be read, why."""
+        """Show the image of a view and what is known about it; where the image cannot be read,
+        why."""
         by_name = {view.frame.name: view for view in self.subject.views}
         if self.selected in self.frusta:
             self.frusta[self.selected].color = COLOURS[by_name[self.selected].role]
         self.selected, view = name, by_name[name]
         self.frusta[name].color = SELECTED
         role = f"chosen at step {view.step}" if view.role == "chosen" else view.role
-        self.facts.content = "\n".join([f"**{name}**: {role}", "", *(f"- {key}: {value}" for key, value in view.facts)])
+        self.facts.content = "\n".join(
+            [f"**{name}**: {role}", "", *(f"- {key}: {value}" for key, value in view.facts)]
+        )
         try:
             image = np.round(srgb_from_linear(view.frame.rgb()) * 255).astype(np.uint8)
         except InputError as error:
@@ -288,7 +320,9 @@ class Viewer:
         with handle.atomic():
             handle.camera.wxyz = SO3.from_matrix(pose[:3, :3]).wxyz
             handle.camera.position = pose[:3, 3]
-            handle.camera.look_at = pose[:3, 3] + pose[:3, 2] * float(np.linalg.norm(centre - pose[:3, 3]))
+            handle.camera.look_at = pose[:3, 3] + pose[:3, 2] * float(
+                np.linalg.norm(centre - pose[:3, 3])
+            )
             handle.camera.fov = _vertical_fov(camera)
 
     def _connected(self, handle: Any) -> None:
@@ -314,7 +348,8 @@ class Viewer:
             client.splats.visible = bool(self.gaussians.value)
 
     def _draw(self, client: _Client) -> None:
-        """Draw the layer for a browser whose camera rests: its Gaussians, and the kernel's image in their place."""
+        """Draw the layer for a browser whose camera rests: its Gaussians, and the kernel's image in
+        their place."""
         asked, layer, subject = (client.moved, self.version), self.layer.value, self.subject
         g = subject.gaussians
         assert g is not None
@@ -334,16 +369,21 @@ class Viewer:
                 client.splats.visible, client.covered = False, True
                 client.handle.scene.set_background_image(image, format="png", depth=depth)
         else:
-            ends = layers.scale(subject, layer) if layer in subject.scalars else (math.nan, math.nan)
+            ends = (
+                layers.scale(subject, layer) if layer in subject.scalars else (math.nan, math.nan)
+            )
             self.legend.content = (
-                layers.legend(layer, ends, subject.unit) if layer != "depth" else "Depth is drawn by the kernel, at rest."
+                layers.legend(layer, ends, subject.unit)
+                if layer != "depth"
+                else "Depth is drawn by the kernel, at rest."
             )
             self._uncover(client)
         client.drawn = asked
 
 
 def window_camera(camera: Any) -> Camera | None:
-    """The camera of a browser window (viser's CameraHandle) as ours, with at most PIXELS; None where the window has no size."""
+    """The camera of a browser window (viser's CameraHandle) as ours, with at most PIXELS; None
+    where the window has no size."""
     width, height = camera.image_width, camera.image_height
     if width < 1 or height < 1:
         return None

@@ -1,4 +1,5 @@
-"""What the viewer shows, read from a run folder or from a PLY: Gaussians and their scalars, cameras, the mesh of the prior."""
+"""What the viewer shows, read from a run folder or from a PLY: Gaussians and their scalars,
+cameras, the mesh of the prior."""
 
 from __future__ import annotations
 
@@ -8,20 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from mgs.active import criteria, run_folder
-from mgs.active.policy_file import label
-from mgs.active.settings import NbvSettings
-from mgs.active.stopping import RunEnd
 from mgs.data.dataset import Frame, load_dataset
 from mgs.data.meshes import Mesh, read_mesh
 from mgs.data.up import PLUS_Z, Up
 from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.gaussians import Gaussians
+from mgs.policy import criteria
+from mgs.policy.from_file import label
 from mgs.report.diagnostics import gaussian_scalars
 from mgs.report.page_facts import cell, measured
 from mgs.report.page_plots import metric_name
 from mgs.report.runs import up_of
+from mgs.run import folder as run_folder
+from mgs.run.ending import RunEnd
+from mgs.run.settings import NbvSettings
 from mgs.splat_ply import ply_colour_space, read_ply
 
 SCALARS = ("information", "uncertainty", "unobserved")
@@ -29,14 +31,15 @@ SCALARS = ("information", "uncertainty", "unobserved")
 
 
 LARGEST = 40.0
-"""Largest distance of a camera, or of 95 % of the Gaussians, from the middle of what is shown. The unit of a world may be
-anything, but depth in a browser ends at about four times of this (`mgs.view.layers.FAR`)."""
+"""Largest distance of a camera, or of 95 % of the Gaussians, from the middle of what is shown. The
+unit of a world may be anything, but depth in a browser ends at about four times of this
+(`mgs.view.layers.FAR`)."""
 
 
 @dataclass(frozen=True)
 class View:
-    """A camera of the dataset. role: "seed", "chosen" or "candidate"; step: at which it was chosen, 0 for seeds, None for
-    candidates; facts: (name, value) of what is known about it."""
+    """A camera of the dataset. role: "seed", "chosen" or "candidate"; step: at which it was chosen,
+    0 for seeds, None for candidates; facts: (name, value) of what is known about it."""
 
     frame: Frame
     role: str
@@ -46,10 +49,11 @@ class View:
 
 @dataclass(frozen=True)
 class Subject:
-    """gaussians: the model; None where a run has no finished step yet. space: "linear" or "srgb", in which its colours are
-    blended. scalars: name -> [N], of SCALARS; none for a PLY. views: of the dataset, in its order; none for a PLY. up, unit:
-    of the world (`mgs.data.dataset.Dataset`); a PLY says nothing of either, and is taken to be +Z up. scale: all lengths over
-    those of the world."""
+    """gaussians: the model; None where a run has no finished step yet. space: "linear" or "srgb",
+    in which its colours are
+    blended. scalars: name -> [N], of SCALARS; none for a PLY. views: of the dataset, in its order;
+    none for a PLY. up, unit: of the world (`mgs.data.dataset.Dataset`); a PLY says nothing of
+    either, and is taken to be +Z up. scale: all lengths over those of the world."""
 
     title: str
     gaussians: Gaussians | None
@@ -64,14 +68,17 @@ class Subject:
     @property
     def taken(self) -> list[View]:
         """The seeds, then the chosen views in their order."""
-        return sorted((view for view in self.views if view.step is not None), key=lambda view: view.step or 0)
+        return sorted(
+            (view for view in self.views if view.step is not None), key=lambda view: view.step or 0
+        )
 
 
 def read_subject(path: str | Path, follow: bool = False) -> Subject:
-    """Read a run folder or a PLY of Gaussians. follow: a run without a finished step is shown without a model.
+    """Read a run folder or a PLY of Gaussians. follow: a run without a finished step is shown
+    without a model.
 
-    Raises InputError if there is neither, if a file is damaged or the dataset has changed, and, unless `follow`, if the run has
-    no finished step.
+    Raises InputError if there is neither, if a file is damaged or the dataset has changed, and,
+    unless `follow`, if the run has no finished step.
     """
     path = Path(path)
     if path.is_dir():
@@ -84,7 +91,8 @@ def read_subject(path: str | Path, follow: bool = False) -> Subject:
 
 
 def fitted(subject: Subject) -> Subject:
-    """The same, with all lengths multiplied such that nothing is farther than LARGEST from the middle."""
+    """The same, with all lengths multiplied such that nothing is farther than LARGEST from the
+    middle."""
     g, mesh = subject.gaussians, subject.mesh
     eyes = np.array([view.frame.camera.position for view in subject.views]).reshape(-1, 3)
     means = eyes[:0] if g is None else g.means
@@ -92,13 +100,22 @@ def fitted(subject: Subject) -> Subject:
         return subject
     centre = np.median(means if len(means) else eyes, axis=0)
     of_means, of_eyes = (np.linalg.norm(points - centre, axis=1) for points in (means, eyes))
-    size = max(float(np.quantile(of_means, 0.95)) if len(means) else 0.0, float(of_eyes.max(initial=0)))
+    size = max(
+        float(np.quantile(of_means, 0.95)) if len(means) else 0.0, float(of_eyes.max(initial=0))
+    )
     if size <= LARGEST:
         return subject
     scale = LARGEST / size
-    views = [replace(view, frame=replace(view.frame, camera=view.frame.camera.scaled(scale))) for view in subject.views]
+    views = [
+        replace(view, frame=replace(view.frame, camera=view.frame.camera.scaled(scale)))
+        for view in subject.views
+    ]
     if g is not None:
-        g = replace(g, means=g.means * np.float32(scale), log_scales=g.log_scales + np.float32(np.log(scale)))
+        g = replace(
+            g,
+            means=g.means * np.float32(scale),
+            log_scales=g.log_scales + np.float32(np.log(scale)),
+        )
     surface = None if mesh is None else replace(mesh, vertices=mesh.vertices * scale)
     return replace(subject, gaussians=g, views=views, mesh=surface, scale=scale)
 
@@ -115,12 +132,21 @@ def _read_run(run: Path, follow: bool) -> Subject:
     name, up = run.resolve().name, up_of(settings.prior, dataset)
     if state is None:
         waiting = [View(frame, "candidate", None, []) for frame in dataset.frames]
-        return Subject(f"{name}: no finished step yet", None, views=waiting, mesh=mesh, up=up, unit=dataset.unit)
+        return Subject(
+            f"{name}: no finished step yet",
+            None,
+            views=waiting,
+            mesh=mesh,
+            up=up,
+            unit=dataset.unit,
+        )
     views = _views(dataset.frames, state, _psnr(run, len(state.taken)))
     early = state.steps[-1].get("ended", {}).get("reason", RunEnd.BUDGET) != RunEnd.BUDGET
     planned = "" if early else f" of {settings.seeds + settings.budget}"
     title = f"{name}: {label(settings.policy)}, {len(state.taken)}{planned} views, {len(state.gaussians):,} Gaussians"
-    return Subject(title, state.gaussians, "linear", _scalars(settings, state), views, mesh, up, dataset.unit)
+    return Subject(
+        title, state.gaussians, "linear", _scalars(settings, state), views, mesh, up, dataset.unit
+    )
 
 
 def _scalars(settings: NbvSettings, state: run_folder.State) -> dict[str, np.ndarray]:
@@ -128,8 +154,12 @@ def _scalars(settings: NbvSettings, state: run_folder.State) -> dict[str, np.nda
     from mgs.splat import groups
 
     columns = groups(state.gaussians.sh_degree, settings.train.means)
-    prior_lam = criteria.regularisation(groups(state.gaussians.sh_degree), settings.pixel_noise, settings.prior_std)
-    found = gaussian_scalars(state.H, state.surface, settings.regularisation(columns), prior_lam, columns)
+    prior_lam = criteria.regularisation(
+        groups(state.gaussians.sh_degree), settings.pixel_noise, settings.prior_std
+    )
+    found = gaussian_scalars(
+        state.H, state.surface, settings.regularisation(columns), prior_lam, columns
+    )
     return {name: found[name] for name in SCALARS}
 
 
@@ -138,16 +168,24 @@ def _psnr(run: Path, images: int) -> dict[str, float]:
     metrics: Any = read_json(run / "metrics.json") if (run / "metrics.json").is_file() else None
     if not isinstance(metrics, dict) or metrics.get("images") != images:
         return {}
-    return {view["name"]: view["psnr"] for view in metrics.get("views", []) if view.get("psnr") is not None}
+    return {
+        view["name"]: view["psnr"]
+        for view in metrics.get("views", [])
+        if view.get("psnr") is not None
+    }
 
 
-def _views(frames: tuple[Frame, ...], state: run_folder.State, psnr: dict[str, float]) -> list[View]:
+def _views(
+    frames: tuple[Frame, ...], state: run_folder.State, psnr: dict[str, float]
+) -> list[View]:
     """The cameras of the dataset, with what the run's state says about each."""
     seeds = state.steps[0]["seeds"]
     steps = {line["frame"]: line for line in state.steps[1:]}
     views = []
     for index, frame in enumerate(frames):
-        facts = [("PSNR of the model here", f"{psnr[frame.name]:.2f} dB")] if frame.name in psnr else []
+        facts = (
+            [("PSNR of the model here", f"{psnr[frame.name]:.2f} dB")] if frame.name in psnr else []
+        )
         if index in seeds:
             views.append(View(frame, "seed", 0, facts))
         elif index in steps:
@@ -156,7 +194,10 @@ def _views(frames: tuple[Frame, ...], state: run_folder.State, psnr: dict[str, f
                 ("information gain", f"{line['information_gain']:.4g}"),
                 ("images then", str(line["images"])),
                 ("surface coverage then", f"{100 * line['coverage']:.2f} %"),
-                *((f"{metric_name(key)}, then", cell(key, value)) for key, value in measured(line).items()),
+                *(
+                    (f"{metric_name(key)}, then", cell(key, value))
+                    for key, value in measured(line).items()
+                ),
             ]
             views.append(View(frame, "chosen", line["step"], facts))
         else:

@@ -13,8 +13,28 @@ from mgs import memory
 from mgs.camera import MAX_PIXELS, MAX_SIDE
 from mgs.errors import InputError
 from mgs.gaussians import MAX_GAUSSIANS, Gaussians
-from mgs.splat import ListCache, as_drjit, blocks, fisher, information, kernels, reference, render, walking
-from mgs.splat.blocks import BLOCK_X, BLOCK_Y, REORDERED, RESHAPED, TILE, build, changes, depth_order, footprints
+from mgs.splat import (
+    ListCache,
+    as_drjit,
+    blocks,
+    fisher,
+    information,
+    kernels,
+    reference,
+    render,
+    walking,
+)
+from mgs.splat.blocks import (
+    BLOCK_X,
+    BLOCK_Y,
+    REORDERED,
+    RESHAPED,
+    TILE,
+    build,
+    changes,
+    depth_order,
+    footprints,
+)
 from mgs.splat.projection import camera_array, project
 from mgs.splat.walking import PIXELS, packet_count
 
@@ -34,13 +54,16 @@ def lists_of(gaussians, camera):
 
 def pairs_of(lists) -> set[tuple[int, int]]:
     """{(splat, block)}."""
-    place, splat, block, start, end = (np.asarray(a) for a in (lists.place, lists.splat, lists.block, lists.start, lists.end))
+    place, splat, block, start, end = (
+        np.asarray(a) for a in (lists.place, lists.splat, lists.block, lists.start, lists.end)
+    )
     splat = np.argsort(place)[splat]
     return {(int(j), int(b)) for b, s, e in zip(block, start, end, strict=True) for j in splat[s:e]}
 
 
 def needed_pairs(gaussians, camera) -> set[tuple[int, int]]:
-    """The pairs with a pixel where the splat is above the threshold of alpha, by the oracle, whatever is in front of it."""
+    """The pairs with a pixel where the splat is above the threshold of alpha, by the oracle,
+    whatever is in front of it."""
     needed = set()
     across = -(-camera.width // BLOCK_X)
     for j in range(len(gaussians)):
@@ -50,9 +73,13 @@ def needed_pairs(gaussians, camera) -> set[tuple[int, int]]:
     return needed
 
 
-@pytest.mark.parametrize(("seed", "scales"), [*((seed, (-6.0, -1.0)) for seed in range(4)), (4, (-9.0, 0.5)), (5, (-2.0, 1.0))])
+@pytest.mark.parametrize(
+    ("seed", "scales"),
+    [*((seed, (-6.0, -1.0)) for seed in range(4)), (4, (-9.0, 0.5)), (5, (-2.0, 1.0))],
+)
 def test_lists_hold_every_pair_and_little_more(seed, scales):
-    """Of small splats, of needles and of splats as large as the image, many of them partly outside it."""
+    """Of small splats, of needles and of splats as large as the image, many of them partly outside
+    it."""
     camera, g = make_camera(), make_gaussians(60, seed, log_scales=scales)
     needed, listed = needed_pairs(g, camera), pairs_of(lists_of(g, camera)[0])
     assert needed <= listed
@@ -62,7 +89,9 @@ def test_lists_hold_every_pair_and_little_more(seed, scales):
 def test_lists_are_in_depth_order_and_slots_of_a_splat_contiguous():
     camera, g = make_camera(), make_gaussians(60, 9)
     lists, splats = lists_of(g, camera)
-    splat, pair, start, end = (np.asarray(a) for a in (lists.splat, lists.pair, lists.start, lists.end))
+    splat, pair, start, end = (
+        np.asarray(a) for a in (lists.splat, lists.pair, lists.start, lists.end)
+    )
     by_place = np.argsort(np.asarray(lists.place))
     assert sorted(by_place) == list(range(60)), "every splat has a place of its own"
     z, used = np.asarray(splats.depth)[by_place], int((end - start).sum())
@@ -75,24 +104,36 @@ def test_lists_are_in_depth_order_and_slots_of_a_splat_contiguous():
 
 
 def test_memory_and_lanes_go_by_tile():
-    """Splats are stored by the tile of their centre, then block, then depth; lanes go by tile, longest list first in each."""
-    camera, g = make_camera((300, 200), focal=300.0), make_gaussians(500, 9, log_scales=(-5.0, -3.0))
+    """Splats are stored by the tile of their centre, then block, then depth; lanes go by tile,
+    longest list first in each."""
+    camera, g = (
+        make_camera((300, 200), focal=300.0),
+        make_gaussians(500, 9, log_scales=(-5.0, -3.0)),
+    )
     lists, splats = lists_of(g, camera)
     across = -(-camera.width // BLOCK_X)
     u, v, z = (
-        np.asarray(a, np.float64)[np.argsort(np.asarray(lists.place))] for a in (splats.mean_x, splats.mean_y, splats.depth)
+        np.asarray(a, np.float64)[np.argsort(np.asarray(lists.place))]
+        for a in (splats.mean_x, splats.mean_y, splats.depth)
     )
-    bx, by = np.clip(u // BLOCK_X, 0, across - 1), np.clip(v // BLOCK_Y, 0, camera.height // BLOCK_Y - 1)
+    bx, by = (
+        np.clip(u // BLOCK_X, 0, across - 1),
+        np.clip(v // BLOCK_Y, 0, camera.height // BLOCK_Y - 1),
+    )
     tile = by // TILE * -(-across // TILE) + bx // TILE
     assert len(set(tile)) > 4
     np.testing.assert_array_equal(np.lexsort((z, bx, by, tile)), np.arange(len(g)))
-    block, length = np.asarray(lists.block).astype(int), (np.asarray(lists.end) - np.asarray(lists.start)).astype(int)
+    block, length = (
+        np.asarray(lists.block).astype(int),
+        (np.asarray(lists.end) - np.asarray(lists.start)).astype(int),
+    )
     tile = block // across // TILE * -(-across // TILE) + block % across // TILE
     np.testing.assert_array_equal(np.lexsort((-length, tile)), np.arange(len(block)))
 
 
 def test_a_new_camera_compiles_nothing():
-    """The kernels that build lists are the same for every camera, though the numbers of pairs differ."""
+    """The kernels that build lists are the same for every camera, though the numbers of pairs
+    differ."""
     g = as_drjit(make_gaussians(300, 3, log_scales=(-5.0, -3.0)))
     seen = []
     for angle in np.linspace(0, 0.3, 4):
@@ -100,17 +141,26 @@ def test_a_new_camera_compiles_nothing():
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             dr.eval(render(g, camera).rgb)
-            seen.append({entry["hash"] for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT})
+            seen.append(
+                {
+                    entry["hash"]
+                    for entry in dr.kernel_history()
+                    if entry["type"] == dr.KernelType.JIT
+                }
+            )
     assert seen[0]
     assert seen[1] == seen[2] == seen[3]
 
 
 def test_kernels_are_recorded_once_whether_lists_are_new_kept_or_rebuilt(monkeypatch):
-    """A recording also depends on which of its inputs are one and the same array, as the splats and the footprints of new lists
-    may be, and those of kept lists are not. No kernel must be recorded twice for that."""
+    """A recording also depends on which of its inputs are one and the same array, as the splats and
+    the footprints of new lists may be, and those of kept lists are not. No kernel must be recorded
+    twice for that."""
     camera, g, cache, recorded = make_camera((46, 31)), make_gaussians(37, 3), ListCache(), []
     walk = walking._walk_until_done
-    monkeypatch.setattr(walking, "_walk_until_done", lambda *arguments: recorded.append(1) or walk(*arguments))
+    monkeypatch.setattr(
+        walking, "_walk_until_done", lambda *arguments: recorded.append(1) or walk(*arguments)
+    )
     for growth, builds in ((0, 1), (0, 1), (0.05, 2), (0.05, 2), (0.4, 3)):
         drawn = as_drjit(changed(g, log_scales=g.log_scales + np.float32(growth)))
         dr.enable_grad(drawn.log_scales)
@@ -124,11 +174,14 @@ def test_kernels_are_recorded_once_whether_lists_are_new_kept_or_rebuilt(monkeyp
 def test_depth_order_is_a_stable_sort():
     rng = np.random.default_rng(0)
     depth = rng.choice(rng.uniform(0.01, 50, 300), 1000).astype(np.float32)
-    np.testing.assert_array_equal(np.asarray(depth_order(mi.Float(depth))), np.argsort(depth, kind="stable"))
+    np.testing.assert_array_equal(
+        np.asarray(depth_order(mi.Float(depth))), np.argsort(depth, kind="stable")
+    )
 
 
 def test_changes_are_found_where_they_matter():
-    """One splat is reshaped, one moved in depth, one reshaped that is never drawn; all others only get other colours."""
+    """One splat is reshaped, one moved in depth, one reshaped that is never drawn; all others only
+    get other colours."""
     camera = make_camera()
     g = make_gaussians(40, 1, logits=(1, 3))
     g = changed(g, logit_opacities=np.where(np.arange(40) == 7, -9.0, g.logit_opacities))
@@ -139,7 +192,9 @@ def test_changes_are_found_where_they_matter():
     drawn = np.asarray(built.level) > 0
     assert drawn[[3, 5]].all()
     assert not drawn[7]
-    found = np.asarray(changes(built, projected(changed(g, log_scales=turned, means=moved, sh=g.sh + 1), camera)))
+    found = np.asarray(
+        changes(built, projected(changed(g, log_scales=turned, means=moved, sh=g.sh + 1), camera))
+    )
     expected = np.zeros(40, int)
     expected[3], expected[5] = RESHAPED, REORDERED
     np.testing.assert_array_equal(found, expected)
@@ -158,7 +213,8 @@ def images(gaussians, camera, cache=None) -> list[np.ndarray]:
     teleport=st.booleans(),
 )
 def test_stale_lists_never_change_an_image(seed, drift, names, teleport):
-    """Parameters drift, jump behind the camera and back; the cached render is bitwise the cold one, gradients' sums too."""
+    """Parameters drift, jump behind the camera and back; the cached render is bitwise the cold one,
+    gradients' sums too."""
     camera, g = make_camera(), make_gaussians(60, seed, log_scales=(-5.0, -1.5))
     rng, cache = np.random.default_rng(seed), ListCache()
     behind = place(camera, rng.uniform(0, 30, (60, 2)), np.full(60, -1.5))
@@ -167,15 +223,21 @@ def test_stale_lists_never_change_an_image(seed, drift, names, teleport):
             np.testing.assert_array_equal(a, b)
         if step in (2, 4):
             np.testing.assert_array_equal(fisher(g, camera, cache=cache), fisher(g, camera))
-        values = {name: getattr(g, name) + drift * rng.normal(size=getattr(g, name).shape) for name in names}
+        values = {
+            name: getattr(g, name) + drift * rng.normal(size=getattr(g, name).shape)
+            for name in names
+        }
         if teleport:
             jump = rng.random(60) < 0.3
-            values["means"] = np.where(jump[:, None], behind if step % 2 else rng.uniform(-0.6, 0.6, (60, 3)), g.means)
+            values["means"] = np.where(
+                jump[:, None], behind if step % 2 else rng.uniform(-0.6, 0.6, (60, 3)), g.means
+            )
         g = changed(g, **values)
 
 
 def test_lists_are_reused_until_a_footprint_changes(monkeypatch):
-    """Colours change no list. Scales do, but not the depth order, which is only found anew where a mean moves."""
+    """Colours change no list. Scales do, but not the depth order, which is only found anew where a
+    mean moves."""
     camera, g, cache = make_camera(), make_gaussians(60, 3), ListCache()
     sorts = []
     monkeypatch.setattr(blocks, "depth_order", lambda depth: sorts.append(1) or depth_order(depth))
@@ -234,14 +296,20 @@ def test_another_number_of_gaussians_is_another_scene():
             np.testing.assert_array_equal(a, b)
 
 
-RING = [make_camera(eye=(2.0 * np.cos(a), 2.0 * np.sin(a), 1.0)) for a in np.linspace(0, 2 * np.pi, 24, endpoint=False)]
+RING = [
+    make_camera(eye=(2.0 * np.cos(a), 2.0 * np.sin(a), 1.0))
+    for a in np.linspace(0, 2 * np.pi, 24, endpoint=False)
+]
 IN_ORDER = [np.arange(12)] * 5
 SHUFFLED = [np.random.default_rng(i).permutation(12) for i in range(6)]
 
 
 def misses(passes, room: int) -> list[int]:
-    """How many lists each pass over cameras of the ring had to build, in a cache with room for so many of them."""
-    splats = projected(make_gaussians(60, 3), RING[0])  # any lists serve: what is kept depends on sizes alone
+    """How many lists each pass over cameras of the ring had to build, in a cache with room for so
+    many of them."""
+    splats = projected(
+        make_gaussians(60, 3), RING[0]
+    )  # any lists serve: what is kept depends on sizes alone
     cache = ListCache()
     cache.get(RING[0], splats)
     cache, built = ListCache(budget=room * cache.nbytes), []
@@ -285,14 +353,18 @@ def test_one_view_larger_than_the_budget_still_renders():
     assert cache.builds == 2
 
 
-@pytest.mark.parametrize(("size", "n", "what"), [((65536, 4), 1 << 19, "blocks"), ((4, 65536), 1 << 18, "rows of blocks")])
+@pytest.mark.parametrize(
+    ("size", "n", "what"),
+    [((65536, 4), 1 << 19, "blocks"), ((4, 65536), 1 << 18, "rows of blocks")],
+)
 def test_pairs_are_counted_in_64_bits(size, n, what):
     """2^32 of them, which 32 bits count as none; refused before memory is taken for them."""
     camera, one = make_camera(size, focal=100.0), make_gaussians(1, 0, spread=0)
     many = Gaussians(*(np.repeat(getattr(one, name), n, 0) for name in vars(one)))
     many.log_scales[:], many.logit_opacities[:] = 9, 2
     with pytest.raises(
-        InputError, match=f"view: 4,294,967,296 pairs of a Gaussian and one of its {what} .* 512.0 GiB"
+        InputError,
+        match=f"view: 4,294,967,296 pairs of a Gaussian and one of its {what} .* 512.0 GiB",
     ) as error:
         render(many, camera)
     assert "\n" not in str(error.value)
@@ -305,7 +377,10 @@ def test_a_view_has_a_bounded_number_of_pairs(monkeypatch):
     images(g, camera)
     monkeypatch.setattr(blocks, "MAX_PAIRS", count - 1)
     for call in (render, fisher):
-        with pytest.raises(InputError, match=f"view: {count:,} pairs .* {count - 1:,} are the most; draw fewer or smaller"):
+        with pytest.raises(
+            InputError,
+            match=f"view: {count:,} pairs .* {count - 1:,} are the most; draw fewer or smaller",
+        ):
             call(g, camera)
 
 
@@ -318,7 +393,11 @@ def test_what_memory_has_no_room_for_is_refused(monkeypatch, tmp_path):
     monkeypatch.setattr(memory, "LITTLE", 0)
     whole = np.asarray(render(g, camera).rgb)
     for room, call, said in (
-        (count * blocks.PAIR_BYTES // 2, render, f"view: {count:,} pairs .* GiB are free; draw fewer or smaller"),
+        (
+            count * blocks.PAIR_BYTES // 2,
+            render,
+            f"view: {count:,} pairs .* GiB are free; draw fewer or smaller",
+        ),
         (
             60 * information.BLOCK_BYTES // 2,
             fisher_of_blocks,
@@ -339,7 +418,9 @@ def test_what_drjit_keeps_for_later_is_given_back_before_anything_is_refused(mon
     monkeypatch.setattr(memory, "_spare", lambda: 3e9 if given_back else 1e9)
     memory.check_room(2e9, "much", "take less")
     assert given_back == [True]
-    with pytest.raises(InputError, match=r"more may take 3\.7 GiB, and 2\.8 GiB are free; take less"):
+    with pytest.raises(
+        InputError, match=r"more may take 3\.7 GiB, and 2\.8 GiB are free; take less"
+    ):
         memory.check_room(4e9, "more", "take less")
 
 
@@ -349,7 +430,9 @@ def fisher_of_blocks(gaussians, camera):
 
 def test_places_in_buffers_stay_below_31_bits():
     """Of the most pairs, the most Gaussians and the largest images."""
-    most = max(kernels.ADJOINT_SUMS[True], kernels.fisher_sums(True, False))  # with means it is checked apart
+    most = max(
+        kernels.ADJOINT_SUMS[True], kernels.fisher_sums(True, False)
+    )  # with means it is checked apart
     assert blocks._room(blocks.MAX_PAIRS) * 4 * packet_count(most) < 1 << 31
     assert MAX_GAUSSIANS * max(3 * 16, 4 * packet_count(kernels.fisher_sums(True, True))) < 1 << 31
     for width in (1, 9, MAX_PIXELS // MAX_SIDE, 12_345, MAX_SIDE):
@@ -366,18 +449,27 @@ def test_what_is_too_large_for_the_kernels_is_refused_at_once():
     one = make_gaussians(1, 0, 3)
 
     def many(n):
-        return Gaussians(*(np.broadcast_to(getattr(one, name), (n, *getattr(one, name).shape[1:])) for name in vars(one)))
+        return Gaussians(
+            *(
+                np.broadcast_to(getattr(one, name), (n, *getattr(one, name).shape[1:]))
+                for name in vars(one)
+            )
+        )
 
     for call in (render, fisher):
         with pytest.raises(InputError, match="gaussians: 33,554,433 are more than 33,554,432"):
             call(many(MAX_GAUSSIANS + 1), make_camera())
-    with pytest.raises(InputError, match=r"blocks of 700,000 Gaussians of SH degree 3 would take 8\.2 GiB, and 8 are the most"):
+    with pytest.raises(
+        InputError,
+        match=r"blocks of 700,000 Gaussians of SH degree 3 would take 8\.2 GiB, and 8 are the most",
+    ):
         fisher(many(700_000), make_camera(), "block")
 
 
 @pytest.mark.parametrize("tile", [1, 3, 1000])
 def test_the_size_of_tiles_changes_no_bit(tile, monkeypatch):
-    """Tiles decide in which order splats are stored and blocks drawn: no image, gradient or information may depend on them."""
+    """Tiles decide in which order splats are stored and blocks drawn: no image, gradient or
+    information may depend on them."""
     camera, g = make_camera((150, 70), focal=150.0), make_gaussians(80, 7, log_scales=(-5.0, -1.5))
 
     def everything():

@@ -1,4 +1,5 @@
-"""The same input gives bitwise the same image, gradient and Fisher information: reruns, 1 or 2 threads, a new process."""
+"""The same input gives bitwise the same image, gradient and Fisher information: reruns, 1 or 2
+threads, a new process."""
 
 import hashlib
 import json
@@ -18,7 +19,8 @@ BACKGROUND = (0.1, 0.2, 0.7)
 
 
 def results(threads: int | None = None, degree: int = 1) -> dict[str, bytes]:
-    """Bytes of every output: images, gradients of all parameters, Fisher information by every estimator."""
+    """Bytes of every output: images, gradients of all parameters, Fisher information by every
+    estimator."""
     before = dr.thread_count()
     if threads is not None:
         dr.set_thread_count(threads)
@@ -30,8 +32,12 @@ def results(threads: int | None = None, degree: int = 1) -> dict[str, bytes]:
             setattr(watched, name, dr.copy(getattr(watched, name)))
             dr.enable_grad(getattr(watched, name))
         image = render(watched, camera, BACKGROUND)
-        out = {name: np.asarray(dr.detach(getattr(image, name))) for name in ("rgb", "alpha", "depth")}
-        loss = dr.sum(dr.square(image.rgb - 0.3), axis=None) + dr.sum(image.alpha * image.depth, axis=None)
+        out = {
+            name: np.asarray(dr.detach(getattr(image, name))) for name in ("rgb", "alpha", "depth")
+        }
+        loss = dr.sum(dr.square(image.rgb - 0.3), axis=None) + dr.sum(
+            image.alpha * image.depth, axis=None
+        )
         dr.backward(loss)
         out |= {f"d {name}": np.asarray(dr.grad(getattr(watched, name))) for name in PARAMETERS}
         cache = ListCache()
@@ -68,10 +74,13 @@ def test_threads_change_nothing(first, threads):
 
 @pytest.mark.parametrize("scale", [1e-12, 1e-20, 1e-28, 1e-36])
 def test_faint_gradients_are_deterministic_too(scale):
-    """Denormal numbers are flushed by some threads and not by others: they must not reach a result."""
+    """Denormal numbers are flushed by some threads and not by others: they must not reach a
+    result."""
     camera = make_camera((200, 150), focal=200.0)
     gaussians = make_gaussians(1500, 11, 1, log_scales=(-6.0, -2.5))
-    weight = mi.TensorXf(np.float32(scale) * np.random.default_rng(0).normal(size=(150, 200, 3)).astype(np.float32))
+    weight = mi.TensorXf(
+        np.float32(scale) * np.random.default_rng(0).normal(size=(150, 200, 3)).astype(np.float32)
+    )
     gradients = []
     for threads in (1, 2):
         before = dr.thread_count()
@@ -81,13 +90,16 @@ def test_faint_gradients_are_deterministic_too(scale):
             setattr(watched, name, dr.copy(getattr(watched, name)))
             dr.enable_grad(getattr(watched, name))
         dr.backward(dr.sum(render(watched, camera).rgb * weight, axis=None))
-        gradients.append({name: np.asarray(dr.grad(getattr(watched, name))).tobytes() for name in PARAMETERS})
+        gradients.append(
+            {name: np.asarray(dr.grad(getattr(watched, name))).tobytes() for name in PARAMETERS}
+        )
         dr.set_thread_count(before)
     assert differing(*gradients) == []
 
 
 def test_faint_information_is_deterministic_too():
-    """Splats of a micrometre far away carry information that float32 can only hold as a denormal."""
+    """Splats of a micrometre far away carry information that float32 can only hold as a
+    denormal."""
     camera = make_camera((200, 150), focal=200.0, eye=(180.0, 40.0, 90.0))
     gaussians = make_gaussians(3000, 12, 0, log_scales=(-16.0, -12.0), logits=(-4, 20))
     information = []
@@ -108,7 +120,8 @@ def test_hutchinson_draws_the_same_probes():
 
 
 def test_garbage_is_not_collected_while_a_kernel_is_recorded():
-    """A Mitsuba scene that Python frees during a recording would end the process: so in a process of its own."""
+    """A Mitsuba scene that Python frees during a recording would end the process: so in a process
+    of its own."""
     code = """
 from mgs import runtime; runtime.start()
 import gc
@@ -131,13 +144,20 @@ render(make_gaussians(20, 0), make_camera())
 print("drawn")
 """
     root = __file__.rsplit("/splat/", 1)[0]
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=root,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
     assert done.stdout == "drawn\n", done.stderr
 
 
 def test_threads_may_draw_at_once():
-    """Same bits as one after the other; the collector is off in every recording and on in the end. In a process of its own,
-    since two recordings at a time hang or end it."""
+    """Same bits as one after the other; the collector is off in every recording and on in the end.
+    In a process of its own, since two recordings at a time hang or end it."""
     code = """
 from mgs import runtime; runtime.start()
 import gc
@@ -168,7 +188,14 @@ assert at_once == [draw(i) for i in range(8)]
 print("drawn")
 """
     root = __file__.rsplit("/splat/", 1)[0]
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=root,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
     assert done.stdout == "drawn\n", done.stderr
 
 
@@ -181,7 +208,14 @@ def test_another_process_with_one_thread_agrees(first):
         "print(json.dumps({k: hashlib.sha256(v).hexdigest() for k, v in results(1).items()}))\n"
     )
     root = __file__.rsplit("/splat/", 1)[0]
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=root,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     other = json.loads(done.stdout.splitlines()[-1])
     assert differing({k: hashlib.sha256(v).hexdigest() for k, v in first.items()}, other) == []

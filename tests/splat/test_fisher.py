@@ -1,4 +1,5 @@
-"""Fisher information against a brute-force Jacobian per pixel and channel, in float64; the other estimators against theirs."""
+"""Fisher information against a brute-force Jacobian per pixel and channel, in float64; the other
+estimators against theirs."""
 
 import drjit as dr
 import mitsuba as mi
@@ -21,7 +22,8 @@ FLOOR = 1e-6
 
 
 def assert_close(found, expected, what=""):
-    """Relative error TOLERANCE on entries above FLOOR of the largest; FLOOR * TOLERANCE * 10 of the largest on the others."""
+    """Relative error TOLERANCE on entries above FLOOR of the largest; FLOOR * TOLERANCE * 10 of the
+    largest on the others."""
     assert found.dtype == np.float32
     assert found.shape == expected.shape
     size, error = np.abs(expected), np.abs(found - expected)
@@ -37,7 +39,8 @@ def diagonal(blocks) -> np.ndarray:
 
 
 def make(seed, degree=0, n=16, **style):
-    """A random scene with a wide splat whose alpha is clamped in the middle and one whose colours are clamped at 0."""
+    """A random scene with a wide splat whose alpha is clamped in the middle and one whose colours
+    are clamped at 0."""
     g = make_gaussians(n, seed, degree, **{"log_scales": (-4.0, -1.0), **style})
     g.means[0], g.log_scales[0], g.logit_opacities[0] = 0, (-0.5, -0.8, -0.3), 20
     g.sh[1] = 0
@@ -61,8 +64,8 @@ def test_exact_and_block_against_brute_force(degree):
 
 
 def test_recorded_kernels_know_numbers_of_gaussians_from_other_numbers():
-    """Scenes of 8, 10, 7, 22, 32 and 4 Gaussians in turn. The kernels contain these numbers for other reasons (sums, pixels),
-    and a recording once took one for the other."""
+    """Scenes of 8, 10, 7, 22, 32 and 4 Gaussians in turn. The kernels contain these numbers for
+    other reasons (sums, pixels), and a recording once took one for the other."""
     camera = make_camera()
     for n in (8, 10, 7, 22, 32, 4):
         g = calm(lambda seed, n=n: make_gaussians(n, seed, log_scales=(-4.0, -1.0)), camera, n)
@@ -74,19 +77,33 @@ def test_recorded_kernels_know_numbers_of_gaussians_from_other_numbers():
             watched = as_drjit(g)
             dr.enable_grad(watched.sh, *([watched.means] if free else []))
             dr.backward(dr.sum(render(watched, camera, BACKGROUND).rgb, axis=None))
-            np.testing.assert_allclose(dr.grad(watched.sh).numpy()[:, 0], J.sum((0, 1))[:, :3], rtol=1e-4, atol=1e-4)
+            np.testing.assert_allclose(
+                dr.grad(watched.sh).numpy()[:, 0], J.sum((0, 1))[:, :3], rtol=1e-4, atol=1e-4
+            )
 
 
 @pytest.mark.parametrize("degree", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_blocks_of_one_gaussian(degree):
-    """With one Gaussian all addresses are constants, which is hardest on the compiler: it takes 20 s for degree 3."""
+    """With one Gaussian all addresses are constants, which is hardest on the compiler: it takes 20
+    s for degree 3."""
     camera = make_camera()
-    g = calm(lambda seed: make_gaussians(1, seed, degree, spread=0.1, log_scales=(-2, -1), logits=(1, 2)), camera, 3)
-    assert_close(fisher(g, camera, "block", BACKGROUND), reference.fisher_block(g, camera, BACKGROUND), f"one, degree {degree}")
+    g = calm(
+        lambda seed: make_gaussians(
+            1, seed, degree, spread=0.1, log_scales=(-2, -1), logits=(1, 2)
+        ),
+        camera,
+        3,
+    )
+    assert_close(
+        fisher(g, camera, "block", BACKGROUND),
+        reference.fisher_block(g, camera, BACKGROUND),
+        f"one, degree {degree}",
+    )
 
 
 def test_images_of_several_tiles():
-    """Memory and lanes are ordered by tiles of 128x64 pixels; this image has four, and borders between them must not matter."""
+    """Memory and lanes are ordered by tiles of 128x64 pixels; this image has four, and borders
+    between them must not matter."""
     camera = make_camera((150, 70), focal=150.0)
     g = calm(lambda seed: make_gaussians(30, seed, log_scales=(-4.0, -1.0)), camera, 3)
     expected = reference.fisher_block(g, camera, BACKGROUND)
@@ -98,7 +115,9 @@ def test_images_of_several_tiles():
     image = render(watched, camera, BACKGROUND)
     dr.backward(dr.sum(image.rgb * mi.TensorXf(weights), axis=None))
     np.testing.assert_allclose(image.rgb, reference.render(g, camera, BACKGROUND)["rgb"], atol=2e-5)
-    scales = np.tensordot(weights.reshape(-1, 3), reference.jacobian(g, camera, BACKGROUND), axes=([0, 1], [0, 1]))[:, 3:6]
+    scales = np.tensordot(
+        weights.reshape(-1, 3), reference.jacobian(g, camera, BACKGROUND), axes=([0, 1], [0, 1])
+    )[:, 3:6]
     found = np.asarray(dr.grad(watched.log_scales))
     assert np.linalg.norm(found - scales) < 1e-4 * np.linalg.norm(scales)
 
@@ -153,12 +172,16 @@ def test_groups_tile_the_columns(degree):
 
 
 def test_hutchinson_converges_as_one_over_sqrt_k():
-    """The squared error of the mean of k probes is 2 (H^2 - sum J^4) / k, exactly; averaged over parameters, to sampling error.
+    """The squared error of the mean of k probes is 2 (H^2 - sum J^4) / k, exactly; averaged over
+    parameters, to sampling error.
 
-    Probes are nested (the first k of 256), as the estimator draws them, so this also fixes its seeds.
+    Probes are nested (the first k of 256), as the estimator draws them, so this also fixes its
+    seeds.
     """
     camera = make_camera((21, 14), focal=24)
-    g = calm(lambda seed: make_gaussians(16, seed, log_scales=(-3.5, -1.0), logits=(-2, 3)), camera, 3)
+    g = calm(
+        lambda seed: make_gaussians(16, seed, log_scales=(-3.5, -1.0), logits=(-2, 3)), camera, 3
+    )
     J2 = reference.jacobian(g, camera, BACKGROUND).reshape(-1, 16, 11) ** 2
     H = J2.sum(0)
     variance = 2 * (H**2 - (J2**2).sum(0))
@@ -175,13 +198,18 @@ def test_hutchinson_converges_as_one_over_sqrt_k():
 
 
 def test_probes_of_hutchinson_are_independent_from_view_to_view():
-    """Errors of 16 neighbouring views average out in their sum: it is off by a quarter of what one view is off by."""
+    """Errors of 16 neighbouring views average out in their sum: it is off by a quarter of what one
+    view is off by."""
     g = make_gaussians(16, 3, log_scales=(-3.5, -1.0), logits=(-2, 3))
     cameras = [make_camera((21, 14), focal=24, eye=(2.0, 0.4 + 1e-3 * i, 1.1)) for i in range(16)]
     exact = [fisher(g, camera) for camera in cameras]
     estimate = [fisher(g, camera, "hutchinson", probes=1) for camera in cameras]
-    each = np.mean([np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in zip(estimate, exact, strict=True)])
-    together = np.linalg.norm(np.sum(estimate, 0) - np.sum(exact, 0)) / np.linalg.norm(np.sum(exact, 0))
+    each = np.mean(
+        [np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in zip(estimate, exact, strict=True)]
+    )
+    together = np.linalg.norm(np.sum(estimate, 0) - np.sum(exact, 0)) / np.linalg.norm(
+        np.sum(exact, 0)
+    )
     print(f"one view {each:.2f}, sum of 16 {together:.2f}")
     assert together < 0.5 * each
     again = fisher(g, cameras[3], "hutchinson", probes=1)
@@ -190,14 +218,18 @@ def test_probes_of_hutchinson_are_independent_from_view_to_view():
 
 def test_hutchinson_is_the_same_with_and_without_a_cache():
     camera, g = make_camera(), make_gaussians(16, 6)
-    np.testing.assert_array_equal(fisher(g, camera, "hutchinson"), fisher(g, camera, "hutchinson", cache=ListCache()))
+    np.testing.assert_array_equal(
+        fisher(g, camera, "hutchinson"), fisher(g, camera, "hutchinson", cache=ListCache())
+    )
 
 
 def test_probes_of_hutchinson_are_an_option():
     """More probes come nearer; the other estimators have no options."""
     camera, g = make_camera(), make_gaussians(16, 6)
     exact = fisher(g, camera)
-    few, many = (np.linalg.norm(fisher(g, camera, "hutchinson", probes=k) - exact) for k in (2, 128))
+    few, many = (
+        np.linalg.norm(fisher(g, camera, "hutchinson", probes=k) - exact) for k in (2, 128)
+    )
     assert many < 0.5 * few
     for probes in (0, -1, 1.5):
         with pytest.raises(InputError, match="probes"):
@@ -216,13 +248,19 @@ def test_gradient_estimators_work_where_gradients_are_suspended():
 def test_loss_gradient_is_the_square_of_its_loss_by_central_differences():
     """L = mean (rgb - 0.5)^2 of the oracle, differentiated numerically and squared."""
     camera = make_camera()
-    g = calm(lambda seed: make_gaussians(8, seed, log_scales=(-3.0, -1.0), logits=(-1, 4)), camera, 8)
+    g = calm(
+        lambda seed: make_gaussians(8, seed, log_scales=(-3.0, -1.0), logits=(-1, 4)), camera, 8
+    )
 
     def loss(gaussians):
         return ((reference.render(gaussians, camera, BACKGROUND)["rgb"] - 0.5) ** 2).mean()
 
     columns = [("sh", (0, c)) for c in range(3)]
-    columns += [("log_scales", (i,)) for i in range(3)] + [("quats", (i,)) for i in range(4)] + [("logit_opacities", ())]
+    columns += (
+        [("log_scales", (i,)) for i in range(3)]
+        + [("quats", (i,)) for i in range(4)]
+        + [("logit_opacities", ())]
+    )
     expected = np.zeros((8, 11))
     for j in range(8):
         for column, (name, index) in enumerate(columns):
@@ -233,12 +271,15 @@ def test_loss_gradient_is_the_square_of_its_loss_by_central_differences():
                 ends.append(loss(moved))
             expected[j, column] = ((ends[0] - ends[1]) / 2e-5) ** 2
     found = fisher(g, camera, "loss-gradient", BACKGROUND)
-    assert np.linalg.norm(np.sqrt(found) - np.sqrt(expected)) < 1e-4 * np.linalg.norm(np.sqrt(expected))
+    assert np.linalg.norm(np.sqrt(found) - np.sqrt(expected)) < 1e-4 * np.linalg.norm(
+        np.sqrt(expected)
+    )
     assert np.linalg.norm(found - expected) < 2e-4 * np.linalg.norm(expected)
 
 
 def test_loss_gradient_is_not_the_fisher_information():
-    """Gradients of pixels cancel before they are squared, so the two differ by far more than a factor."""
+    """Gradients of pixels cancel before they are squared, so the two differ by far more than a
+    factor."""
     camera, g = make_camera(), make_gaussians(16, 9)
     exact, scalar = fisher(g, camera), fisher(g, camera, "loss-gradient")
     seen = exact > 1e-6 * exact.max()

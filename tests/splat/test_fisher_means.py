@@ -1,4 +1,5 @@
-"""Fisher information of the means, and of alpha as a fourth channel: against the oracle, `jvp`, and a colour in its place."""
+"""Fisher information of the means, and of alpha as a fourth channel: against the oracle, `jvp`, and
+a colour in its place."""
 
 import numpy as np
 import pytest
@@ -16,8 +17,9 @@ from .test_robustness import CASES
 
 MOVING = ("normal", "free")
 CORRELATION = 1e-5
-"""Tolerance of blocks, as a share of sqrt(H_ii H_jj). Their columns have different units here (a pixel changes by 1e3 a metre,
-and by 1 a unit of colour), so that no entry is small or large by itself."""
+"""Tolerance of blocks, as a share of sqrt(H_ii H_jj). Their columns have different units here (a
+pixel changes by 1e3 a metre, and by 1 a unit of colour), so that no entry is small or large by
+itself."""
 
 
 def normals_of(gaussians, seed=0) -> np.ndarray:
@@ -25,15 +27,28 @@ def normals_of(gaussians, seed=0) -> np.ndarray:
     return np.random.default_rng([seed, 5]).normal(size=(len(gaussians), 3)) * 10
 
 
-def assert_means_close(gaussians, camera, means, alpha_weight=0.0, background=BACKGROUND, normals=None, what=""):
-    """Both estimators against the oracle: diagonals group by group, relatively; blocks as a share of sqrt(H_ii H_jj)."""
-    options = {"means": means, "normals": normals_of(gaussians) if normals is None else normals, "alpha_weight": alpha_weight}
+def assert_means_close(
+    gaussians, camera, means, alpha_weight=0.0, background=BACKGROUND, normals=None, what=""
+):
+    """Both estimators against the oracle: diagonals group by group, relatively; blocks as a share
+    of sqrt(H_ii H_jj)."""
+    options = {
+        "means": means,
+        "normals": normals_of(gaussians) if normals is None else normals,
+        "alpha_weight": alpha_weight,
+    }
     expected = reference.fisher_block(gaussians, camera, background, **options)
     exact = fisher(gaussians, camera, "exact", background, **options)
     block = fisher(gaussians, camera, "block", background, **options)
     for name, columns in groups(gaussians.sh_degree, means).items():
-        assert_close(exact[:, columns], diagonal(expected)[:, columns], f"{what} {means} {name} exact")
-        assert_close(diagonal(block)[:, columns], diagonal(expected)[:, columns], f"{what} {means} {name} block")
+        assert_close(
+            exact[:, columns], diagonal(expected)[:, columns], f"{what} {means} {name} exact"
+        )
+        assert_close(
+            diagonal(block)[:, columns],
+            diagonal(expected)[:, columns],
+            f"{what} {means} {name} block",
+        )
     size = np.sqrt(diagonal(expected)[:, :, None] * diagonal(expected)[:, None, :])
     seen = size > 1e-6 * size.max()
     error = (np.abs(block - expected)[seen] / size[seen]).max()
@@ -45,11 +60,14 @@ def assert_means_close(gaussians, camera, means, alpha_weight=0.0, background=BA
 @pytest.mark.parametrize("means", MOVING)
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_means_against_brute_force(degree, means):
-    """Two weights of alpha after each other, which one recorded kernel must tell apart, and none."""
+    """Two weights of alpha after each other, which one recorded kernel must tell apart, and
+    none."""
     camera = make_camera()
     g = calm(lambda seed: make(seed, degree), camera, 20 + degree)
     for alpha_weight in (0.0, 0.3, 4.0):
-        assert_means_close(g, camera, means, alpha_weight, what=f"degree {degree}, alpha {alpha_weight}")
+        assert_means_close(
+            g, camera, means, alpha_weight, what=f"degree {degree}, alpha {alpha_weight}"
+        )
 
 
 @pytest.mark.parametrize("means", MOVING)
@@ -82,7 +100,9 @@ def test_means_of_other_scenes_and_cameras(n, style, size, eye, means):
     to_camera=st.booleans(),
     alpha_weight=st.sampled_from([0, 1e-3, 1, 100]),
 )
-def test_means_of_any_scene(seed, degree, scale, stretch, logit, azimuth, height, means, to_camera, alpha_weight):
+def test_means_of_any_scene(
+    seed, degree, scale, stretch, logit, azimuth, height, means, to_camera, alpha_weight
+):
     """Normals that point to the camera are the hardest: moving along them changes little."""
     camera = make_camera(eye=(2 * np.cos(azimuth), 2 * np.sin(azimuth), height))
     style = {"log_scales": (scale - stretch, scale), "logits": (logit - 4, logit)}
@@ -93,13 +113,15 @@ def test_means_of_any_scene(seed, degree, scale, stretch, logit, azimuth, height
 
 @pytest.mark.parametrize("degree", [0, 2])
 def test_information_is_the_size_of_tangents(degree):
-    """v^T F v = |J v|^2 with J v from the tangent kernel: for each coordinate of a mean, along normals, and for random v of all
-    parameters of one Gaussian."""
+    """v^T F v = |J v|^2 with J v from the tangent kernel: for each coordinate of a mean, along
+    normals, and for random v of all parameters of one Gaussian."""
     camera, weight = make_camera(), 0.3
     g = make_gaussians(8, 40 + degree, degree, log_scales=(-4.0, -1.0))
     normals = normals_of(g)
     unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    blocks = fisher(g, camera, "block", BACKGROUND, means="free", alpha_weight=weight).astype(np.float64)
+    blocks = fisher(g, camera, "block", BACKGROUND, means="free", alpha_weight=weight).astype(
+        np.float64
+    )
     free, normal = (
         fisher(g, camera, "exact", BACKGROUND, means=means, normals=normals, alpha_weight=weight)
         for means in ("free", "normal")
@@ -117,7 +139,9 @@ def test_information_is_the_size_of_tangents(degree):
     rng, k = np.random.default_rng(degree), 3 * (degree + 1) ** 2
     for j in range(len(g)):
         for i in range(3):
-            np.testing.assert_allclose(free[j, k + 8 + i], squared(j, means=np.eye(3)[i]), rtol=1e-4)
+            np.testing.assert_allclose(
+                free[j, k + 8 + i], squared(j, means=np.eye(3)[i]), rtol=1e-4
+            )
         np.testing.assert_allclose(normal[j, k + 8], squared(j, means=unit[j]), rtol=1e-4)
         v = (rng.normal(size=k + 11) / np.sqrt(np.diag(blocks[j]) + 1e-12)).astype(np.float32)
         parts = [v[:k].reshape(-1, 3), v[k : k + 3], v[k + 3 : k + 7], v[k + 7], v[k + 8 :]]
@@ -128,7 +152,8 @@ def test_information_is_the_size_of_tangents(degree):
 @pytest.mark.parametrize("estimator", ["exact", "block"])
 @pytest.mark.parametrize("means", MEANS)
 def test_alpha_is_a_colour_that_all_share_over_black(means, estimator):
-    """What alpha adds is the information of a red image of the same Gaussians, as parameters of the footprint see it."""
+    """What alpha adds is the information of a red image of the same Gaussians, as parameters of the
+    footprint see it."""
     camera, weight = make_camera(), 0.7
     g = make_gaussians(30, 8, log_scales=(-4.0, -1.0))
     options = {"means": means, "normals": normals_of(g)}
@@ -136,10 +161,18 @@ def test_alpha_is_a_colour_that_all_share_over_black(means, estimator):
     without = fisher(g, camera, estimator, BACKGROUND, **options)
     with_alpha = fisher(g, camera, estimator, BACKGROUND, alpha_weight=weight, **options)
     alone = fisher(red, camera, estimator, **options)
-    np.testing.assert_allclose(with_alpha[:, :3], without[:, :3], rtol=1e-5, atol=1e-5 * np.abs(without[:, :3]).max())
-    footprint = (slice(None), slice(3, None)) if estimator == "exact" else (slice(None), slice(3, None), slice(3, None))
+    np.testing.assert_allclose(
+        with_alpha[:, :3], without[:, :3], rtol=1e-5, atol=1e-5 * np.abs(without[:, :3]).max()
+    )
+    footprint = (
+        (slice(None), slice(3, None))
+        if estimator == "exact"
+        else (slice(None), slice(3, None), slice(3, None))
+    )
     found, expected = with_alpha[footprint], (without + weight * alone)[footprint]
-    assert (np.abs(weight * alone[footprint]) > 0.1 * np.abs(expected)).mean() > 0.2, "alpha adds nothing to speak of"
+    assert (np.abs(weight * alone[footprint]) > 0.1 * np.abs(expected)).mean() > 0.2, (
+        "alpha adds nothing to speak of"
+    )
     if estimator == "block":
         size = np.sqrt(diagonal(expected)[:, :, None] * diagonal(expected)[:, None, :])
         assert (np.abs(found - expected) <= 2 * CORRELATION * size).all()
@@ -148,7 +181,11 @@ def test_alpha_is_a_colour_that_all_share_over_black(means, estimator):
 
 
 def test_nothing_is_summed_that_is_not_asked_for():
-    sums = {(cross, means): kernels.fisher_sums(cross, means) for cross in (False, True) for means in (False, True)}
+    sums = {
+        (cross, means): kernels.fisher_sums(cross, means)
+        for cross in (False, True)
+        for means in (False, True)
+    }
     assert sums == {(False, False): 7, (True, False): 22, (False, True): 16, (True, True): 34}
 
 
@@ -181,18 +218,28 @@ def test_groups_of_means_come_last(degree):
         g, none = make_gaussians(5, 1, degree), make_gaussians(0, 1, degree)
         P = last + count
         assert fisher(g, make_camera(), means=means, normals=normals_of(g)).shape == (5, P)
-        assert fisher(none, make_camera(), "block", means=means, normals=np.zeros((0, 3))).shape == (0, P, P)
+        assert fisher(
+            none, make_camera(), "block", means=means, normals=np.zeros((0, 3))
+        ).shape == (0, P, P)
 
 
 def test_unseen_means_and_clamped_alphas_carry_no_information():
     camera, g = make_camera(), make_gaussians(16, 5, 1)
     g.means[3] = camera.position - 2 * camera.world_to_camera[2, :3]
     g.means[4] = camera.position
-    exact, block = (fisher(g, camera, e, means="free", alpha_weight=2.0) for e in ("exact", "block"))
+    exact, block = (
+        fisher(g, camera, e, means="free", alpha_weight=2.0) for e in ("exact", "block")
+    )
     assert (exact[[3, 4]] == 0).all()
     assert (block[[3, 4]] == 0).all()
     assert (exact[5, -3:] > 0).all()
-    wide = changed(g[:1], means=np.zeros((1, 3)), log_scales=np.full((1, 3), 6.0), logit_opacities=[20.0], sh=0 * g.sh[:1])
+    wide = changed(
+        g[:1],
+        means=np.zeros((1, 3)),
+        log_scales=np.full((1, 3), 6.0),
+        logit_opacities=[20.0],
+        sh=0 * g.sh[:1],
+    )
     assert (fisher(wide, camera, means="free", alpha_weight=2.0)[:, 12:] == 0).all()
 
 
@@ -208,15 +255,24 @@ def test_extreme_scenes_give_finite_information(name):
     [
         ({"means": "fixed"}, "means 'fixed': unknown; choose one of frozen, normal, free"),
         ({"means": "normal"}, r"fisher: means='normal' needs normals \[N,3\]"),
-        ({"means": "normal", "normals": np.ones((4, 3))}, r"fisher: normals have shape \(4, 3\), expected \(5, 3\)"),
-        ({"means": "normal", "normals": np.eye(5, 3)}, "fisher: a normal is zero, NaN or infinite, first at Gaussian 3"),
+        (
+            {"means": "normal", "normals": np.ones((4, 3))},
+            r"fisher: normals have shape \(4, 3\), expected \(5, 3\)",
+        ),
+        (
+            {"means": "normal", "normals": np.eye(5, 3)},
+            "fisher: a normal is zero, NaN or infinite, first at Gaussian 3",
+        ),
         (
             {"means": "normal", "normals": np.full((5, 3), np.nan)},
             "fisher: a normal is zero, NaN or infinite, first at Gaussian 0",
         ),
         ({"alpha_weight": -0.1}, "fisher: alpha_weight -0.1 must be from 0 to 1e[+]12"),
         ({"alpha_weight": np.nan}, "fisher: alpha_weight nan must be from 0 to 1e[+]12"),
-        ({"alpha_weight": 1e13}, "fisher: alpha_weight 1e[+]?13|alpha_weight 10000000000000.0 must be"),
+        (
+            {"alpha_weight": 1e13},
+            "fisher: alpha_weight 1e[+]?13|alpha_weight 10000000000000.0 must be",
+        ),
         (
             {"estimator": "hutchinson", "means": "free"},
             "fisher: the estimator 'hutchinson' knows neither means nor alpha; use exact or block",
@@ -239,6 +295,7 @@ def test_too_many_sums_are_refused(monkeypatch):
     monkeypatch.setattr(information, "MAX_SUMS", 1024 * 24 + 1)
     fisher(g, camera, "block")
     with pytest.raises(
-        InputError, match=r"view: 1,024 pairs of a Gaussian and a block .* which takes fewer than 682; take fewer"
+        InputError,
+        match=r"view: 1,024 pairs of a Gaussian and a block .* which takes fewer than 682; take fewer",
     ):
         fisher(g, camera, "block", means="free")

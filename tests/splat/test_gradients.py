@@ -1,6 +1,8 @@
-"""Gradients of images against the oracle: colours by its Jacobian, everything else by central differences in float64.
+"""Gradients of images against the oracle: colours by its Jacobian, everything else by central
+differences in float64.
 
-Judged as vectors: relative L2 error, cosine and signed bias. Scenes have no pixel near a threshold, where no gradient exists.
+Judged as vectors: relative L2 error, cosine and signed bias. Scenes have no pixel near a threshold,
+where no gradient exists.
 """
 
 from dataclasses import fields
@@ -27,17 +29,25 @@ def image_weights(camera, seed=0) -> dict[str, np.ndarray]:
     """Gradients of the loss with respect to each output image: independent normal numbers."""
     rng = np.random.default_rng([seed, 99])
     shape = (camera.height, camera.width)
-    return {"rgb": rng.normal(0, 1, (*shape, 3)), "alpha": rng.normal(0, 1, shape), "depth": rng.normal(0, 1, shape)}
+    return {
+        "rgb": rng.normal(0, 1, (*shape, 3)),
+        "alpha": rng.normal(0, 1, shape),
+        "depth": rng.normal(0, 1, shape),
+    }
 
 
 def gradients(gaussians, camera, weights, wanted=PARAMETERS) -> dict[str, np.ndarray]:
-    """By `dr.backward` through `render`: the gradient of sum over outputs of sum(weight * image)."""
+    """By `dr.backward` through `render`: the gradient of sum over outputs of sum(weight *
+    image)."""
     watched = as_drjit(gaussians)
     for name in wanted:
         setattr(watched, name, dr.copy(getattr(watched, name)))
         dr.enable_grad(getattr(watched, name))
     image = render(watched, camera, BACKGROUND)
-    loss = sum(dr.sum(getattr(image, name) * mi.TensorXf(w.astype(np.float32)), axis=None) for name, w in weights.items())
+    loss = sum(
+        dr.sum(getattr(image, name) * mi.TensorXf(w.astype(np.float32)), axis=None)
+        for name, w in weights.items()
+    )
     dr.backward(loss)
     return {name: np.asarray(dr.grad(getattr(watched, name))) for name in wanted}
 
@@ -65,18 +75,28 @@ def differences(gaussians, camera, weights, wanted, step=1e-6) -> dict[str, np.n
 
 @cache
 def case(degree: int, n=10):
-    """(gaussians, camera, weights, expected gradients per output): computed once for all tests of a degree."""
+    """(gaussians, camera, weights, expected gradients per output): computed once for all tests of a
+    degree."""
     camera = make_camera()
-    gaussians = calm(lambda seed: make_gaussians(n, seed, degree, log_scales=(-4.0, -1.0)), camera, 10 + degree)
+    gaussians = calm(
+        lambda seed: make_gaussians(n, seed, degree, log_scales=(-4.0, -1.0)), camera, 10 + degree
+    )
     weights = image_weights(camera, degree)
-    expected = differences(gaussians, camera, weights, ("means", "log_scales", "quats", "logit_opacities"))
+    expected = differences(
+        gaussians, camera, weights, ("means", "log_scales", "quats", "logit_opacities")
+    )
     J = reference.jacobian(gaussians, camera, BACKGROUND)
     flat = np.tensordot(weights["rgb"].reshape(-1, 3), J, axes=([0, 1], [0, 1]))
     K = (degree + 1) ** 2
     sh = np.zeros((len(OUTPUTS), n, K, 3))
     sh[0] = flat[:, : 3 * K].reshape(n, K, 3)
-    geometry = np.concatenate([expected["log_scales"][0], expected["quats"][0], expected["logit_opacities"][0][:, None]], 1)
-    assert compare(flat[:, 3 * K :], geometry)[0] < 1e-7, "the oracle disagrees with its own differences"
+    geometry = np.concatenate(
+        [expected["log_scales"][0], expected["quats"][0], expected["logit_opacities"][0][:, None]],
+        1,
+    )
+    assert compare(flat[:, 3 * K :], geometry)[0] < 1e-7, (
+        "the oracle disagrees with its own differences"
+    )
     return gaussians, camera, weights, {**expected, "sh": sh}
 
 
@@ -91,7 +111,9 @@ def test_gradient_of_each_output(degree, output, record_property):
         assert found[name].shape == getattr(gaussians, name).shape
         error, sine, bias = compare(found[name], truth)
         record_property(name, (error, sine, bias))
-        print(f"degree {degree} {output:5} {name:16} relative L2 {error:.1e}  1 - cosine {sine:.1e}  bias {bias:+.1e}")
+        print(
+            f"degree {degree} {output:5} {name:16} relative L2 {error:.1e}  1 - cosine {sine:.1e}  bias {bias:+.1e}"
+        )
         assert error < TOLERANCE, name
         assert sine < TOLERANCE**2, name
         assert abs(bias) < TOLERANCE / 2, name
@@ -115,7 +137,8 @@ def test_colours_do_not_move_alpha_or_depth(output):
 
 @pytest.mark.parametrize("seed", [4, 5])
 def test_gradient_of_the_depth_of_faint_splats(seed):
-    """Expected depth is a quotient by alpha, here a few 1/255: its own rounding must not be the gradient."""
+    """Expected depth is a quotient by alpha, here a few 1/255: its own rounding must not be the
+    gradient."""
     camera = make_camera()
     gaussians = make_gaussians(5, seed, logits=(-3, -1))
     assert margins(gaussians, camera).min() > 1e-3
@@ -138,7 +161,8 @@ LOSSES = {
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_gradient_of_any_loss(loss):
-    """Losses that slice, join and reduce images, against the same loss in two steps: some once ended the process in Dr.Jit."""
+    """Losses that slice, join and reduce images, against the same loss in two steps: some once
+    ended the process in Dr.Jit."""
     gaussians, camera, _, _ = case(1)
     watched = as_drjit(gaussians)
     dr.enable_grad(watched.log_scales)
@@ -155,10 +179,13 @@ def test_gradient_of_any_loss(loss):
 @pytest.mark.parametrize("means", [False, True])
 @pytest.mark.parametrize("channels", [3, 4])
 def test_some_channels_alone_have_the_same_image_and_derivatives(means, channels):
-    """What fits draw (`composite_channels`): the colours of `render` over black bit for bit, its alpha, gradients, tangents."""
+    """What fits draw (`composite_channels`): the colours of `render` over black bit for bit, its
+    alpha, gradients, tangents."""
     camera, gaussians = make_camera(), make_gaussians(60, 3, 1, log_scales=(-5.0, -1.5))
     weights = image_weights(camera)
-    weights = mi.TensorXf(np.dstack([weights["rgb"], weights["alpha"]])[..., :channels].astype(np.float32))
+    weights = mi.TensorXf(
+        np.dstack([weights["rgb"], weights["alpha"]])[..., :channels].astype(np.float32)
+    )
     wanted = PARAMETERS if means else PARAMETERS[1:]
 
     def alone(watched):
@@ -187,7 +214,11 @@ def test_some_channels_alone_have_the_same_image_and_derivatives(means, channels
     def together(watched):
         image = render(watched, camera)
         rgba = mi.Vector4f(*mi.Color3f(dr.unravel(mi.Color3f, image.rgb.array)), image.alpha.array)
-        return image.rgb if channels == 3 else mi.TensorXf(dr.ravel(rgba), (camera.height, camera.width, 4))
+        return (
+            image.rgb
+            if channels == 3
+            else mi.TensorXf(dr.ravel(rgba), (camera.height, camera.width, 4))
+        )
 
     expected, found = derivatives(together), derivatives(alone)
     np.testing.assert_array_equal(found[0][..., :3], expected[0][..., :3])
@@ -197,7 +228,8 @@ def test_some_channels_alone_have_the_same_image_and_derivatives(means, channels
 
 
 def test_frozen_means_change_no_other_gradient():
-    """Without gradients for the means the kernel leaves out two sums; every other gradient is bitwise the same."""
+    """Without gradients for the means the kernel leaves out two sums; every other gradient is
+    bitwise the same."""
     gaussians, camera, weights, _ = case(1)
     free = gradients(gaussians, camera, weights)
     frozen = gradients(gaussians, camera, weights, PARAMETERS[1:])
@@ -214,7 +246,8 @@ def test_one_parameter_alone_has_the_same_gradient():
 
 
 def test_gradient_stops_where_something_is_clamped():
-    """A colour below 0, an alpha above ALPHA_MAX, a log-scale outside its range: no gradient, as in the oracle."""
+    """A colour below 0, an alpha above ALPHA_MAX, a log-scale outside its range: no gradient, as in
+    the oracle."""
     gaussians, camera, weights, _ = case(0)
     dark = gaussians.sh.copy()
     dark[3] = -10
@@ -241,7 +274,11 @@ def test_gradient_stops_where_something_is_clamped():
 def test_gradient_for_any_scene(seed, degree, scale, stretch, logit, focal):
     """Scales, rotations and opacities in any scene, by the oracle's Jacobian."""
     camera = make_camera(focal=focal)
-    gaussians = calm(lambda s: make_gaussians(10, s, degree, (scale - stretch, scale), (logit - 4, logit)), camera, seed)
+    gaussians = calm(
+        lambda s: make_gaussians(10, s, degree, (scale - stretch, scale), (logit - 4, logit)),
+        camera,
+        seed,
+    )
     weights = {"rgb": image_weights(camera, seed)["rgb"]}
     J = reference.jacobian(gaussians, camera, BACKGROUND)
     expected = np.tensordot(weights["rgb"].reshape(-1, 3), J, axes=([0, 1], [0, 1]))

@@ -31,7 +31,11 @@ def test_eight_lanes_draw_the_same_image_and_information_as_sixteen(tmp_path):
     runtime.start()
     if runtime.processor()["simd_width"] != 16:
         pytest.skip("this processor has no registers of sixteen lanes")
-    subprocess.run([sys.executable, "-c", CODE, str(tmp_path / "x.npz")], cwd=Path(__file__).parents[2], check=True)
+    subprocess.run(
+        [sys.executable, "-c", CODE, str(tmp_path / "x.npz")],
+        cwd=Path(__file__).parents[2],
+        check=True,
+    )
     camera, gaussians = make_camera(), make_gaussians(60, 4)
     narrow = np.load(tmp_path / "x.npz")
     np.testing.assert_array_equal(narrow["rgb"], np.asarray(render(gaussians, camera).rgb))

@@ -1,4 +1,5 @@
-"""Images against the float64 oracle: error where no decision flips, share of pixels where one does, thresholds."""
+"""Images against the float64 oracle: error where no decision flips, share of pixels where one does,
+thresholds."""
 
 import drjit as dr
 import mitsuba as mi
@@ -15,10 +16,12 @@ from mgs.splat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from .scenes import SIZE, changed, make_camera, make_gaussians, margins, place
 
 TOLERANCE = 2e-5
-"""Of rgb and alpha, absolute; of depth weighted by alpha, in units of the farthest splat's depth (it is one more colour)."""
+"""Of rgb and alpha, absolute; of depth weighted by alpha, in units of the farthest splat's depth
+(it is one more colour)."""
 
 NEAR = 3e-5
-"""Relative error of alpha that float32 may make: pixels whose decisions are nearer than this may flip."""
+"""Relative error of alpha that float32 may make: pixels whose decisions are nearer than this may
+flip."""
 
 STYLES = {
     "mixed": {},
@@ -45,12 +48,15 @@ def errors(gaussians, camera, background) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def population():
-    """All random scenes, five styles by four SH degrees by three seeds: errors and decided masks, [60, H, W]."""
+    """All random scenes, five styles by four SH degrees by three seeds: errors and decided masks,
+    [60, H, W]."""
     results = []
     for number, style in enumerate(STYLES.values()):
         for degree in range(4):
             for seed in range(3):
-                camera = make_camera(eye=((2.0, 0.4, 1.1), (-1.2, 1.5, 0.3), (0.1, -0.2, 2.5))[seed])
+                camera = make_camera(
+                    eye=((2.0, 0.4, 1.1), (-1.2, 1.5, 0.3), (0.1, -0.2, 2.5))[seed]
+                )
                 gaussians = make_gaussians(60, 100 * number + seed, degree, **style)
                 results.append(errors(gaussians, camera, (0.1, 0.5, 0.9)))
     return np.stack([r[0] for r in results]), np.stack([r[1] for r in results])
@@ -85,8 +91,12 @@ def test_share_of_flipped_pixels(population, record_property):
     eye=st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(0.1, 2)),
     focal=st.floats(10, 100),
 )
-def test_matches_oracle_for_any_scene(seed, n, size, degree, scale, stretch, logit, background, eye, focal):
-    gaussians = make_gaussians(n, seed, degree, (scale - stretch, scale), (logit - 3, logit), colour=1.0)
+def test_matches_oracle_for_any_scene(
+    seed, n, size, degree, scale, stretch, logit, background, eye, focal
+):
+    gaussians = make_gaussians(
+        n, seed, degree, (scale - stretch, scale), (logit - 3, logit), colour=1.0
+    )
     camera = make_camera(size, focal, eye, target=(0.05, 0.02, 0.01))
     error, decided = errors(gaussians, camera, background)
     assert np.isfinite(error).all()
@@ -95,7 +105,8 @@ def test_matches_oracle_for_any_scene(seed, n, size, degree, scale, stretch, log
 
 @pytest.mark.parametrize("centre", [(320.0, 4.0), (-300.0, -200.0), (600.0, 240.0)])
 def test_error_at_the_edge_of_a_large_image(centre):
-    """Splats of a pixel's size, 640 pixels from the corner or far from the principal point, where float32 pixels are coarse."""
+    """Splats of a pixel's size, 640 pixels from the corner or far from the principal point, where
+    float32 pixels are coarse."""
     camera = make_camera((640, 6), focal=600.0, centre=centre)
     for seed in range(4):
         rng = np.random.default_rng(seed)
@@ -130,7 +141,8 @@ def test_threshold_of_alpha(above):
 
 @pytest.mark.parametrize("above", [False, True])
 def test_threshold_of_transmittance(above):
-    """Three splats leave T1; a fourth would leave 1e-4 (1 +- 1e-3) and is drawn only if that is above the limit."""
+    """Three splats leave T1; a fourth would leave 1e-4 (1 +- 1e-3) and is drawn only if that is
+    above the limit."""
     camera = make_camera()
     last = 1 - TRANSMITTANCE_MIN * (1.001 if above else 0.999) / 0.1**3
     gaussians = stack(camera, [0.9, 0.9, 0.9, last])
@@ -165,7 +177,10 @@ def test_background_changes_no_alpha_and_no_depth():
 
 def test_adam_of_mitsuba_fits_an_image_through_the_renderer():
     """`mi.ad.Adam` on colours and opacities, from grey: the loss falls a hundredfold."""
-    camera, truth = make_camera(), make_gaussians(16, 7, log_scales=(-2.5, -1.5), logits=(0, 3), colour=1.0)
+    camera, truth = (
+        make_camera(),
+        make_gaussians(16, 7, log_scales=(-2.5, -1.5), logits=(0, 3), colour=1.0),
+    )
     target = dr.detach(render(truth, camera).rgb)
     model = as_drjit(changed(truth, sh=0 * truth.sh, logit_opacities=0 * truth.logit_opacities))
     optimiser = mi.ad.Adam(lr=0.1)

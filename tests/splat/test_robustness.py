@@ -1,4 +1,5 @@
-"""Extreme input: finite, right against the oracle, and finite gradients; what is not a number is an error that names it."""
+"""Extreme input: finite, right against the oracle, and finite gradients; what is not a number is an
+error that names it."""
 
 import re
 from pathlib import Path
@@ -34,12 +35,17 @@ def with_first(name: str, value, seed=0) -> Gaussians:
 
 
 def behind_camera() -> Gaussians:
-    return with_first("means", place(CAMERA, [(5, 5), (20, 13), (30, 20), (44, 2)], [-1e-3, -0.5, -2, -100]))
+    return with_first(
+        "means", place(CAMERA, [(5, 5), (20, 13), (30, 20), (44, 2)], [-1e-3, -0.5, -2, -100])
+    )
 
 
 def around_near_plane() -> Gaussians:
-    """In front of it by a micrometre and behind it by as much; small enough that EWA means something there."""
-    means = place(CAMERA, [(5, 5), (20, 13), (30, 20), (44, 2)], [NEAR * 1.001, NEAR * 0.999, NEAR * 1.1, 0])
+    """In front of it by a micrometre and behind it by as much; small enough that EWA means
+    something there."""
+    means = place(
+        CAMERA, [(5, 5), (20, 13), (30, 20), (44, 2)], [NEAR * 1.001, NEAR * 0.999, NEAR * 1.1, 0]
+    )
     g = with_first("means", means)
     g.log_scales[:4] = -8
     return g
@@ -83,12 +89,17 @@ def gradients(gaussians, camera) -> dict[str, np.ndarray]:
         setattr(watched, name, dr.copy(getattr(watched, name)))
         dr.enable_grad(getattr(watched, name))
     image = render(watched, camera, BACKGROUND)
-    dr.backward(dr.sum(image.rgb, axis=None) + dr.sum(image.alpha, axis=None) + dr.sum(image.depth * image.alpha, axis=None))
+    dr.backward(
+        dr.sum(image.rgb, axis=None)
+        + dr.sum(image.alpha, axis=None)
+        + dr.sum(image.depth * image.alpha, axis=None)
+    )
     return {name: np.asarray(dr.grad(getattr(watched, name))) for name in PARAMETERS}
 
 
 def assert_right(gaussians, camera, quats: bool = True) -> None:
-    """Image and Fisher against the oracle (quats=False: but for quaternions), gradients finite. No pixel is near a decision."""
+    """Image and Fisher against the oracle (quats=False: but for quaternions), gradients finite. No
+    pixel is near a decision."""
     image = render(gaussians, camera, BACKGROUND)
     with np.errstate(all="ignore"):
         truth = reference.render(gaussians, camera, BACKGROUND)
@@ -105,7 +116,9 @@ def assert_right(gaussians, camera, quats: bool = True) -> None:
         assert np.isfinite(gradient).all(), f"gradient of {name}"
     with np.errstate(all="ignore"):
         expected = reference.fisher_block(gaussians, camera, BACKGROUND)
-    found, blocks = (fisher(gaussians, camera, estimator, BACKGROUND) for estimator in ("exact", "block"))
+    found, blocks = (
+        fisher(gaussians, camera, estimator, BACKGROUND) for estimator in ("exact", "block")
+    )
     assert np.isfinite(found).all()
     assert np.isfinite(blocks).all()
     assert (found >= 0).all()
@@ -113,12 +126,15 @@ def assert_right(gaussians, camera, quats: bool = True) -> None:
     part = np.arange(11) if quats else np.array([0, 1, 2, 3, 4, 5, 10])
     square = np.ix_(np.arange(len(found)), part, part)
     for values, truths in ((found[:, part], diagonal[:, part]), (blocks[square], expected[square])):
-        big = np.abs(truths) >= 1e-6 * np.abs(truths).max()  # where nothing is seen all are, and must be 0
+        big = (
+            np.abs(truths) >= 1e-6 * np.abs(truths).max()
+        )  # where nothing is seen all are, and must be 0
         np.testing.assert_allclose(values[big], truths[big], rtol=1e-3)
 
 
 BEYOND_DIFFERENCES = {"scales of e^30 and e^-30", "quaternions of norm 1e-9"}
-"""Where the oracle's central differences by quaternions miss: their step is beyond the quaternion, or turns a needle away."""
+"""Where the oracle's central differences by quaternions miss: their step is beyond the quaternion,
+or turns a needle away."""
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -128,7 +144,8 @@ def test_extreme_gaussians(name):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_needles_across_a_large_image(seed):
-    """A metre long, a tenth of a millimetre thick: half an image from its centre, xi is a small difference of large numbers."""
+    """A metre long, a tenth of a millimetre thick: half an image from its centre, xi is a small
+    difference of large numbers."""
     g = make_gaussians(6, seed, spread=0.3, logits=(0, 4))
     g.log_scales[:] = np.log([1, 1e-4, 1e-4])
     assert_right(g, make_camera((640, 120), focal=600))
@@ -137,10 +154,14 @@ def test_needles_across_a_large_image(seed):
 def test_splats_behind_the_camera_change_nothing():
     g = behind_camera()
     rest = Gaussians(*(getattr(g, name)[4:] for name in vars(g)))
-    np.testing.assert_array_equal(np.asarray(render(g, CAMERA).rgb), np.asarray(render(rest, CAMERA).rgb))
+    np.testing.assert_array_equal(
+        np.asarray(render(g, CAMERA).rgb), np.asarray(render(rest, CAMERA).rgb)
+    )
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 30), (30, 1), (7, 3), (8, 4), (9, 5), (16, 8), (33, 17)])
+@pytest.mark.parametrize(
+    "size", [(1, 1), (1, 30), (30, 1), (7, 3), (8, 4), (9, 5), (16, 8), (33, 17)]
+)
 def test_any_image_size(size):
     camera = make_camera(size, focal=0.8 * max(size))
     assert_right(scene(2), camera)
@@ -151,7 +172,9 @@ def test_any_image_size(size):
 
 def test_image_sizes_may_be_numpys_integers_and_are_whole():
     camera = make_camera()
-    counted = Camera(camera.K, np.int64(camera.width), np.uint16(camera.height), camera.world_to_camera)
+    counted = Camera(
+        camera.K, np.int64(camera.width), np.uint16(camera.height), camera.world_to_camera
+    )
     np.testing.assert_array_equal(render(scene(2), counted).rgb, render(scene(2), camera).rgb)
     with pytest.raises(InputError, match="must be whole pixels"):
         Camera(camera.K, 45.5, 31, camera.world_to_camera)
@@ -172,7 +195,9 @@ def test_no_gaussians_is_the_background(degree):
     g = make_gaussians(0, 0, degree)
     for cache in (None, ListCache()):
         image = render(g, CAMERA, BACKGROUND, cache)
-        np.testing.assert_allclose(np.asarray(image.rgb), np.broadcast_to(BACKGROUND, (SIZE[1], SIZE[0], 3)), atol=1e-7)
+        np.testing.assert_allclose(
+            np.asarray(image.rgb), np.broadcast_to(BACKGROUND, (SIZE[1], SIZE[0], 3)), atol=1e-7
+        )
         assert not np.any(np.asarray(image.alpha))
         assert not np.any(np.asarray(image.depth))
     columns = 3 * (degree + 1) ** 2 + 8
@@ -196,17 +221,31 @@ def test_gradient_of_extreme_scenes_is_right_too():
     g = thin(1e3)
     g.logit_opacities[::2] = 20
     least = margins(g, CAMERA)
-    weights = np.where((least > 1e-4)[..., None], np.random.default_rng(0).normal(size=(SIZE[1], SIZE[0], 3)), 0)
+    weights = np.where(
+        (least > 1e-4)[..., None], np.random.default_rng(0).normal(size=(SIZE[1], SIZE[0], 3)), 0
+    )
     watched = as_drjit(g)
     for name in PARAMETERS[1:]:
         setattr(watched, name, dr.copy(getattr(watched, name)))
         dr.enable_grad(getattr(watched, name))
-    dr.backward(dr.sum(render(watched, CAMERA, BACKGROUND).rgb * mi.TensorXf(weights.astype(np.float32)), axis=None))
+    dr.backward(
+        dr.sum(
+            render(watched, CAMERA, BACKGROUND).rgb * mi.TensorXf(weights.astype(np.float32)),
+            axis=None,
+        )
+    )
     J = reference.jacobian(g, CAMERA, BACKGROUND)
     expected = np.tensordot(weights.reshape(-1, 3), J, axes=([0, 1], [0, 1]))
-    parts = {"sh": slice(0, 3), "log_scales": slice(3, 6), "quats": slice(6, 10), "logit_opacities": slice(10, 11)}
+    parts = {
+        "sh": slice(0, 3),
+        "log_scales": slice(3, 6),
+        "quats": slice(6, 10),
+        "logit_opacities": slice(10, 11),
+    }
     for name, part in parts.items():
-        assert compare(np.asarray(dr.grad(getattr(watched, name))), expected[:, part])[0] < 1e-4, name
+        assert compare(np.asarray(dr.grad(getattr(watched, name))), expected[:, part])[0] < 1e-4, (
+            name
+        )
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -224,7 +263,9 @@ def test_not_a_number_names_the_parameter_and_the_first_gaussian(name, value):
         lambda: fisher(g, CAMERA),
         lambda: fisher(g, CAMERA, "hutchinson"),
     ):
-        with pytest.raises(InputError, match=f"{name} is NaN or infinite, first at Gaussian 5") as error:
+        with pytest.raises(
+            InputError, match=f"{name} is NaN or infinite, first at Gaussian 5"
+        ) as error:
             call()
         assert "\n" not in str(error.value)
 
@@ -244,10 +285,19 @@ def test_colours_beyond_measure_are_an_error(colour):
     """Their information would be infinite and their gradients NaN; a background's, too."""
     g = scene()
     g.sh[5, 0, 1] = colour
-    for call in (g.check, lambda: render(g, CAMERA), lambda: fisher(g, CAMERA), lambda: fisher(g, CAMERA, "hutchinson")):
-        with pytest.raises(InputError, match="sh is beyond 1,000,000, first at Gaussian 5; remove or repair it"):
+    for call in (
+        g.check,
+        lambda: render(g, CAMERA),
+        lambda: fisher(g, CAMERA),
+        lambda: fisher(g, CAMERA, "hutchinson"),
+    ):
+        with pytest.raises(
+            InputError, match="sh is beyond 1,000,000, first at Gaussian 5; remove or repair it"
+        ):
             call()
-    with pytest.raises(InputError, match="must be one or three numbers, linear RGB, up to 1,000,000"):
+    with pytest.raises(
+        InputError, match="must be one or three numbers, linear RGB, up to 1,000,000"
+    ):
         fisher(scene(), CAMERA, background=(0, colour, 0))
 
 
@@ -286,10 +336,13 @@ def test_shapes_that_do_not_fit_are_an_error(name, shape):
 
 
 def test_no_variant_is_named_in_the_code():
-    """The same code runs on any variant: nothing in the kernels or the plugins names one, or its backend's module."""
+    """The same code runs on any variant: nothing in the kernels or the plugins names one, or its
+    backend's module."""
     folders = [Path(mgs.splat.__file__).parent, Path(mgs.splat.__file__).parents[2] / "plugins"]
     files = [path for folder in folders for path in folder.rglob("*.py")]
     assert len(files) >= 6
     for path in files:
-        found = re.search(r"llvm_|cuda_|scalar_rgb|metal_|drjit\.(llvm|cuda)|set_variant", path.read_text())
+        found = re.search(
+            r"llvm_|cuda_|scalar_rgb|metal_|drjit\.(llvm|cuda)|set_variant", path.read_text()
+        )
         assert found is None, f"{path} names {found.group()}"

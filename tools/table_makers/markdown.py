@@ -10,7 +10,9 @@ from typing import Any
 def markdown(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table; all columns but the first are right-aligned."""
     lines = [heading, ["---", *["---:"] * (len(heading) - 1)], *rows]
-    return "".join("|" + "".join(f" {cell} |" if cell else " |" for cell in line) + "\n" for line in lines)
+    return "".join(
+        "|" + "".join(f" {cell} |" if cell else " |" for cell in line) + "\n" for line in lines
+    )
 
 
 def short(value: float, digits: int = 1) -> str:
@@ -20,21 +22,30 @@ def short(value: float, digits: int = 1) -> str:
 
 
 def made_by(data: dict[str, Any]) -> str:
-    """The command that measured the numbers, the machine where the file names it, and the versions."""
+    """The command that measured the numbers, the machine where the file names it, and the
+    versions."""
     command, machine, versions = data["command"], data.get("machine"), data["versions"]
     if not command.startswith("mgs "):
         command = f"python benchmarks/{command}"
     command = _as_a_loop(command)
-    cores = f" on {_threads(machine['threads'])} ({machine['cpu']}, {machine['simd_width']} float32 lanes)" if machine else ""
+    cores = (
+        f" on {_threads(machine['threads'])} ({machine['cpu']}, {machine['simd_width']} float32 lanes)"
+        if machine
+        else ""
+    )
     commit = f" ({versions['commit']})" if "commit" in versions else ""
     return f"\n`{command}`{cores}; mgs {versions['mgs']}{commit}, Mitsuba {versions['mitsuba']}, Dr.Jit {versions['drjit']}.\n"
 
 
 def _as_a_loop(command: str) -> str:
-    """A command whose last words are the same for several rocks of a study, as a loop over the rocks."""
+    """A command whose last words are the same for several rocks of a study, as a loop over the
+    rocks."""
     rocks = re.findall(r" \S+/cells/dataset/([\w-]+)/\S+:\S+", command)
     words = command.split()
-    patterns = {word.replace(rock, "$r") for word, rock in zip(words[len(words) - len(rocks) :], rocks, strict=True)}
+    patterns = {
+        word.replace(rock, "$r")
+        for word, rock in zip(words[len(words) - len(rocks) :], rocks, strict=True)
+    }
     if len(rocks) < 2 or len(patterns) > 1:
         return command
     first = " ".join(words[: len(words) - len(rocks)])

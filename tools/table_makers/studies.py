@@ -20,7 +20,15 @@ def stability(data: dict[str, Any]) -> str:
     rows = []
     for experiment in data["experiments"]:
         for claim in experiment["claims"]:
-            rows.append([experiment["name"], claim["hypothesis"], f"**{claim['verdict']}**", effect(claim), str(claim["runs"])])
+            rows.append(
+                [
+                    experiment["name"],
+                    claim["hypothesis"],
+                    f"**{claim['verdict']}**",
+                    effect(claim),
+                    str(claim["runs"]),
+                ]
+            )
     heading = ["experiment", "hypothesis", "verdict", "mean effect (95 % interval)", "runs"]
     return markdown(heading, rows) + made_by(data)
 
@@ -30,11 +38,22 @@ def parsimony(data: dict[str, Any]) -> str:
     rows = []
     for r in data["rows"]:
         n = f"{r['gaussians']:,}" + (" (auto)" if r["asked"] == "auto" else "")
-        cells = [n, r["learned"], str(r["degree"]), f"{r['parameters']:,}", f"{r['psnr_inside']:.2f}", f"{r['psnr']:.2f}"]
+        cells = [
+            n,
+            r["learned"],
+            str(r["degree"]),
+            f"{r['parameters']:,}",
+            f"{r['psnr_inside']:.2f}",
+            f"{r['psnr']:.2f}",
+        ]
         if r["learned"] == "auto":  # it is fitted to all views at once
             cells += ["", "", ""]
         else:
-            cells += [f"{1e3 * math.sqrt(r['next_error']):.1f}", f"{r['predictive']:.2f}", f"{r['evidence'] / 1e3:,.0f}"]
+            cells += [
+                f"{1e3 * math.sqrt(r['next_error']):.1f}",
+                f"{r['predictive']:.2f}",
+                f"{r['evidence'] / 1e3:,.0f}",
+            ]
         rows.append([r["scene"], *cells, f"{r['seconds']:.0f}"])
     heading = [
         "scene", "N", "learned", "SH", "parameters", "PSNR inside", "PSNR", "rms of the next view, 1e-3", "predictive",
@@ -44,15 +63,22 @@ def parsimony(data: dict[str, Any]) -> str:
 
 
 def parsimony_verdict(data: dict[str, Any]) -> str:
-    """What is chosen automatically, the number of Gaussians alone and everything, beside fixed numbers."""
+    """What is chosen automatically, the number of Gaussians alone and everything, beside fixed
+    numbers."""
     rows = []
     for scene, one in data["scenes"].items():
-        number = next(r for r in data["rows"] if r["scene"] == scene and r["asked"] == "auto" and r["learned"] == "+ rotation")
+        number = next(
+            r
+            for r in data["rows"]
+            if r["scene"] == scene and r["asked"] == "auto" and r["learned"] == "+ rotation"
+        )
         cells = [
             f"{one['best']:.2f}", f"{one['number']:.2f}, {number['parameters']:,}", f"{one['auto']:.2f}, {one['parameters']:,}",
             f"{round(one['loss'], 2) + 0.0:.2f}", f"{one['smallest']:,}",
         ]  # fmt: skip
-        rows.append([scene, *cells, " and ".join("yes" if one[key] else "no" for key in ("close", "small"))])
+        rows.append(
+            [scene, *cells, " and ".join("yes" if one[key] else "no" for key in ("close", "small"))]
+        )
     heading = [
         "scene", "best fixed, dB", "automatic number: dB, parameters", "all automatic: dB, parameters", "loss",
         "smallest fixed within 0.1 dB, parameters", "close, and no larger",
@@ -64,10 +90,16 @@ def parsimony_lean(data: dict[str, Any]) -> str:
     """What `mgs refit` chooses, and why."""
     rows = []
     for scene, one in data["scenes"].items():
-        lean, of = one["lean"], [r for r in data["rows"] if r["scene"] == scene and r["asked"] == "auto"]
+        lean, of = (
+            one["lean"],
+            [r for r in data["rows"] if r["scene"] == scene and r["asked"] == "auto"],
+        )
         by_degree = {r["degree"]: r["psnr_inside"] for r in of if r["learned"] == "+ rotation"}
         whole = next(r for r in of if r["learned"] == "+ rotation" and r["degree"] == 0)
-        shares = [f"{lean['shares'][kind]:.0%}" if kind in lean["shares"] else "" for kind in ("opacity", "scale", "rotation")]
+        shares = [
+            f"{lean['shares'][kind]:.0%}" if kind in lean["shares"] else ""
+            for kind in ("opacity", "scale", "rotation")
+        ]
         rows.append([
             scene, *shares, f"{lean['directional_gain']:+.2f} ± {lean['directional_error']:.2f}", str(lean["degree"]),
             f"{by_degree[1] - by_degree[0]:+.2f}", f"{lean['shares'].get('directional', 0):.0%}",
@@ -88,9 +120,20 @@ def left_out(data: dict[str, Any]) -> str:
         cells = [f"{one['psnr'][1] - one['psnr'][0]:+.2f}"]
         for name in ("blocks", "between"):
             found = one[name]
-            cells += [f"{found['gain']:+.2f} ({found['error']:.2f})", "degree 1" if found["pays"] else "degree 0"]
+            cells += [
+                f"{found['gain']:+.2f} ({found['error']:.2f})",
+                "degree 1" if found["pays"] else "degree 0",
+            ]
         rows.append([f"{one['rock']}, {one['material']}", str(one["views"]), *cells])
-    heading = ["rock", "views", "gain on test views, dB", "on blocks left out, dB", "asks for", "between, dB", "asks for"]
+    heading = [
+        "rock",
+        "views",
+        "gain on test views, dB",
+        "on blocks left out, dB",
+        "asks for",
+        "between, dB",
+        "asks for",
+    ]
     return markdown(heading, rows) + made_by(data)
 
 
@@ -99,16 +142,24 @@ def parsimony_rules(data: dict[str, Any]) -> str:
     rows = []
     for scene, one in data["scenes"].items():
         for axis in ("gaussians", "learned", "degree"):
-            found = [one["chosen"][f"{axis} by {rule}"] for rule in ("psnr_inside", "next_error", "predictive", "evidence")]
+            found = [
+                one["chosen"][f"{axis} by {rule}"]
+                for rule in ("psnr_inside", "next_error", "predictive", "evidence")
+            ]
             cells = [f"{c['value']:,}" if axis == "gaussians" else str(c["value"]) for c in found]
             rows.append(
                 [
                     f"{scene}, {axis}",
                     cells[0],
-                    *(f"{c} ({0.0 - round(f['loss'], 2):.2f})" for c, f in zip(cells[1:], found[1:], strict=True)),
+                    *(
+                        f"{c} ({0.0 - round(f['loss'], 2):.2f})"
+                        for c, f in zip(cells[1:], found[1:], strict=True)
+                    ),
                 ]
             )
-    return markdown(["", "best on the test views", "by next error", "by predictive", "by evidence"], rows)
+    return markdown(
+        ["", "best on the test views", "by next error", "by predictive", "by evidence"], rows
+    )
 
 
 def parsimony_prune(data: dict[str, Any]) -> str:
@@ -120,7 +171,15 @@ def parsimony_prune(data: dict[str, Any]) -> str:
             left = f"{p['gaussians']:,} of {before:,} ({p['gaussians'] / before:.0%})"
             change = [f"{1e3 * p[key]:.2f}" for key in ("predicted", "actual")]
             ratio = f"{(p['actual'] / p['predicted']) ** 2:.2f}" if p["predicted"] else ""
-            rows.append([f"{scene}, {p['noise']:g} sigma", left, *change, ratio, f"{p['psnr_inside'] - one['number']:+.2f}"])
+            rows.append(
+                [
+                    f"{scene}, {p['noise']:g} sigma",
+                    left,
+                    *change,
+                    ratio,
+                    f"{p['psnr_inside'] - one['number']:+.2f}",
+                ]
+            )
     heading = [
         "scene, noise",
         "Gaussians left",
@@ -159,45 +218,72 @@ REPRODUCED = {
     "seeds": "PSNR of the last model against the number of seeds",
     "pools": "PSNR of the last model over random, for each pool and policy",
 }
-"""Results of `mgs reproduce` that have a table, by name, and what their picture shows; Table I has none."""
+"""Results of `mgs reproduce` that have a table, by name, and what their picture shows; Table I has
+none."""
 
 
 def reproduced(name: str) -> Callable[[dict[str, Any]], str]:
-    """What makes a table of `mgs reproduce`, by its name: as the study wrote it, its command, and its picture."""
+    """What makes a table of `mgs reproduce`, by its name: as the study wrote it, its command, and
+    its picture."""
 
     def table(data: dict[str, Any]) -> str:
-        picture = f"\n![{REPRODUCED[name]}](results/reproduce/{name}.png)\n" if REPRODUCED[name] else ""
+        picture = (
+            f"\n![{REPRODUCED[name]}](results/reproduce/{name}.png)\n" if REPRODUCED[name] else ""
+        )
         return f"{data['markdown']}{made_by(data)}{picture}"
 
     return table
 
 
 def ablations(data: dict[str, Any]) -> str:
-    """Policies of `benchmarks/policies.py` beside `d-optimal`: by how much the leader is ahead of each."""
+    """Policies of `benchmarks/policies.py` beside `d-optimal`: by how much the leader is ahead of
+    each."""
     rows = [row for row in data["rows"] if ".py:" in row["policy"] or row["policy"] == "d-optimal"]
-    return matrix(rows, f"{LEADER} over it (dB)", lambda row: led(row, "test_psnr_led")) + made_by(data)
+    return matrix(rows, f"{LEADER} over it (dB)", lambda row: led(row, "test_psnr_led")) + made_by(
+        data
+    )
 
 
 def oracle(data: dict[str, Any]) -> str:
-    """What each policy gains over random draws on the test views, and its share of what the oracle gains, pool by pool."""
+    """What each policy gains over random draws on the test views, and its share of what the oracle
+    gains, pool by pool."""
     rows = data["rows"]
     pools, policies = (list(dict.fromkeys(row[key] for row in rows)) for key in ("pool", "policy"))
     found = {(row["policy"], row["pool"]): row for row in rows}
     lines = []
     for policy in policies:
         of = [found[policy, pool] for pool in pools]
-        lines.append([policy, *(f"{row['test_psnr_over_random']:+.2f} ({row['test_psnr_share']:.2f})" for row in of)])
-    return markdown([f"{data['rocks']} rocks: over random, dB (share)", *pools], lines) + made_by(data)
+        lines.append(
+            [
+                policy,
+                *(
+                    f"{row['test_psnr_over_random']:+.2f} ({row['test_psnr_share']:.2f})"
+                    for row in of
+                ),
+            ]
+        )
+    return markdown([f"{data['rocks']} rocks: over random, dB (share)", *pools], lines) + made_by(
+        data
+    )
 
 
 def own_policy(data: dict[str, Any]) -> str:
-    """By how much a policy of the user's own is behind the leader, at the end and over the whole curve."""
-    rows = [row | {"policy": what} for row in data["rows"] if ".py:" in row["policy"] for what in LED_COLUMNS]
-    return matrix(rows, f"{LEADER} over it (dB)", lambda row: led(row, LED_COLUMNS[row["policy"]])) + made_by(data)
+    """By how much a policy of the user's own is behind the leader, at the end and over the whole
+    curve."""
+    rows = [
+        row | {"policy": what}
+        for row in data["rows"]
+        if ".py:" in row["policy"]
+        for what in LED_COLUMNS
+    ]
+    return matrix(
+        rows, f"{LEADER} over it (dB)", lambda row: led(row, LED_COLUMNS[row["policy"]])
+    ) + made_by(data)
 
 
 def small_lambda(data: dict[str, Any]) -> str:
-    """Runs of `benchmarks/small_lambda.py` over those of d-optimal: mean, least and largest difference."""
+    """Runs of `benchmarks/small_lambda.py` over those of d-optimal: mean, least and largest
+    difference."""
     records, rows = data["records"], []
     base = {(r["rock"], r["pool"]): r for r in records if r["policy"] == "d-optimal"}
     for policy in dict.fromkeys(r["policy"] for r in records):
@@ -207,7 +293,9 @@ def small_lambda(data: dict[str, Any]) -> str:
             mean, least, most = sum(more) / len(more), min(more), max(more)
             is_base = policy == "d-optimal"
             cells.append(
-                f"{sum(r[key] for r in of) / len(of):.2f}" if is_base else f"{mean:+.2f} ({least:+.2f} to {most:+.2f})"
+                f"{sum(r[key] for r in of) / len(of):.2f}"
+                if is_base
+                else f"{mean:+.2f} ({least:+.2f} to {most:+.2f})"
             )
         rows.append([policy, *cells])
     heading = ["policy", "last model, full frame (dB)", "rock", "whole curve, full frame", "rock"]
@@ -228,7 +316,10 @@ def lunar(data: dict[str, Any]) -> str:
     samples = [f"sample {number}" for number in re.findall(r"--mesh \w*?(\d+)\.", data["command"])]
     keys = {"test_psnr": "full frame", "test_psnr_mask": "rock"}
     policies = data["test_psnr"]["area_by_rock"]
-    rows = [[policy, *(f"{area:.2f}" for key in keys for area in data[key]["area_by_rock"][policy])] for policy in policies]
+    rows = [
+        [policy, *(f"{area:.2f}" for key in keys for area in data[key]["area_by_rock"][policy])]
+        for policy in policies
+    ]
     heading = [f"{sample}, {part} (dB)" for part in keys.values() for sample in samples]
     return markdown(["policy", *heading], rows) + made_by(data)
 
@@ -238,11 +329,18 @@ def clean_alarms(data: dict[str, Any]) -> str:
     rows = []
     for name, found in data["signs"].items():
         rows.append(
-            [name, f"{found['runs']} of {data['runs']}", f"{found['rocks']} of {data['rocks']}", f"{found['largest']:.2f}"]
+            [
+                name,
+                f"{found['runs']} of {data['runs']}",
+                f"{found['rocks']} of {data['rocks']}",
+                f"{found['largest']:.2f}",
+            ]
         )
     alarms = sum(pool["alarms"] for pool in data["pools"].values())
     rows.append(["any but `saturated`", f"{alarms} of {data['runs']}", "", ""])
-    pools = ", ".join(f"{name} {pool['alarms']} of {pool['runs']}" for name, pool in data["pools"].items())
+    pools = ", ".join(
+        f"{name} {pool['alarms']} of {pool['runs']}" for name, pool in data["pools"].items()
+    )
     heading = ["sign", "runs beyond its limit", "rocks", "largest value over the limit"]
     return markdown(heading, rows) + f"\nThe last row by pool: {pools}.\n" + made_by(data)
 
@@ -273,7 +371,11 @@ TABLES: dict[str, tuple[str, Callable[[Any], str]]] = {
     "oracle": ("results/oracle/pools", oracle),
     **{f"chart-{name}": ("results/chart/chart", chart(name)) for name in CHART_TABLES},
 }
-"""By name: the file, seen from docs/ and without `.json`, and what makes the table of its contents."""
+"""By name: the file, seen from docs/ and without `.json`, and what makes the table of its
+contents."""
 
-NOT_RUN = {f"results/reproduce/{name}": f"Not run yet: `mgs reproduce OUT --only {name}`.\n" for name in REPRODUCED}
+NOT_RUN = {
+    f"results/reproduce/{name}": f"Not run yet: `mgs reproduce OUT --only {name}`.\n"
+    for name in REPRODUCED
+}
 """What stands for a table whose file may be missing."""

@@ -1,8 +1,10 @@
-"""Speed against accuracy of the core: image, gradient and Fisher information, against the float64 oracle.
+"""Speed against accuracy of the core: image, gradient and Fisher information, against the float64
+oracle.
 
-Errors are measured on a scene small enough for the oracle's dense Jacobian; times both there, where a call is mostly overhead,
-and at a working size. An error is the largest over all entries, relative to the largest entry of the oracle; parameters have
-different units, so each kind of parameter is compared by itself, and the worst kind counts.
+Errors are measured on a scene small enough for the oracle's dense Jacobian; times both there, where
+a call is mostly overhead, and at a working size. An error is the largest over all entries, relative
+to the largest entry of the oracle; parameters have different units, so each kind of parameter is
+compared by itself, and the worst kind counts.
 """
 
 from __future__ import annotations
@@ -32,7 +34,8 @@ CALLS = 5
 
 @dataclass(frozen=True)
 class Scene:
-    """Gaussians of a rock, a camera that they fill, and an image by which gradients are weighted [H,W,3]."""
+    """Gaussians of a rock, a camera that they fill, and an image by which gradients are weighted
+    [H,W,3]."""
 
     gaussians: Gaussians
     camera: Camera
@@ -46,7 +49,9 @@ def scene(n: int, size: tuple[int, int]) -> Scene:
 
     gaussians = surface_gaussians(n)
     camera = surface_camera(gaussians, *size)
-    weights = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
+    weights = (
+        np.random.default_rng(0).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
+    )
     return Scene(gaussians, camera, weights)
 
 
@@ -68,11 +73,21 @@ def gradient(where: Scene) -> Call:
     from mgs.bench.core import gradient as parts
     from mgs.splat import ListCache, as_drjit
 
-    device, cache, weights = as_drjit(where.gaussians), ListCache(), mi.TensorXf(padded(where.weights))
+    device, cache, weights = (
+        as_drjit(where.gaussians),
+        ListCache(),
+        mi.TensorXf(padded(where.weights)),
+    )
     n = len(where.gaussians)
 
     def call() -> np.ndarray:
-        return np.concatenate([np.asarray(part).reshape(n, -1) for part in parts(device, where.camera, weights, cache)], 1)
+        return np.concatenate(
+            [
+                np.asarray(part).reshape(n, -1)
+                for part in parts(device, where.camera, weights, cache)
+            ],
+            1,
+        )
 
     return call
 
@@ -105,7 +120,10 @@ def rows_of(plan: Plan) -> dict[str, tuple[str, Callable[[Scene], Call]]]:
         "block": ("blocks", partial(information, estimator="block")),
     }
     for k in plan.probes:
-        found[f"hutchinson {k}"] = ("diagonal", partial(information, estimator="hutchinson", probes=k))
+        found[f"hutchinson {k}"] = (
+            "diagonal",
+            partial(information, estimator="hutchinson", probes=k),
+        )
     return found
 
 
@@ -123,8 +141,8 @@ def oracle(what: str, where: Scene) -> np.ndarray:
 
 
 def error(found: np.ndarray, truth: np.ndarray, what: str) -> float:
-    """Largest error over the largest entry of the truth; of gradients and information the worst over the kinds of parameters,
-    of blocks after each entry is divided by sqrt(H_ii H_jj)."""
+    """Largest error over the largest entry of the truth; of gradients and information the worst
+    over the kinds of parameters, of blocks after each entry is divided by sqrt(H_ii H_jj)."""
     from mgs.splat import groups
 
     difference = np.abs(found - truth)
@@ -134,13 +152,20 @@ def error(found: np.ndarray, truth: np.ndarray, what: str) -> float:
         diagonal = np.sqrt(np.maximum(np.einsum("nii->ni", truth), 0))
         scale = diagonal[:, :, None] * diagonal[:, None, :]
         return float((difference[scale > 0] / scale[scale > 0]).max())
-    return float(max(difference[:, kind].max() / np.abs(truth[:, kind]).max() for kind in groups(0).values()))
+    return float(
+        max(difference[:, kind].max() / np.abs(truth[:, kind]).max() for kind in groups(0).values())
+    )
 
 
 def cells(plan: Plan, repeats: int, preset: str) -> list[Cell]:
     """A cell for each row. preset: the name of the plan."""
     return [
-        Cell(cell_name(name), "mgs.study.chart.core:measure", {"row": name, "preset": preset, "repeats": repeats}, alone=True)
+        Cell(
+            cell_name(name),
+            "mgs.study.chart.core:measure",
+            {"row": name, "preset": preset, "repeats": repeats},
+            alone=True,
+        )
         for name in rows_of(plan)
     ]
 
@@ -151,7 +176,8 @@ def cell_name(row: str) -> str:
 
 
 def measure(root: Path, out: Path, row: str, preset: str, repeats: int) -> dict[str, Any]:
-    """Error of a row on the small scene, and its times (`timed`) at the working size; small_wall: seconds on the small one."""
+    """Error of a row on the small scene, and its times (`timed`) at the working size; small_wall:
+    seconds on the small one."""
     from mgs import runtime
 
     runtime.start()
@@ -160,13 +186,19 @@ def measure(root: Path, out: Path, row: str, preset: str, repeats: int) -> dict[
     small = scene(*SMALL)
     found, on_small = _of_one_call(make(small), repeats)
     _, times = _of_one_call(make(scene(plan.core_gaussians, plan.core_size)), repeats)
-    return {**times, "small_wall": on_small["wall"], "error": error(found, oracle(what, small), what)}
+    return {
+        **times,
+        "small_wall": on_small["wall"],
+        "error": error(found, oracle(what, small), what),
+    }
 
 
 def _of_one_call(call: Call, repeats: int) -> tuple[np.ndarray, dict[str, float]]:
     """What a call returns, and its times; the reference's are left as they are."""
     results, times = timed(lambda: [call() for _ in range(CALLS)], repeats)
-    return results[-1], {name: value / (1 if name == "reference" else CALLS) for name, value in times.items()}
+    return results[-1], {
+        name: value / (1 if name == "reference" else CALLS) for name, value in times.items()
+    }
 
 
 def rows(plan: Plan, found: dict[str, Any], command: str) -> list[dict[str, Any]]:

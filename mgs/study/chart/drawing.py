@@ -23,7 +23,8 @@ FIT_FACTORS = {
     "crossed": "number of Gaussians x passes", "half the size": "trained at half the size", "optimiser": "Adam, passes",
     "learned": "less is learned",
 }  # fmt: skip
-"""What the left panels show, by factor. A point of several factors is drawn as the first of its own."""
+"""What the left panels show, by factor. A point of several factors is drawn as the first of its
+own."""
 
 RUN_FACTORS = {
     "crossed, run": "number of Gaussians x passes", "policy, run": "policy", "estimator, run": "estimator",
@@ -34,7 +35,11 @@ RUN_FACTORS = {
 def _points(axes: Any, rows: Rows, y: str, style: int, label: str, x: str = "seconds") -> None:
     """Points with error bars along the time."""
     xs, ys = np.array([row[x] for row in rows]), [row[y] for row in rows]
-    error = [xs - [row[f"{x}_low"] for row in rows], [row[f"{x}_high"] for row in rows] - xs] if f"{x}_low" in rows[0] else None
+    error = (
+        [xs - [row[f"{x}_low"] for row in rows], [row[f"{x}_high"] for row in rows] - xs]
+        if f"{x}_low" in rows[0]
+        else None
+    )
     axes.errorbar(
         xs, ys, xerr=error, fmt=MARKERS[style % 7], color=COLOURS[style % 7], ms=4.5, mew=0.4, mec="white", elinewidth=0.8,
         ls="none", label=label,
@@ -61,7 +66,8 @@ def _seconds_axis(axes: Any) -> None:
 
 
 def _drawn(axes: Any) -> np.ndarray:
-    """Points [P,2], pixels of the figure, on everything that is drawn in some axes: markers, and lines in small steps."""
+    """Points [P,2], pixels of the figure, on everything that is drawn in some axes: markers, and
+    lines in small steps."""
     lines = [(line.get_xydata(), line.get_linestyle() != "None") for line in axes.lines]
     lines += [(segment, True) for bars in axes.collections for segment in bars.get_segments()]
     points = [np.zeros((0, 2))]
@@ -69,12 +75,15 @@ def _drawn(axes: Any) -> np.ndarray:
         at = axes.transData.transform(np.asarray(path, np.float64).reshape(-1, 2))
         points.append(at)
         if joined:
-            points += [np.linspace(a, b, 2 + int(np.abs(b - a).max() // 4)) for a, b in pairwise(at)]
+            points += [
+                np.linspace(a, b, 2 + int(np.abs(b - a).max() // 4)) for a, b in pairwise(at)
+            ]
     return np.concatenate(points)
 
 
 def _label(axes: Any, rows: Rows, x: str, y: str, text: Callable[[dict[str, Any]], str]) -> None:
-    """Names beside points, each where it covers nothing that is drawn or written already, with a thin line to its point."""
+    """Names beside points, each where it covers nothing that is drawn or written already, with a
+    thin line to its point."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.text import Text
 
@@ -92,22 +101,33 @@ def _label(axes: Any, rows: Rows, x: str, y: str, text: Callable[[dict[str, Any]
             note.set_in_layout(False)
             note.update_positions(renderer)
             box = Text.get_window_extent(note, renderer).padded(2)  # without the line
-            inside = axes.bbox.x0 <= box.x0 and box.x1 <= axes.bbox.x1 and axes.bbox.y0 <= box.y0 and box.y1 <= axes.bbox.y1
+            inside = (
+                axes.bbox.x0 <= box.x0
+                and box.x1 <= axes.bbox.x1
+                and axes.bbox.y0 <= box.y0
+                and box.y1 <= axes.bbox.y1
+            )
             covers = ((drawn > (box.x0, box.y0)) & (drawn < (box.x1, box.y1))).all(axis=1).any()
-            if (inside and not covers and not any(box.overlaps(other) for other in boxes)) or (dx, dy) == _OFFSETS[-1]:
+            if (inside and not covers and not any(box.overlaps(other) for other in boxes)) or (
+                dx,
+                dy,
+            ) == _OFFSETS[-1]:
                 boxes.append(box)
                 break
             note.remove()
 
 
 _OFFSETS = tuple(
-    (side * (6 + 1.2 * abs(dy)), dy) for dy in (0, 9, -9, 18, -18, 27, -27, 38, -38, 50, -50, 64, -64) for side in (1, -1)
+    (side * (6 + 1.2 * abs(dy)), dy)
+    for dy in (0, 9, -9, 18, -18, 27, -27, 38, -38, 50, -50, 64, -64)
+    for side in (1, -1)
 )
 """Where a label is tried, points from its own point."""
 
 
 def fit_figure(path: str | Path, rows: Rows) -> None:
-    """Seconds against PSNR and SSIM, of fits (left) and of runs (right), with fronts; presets have names."""
+    """Seconds against PSNR and SSIM, of fits (left) and of runs (right), with fronts; presets have
+    names."""
     import matplotlib
 
     counts = Counter(row["images"] for row in rows)
@@ -120,14 +140,28 @@ def fit_figure(path: str | Path, rows: Rows) -> None:
             for axes, metric, flag, unit in zip(panels[:, column], *_METRICS, strict=True):
                 _fit_panel(axes, own, metric, flag, factors)
                 axes.set(ylabel=f"{metric.upper()} on the test views{unit}")
-            panels[1, column].set(xlabel="seconds of the whole run" if is_run else "seconds of the fit")
+            panels[1, column].set(
+                xlabel="seconds of the whole run" if is_run else "seconds of the fit"
+            )
             title = f"{'runs to' if is_run else 'one fit of'} {most} images"
             panels[0, column].legend(title=title, loc="lower left", bbox_to_anchor=(0, 1), ncols=3)
         for axes, metric, flag, _ in zip(panels[:, 0], *_METRICS, strict=True):
             on = [row for row in rows if not row["policy"] and row["images"] == most and row[flag]]
-            _label(axes, on, "seconds", metric, lambda row: f"{row['gaussians']:,}, {row['passes']} passes")
+            _label(
+                axes,
+                on,
+                "seconds",
+                metric,
+                lambda row: f"{row['gaussians']:,}, {row['passes']} passes",
+            )
         for axes, metric in zip(panels[:, 1], _METRICS[0], strict=True):
-            _label(axes, [row for row in rows if row["preset"]], "seconds", metric, lambda row: str(row["preset"]))
+            _label(
+                axes,
+                [row for row in rows if row["preset"]],
+                "seconds",
+                metric,
+                lambda row: str(row["preset"]),
+            )
         save_figure(figure, path)
 
 
@@ -136,7 +170,8 @@ _METRICS = (("psnr", "ssim"), ("front", "front_ssim"), (", dB", ""))
 
 
 def passes_figure(path: str | Path, rows: Rows) -> None:
-    """PSNR against what does not depend on a machine: passes (left), and the number of images (right)."""
+    """PSNR against what does not depend on a machine: passes (left), and the number of images
+    (right)."""
     import matplotlib
 
     most = Counter(row["images"] for row in rows).most_common(1)[0][0]
@@ -149,7 +184,8 @@ def passes_figure(path: str | Path, rows: Rows) -> None:
 
 
 def _passes_panel(axes: Any, rows: Rows) -> None:
-    """Passes of all fits together against PSNR: a line for each number of Gaussians, of fits (-) and of runs (--)."""
+    """Passes of all fits together against PSNR: a line for each number of Gaussians, of fits (-)
+    and of runs (--)."""
     crossed = [row for row in rows if "crossed" in row["factors"]]
     for style, n in enumerate(sorted({row["gaussians"] for row in crossed})):
         look = {"color": COLOURS[style % 7], "marker": MARKERS[style % 7], "ms": 4, "lw": 1}
@@ -159,23 +195,39 @@ def _passes_panel(axes: Any, rows: Rows) -> None:
                 key=lambda row: int(row["total_passes"]),
             )
             label = None if is_run else f"{n:,} Gaussians"
-            axes.plot([r["total_passes"] for r in some], [r["psnr"] for r in some], ls=dashes, label=label, **look)
+            axes.plot(
+                [r["total_passes"] for r in some],
+                [r["psnr"] for r in some],
+                ls=dashes,
+                label=label,
+                **look,
+            )
     axes.plot([], [], "k--", lw=1, label="runs")
     _seconds_axis(axes)
-    axes.set(xlabel="passes over the images, of all fits of a run together", ylabel="PSNR on the test views, dB")
+    axes.set(
+        xlabel="passes over the images, of all fits of a run together",
+        ylabel="PSNR on the test views, dB",
+    )
     axes.legend(loc="lower right")
 
 
 def _images_panel(axes: Any, rows: Rows) -> None:
     """The number of images of one fit against PSNR, in the frame and inside the rock."""
     default = next(row for row in rows if not row["policy"])  # the first has the defaults
-    some = [row for row in rows if not row["policy"] and all(row[key] == default[key] for key in _SETTINGS)]
+    some = [
+        row
+        for row in rows
+        if not row["policy"] and all(row[key] == default[key] for key in _SETTINGS)
+    ]
     some.sort(key=lambda row: int(row["images"]))
     for style, (metric, label) in enumerate((("psnr", "full frame"), ("psnr_mask", "rock"))):
         look = {"color": COLOURS[style], "marker": MARKERS[style], "ms": 4, "lw": 1}
         axes.plot([r["images"] for r in some], [r[metric] for r in some], label=label, **look)
     axes.set_xticks([row["images"] for row in some])
-    axes.set(xlabel=f"images of one fit of {default['gaussians']:,} Gaussians", ylabel="PSNR on the test views, dB")
+    axes.set(
+        xlabel=f"images of one fit of {default['gaussians']:,} Gaussians",
+        ylabel="PSNR on the test views, dB",
+    )
     axes.legend(loc="center right")
 
 
@@ -196,7 +248,14 @@ def _fit_panel(axes: Any, rows: Rows, metric: str, flag: str, factors: dict[str,
             _points(axes, some, metric, style, label)
     named = [row for row in rows if row["preset"]]
     if named:
-        axes.plot([r["seconds"] for r in named], [r[metric] for r in named], "k*", ms=10, label="preset", zorder=4)
+        axes.plot(
+            [r["seconds"] for r in named],
+            [r[metric] for r in named],
+            "k*",
+            ms=10,
+            label="preset",
+            zorder=4,
+        )
 
 
 def scoring_figure(path: str | Path, rows: Rows) -> None:
@@ -204,7 +263,10 @@ def scoring_figure(path: str | Path, rows: Rows) -> None:
     import matplotlib
 
     families = list(dict.fromkeys(row["family"] for row in rows))
-    scaled = [row | {f"ms{end}": 1e3 * row[f"seconds{end}"] for end in ("", "_low", "_high")} for row in rows]
+    scaled = [
+        row | {f"ms{end}": 1e3 * row[f"seconds{end}"] for end in ("", "_low", "_high")}
+        for row in rows
+    ]
     with matplotlib.rc_context(STYLE | {"legend.fontsize": 7}):
         figure = new_figure(11, 5.2)
         panels = figure.subplots(1, 2)
@@ -217,12 +279,28 @@ def scoring_figure(path: str | Path, rows: Rows) -> None:
             scaled = [row | {"percent": 100 * row["regret"]} for row in scaled]
             better = [row[metric] if metric == "tau" else -row[metric] for row in scaled]
             on = pareto_front([row["ms"] for row in scaled], better)
-            _front(axes, [row | {"on": flag} for row, flag in zip(scaled, on, strict=True)], metric, "on", "ms")
+            _front(
+                axes,
+                [row | {"on": flag} for row, flag in zip(scaled, on, strict=True)],
+                metric,
+                "on",
+                "ms",
+            )
             for style, family in enumerate(families):
-                _points(axes, [row for row in scaled if row["family"] == family], metric, style, family, "ms")
+                _points(
+                    axes,
+                    [row for row in scaled if row["family"] == family],
+                    metric,
+                    style,
+                    family,
+                    "ms",
+                )
             _seconds_axis(axes)
             axes.margins(0.12)
-            axes.set(xlabel="milliseconds a candidate, information of the views taken included", ylabel=label)
+            axes.set(
+                xlabel="milliseconds a candidate, information of the views taken included",
+                ylabel=label,
+            )
             _label(axes, scaled, "ms", metric, lambda row: str(row["variant"]))
         save_figure(figure, path)
 
@@ -232,16 +310,24 @@ def core_figure(path: str | Path, rows: Rows) -> None:
     import matplotlib
 
     kinds = list(dict.fromkeys(row["computes"] for row in rows))
-    scaled = [row | {f"ms{end}": 1e3 * row[f"seconds{end}"] for end in ("", "_low", "_high")} for row in rows]
+    scaled = [
+        row | {f"ms{end}": 1e3 * row[f"seconds{end}"] for end in ("", "_low", "_high")}
+        for row in rows
+    ]
     with matplotlib.rc_context(STYLE):
         figure = new_figure(7, 4.6)
         axes = figure.subplots()
         for style, kind in enumerate(kinds):
-            _points(axes, [row for row in scaled if row["computes"] == kind], "error", style, kind, "ms")
+            _points(
+                axes, [row for row in scaled if row["computes"] == kind], "error", style, kind, "ms"
+            )
         _seconds_axis(axes)
         axes.set_yscale("log")
         axes.margins(0.12)
-        axes.set(xlabel="milliseconds at the working size", ylabel="largest error, of the largest entry of the float64 oracle")
+        axes.set(
+            xlabel="milliseconds at the working size",
+            ylabel="largest error, of the largest entry of the float64 oracle",
+        )
         axes.legend(loc="center right")
         _label(axes, scaled, "ms", "error", lambda row: str(row["row"]))
         save_figure(figure, path)
@@ -252,7 +338,8 @@ DASHES = {"one step": ":", "by H": "-", "by H, known": "--"}
 
 
 def bytes_figure(path: str | Path, rows: Rows) -> None:
-    """Kilobytes sent against PSNR: images, and models of several sizes by how their numbers are rounded."""
+    """Kilobytes sent against PSNR: images, and models of several sizes by how their numbers are
+    rounded."""
     import matplotlib
 
     scaled = [row | {"kb": row["bytes"] / 1e3} for row in rows]
@@ -265,12 +352,29 @@ def bytes_figure(path: str | Path, rows: Rows) -> None:
         for style, n in enumerate(sorted({row["gaussians"] for row in models})):
             _model_lines(axes, [row for row in models if row["gaussians"] == n], style)
         photos.sort(key=lambda row: float(row["kb"]))
-        axes.plot([r["kb"] for r in photos], [r["psnr"] for r in photos], "k-P", ms=5, lw=0.8, label="images as PNG")
+        axes.plot(
+            [r["kb"] for r in photos],
+            [r["psnr"] for r in photos],
+            "k-P",
+            ms=5,
+            lw=0.8,
+            label="images as PNG",
+        )
         shown = [*models, *photos]
         costs = [np.nan if row["quantiser"] == "by H, known" else row["kb"] for row in shown]
         on = pareto_front(costs, [row["psnr"] for row in shown])
-        _front(axes, [row | {"on": flag} for row, flag in zip(shown, on, strict=True)], "psnr", "on", "kb")
-        for text, name in (("one step a column", "one step"), ("steps by H, sent", "by H"), ("a bound", "by H, known")):
+        _front(
+            axes,
+            [row | {"on": flag} for row, flag in zip(shown, on, strict=True)],
+            "psnr",
+            "on",
+            "kb",
+        )
+        for text, name in (
+            ("one step a column", "one step"),
+            ("steps by H, sent", "by H"),
+            ("a bound", "by H, known"),
+        ):
             axes.plot([], [], DASHES[name], color="#444444", lw=1, label=text)
         axes.plot([], [], "o", mfc="white", color="#444444", label="float32")
         _seconds_axis(axes)
@@ -284,9 +388,19 @@ def _model_lines(axes: Any, rows: Rows, style: int) -> None:
     """One model: a line for each way to round its numbers, and an empty marker for float32."""
     look = {"marker": MARKERS[style % 7], "color": COLOURS[style % 7]}
     for quantiser, dash in DASHES.items():
-        some = sorted((row for row in rows if row["quantiser"] == quantiser), key=lambda row: float(row["kb"]))
+        some = sorted(
+            (row for row in rows if row["quantiser"] == quantiser), key=lambda row: float(row["kb"])
+        )
         label = f"{rows[0]['gaussians']:,} Gaussians" if quantiser == "by H" else None
-        axes.plot([r["kb"] for r in some], [r["psnr"] for r in some], ls=dash, ms=3, lw=1, label=label, **look)
+        axes.plot(
+            [r["kb"] for r in some],
+            [r["psnr"] for r in some],
+            ls=dash,
+            ms=3,
+            lw=1,
+            label=label,
+            **look,
+        )
     whole = [row for row in rows if row["quantiser"] == "float32"]
     axes.plot([r["kb"] for r in whole], [r["psnr"] for r in whole], ls="none", mfc="white", **look)
 

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 
 def pareto_front(costs: Sequence[float], gains: Sequence[float]) -> NDArray[np.bool_]:
-    """[n] which points lie on the front: no other point has at most the cost and at least the gain, and one of both better.
+    """[n] which points lie on the front: no other point has at most the cost and at least the gain,
+    and one of both better.
 
-    costs: the less the better; gains: the more the better. Points with a NaN are not on it. Of equal points all are.
+    costs: the less the better; gains: the more the better. Points with a NaN are not on it. Of
+    equal points all are.
     """
     cost, gain = np.asarray(costs, np.float64), np.asarray(gains, np.float64)
     no_worse = (cost[None] <= cost[:, None]) & (gain[None] >= gain[:, None])

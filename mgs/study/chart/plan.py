@@ -1,4 +1,5 @@
-"""What the charts measure, by the name of a preset: sizes of the data, and the values that each factor takes."""
+"""What the charts measure, by the name of a preset: sizes of the data, and the values that each
+factor takes."""
 
 from __future__ import annotations
 
@@ -8,14 +9,16 @@ from pathlib import Path
 from mgs.study.sweep import Cell
 
 KINDS = ("fit", "scoring", "core", "bytes", "presets")
-"""The charts; "presets" is a table: `mgs nbv --preset` on scenes that the other charts do not use."""
+"""The charts; "presets" is a table: `mgs nbv --preset` on scenes that the other charts do not
+use."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """width, height: of the images, pixels; half of them for "half". frames, test_views: of the data. images: how many are
-    fitted, of which `seeds` at evenly spaced azimuths. repeats: how often a point is timed, if it is not said. The others are
-    values of factors; run_passes: of the first fit of runs."""
+    """width, height: of the images, pixels; half of them for "half". frames, test_views: of the
+    data. images: how many are fitted, of which `seeds` at evenly spaced azimuths. repeats: how
+    often a point is timed, if it is not said. The others are values of factors; run_passes: of the
+    first fit of runs."""
 
     width: int
     height: int
@@ -54,18 +57,21 @@ PLANS = {
 """`quick` takes nine to eleven minutes on two quiet cores, `full` some hours."""
 
 DENSITY = 1 / 8
-"""Density of the prior of the default point (`mgs.prior.settings.PriorSettings`): about what `mgs demo` has."""
+"""Density of the prior of the default point (`mgs.prior.settings.PriorSettings`): about what `mgs
+demo` has."""
 
 SCENE = "boulder"
 """The scene of the charts."""
 
 OTHER_SCENES = ("strata", "low-sun")
-"""The scenes on which the presets are judged. On SCENE, contact-binary and pebbles they were chosen."""
+"""The scenes on which the presets are judged. On SCENE, contact-binary and pebbles they were
+chosen."""
 
 
 @dataclass(frozen=True)
 class Data:
-    """A dataset and its priors as cells. folder: of the dataset, below the study's folder or anywhere; cells: that make it."""
+    """A dataset and its priors as cells. folder: of the dataset, below the study's folder or
+    anywhere; cells: that make it."""
 
     label: str
     folder: str
@@ -78,7 +84,12 @@ class Data:
     def prior(self, density: float) -> Cell:
         """The cell of a prior of this density; its name has the pixels for each sample."""
         arguments = {"dataset": self.folder, "density": density}
-        return Cell(f"prior/{self.label}-{1 / density:g}", "mgs.study.chart.subject:make_prior", arguments, self.needs)
+        return Cell(
+            f"prior/{self.label}-{1 / density:g}",
+            "mgs.study.chart.subject:make_prior",
+            arguments,
+            self.needs,
+        )
 
 
 def synthetic(plan: Plan, scene: str, half: bool = False) -> Data:

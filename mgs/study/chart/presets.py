@@ -1,4 +1,5 @@
-"""The presets of `mgs nbv` on scenes that the charts did not use: beside the best settings of a grid that take no more time."""
+"""The presets of `mgs nbv` on scenes that the charts did not use: beside the best settings of a
+grid that take no more time."""
 
 from __future__ import annotations
 
@@ -11,23 +12,29 @@ from mgs.study.chart.timing import with_seconds
 from mgs.study.sweep import Cell
 
 EQUAL_TIME = 1.05
-"""Settings that take so many times as long still count as of equal time: less than that is not resolved by the clock."""
+"""Settings that take so many times as long still count as of equal time: less than that is not
+resolved by the clock."""
 
 LOSS = 0.1
 """By how much a preset may be worse than the best of equal time, dB."""
 
 
 def cells(plan: Plan, repeats: int) -> list[Cell]:
-    """The runs of `mgs.study.chart.fit.crossed_runs`, among which the presets are, on every other scene."""
+    """The runs of `mgs.study.chart.fit.crossed_runs`, among which the presets are, on every other
+    scene."""
     found = [
-        cell for scene in OTHER_SCENES for cell in fit.cells(plan, synthetic(plan, scene), fit.crossed_runs(plan), repeats)
+        cell
+        for scene in OTHER_SCENES
+        for cell in fit.cells(plan, synthetic(plan, scene), fit.crossed_runs(plan), repeats)
     ]
     return list({cell.name: cell for cell in found}.values())
 
 
 def rows(plan: Plan, root: Path, found: dict[str, Any], unit: float) -> list[dict[str, Any]]:
-    """A row for each scene and preset: its time and quality, best: the PSNR of the best of equal time, loss: how much better
-    that is, dB, holds: whether that is at most LOSS, best_*: what that one is. unit: seconds of the reference."""
+    """A row for each scene and preset: its time and quality, best: the PSNR of the best of equal
+    time, loss: how much better
+    that is, dB, holds: whether that is at most LOSS, best_*: what that one is. unit: seconds of the
+    reference."""
     made = []
     for scene in OTHER_SCENES:
         data = synthetic(plan, scene)
@@ -35,7 +42,9 @@ def rows(plan: Plan, root: Path, found: dict[str, Any], unit: float) -> list[dic
         timed = dict(zip(runs, with_seconds(list(runs.values()), unit), strict=True))
         for name, point in fit.preset_points(plan).items():
             run, prior = timed[point], data.prior(point.density)
-            equal = [p for p, other in timed.items() if other["seconds"] <= EQUAL_TIME * run["seconds"]]
+            equal = [
+                p for p, other in timed.items() if other["seconds"] <= EQUAL_TIME * run["seconds"]
+            ]
             winner = max(equal, key=lambda p: timed[p]["psnr"])
             best = timed[winner]["psnr"]
             loss = best - run["psnr"]

@@ -31,10 +31,12 @@ def chart(
 ) -> dict[str, Any]:
     """Measure and draw; what is measured already is kept. kinds: of `mgs.study.chart.plan.KINDS`.
 
-    Writes KIND.csv of every kind, its figures (`mgs.study.chart.drawing.FIGURES`), and chart.json, which has all rows; kinds
-    that are not asked for are left as they are. dataset: in place of the one that is rendered; it needs test views.
-    report(cell, done, total) is told before each cell. Returns what chart.json holds.
-    Raises InputError for an unknown preset, as `load_dataset` and `run_cells`, and where the dataset has no test views.
+    Writes KIND.csv of every kind, its figures (`mgs.study.chart.drawing.FIGURES`), and chart.json,
+    which has all rows; kinds
+    that are not asked for are left as they are. dataset: in place of the one that is rendered; it
+    needs test views. report(cell, done, total) is told before each cell. Returns what chart.json
+    holds. Raises InputError for an unknown preset, as `load_dataset` and `run_cells`, and where the
+    dataset has no test views.
     """
     from mgs import runtime
     from mgs.data.dataset import load_dataset
@@ -46,14 +48,27 @@ def chart(
     runtime.start()
     out.mkdir(parents=True, exist_ok=True)
     data = synthetic(plan, SCENE) if dataset is None else own(dataset)
-    cells = {cell.name: cell for kind in kinds for cell in cells_of(kind, plan, preset, data, repeats)}
+    cells = {
+        cell.name: cell for kind in kinds for cell in cells_of(kind, plan, preset, data, repeats)
+    }
     with locked(out):
         found = run_cells(out, list(cells.values()), report)
-        unit = float(np.median([result["reference"] for result in found.values() if "reference" in result] or [0.0]))
+        unit = float(
+            np.median(
+                [result["reference"] for result in found.values() if "reference" in result] or [0.0]
+            )
+        )
         commands = {kind: command_of(kind, preset, data, out, repeats) for kind in kinds}
         rows = {kind: rows_of(kind, plan, data, out, found, unit, commands[kind]) for kind in kinds}
-        about = {"preset": preset, "repeats": repeats, "reference_seconds": unit, "machine": runtime.processor()}
-        measured = {kind: {"command": commands[kind], **about, "rows": made} for kind, made in rows.items()}
+        about = {
+            "preset": preset,
+            "repeats": repeats,
+            "reference_seconds": unit,
+            "machine": runtime.processor(),
+        }
+        measured = {
+            kind: {"command": commands[kind], **about, "rows": made} for kind, made in rows.items()
+        }
         path = out / "chart.json"
         result = {**_known(path), **measured, "versions": versions()}
         for kind, made in rows.items():
@@ -77,7 +92,9 @@ def cells_of(kind: str, plan: Plan, preset: str, data: Data, repeats: int) -> li
     """The cells of a chart, and those that they need."""
     if kind == "fit":
         half = None if not data.cells else synthetic(plan, SCENE, half=True)
-        points = [point for points in fit.factors(plan, half is not None).values() for point in points]
+        points = [
+            point for points in fit.factors(plan, half is not None).values() for point in points
+        ]
         return fit.cells(plan, data, points, repeats, half)
     if kind == "scoring":
         return scoring.cells(plan, data, repeats, preset)
@@ -88,16 +105,35 @@ def cells_of(kind: str, plan: Plan, preset: str, data: Data, repeats: int) -> li
 
 def command_of(kind: str, preset: str, data: Data, out: Path, repeats: int) -> str:
     """The command that measures a chart in the folder `out`."""
-    words = ["mgs", "chart", str(out), "--only", kind, "--preset", preset, "--repeats", str(repeats)]
+    words = [
+        "mgs",
+        "chart",
+        str(out),
+        "--only",
+        kind,
+        "--preset",
+        preset,
+        "--repeats",
+        str(repeats),
+    ]
     return shlex.join([*words, *([] if data.cells else ["--dataset", data.folder])])
 
 
-def rows_of(kind: str, plan: Plan, data: Data, root: Path, found: dict[str, Any], unit: float, command: str) -> Rows:
-    """The rows of a chart, with a command each. unit: seconds of the reference. command: that of the whole chart."""
+def rows_of(
+    kind: str, plan: Plan, data: Data, root: Path, found: dict[str, Any], unit: float, command: str
+) -> Rows:
+    """The rows of a chart, with a command each. unit: seconds of the reference. command: that of
+    the whole chart."""
     if kind == "fit":
-        return fit.with_fronts(with_seconds(fit.rows(plan, data, root, found, bool(data.cells)), unit))
+        return fit.with_fronts(
+            with_seconds(fit.rows(plan, data, root, found, bool(data.cells)), unit)
+        )
     if kind == "scoring":
         return with_seconds(scoring.rows(plan, data, found, command), unit)
     if kind == "core":
         return with_seconds(core.rows(plan, found, command), unit)
-    return sending.rows(plan, data, found, command) if kind == "bytes" else presets.rows(plan, root, found, unit)
+    return (
+        sending.rows(plan, data, found, command)
+        if kind == "bytes"
+        else presets.rows(plan, root, found, unit)
+    )

@@ -1,4 +1,5 @@
-"""The data that the charts measure on: cells that make datasets and priors, and how good a model is on the test views."""
+"""The data that the charts measure on: cells that make datasets and priors, and how good a model is
+on the test views."""
 
 from __future__ import annotations
 
@@ -16,7 +17,9 @@ SPP = 8
 """Samples per pixel of the data, denoised: those of the preset `quick` of `mgs synth-orbit`."""
 
 
-def make_dataset(root: Path, out: Path, scene: str, width: int, height: int, frames: int, test_views: int) -> dict[str, Any]:
+def make_dataset(
+    root: Path, out: Path, scene: str, width: int, height: int, frames: int, test_views: int
+) -> dict[str, Any]:
     """Render a scene into the folder `data` of the cell, as `mgs synth-orbit` does."""
     from mgs.synth.rendering import Preset
 
@@ -25,7 +28,8 @@ def make_dataset(root: Path, out: Path, scene: str, width: int, height: int, fra
 
 
 def make_prior(root: Path, out: Path, dataset: str, density: float) -> dict[str, Any]:
-    """Build a prior of so many samples per pixel into the folder `prior` of the cell; tells its number of Gaussians."""
+    """Build a prior of so many samples per pixel into the folder `prior` of the cell; tells its
+    number of Gaussians."""
     prior = made_prior(out / "prior", root / dataset, density=density)
     return {"gaussians": len(prior.points) + prior.backed, "spacing": prior.spacing}
 

@@ -1,4 +1,5 @@
-"""The tables of docs/speed-accuracy.md, as cells of text, made of what chart.json holds. Nothing is measured here."""
+"""The tables of docs/speed-accuracy.md, as cells of text, made of what chart.json holds. Nothing is
+measured here."""
 
 from __future__ import annotations
 
@@ -6,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from mgs.active.settings import PASSES, WARM_PASSES
+from mgs.fit.settings import PASSES, WARM_PASSES
 from mgs.study.chart.plan import DENSITY
 
 Rows = list[dict[str, Any]]
@@ -14,8 +15,11 @@ Cells = list[list[str]]
 
 
 def span(row: dict[str, Any], scale: float = 1.0) -> str:
-    """Seconds of a row of `mgs chart`, times a scale, and their extremes where it was timed more than once."""
-    value, low, high = (_digits(scale * row[key]) for key in ("seconds", "seconds_low", "seconds_high"))
+    """Seconds of a row of `mgs chart`, times a scale, and their extremes where it was timed more
+    than once."""
+    value, low, high = (
+        _digits(scale * row[key]) for key in ("seconds", "seconds_low", "seconds_high")
+    )
     return value if low == high else f"{value} ({low} to {high})"
 
 
@@ -29,7 +33,9 @@ def settings_of(row: dict[str, Any]) -> str:
     passes = f"{row['passes']} passes" + (f", then {row['warm_passes']}" if row["policy"] else "")
     parts = [f"{row['gaussians']:,} Gaussians", passes]
     parts += [
-        row[key] for key, usual in (("policy", ""), ("optimiser", "natural"), ("estimator", "exact")) if row[key] != usual
+        row[key]
+        for key, usual in (("policy", ""), ("optimiser", "natural"), ("estimator", "exact"))
+        if row[key] != usual
     ]
     parts += [] if row["learned"] == "all" else [f"learned: {row['learned']}"]
     return ", ".join([*parts, *(["half the size"] if row["half"] else [])])
@@ -46,7 +52,11 @@ def qualities(row: dict[str, Any]) -> list[str]:
 
 def front(rows: Rows) -> Cells:
     """Fits of the usual number of images that lie on the front of seconds against PSNR."""
-    return _by_seconds(row for row in rows if not row["policy"] and row["front"] and "crossed" in row["factors"].split("; "))
+    return _by_seconds(
+        row
+        for row in rows
+        if not row["policy"] and row["front"] and "crossed" in row["factors"].split("; ")
+    )
 
 
 def runs(rows: Rows) -> Cells:
@@ -56,7 +66,11 @@ def runs(rows: Rows) -> Cells:
 
 def _by_seconds(rows: Iterable[dict[str, Any]]) -> Cells:
     return [
-        [(f"**{row['preset']}**: " if row["preset"] else "") + settings_of(row), span(row), *qualities(row)]
+        [
+            (f"**{row['preset']}**: " if row["preset"] else "") + settings_of(row),
+            span(row),
+            *qualities(row),
+        ]
         for row in sorted(rows, key=lambda row: float(row["seconds"]))
     ]
 
@@ -81,7 +95,11 @@ def factors(rows: Rows) -> Cells:
             differs = [key for key, value in wanted.items() if row[key] != value]
             if len(differs) != 1 or bool(row["policy"]) != bool(policy):
                 continue
-            value = "half the size" if differs == ["half"] else f"{differs[0].replace('_', ' ')} {row[differs[0]]}"
+            value = (
+                "half the size"
+                if differs == ["half"]
+                else f"{differs[0].replace('_', ' ')} {row[differs[0]]}"
+            )
             changes = [f"{row['psnr'] - base['psnr']:+.2f}", f"{row['ssim'] - base['ssim']:+.4f}"]
             changes.append(f"{row['psnr_mask'] - base['psnr_mask']:+.2f}")
             kind = "run" if policy else "fit"
@@ -117,7 +135,11 @@ def bytes_sent(rows: Rows) -> Cells:
         exact = next(row for row in of if row["quantiser"] == "float32")["psnr"]
         cells = []
         for name in ("float32", "one step", "by H", "by H, known", "PNG"):
-            sizes = [row["bytes"] for row in of if row["quantiser"] == name and row["psnr"] >= exact - 0.1]
+            sizes = [
+                row["bytes"]
+                for row in of
+                if row["quantiser"] == name and row["psnr"] >= exact - 0.1
+            ]
             cells.append(f"{min(sizes) / 1e3:.1f} kB" if sizes else "none")
         lines.append([f"{n:,}, {images}: {exact:.2f} dB", *cells])
     return lines
@@ -140,9 +162,17 @@ TABLES: dict[str, tuple[str, tuple[str, ...], Callable[[Rows], Cells]]] = {
     "front": ("fit", ("on the front", "seconds", *QUALITY), front),
     "runs": ("fit", ("runs: front and presets", "seconds", *QUALITY), runs),
     "factors": ("fit", ("one factor changed", "times the seconds", *QUALITY), factors),
-    "scoring": ("scoring", ("scores", "ms a candidate", "over exact", "Kendall's tau", "regret"), scoring),
+    "scoring": (
+        "scoring",
+        ("scores", "ms a candidate", "over exact", "Kendall's tau", "regret"),
+        scoring,
+    ),
     "core": ("core", ("kernel", "computes", "ms at the working size", "largest error"), core),
-    "bytes": ("bytes", ("Gaussians, images", "float32", "one step", "by H", "by H, known", "images as PNG"), bytes_sent),
+    "bytes": (
+        "bytes",
+        ("Gaussians, images", "float32", "one step", "by H", "by H, known", "images as PNG"),
+        bytes_sent,
+    ),
     "presets": (
         "presets",
         (
@@ -170,10 +200,11 @@ PICTURES = {
 
 
 def chart_table(name: str, data: dict[str, Any]) -> tuple[str, tuple[str, ...], Cells, str]:
-    """(chart, heading, cells, note) of one of TABLES; data: what chart.json holds. Without cells where nothing is measured yet.
+    """(chart, heading, cells, note) of one of TABLES; data: what chart.json holds. Without cells
+    where nothing is measured yet.
 
-    The chart is a line of Markdown, empty where there is none. The note tells the command, the machine, and how long the
-    reference took of all that was timed.
+    The chart is a line of Markdown, empty where there is none. The note tells the command, the
+    machine, and how long the reference took of all that was timed.
     """
     kind, heading, cells = TABLES[name]
     if kind not in data:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mgs.active.criteria import Score, d_optimal, fisherrf, t_optimal
 from mgs.metrics import agreement
+from mgs.policy.criteria import Score, d_optimal, fisherrf, t_optimal
 from mgs.study.stress.experiment import Experiment, Panel, cells_per_rock, turns
 from mgs.study.stress.lab import open_lab
 from mgs.study.stress.verdict import Claim, Row, runs_of, single
@@ -17,16 +17,20 @@ EARLY = 5
 """Passes of a choice that is made too early; the default of the first fit is twice as many."""
 
 
-def convergence(root: Path, out: Path, scene: str, turns_: int, passes: list[int]) -> dict[str, Any]:
-    """Fits of several lengths to four views, with and without the prior on the parameters: quality on the test views, and how
-    the ranking of candidates agrees with that of the longest fit."""
+def convergence(
+    root: Path, out: Path, scene: str, turns_: int, passes: list[int]
+) -> dict[str, Any]:
+    """Fits of several lengths to four views, with and without the prior on the parameters: quality
+    on the test views, and how the ranking of candidates agrees with that of the longest fit."""
     lab, rows = open_lab(root, scene), []
     for suffix, turn in turns(turns_):
         taken = lab.even(4, turn)
         start, left = lab.start(taken), lab.left(taken)
         for with_prior in (True, False):
             kind = "with the prior" if with_prior else "no prior"
-            models = [lab.fit(taken, p, with_prior=with_prior, start=start).gaussians for p in passes]
+            models = [
+                lab.fit(taken, p, with_prior=with_prior, start=start).gaussians for p in passes
+            ]
             for name, score in SCORES.items():
                 scores = [lab.scores(model, taken, left, score) for model in models]
                 for count, model, found in zip(passes, models, scores, strict=True):

@@ -23,28 +23,33 @@ from mgs.study.stress.verdict import Claim, Row
 from mgs.study.sweep import Cell
 
 BLOCKS = 8
-"""Parts into which the second half of the steps is cut; memory of a part is the median over its steps. The first half warms
-up: recordings and block lists are kept up to a limit, which must be reached before the slope means anything."""
+"""Parts into which the second half of the steps is cut; memory of a part is the median over its
+steps. The first half warms
+up: recordings and block lists are kept up to a limit, which must be reached before the slope means
+anything."""
 
 LISTS = 1 << 22
 """Budget of the block lists in this test, bytes: so small that it is used up soon."""
 
 
 def endurance(root: Path, out: Path, scene: str, steps: int) -> dict[str, Any]:
-    """Steps as those of `mgs nbv`, in a process of its own, so that nothing done before counts. It runs this module: workers
-    may not start processes of `multiprocessing`."""
+    """Steps as those of `mgs nbv`, in a process of its own, so that nothing done before counts. It
+    runs this module: workers may not start processes of `multiprocessing`."""
     rows = out / "rows.json"
     subprocess.run([sys.executable, "-m", __name__, root, scene, str(steps), rows], check=True)
     return {"rows": read_json(rows)}
 
 
 def _steps(root: Path, scene: str, steps: int) -> list[Row]:
-    """Fit to three views that were never seen before and measure the information of a fourth, again and again."""
+    """Fit to three views that were never seen before and measure the information of a fourth, again
+    and again."""
     from mgs.splat import ListCache
 
     lab = replace(open_lab(root, scene), cache=ListCache(LISTS))
     rng, model = np.random.default_rng(0), lab.start(lab.even(4))
-    found = np.ones((steps, 2))  # written to before the first step, so that keeping the results takes no memory later
+    found = np.ones(
+        (steps, 2)
+    )  # written to before the first step, so that keeping the results takes no memory later
     for step in range(steps):
         views = [int(i) for i in rng.choice(len(lab.frames), 4, replace=False)]
         moved = _moved(lab, views, rng)
@@ -59,7 +64,8 @@ def _steps(root: Path, scene: str, steps: int) -> list[Row]:
 
 
 def _moved(lab: Lab, views: Sequence[int], rng: np.random.Generator) -> Lab:
-    """Some frames with cameras that were moved by a millimetre or so: new cameras for every cache."""
+    """Some frames with cameras that were moved by a millimetre or so: new cameras for every
+    cache."""
     frames = []
     for i in views:
         pose = lab.cameras[i].world_to_camera.copy()
@@ -87,7 +93,11 @@ def slopes(rows: Sequence[Row]) -> list[float]:
 
 
 def _cells(preset: Preset) -> list[Cell]:
-    return [rock_cell("endurance", f"{__name__}:endurance", preset, *preset.rocks[0], steps=preset.steps)]
+    return [
+        rock_cell(
+            "endurance", f"{__name__}:endurance", preset, *preset.rocks[0], steps=preset.steps
+        )
+    ]
 
 
 ENDURANCE = Experiment(

@@ -13,10 +13,11 @@ from mgs.study.sweep import Cell
 
 @dataclass(frozen=True)
 class Panel:
-    """One plot of an experiment's rows: the mean of column y over runs, with its 95 % interval, against column x.
+    """One plot of an experiment's rows: the mean of column y over runs, with its 95 % interval,
+    against column x.
 
-    by: column whose values are lines of their own. log: whether x is logarithmic. Where x is text, each value has a bar. only:
-    entries that a row must have to count; it must have the columns too.
+    by: column whose values are lines of their own. log: whether x is logarithmic. Where x is text,
+    each value has a bar. only: entries that a row must have to count; it must have the columns too.
     """
 
     x: str
@@ -30,8 +31,8 @@ class Panel:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A question about where the method fails. cells(preset): the work; the result of each holds "rows", a list of records
-    with a `run` each. derived(rows): more rows, for the picture alone."""
+    """A question about where the method fails. cells(preset): the work; the result of each holds
+    "rows", a list of records with a `run` each. derived(rows): more rows, for the picture alone."""
 
     question: str
     cells: Callable[[Preset], list[Cell]]
@@ -41,8 +42,11 @@ class Experiment:
     data: Callable[[Preset], list[Cell]] = lambda preset: []
 
 
-def cells_per_rock(name: str, task: str, arguments: Callable[[Preset], dict[str, Any]]) -> Callable[[Preset], list[Cell]]:
-    """The usual cells: one for each of the preset's rocks, named EXPERIMENT/SCENE, which needs the cell of its dataset."""
+def cells_per_rock(
+    name: str, task: str, arguments: Callable[[Preset], dict[str, Any]]
+) -> Callable[[Preset], list[Cell]]:
+    """The usual cells: one for each of the preset's rocks, named EXPERIMENT/SCENE, which needs the
+    cell of its dataset."""
 
     def cells(preset: Preset) -> list[Cell]:
         return [rock_cell(name, task, preset, *rock, **arguments(preset)) for rock in preset.rocks]
@@ -50,12 +54,17 @@ def cells_per_rock(name: str, task: str, arguments: Callable[[Preset], dict[str,
     return cells
 
 
-def rock_cell(name: str, task: str, preset: Preset, scene: str, seed: int, **arguments: Any) -> Cell:
+def rock_cell(
+    name: str, task: str, preset: Preset, scene: str, seed: int, **arguments: Any
+) -> Cell:
     """One such cell; the task is told the scene's name and seed as `scene`."""
     data = scene_cell(preset, scene, seed)
-    return Cell(f"{name}/{scene}-{seed}", task, {"scene": f"{scene}-{seed}", **arguments}, (data.name,))
+    return Cell(
+        f"{name}/{scene}-{seed}", task, {"scene": f"{scene}-{seed}", **arguments}, (data.name,)
+    )
 
 
 def turns(count: int) -> list[tuple[str, float]]:
-    """Sets of views of one rock: a suffix for the name of the run, and by which share of their spacing they are turned."""
+    """Sets of views of one rock: a suffix for the name of the run, and by which share of their
+    spacing they are turned."""
     return [(f"turn {k}", k / count) for k in range(count)]

@@ -1,7 +1,8 @@
-"""Faults of the data and of the prior, one pure function each; what they cost, and which signs tell of them.
+"""Faults of the data and of the prior, one pure function each; what they cost, and which signs tell
+of them.
 
-A run counts as failed if its PSNR on the test views, which no fault touches, is more than FAILURE dB below that of the clean
-run on the same rock and views.
+A run counts as failed if its PSNR on the test views, which no fault touches, is more than FAILURE
+dB below that of the clean run on the same rock and views.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, shift
 from scipy.spatial.transform import Rotation
 
-from mgs.active import detectors
-from mgs.active.criteria import coverage
-from mgs.active.settings import PASSES
 from mgs.camera import Camera
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data.dataset import Frame, target_of
+from mgs.fit.settings import PASSES
+from mgs.policy.criteria import coverage
 from mgs.prior.build import Prior
+from mgs.run import detectors
 from mgs.seeds import generator
 from mgs.splat import render
 from mgs.study.stress.experiment import turns
@@ -37,8 +38,8 @@ VIEWS = 6
 
 @dataclass(frozen=True)
 class Captured(Frame):
-    """A frame whose pixels are in memory, so that they can be spoiled. pixels: linear RGB [H,W,3]; rgba: the rock alone,
-    premultiplied [H,W,4]; z: depth [H,W], metres; rock: its mask [H,W]."""
+    """A frame whose pixels are in memory, so that they can be spoiled. pixels: linear RGB [H,W,3];
+    rgba: the rock alone, premultiplied [H,W,4]; z: depth [H,W], metres; rock: its mask [H,W]."""
 
     pixels: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
     rgba: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 4)))
@@ -65,7 +66,9 @@ class Captured(Frame):
 def captured(frame: Frame) -> Captured:
     """A frame of a dataset with its pixels read."""
     own = {name: getattr(frame, name) for name in Frame.__dataclass_fields__}
-    return Captured(**own, pixels=frame.rgb(), rgba=frame.target()[0], z=frame.depth(), rock=frame.mask())
+    return Captured(
+        **own, pixels=frame.rgb(), rgba=frame.target()[0], z=frame.depth(), rock=frame.mask()
+    )
 
 
 ImageFault = Callable[[Captured, float, np.random.Generator], Captured]
@@ -79,22 +82,30 @@ def _colours(frame: Captured, change: Callable[[np.ndarray], np.ndarray]) -> Cap
     alpha = frame.rgba[..., 3:]
     rock = np.clip(change(frame.rgba[..., :3]), 0, None) * (alpha > 0)
     rgba = np.concatenate([rock, alpha], axis=-1, dtype=np.float32)
-    return replace(frame, pixels=np.clip(change(frame.pixels), 0, None).astype(np.float32), rgba=rgba)
+    return replace(
+        frame, pixels=np.clip(change(frame.pixels), 0, None).astype(np.float32), rgba=rgba
+    )
 
 
 def pose_noise(frame: Captured, size: float, rng: np.random.Generator) -> Captured:
-    """size: degrees about each axis of the camera; its position is off by as much as keeps the rock in sight, 1 cm a degree."""
+    """size: degrees about each axis of the camera; its position is off by as much as keeps the rock
+    in sight, 1 cm a degree."""
     pose = frame.camera.world_to_camera.copy()
     turn = Rotation.from_rotvec(np.deg2rad(size) * rng.normal(size=3)).as_matrix()
     pose[:3] = turn @ pose[:3]
     pose[:3, 3] += 0.01 * size * rng.normal(size=3)
-    return replace(frame, camera=Camera(frame.camera.K, frame.camera.width, frame.camera.height, pose))
+    return replace(
+        frame, camera=Camera(frame.camera.K, frame.camera.width, frame.camera.height, pose)
+    )
 
 
 def image_noise(frame: Captured, size: float, rng: np.random.Generator) -> Captured:
     """size: standard deviation of noise on sRGB values."""
     noise = rng.normal(0, size, frame.pixels.shape)
-    return _colours(frame, lambda rgb: linear_from_srgb(np.clip(srgb_from_linear(np.clip(rgb, 0, 1)) + noise, 0, 1)))
+    return _colours(
+        frame,
+        lambda rgb: linear_from_srgb(np.clip(srgb_from_linear(np.clip(rgb, 0, 1)) + noise, 0, 1)),
+    )
 
 
 def exposure(frame: Captured, size: float, rng: np.random.Generator) -> Captured:
@@ -110,25 +121,42 @@ def motion_blur(frame: Captured, size: float, rng: np.random.Generator) -> Captu
     steps = [(t * np.sin(angle), t * np.cos(angle), 0) for t in offsets]
     moved = np.mean([shift(frame.rgba, step, order=1, mode="nearest") for step in steps], axis=0)
     pixels = np.mean([shift(frame.pixels, step, order=1, mode="nearest") for step in steps], axis=0)
-    return replace(frame, pixels=pixels.astype(np.float32), rgba=moved.astype(np.float32), rock=moved[..., 3] >= 0.5)
+    return replace(
+        frame,
+        pixels=pixels.astype(np.float32),
+        rgba=moved.astype(np.float32),
+        rock=moved[..., 3] >= 0.5,
+    )
 
 
 def defocus(frame: Captured, size: float, rng: np.random.Generator) -> Captured:
     """size: standard deviation of the blur, pixels."""
     rgba = gaussian_filter(frame.rgba, (size, size, 0)).astype(np.float32)
-    return replace(frame, pixels=gaussian_filter(frame.pixels, (size, size, 0)), rgba=rgba, rock=rgba[..., 3] >= 0.5)
+    return replace(
+        frame,
+        pixels=gaussian_filter(frame.pixels, (size, size, 0)),
+        rgba=rgba,
+        rock=rgba[..., 3] >= 0.5,
+    )
 
 
 def missing_depth(frame: Captured, size: float, rng: np.random.Generator) -> Captured:
-    """size: share of the pixels without a return, in patches. The prior was built before; depth colours the Gaussians."""
+    """size: share of the pixels without a return, in patches. The prior was built before; depth
+    colours the Gaussians."""
     patches = gaussian_filter(rng.normal(size=frame.z.shape), 4)
-    return replace(frame, z=np.where(patches < np.quantile(patches, size), 0, frame.z).astype(np.float32))
+    return replace(
+        frame, z=np.where(patches < np.quantile(patches, size), 0, frame.z).astype(np.float32)
+    )
 
 
 def shifted_mask(frame: Captured, size: float, rng: np.random.Generator) -> Captured:
-    """size: pixels by which the mask is off, in a random direction; what it cuts out is taken for the rock."""
+    """size: pixels by which the mask is off, in a random direction; what it cuts out is taken for
+    the rock."""
     angle = rng.uniform(0, 2 * np.pi)
-    return _masked(frame, shift(frame.rgba[..., 3], (size * np.sin(angle), size * np.cos(angle)), order=1) >= 0.5)
+    return _masked(
+        frame,
+        shift(frame.rgba[..., 3], (size * np.sin(angle), size * np.cos(angle)), order=1) >= 0.5,
+    )
 
 
 def wrong_mask(frame: Captured, size: float, rng: np.random.Generator) -> Captured:
@@ -141,7 +169,11 @@ def wrong_mask(frame: Captured, size: float, rng: np.random.Generator) -> Captur
 def _masked(frame: Captured, mask: np.ndarray) -> Captured:
     """The frame with the rock cut out of its image by another mask."""
     alpha = mask.astype(np.float32)[..., None]
-    return replace(frame, rock=mask, rgba=np.concatenate([frame.pixels * alpha, alpha], axis=-1, dtype=np.float32))
+    return replace(
+        frame,
+        rock=mask,
+        rgba=np.concatenate([frame.pixels * alpha, alpha], axis=-1, dtype=np.float32),
+    )
 
 
 IMAGE_FAULTS: dict[str, tuple[ImageFault, tuple[float, ...]]] = {
@@ -168,7 +200,8 @@ def noisy_prior(prior: Prior, size: float, rng: np.random.Generator) -> Prior:
 
 
 def smoothed_prior(prior: Prior, size: float, rng: np.random.Generator) -> Prior:
-    """size: how many times each point moves to the mean of its 32 nearest, as an over-smoothed Poisson mesh would lie."""
+    """size: how many times each point moves to the mean of its 32 nearest, as an over-smoothed
+    Poisson mesh would lie."""
     from scipy.spatial import cKDTree
 
     points = prior.points
@@ -179,7 +212,8 @@ def smoothed_prior(prior: Prior, size: float, rng: np.random.Generator) -> Prior
 
 
 def holes(prior: Prior, size: float, rng: np.random.Generator) -> Prior:
-    """size: share of the surface that is missing, around one random point. The Gaussians that are left stay as they are."""
+    """size: share of the surface that is missing, around one random point. The Gaussians that are
+    left stay as they are."""
     n = len(prior.points)
     away = np.linalg.norm(prior.points - prior.points[rng.integers(n)], axis=1)
     kept = away > np.quantile(away, size)
@@ -225,27 +259,47 @@ ONE_POSE = (1.0, 4.0)
 """Degrees of `pose_noise` in a single view."""
 
 
-def signs_of(lab: Lab, taken: Sequence[int], passes: int = PASSES, means: str = "frozen") -> tuple[Any, dict[str, float]]:
+def signs_of(
+    lab: Lab, taken: Sequence[int], passes: int = PASSES, means: str = "frozen"
+) -> tuple[Any, dict[str, float]]:
     """A fit, and the signs that the loop would have of it after its first step."""
     start = lab.start(taken)
     found = lab.fit(taken, passes, means, with_prior=means == "frozen", start=start)
     lam, views = lab.lam(), []
     surface = np.sum(lab.information(start, taken), axis=0)[: len(lab.prior.points)]
     for frame in (lab.frames[i] for i in taken):
-        old, new = (render(model, frame.camera, cache=lab.cache) for model in (start, found.gaussians))
-        target, mask, margin = target_of(frame), frame.mask(), detectors.outline_margin(start, frame.camera)
-        before = detectors.before_fit(target, mask, np.asarray(old.rgb), np.asarray(old.alpha), margin)
+        old, new = (
+            render(model, frame.camera, cache=lab.cache) for model in (start, found.gaussians)
+        )
+        target, mask, margin = (
+            target_of(frame),
+            frame.mask(),
+            detectors.outline_margin(start, frame.camera),
+        )
+        before = detectors.before_fit(
+            target, mask, np.asarray(old.rgb), np.asarray(old.alpha), margin
+        )
         views.append(detectors.view_signs(target, mask, np.asarray(new.rgb), before))
     drift = detectors.means_drift(found.gaussians.means, start.means, start.log_scales)
-    return found.gaussians, detectors.step_signs(views, found.losses, coverage(surface, lam), [], drift)
+    return found.gaussians, detectors.step_signs(
+        views, found.losses, coverage(surface, lam), [], drift
+    )
 
 
-def _row(lab: Lab, run: str, fault: str, size: float, clean: Mapping[str, Any] | None, *arguments: Any) -> Row:
+def _row(
+    lab: Lab, run: str, fault: str, size: float, clean: Mapping[str, Any] | None, *arguments: Any
+) -> Row:
     model, signs = signs_of(lab, *arguments)
     quality = lab.quality(model)
     reference = quality["psnr"] if clean is None else clean["psnr"]
     lost = reference - quality["psnr"]
-    named = {"run": run, "scene": run.split(",")[0], "fault": fault, "size": size, "label": f"{fault} {size:g}"}
+    named = {
+        "run": run,
+        "scene": run.split(",")[0],
+        "fault": fault,
+        "size": size,
+        "label": f"{fault} {size:g}",
+    }
     return (
         named
         | quality
@@ -254,10 +308,14 @@ def _row(lab: Lab, run: str, fault: str, size: float, clean: Mapping[str, Any] |
     )
 
 
-def faults(root: Path, out: Path, scene: str, kinds: str, others: list[str], repeats: int) -> dict[str, Any]:
-    """Fits to evenly spread views with every fault of a kind ("images" or "prior") at every size, beside clean ones.
+def faults(
+    root: Path, out: Path, scene: str, kinds: str, others: list[str], repeats: int
+) -> dict[str, Any]:
+    """Fits to evenly spread views with every fault of a kind ("images" or "prior") at every size,
+    beside clean ones.
 
-    others: rocks whose priors are tried in the place of the right one. repeats: draws of faults, each with views of its own.
+    others: rocks whose priors are tried in the place of the right one. repeats: draws of faults,
+    each with views of its own.
     """
     opened, rows = open_lab(root, scene), []
     lab = opened.changed(frames=tuple(captured(frame) for frame in opened.frames))
@@ -269,24 +327,40 @@ def faults(root: Path, out: Path, scene: str, kinds: str, others: list[str], rep
         for fault, (function, sizes) in table.items():
             for size in sizes:
                 rng = generator(0, f"stress/{named}/{fault}/{size}")
-                rows.append(_row(_spoiled(lab, taken, kinds, function, size, rng), named, fault, size, clean, taken))
+                rows.append(
+                    _row(
+                        _spoiled(lab, taken, kinds, function, size, rng),
+                        named,
+                        fault,
+                        size,
+                        clean,
+                        taken,
+                    )
+                )
         if kinds == "images":
             rows += _fit_faults(lab, named, taken, turn, clean)
         else:
-            wrong = {k: lab.changed(prior=open_lab(root, name).prior) for k, name in enumerate(others)}
+            wrong = {
+                k: lab.changed(prior=open_lab(root, name).prior) for k, name in enumerate(others)
+            }
             rows += [_row(wrong[k], named, "another rock's prior", k, clean, taken) for k in wrong]
     return {"rows": rows}
 
 
-def _spoiled(lab: Lab, taken: Sequence[int], kinds: str, function: Any, size: float, rng: np.random.Generator) -> Lab:
+def _spoiled(
+    lab: Lab, taken: Sequence[int], kinds: str, function: Any, size: float, rng: np.random.Generator
+) -> Lab:
     """The lab with the fault: in the frames that are fitted, or in the prior."""
     if kinds == "prior":
         return lab.changed(prior=function(lab.prior, size, rng))
-    return lab.changed(frames=tuple(function(f, size, rng) if i in taken else f for i, f in enumerate(lab.frames)))
+    return lab.changed(
+        frames=tuple(function(f, size, rng) if i in taken else f for i, f in enumerate(lab.frames))
+    )
 
 
 def _fit_faults(lab: Lab, run: str, taken: Sequence[int], turn: float, clean: Row) -> list[Row]:
-    """Fits of too few passes, fits with free means on few views, with their own clean runs, and one view with a wrong pose."""
+    """Fits of too few passes, fits with free means on few views, with their own clean runs, and one
+    view with a wrong pose."""
     rows = [_row(lab, run, "few passes", passes, clean, taken, passes) for passes in SHORT_FITS]
     for count in FREE_VIEWS:
         few = lab.even(count, turn)
@@ -294,7 +368,16 @@ def _fit_faults(lab: Lab, run: str, taken: Sequence[int], turn: float, clean: Ro
         rows += [frozen, _row(lab, run, "free means", count, frozen, few, FREE_PASSES, "free")]
     for size in ONE_POSE:
         rng = generator(0, f"stress/{run}/one bad pose/{size}")
-        rows.append(_row(_spoiled(lab, taken[:1], "images", pose_noise, size, rng), run, "one bad pose", size, clean, taken))
+        rows.append(
+            _row(
+                _spoiled(lab, taken[:1], "images", pose_noise, size, rng),
+                run,
+                "one bad pose",
+                size,
+                clean,
+                taken,
+            )
+        )
     return rows
 
 

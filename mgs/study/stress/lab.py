@@ -1,4 +1,5 @@
-"""What the experiments work on: small rocks, each made once, and the calls that most experiments need."""
+"""What the experiments work on: small rocks, each made once, and the calls that most experiments
+need."""
 
 from __future__ import annotations
 
@@ -11,19 +12,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mgs.active.criteria import MEAN_STD, PRIOR_STD, Score, d_optimal, lam_by_kind, regularisation
-from mgs.active.fitting import Fit, fit
-from mgs.active.outlook import Outlook
-from mgs.active.policies import policy_named
-from mgs.active.pose_policies import seed_views
-from mgs.active.settings import MEAN_RATE, PASSES, RATES, WARM_PASSES, TrainSettings
-from mgs.active.sight import Sight
-from mgs.active.stations import psnr_measure
 from mgs.camera import Camera
 from mgs.data.dataset import Frame, load_dataset, target_of
+from mgs.fit.fitting import Fit, fit
+from mgs.fit.settings import MEAN_RATE, PASSES, RATES, WARM_PASSES, TrainSettings
 from mgs.gaussians import Gaussians
+from mgs.policy.context import PolicyContext
+from mgs.policy.criteria import MEAN_STD, PRIOR_STD, Score, d_optimal, lam_by_kind, regularisation
+from mgs.policy.poses import seed_views
+from mgs.policy.registry import policy_named
+from mgs.policy.visibility import Visibility
 from mgs.prior.build import Prior, load_prior
 from mgs.prior.initial import initial_gaussians, initial_normals, warm_start
+from mgs.run.stations import psnr_measure
 from mgs.seeds import generator
 from mgs.splat import ListCache, fisher, groups
 from mgs.study.material import made_dataset, made_prior, test_views_of
@@ -45,9 +46,12 @@ POLICIES = ("d-optimal", "directional-i", "uniform", "random")
 class Preset:
     """How large the experiments are.
 
-    images: of every dataset. tests: test views of each. gaussians: of each prior. rocks: the (scene, seed) that all experiments
-    use. others: more of them, for the experiment on scenes. turns: sets of views per rock, turned against one another, so that
-    there are several runs per rock. repeats: draws of each random fault. few_views: numbers of views with free means; 2
+    images: of every dataset. tests: test views of each. gaussians: of each prior. rocks: the
+    (scene, seed) that all experiments
+    use. others: more of them, for the experiment on scenes. turns: sets of views per rock, turned
+    against one another, so that
+    there are several runs per rock. repeats: draws of each random fault. few_views: numbers of
+    views with free means; 2
     and 4 are among them. passes: lengths of fits. steps: of the test of memory.
     """
 
@@ -86,13 +90,24 @@ def scene_cell(preset: Preset, scene: str, seed: int) -> Cell:
     return Cell(f"dataset/{scene}-{seed}", f"{__name__}:make_scene", arguments)
 
 
-def variant_cell(preset: Preset, scene: str, seed: int, variant: str, changes: dict[str, dict[str, Any]], **other: int) -> Cell:
-    """The same for a scene of which some keys have other values; its name ends in that of the variant.
+def variant_cell(
+    preset: Preset,
+    scene: str,
+    seed: int,
+    variant: str,
+    changes: dict[str, dict[str, Any]],
+    **other: int,
+) -> Cell:
+    """The same for a scene of which some keys have other values; its name ends in that of the
+    variant.
 
-    changes: the values by section and key of the scene file. other: arguments of `make_scene` in place of the preset's.
+    changes: the values by section and key of the scene file. other: arguments of `make_scene` in
+    place of the preset's.
     """
     cell = scene_cell(preset, scene, seed)
-    return replace(cell, name=f"{cell.name}-{variant}", arguments=cell.arguments | {"changes": changes} | other)
+    return replace(
+        cell, name=f"{cell.name}-{variant}", arguments=cell.arguments | {"changes": changes} | other
+    )
 
 
 def make_scene(
@@ -108,10 +123,13 @@ def make_scene(
     gaussians: int,
     changes: dict[str, dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
-    """Render a dataset into OUT/dataset and build its prior, unless it has 0 Gaussians, in OUT/prior. changes: as in
-    `variant_cell`."""
+    """Render a dataset into OUT/dataset and build its prior, unless it has 0 Gaussians, in
+    OUT/prior. changes: as in `variant_cell`."""
     loaded = load_scene_file(scene)
-    sections = {name: getattr(loaded, name).model_copy(update=values) for name, values in (changes or {}).items()}
+    sections = {
+        name: getattr(loaded, name).model_copy(update=values)
+        for name, values in (changes or {}).items()
+    }
     images = Images(width, height, frames, spp)
     made_dataset(out / "dataset", loaded.model_copy(update=sections), images, seed, tests)
     if gaussians:
@@ -121,7 +139,8 @@ def make_scene(
 
 @dataclass(frozen=True)
 class Lab:
-    """A rock to experiment on: frames to fit to, a prior, and a measure on test views, which no fault ever touches."""
+    """A rock to experiment on: frames to fit to, a prior, and a measure on test views, which no
+    fault ever touches."""
 
     name: str
     frames: tuple[Frame, ...]
@@ -139,9 +158,12 @@ class Lab:
         return replace(self, cache=ListCache(CACHE), **fields)
 
     def even(self, count: int, turn: float = 0.0) -> list[int]:
-        """Views at evenly spaced azimuths; turn: from 0 to 1, by which share of the spacing they are turned."""
+        """Views at evenly spaced azimuths; turn: from 0 to 1, by which share of the spacing they
+        are turned."""
         angle = -2 * np.pi * turn / count
-        about_z = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        about_z = np.array(
+            [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+        )
         centre = self.prior.points.mean(0)
         positions = np.array([camera.position for camera in self.cameras])
         return seed_views((positions - centre) @ about_z.T, np.zeros(3), count)
@@ -156,7 +178,9 @@ class Lab:
 
     def lam(self, means: str = "frozen") -> Array:
         """lambda of each column of the information, for the default settings of `mgs nbv`."""
-        return regularisation(groups(0, means), prior_std=PRIOR_STD | {"mean": MEAN_STD * self.prior.spacing})
+        return regularisation(
+            groups(0, means), prior_std=PRIOR_STD | {"mean": MEAN_STD * self.prior.spacing}
+        )
 
     def fit(
         self,
@@ -168,8 +192,10 @@ class Lab:
         start: Gaussians | None = None,
         seed: int = 0,
     ) -> Fit:
-        """A fit of exactly so many passes, otherwise with the default settings of `mgs nbv`. with_prior: whether lambda holds
-        the parameters. model: where it begins; start: where lambda holds the parameters; both by default the Gaussians before
+        """A fit of exactly so many passes, otherwise with the default settings of `mgs nbv`.
+        with_prior: whether lambda holds
+        the parameters. model: where it begins; start: where lambda holds the parameters; both by
+        default the Gaussians before
         training. seed: of the order of the images."""
         start = self.start(taken) if start is None else start
         rates = RATES | {"mean": MEAN_RATE * self.prior.spacing}
@@ -181,9 +207,14 @@ class Lab:
             settings, None, self.cache, start, lam, initial_normals(self.prior),
         )  # fmt: skip
 
-    def information(self, model: Gaussians, views: Sequence[int], means: str = "frozen") -> list[Array]:
+    def information(
+        self, model: Gaussians, views: Sequence[int], means: str = "frozen"
+    ) -> list[Array]:
         """Exact Fisher information [N,P] of some of the views."""
-        return [fisher(model, self.cameras[i], cache=self.cache, means=means).astype(np.float64) for i in views]
+        return [
+            fisher(model, self.cameras[i], cache=self.cache, means=means).astype(np.float64)
+            for i in views
+        ]
 
     def scores(
         self,
@@ -199,7 +230,8 @@ class Lab:
         return np.array([score(F, H, lam) for F in self.information(model, left, means)])
 
     def quality(self, model: Gaussians) -> dict[str, float]:
-        """PSNR on the test views, dB: mean over whole images (`psnr`), and inside the rock's mask (`psnr_mask`)."""
+        """PSNR on the test views, dB: mean over whole images (`psnr`), and inside the rock's mask
+        (`psnr_mask`)."""
         found = self.measure(model, [])
         return {"psnr": found["psnr"], "psnr_mask": found["psnr_mask"]}
 
@@ -216,19 +248,28 @@ def open_lab(root: Path, scene: str) -> Lab:
     return _opened(cell_folder(root, f"dataset/{scene}"), scene)
 
 
-def greedy(lab: Lab, taken: Sequence[int], allowed: Sequence[int], count: int, policy: str = "d-optimal") -> list[int]:
-    """Views after `count` steps of the loop, fitted as `mgs nbv` does by default, candidates only among `allowed`.
+def greedy(
+    lab: Lab, taken: Sequence[int], allowed: Sequence[int], count: int, policy: str = "d-optimal"
+) -> list[int]:
+    """Views after `count` steps of the loop, fitted as `mgs nbv` does by default, candidates only
+    among `allowed`.
 
-    policy: "d-optimal", or one of `mgs.active.policies.policy_names` that looks at poses and the prior's surface alone.
+    policy: "d-optimal", or one of `mgs.policy.registry.policy_names` that looks at poses and the
+    prior's surface alone.
     """
     views, start = list(taken), lab.start(taken)
-    model, of_surface = start, None if policy == "d-optimal" else _surface_scores(lab, start, policy)
+    model, of_surface = (
+        start,
+        None if policy == "d-optimal" else _surface_scores(lab, start, policy),
+    )
     for step in range(count):
         left = [i for i in allowed if i not in views]
         if of_surface is None:
             before, start = start, lab.start(views)
             passes = PASSES if step == 0 else WARM_PASSES
-            model = lab.fit(views, passes, model=warm_start(model, before, start), start=start).gaussians
+            model = lab.fit(
+                views, passes, model=warm_start(model, before, start), start=start
+            ).gaussians
             scores = lab.scores(model, views, left)
         else:
             scores = of_surface(views, left, generator(0, f"stress/{policy}/{step}"))
@@ -236,8 +277,11 @@ def greedy(lab: Lab, taken: Sequence[int], allowed: Sequence[int], count: int, p
     return views
 
 
-def by_policy(lab: Lab, seeds: Sequence[int], count: int, policies: Sequence[str] = POLICIES) -> list[dict[str, Any]]:
-    """Quality of a model of `count` views, of which all but the seeds were chosen by a policy: a row for each policy."""
+def by_policy(
+    lab: Lab, seeds: Sequence[int], count: int, policies: Sequence[str] = POLICIES
+) -> list[dict[str, Any]]:
+    """Quality of a model of `count` views, of which all but the seeds were chosen by a policy: a
+    row for each policy."""
     rows = []
     for policy in policies:
         views = greedy(lab, seeds, range(len(lab.frames)), count - len(seeds), policy)
@@ -248,7 +292,8 @@ def by_policy(lab: Lab, seeds: Sequence[int], count: int, policies: Sequence[str
 def _surface_scores(
     lab: Lab, start: Gaussians, policy: str
 ) -> Callable[[list[int], list[int], np.random.Generator], NDArray[np.float64]]:
-    """A function of the views taken, those left and a generator, that gives each of those left the score of a policy.
+    """A function of the views taken, those left and a generator, that gives each of those left the
+    score of a policy.
 
     start: the Gaussians before training, in any colours."""
     choose, lam, n = policy_named(policy), lab.lam(), len(lab.prior.points)
@@ -257,11 +302,11 @@ def _surface_scores(
     def look(camera: Camera) -> Array:
         return fisher(start, camera, cache=lab.cache)[:n]
 
-    sight = Sight(lab.cameras, look, points, centre, float(lam[0]))
+    sight = Visibility(lab.cameras, look, points, centre, float(lam[0]))
     unknown, nothing = np.zeros((0, len(lam))), _of_fit
 
     def scores(views: list[int], left: list[int], rng: np.random.Generator) -> NDArray[np.float64]:
-        return np.asarray(choose(Outlook(
+        return np.asarray(choose(PolicyContext(
             positions=sight.positions, left=left, visited=views, centre=centre, rng=rng, H=unknown, lam=lam, points=points,
             surface_H=unknown, prior_lam=lam, information=nothing, surface_information=nothing, estimate=nothing,
             seen=sight.seen, dome=sight.dome, gains=sight.gains,
@@ -271,4 +316,6 @@ def _surface_scores(
 
 
 def _of_fit(*_: object) -> Array:
-    raise NotImplementedError("greedy: has no information for this policy; it serves d-optimal, and what needs no fit")
+    raise NotImplementedError(
+        "greedy: has no information for this policy; it serves d-optimal, and what needs no fit"
+    )

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from mgs.active.criteria import d_optimal
-from mgs.active.fitting import fit
-from mgs.active.settings import TrainSettings
 from mgs.camera import Camera
 from mgs.errors import InputError
+from mgs.fit.fitting import fit
+from mgs.fit.settings import TrainSettings
 from mgs.gaussians import Gaussians
+from mgs.policy.criteria import d_optimal
 from mgs.splat import fisher, render
 from mgs.study.stress.experiment import Experiment, Panel, rock_cell
 from mgs.study.stress.lab import Lab, Preset, open_lab
@@ -23,7 +23,8 @@ from mgs.study.stress.verdict import Claim
 from mgs.study.sweep import Cell
 
 Case = Callable[[Gaussians, Camera, int], tuple[Gaussians, Camera, float | None]]
-"""(model, camera, largest number of Gaussians) -> model, camera, and a colour that the whole image has, None: as rendered."""
+"""(model, camera, largest number of Gaussians) -> model, camera, and a colour that the whole image
+has, None: as rendered."""
 
 
 def _scaled(model: Gaussians, change: tuple[float, float, float]) -> Gaussians:
@@ -47,7 +48,11 @@ CASES: dict[str, Case] = {
     "anisotropy 1:1,000,000": lambda m, c, n: (_scaled(m, (100.0, 1.0, 0.001)), c, None),
     "opacities saturated at 1": lambda m, c, n: (_everywhere(m, 40.0), c, None),
     "opacities saturated at 0": lambda m, c, n: (_everywhere(m, -40.0), c, None),
-    "all Gaussians at one place": lambda m, c, n: (replace(m, means=np.tile(m.means[:1], (len(m), 1))), c, None),
+    "all Gaussians at one place": lambda m, c, n: (
+        replace(m, means=np.tile(m.means[:1], (len(m), 1))),
+        c,
+        None,
+    ),
     "image of one colour": lambda m, c, n: (m, c, 0.3),
     "image all black": lambda m, c, n: (m, c, 0.0),
     "image a thousand times too bright": lambda m, c, n: (m, c, 1000.0),
@@ -55,9 +60,14 @@ CASES: dict[str, Case] = {
     "many Gaussians": lambda m, c, n: (_repeated(m, n), c, None),
     "image of 1 pixel": lambda m, c, n: (m, resized(c, 1e-6), None),
     "image of 3840x2880": lambda m, c, n: (m, resized(c, 3840 / c.width), None),
-    "rock behind the camera": lambda m, c, n: (m, replace(c, world_to_camera=_turned_round(c.world_to_camera)), None),
+    "rock behind the camera": lambda m, c, n: (
+        m,
+        replace(c, world_to_camera=_turned_round(c.world_to_camera)),
+        None,
+    ),
 }
-"""By name. They are fitted for two passes to one image, rendered before and after, and their information is measured."""
+"""By name. They are fitted for two passes to one image, rendered before and after, and their
+information is measured."""
 
 
 def _turned_round(pose: np.ndarray) -> np.ndarray:
@@ -69,19 +79,28 @@ def numbers(root: Path, out: Path, scene: str, most: int) -> dict[str, Any]:
     lab = open_lab(root, scene)
     taken = lab.even(4)
     model = lab.fit(taken).gaussians
-    rows = [{"run": name, "what": "case", **_tried(case(model, lab.cameras[0], most))} for name, case in CASES.items()]
+    rows = [
+        {"run": name, "what": "case", **_tried(case(model, lab.cameras[0], most))}
+        for name, case in CASES.items()
+    ]
     return {"rows": rows + [_offered_twice(lab, model, view) for view in lab.left(taken)]}
 
 
 def _tried(case: tuple[Gaussians, Camera, float | None]) -> dict[str, Any]:
-    """Whether all that the program computes of a case is finite, and whether it refused it in one clear line."""
+    """Whether all that the program computes of a case is finite, and whether it refused it in one
+    clear line."""
     model, camera, colour = case
     try:
         image = render(model, camera)
         rgb = np.asarray(image.rgb)
         target = rgb * 0.5 + 0.1 if colour is None else np.full_like(rgb, colour)
         fitted = fit(model, [camera], [target], TrainSettings(passes=2)).gaussians
-        found = [rgb, np.asarray(image.alpha), np.asarray(image.depth), np.asarray(render(fitted, camera).rgb)]
+        found = [
+            rgb,
+            np.asarray(image.alpha),
+            np.asarray(image.depth),
+            np.asarray(render(fitted, camera).rgb),
+        ]
         found += [fisher(one, camera) for one in (model, fitted)]
         finite = all(np.isfinite(array).all() for array in found) and bool((found[-1] >= 0).all())
     except InputError as error:
@@ -90,7 +109,8 @@ def _tried(case: tuple[Gaussians, Camera, float | None]) -> dict[str, Any]:
 
 
 def _offered_twice(lab: Lab, model: Gaussians, view: int) -> dict[str, Any]:
-    """What a view gains when it is taken for the second time, over the first; no other view has been taken."""
+    """What a view gains when it is taken for the second time, over the first; no other view has
+    been taken."""
     F, lam = lab.information(model, [view])[0], lab.lam()
     first, second = d_optimal(F, np.zeros_like(F), lam), d_optimal(F, F, lam)
     return {"run": lab.frames[view].name, "what": "twice", "ratio": second / first}

@@ -1,4 +1,5 @@
-"""Numerics of the criteria: information near zero, ties, blocks that are nearly singular, single precision."""
+"""Numerics of the criteria: information near zero, ties, blocks that are nearly singular, single
+precision."""
 
 from __future__ import annotations
 
@@ -7,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from mgs.active.criteria import d_optimal, e_optimal
 from mgs.metrics import agreement
+from mgs.policy.criteria import d_optimal, e_optimal
 from mgs.splat import fisher
 from mgs.study.stress.experiment import Experiment, Panel, cells_per_rock, turns
 from mgs.study.stress.lab import Array, open_lab
@@ -55,7 +56,8 @@ def _in_float32(F: Array, H: Array, lam: Array) -> float:
 
 
 def _top_share(F: Array, H: Array, lam: Array, logarithm: bool = False) -> float:
-    """The share of a candidate's T-optimal score (or of Eq. 7, with the logarithm) that the largest 1 % of its terms make."""
+    """The share of a candidate's T-optimal score (or of Eq. 7, with the logarithm) that the largest
+    1 % of its terms make."""
     terms = np.log1p(F / (H + lam)) if logarithm else F / ((H + lam) * (H + F + lam))
     ordered = np.sort(terms, axis=None)
     total = float(ordered.sum())
@@ -63,7 +65,8 @@ def _top_share(F: Array, H: Array, lam: Array, logarithm: bool = False) -> float
 
 
 def _not_positive(blocks: Array, lam: float, kind: Any) -> float:
-    """The share of 11x11 blocks that are not positive definite in this precision, so that their log det cannot be taken."""
+    """The share of 11x11 blocks that are not positive definite in this precision, so that their log
+    det cannot be taken."""
     matrices = (blocks + lam * np.eye(blocks.shape[1])).astype(kind)
     return float((np.linalg.eigvalsh(matrices)[:, 0] <= 0).mean())
 

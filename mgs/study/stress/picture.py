@@ -28,7 +28,8 @@ PANELS, NAMES = 3, 12
 
 
 def draw_experiment(path: Path, experiment: Experiment, rows: Sequence[Row]) -> None:
-    """Draw all panels that have rows: those against numbers side by side, those against names beside or below them.
+    """Draw all panels that have rows: those against numbers side by side, those against names
+    beside or below them.
 
     Raises InputError if the file cannot be written."""
     import matplotlib
@@ -42,7 +43,9 @@ def draw_experiment(path: Path, experiment: Experiment, rows: Sequence[Row]) -> 
         figure = new_figure(max(sum(of_band) for of_band in widths), sum(heights))
         parts = figure.subfigures(len(bands), 1, squeeze=False, height_ratios=heights)[:, 0]
         for part, band, of_band in zip(parts, bands, widths, strict=True):
-            axes = part.subplots(1, len(band), squeeze=False, gridspec_kw={"width_ratios": of_band})[0]
+            axes = part.subplots(
+                1, len(band), squeeze=False, gridspec_kw={"width_ratios": of_band}
+            )[0]
             for axis, (panel, of_it) in zip(axes, band, strict=True):
                 (_draw_lines if _numeric(panel, of_it) else _draw_names)(axis, panel, of_it)
                 if panel.by:
@@ -54,7 +57,9 @@ def _bands(drawn: Drawn) -> list[Drawn]:
     """Rows of panels from top to bottom."""
     lines = [(panel, of_it) for panel, of_it in drawn if _numeric(panel, of_it)]
     names = [(panel, of_it) for panel, of_it in drawn if not _numeric(panel, of_it)]
-    if len(drawn) <= PANELS and all(len({row[panel.x] for row in of_it}) <= NAMES for panel, of_it in names):
+    if len(drawn) <= PANELS and all(
+        len({row[panel.x] for row in of_it}) <= NAMES for panel, of_it in names
+    ):
         return [lines + names]
     return [band for band in (lines, names) if band]
 
@@ -70,12 +75,19 @@ def _numeric(panel: Panel, rows: Sequence[Row]) -> bool:
 
 def _width(panel: Panel, rows: Sequence[Row]) -> float:
     """Inches; the letters of a name are about 0.06 inches wide."""
-    return WIDTH if _numeric(panel, rows) else WIDTH - 0.4 + 0.06 * max(len(row[panel.x]) for row in rows)
+    return (
+        WIDTH
+        if _numeric(panel, rows)
+        else WIDTH - 0.4 + 0.06 * max(len(row[panel.x]) for row in rows)
+    )
 
 
 def _height(band: Drawn) -> float:
     """Inches: of the plots, and of a legend above them."""
-    heights = [HEIGHT if _numeric(panel, of_it) else _height_of_names(panel, of_it) for panel, of_it in band]
+    heights = [
+        HEIGHT if _numeric(panel, of_it) else _height_of_names(panel, of_it)
+        for panel, of_it in band
+    ]
     legend = max((len(_groups(panel, of_it)) + 1) // 2 if panel.by else 0 for panel, of_it in band)
     return max(heights) + 0.17 * legend
 
@@ -90,10 +102,16 @@ def _groups(panel: Panel, rows: Sequence[Row]) -> list[Any]:
 
 
 def _styles(groups: Sequence[Any]) -> list[dict[str, Any]]:
-    """How to draw each group, keywords for matplotlib: policies as in all figures, others in the order of the same table."""
+    """How to draw each group, keywords for matplotlib: policies as in all figures, others in the
+    order of the same table."""
     of_policies = all(group in POLICY_STYLE for group in groups)
-    table = [POLICY_STYLE[group] for group in groups] if of_policies else cycle(POLICY_STYLE.values())
-    return [{"color": c, "marker": m, "label": group} for group, (c, m) in zip(groups, table, strict=False)]
+    table = (
+        [POLICY_STYLE[group] for group in groups] if of_policies else cycle(POLICY_STYLE.values())
+    )
+    return [
+        {"color": c, "marker": m, "label": group}
+        for group, (c, m) in zip(groups, table, strict=False)
+    ]
 
 
 def _points(panel: Panel, rows: Sequence[Row], group: Any) -> tuple[list[Any], np.ndarray]:
@@ -128,13 +146,22 @@ def _draw_lines(axis: Axes, panel: Panel, rows: Sequence[Row]) -> None:
 
 
 def _draw_names(axis: Axes, panel: Panel, rows: Sequence[Row]) -> None:
-    """A line of its own for each name, from top to bottom: the mean as a point, its interval as a bar through it."""
+    """A line of its own for each name, from top to bottom: the mean as a point, its interval as a
+    bar through it."""
     groups = _groups(panel, rows)
     names = list(dict.fromkeys(row[panel.x] for row in rows))
     for k, (group, style) in enumerate(zip(groups, _styles(groups), strict=True)):
         found, (mean, low, high) = _points(panel, rows, group)
-        place = np.array([names.index(name) for name in found]) + (k - (len(groups) - 1) / 2) * 0.6 / len(groups)
-        axis.errorbar(mean, place, xerr=np.abs([mean - low, high - mean]), capsize=2, **(style | {"linestyle": "none"}))
+        place = np.array([names.index(name) for name in found]) + (
+            k - (len(groups) - 1) / 2
+        ) * 0.6 / len(groups)
+        axis.errorbar(
+            mean,
+            place,
+            xerr=np.abs([mean - low, high - mean]),
+            capsize=2,
+            **(style | {"linestyle": "none"}),
+        )
     axis.set_ylim(len(names) - 0.4, -0.6)
     axis.set_yticks(range(len(names)), names, fontsize=8)
     axis.tick_params(axis="y", length=0)
@@ -142,4 +169,7 @@ def _draw_names(axis: Axes, panel: Panel, rows: Sequence[Row]) -> None:
         axis.update_datalim([(0.0, 0.0)])
     axis.margins(x=0.08)
     axis.autoscale(axis="x")
-    axis.set(xlabel=textwrap.fill(panel.y_label, 40), ylabel=textwrap.fill(panel.x_label, 12 + len(names)))
+    axis.set(
+        xlabel=textwrap.fill(panel.y_label, 40),
+        ylabel=textwrap.fill(panel.x_label, 12 + len(names)),
+    )

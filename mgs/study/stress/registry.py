@@ -54,12 +54,14 @@ def run_stress(
     report: Callable[[str, int, int], None],
     workers: int = 1,
 ) -> dict[str, Any]:
-    """Do the experiments of these names in the folder `out`, and write stability.csv, verdicts.json, NAME.png and stability.md.
+    """Do the experiments of these names in the folder `out`, and write stability.csv,
+    verdicts.json, NAME.png and stability.md.
 
-    command: the line that makes it again, for verdicts.json. report(cell, done, total) is told before each cell that is not
-    done yet. workers: processes that do cells side by side. Returns what verdicts.json holds: also of the experiments that were
-    done in this folder before. Called again, it does what is left. Raises InputError if `out` holds results of another preset
-    or version.
+    command: the line that makes it again, for verdicts.json. report(cell, done, total) is told
+    before each cell that is not
+    done yet. workers: processes that do cells side by side. Returns what verdicts.json holds: also
+    of the experiments that were done in this folder before. Called again, it does what is left.
+    Raises InputError if `out` holds results of another preset or version.
     """
     cells = {cell.name: cell for name in names for cell in EXPERIMENTS[name].cells(preset)}
     data = {cell.name: cell for cell in datasets(preset)}
@@ -85,14 +87,20 @@ def rows_done(out: Path, preset: Preset) -> dict[str, list[Row]]:
 
 
 def write_results(out: Path, rows: dict[str, list[Row]], command: str) -> dict[str, Any]:
-    """Verdicts, pictures and tables of what was measured, rows by experiment; returns what verdicts.json holds."""
+    """Verdicts, pictures and tables of what was measured, rows by experiment; returns what
+    verdicts.json holds."""
     experiments = []
     for name, of_one in rows.items():
         experiment = EXPERIMENTS[name]
         claims = [judged(claim, of_one) for claim in experiment.claims]
         experiments.append({"name": name, "question": experiment.question, "claims": claims})
         draw_experiment(out / f"{name}.png", experiment, of_one)
-    verdicts = {"experiments": experiments, "command": command, "machine": processor(), "versions": versions()}
+    verdicts = {
+        "experiments": experiments,
+        "command": command,
+        "machine": processor(),
+        "versions": versions(),
+    }
     flat = [{"experiment": name} | row for name, of_one in rows.items() for row in of_one]
     write_csv(out / "stability.csv", flat)
     with atomic_path(out / "stability.md") as temporary:
@@ -103,9 +111,18 @@ def write_results(out: Path, rows: dict[str, list[Row]], command: str) -> dict[s
 
 def table(verdicts: dict[str, Any]) -> str:
     """The verdicts as a Markdown table."""
-    lines = ["| experiment | hypothesis | verdict | mean effect (95 % interval) | runs |", "| --- | --- | --- | ---: | ---: |"]
+    lines = [
+        "| experiment | hypothesis | verdict | mean effect (95 % interval) | runs |",
+        "| --- | --- | --- | ---: | ---: |",
+    ]
     for experiment in verdicts["experiments"]:
         for claim in experiment["claims"]:
-            cells = [experiment["name"], claim["hypothesis"], f"**{claim['verdict']}**", effect(claim), str(claim["runs"])]
+            cells = [
+                experiment["name"],
+                claim["hypothesis"],
+                f"**{claim['verdict']}**",
+                effect(claim),
+                str(claim["runs"]),
+            ]
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"

@@ -1,4 +1,5 @@
-"""What changes the choice of a view although the rock stays the same: lambda, prior widths, units, resolution."""
+"""What changes the choice of a view although the rock stays the same: lambda, prior widths, units,
+resolution."""
 
 from __future__ import annotations
 
@@ -9,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from mgs.active.criteria import d_optimal
 from mgs.camera import Camera
 from mgs.gaussians import Gaussians
 from mgs.metrics import agreement
+from mgs.policy.criteria import d_optimal
 from mgs.splat import fisher, groups
 from mgs.study.stress.experiment import Experiment, Panel, cells_per_rock, turns
 from mgs.study.stress.lab import Array, open_lab
@@ -38,7 +39,12 @@ def resized(camera: Camera, factor: float) -> Camera:
     """The same camera with an image of another size."""
     K = camera.K.copy()
     K[:2] *= factor
-    return Camera(K, max(1, round(camera.width * factor)), max(1, round(camera.height * factor)), camera.world_to_camera)
+    return Camera(
+        K,
+        max(1, round(camera.width * factor)),
+        max(1, round(camera.height * factor)),
+        camera.world_to_camera,
+    )
 
 
 def in_millimetres(model: Gaussians, camera: Camera) -> tuple[Gaussians, Camera]:
@@ -46,23 +52,34 @@ def in_millimetres(model: Gaussians, camera: Camera) -> tuple[Gaussians, Camera]
     pose = camera.world_to_camera.copy()
     pose[:3, 3] *= 1000
     scaled = replace(
-        model, means=(1000 * model.means).astype(np.float32), log_scales=(model.log_scales + np.log(1000)).astype(np.float32)
+        model,
+        means=(1000 * model.means).astype(np.float32),
+        log_scales=(model.log_scales + np.log(1000)).astype(np.float32),
     )
     return scaled, replace(camera, world_to_camera=pose)
 
 
 def scales(root: Path, out: Path, scene: str, turns_: int) -> dict[str, Any]:
-    """The ranking of candidates from four even views under each change, against that of the default settings."""
+    """The ranking of candidates from four even views under each change, against that of the default
+    settings."""
     lab, rows = open_lab(root, scene), []
     for suffix, turn in turns(turns_):
         taken = lab.even(4, turn)
         left, model = lab.left(taken), lab.fit(taken).gaussians
-        H, Fs, lam = np.sum(lab.information(model, taken), axis=0), lab.information(model, left), lab.lam()
+        H, Fs, lam = (
+            np.sum(lab.information(model, taken), axis=0),
+            lab.information(model, left),
+            lab.lam(),
+        )
         base = np.array([d_optimal(F, H, lam) for F in Fs])
         run = f"{scene}, {suffix}"
 
-        def add(what: str, setting: float | str, scores: Array, against: Array = base, run: str = run) -> None:
-            rows.append({"run": run, "what": what, "setting": setting, **agreement(scores, against)})
+        def add(
+            what: str, setting: float | str, scores: Array, against: Array = base, run: str = run
+        ) -> None:
+            rows.append(
+                {"run": run, "what": what, "setting": setting, **agreement(scores, against)}
+            )
 
         def scored(lam: Array, factor: float = 1.0, H: Array = H, Fs: list[Array] = Fs) -> Array:
             return np.array([d_optimal(factor * F, factor * H, lam) for F in Fs])
@@ -84,17 +101,34 @@ def scales(root: Path, out: Path, scene: str, turns_: int) -> dict[str, Any]:
         add("millimetres", "frozen means", _scored(scaled, cameras, taken, left, lam))
         one = np.full_like(lab.lam("free"), ONE_LAMBDA)
         metres = _scored(model, lab.cameras, taken, left, one, "free")
-        add("millimetres", "free means, one lambda", _scored(scaled, cameras, taken, left, one, "free"), metres)
+        add(
+            "millimetres",
+            "free means, one lambda",
+            _scored(scaled, cameras, taken, left, one, "free"),
+            metres,
+        )
         default = lab.lam("free")
         millimetres = default.copy()
-        millimetres[groups(0, "free")["mean"]] /= 1000**2  # tau is a share of the spacing, so it is in millimetres too
+        millimetres[groups(0, "free")["mean"]] /= (
+            1000**2
+        )  # tau is a share of the spacing, so it is in millimetres too
         metres = _scored(model, lab.cameras, taken, left, default, "free")
-        add("millimetres", "free means", _scored(scaled, cameras, taken, left, millimetres, "free"), metres)
+        add(
+            "millimetres",
+            "free means",
+            _scored(scaled, cameras, taken, left, millimetres, "free"),
+            metres,
+        )
     return {"rows": rows}
 
 
 def _scored(
-    model: Gaussians, cameras: Sequence[Camera], taken: Sequence[int], left: Sequence[int], lam: Array, means: str = "frozen"
+    model: Gaussians,
+    cameras: Sequence[Camera],
+    taken: Sequence[int],
+    left: Sequence[int],
+    lam: Array,
+    means: str = "frozen",
 ) -> Array:
     """Eq. 7 of the views left, from cameras that are not those of the dataset."""
     H = np.sum([fisher(model, cameras[i], means=means).astype(np.float64) for i in taken], axis=0)
@@ -104,7 +138,10 @@ def _scored(
 def _worst_regret(what: str, settings: Sequence[float]) -> Any:
     def effects(rows: Sequence[Row]) -> list[float]:
         of = [row for row in rows if row["what"] == what and row["setting"] in settings]
-        return [max(row["regret"] for row in of if row["run"] == run) for run in runs_of(of, {"what": what})]
+        return [
+            max(row["regret"] for row in of if row["run"] == run)
+            for run in runs_of(of, {"what": what})
+        ]
 
     return effects
 

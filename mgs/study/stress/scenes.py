@@ -1,4 +1,5 @@
-"""Scenes that are harder than a boulder in the afternoon: a rock that hides parts of itself, long shadows, small stones."""
+"""Scenes that are harder than a boulder in the afternoon: a rock that hides parts of itself, long
+shadows, small stones."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ VIEWS = 8
 
 
 def scenes(root: Path, out: Path, scene: str, kind: str, turns_: int) -> dict[str, Any]:
-    """Models of eight images, four of them seeds, chosen by each policy. kind: "usual" or "hard", for the claims."""
+    """Models of eight images, four of them seeds, chosen by each policy. kind: "usual" or "hard",
+    for the claims."""
     lab, rows = open_lab(root, scene), []
     for suffix, turn in turns(turns_):
         known = {"run": f"{scene}, {suffix}", "scene": scene.rpartition("-")[0], "kind": kind}
@@ -25,7 +27,10 @@ def scenes(root: Path, out: Path, scene: str, kind: str, turns_: int) -> dict[st
 
 def _cells(preset: Preset) -> list[Cell]:
     kinds = [(rock, "usual") for rock in preset.rocks] + [(rock, "hard") for rock in preset.others]
-    return [rock_cell("scenes", f"{__name__}:scenes", preset, *rock, kind=kind, turns_=preset.turns) for rock, kind in kinds]
+    return [
+        rock_cell("scenes", f"{__name__}:scenes", preset, *rock, kind=kind, turns_=preset.turns)
+        for rock, kind in kinds
+    ]
 
 
 def _difference(kind: str, other: str) -> Effects:

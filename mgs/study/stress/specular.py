@@ -1,4 +1,5 @@
-"""A rock that shines: its colour depends on the direction it is seen from, which the default model does not have."""
+"""A rock that shines: its colour depends on the direction it is seen from, which the default model
+does not have."""
 
 from __future__ import annotations
 
@@ -8,19 +9,22 @@ from typing import Any
 
 import numpy as np
 
-from mgs.active.pose_policies import angle_between, azimuths
-from mgs.active.stations import psnr_measure
 from mgs.data.dataset import load_dataset, target_of
 from mgs.files import read_json
 from mgs.gaussians import Gaussians
 from mgs.metrics import masked_squares
+from mgs.policy.poses import angle_between, azimuths
+from mgs.run.stations import psnr_measure
 from mgs.splat import ListCache, render
 from mgs.study.stress.experiment import Experiment, Panel, turns
 from mgs.study.stress.lab import CACHE, Lab, Preset, by_policy, open_lab, variant_cell
 from mgs.study.stress.verdict import Claim, Effects, Row, paired, runs_of
 from mgs.study.sweep import Cell, cell_folder
 
-MATERIALS = {"diffuse": {"specular": 0.0, "roughness": 0.8}, "specular": {"specular": 0.5, "roughness": 0.3}}
+MATERIALS = {
+    "diffuse": {"specular": 0.0, "roughness": 0.8},
+    "specular": {"specular": 0.5, "roughness": 0.3},
+}
 """Keys of [rock] in a scene file: no mirror-like reflection at all, and a strong one."""
 
 SHINY = "specular"
@@ -36,25 +40,37 @@ BIN = 30
 
 
 def errors_by_angle(lab: Lab, model: Gaussians, views: Sequence[int], sun: float) -> list[Row]:
-    """For each of some views the root of the mean squared error inside the mask, linear RGB, and the angle between the azimuths
-    of camera and sun, seen from the rock, degrees: 0 where the camera has the sun behind it, 180 where it looks towards it.
+    """For each of some views the root of the mean squared error inside the mask, linear RGB, and
+    the angle between the azimuths
+    of camera and sun, seen from the rock, degrees: 0 where the camera has the sun behind it, 180
+    where it looks towards it.
 
     sun: its azimuth, degrees."""
     positions = np.array([lab.cameras[i].position for i in views])
-    angles = np.degrees(angle_between(azimuths(positions, lab.prior.points.mean(0)), np.radians(sun)))
+    angles = np.degrees(
+        angle_between(azimuths(positions, lab.prior.points.mean(0)), np.radians(sun))
+    )
     rows = []
     for i, angle in zip(views, angles, strict=True):
         frame = lab.frames[i]
-        squares = masked_squares(np.asarray(render(model, frame.camera, cache=lab.cache).rgb), target_of(frame), frame.mask())
+        squares = masked_squares(
+            np.asarray(render(model, frame.camera, cache=lab.cache).rgb),
+            target_of(frame),
+            frame.mask(),
+        )
         rows.append(
-            {"angle": float(angle), "angle of sun": float(BIN * round(angle / BIN)), "rms": float(np.sqrt(np.mean(squares)))}
+            {
+                "angle": float(angle),
+                "angle of sun": float(BIN * round(angle / BIN)),
+                "rms": float(np.sqrt(np.mean(squares))),
+            }
         )
     return rows
 
 
 def specular(root: Path, out: Path, scene: str, turns_: int) -> dict[str, Any]:
-    """Models of the rock in each material, on few views and of views that policies chose; of the specular one, of every SH
-    degree, and on all views too."""
+    """Models of the rock in each material, on few views and of views that policies chose; of the
+    specular one, of every SH degree, and on all views too."""
     rows = list[Row]()
     for material in MATERIALS:
         lab = open_lab(root, f"{scene}-{material}")
@@ -71,7 +87,10 @@ def specular(root: Path, out: Path, scene: str, turns_: int) -> dict[str, Any]:
             rows += [named | row for row in by_policy(lab, lab.even(SEEDS, turn), VIEWS)]
         if material == SHINY:
             taken = list(range(len(lab.frames)))
-            rows += [{"run": scene, "material": material} | row for row in _qualities(lab, taken, _fits(lab, taken, degrees))]
+            rows += [
+                {"run": scene, "material": material} | row
+                for row in _qualities(lab, taken, _fits(lab, taken, degrees))
+            ]
     return {"rows": rows}
 
 
@@ -87,8 +106,13 @@ def _qualities(lab: Lab, taken: Sequence[int], models: Sequence[Gaussians]) -> l
 
 
 def _on_orbit(measured: dict[str, float], model: Gaussians) -> Row:
-    """The same, but judged by the frames of the orbit that were not fitted: for the picture, not for the claims."""
-    return {"fitted": f"{FEW} views; on orbit", "degree": model.sh_degree, "psnr": measured["held_out_psnr"]}
+    """The same, but judged by the frames of the orbit that were not fitted: for the picture, not
+    for the claims."""
+    return {
+        "fitted": f"{FEW} views; on orbit",
+        "degree": model.sh_degree,
+        "psnr": measured["held_out_psnr"],
+    }
 
 
 def _data(preset: Preset) -> list[Cell]:
@@ -111,9 +135,12 @@ def _cells(preset: Preset) -> list[Cell]:
 
 
 def best_of_degrees(views: int) -> Effects:
-    """Effects: PSNR of the best degree from 1 to 3 on the specular rock, minus that of degree 0, run by run."""
+    """Effects: PSNR of the best degree from 1 to 3 on the specular rock, minus that of degree 0,
+    run by run."""
     of = [paired("psnr", _fit(views, degree), _fit(views, 0)) for degree in DEGREES[1:]]
-    return lambda rows: [float(max(gains)) for gains in zip(*(effects(rows) for effects in of), strict=True)]
+    return lambda rows: [
+        float(max(gains)) for gains in zip(*(effects(rows) for effects in of), strict=True)
+    ]
 
 
 def _fit(views: int, degree: int, material: str = SHINY) -> Row:
@@ -121,23 +148,32 @@ def _fit(views: int, degree: int, material: str = SHINY) -> Row:
 
 
 def towards_the_sun(rows: Sequence[Row]) -> list[float]:
-    """For each run: by how much the error of the specular rock exceeds that of the diffuse one in views towards the sun (from
-    120 degrees on), minus the same of views that have it behind them (up to 60)."""
+    """For each run: by how much the error of the specular rock exceeds that of the diffuse one in
+    views towards the sun (from 120 degrees on), minus the same of views that have it behind them
+    (up to 60)."""
     views = [row for row in rows if "rms" in row]
     found = []
     for run in runs_of(views, {}):
 
         def mean(material: str, low: float, high: float, run: str = run) -> float:
-            one = [r["rms"] for r in views if r["run"] == run and r["material"] == material and low <= r["angle"] <= high]
+            one = [
+                r["rms"]
+                for r in views
+                if r["run"] == run and r["material"] == material and low <= r["angle"] <= high
+            ]
             return float(np.mean(one))
 
-        facing, behind = (mean("specular", *span) - mean("diffuse", *span) for span in ((120, 180), (0, 60)))
+        facing, behind = (
+            mean("specular", *span) - mean("diffuse", *span) for span in ((120, 180), (0, 60))
+        )
         found.append(facing - behind)
     return found
 
 
 def _ahead(policy: str, other: str) -> Effects:
-    return paired("psnr", {"material": SHINY, "policy": policy}, {"material": SHINY, "policy": other})
+    return paired(
+        "psnr", {"material": SHINY, "policy": policy}, {"material": SHINY, "policy": other}
+    )
 
 
 SPECULAR = Experiment(

@@ -1,9 +1,11 @@
-"""How much models of few views depend on chance: on which splats are left out, and on the order in which images are fitted.
+"""How much models of few views depend on chance: on which splats are left out, and on the order in
+which images are fitted.
 
-Splats that make up for one another's errors in the views fitted give wrong images elsewhere (co-adaptation). It is measured as
-in the literature on few views: random halves of the splats are drawn, and the spread of these images is the root of the mean
-variance of a pixel. Here images are divided by their alpha, which half of the splats cannot fill; a pixel counts where alpha
-is above LEAST_ALPHA.
+Splats that make up for one another's errors in the views fitted give wrong images elsewhere
+(co-adaptation). It is measured as
+in the literature on few views: random halves of the splats are drawn, and the spread of these
+images is the root of the mean variance of a pixel. Here images are divided by their alpha, which
+half of the splats cannot fill; a pixel counts where alpha is above LEAST_ALPHA.
 """
 
 from __future__ import annotations
@@ -33,46 +35,69 @@ LEAST_ALPHA = 0.5
 
 
 def images_of(lab: Lab, models: Sequence[Gaussians], views: Sequence[int]) -> Array:
-    """[models,pixels,3] linear RGB over alpha, of the pixels inside the masks of some views where all models have enough."""
+    """[models,pixels,3] linear RGB over alpha, of the pixels inside the masks of some views where
+    all models have enough."""
     found = []
     for view in views:
         renders = [render(model, lab.cameras[view], cache=lab.cache) for model in models]
         alpha = np.array([np.asarray(image.alpha) for image in renders])
-        rgb = np.array([np.asarray(image.rgb) for image in renders], np.float64) / np.maximum(alpha, LEAST_ALPHA)[..., None]
+        rgb = (
+            np.array([np.asarray(image.rgb) for image in renders], np.float64)
+            / np.maximum(alpha, LEAST_ALPHA)[..., None]
+        )
         found.append(rgb[:, lab.frames[view].mask() & (alpha > LEAST_ALPHA).all(axis=0)])
     return np.concatenate(found, axis=1)
 
 
 def spread_of(images: Array) -> float:
-    """Root of the mean variance of a pixel value over the models; images as `images_of` returns them."""
+    """Root of the mean variance of a pixel value over the models; images as `images_of` returns
+    them."""
     return float(np.sqrt(images.var(axis=0).mean()))
 
 
 def spread(root: Path, out: Path, scene: str, turns_: int, counts: list[int]) -> dict[str, Any]:
-    """Spread over halves of the splats before and after a fit, and over fits with other orders of the images; and the error."""
+    """Spread over halves of the splats before and after a fit, and over fits with other orders of
+    the images; and the error."""
     lab, rows = open_lab(root, scene), []
     for suffix, turn in turns(turns_):
         for count in counts:
             taken = lab.even(count, turn)
             left = lab.left(taken)
             views = left[:: len(left) // JUDGED][:JUDGED]
-            start, fits = lab.start(taken), [lab.fit(taken, seed=seed).gaussians for seed in range(DRAWS)]
+            start, fits = (
+                lab.start(taken),
+                [lab.fit(taken, seed=seed).gaussians for seed in range(DRAWS)],
+            )
             rng = generator(0, f"stress/spread/{scene}/{suffix}/{count}")
             halves = [rng.random(len(start)) < 0.5 for _ in range(DRAWS)]
             found = {
-                "before the fit": spread_of(images_of(lab, [start[half] for half in halves], views)),
-                "after the fit": spread_of(images_of(lab, [fits[0][half] for half in halves], views)),
+                "before the fit": spread_of(
+                    images_of(lab, [start[half] for half in halves], views)
+                ),
+                "after the fit": spread_of(
+                    images_of(lab, [fits[0][half] for half in halves], views)
+                ),
                 "other orders": spread_of(images_of(lab, fits, views)),
             }
-            named, error = {"run": f"{scene}, {suffix}", "views": count}, error_of(lab, fits[0], views)
-            rows += [named | {"of": of, "spread": value, "error": error, "share": value / error} for of, value in found.items()]
+            named, error = (
+                {"run": f"{scene}, {suffix}", "views": count},
+                error_of(lab, fits[0], views),
+            )
+            rows += [
+                named | {"of": of, "spread": value, "error": error, "share": value / error}
+                for of, value in found.items()
+            ]
     return {"rows": rows}
 
 
 def error_of(lab: Lab, model: Gaussians, views: Sequence[int]) -> float:
     """Root of the mean squared error inside the masks, linear RGB."""
     squares = [
-        masked_squares(np.asarray(render(model, frame.camera, cache=lab.cache).rgb), target_of(frame), frame.mask())
+        masked_squares(
+            np.asarray(render(model, frame.camera, cache=lab.cache).rgb),
+            target_of(frame),
+            frame.mask(),
+        )
         for frame in (lab.frames[view] for view in views)
     ]
     return float(np.sqrt(np.mean(np.concatenate(squares))))

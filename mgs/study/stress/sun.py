@@ -1,4 +1,5 @@
-"""A sun that stands elsewhere in the second half of the flight: what it costs, what notices it, and whether gains help."""
+"""A sun that stands elsewhere in the second half of the flight: what it costs, what notices it, and
+whether gains help."""
 
 from __future__ import annotations
 
@@ -9,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from mgs.active.detectors import DETECTORS
-from mgs.active.stations import psnr_measure
 from mgs.data.dataset import load_dataset
 from mgs.files import read_json
 from mgs.metrics import agreement
 from mgs.prior.exposure import exposure_of
+from mgs.run.detectors import DETECTORS
+from mgs.run.stations import psnr_measure
 from mgs.splat import ListCache
 from mgs.study.material import test_views_of
 from mgs.study.stress.experiment import Experiment, Panel, turns
@@ -39,9 +40,11 @@ def scaled(frame: Captured, factor: np.ndarray) -> Captured:
 
 
 def two_suns(lab: Lab, root: Path, scene: str, other: str) -> Lab:
-    """The lab with the second half of its flight under the sun of another dataset, whose cameras are the same.
+    """The lab with the second half of its flight under the sun of another dataset, whose cameras
+    are the same.
 
-    scene, other: cells of datasets. The photographs are brought to one exposure: each dataset was metered by itself."""
+    scene, other: cells of datasets. The photographs are brought to one exposure: each dataset was
+    metered by itself."""
     folders = [cell_folder(root, f"dataset/{name}") / "dataset" for name in (scene, other)]
     first, second = (float(read_json(folder / "config.json")["exposure"]) for folder in folders)
     half, others = len(lab.frames) // 2, load_dataset(folders[1]).frames
@@ -50,19 +53,24 @@ def two_suns(lab: Lab, root: Path, scene: str, other: str) -> Lab:
 
 
 def with_gains(lab: Lab, taken: Sequence[int]) -> Lab:
-    """The lab whose photographs taken are divided by the gains that `mgs nbv --exposure` estimates of them."""
+    """The lab whose photographs taken are divided by the gains that `mgs nbv --exposure` estimates
+    of them."""
     gains = dict(zip(taken, exposure_of(lab.prior)([lab.frames[i] for i in taken]), strict=True))
-    frames = [scaled(captured(f), 1 / gains[i]) if i in gains else f for i, f in enumerate(lab.frames)]
+    frames = [
+        scaled(captured(f), 1 / gains[i]) if i in gains else f for i, f in enumerate(lab.frames)
+    ]
     return lab.changed(frames=tuple(frames))
 
 
 def first_half(count: int, views: int, turn: float) -> list[int]:
-    """So many frames spread over the first half of `count`; turn: by which share of their spacing they are moved on."""
+    """So many frames spread over the first half of `count`; turn: by which share of their spacing
+    they are moved on."""
     return [int((k + turn) * (count // 2) / views) for k in range(views)]
 
 
 def sun(root: Path, out: Path, scene: str, other: str, turns_: int) -> dict[str, Any]:
-    """Fits to evenly spread views under one sun and under two, and the ranking of candidates. other: the second sun's cell."""
+    """Fits to evenly spread views under one sun and under two, and the ranking of candidates.
+    other: the second sun's cell."""
     lab, rows = open_lab(root, scene), list[Row]()
     labs = {ONE: lab, TWO: two_suns(lab, root, scene, other)}
     tests = test_views_of(load_dataset(cell_folder(root, f"dataset/{scene}") / "dataset"))
@@ -74,12 +82,21 @@ def sun(root: Path, out: Path, scene: str, other: str, turns_: int) -> dict[str,
             photographs = labs.get(light, lab)
             model, signs = signs_of(with_gains(photographs, taken) if gains else photographs, taken)
             quality, said = corrected(model, []), loud(signs)
-            row: Row = {"light": light, "gains": gains, "label": light + (", --exposure" if gains else "")}
+            row: Row = {
+                "light": light,
+                "gains": gains,
+                "label": light + (", --exposure" if gains else ""),
+            }
             row |= {key: quality[key] for key in ("psnr", "psnr_mask", "psnr_corrected")}
-            rows.append(run | row | {"alarm": float(bool(said)), "alarms": " ".join(said)} | named(signs))
+            rows.append(
+                run | row | {"alarm": float(bool(said)), "alarms": " ".join(said)} | named(signs)
+            )
         seeds = lab.even(SEEDS, turn)
         reference = _ranking(lab, seeds)
-        rows += [run | {"ranking": light, **agreement(_ranking(of, seeds), reference)} for light, of in labs.items()]
+        rows += [
+            run | {"ranking": light, **agreement(_ranking(of, seeds), reference)}
+            for light, of in labs.items()
+        ]
     return {"rows": rows}
 
 
@@ -109,13 +126,20 @@ def _cells(preset: Preset) -> list[Cell]:
 
 def _data(preset: Preset) -> list[Cell]:
     """The same orbits under the second sun, without test views and priors."""
-    changes = {scene: {"sky": {"sun_azimuth": load_scene_file(scene).sky.sun_azimuth + TURN}} for scene, _ in preset.rocks}
-    return [variant_cell(preset, scene, seed, "later", changes[scene], tests=0, gaussians=0) for scene, seed in preset.rocks]
+    changes = {
+        scene: {"sky": {"sun_azimuth": load_scene_file(scene).sky.sun_azimuth + TURN}}
+        for scene, _ in preset.rocks
+    }
+    return [
+        variant_cell(preset, scene, seed, "later", changes[scene], tests=0, gaussians=0)
+        for scene, seed in preset.rocks
+    ]
 
 
 def of_limits(rows: Sequence[Row]) -> list[Row]:
-    """Signs of the fits without gains over their limits, for the picture; without those that are of no use here: `means`, which
-    are frozen, and `worse`, which is of fits that start from a fitted model."""
+    """Signs of the fits without gains over their limits, for the picture; without those that are of
+    no use here: `means`, which are frozen, and `worse`, which is of fits that start from a fitted
+    model."""
     return [
         {"run": row["run"], "sign": name, "of limit": row[f"sign {name}"] / detector.limit, "under": row["light"]}
         for row in rows

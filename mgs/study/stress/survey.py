@@ -1,4 +1,5 @@
-"""Noise of the depth sensor and drift of the poses, as `mgs survey` flies with them: their cost, and the order of policies."""
+"""Noise of the depth sensor and drift of the poses, as `mgs survey` flies with them: their cost,
+and the order of policies."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ EXACT, USUAL, WORST = "exact", "noise 1, drift 1", "noise 4, drift 4"
 LEVELS: dict[str, tuple[float, float | None]] = {
     EXACT: (0, None), "noise 1": (1, None), "noise 4": (4, None), USUAL: (1, 1), WORST: (4, 4),
 }  # fmt: skip
-"""Factors on the noise of the depth camera and on the drift of odometry; None: the poses are those flown."""
+"""Factors on the noise of the depth camera and on the drift of odometry; None: the poses are those
+flown."""
 
 COMPARED = (EXACT, USUAL, WORST)
 """Levels at which all policies are compared; at the others, views are spread evenly."""
@@ -33,9 +35,11 @@ VIEWS, SEEDS = 8, 4
 
 
 def surveyed(lab: Lab, root: Path, out: Path, level: str, gaussians: int) -> tuple[Lab, Row]:
-    """The lab with the frames and the prior of a survey of its dataset, written into OUT, and how wrong the survey is.
+    """The lab with the frames and the prior of a survey of its dataset, written into OUT, and how
+    wrong the survey is.
 
-    Returns too `depth error`, robust standard deviation on the rock, and `pose error`, rms of the positions; millimetres.
+    Returns too `depth error`, robust standard deviation on the rock, and `pose error`, rms of the
+    positions; millimetres.
     """
     if level == EXACT:
         return lab, {"depth error": 0.0, "pose error": 0.0}
@@ -47,17 +51,21 @@ def surveyed(lab: Lab, root: Path, out: Path, level: str, gaussians: int) -> tup
         flown = fly(source, settings)
         with atomic_folder(folder) as unfinished:
             dataset = write_survey(unfinished, source, flown)
-            save_prior(unfinished / "prior", build_prior(dataset, PriorSettings(gaussians=gaussians))[0])
+            save_prior(
+                unfinished / "prior", build_prior(dataset, PriorSettings(gaussians=gaussians))[0]
+            )
             write_json(unfinished / "survey.json", survey_numbers(source, flown, settings))
     numbers = read_json(folder / "survey.json")
     pose = numbers["error"]["optimised"]["ate_rms"]
     errors = {"depth error": 1e3 * numbers["depth_error_on_rock"], "pose error": 1e3 * pose}
-    return lab.changed(frames=load_dataset(folder).frames, prior=load_prior(folder / "prior")), errors
+    return lab.changed(
+        frames=load_dataset(folder).frames, prior=load_prior(folder / "prior")
+    ), errors
 
 
 def survey(root: Path, out: Path, scene: str, turns_: int, gaussians: int) -> dict[str, Any]:
-    """Models of eight images, four of them seeds, chosen by each policy, of a survey with every level of noise and drift. The
-    test views have true poses."""
+    """Models of eight images, four of them seeds, chosen by each policy, of a survey with every
+    level of noise and drift. The test views have true poses."""
     lab, rows = open_lab(root, scene), []
     for level in LEVELS:
         found, errors = surveyed(lab, root, out, level, gaussians)
@@ -70,20 +78,30 @@ def survey(root: Path, out: Path, scene: str, turns_: int, gaussians: int) -> di
 
 
 def order(level: str) -> Effects:
-    """Effects: Kendall's tau of the policies' PSNR at a level with that of exact data, run by run."""
+    """Effects: Kendall's tau of the policies' PSNR at a level with that of exact data, run by
+    run."""
 
     def taus(rows: Sequence[Row]) -> list[float]:
         def of(run: str, level: str) -> list[float]:
-            found = {row["policy"]: row["psnr"] for row in rows if row["run"] == run and row["level"] == level}
+            found = {
+                row["policy"]: row["psnr"]
+                for row in rows
+                if row["run"] == run and row["level"] == level
+            }
             return [found[policy] for policy in POLICIES]
 
-        return [float(kendalltau(of(run, level), of(run, EXACT)).statistic) for run in runs_of(rows, {"level": level})]
+        return [
+            float(kendalltau(of(run, level), of(run, EXACT)).statistic)
+            for run in runs_of(rows, {"level": level})
+        ]
 
     return taus
 
 
 def _cost(level: str) -> Effects:
-    return paired("psnr", {"level": EXACT, "policy": "uniform"}, {"level": level, "policy": "uniform"})
+    return paired(
+        "psnr", {"level": EXACT, "policy": "uniform"}, {"level": level, "policy": "uniform"}
+    )
 
 
 def _ahead(policy: str, other: str) -> Effects:

@@ -1,9 +1,10 @@
 """From numbers to a verdict, by one rule for all experiments.
 
-A claim says on which side of a bound the mean of an effect lies. It *holds* where the whole 95 % interval of the mean
-(Student's t over runs, which it takes for independent) lies on that side, it *fails* where the whole interval lies on the other
-side, and otherwise it *depends*: on the rock, on the views, or on chance, which so few runs cannot tell apart. Fewer than two
-runs have no interval, so their verdict is `depends`.
+A claim says on which side of a bound the mean of an effect lies. It *holds* where the whole 95 %
+interval of the mean (Student's t over runs, which it takes for independent) lies on that side, it
+*fails* where the whole interval lies on the other side, and otherwise it *depends*: on the rock, on
+the views, or on chance, which so few runs cannot tell apart. Fewer than two runs have no interval,
+so their verdict is `depends`.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ class Claim:
     """A hypothesis that was fixed before its numbers were seen.
 
     hypothesis: a sentence. effects: the numbers. unit: of these numbers. side, bound:
-    the hypothesis in numbers: the mean effect is "above" the bound (or equal) or "below" it (or equal). over: what a run is.
+    the hypothesis in numbers: the mean effect is "above" the bound (or equal) or "below" it (or
+    equal). over: what a run is.
     """
 
     hypothesis: str
@@ -59,7 +61,8 @@ def outcome(side: str, bound: float, between: tuple[float, float] | None) -> Out
 
 
 def judged(claim: Claim, rows: Sequence[Row]) -> dict[str, Any]:
-    """What verdicts.json holds of a claim: hypothesis, verdict, effect, interval, runs, and the rule in numbers."""
+    """What verdicts.json holds of a claim: hypothesis, verdict, effect, interval, runs, and the
+    rule in numbers."""
     effects = claim.effects(rows)
     between = interval(effects)
     return {
@@ -83,8 +86,12 @@ def effect(claim: dict[str, Any]) -> str:
 
 
 def paired(value: str, one: Row, other: Row) -> Effects:
-    """Effects: `value` of the rows that agree with `one`, minus that of the rows that agree with `other`, run by run."""
-    return lambda rows: [_value(rows, value, one, run) - _value(rows, value, other, run) for run in runs_of(rows, one, other)]
+    """Effects: `value` of the rows that agree with `one`, minus that of the rows that agree with
+    `other`, run by run."""
+    return lambda rows: [
+        _value(rows, value, one, run) - _value(rows, value, other, run)
+        for run in runs_of(rows, one, other)
+    ]
 
 
 def single(value: str, one: Row) -> Effects:
@@ -108,8 +115,9 @@ def _agrees(row: Row, one: Row) -> bool:
 
 
 def roc_area(values: Sequence[float], failed: Sequence[bool]) -> float | None:
-    """Area under the ROC of a statistic that should be large where a run failed: the probability that a failed run has the
-    larger value, a tie counts half (Mann-Whitney). None where all runs failed, or none."""
+    """Area under the ROC of a statistic that should be large where a run failed: the probability
+    that a failed run has the larger value, a tie counts half (Mann-Whitney). None where all runs
+    failed, or none."""
     values_, failed_ = np.asarray(values, float), np.asarray(failed, bool)
     bad, good = values_[failed_], values_[~failed_]
     if not len(bad) or not len(good):

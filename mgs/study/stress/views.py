@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from mgs.active.pose_policies import azimuths
 from mgs.metrics import agreement
+from mgs.policy.poses import azimuths
 from mgs.study.stress.experiment import Experiment, Panel, cells_per_rock, turns
 from mgs.study.stress.lab import Array, Lab, greedy, open_lab
 from mgs.study.stress.verdict import Claim, Effects, paired, single
@@ -22,15 +22,17 @@ KINDS = {
     "frozen, no prior": ("frozen", False),
     "free, no prior": ("free", False),
 }
-"""What the means may do, and whether a prior holds all parameters: the paper has none. Free means are compared with frozen ones
-of the same prior, since a fit without one loses quality whatever its means do."""
+"""What the means may do, and whether a prior holds all parameters: the paper has none. Free means
+are compared with frozen ones of the same prior, since a fit without one loses quality whatever its
+means do."""
 
 VIEWS = 8
 """Views of the models whose seeds are compared."""
 
 
 def free_means(root: Path, out: Path, scene: str, turns_: int, counts: list[int]) -> dict[str, Any]:
-    """Fits with frozen and with free means on few views: quality, drift of the means, ranking of the other views."""
+    """Fits with frozen and with free means on few views: quality, drift of the means, ranking of
+    the other views."""
     lab, rows = open_lab(root, scene), []
     for suffix, turn in turns(turns_):
         for count in counts:
@@ -87,7 +89,8 @@ def _around(lab: Lab, turn: float, count: int) -> list[int]:
 
 
 def seeds(root: Path, out: Path, scene: str, turns_: int) -> dict[str, Any]:
-    """Models of the same number of views from different seeds; and from an orbit of which one half cannot be reached."""
+    """Models of the same number of views from different seeds; and from an orbit of which one half
+    cannot be reached."""
     lab, rows = open_lab(root, scene), []
     n = len(lab.frames)
     everything = list(range(n))
@@ -101,12 +104,22 @@ def seeds(root: Path, out: Path, scene: str, turns_: int) -> dict[str, Any]:
             for policy in ("d-optimal", "uniform"):
                 chosen = greedy(lab, taken, allowed, VIEWS - len(taken), policy)
                 quality = lab.quality(lab.fit(chosen).gaussians)
-                rows.append({"run": f"{scene}, {suffix}", "seeds": name, "policy": policy, "images": len(chosen), **quality})
+                rows.append(
+                    {
+                        "run": f"{scene}, {suffix}",
+                        "seeds": name,
+                        "policy": policy,
+                        "images": len(chosen),
+                        **quality,
+                    }
+                )
     return {"rows": rows}
 
 
 def _against_even(name: str, policy: str = "d-optimal") -> Effects:
-    return paired("psnr", {"seeds": name, "policy": policy}, {"seeds": "4 even seeds", "policy": policy})
+    return paired(
+        "psnr", {"seeds": name, "policy": policy}, {"seeds": "4 even seeds", "policy": policy}
+    )
 
 
 SEEDS = Experiment(

@@ -1,9 +1,11 @@
-"""Signs that a run is going wrong: small numbers from each step, the value beyond which each is said, and the words.
+"""Signs that a run is going wrong: small numbers from each step, the value beyond which each is
+said, and the words.
 
-Every sign is larger where things are worse. `mgs nbv` prints a line when a sign goes beyond its limit, and keeps all of them in
-steps.jsonl. A fit that diverges ends the run with a line of its own (`mgs.active.stopping`), and means that are frozen have no
-drift. The limits are chosen by good runs of `mgs nbv` (of colours alone) and of `mgs stress --preset quick`
-(docs/stability.md): 1.4 to 4 times the largest value that was seen there, or, where a comment says so, by something else.
+Every sign is larger where things are worse. `mgs nbv` prints a line when a sign goes beyond its
+limit, and keeps all of them in steps.jsonl. A fit that diverges ends the run with a line of its own
+(`mgs.fit.stopping`), and means that are frozen have no drift. The limits are chosen by good runs of
+`mgs nbv` (of colours alone) and of `mgs stress --preset quick` (docs/stability.md): 1.4 to 4 times
+the largest value that was seen there, or, where a comment says so, by something else.
 """
 
 from __future__ import annotations
@@ -23,17 +25,20 @@ DARK = 1e-3
 
 
 COVERING_VIEWS = 4
-"""Fewest views of which a good coverage can be expected: two or three do not see all sides of a rock, however good they are."""
+"""Fewest views of which a good coverage can be expected: two or three do not see all sides of a
+rock, however good they are."""
 
 
 @dataclass(frozen=True)
 class Before:
     """What one captured image says of the Gaussians before any training.
 
-    outline: of the pixels that either the rock's mask or the Gaussians cover, the share where they disagree, the rim left out
-    (`outline_margin`). offset: distance between the centres of the two areas, over the square root of the mask's area.
-    exposure: median over the pixels of the logarithm of the image's brightness over the render's. The render has the mean
-    colours of the seeds' images; it is grey where none of them looked, which a median forgives in less than half of the pixels.
+    outline: of the pixels that either the rock's mask or the Gaussians cover, the share where they
+    disagree, the rim left out (`outline_margin`). offset: distance between the centres of the two
+    areas, over the square root of the mask's area.
+    exposure: median over the pixels of the logarithm of the image's brightness over the render's.
+    The render has the mean colours of the seeds' images; it is grey where none of them looked,
+    which a median forgives in less than half of the pixels.
     """
 
     outline: float
@@ -45,7 +50,8 @@ class Before:
 class ViewSigns:
     """What one captured image says of the fitted model, and said before.
 
-    unexplained: mean squared error inside the rock's mask over the variance of the image there: 0 is a perfect fit, 1 is no
+    unexplained: mean squared error inside the rock's mask over the variance of the image there: 0
+    is a perfect fit, 1 is no
     better than a single colour. error: root of that mean squared error, linear RGB.
     """
 
@@ -54,12 +60,16 @@ class ViewSigns:
     error: float
 
 
-def before_fit(target: np.ndarray, mask: np.ndarray, rendered: np.ndarray, alpha: np.ndarray, margin: int) -> Before:
+def before_fit(
+    target: np.ndarray, mask: np.ndarray, rendered: np.ndarray, alpha: np.ndarray, margin: int
+) -> Before:
     """The signs of a view and the Gaussians before any training.
 
-    target: [H,W,4], colour and weight, or more (`mgs.data.dataset.target_of`); mask: bool [H,W]; rendered: [H,W,3] linear RGB
-    and alpha [H,W], which count as drawn from 0.5 up. margin: pixels, of `outline_margin`: a pixel disagrees if it is drawn and
-    farther than that outside the mask, or not drawn and farther inside.
+    target: [H,W,4], colour and weight, or more (`mgs.data.dataset.target_of`); mask: bool [H,W];
+    rendered: [H,W,3] linear RGB
+    and alpha [H,W], which count as drawn from 0.5 up. margin: pixels, of `outline_margin`: a pixel
+    disagrees if it is drawn and farther than that outside the mask, or not drawn and farther
+    inside.
     """
     drawn = alpha >= 0.5
     either = int((mask | drawn).sum())
@@ -67,13 +77,20 @@ def before_fit(target: np.ndarray, mask: np.ndarray, rendered: np.ndarray, alpha
     inside = binary_erosion(mask, iterations=margin, border_value=1)
     wrong = int(((drawn & outside) | (inside & ~drawn)).sum())
     both = mask & drawn & (target[..., 3] > 0)
-    truth, colour = (image[both][:, :3].astype(np.float64).mean(axis=1) for image in (target, rendered))
+    truth, colour = (
+        image[both][:, :3].astype(np.float64).mean(axis=1) for image in (target, rendered)
+    )
     ratios = np.log(truth + DARK) - np.log(colour + DARK)
-    return Before(wrong / max(either, 1), _distance(mask, drawn), float(np.median(ratios)) if len(ratios) else 0.0)
+    return Before(
+        wrong / max(either, 1),
+        _distance(mask, drawn),
+        float(np.median(ratios)) if len(ratios) else 0.0,
+    )
 
 
 def _distance(one: np.ndarray, other: np.ndarray) -> float:
-    """Between the centres of two areas, over the square root of the first one; 1 where either is empty."""
+    """Between the centres of two areas, over the square root of the first one; 1 where either is
+    empty."""
     if not one.any() or not other.any():
         return 1.0
     apart = np.linalg.norm(np.argwhere(one).mean(axis=0) - np.argwhere(other).mean(axis=0))
@@ -81,7 +98,8 @@ def _distance(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def outline_margin(start: Gaussians, camera: Camera) -> int:
-    """How far the outline of a good prior may be from the mask, pixels: Gaussians on the rim stand out by about their standard
+    """How far the outline of a good prior may be from the mask, pixels: Gaussians on the rim stand
+    out by about their standard
     deviation, and the mask has whole pixels. start: the Gaussians before any training."""
     _, depth = camera.project(start.means)
     in_front = depth[depth > 0]
@@ -91,8 +109,11 @@ def outline_margin(start: Gaussians, camera: Camera) -> int:
     return 1 + math.ceil(size * camera.K[0, 0] / float(np.median(in_front)))
 
 
-def view_signs(target: np.ndarray, mask: np.ndarray, rendered: np.ndarray, before: Before) -> ViewSigns:
-    """The signs of a view that was fitted. rendered: of the fitted model; all else as in `before_fit`."""
+def view_signs(
+    target: np.ndarray, mask: np.ndarray, rendered: np.ndarray, before: Before
+) -> ViewSigns:
+    """The signs of a view that was fitted. rendered: of the fitted model; all else as in
+    `before_fit`."""
     counted = mask & (target[..., 3] > 0)
     if not counted.any():
         return ViewSigns(before, 0.0, 0.0)
@@ -102,16 +123,23 @@ def view_signs(target: np.ndarray, mask: np.ndarray, rendered: np.ndarray, befor
 
 
 def step_signs(
-    views: Sequence[ViewSigns], losses: Sequence[float], coverage: float, gains: Sequence[float], drift: float
+    views: Sequence[ViewSigns],
+    losses: Sequence[float],
+    coverage: float,
+    gains: Sequence[float],
+    drift: float,
 ) -> dict[str, float]:
-    """The signs of a step, by the names in DETECTORS; those that this step cannot tell are left out.
+    """The signs of a step, by the names in DETECTORS; those that this step cannot tell are left
+    out.
 
-    views: of every view taken. losses: of the model that the fit started from, then of each pass. coverage: Eq. 9, 0 to 1.
+    views: of every view taken. losses: of the model that the fit started from, then of each pass.
+    coverage: Eq. 9, 0 to 1.
     gains: information gain of every view chosen so far, in order. drift: of `means_drift`.
     """
     signs = {"means": drift}
     if len(losses) >= 2 and min(losses) > 0 and np.isfinite(losses).all():
-        # A fit that starts from a fitted model rises first: coming back to where it began is no sign of more to come.
+        # A fit that starts from a fitted model rises first: coming back to where it began is no
+        # sign of more to come.
         window, lowest = min(2, len(losses) - 1), np.minimum.accumulate(losses)
         signs["unconverged"] = float(1 - (lowest[-1] / lowest[-1 - window]) ** (1 / window))
         signs["worse"] = min(losses[1:]) / losses[0] - 1
@@ -132,8 +160,8 @@ def step_signs(
 
 
 def means_drift(means: np.ndarray, start: np.ndarray, log_scales: np.ndarray) -> float:
-    """How far means [N,3] are from where they started, rms, over the median of the Gaussians' largest standard deviation then
-    (log_scales [N,3])."""
+    """How far means [N,3] are from where they started, rms, over the median of the Gaussians'
+    largest standard deviation then (log_scales [N,3])."""
     if np.array_equal(means, start):
         return 0.0
     size = float(np.median(np.exp(log_scales.max(axis=1))))
@@ -223,7 +251,8 @@ DETECTORS: dict[str, Detector] = {
 
 
 def alarms(signs: Mapping[str, float], before: Mapping[str, float] | None = None) -> list[str]:
-    """What to say after a step: a sentence for each sign that is beyond its limit now, and was not in the step before."""
+    """What to say after a step: a sentence for each sign that is beyond its limit now, and was not
+    in the step before."""
     before = before or {}
     return [
         row.words(signs[name], row.limit)

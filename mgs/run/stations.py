@@ -7,28 +7,33 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from mgs import runtime
-from mgs.active.criteria import lam_by_kind
-from mgs.active.fitting import Fit, fit
-from mgs.active.inputs import prior_digest
-from mgs.active.loop import Stations
-from mgs.active.settings import NbvSettings, TrainSettings
 from mgs.camera import Camera
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data.dataset import Dataset, Frame
+from mgs.fit.fitting import Fit, fit
+from mgs.fit.settings import TrainSettings
 from mgs.gaussians import Gaussians
 from mgs.memory import IMAGE_BYTES, kept_within
 from mgs.metrics import colour_corrected, psnr
+from mgs.policy.criteria import lam_by_kind
 from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of
 from mgs.prior.initial import Colours, colours_of, initial_gaussians, initial_normals
+from mgs.run.inputs import prior_digest
+from mgs.run.loop import Stations
+from mgs.run.settings import NbvSettings
 from mgs.splat import ListCache, fisher, groups, render
 
 
 def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stations:
-    """Stations on the splat core, starting from the prior; the rock is at the prior's centre of mass."""
+    """Stations on the splat core, starting from the prior; the rock is at the prior's centre of
+    mass."""
     cache, means = ListCache(), settings.train.means
     columns = groups(0, means)
-    by_kind, normals = lam_by_kind(settings.regularisation(columns), columns), initial_normals(prior)
+    by_kind, normals = (
+        lam_by_kind(settings.regularisation(columns), columns),
+        initial_normals(prior),
+    )
     exposure = exposure_of(prior) if settings.exposure else None
     colours = kept_colours(dataset, prior)
 
@@ -72,7 +77,8 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
 
 
 def capture_of(dataset: Dataset) -> Callable[[Frame], None]:
-    """`mgs.synth.capture.capture_of`, imported here because only runs that capture need it, and a variant before it."""
+    """`mgs.synth.capture.capture_of`, imported here because only runs that capture need it, and a
+    variant before it."""
     runtime.start()
     from mgs.synth import capture
 
@@ -80,21 +86,28 @@ def capture_of(dataset: Dataset) -> Callable[[Frame], None]:
 
 
 def kept_colours(dataset: Dataset, prior: Prior) -> Callable[[Frame], Colours]:
-    """`mgs.prior.initial.colours_of` the prior, whose results for frames of the dataset are kept within IMAGE_BYTES."""
+    """`mgs.prior.initial.colours_of` the prior, whose results for frames of the dataset are kept
+    within IMAGE_BYTES."""
     of, index = colours_of(prior), {frame.name: i for i, frame in enumerate(dataset.frames)}
-    kept = kept_within(IMAGE_BYTES, lambda i: of(dataset.frames[i]), lambda found: sum(part.nbytes for part in found))
+    kept = kept_within(
+        IMAGE_BYTES,
+        lambda i: of(dataset.frames[i]),
+        lambda found: sum(part.nbytes for part in found),
+    )
     return lambda frame: kept(index[frame.name])
 
 
 def psnr_measure(
     dataset: Dataset, cache: ListCache, exposure: bool = False
 ) -> Callable[[Gaussians, list[int]], dict[str, float]]:
-    """measure(gaussians, frames taken) -> mean PSNR, dB: `psnr` and `psnr_mask` (inside the rock mask) over all views,
-    `held_out_psnr` and `held_out_psnr_mask` over those never trained on, `test_psnr` and `test_psnr_mask` over the test views
-    where the dataset has some; frames on demand that were not taken have no image, and no part in any of them. With `exposure`
-    the same once more with `_corrected` at the end, of renders that are brought to the exposure of the view
-    (`mgs.metrics.colour_corrected`). As `mgs.report.evaluation`, without its other metrics, which cost more. A mean over no
-    view (all masks empty, none held out) is left out. Raises InputError as `Dataset.test_views`.
+    """measure(gaussians, frames taken) -> mean PSNR, dB: `psnr` and `psnr_mask` (inside the rock
+    mask) over all views, `held_out_psnr` and `held_out_psnr_mask` over those never trained on,
+    `test_psnr` and `test_psnr_mask` over the test views where the dataset has some; frames on
+    demand that were not taken have no image, and no part in any of them. With `exposure` the same
+    once more with `_corrected` at the end, of renders that are brought to the exposure of the view
+    (`mgs.metrics.colour_corrected`). As `mgs.report.evaluation`, without its other metrics, which
+    cost more. A mean over no view (all masks empty, none held out) is left out. Raises InputError
+    as `Dataset.test_views`.
     """
     tests = dataset.test_views()
     frames = [*dataset.frames, *(tests.frames if tests else ())]
@@ -106,19 +119,35 @@ def psnr_measure(
 
     truth = kept_within(IMAGE_BYTES, read, lambda parts: sum(part.nbytes for part in parts))
 
-    def values(image: np.ndarray, known: np.ndarray, rock: np.ndarray, rendered: np.ndarray) -> list[float]:
-        shown = [rendered, colour_corrected(linear_from_srgb(image), rendered, rock)] if exposure else [rendered]
+    def values(
+        image: np.ndarray, known: np.ndarray, rock: np.ndarray, rendered: np.ndarray
+    ) -> list[float]:
+        shown = (
+            [rendered, colour_corrected(linear_from_srgb(image), rendered, rock)]
+            if exposure
+            else [rendered]
+        )
         return [psnr(srgb_from_linear(one), image, mask) for one in shown for mask in (known, rock)]
 
     def measured(gaussians: Gaussians, chosen: Iterable[int]) -> np.ndarray:
-        found = [values(*truth(i), np.asarray(render(gaussians, frames[i].camera, cache=cache).rgb)) for i in chosen]
+        found = [
+            values(*truth(i), np.asarray(render(gaussians, frames[i].camera, cache=cache).rgb))
+            for i in chosen
+        ]
         return np.array(found).reshape(-1, len(names))
 
     def measure(gaussians: Gaussians, taken: list[int]) -> dict[str, float]:
         shown = [i for i, frame in enumerate(dataset.frames) if i in taken or not frame.on_demand]
-        views, test_views = measured(gaussians, shown), measured(gaussians, range(len(dataset), len(frames)))
+        views, test_views = (
+            measured(gaussians, shown),
+            measured(gaussians, range(len(dataset), len(frames))),
+        )
         held_out = views[[i not in taken for i in shown]]
-        return _means(views, "", names) | _means(held_out, "held_out_", names) | _means(test_views, "test_", names)
+        return (
+            _means(views, "", names)
+            | _means(held_out, "held_out_", names)
+            | _means(test_views, "test_", names)
+        )
 
     return measure
 

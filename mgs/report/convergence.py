@@ -1,8 +1,10 @@
-"""How near its end the fit of a run stopped: a prediction of how much lower the objective could still get.
+"""How near its end the fit of a run stopped: a prediction of how much lower the objective could
+still get.
 
-A fit is stopped long before the minimum: the images held out are as good by then, and the ranking of candidates changes little
-(docs/fit.md). What a loss does from pass to pass says nothing about how far away the minimum is. The Newton decrease does: half
-of g^T (J^T J + lam)^-1 g, exact where images are linear in the parameters.
+A fit is stopped long before the minimum: the images held out are as good by then, and the ranking
+of candidates changes little (docs/fit.md). What a loss does from pass to pass says nothing about
+how far away the minimum is. The Newton decrease does: half of g^T (J^T J + lam)^-1 g, exact where
+images are linear in the parameters.
 """
 
 from __future__ import annotations
@@ -10,17 +12,18 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from mgs.active.criteria import lam_by_kind
-from mgs.active.evidence import last_images
-from mgs.active.objective import newton_decrease, objective
-from mgs.active.settings import NbvSettings
 from mgs.data.dataset import Frame
+from mgs.fit.objective import newton_decrease, objective
 from mgs.gaussians import Gaussians
+from mgs.policy.criteria import lam_by_kind
 from mgs.prior.build import Prior
+from mgs.report.evidence import last_images
+from mgs.run.settings import NbvSettings
 from mgs.splat import as_drjit, groups
 
 CG_ITERATIONS = 20
-"""Iterations of conjugate gradients; `mgs bench fit` compares what they predict with what a longer fit finds."""
+"""Iterations of conjugate gradients; `mgs bench fit` compares what they predict with what a longer
+fit finds."""
 
 CONVERGED_SHARE = 0.02
 """A fit has converged if the objective is predicted to fall by at most this share of itself."""
@@ -36,8 +39,9 @@ def remaining_decrease(
     """The objective of the last fit of a run, and by how much it is predicted to fall yet.
 
     gaussians: the fitted model; frames: those taken, in their order, so the seeds first.
-    Returns "phi" (`mgs.active.objective`, squared pixel values); "predicted_decrease", the Newton decrease after CG_ITERATIONS,
-    a share of phi; and "converged", whether that is at most CONVERGED_SHARE. Raises InputError where a frame cannot be read.
+    Returns "phi" (`mgs.fit.objective`, squared pixel values); "predicted_decrease", the Newton
+    decrease after CG_ITERATIONS, a share of phi; and "converged", whether that is at most
+    CONVERGED_SHARE. Raises InputError where a frame cannot be read.
     """
     images, train = last_images(settings, prior, frames), settings.train
     kinds = groups(0, train.means)

@@ -1,4 +1,5 @@
-"""Pose policies: scores of candidates from camera positions alone. Pure NumPy, each a row of a table."""
+"""Pose policies: scores of candidates from camera positions alone. Pure NumPy, each a row of a
+table."""
 
 from __future__ import annotations
 
@@ -7,13 +8,14 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from mgs.active.criteria import Array
+from mgs.policy.criteria import Array
 
 PosePolicy = Callable[[Array, Array, Array, np.random.Generator], Array]
 
 
 def azimuths(positions: Array, centre: Array) -> NDArray[np.float64]:
-    """Camera centres [C,3] -> angle about the vertical through `centre` [3], radians in [0, 2 pi), 0 = +X."""
+    """Camera centres [C,3] -> angle about the vertical through `centre` [3], radians in [0, 2 pi),
+    0 = +X."""
     offset = np.asarray(positions, np.float64) - centre
     return np.arctan2(offset[:, 1], offset[:, 0]) % (2 * np.pi)
 
@@ -24,33 +26,47 @@ def angle_between(a: Array, b: Array) -> NDArray[np.float64]:
 
 
 def random_order(candidates: Array, taken: Array, centre: Array, rng: np.random.Generator) -> Array:
-    """A draw at random. The loop derives `rng` from the run's seed and the step: reproducible, and new in every round."""
+    """A draw at random. The loop derives `rng` from the run's seed and the step: reproducible, and
+    new in every round."""
     return rng.random(len(candidates))
 
 
-def uniform_azimuth(candidates: Array, taken: Array, centre: Array, rng: np.random.Generator) -> Array:
-    """Gap to the taken azimuth on the left times that on the right, square radians: spreads the views evenly at every count.
+def uniform_azimuth(
+    candidates: Array, taken: Array, centre: Array, rng: np.random.Generator
+) -> Array:
+    """Gap to the taken azimuth on the left times that on the right, square radians: spreads the
+    views evenly at every count.
 
-    Splitting a gap a + b lowers the sum of squared gaps by 2ab, so this is greedy for the most even spread.
+    Splitting a gap a + b lowers the sum of squared gaps by 2ab, so this is greedy for the most even
+    spread.
     """
     gaps = (azimuths(taken, centre)[None, :] - azimuths(candidates, centre)[:, None]) % (2 * np.pi)
     return _rounded(gaps.min(axis=1) * (2 * np.pi - gaps.max(axis=1)))
 
 
-def farthest_pose(candidates: Array, taken: Array, centre: Array, rng: np.random.Generator) -> Array:
+def farthest_pose(
+    candidates: Array, taken: Array, centre: Array, rng: np.random.Generator
+) -> Array:
     """Distance to the nearest camera already taken, metres (farthest-point sampling)."""
     distance = np.linalg.norm(candidates[:, None, :] - taken[None, :, :], axis=2)
     return _rounded(distance.min(axis=1))
 
 
-def smallest_angle(candidates: Array, taken: Array, centre: Array, rng: np.random.Generator) -> Array:
-    """Angle to the nearest camera already taken, as seen from `centre`, radians: spreads the views over the whole dome."""
-    ours, theirs = (offset / np.linalg.norm(offset, axis=1, keepdims=True) for offset in (candidates - centre, taken - centre))
+def smallest_angle(
+    candidates: Array, taken: Array, centre: Array, rng: np.random.Generator
+) -> Array:
+    """Angle to the nearest camera already taken, as seen from `centre`, radians: spreads the views
+    over the whole dome."""
+    ours, theirs = (
+        offset / np.linalg.norm(offset, axis=1, keepdims=True)
+        for offset in (candidates - centre, taken - centre)
+    )
     return _rounded(np.arccos(np.clip(ours @ theirs.T, -1, 1)).min(axis=1))
 
 
 def _rounded(scores: Array) -> Array:
-    """Equal distances differ in the last bits; without them a tie is a tie (the loop takes the farthest, seeds the first)."""
+    """Equal distances differ in the last bits; without them a tie is a tie (the loop takes the
+    farthest, seeds the first)."""
     return np.round(scores, 9)
 
 
@@ -64,16 +80,18 @@ POSE_POLICIES: dict[str, PosePolicy] = {
 
 
 def nearest_poses(positions: Array, here: Array, count: int) -> list[int]:
-    """Indices of the `count` positions [C,3] nearest to `here` [3], in their order; all of them where they are fewer."""
+    """Indices of the `count` positions [C,3] nearest to `here` [3], in their order; all of them
+    where they are fewer."""
     distance = _rounded(np.linalg.norm(positions - here, axis=1))
     return sorted(int(k) for k in np.argsort(distance, kind="stable")[:count])
 
 
 def travel_cost(positions: Array, here: Array, travel: float) -> NDArray[np.float64]:
-    """Cost of an image at each of the positions [C,3] for a camera that is `here` [3], in images: 1 + distance / travel.
+    """Cost of an image at each of the positions [C,3] for a camera that is `here` [3], in images: 1
+    + distance / travel.
 
-    The distance is that of the straight line, the least that there is to go. travel: the distance, metres, that costs as much
-    as an image.
+    The distance is that of the straight line, the least that there is to go. travel: the distance,
+    metres, that costs as much as an image.
     """
     return np.asarray(1 + _rounded(np.linalg.norm(positions - here, axis=1)) / travel)
 
@@ -84,7 +102,8 @@ def path_length(positions: Array) -> float:
 
 
 def seed_views(positions: Array, centre: Array, count: int) -> list[int]:
-    """Frames nearest to `count` evenly spaced azimuths (0, 360/count, ...), each frame once; in that order.
+    """Frames nearest to `count` evenly spaced azimuths (0, 360/count, ...), each frame once; in
+    that order.
 
     positions [C,3] camera centres, centre [3] the rock; metres. Needs count <= C.
     """

@@ -1,1 +1,0 @@
-"""Active selection: fit, information, criterion, capture, again."""

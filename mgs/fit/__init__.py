@@ -1,0 +1,1 @@
+"""Fit Gaussians to images: objective, optimisers, stopping, evidence."""

@@ -1,0 +1,1 @@
+"""What a view is worth: criteria, pose rules, and the registry of policies."""
