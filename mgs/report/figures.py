@@ -172,9 +172,7 @@ def gain_figure(path: str | Path, gains: Mapping[str, Sequence[float]]) -> None:
     _curves_figure(path, [panel], 4.8, lambda axes: axes[0].set_ylim(bottom=0))
 
 
-def coverage_figure(
-    path: str | Path, coverage: Mapping[str, tuple[Sequence[int], Sequence[float]]]
-) -> None:
+def coverage_figure(path: str | Path, coverage: Curves) -> None:
     """Draw surface coverage after each step, and what each step added (the paper's Fig. 3).
 
     coverage: label -> (number of training images, share of the surface observed, 0 to 1), after the
