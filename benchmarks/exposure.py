@@ -20,7 +20,8 @@ import numpy as np
 from own_data import photographs
 
 from mgs import runtime
-from mgs.data.importers import import_source, read_source
+from mgs.data.importers import import_source
+from mgs.data.sources import read_source
 from mgs.files import write_json
 from mgs.fit.settings import COLOURS_ALONE
 from mgs.prior.build import build_prior, save_prior

@@ -21,7 +21,7 @@ import numpy as np
 
 from mgs import runtime
 from mgs.data.dataset import load_dataset, target_of
-from mgs.data.meshes import distances_to_mesh, read_rock
+from mgs.data.meshes import distances_to_mesh, read_mesh
 from mgs.files import write_json
 from mgs.fit.settings import TrainSettings
 from mgs.plotting import STYLE, new_figure, save_figure
@@ -44,7 +44,7 @@ def study(root: Path, gaussians: int, passes: int) -> list[dict[str, Any]]:
     dataset = load_dataset(root)
     tests = dataset.test_views().frames
     frames, records = dataset.frames, []
-    true = read_rock(root / "rock.glb") if (root / "rock.glb").is_file() else None
+    true = read_mesh(root / "rock.glb") if (root / "rock.glb").is_file() else None
     exact, _ = build_prior(dataset, PriorSettings(gaussians=gaussians))
     positions = np.array([frame.camera.position for frame in frames])
     taken = {views: seed_views(positions, exact.points.mean(0), views) for views in VIEWS}

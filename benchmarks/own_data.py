@@ -25,9 +25,10 @@ from mgs import runtime
 from mgs.cli.dataset import UNCERTAINTY
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import Dataset, Frame, load_dataset, target_of
-from mgs.data.importers import import_source, read_source
+from mgs.data.importers import import_source
 from mgs.data.masks import make_masks
 from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh
+from mgs.data.sources import read_source
 from mgs.data.up import upright
 from mgs.files import write_json
 from mgs.fit.fitting import fit
