@@ -22,8 +22,8 @@ def _directional_i(context: PolicyContext, noise: float) -> np.ndarray:
         lam,
         3,
         0.1,
-        context.views(context.visited),
-        context.views(context.left),
+        context.views(context.taken_frames),
+        context.views(context.candidate_frames),
         context.dome(),
     )
 

@@ -17,13 +17,13 @@ from mgs.policy.registry import PAPER_LAM
 def linear_look(context: PolicyContext) -> np.ndarray:
     """`directional-i` with colours that change with the direction linearly (SH degree 1, tau 0.1)
     instead of degree 3."""
-    return context.gains(context.visited, context.left, 1, 0.1, True)
+    return context.gains(context.taken_frames, context.candidate_frames, 1, 0.1, True)
 
 
 def degree_0(context: PolicyContext) -> np.ndarray:
     """`directional-i` with colours that are the same from everywhere: what is left are pixels on
     parts seen little so far."""
-    return context.gains(context.visited, context.left, 0, 0.1, True)
+    return context.gains(context.taken_frames, context.candidate_frames, 0, 0.1, True)
 
 
 def poses_alone(context: PolicyContext) -> np.ndarray:
@@ -61,7 +61,13 @@ def trained_gaussians(context: PolicyContext) -> np.ndarray:
 
     lam = float(context.prior_lam[0])
     return gains(
-        context.points, lam, 3, 0.1, fitted(context.visited), fitted(context.left), context.dome()
+        context.points,
+        lam,
+        3,
+        0.1,
+        fitted(context.taken_frames),
+        fitted(context.candidate_frames),
+        context.dome(),
     )
 
 
@@ -88,8 +94,10 @@ rotation_alone, opacity_alone = _of_kind("rotation"), _of_kind("opacity")
 
 def _by_loss(context: PolicyContext, estimator: str, lam: np.ndarray) -> np.ndarray:
     """Eq. 7 of an estimator, for the views taken too."""
-    H = sum(context.estimate(i, estimator).astype(np.float64) for i in context.visited)
-    return np.array([d_optimal(context.estimate(i, estimator), H, lam) for i in context.left])
+    H = sum(context.estimate(i, estimator).astype(np.float64) for i in context.taken_frames)
+    return np.array(
+        [d_optimal(context.estimate(i, estimator), H, lam) for i in context.candidate_frames]
+    )
 
 
 def paper_black(context: PolicyContext) -> np.ndarray:
@@ -115,7 +123,7 @@ def paper_scaled(context: PolicyContext) -> np.ndarray:
     mean entries of its information and of the exact. A mean loss has far smaller gradients than
     pixels have, and one lambda of 1e-6 swamps them."""
     means = [
-        np.mean([context.estimate(i, name).mean() for i in context.visited])
+        np.mean([context.estimate(i, name).mean() for i in context.taken_frames])
         for name in ("loss-gradient", "exact")
     ]
     return _by_loss(context, "loss-gradient", context.lam * float(means[0] / means[1]))
@@ -124,7 +132,7 @@ def paper_scaled(context: PolicyContext) -> np.ndarray:
 def paper_small_lam(context: PolicyContext) -> np.ndarray:
     """`paper` with one lambda that is as small for its information as 1e-6 is for the exact."""
     means = [
-        np.mean([context.estimate(i, name).mean() for i in context.visited])
+        np.mean([context.estimate(i, name).mean() for i in context.taken_frames])
         for name in ("loss-gradient", "exact")
     ]
     return _by_loss(context, "loss-gradient", _one_lam(context) * float(means[0] / means[1]))
