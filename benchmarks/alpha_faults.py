@@ -28,7 +28,7 @@ from mgs.prior.build import Prior, build_prior
 from mgs.prior.initial import initial_gaussians
 from mgs.prior.settings import PriorSettings
 from mgs.provenance import command_line, versions
-from mgs.run.stations import psnr_measure
+from mgs.run.operations import psnr_measure
 from mgs.seeds import generator
 from mgs.splat import ListCache, groups
 from mgs.study.stress.faults import IMAGE_FAULTS, PRIOR_FAULTS, Captured, captured

@@ -25,8 +25,8 @@ from mgs.policy.criteria import PIXEL_NOISE
 from mgs.prior.build import load_prior
 from mgs.provenance import command_line, versions
 from mgs.run.loop import Loop
+from mgs.run.operations import operations_of, psnr_measure
 from mgs.run.settings import NbvSettings
-from mgs.run.stations import psnr_measure, real_stations
 from mgs.splat import ListCache
 from mgs.study.material import test_views_of
 
@@ -47,7 +47,7 @@ def record(dataset_path: Path, prior_path: Path, of_fit: float, of_score: float)
         dataset=dataset_path, prior=prior_path, seeds=SEEDS, budget=BUDGET, pixel_noise=of_fit
     )
     scored = settings.model_copy(update={"pixel_noise": of_score})
-    stations = real_stations(dataset, prior, settings)
+    stations = operations_of(dataset, prior, settings)
     with tempfile.TemporaryDirectory() as folder:
         loop = Loop(Path(folder), scored, dataset, stations, lambda stage, done, total: None)
         state = loop.first()

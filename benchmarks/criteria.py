@@ -81,9 +81,9 @@ class Bench:
         self.metric = f"test_{METRIC}" if self.dataset.test_views() else METRIC
         self.left = [i for i in range(len(self.dataset)) if i not in state.taken]
         self.model = array_digest(asdict(state.gaussians).values())
-        from mgs.run.stations import real_stations
+        from mgs.run.operations import operations_of
 
-        self.stations = real_stations(self.dataset, self.prior, self.settings)
+        self.stations = operations_of(self.dataset, self.prior, self.settings)
 
     def loop(self, order: int) -> Loop:
         """The loop of the run; fits take the images in another order for each number."""

@@ -31,8 +31,8 @@ from mgs.policy.directional import precision
 from mgs.prior.build import load_prior
 from mgs.provenance import command_line, versions
 from mgs.run.loop import Loop, Stations
+from mgs.run.operations import operations_of, psnr_measure
 from mgs.run.settings import NbvSettings
-from mgs.run.stations import psnr_measure, real_stations
 from mgs.splat import ListCache, fisher, groups
 from mgs.study.material import test_views_of
 
@@ -74,7 +74,7 @@ def record(dataset_path: Path, prior_path: Path, degree: int, policy: str) -> di
     settings = NbvSettings(
         dataset=dataset_path, prior=prior_path, policy=policy, seeds=SEEDS, budget=BUDGET
     )
-    plain = real_stations(dataset, prior, settings)
+    plain = operations_of(dataset, prior, settings)
     stations, lam = with_degree(plain, settings, degree)
     with tempfile.TemporaryDirectory() as folder:
         loop = Loop(Path(folder), settings, dataset, stations, lambda stage, done, total: None)

@@ -30,8 +30,8 @@ from mgs.prior.build import build_prior
 from mgs.prior.settings import PriorSettings
 from mgs.provenance import command_line, versions
 from mgs.report.evaluation import evaluate
+from mgs.run.operations import operations_of
 from mgs.run.settings import NbvSettings
-from mgs.run.stations import real_stations
 from mgs.splat import MEANS
 
 GAUSSIANS, VIEWS, NOISES, HULL = 5_000, (12, 4), (0.0, 0.5, 1.5), "hull"
@@ -67,7 +67,7 @@ def study(root: Path, gaussians: int, passes: int) -> list[dict[str, Any]]:
                 settings = NbvSettings(dataset=root, prior=root, train=train).with_spacing(
                     prior.spacing
                 )
-                stations = real_stations(dataset, prior, settings)
+                stations = operations_of(dataset, prior, settings)
                 start = stations.initial(chosen)
                 fit = stations.fit(
                     start, start, cameras, targets, settings.train, lambda done, most: None

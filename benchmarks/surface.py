@@ -34,7 +34,7 @@ from mgs.prior.build import build_prior
 from mgs.prior.initial import initial_gaussians
 from mgs.prior.settings import PriorSettings
 from mgs.provenance import command_line, versions
-from mgs.run.stations import psnr_measure
+from mgs.run.operations import psnr_measure
 from mgs.splat import ListCache, groups
 
 VIEWS, GAUSSIANS = 12, 10_000

@@ -29,8 +29,8 @@ from mgs.prior.build import Prior, build_prior
 from mgs.prior.initial import warm_start
 from mgs.prior.settings import PriorSettings
 from mgs.provenance import command_line, versions
+from mgs.run.operations import operations_of
 from mgs.run.settings import NbvSettings
-from mgs.run.stations import real_stations
 
 SEEDS = (1, 2, 4)
 JUDGED = (6, 8, 12)
@@ -58,7 +58,7 @@ def models(
 ) -> Iterator[tuple[list[int], Gaussians]]:
     """Views taken, and the model fitted to them, for each number of images from the seeds on."""
     settings = NbvSettings(dataset=dataset.root, prior=dataset.root, seeds=seeds)
-    stations = real_stations(dataset, prior, settings)
+    stations = operations_of(dataset, prior, settings)
     of_seeds = before = model = stations.initial([dataset.frames[i] for i in order[:seeds]])
     for count in range(seeds, len(order) + 1):
         frames = [dataset.frames[i] for i in order[:count]]
@@ -80,7 +80,7 @@ def study(root: Path) -> list[dict[str, Any]]:
             f"{root}: has no test views; make it with `mgs synth-orbit --test-views 12`"
         )
     prior, _ = build_prior(dataset, PriorSettings(gaussians=GAUSSIANS))
-    measure = real_stations(dataset, prior, NbvSettings(dataset=root, prior=root)).measure
+    measure = operations_of(dataset, prior, NbvSettings(dataset=root, prior=root)).measure
     records = []
     for seeds in SEEDS:
         order = order_of_views(dataset, prior.points.mean(0), seeds, max(JUDGED))

@@ -28,7 +28,7 @@ from mgs.fit.stopping import StopReason
 from mgs.policy.criteria import PIXEL_NOISE
 from mgs.policy.registry import policy_names
 from mgs.rotation import QUAT_MIN
-from mgs.run import loop
+from mgs.run import recording
 from mgs.run.ending import RunEnd
 from mgs.splat import ESTIMATORS, constants
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, TILE
@@ -385,8 +385,8 @@ def test_the_tables_of_the_loop_are_those_of_the_code(dataset, tmp_path):
         for views in ("", "held_out_", "test_")
         for name in ("psnr", "psnr_mask")
     }
-    stations = tiny.stations(measure=lambda gaussians, taken: qualities)
-    state = loop.run(tmp_path / "run", settings, loaded, stations, tiny.silent)
+    stations = tiny.operations(measure=lambda gaussians, taken: qualities)
+    state = recording.run(tmp_path / "run", settings, loaded, stations, tiny.silent)
     keys -= {
         "signs",
         "warnings",

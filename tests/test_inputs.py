@@ -19,7 +19,7 @@ from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.images import write_exr
 from mgs.run import folder as run_folder
-from mgs.run import loop
+from mgs.run import recording
 
 
 def retouch(path: Path) -> None:
@@ -77,11 +77,11 @@ def half_done(tmp_path):
     """A dataset of its own and a run of three steps of six."""
     root = tiny.write_dataset(tmp_path / "dataset")
     settings = tiny.start(tmp_path / "run", load_dataset(root))
-    loop.run(
+    recording.run(
         tmp_path / "run",
         settings.model_copy(update={"budget": 2}),
         load_dataset(root),
-        tiny.stations(),
+        tiny.operations(),
         tiny.silent,
     )
     return root, tmp_path / "run"
@@ -90,8 +90,8 @@ def half_done(tmp_path):
 def resume(root: Path, out: Path, **parts) -> tuple[run_folder.State, list[str]]:
     """The last state of a resumed run, and what was said on the way."""
     said: list[str] = []
-    stations = tiny.stations(**parts)
-    return loop.run(
+    stations = tiny.operations(**parts)
+    return recording.run(
         out,
         run_folder.read_settings(out),
         load_dataset(root),

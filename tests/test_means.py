@@ -24,7 +24,6 @@ from mgs.prior.initial import initial_normals
 from mgs.report.convergence import remaining_decrease
 from mgs.rotation import quat_from_normals
 from mgs.run import folder as run_folder
-from mgs.run import stations
 from mgs.run.nbv import resume_nbv, run_nbv, start_run
 from mgs.run.settings import NbvSettings
 from mgs.splat import MEANS, as_drjit, fisher, groups, render
@@ -275,7 +274,7 @@ def test_criteria_see_the_means_and_coverage_does_not(files, whole):
 
 def test_interrupted_and_resumed_the_run_is_the_same(files, whole, tmp_path, monkeypatch):
     means, out, state = whole
-    real, calls = stations.fit, []
+    real, calls = operations.fit, []
 
     def struck(*arguments):
         calls.append(1)
@@ -283,7 +282,7 @@ def test_interrupted_and_resumed_the_run_is_the_same(files, whole, tmp_path, mon
             raise KeyboardInterrupt
         return real(*arguments)
 
-    monkeypatch.setattr(stations, "fit", struck)
+    monkeypatch.setattr(operations, "fit", struck)
     with pytest.raises(KeyboardInterrupt):
         run_nbv(files[0], tmp_path / "run", **options(files, means))
     resumed = resume_nbv(tmp_path / "run")

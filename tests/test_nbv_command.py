@@ -25,7 +25,7 @@ from mgs.policy import poses as pose_policies
 from mgs.prior.build import load_prior, save_prior
 from mgs.report.convergence import remaining_decrease
 from mgs.run import folder as run_folder
-from mgs.run import loop, nbv
+from mgs.run import nbv, recording
 from mgs.run.folder import load_run
 from mgs.splat import fisher
 
@@ -94,13 +94,13 @@ def test_a_frame_without_rock_is_refused_before_it_is_fitted_to(
     loaded = load_dataset(dataset)
     settings = tiny.start(tmp_path / "run", loaded, policy="farthest")
     with pytest.raises(InputError, match=f"{named}.*is empty"):
-        loop.run(tmp_path / "run", settings, loaded, tiny.stations(fit=fit), tiny.silent)
+        recording.run(tmp_path / "run", settings, loaded, tiny.operations(fit=fit), tiny.silent)
     assert max(fits, default=0) == images
 
 
 def test_a_mean_over_no_view_is_left_out(dataset, tmp_path):
     """Held-out frames without rock: no line of steps.jsonl holds NaN, which is no JSON."""
-    from mgs.run.stations import psnr_measure
+    from mgs.run.operations import psnr_measure
     from mgs.splat import ListCache
 
     loaded, model = load_dataset(dataset), tiny.initial([])
@@ -492,11 +492,11 @@ def test_the_documented_policy_of_ones_own(dataset, tmp_path, monkeypatch):
     own = criteria.CRITERIA[name]
     counted = criteria.Criterion(lambda *given: scores.append(own.score(*given)) or scores[-1])
     monkeypatch.setitem(criteria.CRITERIA, name, counted)
-    state = loop.run(
+    state = recording.run(
         tmp_path / "run",
         run_folder.read_settings(tmp_path / "run"),
         loaded,
-        tiny.stations(),
+        tiny.operations(),
         tiny.silent,
     )
     assert len(scores) == len(loaded) - 4
@@ -505,11 +505,11 @@ def test_the_documented_policy_of_ones_own(dataset, tmp_path, monkeypatch):
     monkeypatch.undo()
     assert load_run(tmp_path / "run")[3] == name
     with pytest.raises(InputError, match=f"--policy {name}: unknown; choose one of d-optimal"):
-        loop.run(
+        recording.run(
             tmp_path / "run",
             run_folder.read_settings(tmp_path / "run"),
             loaded,
-            tiny.stations(),
+            tiny.operations(),
             tiny.silent,
         )
 

@@ -16,7 +16,7 @@ from mgs.policy import from_file as policy_file
 from mgs.policy import poses as pose_policies
 from mgs.policy.registry import policy_named
 from mgs.report.runs import read_run
-from mgs.run import loop
+from mgs.run import recording
 from mgs.run.nbv import start_run
 from mgs.run.settings import NbvSettings
 
@@ -77,7 +77,7 @@ def file(tmp_path):
 
 def run(out, dataset, **values):
     settings = tiny.start(out, dataset, **({"budget": 3} | values))
-    return loop.run(out, settings, dataset, tiny.stations(), tiny.silent)
+    return recording.run(out, settings, dataset, tiny.operations(), tiny.silent)
 
 
 @pytest.mark.parametrize(
@@ -173,10 +173,12 @@ def test_a_run_goes_on_with_the_same_file_only(dataset, file, tmp_path, monkeypa
     with pytest.raises(
         InputError, match=r"mine\.py:poses: its file has changed since .*half was started"
     ):
-        loop.run(tmp_path / "half", settings, load_dataset(dataset), tiny.stations(), tiny.silent)
+        recording.run(
+            tmp_path / "half", settings, load_dataset(dataset), tiny.operations(), tiny.silent
+        )
     file.write_text(FUNCTIONS)
-    state = loop.run(
-        tmp_path / "half", settings, load_dataset(dataset), tiny.stations(), tiny.silent
+    state = recording.run(
+        tmp_path / "half", settings, load_dataset(dataset), tiny.operations(), tiny.silent
     )
     assert len(state.taken) == 5
 

@@ -15,7 +15,7 @@ from mgs.errors import InputError
 from mgs.policy import criteria
 from mgs.policy import poses as pose_policies
 from mgs.run import folder as run_folder
-from mgs.run import loop
+from mgs.run import recording
 
 METRES = st.floats(-100, 100)
 
@@ -26,7 +26,9 @@ def loaded(tmp_path_factory):
 
 
 def run(out, dataset, **values) -> run_folder.State:
-    return loop.run(out, tiny.start(out, dataset, **values), dataset, tiny.stations(), tiny.silent)
+    return recording.run(
+        out, tiny.start(out, dataset, **values), dataset, tiny.operations(), tiny.silent
+    )
 
 
 @given(

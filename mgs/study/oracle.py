@@ -16,8 +16,8 @@ from mgs.prior.build import load_prior
 from mgs.run.folder import State, read_checkpoint, read_settings, write_checkpoint
 from mgs.run.loop import Loop, Progress, Stations
 from mgs.run.nbv import start_run
+from mgs.run.operations import operations_of, psnr_measure
 from mgs.run.settings import NbvSettings
-from mgs.run.stations import psnr_measure, real_stations
 from mgs.splat import ListCache
 from mgs.study.material import test_views_of
 from mgs.study.sweep import cell_folder
@@ -81,7 +81,7 @@ def choose_all(run: Path) -> State:
     settings = read_settings(run)
     loaded = load_dataset(settings.dataset)
     tests = test_views_of(loaded)
-    stations = real_stations(loaded, load_prior(settings.prior), settings)
+    stations = operations_of(loaded, load_prior(settings.prior), settings)
     oracle = Oracle(run, settings, loaded, tests, stations, lambda stage, done, total: None)
     state = oracle.marked(read_checkpoint(run) or oracle.first())
     write_checkpoint(run, state)

@@ -52,7 +52,7 @@ class State:
         from mgs.prior.build import load_prior
         from mgs.run.folder import read_settings
         from mgs.run.loop import Loop
-        from mgs.run.stations import real_stations
+        from mgs.run.operations import operations_of
         from mgs.splat import ListCache
 
         data, settings = load_dataset(root / dataset), read_settings(runs / "run")
@@ -71,7 +71,7 @@ class State:
         self.cameras, self.cache = [frame.camera for frame in data.frames], ListCache()
         self.left = [i for i in range(len(data)) if i not in self.taken]
         self.folders = [runs / str(k) for k in range(step + 1)]
-        stations = real_stations(data, load_prior(root / prior), settings)
+        stations = operations_of(data, load_prior(root / prior), settings)
         self.loop = Loop(runs / "run", settings, data, stations, lambda *_: None)
         self.lam = settings.regularisation(stations.groups)
 

@@ -137,7 +137,7 @@ def measure(
     from mgs.prior.build import load_prior
     from mgs.run.folder import read_settings
     from mgs.run.nbv import run_nbv
-    from mgs.run.stations import real_stations
+    from mgs.run.operations import operations_of
 
     data, run = load_dataset(root / dataset), out / "run"
     shutil.rmtree(run, ignore_errors=True)  # what an interrupted call left
@@ -145,7 +145,7 @@ def measure(
         root / dataset, run, prior=root / prior, seeds=images, budget=0, train=COLOURS_ALONE
     )
     settings = read_settings(run)
-    stations = real_stations(data, load_prior(root / prior), settings)
+    stations = operations_of(data, load_prior(root / prior), settings)
     lam, model = settings.regularisation(stations.groups), as_matrix(state.gaussians)
     start = as_matrix(stations.initial([data.frames[i] for i in state.taken]))
     start[:, :3] = model[:, :3].mean(0)

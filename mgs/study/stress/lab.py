@@ -24,7 +24,7 @@ from mgs.policy.registry import policy_named
 from mgs.policy.visibility import Visibility
 from mgs.prior.build import Prior, load_prior
 from mgs.prior.initial import initial_gaussians, initial_normals, warm_start
-from mgs.run.stations import psnr_measure
+from mgs.run.operations import psnr_measure
 from mgs.seeds import generator
 from mgs.splat import ListCache, fisher, groups
 from mgs.study.material import made_dataset, made_prior, test_views_of

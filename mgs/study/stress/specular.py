@@ -14,7 +14,7 @@ from mgs.files import read_json
 from mgs.gaussians import Gaussians
 from mgs.metrics import masked_squares
 from mgs.policy.poses import angle_between, azimuths
-from mgs.run.stations import psnr_measure
+from mgs.run.operations import psnr_measure
 from mgs.splat import ListCache, render
 from mgs.study.stress.experiment import Experiment, Panel, turns
 from mgs.study.stress.lab import CACHE, Lab, Preset, by_policy, open_lab, variant_cell

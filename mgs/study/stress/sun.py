@@ -15,7 +15,7 @@ from mgs.files import read_json
 from mgs.metrics import agreement
 from mgs.prior.exposure import exposure_of
 from mgs.run.detectors import DETECTORS
-from mgs.run.stations import psnr_measure
+from mgs.run.operations import psnr_measure
 from mgs.splat import ListCache
 from mgs.study.material import test_views_of
 from mgs.study.stress.experiment import Experiment, Panel, turns
