@@ -89,11 +89,13 @@ def test_commands_of_points_say_what_was_measured(name):
             point.settings(chosen.seeds),
         )
         train = made.pop("train")
-        rates = dict(pair.split("=") for pair in said["rate"] or [])
+        rates = dict(pair.split("=") for pair in said["rates"] or [])
         assert said["alpha_weight"] == 0
-        assert {key: said[key] for key in (*made, "passes", "optimiser")} == made | {
-            k: train[k] for k in ("passes", "optimiser")
-        }
+        given = made | {k: train[k] for k in ("passes", "optimiser")}
+        defaults = {**NbvSettings.model_fields, **TrainSettings.model_fields}
+        assert {
+            key: defaults[key].default if said[key] is None else said[key] for key in given
+        } == given
         assert {kind: float(rate) for kind, rate in rates.items()} == train["rates"]
         assert NbvSettings(dataset="DATA", prior="PRIOR", **made, train=train).train_at(
             1

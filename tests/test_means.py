@@ -24,6 +24,7 @@ from mgs.prior.initial import initial_normals
 from mgs.report.convergence import remaining_decrease
 from mgs.rotation import quat_from_normals
 from mgs.run import folder as run_folder
+from mgs.run import operations
 from mgs.run.nbv import resume_nbv, run_nbv, start_run
 from mgs.run.settings import NbvSettings
 from mgs.splat import MEANS, as_drjit, fisher, groups, render
@@ -228,18 +229,17 @@ def whole(request, files, tmp_path_factory):
 
 
 def test_units_are_spacings_of_the_prior_unless_given(files, tmp_path):
-    made = start_run(files[0], tmp_path / "run", **options(files, "normal"))
+    made = start_run(files[0], tmp_path / "run", **options(files, "normal")).settings
     assert made.prior_std["mean"] == MEAN_STD * 0.5
     assert made.train.rates["mean"] == MEAN_RATE * 0.5
     assert run_folder.read_settings(tmp_path / "run") == made
     given = options(
         files, "normal", prior_std={"mean": 0.3}, train={"means": "normal", "rates": {"mean": 0.01}}
     )
-    own = start_run(files[0], tmp_path / "own", **given)
+    own = start_run(files[0], tmp_path / "own", **given).settings
     assert (own.prior_std["mean"], own.train.rates["mean"]) == (0.3, 0.01)
-    assert (
-        "mean" not in start_run(files[0], tmp_path / "frozen", **options(files, "frozen")).prior_std
-    )
+    frozen = start_run(files[0], tmp_path / "frozen", **options(files, "frozen")).settings
+    assert "mean" not in frozen.prior_std
 
 
 def test_criteria_see_the_means_and_coverage_does_not(files, whole):
@@ -304,11 +304,11 @@ def test_policies_choose_with_learned_means(files, tmp_path, policy):
         (["--means", "loose"], "--means loose: Input should be 'frozen', 'normal' or 'free'"),
         (
             ["--means", "free", "--estimator", "hutchinson"],
-            "--means free: --estimator hutchinson knows nothing of means",
+            "--means free: --estimator hutchinson has no information about means",
         ),
         (
             ["--means", "free", "--policy", "paper"],
-            "--means free: --policy paper knows nothing of means",
+            "--means free: --policy paper has no information about means",
         ),
         (
             ["--means", "normal", "--prior-std", "mean=0"],

@@ -355,7 +355,7 @@ def test_resuming_a_finished_run_changes_nothing(dataset, tmp_path):
 @pytest.mark.parametrize("score", [math.nan, math.inf])
 def test_a_policy_that_gives_no_number_is_named(dataset, tmp_path, monkeypatch, score):
     monkeypatch.setitem(criteria.CRITERIA, "mine", criteria.Criterion(lambda F, H, lam: score))
-    with pytest.raises(InputError, match="policy mine: gave a score that is NaN or infinite"):
+    with pytest.raises(InputError, match="policy mine: returned a score that is NaN or infinite"):
         run(tmp_path / "run", dataset, policy="mine")
     assert len(lines(tmp_path / "run")) == 1
 

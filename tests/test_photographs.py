@@ -39,6 +39,7 @@ from mgs.prior.build import build_prior, load_prior
 from mgs.prior.hull import visual_hull
 from mgs.prior.points import main_cluster, on_surface
 from mgs.prior.settings import PriorSettings
+from mgs.run import recording
 
 
 @pytest.fixture(autouse=True)

@@ -148,7 +148,7 @@ def test_a_policy_that_cannot_be_loaded_is_one_line(dataset, file, tmp_path, nam
     ("function", "message"),
     [
         ("broken", r"line 41 of .*mine\.py failed: ZeroDivisionError: division by zero"),
-        ("few", r"gave scores of shape \(1,\) to 9 candidates"),
+        ("few", r"returned scores of shape \(1,\) for 9 candidates"),
     ],
 )
 def test_a_policy_that_fails_keeps_the_steps_before(dataset, file, tmp_path, function, message):

@@ -111,7 +111,7 @@ def test_what_cannot_be_divided_by_a_cost_is_refused(loaded, tmp_path, monkeypat
     )
     with pytest.raises(
         InputError,
-        match="policy mine: gave negative scores, which --travel cannot divide by a cost",
+        match="policy mine: returned negative scores, which --travel cannot divide",
     ):
         run(tmp_path / "run", loaded, policy="mine", travel=1.0)
     assert len(run(tmp_path / "free", loaded, policy="mine").taken) == 8

@@ -55,27 +55,21 @@ def complete(given: Any, defaults: Mapping[str, float]) -> Any:
 class TrainSettings(BaseModel):
     """How a fit is done: `mgs.fit.fitting.fit`."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     means: Literal["frozen", "normal", "free"] = "frozen"
-    """What the means may do: stay, as in the paper; move along the prior's normals; move freely
-    (`mgs.splat.MEANS`)."""
+    """How means move: frozen, as in the paper; normal, along the prior's normals; or free."""
     optimiser: str = "natural"
-    """A row of `mgs.fit.optimisers.OPTIMISERS`."""
+    """Optimiser of the fit: natural (gradient over Fisher information) or adam."""
     passes: Annotated[int, Field(ge=1)] = PASSES
-    """Most passes over the images."""
+    """Most passes over the images in any fit."""
     tolerance: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.01
     """Settled when a pass lowers the loss by less than this share, twice in a row, and does not
     raise it by more (`mgs.fit.stopping.stop_reason`)."""
     rates: dict[str, Annotated[float, Field(ge=0, allow_inf_nan=False)]] = RATES
-    """Learning rate of each kind of parameter; kinds left out take those of RATES. A rate of 0
-    leaves a kind as it is. That of `mean`, metres, is read only where means are learned, and must
-    be there then; `mgs nbv` sets it (`with_spacing`)."""
+    """Learning rate of a kind of parameter, 0: not learned; of `mean` in metres, where it moves."""
     alpha_weight: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)] = 0.0
-    """(sigma_rgb / sigma_alpha)^2, with which alpha is a fourth channel of a pixel; 0: it is none.
-    Runs have ALPHA_WEIGHT by
-    default. The criteria leave it out: with a weight up to 1 they chose the same views
-    (docs/fit.md)."""
+    """Weight of alpha as a fourth channel of a pixel, (sigma_rgb / sigma_alpha)^2; 0: none."""
     decay: Positive = 0.1
     """The rates fall by this factor over `passes`."""
     seed: Annotated[int, Field(ge=0)] = 0

@@ -92,10 +92,10 @@ def check_unchanged(
         raise InputError(changed_prior(out, settings.prior))
     changed = f"changed since {out} was started; restore"
     if record.get("policy") != policy_record(settings.policy).get("policy"):
-        raise InputError(f"policy {settings.policy}: its file {changed} it, or start a new run")
+        raise InputError(f"policy {settings.policy}: its file has {changed} it, or start a new run")
     for frame in dataset.frames:
         if record["cameras"].get(frame.name) != camera_digest(frame.camera):
-            where = f"{dataset.root / 'transforms.json'}: the camera of frame {frame.name}"
+            where = f"{dataset.root / 'transforms.json'}: the camera of frame {frame.name} has"
             raise InputError(f"{where} {changed} it, or start a new run")
         known = record["files"].get(frame.name, {})
         for kind, digest in frame_digests(frame, known).items():

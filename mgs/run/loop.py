@@ -28,19 +28,26 @@ if TYPE_CHECKING:
     from mgs.fit.fitting import Fit
 
 
-def select_views(problem: Problem, state: Fitted | None = None) -> Iterator[Learned]:
-    """Run the loop from the seeds, or from a state; give the state after every fit.
+Chooser = Callable[[Problem, Fitted, Callable[[int], np.ndarray]], tuple[int, float]]
+"""A function as `choose`."""
 
-    Ends when the budget is spent, or where `stop_uncertainty` or `stop_gain` says so. Raises
-    InputError where a policy returns no valid score, or a frame it takes cannot be read.
+
+def select_views(
+    problem: Problem, state: Fitted | None = None, chooser: Chooser | None = None
+) -> Iterator[Learned | Choice]:
+    """Run the loop from the seeds, or from a state; yield the state after every fit.
+
+    Ends when the budget is spent, or as `stop_uncertainty` or `stop_gain` say; the last item is
+    then the view that was refused for its gain. chooser: in place of `choose`. Raises InputError as
+    `choose` and `learn`.
     """
     if state is None:
         state = learn(problem, problem.seeds)
         yield state
     while not finished(problem, state):
-        planned, choices, refused = choose_batch(problem, state)
-        if not choices:
-            yield Learned(state.gaussians, state.H, state.surface, state.taken, refused=refused)
+        planned, choices, refused = choose_batch(problem, state, chooser or choose)
+        if refused and not choices:
+            yield refused
             return
         state = learn(problem, planned.taken, state, planned.surface, choices)
         yield state
@@ -147,7 +154,9 @@ def surface_information(
     return surface
 
 
-def choose_batch(problem: Problem, state: Fitted) -> tuple[Fitted, list[Choice], Choice | None]:
+def choose_batch(
+    problem: Problem, state: Fitted, chooser: Chooser
+) -> tuple[Fitted, list[Choice], Choice | None]:
     """Choose up to `batch` views about one model, each as if those before it were taken.
 
     Returns (the state as if they were taken, choices, the choice whose gain is below `stop_gain`).
@@ -157,7 +166,7 @@ def choose_batch(problem: Problem, state: Fitted) -> tuple[Fitted, list[Choice],
     left = settings.budget - (len(state.taken) - settings.seeds)
     planned = state
     for _ in range(min(settings.batch, left)):
-        frame, score = choose(problem, planned, fisher)
+        frame, score = chooser(problem, planned, fisher)
         F = fisher(frame)
         gain = criteria.d_optimal(F, planned.H, problem.lam)
         surface = surface_information(problem, [frame], planned)

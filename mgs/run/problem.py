@@ -113,7 +113,7 @@ class Problem:
         self.image = kept_within(
             IMAGE_BYTES, lambda i: target_of(self.frames[i], with_alpha), lambda image: image.nbytes
         )
-        self._start_of = lru_cache(maxsize=2)(self._coloured)
+        self._start_of = lru_cache(maxsize=2)(self.coloured)
 
     @cached_property
     def start(self) -> Gaussians:
@@ -147,7 +147,8 @@ class Problem:
         """The Gaussians before training, in the colours of all views taken."""
         return self._start_of(tuple(taken))
 
-    def _coloured(self, taken: tuple[int, ...]) -> Gaussians:
+    def coloured(self, taken: tuple[int, ...]) -> Gaussians:
+        """`start_of`, computed anew."""
         sh = self.operations.initial([self.frames[i] for i in taken]).sh
         return replace(self.start, sh=sh)
 

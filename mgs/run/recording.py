@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,8 @@ from mgs.data.dataset import Dataset
 from mgs.errors import InputError
 from mgs.files import locked
 from mgs.policy import criteria
-from mgs.run import detectors, inputs
+from mgs.run import inputs
+from mgs.run.checks import Checks
 from mgs.run.ending import FitDivergedError, diverged, run_end
 from mgs.run.folder import (
     DATASET,
@@ -24,7 +24,7 @@ from mgs.run.folder import (
     write_checkpoint,
     write_steps,
 )
-from mgs.run.loop import select_views, targets, uncertainty
+from mgs.run.loop import Chooser, select_views, uncertainty
 from mgs.run.problem import Operations, Problem, Progress
 from mgs.run.settings import NbvSettings
 from mgs.run.state import Choice, Learned, State
@@ -49,12 +49,12 @@ def run(
     operations: Operations,
     progress: Progress,
     on_step: Callable[[State], None] = lambda state: None,
-    say: Callable[[str], None] = lambda text: None,
+    chooser: Chooser | None = None,
 ) -> State:
     """Run or resume the loop in `out` (which has its config.json) to its end; return the last state.
 
-    on_step(state): called after every step, or batch of steps, that is on disk. say(text): called
-    with a message for the user. Killed at any moment and called again, it takes the same views as
+    on_step(state): called after every step, or batch of steps, that is on disk. chooser: as
+    `select_views`. Killed at any moment and called again, it takes the same views as
     an uninterrupted run.
 
     Raises InputError as `check_settings`; where another process works on the folder; where the
@@ -78,7 +78,7 @@ def run(
                 write_checkpoint(out, state)
             on_step(state)
         if state is None or "ended" not in state.steps[-1]:
-            state = _go_on(out, problem, recorder, state, on_step)
+            state = _go_on(out, problem, recorder, state, on_step, chooser)
         write_steps(out, state)
         write_ply(out / "gaussians.ply", state.gaussians)
         return state
@@ -90,12 +90,14 @@ def _go_on(
     recorder: Recorder,
     state: State | None,
     on_step: Callable[[State], None],
+    chooser: Chooser | None,
 ) -> State:
     """Run the loop from a state to its end, and commit every step."""
     try:
-        for learned in select_views(problem, state):
-            if learned.refused is not None and state is not None:
-                state = mark_end(problem, state, learned.refused)
+        for learned in select_views(problem, state, chooser):
+            if isinstance(learned, Choice):
+                assert state is not None
+                state = mark_end(problem, state, learned)
                 write_checkpoint(out, state)
             else:
                 state = recorder.recorded(learned, state)
@@ -184,7 +186,8 @@ class Recorder:
             "cameras": cameras,
             **inputs.policy_record(problem.settings.policy),
         }
-        self.before_fit = cache(self._before_fit)
+        render = problem.operations.render
+        self.checks = Checks(problem, render) if render else None
 
     def recorded(self, learned: Learned, state: State | None) -> State:
         """The state after a fit: a line for the seeds, or for each view chosen since `state`."""
@@ -201,11 +204,11 @@ class Recorder:
         if learned.gains is not None:
             names = [problem.frames[i].name for i in learned.taken]
             line["exposure"] = dict(zip(names, learned.gains.tolist(), strict=True))
-        if problem.operations.render:
+        if self.checks:
             self.stopwatch("checking", 0, 1)
             if learned.before is not None:
-                line |= self.residual(learned, new)
-            line |= self.signs(learned, [*known, *lines])
+                line |= self.checks.residual(learned, learned.before, new)
+            line |= self.checks.signs(learned, [*known, *lines])
         every, first, step = settings.evaluate_every, len(known), line["step"]
         if every and any(k % every == 0 for k in range(first, step + 1)):
             self.stopwatch("evaluating", 0, 1)
@@ -227,7 +230,7 @@ class Recorder:
         if not learned.choices:
             names = [problem.frames[i].name for i in learned.taken]
             coverage = criteria.coverage(learned.surface, problem.prior_lam)
-            line = {"step": 0, "frame": None, "name": None}
+            line: dict[str, Any] = {"step": 0, "frame": None, "name": None}
             line |= {"seeds": learned.taken, "seed_names": names}
             line |= {"score": None, "information_gain": None}
             return [line | {"images": seeds, "coverage": coverage, "seconds": {}}]
@@ -246,62 +249,3 @@ class Recorder:
             }
             for k, (choice, seconds) in enumerate(zip(learned.choices, laps, strict=True))
         ]
-
-    def residual(self, learned: Learned, new: list[int]) -> dict[str, float]:
-        """`residual` of a step: rms difference of new images to the model before, linear RGB.
-
-        Inside the mask; to be compared with the setting `pixel_noise`. Empty where no pixel counts.
-        """
-        problem = self.problem
-        shown = targets(problem, learned.taken, learned.gains)[-len(new) :]
-        found = detectors.residual(
-            (
-                problem.operations.render(learned.before, problem.cameras[i])[0],
-                target,
-                problem.frames[i].mask(),
-            )
-            for i, target in zip(new, shown, strict=True)
-        )
-        return {} if found is None else {"residual": found}
-
-    def signs(self, learned: Learned, steps: list[dict[str, Any]]) -> dict[str, Any]:
-        """`signs` of the last step and `warnings` where one exceeds its limit for the first time."""
-        problem, gains, fit = self.problem, learned.gains, learned.fit
-        views = []
-        shown = targets(problem, learned.taken, gains)
-        for k, (i, target) in enumerate(zip(learned.taken, shown, strict=True)):
-            packed, before = self.before_fit(i)
-            size = target.shape[0] * target.shape[1]
-            mask = np.unpackbits(packed, count=size).astype(bool).reshape(target.shape[:2])
-            if gains is not None:  # the estimated gain explains this part
-                exposure = before.exposure - float(np.log(gains[k].mean()))
-                before = replace(before, exposure=exposure)
-            rendered = problem.operations.render(fit.gaussians, problem.cameras[i])[0]
-            views.append(detectors.view_signs(target, mask, rendered, before))
-        scores = [
-            step["information_gain"] for step in steps if step["information_gain"] is not None
-        ]
-        start, coverage = problem.start, steps[-1]["coverage"]
-        drift = detectors.means_drift(fit.gaussians.means, start.means, start.log_scales)
-        signs = detectors.step_signs(views, fit.losses, coverage, scores, drift)
-        before_this = next(
-            (step["signs"] for step in reversed(steps[:-1]) if "signs" in step), None
-        )
-        said = detectors.alarms(signs, before_this)
-        return {"signs": signs, "warnings": said} if said else {"signs": signs}
-
-    def _before_fit(self, frame: int) -> tuple[np.ndarray, detectors.Before]:
-        """Mask of a frame taken, one bit a pixel, and its signs before any training.
-
-        Gaussians that no seed saw get the frame's own colours: grey would look like a change of
-        exposure.
-        """
-        problem = self.problem
-        mask, camera = problem.frames[frame].mask(), problem.cameras[frame]
-        margin = detectors.outline_margin(problem.start, camera)
-        grey = ~problem.start.sh.any(axis=(1, 2), keepdims=True)
-        own = problem.start_of([frame]).sh
-        start = replace(problem.start, sh=np.where(grey, own, problem.start.sh))
-        rendered, alpha = problem.operations.render(start, camera)
-        signs = detectors.before_fit(problem.image(frame), mask, rendered, alpha, margin)
-        return np.packbits(mask), signs

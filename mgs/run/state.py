@@ -46,15 +46,14 @@ class Fitted:
 class Learned(Fitted):
     """A `Fitted` state as `select_views` gives it, with how it was reached.
 
+    fit: the fit that found the model. gains [V,3]: exposure of the views taken, if it is estimated.
     before: the model before these views, None after the seeds. choices: the views chosen since.
-    refused: the next view, where its gain is below `stop_gain`: the loop has ended there.
     """
 
-    fit: Fit | None = None
+    fit: Fit
     gains: np.ndarray | None = None
     before: Gaussians | None = None
     choices: list[Choice] = field(default_factory=list)
-    refused: Choice | None = None
 
 
 @dataclass

@@ -51,8 +51,8 @@ class State:
     ) -> None:
         from mgs.prior.build import load_prior
         from mgs.run.folder import read_settings
-        from mgs.run.loop import Loop
         from mgs.run.operations import operations_of
+        from mgs.run.problem import Problem
         from mgs.splat import ListCache
 
         data, settings = load_dataset(root / dataset), read_settings(runs / "run")
@@ -72,7 +72,7 @@ class State:
         self.left = [i for i in range(len(data)) if i not in self.taken]
         self.folders = [runs / str(k) for k in range(step + 1)]
         stations = operations_of(data, load_prior(root / prior), settings)
-        self.loop = Loop(runs / "run", settings, data, stations, lambda *_: None)
+        self.problem = Problem(data, settings, stations)
         self.lam = settings.regularisation(stations.groups)
 
     @functools.cached_property
@@ -183,8 +183,11 @@ def by_policy(state: State, name: str) -> NDArray[np.float64]:
     first choice."""
     from mgs.policy.registry import policy_named
 
-    state.loop.look_anew()
-    return np.asarray(policy_named(name)(state.loop.context(state.state, state.left)), np.float64)
+    problem = state.problem
+    problem.__dict__.pop("visibility", None)
+    fisher = problem.view_information(state.model)
+    context = problem.context(state.state, state.left, fisher)
+    return np.asarray(policy_named(name)(context), np.float64)
 
 
 def block_scores(state: State) -> NDArray[np.float64]:
