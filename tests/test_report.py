@@ -264,7 +264,7 @@ def test_table(request, sets):
         assert lines[0][2] == "PSNR, test views (dB)"
         assert lines[3][2] == f"{metrics['test']['psnr']:.2f}"
     console = Console(width=80, file=io.StringIO())
-    printing.print_table(console, rows)
+    printing.print_quality(console, rows)
     printed = console.file.getvalue()
     assert max(map(len, printed.splitlines())) <= 80
     for key in printing.SHOWN["test" in sets]:
@@ -634,7 +634,7 @@ def test_a_long_name_cuts_no_number_and_is_not_cut(name):
         zip(printing.SHOWN[False], (30.09, 0.9426, 29.56, 0.9362, 27.54, 0.7538), strict=True)
     )
     row = {"images": 12, "coverage": 100.0} | values
-    printing.print_table(console, [{"policy": name} | row, {"policy": "random"} | row])
+    printing.print_quality(console, [{"policy": name} | row, {"policy": "random"} | row])
     text = console.export_text()
     assert all(
         text.count(tables.table_cell(key, value)) == 2

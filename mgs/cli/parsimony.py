@@ -30,7 +30,7 @@ def parsimony(
     from rich.console import Console
 
     from mgs import runtime
-    from mgs.cli.printing import cells_bar
+    from mgs.cli.progress import progress_bar
     from mgs.errors import row_named
     from mgs.files import check_writable, write_csv, write_json
     from mgs.provenance import command_line, versions
@@ -41,7 +41,7 @@ def parsimony(
     check_writable(out)
     runtime.start()
     console = Console(highlight=False)
-    with cells_bar(console) as report:
+    with progress_bar(console=console) as report:
         found = run_study(out, size, report)
     about = {
         "command": command_line(),

@@ -108,7 +108,7 @@ def prior(
     """
     from rich.console import Console
 
-    from mgs.cli.printing import parse_gaussians, parse_up
+    from mgs.cli.options import parse_gaussians, parse_up
     from mgs.data.dataset import load_dataset
     from mgs.data.meshes import GLTF
     from mgs.errors import InputError

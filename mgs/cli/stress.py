@@ -34,7 +34,7 @@ def stress(
     from rich.console import Console
 
     from mgs import runtime
-    from mgs.cli.printing import cells_bar
+    from mgs.cli.progress import progress_bar
     from mgs.errors import row_named
     from mgs.files import check_writable
     from mgs.provenance import command_line
@@ -48,7 +48,7 @@ def stress(
     size, names = row_named(PRESETS, preset, "--preset"), names_of(only, EXPERIMENTS)
     console = Console(highlight=False)
     check_writable(out)
-    with cells_bar(console) as report:
+    with progress_bar(console=console) as report:
         verdicts = run_stress(out, size, names, command_line(), report, workers)
     for experiment in verdicts["experiments"]:
         console.print(
