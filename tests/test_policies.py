@@ -192,7 +192,7 @@ def outlook_of(models, H, **given):
     """An context on three candidates, 1, 2 and 3, after one view, 0."""
     nothing = np.zeros((0, 11))
     parts = {
-        "positions": CIRCLE[:4], "left": [1, 2, 3], "visited": [0], "centre": CENTRE, "rng": np.random.default_rng(0),
+        "positions": CIRCLE[:4], "candidate_frames": [1, 2, 3], "taken_frames": [0], "centre": CENTRE, "rng": np.random.default_rng(0),
         "H": H, "lam": LAM, "points": np.zeros((0, 3)), "surface_H": nothing, "prior_lam": LAM,
         "information": lambda view: models["exact"][view], "surface_information": lambda view: nothing,
         "estimate": lambda view, estimator: models[estimator][view], "seen": lambda view: np.zeros(0), "dome": lambda: None,
@@ -217,9 +217,9 @@ def test_what_the_outlook_policies_ask_for():
         criteria.i_optimal(models["exact"][i], H, LAM, models["exact"].mean(0)) for i in (1, 2, 3)
     ]
     assert policies.policy_named("i-optimal")(context) == pytest.approx(expected)
-    assert policies.policy_named("i-optimal")(outlook_of(models, H, left=[2])) == pytest.approx(
-        expected[1:2]
-    )
+    assert policies.policy_named("i-optimal")(
+        outlook_of(models, H, candidate_frames=[2])
+    ) == pytest.approx(expected[1:2])
     taken = criteria.block_log_determinant(models["block"][0], LAM)
     expected = [
         criteria.block_log_determinant(models["block"][0] + models["block"][i], LAM) - taken
@@ -257,13 +257,18 @@ def test_cover_and_completeness_look_at_what_was_not_observed():
         None,
         positions=positions,
         points=points,
-        visited=[0, 2],
-        left=[1],
+        taken_frames=[0, 2],
+        candidate_frames=[1],
         seen=lambda view: seen[view],
     )
     assert policies.policy_named("cover")(both) == pytest.approx([(1 - np.cos(0.5)) / 2])
     blind = outlook_of(
-        {}, None, positions=positions, points=points, left=[1], seen=lambda view: np.zeros(2)
+        {},
+        None,
+        positions=positions,
+        points=points,
+        candidate_frames=[1],
+        seen=lambda view: np.zeros(2),
     )
     assert policies.policy_named("cover")(blind) == 0
 

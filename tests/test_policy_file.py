@@ -14,7 +14,7 @@ from mgs.errors import InputError
 from mgs.policy import criteria
 from mgs.policy import from_file as policy_file
 from mgs.policy import poses as pose_policies
-from mgs.policy.registry import policy_named
+from mgs.policy.registry import check_policy, policy_named
 from mgs.report.runs import read_run
 from mgs.run import loop
 from mgs.run.nbv import start_run
@@ -41,8 +41,8 @@ def draw(rng, candidates):
     return rng.random(len(candidates))
 
 def everything(context, seen, seen_taken, points, candidate, centre):
-    assert seen.shape == (len(context.left), len(points))
-    assert seen_taken.shape == (len(context.visited), len(points))
+    assert seen.shape == (len(context.candidate_frames), len(points))
+    assert seen_taken.shape == (len(context.taken_frames), len(points))
     assert len(context.dome().positions) == len(context.dome().seen)
     return float(candidate[2] - centre[2])
 
@@ -120,7 +120,7 @@ def test_draws_do_not_depend_on_the_folder_of_the_file(dataset, file, tmp_path):
         ("mine.py:number", r"has no function number"),
         (
             "mine.py:wrong",
-            r"asks for photos, which is not known here; what can be asked for is F, ",
+            r"unknown parameter photos; choose from F, ",
         ),
         ("missing.py:poses", r"no such file .*missing\.py; correct the path"),
         ("bad.py:poses", r"line 2 of .*bad\.py failed: SyntaxError"),
@@ -237,3 +237,28 @@ def test_criteria_are_the_same_through_an_outlook(dataset, tmp_path):
     F = tiny.fisher(seeds.gaussians, loaded.frames[state.taken[3]].camera)
     lam = criteria.regularisation(tiny.GROUPS)
     assert state.steps[1]["score"] == criteria.fisherrf(F, seeds.H, lam)
+
+
+def test_a_name_is_checked_without_running_its_file(file, tmp_path):
+    (tmp_path / "loud.py").write_text("raise SystemExit\n\ndef loud(candidates): ...\n")
+    (tmp_path / "bad.py").write_text("def (:\n")
+    check_policy("d-optimal")
+    check_policy(f"{tmp_path}/loud.py:loud")
+    for name, message in [
+        (f"{file}:nothing", "has no function nothing"),
+        (f"{tmp_path}/bad.py:poses", "line 1 of .* failed: SyntaxError"),
+        ("missing.py:poses", "no such file"),
+        ("best", "unknown; choose one of d-optimal"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            check_policy(name)
+
+
+def test_a_file_is_executed_once_until_it_changes(tmp_path):
+    path, log = tmp_path / "mine.py", tmp_path / "log"
+    source = f"with open({str(log)!r}, 'a') as log: log.write('x')\ndef poses(taken): ...\n"
+    for count, text in enumerate([source, source + "# changed\n"], start=1):
+        path.write_text(text)
+        policy_named(f"{path}:poses")
+        policy_named(f"{path}:poses")
+        assert log.read_text() == count * "x"

@@ -307,7 +307,7 @@ def _surface_scores(
 
     def scores(views: list[int], left: list[int], rng: np.random.Generator) -> NDArray[np.float64]:
         return np.asarray(choose(PolicyContext(
-            positions=sight.positions, left=left, visited=views, centre=centre, rng=rng, H=unknown, lam=lam, points=points,
+            positions=sight.positions, candidate_frames=left, taken_frames=views, centre=centre, rng=rng, H=unknown, lam=lam, points=points,
             surface_H=unknown, prior_lam=lam, information=nothing, surface_information=nothing, estimate=nothing,
             seen=sight.seen, dome=sight.dome, gains=sight.gains,
         )))  # fmt: skip
