@@ -1,7 +1,7 @@
 """Hooks of `mkdocs build`.
 
-They add the changelog, replace the mark `<!-- commands -->` by what `mgs COMMAND --help` says, and
-refuse a site that loads something from a network.
+They add the changelog, point links to source files to the API, replace the mark `<!-- commands -->`
+by what `mgs COMMAND --help` says, and refuse a site that loads something from a network.
 """
 
 from __future__ import annotations
@@ -20,6 +20,9 @@ from mgs.cli.app import app
 
 CHANGELOG = Path(__file__).parent.parent / "CHANGELOG.md"
 
+SOURCE = re.compile(r"\]\(\.\./mgs/(\w+)/(\w+)\.py\)")
+"""Link from a page in docs/ to a module, which the site replaces by its part of the API."""
+
 LOADED = re.compile(
     r"""<(script|img|iframe|source)\b[^>]* src="?(https?:)?//"""
     r"""|<link\b[^>]*rel="?(stylesheet|icon|preload)[^>]*href="?(https?:)?//"""
@@ -37,7 +40,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Replace the mark of the commands."""
+    """Replace the mark of the commands and links to source files."""
+    markdown = SOURCE.sub(r"](api/\1.md#mgs.\1.\2)", markdown)
     mark = "<!-- commands -->"
     return markdown.replace(mark, command_reference()) if mark in markdown else markdown
 
