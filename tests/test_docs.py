@@ -1,13 +1,10 @@
-"""The README and the pages in docs/: against the code they describe, their links, their tables, and
-the site made of them."""
+"""The README and the pages in docs/: against the code they describe, their links, and the site
+made of them."""
 
 import ast
-import importlib
-import json
 import pkgutil
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 import zlib
@@ -399,73 +396,3 @@ def test_the_tables_of_the_loop_are_those_of_the_code(dataset, tmp_path):
         for row in rows((DOCS / "howto/estimator.md").read_text(), "| name | what")
     ]
     assert set(estimators) == set(ESTIMATORS) - {"block"}
-
-
-@pytest.fixture(scope="module")
-def tables():
-    """tools/tables.py, which is no part of the package; it imports what lies beside it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(ROOT / "tools")
-        yield importlib.import_module("tables")
-
-
-def test_tables_are_what_their_numbers_say(tables, capsys):
-    assert tables.main(["--check"]) == 0, capsys.readouterr().err
-    used = {
-        match["name"]
-        for page in PAGES
-        for match in tables.MARK.finditer(page.read_text())
-        if match["name"]
-    }
-    assert used == set(tables.TABLES)
-
-
-def test_a_stale_table_is_found_and_made_anew(tables, tmp_path, capsys):
-    for page in PAGES:
-        (tmp_path / page.relative_to(ROOT)).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(page, tmp_path / page.relative_to(ROOT))
-    numbers = tmp_path / "docs/benchmarks"
-    shutil.copytree(DOCS / "benchmarks", numbers)
-    shutil.copytree(DOCS / "results", tmp_path / "docs/results", dirs_exist_ok=True)
-    measured = json.loads((numbers / "splat.json").read_text())
-    measured["seconds"]["forward_warm"] = 0.0271
-    (numbers / "splat.json").write_text(json.dumps(measured))
-    assert tables.main(["--check"], tmp_path) == 1
-    assert capsys.readouterr().err.count("stale") == 2
-    assert (tmp_path / "README.md").read_text() == (ROOT / "README.md").read_text()
-    assert tables.main([], tmp_path) == 0
-    assert "| 27.1 ms |" in (tmp_path / "README.md").read_text()
-    assert "| 27.1 ms |" in (tmp_path / "docs/splatting.md").read_text()
-    assert tables.main(["--check"], tmp_path) == 0
-
-
-def test_a_table_that_was_not_run_yet_says_so(tables, tmp_path):
-    page = "<!-- table: reproduce-seeds -->\n<!-- end of table -->"
-    not_run = tables.rewritten(page, tmp_path)
-    assert "\n\nNot run yet: `mgs reproduce OUT --only seeds`.\n\n" in not_run
-    (tmp_path / "results/reproduce").mkdir(parents=True)
-    versions = {"mgs": "1", "mitsuba": "2", "drjit": "3"}
-    made = {
-        "command": "mgs reproduce --only seeds",
-        "versions": versions,
-        "markdown": "| a |\n| --- |\n",
-    }
-    (tmp_path / "results/reproduce/seeds.json").write_text(json.dumps(made))
-    new = tables.rewritten(not_run, tmp_path)
-    assert "\n| a |\n| --- |\n\n`mgs reproduce --only seeds`; mgs 1," in new
-    assert "(results/reproduce/seeds.png)" in new
-    assert "Not run" not in new
-
-
-@pytest.mark.parametrize(
-    ("page", "message"),
-    [
-        ("<!-- table: mine -->\n<!-- end of table -->", "no such table"),
-        ("<!-- table: demo -->\n", "no partner"),
-        ("<!-- end of table -->\n<!-- table: demo -->", "pairs"),
-        ("<!-- table: demo -->\n<!-- table: demo -->", "pairs"),
-    ],
-)
-def test_marks_of_tables_that_are_wrong(tables, page, message):
-    with pytest.raises(ValueError, match=message):
-        tables.rewritten(page, DOCS)

@@ -39,7 +39,7 @@ from PIL import ExifTags, Image
 from mgs.camera import Camera, opengl_from_opencv
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import Dataset, Frame, load_dataset
-from mgs.data.meshes import read_rock
+from mgs.data.meshes import read_mesh
 from mgs.images import LUMA, write_png
 from mgs.seeds import generator
 from mgs.survey.depth_sensor import noisy_depth
@@ -481,7 +481,7 @@ def _write_truth(root: Path, world: World, out: Path, gains: dict[str, list[floa
     import trimesh
 
     if (root / "rock.glb").is_file():
-        rock = read_rock(root / "rock.glb")
+        rock = read_mesh(root / "rock.glb")
         trimesh.Trimesh(world.points(rock.vertices), rock.faces, process=False).export(
             out / "truth.ply"
         )
