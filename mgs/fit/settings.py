@@ -23,7 +23,7 @@ fitted to all images but one. More cost more and overfit. Chosen constants
 
 ALPHA_WEIGHT = 0.1
 """`TrainSettings.alpha_weight` of a run that says nothing of it, where all frames have a mask or
-alpha. A chosen constant (docs/nbv.md, An opaque surface)."""
+alpha. A chosen constant (docs/fit.md, An opaque surface)."""
 
 COLOURS_ALONE = {"alpha_weight": 0.0}
 """Values of `TrainSettings` with which colours alone are fitted, as in the paper. All studies of
