@@ -35,15 +35,16 @@ VIEWS = (2, 17)
 def measure() -> list[dict[str, Any]]:
     """Render each setting; times are medians over the views after one warm-up frame."""
     runtime.start()
-    from mgs.synth.rendering import ROCK_EXPOSURE, Preset, rock_cameras
+    from mgs.synth.orbit import rock_cameras
+    from mgs.synth.rendering import ROCK_EXPOSURE
     from mgs.synth.rock import make_rock
-    from mgs.synth.scene import Scene
+    from mgs.synth.scene import MitsubaScene
     from mgs.synth.scene_file import load_scene_file
 
     settings = load_scene_file("boulder")
     rock = make_rock(settings.rock, generator(0, "rock"))
-    cameras = rock_cameras(settings, Preset(*SIZE, 32, 1), rock)
-    scene = Scene(settings, rock, cameras[0], 0)
+    cameras = rock_cameras(settings, SIZE, 32, rock)
+    scene = MitsubaScene(settings, rock, cameras[0], 0)
 
     def reference(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         seeds = range(1000, 1000 + REFERENCE_SPP // 64)

@@ -29,7 +29,7 @@ from mgs.seeds import generator
 from mgs.splat import ListCache, fisher, groups
 from mgs.study.material import made_dataset, made_prior, test_views_of
 from mgs.study.sweep import Cell, cell_folder
-from mgs.synth.rendering import Preset as Images
+from mgs.synth.rendering import RenderPreset as Images
 from mgs.synth.scene_file import load_scene_file
 
 Array = NDArray[np.floating]
