@@ -40,7 +40,7 @@ from .splat import jvp as jvp
 from .splat import render as render
 from .splat_ply import read_ply as read_ply
 from .splat_ply import write_ply as write_ply
-from .synth.rendering import Preset as Preset
+from .synth.rendering import RenderPreset as RenderPreset
 from .synth.rendering import synthesise as synthesise
 
 __version__: str

@@ -30,7 +30,7 @@ def test_the_figures_are_those_of_the_fits(root, monkeypatch):
     figures, end = found["figures"], found["end"]
     assert figures.keys() == bench.TARGETS.keys()
     assert len(said) == 3
-    case = bench._case(bench.load_dataset(root), 200, "even", 4, 0.1)
+    case = bench.make_case(bench.load_dataset(root), 200, "even", 4, 0.1)
     fitted = case.fit()
     frames, spacing = case.dataset.frames, case.prior.spacing
     names = [frames[i].name for i in case.taken]
@@ -54,14 +54,16 @@ def test_the_figures_are_those_of_the_fits(root, monkeypatch):
 
 
 def test_alpha_is_part_of_the_fit_and_of_its_objective(root):
-    cases = [bench._case(bench.load_dataset(root), 200, "even", 4, weight) for weight in (0, 0.1)]
+    cases = [
+        bench.make_case(bench.load_dataset(root), 200, "even", 4, weight) for weight in (0, 0.1)
+    ]
     assert [case.objective().alpha_weight for case in cases] == [0, 0.1]
     assert cases[0].fit().gaussians != cases[1].fit().gaussians
 
 
 def test_a_ranking_agrees_with_itself(root, monkeypatch):
     monkeypatch.setattr(bench, "LONGER", 1)
-    case = bench._case(bench.load_dataset(root), 200, "random", 4, 0.0)
+    case = bench.make_case(bench.load_dataset(root), 200, "random", 4, 0.0)
     shorter = case.fit(passes=TrainSettings().passes // 2, tolerance=0.0)
     scores = [case.scores(fit.gaussians) for fit in (shorter, case.fit())]
     assert bench._ranking(case) == {

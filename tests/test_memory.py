@@ -21,7 +21,8 @@ import synthetic
 
 import mgs
 from mgs.data.dataset import Dataset, Frame, load_dataset
-from mgs.data.importers import import_source, read_source
+from mgs.data.importers import import_source
+from mgs.data.sources import read_source
 from mgs.fit import objective
 from mgs.memory import PADDING, Deferred, kept_within, padded
 from mgs.prior.build import build_prior, save_prior

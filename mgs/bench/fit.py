@@ -29,10 +29,13 @@ from mgs.report.evaluation import evaluate
 from mgs.seeds import generator
 from mgs.splat import ListCache, as_drjit, fisher, groups
 
+Criterion = Callable[[np.ndarray, np.ndarray, np.ndarray], float]
+"""Score from the information F and H [N,P] and lambda [P]."""
+
 VIEWS = 12
 SIZES = (10_000, 20_000)
 STATES = (("even", 4), ("random", 4), ("random", 6), ("random", 8))
-"""States from which candidates are ranked: how views are drawn (`_case`), and their number."""
+"""States from which candidates are ranked: how views are drawn (`make_case`), and their number."""
 
 LONGER = 10
 """Passes of the fit that stands for the end, over those of the fit that stopped."""
@@ -51,7 +54,7 @@ TARGETS = {
 
 
 @dataclass(frozen=True)
-class _Case:
+class Case:
     """A dataset, its prior, the views taken and the Gaussians before training."""
 
     dataset: Dataset
@@ -85,13 +88,13 @@ class _Case:
         found = evaluate(model, [], [], test_frames=tests.frames, spacing=self.prior.spacing)
         return dict(found["test"])
 
-    def scores(self, model: Gaussians) -> np.ndarray:
-        """Eq. 7 of each view that is not taken [C]."""
+    def scores(self, model: Gaussians, criterion: Criterion = d_optimal) -> np.ndarray:
+        """Score each view that is not taken, by a criterion of the diagonal information [C]."""
         cameras, lam = [frame.camera for frame in self.dataset.frames], regularisation(groups(0))
-        taken = [fisher(model, cameras[i], cache=self.cache) for i in self.taken]
-        H = np.stack(taken).sum(0, dtype=np.float64)
-        left = [camera for i, camera in enumerate(cameras) if i not in self.taken]
-        return np.array([d_optimal(fisher(model, c, cache=self.cache), H, lam) for c in left])
+        found = [fisher(model, camera, cache=self.cache) for camera in cameras]
+        H = np.stack([found[i] for i in self.taken]).sum(0, dtype=np.float64)
+        left = [F for i, F in enumerate(found) if i not in self.taken]
+        return np.array([criterion(F, H, lam) for F in left])
 
     def _images(self) -> tuple[list[Any], list[np.ndarray]]:
         frames = [self.dataset.frames[i] for i in self.taken]
@@ -111,7 +114,7 @@ def bench_fit(
     """
     dataset = load_dataset(root)
     report(f"accuracy of {' and '.join(f'{n:,}' for n in SIZES)} Gaussians on {VIEWS} views")
-    cases = {n: _case(dataset, n, "even", VIEWS, alpha_weight) for n in SIZES}
+    cases = {n: make_case(dataset, n, "even", VIEWS, alpha_weight) for n in SIZES}
     fits = {n: case.fit() for n, case in cases.items()}
     means = {n: case.measure(fits[n].gaussians) for n, case in cases.items()}
     tests = {n: case.measure(fits[n].gaussians, test=True) for n, case in cases.items()}
@@ -119,7 +122,9 @@ def bench_fit(
     report("the end of the fit: predicted and found")
     end = _end_of_fit(cases[small], fits[small])
     report(f"ranking of candidates from {len(STATES)} states")
-    ranking = [_ranking(_case(dataset, small, how, count, alpha_weight)) for how, count in STATES]
+    ranking = [
+        _ranking(make_case(dataset, small, how, count, alpha_weight)) for how, count in STATES
+    ]
 
     def mean(name: str) -> float:
         return float(np.mean([row[name] for row in ranking]))
@@ -148,7 +153,7 @@ def _lam_by_kind() -> dict[str, float]:
     return lam_by_kind(regularisation(groups(0)), groups(0))
 
 
-def _case(dataset: Dataset, gaussians: int, how: str, count: int, alpha_weight: float) -> _Case:
+def make_case(dataset: Dataset, gaussians: int, how: str, count: int, alpha_weight: float) -> Case:
     """Take `count` views, "even" in azimuth or "random"."""
     prior, _ = build_prior(dataset, PriorSettings(gaussians=gaussians))
     positions = np.array([frame.camera.position for frame in dataset.frames])
@@ -157,10 +162,10 @@ def _case(dataset: Dataset, gaussians: int, how: str, count: int, alpha_weight: 
         draw = generator(0, f"bench/fit/{count}").choice(len(positions), count, replace=False)
         taken = sorted(draw.tolist())
     start = initial_gaussians(prior, [dataset.frames[i] for i in taken])[0]
-    return _Case(dataset, prior, list(taken), start, ListCache(), alpha_weight)
+    return Case(dataset, prior, list(taken), start, ListCache(), alpha_weight)
 
 
-def _end_of_fit(case: _Case, stopped: Fit) -> dict[str, Any]:
+def _end_of_fit(case: Case, stopped: Fit) -> dict[str, Any]:
     """Objective phi where the fit stopped, the decrease predicted from there, and the one that a
     longer fit finds."""
     goal, model = case.objective(), as_drjit(stopped.gaussians)
@@ -177,7 +182,7 @@ def _end_of_fit(case: _Case, stopped: Fit) -> dict[str, Any]:
     }
 
 
-def _ranking(case: _Case) -> dict[str, float]:
+def _ranking(case: Case) -> dict[str, float]:
     """Compare the D-optimal ranking where the fit stops with other lengths of the fit.
 
     "tau" and "regret": Kendall's tau and regret against LONGER times the passes. "tau_half": tau

@@ -224,8 +224,8 @@ def scaling_figure(path: str | Path, points: Records) -> None:
 def _draw_lines(
     axis: Any, points: Records, what: tuple[str, str, float], sweeps: list[str], text: str
 ) -> None:
-    """Draw what = (key, quantity, factor), a line for each of at most two sweeps, the second dashed;
-    text: label of the first."""
+    """Draw what = (key, quantity, factor), one line for each of at most two sweeps;
+    the second is dashed. text: label of the first."""
     key, quantity, scale = what
     colour, marker = LINES[quantity]
     for sweep, dash, label in zip(sweeps, ("-", "--"), (text, None), strict=False):

@@ -65,16 +65,17 @@ def _write_figures(runs: list[Path], out: Path, kind: str) -> None:
 
     from mgs.cli.printing import print_quality
     from mgs.files import check_writable
-    from mgs.report.runs import labelled_runs
-    from mgs.report.tables import table_numbers
+    from mgs.report.runs import compare_runs
+    from mgs.report.tables import comparison_rows
     from mgs.report.writing import write_report
     from mgs.run.ending import why_ended
 
     check_writable(out / "table.md")  # before the figures are drawn, not after it
-    written = write_report(out, runs, kind)
-    rows = table_numbers(runs)
+    compared = compare_runs(runs)
+    written = write_report(out, compared, kind)
+    rows = comparison_rows(compared)
     print_quality(Console(), rows)
-    for row, run in zip(rows, labelled_runs(runs).values(), strict=True):
+    for row, run in zip(rows, compared.runs.values(), strict=True):
         if run.ended:
             length = f"{row['path']:.2f} {row['unit']}"
             typer.echo(

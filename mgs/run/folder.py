@@ -66,11 +66,7 @@ class Run:
         """The dataset of the run."""
         if self._dataset is not None:
             return self._dataset
-        path = self.settings.dataset
-        if not path.is_dir():
-            where = f"{self.folder / 'config.json'}: dataset {path}"
-            raise InputError(f"{where} is not there; if it was moved, correct `dataset` there")
-        dataset = load_dataset(path)
+        dataset = load_dataset(self.settings.dataset)
         check_same_frames(self.folder, dataset)
         return dataset
 
@@ -107,9 +103,16 @@ class Run:
 
 
 def open_run(folder: str | Path) -> Run:
-    """Open a run folder. Raises InputError as `read_config`, and where a setting is wrong."""
+    """Open a run folder.
+
+    Raises InputError as `read_config`, where a setting is wrong, and where the dataset is gone.
+    """
     folder = Path(folder)
-    settings = validated(NbvSettings, read_config(folder)["settings"], folder / "config.json")
+    path = folder / "config.json"
+    settings = validated(NbvSettings, read_config(folder)["settings"], path)
+    if not settings.dataset.is_dir():
+        where = f"{path}: dataset {settings.dataset} is not there"
+        raise InputError(f"{where}; if it was moved, correct `dataset` in this file")
     return Run(folder, settings)
 
 

@@ -192,9 +192,9 @@ def choose(
     scores = np.asarray(problem.policy(context), np.float64)
     farthest = poses.farthest_pose(context.candidates, context.taken, context.centre, context.rng)
     where = f"policy {problem.settings.policy}: returned"
-    if scores.shape != (len(context.left),):
+    if scores.shape != (len(context.candidate_frames),):
         raise InputError(
-            f"{where} scores of shape {scores.shape} for {len(context.left)} candidates; "
+            f"{where} scores of shape {scores.shape} for {len(context.candidate_frames)} candidates; "
             "return one number for each"
         )
     weighed = scores / travel_cost(problem, context)
@@ -203,7 +203,7 @@ def choose(
         raise InputError(f"{where} a score that is NaN or infinite (docs/howto/policy.md)")
     if problem.settings.travel is not None and scores[best] < 0:
         raise InputError(f"{where} negative scores, which --travel cannot divide; leave it out")
-    return context.left[best], float(scores[best])
+    return context.candidate_frames[best], float(scores[best])
 
 
 def reachable(problem: Problem, taken: Sequence[int]) -> list[int]:
@@ -219,5 +219,5 @@ def reachable(problem: Problem, taken: Sequence[int]) -> list[int]:
 def travel_cost(problem: Problem, context: PolicyContext) -> np.ndarray:
     """Travel cost of each candidate [C]; ones without the setting `travel`."""
     if problem.settings.travel is None:
-        return np.ones(len(context.left))
+        return np.ones(len(context.candidate_frames))
     return poses.travel_cost(context.candidates, context.taken[-1], problem.settings.travel)

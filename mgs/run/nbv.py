@@ -14,6 +14,7 @@ from mgs.data.dataset import Dataset, load_dataset
 from mgs.errors import InputError, row_named
 from mgs.files import atomic_folder
 from mgs.policy.from_file import absolute
+from mgs.policy.registry import policy_named
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.run import recording
@@ -96,6 +97,7 @@ def start_run(
     known = validated(NbvSettings, {"dataset": root.resolve(), "prior": where.resolve(), **given})
     count = len(loaded) if loaded else _candidates(capture)
     complete = _resolved(known, count, "budget" in settings)
+    policy_named(complete.policy)  # a user's file fails here, before there is a folder
     check_settings(complete, count)
     found = None if prior is None else load_prior(prior)
     with atomic_folder(out) as unfinished:

@@ -136,12 +136,12 @@ class Problem:
     def visibility(self) -> Visibility:
         """What each pose sees of the surface."""
 
-        def told(done: int, total: int) -> None:
+        def progress(done: int, total: int) -> None:
             self.progress("scoring candidates", done, total)
 
         lam = float(self.prior_lam[0])
         look = self._exact_on_surface
-        return Visibility(self.cameras, look, self.points, self.centre, lam, self.turn, told)
+        return Visibility(self.cameras, look, self.points, self.centre, lam, self.turn, progress)
 
     def start_of(self, taken: Sequence[int]) -> Gaussians:
         """The Gaussians before training, in the colours of all views taken."""
@@ -177,9 +177,16 @@ class Problem:
         return kept_within(room, lambda i: fisher(model, cameras[i]), lambda F: F.nbytes)
 
     def context(
-        self, state: Fitted, left: list[int], fisher: Callable[[int], np.ndarray]
+        self,
+        state: Fitted,
+        left: list[int],
+        fisher: Callable[[int], np.ndarray] | None = None,
     ) -> PolicyContext:
-        """What the policy may use to choose among the frames in `left`."""
+        """What the policy may use to choose among the frames in `left`.
+
+        fisher(frame): information of its view at the model, computed by default.
+        """
+        fisher = fisher or self.view_information(state.gaussians)
         step = len(state.taken) - self.settings.seeds + 1
 
         def shown(view: int) -> int:
@@ -191,8 +198,8 @@ class Problem:
         self.progress("scoring candidates", 0, len(left))
         return PolicyContext(
             positions=self.positions,
-            left=left,
-            visited=state.taken,
+            candidate_frames=left,
+            taken_frames=state.taken,
             centre=self.centre,
             rng=generator(self.settings.seed, f"{label(self.settings.policy)}/{step}"),
             H=state.H,

@@ -26,7 +26,7 @@ from mgs.fit.settings import (
     complete,
 )
 from mgs.policy.criteria import MEAN_STD, PIXEL_NOISE, PRIOR_STD, regularisation
-from mgs.policy.registry import policy_named
+from mgs.policy.registry import check_policy
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ def check_settings(settings: NbvSettings, frames: int) -> None:
     from mgs.splat import ESTIMATORS
 
     diagonal = [name for name in ESTIMATORS if name != "block"]
-    policy_named(settings.policy)
+    check_policy(settings.policy)
     if settings.estimator not in diagonal:
         known = ", ".join(diagonal)
         raise InputError(f"--estimator {settings.estimator}: unknown; choose one of {known}")

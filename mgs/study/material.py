@@ -14,14 +14,14 @@ from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.settings import PriorSettings
 
 if TYPE_CHECKING:
-    from mgs.synth.rendering import Preset
+    from mgs.synth.rendering import RenderPreset
     from mgs.synth.scene_file import SceneFile
 
 
 def made_dataset(
     folder: Path,
     scene: str | SceneFile,
-    preset: Preset,
+    preset: RenderPreset,
     seed: int = 0,
     test_views: int = 0,
     mesh: str | None = None,

@@ -176,7 +176,9 @@ def make_dataset(
     loaded = loaded.model_copy(
         update={"rock": loaded.rock.model_copy(update=VARIANTS.get(scene, {}))}
     )
-    made_dataset(out / "data", loaded, rendering.Preset(width, height, frames, spp), seed, tests)
+    made_dataset(
+        out / "data", loaded, rendering.RenderPreset(width, height, frames, spp), seed, tests
+    )
     return {}
 
 

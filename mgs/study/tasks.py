@@ -27,7 +27,7 @@ from mgs.run.folder import State
 from mgs.run.nbv import resume_nbv, run_nbv
 from mgs.study.material import made_dataset, made_prior
 from mgs.study.sweep import cell_folder
-from mgs.synth.rendering import Preset
+from mgs.synth.rendering import RenderPreset
 from mgs.synth.scene_file import load_scene_file
 
 CURVES = ("images", "coverage", "test_psnr", "test_psnr_mask")
@@ -51,13 +51,13 @@ def make_dataset(
     mesh: str | None = None,
 ) -> dict[str, Any]:
     """Render a scene's rock of that seed, or a mesh in its place, from an orbit of that kind.
-    preset: fields of `mgs.synth.rendering.Preset`; distances: of `mgs.synth.scene_file.Orbit`."""
+    preset: fields of `mgs.synth.rendering.RenderPreset`; distances: of `mgs.synth.scene_file.Orbit`."""
     loaded = load_scene_file(scene)
     flight = loaded.orbit.model_copy(update={"kind": orbit, "distances": tuple(distances)})
     settings = loaded.model_copy(update={"orbit": flight})
     return {
         "frames": len(
-            made_dataset(out / "dataset", settings, Preset(**preset), seed, test_views, mesh)
+            made_dataset(out / "dataset", settings, RenderPreset(**preset), seed, test_views, mesh)
         )
     }
 

@@ -21,9 +21,11 @@ def make_dataset(
     root: Path, out: Path, scene: str, width: int, height: int, frames: int, test_views: int
 ) -> dict[str, Any]:
     """Render a scene into the folder `data` of the cell, as `mgs synth-orbit` does."""
-    from mgs.synth.rendering import Preset
+    from mgs.synth.rendering import RenderPreset
 
-    made_dataset(out / "data", scene, Preset(width, height, frames, SPP), test_views=test_views)
+    made_dataset(
+        out / "data", scene, RenderPreset(width, height, frames, SPP), test_views=test_views
+    )
     return {"frames": frames, "test_views": test_views}
 
 

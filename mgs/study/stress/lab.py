@@ -29,7 +29,7 @@ from mgs.seeds import generator
 from mgs.splat import ListCache, fisher, groups
 from mgs.study.material import made_dataset, made_prior, test_views_of
 from mgs.study.sweep import Cell, cell_folder
-from mgs.synth.rendering import Preset as Images
+from mgs.synth.rendering import RenderPreset as Images
 from mgs.synth.scene_file import load_scene_file
 
 Array = NDArray[np.floating]
@@ -307,7 +307,7 @@ def _surface_scores(
 
     def scores(views: list[int], left: list[int], rng: np.random.Generator) -> NDArray[np.float64]:
         return np.asarray(choose(PolicyContext(
-            positions=sight.positions, left=left, visited=views, centre=centre, rng=rng, H=unknown, lam=lam, points=points,
+            positions=sight.positions, candidate_frames=left, taken_frames=views, centre=centre, rng=rng, H=unknown, lam=lam, points=points,
             surface_H=unknown, prior_lam=lam, information=nothing, surface_information=nothing, estimate=nothing,
             seen=sight.seen, dome=sight.dome, gains=sight.gains,
         )))  # fmt: skip

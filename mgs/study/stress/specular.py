@@ -13,7 +13,7 @@ from mgs.data.dataset import load_dataset, target_of
 from mgs.files import read_json
 from mgs.gaussians import Gaussians
 from mgs.metrics import masked_squares
-from mgs.policy.poses import angle_between, azimuths
+from mgs.policy.poses import azimuth_difference, azimuths
 from mgs.run.operations import psnr_measure
 from mgs.splat import ListCache, render
 from mgs.study.stress.experiment import Experiment, Panel, turns
@@ -48,7 +48,7 @@ def errors_by_angle(lab: Lab, model: Gaussians, views: Sequence[int], sun: float
     sun: its azimuth, degrees."""
     positions = np.array([lab.cameras[i].position for i in views])
     angles = np.degrees(
-        angle_between(azimuths(positions, lab.prior.points.mean(0)), np.radians(sun))
+        azimuth_difference(azimuths(positions, lab.prior.points.mean(0)), np.radians(sun))
     )
     rows = []
     for i, angle in zip(views, angles, strict=True):
