@@ -84,7 +84,7 @@ def command_lines(body: str) -> list[list[str]]:
 
 
 def run_command(words: list[str]) -> None:
-    """Run `mgs ...` or `python FILE ...` in this process; RuntimeError if its exit code is not 0."""
+    """Run `mgs ...` or `python FILE ...` in this process; RuntimeError unless it exits with 0."""
     before = sys.argv
     try:
         if words[0] == "mgs":

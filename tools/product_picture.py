@@ -1,42 +1,26 @@
-"""Draw the pictures of docs/images that show the demo: `python tools/screenshots.py demo`.
+"""Draw docs/images/product.png, the README's first picture, from the folder of `make demo`.
 
-`product.png` (first picture of the README) needs the demo alone. `report_html.png` and `view.png`
-also need a headless Chromium.
+python tools/product_picture.py demo
 """
 
 from __future__ import annotations
 
 import json
-import shutil
-import signal
-import subprocess
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
-from PIL import Image
 
 import mgs
-from mgs.cli.demo import POLICIES
 from mgs.colour import srgb_from_linear
 from mgs.plotting import STYLE, crop, new_figure, save_figure
 from mgs.policy.criteria import regularisation, uncertainty
 from mgs.report.diagnostics import view_maps
-from mgs.report.page import write_page
 from mgs.splat import groups
 
-IMAGES = Path(__file__).parent.parent / "docs/images"
-
-ARGUMENTS = [
-    "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist",
-]
-"""WebGL without a graphics card."""
+PICTURE = Path(__file__).parent.parent / "docs/images/product.png"
 
 
 def product(demo: Path, run: str = "d-optimal", view: str = "kf_0013") -> None:
@@ -78,7 +62,7 @@ def product(demo: Path, run: str = "d-optimal", view: str = "kf_0013") -> None:
         bar.set_label("posterior variance / prior variance")
         for _ in range(3):  # the layout of panels with a fixed aspect settles in a few passes
             figure.draw_without_rendering()
-        save_figure(figure, IMAGES / "product.png")
+        save_figure(figure, PICTURE)
 
 
 def _orbit(axis: Any, dataset: Any, rock: np.ndarray, seeds: list[int], chosen: list[int]) -> None:
@@ -103,62 +87,5 @@ def _orbit(axis: Any, dataset: Any, rock: np.ndarray, seeds: list[int], chosen: 
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=3, fontsize=8, handletextpad=0)
 
 
-def report(browser: Any, demo: Path, folder: Path) -> None:
-    """Draw the page of the demo's runs, on a desk and on a phone, side by side."""
-    page = folder / "page.html"
-    write_page(page, [demo / policy for policy in POLICIES])
-    both = Image.new("RGB", (1510, 1180), "white")
-    for x, width, scheme, section in ((0, 1100, "light", "steps"), (1120, 390, "dark", "compare")):
-        tab = browser.new_context(
-            viewport={"width": width, "height": both.height}, color_scheme=scheme
-        ).new_page()
-        tab.goto(page.as_uri())
-        tab.locator("#step").fill("6")
-        tab.evaluate(f"document.getElementById('{section}').scrollIntoView()")
-        tab.wait_for_timeout(4000)
-        tab.screenshot(path=folder / f"{section}.png")
-        both.paste(Image.open(folder / f"{section}.png"), (x, 0))
-    save(both, "report_html.png")
-
-
-def viewer(browser: Any, demo: Path, folder: Path) -> None:
-    """Draw the viewer of a run, with a camera selected."""
-    command = [sys.executable, "-m", "mgs", "view", str(demo / "d-optimal"), "--port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        address = process.stdout.readline().split()[1]
-        tab = browser.new_context(viewport={"width": 1100, "height": 760}).new_page()
-        tab.goto(address)
-        tab.get_by_label("View", exact=True).first.click()
-        tab.get_by_role("option", name="kf_0028", exact=True).click()
-        for x in range(420, 520, 20):  # until the notice about software rendering has gone
-            tab.mouse.move(x, 500)
-            tab.mouse.down()
-        tab.mouse.up()
-        tab.locator("button[class*=CloseButton]").first.click()
-        tab.wait_for_timeout(5000)
-        tab.screenshot(path=folder / "view.png")
-        process.send_signal(signal.SIGINT)
-    save(Image.open(folder / "view.png"), "view.png")
-
-
-def save(picture: Image.Image, name: str) -> None:
-    """Write a picture at two thirds of its size."""
-    size = picture.width * 2 // 3, picture.height * 2 // 3
-    picture.convert("RGB").resize(size, Image.Resampling.LANCZOS).save(IMAGES / name, optimize=True)
-
-
-def main(demo: Path) -> None:
-    """Draw all pictures from the folder of the demo."""
-    from playwright.sync_api import sync_playwright
-
-    product(demo)
-    with sync_playwright() as driver, tempfile.TemporaryDirectory() as folder:
-        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=ARGUMENTS)
-        report(browser, demo, Path(folder))
-        viewer(browser, demo, Path(folder))
-        browser.close()
-
-
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    product(Path(sys.argv[1]))
