@@ -22,7 +22,7 @@ fitted to all images but the new. More passes overfit. Chosen constants
 
 ALPHA_WEIGHT = 0.1
 """Default of `TrainSettings.alpha_weight` in a run whose frames all have a mask or alpha. A chosen
-constant (docs/nbv.md, An opaque surface)."""
+constant (docs/fit.md, An opaque surface)."""
 
 COLOURS_ALONE = {"alpha_weight": 0.0}
 """Values of `TrainSettings` that fit colours alone, as in the paper."""
