@@ -257,7 +257,10 @@ def test_policies_choose_with_learned_means(files, tmp_path, policy):
     ("given", "message"),
     [
         (["--means", "loose"], "--means loose: Input should be 'frozen', 'normal' or 'free'"),
-        (["--means", "free", "--estimator", "hutchinson"], "--estimator hutchinson has no information"),
+        (
+            ["--means", "free", "--estimator", "hutchinson"],
+            "--estimator hutchinson has no information",
+        ),
         (["--means", "free", "--policy", "paper"], "--policy paper has no information about means"),
         (["--means", "normal", "--prior-std", "mean=0"], "--prior-std mean=0.0: Input should be"),
     ],
