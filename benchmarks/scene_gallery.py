@@ -1,13 +1,14 @@
-"""The pictures of docs/data.md: a strip of frames per scene, from datasets in a folder, the outline
-of a rock, the four orbits.
+"""Draw the pictures of docs/data.md: frames of each scene, a rock's outline, the four orbits.
 
-for s in boulder contact-binary strata low-sun pebbles; do mgs synth-orbit out/$s --scene $s
---frames 8; done python benchmarks/scene_gallery.py out docs/images
+    python benchmarks/scene_gallery.py DATASETS docs/images
+
+DATASETS is a folder of datasets, one for each scene, as `mgs synth-orbit DATASETS/boulder --scene
+boulder --frames 8` makes them.
 """
 
 from __future__ import annotations
 
-import argparse
+import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -20,11 +21,11 @@ from mgs.synth.orbit import orbit_positions
 from mgs.synth.scene_file import ORBITS, load_scene_file
 
 WIDTH = 232
-"""Of one frame in a strip, pixels."""
+"""Width of one frame in a strip, pixels."""
 
 
 def strip(folder: Path, columns: int = 4) -> Image.Image:
-    """Evenly spaced frames of a dataset, side by side."""
+    """Put evenly spaced frames of a dataset side by side."""
     frames = load_dataset(folder).frames
     chosen = [frames[i * len(frames) // columns] for i in range(columns)]
     height = round(WIDTH * chosen[0].camera.height / chosen[0].camera.width)
@@ -39,8 +40,8 @@ def strip(folder: Path, columns: int = 4) -> Image.Image:
 
 
 def draw_outline(folder: Path, size: int = 56, zoom: int = 5) -> Image.Image:
-    """The left edge of the rock in the first frame: image times mask, and the rock alone, each in
-    front of black and white."""
+    """Draw the left edge of the rock in the first frame: image times mask, and the rock alone, each
+    in front of black and of white."""
     frame = load_dataset(folder).frames[0]
     (rgba, _), mask = frame.target(), frame.mask()
     column = np.flatnonzero(mask.any(0))[0]
@@ -57,8 +58,7 @@ def draw_outline(folder: Path, size: int = 56, zoom: int = 5) -> Image.Image:
 
 
 def draw_orbits(path: Path, frames: int = 60) -> None:
-    """The four orbits of the default scene: camera centres, coloured by the order in which they are
-    flown."""
+    """Draw the camera centres of the default scene's four orbits, coloured in order of flight."""
     settings = load_scene_file("boulder").orbit
     figure = plt.figure(figsize=(10, 2.7), constrained_layout=True)
     for i, kind in enumerate(ORBITS):
@@ -69,29 +69,21 @@ def draw_orbits(path: Path, frames: int = 60) -> None:
         axes.plot(x, y, z, color="0.75", linewidth=0.8)
         axes.scatter(x, y, z, c=np.arange(frames), s=8, cmap="viridis", depthshade=False)
         axes.scatter(0, 0, 0.6, color="saddlebrown", s=60)
-        axes.set(
-            title=kind,
-            xlim=(-4, 4),
-            ylim=(-4, 4),
-            zlim=(0, 4),
-            xticks=[-4, 0, 4],
-            yticks=[-4, 0, 4],
-            zticks=[0, 2, 4],
-        )
+        axes.set(title=kind, xlim=(-4, 4), ylim=(-4, 4), zlim=(0, 4))
+        axes.set(xticks=[-4, 0, 4], yticks=[-4, 0, 4], zticks=[0, 2, 4])
         axes.set_box_aspect((2, 2, 1))
     figure.savefig(path, dpi=110)
 
 
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("datasets", type=Path)
-    parser.add_argument("out", type=Path)
-    arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    for dataset in sorted(path.parent for path in arguments.datasets.glob("*/transforms.json")):
-        strip(dataset).save(arguments.out / f"scene_{dataset.name}.png", optimize=True)
+def main(datasets: Path, out: Path) -> None:
+    """Draw all pictures into the folder `out`."""
+    out.mkdir(parents=True, exist_ok=True)
+    for dataset in sorted(path.parent for path in datasets.glob("*/transforms.json")):
+        strip(dataset).save(out / f"scene_{dataset.name}.png", optimize=True)
         if dataset.name == "boulder":
-            draw_outline(dataset).save(arguments.out / "outline.png", optimize=True)
-    draw_orbits(arguments.out / "orbits.png")
+            draw_outline(dataset).save(out / "outline.png", optimize=True)
+    draw_orbits(out / "orbits.png")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -1,10 +1,8 @@
-"""Draw docs/images/splatting.png: one Gaussian, its blocks, the lanes that own them, and the seven
-sums of the Fisher pass.
+"""Draw docs/images/splatting.png: how the kernels project, list, walk and sum.
 
-    .venv/bin/python benchmarks/splatting_figure.py docs/images/splatting.png
+    python benchmarks/splatting_figure.py docs/images/splatting.png
 
-Everything drawn is read from the kernels' own data structures for a rock of 3,000 Gaussians at
-160x120.
+Everything drawn is read from the kernels' own data for a rock of 3,000 Gaussians at 160x120.
 """
 
 import sys
@@ -27,6 +25,7 @@ ORANGE, BLUE = "#d55e00", "#0072b2"
 
 
 def main(path: str, count: int = 3000) -> None:
+    """Draw the figure of a rock of `count` Gaussians."""
     gaussians = surface_gaussians(count)
     camera = surface_camera(gaussians, 160, 120)
     image = np.asarray(render(gaussians, camera).rgb)
@@ -54,7 +53,7 @@ def main(path: str, count: int = 3000) -> None:
 
 
 def showcase(gaussians, camera) -> int:
-    """The visible Gaussian with the most elongated footprint near the middle of the image."""
+    """Index of the visible Gaussian with the most elongated footprint near the image centre."""
     p = reference.project(gaussians, camera)
     order, alpha, T, _ = reference.composite(p, camera)
     weight = np.zeros(len(gaussians))
@@ -65,6 +64,7 @@ def showcase(gaussians, camera) -> int:
 
 
 def footprint_panel(axis, image, camera, gaussians, j, blocks, blocks_x) -> None:
+    """Draw the rim of Gaussian j and the blocks that list it, over the image."""
     p = reference.project(gaussians, camera)
     level = 2 * np.log(255 * p.opacities[j])
     values, vectors = np.linalg.eigh(p.cov2d[j])
@@ -92,6 +92,7 @@ def footprint_panel(axis, image, camera, gaussians, j, blocks, blocks_x) -> None
 
 
 def lists_panel(axis, lengths, block, blocks_x, camera) -> None:
+    """Draw the length of the list of each block."""
     grid = np.zeros(len(block))
     grid[block] = lengths
     for edge in range(BLOCK_X * TILE, camera.width, BLOCK_X * TILE):
@@ -107,6 +108,7 @@ def lists_panel(axis, lengths, block, blocks_x, camera) -> None:
 
 
 def lanes_panel(axis, lengths) -> None:
+    """Draw the length of the list of each SIMD lane."""
     packet = np.arange(len(lengths)) // 16
     axis.bar(
         np.arange(len(lengths)),
@@ -122,7 +124,7 @@ def lanes_panel(axis, lengths) -> None:
 
 
 def sums_panels(figure, gaussians, camera, j) -> None:
-    """What the Fisher pass adds up for one splat: per-pixel terms in float64 from the reference."""
+    """Draw the seven terms of the Fisher pass for Gaussian j per pixel, float64 by the oracle."""
     p = reference.project(gaussians, camera)
     order, alpha, T, _ = reference.composite(p, camera)
     i = int(np.flatnonzero(order == j)[0])
@@ -147,7 +149,8 @@ def sums_panels(figure, gaussians, camera, j) -> None:
         r"$|s|^2\eta^4$": s2 * eta**4,
     }
     figure.suptitle(
-        "4  sum: the seven terms of the exact Fisher diagonal of that splat, per pixel (their sums: one number each)",
+        "4  sum: the seven terms of the exact Fisher diagonal of that splat, per pixel "
+        "(their sums: one number each)",
         fontsize=9,
     )
     x, y = p.means2d[j]

@@ -1,8 +1,5 @@
 # The public names of mgs: `mgs/__init__.py` reads them from here, and so do type checkers.
 
-from .active.nbv import resume_nbv as resume_nbv
-from .active.nbv import run_nbv as run_nbv
-from .active.run_folder import State as State
 from .camera import Camera as Camera
 from .camera import look_at as look_at
 from .data.dataset import Dataset as Dataset
@@ -22,6 +19,9 @@ from .report.evaluation import evaluate as evaluate
 from .report.evaluation import evaluate_run as evaluate_run
 from .report.page import write_page as write_page
 from .report.writing import write_report as write_report
+from .run.folder import State as State
+from .run.nbv import resume_nbv as resume_nbv
+from .run.nbv import run_nbv as run_nbv
 from .splat import ListCache as ListCache
 from .splat import as_drjit as as_drjit
 from .splat import fisher as fisher
@@ -29,7 +29,7 @@ from .splat import jvp as jvp
 from .splat import render as render
 from .splat_ply import read_ply as read_ply
 from .splat_ply import write_ply as write_ply
-from .synth.rendering import Preset as Preset
+from .synth.rendering import RenderPreset as RenderPreset
 from .synth.rendering import synthesise as synthesise
 
 __version__: str

@@ -1,5 +1,4 @@
-"""What `mgs bench` records: views never seen before, memory of one point alone, exponents, the
-command line."""
+"""`mgs bench splat` and `mgs bench scaling`: what is timed, counted, fitted, drawn and written."""
 
 from __future__ import annotations
 
@@ -11,22 +10,23 @@ import tiny
 from PIL import Image
 from refusals import refused
 
-from mgs.bench import chart, core
-from mgs.bench.chart import scaling_figure
-from mgs.bench.growth import OPERATIONS, fitted, linear_growth, scaling_exponents
+from mgs.bench import core, scaling
+from mgs.bench.scaling import OPERATIONS, fitted, growth, linear_growth, scaling_exponents
 from mgs.cli.app import main
 from mgs.files import read_json
+from mgs.splat import as_drjit, fisher, render
+from mgs.splat.blocks import BLOCK_X, BLOCK_Y
+from mgs.splat.walking import PIXELS
 
 
 def points(most: int = 1_000_000) -> list[dict]:
     """Records of a machine on which N brings pairs ~ N^0.5 and time ~ pairs^1.4, pixels pairs ~
     pixels^0.5 and time ~ pairs, both time ~ pairs^0.9."""
-    numbers = [n for n in (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000) if n <= most]
-    rows = [
-        ("gaussians", n, 307_200, 2, n**0.5, n**0.7 if n >= most // 100 else 1.0) for n in numbers
-    ]
+    numbers = [n for n in scaling.NUMBERS if n <= most]
+    grown = {n: n >= most // 100 for n in numbers}
+    rows = [("gaussians", n, 307_200, 2, n**0.5, n**0.7 if grown[n] else 1.0) for n in numbers]
     rows += [("pixels", 100_000, 4**i, 2, 2.0**i, 2.0**i) for i in range(4)]
-    rows += [("both", n, 3 * n, 2, float(n), n**0.9 if n >= most // 100 else 1.0) for n in numbers]
+    rows += [("both", n, 3 * n, 2, float(n), n**0.9 if grown[n] else 1.0) for n in numbers]
     rows += [("threads", 100_000, 307_200, t, 1.0, 1 / t) for t in (1, 2)]
     return [
         dict(zip(("sweep", "n", "pixels", "threads", "pairs"), row[:5], strict=True))
@@ -36,7 +36,7 @@ def points(most: int = 1_000_000) -> list[dict]:
     ]
 
 
-def test_growth_with_pairs_is_told_for_either_way_to_get_more():
+def test_exponents_of_growth():
     records = points()
     assert fitted(records)[0]["n"] == 10_000
     row = scaling_exponents(records)["forward, cold"]
@@ -58,21 +58,17 @@ def test_growth_with_pairs_is_told_for_either_way_to_get_more():
 @pytest.mark.parametrize("threads", [1, 2])
 def test_the_chart_shows_the_records(tmp_path, monkeypatch, threads):
     drawn = []
-    monkeypatch.setattr(chart, "save_figure", lambda figure, path: drawn.append((figure, path)))
+    monkeypatch.setattr(scaling, "save_figure", lambda figure, path: drawn.append((figure, path)))
     records = [p for p in points() if p["sweep"] != "threads" or p["threads"] <= threads]
-    scaling_figure(tmp_path / "chart.png", records)
+    scaling.scaling_figure(tmp_path / "chart.png", records)
     ((figure, path),) = drawn
     assert path == tmp_path / "chart.png"
-    forward = [axis.lines[0].get_xydata() for axis in figure.axes[:4]]
-    for found, (sweep, key) in zip(
-        forward,
-        (("gaussians", "n"), ("pixels",) * 2, ("threads",) * 2, ("both", "pairs")),
-        strict=True,
-    ):
+    axes = figure.axes[:4]
+    sweeps = {"gaussians": "n", "pixels": "pixels", "threads": "threads", "both": "pairs"}
+    for axis, (sweep, key) in zip(axes, sweeps.items(), strict=True):
         expected = [(p[key], 1e3 * p["forward_warm"]) for p in records if p["sweep"] == sweep]
-        np.testing.assert_allclose(found, expected)
-    titles = [axis.get_legend().get_texts()[0].get_text() for axis in figure.axes[:4]]
-    assert titles == [
+        np.testing.assert_allclose(axis.lines[0].get_xydata(), expected)
+    assert [axis.get_legend().get_texts()[0].get_text() for axis in axes] == [
         "forward, warm: 0.70",
         "forward, warm: 0.50",
         "forward, warm: -1.00" if threads > 1 else "forward, warm: ",
@@ -80,8 +76,7 @@ def test_the_chart_shows_the_records(tmp_path, monkeypatch, threads):
     ]
 
 
-def test_linear_growth_finds_the_costs_it_is_made_of():
-    """And says by how much a time that grows faster is missed."""
+def test_linear_growth_finds_its_costs_and_the_worst_deviation():
     records = points()
     for p in records:
         p.update(dict.fromkeys(OPERATIONS, 2e-3 + 3e-9 * p["pairs"] + 5e-9 * p["n"]))
@@ -93,7 +88,7 @@ def test_linear_growth_finds_the_costs_it_is_made_of():
     assert found["forward, cold"]["worst deviation"] > 0.3
 
 
-def test_cold_means_a_view_never_seen_before(monkeypatch):
+def test_cold_renders_a_new_view_in_each_call(monkeypatch):
     gaussians = tiny.initial([])
     camera, seen, draw = core.surface_camera(gaussians, 32, 24), [], core.render
 
@@ -116,14 +111,54 @@ def test_cold_means_a_view_never_seen_before(monkeypatch):
         assert other.position[2] == pytest.approx(camera.position[2])
 
 
+def test_operations_of_a_known_loop_are_counted():
+    """Five chains of an FMA (2) and a division (1); the sum after the loop is not part of it."""
+    x, n = dr.arange(mi.Float, 64) + 1, dr.opaque(mi.UInt32, 3)
+    dr.eval(x)
+
+    def body(i, values):
+        return i + 1, [dr.fma(v, x, 0.5) / v for v in values]
+
+    def call():
+        start = dr.zeros(mi.UInt32, 64), [x] * 5
+        return sum(dr.while_loop(start, lambda i, _: i < n, body)[1])
+
+    assert core.flops_per_pair(call, 64) == 5 * 3 / core.TOGETHER
+    assert core.flops_per_pair(call, 1) == 0
+
+
+def test_operations_of_the_kernels():
+    """Exact Fisher walks the lists a second time and differentiates, so it computes more."""
+    gaussians = core.surface_gaussians(500)
+    camera, device = core.surface_camera(gaussians, 184, 92), as_drjit(gaussians)
+    blocks = (184 // BLOCK_X) * (92 // BLOCK_Y)
+    forward = core.flops_per_pair(lambda: render(device, camera).rgb, blocks)
+    exact = core.flops_per_pair(lambda: fisher(device, camera), blocks)
+    assert 15 * PIXELS < forward < 25 * PIXELS
+    assert 2 * forward < exact < 5 * forward
+
+
+def test_bench_splat_measures_every_target():
+    said = []
+    found = core.bench_splat(1000, 64, 48, 3, said.append)
+    assert len(said) == 4
+    assert found["figures"].keys() == core.TARGETS.keys()
+    assert all(value > 0 for value in found["figures"].values())
+    assert set(found["seconds"]) == {*OPERATIONS, "volprim_forward", "volprim_gradient"}
+    assert all(0 < share < 1 for share in found["share_of_peak"].values())
+    assert found["peak_gflops_measured"] > 1
+
+
 def test_peak_memory_is_that_of_the_point_alone():
     dr.eval(dr.arange(mi.Float, 1 << 26))
     assert dr.detail.malloc_watermark(dr.JitBackend.LLVM) >= 1 << 28
-    assert core.in_new_process(core.scaling_point, 1000, 32, 24, 1, 3)["peak_bytes"] < 1 << 27
+    found = scaling.in_new_process(scaling.scaling_point, 1000, 32, 24, 1, 3)
+    assert found["peak_bytes"] < 1 << 27
 
 
 def test_the_json_holds_the_command_as_typed(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(core, "bench_scaling", lambda *_: points())
+    result = {"repeats": 5, "points": points()} | growth(points())
+    monkeypatch.setattr(scaling, "bench_scaling", lambda *_: dict(result))
     chart, json = tmp_path / "chart.png", tmp_path / "a b.json"
     arguments = ["bench", "scaling", "--repeats", "5", "--json", str(json), "--chart", str(chart)]
     monkeypatch.setattr("sys.argv", ["/somewhere/bin/mgs", *arguments])
@@ -144,21 +179,14 @@ def test_the_json_holds_the_command_as_typed(monkeypatch, capsys, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (
-            ["splat", "--chart", "x.png"],
-            "--chart: is for scaling and roofline, not for splat; leave it out",
-        ),
-        (
-            ["fit", "--gaussians", 5000],
-            "--gaussians: is for splat and scaling and roofline, not for fit",
-        ),
+        (["splat", "--chart", "x.png"], "--chart: is for scaling, not for splat; leave it out"),
+        (["fit", "--gaussians", 5000], "--gaussians: is for splat and scaling, not for fit"),
         (["fit", "--repeats", 5], "--repeats: is for"),
-        (["roofline", "--dataset", "demo/dataset"], "--dataset: is for fit, not for roofline"),
+        (["scaling", "--dataset", "demo/dataset"], "--dataset: is for fit, not for scaling"),
+        (["splat", "--alpha-weight", 0], "--alpha-weight: is for fit, not for splat"),
+        (["scaling", "--gaussians", 2999], "at least 3000"),
+        (["scaling", "--json", "."], "is a folder; name a file"),
     ],
 )
-def test_what_a_benchmark_has_no_use_for_is_refused(capsys, arguments, line):
+def test_refused(capsys, arguments, line):
     assert line in refused(capsys, ["bench", *arguments])
-
-
-def test_one_n_is_too_few_to_fit(capsys):
-    assert "at least 3000" in refused(capsys, ["bench", "scaling", "--gaussians", 2999])

@@ -1,4 +1,4 @@
-"""`mgs bench fit`: the figures are those of the fits that it says it makes."""
+"""`mgs bench fit`: its figures are those of the fits that it describes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from mgs.bench import fit as bench
 from mgs.fit.settings import TrainSettings
 from mgs.metrics import agreement
 from mgs.report.evaluation import evaluate
+from mgs.splat import as_drjit
 
 
 @pytest.fixture(scope="module")
@@ -19,90 +20,53 @@ def root(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def small(monkeypatch):
-    """Everything at a size that takes seconds."""
+def test_the_figures_are_those_of_the_fits(root, monkeypatch):
     monkeypatch.setattr(bench, "SIZES", (200, 400))
     monkeypatch.setattr(bench, "VIEWS", 4)
     monkeypatch.setattr(bench, "STATES", (("even", 3), ("random", 4)))
-    monkeypatch.setattr(bench, "OLD_PASSES", 2)
-    monkeypatch.setattr(bench, "TRIED_PASSES", (1, 20))
     monkeypatch.setattr(bench, "LONGER", 3)
-
-
-def test_the_figures_are_those_of_the_fits(root, small):
     said = []
     found = bench.bench_fit(root, said.append)
-    assert found["figures"].keys() == bench.TARGETS.keys()
-    assert len(said) == 4
-    case = bench._case(bench.load_dataset(root), 200, "even", 4, 0.1)
-    fitted = case.fit(case.start, case.taken, TrainSettings())
-    names = [case.dataset.frames[i].name for i in case.taken]
-    means = evaluate(fitted.gaussians, case.dataset.frames, names, spacing=case.prior.spacing)[
-        "held_out"
-    ]
-    figures = found["figures"]
-    assert (figures["psnr_held_out"], figures["psnr_inside_10k"]) == (
-        means["psnr"],
-        means["psnr_inside"],
-    )
-    assert (
-        figures["psnr_inside_20k"] == found["held_out"][400]["psnr_inside"] != means["psnr_inside"]
-    )
+    figures, end = found["figures"], found["end"]
+    assert figures.keys() == bench.TARGETS.keys()
+    assert len(said) == 3
+    case = bench.make_case(bench.load_dataset(root), 200, "even", 4, 0.1)
+    fitted = case.fit()
+    frames, spacing = case.dataset.frames, case.prior.spacing
+    names = [frames[i].name for i in case.taken]
+    means = evaluate(fitted.gaussians, frames, names, spacing=spacing)["held_out"]
+    assert figures["psnr_held_out"] == means["psnr"]
+    assert figures["psnr_inside_10k"] == means["psnr_inside"]
+    assert figures["psnr_inside_20k"] == found["held_out"][400]["psnr_inside"]
+    assert figures["psnr_inside_20k"] != means["psnr_inside"]
     tests = case.dataset.test_views().frames
-    assert (
-        found["test"][200]
-        == evaluate(fitted.gaussians, [], [], test_frames=tests, spacing=case.prior.spacing)["test"]
-    )
-    end = found["end"]
-    assert end["phi"] == case.phi(fitted.gaussians)
-    longer = case.fit(
-        case.start, case.taken, TrainSettings(passes=3 * fitted.passes, tolerance=0.0)
-    )
-    assert end["found"] == end["phi"] - case.phi(longer.gaussians) > 0
+    on_test = evaluate(fitted.gaussians, [], [], test_frames=tests, spacing=spacing)["test"]
+    assert found["test"][200] == on_test
+    phi = case.objective().phi
+    longer = case.fit(passes=3 * fitted.passes, tolerance=0.0)
+    assert end["phi"] == phi(as_drjit(fitted.gaussians))
+    assert end["found"] == end["phi"] - phi(as_drjit(longer.gaussians)) > 0
     assert figures["predicted_over_found_decrease"] == end["predicted"] / end["found"] > 0
-    assert figures["ranking_tau"] == pytest.approx(
-        sum(state["tau"] for state in found["ranking"]) / 2
-    )
-    assert [state["views"] for state in found["ranking"]] == [3, 4]
-    assert found["ranking_tau_half"] == pytest.approx(
-        sum(state["tau_half"] for state in found["ranking"]) / 2
-    )
-
-
-def test_passes_are_those_of_the_first_fit_that_reaches_the_objective(root, small, monkeypatch):
-    case = bench._case(bench.load_dataset(root), 200, "even", 4, 0.1)
-    found = bench.passes_to(case, case.start)
-    assert found["share"] == found["tried"][-1]["passes"] / 2
-    assert found["share_of_seconds"] == found["tried"][-1]["seconds"] / found["old"]["seconds"]
-    assert found["tried"][-1]["phi"] <= found["old"]["phi"]
-    assert all(one["phi"] > found["old"]["phi"] for one in found["tried"][:-1])
-    monkeypatch.setattr(bench, "OLD_PASSES", 60)
-    monkeypatch.setattr(bench, "TRIED_PASSES", (1,))
-    missed = bench.passes_to(case, case.start)
-    assert missed["share"] is missed["share_of_seconds"] is None
+    rows = found["ranking"]
+    assert [row["views"] for row in rows] == [3, 4]
+    assert figures["ranking_tau"] == pytest.approx(sum(row["tau"] for row in rows) / 2)
+    assert found["ranking_tau_half"] == pytest.approx(sum(row["tau_half"] for row in rows) / 2)
 
 
 def test_alpha_is_part_of_the_fit_and_of_its_objective(root):
-    dataset = bench.load_dataset(root)
-    models = {}
-    for weight in (0.0, 0.1):
-        case = bench._case(dataset, 200, "even", 4, weight)
-        models[weight] = case.fit(case.start, case.taken, TrainSettings()).gaussians
-        assert case.objective(case.taken).alpha_weight == weight
-    assert models[0.0] != models[0.1]
+    cases = [
+        bench.make_case(bench.load_dataset(root), 200, "even", 4, weight) for weight in (0, 0.1)
+    ]
+    assert [case.objective().alpha_weight for case in cases] == [0, 0.1]
+    assert cases[0].fit().gaussians != cases[1].fit().gaussians
 
 
-def test_a_ranking_agrees_with_itself(root, small, monkeypatch):
+def test_a_ranking_agrees_with_itself(root, monkeypatch):
     monkeypatch.setattr(bench, "LONGER", 1)
-    case = bench._case(bench.load_dataset(root), 200, "random", 4, 0.0)
-    found = bench._ranking(case)
-    shorter = case.fit(
-        case.start, case.taken, TrainSettings(passes=TrainSettings().passes // 2, tolerance=0.0)
-    )
-    stopped = case.fit(case.start, case.taken, TrainSettings())
-    scores = [bench._scores(case, model.gaussians) for model in (shorter, stopped)]
-    assert found == {
+    case = bench.make_case(bench.load_dataset(root), 200, "random", 4, 0.0)
+    shorter = case.fit(passes=TrainSettings().passes // 2, tolerance=0.0)
+    scores = [case.scores(fit.gaussians) for fit in (shorter, case.fit())]
+    assert bench._ranking(case) == {
         "views": 4,
         "tau_half": agreement(*scores)["tau"],
         "tau": pytest.approx(1),

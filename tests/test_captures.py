@@ -14,11 +14,12 @@ import trimesh
 
 from mgs.camera import Camera, look_at
 from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
-from mgs.data.importers import import_source, read_source
+from mgs.data.importers import import_source
 from mgs.data.masks import make_masks
 from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh, to_glb
 from mgs.data.raycast import mesh_depth
-from mgs.data.up import angle_between, unit_up
+from mgs.data.sources import read_source
+from mgs.data.up import degrees_between, unit_up
 from mgs.files import read_json
 from mgs.images import write_exr, write_png
 from mgs.prior.build import Prior, build_prior
@@ -172,7 +173,7 @@ def prior_of(source: Path, out: Path, masks: bool) -> tuple[Dataset, Prior, np.n
     surface, metres."""
     found, truth = read_source(source), read_json(source / "truth.json")
     up = found.up_or_estimate()[0]
-    assert angle_between(up, unit_up(truth["up"])) < 2
+    assert degrees_between(up, unit_up(truth["up"])) < 2
     dataset = import_source(found, out, masks=source / "masks" if masks else None, up=up)
     prior, _ = build_prior(dataset, PriorSettings(gaussians=1500, backing=0))
     assert trimesh.Trimesh(prior.mesh.vertices, prior.mesh.faces).is_watertight
@@ -189,7 +190,7 @@ def test_a_toy_on_a_table(capture: Callable[[str], Path], tmp_path: Path, masks:
     _, prior, distance = prior_of(capture("toy"), tmp_path / "d", masks)
     assert ("plane_normal" in prior.numbers) != masks
     if not masks:
-        assert angle_between(unit_up(prior.numbers["plane_normal"]), prior.up) < 3
+        assert degrees_between(unit_up(prior.numbers["plane_normal"]), prior.up) < 3
     assert distance.mean() < (0.004 if masks else 0.006)  # a pixel is 7 mm
     assert np.quantile(distance, 0.9) < (0.008 if masks else 0.015)
     size = np.ptp(prior.points, axis=0) / read_json(capture("toy") / "truth.json")["scale"]

@@ -26,7 +26,9 @@ from mgs.cli.app import main
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data.check import check_dataset
 from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
-from mgs.data.importers import import_source, read_source, undistorter
+from mgs.data.importers import import_source
+from mgs.data.lens import undistorter
+from mgs.data.sources import read_source
 from mgs.files import read_json, write_json
 from mgs.images import write_png
 from mgs.prior.build import build_prior, load_prior

@@ -195,7 +195,10 @@ def test_damaged_settings_of_the_fit_are_one_line_on_resume(dataset, tmp_path, c
 def test_learning_rates_that_are_too_high_are_one_line(dataset, prior, tmp_path, capsys):
     """The loss settles on that of a black image: flat, but above its start."""
     run = tmp_path / "run"
-    train = {"optimiser": "adam", "rates": [20, 20, 10, 50]}
+    train = {
+        "optimiser": "adam",
+        "rates": {"colour": 20, "scale": 20, "rotation": 10, "opacity": 50},
+    }
     tiny.start(run, load_dataset(dataset), prior=prior, budget=1, train=train)
     said = refused(capsys, ["nbv", "--resume", run])
     assert "the fit to the seeds diverged: its loss was" in said
@@ -469,13 +472,6 @@ def test_alpha_as_a_channel_reaches_every_fit_and_the_resumed_run(dataset, prior
         for s in (settings, with_alpha)
     ]
     assert phi[1] > phi[0] > 0
-
-
-def test_settings_of_the_fit_are_read_as_older_runs_wrote_them():
-    older = {"passes": 6, "tolerance": 0.01, "rates": [0.1, 0.2, 0.3, 0.4], "decay": 0.1, "seed": 2}
-    found = TrainSettings(**older)
-    assert found.rates == {"colour": 0.1, "scale": 0.2, "rotation": 0.3, "opacity": 0.4}
-    assert TrainSettings(**found.model_dump()) == found
 
 
 def test_the_documented_policy_of_ones_own(dataset, tmp_path, monkeypatch):

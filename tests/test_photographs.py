@@ -26,11 +26,12 @@ from mgs.camera import Camera, look_at
 from mgs.cli.app import main
 from mgs.data.clouds import SparseCloud, read_cloud, views_of, write_cloud
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
-from mgs.data.importers import import_source, read_source
+from mgs.data.importers import import_source
 from mgs.data.lens import shrunk
 from mgs.data.masks import make_masks
 from mgs.data.meshes import distances_to_mesh, read_mesh
-from mgs.data.up import angle_between, unit_up, up_of_cameras, upright
+from mgs.data.sources import read_source
+from mgs.data.up import degrees_between, unit_up, up_of_cameras, upright
 from mgs.errors import InputError
 from mgs.files import read_json, write_json
 from mgs.images import write_png
@@ -211,7 +212,7 @@ def test_real_clouds_give_the_rock(
     assert np.quantile(distance, 0.9) < (0.035 if masks else 0.06)
     assert cloud is not None
     assert len(cloud.rock_points) > 150
-    assert angle_between(prior.up, unit_up(read_json(data(kind) / "truth.json")["up"])) < 3
+    assert degrees_between(prior.up, unit_up(read_json(data(kind) / "truth.json")["up"])) < 3
     again, _ = build_prior(dataset, PriorSettings(gaussians=600, backing=0))
     assert np.array_equal(prior.points, again.points)
 
@@ -354,7 +355,7 @@ def test_up_is_found_in_a_turned_world_of_cameras_held_nearly_level(
         pose[:3, :3] = pose[:3, :3] @ turn.T
         cameras.append(Camera(np.diag([50.0, 50.0, 1.0]), 64, 48, pose))
     up = turn @ [0, 0, 1]
-    assert angle_between(up_of_cameras(cameras), unit_up(up)) < 5
+    assert degrees_between(up_of_cameras(cameras), unit_up(up)) < 5
 
 
 def test_policies_measure_azimuths_about_the_up_axis(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from mgs.data.meshes import read_mesh, read_rock, to_glb
+from mgs.data.meshes import read_mesh, to_glb
 from mgs.errors import InputError
 from mgs.seeds import generator
 from mgs.synth.noise import Noise
@@ -58,10 +58,9 @@ def test_glb_round_trip_keeps_geometry_and_colours(tmp_path):
     np.testing.assert_array_equal(
         back.visual.to_color().vertex_colors, rock.visual.to_color().vertex_colors
     )
-    for read in (read_mesh, read_rock):
-        np.testing.assert_array_equal(
-            read(tmp_path / "rock.glb").vertices, rock.vertices.astype(np.float32)
-        )
+    np.testing.assert_array_equal(
+        read_mesh(tmp_path / "rock.glb").vertices, rock.vertices.astype(np.float32)
+    )
 
 
 def test_glb_is_y_up_as_its_format_has_it(tmp_path):
@@ -73,12 +72,6 @@ def test_glb_is_y_up_as_its_format_has_it(tmp_path):
     np.testing.assert_allclose(raw.bounds, [[-0.5, 0, -1], [0.5, 5, 1]])
     assert raw.volume > 0
     np.testing.assert_array_equal(box.bounds, [[-0.5, -1, 0], [0.5, 1, 5]])  # itself it stays
-
-
-def test_rock_of_a_dataset_of_an_older_mgs_is_z_up(tmp_path):
-    box = trimesh.creation.box([1.0, 2.0, 5.0])
-    box.export(tmp_path / "rock.glb")
-    np.testing.assert_allclose(np.ptp(read_rock(tmp_path / "rock.glb").vertices, 0), [1, 2, 5])
 
 
 @pytest.mark.parametrize("suffix", ["glb", "obj", "ply"])

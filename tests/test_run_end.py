@@ -18,7 +18,7 @@ from mgs.data.dataset import load_dataset
 from mgs.files import write_json
 from mgs.policy import criteria
 from mgs.report.page_facts import read_shown
-from mgs.report.runs import check_finished, read_run
+from mgs.report.runs import read_run
 from mgs.report.tables import markdown_table, table_numbers
 from mgs.run import folder as run_folder
 from mgs.run import loop
@@ -148,24 +148,6 @@ def test_resuming_a_run_that_has_ended_does_nothing_until_its_rule_is_changed(
     assert last.taken == whole.taken
     assert ["ended" in step for step in last.steps] == [False] * 5 + [True]
     np.testing.assert_array_equal(last.gaussians.sh, whole.gaussians.sh)
-
-
-def test_a_run_of_a_version_that_did_not_say_why_it_ended(loaded, tmp_path):
-    out = tmp_path / "run"
-    state = run(out, loaded, budget=1)
-    steps = [
-        {key: value for key, value in step.items() if key not in ("ended", "uncertainty")}
-        for step in state.steps
-    ]
-    run_folder.write_checkpoint(
-        out,
-        run_folder.State(state.gaussians, state.H, state.surface, state.taken, steps, state.inputs),
-    )
-    check_finished(read_run(out))
-    assert resume(out, loaded, tiny.stations(fit=never, fisher=never)).steps[-1]["ended"] == {
-        "reason": "budget",
-        "views": 1,
-    }
 
 
 @pytest.mark.parametrize(

@@ -1,26 +1,21 @@
-"""Timings of the splatting kernels: beside Mitsuba's own splatting integrator, and as the work
-grows. All times are medians.
+"""Time the splatting kernels and Mitsuba's own splatting integrator, `volprim_rf_basic`.
 
-Kernels are compiled, and memory is allocated, before anything is timed. Ratios of times are about
-the same on other machines; times are not.
+Kernels are compiled and memory is allocated before anything is timed. Times are medians. Ratios of
+times are about the same on other machines; times are not.
 """
 
 from __future__ import annotations
 
-import multiprocessing
+import re
 import resource
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mgs import runtime
-from mgs.bench.machine import peak_flops
-from mgs.bench.work import KernelWork, count_work
 from mgs.camera import Camera, look_at
 from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
 from mgs.memory import padded
@@ -39,21 +34,28 @@ TARGETS = {
     "block_fisher_over_gradient": ("at most", 2.0),
     "tiny_forward_ms": ("at most", 5.0),
 }
-"""What this project asks of itself, by the names in "figures" of `bench_splat`: `mgs bench splat`
-prints them beside what was measured. *_speedup: time of Mitsuba's integrator over ours;
-*_over_gradient: time of the Fisher information over that of image and gradient; tiny_forward_ms:
-milliseconds."""
+"""Goals for the "figures" of `bench_splat`, printed beside them by `mgs bench splat`.
+
+*_speedup: time of Mitsuba's integrator over ours. *_over_gradient: time of the Fisher information
+over that of image and gradient. tiny_forward_ms: milliseconds.
+"""
 
 WARM_UP = 2
-"""Number of calls before those that are timed: they compile kernels and allocate memory."""
+"""Untimed calls before the timed ones: they compile kernels and allocate memory."""
+
+SECOND_OPERATION = re.compile(r"call <.*@llvm\.fma")
+OPERATION = re.compile(r" (?:fadd|fsub|fmul|fdiv) <|call <.*(?:@llvm\.(?:fma|sqrt)|rcp14|rsqrt14)")
+"""Floating-point instructions of LLVM. An FMA counts twice."""
+
+LOOP = re.compile(r"^l_(\d+)_cond:(.*?)^l_\1_end:", re.MULTILINE | re.DOTALL)
+"""A loop of a compiled kernel."""
 
 
 def surface_gaussians(n: int, seed: int = 0) -> Gaussians:
-    """n flat Gaussians at random points on the surface of the default rock.
+    """Sample n flat Gaussians on the surface of the default rock, the scene of the TARGETS.
 
-    Their standard deviations are 0.8, 0.8 and 0.2 spacings (the square root of area / n), their
-    opacity is 0.73 (logit 1), their colours are random. These are the Gaussians for which the
-    TARGETS were set.
+    Their standard deviations are 0.8, 0.8 and 0.2 spacings (the square root of area / n). Their
+    opacity is 0.73 (logit 1), their colours are random.
     """
     import trimesh
 
@@ -74,8 +76,7 @@ def surface_gaussians(n: int, seed: int = 0) -> Gaussians:
 
 
 def surface_camera(gaussians: Gaussians, width: int, height: int) -> Camera:
-    """A camera with an image of width x height pixels, 25 degrees above the horizon and three radii
-    away from the Gaussians, which fill its image."""
+    """Camera 25 degrees above the horizon and three radii away, whose image the Gaussians fill."""
     low, high = gaussians.means.min(axis=0), gaussians.means.max(axis=0)
     centre, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
     pose = look_at(centre + 3 * radius * np.array([np.cos(0.44), 0.0, np.sin(0.44)]), centre)
@@ -87,10 +88,9 @@ def surface_camera(gaussians: Gaussians, width: int, height: int) -> Camera:
 
 
 def turned_cameras(camera: Camera, gaussians: Gaussians, count: int) -> list[Camera]:
-    """`count` other cameras: the camera turned about the vertical axis through the middle of the
-    Gaussians, in even steps.
+    """Turn the camera about the vertical axis through the centre, in `count` even steps.
 
-    Intrinsics, distance and elevation stay the same, so that the number of (splat, block) pairs is
+    Intrinsics, distance and elevation stay the same, so the number of (splat, block) pairs is
     similar (within 6 % for 100,000 Gaussians).
     """
     to_centre = np.eye(4)
@@ -105,8 +105,10 @@ def turned_cameras(camera: Camera, gaussians: Gaussians, count: int) -> list[Cam
 
 
 def median_seconds(call: Callable[[], Any], repeats: int) -> float:
-    """Median of the wall-clock seconds of `repeats` calls, after WARM_UP calls that do not count.
-    What a call returns is evaluated by Dr.Jit within its time."""
+    """Median wall-clock seconds of `repeats` calls, after WARM_UP untimed ones.
+
+    The result of each call is evaluated within its time.
+    """
     seconds = []
     for i in range(repeats + WARM_UP):
         start = time.perf_counter()
@@ -120,10 +122,9 @@ def median_seconds(call: Callable[[], Any], repeats: int) -> float:
 def gradient(
     gaussians: Gaussians, camera: Camera, weights: Any, cache: ListCache | None
 ) -> list[Any]:
-    """Render, then differentiate: gradients of a weighted sum of the image with respect to each of
-    LEARNED.
+    """Gradients of sum(image * weights) with respect to each of LEARNED.
 
-    weights: TensorXf [H,W,3]; cache: as `mgs.splat.render`.
+    weights: TensorXf [H,W,3]. cache: as in `mgs.splat.render`.
     """
     dr.enable_grad([getattr(gaussians, name) for name in LEARNED])
     loss = dr.sum(render(gaussians, camera, cache=cache).rgb * weights, axis=None)
@@ -133,17 +134,13 @@ def gradient(
     return gradients
 
 
-def time_core(
-    gaussians: Gaussians, camera: Camera, repeats: int, blocks: bool = True
-) -> dict[str, float]:
-    """Seconds of each operation on these Gaussians (NumPy fields).
+def time_core(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
+    """Time each operation on these Gaussians (NumPy fields); seconds by name.
 
-    forward_cold: render a view that was never seen before, another one in each call, so that its
-    block lists must be built. The
-    other operations see the same camera again, whose lists are kept: forward_warm, render;
-    gradient_warm, `gradient`; fisher_exact and, if `blocks`, fisher_block, `mgs.splat.fisher` with
-    these estimators. Also pairs: the number of (splat, block) pairs of the camera; list_bytes:
-    memory of its lists, bytes.
+    forward_cold renders a new view in each call, so its block lists must be built. The others use
+    one camera and keep its lists: forward_warm renders, gradient_warm is `gradient`, fisher_exact
+    and fisher_block are `mgs.splat.fisher`. The result also has pairs, the number of (splat, block)
+    pairs of the camera, and list_bytes, the memory of its lists.
     """
     device, cache = as_drjit(gaussians), ListCache()
     new_views = iter(turned_cameras(camera, gaussians, repeats + WARM_UP))
@@ -151,26 +148,21 @@ def time_core(
         padded(np.random.default_rng(0).normal(size=(camera.height, camera.width, 3)))
     )
     dr.eval(device, weights)
-    seconds = {
-        "forward_cold": median_seconds(lambda: render(device, next(new_views)).rgb, repeats),
-        "forward_warm": median_seconds(lambda: render(device, camera, cache=cache).rgb, repeats),
-        "gradient_warm": median_seconds(lambda: gradient(device, camera, weights, cache), repeats),
-        "fisher_exact": median_seconds(
-            lambda: fisher(device, camera, "exact", cache=cache), repeats
-        ),
+    calls: dict[str, Callable[[], Any]] = {
+        "forward_cold": lambda: render(device, next(new_views)).rgb,
+        "forward_warm": lambda: render(device, camera, cache=cache).rgb,
+        "gradient_warm": lambda: gradient(device, camera, weights, cache),
+        "fisher_exact": lambda: fisher(device, camera, "exact", cache=cache),
+        "fisher_block": lambda: fisher(device, camera, "block", cache=cache),
     }
-    if blocks:
-        seconds["fisher_block"] = median_seconds(
-            lambda: fisher(device, camera, "block", cache=cache), repeats
-        )
+    seconds = {name: median_seconds(call, repeats) for name, call in calls.items()}
     lists, _ = cache.get(camera, project(device, camera_array(camera)))
     pairs = float(np.sum(np.asarray(lists.end).astype(np.int64) - np.asarray(lists.start)))
     return seconds | {"pairs": pairs, "list_bytes": float(cache.nbytes)}
 
 
 def volprim_scene(gaussians: Gaussians, camera: Camera) -> Any:
-    """The Gaussians as a scene of Mitsuba's own integrator for them, `volprim_rf_basic`, seen by
-    the camera."""
+    """Mitsuba scene of the Gaussians, with the integrator `volprim_rf_basic`."""
     quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     forward = camera.world_to_camera[2, :3]
     return mi.load_dict(
@@ -205,8 +197,8 @@ def volprim_scene(gaussians: Gaussians, camera: Camera) -> Any:
 
 
 def time_volprim(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
-    """Seconds of Mitsuba's own integrator for such Gaussians, `volprim_rf_basic`: volprim_forward,
-    an image; volprim_gradient, an image and the gradients of its sum."""
+    """Time Mitsuba's integrator: volprim_forward, an image; volprim_gradient, an image and the
+    gradients of its sum; seconds."""
     scene = volprim_scene(gaussians, camera)
     parameters = mi.traverse(scene)
     names = ["gaussians.data", "gaussians.opacities", "gaussians.sh_coeffs"]
@@ -222,40 +214,61 @@ def time_volprim(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str
 
 
 def flops_per_pair(call: Callable[[], Any], lanes: int) -> float:
-    """Floating-point operations of a call for each (splat, block) pair, counted in the LLVM IR of
-    the kernels that walk through
-    block lists: those with this number of lanes, that of the image's blocks, in their first loops.
-    An FMA counts as two."""
+    """Count the floating-point operations of a call per (splat, block) pair.
+
+    Counts those in the first loop of each kernel of `lanes` lanes (the blocks of the image), in the
+    code that Dr.Jit compiled. A kernel with a second loop, which clears sums, draws one pair in an
+    iteration; the others draw TOGETHER.
+    """
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         dr.eval(call())
-        found = [
-            entry for entry in dr.kernel_history([dr.KernelType.JIT]) if entry["size"] == lanes
-        ]
+        history = dr.kernel_history([dr.KernelType.JIT])
     total = 0.0
-    for counted in (count_work(entry["ir"].getvalue()) for entry in found):
-        for work in counted.loops[:1]:
-            total += (work.flops + work.flops64) / pairs_in_an_iteration(counted)
+    for entry in history:
+        loops = LOOP.findall(entry["ir"].getvalue()) if entry["size"] == lanes else []
+        if loops:
+            body = loops[0][1]
+            operations = len(OPERATION.findall(body)) + len(SECOND_OPERATION.findall(body))
+            total += operations / (TOGETHER if len(loops) == 1 else 1)
     return total
 
 
-def pairs_in_an_iteration(walk: KernelWork) -> int:
-    """How many (splat, block) pairs the first loop of a walk draws in one iteration. A walk that
-    stores sums draws one; it is known by its second loop, which writes zeros."""
-    return 1 if len(walk.loops) > 1 else TOGETHER
+def peak_flops(lanes: int = 1 << 16, rounds: int = 64) -> float:
+    """Measure the machine's FMAs, each two operations, in floating-point operations per second.
+
+    Runs 8 independent chains of FMAs in each lane, on registers, with Dr.Jit's number of threads.
+    The fastest of 15 calls counts, by Dr.Jit's own clock.
+    """
+    scale = dr.opaque(mi.Float, 0.999)
+    x = dr.arange(mi.Float, lanes) * (1 / lanes) + 1
+    dr.eval(x)
+    start = [x + i for i in range(8)]
+
+    def body(i: Any, chains: list[Any]) -> Any:
+        for _ in range(16):
+            chains = [dr.fma(value, scale, scale) for value in chains]
+        return i + 1, chains
+
+    seconds = []
+    for _ in range(15):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            dr.eval(sum(dr.while_loop((mi.UInt32(0), start), lambda i, _: i < rounds, body)[1]))
+            dr.sync_thread()
+            seconds.append(1e-3 * dr.kernel_history([dr.KernelType.JIT])[-1]["execution_time"])
+    return 2 * 8 * 16 * lanes * rounds / min(seconds)
 
 
 def bench_splat(
     n: int, width: int, height: int, repeats: int, report: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Measure what `mgs bench splat` prints and writes: n Gaussians in an image of width x height
-    pixels.
+    """Measure what `mgs bench splat` prints: n Gaussians in an image of width x height pixels.
 
     report(what) is called before each measurement. Returns "scene"; "seconds" of each operation;
     "figures", those of TARGETS; "pairs" (splat, block); "pixel_splat_pairs_per_second";
-    "peak_gflops_measured" and "share_of_peak" that the kernels reach; "list_megabytes" of a
-    camera's block lists; "peak_memory_megabytes" of the process before Mitsuba's integrator is
-    loaded.
+    "peak_gflops_measured"; "share_of_peak" of the kernels; "list_megabytes" of a camera's block
+    lists; and "peak_memory_megabytes" of the process before Mitsuba's integrator is loaded.
     """
     gaussians = surface_gaussians(n)
     camera = surface_camera(gaussians, width, height)
@@ -299,59 +312,3 @@ def bench_splat(
         "list_megabytes": own["list_bytes"] / 1e6,
         "peak_memory_megabytes": memory,
     }
-
-
-def bench_scaling(
-    repeats: int, report: Callable[[str], None], most: int = 1_000_000
-) -> list[dict[str, Any]]:
-    """Measure `scaling_point` along four sweeps; returns a record for each point. most: largest
-    number N of Gaussians.
-
-    gaussians: N grows, at 640x480. pixels: the image grows, at N = 100,000. both: N and the number
-    of pixels grow together, with 640x480 at 100,000; a Gaussian then keeps its number of pairs, and
-    only the number of all (splat, block) pairs grows.
-    threads: one, and all. A record holds "sweep", "n", "pixels", "threads" and what `scaling_point`
-    returns. report(what) is called before each point.
-    """
-    threads = dr.thread_count()
-    numbers = [n for n in (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000) if n <= most]
-    points = [("gaussians", n, 640, 480, threads) for n in numbers]
-    base = min(100_000, most)
-    points += [
-        ("pixels", base, w, h, threads)
-        for w, h in ((160, 120), (320, 240), (640, 480), (1280, 960))
-    ]
-    points += [
-        ("both", n, round(640 * (n / 1e5) ** 0.5), round(480 * (n / 1e5) ** 0.5), threads)
-        for n in numbers
-    ]
-    points += [("threads", base, 640, 480, t) for t in sorted({1, threads})]
-    records = []
-    for sweep, n, width, height, count in points:
-        report(f"{n:,} Gaussians, {width}x{height}, {count} thread{'' if count == 1 else 's'}")
-        where = {"sweep": sweep, "n": n, "pixels": width * height, "threads": count}
-        records.append(where | in_new_process(scaling_point, n, width, height, count, repeats))
-    return records
-
-
-def scaling_point(
-    n: int, width: int, height: int, threads: int, repeats: int, blocks: bool = True
-) -> dict[str, float]:
-    """What `time_core` returns, with this many threads, and peak_bytes: the most memory that Dr.Jit
-    has held in this process."""
-    dr.set_thread_count(threads)
-    gaussians = surface_gaussians(n)
-    seconds = time_core(gaussians, surface_camera(gaussians, width, height), repeats, blocks)
-    return seconds | {"peak_bytes": float(dr.detail.malloc_watermark(dr.JitBackend.LLVM))}
-
-
-def in_new_process(
-    call: Callable[..., Any], *arguments: Any, initializer: Callable[[], None] = runtime.start
-) -> Any:
-    """Call a function in a new process, after `initializer`, and return its result, so that nothing
-    is left over from earlier
-    calls: no memory, no recorded kernel, no block list. The functions and the arguments must be
-    picklable."""
-    spawn = multiprocessing.get_context("spawn")  # Dr.Jit's threads do not survive a fork
-    with ProcessPoolExecutor(1, spawn, initializer=initializer) as pool:
-        return pool.submit(call, *arguments).result()

@@ -79,7 +79,7 @@ def _check(path: Path) -> None:
     from rich.console import Console
     from rich.progress import Progress
 
-    from mgs.data.check import check_dataset, there
+    from mgs.data.check import check_dataset, taken_frames
     from mgs.data.dataset import load_dataset
     from mgs.errors import InputError
 
@@ -89,7 +89,7 @@ def _check(path: Path) -> None:
         task = bar.add_task("reading", total=len(loaded))
         check = check_dataset(loaded, lambda done, total: bar.update(task, completed=done))
     camera, (low, high) = loaded.frames[0].camera, check.depth_range
-    missing = len(loaded) - len(there(loaded))
+    missing = len(loaded) - len(taken_frames(loaded))
     count = f"{len(loaded)} frames" + (
         f" ({missing} of them on demand, not taken yet)" if missing else ""
     )

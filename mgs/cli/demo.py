@@ -36,7 +36,7 @@ def demo(
     from mgs import runtime
     from mgs.cli.diagnose import diagnose
     from mgs.cli.nbv import resume_and_print, start_and_print
-    from mgs.cli.printing import print_table
+    from mgs.cli.printing import print_quality
     from mgs.cli.prior import prior
     from mgs.cli.synth_orbit import synth_orbit
     from mgs.files import check_new_folder, check_writable
@@ -71,7 +71,7 @@ def demo(
     diagnose(runs[0])
     heading("5/5 the report")
     written = write_report(report, runs)
-    print_table(console, table_numbers(runs))
+    print_quality(console, table_numbers(runs))
     console.print(f"done in {time.monotonic() - started:.0f} s; look at:")
     for picture in (dataset / "contact_sheet.png", folder / "prior.png", *written):
         console.print(f"  {picture}", soft_wrap=True)

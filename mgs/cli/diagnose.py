@@ -37,9 +37,10 @@ def diagnose(
     each left out of a fit once; and NAME.errors.exr, true error and predicted standard deviation of
     some views.
     """
-    from rich.progress import Progress
+    from functools import partial
 
     from mgs import runtime
+    from mgs.cli.progress import progress_bar
     from mgs.errors import InputError
     from mgs.report.diagnostics import diagnose_run
 
@@ -51,17 +52,12 @@ def diagnose(
             f"--views {views!r}: names no frame; give some, as in kf_0003,kf_0010, or leave it out"
         )
     runtime.start()
-    with Progress(transient=True) as bar:
-        task = bar.add_task("calibrating" if calibrate else "mapping", total=None)
-
-        def progress(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
-
+    with progress_bar() as bar:
         if calibrate:
             from mgs.report.predicted_error import calibrate_run
 
-            written = calibrate_run(run, progress)
+            written = calibrate_run(run, partial(bar, "calibrating"))
         else:
-            written = diagnose_run(run, wanted, progress)
+            written = diagnose_run(run, wanted, partial(bar, "mapping"))
     for path in written:
         typer.echo(f"wrote {path}")

@@ -25,23 +25,24 @@ def evaluate(
     the rock only. metrics.json also has the errors of alpha and depth, where the dataset has their
     truth.
     """
+    from functools import partial
+
     from rich.console import Console
-    from rich.progress import Progress
 
     from mgs import runtime
-    from mgs.cli.printing import print_table
+    from mgs.cli.printing import print_quality
+    from mgs.cli.progress import progress_bar
     from mgs.report.evaluation import evaluate_run
     from mgs.report.tables import table_numbers
 
     runtime.start()
     said: list[str] = []
-    with Progress(transient=True) as bar:
-        task = bar.add_task("rendering and comparing", total=None)
+    with progress_bar() as bar:
         evaluate_run(
             run,
             pictures=pictures,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            progress=partial(bar, "rendering and comparing"),
             say=said.append,
         )
-    print_table(Console(), table_numbers([run]))
+    print_quality(Console(), table_numbers([run]))
     typer.echo("\n".join(said))

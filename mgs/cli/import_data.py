@@ -79,10 +79,11 @@ def import_data(
     from rich.console import Console
     from rich.progress import Progress
 
-    from mgs.cli.printing import parse_up
+    from mgs.cli.options import parse_up
     from mgs.data.dataset import TEST_FOLDER
-    from mgs.data.importers import import_source, read_source
+    from mgs.data.importers import import_source
     from mgs.data.meshes import GLTF
+    from mgs.data.sources import read_source
     from mgs.errors import InputError
     from mgs.images import exif_exposure
 

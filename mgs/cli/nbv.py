@@ -191,7 +191,7 @@ def nbv(
     """
     from rich.console import Console
 
-    from mgs.cli.printing import parse_gaussians
+    from mgs.cli.options import parse_gaussians
     from mgs.errors import InputError
 
     console = Console(highlight=False)

@@ -108,7 +108,7 @@ def prior(
     """
     from rich.console import Console
 
-    from mgs.cli.printing import parse_gaussians, parse_up
+    from mgs.cli.options import parse_gaussians, parse_up
     from mgs.data.dataset import load_dataset
     from mgs.data.meshes import GLTF
     from mgs.errors import InputError
@@ -277,13 +277,13 @@ def _reason(numbers: dict[str, Any]) -> str:
 
 def _up(numbers: dict[str, Any]) -> str:
     """Which way is up, and how far the ground plane's normal is from it where there is a plane."""
-    from mgs.data.up import angle_between, unit_up
+    from mgs.data.up import degrees_between, unit_up
 
     up = unit_up(numbers["up"])
     text = f"({', '.join(f'{value:.3g}' for value in up)})"
     if "plane_normal" not in numbers:
         return text
-    return f"{text}; the ground plane's normal is {angle_between(up, unit_up(numbers['plane_normal'])):.1f}° from it"
+    return f"{text}; the ground plane's normal is {degrees_between(up, unit_up(numbers['plane_normal'])):.1f}° from it"
 
 
 def _add_cloud_rows(table: Any, numbers: dict[str, Any], length: Callable[[float], str]) -> None:

@@ -29,12 +29,13 @@ def prune(
     from rich.console import Console
 
     from mgs import runtime
+    from mgs.cli.progress import progress_bar
     from mgs.report.pruning import PRUNED, prune_run
 
     runtime.start()
     console = Console(highlight=False)
-    with console.status("reading") as status:
-        found = prune_run(run, noise, status.update)
+    with progress_bar() as bar:
+        found = prune_run(run, noise, bar)
     share = 1 - found.after / found.before
     console.print(f"{found.before:,} Gaussians, {found.after:,} stay: {share:.0%} are left out")
     console.print(

@@ -45,12 +45,13 @@ def refit(
     from rich.console import Console
 
     from mgs import runtime
+    from mgs.cli.progress import progress_bar
     from mgs.report.refitting import REFITTED, refit_run
 
     runtime.start()
     console, asked = Console(highlight=False), {"learn": learn, "sh": sh, "loss": loss}
-    with console.status("reading") as status:
-        found = refit_run(run, say=status.update, **asked)  # type: ignore[arg-type]
+    with progress_bar() as bar:
+        found = refit_run(run, say=bar, **asked)  # type: ignore[arg-type]
     for line in lines(found):
         console.print(line, soft_wrap=True)
     console.print(f"wrote {run / REFITTED}", soft_wrap=True)

@@ -64,9 +64,10 @@ def render(
 
     Writes one PNG for each camera, with the name of the camera's image.
     """
-    from rich.progress import Progress
+    from functools import partial
 
     from mgs import runtime
+    from mgs.cli.progress import progress_bar
     from mgs.data.dataset import load_cameras
     from mgs.errors import InputError
     from mgs.files import new_folder
@@ -84,8 +85,7 @@ def render(
     space = ply_colour_space(splats) if colour_space is ColourSpace.auto else colour_space.value
     new_folder(out)
     runtime.start()
-    with Progress(transient=True) as bar:
-        task = bar.add_task("rendering", total=len(views))
+    with progress_bar() as bar:
         draw_views(
             out,
             gaussians,
@@ -93,7 +93,7 @@ def render(
             space,
             background,
             exr,
-            progress=lambda done, total: bar.update(task, completed=done),
+            progress=partial(bar, "rendering"),
         )
     degree = f"SH degree {gaussians.sh_degree}, colours in {'linear RGB' if space == 'linear' else 'sRGB'}"
     typer.echo(f"wrote {len(views)} views of {len(gaussians):,} Gaussians ({degree}) to {out}")

@@ -63,18 +63,19 @@ def _write_figures(runs: list[Path], out: Path, kind: str) -> None:
     """Write the figures and the table, print the table, and say what was left out."""
     from rich.console import Console
 
-    from mgs.cli.printing import print_table
+    from mgs.cli.printing import print_quality
     from mgs.files import check_writable
-    from mgs.report.runs import labelled_runs
-    from mgs.report.tables import table_numbers
+    from mgs.report.runs import compare_runs
+    from mgs.report.tables import comparison_rows
     from mgs.report.writing import write_report
     from mgs.run.ending import why_ended
 
     check_writable(out / "table.md")  # before the figures are drawn, not after it
-    written = write_report(out, runs, kind)
-    rows = table_numbers(runs)
-    print_table(Console(), rows)
-    for row, run in zip(rows, labelled_runs(runs).values(), strict=True):
+    compared = compare_runs(runs)
+    written = write_report(out, compared, kind)
+    rows = comparison_rows(compared)
+    print_quality(Console(), rows)
+    for row, run in zip(rows, compared.runs.values(), strict=True):
         if run.ended:
             length = f"{row['path']:.2f} {row['unit']}"
             typer.echo(
@@ -90,15 +91,13 @@ def _write_figures(runs: list[Path], out: Path, kind: str) -> None:
 
 def _write_page(runs: list[Path], html: Path) -> None:
     """Write the page, with a progress bar, and print its size."""
-    from rich.progress import Progress
+    from functools import partial
 
     from mgs import runtime
+    from mgs.cli.progress import progress_bar
     from mgs.report.page import write_page
 
     runtime.start()
-    with Progress(transient=True) as bar:
-        task = bar.add_task("drawing", total=None)
-        size = write_page(
-            html, runs, progress=lambda done, total: bar.update(task, completed=done, total=total)
-        )
+    with progress_bar() as bar:
+        size = write_page(html, runs, progress=partial(bar, "drawing"))
     typer.echo(f"wrote {html} ({size / 1e6:.1f} MB)")

@@ -1,2 +1,1 @@
-"""Datasets on disk: reading, checking and importing them; meshes; and which points a camera
-sees."""
+"""Datasets on disk: reading, checking and importing them; meshes; and visibility of points."""

@@ -1,4 +1,4 @@
-"""COLMAP's sparse models, text or binary, read by pycolmap."""
+"""COLMAP sparse models, text or binary, read by pycolmap."""
 
 from __future__ import annotations
 
@@ -11,19 +11,18 @@ from mgs.camera import Camera
 from mgs.data.clouds import SparseCloud
 from mgs.errors import InputError
 
+OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""Coefficients of OpenCV's rational distortion model, in its order."""
+
 MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": (),
     "PINHOLE": (),
     "SIMPLE_RADIAL": ("k1",),
     "RADIAL": ("k1", "k2"),
     "OPENCV": ("k1", "k2", "p1", "p2"),
-    "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "FULL_OPENCV": OPENCV_ORDER,
 }
-"""Distortion coefficients of each of COLMAP's camera models, in the order in which they follow
-focal lengths and principal point in COLMAP's list of parameters."""
-
-OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-"""Coefficients of OpenCV's rational model, in OpenCV's order."""
+"""COLMAP camera model -> its distortion coefficients, the last entries of its parameters."""
 
 
 def is_model(folder: Path) -> bool:
@@ -35,17 +34,16 @@ def is_model(folder: Path) -> bool:
 
 
 def read_model(model: Path) -> tuple[list[tuple[str, Camera, np.ndarray]], SparseCloud | None]:
-    """The images of a model, in the order of their names, and its points: ([(name, camera,
-    distortion)], cloud).
+    """Images of a model, sorted by name, and its points: ([(name, camera, distortion)], cloud).
 
-    distortion: eight coefficients in OpenCV's order. Raises InputError where the model is damaged,
-    or a lens is not supported.
+    distortion: eight coefficients in OPENCV_ORDER. Raises InputError if the model is damaged or a
+    lens is not supported.
     """
     import pycolmap
 
     try:
         reconstruction = pycolmap.Reconstruction(model)
-    except Exception as error:  # pycolmap raises many types; each means a damaged model.
+    except Exception as error:  # pycolmap raises many types for damaged models
         reason = " ".join(str(error).split())[:120]
         raise InputError(
             f"{model}: not a readable COLMAP model ({reason}); export it again"
@@ -56,21 +54,20 @@ def read_model(model: Path) -> tuple[list[tuple[str, Camera, np.ndarray]], Spars
         keys = MODELS.get(lens.model_name)
         if keys is None:
             raise InputError(
-                f"{model}: camera model {lens.model_name} is not supported; run COLMAP's image_undistorter first"
+                f"{model}: camera model {lens.model_name} is not supported; "
+                "run COLMAP's image_undistorter first"
             )
         pose = np.eye(4)
         pose[:3] = image.cam_from_world().matrix()
         camera = Camera(lens.calibration_matrix(), lens.width, lens.height, pose)
         values = dict(zip(keys, lens.params[len(lens.params) - len(keys) :], strict=True))
-        images.append(
-            (image.name, camera, np.array([values.get(key, 0.0) for key in OPENCV_ORDER]))
-        )
+        distortion = np.array([values.get(key, 0.0) for key in OPENCV_ORDER])
+        images.append((image.name, camera, distortion))
     return images, _cloud(reconstruction)
 
 
 def _cloud(reconstruction: Any) -> SparseCloud | None:
-    """The triangulated points that some image saw. A reprojection error of -1 is COLMAP's word for
-    unknown."""
+    """Triangulated points that some image saw. COLMAP writes -1 for an unknown error."""
     centres = {
         image.image_id: image.projection_center() for image in reconstruction.images.values()
     }
@@ -81,15 +78,11 @@ def _cloud(reconstruction: Any) -> SparseCloud | None:
             rays = np.stack([centres[image] for image in seen]) - point.xyz
             points.append(point.xyz)
             views.append((rays / np.linalg.norm(rays, axis=1, keepdims=True)).mean(0))
-            tracks.append(len(seen))
+            tracks.append(float(len(seen)))
             errors.append(point.error)
     if not points:
         return None
-    directions, known = np.stack(views), np.array(errors)
+    directions, error = np.stack(views), np.array(errors)
     directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
-    return SparseCloud(
-        np.stack(points),
-        directions,
-        np.array(tracks, np.float64),
-        known if (known >= 0).all() else None,
-    )
+    known = error if (error >= 0).all() else None
+    return SparseCloud(np.stack(points), directions, np.array(tracks), known)

@@ -1,4 +1,4 @@
-"""Triangle meshes and point clouds on disk, and distances to a mesh."""
+"""Triangle meshes on disk, and distances to a mesh."""
 
 from __future__ import annotations
 
@@ -7,47 +7,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from plyfile import PlyData, PlyElement
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from mgs.errors import InputError
-from mgs.files import atomic_path, reading
+from mgs.files import reading
 from mgs.rotation import WORLD_FROM_GLTF
 
 if TYPE_CHECKING:
     import trimesh
 
-
-def write_points(path: str | Path, points: np.ndarray, normals: np.ndarray) -> None:
-    """Write points and normals [N,3] as a binary PLY (x y z nx ny nz, float32), atomically."""
-    columns = np.concatenate([points, normals], 1).astype(np.float32)
-    vertices = np.empty(
-        len(columns), dtype=[(name, "f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
-    )
-    for k, name in enumerate(vertices.dtype.names or ()):
-        vertices[name] = columns[:, k]
-    with atomic_path(path) as temporary:
-        PlyData([PlyElement.describe(vertices, "vertex")]).write(str(temporary))
-
-
 GLTF = (".glb", ".gltf")
 
-GLTF_UP = "+Y"
-"""Value of `up` in the extras of the mesh in GLB files that `to_glb` makes."""
-
 FURTHEST = 1e15
-"""Largest coordinate of a mesh, metres. Areas are squared, and with larger coordinates these
-squares would not fit float32."""
+"""Largest coordinate of a mesh, metres: the squares of areas must fit float32."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh: vertices [V,3] world, metres; faces [F,3], indices of their vertices; seen
-    [F] bool.
+    """A triangle mesh: vertices [V,3] world, metres; faces [F,3] vertex indices; seen [F] bool.
 
-    `seen` marks the faces that a survey saw. Only these are sampled: a reconstruction also closes
-    holes that nobody has seen.
+    seen: faces that a survey saw. Only these are sampled; the others close holes of the
+    reconstruction.
     """
 
     vertices: np.ndarray
@@ -55,15 +36,19 @@ class Mesh:
     seen: np.ndarray
 
     @property
+    def crosses(self) -> np.ndarray:
+        """[F,3] face normals, of length twice the area."""
+        return face_crosses(self.vertices, self.faces)
+
+    @property
     def areas(self) -> np.ndarray:
         """[F] square metres."""
-        return np.linalg.norm(_crosses(self.vertices, self.faces), axis=1) / 2
+        return np.linalg.norm(self.crosses, axis=1) / 2
 
     @property
     def vertex_normals(self) -> np.ndarray:
-        """[V,3] unit normals: the mean over the seen faces around a vertex, weighted by area; zero
-        where there is none."""
-        cross = _crosses(self.vertices, self.faces) * self.seen[:, None]
+        """[V,3] unit normals: area-weighted mean over the seen faces at a vertex; zero if none."""
+        cross = self.crosses * self.seen[:, None]
         normals = np.zeros_like(self.vertices)
         for k in range(3):
             np.add.at(normals, self.faces[:, k], cross)
@@ -71,9 +56,8 @@ class Mesh:
         return normals / np.where(norm > 0, norm, 1.0)
 
 
-def _crosses(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[F,3] vectors along the normals of the faces; the length of each is twice the area of its
-    face."""
+def face_crosses(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[F,3] normals of faces [F,3], of length twice the area."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return np.cross(b - a, c - a)
 
@@ -81,9 +65,8 @@ def _crosses(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def load_mesh(path: str | Path) -> trimesh.Trimesh:
     """Read a triangle mesh (GLB, OBJ, PLY ...) with its texture, in the axes and units of its file.
 
-    Raises InputError where the file is missing or unreadable, where the mesh has no faces or no
-    area, and where a vertex is NaN, infinite or beyond FURTHEST, or a face names a vertex that does
-    not exist.
+    Raises InputError if the file is missing or unreadable, the mesh has no faces or no area, a
+    vertex is NaN, infinite or beyond FURTHEST, or a face names a vertex that does not exist.
     """
     import trimesh
 
@@ -93,16 +76,12 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     try:
         mesh: Any = trimesh.load(path, process=False) if path.suffix.lower() in GLTF else None
         parts = list(mesh.graph.nodes_geometry) if isinstance(mesh, trimesh.Scene) else []
-        if len(parts) == 1:
+        if len(parts) == 1:  # force="mesh" below would lose the file's normals
             transform, name = mesh.graph[parts[0]]
-            mesh = mesh.geometry[name].apply_transform(
-                transform
-            )  # force="mesh" below would lose the file's normals
+            mesh = mesh.geometry[name].apply_transform(transform)
         else:
             mesh = trimesh.load(path, force="mesh", process=False)
-    except (
-        Exception
-    ) as error:  # trimesh's readers raise many types; each means a damaged or unknown file.
+    except Exception as error:  # trimesh raises many types for damaged or unknown files
         reason = " ".join(str(error).split())[:120]
         raise InputError(
             f"{path}: not a readable mesh ({reason}); export it again as GLB, OBJ or PLY"
@@ -115,54 +94,28 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     absent = (mesh.faces < 0) | (mesh.faces >= len(mesh.vertices))
     if absent.any():
         face, corner = np.argwhere(absent)[0]
-        raise InputError(
-            f"{path}: face {face} names vertex {mesh.faces[face, corner]} of {len(mesh.vertices)}; repair the mesh"
-        )
+        named = f"vertex {mesh.faces[face, corner]} of {len(mesh.vertices)}"
+        raise InputError(f"{path}: face {face} names {named}; repair the mesh")
     if np.abs(mesh.vertices).max() > FURTHEST:
         raise InputError(
-            f"{path}: has vertices further than {FURTHEST:g} m from the origin; repair or scale the mesh"
+            f"{path}: has vertices further than {FURTHEST:g} m from the origin; "
+            "repair or scale the mesh"
         )
-    if not _crosses(np.asarray(mesh.vertices, np.float64), mesh.faces).any():
+    if not face_crosses(np.asarray(mesh.vertices, np.float64), mesh.faces).any():
         raise InputError(f"{path}: none of its faces has an area; repair the mesh")
     return mesh
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """Read a triangle mesh in world coordinates, metres, and make it one clean surface; all of it
-    counts as seen.
+    """Read a triangle mesh in world coordinates, metres, as one clean surface, all of it seen.
 
-    glTF and GLB files are +Y up by their format, and are turned to +Z up; other formats have no
-    rule, and are taken as they are. Faces without area, repeated faces and vertices without a face
-    are left out. A face whose corners run the other way round than those of its neighbours is
-    turned over, and so are all faces where the mesh is inside out. Raises InputError as
-    `load_mesh`.
-    """
-    return _in_world(load_mesh(path), Path(path).suffix.lower() in GLTF)
-
-
-def read_rock(path: str | Path) -> Mesh:
-    """Read the true rock of a dataset, `rock.glb`, as `read_mesh` does.
-
-    A file without the mark of `to_glb` was written by an older version of mgs, and is +Z up.
+    glTF and GLB are +Y up by their format and turned to +Z up; other formats have no rule and are
+    taken as they are. Faces without area, repeated faces and unused vertices are removed. Faces are
+    wound as their neighbours, and outwards. Raises InputError as `load_mesh`.
     """
     mesh = load_mesh(path)
-    return _in_world(mesh, mesh.metadata.get("up") == GLTF_UP)
-
-
-def to_glb(mesh: trimesh.Trimesh) -> bytes:
-    """The bytes of a GLB file of a mesh in world coordinates, with normals and texture, turned to
-    +Y up and marked GLTF_UP."""
-    turned: Any = mesh.copy(include_cache=True)  # the cache holds the vertex normals
-    turned.apply_transform(WORLD_FROM_GLTF.T)
-    turned.metadata["up"] = GLTF_UP
-    return turned.export(None, file_type="glb", include_normals=True)
-
-
-def _in_world(mesh: trimesh.Trimesh, y_up: bool) -> Mesh:
-    """A mesh in world coordinates, cleaned as `read_mesh` says; y_up: whether the given mesh is +Y
-    up."""
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    if y_up:
+    if Path(path).suffix.lower() in GLTF:
         vertices = vertices @ WORLD_FROM_GLTF[:3, :3].T
     faces = faces[distinct_faces(vertices, faces)]
     place = _places(vertices)
@@ -174,32 +127,34 @@ def _in_world(mesh: trimesh.Trimesh, y_up: bool) -> Mesh:
     return Mesh(vertices, faces[:, ::-1] if inside_out else faces, np.ones(len(faces), bool))
 
 
+def to_glb(mesh: trimesh.Trimesh) -> bytes:
+    """GLB file of a mesh in world coordinates, with normals and texture, turned to +Y up."""
+    turned: Any = mesh.copy(include_cache=True)  # the cache holds the vertex normals
+    turned.apply_transform(WORLD_FROM_GLTF.T)
+    return turned.export(None, file_type="glb", include_normals=True)
+
+
 def distinct_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Which faces [F,3] to keep: indices, ascending, of those with an area, and of faces at the
-    same three places, whichever
-    way round, only the first. vertices: [V,3]."""
-    kept = np.flatnonzero(np.linalg.norm(_crosses(vertices, faces), axis=1) > 0)
+    """Ascending indices of faces [F,3] that have an area; of faces with the same corners, whichever
+    way round, the first."""
+    kept = np.flatnonzero(np.linalg.norm(face_crosses(vertices, faces), axis=1) > 0)
     corners = np.sort(_places(vertices)[faces[kept]], axis=1)
     return kept[np.sort(np.unique(corners, axis=0, return_index=True)[1])]
 
 
 def _places(vertices: np.ndarray) -> np.ndarray:
-    """[V] a number for each vertex; vertices at the same place have the same number. 0.0 and -0.0
-    are the same coordinate."""
+    """[V] number of each vertex's place. 0.0 and -0.0 are the same coordinate."""
     return np.unique(vertices + 0.0, axis=0, return_inverse=True)[1].ravel()
 
 
 def _wound_against(faces: np.ndarray) -> np.ndarray:
-    """Which of the faces [F,3] to turn over so that neighbours are wound alike, bool [F]; of each
-    connected piece, the fewer.
+    """Which faces [F,3] to flip so that neighbours are wound alike, bool [F]: of each connected
+    piece, the fewer.
 
-    A face is wound clockwise or counter-clockwise: the order of its corners. Neighbours are two
-    faces that share an edge which no third face has. They are wound alike where their corners
-    follow that edge in opposite directions.
-    Method: a graph has two nodes for each face, f for "keep" and F + f for "turn over". An edge of
-    the graph joins two nodes of neighbours that go together. The connected components then say what
-    goes with what. A piece that has only one side (a Moebius strip) cannot be wound alike, and is
-    left as it is.
+    Neighbours share an edge with no third face, and are wound alike if they traverse it in opposite
+    directions. Method: a graph with nodes f ("keep") and F + f ("flip"), and an edge between nodes
+    of neighbours that go together; its connected components decide. One-sided pieces (Moebius
+    strips) are left as they are.
     """
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     forward = edges[:, 0] < edges[:, 1]
@@ -213,15 +168,12 @@ def _wound_against(faces: np.ndarray) -> np.ndarray:
     n, first, second = len(faces), first // 3, second // 3
     if not against.any():
         return np.zeros(n, bool)
-    ends = (
-        np.concatenate([first, first + n]),
-        np.concatenate([second + n * against, second + n * ~against]),
-    )
-    label = connected_components(
-        coo_array((np.ones(len(ends[0]), bool), ends), shape=(2 * n, 2 * n)), directed=False
-    )[1]
-    turned, piece = label[:n] > label[n:], np.minimum(label[:n], label[n:])
-    return turned ^ (np.bincount(piece, turned) > np.bincount(piece) / 2)[piece]
+    starts = np.concatenate([first, first + n])
+    ends = np.concatenate([second + n * against, second + n * ~against])
+    graph = coo_array((np.ones(len(starts), bool), (starts, ends)), shape=(2 * n, 2 * n))
+    label = connected_components(graph, directed=False)[1]
+    flipped, piece = label[:n] > label[n:], np.minimum(label[:n], label[n:])
+    return flipped ^ (np.bincount(piece, flipped) > np.bincount(piece) / 2)[piece]
 
 
 def distances_to_mesh(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -18,16 +18,13 @@ if TYPE_CHECKING:
 
 
 def mesh_depth(mesh: Mesh) -> Callable[[Camera], np.ndarray]:
-    """A function that gives the z-depth of the mesh in a camera: float32 [H,W], metres, 0 where no
-    face is met.
+    """Return depth(camera): z-depth of the mesh, float32 [H,W], metres, 0 where no face is hit.
 
-    One ray is cast through the centre of each pixel; it meets a face from either side.
-    Raises InputError where no variant can be started (`mgs.runtime.start`).
+    One ray through each pixel centre, which meets faces from either side. Raises InputError if no
+    variant can be started (`mgs.runtime.start`).
     """
     runtime.start()
-    centre = mesh.vertices.mean(
-        0
-    )  # rays are cast in coordinates around it: float32 is finest near the origin
+    centre = mesh.vertices.mean(0)  # rays are cast around it: float32 is finest near the origin
     shape = mi.Mesh("mesh", len(mesh.vertices), len(mesh.faces))
     params = mi.traverse(shape)
     params["vertex_positions"] = mi.Float(padded(mesh.vertices - centre).ravel())
@@ -38,15 +35,12 @@ def mesh_depth(mesh: Mesh) -> Callable[[Camera], np.ndarray]:
     def depth(camera: Camera) -> np.ndarray:
         rays = mi.Matrix3f(camera.camera_to_world[:3, :3] @ np.linalg.inv(camera.K))
         origin = mi.Point3f(*(camera.position - centre).tolist())
-        dr.make_opaque(
-            rays, origin
-        )  # a number that the compiler knows would cost a new kernel for every camera
+        dr.make_opaque(rays, origin)  # literals would compile a new kernel for every camera
         pixel = dr.arange(mi.UInt32, camera.width * camera.height)
         row = pixel // camera.width
         column = pixel - row * camera.width
-        direction = rays @ mi.Vector3f(
-            mi.Float(column) + 0.5, mi.Float(row) + 0.5, 1
-        )  # of z-depth 1, so t is z-depth
+        # Directions have z-depth 1, so t is z-depth.
+        direction = rays @ mi.Vector3f(mi.Float(column) + 0.5, mi.Float(row) + 0.5, 1)
         hit = scene.ray_intersect_preliminary(mi.Ray3f(origin, direction))
         return dr.select(hit.is_valid(), hit.t, 0).numpy().reshape(camera.height, camera.width)
 

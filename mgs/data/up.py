@@ -1,5 +1,4 @@
-"""Which way is up in a world that nobody levelled: the cameras tell it, because people hold them
-level."""
+"""The upward direction of a world that nobody levelled, estimated from cameras held level."""
 
 from __future__ import annotations
 
@@ -11,24 +10,22 @@ from mgs.camera import Camera
 from mgs.errors import InputError
 
 Up = tuple[float, float, float]
-"""A unit vector in the world that points upwards."""
+"""Unit vector in the world that points upwards."""
 
 PLUS_Z: Up = (0.0, 0.0, 1.0)
 
 LEVEL = 0.1
-"""Least second singular value of the cameras' right-hand axes, over the square root of their
-number. With less the cameras look the same way, and a direction across all of these axes is not
-unique; then the mean of their upward axes is taken."""
+"""Least second singular value of the cameras' right-hand axes over the square root of their number.
+Below it the cameras look the same way, the direction across their axes is not unique, and the mean
+of their upward axes is taken."""
 
 
 def up_of_cameras(cameras: Sequence[Camera]) -> Up:
-    """The common up vector of cameras: the direction most nearly at right angles to the right-hand
-    axes of all of them.
+    """Common up vector of cameras: the direction most nearly orthogonal to all right-hand axes.
 
-    A camera that is held level has a horizontal right-hand axis, however steeply it looks down. So
-    this direction is the last right singular vector of the stacked axes, on the side of the
-    cameras' own upward axes. Raises InputError where these axes cancel, so that there is no such
-    side.
+    A level camera has a horizontal right-hand axis, however steeply it looks down. The result is
+    the last right singular vector of the stacked axes, on the side of the cameras' upward axes.
+    Raises InputError if these cancel.
     """
     right = np.stack([camera.world_to_camera[0, :3] for camera in cameras])
     upward = -np.stack([camera.world_to_camera[1, :3] for camera in cameras]).mean(0)
@@ -43,8 +40,8 @@ def up_of_cameras(cameras: Sequence[Camera]) -> Up:
 
 
 def unit_up(vector: Sequence[float] | np.ndarray) -> Up:
-    """A vector of length 1 in the direction of the one given. Raises InputError if that is not
-    finite or zero, or not of three numbers."""
+    """The vector scaled to length 1. Raises InputError unless it is three finite numbers, not all
+    0."""
     try:
         given = np.asarray(vector, np.float64)
     except (TypeError, ValueError):
@@ -52,25 +49,23 @@ def unit_up(vector: Sequence[float] | np.ndarray) -> Up:
     length = np.linalg.norm(given)
     if given.shape != (3,) or not np.isfinite(given).all() or length == 0:
         raise InputError(
-            "up: must be three finite numbers that are not all zero; correct --up, or `up` of transforms.json"
+            "up: must be three finite numbers that are not all zero; "
+            "correct --up, or `up` of transforms.json"
         )
     x, y, z = (given / length + 0.0).tolist()
     return x, y, z
 
 
 def upright(up: Up) -> np.ndarray:
-    """The rotation [3,3] that turns the direction `up` to +Z by the shortest way; exactly the
-    identity for +Z."""
+    """Shortest rotation [3,3] that turns `up` to +Z; exactly the identity for +Z."""
     x, y, z = up
-    if (
-        z < -1 + 1e-12
-    ):  # there is no one shortest way: half a turn about x first, and what is then left
+    if z < -1 + 1e-12:  # the shortest rotation is not unique: turn by half about x first
         half_turn = np.diag([1.0, -1.0, -1.0])
         return np.asarray(upright((x, -y, -z)) @ half_turn)
     across = np.array([[x * x, x * y, 0.0], [x * y, y * y, 0.0], [0.0, 0.0, 0.0]]) / (1 + z)
     return np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [x, y, z]]) - across
 
 
-def angle_between(a: Up, b: Up) -> float:
+def degrees_between(a: Up, b: Up) -> float:
     """Angle between two directions, degrees."""
     return float(np.degrees(np.arccos(np.clip(np.dot(a, b), -1, 1))))

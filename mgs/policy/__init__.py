@@ -1,1 +1,1 @@
-"""What a view is worth: criteria, pose rules, and the registry of policies."""
+"""Score candidate views: criteria, pose rules, and the registry of policies."""

@@ -1,5 +1,4 @@
-"""What a policy may look at when a view is chosen: poses, information and surface, each measured
-when it is asked for."""
+"""`PolicyContext`: the data that a policy may use to score candidate views."""
 
 from __future__ import annotations
 
@@ -13,38 +12,37 @@ from mgs.policy.criteria import Array
 from mgs.policy.directional import Views
 
 Gains = Callable[[Sequence[int], Sequence[int], int, float, bool], NDArray[np.float64]]
-"""(views taken, candidates, degree, tau, whether over a dome) -> the gain of each candidate [C] by
-directional I-optimality, or without a dome D-optimality (`mgs.policy.directional`)."""
+"""(frames taken, candidate frames, SH degree, tau, over_dome) -> gain of each candidate [C]:
+directional I-optimality if over_dome, else D-optimality (`mgs.policy.directional`)."""
 
 
 @dataclass(frozen=True)
 class PolicyContext:
-    """What is known when a view is chosen: nothing of it from a candidate's image. Views are meant
-    by the index of their frame.
+    """What is known when a view is chosen. Candidates' images are not part of it.
 
-    positions: [V,3] camera centres of all frames, metres; like `centre` and `points`, in
-    coordinates in which +Z is up.
-    left: the candidates. visited: the views taken, in their order, then those chosen before in the
-    same batch: no image of these was read, but they count as taken, and what they would say about
-    the present model is in H and surface_H.
-    centre: [3] the middle of the rock. rng: new in each step, drawn from the run's seed.
-    H, lam: [M,P] information of the views taken about the model fitted so far, and [P] lambda, of
-    the run.
-    points: [N,3] the Gaussians on the prior's surface, before training. surface_H, prior_lam: the
-    same as H and lam for these.
-    information(view), surface_information(view): what one view adds to H, and to surface_H.
-    estimate(view, estimator): the information of one view about the fitted model, by any row of
-    `mgs.splat.ESTIMATORS`.
-    seen(view): [N] squared blending weights of the surface in one view
-    (`mgs.policy.directional.squared_weights`).
-    dome(): a dome of poses around the rock, and what they see of the surface.
-    gains(visited, left, degree, tau, over_dome): directional gains of candidates (`Gains`), fast
-    where `visited` only grows.
+    Views are given by the index of their frame. Positions are in metres, with +Z up. In a batch,
+    the views chosen before count as taken: H and surface_H include their information.
+
+    positions: camera centres of all frames [V,3].
+    candidate_frames: frames to score.
+    taken_frames: frames taken, in order.
+    centre: middle of the rock [3].
+    rng: random generator, new in each step, derived from the run's seed.
+    H: information of the views taken, about the model fitted so far [M,P].
+    lam: lambda of the run [P].
+    points: means of the Gaussians on the prior's surface, before training [N,3].
+    surface_H, prior_lam: H and lam for these Gaussians.
+    information(frame), surface_information(frame): contribution of one view to H, to surface_H.
+    estimate(frame, estimator): information of one view by a row of `mgs.splat.ESTIMATORS`.
+    seen(frame): squared blending weights of the surface's Gaussians in one view [N]
+        (`mgs.policy.directional.squared_weights`).
+    dome(): poses on a dome around the rock, and what they see of the surface.
+    gains: directional gains of candidates (`Gains`). Fast while views are only added.
     """
 
     positions: Array
-    left: list[int]
-    visited: list[int]
+    candidate_frames: list[int]
+    taken_frames: list[int]
     centre: Array
     rng: np.random.Generator
     H: Array
@@ -61,13 +59,13 @@ class PolicyContext:
 
     @property
     def candidates(self) -> Array:
-        """[C,3] positions of the candidates, metres."""
-        return self.positions[self.left]
+        """Camera centres of the candidates [C,3], metres."""
+        return self.positions[self.candidate_frames]
 
     @property
     def taken(self) -> Array:
-        """[T,3] positions of the views taken, in the order in which they were taken, metres."""
-        return self.positions[self.visited]
+        """Camera centres of the views taken [T,3], in order, metres."""
+        return self.positions[self.taken_frames]
 
     def views(self, frames: list[int]) -> Views:
         """Poses of some frames, and what they see of the surface."""
@@ -75,4 +73,4 @@ class PolicyContext:
 
 
 Policy = Callable[[PolicyContext], Array]
-"""(context) -> score of each candidate [C], in the order of `left`."""
+"""(context) -> score of each candidate [C], in the order of `candidate_frames`."""

@@ -1,12 +1,13 @@
-"""A policy in a file of the user's own, FILE.py:FUNCTION. The function is told what its parameters
-are named after."""
+"""Load a policy from a user's file, named FILE.py:FUNCTION."""
 
 from __future__ import annotations
 
+import ast
 import inspect
 import sys
 import traceback
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 from mgs.errors import InputError
 from mgs.policy.context import Policy, PolicyContext
 
-TOLD: dict[str, Callable[[PolicyContext], Any]] = {
+CONTEXT_ARGUMENTS: dict[str, Callable[[PolicyContext], Any]] = {
     "context": lambda context: context,
     "candidates": lambda context: context.candidates,
     "taken": lambda context: context.taken,
@@ -25,30 +26,29 @@ TOLD: dict[str, Callable[[PolicyContext], Any]] = {
     "points": lambda context: context.points,
     "surface_H": lambda context: context.surface_H,
     "prior_lam": lambda context: context.prior_lam,
-    "seen": lambda context: context.views(context.left).seen,
-    "seen_taken": lambda context: context.views(context.visited).seen,
+    "seen": lambda context: context.views(context.candidate_frames).seen,
+    "seen_taken": lambda context: context.views(context.taken_frames).seen,
 }
-"""What a parameter of each name is given, once in a step (`PolicyContext` says what these are).
-seen, seen_taken: [C,N] and [T,N] squared blending weights of the surface's Gaussians in the
-candidates and in the views taken."""
+"""Arguments that are the same for all candidates of a step, by parameter name. seen, seen_taken:
+squared blending weights of the surface's Gaussians in the candidates [C,N] and in the views taken
+[T,N]. For the others see `PolicyContext`."""
 
-EACH: dict[str, Callable[[PolicyContext, int], Any]] = {
-    "F": lambda context, view: context.information(view),
-    "surface_F": lambda context, view: context.surface_information(view),
-    "candidate": lambda context, view: context.positions[view],
+CANDIDATE_ARGUMENTS: dict[str, Callable[[PolicyContext, int], Any]] = {
+    "F": lambda context, frame: context.information(frame),
+    "surface_F": lambda context, frame: context.surface_information(frame),
+    "candidate": lambda context, frame: context.positions[frame],
 }
-"""The same for what differs from one candidate to the next: its information, as H and as surface_H,
-and its position [3]."""
+"""Arguments of one candidate, by parameter name: its information about the model and about the
+surface, and its camera centre [3]."""
 
 
 def in_file(name: str) -> bool:
-    """Whether the name of a policy is of the form FILE.py:FUNCTION."""
+    """Whether the name of a policy has the form FILE.py:FUNCTION."""
     return ".py:" in name
 
 
 def absolute(name: str) -> str:
-    """The name of a policy, with the whole path where it is in a file, so that it holds in any
-    folder."""
+    """The name of a policy, with the absolute path of its file if it has one."""
     return str(Path(name).resolve()) if in_file(name) else name
 
 
@@ -62,56 +62,97 @@ def file_of(name: str) -> Path:
     return Path(name.rpartition(":")[0])
 
 
-def load(name: str) -> Policy:
-    """The policy FILE.py:FUNCTION.
+def check(name: str) -> None:
+    """Raise InputError if the file is missing, has a syntax error, or defines no such function.
 
-    A function with a parameter that is named in EACH is called for every candidate, and returns its
-    score; any other is called once in a step, and returns the scores [C] of all candidates. Raises
-    InputError where the file is missing or fails to run, where it has no such function, and where a
-    parameter is none of those known.
+    The file is parsed but not executed, so an error of its execution is raised by `load` only.
     """
     path, function = file_of(name), name.rpartition(":")[2]
-    if not path.is_file():
-        raise InputError(
-            f"--policy {name}: no such file {path}; correct the path (of a run, `policy` in its config.json)"
-        )
-    module = ModuleType(f"policy {path.resolve()}")
-    sys.modules[module.__name__] = (
-        module  # where a dataclass looks for the names in its annotations
-    )
     try:
-        exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)
+        tree = ast.parse(_source(name))
+    except (SyntaxError, ValueError) as error:
+        raise InputError(f"--policy {name}: {_failed(path, error)}") from error
+    if not {function, "*"} & set(_names_bound(tree)):
+        raise _no_function(name)
+
+
+def load(name: str) -> Policy:
+    """The policy FILE.py:FUNCTION. A file is executed once per process, unless it changes.
+
+    A function with a parameter of CANDIDATE_ARGUMENTS is called once per candidate and returns its
+    score. Any other is called once per step and returns the scores of all candidates [C].
+
+    Raises InputError if the file is missing or fails, has no such function, or the function has an
+    unknown parameter.
+    """
+    path, source = file_of(name), _source(name)
+    try:
+        module = _executed(path, source)
     except Exception as error:
         raise InputError(f"--policy {name}: {_failed(path, error)}") from error
-    found = getattr(module, function, None)
-    if not callable(found):
-        raise InputError(
-            f"--policy {name}: {path} has no function {function}; give the name of one that it has"
-        )
-    return _asking(name, path, found)
+    function = getattr(module, name.rpartition(":")[2], None)
+    if not callable(function):
+        raise _no_function(name)
+    return _by_parameter_name(name, path, function)
 
 
-def _asking(name: str, path: Path, function: Callable[..., Any]) -> Policy:
-    """A function as a policy that gives it what its parameters are named after."""
-    names = list(inspect.signature(function).parameters)
-    unknown = [parameter for parameter in names if parameter not in TOLD and parameter not in EACH]
-    if unknown:
-        known = ", ".join([*EACH, *TOLD])
+def _source(name: str) -> bytes:
+    path = file_of(name)
+    if not path.is_file():
         raise InputError(
-            f"--policy {name}: asks for {unknown[0]}, which is not known here; what can be asked for is {known}"
+            f"--policy {name}: no such file {path}; correct the path "
+            "(for a run, `policy` in its config.json)"
         )
-    once, each = (
-        [parameter for parameter in names if parameter in table] for table in (TOLD, EACH)
+    return path.read_bytes()
+
+
+@cache
+def _executed(path: Path, source: bytes) -> ModuleType:
+    module = ModuleType(f"policy {path.resolve()}")
+    sys.modules[module.__name__] = module  # dataclasses look up their annotations there
+    exec(compile(source, str(path), "exec"), module.__dict__)
+    return module
+
+
+def _names_bound(tree: ast.AST) -> list[str]:
+    """Names that a file defines, assigns or imports; "*" for an import of everything."""
+    names = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.append(node.name)
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            names.append(node.id)
+        elif isinstance(node, ast.alias):
+            names.append(node.asname or node.name)
+    return names
+
+
+def _no_function(name: str) -> InputError:
+    path, _, function = name.rpartition(":")
+    return InputError(
+        f"--policy {name}: {path} has no function {function}; give the name of one that it has"
     )
 
+
+def _by_parameter_name(name: str, path: Path, function: Callable[..., Any]) -> Policy:
+    """Wrap a function as a policy; its arguments are passed by parameter name."""
+    known = [*CANDIDATE_ARGUMENTS, *CONTEXT_ARGUMENTS]
+    parameters = list(inspect.signature(function).parameters)
+    if unknown := [parameter for parameter in parameters if parameter not in known]:
+        raise InputError(
+            f"--policy {name}: unknown parameter {unknown[0]}; choose from {', '.join(known)}"
+        )
+    shared = {p: CONTEXT_ARGUMENTS[p] for p in parameters if p in CONTEXT_ARGUMENTS}
+    single = {p: CANDIDATE_ARGUMENTS[p] for p in parameters if p in CANDIDATE_ARGUMENTS}
+
     def policy(context: PolicyContext) -> Any:
-        told = {parameter: TOLD[parameter](context) for parameter in once}
+        arguments = {p: value(context) for p, value in shared.items()}
         try:
-            if not each:
-                return function(**told)
+            if not single:
+                return function(**arguments)
             return [
-                function(**told, **{p: EACH[p](context, view) for p in each})
-                for view in context.left
+                function(**arguments, **{p: value(context, i) for p, value in single.items()})
+                for i in context.candidate_frames
             ]
         except InputError:
             raise
@@ -122,12 +163,12 @@ def _asking(name: str, path: Path, function: Callable[..., Any]) -> Policy:
 
 
 def _failed(path: Path, error: Exception) -> str:
-    """What to say of an exception that a file raised: the line of the file where it came from, and
-    its message."""
-    frames = [
-        frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)
-    ]
-    line = error.lineno if isinstance(error, SyntaxError) else frames[-1].lineno if frames else None
+    """Message for an exception of a user's file: the last line of that file in the traceback."""
+    if isinstance(error, SyntaxError):
+        line, message = error.lineno, error.msg
+    else:
+        frames = traceback.extract_tb(error.__traceback__)
+        lines = [frame.lineno for frame in frames if frame.filename == str(path)]
+        line, message = lines[-1] if lines else None, str(error)
     where = f"line {line} of {path}" if line else str(path)
-    message = error.msg if isinstance(error, SyntaxError) else error
     return f"{where} failed: {type(error).__name__}: {message}"

@@ -1,22 +1,20 @@
-"""The gains of `mgs.policy.directional` for a pool of poses, brought up to date when a view is
-taken instead of computed anew.
+"""Gains of `mgs.policy.directional` for a pool of poses, updated when a view is taken.
 
-With the symbols of that module, two numbers are kept of every pose c and Gaussian j that it sees: g
-= y_c^T S_j y_c, and for I-optimality q = y_c^T S_j M_j S_j y_c. The gains follow from them: 3/2
-log(1 + W g) nats, and W q / (1 + W g). A new view sees j along y with the squared weights W. With u
-= S_j y, w = S_j M_j u and k = W / (1 + W y^T u), it changes (Sherman-Morrison)
+With the symbols of that module, two numbers are kept for each pose c and Gaussian j that it sees:
+g = y_c^T S_j y_c, and for I-optimality q = y_c^T S_j M_j S_j y_c. The gains are then
+3/2 log(1 + W g) nats, and W q / (1 + W g). Let a new view see j along y with the squared weights W,
+and let u = S_j y, w = S_j M_j u and k = W / (1 + W y^T u). By the Sherman-Morrison formula
 
-    S_j by -k u u^T,   g by -k (u^T y_c)^2,   q by -2 k (u^T y_c) (w^T y_c) + k^2 (y^T w) (u^T
-    y_c)^2,
+    S_j changes by -k u u^T
+    g changes by -k (u^T y_c)^2
+    q changes by -2 k (u^T y_c) (w^T y_c) + k^2 (y^T w) (u^T y_c)^2
 
-so a choice costs two products of vectors for each pose and Gaussian, and nothing is inverted. All
-is float64: in float32 a variance that falls from that of the prior to that of a hundred measured
-pixels would be lost in rounding. Each number is written by one lane alone and depends on the views
-and their order only, so a resumed run has the same, bit for bit.
+so a choice costs two dot products for each pose and Gaussian, and no matrix is inverted. All is
+float64, because variances fall by many orders of magnitude. Each number is written by one lane, so
+results depend on the views and their order only, and a resumed run has the same bits.
 
-What the matrices cost is reading and writing them. So of each only the upper triangle is kept,
-entry by entry, all Gaussians'
-numbers of one entry side by side: one kernel reads S and M once, and writes S once.
+Memory traffic dominates. So the upper triangle alone is kept of each matrix, as one array [N] for
+each entry: one kernel reads S and M once, and writes S once.
 """
 
 from __future__ import annotations
@@ -33,56 +31,55 @@ from numpy.typing import NDArray
 from mgs.memory import IMAGE_BYTES, padded
 from mgs.policy.context import Gains
 from mgs.policy.criteria import Array
-from mgs.policy.directional import Views, gains, in_parts, information, precision
+from mgs.policy.directional import Views, gains, in_parts, information, of_points, precision
 from mgs.splat.recording import one_at_a_time
 
 BYTES_OF_ENTRY, BYTES_OF_PAIR = 16, 40
-"""Memory of a Gaussian's entry of both matrices, and of a pose and a Gaussian that it sees. While a
-view is taken, S, g and q exist twice."""
+"""Bytes of one entry of both matrices for a Gaussian, and of a pair of a pose and a Gaussian. S, g
+and q exist twice during an update."""
 
 
 def pool_gains(
     points: Array, lam: float, pool: Callable[[], Views], dome: Callable[[], Views]
 ) -> Gains:
-    """The gains of `mgs.policy.directional.gains` for poses of a pool, as a function that is fast
-    after one more view.
+    """A function that computes `mgs.policy.directional.gains` for the poses of a pool.
 
-    points: [N,3] means of the Gaussians on the surface, metres. pool(), dome(): all poses and the
-    dome, and what they see. What is kept between calls takes at most IMAGE_BYTES for each degree;
-    where it would take more, gains are computed anew.
+    It is fast if the views taken begin with those of the call before. It keeps at most IMAGE_BYTES
+    for each degree; if more is needed, it computes every gain from scratch.
+
+    points: means of the Gaussians on the surface [N,3], metres. pool(), dome(): all poses, the
+    poses of the dome, and what they see.
     """
     known: dict[tuple[int, float, bool], PoolGains] = {}
     pairs = cache(lambda: int(np.count_nonzero(pool().seen)))
 
     def found(
-        taken: Sequence[int], left: Sequence[int], degree: int, tau: float, over_dome: bool
+        taken: Sequence[int], candidates: Sequence[int], degree: int, tau: float, over_dome: bool
     ) -> NDArray[np.float64]:
-        key, views = (degree, tau, over_dome), pool()
-        kept = (
-            BYTES_OF_ENTRY * len(points) * len(_upper((degree + 1) ** 2)) + BYTES_OF_PAIR * pairs()
-        )
-        if kept > IMAGE_BYTES or not pairs():  # Dr.Jit has no kernels for empty arrays
-            before, candidates = (
-                Views(views.positions[list(some)], views.seen[list(some)]) for some in (taken, left)
+        key, views, around = (degree, tau, over_dome), pool(), dome() if over_dome else None
+        entries = len(points) * len(_upper((degree + 1) ** 2))
+        if not pairs() or BYTES_OF_ENTRY * entries + BYTES_OF_PAIR * pairs() > IMAGE_BYTES:
+            before, after = (
+                Views(views.positions[list(some)], views.seen[list(some)])
+                for some in (taken, candidates)
             )
-            return gains(
-                points, lam, degree, tau, before, candidates, dome() if over_dome else None
-            )
-        if key not in known or known[key].taken != list(taken[: len(known[key].taken)]):
-            known[key] = PoolGains(points, views, lam, degree, tau, dome() if over_dome else None)
-        known[key].take(taken[len(known[key].taken) :])
-        return known[key].of_poses(left)
+            return gains(points, lam, degree, tau, before, after, around)
+        kept = known.get(key)
+        if kept is None or kept.taken != list(taken[: len(kept.taken)]):
+            kept = known[key] = PoolGains(points, views, lam, degree, tau, around)
+        kept.take(taken[len(kept.taken) :])
+        return kept.of_poses(candidates)
 
     return found
 
 
 class PoolGains:
-    """Gains of the poses of a pool after views among them, `taken`. pool: all poses; the others as
-    in `mgs.policy.directional.gains`.
+    """Gains of the poses of a pool after the views `taken`. Arguments as in
+    `mgs.policy.directional.gains`.
 
-    S, M: the matrices, as `_upper` counts their entries; of each, one number for every Gaussian. g,
-    q: of each pair of a pose and a Gaussian that it sees, whose indices are `by` and `of`. M and q
-    are None for D-optimality.
+    S, M: matrices, one array [N] for each entry of `_upper`.
+    g, q: one number for each pair of a pose and a Gaussian that it sees.
+    by, of: pose and Gaussian of each pair. M and q are None for D-optimality.
     """
 
     @one_at_a_time
@@ -99,10 +96,8 @@ class PoolGains:
         self.points = mi.Float64(padded(points, np.float64).ravel())
         self.positions = mi.Float64(padded(pool.positions, np.float64).ravel())
         of, self.poses = np.nonzero(pool.seen.T)
-        self.of, self.by = (
-            mi.UInt32(padded(of, np.uint32)),
-            mi.UInt32(padded(self.poses, np.uint32)),
-        )
+        self.of = mi.UInt32(padded(of, np.uint32))
+        self.by = mi.UInt32(padded(self.poses, np.uint32))
         self.weights = mi.Float64(padded(pool.seen[self.poses, of], np.float64))
         variance = 1 / precision(degree, tau, lam)
         upper = _upper(len(variance))
@@ -113,42 +108,37 @@ class PoolGains:
         moved = [float(v) * value for v, value in zip(variance, y, strict=True)]
         self.g, self.M, self.q = _dot(moved, y), None, None
         if dome is not None:
-            parts = in_parts(
-                len(points),
-                lambda s: information(points[s], Views(dome.positions, dome.seen[:, s]), degree),
-            )
-            M = np.concatenate(parts)
+
+            def part(some: slice) -> NDArray[np.float64]:
+                return information(points[some], of_points(dome, some), degree)
+
+            M = np.concatenate(in_parts(len(points), part))
             self.M = [mi.Float64(padded(M[:, a, b], np.float64)) for a, b in upper]
             self.q = _dot(_times([_at(entry, self.of) for entry in self.M], moved), moved)
         dr.eval(self.S, self.M, self.g, self.q)
 
     @one_at_a_time
     def of_poses(self, poses: Sequence[int]) -> NDArray[np.float64]:
-        """[C] the gain of each of some poses."""
+        """Gain of each of these poses [C]."""
         explained = self.weights * self.g
-        of_pairs = (
-            1.5 * np.log1p(explained) if self.q is None else self.weights * self.q / (1 + explained)
-        )
-        return np.asarray(
-            np.bincount(self.poses, np.asarray(of_pairs), len(self.pool.positions))[list(poses)],
-            np.float64,
-        )
+        if self.q is None:
+            of_pairs = 1.5 * np.log1p(explained)
+        else:
+            of_pairs = self.weights * self.q / (1 + explained)
+        sums = np.bincount(self.poses, np.asarray(of_pairs), len(self.pool.positions))
+        return np.asarray(sums[list(poses)], np.float64)
 
     @one_at_a_time
     def take(self, views: Sequence[int]) -> None:
-        """Take more views, one after another."""
+        """Update the gains with more views, one after another."""
         for view in views:
             self.taken.append(view)
             self._take(view)
 
     def _take(self, view: int) -> None:
-        """Bring everything up to date with one more view."""
         n = len(self.points) // 3
-        weights, everyone = (
-            mi.Float64(padded(self.pool.seen[view], np.float64)),
-            dr.arange(mi.UInt32, n),
-        )
-        y = self._harmonics(everyone, dr.opaque(mi.UInt32, view, n))
+        weights = mi.Float64(padded(self.pool.seen[view], np.float64))
+        y = self._harmonics(dr.arange(mi.UInt32, n), dr.opaque(mi.UInt32, view, n))
         u = _times(self.S, y)
         w = None if self.M is None else _times(self.S, _times(self.M, u))
         k = weights / (1 + weights * _dot(y, u))
@@ -156,13 +146,13 @@ class PoolGains:
         self.S = [
             entry - k * u[a] * u[b] for entry, (a, b) in zip(self.S, _upper(len(y)), strict=True)
         ]
-        u, w = _side_by_side(u), None if w is None else _side_by_side(w)
+        u, w = _interleaved(u), None if w is None else _interleaved(w)
         dr.eval(self.S, u, w, k, both)
         self._update(u, w, k, both)
 
     def _update(self, u: Any, w: Any, k: Any, both: Any) -> None:
-        """Bring g and q up to date. u, w: [N*K]; k: [N], 0 where the view misses a Gaussian; both:
-        k^2 y^T w."""
+        """Update g and q. u, w: [N*K]; k: [N], 0 where the view misses a Gaussian; both: k^2 y^T w
+        [N]."""
 
         def change(k_of: Any, g: Any, q: Any) -> Any:
             y = self._harmonics(self.of, self.by)
@@ -171,22 +161,20 @@ class PoolGains:
                 q = q + _at(both, self.of) * dr.square(uy) - 2 * k_of * uy * _dot(self._row(w), y)
             return mi.Float64(0), g - k_of * dr.square(uy), q
 
-        # A loop of one round. Lanes side by side are mostly of one Gaussian, and where the view
-        # misses it they skip the round.
+        # A loop of at most one round: neighbouring lanes mostly belong to one Gaussian, and skip
+        # the round if the view misses it.
         before = _at(k, self.of), self.g, mi.Float64(0) if w is None else self.q
         _, self.g, q = dr.while_loop(before, lambda k_of, g, q: k_of > 0, change)
         self.q = None if w is None else q
         dr.eval(self.g, self.q)
 
     def _harmonics(self, of: Any, by: Any) -> list[Any]:
-        """K spherical harmonics of the directions from poses to Gaussians, given the indices of
-        both."""
+        """K spherical harmonics of the directions from poses to Gaussians, given their indices."""
         offset = dr.gather(mi.Point3d, self.points, of) - dr.gather(mi.Point3d, self.positions, by)
         return list(dr.sh_eval(mi.Vector3d(offset * dr.rcp(dr.norm(offset))), self.degree))
 
     def _row(self, vectors: Any) -> list[Any]:
-        """K numbers of each pair's Gaussian from vectors [N*K]; four are read at once where K
-        allows it."""
+        """The K entries for each pair's Gaussian of vectors [N*K]; four at once if K allows it."""
         K = (self.degree + 1) ** 2
         if K % 4:
             return [_at(vectors, self.of * K + b) for b in range(K)]
@@ -204,15 +192,13 @@ def _upper(K: int) -> list[tuple[int, int]]:
 
 def _times(matrix: list[Any], vector: list[Any]) -> list[Any]:
     """Product of a symmetric matrix, given by its upper triangle, and a vector."""
-    entries = dict(zip(_upper(len(vector)), matrix, strict=True))
-    return [
-        _dot([entries[min(a, b), max(a, b)] for b in range(len(vector))], vector)
-        for a in range(len(vector))
-    ]
+    K = len(vector)
+    entries = dict(zip(_upper(K), matrix, strict=True))
+    return [_dot([entries[min(a, b), max(a, b)] for b in range(K)], vector) for a in range(K)]
 
 
-def _side_by_side(vector: list[Any]) -> Any:
-    """[N*K] with the K numbers of a Gaussian side by side, from K arrays [N]."""
+def _interleaved(vector: list[Any]) -> Any:
+    """Interleave K arrays [N] as one [N*K]."""
     n, K = len(vector[0]), len(vector)
     packed, first = dr.zeros(mi.Float64, n * K), dr.arange(mi.UInt32, n) * K
     for b, values in enumerate(vector):

@@ -1,5 +1,4 @@
-"""Pose policies: scores of candidates from camera positions alone. Pure NumPy, each a row of a
-table."""
+"""Pose policies: scores of candidates from camera positions alone. Pure NumPy."""
 
 from __future__ import annotations
 
@@ -11,31 +10,31 @@ from numpy.typing import NDArray
 from mgs.policy.criteria import Array
 
 PosePolicy = Callable[[Array, Array, Array, np.random.Generator], Array]
+"""(candidates [C,3], taken [T,3], centre [3], rng) -> score of each candidate [C]. Positions in
+metres."""
 
 
 def azimuths(positions: Array, centre: Array) -> NDArray[np.float64]:
-    """Camera centres [C,3] -> angle about the vertical through `centre` [3], radians in [0, 2 pi),
-    0 = +X."""
+    """Azimuths of camera centres [C,3] about the vertical through `centre` [3], radians in
+    [0, 2 pi), 0 = +X."""
     offset = np.asarray(positions, np.float64) - centre
     return np.arctan2(offset[:, 1], offset[:, 0]) % (2 * np.pi)
 
 
-def angle_between(a: Array, b: Array) -> NDArray[np.float64]:
+def azimuth_difference(a: Array, b: Array) -> NDArray[np.float64]:
     """Smallest angle between azimuths (broadcast), radians in [0, pi]."""
     return np.abs((a - b + np.pi) % (2 * np.pi) - np.pi)
 
 
 def random_order(candidates: Array, taken: Array, centre: Array, rng: np.random.Generator) -> Array:
-    """A draw at random. The loop derives `rng` from the run's seed and the step: reproducible, and
-    new in every round."""
+    """A random number for each candidate."""
     return rng.random(len(candidates))
 
 
 def uniform_azimuth(
     candidates: Array, taken: Array, centre: Array, rng: np.random.Generator
 ) -> Array:
-    """Gap to the taken azimuth on the left times that on the right, square radians: spreads the
-    views evenly at every count.
+    """Azimuth gap to the next view taken on the left times that on the right, square radians.
 
     Splitting a gap a + b lowers the sum of squared gaps by 2ab, so this is greedy for the most even
     spread.
@@ -55,8 +54,7 @@ def farthest_pose(
 def smallest_angle(
     candidates: Array, taken: Array, centre: Array, rng: np.random.Generator
 ) -> Array:
-    """Angle to the nearest camera already taken, as seen from `centre`, radians: spreads the views
-    over the whole dome."""
+    """Angle at `centre` to the nearest camera already taken, radians."""
     ours, theirs = (
         offset / np.linalg.norm(offset, axis=1, keepdims=True)
         for offset in (candidates - centre, taken - centre)
@@ -65,8 +63,7 @@ def smallest_angle(
 
 
 def _rounded(scores: Array) -> Array:
-    """Equal distances differ in the last bits; without them a tie is a tie (the loop takes the
-    farthest, seeds the first)."""
+    """Round, so that distances which differ only by rounding errors are ties."""
     return np.round(scores, 9)
 
 
@@ -76,40 +73,38 @@ POSE_POLICIES: dict[str, PosePolicy] = {
     "farthest": farthest_pose,
     "angle": smallest_angle,
 }
-"""Policies that look at poses, by name. A program may add its own (docs/howto/policy.md)."""
+"""Policies that use poses alone, by name. A program may add its own (docs/howto/policy.md)."""
 
 
 def nearest_poses(positions: Array, here: Array, count: int) -> list[int]:
-    """Indices of the `count` positions [C,3] nearest to `here` [3], in their order; all of them
-    where they are fewer."""
+    """Sorted indices of the `count` positions [C,3] nearest to `here` [3]; all if there are
+    fewer."""
     distance = _rounded(np.linalg.norm(positions - here, axis=1))
     return sorted(int(k) for k in np.argsort(distance, kind="stable")[:count])
 
 
 def travel_cost(positions: Array, here: Array, travel: float) -> NDArray[np.float64]:
-    """Cost of an image at each of the positions [C,3] for a camera that is `here` [3], in images: 1
-    + distance / travel.
+    """Cost of an image at each position [C,3] for a camera that is at `here` [3], in images.
 
-    The distance is that of the straight line, the least that there is to go. travel: the distance,
-    metres, that costs as much as an image.
+    It is 1 + distance / travel, with the distance along a straight line. travel: metres that cost
+    as much as an image.
     """
     return np.asarray(1 + _rounded(np.linalg.norm(positions - here, axis=1)) / travel)
 
 
 def path_length(positions: Array) -> float:
-    """Length of the straight lines from each position [T,3] to the next, metres."""
+    """Length of the polygon through the positions [T,3], metres."""
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
 
 def seed_views(positions: Array, centre: Array, count: int) -> list[int]:
-    """Frames nearest to `count` evenly spaced azimuths (0, 360/count, ...), each frame once; in
-    that order.
+    """Distinct frames nearest to `count` evenly spaced azimuths (0, 360/count, ...), in that order.
 
-    positions [C,3] camera centres, centre [3] the rock; metres. Needs count <= C.
+    positions: camera centres [C,3]; centre: the rock [3]; metres. Needs count <= C.
     """
     angles, seeds = azimuths(positions, centre), list[int]()
     for target in 2 * np.pi * np.arange(count) / count:
-        distance = _rounded(angle_between(angles, target))
+        distance = _rounded(azimuth_difference(angles, target))
         distance[seeds] = np.inf
         seeds.append(int(np.argmin(distance)))
     return seeds

@@ -1,9 +1,8 @@
-"""Every policy by its name, as a function of the `mgs.policy.context.PolicyContext` that gives each
-candidate a score.
+"""All policies by name.
 
-There are three tables, by what their functions look at: `mgs.policy.criteria.CRITERIA` at
-information, `mgs.policy.poses.POSE_POLICIES` at poses, and CONTEXT_POLICIES here at whatever an
-PolicyContext has. A name like FILE.py:FUNCTION is a policy in a file of the user's own
+Three tables hold them, by what their functions use: information
+(`mgs.policy.criteria.CRITERIA`), poses (`mgs.policy.poses.POSE_POLICIES`), or the whole
+`PolicyContext` (CONTEXT_POLICIES below). A name like FILE.py:FUNCTION is a policy in a user's file
 (`mgs.policy.from_file`).
 """
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from mgs.colour import SH_C0
 from mgs.errors import InputError
+from mgs.policy import from_file
 from mgs.policy.context import Policy, PolicyContext
 from mgs.policy.criteria import (
     CRITERIA,
@@ -24,73 +24,71 @@ from mgs.policy.criteria import (
     observed,
 )
 from mgs.policy.criteria import i_optimal as i_optimality
-from mgs.policy.from_file import in_file, load
 from mgs.policy.poses import POSE_POLICIES
 
 PAPER_LAM = 1e-6
-"""The one lambda of the policy `paper`: that of POp-GS, since the paper does not say which it
-used."""
+"""Lambda of the policy `paper`, for all parameters: that of POp-GS, since the paper states none."""
 
 
 def directional_d(context: PolicyContext) -> Array:
     """Directional D-optimality, nats, with colours of SH degree 2 and tau 0.3
     (`mgs.policy.directional`)."""
-    return context.gains(context.visited, context.left, 2, 0.3, False)
+    return context.gains(context.taken_frames, context.candidate_frames, 2, 0.3, False)
 
 
 def directional_i(context: PolicyContext) -> Array:
     """Directional I-optimality over a dome, with colours of SH degree 3 and tau 0.1
     (`mgs.policy.directional`)."""
-    return context.gains(context.visited, context.left, 3, 0.1, True)
+    return context.gains(context.taken_frames, context.candidate_frames, 3, 0.1, True)
 
 
 def i_optimal(context: PolicyContext) -> Array:
-    """I-optimality over all poses of the dataset, taken or not
-    (`mgs.policy.criteria.i_optimal`)."""
-    others = [i for i in range(len(context.positions)) if i not in context.visited]
-    mean = (context.H + sum(context.information(i) for i in others)) / len(context.positions)
+    """I-optimality over all poses of the dataset (`mgs.policy.criteria.i_optimal`)."""
+    H, lam, count = context.H, context.lam, len(context.positions)
+    others = [i for i in range(count) if i not in context.taken_frames]
+    mean = (H + sum(context.information(i) for i in others)) / count
     return np.array(
-        [i_optimality(context.information(i), context.H, context.lam, mean) for i in context.left]
+        [i_optimality(context.information(i), H, lam, mean) for i in context.candidate_frames]
     )
 
 
 def block_d(context: PolicyContext) -> Array:
     """Eq. 7 for the exact 11x11 blocks (`mgs.policy.criteria.block_log_determinant`), whatever the
     estimator of the run."""
-    H = _sum(context, "block")
-    before, lam = block_log_determinant(H, context.lam), context.lam
+    H, lam = _summed(context, "block"), context.lam
+    before = block_log_determinant(H, lam)
     return np.array(
         [
             block_log_determinant(H + context.estimate(i, "block"), lam) - before
-            for i in context.left
+            for i in context.candidate_frames
         ]
     )
 
 
 def paper(context: PolicyContext) -> Array:
-    """The paper's method to the letter: Eq. 7 on squared gradients of one scalar loss per image,
-    with one lambda (PAPER_LAM).
+    """Eq. 7 as the paper has it: squared gradients of one scalar loss per image, one lambda.
 
-    The paper names neither the loss nor the lambda. The loss is that of the estimator
-    `loss-gradient`, for the views taken too.
+    The paper states neither the loss nor the lambda. The loss is that of the estimator
+    `loss-gradient`, lambda is PAPER_LAM.
     """
-    H, lam = _sum(context, "loss-gradient"), np.full_like(context.lam, PAPER_LAM)
-    return np.array([d_optimal(context.estimate(i, "loss-gradient"), H, lam) for i in context.left])
+    H, lam = _summed(context, "loss-gradient"), np.full_like(context.lam, PAPER_LAM)
+    return np.array(
+        [d_optimal(context.estimate(i, "loss-gradient"), H, lam) for i in context.candidate_frames]
+    )
 
 
 def cover(context: PolicyContext) -> Array:
-    """COVER ("Coverage Optimization for Camera View Selection", 2026): how far the direction of a
-    view is from those from which the surface that it sees was observed before.
+    """COVER ("Coverage Optimization for Camera View Selection", 2026): new viewing directions.
 
     For each Gaussian (1 - cos)/2 of the angle between the candidate's direction and the nearest one
-    from which it was `observed`, or 1 where it never was; then the mean over what the candidate
-    sees, by squared blending weights. In [0, 1]. The paper counts a view for all that lies in its
-    frustum, hidden or not, and rounds directions to bins.
+    from which it was `observed`, or 1 if it never was; then the mean over the candidate's view,
+    weighted by squared blending weights. In [0, 1]. The paper counts all Gaussians in the frustum,
+    hidden or not, and rounds directions to bins.
     """
     least = context.prior_lam[0] / SH_C0**2
-    taken = [(context.positions[i], context.seen(i) > least) for i in context.visited]
+    taken = [(context.positions[i], context.seen(i) > least) for i in context.taken_frames]
     scores = []
-    for i in context.left:
+    for i in context.candidate_frames:
         weights = context.seen(i)
         some = np.flatnonzero(weights)
         points, weights = context.points[some], weights[some]
@@ -103,23 +101,21 @@ def cover(context: PolicyContext) -> Array:
 
 
 def _directions(points: Array, position: Array) -> Array:
-    """[N,3] unit vectors from a camera to points."""
+    """Unit vectors from a camera to points [N,3]."""
     offset = points - position
     return np.asarray(offset / np.linalg.norm(offset, axis=1, keepdims=True))
 
 
 def completeness(context: PolicyContext) -> Array:
-    """ActiveSplat's completeness (2024), the part of a view that no view has shown: here, where a
-    prior knows the surface, the squared blending weights of its Gaussians that are not `observed`.
-    Zero once all are, as with `coverage`."""
+    """Completeness after ActiveSplat (2024): squared blending weights of the surface's Gaussians
+    that no view has `observed`, summed. Zero once all are, as with `coverage`."""
     unknown = ~observed(context.surface_H, context.prior_lam)
-    return np.array([context.seen(i)[unknown].sum() for i in context.left])
+    return np.array([context.seen(i)[unknown].sum() for i in context.candidate_frames])
 
 
-def _sum(context: PolicyContext, estimator: str) -> NDArray[np.float64]:
-    """Information of the views taken, by an estimator, summed; that of one view is in memory at a
-    time."""
-    first, *others = context.visited
+def _summed(context: PolicyContext, estimator: str) -> NDArray[np.float64]:
+    """Information of the views taken, by an estimator. One view is in memory at a time."""
+    first, *others = context.taken_frames
     total = np.array(context.estimate(first, estimator), np.float64)
     for i in others:
         total += context.estimate(i, estimator)
@@ -135,44 +131,48 @@ CONTEXT_POLICIES: dict[str, Policy] = {
     "cover": cover,
     "completeness": completeness,
 }
-"""Policies that are told all that there is, by name. A program may add its own
+"""Policies that use the whole context, by name. A program may add its own
 (docs/howto/policy.md)."""
 
 
 def policy_names() -> list[str]:
-    """Every name that `mgs nbv --policy` accepts: the rows of the three tables, as they are now."""
+    """Names of the three tables, which `mgs nbv --policy` accepts."""
     return [*CRITERIA, *CONTEXT_POLICIES, *POSE_POLICIES]
 
 
+def check_policy(name: str) -> None:
+    """Raise InputError if there is no such policy. A user's file is parsed, not executed
+    (`mgs.policy.from_file.check`)."""
+    if from_file.in_file(name):
+        from_file.check(name)
+    elif name not in policy_names():
+        raise InputError(
+            f"--policy {name}: unknown; choose one of {', '.join(policy_names())}, "
+            "or add your own (docs/howto/policy.md)"
+        )
+
+
 def policy_named(name: str) -> Policy:
-    """The policy of that name, as a function of an PolicyContext. Raises InputError if there is
-    none, and as `policy_file.load`."""
-    if in_file(name):
-        return load(name)
+    """The policy of that name. Executes a user's file. Raises InputError as `check_policy` and
+    `mgs.policy.from_file.load`."""
+    if from_file.in_file(name):
+        return from_file.load(name)
+    check_policy(name)
     if name in CRITERIA:
         return _of_criterion(CRITERIA[name])
-    if name in POSE_POLICIES:
-        row = POSE_POLICIES[name]
-        return lambda context: row(context.candidates, context.taken, context.centre, context.rng)
     if name in CONTEXT_POLICIES:
         return CONTEXT_POLICIES[name]
-    known = ", ".join(policy_names())
-    raise InputError(
-        f"--policy {name}: unknown; choose one of {known}, or add your own (docs/howto/policy.md)"
-    )
+    rule = POSE_POLICIES[name]
+    return lambda context: rule(context.candidates, context.taken, context.centre, context.rng)
 
 
 def _of_criterion(criterion: Criterion) -> Policy:
-    """A criterion as a policy; the information of one candidate is in memory at a time."""
+    """A criterion as a policy. The information of one candidate is in memory at a time."""
 
     def scores(context: PolicyContext) -> NDArray[np.float64]:
-        at_prior = criterion.at == "prior"
-        look, H = (
-            (context.surface_information, context.surface_H)
-            if at_prior
-            else (context.information, context.H)
-        )
-        lam = context.prior_lam if at_prior else context.lam
-        return np.array([criterion.score(look(i), H, lam) for i in context.left])
+        F, H, lam = context.information, context.H, context.lam
+        if criterion.at == "prior":
+            F, H, lam = context.surface_information, context.surface_H, context.prior_lam
+        return np.array([criterion.score(F(i), H, lam) for i in context.candidate_frames])
 
     return scores

@@ -18,9 +18,10 @@ from plyfile import PlyData, PlyParseError
 from scipy.spatial import cKDTree
 
 from mgs.camera import Camera
+from mgs.data.clouds import SparseCloud, write_cloud
 from mgs.data.dataset import Dataset, Frame
-from mgs.data.lens import shrunk, stride_for
-from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh, write_points
+from mgs.data.lens import shrunk_to
+from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh
 from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.data.visibility import in_mask, visible
 from mgs.errors import InputError
@@ -279,9 +280,7 @@ def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:
     for frame in with_depth or frames:
         camera = frame.camera
         if of_mesh:  # of a large photograph every few pixels will do
-            camera = shrunk(camera, lambda pixels, smooth: pixels, stride_for(camera, MOST_PIXELS))[
-                0
-            ]
+            camera = shrunk_to(camera, MOST_PIXELS)[0]
         depth = of_mesh(camera) if of_mesh else frame.depth()
         seen |= visible(mesh.vertices, normals, camera, depth, tolerance) & in_mask(
             mesh.vertices, frame
@@ -303,7 +302,7 @@ def save_prior(out: str | Path, prior: Prior) -> Path:
     out = new_folder(out)
     with atomic_path(out / "mesh.ply") as temporary:
         trimesh.Trimesh(prior.mesh.vertices, prior.mesh.faces, process=False).export(temporary)
-    write_points(out / "points.ply", prior.points, prior.normals)
+    write_cloud(out / "points.ply", SparseCloud(prior.points, prior.normals))
     write_json(out / "prior.json", prior.numbers)
     return out
 

@@ -17,7 +17,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, label
 
 from mgs.camera import Camera
 from mgs.data.dataset import Frame
-from mgs.data.lens import shrunk, stride_for
+from mgs.data.lens import shrunk_to
 from mgs.data.meshes import Mesh
 from mgs.errors import InputError
 
@@ -133,9 +133,7 @@ class _View:
 def _view(frame: Frame) -> _View:
     """The view of a frame. All are kept in memory, so a mask of more than MOST_PIXELS is made
     smaller."""
-    camera, smaller = shrunk(
-        frame.camera, lambda pixels, smooth: pixels, stride_for(frame.camera, MOST_PIXELS)
-    )
+    camera, smaller = shrunk_to(frame.camera, MOST_PIXELS)
     return _View(
         camera, _signed_distance(smaller(frame.mask().astype(np.uint8) * 255, True) >= 128)
     )

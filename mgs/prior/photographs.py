@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mgs.data.clouds import in_image, read_cloud
+from mgs.data.clouds import read_cloud
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.meshes import Mesh
-from mgs.data.visibility import has_masks
+from mgs.data.visibility import has_masks, in_image
 from mgs.errors import InputError
 from mgs.prior.hull import Hull, visual_hull
 from mgs.prior.points import segment_points, spacing_of
@@ -109,7 +109,7 @@ def check_photographs(frames: Sequence[Frame]) -> None:
             f"prior: {len(frames)} photographs without depth are too few; take at least {LEAST_PHOTOGRAPHS}, from all sides"
         )
     point = focus(frames).point[None]
-    seen = [bool(in_image(point, frame.camera)[0]) for frame in frames]
+    seen = [bool(in_image(frame.camera, *frame.camera.project(point))[0]) for frame in frames]
     if np.mean(seen) < LEAST_OVERLAP:
         raise InputError(
             f"prior: the photographs do not overlap: of {len(frames)} cameras only {sum(seen)} have in their image what all "

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mgs.data.dataset import Frame
-from mgs.data.meshes import Mesh, distances_to_mesh, read_rock
+from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh
 from mgs.data.visibility import visible
 from mgs.errors import InputError
 from mgs.prior.segmentation import SegmentedCloud
@@ -47,7 +47,7 @@ def error_to_truth(
     """
     import trimesh
 
-    known = read_rock(truth)
+    known = read_mesh(truth)
     true = trimesh.Trimesh(known.vertices, known.faces, process=False)
     surface, face = trimesh.sample.sample_surface(
         true, TRUTH_SAMPLES, seed=derive_seed(seed, "prior/truth")

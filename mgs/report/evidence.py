@@ -310,7 +310,7 @@ def _worth(model: Gaussians, images: Images, settings: NbvSettings, cache: ListC
         objective(model, *given, cache, train.means, images.normals, train.alpha_weight),
         as_drjit(model),
     )
-    away = _flat([part for part, _ in goal.pulls(fields)], len(model))
+    away = _flat([part for part, _ in goal.offsets(fields)], len(model))
     precision, of = _flat(goal.diagonal(fields), len(model)), kinds(degree, train.means)
     return worth(away, precision, lam, settings.pixel_noise, of, goal.phi(fields))
 

@@ -1,8 +1,7 @@
-"""Figures that compare runs: each function takes plain data and writes one PNG.
-`mgs.report.writing` calls them.
+"""Figures of reports: each function takes plain data and writes one file, a PNG, PDF or SVG.
 
-"Label" is what a run is called in a report: its policy, and its folder if several runs have the
-same policy. Every function raises InputError if its file cannot be written.
+A label is what a report calls a run: its policy, and its folder if several runs have the same
+policy. Every function raises InputError if its file cannot be written.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ import numpy as np
 from mgs.colour import srgb_from_linear
 from mgs.data.up import PLUS_Z, Up, upright
 from mgs.plotting import STYLE, crop, new_figure, save_figure
+from mgs.report.calibration import BINS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,17 +43,21 @@ POLICY_STYLE: dict[str, tuple[str, str | tuple[int, int, int]]] = {
     "completeness": ("#8888ee", "H"),
 }
 """Colour and marker of each policy, the same in every figure. The first seven colours are those of
-Okabe and Ito; the others were chosen so that colour-blind people can tell them all apart. The
-markers tell them apart in grey."""
+Okabe and Ito; the others were chosen so that colour-blind readers can tell all of them apart."""
+
+PREDICTION_COLOURS = ("#8a8a8a", "#c44e1f", "#3b6fb6", "#1b1b1b")
+"""Colours of the predictions in `uncertainty_figure`, in their order."""
+
+Curves = Mapping[str, tuple[Sequence[float], Sequence[float]]]
+"""Label of a run -> x and y of its line."""
 
 
 def line_styles(labels: Iterable[str]) -> list[dict[str, Any]]:
-    """How to draw the line of each label: keywords for matplotlib's `plot`.
+    """Style of the line of each label: keywords for matplotlib's `plot`.
 
-    The first line of a policy in POLICY_STYLE has the policy's colour and marker. A second line of
-    the same policy, and one of a policy of the user's own, takes colour and marker of a policy that
-    has no line, from the end of the table. When none are left, they are used again, for dashed
-    lines.
+    The first line of a policy in POLICY_STYLE has the policy's colour and marker. Further lines of
+    it, and those of other policies, take unused styles from the end of the table. When none are
+    left, all styles are used again with dashed lines.
     """
     labels = list(labels)
     first = {label.split(" ")[0]: label for label in reversed(labels)}
@@ -71,6 +75,12 @@ def line_styles(labels: Iterable[str]) -> list[dict[str, Any]]:
     return styles
 
 
+def axis_names(up: Up, unit: str) -> tuple[str, str, str]:
+    """Names of the axes of a world that was turned so that +Z is up."""
+    x, y, z = ("x", "y", "z") if up == PLUS_Z else ("horizontal", "horizontal, across", "up")
+    return f"{x} ({unit})", f"{y} ({unit})", f"{z} ({unit})"
+
+
 def orbit_figure(
     path: str | Path,
     positions: np.ndarray,
@@ -79,13 +89,12 @@ def orbit_figure(
     up: Up = PLUS_Z,
     unit: str = "m",
 ) -> None:
-    """The orbit from above, in one panel for each run: all poses, the seeds, and the chosen views,
-    numbered in their order.
+    """Draw the orbit from above, a panel for each run: poses, seeds, and the chosen views,
+    numbered.
 
-    positions: [C,3] camera centres, world. surface: [N,3] points of the rock, or None to leave it
-    out. choices: label -> (indices of the seeds, indices of the chosen views in their order), into
-    positions. up, unit: of the world (`mgs.data.dataset.Dataset`); where +Z is not up, the world is
-    turned by `mgs.data.up.upright` before it is drawn.
+    positions: [C,3] camera centres, world. surface: [N,3] points of the rock, or None. choices:
+    label -> indices into positions: (seeds, chosen views in their order). up, unit: of the world
+    (`mgs.data.dataset.Dataset`); it is drawn turned so that +Z is up.
     """
     import matplotlib
     from matplotlib.cm import ScalarMappable
@@ -95,33 +104,24 @@ def orbit_figure(
     turn, (x, y, _) = upright(up), axis_names(up, unit)
     positions = np.asarray(positions) @ turn.T
     surface = None if surface is None else np.asarray(surface) @ turn.T
+    last = max((len(chosen) for _, chosen in choices.values()), default=1)
+    norm = Normalize(1, max(last, 2))
     with matplotlib.rc_context(STYLE):
         figure = new_figure(3.1 * len(choices) + 0.8, 3.9)
         axes = figure.subplots(1, len(choices), sharex=True, sharey=True, squeeze=False)[0]
-        last = max((len(chosen) for _, chosen in choices.values()), default=1)
-        norm = Normalize(1, max(last, 2))
-        for axis, (policy, (seeds, chosen)) in zip(axes, choices.items(), strict=True):
+        for axis, (label, (seeds, chosen)) in zip(axes, choices.items(), strict=True):
             _orbit_panel(axis, positions, surface, list(seeds), list(chosen), norm)
-            axis.set(
-                title=_in_lines(f"{policy}: {len(seeds)} seeds, {len(chosen)} chosen"), xlabel=x
-            )
+            title = f"{label}: {len(seeds)} seeds, {len(chosen)} chosen"
+            axis.set(title=_in_lines(title), xlabel=x)
         axes[0].set_ylabel(y)
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
         bar = figure.colorbar(ScalarMappable(norm, "viridis"), ax=list(axes), shrink=0.8, pad=0.01)
         bar.locator = MaxNLocator(integer=True)
         bar.set_label("step at which the view was chosen")
-        for _ in range(
-            3
-        ):  # panels of a fixed aspect: matplotlib's layout finds room for titles of two lines by and by only
+        # Panels of a fixed aspect: the layout needs some passes to find room for two-line titles.
+        for _ in range(3):
             figure.draw_without_rendering()
         save_figure(figure, path)
-
-
-def axis_names(up: Up, unit: str) -> tuple[str, str, str]:
-    """What the axes of a world are called that is turned so that +Z is up: x, y and z only where it
-    had not to be turned."""
-    names = ("x", "y", "z") if up == PLUS_Z else ("horizontal", "horizontal, across", "up")
-    return (f"{names[0]} ({unit})", f"{names[1]} ({unit})", f"{names[2]} ({unit})")
 
 
 def _orbit_panel(
@@ -132,45 +132,19 @@ def _orbit_panel(
     chosen: list[int],
     norm: Any,
 ) -> None:
-    """The panel of one run in `orbit_figure`. norm: scale of the colours by which the order of the
-    choices is shown."""
-    xy = np.asarray(positions)[:, :2]
-    centre = xy.mean(axis=0) if surface is None else np.asarray(surface)[:, :2].mean(axis=0)
+    """Draw one run in `orbit_figure`. norm: colour scale of the order of the choices."""
+    xy = positions[:, :2]
+    centre = xy.mean(axis=0) if surface is None else surface[:, :2].mean(axis=0)
     if surface is not None:
-        rock = np.asarray(surface)[:: max(1, len(surface) // 6000)]
+        rock = surface[:: max(1, len(surface) // 6000)]
         axis.scatter(rock[:, 0], rock[:, 1], s=0.6, color="#b9b4ab", linewidths=0, zorder=1)
-    axis.scatter(
-        xy[:, 0],
-        xy[:, 1],
-        s=12,
-        facecolors="white",
-        edgecolors="#9a9a9a",
-        linewidths=0.6,
-        label="candidate",
-        zorder=2,
-    )
-    axis.scatter(
-        xy[seeds, 0],
-        xy[seeds, 1],
-        s=46,
-        marker="*",
-        color="#D55E00",
-        linewidths=0,
-        label="seed",
-        zorder=4,
-    )
     order = np.arange(1, len(chosen) + 1)
-    axis.scatter(
-        xy[chosen, 0],
-        xy[chosen, 1],
-        s=26,
-        c=order,
-        cmap="viridis",
-        norm=norm,
-        linewidths=0,
-        label="chosen",
-        zorder=3,
-    )
+    hollow = {"facecolors": "white", "edgecolors": "#9a9a9a", "linewidths": 0.6}
+    star = {"marker": "*", "color": "#D55E00", "linewidths": 0}
+    by_order = {"c": order, "cmap": "viridis", "norm": norm, "linewidths": 0}
+    axis.scatter(*xy.T, s=12, label="candidate", zorder=2, **hollow)
+    axis.scatter(*xy[seeds].T, s=46, label="seed", zorder=4, **star)
+    axis.scatter(*xy[chosen].T, s=26, label="chosen", zorder=3, **by_order)
     for number, index in zip(order, chosen, strict=True):
         outward = xy[index] - centre
         outward = outward / max(float(np.linalg.norm(outward)), 1e-9)
@@ -184,97 +158,80 @@ def _orbit_panel(
             va="center",
         )
     span = np.abs(xy - centre).max() * 1.2
-    axis.set(
-        xlim=(centre[0] - span, centre[0] + span),
-        ylim=(centre[1] - span, centre[1] + span),
-        aspect="equal",
-    )
+    low, high = centre - span, centre + span
+    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
 
 
 def gain_figure(path: str | Path, gains: Mapping[str, Sequence[float]]) -> None:
-    """Information gain (the paper's Eq. 7) of the view that each step selected, one line for each
-    run (the paper's Fig. 2).
+    """Draw the information gain (Eq. 7) of the view that each step selected (the paper's Fig. 2).
 
     gains: label -> gain of each step after the seeds.
     """
-    import matplotlib
-
-    with matplotlib.rc_context(STYLE):
-        figure = new_figure(4.8, 3.1)
-        axis = figure.subplots()
-        for values, style in zip(gains.values(), line_styles(gains), strict=True):
-            axis.plot(np.arange(1, len(values) + 1), values, **style)
-        axis.set(xlabel="active step", ylabel=r"$\mathrm{IG}_D$ of the selected view")
-        axis.set_ylim(bottom=0)
-        _whole_steps(axis)
-        _legend_beside(figure)
-        save_figure(figure, path)
+    curves = {label: (range(1, len(values) + 1), values) for label, values in gains.items()}
+    panel = (curves, "active step", r"$\mathrm{IG}_D$ of the selected view")
+    _curves_figure(path, [panel], 4.8, lambda axes: axes[0].set_ylim(bottom=0))
 
 
-def coverage_figure(
-    path: str | Path, coverage: Mapping[str, tuple[Sequence[int], Sequence[float]]]
+def coverage_figure(path: str | Path, coverage: Curves) -> None:
+    """Draw surface coverage after each step, and what each step added (the paper's Fig. 3).
+
+    coverage: label -> (number of training images, share of the surface observed, 0 to 1), after the
+    seeds and after each step.
+    """
+    percent = {label: (x, 100 * np.asarray(y, float)) for label, (x, y) in coverage.items()}
+    added = {label: (x[1:], np.diff(y)) for label, (x, y) in percent.items()}
+    panels = [
+        (percent, "images", r"surface coverage $C$ (%)"),
+        (added, "images", "coverage gained (percentage points)"),
+    ]
+    zero = {"color": "#9a9a9a", "linewidth": 0.8, "zorder": 0}
+    _curves_figure(path, panels, 7.2, lambda axes: axes[1].axhline(0, **zero))
+
+
+def psnr_figure(path: str | Path, panels: Mapping[str, Curves]) -> None:
+    """Draw PSNR against the number of images, a panel for each set of views.
+
+    panels: set of views -> label -> (numbers of images, PSNR in dB).
+    """
+    x = "images in the training set"
+    drawn = [(curves, x, f"PSNR, {what} (dB)") for what, curves in panels.items()]
+    _curves_figure(path, drawn, 3.6 * len(panels))
+
+
+def _curves_figure(
+    path: str | Path,
+    panels: Sequence[tuple[Mapping[str, Any], str, str]],
+    width: float,
+    finish: Any = lambda axes: None,
 ) -> None:
-    """Surface coverage after each step, and what each step added to it, one line for each run (the
-    paper's Fig. 3).
+    """Write a figure of panels (curves, x label, y label), one line for each label.
 
-    coverage: label -> (number of images in the training set, share of the surface observed, 0 to
-    1), after the seeds and then after each step.
+    finish: called with the axes before the legend is added.
     """
     import matplotlib
+    from matplotlib.ticker import MaxNLocator
 
     with matplotlib.rc_context(STYLE):
-        figure = new_figure(7.2, 3.1)
-        left, right = figure.subplots(1, 2)
-        for (images, shares), style in zip(coverage.values(), line_styles(coverage), strict=True):
-            percent = 100 * np.asarray(shares, float)
-            left.plot(images, percent, **style)
-            right.plot(list(images)[1:], np.diff(percent), **style)
-        left.set(xlabel="images", ylabel=r"surface coverage $C$ (%)")
-        right.set(xlabel="images", ylabel="coverage gained (percentage points)")
-        right.axhline(0, color="#9a9a9a", linewidth=0.8, zorder=0)
-        for axis in (left, right):
-            _whole_steps(axis)
-        _legend_beside(figure)
-        save_figure(figure, path)
-
-
-def psnr_figure(
-    path: str | Path, panels: Mapping[str, Mapping[str, tuple[Sequence[int], Sequence[float]]]]
-) -> None:
-    """PSNR against the number of images, one line for each run, in one panel for each thing that is
-    measured.
-
-    panels: what is measured -> label -> (numbers of images, PSNR in dB).
-    """
-    import matplotlib
-
-    with matplotlib.rc_context(STYLE):
-        figure = new_figure(3.6 * len(panels), 3.1)
+        figure = new_figure(width, 3.1)
         axes = figure.subplots(1, len(panels), squeeze=False)[0]
-        for axis, (what, curves) in zip(axes, panels.items(), strict=True):
-            for (images, decibels), style in zip(curves.values(), line_styles(curves), strict=True):
-                axis.plot(images, decibels, **style)
-            axis.set(xlabel="images in the training set", ylabel=f"PSNR, {what} (dB)")
-            _whole_steps(axis)
+        for axis, (curves, x, y) in zip(axes, panels, strict=True):
+            for (xs, ys), style in zip(curves.values(), line_styles(curves), strict=True):
+                axis.plot(xs, ys, **style)
+            axis.set(xlabel=x, ylabel=y)
+            axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+        finish(axes)
         _legend_beside(figure)
         save_figure(figure, path)
 
 
 def _legend_beside(figure: Figure) -> None:
-    """Put the legend of a figure's first axes to the right of all axes, where it covers no line,
-    and make the figure larger by the room that it takes."""
+    """Put the legend of the first axes to the right of all axes, and enlarge the figure by its
+    width."""
     legend = figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right upper")
     box, (width, height) = legend.get_window_extent(), figure.get_size_inches()
     figure.set_size_inches(
         width + box.width / figure.dpi, max(height, box.height / figure.dpi + 0.1)
     )
-
-
-def _whole_steps(axis: Axes) -> None:
-    """Put the ticks of the x axis at whole numbers."""
-    from matplotlib.ticker import MaxNLocator
-
-    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 def comparison_figure(
@@ -285,17 +242,17 @@ def comparison_figure(
     title: str = "",
     captions: Mapping[str, str] | None = None,
 ) -> None:
-    """Truth and renders of one view, each with its absolute difference below (the paper's Fig. 4),
-    cropped to the rock.
+    """Draw truth and renders of one view, and their absolute differences below (the paper's Fig.
+    4), cropped to the rock.
 
-    truth, renders: linear RGB [H,W,3]; captions: policy -> text under its name (PSNR, SSIM).
+    truth, renders: linear RGB [H,W,3]; captions: label -> text below it (PSNR, SSIM).
     """
     import matplotlib
 
     window = crop(truth.max(axis=2) > 0)
     shown = srgb_from_linear(truth)[window]
-    images = {policy: srgb_from_linear(image)[window] for policy, image in renders.items()}
-    differences = {policy: np.abs(image - shown).mean(axis=2) for policy, image in images.items()}
+    images = {label: srgb_from_linear(image)[window] for label, image in renders.items()}
+    differences = {label: np.abs(image - shown).mean(axis=2) for label, image in images.items()}
     limit = max(float(np.quantile(d, 0.995)) for d in differences.values()) or 1.0
     columns, aspect = 1 + len(images), shown.shape[0] / shown.shape[1]
     with matplotlib.rc_context(STYLE | {"axes.grid": False}):
@@ -303,31 +260,114 @@ def comparison_figure(
         axes = figure.subplots(2, columns)
         axes[0, 0].imshow(shown, interpolation="nearest")
         axes[0, 0].set_title(f"truth\n{_in_lines(title)}")
-        for column, (policy, image) in enumerate(images.items(), 1):
-            axes[0, column].imshow(image, interpolation="nearest")
-            caption = f"\n{_in_lines(captions[policy])}" if captions and policy in captions else ""
-            axes[0, column].set_title(_in_lines(policy) + caption)
-            map_ = axes[1, column].imshow(
-                differences[policy], cmap="magma", vmin=0, vmax=limit, interpolation="nearest"
-            )
+        scale = {"cmap": "magma", "vmin": 0, "vmax": limit, "interpolation": "nearest"}
+        for (above, below), (label, image) in zip(axes.T[1:], images.items(), strict=True):
+            above.imshow(image, interpolation="nearest")
+            caption = f"\n{_in_lines(captions[label])}" if captions and label in captions else ""
+            above.set_title(_in_lines(label) + caption)
+            map_ = below.imshow(differences[label], **scale)
         for axis in axes.flat:
             axis.set_axis_off()
-        axes[1, 0].text(
-            0.97,
-            0.5,
-            "absolute\ndifference",
-            ha="right",
-            va="center",
-            transform=axes[1, 0].transAxes,
-        )
-        bar = figure.colorbar(
-            map_, ax=list(axes[1, 1:]), orientation="horizontal", shrink=0.6, pad=0.02, aspect=40
-        )
-        label = "mean absolute difference of the sRGB channels, in [0, 1]"
-        bar.set_label(label if columns > 2 else _in_lines(label))
+        corner = axes[1, 0]
+        place = {"ha": "right", "va": "center", "transform": corner.transAxes}
+        corner.text(0.97, 0.5, "absolute\ndifference", **place)
+        layout = {"orientation": "horizontal", "shrink": 0.6, "pad": 0.02, "aspect": 40}
+        bar = figure.colorbar(map_, ax=list(axes[1, 1:]), **layout)
+        meaning = "mean absolute difference of the sRGB channels, in [0, 1]"
+        bar.set_label(meaning if columns > 2 else _in_lines(meaning))
         save_figure(figure, path)
 
 
 def _in_lines(text: str, width: int = 34) -> str:
-    """Text in lines of at most that many characters: what fits above one column of a figure."""
+    """Wrap text to lines of at most `width` characters, which fit above one column."""
     return "\n".join(textwrap.wrap(text, width))
+
+
+def uncertainty_figure(
+    path: str | Path, rows: Sequence[dict[str, Any]], maps: Sequence[tuple[str, Any, Any, Any]]
+) -> None:
+    """Draw predicted and true errors, for `mgs diagnose RUN --calibrate`.
+
+    Above: rms over the channels of both, for each view of `maps` (name, error [H,W,3], sigma
+    [H,W,3], inside [H,W]). Below: AUSE, shares inside the intervals, and histograms of the
+    probability integral transform, for every prediction in `rows`
+    (`mgs.report.calibration.judged`), over test views or else held-out views.
+    """
+    import matplotlib
+
+    judged_on = "test" if any(row["views"] == "test" for row in rows) else "held out"
+    shown = [row for row in rows if row["views"] == judged_on]
+    coloured = list(zip(shown, PREDICTION_COLOURS, strict=False))
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(8.4, 6.4)
+        above, below = figure.subfigures(2, 1, height_ratios=(1.15, 1))
+        _draw_maps(above, maps)
+        area, held, pit = below.subplots(1, 3)
+        _draw_ause(area, coloured)
+        _draw_held(held, coloured)
+        _draw_pit(pit, coloured)
+        handles = [
+            matplotlib.patches.Patch(color=colour, label=row["prediction"])
+            for row, colour in coloured
+        ]
+        below.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+        save_figure(figure, path)
+
+
+def _draw_maps(figure: Any, maps: Sequence[tuple[str, Any, Any, Any]]) -> None:
+    """Draw true error above predicted error, a column for each view."""
+
+    def rms(values: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.square(values).mean(-1))
+
+    axes = figure.subplots(2, len(maps), squeeze=False)
+    top = max(float(np.quantile(rms(error)[inside], 0.98)) for _, error, _, inside in maps)
+    scale = {"cmap": "inferno", "vmin": 0, "vmax": top, "interpolation": "nearest"}
+    image = None
+    for column, (name, error, sigma, inside) in zip(axes.T, maps, strict=True):
+        panels = (("true error", error), ("predicted", sigma))
+        for axis, (label, values) in zip(column, panels, strict=True):
+            image = axis.imshow(np.ma.masked_where(~inside, rms(values))[crop(inside)], **scale)
+            axis.set_title(f"{name}, {label}")
+            axis.set_axis_off()
+    figure.colorbar(image, ax=axes, label="rms of the channels, linear RGB", shrink=0.8)
+
+
+def _draw_ause(axis: Any, rows: Sequence[tuple[dict[str, Any], str]]) -> None:
+    """Draw AUSE of absolute errors as bars, with ticks for a perfect sigma and a line for a
+    constant one."""
+    for i, (row, colour) in enumerate(rows):
+        area = row["ause"]["mae"]
+        ends, perfect = [i - 0.4, i + 0.4], [area["perfect"]] * 2
+        axis.bar(i, area["ause"], color=colour)
+        axis.plot(ends, perfect, color="white", linewidth=2.5)
+        label = "if it were perfect" if i == 0 else None
+        axis.plot(ends, perfect, color="black", linewidth=1, label=label)
+    constant = rows[0][0]["ause"]["mae"]["constant"]
+    axis.axhline(constant, color="black", linewidth=1, linestyle="--", label="a constant")
+    axis.set_xticks([])
+    axis.set_ylabel("AUSE of |error|")
+    axis.set_ylim(0, 1.3 * constant)
+    axis.legend(loc="upper right", fontsize=8)
+
+
+def _draw_held(axis: Any, rows: Sequence[tuple[dict[str, Any], str]]) -> None:
+    """Draw shares of the errors inside the intervals of 90 %, in thirds of the pixels by sigma."""
+    for i, (row, colour) in enumerate(rows):
+        x = np.arange(3) + 0.06 * (i - 1.5)
+        axis.plot(x, row["held"]["0.9"][1:], "o", color=colour, markersize=5)
+    axis.axhspan(0.87, 0.93, color="#e4e4e4", zorder=0)
+    axis.set_xticks(range(3), ["least", "middle", "largest"])
+    axis.set_xlim(-0.5, 2.5)
+    axis.set_xlabel("third of the pixels by predicted error")
+    axis.set_ylabel("inside the interval of 90 %")
+
+
+def _draw_pit(axis: Any, rows: Sequence[tuple[dict[str, Any], str]]) -> None:
+    """Draw histograms of the probability integral transform."""
+    edges = np.linspace(0, 1, BINS + 1)
+    for row, colour in rows:
+        axis.stairs(np.array(row["pit"]) * BINS, edges, color=colour, linewidth=1.4)
+    axis.axhline(1, color="black", linewidth=0.8, linestyle="--")
+    axis.set_xlabel("probability integral transform")
+    axis.set_ylabel("density")

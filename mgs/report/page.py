@@ -1,14 +1,13 @@
 """The report as one HTML page that opens from the disk and loads nothing: `mgs report --html`.
 
-Everything is taken from the files of the runs and of their dataset; only the pictures are drawn
-anew, from the models that the
-run folders hold. A run may be unfinished, and may have been measured or not: what is not there is
-left out, and said.
+Everything is taken from the files of the runs and of their dataset. Only pictures are drawn, of the
+models that the run folders hold. A run may be unfinished or not measured; the page says what is
+missing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -19,9 +18,9 @@ import numpy as np
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.up import upright
 from mgs.files import atomic_path
+from mgs.report.figures import Curves
 from mgs.report.page_facts import (
     Shown,
-    cell,
     links,
     measured,
     measured_views,
@@ -32,26 +31,19 @@ from mgs.report.page_facts import (
 from mgs.report.page_pictures import (
     ERROR_COLOURS,
     UNCERTAINTY_COLOURS,
-    WIDEST,
     Album,
     colour_scale,
     draw_render,
     draw_taken,
     new_album,
 )
-from mgs.report.page_plots import (
-    Curves,
-    line_plot,
-    metric_name,
-    orbit_plot,
-    timing_plot,
-    views_plot,
-)
-from mgs.report.runs import Run, dataset_of, labelled_runs
+from mgs.report.page_plots import line_plot, metric_name, orbit_plot, timing_plot, views_plot
+from mgs.report.runs import RunFiles, compare_runs
+from mgs.report.tables import table_cell
 from mgs.run.folder import read_settings
 
 COMPARED = 6
-"""Most views of the dataset, and most of its test views, that truth and renders are compared on."""
+"""Most views of the dataset, and most test views, on which truth and renders are compared."""
 
 
 def write_page(
@@ -59,39 +51,36 @@ def write_page(
     folders: Sequence[str | Path],
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> int:
-    """Write the page of these runs as one HTML file, and return its size in bytes.
+    """Write the page of these runs as one HTML file; return its size in bytes.
 
     folders: run folders on one dataset, finished or not. progress: called as progress(pictures of
-    views drawn, in all). Links to other files are relative to the page. The same files give the
-    same page, byte for byte. Raises InputError as `mgs.report.runs.labelled_runs` and `dataset_of`,
-    and if a file is damaged or the page cannot be written.
+    views drawn, all). Links to other files are relative to the page. The same files give the same
+    page, byte for byte. Raises InputError as `mgs.report.runs.compare_runs`, and if a file is
+    damaged or the page cannot be written.
     """
-    path = Path(path)
-    runs = labelled_runs(folders)
-    dataset = dataset_of(list(runs.values()))
-    shown = [read_shown(label, run, dataset) for label, run in runs.items()]
+    path, compared = Path(path), compare_runs(folders)
+    dataset = compared.dataset
+    shown = [read_shown(label, run, dataset) for label, run in compared.runs.items()]
     album, views = draw_pictures(shown, dataset, progress)
     limit = album.finish()
-    data = {
-        "pictures": album.pictures,
-        "runs": [_sections(one, dataset) for one in shown],
-        "compared": _compared(shown, views),
-        "plots": _plots(shown),
-    }
-    scales = {
-        "error": colour_scale(ERROR_COLOURS),
-        "uncertainty": colour_scale(UNCERTAINTY_COLOURS),
-    }
     text = _fill_in(
-        title=", ".join(runs),
+        title=", ".join(compared.runs),
         dataset=dataset.root.resolve().name,
         shown=shown,
         summary=summary_rows(shown),
         settings=setting_rows(shown),
         files=[(one.label, links(one.run, path)) for one in shown],
-        data=data,
+        data={
+            "pictures": album.pictures,
+            "runs": [_section(one, dataset) for one in shown],
+            "compared": [_compared(shown, frame) for frame in views],
+            "plots": _plots(shown),
+        },
         limit=limit,
-        scales=scales,
+        scales={
+            "error": colour_scale(ERROR_COLOURS),
+            "uncertainty": colour_scale(UNCERTAINTY_COLOURS),
+        },
     )
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -103,27 +92,23 @@ def draw_pictures(
     dataset: Dataset,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Album, list[Frame]]:
-    """(album, frames) of the page: of every run the views that it took, and of the frames returned
-    the truth and the renders of all runs.
+    """Draw the pictures of the page: of every run the views that it took, and of the returned
+    frames (`compared_frames`) the truth and the renders of all runs.
 
-    These frames are up to COMPARED that the fewest runs were trained on, spread evenly, and as many
-    test views of the dataset, whose names begin with `test/`. Raises InputError if a file of a
-    frame cannot be read.
+    Raises InputError if a file of a frame cannot be read.
     """
     from mgs.splat import render
 
-    modelled = [one for one in shown if one.model is not None]
+    modelled = [(one, one.model) for one in shown if one.model is not None]
     if not modelled:
-        return Album((slice(None), slice(None)), WIDEST), []
+        return Album(), []
     views = compared_frames([one.run for one in shown], dataset)
-    frames = [*views, *(frame for one in modelled for frame in one.frames)]
-    total = sum(len(one.frames) for one in modelled) + len(views) * len(modelled)
-    count = (
-        2 * total
-        + 2 * sum(len(one.frames) for one in modelled)
-        + len({frame.name for frame in frames})
-    )
-    album, done = new_album(frames, count), 0
+    frames = [*views, *(frame for one, _ in modelled for frame in one.frames)]
+    taken = sum(len(one.frames) for one, _ in modelled)
+    total, done = taken + len(views) * len(modelled), 0
+    # Of each view a render and an error, of taken ones two maps more, of each frame a truth.
+    count = 2 * total + 2 * taken + len({frame.name for frame in frames})
+    album = new_album(frames, count)
 
     def drawn() -> None:
         nonlocal done
@@ -131,42 +116,28 @@ def draw_pictures(
         progress(done, total)
 
     progress(0, total)
-    for one in modelled:
-        assert one.model is not None
+    for one, model in modelled:
         settings = read_settings(one.run.folder)
-        draw_taken(
-            album,
-            one.label,
-            one.model,
-            one.frames,
-            (settings.pixel_noise, settings.prior_std),
-            drawn,
-        )
+        noise = settings.pixel_noise, settings.prior_std
+        draw_taken(album, one.label, model, one.frames, noise, drawn)
         for frame in views:
-            if f"render/{frame.name}/{one.label}" not in album.pictures:
-                draw_render(
-                    album,
-                    f"{frame.name}/{one.label}",
-                    frame,
-                    np.asarray(render(one.model, frame.camera).rgb),
-                )
+            name = f"{frame.name}/{one.label}"
+            if f"render/{name}" not in album.pictures:
+                draw_render(album, name, frame, np.asarray(render(model, frame.camera).rgb))
             drawn()
     return album, views
 
 
-def compared_frames(runs: Sequence[Run], dataset: Dataset) -> list[Frame]:
-    """The frames that `draw_pictures` compares truth and renders on."""
-    taken = [{dataset.frames[i].name for i in run.seeds + run.chosen} for run in runs]
+def compared_frames(runs: Sequence[RunFiles], dataset: Dataset) -> list[Frame]:
+    """Frames on which the page compares truth and renders: up to COMPARED that the fewest runs were
+    trained on, spread evenly, and as many test views, named `test/NAME`."""
+    taken = [{dataset.frames[i].name for i in run.taken} for run in runs]
     there = dataset.with_images(set.union(*taken))
     counts = [sum(frame.name in names for names in taken) for frame in there]
     pool = [frame for frame, count in zip(there, counts, strict=True) if count == min(counts)]
     tests = dataset.test_views()
-    named = (
-        []
-        if tests is None
-        else [replace(frame, name=f"test/{frame.name}") for frame in tests.frames]
-    )
-    return [*_spread(pool), *_spread(named)]
+    frames = () if tests is None else tests.frames
+    return [*_spread(pool), *_spread([replace(f, name=f"test/{f.name}") for f in frames])]
 
 
 def _spread(frames: Sequence[Frame]) -> list[Frame]:
@@ -175,183 +146,133 @@ def _spread(frames: Sequence[Frame]) -> list[Frame]:
     return [frames[i * len(frames) // count] for i in range(count)]
 
 
-def _sections(one: Shown, dataset: Dataset) -> dict[str, Any]:
-    """What the section of one run shows: its views in the order they were taken, the orbit and the
-    times."""
-    steps, seeds = one.run.steps, len(one.run.seeds)
-    views = []
-    for k, frame in enumerate(one.frames):
-        step = steps[max(0, k - seeds + 1)]
-        what = f"seed {k + 1} of {seeds}" if k < seeds else f"step {step['step']}"
-        facts = [("view", frame.name), ("taken as", what), ("images so far", str(k + 1))]
-        if k >= seeds:
-            facts.append(("information gain", f"{step['information_gain']:.4g}"))
-        if k >= seeds - 1:  # of the seeds, the coverage is known after the last
-            facts.append(("surface coverage", f"{100 * step['coverage']:.2f} %"))
-            facts += [(metric_name(key), cell(key, value)) for key, value in measured(step).items()]
-        views.append(
-            {
-                "name": frame.name,
-                "facts": facts,
-                "pictures": _pictures(one, frame, k + 1),
-                "eye": (upright(one.up) @ frame.camera.position).tolist(),
-            }
-        )
-    cameras, names = (
-        [frame.camera for frame in dataset.frames],
-        [frame.name for frame in dataset.frames],
-    )
+def _section(one: Shown, dataset: Dataset) -> dict[str, Any]:
+    """Section of one run: its views in the order they were taken, orbit, and times."""
+    run, cameras = one.run, [frame.camera for frame in dataset.frames]
+    names = [frame.name for frame in dataset.frames]
     orbit = orbit_plot(
-        one.label, cameras, names, one.run.seeds, one.run.chosen, one.model, one.up, one.unit
+        one.label, cameras, names, run.seeds, run.chosen, one.model, one.up, one.unit
     )
     return {
         "label": one.label,
-        "views": views,
+        "views": [_view(one, k) for k in range(len(one.frames))],
         "orbit": orbit,
-        "time": timing_plot(one.label, steps),
+        "time": timing_plot(one.label, run.steps),
     }
 
 
-def _pictures(one: Shown, frame: Frame, images: int) -> list[dict[str, str]]:
-    """The pictures of a view that a run took: their names in the album, captions and alternative
-    texts."""
-    if one.model is None:
-        return []
-    last, view, quality = (
-        f"the model of {len(one.frames)} images",
-        frame.name,
-        _quality(one, frame.name),
-    )
+def _view(one: Shown, k: int) -> dict[str, Any]:
+    """The k-th view that a run took: facts, pictures, and the position of its camera in the
+    plot."""
+    frame, seeds = one.frames[k], len(one.run.seeds)
+    step = one.run.steps[max(0, k - seeds + 1)]
+    role = f"seed {k + 1} of {seeds}" if k < seeds else f"step {step['step']}"
+    facts = [("view", frame.name), ("taken as", role), ("images so far", str(k + 1))]
+    if k >= seeds:
+        facts.append(("information gain", f"{step['information_gain']:.4g}"))
+    if k >= seeds - 1:  # of the seeds, the coverage is known after the last
+        facts.append(("surface coverage", f"{100 * step['coverage']:.2f} %"))
+        facts += [(metric_name(key), table_cell(key, v)) for key, v in measured(step).items()]
+    pictures = [] if one.model is None else _pictures(one, frame.name, k + 1)
+    eye = (upright(one.up) @ frame.camera.position).tolist()
+    return {"name": frame.name, "facts": facts, "pictures": pictures, "eye": eye}
+
+
+def _pictures(one: Shown, view: str, images: int) -> list[dict[str, str]]:
+    """Pictures of a view that a run took: names in the album, captions, alternative texts. images:
+    number of images with this one."""
+    quality, own = one.psnr_of(view), f"{view}/{one.label}"
     before, after = (f"{n} image{'' if n == 1 else 's'}" for n in (images - 1, images))
-    return [
-        {
-            "name": f"truth/{view}",
-            "caption": "truth",
-            "alt": f"Truth: the image of {view}, the rock in front of black.",
-        },
-        {
-            "name": f"render/{view}/{one.label}",
-            "caption": f"render{quality}",
-            "alt": f"Render of {last} at {view}{quality}.",
-        },
-        {
-            "name": f"error/{view}/{one.label}",
-            "caption": "error",
-            "alt": f"Absolute difference of truth and render at {view}, bright where it is large{quality}.",
-        },
-        {
-            "name": f"before/{view}/{one.label}",
-            "caption": f"uncertainty before ({before})",
-            "alt": f"Uncertainty seen from {view} before it was taken, with {before}: bright where little is known.",
-        },
-        {
-            "name": f"after/{view}/{one.label}",
-            "caption": f"uncertainty after ({after})",
-            "alt": f"Uncertainty seen from {view} after it was taken, with {after}: bright where little is known.",
-        },
+    known = f"Uncertainty seen from {view}"
+    rows = [
+        (f"truth/{view}", "truth", f"Truth: the image of {view}, the rock in front of black."),
+        (
+            f"render/{own}",
+            f"render{quality}",
+            f"Render of the model of {len(one.frames)} images at {view}{quality}.",
+        ),
+        (
+            f"error/{own}",
+            "error",
+            f"Absolute difference of truth and render at {view}, bright where it is large"
+            f"{quality}.",
+        ),
+        (
+            f"before/{own}",
+            f"uncertainty before ({before})",
+            f"{known} before it was taken, with {before}: bright where little is known.",
+        ),
+        (
+            f"after/{own}",
+            f"uncertainty after ({after})",
+            f"{known} after it was taken, with {after}: bright where little is known.",
+        ),
     ]
+    return [{"name": name, "caption": caption, "alt": alt} for name, caption, alt in rows]
 
 
-def _quality(one: Shown, view: str) -> str:
-    """PSNR of a view as part of a caption; empty where it was not measured."""
-    found = next((v for v in measured_views(one) if v["name"] == view), None)
-    decibels = None if found is None else found.get("psnr")
-    return "" if decibels is None else f", {decibels:.2f} dB"
-
-
-def _compared(shown: Sequence[Shown], views: Sequence[Frame]) -> list[dict[str, Any]]:
-    """For each view that is compared: what can stand on either side of the divider, the truth
-    first."""
-    found = []
-    for frame in views:
-        sides = [
-            {"label": "truth", "name": f"truth/{frame.name}", "alt": f"Truth at {frame.name}."}
-        ]
-        trained = []
-        for one in shown:
-            if one.model is not None:
-                quality = _quality(one, frame.name)
-                alt = f"Render of {one.label} at {frame.name}{quality}."
-                sides.append(
-                    {
-                        "label": one.label + quality,
-                        "name": f"render/{frame.name}/{one.label}",
-                        "alt": alt,
-                    }
-                )
-            trained += [one.label] if frame.name in {f.name for f in one.frames} else []
-        note = f"trained on by {', '.join(trained)}" if trained else "never trained on"
-        found.append({"view": frame.name, "note": note, "sides": sides})
-    return found
+def _compared(shown: Sequence[Shown], frame: Frame) -> dict[str, Any]:
+    """What can stand on either side of the divider at a view: the truth, and the renders of all
+    runs."""
+    view = frame.name
+    sides = [{"label": "truth", "name": f"truth/{view}", "alt": f"Truth at {view}."}]
+    for one in shown:
+        if one.model is not None:
+            quality, name = one.psnr_of(view), f"render/{view}/{one.label}"
+            alt = f"Render of {one.label} at {view}{quality}."
+            sides.append({"label": one.label + quality, "name": name, "alt": alt})
+    trained = [one.label for one in shown if view in {f.name for f in one.frames}]
+    note = f"trained on by {', '.join(trained)}" if trained else "never trained on"
+    return {"view": view, "note": note, "sides": sides}
 
 
 def _plots(shown: Sequence[Shown]) -> list[dict[str, Any]]:
-    """The plots that compare runs: the paper's figures, and every metric that the steps or the
-    views were measured by."""
-
-    def curves(key: str, factor: float = 1.0) -> Curves:
-        lines = {
-            one.label: [(s["images"], (s | measured(s)).get(key)) for s in one.run.steps]
-            for one in shown
-        }
-        known = {
-            label: [(x, factor * y) for x, y in points if y is not None]
-            for label, points in lines.items()
-        }
-        return {
-            label: ([x for x, _ in points], [y for _, y in points])
-            for label, points in known.items()
-            if points
-        }
-
-    covered = curves("coverage", 100)
+    """Plots that compare runs: the paper's figures, and every metric that was measured after steps
+    or of views."""
+    covered = _curves(shown, "coverage", 100)
     added = {
         label: (x[1:], [b - a for a, b in pairwise(y)])
         for label, (x, y) in covered.items()
         if len(y) > 1
     }
+    gain, left = _curves(shown, "information_gain"), _curves(shown, "uncertainty")
     wanted = [
-        (
-            "Information gain of each chosen view (the paper's Fig. 2)",
-            curves("information_gain"),
-            "gain, Eq. 7",
-            True,
-        ),
+        ("Information gain of each chosen view (the paper's Fig. 2)", gain, "gain, Eq. 7", True),
         ("Surface coverage (Fig. 3)", covered, "coverage (%)", False),
         ("Coverage that each view added (Fig. 3)", added, "percentage points", True),
-        (
-            "Variance that is left, over that of the prior",
-            curves("uncertainty"),
-            "mean over all parameters",
-            True,
-        ),
+        ("Variance left, over that of the prior", left, "mean over all parameters", True),
     ]
-    keys = dict.fromkeys(key for one in shown for step in one.run.steps for key in measured(step))
-    wanted += [
-        (f"{metric_name(key)} after each step", curves(key), metric_name(key), False)
-        for key in keys
-    ]
-    wanted.append(("Loss at the end of each fit", curves("loss"), "mean squared error", True))
+    for key in dict.fromkeys(key for one in shown for s in one.run.steps for key in measured(s)):
+        name = metric_name(key)
+        wanted.append((f"{name} after each step", _curves(shown, key), name, False))
+    loss = _curves(shown, "loss")
+    wanted.append(("Loss at the end of each fit", loss, "mean squared error", True))
     plots = [
         line_plot(title, found, "images", y, zero) for title, found, y, zero in wanted if found
     ]
     views = {one.label: measured_views(one) for one in shown if one.metrics is not None}
     if views:
-        plots.append(
-            views_plot("psnr_mask", views)
-            if _all_have("psnr_mask", views)
-            else views_plot("psnr", views)
+        masked = all(
+            any(view.get("psnr_mask") is not None for view in of_run) for of_run in views.values()
         )
+        plots.append(views_plot("psnr_mask" if masked else "psnr", views))
     return plots
 
 
-def _all_have(key: str, runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> bool:
-    """Whether each run has this metric for some view."""
-    return all(any(view.get(key) is not None for view in views) for views in runs.values())
+def _curves(shown: Sequence[Shown], key: str, factor: float = 1.0) -> Curves:
+    """A number or metric of the steps of each run, times a factor, against the number of images;
+    without runs that have none."""
+    curves = {}
+    for one in shown:
+        values = [(s["images"], (s | measured(s)).get(key)) for s in one.run.steps]
+        points = [(x, factor * y) for x, y in values if y is not None]
+        if points:
+            curves[one.label] = ([x for x, _ in points], [y for _, y in points])
+    return curves
 
 
 def _fill_in(**values: Any) -> str:
-    """The page, from the template beside this file."""
+    """Fill in the template beside this file."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
     from plotly.offline import get_plotlyjs
@@ -364,10 +285,7 @@ def _fill_in(**values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    parts = {
-        name: Markup((folder / f"page.{name}").read_text(encoding="utf-8"))
-        for name in ("css", "js")
-    }
-    return environment.get_template("page.html").render(
-        **values, **parts, plotly=Markup(get_plotlyjs())
-    )
+    for name in ("css", "js"):
+        values[name] = Markup((folder / f"page.{name}").read_text(encoding="utf-8"))
+    values["plotly"] = Markup(get_plotlyjs())
+    return environment.get_template("page.html").render(**values)

@@ -241,7 +241,7 @@ def calibrate_run(
     `mgs.run.folder.load_run`, and for a run that learns means, has fewer than 2 FOLDS images, or
     has seen all views there are.
     """
-    from mgs.report.uncertainty_figure import write_uncertainty
+    from mgs.report.figures import uncertainty_figure
 
     run = Path(run)
     gaussians, dataset, trained, _ = run_folder.load_run(run)
@@ -286,7 +286,7 @@ def calibrate_run(
         _maps(final, frame, calibrations["all"], seed)
         for frame in shown[:: -(-len(shown) // MAPPED)]
     ]
-    write_uncertainty(out / "uncertainty.png", rows, maps)
+    uncertainty_figure(out / "uncertainty.png", rows, maps)
     return [
         out / "uncertainty.json",
         out / "uncertainty.png",

@@ -1,5 +1,4 @@
-"""Run folders as a report needs them: read, checked, and found fit to be compared. Nothing is
-computed anew."""
+"""Run folders as a report reads them: checked, and fit to be compared. Nothing is computed."""
 
 from __future__ import annotations
 
@@ -22,7 +21,7 @@ from mgs.run.settings import validated
 
 
 class _Settings(BaseModel):
-    """What a report needs of the settings in config.json."""
+    """Settings in config.json that a report needs."""
 
     policy: str
     dataset: str
@@ -31,33 +30,33 @@ class _Settings(BaseModel):
 
 
 class _Ended(BaseModel):
-    """What it needs of why a run ended."""
-
     reason: RunEnd
     views: int
 
 
-class _SeedLine(BaseModel):
-    """What it needs of the first line of steps.jsonl, which is about the seeds."""
+class _Line(BaseModel):
+    """Numbers that a report needs of every line of steps.jsonl."""
 
-    seeds: list[int]
     images: int
     coverage: float
     ended: _Ended | None = None
 
 
-class _ChoiceLine(BaseModel):
-    """What it needs of each other line of steps.jsonl, which is about one view that was chosen."""
+class _SeedLine(_Line):
+    """The first line, which is about the seeds."""
+
+    seeds: list[int]
+
+
+class _ChoiceLine(_Line):
+    """Any other line, which is about one chosen view."""
 
     frame: int
     information_gain: float
-    images: int
-    coverage: float
-    ended: _Ended | None = None
 
 
 class _View(BaseModel):
-    """What it needs of each view in metrics.json."""
+    """A view in metrics.json."""
 
     name: str
     trained: bool
@@ -66,7 +65,7 @@ class _View(BaseModel):
 
 
 class _Metrics(BaseModel):
-    """What it needs of metrics.json."""
+    """Contents of metrics.json that a report needs."""
 
     images: int
     all: dict[str, float | None]
@@ -77,12 +76,12 @@ class _Metrics(BaseModel):
 
 
 @dataclass(frozen=True)
-class Run:
-    """What the files of a run folder say.
+class RunFiles:
+    """Contents of the files of a run folder.
 
-    policy: its name. steps: the lines of steps.jsonl (`mgs.run.folder` says what they hold).
-    metrics: metrics.json as `mgs.report.evaluation.evaluate` returns it, None if the run was not
-    evaluated. settings: those in config.json.
+    policy: its name. steps: the lines of steps.jsonl (`mgs.run.folder` lists their keys). metrics:
+    metrics.json (`mgs.report.evaluation.evaluate`), None if the run was not evaluated. settings:
+    those in config.json.
     """
 
     folder: Path
@@ -98,21 +97,33 @@ class Run:
 
     @property
     def chosen(self) -> list[int]:
-        """Indices of the frames that the policy chose, in the order of their choice."""
+        """Indices of the chosen frames, in the order of their choice."""
         return [int(step["frame"]) for step in self.steps[1:]]
 
     @property
+    def taken(self) -> list[int]:
+        """Indices of all frames trained on: seeds, then chosen ones."""
+        return self.seeds + self.chosen
+
+    @property
     def ended(self) -> dict[str, Any] | None:
-        """Why the run ended, as `ended` of steps.jsonl, which older runs lack; None: it is
-        unfinished."""
-        views, recorded = len(self.chosen), self.steps[-1].get("ended")
-        if views >= self.settings["budget"]:
-            return {"reason": str(RunEnd.BUDGET), "views": views}
-        return None if recorded is None or recorded["reason"] == RunEnd.BUDGET else recorded
+        """Why the run ended, as in steps.jsonl; None for an unfinished run, also where the budget
+        was raised after it was spent."""
+        ended = self.steps[-1].get("ended")
+        spent = ended is not None and ended["reason"] == RunEnd.BUDGET
+        return None if spent and len(self.chosen) < self.settings["budget"] else ended
 
 
-def read_run(folder: str | Path) -> Run:
-    """Read config.json, steps.jsonl and, if it is there, metrics.json from a run folder.
+@dataclass(frozen=True)
+class Comparison:
+    """Runs on one dataset, by label: the policy, with the folder's name if several runs have it."""
+
+    runs: dict[str, RunFiles]
+    dataset: Dataset
+
+
+def read_run(folder: str | Path) -> RunFiles:
+    """Read config.json, steps.jsonl and, if it exists, metrics.json of a run folder.
 
     Raises InputError if the folder holds no run, or a file is damaged, empty, or lacks a number
     that a report needs.
@@ -129,60 +140,70 @@ def read_run(folder: str | Path) -> Run:
         raise InputError(
             f"{path}: is damaged; measure the run again with `mgs eval {folder}`"
         ) from None
-    return Run(folder, label(settings.policy), steps, metrics, config["settings"])
+    return RunFiles(folder, label(settings.policy), steps, metrics, config["settings"])
 
 
 def _read_steps(folder: Path) -> list[dict[str, Any]]:
-    """The lines of steps.jsonl. Raises InputError if the file is missing, or naming the line that
-    is damaged and how."""
+    """Read steps.jsonl. Raises InputError if it is missing, or with the number of a damaged
+    line."""
     path, resume = folder / "steps.jsonl", f"`mgs nbv --resume {folder}`"
     if not path.is_file():
         raise InputError(
             f"{path}: no such file; the run has no finished step, continue it with {resume}"
         )
     steps: list[dict[str, Any]] = []
-    for number, text in enumerate(
-        path.read_text(encoding="utf-8", errors="replace").splitlines() or [""], 1
-    ):
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines() or [""]
+    for number, text in enumerate(lines, 1):
         try:
             steps.append(json.loads(text))
             (_SeedLine if number == 1 else _ChoiceLine).model_validate(steps[-1])
         except ValueError as error:
             raise InputError(
-                f"{path}: line {number} is damaged ({_cause(error)}); write the file anew with {resume}"
+                f"{path}: line {number} is damaged ({_cause(error)}); "
+                f"write the file anew with {resume}"
             ) from None
     return steps
 
 
 def _cause(error: ValueError) -> str:
-    """What is wrong with a line, in a few words: the key and what it lacks, or that the line is not
-    JSON."""
+    """What is wrong with a line: a key and its error, or "no JSON"."""
     if not isinstance(error, ValidationError):
         return "no JSON"
     first = error.errors(include_url=False)[0]
     return ": ".join(str(part) for part in (*first["loc"], first["msg"]))
 
 
-def check_finished(run: Run) -> None:
+def check_finished(run: RunFiles) -> None:
     """Raises InputError if a run has not ended, or its last file, gaussians.ply, is missing."""
-    taken, planned = len(run.seeds + run.chosen), run.settings["seeds"] + run.settings["budget"]
+    taken, planned = len(run.taken), run.settings["seeds"] + run.settings["budget"]
     resume = f"`mgs nbv --resume {run.folder}`"
     if run.ended is None:
         raise InputError(
-            f"{run.folder}: is unfinished, with {taken} of {planned} views; go on with {resume}, then report"
+            f"{run.folder}: is unfinished, with {taken} of {planned} views; "
+            f"go on with {resume}, then report"
         )
     if not (run.folder / "gaussians.ply").is_file():
         raise InputError(
-            f"{run.folder}: has all {taken} views, but no gaussians.ply; write it with {resume}, then report"
+            f"{run.folder}: has all {taken} views, but no gaussians.ply; "
+            f"write it with {resume}, then report"
         )
 
 
-def labelled_runs(folders: Sequence[str | Path]) -> dict[str, Run]:
-    """Read runs that are to be compared, by label: the policy, with the folder's name if several
-    runs have the same policy.
+def check_measured(run: RunFiles) -> None:
+    """Raises InputError if a run was not evaluated since its last step."""
+    if run.metrics is None or run.metrics["images"] != len(run.taken):
+        raise InputError(
+            f"{run.folder}: was not evaluated since its last step; "
+            f"measure it with `mgs eval {run.folder}`"
+        )
 
-    Raises InputError as `read_run`, if two runs have the same policy and folder name, or if the
-    runs are on different datasets.
+
+def compare_runs(folders: Sequence[str | Path]) -> Comparison:
+    """Read runs that are to be compared, and load their dataset.
+
+    Raises InputError as `read_run`; if two runs have the same policy and folder name; if the runs
+    are on different datasets; and if the dataset is missing, unreadable, or no longer has the
+    frames that a run was started on.
     """
     runs = [read_run(folder) for folder in folders]
     policies = [run.policy for run in runs]
@@ -194,45 +215,25 @@ def labelled_runs(folders: Sequence[str | Path]) -> dict[str, Run]:
     }
     if len(labelled) < len(runs):
         raise InputError(
-            "report: two of the runs have the same policy and folder name; give each run once, or rename a folder"
+            "report: two of the runs have the same policy and folder name; "
+            "give each run once, or rename a folder"
         )
     for run in runs:
         if run.settings["dataset"] != runs[0].settings["dataset"]:
             raise InputError(
-                f"{run.folder}: is a run on another dataset than {runs[0].folder}; compare runs on one dataset"
+                f"{run.folder}: is a run on another dataset than {runs[0].folder}; "
+                "compare runs on one dataset"
             )
-    return labelled
-
-
-def evaluated_runs(folders: Sequence[str | Path]) -> dict[str, Run]:
-    """`labelled_runs`, all of which were evaluated. Raises InputError as that, or if a run was not
-    since its last step."""
-    labelled = labelled_runs(folders)
-    for run in labelled.values():
-        if run.metrics is None or run.metrics["images"] != len(run.seeds + run.chosen):
-            raise InputError(
-                f"{run.folder}: was not evaluated since its last step; measure it with `mgs eval {run.folder}`"
-            )
-    return labelled
-
-
-def dataset_of(runs: Sequence[Run]) -> Dataset:
-    """Load the dataset that runs have in common (see `evaluated_runs`).
-
-    Raises InputError if it is missing, cannot be read, or no longer has the frames that a run was
-    started on.
-    """
     dataset = load_dataset(read_settings(runs[0].folder).dataset)
     for run in runs:
         check_same_frames(run.folder, dataset)
-    return dataset
+    return Comparison(labelled, dataset)
 
 
 def up_of(prior: str | Path, dataset: Dataset) -> Up:
-    """Which way was up for a run: as the folder of its prior says, or, where that is not there, as
-    the dataset does.
+    """Up direction of a run: that of its prior, or of the dataset if the prior's folder is gone.
 
-    Raises InputError if the prior's file is damaged.
+    Raises InputError if prior.json is damaged.
     """
     file = Path(prior) / "prior.json"
     numbers = read_json(file) if file.is_file() else None

@@ -1,4 +1,4 @@
-"""The table that compares runs: as numbers, as text, as Markdown."""
+"""The table that compares runs: as numbers, as cells of text, as Markdown."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from mgs.data.dataset import Frame
 from mgs.policy.poses import path_length
-from mgs.report.runs import dataset_of, evaluated_runs
+from mgs.report.runs import Comparison, check_measured, compare_runs
 from mgs.run.ending import RunEnd
 
 COLUMNS = {
@@ -31,87 +32,95 @@ COLUMNS = {
     "path": "path ({unit})",
     "ended": "ended by",
 }
-"""Columns of the table: the key of the number in a row of `table_numbers` -> the heading. Those of
-the test views stand first, because they are the same for every run; where no run was measured on
-test views, they are left out, and where no run has views held out, those of them; where no run
-estimated the exposure of images, those with an exposure that was fitted; where all runs spent their
-budget, why they ended. Rows that older versions wrote have no path (`table_columns`)."""
+"""Columns of the table: key in a row of `table_numbers` -> heading. `table_columns` leaves out
+those that no row needs."""
 
 
 def table_numbers(folders: Sequence[str | Path]) -> list[dict[str, Any]]:
-    """One row for each run, as numbers.
+    """`comparison_rows` of run folders. Raises InputError as `compare_runs` and that."""
+    return comparison_rows(compare_runs(folders))
 
-    policy: the run's label (`evaluated_runs`); images: how many the model was trained on; coverage:
-    of the surface, per cent;
-    path: from view to view in straight lines, from the first seed on; unit: of its length, metres
-    where it is "m";
-    test.NAME (where the dataset has test views), all.NAME and held_out.NAME: the means in
-    metrics.json, PSNR in dB, None if there is no view to average. A run that estimated the exposure
-    of images has "exposure": True, and one that ended before its budget was spent has "ended": the
-    reason (`mgs.run.ending.RunEnd`). Raises InputError as `evaluated_runs` and `dataset_of`.
+
+def comparison_rows(compared: Comparison) -> list[dict[str, Any]]:
+    """Numbers of each run, a row each.
+
+    - policy: the run's label; images: number of training images; coverage: of the surface, per
+      cent.
+    - path: length of the straight lines from view to view, first seed first; unit: of that length,
+      metres where it is "m".
+    - test.NAME (if the dataset has test views), all.NAME, held_out.NAME: means in metrics.json,
+      PSNR in dB; None if there is no view to average.
+    - exposure: True, only for a run that estimated the exposure of images.
+    - ended: the reason (`mgs.run.ending.RunEnd`), only for a run that ended before its budget was
+      spent.
+
+    Raises InputError if a run was not evaluated since its last step.
     """
-    rows, runs = [], evaluated_runs(folders)
-    dataset = dataset_of(list(runs.values()))
-    for label, run in runs.items():
+    rows = []
+    for label, run in compared.runs.items():
+        check_measured(run)
         metrics = run.metrics or {}
-        row = {"policy": label, "images": metrics["images"]}
-        sets = [views for views in ("test", "all", "held_out") if views in metrics]
-        row |= {
-            f"{views}.{name}": metrics[views][name] for views in sets for name in metrics[views]
-        }
-        row |= {"exposure": True} if run.settings.get("exposure") else {}
-        row |= (
-            {"ended": run.ended["reason"]}
-            if run.ended and run.ended["reason"] != RunEnd.BUDGET
-            else {}
-        )
-        path = path_length(
-            np.array([dataset.frames[i].camera.position for i in run.seeds + run.chosen])
-        )
-        rows.append(
-            row | {"coverage": 100 * run.steps[-1]["coverage"], "path": path, "unit": dataset.unit}
-        )
+        row: dict[str, Any] = {"policy": label, "images": metrics["images"]}
+        for views in ("test", "all", "held_out"):
+            row |= {f"{views}.{name}": value for name, value in metrics.get(views, {}).items()}
+        if run.settings.get("exposure"):
+            row["exposure"] = True
+        if run.ended and run.ended["reason"] != RunEnd.BUDGET:
+            row["ended"] = run.ended["reason"]
+        row["coverage"] = 100 * run.steps[-1]["coverage"]
+        row["path"] = path_of([compared.dataset.frames[i] for i in run.taken])
+        row["unit"] = compared.dataset.unit
+        rows.append(row)
     return rows
 
 
+def path_of(frames: Sequence[Frame]) -> float:
+    """Length of the straight lines from camera to camera."""
+    return path_length(np.array([frame.camera.position for frame in frames]))
+
+
 def table_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The keys of COLUMNS, in order, that say something of these rows of `table_numbers`."""
-    exposure, tests = (
-        any(row.get("exposure") for row in rows),
-        any("test.psnr" in row for row in rows),
-    )
-    shown = [
-        key
-        for key in COLUMNS
-        if (exposure or "corrected" not in key) and (tests or not key.startswith("test."))
-    ]
-    if not has_held_out(rows):
-        shown = [key for key in shown if not key.startswith("held_out.")]
-    return [key for key in shown if key not in ("path", "ended") or any(key in row for row in rows)]
+    """Keys of COLUMNS that say something of these rows, in order.
+
+    Left out are test views if no run was measured on some, held-out views if no run has some, a
+    fitted exposure if no run estimated exposure, and the reason of the end if all runs spent their
+    budget.
+    """
+    exposure = any(row.get("exposure") for row in rows)
+    tests, new = any("test.psnr" in row for row in rows), has_held_out(rows)
+    ended = any("ended" in row for row in rows)
+
+    def shown(key: str) -> bool:
+        if key == "ended":
+            return ended
+        views = key.partition(".")[0]
+        return {"test": tests, "held_out": new}.get(views, True) and (
+            exposure or "corrected" not in key
+        )
+
+    return [key for key in COLUMNS if shown(key)]
 
 
 def has_held_out(rows: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether a run of these rows has views with images that it was not trained on. Rows of older
-    versions have no count."""
+    """Whether a run of these rows has views with images that it was not trained on."""
     return any(row.get("held_out.count", 1) for row in rows)
 
 
-def table_cell(column: str, value: Any) -> str:
-    """A number of the table as text, with two decimals, of an SSIM four; a dash for None. column: a
-    key of COLUMNS."""
+def table_cell(key: str, value: Any) -> str:
+    """Format a number as a table cell: SSIM with four decimals, PSNR (dB), coverage (%) and path
+    with two, others with five digits; a dash for None. key: its name, as in COLUMNS or
+    metrics.json."""
     if value is None:
         return "–"
-    return (
-        f"{value:.4f}"
-        if "ssim" in column
-        else f"{value:.2f}"
-        if isinstance(value, float)
-        else str(value)
-    )
+    if not isinstance(value, float):
+        return str(value)
+    if "ssim" in key:
+        return f"{value:.4f}"
+    return f"{value:.2f}" if "psnr" in key or key in ("coverage", "path") else f"{value:.5g}"
 
 
 def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The rows of `table_numbers` as a Markdown table, with the numbers aligned to the right."""
+    """Format the rows of `table_numbers` as a Markdown table."""
     columns = table_columns(rows)
     every = ", all" if has_held_out(rows) else ", views trained on"
     headings = [
@@ -122,6 +131,6 @@ def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def markdown(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table; all columns but the first are right-aligned."""
+    """Format a Markdown table; all columns but the first are right-aligned."""
     lines = [heading, ["---", *["---:"] * (len(heading) - 1)], *rows]
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)

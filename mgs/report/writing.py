@@ -1,5 +1,4 @@
-"""The report that compares runs on one dataset: all figures and the table, drawn from the files of
-the runs alone."""
+"""The report that compares runs on one dataset: figures and a table, from the runs' files alone."""
 
 from __future__ import annotations
 
@@ -11,146 +10,154 @@ import numpy as np
 from mgs.data.dataset import TEST_FOLDER, Dataset, Frame
 from mgs.errors import InputError
 from mgs.files import atomic_path, write_json
+from mgs.report import figures
 from mgs.report.evaluation import read_comparison
-from mgs.report.figures import (
-    comparison_figure,
-    coverage_figure,
-    gain_figure,
-    orbit_figure,
-    psnr_figure,
+from mgs.report.runs import (
+    Comparison,
+    RunFiles,
+    check_finished,
+    check_measured,
+    compare_runs,
+    up_of,
 )
-from mgs.report.runs import Run, check_finished, dataset_of, evaluated_runs, read_run, up_of
-from mgs.report.tables import markdown_table, table_numbers
+from mgs.report.tables import comparison_rows, markdown_table
 from mgs.splat_ply import read_ply
 
 
-def write_report(out: str | Path, folders: Sequence[str | Path], kind: str = "png") -> list[Path]:
-    """Write all figures and the table of runs into the folder `out`, and return the paths of the
-    files.
+def write_report(
+    out: str | Path, runs: Sequence[str | Path] | Comparison, kind: str = "png"
+) -> list[Path]:
+    """Write all figures and the table of runs into the folder `out`; return the paths of the files.
 
-    folders: the run folders. kind: what the figures are written as, one of `mgs.plotting.FORMATS`.
-    The files: orbit.png, gain.png, coverage.png, comparison.png (of a test view, or where there are
-    none, of a view that the fewest runs were trained on), psnr.png (only if all runs were evaluated
-    after some of their steps; over the test views, or where there are none, over all views),
-    table.md and table.json (`table_numbers`). Files of an earlier report are replaced. Raises
-    InputError as `evaluated_runs` and `dataset_of`, if a run is unfinished, or if a picture of `mgs
-    eval` is missing or damaged; then nothing is written.
+    runs: run folders, or what `compare_runs` read of them. kind: format of the figures, one of
+    `mgs.plotting.FORMATS`.
+
+    - orbit.png, gain.png, coverage.png (`mgs.report.figures`);
+    - comparison.png: a view as `shown_view` chooses it;
+    - psnr.png: only if all runs were evaluated after some of their steps; over the test views, or
+      without them over all views;
+    - table.md and table.json (`mgs.report.tables.comparison_rows`).
+
+    Files of an earlier report are replaced. Raises InputError as `compare_runs`; if a run is
+    unfinished or was not evaluated since its last step; and if a picture of `mgs eval` is missing
+    or damaged. Then nothing is written.
     """
-    for folder in folders:
-        check_finished(read_run(folder))
-    out, runs = Path(out), evaluated_runs(folders)
-    first = next(iter(runs.values()))
-    dataset = dataset_of(list(runs.values()))
-    frame, views = shown_view(list(runs.values()), dataset)
-    within = Path("renders", TEST_FOLDER) if views == "test_views" else Path("renders")
-    pictures = {label: run.folder / within / f"{frame.name}.png" for label, run in runs.items()}
-    for label, picture in pictures.items():
-        stale = (runs[label].metrics or {}).get(
-            "pictures"
-        ) is False  # of an earlier model; older runs do not say
-        if stale or not picture.is_file():
-            raise InputError(
-                f"{picture}: no picture of this model; draw it with `mgs eval {runs[label].folder}`"
-            )
-    captions = {label: _caption(run, views, frame.name) for label, run in runs.items()}
-    pairs = {label: read_comparison(picture, frame.camera) for label, picture in pictures.items()}
+    compared = runs if isinstance(runs, Comparison) else compare_runs(runs)
+    for run in compared.runs.values():
+        check_finished(run)
+        check_measured(run)
+    out, dataset = Path(out), compared.dataset
+    frame, truth, renders, captions = _comparison(compared)
+    paths = {name: out / f"{name}.{kind}" for name in ("orbit", "gain", "coverage", "comparison")}
 
-    figures = {name: out / f"{name}.{kind}" for name in ("orbit", "gain", "coverage", "comparison")}
+    first = next(iter(compared.runs.values()))
     positions = np.array([frame.camera.position for frame in dataset.frames])
-    choices = {label: (run.seeds, run.chosen) for label, run in runs.items()}
-    means, up = (
-        read_ply(first.folder / "gaussians.ply").means,
-        up_of(first.settings.get("prior", ""), dataset),
+    means = read_ply(first.folder / "gaussians.ply").means
+    choices = {label: (run.seeds, run.chosen) for label, run in compared.runs.items()}
+    up = up_of(first.settings.get("prior", ""), dataset)
+    figures.orbit_figure(paths["orbit"], positions, means, choices, up, dataset.unit)
+    steps = {label: run.steps for label, run in compared.runs.items()}
+    gains = {label: [s["information_gain"] for s in lines[1:]] for label, lines in steps.items()}
+    figures.gain_figure(paths["gain"], gains)
+    figures.coverage_figure(paths["coverage"], _curves(steps, "coverage"))
+    figures.comparison_figure(
+        paths["comparison"], truth, renders, title=frame.name, captions=captions
     )
-    orbit_figure(figures["orbit"], positions, means, choices, up, dataset.unit)
-    gain_figure(
-        figures["gain"],
-        {label: [s["information_gain"] for s in run.steps[1:]] for label, run in runs.items()},
-    )
-    curves = {
-        label: ([s["images"] for s in run.steps], [s["coverage"] for s in run.steps])
-        for label, run in runs.items()
-    }
-    coverage_figure(figures["coverage"], curves)
+    every = "views taken so far" if dataset.on_demand else "all views"
+    if panels := _psnr_panels(steps, every):
+        paths["psnr"] = out / f"psnr.{kind}"
+        figures.psnr_figure(paths["psnr"], panels)
 
-    truth = next(iter(pairs.values()))[0]
-    renders = {label: rendered for label, (_, rendered) in pairs.items()}
-    comparison_figure(figures["comparison"], truth, renders, title=frame.name, captions=captions)
-    written = list(figures.values())
-
-    panels = _psnr_panels(runs, "views taken so far" if dataset.on_demand else "all views")
-    if panels:
-        psnr_figure(out / f"psnr.{kind}", panels)
-        written.append(out / f"psnr.{kind}")
-    numbers = table_numbers(folders)
+    rows = comparison_rows(compared)
     with atomic_path(out / "table.md") as temporary:
-        temporary.write_text(markdown_table(numbers), encoding="utf-8")
-    write_json(out / "table.json", numbers)
-    return [*written, out / "table.md", out / "table.json"]
+        temporary.write_text(markdown_table(rows), encoding="utf-8")
+    write_json(out / "table.json", rows)
+    return [*paths.values(), out / "table.md", out / "table.json"]
 
 
-def shown_view(runs: Sequence[Run], dataset: Dataset) -> tuple[Frame, str]:
-    """The view that the comparison shows, and the key of metrics.json that has its numbers:
-    "test_views" or "views".
+def _comparison(
+    compared: Comparison,
+) -> tuple[Frame, np.ndarray, dict[str, np.ndarray], dict[str, str]]:
+    """The shown view: frame, truth [H,W,3], renders [H,W,3] by label, captions by label."""
+    frame, views = shown_view(list(compared.runs.values()), compared.dataset)
+    within = Path("renders", TEST_FOLDER) if views == "test_views" else Path("renders")
+    pictures = {}
+    for label, run in compared.runs.items():
+        picture = run.folder / within / f"{frame.name}.png"
+        of_this_model = (run.metrics or {}).get("pictures", True)
+        if not (of_this_model and picture.is_file()):
+            raise InputError(
+                f"{picture}: no picture of this model; draw it with `mgs eval {run.folder}`"
+            )
+        pictures[label] = picture
+    captions = {label: _caption(run, views, frame.name) for label, run in compared.runs.items()}
+    pairs = {label: read_comparison(picture, frame.camera) for label, picture in pictures.items()}
+    truth = next(iter(pairs.values()))[0]
+    return frame, truth, {label: render for label, (_, render) in pairs.items()}, captions
 
-    It is the middle one of the test views where all runs were measured on them, otherwise a view
-    that the fewest runs were trained on (`unseen_view`); of frames on demand, one that all runs
-    have taken. Raises InputError as `Dataset.test_views`, and where there is no such frame.
+
+def shown_view(runs: Sequence[RunFiles], dataset: Dataset) -> tuple[Frame, str]:
+    """The view that the comparison shows, and the key of metrics.json that lists it, "test_views"
+    or "views".
+
+    It is the middle test view if all runs were measured on test views, else a view that the fewest
+    runs were trained on (`unseen_view`). Of frames on demand, only those that all runs have taken
+    have an image. Raises InputError as `Dataset.test_views`, and if there is no such frame.
     """
     tests = dataset.test_views()
     if tests is not None and all((run.metrics or {}).get("test_views") for run in runs):
         return tests.frames[len(tests) // 2], "test_views"
-    shared = set.intersection(
-        *({dataset.frames[i].name for i in run.seeds + run.chosen} for run in runs)
-    )
+    shared = set.intersection(*({dataset.frames[i].name for i in run.taken} for run in runs))
     shown = {frame.name for frame in dataset.with_images(shared)}
     if not shown:
         raise InputError(
-            f"{dataset.root}: has no test views, and no frame that all runs have taken; report them one by one"
+            f"{dataset.root}: has no test views, and no frame that all runs have taken; "
+            "report them one by one"
         )
     indices = [index for index, frame in enumerate(dataset.frames) if frame.name in shown]
     return dataset.frames[unseen_view(runs, indices)], "views"
 
 
-def _psnr_panels(
-    runs: Mapping[str, Run], every: str
-) -> dict[str, dict[str, tuple[list[int], list[float]]]]:
-    """What `psnr_figure` draws: PSNR over the test views, or, where a run was never measured on
-    them, over all views, which are called `every`. Nothing where a run was never measured on these
-    either.
-    """
-    for prefix, views in (("test_", "test views"), ("", every)):
-        keys = {views: f"{prefix}psnr", f"{views}, rock only": f"{prefix}psnr_mask"}
-        measured = {
-            label: [s for s in run.steps if set(keys.values()) <= s.keys()]
-            for label, run in runs.items()
-        }
-        if all(measured.values()):
-            return {
-                what: {
-                    label: ([s["images"] for s in steps], [s[key] for s in steps])
-                    for label, steps in measured.items()
-                }
-                for what, key in keys.items()
-            }
-    return {}
-
-
-def unseen_view(runs: Sequence[Run], frames: Sequence[int]) -> int:
-    """Index of a frame that the fewest runs were trained on; of several such frames, the middle
-    one. frames: indices of those among which to choose."""
-    counts = {index: sum(index in run.seeds + run.chosen for run in runs) for index in frames}
+def unseen_view(runs: Sequence[RunFiles], frames: Sequence[int]) -> int:
+    """Index of a frame that the fewest runs were trained on; of several, the middle one. frames:
+    indices to choose from."""
+    counts = {index: sum(index in run.taken for run in runs) for index in frames}
     fewest = [index for index in frames if counts[index] == min(counts.values())]
     return fewest[len(fewest) // 2]
 
 
-def _caption(run: Run, views: str, name: str) -> str:
-    """What stands above a render of the view `name`: number of images, PSNR, SSIM. views: key of
-    metrics.json that lists it. Raises InputError if it was not evaluated."""
+def _caption(run: RunFiles, views: str, name: str) -> str:
+    """Number of images, PSNR and SSIM of a render. views: key of metrics.json that lists it.
+    Raises InputError if it was not evaluated."""
     view = next((view for view in (run.metrics or {})[views] if view["name"] == name), None)
     if view is None:
         raise InputError(
             f"{run.folder}: was not evaluated on {name}; measure it with `mgs eval {run.folder}`"
         )
     seen = ", trained on" if view["trained"] else ""
-    return f"{len(run.seeds) + len(run.chosen)} images{seen}; {view['psnr']:.2f} dB, SSIM {view['ssim']:.4f}"
+    quality = f"{view['psnr']:.2f} dB, SSIM {view['ssim']:.4f}"
+    return f"{len(run.taken)} images{seen}; {quality}"
+
+
+def _curves(steps: Mapping[str, Sequence[Mapping[str, float]]], key: str) -> figures.Curves:
+    """A number of the steps of each run against the number of images."""
+    return {
+        label: ([s["images"] for s in lines], [s[key] for s in lines])
+        for label, lines in steps.items()
+    }
+
+
+def _psnr_panels(
+    steps: Mapping[str, Sequence[Mapping[str, float]]], every: str
+) -> dict[str, figures.Curves]:
+    """Panels of `psnr_figure`: over the test views, or else over all views, which are called
+    `every`. Empty if a run was measured on neither."""
+    for prefix, views in (("test_", "test views"), ("", every)):
+        keys = {views: f"{prefix}psnr", f"{views}, rock only": f"{prefix}psnr_mask"}
+        measured = {
+            label: [s for s in lines if set(keys.values()) <= s.keys()]
+            for label, lines in steps.items()
+        }
+        if all(measured.values()):
+            return {what: _curves(measured, key) for what, key in keys.items()}
+    return {}

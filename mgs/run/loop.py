@@ -330,12 +330,12 @@ class Loop:
             context.candidates, context.taken, context.centre, context.rng
         )
         where = f"policy {self.settings.policy}: gave"
-        if scores.shape != (len(context.left),):
+        if scores.shape != (len(context.candidate_frames),):
             raise InputError(
-                f"{where} scores of shape {scores.shape} to {len(context.left)} candidates; give each one number"
+                f"{where} scores of shape {scores.shape} to {len(context.candidate_frames)} candidates; give each one number"
             )
         weighed = scores / self.cost(context)
-        best = max(range(len(context.left)), key=lambda k: (weighed[k], farthest[k]))
+        best = max(range(len(context.candidate_frames)), key=lambda k: (weighed[k], farthest[k]))
         if np.isnan(scores).any() or np.isinf(scores[best]):
             raise InputError(
                 f"{where} a score that is NaN or infinite; correct it (docs/howto/policy.md)"
@@ -344,13 +344,13 @@ class Loop:
             raise InputError(
                 f"{where} negative scores, which --travel cannot divide by a cost; leave it out, or correct them"
             )
-        return context.left[best], float(scores[best])
+        return context.candidate_frames[best], float(scores[best])
 
     def cost(self, context: PolicyContext) -> np.ndarray:
         """By what the scores of the candidates are divided, [C]; with the setting `travel` it grows
         with the way to them."""
         if self.settings.travel is None:
-            return np.ones(len(context.left))
+            return np.ones(len(context.candidate_frames))
         return pose_policies.travel_cost(
             context.candidates, context.taken[-1], self.settings.travel
         )
@@ -367,7 +367,7 @@ class Loop:
         return [left[k] for k in near]
 
     def context(self, state: State, left: list[int]) -> PolicyContext:
-        """What the policy is told when it chooses among the frames in `left`."""
+        """What the policy sees when it chooses among the frames in `left`."""
 
         def told(view: int) -> int:
             self.progress("scoring candidates", left.index(view) if view in left else 0, len(left))
@@ -375,8 +375,8 @@ class Loop:
 
         return PolicyContext(
             positions=self.positions,
-            left=left,
-            visited=state.taken,
+            candidate_frames=left,
+            taken_frames=state.taken,
             centre=self.centre,
             rng=generator(
                 self.settings.seed, f"{policy_file.label(self.settings.policy)}/{len(state.steps)}"

@@ -126,13 +126,11 @@ def make_dataset(
     mesh: str | None = None,
 ) -> dict[str, Any]:
     """Render the dataset of a `Scene` and a `Size` into OUT/dataset, as `mgs synth-orbit` does."""
-    from mgs.synth.rendering import Preset, synthesise  # needs a variant of Mitsuba
+    from mgs.synth.rendering import RenderPreset, synthesise  # needs a variant of Mitsuba
     from mgs.synth.scene_file import SceneFile, load_scene_file
 
-    folder, images = (
-        out / "dataset",
-        Preset(*(size[key] for key in ("width", "height", "frames", "spp"))),
-    )
+    folder = out / "dataset"
+    images = RenderPreset(size["width"], size["height"], size["frames"], size["spp"])
     if not (folder / "transforms.json").is_file():
         sections = load_scene_file(scene).model_dump()
         for section, values in (changes or {}).items():

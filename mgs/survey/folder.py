@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from mgs.data.clouds import SparseCloud, write_cloud
 from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
-from mgs.data.meshes import write_points
 from mgs.files import copy_file, write_json
 from mgs.images import write_exr
 from mgs.survey import figure
@@ -29,7 +29,7 @@ def save_survey(
     numbers = survey_numbers(dataset, survey, settings)
     cloud = fuse_frames(write_survey(out, dataset, survey).frames)
     numbers["points"] = len(cloud.points)
-    write_points(out / "cloud.ply", cloud.points, cloud.views)
+    write_cloud(out / "cloud.ply", SparseCloud(cloud.points, cloud.views))
     figure.draw_survey(out / "survey.png", dataset, survey, cloud, numbers)
     write_json(out / "survey.json", numbers)
     return numbers

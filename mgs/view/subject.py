@@ -18,9 +18,10 @@ from mgs.gaussians import Gaussians
 from mgs.policy import criteria
 from mgs.policy.from_file import label
 from mgs.report.diagnostics import gaussian_scalars
-from mgs.report.page_facts import cell, measured
+from mgs.report.page_facts import measured
 from mgs.report.page_plots import metric_name
 from mgs.report.runs import up_of
+from mgs.report.tables import table_cell
 from mgs.run import folder as run_folder
 from mgs.run.ending import RunEnd
 from mgs.run.settings import NbvSettings
@@ -195,7 +196,7 @@ def _views(
                 ("images then", str(line["images"])),
                 ("surface coverage then", f"{100 * line['coverage']:.2f} %"),
                 *(
-                    (f"{metric_name(key)}, then", cell(key, value))
+                    (f"{metric_name(key)}, then", table_cell(key, value))
                     for key, value in measured(line).items()
                 ),
             ]

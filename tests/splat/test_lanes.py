@@ -13,13 +13,18 @@ from mgs.splat import fisher, render
 from .scenes import make_camera, make_gaussians
 
 CODE = """
-import sys
+import ctypes, sys
+from pathlib import Path
+import drjit as dr
 import numpy as np
 from mgs import runtime
 runtime.start()
-sys.path += ["benchmarks", "tests"]
-from lanes import set_lanes
-set_lanes(8)
+core = ctypes.CDLL(str(Path(dr.__file__).parent / "libdrjit-core.so"))
+set_target = core._Z19jit_llvm_set_targetPKcS0_j  # jit_llvm_set_target, a C++ function
+set_target.argtypes, set_target.restype = [ctypes.c_char_p, ctypes.c_char_p, ctypes.c_uint], None
+set_target(b"haswell", b"", 8)
+assert runtime.processor()["simd_width"] == 8
+sys.path.append("tests")
 from splat.scenes import make_camera, make_gaussians
 from mgs.splat import fisher, render
 camera, gaussians = make_camera(), make_gaussians(60, 4)

@@ -1,0 +1,59 @@
+"""Progress of a command on the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress, TaskID
+
+
+class ProgressBar:
+    """Lines at the bottom of the terminal, made by `progress_bar`: the stage at work, and above it
+    the whole work once `whole` was called."""
+
+    def __init__(self, bar: Progress, stage: str) -> None:
+        self._bar = bar
+        self._whole: TaskID | None = None
+        self._name = stage
+        self._stage = bar.add_task(stage, total=None)
+
+    def __call__(self, stage: str, done: int = 0, total: int = 0) -> None:
+        """Show a stage and how far it is. total: 0 if unknown."""
+        if stage != self._name:
+            self._bar.remove_task(self._stage)
+            self._name, self._stage = stage, self._bar.add_task(stage, total=None)
+        self._bar.update(self._stage, completed=done, total=total or None)
+
+    def whole(self, name: str, done: int, total: int) -> None:
+        """Show how far the whole work is."""
+        if self._whole is None:
+            self._whole = self._bar.add_task(name, total=total)
+        self._bar.update(self._whole, completed=done, total=total)
+
+    def print(self, text: str) -> None:
+        """Print a line above the bar; it stays when the bar goes."""
+        self._bar.console.print(text, soft_wrap=True, markup=False, highlight=False)
+
+
+@contextmanager
+def progress_bar(stage: str = "reading", console: Console | None = None) -> Iterator[ProgressBar]:
+    """Show progress while the context is open, on a terminal only; nothing of it stays.
+
+    The object it yields is called as progress(stage, done, total). For a function that reports
+    (done, total) alone, pass `functools.partial(progress, "rendering")`.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console or Console(), transient=True) as bar:
+        yield ProgressBar(bar, stage)

@@ -1,0 +1,245 @@
+"""Data to import: cameras and files in the formats of nerfstudio, NeRF-synthetic and COLMAP."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.camera import Camera, opencv_from_opengl
+from mgs.data.clouds import SparseCloud, read_cloud
+from mgs.data.colmap import is_model, read_model
+from mgs.data.dataset import FRAME_INTERVAL, PINHOLES, read_records
+from mgs.data.up import PLUS_Z, Up, degrees_between, unit_up, up_of_cameras
+from mgs.errors import InputError
+from mgs.images import read_rgba
+
+DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
+"""Coefficients of the OPENCV camera model, in OpenCV's order."""
+
+LEVELLED = 10.0
+"""A transforms.json whose cameras' common up vector is within this angle of +Z, degrees, is taken
+as +Z up."""
+
+SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
+"""NeRF-synthetic names images without a suffix."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One frame to import, with its camera before undistortion, and its files.
+
+    distortion: coefficients in OpenCV's order. timestamp: seconds. depth_unit: metres per step of
+    a PNG depth image.
+    """
+
+    name: str
+    camera: Camera
+    distortion: np.ndarray
+    timestamp: float
+    image: Path
+    depth: Path | None = None
+    depth_unit: float = 1.0
+    mask: Path | None = None
+    rock: Path | None = None
+
+
+@dataclass(frozen=True)
+class Source:
+    """Data to import.
+
+    shots: frames whose image exists; missing: number of the others. sparse: triangulated points.
+    up, unit ("m" or "unit"): None if the source does not say. no_cloud: file of points that the
+    source names and that does not exist.
+    """
+
+    kind: str
+    shots: list[Shot]
+    missing: int
+    sparse: SparseCloud | None = None
+    up: Up | None = None
+    unit: str | None = None
+    no_cloud: Path | None = None
+
+    def in_metres(self, unit: float) -> Source:
+        """Scale cameras and points by `unit` metres; depth is in metres already. Raises InputError
+        unless it is positive and finite."""
+        if not 0 < unit < np.inf:
+            raise InputError(
+                f"import: --unit {unit} must be a positive number of metres; correct it"
+            )
+        shots = [replace(shot, camera=shot.camera.scaled(unit)) for shot in self.shots]
+        return replace(self, shots=shots, sparse=self.sparse and self.sparse.scaled(unit), unit="m")
+
+    def set_apart(self, every: int) -> tuple[Source, Source]:
+        """Split into (training, test): every Nth shot by name, from the first, is a test view.
+
+        Raises InputError if no training shot is left.
+        """
+        names = sorted(shot.name for shot in self.shots)[::every]
+        apart = [shot for shot in self.shots if shot.name in names]
+        kept = [shot for shot in self.shots if shot.name not in names]
+        if not kept:
+            raise InputError(
+                f"import: --test-every {every} of {len(self.shots)} images leaves none to choose "
+                "from; correct it"
+            )
+        return replace(self, shots=kept), replace(self, shots=apart, sparse=None)
+
+    def up_or_estimate(self) -> tuple[Up, str]:
+        """Up vector and the reason for it: given by the source, by the format, or estimated by
+        `up_of_cameras`, whose InputError it raises."""
+        if self.up is not None:
+            return self.up, "as the source says"
+        if self.kind == "NeRF-synthetic":
+            return PLUS_Z, "the rule of NeRF-synthetic data"
+        found = up_of_cameras([shot.camera for shot in self.shots])
+        if self.kind == "nerfstudio" and degrees_between(found, PLUS_Z) < LEVELLED:
+            return PLUS_Z, f"the cameras' common up vector is within {LEVELLED:.0f} degrees of it"
+        return found, "the cameras' common up vector"
+
+
+def read_source(source: str | Path, images: Path | None = None, split: str = "train") -> Source:
+    """Recognise the format of a source, and read its cameras and file names.
+
+    source: a transforms.json or its folder; a folder with NeRF-synthetic's transforms_SPLIT.json;
+    or a folder with a COLMAP model in itself, sparse/ or sparse/0/. images: COLMAP's image folder,
+    by default SOURCE/images. split: train, val or test. Raises InputError if no format is
+    recognised, no image exists, a frame is listed twice, or a camera model is not supported.
+    """
+    source = Path(source)
+    if not source.exists():
+        raise InputError(
+            f"{source}: no such file or folder; "
+            "give a transforms.json, its folder, or a COLMAP folder"
+        )
+    path = source if source.is_file() else source / "transforms.json"
+    split_path = source / f"transforms_{split}.json"
+    folders = (source / "sparse/0", source / "sparse", source)
+    if path.is_file() or split_path.is_file():
+        result = _read_transforms(path if path.is_file() else split_path)
+    elif model := next((folder for folder in folders if is_model(folder)), None):
+        result = _read_colmap(model, images if images is not None else source / "images")
+    else:
+        raise InputError(
+            f"{source}: holds no transforms.json, transforms_{split}.json or COLMAP model "
+            "(cameras, images and points3D, .bin or .txt, in sparse/0, sparse or the folder itself)"
+        )
+    if not result.shots:
+        raise InputError(
+            f"{source}: none of the {result.missing} images it lists exists; "
+            "restore them or give --images"
+        )
+    for name, count in Counter(shot.name for shot in result.shots).items():
+        if count > 1:
+            raise InputError(f"{source}: lists {name} more than once; remove the duplicate frames")
+    return result
+
+
+def find_image(folder: Path, name: str) -> Path | None:
+    """The file of this name in a folder, with one of SUFFIXES, or None."""
+    paths = (folder / f"{name}{suffix}" for suffix in SUFFIXES)
+    return next((path for path in paths if path.is_file()), None)
+
+
+def _frame_name(path: str) -> str:
+    """Flat name of an image path: images/left/0001.png -> left_0001."""
+    parts = Path(path).with_suffix("").parts
+    return "_".join(part for part in parts if part not in (".", "..", "/", "images"))
+
+
+def _read_transforms(path: Path) -> Source:
+    """Read a transforms.json of nerfstudio or NeRF-synthetic (camera_angle_x, no suffixes)."""
+    data, records = read_records(path)
+    model = data.get("camera_model", "OPENCV")
+    if model not in PINHOLES:
+        raise InputError(
+            f"{path}: camera model {model} is not supported; "
+            "undistort the images to OPENCV or PINHOLE first"
+        )
+    scale = _number(path, "depth_unit_scale_factor", data.get("depth_unit_scale_factor", 1e-3))
+    shots, missing = [], 0
+    for index, record in enumerate(records):
+        image = find_image(path.parent, record["file_path"])
+        if image is None:
+            missing += 1
+            continue
+        keys = ("depth_file_path", "mask_path", "rock_file_path")
+        depth, mask, rock = (path.parent / record[key] if record.get(key) else None for key in keys)
+        camera, distortion = _transforms_camera(path, index, {**data, **record}, image)
+        time = record.get("timestamp", FRAME_INTERVAL * index)
+        time = _number(path, f"timestamp of frame {index}", time)
+        unit = 1.0 if depth is None or depth.suffix.lower() == ".exr" else scale
+        name = _frame_name(record["file_path"])
+        shots.append(Shot(name, camera, distortion, time, image, depth, unit, mask, rock))
+    kind = "NeRF-synthetic" if "camera_angle_x" in data and "fl_x" not in data else "nerfstudio"
+    cloud = path.parent / str(data["ply_file_path"]) if data.get("ply_file_path") else None
+    no_cloud = cloud if cloud is not None and not cloud.is_file() else None
+    sparse = read_cloud(cloud) if cloud is not None and no_cloud is None else None
+    up = unit_up(data["up"]) if data.get("up") else None
+    length = str(data.get("unit") or "") or ("m" if any(shot.depth for shot in shots) else None)
+    return Source(kind, shots, missing, sparse, up, length, no_cloud)
+
+
+def _number(path: Path, what: str, value: Any) -> float:
+    """A finite number. Raises InputError, which names `what`, for anything else."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = np.nan
+    if not np.isfinite(number):
+        raise InputError(f"{path}: {what} is {value!r}, no finite number; correct it")
+    return number
+
+
+def _transforms_camera(
+    path: Path, index: int, record: dict[str, Any], image: Path
+) -> tuple[Camera, np.ndarray]:
+    """Camera and distortion of a frame; intrinsics that are not given follow from the image."""
+    where = f"{path}: frame {index}"
+    try:
+        if "w" in record and "h" in record:
+            width, height = int(record["w"]), int(record["h"])
+        else:
+            height, width = read_rgba(image).shape[:2]
+        if "fl_x" in record:
+            fl_x = float(record["fl_x"])
+        else:
+            fl_x = width / 2 / math.tan(float(record["camera_angle_x"]) / 2)
+        defaults = {"fl_y": fl_x, "cx": width / 2, "cy": height / 2}
+        fl_y, cx, cy = (float(record.get(key, value)) for key, value in defaults.items())
+        K = np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]])
+        distortion = np.array([float(record.get(key, 0)) for key in DISTORTION_KEYS])
+        pose = np.array(record["transform_matrix"], np.float64)
+    except (KeyError, TypeError, ValueError, ArithmeticError):
+        raise InputError(
+            f"{where} has no usable intrinsics or pose; give fl_x (or camera_angle_x) and a matrix"
+        ) from None
+    if record.get("k4"):
+        raise InputError(
+            f"{where} has k4, which the OPENCV model lacks; undistort the images first"
+        )
+    if pose.shape == (3, 4):
+        pose = np.vstack([pose, [0, 0, 0, 1]])
+    if pose.shape != (4, 4) or not np.isfinite(pose).all() or not np.isfinite(distortion).all():
+        raise InputError(
+            f"{where} has a pose or distortion that is not finite, or no 4x4 matrix; correct it"
+        )
+    try:
+        return Camera(K, width, height, opencv_from_opengl(pose)), distortion
+    except (np.linalg.LinAlgError, InputError) as error:
+        raise InputError(f"{where}: {error}; correct the pose") from None
+
+
+def _read_colmap(model: Path, images: Path) -> Source:
+    listed, cloud = read_model(model)
+    shots = [
+        Shot(_frame_name(name), camera, distortion, FRAME_INTERVAL * index, images / name)
+        for index, (name, camera, distortion) in enumerate(listed)
+        if (images / name).is_file()
+    ]
+    return Source("COLMAP", shots, len(listed) - len(shots), cloud)

@@ -1,1 +1,0 @@
-"""What makes the tables of tools/tables.py, by where their numbers are."""
