@@ -23,7 +23,7 @@ from mgs.policy import registry as policies
 from mgs.report.writing import write_report
 from mgs.run import folder as run_folder
 from mgs.run import loop
-from mgs.study import tasks
+from mgs.study import case
 
 OF_A_FIT = {"uncertainty", "iterations", "loss", "stop_reason"}
 AT_THE_MODEL = {
@@ -58,8 +58,8 @@ def lines(out: Path) -> list[dict]:
 def test_a_study_has_a_number_for_each_fit_of_a_run(loaded, tmp_path, monkeypatch):
     measure = lambda gaussians, taken: {"test_psnr": 10 + len(taken), "test_psnr_mask": len(taken)}  # noqa: E731
     state = run(tmp_path / "run", loaded, tiny.stations(measure=measure), batch=2, evaluate_every=1)
-    monkeypatch.setattr(tasks, "run_or_resume", lambda *arguments: state)
-    curves = tasks.run_policy(tmp_path, tmp_path, "dataset", "prior", {"batch": 2})
+    monkeypatch.setattr(case, "run_or_resume", lambda *arguments: state)
+    curves = case.run_policy(tmp_path, tmp_path, "dataset", "prior", {"batch": 2})
     assert curves["taken"] == state.taken
     assert curves["images"] == curves["test_psnr_mask"] == [3, 5, 7, 8]
     assert curves["test_psnr"] == [13, 15, 17, 18]

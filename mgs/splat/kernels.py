@@ -164,7 +164,7 @@ def jvp(lists: BlockLists, packed: Any, packed_tangents: Any) -> tuple[Any, ...]
     return _store_pixels(lists, [[without_denormals(x) for x in values] for values in ordered])
 
 
-def _finished(pixels: Any, background: Any, real: Any = mi.Float) -> Any:
+def _finished(pixels: Any, background: Any, real: Any) -> Any:
     """Finished colours of pixels over a background (Color3f), from the [T, r, g, b] of
     `_pixel_sums`."""
     return [
@@ -417,7 +417,7 @@ def removal(lists: BlockLists, packed: Any, background: Any) -> Any:
     """
     lane, T = lanes(lists)
     pixels = _pixel_sums(lists, packed, lane, T, lambda splat: splat.colour)
-    behind = _finished(pixels, background)
+    behind = _finished(pixels, background, mi.Float)
     dr.eval(behind)
 
     def visit(splat: Splats, rows: list[Row], pixels: Any) -> Any:

@@ -19,9 +19,7 @@ from mgs.run.nbv import start_run
 from mgs.run.settings import NbvSettings
 from mgs.run.stations import psnr_measure, real_stations
 from mgs.splat import ListCache
-from mgs.study.material import test_views_of
-from mgs.study.sweep import cell_folder
-from mgs.study.tasks import CURVES, dataset_of
+from mgs.study.case import CURVES, test_views_of
 
 
 class Oracle(Loop):
@@ -59,18 +57,18 @@ class Oracle(Loop):
 def run_oracle(
     root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]
 ) -> dict[str, Any]:
-    """A task, as `mgs.study.tasks.run_policy` with the same result. settings: without a policy.
+    """A task, as `mgs.study.case.run_policy` with the same result. settings: without a policy.
     Goes on where it stopped."""
     run = out / "run"
     if not (run / "config.json").is_file():
-        where = cell_folder(root, prior) / "prior"
+        where = root / prior
         given = {
             "policy": "random",
             "evaluate_every": 1,
             **settings,
             "train": {**COLOURS_ALONE, **settings.get("train", {})},
         }
-        start_run(dataset_of(root, dataset), run, prior=where, **given)
+        start_run(root / dataset, run, prior=where, **given)
     state = choose_all(run)
     return {key: [step[key] for step in state.steps] for key in CURVES} | {"taken": state.taken}
 
