@@ -1,12 +1,11 @@
 """mgs: active Gaussian splatting with exact Fisher information, on Mitsuba 3 and Dr.Jit.
 
-`import mgs` loads nothing else: each public name is loaded when it is first used, and Mitsuba's
-variant is set (`llvm_ad_rgb`, where none is set) when something first computes with it.
+`import mgs` loads nothing else. Each public name is loaded at its first use. Mitsuba's variant is
+set (`llvm_ad_rgb`, if none is set) when something first computes with it.
 
-Arrays: everything takes and gives NumPy arrays, with one exception. `render` and `jvp` give Dr.Jit
-tensors, because `dr.backward` has to find the way back from an image to the Gaussians;
-`numpy.asarray` turns them into arrays. Gaussians may have NumPy or Dr.Jit fields wherever they are
-taken (`as_drjit`).
+Functions take and return NumPy arrays. `render` and `jvp` return Dr.Jit tensors, through which
+`dr.backward` differentiates; `numpy.asarray` converts them. Gaussians may have NumPy or Dr.Jit
+fields wherever they are accepted (`as_drjit`).
 
 Lengths are metres, the world is +Z up, cameras are OpenCV's (x right, y down, z forward), colours
 are linear RGB.
@@ -27,7 +26,7 @@ _MODULES = {
     if isinstance(statement, ast.ImportFrom)
     for alias in statement.names
 }
-"""Public name -> module that has it, read from the stub file, which type checkers read too."""
+"""Public name -> module, read from the stub file, which type checkers read too."""
 
 __all__ = list(_MODULES)
 

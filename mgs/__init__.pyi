@@ -19,9 +19,20 @@ from .report.evaluation import evaluate as evaluate
 from .report.evaluation import evaluate_run as evaluate_run
 from .report.page import write_page as write_page
 from .report.writing import write_report as write_report
-from .run.folder import State as State
+from .run.folder import Run as Run
+from .run.folder import open_run as open_run
+from .run.loop import choose as choose
+from .run.loop import fit_views as fit_views
+from .run.loop import information as information
+from .run.loop import learn as learn
+from .run.loop import select_views as select_views
+from .run.nbv import problem_of as problem_of
 from .run.nbv import resume_nbv as resume_nbv
 from .run.nbv import run_nbv as run_nbv
+from .run.nbv import start_run as start_run
+from .run.problem import Problem as Problem
+from .run.state import Fitted as Fitted
+from .run.state import State as State
 from .splat import ListCache as ListCache
 from .splat import as_drjit as as_drjit
 from .splat import fisher as fisher
@@ -29,7 +40,7 @@ from .splat import jvp as jvp
 from .splat import render as render
 from .splat_ply import read_ply as read_ply
 from .splat_ply import write_ply as write_ply
-from .synth.rendering import Preset as Preset
+from .synth.rendering import RenderPreset as RenderPreset
 from .synth.rendering import synthesise as synthesise
 
 __version__: str

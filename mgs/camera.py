@@ -1,9 +1,9 @@
 """Pinhole cameras, and the coordinate systems used everywhere in mgs.
 
-World: metres, +Z up. Camera: OpenCV axes (x right, y down, z forward). Pixels: (u, v) counted from
-the image's corner, so that
-the centre of the first pixel is (0.5, 0.5). Depth: z-depth in metres, which is measured along the
-camera's z axis and not along the ray; 0 means that the pixel has no depth ("no return").
+- World: metres, +Z up.
+- Camera: OpenCV axes (x right, y down, z forward).
+- Pixels: (u, v) from the image's corner, so the centre of the first pixel is (0.5, 0.5).
+- Depth: z-depth in metres, along the camera's z axis and not along the ray; 0 is "no return".
 """
 
 from __future__ import annotations
@@ -16,26 +16,24 @@ from numpy.typing import ArrayLike, NDArray
 from mgs.errors import InputError
 
 MAX_PIXELS = 2**27
-"""Most pixels of a camera's image. More are probably a typing error, and the memory would not
-suffice to draw them."""
+"""Most pixels of an image. More are probably a typing error and would not fit into memory."""
 
 MAX_SIDE = 2**20
-"""Largest width and largest height of an image, pixels. Beyond it float32 does not resolve pixel
-centres well. Besides, the
-renderer draws whole blocks of pixels: an image that is very long and one pixel wide would take far
-more than MAX_PIXELS."""
+"""Largest width and height of an image, pixels. Beyond it float32 does not resolve pixel centres,
+and the renderer's blocks of pixels would make long narrow images far larger than MAX_PIXELS."""
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-"""OpenGL's camera axes are x right, y up, z backward: two of OpenCV's are turned round."""
+"""OpenGL's camera axes are x right, y up, z backward: two are the negatives of OpenCV's."""
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera. Two cameras are equal if all their numbers are.
+    """Pinhole camera. Two cameras are equal if all their numbers are.
 
-    K: [3,3] float64, the intrinsics in pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]. width,
-    height: of the image, pixels.
-    world_to_camera: [4,4] float64, rigid transform in metres; the camera has OpenCV axes.
+    - K: [3,3] float64, intrinsics in pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
+    - width, height: of the image, pixels.
+    - world_to_camera: [4,4] float64, rigid transform in metres, to OpenCV axes.
+
     Raises InputError if K or the pose is not finite, K has skew or a focal length that is not
     positive, the width or height is not a whole number of at least 1, the image exceeds MAX_PIXELS
     or MAX_SIDE, or the pose is not rigid.
@@ -53,11 +51,11 @@ class Camera:
             whole = int(self.width) == self.width and int(self.height) == self.height
         except (ValueError, OverflowError):  # of NaN and of infinity
             whole = False
+        size = f"camera: image size {self.width}x{self.height} must be"
         if not whole:
-            raise InputError(f"camera: image size {self.width}x{self.height} must be whole pixels")
-        object.__setattr__(
-            self, "width", int(self.width)
-        )  # Dr.Jit does not accept NumPy's integers as sizes
+            raise InputError(f"{size} whole pixels")
+        # Dr.Jit does not accept NumPy's integers as sizes.
+        object.__setattr__(self, "width", int(self.width))
         object.__setattr__(self, "height", int(self.height))
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "world_to_camera", pose)
@@ -67,17 +65,13 @@ class Camera:
             raise InputError("camera: focal lengths must be positive; correct fl_x and fl_y")
         if K[0, 1] != 0 or K[1, 0] != 0 or not np.array_equal(K[2], [0, 0, 1]):
             raise InputError(
-                "camera: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], without skew; resample the images"
+                "camera: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], without skew; "
+                "resample the images"
             )
         if self.width < 1 or self.height < 1 or self.width * self.height > MAX_PIXELS:
-            size = f"{self.width}x{self.height}"
-            raise InputError(
-                f"camera: image size {size} must be at least 1x1, and at most {MAX_PIXELS:,} pixels in all"
-            )
+            raise InputError(f"{size} at least 1x1, and at most {MAX_PIXELS:,} pixels in all")
         if max(self.width, self.height) > MAX_SIDE:
-            raise InputError(
-                f"camera: image size {self.width}x{self.height} must be at most {MAX_SIDE:,} pixels either way"
-            )
+            raise InputError(f"{size} at most {MAX_SIDE:,} pixels either way")
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise InputError(
                 "camera: the pose has NaN or infinite entries; correct its transform matrix"
@@ -99,8 +93,7 @@ class Camera:
 
     @property
     def camera_to_world(self) -> NDArray[np.float64]:
-        """Inverse of world_to_camera [4,4]: a rigid transform in metres; the camera has OpenCV
-        axes."""
+        """Inverse of world_to_camera [4,4]: rigid transform in metres, from OpenCV axes."""
         R, t = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = R.T, -R.T @ t
@@ -113,20 +106,17 @@ class Camera:
 
     @property
     def key(self) -> bytes:
-        """K, pose and image size as bytes. It is what caches and seeds know a view by."""
-        return (
-            self.K.tobytes()
-            + self.world_to_camera.tobytes()
-            + f"{self.width}x{self.height}".encode()
-        )
+        """K, pose and image size as bytes: the key of a view in caches and seeds."""
+        size = f"{self.width}x{self.height}".encode()
+        return self.K.tobytes() + self.world_to_camera.tobytes() + size
 
     def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """World points [N,3], metres -> (pixels [N,2], z-depth [N], metres). Ignore pixels where
-        z-depth is not positive."""
-        p = (
-            np.asarray(points, np.float64) @ self.world_to_camera[:3, :3].T
-            + self.world_to_camera[:3, 3]
-        )
+        """Project world points [N,3], metres, to pixels [N,2] and z-depths [N], metres.
+
+        Pixels are meaningless where the z-depth is not positive.
+        """
+        R, t = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        p = np.asarray(points, np.float64) @ R.T + t
         z = p[:, 2]
         safe = np.where(z > 0, z, 1.0)
         u = self.K[0, 0] * p[:, 0] / safe + self.K[0, 2]
@@ -134,8 +124,10 @@ class Camera:
         return np.stack([u, v], 1), z
 
     def unproject(self, depth: ArrayLike) -> NDArray[np.float64]:
-        """Depth image [H,W] -> world points [H,W,3] at the pixel centres; both in metres. Where the
-        depth is 0, ignore them."""
+        """World points [H,W,3] at the pixel centres of a depth image [H,W], both in metres.
+
+        Points are meaningless where the depth is 0.
+        """
         depth = np.asarray(depth, np.float64)
         v, u = np.mgrid[: self.height, : self.width] + 0.5
         x = (u - self.K[0, 2]) / self.K[0, 0] * depth
@@ -144,8 +136,7 @@ class Camera:
         return np.stack([x, y, depth], -1) @ pose[:3, :3].T + pose[:3, 3]
 
     def resized(self, width: int) -> Camera:
-        """The same view in an image of this width, pixels; the height follows, rounded to a whole
-        number of at least 1.
+        """Same view in an image of this width, pixels. The height follows, rounded, at least 1.
 
         Raises InputError if the image becomes too large.
         """
@@ -154,7 +145,7 @@ class Camera:
         return Camera(scale @ self.K, width, height, self.world_to_camera)
 
     def scaled(self, factor: float) -> Camera:
-        """The same camera in a world whose lengths are multiplied by a factor."""
+        """Same camera in a world whose lengths are multiplied by a factor."""
         pose = self.world_to_camera.copy()
         pose[:3, 3] *= factor
         return Camera(self.K, self.width, self.height, pose)
@@ -163,11 +154,10 @@ class Camera:
 def look_at(
     eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)
 ) -> NDArray[np.float64]:
-    """world_to_camera [4,4] of a camera at `eye` [3] that looks at `target` [3], metres, with the
-    direction `up` [3] upwards.
+    """world_to_camera [4,4] of a camera at `eye` [3], metres, that looks at `target` [3].
 
-    Where the camera looks along `up`, +Y takes its place. Raises InputError if eye and target are
-    the same point.
+    up: direction [3] that points upwards in the image; +Y replaces it if the camera looks along it.
+    Raises InputError if eye and target are the same point.
     """
     eye = np.asarray(eye, np.float64)
     forward: NDArray[np.float64] = np.asarray(target, np.float64) - eye
@@ -186,18 +176,15 @@ def look_at(
 
 
 def opencv_from_opengl(camera_to_world: ArrayLike) -> NDArray[np.float64]:
-    """nerfstudio's camera-to-world [4,4] (OpenGL axes) -> our world_to_camera [4,4] (OpenCV axes).
+    """Invert nerfstudio's camera-to-world [4,4] (OpenGL axes) to world_to_camera [4,4] (OpenCV).
 
     Raises numpy.linalg.LinAlgError if the matrix is singular.
     """
-    return np.asarray(
-        np.linalg.inv(np.asarray(camera_to_world, np.float64) @ _OPENGL_FROM_OPENCV), np.float64
-    )
+    pose: NDArray[np.float64] = np.asarray(camera_to_world, np.float64) @ _OPENGL_FROM_OPENCV
+    return np.asarray(np.linalg.inv(pose), np.float64)
 
 
 def opengl_from_opencv(world_to_camera: ArrayLike) -> NDArray[np.float64]:
-    """Our world_to_camera [4,4] (OpenCV axes) -> nerfstudio's camera-to-world [4,4] (OpenGL
-    axes)."""
-    return np.asarray(
-        np.linalg.inv(np.asarray(world_to_camera, np.float64)) @ _OPENGL_FROM_OPENCV, np.float64
-    )
+    """Invert world_to_camera [4,4] (OpenCV) to nerfstudio's camera-to-world [4,4] (OpenGL)."""
+    pose = np.linalg.inv(np.asarray(world_to_camera, np.float64))
+    return np.asarray(pose @ _OPENGL_FROM_OPENCV, np.float64)

@@ -1,5 +1,5 @@
-"""Colour. Inside the program it is linear RGB, in PNG files sRGB, and in Gaussians spherical
-harmonics of linear RGB."""
+"""Colour: linear RGB inside the program, sRGB in PNG files, spherical harmonics of linear RGB in
+Gaussians."""
 
 from __future__ import annotations
 
@@ -7,19 +7,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 SH_C0 = 0.28209479177387814
-"""Value of the spherical harmonic of degree 0, 1 / (2 sqrt(pi)). A Gaussian whose only coefficient
-is sh0 has the colour
-0.5 + SH_C0 sh0: 3DGS adds 0.5, so that zero coefficients are grey."""
+"""Spherical harmonic of degree 0, 1 / (2 sqrt(pi)). A Gaussian whose only coefficient is sh0 has
+the colour 0.5 + SH_C0 sh0: 3DGS adds 0.5, so zero coefficients are grey."""
 
 
 def srgb_from_linear(linear: ArrayLike) -> NDArray[np.float32]:
-    """Linear RGB of any shape -> sRGB of the same shape (IEC 61966-2-1). Values outside [0,1] are
-    clipped first."""
+    """Convert linear RGB of any shape to sRGB (IEC 61966-2-1). Clips to [0,1] first."""
     c = np.clip(np.asarray(linear, np.float32), 0, 1)
     return np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
 def linear_from_srgb(srgb: ArrayLike) -> NDArray[np.float32]:
-    """sRGB in [0,1], of any shape -> linear RGB of the same shape (IEC 61966-2-1)."""
+    """Convert sRGB in [0,1] of any shape to linear RGB (IEC 61966-2-1)."""
     c = np.asarray(srgb, np.float32)
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The error that stands for bad input: what the user can cause, and can mend."""
+"""The exception for bad input: what the user can cause and can correct."""
 
 from __future__ import annotations
 
@@ -9,17 +9,16 @@ Row = TypeVar("Row")
 
 
 class InputError(ValueError):
-    """Bad input: the message is one line that says what is wrong, where, and how to mend it.
+    """Bad input. The message is one line: what is wrong, where, and how to correct it.
 
     The command line prints the message without a traceback and exits with code 2.
     """
 
 
 def row_named(table: Mapping[str, Row], name: str, what: str) -> Row:
-    """The row of a table that has this name. what: how the user calls the choice, as in --preset,
-    for the message.
+    """Look a name up in a table. what: the option for the message, as in --preset.
 
-    Raises InputError, which lists the names of the table, where there is none.
+    Raises InputError, which lists the names of the table, if it has no such name.
     """
     if name not in table:
         raise InputError(f"{what} {name!r}: unknown; choose one of {', '.join(table)}")

@@ -1,8 +1,7 @@
-"""Reading and writing files and folders so that nothing is ever half-written.
+"""Atomic reading and writing of files and folders.
 
-Output goes to a temporary name in the same folder and is renamed when it is complete. A process
-that is killed meanwhile leaves the temporary file behind, but never an incomplete file under the
-real name.
+Output goes to a temporary name in the same folder and is renamed when complete. A process that is
+killed meanwhile leaves the temporary file, but never an incomplete file under the real name.
 """
 
 from __future__ import annotations
@@ -25,13 +24,11 @@ from mgs.errors import InputError
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Context manager that gives a temporary path beside `path`, with the same suffix, for the
-    block to write to.
+    """Context manager: a temporary path with the same suffix, renamed to `path` after the block.
 
-    After the block it is renamed to `path`; if the block fails it is deleted. Folders that are
-    missing above it are made.
-    Raises InputError if it cannot be written: no permission, a file where a folder is needed, a
-    full disk.
+    If the block fails, the temporary file is deleted. Missing parent folders are made. Raises
+    InputError if the path cannot be written: no permission, a file in place of a folder, a full
+    disk.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
@@ -40,24 +37,24 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
-        raise _not_writable(path, error) from None
+        raise not_writable(path, error) from None
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
 
 
-def _not_writable(path: Path, error: OSError) -> InputError:
-    """The InputError for a path that cannot be written, out of what the operating system said."""
+def not_writable(path: Path, error: Exception) -> InputError:
+    """InputError for a path that cannot be written, with the reason of the system."""
     return InputError(
-        f"{path}: cannot be written ({error.strerror or error}); choose a place you may write to, with room"
+        f"{path}: cannot be written ({getattr(error, 'strerror', None) or error}); "
+        "choose a place you may write to, with room"
     )
 
 
 def check_writable(path: str | Path) -> Path:
-    """Check that a file or folder could be written at `path`, and return it as a Path. Nothing is
-    made.
+    """Check that a file or folder could be written at `path`, and return it as a Path.
 
-    Commands call it before long work. Raises InputError if it could not be written.
+    Makes nothing; commands call it before long work. Raises InputError if it could not be written.
     """
     path = Path(path)
     try:
@@ -65,15 +62,14 @@ def check_writable(path: str | Path) -> Path:
         with TemporaryFile(dir=there if there.is_dir() or there != path else there.parent):
             return path
     except OSError as error:
-        raise _not_writable(path, error) from None
+        raise not_writable(path, error) from None
 
 
 @contextmanager
 def reading(path: Path, what: str = "file") -> Iterator[None]:
-    """Context manager around the reading of `path`: an OSError in its block becomes an InputError
-    of one line.
+    """Context manager: turns an OSError of its block into an InputError.
 
-    The line says that there is no such `what`, or why it cannot be read.
+    Its line says that there is no such `what`, or why it cannot be read.
     """
     try:
         yield
@@ -95,16 +91,15 @@ def copy_file(source: Path, path: Path) -> None:
 
 
 def fingerprint(path: str | Path) -> dict[str, str]:
-    """Name (without folders) and SHA-256 hash of a file, by which it can be recognised later.
-    Raises OSError."""
+    """Name (without folders) and SHA-256 hash of a file. Raises OSError."""
     return {"name": Path(path).name, "sha256": hashlib.sha256(Path(path).read_bytes()).hexdigest()}
 
 
 def write_json(path: str | Path, data: Any) -> None:
-    """Write data as JSON, indented, in UTF-8; the file appears complete.
+    """Write data as indented JSON in UTF-8; the file appears complete.
 
-    Raises ValueError for NaN and infinities, for which JSON has no notation (write None instead),
-    and InputError as `atomic_path`.
+    Raises ValueError for NaN and infinities, which JSON cannot express (write None instead), and
+    InputError as `atomic_path`.
     """
     text = json.dumps(data, indent=2, allow_nan=False)
     with atomic_path(path) as temporary:
@@ -112,11 +107,10 @@ def write_json(path: str | Path, data: Any) -> None:
 
 
 def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
-    """Write records as CSV, in UTF-8; the file appears complete. Returns its path. Raises
-    InputError as `atomic_path`.
+    """Write records as CSV in UTF-8 and return the path; the file appears complete.
 
-    Columns are all keys, in the order in which they are met; what a record lacks, and None, is
-    written as nothing.
+    Columns are all keys in order of appearance. None and missing keys give empty cells. Raises
+    InputError as `atomic_path`.
     """
     columns = list(dict.fromkeys(key for row in rows for key in row))
     with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
@@ -127,23 +121,20 @@ def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
 
 
 def read_json(path: str | Path) -> Any:
-    """Contents of a JSON file. Raises InputError if it is missing, cannot be read or is not valid
-    JSON."""
+    """Contents of a JSON file. Raises InputError if it is missing, unreadable or not valid JSON."""
     path = Path(path)
     with reading(path):
         data = path.read_bytes()
     try:
-        return json.loads(
-            data.decode("utf-8-sig")
-        )  # some tools begin a file with a byte-order mark
-    except (ValueError, RecursionError) as error:  # RecursionError: nested too deeply for Python
+        return json.loads(data.decode("utf-8-sig"))  # some tools write a byte-order mark
+    except (ValueError, RecursionError) as error:  # RecursionError: nested too deeply
         raise InputError(
             f"{path}: not valid JSON ({error}); the file is damaged, write it again"
         ) from None
 
 
 def check_new_folder(path: str | Path) -> Path:
-    """Check that `new_folder(path)` would work, and return the path as a Path. Nothing is made.
+    """Check that `new_folder(path)` would succeed, and return the path as a Path. Makes nothing.
 
     Raises InputError if `path` is a file, is a folder that is not empty, or could not be written.
     """
@@ -156,64 +147,48 @@ def check_new_folder(path: str | Path) -> Path:
 
 
 def new_folder(path: str | Path) -> Path:
-    """Make an output folder, and the folders above it; an empty one that exists is used. Raises
-    InputError as `check_new_folder`."""
+    """Make an output folder and its parents, or use an empty one. Raises InputError as
+    `check_new_folder`."""
     path = check_new_folder(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise _not_writable(path, error) from None
+        raise not_writable(path, error) from None
     return path
 
 
 @contextmanager
-def folder_or_nothing(path: str | Path) -> Iterator[Path]:
-    """Context manager that makes a new folder for its block. If the block fails, everything is
-    again as before.
-
-    That means: the folder and the parents that were made for it are removed, or, if there was an
-    empty folder, it is emptied. Raises InputError as `new_folder`.
-    """
-    path = check_new_folder(path)
-    made = [folder for folder in (path, *path.parents) if not folder.exists()]
-    new_folder(path)
-    try:
-        yield path
-    except BaseException:
-        if made:
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            for child in path.iterdir():
-                shutil.rmtree(child) if child.is_dir() else child.unlink()
-        with suppress(OSError):
-            for folder in made[1:]:
-                folder.rmdir()
-        raise
-
-
-@contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """Context manager that gives a temporary folder beside `path` for its block to fill; after the
-    block it becomes `path`.
+    """Context manager: a temporary folder beside `path`, renamed to it after the block.
 
-    So a folder named `path` is always complete, even if the process is killed; what a killed one
-    left is removed here. Raises InputError as `new_folder`.
+    So a folder named `path` is always complete. If the block fails, the temporary folder and the
+    parents made for it are removed; so are those of processes that were killed. Raises InputError
+    as `new_folder`.
     """
     path = check_new_folder(path).resolve()
     for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
         if not _is_running(leftover.name.split(".")[-2]):
             shutil.rmtree(leftover, ignore_errors=True)
-    with folder_or_nothing(path.with_name(f".{path.name}.{os.getpid()}.part")) as temporary:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    made = [folder for folder in path.parents if not folder.exists()]
+    new_folder(temporary)
+    try:
         yield temporary
         try:
             os.replace(temporary, path)
         except OSError as error:
-            raise _not_writable(path, error) from None
+            raise not_writable(path, error) from None
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        with suppress(OSError):
+            for folder in made:
+                folder.rmdir()
+        raise
 
 
 def _is_running(process: str) -> bool:
-    """Whether there is another process of this id, or the text is none. (In a container every
-    process may have the same id.)"""
+    """Whether another process has this id, or the text is no id. In a container all processes may
+    have the same id."""
     try:
         if int(process) == os.getpid():
             return False
@@ -227,17 +202,17 @@ def _is_running(process: str) -> bool:
 
 @contextmanager
 def locked(folder: str | Path) -> Iterator[None]:
-    """Context manager: while its block runs, no other process gets the lock of the same folder.
+    """Context manager: holds the lock of a folder, which no other process gets meanwhile.
 
-    Raises InputError, naming the process, if another one holds the lock, and if the folder cannot
-    be written. The lock is kept by the operating system, on the file FOLDER/.lock. It ends when the
-    process ends, also when that is killed: a file .lock that is left over locks nothing.
+    Raises InputError if another process holds it, naming that process, and if the folder cannot be
+    written. The system keeps the lock on the file FOLDER/.lock and releases it when the process
+    ends, so a file .lock that is left over locks nothing.
     """
     path = Path(folder) / ".lock"
     try:
         file = _lock(path)
     except OSError as error:
-        raise _not_writable(path, error) from None
+        raise not_writable(path, error) from None
     with file:
         try:
             yield
@@ -249,7 +224,7 @@ def locked(folder: str | Path) -> Iterator[None]:
 def _lock(path: Path) -> TextIO:
     """Open and lock the file, and write this process's id into it. Raises InputError if another
     process has locked it."""
-    while True:  # until the file that is locked is the one that stands under this name
+    while True:  # until the locked file is the one of this name
         with ExitStack() as closed_on_failure:
             file = closed_on_failure.enter_context(open(path, "a+", encoding="ascii"))
             try:
@@ -263,9 +238,7 @@ def _lock(path: Path) -> TextIO:
                 ours = os.path.samestat(os.fstat(file.fileno()), os.stat(path))
             except FileNotFoundError:
                 ours = False
-            if (
-                ours
-            ):  # the process that had the lock before may have removed the file after we opened it
+            if ours:  # else the process that had the lock removed the file after we opened it
                 file.truncate(0)
                 print(os.getpid(), end="", file=file, flush=True)
                 closed_on_failure.pop_all()

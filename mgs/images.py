@@ -1,4 +1,4 @@
-"""Images on disk: PNG and JPEG hold sRGB, OpenEXR holds linear colour, depth and other numbers."""
+"""Images on disk: PNG and JPEG hold sRGB; OpenEXR holds linear colour, depth and other numbers."""
 
 from __future__ import annotations
 
@@ -11,35 +11,34 @@ import numpy as np
 
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.errors import InputError
-from mgs.files import atomic_path, reading
+from mgs.files import atomic_path, not_writable, reading
 
 PNG_BIT_DEPTH = 24
-"""Index of the byte of a PNG file that says how many bits a sample has (PNG specification, section
-11.2.1)."""
+"""Index of the byte of a PNG file that holds the bits of a sample (PNG specification, 11.2.1)."""
 
 ORIENTATION = 0x0112
-"""Number of the EXIF tag that says how a camera was held (EXIF 2.3, section 4.6.4)."""
+"""EXIF tag of the orientation of the camera (EXIF 2.3, 4.6.4)."""
 
 EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
-"""Pillow's names for the kinds of pixels that it converts to 8-bit RGBA without loss: grey, palette
-and RGB, with and without alpha."""
+"""Pillow's pixel modes that it converts to 8-bit RGBA without loss: grey, palette and RGB, with and
+without alpha."""
 
 LUMA = np.array([0.299, 0.587, 0.114])
 """Weights of R, G and B in grey (ITU-R BT.601)."""
 
 PNG_LEVEL = 1
-"""Level of zlib's compression, 1 to 9. Compared with Pillow's own level, 6, a render of 0.56 Mpixel
-is written in 62 instead of 236 ms and is as large, a smooth photo of 3 Mpixel is written in 413
-instead of 644 ms and is 7 % larger, and a mask is written in 9 instead of 14 ms and has 16 instead
-of 5 kB."""
+"""zlib level, 1 to 9. Against Pillow's default of 6, a render of 0.56 Mpixel is as large and is
+written in 62 instead of 236 ms; a smooth photo of 3 Mpixel is 7 % larger."""
 
 
 def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> None:
-    """Write an 8-bit PNG; the file appears complete. What `image` holds is told by its type:
+    """Write an 8-bit PNG; the file appears complete. The type of `image` decides:
 
-    bool [H,W]: a mask, written as black and white. uint8 [H,W,3]: sRGB, written as it is. Float
-    [H,W,3]: linear RGB, converted to sRGB, or with linear=False values that are sRGB in [0,1]
-    already. Raises InputError as `mgs.files.atomic_path`.
+    - bool [H,W]: a mask, black and white.
+    - uint8 [H,W,3]: sRGB, unchanged.
+    - float [H,W,3]: linear RGB, converted to sRGB; with linear=False, sRGB in [0,1].
+
+    Raises InputError as `mgs.files.atomic_path`.
     """
     from PIL import Image
 
@@ -55,8 +54,8 @@ def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> No
 
 
 def _open_image(path: Path) -> tuple[Any, bytes]:
-    """The decoded Pillow image, and the bytes of its file. Raises InputError if it is missing,
-    cannot be read or is damaged."""
+    """Decoded Pillow image and the bytes of its file. Raises InputError if it is missing,
+    unreadable or damaged."""
     from PIL import Image, UnidentifiedImageError
 
     with reading(path, "image"):
@@ -76,54 +75,54 @@ def _open_image(path: Path) -> tuple[Any, bytes]:
 
 
 def exif_orientation(path: str | Path) -> int:
-    """The orientation that EXIF gives an image, 1 (as it is) to 8; 1 where it gives none. From 5
-    on, width and height change places. Raises InputError as `read_rgba`."""
+    """EXIF orientation of an image, 1 (upright) to 8; 1 if absent. From 5 on, width and height are
+    exchanged.
+
+    Raises InputError as `read_rgba`.
+    """
     image, _ = _open_image(Path(path))
     found = image.getexif().get(ORIENTATION, 1)
     return found if found in range(1, 9) else 1
 
 
 def exif_exposure(path: str | Path) -> float | None:
-    """How bright EXIF says that an image was exposed, stops from an unknown origin: log2 of time
-    times ISO over the square of the f-number. None where the file does not say. Only the file's
-    header is read; what cannot be read says nothing."""
+    """Exposure in stops, log2(time ISO / f-number^2), from the EXIF header; None if it lacks that
+    or cannot be read."""
     from PIL import ExifTags, Image
 
     base = ExifTags.Base
     try:
         with Image.open(path) as image:
             exif = image.getexif().get_ifd(ExifTags.IFD.Exif)
-        time, speed, number = (
-            float(exif[tag]) for tag in (base.ExposureTime, base.ISOSpeedRatings, base.FNumber)
-        )
+        tags = base.ExposureTime, base.ISOSpeedRatings, base.FNumber
+        time, speed, number = (float(exif[tag]) for tag in tags)
         return math.log2(time * speed / number**2)
     except (OSError, SyntaxError, KeyError, TypeError, ValueError, ZeroDivisionError):
         return None
 
 
 def read_values(path: str | Path) -> np.ndarray:
-    """The numbers of an image of one channel, such as depth, unchanged: [H,W] uint8 or uint16, of a
+    """Numbers of an image of one channel, such as depth, unchanged: [H,W] uint8 or uint16, of a
     TIFF also int32 or float32.
 
-    Raises InputError if it is missing, cannot be read, is damaged, or does not have one channel.
+    Raises InputError if it is missing, unreadable, damaged, or does not have one channel.
     """
     path = Path(path)
     image, _ = _open_image(path)
     if image.mode not in ("L", "I;16", "I", "F"):
         raise InputError(
-            f"{path}: not a depth image, its pixels are of kind {image.mode}; give one channel of 16 bits, or EXR"
+            f"{path}: not a depth image, its pixels are of kind {image.mode}; "
+            "give one channel of 16 bits, or EXR"
         )
     return np.asarray(image)
 
 
 def read_rgba(path: str | Path) -> np.ndarray:
-    """A PNG, JPEG or other image -> [H,W,4]: sRGB, and alpha that is not multiplied into the
-    colours.
+    """Read an image as sRGB and alpha, not premultiplied: [H,W,4].
 
-    uint16 for a PNG of 16 bits per sample (largest value 65535), uint8 for all others (255). An
-    image without alpha is opaque: its alpha has the largest value. Raises InputError if the file is
-    missing, cannot be read, is damaged, or is neither grey nor RGB. CMYK is refused because only
-    the colour profile of such a file tells what its numbers look like.
+    uint16 (largest value 65535) for a PNG of 16 bits per sample, uint8 (255) for all others. An
+    image without alpha is opaque. Raises InputError if the file is missing, unreadable, damaged, or
+    neither grey nor RGB. CMYK is refused: its colours depend on the file's colour profile.
     """
     import cv2
 
@@ -132,17 +131,18 @@ def read_rgba(path: str | Path) -> np.ndarray:
     bits = data[PNG_BIT_DEPTH] if image.format == "PNG" else 8
     if image.mode not in EIGHT_BIT_MODES and bits < 16:
         raise InputError(
-            f"{path}: pixels of kind {image.mode} are not supported; convert it to grey or RGB of 8 or 16 bits"
+            f"{path}: pixels of kind {image.mode} are not supported; "
+            "convert it to grey or RGB of 8 or 16 bits"
         )
     if bits in (2, 4, 16) and image.mode in ("L", "I", "I;16") and "transparency" in image.info:
-        # A PNG may name one grey value that is transparent. At these bit depths Pillow and OpenCV
-        # both read it wrongly.
+        # A PNG may declare one grey value transparent. Pillow and OpenCV read it wrongly here.
         raise InputError(
-            f"{path}: a grey of {bits} bits that stands for transparent is not supported; convert it to RGBA"
+            f"{path}: a grey of {bits} bits that stands for transparent is not supported; "
+            "convert it to RGBA"
         )
     if bits < 16:
         return np.asarray(image.convert("RGBA"))
-    # OpenCV reads these, because Pillow keeps only the upper 8 bits of 16-bit colour.
+    # Pillow keeps only the upper 8 bits of 16-bit colour.
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.uint16:
         raise InputError(f"{path}: not a readable 16-bit PNG; the file is damaged, write it again")
@@ -151,14 +151,14 @@ def read_rgba(path: str | Path) -> np.ndarray:
 
 
 def read_png(path: str | Path) -> np.ndarray:
-    """An sRGB image of 8 or 16 bits -> linear RGB float32 [H,W,3]; alpha is ignored. Raises
+    """Read an sRGB image of 8 or 16 bits as linear RGB float32 [H,W,3], without alpha. Raises
     InputError as `read_rgba`."""
     rgba = read_rgba(path)
     return linear_from_srgb(rgba[..., :3].astype(np.float32) / np.iinfo(rgba.dtype).max)
 
 
 def read_mask(path: str | Path) -> np.ndarray:
-    """A mask image -> bool [H,W], True where it is at least half white; alpha is ignored. Raises
+    """Read a mask image as bool [H,W], True where it is at least half white; ignores alpha. Raises
     InputError as `read_rgba`."""
     rgba = read_rgba(path)
     return rgba[..., :3] @ LUMA >= 0.5 * np.iinfo(rgba.dtype).max
@@ -178,28 +178,21 @@ def write_exr(path: str | Path, channels: dict[str, np.ndarray]) -> None:
         try:
             file.write(str(temporary))
         except RuntimeError as error:  # OpenEXR raises this if the disk is full
-            raise InputError(
-                f"{path}: cannot be written ({error}); choose a place you may write to, with room"
-            ) from None
+            raise not_writable(Path(path), error) from None
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:
-    """The channels of an OpenEXR file, {name: float32 [H,W]}. Raises InputError if it is missing,
+    """Channels of an OpenEXR file, {name: float32 [H,W]}. Raises InputError if it is missing,
     unreadable or damaged."""
     import OpenEXR
 
     path = Path(path)
-    with (
-        reading(path, "EXR file"),
-        path.open("rb") as opened,
-    ):  # OpenEXR itself would not say why it cannot open a file
-        opened.read(1)
+    with reading(path, "EXR file"), path.open("rb") as opened:
+        opened.read(1)  # OpenEXR would not say why it cannot open a file
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            return {
-                name: np.asarray(channel.pixels, np.float32)
-                for name, channel in file.channels().items()
-            }
+            channels = file.channels().items()
+            return {name: np.asarray(one.pixels, np.float32) for name, one in channels}
     except (RuntimeError, OSError, ValueError, TypeError) as error:
         raise InputError(
             f"{path}: not a readable EXR ({error}); the file is damaged, write it again"

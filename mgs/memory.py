@@ -1,5 +1,4 @@
-"""Memory: whether there is enough, results that are kept while there is room, sequences whose items
-are made when asked for, and arrays for Dr.Jit."""
+"""Memory: checks that it suffices, bounded caches, and arrays for Dr.Jit."""
 
 from __future__ import annotations
 
@@ -15,36 +14,38 @@ from mgs.errors import InputError
 Value = TypeVar("Value")
 
 IMAGE_BYTES = 1 << 30
-"""Most memory for arrays of one kind that are kept to be used again, bytes. Of images, as targets
-of a fit, these are 218 of 640x480, or five of 12 megapixels. All others are read or computed again
-at every use."""
+"""Most memory of arrays of one kind that are kept for reuse, bytes: 218 target images of 640x480,
+or five of 12 megapixels. Others are read or computed again at each use."""
 
 
 LITTLE = 1 << 30
-"""Bytes up to which `check_room` does not ask: asking takes some of the time of a small image."""
+"""Bytes up to which `check_room` checks nothing: the check takes part of the time of a small image.
+"""
 
 MEMORY_FILE = Path("/proc/meminfo")
-"""Where Linux says how much memory can be taken without swapping."""
+"""Linux's report of the memory that is free without swapping."""
 
 
 def check_room(needed: float, what: str, instead: str) -> None:
-    """Raises InputError where so many bytes for `what` are more than the system has to spare, with
-    what to do `instead`: it would end the process without a word. Systems that do not say what they
-    have to spare are trusted. Memory that Dr.Jit keeps for its next arrays is given back before
-    anything is refused."""
+    """Raise InputError if `what` needs more bytes than are free, with what to do `instead`.
+
+    The system would kill the process without a message. Systems that do not report free memory are
+    trusted. The memory that Dr.Jit caches is released before anything is refused.
+    """
     if needed <= LITTLE or needed <= _spare():
         return
-    import drjit as dr  # here, since most who need this module need no Dr.Jit
+    import drjit as dr
 
     dr.flush_malloc_cache()
     if needed > (spare := _spare()):
         raise InputError(
-            f"{what} may take {needed / 2**30:,.1f} GiB, and {spare / 2**30:,.1f} GiB are free; {instead}"
+            f"{what} may take {needed / 2**30:,.1f} GiB, "
+            f"and {spare / 2**30:,.1f} GiB are free; {instead}"
         )
 
 
 def _spare() -> float:
-    """Bytes that the system has to spare; infinity where it does not say."""
+    """Free memory, bytes; infinity if the system does not report it."""
     try:
         found = re.search(r"MemAvailable:\s*(\d+) kB", MEMORY_FILE.read_text(encoding="ascii"))
     except OSError:
@@ -53,25 +54,23 @@ def _spare() -> float:
 
 
 PADDING = 64
-"""Numbers that a kernel may read beyond the end of an array: it takes as many at once as fit into a
-register, 16 at most."""
+"""Numbers that a kernel may read beyond the end of an array: it reads whole registers, of at most
+16."""
 
 
 ALIGNMENT = 64
-"""Bytes. Dr.Jit compiles one kernel for arrays whose addresses are multiples of this, and another
-where one is not."""
+"""Bytes. Dr.Jit compiles different kernels for arrays whose addresses are multiples of this and for
+others."""
 
 
 def padded(values: Any, dtype: Any = np.float32) -> np.ndarray:
-    """A copy of an array, of this type and contiguous, that begins at a multiple of ALIGNMENT, and
-    behind which more of its memory follows.
+    """Copy an array into contiguous memory that begins at a multiple of ALIGNMENT and extends
+    beyond its end.
 
-    Every array that Dr.Jit is to take over from NumPy must be one. Dr.Jit 1.5 does not copy it, and
-    its kernels read a few
-    numbers beyond the end: where the memory ends there, which depends on sizes and on chance, the
-    process dies. And where an
-    array happened to begin would decide which of two kernels is needed: with a hundred arrays,
-    hardly ever one that was compiled before.
+    Every array that Dr.Jit takes over from NumPy must be one. Dr.Jit 1.5 does not copy it, and its
+    kernels read a few numbers beyond the end, where the process would crash if the memory ends
+    there. The alignment decides which kernel is compiled: without a fixed one, a call with a
+    hundred arrays would be compiled again nearly every time.
     """
     values = np.asarray(values)
     memory = np.empty(values.size + PADDING + ALIGNMENT, dtype)
@@ -84,12 +83,10 @@ def padded(values: Any, dtype: Any = np.float32) -> np.ndarray:
 def kept_within(
     budget: int, make: Callable[[int], Value], size: Callable[[Value], int]
 ) -> Callable[[int], Value]:
-    """The function `make`, which keeps its results while their sizes sum to no more than `budget`
-    bytes.
+    """Cache the results of `make` until their sizes sum to `budget` bytes.
 
-    What comes later is made anew at every call. A fit goes through its images again and again in
-    changing orders: a cache that drops what was used longest ago (LRU) would then mostly drop what
-    is needed next.
+    Later keys are made again at each call. A fit uses its images again and again in changing
+    orders, for which an LRU cache would mostly drop what is needed next.
     """
     kept: dict[int, Value] = {}
     held = 0
@@ -108,8 +105,7 @@ def kept_within(
 
 
 class Deferred(Sequence[Value]):
-    """A sequence of the results of get(key) for each of `keys`, called anew whenever an item is
-    asked for."""
+    """Sequence of get(key) for each of `keys`, called whenever an item is accessed."""
 
     def __init__(self, keys: Sequence[int], get: Callable[[int], Value]) -> None:
         self.keys, self.get = keys, get

@@ -1,8 +1,5 @@
-"""How good a rendered view is: as an image (PSNR and SSIM, of sRGB values in [0,1]), and as a
-surface (alpha and depth).
-
-And how well two rankings agree.
-"""
+"""Quality of a rendered view as an image (PSNR and SSIM of sRGB values) and as a surface (alpha and
+depth), and agreement of rankings."""
 
 from __future__ import annotations
 
@@ -14,8 +11,7 @@ from mgs.colour import srgb_from_linear
 from mgs.errors import InputError
 
 PSNR_LIMIT = 100.0
-"""Largest PSNR that is reported, dB: equal images, whose PSNR is infinite, have this one. For
-comparison: rounding to 8 bits is an error of 59 dB."""
+"""Largest PSNR reported, dB, also for equal images. Rounding to 8 bits is an error of 59 dB."""
 
 SSIM_SIGMA = 1.5
 """Standard deviation of the Gaussian window of SSIM, pixels (Wang et al. 2004)."""
@@ -32,30 +28,28 @@ METRICS = (
     "psnr_corrected",
     "psnr_mask_corrected",
 )
-"""Names of the numbers that `compare` gives, as in metrics.json. PSNR is in dB. They are over the
-whole image; with `_mask`, over the rock's mask; with `_inside`, over the pixels that the rock
-covers wholly, so without its outline. With `_corrected`, the render is first brought to the
-exposure and the white balance of the truth (`colour_corrected`)."""
+"""Metrics of `compare`, as in metrics.json; PSNR in dB. Over the whole image; `_mask`, over the
+rock's mask; `_inside`, over the pixels that the rock covers wholly, without its outline.
+`_corrected`: after the render is brought to the exposure and white balance of the truth
+(`colour_corrected`)."""
 
 SPACINGS = (1, 3, 10)
-"""How far behind the true surface a pixel must be drawn to count as too deep, in spacings of the
-prior's samples. One spacing is about what the Gaussians resolve; at ten, the pixel shows another
-part of the rock."""
+"""Depths behind the true surface beyond which a pixel is too deep, in spacings of the prior's
+samples. One is about what the Gaussians resolve; at ten, the pixel shows another part of the rock.
+"""
 
 OPAQUE = 0.9
-"""A pixel wholly on the rock counts as see-through where the model's alpha is below this."""
+"""A pixel wholly on the rock is see-through if the model's alpha is below this."""
 
 SURFACE_METRICS = ("alpha_mae", "depth_error", *(f"too_deep_{k}" for k in SPACINGS), "see_through")
-"""Names of the numbers that `compare_surface` gives, as in metrics.json. `depth_error` is in
-metres, the others are shares."""
+"""Metrics of `compare_surface`, as in metrics.json: `depth_error` in metres, the others shares."""
 
 
 def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio of two images, dB: -10 log10 of the mean squared error over pixels
-    and channels.
+    """Peak signal-to-noise ratio of two images, dB: -10 log10 of the mean squared error.
 
-    a, b: [H,W,3] sRGB in [0,1]; mask: [H,W] bool, if given only its pixels count. At most
-    PSNR_LIMIT, and NaN if the mask is empty. Raises InputError if the shapes differ.
+    a, b: [H,W,3] sRGB in [0,1]. mask: [H,W] bool, the pixels that count; None: all. At most
+    PSNR_LIMIT; NaN if the mask is empty. Raises InputError if the shapes differ.
     """
     _check_same_shape(a, b)
     squares = (np.asarray(a, np.float64) - b) ** 2
@@ -67,44 +61,42 @@ def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     return PSNR_LIMIT if error <= 10 ** (-PSNR_LIMIT / 10) else -10 * math.log10(error)
 
 
-def masked_squares(rendered: np.ndarray, target: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Squared differences [K,3], (linear RGB)², of the pixels of a mask [H,W] whose colour is
-    known.
+def masked_squares(
+    rendered: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None
+) -> np.ndarray:
+    """Squared differences [K,3], (linear RGB)^2, of the pixels of known colour in a mask [H,W].
 
-    rendered: [H,W,3]. target: [H,W,4], colour and weight, or more (`mgs.data.dataset.target_of`);
-    of weight 0 it is not known.
+    rendered: [H,W,3]. target: [H,W,4] or more, colour and weight (`mgs.data.dataset.target_of`); a
+    weight of 0 means unknown. mask: None: all pixels.
     """
-    return np.square(rendered - target[..., :3])[mask & (target[..., 3] > 0)]
+    known = target[..., 3] > 0
+    return np.square(rendered - target[..., :3])[known if mask is None else mask & known]
 
 
 def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Structural similarity of two images (Wang et al. 2004, computed by scikit-image), mean over
-    pixels and channels.
+    """Mean structural similarity of two images (Wang et al. 2004, by scikit-image).
 
-    a, b: [H,W,3] sRGB in [0,1]. Without a mask the mean leaves out the image's border, where the
-    window does not fit; with a mask, [H,W] bool, it is over all pixels of the mask, and NaN if that
-    is empty. Raises InputError if the shapes differ or the images are smaller than the window.
+    a, b: [H,W,3] sRGB in [0,1]. mask: [H,W] bool, the pixels of the mean, NaN if empty; None: all
+    but the border where the window does not fit. Raises InputError if the shapes differ or the
+    images are smaller than the window.
     """
     return _mean_ssim(*_similarity(a, b), mask)
 
 
 def _mean_ssim(mean: float, similarity: np.ndarray, mask: np.ndarray | None) -> float:
-    """What `ssim` returns, of what `_similarity` found, which takes most of its time."""
     if mask is None:
         return mean
     return float(similarity[mask].mean()) if mask.any() else math.nan
 
 
 def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
-    """Mean structural similarity of two images without their border, and that of every pixel and
-    channel [H,W,3]."""
+    """Mean structural similarity without the border, and that of each pixel and channel [H,W,3]."""
     from skimage.metrics import structural_similarity
 
     _check_same_shape(a, b)
     if min(a.shape[:2]) < SSIM_WINDOW:
-        raise InputError(
-            f"SSIM needs images of at least {SSIM_WINDOW}x{SSIM_WINDOW} pixels, not {a.shape[1]}x{a.shape[0]}"
-        )
+        size, least = f"{a.shape[1]}x{a.shape[0]}", f"{SSIM_WINDOW}x{SSIM_WINDOW}"
+        raise InputError(f"SSIM needs images of at least {least} pixels, not {size}")
     mean, similarity = structural_similarity(
         np.asarray(a, np.float64),
         np.asarray(b, np.float64),
@@ -119,13 +111,11 @@ def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def colour_corrected(truth: np.ndarray, rendered: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """A render times a gain per channel: those that bring it nearest to the truth in the pixels of
-    a mask, in least squares.
+    """Scale each channel of a render to fit the truth in a mask, in least squares.
 
-    truth, rendered: [H,W,3] linear RGB; mask: [H,W] bool. The error that is left is none of
-    exposure or white balance. Because the gains are taken from the truth, what is measured of it
-    says less than PSNR does, and has a name of its own. A channel that is black in the mask keeps
-    its values.
+    truth, rendered: [H,W,3] linear RGB. mask: [H,W] bool. Removes errors of exposure and white
+    balance. The gains are taken from the truth, so metrics of the result are named apart. A channel
+    that is black in the mask keeps its values.
     """
     a, b = truth[mask].astype(np.float64), rendered[mask].astype(np.float64)
     squares = (b * b).sum(axis=0)
@@ -136,19 +126,19 @@ def colour_corrected(truth: np.ndarray, rendered: np.ndarray, mask: np.ndarray) 
 def _check_same_shape(a: np.ndarray, b: np.ndarray) -> None:
     if a.shape != b.shape:
         raise InputError(
-            f"images of {a.shape} and {b.shape} cannot be compared; render at the size of the dataset"
+            f"images of {a.shape} and {b.shape} cannot be compared; "
+            "render at the size of the dataset"
         )
 
 
 def compare(
     truth: np.ndarray, rendered: np.ndarray, mask: np.ndarray, weight: np.ndarray
 ) -> dict[str, float]:
-    """The METRICS of one view, over the pixels whose truth is known.
+    """METRICS of one view, over the pixels whose truth is known.
 
-    truth: [H,W,4], linear RGB premultiplied by alpha, and alpha; rendered: [H,W,3] linear RGB;
-    mask: [H,W] bool, the rock;
-    weight: [H,W], 0 where the truth is not known (`mgs.data.dataset.Frame.target`). Raises
-    InputError as `psnr` and `ssim`.
+    truth: [H,W,4], linear RGB premultiplied by alpha, and alpha. rendered: [H,W,3] linear RGB.
+    mask: [H,W] bool, the rock. weight: [H,W], 0 where the truth is unknown
+    (`mgs.data.dataset.Frame.target`). Raises InputError as `psnr` and `ssim`.
     """
     a, b, known = srgb_from_linear(truth[..., :3]), srgb_from_linear(rendered), weight > 0
     whole = None if known.all() else known
@@ -176,22 +166,18 @@ def compare_surface(
     true_depth: np.ndarray | None = None,
     spacing: float | None = None,
 ) -> dict[str, float]:
-    """Those of the SURFACE_METRICS of one view for which the data has a truth; NaN where it has no
-    pixel to measure.
+    """SURFACE_METRICS of one view, those that the data has a truth for; NaN if no pixel counts.
 
-    truth, mask, weight: as in `compare`; alpha, depth: [H,W] of the render, its expected z-depth in
-    metres. fractional: whether the truth's alpha is a share of each pixel, and not only a mask;
-    true_depth: [H,W] metres, 0 where unknown; spacing: of the prior's samples, metres.
+    truth, mask, weight: as in `compare`. alpha, depth: [H,W] of the render, its expected z-depth in
+    metres. fractional: whether the truth's alpha is a share of each pixel, not only a mask.
+    true_depth: [H,W] metres, 0 where unknown. spacing: of the prior's samples, metres.
 
-    - alpha_mae: mean absolute error of alpha over the pixels whose truth is known; only where
-    `fractional`.
-    - depth_error: median absolute error of depth inside the mask, metres; only with a true depth. A
-    pixel where nothing is
-      drawn counts as infinitely deep; NaN where the median is infinite.
-    - too_deep_1, too_deep_3, too_deep_10: share of the same pixels that are deeper than the truth
-    by more than so many
-      spacings; only with a true depth and a spacing.
-    - see_through: share of the pixels that the rock covers wholly whose alpha is below OPAQUE.
+    - alpha_mae: mean absolute error of alpha over the known pixels; only if `fractional`.
+    - depth_error: median absolute error of depth inside the mask, metres; needs a true depth. A
+      pixel where nothing is drawn is infinitely deep; NaN if the median is infinite.
+    - too_deep_1, too_deep_3, too_deep_10: share of the same pixels deeper than the truth by more
+      than so many spacings; needs a true depth and a spacing.
+    - see_through: share of the pixels wholly on the rock whose alpha is below OPAQUE.
     """
     known = weight > 0
     inside = (truth[..., 3] >= 1) & known
@@ -209,17 +195,17 @@ def compare_surface(
 
 
 def _mean(values: np.ndarray) -> float:
-    """Mean of any number of values, NaN of none."""
+    """Mean of the values, NaN if there are none."""
     return float(values.mean()) if values.size else math.nan
 
 
 def agreement(mine: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """How well scores of candidates [C] agree with reference scores: Kendall's `tau`, 0 where one
-    of them is constant; and `regret`, the share of the best reference score that is lost by taking
-    our best."""
-    from scipy.stats import (
-        kendalltau,
-    )  # imported here, because it takes half a second and few programs rank
+    """Agreement of scores of candidates [C] with reference scores.
+
+    "tau": Kendall's tau, 0 if one of them is constant. "regret": share of the best reference score
+    that is lost by taking our best candidate.
+    """
+    from scipy.stats import kendalltau  # takes half a second, and few programs rank
 
     constant = np.ptp(mine) == 0 or np.ptp(reference) == 0
     tau = 0.0 if constant else float(kendalltau(mine, reference).statistic)

@@ -1,4 +1,4 @@
-"""What all figures share: their style, how a figure is made, and how it is written."""
+"""Style, creation and writing of figures."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ DPI = 200
 
 
 FORMATS = ("png", "pdf", "svg")
-"""What figures can be written as."""
+"""File formats of figures."""
 
 
 def new_figure(width: float, height: float, dpi: int = DPI) -> Figure:
-    """An empty figure of this width and height, inches. It needs no display."""
+    """Empty figure of this width and height, inches. It needs no display."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), dpi=dpi, layout="constrained")
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:
-    """Write a figure as its name ends: .png, .pdf or .svg; the file appears complete.
+    """Write a figure in the format of its suffix: .png, .pdf or .svg; the file appears complete.
 
-    Raises InputError for another ending, and as `mgs.files.atomic_path`.
+    Raises InputError for another suffix, and as `mgs.files.atomic_path`.
     """
     kind = Path(path).suffix.lower()[1:]
     if kind not in FORMATS:
@@ -61,10 +61,9 @@ def save_figure(figure: Figure, path: str | Path) -> None:
 
 
 def crop(mask: np.ndarray, margin: float = 0.06) -> tuple[slice, slice]:
-    """The rows and columns of an image that hold its mask [H,W] with a margin around it; all of
-    them if the mask is empty.
+    """Rows and columns of an image that hold its mask [H,W] and a margin; all if the mask is empty.
 
-    margin: a share of the image's height and width.
+    margin: share of the image's height and width.
     """
     rows, columns = np.nonzero(mask)
     if len(rows) == 0:

@@ -1,4 +1,4 @@
-"""What results depend on and files of results therefore record: the command and the versions."""
+"""Command line and versions, which files of results record."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from mgs import __version__
 
 
 def versions() -> dict[str, str]:
-    """Versions of mgs, of Python and of the libraries that compute results; "unknown" for one that
-    is not installed. Where mgs runs from a checkout, its commit too."""
+    """Versions of mgs, Python and the libraries that compute results; "unknown" if not installed.
+
+    If mgs runs from a checkout, also its "commit".
+    """
     found = {"mgs": __version__, **_commit(), "python": platform.python_version()}
     for package in ("mitsuba", "drjit", "numpy"):
         try:
@@ -27,35 +29,26 @@ def versions() -> dict[str, str]:
 
 @cache
 def _commit() -> dict[str, str]:
-    """The commit of the checkout that mgs runs from, with a + where files differ from it; nothing
-    where it is no checkout."""
+    """Commit of the checkout, with a + if files differ from it; {} outside a checkout."""
     checkout = Path(__file__).parent.parent
     if not (checkout / ".git").exists():
         return {}
-    asked = [
-        "git",
-        "-C",
-        str(checkout),
-        "describe",
-        "--always",
-        "--exclude",
-        "*",
-        "--abbrev=7",
-        "--dirty=+",
-    ]
+    git = ["git", "-C", str(checkout), "describe"]
+    options = ["--always", "--exclude", "*", "--abbrev=7", "--dirty=+"]
     try:
-        told = subprocess.run(asked, capture_output=True, text=True, timeout=10, check=True)
+        result = subprocess.run(
+            [*git, *options], capture_output=True, text=True, timeout=10, check=True
+        )
     except (OSError, subprocess.SubprocessError):
         return {}
-    return {"commit": told.stdout.strip()}
+    return {"commit": result.stdout.strip()}
 
 
 def command_line() -> str:
-    """The command line of this process as the user typed it: the program's name without its folder,
-    and the arguments.
+    """Command line of this process as typed, with the program's name without its folder.
 
-    `python -m mgs` is called `mgs`."""
+    `python -m mgs` becomes `mgs`.
+    """
     program = Path(sys.argv[0])
-    return shlex.join(
-        [program.parent.name if program.name == "__main__.py" else program.name, *sys.argv[1:]]
-    )
+    name = program.parent.name if program.name == "__main__.py" else program.name
+    return shlex.join([name, *sys.argv[1:]])

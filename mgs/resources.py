@@ -23,8 +23,7 @@ def resource_folder(name: str) -> Path:
 
 
 def scene_path(scene: str | Path) -> Path:
-    """Path of a scene's TOML file. scene: such a path, or the name of a scene that comes with mgs,
-    as in "boulder".
+    """Path of a scene's TOML file, from that path or from a name such as "boulder".
 
     Raises InputError if there is no such file or name.
     """
@@ -37,6 +36,7 @@ def scene_path(scene: str | Path) -> Path:
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
         raise InputError(
-            f"scene {str(scene)!r}: unknown; choose one of {known}, or give the path of a .toml file"
+            f"scene {str(scene)!r}: unknown; choose one of {known}, "
+            "or give the path of a .toml file"
         )
     return path

@@ -1,5 +1,4 @@
-"""Rotations in NumPy: quaternions (in the order w x y z), rotation matrices, and the turn from
-glTF's axes to ours."""
+"""Rotations in NumPy: quaternions (w x y z), rotation matrices, glTF's axes."""
 
 from __future__ import annotations
 
@@ -7,17 +6,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 QUAT_MIN = 1e-12
-"""A quaternion with no component larger than this counts as zero and means the identity. Were it
-normalised instead, its derivatives would overflow float32."""
+"""Quaternions whose components are all at most this mean the identity. Normalised, their
+derivatives would overflow float32."""
 
 WORLD_FROM_GLTF = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""Rotation [4,4] from the axes of glTF files (and GLB, their binary form), which are +Y up, to the
-world's, which are +Z up. Its inverse is its transpose."""
+"""Rotation [4,4] from the axes of glTF and GLB files (+Y up) to the world's (+Z up); its inverse is
+its transpose."""
 
 
 def rotmat_from_quat(quats: ArrayLike) -> NDArray[np.float64]:
-    """Quaternions wxyz [...,4] of any norm -> rotation matrices [...,3,3]. A zero quaternion gives
-    the identity."""
+    """Rotation matrices [...,3,3] of quaternions wxyz [...,4] of any norm; identity for zero."""
     q = np.asarray(quats, np.float64)
     valid = np.abs(q).max(-1, keepdims=True) > QUAT_MIN
     norm = np.linalg.norm(q, axis=-1, keepdims=True)
@@ -32,8 +30,8 @@ def rotmat_from_quat(quats: ArrayLike) -> NDArray[np.float64]:
 
 
 def quat_from_normals(normals: ArrayLike) -> NDArray[np.float64]:
-    """For each normal [N,3], of any length but 0, the unit quaternion wxyz of the shortest rotation
-    from +Z to it: [N,4]."""
+    """Unit quaternions wxyz [N,4] of the shortest rotations from +Z to the normals [N,3], which
+    have any length but 0."""
     n = np.asarray(normals, np.float64)
     n = n / np.linalg.norm(n, axis=1, keepdims=True)
     q = np.stack([1 + n[:, 2], -n[:, 1], n[:, 0], np.zeros(len(n))], 1)

@@ -1,7 +1,6 @@
-"""Random numbers. A run has one root seed, and every part of the program derives its own seed from
-it by a name of its own.
+"""Random numbers: each part of the program derives its own seed from the root seed of a run.
 
-So a new part, which draws under a new name, changes the draws of no other.
+A new part draws under a new name, so it changes the draws of no other.
 """
 
 from __future__ import annotations
@@ -12,11 +11,10 @@ import numpy as np
 
 
 def derive_seed(root: int, name: str) -> int:
-    """The seed of one part of the program, 32 bits: from the SHA-256 hash of the root seed and the
-    part's name."""
+    """32-bit seed of one part of the program: SHA-256 of the root seed and the part's name."""
     return int.from_bytes(hashlib.sha256(f"{root}/{name}".encode()).digest()[:4], "little")
 
 
 def generator(root: int, name: str) -> np.random.Generator:
-    """NumPy's random generator for one part of the program, seeded by `derive_seed`."""
+    """NumPy random generator of one part of the program, seeded by `derive_seed`."""
     return np.random.default_rng(derive_seed(root, name))

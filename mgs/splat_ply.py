@@ -1,5 +1,5 @@
-"""Gaussians on disk, as PLY files. The layout of 3DGS is written and read; the compressed one of
-SuperSplat and PlayCanvas is only read.
+"""Gaussians as PLY files: writes and reads the layout of 3DGS, and reads the compressed one of
+SuperSplat and PlayCanvas.
 
 The layout of 3DGS has one vertex per Gaussian: x y z; nx ny nz (zero); f_dc_0..2, the coefficients
 of degree 0; f_rest_*, those of higher degrees, all of red, then all of green, then all of blue;
@@ -23,27 +23,24 @@ from mgs.files import atomic_path, reading
 from mgs.gaussians import Gaussians
 
 LINEAR_COMMENT = "mgs: colours are linear RGB"
-"""A comment in the header of the PLY files that mgs writes, because the layout itself cannot say
-what its colours are. Most other tools train on sRGB values as they are, so the colours in their
-files must be blended as sRGB."""
+"""Comment in the header of the files that mgs writes; the layout has no field for the colour space.
+Most other tools train on sRGB values, so the colours in their files must be blended as sRGB."""
 
 CHUNK = 256
-"""Number of consecutive splats of a compressed PLY that share one row of its element `chunk`."""
+"""Consecutive splats of a compressed PLY that share one row of its element `chunk`."""
 
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-"""Properties of a splat in a compressed PLY: one 32-bit word each."""
+"""Properties of a splat in a compressed PLY, one 32-bit word each."""
 
 VECTOR_BITS = ((21, 11), (11, 10), (0, 11))
-"""Where x, y and z lie in the word of a packed position or scale: the lowest bit, and the number of
-bits."""
+"""Lowest bit and number of bits of x, y and z in the word of a packed position or scale."""
 
 TO_ASCII = bytes(byte if byte < 128 else ord("?") for byte in range(256))
-"""Table for `bytes.translate` that replaces every byte that is not ASCII by a question mark."""
+"""Table for `bytes.translate` that replaces bytes that are not ASCII by question marks."""
 
 
 def _ply_names(coefficients: int) -> list[str]:
-    """Names of the properties of the 3DGS layout, in their order. coefficients: spherical harmonics
-    per colour channel, K."""
+    """Properties of the 3DGS layout in order. coefficients: K, per colour channel."""
     rest = 3 * (coefficients - 1)
     return (
         ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -58,42 +55,34 @@ def write_ply(
     """Write Gaussians (NumPy fields) as a binary PLY in the layout of 3DGS; the file appears
     complete.
 
-    It opens in any splat viewer. The colours stay linear RGB, which viewers that expect sRGB show
-    too dark. marks: {name: [N] bool}, further properties of the vertices, bytes of 0 or 1, which
-    `read_ply` and viewers pass over. Raises InputError as `mgs.files.atomic_path`.
+    It opens in any splat viewer. Colours stay linear RGB, which viewers that expect sRGB show too
+    dark. marks: {name: [N] bool}, extra properties of the vertices, bytes of 0 or 1, which
+    `read_ply` and viewers ignore. Raises InputError as `mgs.files.atomic_path`.
     """
     g, n = gaussians, len(gaussians)
     names = _ply_names(g.sh.shape[1])
     rest = np.transpose(g.sh[:, 1:, :], (0, 2, 1)).reshape(n, -1)
-    columns = np.concatenate(
-        [
-            g.means,
-            np.zeros((n, 3)),
-            g.sh[:, 0, :],
-            rest,
-            np.reshape(g.logit_opacities, (n, 1)),
-            g.log_scales,
-            g.quats,
-        ],
-        axis=1,
-    ).astype(np.float32)
+    opacity, normals = np.reshape(g.logit_opacities, (n, 1)), np.zeros((n, 3))
+    parts = [g.means, normals, g.sh[:, 0, :], rest, opacity, g.log_scales, g.quats]
+    columns = np.concatenate(parts, axis=1).astype(np.float32)
     marks = marks or {}
-    vertices = np.empty(
-        n, dtype=[(name, "f4") for name in names] + [(name, "u1") for name in marks]
-    )
+    types = [(name, "f4") for name in names] + [(name, "u1") for name in marks]
+    vertices = np.empty(n, dtype=types)
     for i, name in enumerate(names):
         vertices[name] = columns[:, i]
     for name, mask in marks.items():
         vertices[name] = mask
+    ply = PlyData([PlyElement.describe(vertices, "vertex")], comments=[LINEAR_COMMENT])
     with atomic_path(path) as temporary:
-        PlyData([PlyElement.describe(vertices, "vertex")], comments=[LINEAR_COMMENT]).write(
-            str(temporary)
-        )
+        ply.write(str(temporary))
 
 
 def ply_colour_space(path: str | Path) -> str:
-    """The space in which the colours of a PLY are to be blended: "linear" for files of mgs (by
-    their LINEAR_COMMENT), otherwise "srgb". Raises OSError if the file cannot be read."""
+    """Space in which the colours of a PLY are blended: "linear" for files of mgs (by
+    LINEAR_COMMENT), else "srgb".
+
+    Raises OSError if the file cannot be read.
+    """
     with Path(path).open("rb") as file:
         for line in file:
             if line.strip() == f"comment {LINEAR_COMMENT}".encode():
@@ -104,12 +93,11 @@ def ply_colour_space(path: str | Path) -> str:
 
 
 def read_ply(path: str | Path) -> Gaussians:
-    """Read a PLY in the layout of 3DGS (binary or ASCII, spherical harmonics of degree 0 to 3), or
-    a compressed one.
+    """Read a PLY in the layout of 3DGS (binary or ASCII, SH degree 0 to 3), or a compressed one.
 
-    Properties are found by their names, so their order does not matter, nor do other properties.
-    Colours are taken as they are: see `ply_colour_space`. Raises InputError if the file is missing,
-    is not a PLY, lacks a property, or holds values that `Gaussians.check` refuses.
+    Properties are found by name, in any order; others are ignored. Colours are unchanged: see
+    `ply_colour_space`. Raises InputError if the file is missing, is not a PLY, lacks a property, or
+    holds values that `Gaussians.check` refuses.
     """
     path = Path(path)
     ply = _parse(path)
@@ -130,7 +118,7 @@ def read_ply(path: str | Path) -> Gaussians:
 
 
 def _parse(path: Path) -> PlyData:
-    """The elements of a PLY file. Raises InputError if it cannot be read or is damaged."""
+    """Elements of a PLY file. Raises InputError if it cannot be read or is damaged."""
     try:
         with reading(path, "file; give a 3DGS PLY"):
             return _parse_any_comment(path)
@@ -141,14 +129,12 @@ def _parse(path: Path) -> PlyData:
 
 
 def _parse_any_comment(path: Path) -> PlyData:
-    """PlyData.read, but also of files with comments that are not ASCII, which it refuses."""
+    """PlyData.read that also accepts comments that are not ASCII."""
     try:
         return PlyData.read(str(path))
     except UnicodeDecodeError:
         header, mark, body = path.read_bytes().partition(b"end_header")
-    with NamedTemporaryFile(
-        suffix=".ply"
-    ) as copy:  # plyfile is slow where it does not read from disk
+    with NamedTemporaryFile(suffix=".ply") as copy:  # plyfile is slow except from disk
         copy.write(header.translate(TO_ASCII) + mark + body)
         copy.flush()
         return PlyData.read(copy.name)
@@ -161,25 +147,18 @@ def _from_columns(path: Path, columns: Mapping[str, np.ndarray], n: int) -> Gaus
     coefficients = 1 + rest // 3
     if rest % 3 or coefficients not in (1, 4, 9, 16):
         raise InputError(
-            f"{path}: {rest} f_rest properties fit no SH degree from 0 to 3; expected 0, 9, 24 or 45"
+            f"{path}: {rest} f_rest properties fit no SH degree from 0 to 3; "
+            "expected 0, 9, 24 or 45"
         )
-    missing = [
-        name
-        for name in _ply_names(coefficients)
-        if name not in columns and name not in ("nx", "ny", "nz")
-    ]
-    if missing:
+    names = _ply_names(coefficients)
+    wrong = {n: "is missing" for n in names if n not in columns and n not in ("nx", "ny", "nz")}
+    if not wrong:
+        present = [name for name in names if name in columns]
+        wrong = {name: "is a list" for name in present if columns[name].dtype.kind == "O"}
+    if wrong:
+        name, what = next(iter(wrong.items()))
         raise InputError(
-            f"{path}: not a 3DGS PLY, property {missing[0]!r} is missing; export it with a splatting tool"
-        )
-    lists = [
-        name
-        for name in _ply_names(coefficients)
-        if name in columns and columns[name].dtype.kind == "O"
-    ]
-    if lists:
-        raise InputError(
-            f"{path}: not a 3DGS PLY, property {lists[0]!r} is a list; export it with a splatting tool"
+            f"{path}: not a 3DGS PLY, property {name!r} {what}; export it with a splatting tool"
         )
 
     def stack(*names: str) -> np.ndarray:
@@ -200,14 +179,13 @@ def _from_columns(path: Path, columns: Mapping[str, np.ndarray], n: int) -> Gaus
 
 
 def _decompress(path: Path, ply: PlyData) -> dict[str, np.ndarray]:
-    """The properties of the 3DGS layout, an array [n] each, from a compressed PLY.
+    """Properties of the 3DGS layout, an array [n] each, from a compressed PLY.
 
-    Such files are written by PlayCanvas' splat-transform (`.compressed.ply`). A splat has four
-    32-bit words (PACKED). A number in them is a fraction, 0 to 1, of the way from the least to the
-    largest value that the number has within its chunk of 256 splats; these two are in the element
-    `chunk`. Older files do not have them for colours, whose range is then 0 to 1. Raises InputError
-    if an element or a property is missing, is of another type, or the elements' sizes do not fit
-    together.
+    PlayCanvas' splat-transform writes such files (`.compressed.ply`). A splat has four 32-bit words
+    (PACKED). Their numbers are fractions between the least and the largest value within a chunk of
+    256 splats, given in the element `chunk`. Some files have no range of colours, which is then 0
+    to 1. Raises InputError if an element or a property is missing or of another type, or sizes do
+    not match.
     """
     vertices, n = ply["vertex"].data, len(ply["vertex"].data)
     chunks = ply["chunk"].data if "chunk" in ply else np.empty(0, [])
@@ -216,17 +194,16 @@ def _decompress(path: Path, ply: PlyData) -> dict[str, np.ndarray]:
     ranges = [*"xyz", "scale_x", "scale_y", "scale_z", *("rgb" if coloured else "")]
     wanted = [(chunks, f"{end}_{name}", "f") for name in ranges for end in ("min", "max")]
     for table, name, kind in wanted + [(vertices, name, "u") for name in PACKED]:
-        if (
-            name not in (table.dtype.names or ())
-            or table.dtype[name].kind != kind
-            or table.dtype[name].itemsize < 4
-        ):
+        found = table.dtype[name] if name in (table.dtype.names or ()) else None
+        if found is None or found.kind != kind or found.itemsize < 4:
             raise InputError(
-                f"{path}: a compressed PLY without a usable {name!r}; export it again, or uncompressed"
+                f"{path}: a compressed PLY without a usable {name!r}; "
+                "export it again, or uncompressed"
             )
     if len(chunks) * CHUNK < n:
         raise InputError(
-            f"{path}: {len(chunks)} chunks are too few for {n} splats, {CHUNK} to a chunk; export it again"
+            f"{path}: {len(chunks)} chunks are too few for {n} splats, {CHUNK} to a chunk; "
+            "export it again"
         )
     chunk = np.arange(n) // CHUNK
 
@@ -244,17 +221,12 @@ def _decompress(path: Path, ply: PlyData) -> dict[str, np.ndarray]:
     for i, channel in enumerate("rgb"):
         value = share("packed_color", 24 - 8 * i, 8)
         columns[f"f_dc_{i}"] = ((within(channel, value) if coloured else value) - 0.5) / SH_C0
-    # Opacities are stored in steps of 1/255. Those stored as 0 and 1 would have infinite logits, so
-    # they are moved inside by a
-    # quarter of a step: the middle of the half step of opacities that were rounded to them.
+    # Opacities are stored in steps of 1/255. Those of 0 and 1 have infinite logits, so they become
+    # the middle of the half step that was rounded to them.
     columns["opacity"] = logit(np.clip(share("packed_color", 0, 8), 0.25 / 255, 1 - 0.25 / 255))
-    three = np.stack(
-        [np.sqrt(2) * (share("packed_rotation", lowest, 10) - 0.5) for lowest in (20, 10, 0)], 1
-    )
-    columns |= {
-        f"rot_{i}": column
-        for i, column in enumerate(_unit_quats(vertices["packed_rotation"] >> 30, three).T)
-    }
+    three = [np.sqrt(2) * (share("packed_rotation", lowest, 10) - 0.5) for lowest in (20, 10, 0)]
+    quats = _unit_quats(vertices["packed_rotation"] >> 30, np.stack(three, 1))
+    columns |= {f"rot_{i}": column for i, column in enumerate(quats.T)}
     return columns | _decompress_sh(path, ply, n)
 
 
@@ -263,18 +235,16 @@ def _unit_quats(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     and the other three [N,3]."""
     place = np.arange(4)
     quats = np.take_along_axis(others, np.minimum(place - (place > largest[:, None]), 2), 1)
-    return np.where(
-        place == largest[:, None], np.sqrt(np.maximum(1 - (others**2).sum(1), 0))[:, None], quats
-    )
+    rest = np.sqrt(np.maximum(1 - (others**2).sum(1), 0))
+    return np.where(place == largest[:, None], rest[:, None], quats)
 
 
 def _decompress_sh(path: Path, ply: PlyData, n: int) -> dict[str, np.ndarray]:
-    """The properties f_rest_* of a compressed PLY, an array [n] each; none if it has only colours
-    of degree 0.
+    """Properties f_rest_* of a compressed PLY, an array [n] each; {} if it has only degree 0.
 
     They are bytes, which divide the range -4 to 4 into 256 steps. A byte stands for the middle of
-    its step; 0 and 255 stand for
-    -4 and 4. Raises InputError if the element `sh` is not n rows of bytes.
+    its step, but 0 and 255 for -4 and 4. Raises InputError if the element `sh` is not n rows of
+    bytes.
     """
     if "sh" not in ply:
         return {}

@@ -26,11 +26,11 @@ from mgs.run import nbv
 from mgs.run.inputs import prior_digest
 from mgs.synth import arena, rendering
 from mgs.synth.capture import capture_of
-from mgs.synth.rendering import PoseNoise, Preset, synthesise
+from mgs.synth.rendering import PoseNoise, RenderPreset, synthesise
 from mgs.synth.scene_file import Arena, Rock, SceneFile
 from mgs.view.subject import read_subject
 
-TINY = Preset(width=64, height=48, frames=8, spp=2)
+TINY = RenderPreset(width=64, height=48, frames=8, spp=2)
 SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=20))
 TOML = "[rock]\ndetail = 0.06\n[arena]\nstones = 20\n"
 RUN = ["--seeds", "3", "--budget", "2", "--passes", "4", "--evaluate-every", "1", "--seed", "1"]
@@ -215,7 +215,7 @@ def test_a_mesh_seen_from_noisy_poses_is_captured_from_the_true_ones(full, tmp_p
         synthesise(
             tmp_path / name,
             SCENE,
-            Preset(32, 24, 4, 2),
+            RenderPreset(32, 24, 4, 2),
             mesh=mesh,
             pose_noise=noise,
             on_demand=name == "poses",
@@ -424,7 +424,7 @@ def test_bad_scenes_and_options_are_refused(small, poses, prior, tmp_path, capsy
     assert "give a DATASET or --capture" in refused(
         capsys, ["nbv", poses.root, "--capture", "boulder", *out], tmp_path
     )
-    assert "--capture out" in refused(
+    assert "--capture: --resume takes its settings" in refused(
         capsys, ["nbv", "--resume", tmp_path, "--capture", "boulder"], tmp_path
     )
     assert "--budget 6 exceeds its 5" in refused(

@@ -1,4 +1,4 @@
-"""benchmarks/criteria.py: what it compares, and that it goes on where it was interrupted."""
+"""benchmarks/criteria.py: what it compares, and that it continues where it was interrupted."""
 
 import importlib.util
 import json
@@ -12,13 +12,12 @@ import mgs
 from mgs.errors import InputError
 from mgs.policy.registry import policy_names
 
-ROOT = Path(__file__).parent.parent
-
 
 @pytest.fixture(scope="module")
 def benchmark():
-    """benchmarks/criteria.py, which is no part of the package."""
-    spec = importlib.util.spec_from_file_location("criteria_study", ROOT / "benchmarks/criteria.py")
+    """benchmarks/criteria.py as a module."""
+    path = Path(__file__).parent.parent / "benchmarks/criteria.py"
+    spec = importlib.util.spec_from_file_location("criteria_study", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -26,18 +25,13 @@ def benchmark():
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """The seeds of a tiny dataset with test views."""
+    """Run with the seeds alone of a tiny dataset with test views."""
     root = tmp_path_factory.mktemp("study")
     tiny.write_dataset(root / "data", frames=8)
     tiny.write_dataset(root / "data/test", frames=3)
-    mgs.run_nbv(
-        root / "data",
-        root / "run",
-        prior=tiny.write_prior(root / "prior"),
-        budget=0,
-        seeds=3,
-        train={"passes": 3},
-    )
+    prior = tiny.write_prior(root / "prior")
+    settings = {"budget": 0, "seeds": 3, "train": {"passes": 3}}
+    mgs.run_nbv(root / "data", root / "run", prior=prior, **settings)
     return root / "run"
 
 
@@ -60,9 +54,8 @@ def test_an_interrupted_study_ends_as_another(benchmark, run, tmp_path, monkeypa
     with pytest.raises(KeyboardInterrupt):
         benchmark.study(tmp_path / "again.json", [run], 2, ["random"])
     again = benchmark.study(tmp_path / "again.json", [run], 2, policy_names())
-    assert (
-        len(calls) == 1 + 2 * 5 + 1
-    )  # the start, five candidates in two orders, and the one that was interrupted
+    interrupted = 1
+    assert len(calls) == 1 + 2 * 5 + interrupted  # the start, five candidates in two orders
     assert again == json.loads((tmp_path / "again.json").read_text())
     assert again["states"] == whole["states"]
     text = benchmark.table(again, [run])
@@ -73,40 +66,12 @@ def test_another_state_is_refused(benchmark, run, tmp_path):
     found = benchmark.study(tmp_path / "out.json", [run], 1, ["farthest"])
     found["states"][str(run)]["model"] = "another"
     (tmp_path / "out.json").write_text(json.dumps(found))
-    with pytest.raises(
-        InputError, match=r"holds another state of .*run than its last one; write to a new file"
-    ):
+    with pytest.raises(InputError, match=r"holds another state of .*run; write to a new file"):
         benchmark.study(tmp_path / "out.json", [run], 1, ["farthest"])
 
 
-def test_gains_of_an_earlier_file(benchmark, run, tmp_path):
-    """Its gains are taken where the states are the same but for the last digits; scores are of the
-    states as they are."""
-    old = benchmark.study(tmp_path / "old.json", [run], 2, ["farthest", "uniform"])
-    state = old["states"][str(run)]
-    state |= {"model": "with other last digits", "scores": {"uniform": [0.0] * 5}}
-    (tmp_path / "old.json").write_text(json.dumps(old))
-    found = benchmark.study(
-        tmp_path / "new.json", [run], 2, ["uniform", "coverage"], tmp_path / "old.json"
-    )
-    new = found["states"][str(run)]
-    assert new["psnr"] == state["psnr"]
-    assert new["result"]["gains"] == state["result"]["gains"]
-    assert new["largest_difference"] == 0
-    assert set(new["scores"]) == {"uniform", "coverage", "(farthest)"}
-    assert np.ptp(new["scores"]["uniform"]) > 0
-    state["psnr"]["start"] += 0.03
-    (tmp_path / "old.json").write_text(json.dumps(old))
-    with pytest.raises(
-        InputError,
-        match=r"--gains: are of another state of .* \(PSNR differs by 0.030 dB\); leave them out",
-    ):
-        benchmark.study(tmp_path / "other.json", [run], 2, ["uniform"], tmp_path / "old.json")
-
-
 def test_what_is_compared(benchmark):
-    """A perfect score, its opposite, one that knows nothing, whose choice is the farthest view; and
-    two orders."""
+    """Perfect, opposite and constant scores (whose choice is the farthest view), in two orders."""
     psnr = {"start": 20.0, "a": [20.1, 20.2], "b": [20.4, 20.3], "c": [20.2, 20.6]}
     scores = {"good": [1, 2, 3], "bad": [3, 2, 1], "none": [0, 0, 0], "(farthest)": [1, 5, 2]}
     record = {"candidates": ["a", "b", "c"], "psnr": psnr, "scores": scores}

@@ -1,5 +1,4 @@
-"""Means that are learned, along the prior's normals or freely: steps, what they repair, and runs of
-`mgs nbv`."""
+"""Learned means, along the prior's normals or free: steps of a fit, and runs of `mgs nbv`."""
 
 from __future__ import annotations
 
@@ -22,12 +21,14 @@ from mgs.policy.criteria import MEAN_STD
 from mgs.prior.build import load_prior
 from mgs.prior.initial import initial_normals
 from mgs.report.convergence import remaining_decrease
+from mgs.report.diagnostics import diagnose_run
 from mgs.rotation import quat_from_normals
 from mgs.run import folder as run_folder
-from mgs.run import stations
+from mgs.run import operations
 from mgs.run.nbv import resume_nbv, run_nbv, start_run
 from mgs.run.settings import NbvSettings
 from mgs.splat import MEANS, as_drjit, fisher, groups, render
+from mgs.view.subject import SCALARS, read_subject
 
 N, SPACING = 300, (4 * np.pi / 300) ** 0.5
 MOVING = ("normal", "free")
@@ -41,8 +42,7 @@ def normals() -> np.ndarray:
 
 
 def ball(offsets: np.ndarray | float = 0.0) -> Gaussians:
-    """A speckled unit sphere of flat, opaque Gaussians, each off the surface by its offset [N],
-    metres."""
+    """A speckled unit sphere of flat, opaque Gaussians; offsets [N] from the surface, metres."""
     n = normals()
     return Gaussians(
         means=(n * (1 + np.broadcast_to(offsets, N))[:, None]).astype(np.float32),
@@ -56,9 +56,8 @@ def ball(offsets: np.ndarray | float = 0.0) -> Gaussians:
 @pytest.fixture(scope="module")
 def cameras() -> list[Camera]:
     K = np.array([[60.0, 0, 24], [0, 60.0, 20], [0, 0, 1]])
-    eyes = [
-        (3 * np.cos(a), 3 * np.sin(a), z) for z in (-1.2, 1.2) for a in np.arange(5) * 2 * np.pi / 5
-    ]
+    azimuths = np.arange(5) * 2 * np.pi / 5
+    eyes = [(3 * np.cos(a), 3 * np.sin(a), z) for z in (-1.2, 1.2) for a in azimuths]
     return [Camera(K, 48, 40, look_at(eye, (0, 0, 0))) for eye in eyes]
 
 
@@ -82,39 +81,30 @@ LAM = {
 }
 
 
+def fitted(start, cameras, targets, train, begun=None):
+    """A fit from `begun`, by default `start`, the mean of the prior."""
+    begun = start if begun is None else begun
+    return fit(begun, cameras, targets, train, start=start, lam=LAM, normals=3 * normals())
+
+
 def test_the_names_are_those_of_the_information():
     assert get_args(TrainSettings.model_fields["means"].annotation) == tuple(MEANS)
 
 
-def test_frozen_is_the_default_and_looks_at_nothing_else(cameras, targets):
-    start = ball(0.05)
-    plain = fit(
-        start,
-        cameras,
-        targets,
-        TrainSettings(passes=3),
-        start=start,
-        lam={k: v for k, v in LAM.items() if k != "mean"},
-    )
-    told = fit(
-        start,
-        cameras,
-        targets,
-        settings("frozen", passes=3),
-        start=start,
-        lam=LAM,
-        normals=normals(),
-    )
-    assert plain.gaussians == told.gaussians
-    assert plain.losses == told.losses
+def test_frozen_is_the_default_and_ignores_normals_and_their_lam(cameras, targets):
+    start, lam = ball(0.05), {kind: value for kind, value in LAM.items() if kind != "mean"}
+    plain = fit(start, cameras, targets, TrainSettings(passes=3), start=start, lam=lam)
+    frozen = fitted(start, cameras, targets, settings("frozen", passes=3))
+    assert plain.gaussians == frozen.gaussians
+    assert plain.losses == frozen.losses
     assert np.array_equal(plain.gaussians.means, start.means)
     assert not np.array_equal(plain.gaussians.sh, start.sh)
 
 
 @pytest.mark.parametrize("means", MOVING)
 def test_one_step_is_natural_on_the_gradient_of_the_objective(cameras, targets, means):
-    """Against a tenth of the gradient over four times the information, at most by the rate; the
-    second time replayed."""
+    """The first step is minus a tenth of the gradient over four times the information, at most the
+    rate. The second round is replayed."""
     start, rng = ball(0.02), np.random.default_rng(1)
     for _ in range(2):
         begun = ball(0.02 + 0.01 * rng.standard_normal(N))
@@ -123,9 +113,7 @@ def test_one_step_is_natural_on_the_gradient_of_the_objective(cameras, targets, 
         model = as_drjit(begun)
         g, d = (np.asarray(part(model)[-1]) for part in (goal.gradient, goal.diagonal))
         expected = np.clip(-0.1 * g / (4 * d), -0.002, 0.002)
-        moved = fit(
-            begun, cameras[:1], targets[:1], train, start=start, lam=LAM, normals=3 * normals()
-        ).gaussians
+        moved = fitted(start, cameras[:1], targets[:1], train, begun).gaussians
         step = moved.means.astype(np.float64) - begun.means
         if means == "normal":
             along = (step * normals()).sum(1)
@@ -144,9 +132,8 @@ def test_what_no_image_sees_goes_back_to_its_start(cameras, means):
     lam = dict.fromkeys(LAM, 100.0)
     train = settings(means, 0.004, optimiser="adam", passes=40, decay=1e-2)
     found = fit(begun, cameras, black, train, start=start, lam=lam, normals=normals())
-    assert found.losses[0] == pytest.approx(
-        100 * N * 0.05**2 / sum(b[..., :3].size for b in black), rel=1e-3
-    )
+    pixels = sum(image[..., :3].size for image in black)
+    assert found.losses[0] == pytest.approx(100 * N * 0.05**2 / pixels, rel=1e-3)
     assert np.allclose(found.gaussians.means, start.means, atol=2e-3)
 
 
@@ -155,20 +142,9 @@ def test_displaced_means_move_back_to_the_surface(cameras, targets, means):
     offsets = 0.4 * SPACING * np.random.default_rng(3).standard_normal(N)
     start = ball(offsets)
     frozen, moved = (
-        fit(
-            start,
-            cameras,
-            targets,
-            settings(mode, passes=10),
-            start=start,
-            lam=LAM,
-            normals=normals(),
-        )
-        for mode in ("frozen", means)
+        fitted(start, cameras, targets, settings(mode, passes=10)) for mode in ("frozen", means)
     )
-    seen = (
-        sum(fisher(start, camera)[:, 0] for camera in cameras) > 0.3
-    )  # some begin behind their neighbours
+    seen = sum(fisher(start, camera)[:, 0] for camera in cameras) > 0.3
     assert seen.sum() > 0.8 * N
     before, after = (
         np.abs(np.linalg.norm(g.means, axis=1)[seen] - 1) for g in (start, moved.gaussians)
@@ -181,18 +157,7 @@ def test_displaced_means_move_back_to_the_surface(cameras, targets, means):
 @pytest.mark.parametrize("means", MOVING)
 def test_a_fit_repeats_bitwise(cameras, targets, means):
     start = ball(0.05)
-    first, again = (
-        fit(
-            start,
-            cameras,
-            targets,
-            settings(means, passes=3),
-            start=start,
-            lam=LAM,
-            normals=normals(),
-        )
-        for _ in range(2)
-    )
+    first, again = (fitted(start, cameras, targets, settings(means, passes=3)) for _ in range(2))
     assert first.gaussians == again.gaussians
     assert first.losses == again.losses
 
@@ -213,47 +178,38 @@ def files(tmp_path_factory):
 
 
 def options(files, means: str, **values):
-    return {
-        "prior": files[1],
-        "budget": 2,
-        "seeds": 3,
-        "train": {"means": means, "passes": 3},
-    } | values
+    train = {"means": means, "passes": 3}
+    return {"prior": files[1], "budget": 2, "seeds": 3, "train": train} | values
 
 
 @pytest.fixture(scope="module", params=MOVING)
 def whole(request, files, tmp_path_factory):
-    """(means, run folder, last state) of a run that nothing interrupted."""
+    """(means, run folder, last state) of a complete run."""
     out = tmp_path_factory.mktemp(request.param) / "run"
     return request.param, out, run_nbv(files[0], out, **options(files, request.param))
 
 
 def test_units_are_spacings_of_the_prior_unless_given(files, tmp_path):
-    made = start_run(files[0], tmp_path / "run", **options(files, "normal"))
+    made = start_run(files[0], tmp_path / "run", **options(files, "normal")).settings
     assert made.prior_std["mean"] == MEAN_STD * 0.5
     assert made.train.rates["mean"] == MEAN_RATE * 0.5
     assert run_folder.read_settings(tmp_path / "run") == made
-    given = options(
-        files, "normal", prior_std={"mean": 0.3}, train={"means": "normal", "rates": {"mean": 0.01}}
-    )
-    own = start_run(files[0], tmp_path / "own", **given)
+    train = {"means": "normal", "rates": {"mean": 0.01}}
+    given = options(files, "normal", prior_std={"mean": 0.3}, train=train)
+    own = start_run(files[0], tmp_path / "own", **given).settings
     assert (own.prior_std["mean"], own.train.rates["mean"]) == (0.3, 0.01)
-    assert (
-        "mean" not in start_run(files[0], tmp_path / "frozen", **options(files, "frozen")).prior_std
-    )
+    frozen = start_run(files[0], tmp_path / "frozen", **options(files, "frozen")).settings
+    assert "mean" not in frozen.prior_std
 
 
 def test_criteria_see_the_means_and_coverage_does_not(files, whole):
     means, out, state = whole
-    made, prior, frames = (
-        run_folder.read_settings(out),
-        load_prior(files[1]),
-        load_dataset(files[0]).frames,
-    )
+    made, prior = run_folder.read_settings(out), load_prior(files[1])
+    frames = [load_dataset(files[0]).frames[i] for i in state.taken]
     facing = initial_normals(prior)
     H = sum(
-        fisher(state.gaussians, frames[i].camera, means=means, normals=facing).astype(float)
-        for i in state.taken
+        fisher(state.gaussians, frame.camera, means=means, normals=facing).astype(float)
+        for frame in frames
     )
     np.testing.assert_array_equal(state.H, H)
     assert state.H.shape[1] == 11 + MEANS[means]
@@ -267,15 +223,13 @@ def test_criteria_see_the_means_and_coverage_does_not(files, whole):
     assert np.abs(moved).max() > 1e-3
     sideways = moved - (moved * facing).sum(1, keepdims=True) * facing
     assert (np.abs(sideways).max() < 1e-6) == (means == "normal")
-    share = remaining_decrease(state.gaussians, made, prior, [frames[i] for i in state.taken])[
-        "predicted_decrease"
-    ]
-    assert 0 < share < 1
+    left = remaining_decrease(state.gaussians, made, prior, frames)
+    assert 0 < left["predicted_decrease"] < 1
 
 
 def test_interrupted_and_resumed_the_run_is_the_same(files, whole, tmp_path, monkeypatch):
     means, out, state = whole
-    real, calls = stations.fit, []
+    real, calls = operations.fit, []
 
     def struck(*arguments):
         calls.append(1)
@@ -283,7 +237,7 @@ def test_interrupted_and_resumed_the_run_is_the_same(files, whole, tmp_path, mon
             raise KeyboardInterrupt
         return real(*arguments)
 
-    monkeypatch.setattr(stations, "fit", struck)
+    monkeypatch.setattr(operations, "fit", struck)
     with pytest.raises(KeyboardInterrupt):
         run_nbv(files[0], tmp_path / "run", **options(files, means))
     resumed = resume_nbv(tmp_path / "run")
@@ -305,55 +259,39 @@ def test_policies_choose_with_learned_means(files, tmp_path, policy):
         (["--means", "loose"], "--means loose: Input should be 'frozen', 'normal' or 'free'"),
         (
             ["--means", "free", "--estimator", "hutchinson"],
-            "--means free: --estimator hutchinson knows nothing of means",
+            "--estimator hutchinson has no information",
         ),
-        (
-            ["--means", "free", "--policy", "paper"],
-            "--means free: --policy paper knows nothing of means",
-        ),
-        (
-            ["--means", "normal", "--prior-std", "mean=0"],
-            "--prior-std mean=0.0: Input should be greater than or equal to",
-        ),
+        (["--means", "free", "--policy", "paper"], "--policy paper has no information about means"),
+        (["--means", "normal", "--prior-std", "mean=0"], "--prior-std mean=0.0: Input should be"),
     ],
 )
 def test_bad_options_are_one_line(files, tmp_path, capsys, given, message):
     out = tmp_path / "run"
-    assert message in refused(
-        capsys, ["nbv", files[0], "--prior", files[1], "--budget", "1", "--out", out, *given]
-    )
+    arguments = ["nbv", files[0], "--prior", files[1], "--budget", "1", "--out", out, *given]
+    assert message in refused(capsys, arguments)
     assert not out.exists()
 
 
 def test_means_that_changed_since_the_start_are_one_line(files, whole, capsys):
     means, out, _ = whole
-    config = json.loads((out / "config.json").read_text())
-    changed = json.loads(json.dumps(config))
+    text = (out / "config.json").read_text()
+    changed = json.loads(text)
     changed["settings"]["train"]["means"] = "free" if means == "normal" else "frozen"
     try:
         (out / "config.json").write_text(json.dumps(changed))
         said = refused(capsys, ["nbv", "--resume", out], out)
     finally:
-        (out / "config.json").write_text(json.dumps(config))
-    assert (
-        f"{out / 'config.json'}: settings.train.means has changed since {out} was started; restore it"
-        in said
-    )
+        (out / "config.json").write_text(text)
+    assert f"settings.train.means has changed since {out} was started; restore it" in said
 
 
 def test_diagnostics_and_viewer_read_such_a_run(files, whole):
-    from mgs.report.diagnostics import diagnose_run
-    from mgs.view.subject import SCALARS, read_subject
-
     means, out, state = whole
-    assert (out / "diagnostics/information.ply") in diagnose_run(
-        out, [load_dataset(files[0]).frames[0].name]
-    )
+    written = diagnose_run(out, [load_dataset(files[0]).frames[0].name])
+    assert out / "diagnostics/information.ply" in written
     found = read_subject(out)
     assert set(found.scalars) == set(SCALARS)
     lam = run_folder.read_settings(out).regularisation(groups(0, means))
     assert found.scalars["information"] == pytest.approx(0.5 * np.log1p(state.H / lam).sum(1))
-    assert all(
-        getattr(found.gaussians, name).shape == getattr(state.gaussians, name).shape
-        for name in LEARNED
-    )
+    for name in LEARNED:
+        assert getattr(found.gaussians, name).shape == getattr(state.gaussians, name).shape

@@ -1,5 +1,4 @@
-"""The objective of the fit, with frozen and with learned means: value, gradient, curvature and
-predicted decrease against the float64 oracle."""
+"""Value, gradient, curvature and Newton decrease of the objective against the float64 reference."""
 
 from dataclasses import replace
 
@@ -9,7 +8,9 @@ import pytest
 from mgs.bench.core import surface_camera, surface_gaussians
 from mgs.camera import Camera, look_at
 from mgs.errors import InputError
+from mgs.fit.fitting import fit
 from mgs.fit.objective import newton_decrease, objective
+from mgs.fit.settings import TrainSettings
 from mgs.gaussians import Gaussians, learned
 from mgs.splat import as_drjit, reference
 
@@ -22,12 +23,8 @@ LAM = {"colour": 0.02, "scale": 0.05, "rotation": 0.1, "opacity": 0.01, "mean": 
     params=[("frozen", 0.0), ("normal", 0.0), ("free", 0.0), ("frozen", 0.3), ("free", 2.0)],
 )
 def case(request):
-    """Objective, model, and from the oracle: Jacobian [M,P], residual [M], weights [M], lam [P] and
-    distance to the start [P].
-
-    Parameters are ordered as `learned` has them, one array after the other. Where alpha has a
-    weight it is a fourth channel.
-    """
+    """Objective, model, and from the reference: Jacobian [M,P], residual [M], weights [M], lam [P]
+    and offset from the start [P], parameters in the order of `learned`."""
     means, alpha_weight = request.param
     start = surface_gaussians(N)
     start.log_scales += 0.9
@@ -74,17 +71,14 @@ def case(request):
     weight = np.concatenate(
         [np.broadcast_to(w, t.shape).ravel() for w, t in zip(weights, truths, strict=True)]
     )
-    changes = [(getattr(model, name) - getattr(start, name)).ravel() for name in learned()] + [
-        offsets.ravel()
-    ]
-    lam = np.concatenate(
-        [np.full(change.size, LAM[kind]) for change, kind in zip(changes, LAM, strict=True)]
-    )
+    changes = [(getattr(model, name) - getattr(start, name)).ravel() for name in learned()]
+    changes.append(offsets.ravel())
+    lam = np.repeat(list(LAM.values()), [change.size for change in changes])
     away = np.concatenate(changes).astype(np.float64)
     return goal, as_drjit(model), np.concatenate(rows), residual, weight, lam, away
 
 
-def flat(vector) -> np.ndarray:
+def flat(vector):
     return np.concatenate([np.asarray(v).ravel() for v in vector])
 
 
@@ -103,7 +97,7 @@ def test_the_gradient_is_that_of_the_oracle(case):
 def test_the_curvature_is_jtj_plus_lam_of_the_oracle(case):
     goal, model, J, _, weight, lam, _ = case
     rng = np.random.default_rng(1)
-    parts = [rng.standard_normal(away.shape).astype(np.float32) for away, _ in goal.pulls(model)]
+    parts = [rng.standard_normal(away.shape).astype(np.float32) for away, _ in goal.offsets(model)]
     v = flat(parts)
     expected = J.T @ (weight * (J @ v)) + lam * v
     found = flat(goal.curvature_times(model, [type(model.means)(part) for part in parts]))
@@ -132,88 +126,59 @@ def test_the_newton_decrease_grows_to_that_of_a_dense_solve(case):
     expected = 0.5 * g @ np.linalg.solve(A, g)
     found = newton_decrease(goal, model, 40)
     assert (np.diff(found[:8]) > 0).all()
-    assert (
-        np.diff(found) > -5e-3 * expected
-    ).all()  # single precision loses the conjugacy in the end
+    assert (np.diff(found) > -5e-3 * expected).all()  # float32 loses the conjugacy in the end
     assert found[-1] == pytest.approx(expected, rel=0.01)
-    assert (
-        found[0] < 0.9 * expected
-    )  # it takes more than one iteration: the parameters are correlated
+    assert found[0] < 0.9 * expected  # the parameters are correlated
 
 
-def test_at_a_minimum_nothing_is_predicted_to_be_gained(case):
-    """As for a model that no camera sees."""
-    goal, *_ = case
+UNSEEN = np.zeros((20, 24, 4), np.float32)
+"""A target of weight 0, so that the prior alone acts."""
+
+
+def test_at_a_minimum_nothing_is_predicted_to_be_gained():
     model = surface_gaussians(50)
-    unseen = np.zeros((20, 24, 4), np.float32)  # of weight 0
-    resting = objective(model, [goal.photos[0].camera], [unseen], lam={"colour": 1.0})
+    resting = objective(model, [surface_camera(model, 24, 20)], [UNSEEN], lam={"colour": 1.0})
     assert newton_decrease(resting, as_drjit(model), 5) == [0.0]
 
 
-def test_a_start_in_the_memory_of_the_model_is_kept_apart(case):
-    """Dr.Jit takes two arrays in one memory for one when it records: a later fit would then be
-    pulled to the wrong start."""
-    from mgs.fit.fitting import fit
-    from mgs.fit.settings import TrainSettings
-
-    goal, _, *_ = case
-    camera = goal.photos[0].camera
+def test_a_start_in_the_memory_of_the_model_is_kept_apart():
+    """Otherwise a recorded step takes model and start for one array, and a later fit is pulled to
+    the wrong start."""
     model = surface_gaussians(50)
-    target = np.zeros((20, 24, 4), np.float32)  # of weight 0: the prior alone moves the parameters
-    settings = TrainSettings(optimiser="adam", passes=1, rates=(0.01, 0, 0, 0))
-    fit(model, [camera], [target], settings, start=model, lam={"colour": 1.0})
-    other = Gaussians(
-        model.means, model.log_scales, model.quats, model.logit_opacities, model.sh - 0.2
-    )
-    moved = fit(model, [camera], [target], settings, start=other, lam={"colour": 1.0}).gaussians
+    images = model, [surface_camera(model, 24, 20)], [UNSEEN]
+    settings = TrainSettings(optimiser="adam", passes=1, rates={"colour": 0.01})
+    fit(*images, settings, start=model, lam={"colour": 1.0})
+    other = replace(model, sh=model.sh - 0.2)
+    moved = fit(*images, settings, start=other, lam={"colour": 1.0}).gaussians
     assert np.allclose(moved.sh - model.sh, -0.01, rtol=0.02)
 
 
 def test_a_lam_for_each_degree_of_the_colours():
-    """Of images without weight, so that the prior is all there is."""
-    from mgs.fit.fitting import fit
-    from mgs.fit.settings import TrainSettings
-
     start = surface_gaussians(50).with_degree(2)
-    camera, unseen = surface_camera(start, 24, 20), np.zeros((20, 24, 4), np.float32)
-    model = replace(
-        start,
-        sh=start.sh
-        + np.linspace(-0.5, 0.5, start.sh.size, dtype=np.float32).reshape(start.sh.shape),
-    )
+    camera, size = surface_camera(start, 24, 20), start.sh.size
+    change = np.linspace(-0.5, 0.5, size, dtype=np.float32).reshape(start.sh.shape)
+    model = replace(start, sh=start.sh + change)
     lam = np.repeat([1.0, 4.0, 9.0], [1, 3, 5])[None, :, None]
-    goal = objective(start, [camera], [unseen], lam={"colour": lam})
+    goal = objective(start, [camera], [UNSEEN], lam={"colour": lam})
     away = model.sh - start.sh
     assert goal.phi(as_drjit(model)) == pytest.approx(0.5 * (lam * away**2).sum(), rel=1e-5)
     assert np.allclose(np.asarray(goal.gradient(as_drjit(model))[0]), lam * away, rtol=1e-5)
-    blind = replace(
-        start, logit_opacities=np.full(50, -40, np.float32)
-    )  # no information but the prior's
-    assert np.allclose(
-        np.asarray(goal.diagonal(as_drjit(blind))[0]), np.broadcast_to(lam, away.shape)
-    )
-    found = fit(
-        model,
-        [camera],
-        [unseen],
-        TrainSettings(passes=40, rates={"colour": 0.2}),
-        start=start,
-        lam={"colour": lam},
-    )
-    assert found.losses[0] == pytest.approx((lam * away**2).sum() / unseen[..., :3].size, rel=1e-5)
+    blind = replace(start, logit_opacities=np.full(50, -40, np.float32))
+    diagonal = np.asarray(goal.diagonal(as_drjit(blind))[0])
+    assert np.allclose(diagonal, np.broadcast_to(lam, away.shape))
+    settings = TrainSettings(passes=40, rates={"colour": 0.2})
+    found = fit(model, [camera], [UNSEEN], settings, start=start, lam={"colour": lam})
+    assert found.losses[0] == pytest.approx((lam * away**2).sum() / UNSEEN[..., :3].size, rel=1e-5)
     assert found.loss < 0.05 * found.losses[0]
 
 
 def test_a_weight_for_alpha_needs_alpha():
     start = surface_gaussians(50)
-    camera, target = surface_camera(start, 24, 20), np.zeros((20, 24, 4), np.float32)
-    goal = objective(start, [camera], [target], alpha_weight=0.1)
-    with pytest.raises(
-        InputError,
-        match="target: has 4 channels, and with a weight for alpha it needs 5, alpha as the last",
-    ):
+    camera = surface_camera(start, 24, 20)
+    goal = objective(start, [camera], [UNSEEN], alpha_weight=0.1)
+    with pytest.raises(InputError, match=r"target: has 4 channels, .* it needs 5, alpha as the"):
         goal.phi(as_drjit(start))
-    with_alpha = objective(start, [camera], [np.dstack([target, target[..., 0]])])
+    with_alpha = objective(start, [camera], [np.dstack([UNSEEN, UNSEEN[..., 0]])])
     assert with_alpha.photos[0].size == (24, 20, 3), "without a weight alpha is not read"
 
 

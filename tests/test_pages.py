@@ -1,6 +1,8 @@
-"""The tutorial and the how-to pages: what they tell their readers to do is done, on small data."""
+"""The tutorial and the how-to pages run as they stand, on small data."""
 
 import importlib.util
+import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -20,18 +22,16 @@ HOWTO = sorted((ROOT / "docs/howto").glob("*.md"))
 
 @pytest.fixture(scope="module")
 def pages():
-    """tools/pages.py, which is no part of the package."""
+    """tools/pages.py, which is not in the package."""
     spec = importlib.util.spec_from_file_location("pages", ROOT / "tools/pages.py")
     module = importlib.util.module_from_spec(spec)
-    sys.modules["pages"] = module
     spec.loader.exec_module(module)
     return module
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """What the how-to pages take for granted: the demo, photos with depth, a COLMAP model, masks,
-    and a mesh of the rock."""
+    """What the how-to pages start from: demo, photos with depth, a COLMAP model, masks, a mesh."""
     folder = tmp_path_factory.mktemp("readers")
     dataset = synthetic.write_dataset(folder / "demo/dataset", synthetic.orbit_cameras(14, 48, 36))
     prior, _ = mgs.build_prior(dataset, mgs.PriorSettings(gaussians=300))
@@ -44,9 +44,8 @@ def data(tmp_path_factory):
 
 
 @pytest.fixture
-def as_before():
-    """Rows that a page adds to the tables are gone at the end, and so is the module that it
-    writes."""
+def tables_restored():
+    """Remove the rows and the module that a page adds."""
     tables = [
         (table, dict(table))
         for table in (criteria.CRITERIA, pose_policies.POSE_POLICIES, ESTIMATORS)
@@ -59,27 +58,30 @@ def as_before():
 
 
 def test_the_tutorial_prints_what_it_shows(pages, tmp_path):
-    said = pages.follow(pages.TUTORIAL, tmp_path)
-    assert pages.stale(said) == []
-    assert sum(one.shown is not None for one in said) >= 8
-    for picture in pages.PICTURES:
-        assert (tmp_path / picture).is_file()
+    page, differences = pages.run_page(pages.TUTORIAL, tmp_path)
+    assert differences == []
+    assert page.count("```text") >= 8
+    assert all((tmp_path / picture).is_file() for picture in pages.PICTURES)
+    keys = json.loads((tmp_path / "out/d-optimal/steps.jsonl").read_text().splitlines()[-1])
+    documented = set(re.findall(r"`(\w+)`", (ROOT / "docs/nbv.md").read_text()))
+    assert set(keys) <= documented
+
+
+def test_the_notebook_is_the_tutorial(pages):
+    """Its code cells are the blocks that the tutorial's test executes."""
+    made = pages.notebook(pages.TUTORIAL.read_text())
+    assert pages.NOTEBOOK.read_text() == made, "run python tools/pages.py --write"
 
 
 @pytest.mark.parametrize("page", HOWTO, ids=lambda page: page.stem)
-def test_a_how_to_page_can_be_followed(pages, data, as_before, monkeypatch, page):
-    monkeypatch.setattr(
-        arena, "TEXELS", 64
-    )  # of the ground's texture, which costs much and is not looked at
-    said = pages.follow(page, data)
-    assert pages.stale(said) == []
-    assert len(said) >= 3
+def test_a_how_to_page_can_be_followed(pages, data, tables_restored, monkeypatch, page):
+    monkeypatch.setattr(arena, "TEXELS", 64)  # a small ground texture renders faster
+    assert pages.run_page(page, data)[1] == []
 
 
 @pytest.mark.parametrize(
     ("printed", "same"),
     [
-        ("kf_0002: 3 images, 99.1 %\n", True),
         ("kf_0002:  3 images, 97.0 %\n", True),
         ("kf_0002: 3 images, 90.0 %\n", False),
         ("kf_0003: 3 images, 99.1 %\n", False),
@@ -91,22 +93,20 @@ def test_words_and_whole_numbers_must_be_those_shown(pages, printed, same):
     assert pages.alike("kf_0002: 3 images, 99.1 %\n", printed) == same
 
 
-def test_what_a_page_shows_is_found_to_be_stale_and_made_anew(pages, tmp_path):
+def test_other_output_is_found_and_written(pages, tmp_path):
     page = tmp_path / "page.md"
-    page.write_text(
-        '# A page\n\n```python title="mine.py"\nx = 1 + 1\n```\n\n```python\nimport mine\n\nprint(mine.x)\n```\n\n'
-        "```text\n3\n```\n\n```python\nprint('not shown')\n```\n"
+    text = (
+        '# A page\n\n```python title="mine.py"\nx = 1 + 1\n```\n\n'
+        "```python\nimport mine\n\nprint(mine.x)\n```\n\n```text\n3\n```\n"
     )
-    said = pages.follow(page, tmp_path)
+    page.write_text(text)
+    rewritten, differences = pages.run_page(page, tmp_path)
     sys.modules.pop("mine")
-    assert [one.printed for one in said] == ["", "2\n", "not shown\n"]
-    assert pages.stale(said) == ["line 14: shows\n3\nbut this was printed:\n2\n"]
-    assert pages.rewritten(page.read_text(), said) == page.read_text().replace(
-        "text\n3\n", "text\n2\n"
-    )
+    assert differences == ["line 14: shows\n3\nbut this was printed:\n2\n"]
+    assert rewritten == text.replace("text\n3\n", "text\n2\n")
 
 
-def test_a_command_that_fails_is_told(pages, tmp_path):
+def test_a_failing_command_stops_the_page(pages, tmp_path):
     (tmp_path / "page.md").write_text("```sh\nmgs eval nothing   # there is no such run\n```\n")
     with pytest.raises(RuntimeError, match="mgs eval nothing: exit code 2"):
-        pages.follow(tmp_path / "page.md", tmp_path)
+        pages.run_page(tmp_path / "page.md", tmp_path)

@@ -16,7 +16,7 @@ from mgs.synth import arena
 from mgs.synth.arena import make_ground, make_stones
 from mgs.synth.rock import make_rock
 from mgs.synth.rock_layer import RockLayer, continued, lattice, render_layers, with_coverage
-from mgs.synth.scene import Scene, sensor_dict
+from mgs.synth.scene import MitsubaScene, sensor_dict
 from mgs.synth.scene_file import Arena, Rock, SceneFile, load_scene_file
 
 K = np.array([[70.0, 0, 30.5], [0, 70.0, 27.25], [0, 0, 1]])
@@ -59,7 +59,7 @@ def test_colour_and_depth_agree_on_the_silhouette():
         Camera(K, 64, 48, look_at(eye, [0, 0, 0.6])) for eye in ([3, 0, 1.5], [-1, 2.5, 2.0])
     ]
     settings = SceneFile(arena=Arena(colour=(0.3, 0.3, 0.3), stones=0))
-    scene = Scene(settings, rock, cameras[0], seed=0)
+    scene = MitsubaScene(settings, rock, cameras[0], seed=0)
     for index, camera in enumerate(cameras):
         rendered = scene.render(camera, spp=16, seed=index, denoise=False)
         redness = rendered.rgb[..., 0] / np.maximum(rendered.rgb.sum(-1), 1e-6)
@@ -76,7 +76,7 @@ def test_texture_lies_on_the_rock_as_in_the_mesh(monkeypatch):
     monkeypatch.setattr(arena, "TEXELS", 64)
     rock = make_rock(Rock(detail=0.04), generator(0, "rock"))
     camera = Camera(K * [[2], [2], [1]], 128, 96, look_at([3, 1, 1.5], [0, 0, 0.6]))
-    scene = Scene(SceneFile(arena=Arena(stones=0)), rock, camera, seed=0)
+    scene = MitsubaScene(SceneFile(arena=Arena(stones=0)), rock, camera, seed=0)
     albedo = render_layers(scene.scene, scene.guides, spp=16, seed=0)[0][..., 3:6]
     depth, mask = scene.cast(camera)
     points = camera.unproject(depth)[mask]
@@ -95,7 +95,7 @@ def ball():
         rock, vertex_colors=np.tile([255, 0, 0, 255], (len(rock.vertices), 1))
     )
     camera = Camera(K, 64, 48, look_at([3, 0, 1.5], [0, 0, 0.6]))
-    return Scene(
+    return MitsubaScene(
         SceneFile(arena=Arena(colour=(0.3, 0.3, 0.3), stones=0)), rock, camera, seed=0
     ), camera
 
@@ -195,7 +195,7 @@ def test_a_specular_rock_shines_where_it_mirrors_the_sun_and_nowhere_else():
         rock = trimesh.creation.icosphere(4, 0.7)
         rock.apply_translation([0, 0, 0.7])
         settings = SceneFile(rock=Rock(specular=specular, roughness=0.2), arena=Arena(stones=0))
-        images[specular] = Scene(settings, rock, camera, seed=0).render(
+        images[specular] = MitsubaScene(settings, rock, camera, seed=0).render(
             camera, spp=16, seed=0, denoise=False
         )
     seen = images[0.0].mask & images[0.5].mask

@@ -20,19 +20,18 @@ from mgs.files import locked, read_json
 from mgs.resources import resource_folder
 from mgs.rotation import WORLD_FROM_GLTF
 from mgs.seeds import generator
+from mgs.synth.orbit import evaluation_cameras, rock_cameras
 from mgs.synth.rendering import (
     ROCK_EXPOSURE,
     PoseNoise,
-    Preset,
+    RenderPreset,
     _meter,
-    dome_cameras,
-    rock_cameras,
     synthesise,
 )
 from mgs.synth.rock import make_rock
 from mgs.synth.scene_file import ORBITS, Arena, Orbit, Rock, SceneFile, load_scene_file
 
-TINY = Preset(width=64, height=48, frames=5, spp=2)
+TINY = RenderPreset(width=64, height=48, frames=5, spp=2)
 SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=20))
 
 
@@ -125,17 +124,17 @@ def test_test_views_are_a_dataset_of_their_own_and_change_nothing_else(dataset, 
 def test_the_dome_of_test_views_has_the_orbits_radius_and_shows_the_whole_rock():
     settings = SceneFile(orbit=Orbit(kind="circle", radius=5, altitude=1))
     rock = make_rock(SCENE.rock, generator(0, "rock"))
-    cameras = dome_cameras(settings, Preset(640, 480, 3, 1), rock, 60)
+    cameras = evaluation_cameras(settings, (640, 480), 60, rock)
     out = np.array([camera.position for camera in cameras]) - [0, 0, rock.bounds[1, 2] / 2]
     np.testing.assert_allclose(np.linalg.norm(out, axis=1), 5)
     elevation = np.sort(np.degrees(np.arcsin(out[:, 2] / 5)))
     assert 5 < elevation[0] < 6
     assert 70 < elevation[-1] < 75
-    assert dome_cameras(settings, TINY, rock, 0) == []
+    assert evaluation_cameras(settings, (64, 48), 0, rock) == []
     near = SCENE.model_copy(update={"orbit": Orbit(kind="circle", radius=1.8, altitude=6)})
-    assert len(rock_cameras(near, TINY, rock)) == 5
+    assert len(rock_cameras(near, (64, 48), 5, rock)) == 5
     with pytest.raises(InputError, match="not wholly in test view"):
-        dome_cameras(near, TINY, rock, 10)
+        evaluation_cameras(near, (64, 48), 10, rock)
 
 
 def test_poses_on_disk_are_the_orbit(dataset):
@@ -217,7 +216,7 @@ def test_another_mesh_of_the_same_name_is_not_gone_on_with(tmp_path):
     def stop(done, total):
         raise Stop
 
-    path, small = tmp_path / "rock.ply", Preset(width=32, height=24, frames=2, spp=1)
+    path, small = tmp_path / "rock.ply", RenderPreset(width=32, height=24, frames=2, spp=1)
     trimesh.creation.icosphere(subdivisions=2).export(path)
     with pytest.raises(Stop):
         synthesise(tmp_path / "out", SCENE, small, mesh=path, progress=stop)
@@ -255,7 +254,7 @@ def test_the_rock_of_a_dataset_given_back_as_mesh_is_the_same_scene(dataset, tmp
 def test_what_is_taken_as_up_is_said(tmp_path, suffix, up, said):
     path, notes = tmp_path / f"rock.{suffix}", []
     trimesh.creation.icosphere(subdivisions=2).export(path)
-    small = Preset(width=32, height=24, frames=1, spp=1)
+    small = RenderPreset(width=32, height=24, frames=1, spp=1)
     dataset = synthesise(tmp_path / "out", SCENE, small, mesh=path, mesh_up=up, say=notes.append)
     assert f"{path}: {said}; scaled" in notes[0]
     assert read_json(dataset.root / "config.json")["mesh"]["up"] == said[1].lower()
@@ -275,7 +274,7 @@ def test_a_dark_rock_does_not_blow_out_the_ground(tmp_path):
 
 def test_the_exposure_of_other_rocks_is_that_of_the_rock_alone(tmp_path):
     notes = []
-    small = Preset(width=32, height=24, frames=4, spp=64)
+    small = RenderPreset(width=32, height=24, frames=4, spp=64)
     usual = synthesise(tmp_path / "usual", SCENE, small, seed=3, say=notes.append)
     assert notes == []
     assert np.mean([frame.rgb()[frame.mask()].mean() for frame in usual.frames]) == pytest.approx(
@@ -293,7 +292,7 @@ def test_rock_that_does_not_fit_the_frame(tmp_path):
 def test_without_the_denoiser_more_samples_and_a_note(tmp_path, monkeypatch):
     monkeypatch.setattr("mgs.synth.rendering.importlib.util.find_spec", lambda name: None)
     notes = []
-    small = Preset(width=32, height=24, frames=1, spp=1)
+    small = RenderPreset(width=32, height=24, frames=1, spp=1)
     dataset = synthesise(tmp_path / "plain", SCENE, small, say=notes.append)
     assert "pip install pyoidn" in notes[0]
     assert read_json(dataset.root / "config.json")["samples_per_pixel"] == 8
@@ -330,10 +329,8 @@ def test_every_scene_frames_its_rock_on_every_orbit(scene):
         flown = settings.model_copy(
             update={"orbit": settings.orbit.model_copy(update={"kind": kind})}
         )
-        cameras = rock_cameras(flown, Preset(640, 480, 36, 1), rock)
-        dome_cameras(
-            flown, Preset(640, 480, 36, 1), rock, 60
-        )  # would refuse a view without the whole rock
+        cameras = rock_cameras(flown, (640, 480), 36, rock)
+        evaluation_cameras(flown, (640, 480), 60, rock)  # refuses a view without the whole rock
         heights = [
             np.ptp(camera.project(rock.vertices[rock.vertices[:, 2] > 0])[0][:, 1]) / 480
             for camera in cameras

@@ -1,4 +1,4 @@
-"""What it costs to go to a view: scores over costs, and the length of the path."""
+"""Moves from view to view: scores over travel costs, path lengths, nearest poses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mgs.errors import InputError
 from mgs.policy import criteria
 from mgs.policy import poses as pose_policies
 from mgs.run import folder as run_folder
-from mgs.run import loop
+from mgs.run import recording
 
 METRES = st.floats(-100, 100)
 
@@ -26,7 +26,9 @@ def loaded(tmp_path_factory):
 
 
 def run(out, dataset, **values) -> run_folder.State:
-    return loop.run(out, tiny.start(out, dataset, **values), dataset, tiny.stations(), tiny.silent)
+    return recording.run(
+        out, tiny.start(out, dataset, **values), dataset, tiny.operations(), tiny.silent
+    )
 
 
 @given(
@@ -40,11 +42,9 @@ def test_cost_of_an_image_and_of_the_way_to_it(positions, here, travel, factor):
     distance = np.linalg.norm(positions - here, axis=1)
     np.testing.assert_allclose(travel * (cost - 1), distance, atol=1e-6)
     assert (cost >= 1).all()
-    assert pose_policies.travel_cost(here[None], here, travel) == 1, (
-        "an image where the camera is costs one image"
-    )
+    assert pose_policies.travel_cost(here[None], here, travel) == 1
     scaled = pose_policies.travel_cost(factor * positions, factor * here, factor * travel)
-    np.testing.assert_allclose(cost, scaled, rtol=1e-6, err_msg="whatever the unit of length")
+    np.testing.assert_allclose(cost, scaled, rtol=1e-6)
 
 
 @given(arrays(np.float64, (5, 3), elements=METRES))
@@ -52,45 +52,35 @@ def test_a_path_is_as_long_there_as_back_and_no_shorter_than_a_straight_line(pos
     length = pose_policies.path_length(positions)
     assert length == pytest.approx(pose_policies.path_length(positions[::-1]))
     assert length >= np.linalg.norm(positions[-1] - positions[0]) - 1e-9
-    assert length == pytest.approx(
-        pose_policies.path_length(positions[:3]) + pose_policies.path_length(positions[2:])
-    )
+    parts = positions[:3], positions[2:]
+    assert length == pytest.approx(sum(pose_policies.path_length(part) for part in parts))
     assert pose_policies.path_length(positions[:1]) == 0
 
 
 @pytest.mark.parametrize("travel", [0.01, 1.5])
 @pytest.mark.parametrize("batch", [1, 2])
 def test_the_choice_is_the_best_gain_for_its_cost(loaded, tmp_path, travel, batch):
-    """With a short distance it is the gain per metre; the recorded score remains the policy's
-    own."""
+    """The recorded score remains the policy's own. With travel = 0.01 m, the gain per metre
+    decides."""
     state = run(tmp_path / "run", loaded, travel=travel, batch=batch, budget=2)
     seeds = run(tmp_path / "seeds", loaded, budget=0)
     first = run(tmp_path / "first", loaded, travel=travel, budget=1)
-    lam, positions = (
-        criteria.regularisation(tiny.GROUPS),
-        np.array([camera.position for camera in tiny.orbit()]),
-    )
-    after_one = (first.gaussians, first.H)
+    cameras = [frame.camera for frame in loaded.frames]
+    positions = np.array([camera.position for camera in cameras])
+    lam = criteria.regularisation(tiny.GROUPS)
+    models = [(seeds.gaussians, seeds.H), (first.gaussians, first.H)]
     if batch == 2:
-        F = tiny.fisher(seeds.gaussians, loaded.frames[first.taken[-1]].camera)
-        after_one = (seeds.gaussians, seeds.H + F)
-    for step, (model, H) in zip(
-        state.steps[1:], [(seeds.gaussians, seeds.H), after_one], strict=True
-    ):
+        F = tiny.fisher(seeds.gaussians, cameras[first.taken[-1]])
+        models[1] = (seeds.gaussians, seeds.H + F)
+    for step, (model, H) in zip(state.steps[1:], models, strict=True):
         taken = state.taken[: step["images"] - 1]
         left = [i for i in range(len(loaded)) if i not in taken]
-        gains = np.array(
-            [criteria.d_optimal(tiny.fisher(model, loaded.frames[i].camera), H, lam) for i in left]
-        )
+        gains = np.array([criteria.d_optimal(tiny.fisher(model, cameras[i]), H, lam) for i in left])
         distance = np.linalg.norm(positions[left] - positions[taken[-1]], axis=1)
         worth = gains / (distance if travel == 0.01 else 1 + distance / travel)
-        best = int(np.argmax(np.round(worth, 12)))
-        assert worth[left.index(step["frame"])] == pytest.approx(worth[best], rel=0.01)
-        assert (
-            step["score"]
-            == step["information_gain"]
-            == pytest.approx(gains[left.index(step["frame"])])
-        )
+        chosen = left.index(step["frame"])
+        assert worth[chosen] == pytest.approx(worth.max(), rel=0.01)
+        assert step["score"] == step["information_gain"] == pytest.approx(gains[chosen])
 
 
 def test_dear_travel_makes_the_path_shorter_and_cheap_travel_changes_nothing(loaded, tmp_path):
@@ -104,25 +94,47 @@ def test_dear_travel_makes_the_path_shorter_and_cheap_travel_changes_nothing(loa
 
 
 def test_what_cannot_be_divided_by_a_cost_is_refused(loaded, tmp_path, monkeypatch):
-    monkeypatch.setitem(
-        pose_policies.POSE_POLICIES, "mine", lambda candidates, *rest: -np.ones(len(candidates))
-    )
-    with pytest.raises(
-        InputError,
-        match="policy mine: gave negative scores, which --travel cannot divide by a cost",
-    ):
+    negative = lambda candidates, *rest: -np.ones(len(candidates))  # noqa: E731
+    monkeypatch.setitem(pose_policies.POSE_POLICIES, "mine", negative)
+    with pytest.raises(InputError, match="policy mine: returned negative scores, which --travel"):
         run(tmp_path / "run", loaded, policy="mine", travel=1.0)
     assert len(run(tmp_path / "free", loaded, policy="mine").taken) == 8
 
 
 @pytest.mark.parametrize(
-    ("travel", "said"),
-    [("0", "greater than or equal to"), ("-1", "greater"), ("nan", ""), ("far", "")],
+    ("option", "value"),
+    [("--travel", "0"), ("--travel", "-1"), ("--travel", "nan"), ("--nearest", "0")],
 )
-def test_a_distance_that_is_none_is_one_line(dataset, prior, tmp_path, capsys, travel, said):
-    line = refused(
-        capsys, ["nbv", dataset, "--prior", prior, "--out", tmp_path / "run", "--travel", travel]
+def test_a_distance_that_is_none_is_one_line(dataset, prior, tmp_path, capsys, option, value):
+    out = tmp_path / "run"
+    assert option in refused(
+        capsys, ["nbv", dataset, "--prior", prior, "--out", out, option, value]
     )
-    assert "--travel" in line
-    assert said in line
-    assert not (tmp_path / "run").exists()
+    assert not out.exists()
+
+
+def test_moves_can_be_limited_to_the_nearest_poses(loaded, tmp_path):
+    """Twelve poses on a circle; 0, 4 and 8 are seeds, so 7 and 9 are nearest to the last."""
+    given = {"policy": "farthest", "budget": 6}
+    state = run(tmp_path / "run", loaded, nearest=2, **given)
+    positions = np.array([frame.camera.position for frame in loaded.frames])
+    assert state.taken[3] in (7, 9)
+    for step in range(3, 9):
+        left = [i for i in range(12) if i not in state.taken[:step]]
+        here = positions[state.taken[step - 1]]
+        near = [left[k] for k in pose_policies.nearest_poses(positions[left], here, 2)]
+        assert len(near) == 2
+        assert state.taken[step] in near
+    free = run(tmp_path / "free", loaded, **given)
+    wide = run(tmp_path / "wide", loaded, nearest=12, **given)
+    assert wide.taken == free.taken != state.taken
+
+
+@pytest.mark.parametrize(
+    ("count", "nearest"),
+    [(1, [0]), (2, [0, 2]), (3, [0, 2, 3]), (9, [0, 1, 2, 3, 4])],
+)
+def test_the_nearest_poses(count, nearest):
+    """Of equal distances the first."""
+    positions = np.array([[0.0, 0, 0], [3, 0, 0], [1, 0, 0], [-1, 0, 0], [9, 0, 0]])
+    assert pose_policies.nearest_poses(positions, np.zeros(3), count) == nearest

@@ -1,22 +1,19 @@
-"""Does what a page of docs/ tells its readers to do, and compares what is printed with what the
-page shows.
+"""Run what a page of docs/ shows its readers, and compare the printed output with the page.
 
-    python tools/pages.py            # run docs/tutorial.md in a new folder; exit code 1 where it
-    shows something else python tools/pages.py --write    # the same, and write what was printed,
-    and the pictures, into docs/
+    python tools/pages.py            # run docs/tutorial.md; exit code 1 where its output differs
+    python tools/pages.py --write    # and write output, pictures and docs/tutorial.ipynb
 
-A page is read as its readers take it. Blocks of Python run one after another in one program,
-started in one folder. A block with a title is a file of that name. In a block marked `sh`, each
-line is a command: `mgs ...`, or `python FILE ...`. A block marked `text` shows what the block
-before it prints.
+Python blocks run in order, in one program and one folder. A block with a title is a file of that
+name. In a block marked `sh`, each line is a command, `mgs ...` or `python FILE ...`. A block marked
+`text` shows what the block before it prints.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
+import json
 import math
-import os
 import re
 import runpy
 import shlex
@@ -24,12 +21,12 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parent.parent
 TUTORIAL = ROOT / "docs/tutorial.md"
+NOTEBOOK = TUTORIAL.with_suffix(".ipynb")
 
 PICTURES = {
     "out/report/orbit.png": "tutorial_orbit.png",
@@ -42,101 +39,52 @@ FENCE = re.compile(
     re.MULTILINE | re.DOTALL,
 )
 
+NUMBER = re.compile(r"-?\d+\.\d+(?:e[+-]?\d+)?")
 TOLERANCE = 0.05
-"""Numbers with a decimal point are compared to this share: processors, and versions of LLVM, round
-differently."""
+"""Relative tolerance of numbers with a decimal point: processors round differently."""
 
 
-@dataclass(frozen=True)
-class Block:
-    """A fenced block. line: of the page, where its body starts; start, end: the same in characters,
-    and where it ends."""
+def run_page(path: Path, folder: Path) -> tuple[str, list[str]]:
+    """Run a page in a folder.
 
-    language: str
-    title: str | None
-    body: str
-    line: int
-    start: int
-    end: int
+    Returns the page with the output that was printed, and one line for each block that shows
+    another output. Tracebacks have the line numbers of the page.
+    """
+    page = path.read_text(encoding="utf-8")
+    variables: dict[str, Any] = {"__name__": "__main__"}
+    printed, differences = "", list[str]()
 
+    def run(match: re.Match[str]) -> str:
+        nonlocal printed
+        language, title, body = match.groups()
+        line = page.count("\n", 0, match.start("body")) + 1
+        if language == "text":
+            if not alike(body, printed):
+                differences.append(f"line {line}: shows\n{body}but this was printed:\n{printed}")
+            return match[0].replace(body, printed)
+        with contextlib.redirect_stdout(io.StringIO()) as output:
+            if title is not None:
+                (folder / title).write_text(body, encoding="utf-8")
+            elif language == "python":
+                exec(compile("\n" * (line - 1) + body, str(path), "exec"), variables)
+            elif language == "sh":
+                for words in command_lines(body):
+                    run_command(words)
+        printed = output.getvalue()
+        return match[0]
 
-@dataclass(frozen=True)
-class Said:
-    """What a block printed, and the block of the page that shows it, where there is one."""
-
-    block: Block
-    printed: str
-    shown: Block | None
-
-
-def blocks(page: str) -> list[Block]:
-    """The fenced blocks of a page that name their language."""
-    found = []
-    for match in FENCE.finditer(page):
-        start, end = match.span("body")
-        found.append(
-            Block(
-                match["language"],
-                match["title"],
-                match["body"],
-                page.count("\n", 0, start) + 1,
-                start,
-                end,
-            )
-        )
-    return found
+    with contextlib.chdir(folder), _importable(folder):
+        return FENCE.sub(run, page), differences
 
 
-def commands(block: Block) -> list[list[str]]:
-    """The command lines of a block, each as its words, comments left out."""
-    lines = block.body.replace("\\\n", " ").splitlines()
+def command_lines(body: str) -> list[list[str]]:
+    """Return the words of each command line, without comments."""
+    lines = body.replace("\\\n", " ").splitlines()
     return [words for line in lines if (words := shlex.split(line, comments=True))]
 
 
-def follow(path: Path, folder: Path) -> list[Said]:
-    """Do what the page tells, in the folder: write its files, run its Python and its commands;
-    returns what they printed.
-
-    Where one fails, its exception is raised; the traceback of Python on the page has the page's
-    line numbers.
-    """
-    found, variables, said = (
-        blocks(path.read_text(encoding="utf-8")),
-        {"__name__": "__main__"},
-        list[Said](),
-    )
-    with contextlib.chdir(folder), _importable(folder):
-        for block, following in zip(found, [*found[1:], None], strict=True):
-            shown = following if following is not None and following.language == "text" else None
-            with contextlib.redirect_stdout(io.StringIO()) as printed:
-                if block.title is not None:
-                    (folder / block.title).write_text(block.body, encoding="utf-8")
-                elif block.language == "python":
-                    exec(
-                        compile("\n" * (block.line - 1) + block.body, str(path), "exec"), variables
-                    )
-                elif block.language == "sh":
-                    for words in commands(block):
-                        command(words)
-                else:
-                    continue
-            said.append(Said(block, printed.getvalue(), shown))
-    return said
-
-
-@contextlib.contextmanager
-def _importable(folder: Path) -> Iterator[None]:
-    """Let programs import the files in the folder, as Python does for those started there."""
-    sys.path.insert(0, str(folder))
-    try:
-        yield
-    finally:
-        sys.path.remove(str(folder))
-
-
-def command(words: list[str]) -> None:
-    """`mgs ...` or `python FILE ...`, in this process. Raises RuntimeError where it ends with an
-    exit code."""
+def run_command(words: list[str]) -> None:
+    """Run `mgs ...` or `python FILE ...` in this process; RuntimeError unless it exits with 0."""
     before = sys.argv
     try:
         if words[0] == "mgs":
@@ -147,7 +95,7 @@ def command(words: list[str]) -> None:
             sys.argv = words[1:]
             runpy.run_path(words[1], run_name="__main__")
         else:
-            raise RuntimeError(f"{words[0]}: not a command of these pages")
+            raise RuntimeError(f"{words[0]}: only mgs and python run here")
     except SystemExit as stop:
         if stop.code:
             raise RuntimeError(f"{shlex.join(words)}: exit code {stop.code}") from None
@@ -155,51 +103,59 @@ def command(words: list[str]) -> None:
         sys.argv = before
 
 
+@contextlib.contextmanager
+def _importable(folder: Path) -> Iterator[None]:
+    sys.path.insert(0, str(folder))
+    try:
+        yield
+    finally:
+        sys.path.remove(str(folder))
+
+
 def alike(shown: str, printed: str) -> bool:
-    """Whether a page shows what is printed: words and whole numbers as they are, others within
-    TOLERANCE."""
-    number = re.compile(r"-?\d+\.\d+(?:e[+-]?\d+)?")
-    if number.sub("0.0", shown).split() != number.sub("0.0", printed).split():
+    """Whether words and whole numbers are equal, and other numbers within TOLERANCE."""
+    if NUMBER.sub("0.0", shown).split() != NUMBER.sub("0.0", printed).split():
         return False
-    pairs: Any = zip(number.findall(shown), number.findall(printed), strict=True)
+    pairs = zip(NUMBER.findall(shown), NUMBER.findall(printed), strict=True)
     return all(math.isclose(float(a), float(b), rel_tol=TOLERANCE) for a, b in pairs)
 
 
-def stale(said: list[Said]) -> list[str]:
-    """What the page shows otherwise than it was printed, a line each."""
-    return [
-        f"line {one.shown.line}: shows\n{one.shown.body}but this was printed:\n{one.printed}"
-        for one in said
-        if one.shown is not None and not alike(one.shown.body, one.printed)
-    ]
+def notebook(page: str) -> str:
+    """Return a page as a Jupyter notebook: its Python blocks are code cells with their output."""
+    cells: list[dict[str, Any]] = []
 
+    def add(kind: str, source: str, **more: Any) -> None:
+        if source.strip():
+            lines = source.strip().splitlines(keepends=True)
+            cells.append({"cell_type": kind, "id": f"cell-{len(cells)}", "metadata": {}, **more})
+            cells[-1]["source"] = lines
 
-def rewritten(page: str, said: list[Said]) -> str:
-    """The page, showing what was printed."""
-    for one in reversed(said):
-        if one.shown is not None:
-            page = page[: one.shown.start] + one.printed + page[one.shown.end :]
-    return page
+    end = 0
+    for match in FENCE.finditer(page):
+        add("markdown", page[end : match.start()])
+        if match["language"] == "text":
+            lines = match["body"].splitlines(keepends=True)
+            cells[-1]["outputs"] = [{"name": "stdout", "output_type": "stream", "text": lines}]
+        else:
+            add("code", match["body"], execution_count=None, outputs=[])
+        end = match.end()
+    add("markdown", page[end:])
+    kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
+    book = {"cells": cells, "metadata": {"kernelspec": kernel}, "nbformat": 4, "nbformat_minor": 5}
+    return json.dumps(book, indent=1, ensure_ascii=False) + "\n"
 
 
 def main(arguments: list[str]) -> int:
-    """Run the tutorial; with --write also renew what it shows. Returns the exit code."""
+    """Run the tutorial; with --write also renew its output. Returns the exit code."""
     with tempfile.TemporaryDirectory() as folder:
-        said = follow(TUTORIAL, Path(folder))
+        page, differences = run_page(TUTORIAL, Path(folder))
         if "--write" in arguments:
-            TUTORIAL.write_text(
-                rewritten(TUTORIAL.read_text(encoding="utf-8"), said), encoding="utf-8"
-            )
+            TUTORIAL.write_text(page, encoding="utf-8")
+            NOTEBOOK.write_text(notebook(page), encoding="utf-8")
             for source, name in PICTURES.items():
                 shutil.copyfile(Path(folder) / source, ROOT / "docs/images" / name)
             return 0
-    differences = stale(said)
-    print(
-        "\n".join(
-            [f"{os.path.relpath(TUTORIAL)}: {text}" for text in differences]
-            or ["the tutorial prints what it shows"]
-        )
-    )
+    print("\n".join(differences) or "the tutorial prints what it shows")
     return int(bool(differences))
 
 

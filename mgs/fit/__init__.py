@@ -1,1 +1,1 @@
-"""Fit Gaussians to images: objective, optimisers, stopping, evidence."""
+"""Fit Gaussians to images: objective, optimisers, stopping."""

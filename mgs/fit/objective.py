@@ -1,29 +1,26 @@
-"""What a fit lowers: the negative logarithm of the posterior of the Gaussians' parameters, its
-gradient and its curvature.
+"""Objective of a fit: the negative logarithm of the posterior of the Gaussians' parameters, with
+its gradient and curvature.
 
-A pixel is the rendered value plus noise of standard deviation sigma, and each parameter lies around
-its start with a standard deviation tau. The negative logarithm of the posterior is then, up to a
-constant and times sigma^2, the objective
+Model: a pixel is the rendered value plus noise of standard deviation sigma, and each parameter is
+normally distributed around its start with standard deviation tau. The negative logarithm of the
+posterior, up to a constant and times sigma^2, is
 
-    Phi = 1/2 sum over images, pixels and channels of (rendered - target)^2  +  1/2 sum over
-    parameters of lam (theta - start)^2
+    Phi = 1/2 sum over images, pixels and channels of (rendered - target)^2
+        + 1/2 sum over parameters of lam (theta - start)^2
 
-with lam = (sigma / tau)^2 (`mgs.policy.criteria.regularisation`). Its curvature, J^T J + lam with
-the Jacobian J of all images,
-is the matrix whose diagonal the criteria use: the model that is fitted and the one whose
-information is measured are the same. With lam = 0 it is maximum likelihood, the paper's Eq. 2 up to
-a constant.
+with lam = (sigma / tau)^2 (`mgs.policy.criteria.regularisation`). Its curvature is J^T J + lam,
+with the Jacobian J of all images: the matrix whose diagonal the criteria use. With lam = 0 it is
+maximum likelihood, the paper's Eq. 2 up to a constant.
 
-Alpha may be a fourth channel, with noise of its own, sigma_alpha: its squared differences then
-count alpha_weight = (sigma / sigma_alpha)^2 times. What a camera sees of alpha is the outline of
-the rock. The criteria leave it out.
+Alpha may be a fourth channel with noise sigma_alpha. Its squared differences then count
+alpha_weight = (sigma / sigma_alpha)^2 times. The criteria ignore alpha.
 
-The means are frozen by default, as in the paper. Where they are "free", all three coordinates are
-parameters like the others. Where they move along the "normal", the parameter is one offset per
-Gaussian, metres: how far its mean lies from its start, along a given normal.
+Means are frozen by default, as in the paper. Means that are "free" are parameters like the others.
+Means that move along the "normal" have one parameter per Gaussian: the offset from the start along
+a given normal, metres.
 
-The curvature is never stored (10,000 Gaussians have 110,000 parameters): its product with a vector
-takes one derivative in forward mode and one in reverse mode for each image.
+The curvature is never stored. Its product with a vector takes one derivative in forward mode and
+one in reverse mode for each image.
 """
 
 from __future__ import annotations
@@ -48,15 +45,18 @@ from mgs.splat.recording import frozen, one_at_a_time
 from mgs.splat.rendering import composite_channels, splats_and_lists
 
 Vector = list[Any]
-"""A number for every learned parameter: a TensorXf for each array of `mgs.gaussians.learned`, of
-its shape; for means that move along their normals the shape is [N]."""
+"""One number per learned parameter: a TensorXf of the shape of each array of
+`mgs.gaussians.learned`; [N] for means that move along their normals."""
 
 
 @dataclass(frozen=True)
 class Photo:
-    """An image to fit to: its camera, the same for the kernels, its pixels, mi.Float [H*W*C] of C =
-    3 channels, or 4 with alpha, and by what differences to them are multiplied, mi.Float
-    [H*W*C]."""
+    """An image to fit to.
+
+    camera, array: its camera, as an object and for the kernels.
+    pixels: mi.Float [H*W*C], with C = 3 channels, or 4 with alpha.
+    weights: factors of the differences to the pixels, mi.Float [H*W*C].
+    """
 
     camera: Camera
     array: Any
@@ -65,25 +65,45 @@ class Photo:
 
     @property
     def size(self) -> tuple[int, int, int]:
-        """Width and height, pixels, and the number of channels: 3, or with alpha 4."""
-        return (
-            self.camera.width,
-            self.camera.height,
-            len(self.pixels) // (self.camera.width * self.camera.height),
-        )
+        """Width, height and number of channels."""
+        width, height = self.camera.width, self.camera.height
+        return width, height, len(self.pixels) // (width * height)
 
     @property
     def nbytes(self) -> int:
-        """Memory of pixels and weights."""
+        """Memory of pixels and weights, bytes."""
         return 4 * (len(self.pixels) + len(self.weights))
 
 
 @dataclass
-class Prior:
-    """What holds the parameters near their start: for each of the learned arrays its lam, Float, of
-    one number or of one for
-    each parameter. share: 1 / number of images, Float, the part of the prior that goes with one
-    image. normals: where means move along them, TensorXf [N,3].
+class View:
+    """A `Photo` as recorded functions take it, with the block lists and packed splats of a
+    model."""
+
+    camera: Any
+    pixels: Any
+    weights: Any
+    size: tuple[int, int, int]
+    lists: BlockLists
+    packed: Any
+
+    @property
+    def recorded_sizes(self) -> tuple[int, ...]:
+        """Sizes that a recording holds as constants (`mgs.splat.recording.frozen`)."""
+        return len(self.lists.splat), len(self.lists.block), *self.size
+
+    def rendered(self, model: Gaussians) -> Any:
+        """Pixels of a model, TensorXf [H,W,C], differentiable."""
+        return composite_channels(project(model, self.camera), self.packed, self.lists, *self.size)
+
+
+@dataclass
+class ParameterPrior:
+    """Normal distribution of the learned parameters around their start.
+
+    lam: of each learned array, a Float of one number or one per parameter.
+    share: 1 / number of images, Float: the part of the prior that belongs to one image.
+    normals: TensorXf [N,3], if means move along them.
     """
 
     start: Gaussians
@@ -99,144 +119,117 @@ class Prior:
         return "free" if self.normals is None else "normal"
 
     def along(self, name: str, vectors: Any) -> Any:
-        """Changes of a parameter, or derivatives by it, as those of what is learned of it: for
-        means that move along their normals the part along these, [N,3] -> [N]; for everything else
-        the same again."""
+        """Project displacements of the means on their normals, [N,3] -> [N]. Other parameters, and
+        free means, stay as they are."""
         if name != "means" or self.normals is None:
             return vectors
-        product = dr.dot(
-            rows_as_vectors(vectors, mi.Vector3f), rows_as_vectors(self.normals, mi.Vector3f)
-        )
-        return mi.TensorXf(product, vectors.shape[:1])
+        vectors_3d, normals = (rows_as_vectors(v, mi.Vector3f) for v in (vectors, self.normals))
+        return mi.TensorXf(dr.dot(vectors_3d, normals), vectors.shape[:1])
 
-    def across(self, name: str, changes: Any) -> Any:
-        """The way back: changes of what is learned as changes of the parameter itself, for offsets
-        [N] -> [N,3]."""
+    def across(self, name: str, offsets: Any) -> Any:
+        """Map offsets along the normals to 3D displacements, [N] -> [N,3]. Other parameters, and
+        free means, stay as they are."""
         if name != "means" or self.normals is None:
-            return changes
-        return mi.TensorXf(
-            dr.ravel(rows_as_vectors(self.normals, mi.Vector3f) * changes.array), self.normals.shape
-        )
+            return offsets
+        displacements = rows_as_vectors(self.normals, mi.Vector3f) * offsets.array
+        return mi.TensorXf(dr.ravel(displacements), self.normals.shape)
 
 
 @dataclass(frozen=True)
 class Objective:
-    """Phi of this module's docstring, for some images. Models are Gaussians with TensorXf fields.
+    """Phi for some images (see the module). Models are Gaussians with TensorXf fields.
 
-    photos: those beyond IMAGE_BYTES are made anew from their target at every use. alpha_weight: as
-    in the module's docstring; 0 where alpha is no channel."""
+    photos: beyond IMAGE_BYTES, they are made from their targets at every use.
+    """
 
     photos: Sequence[Photo]
-    prior: Prior
+    prior: ParameterPrior
     cache: ListCache
     alpha_weight: float = 0.0
 
     def loss(self, model: Gaussians) -> float:
-        """2 Phi over the number of pixel values: the mean squared error of the images plus the
-        prior's part."""
+        """2 Phi over the number of pixel values: mean squared error plus the prior's part."""
         penalty = sum(
-            weighted_squares(lam * self.prior.share, d.array) for d, lam in self.pulls(model)
+            weighted_squares(lam * self.prior.share, d.array) for d, lam in self.offsets(model)
         )
         errors = []
         for photo in self.photos:
-            drawn = _drawn(model, photo, self.cache)
-            errors.append(
-                dr.mean(dr.square((drawn - photo.pixels) * photo.weights))
-                + penalty / len(photo.pixels)
-            )
-            dr.eval(errors[-1])  # or it would hold the image until the last one is done
+            difference = (_rendered(model, photo, self.cache) - photo.pixels) * photo.weights
+            errors.append(dr.mean(dr.square(difference)) + penalty / len(photo.pixels))
+            dr.eval(errors[-1])  # frees the rendered image
         return float(np.mean([float(error[0]) for error in errors]))
 
     def phi(self, model: Gaussians) -> float:
-        """Phi itself, (pixel value)^2."""
+        """Phi, squared pixel values."""
         return 0.5 * sum(len(photo.pixels) for photo in self.photos) * self.loss(model)
 
     def gradient(self, model: Gaussians) -> Vector:
-        """The derivative of Phi by the parameters."""
-        total = [mi.TensorXf(lam * d.array, d.shape) for d, lam in self.pulls(model)]
-        for photo in self.photos:
-            lists, packed = self.lists(model, photo)
-            parts = _image_gradient(
-                model,
-                self.prior,
-                photo.array,
-                packed,
-                lists,
-                photo.pixels,
-                photo.weights,
-                photo.size,
-            )
-            total = [a + b for a, b in zip(total, parts, strict=True)]
-            dr.eval(total)
-        return total
+        """Derivative of Phi by the learned parameters."""
+        prior_part = [mi.TensorXf(lam * d.array, d.shape) for d, lam in self.offsets(model)]
+        return self._summed(
+            prior_part,
+            lambda photo: _image_gradient(model, self.prior, self.view(model, photo)),
+        )
 
     def curvature_times(self, model: Gaussians, vector: Vector) -> Vector:
-        """(J^T J + lam) times a vector."""
-        total = [
-            mi.TensorXf(lam * v.array, v.shape)
-            for v, lam in zip(vector, self.prior.lam.values(), strict=True)
-        ]
-        for photo in self.photos:
-            lists, packed = self.lists(model, photo)
-            parts = _image_curvature(
-                model, self.prior, vector, photo.array, packed, lists, photo.weights, photo.size
-            )
-            total = [a + b for a, b in zip(total, parts, strict=True)]
-            dr.eval(total)
-        return total
+        """Product of J^T J + lam and a vector."""
+        lam = self.prior.lam.values()
+        return self._summed(
+            [mi.TensorXf(part * v.array, v.shape) for v, part in zip(vector, lam, strict=True)],
+            lambda photo: _image_curvature(model, self.prior, self.view(model, photo), vector),
+        )
 
     def diagonal(self, model: Gaussians) -> Vector:
-        """The diagonal of J^T J + lam, by exact Fisher information; weights of pixels are taken as
-        1."""
-        total = [
-            mi.TensorXf(lam + dr.zeros(mi.Float, d.array.shape[0]), d.shape)
-            for d, lam in self.pulls(model)
-        ]
+        """Diagonal of J^T J + lam, with pixel weights of 1."""
+        return self._summed(
+            [
+                mi.TensorXf(lam + dr.zeros(mi.Float, d.array.shape[0]), d.shape)
+                for d, lam in self.offsets(model)
+            ],
+            lambda photo: self._information(model, photo),
+        )
+
+    def _summed(self, total: Vector, of_photo: Callable[[Photo], Vector]) -> Vector:
+        """A vector plus the vectors of all photos."""
         for photo in self.photos:
-            total = [
-                t + part for t, part in zip(total, self._information(model, photo), strict=True)
-            ]
+            total = [a + b for a, b in zip(total, of_photo(photo), strict=True)]
             dr.eval(total)
         return total
 
     def largest_diagonal(self, model: Gaussians) -> Vector:
-        """The largest entry of any one image's diagonal, with that image's share of lam: what
-        bounds a step on one image."""
-        least = [(d, lam * self.prior.share) for d, lam in self.pulls(model)]
-        largest = [dr.zeros(mi.TensorXf, d.shape) for d, _ in least]
+        """Largest diagonal of J^T J of any one image, per parameter, plus that image's share of
+        lam. It bounds a step on one image."""
+        offsets = self.offsets(model)
+        largest = [dr.zeros(mi.TensorXf, d.shape) for d, _ in offsets]
         for photo in self.photos:
-            parts = self._information(model, photo)
+            found = self._information(model, photo)
             largest = [
                 mi.TensorXf(dr.maximum(a.array, b.array), a.shape)
-                for a, b in zip(largest, parts, strict=True)
+                for a, b in zip(largest, found, strict=True)
             ]
             dr.eval(largest)
         return [
-            mi.TensorXf(a.array + lam, a.shape) for a, (_, lam) in zip(largest, least, strict=True)
+            mi.TensorXf(a.array + lam * self.prior.share, a.shape)
+            for a, (_, lam) in zip(largest, offsets, strict=True)
         ]
 
     def _information(self, model: Gaussians, photo: Photo) -> Vector:
-        """The exact Fisher information of one image."""
-        means = self.prior.means
+        """Exact Fisher information of one image."""
+        means, weight = self.prior.means, self.alpha_weight
         normals = np.asarray(self.prior.normals) if means == "normal" else None
         found = fisher(
-            model,
-            photo.camera,
-            cache=self.cache,
-            means=means,
-            normals=normals,
-            alpha_weight=self.alpha_weight,
+            model, photo.camera, cache=self.cache, means=means, normals=normals, alpha_weight=weight
         )
-        columns = zip(self.pulls(model), groups(model.sh_degree, means).values(), strict=True)
+        columns = zip(self.offsets(model), groups(model.sh_degree, means).values(), strict=True)
         return [mi.TensorXf(padded(found[:, c]).reshape(d.shape)) for (d, _), c in columns]
 
-    def lists(self, model: Gaussians, photo: Photo) -> tuple[BlockLists, Any]:
-        """Block lists of one image and the splats packed for them. Raises InputError as
-        `ListCache.get`."""
-        return self.cache.get(photo.camera, _project(model, photo.array))
+    def view(self, model: Gaussians, photo: Photo) -> View:
+        """A photo with the block lists of a model. Raises InputError as `ListCache.get`."""
+        lists, packed = self.cache.get(photo.camera, _project(model, photo.array))
+        return View(photo.array, photo.pixels, photo.weights, photo.size, lists, packed)
 
-    def pulls(self, model: Gaussians) -> list[tuple[Any, Any]]:
-        """For each of the learned arrays how far it is from its start, and its lam."""
+    def offsets(self, model: Gaussians) -> list[tuple[Any, Any]]:
+        """(offset from the start, lam) of each learned array."""
         prior = self.prior
         return [
             (prior.along(n, getattr(model, n) - getattr(prior.start, n)), lam)
@@ -255,14 +248,13 @@ def objective(
     normals: np.ndarray | None = None,
     alpha_weight: float = 0.0,
 ) -> Objective:
-    """The objective of `mgs.fit.fitting.fit`, from the same arguments; means, alpha_weight: the
-    settings of these names.
+    """The objective of `mgs.fit.fitting.fit`, from the same arguments and settings.
 
-    Raises InputError where the start or the normals do not fit the Gaussians, or `means` is not a
-    name in `mgs.splat.MEANS`. Where alpha has a weight and a target has no alpha, it is raised by
-    whatever reads that target first.
+    Raises InputError if the start or the normals do not fit the Gaussians, or `means` is not a name
+    in `mgs.splat.MEANS`. A target without alpha, where alpha has a weight, raises it when it is
+    read.
     """
-    groups(gaussians.sh_degree, means)  # raises where the name is unknown
+    groups(gaussians.sh_degree, means)  # raises if the name is unknown
     unit = unit_normals(len(gaussians), normals) if means == "normal" else None
     if len(cameras) != len(targets):
         raise ValueError(f"there are {len(cameras)} cameras, but {len(targets)} targets")
@@ -274,10 +266,11 @@ def objective(
     start = gaussians if start is None else start
     if start.sh.shape != gaussians.sh.shape:
         raise InputError(
-            f"start: has colours of shape {start.sh.shape}, expected {gaussians.sh.shape}, that of the Gaussians"
+            f"start: has colours of shape {start.sh.shape}, "
+            f"expected {gaussians.sh.shape}, that of the Gaussians"
         )
-    # A copy: Dr.Jit uses NumPy's memory in place, and a recorded step takes parameters and start
-    # for the same array for ever if they were in the same memory when it was recorded (Dr.Jit 1.5).
+    # A copy, because Dr.Jit uses NumPy's memory in place. If parameters and start shared memory
+    # when a step is recorded, its replays would take them for the same array (Dr.Jit 1.5).
     start = as_drjit(
         Gaussians(*(np.array(getattr(start, f.name), np.float32) for f in fields(start)))
     )
@@ -286,35 +279,34 @@ def objective(
         for name, kind in learned(means).items()
     }
     directions = None if unit is None else mi.TensorXf(padded(unit))
-    prior = Prior(start, values, dr.opaque(mi.Float, 1 / max(len(photos), 1)), directions)
+    share = dr.opaque(mi.Float, 1 / max(len(photos), 1))
+    prior = ParameterPrior(start, values, share, directions)
     return Objective(photos, prior, cache or ListCache(), alpha_weight)
 
 
-def weighted_squares(lam: Any, away: Any) -> Any:
-    """Sum of lam times the square of distances, Float [1]; lam: of one number, or of one for each
-    distance."""
-    return lam * dr.sum(dr.square(away)) if len(lam) == 1 else dr.sum(lam * dr.square(away))
+def weighted_squares(lam: Any, offsets: Any) -> Any:
+    """Sum of lam times squared offsets, Float [1]. lam: one number, or one per offset."""
+    return lam * dr.sum(dr.square(offsets)) if len(lam) == 1 else dr.sum(lam * dr.square(offsets))
 
 
 def filled(values: float | np.ndarray, shape: tuple[int, ...]) -> Any:
-    """A number as Float, or an array that broadcasts to a shape as Float of as many numbers as the
-    shape has."""
+    """A number as Float [1], or an array broadcast to `shape` as a flat Float."""
     if np.ndim(values) == 0:
         return dr.opaque(mi.Float, float(values))
     return mi.Float(padded(np.broadcast_to(values, shape).astype(np.float32)).ravel())
 
 
 def _photo(camera: Camera, target: np.ndarray, alpha_weight: float) -> Photo:
-    """target: as `fit` takes it. Raises InputError where alpha has a weight and the target has
-    none."""
+    """A `Photo` from a target of `fit`. Raises InputError if alpha has a weight and the target has
+    no alpha."""
     pixels, channels = target[..., :3], target.shape[-1]
-    weights = np.broadcast_to(
-        target[..., 3:4] if channels > 3 else np.ones((), np.float32), pixels.shape
-    )
+    known = target[..., 3:4] if channels > 3 else np.ones((), np.float32)
+    weights = np.broadcast_to(known, pixels.shape)
     if alpha_weight:
         if channels < 5:
             raise InputError(
-                f"target: has {channels} channels, and with a weight for alpha it needs 5, alpha as the last"
+                f"target: has {channels} channels, and with a weight for alpha it needs 5, "
+                "alpha as the last"
             )
         pixels = np.dstack([pixels, target[..., 4]])
         weights = np.dstack([weights, np.float32(np.sqrt(alpha_weight)) * weights[..., 0]])
@@ -324,9 +316,8 @@ def _photo(camera: Camera, target: np.ndarray, alpha_weight: float) -> Photo:
 
 
 @one_at_a_time
-def _drawn(model: Gaussians, photo: Photo, cache: ListCache) -> Any:
-    """The pixels of an image as the model has them, Float [H*W*C]. Raises InputError as
-    `mgs.splat.render`."""
+def _rendered(model: Gaussians, photo: Photo, cache: ListCache) -> Any:
+    """Pixels of a model for a photo, Float [H*W*C]. Raises InputError as `mgs.splat.render`."""
     splats, lists, packed = splats_and_lists(model, photo.camera, cache)
     return composite_channels(splats, packed, lists, *photo.size).array
 
@@ -337,28 +328,31 @@ def newton_decrease(
     iterations: int,
     progress: Callable[[int, int], None] = lambda done, most: None,
 ) -> list[float]:
-    """By how much Phi would fall at most if the images were linear in the parameters: 1/2 g^T (J^T
-    J + lam)^-1 g, after each iteration of conjugate gradients with the diagonal of the matrix as
-    preconditioner.
+    """Newton decrease 1/2 g^T (J^T J + lam)^-1 g after each iteration of conjugate gradients with
+    the diagonal as preconditioner.
 
-    The numbers grow from iteration to iteration, towards the limit. The full J^T J is needed: its
-    diagonal ignores that neighbouring splats can do each other's work, and so takes them for better
-    determined than they are. lam must not be 0.
+    It is the largest decrease of Phi if images were linear in the parameters. The numbers grow
+    towards it. The full J^T J is needed: its diagonal ignores that neighbouring splats can replace
+    each other. lam must not be 0.
     """
     gradient = found.gradient(model)
     inverse = [dr.rcp(d.array) for d in found.diagonal(model)]
+
+    def preconditioned(vector: Vector) -> Vector:
+        return [mi.TensorXf(i * v.array, v.shape) for i, v in zip(inverse, vector, strict=True)]
+
     x = [dr.zeros(mi.TensorXf, g.shape) for g in gradient]
     residual = [-g for g in gradient]
-    z = [mi.TensorXf(i * r.array, r.shape) for i, r in zip(inverse, residual, strict=True)]
+    z = preconditioned(residual)
     direction, rz, decreases = z, dot(residual, z), []
-    if rz == 0:  # at a minimum; so is a model that no camera sees
+    if rz == 0:  # at a minimum, or no camera sees the model
         return [0.0]
     for done in range(iterations):
         progress(done, iterations)
         product = found.curvature_times(model, direction)
         step = rz / dot(direction, product)
         x, residual = plus(x, step, direction), plus(residual, -step, product)
-        z = [mi.TensorXf(i * r.array, r.shape) for i, r in zip(inverse, residual, strict=True)]
+        z = preconditioned(residual)
         before, rz = rz, dot(residual, z)
         direction = plus(z, rz / before, direction)
         dr.eval(x, residual, direction)
@@ -367,7 +361,7 @@ def newton_decrease(
 
 
 def dot(a: Vector, b: Vector) -> float:
-    """Sum of products, in double precision."""
+    """Dot product, in double precision."""
     sums = [dr.sum(mi.Float64(x.array) * mi.Float64(y.array)) for x, y in zip(a, b, strict=True)]
     return sum(float(s[0]) for s in sums)
 
@@ -380,16 +374,16 @@ def plus(a: Vector, factor: float, b: Vector) -> Vector:
     ]
 
 
-def watched(model: Gaussians, prior: Prior) -> Gaussians:
-    """A copy of the model whose learned parameters have gradients enabled, for use inside a
-    recorded function."""
+def with_gradients(model: Gaussians, prior: ParameterPrior) -> Gaussians:
+    """A copy of a model whose learned parameters have gradients enabled. For use in recorded
+    functions."""
     values = {name: dr.copy(dr.detach(getattr(model, name))) for name in prior.lam}
     dr.enable_grad(list(values.values()))
     return replace(model, **values)
 
 
-def _sizes(model: Gaussians, prior: Prior, lists: BlockLists, size: Any) -> tuple[Any, ...]:
-    return prior.means, len(lists.splat), len(lists.block), *model.sh.shape, *size
+def _sizes(model: Gaussians, prior: ParameterPrior, view: View, *others: Any) -> tuple[Any, ...]:
+    return prior.means, *model.sh.shape, *view.recorded_sizes
 
 
 @frozen(lambda model, camera: model.sh.shape)
@@ -397,56 +391,29 @@ def _project(model: Gaussians, camera: Any) -> Any:
     return project(model, camera)
 
 
-@frozen(
-    lambda model, prior, camera, packed, lists, target, weight, size: _sizes(
-        model, prior, lists, size
-    )
-)
-def _image_gradient(
-    model: Gaussians,
-    prior: Prior,
-    camera: Any,
-    packed: Any,
-    lists: BlockLists,
-    target: Any,
-    weight: Any,
-    size: Any,
-) -> Vector:
-    """The derivative of half the summed squared error of one image."""
-    copy = watched(model, prior)
-    drawn = composite_channels(project(copy, camera), packed, lists, *size)
-    dr.backward(0.5 * dr.sum(dr.square((drawn.array - target) * weight)))
+@frozen(_sizes)
+def _image_gradient(model: Gaussians, prior: ParameterPrior, view: View) -> Vector:
+    """Derivative of half the summed squared error of one image."""
+    copy = with_gradients(model, prior)
+    error = (view.rendered(copy).array - view.pixels) * view.weights
+    dr.backward(0.5 * dr.sum(dr.square(error)))
     return _gradients(copy, prior)
 
 
-@frozen(
-    lambda model, prior, vector, camera, packed, lists, weight, size: _sizes(
-        model, prior, lists, size
-    )
-)
-def _image_curvature(
-    model: Gaussians,
-    prior: Prior,
-    vector: Vector,
-    camera: Any,
-    packed: Any,
-    lists: BlockLists,
-    weight: Any,
-    size: Any,
-) -> Vector:
-    """J^T J times a vector, for one image: forward mode gives J v, reverse mode J^T of that."""
-    copy = watched(model, prior)
+@frozen(_sizes)
+def _image_curvature(model: Gaussians, prior: ParameterPrior, view: View, vector: Vector) -> Vector:
+    """Product of J^T J of one image and a vector: J v in forward mode, then J^T in reverse mode."""
+    copy = with_gradients(model, prior)
     for name, tangent in zip(prior.lam, vector, strict=True):
         dr.set_grad(getattr(copy, name), prior.across(name, tangent))
-    drawn = composite_channels(project(copy, camera), packed, lists, *size)
-    dr.forward_to(drawn)
-    along = dr.detach(dr.grad(drawn).array) * dr.square(weight)
-    copy = watched(model, prior)
-    drawn = composite_channels(project(copy, camera), packed, lists, *size)
-    dr.backward(dr.sum(drawn.array * along))
+    rendered = view.rendered(copy)
+    dr.forward_to(rendered)
+    product = dr.detach(dr.grad(rendered).array) * dr.square(view.weights)
+    copy = with_gradients(model, prior)
+    dr.backward(dr.sum(view.rendered(copy).array * product))
     return _gradients(copy, prior)
 
 
-def _gradients(copy: Gaussians, prior: Prior) -> Vector:
-    """The gradients that were found for a `watched` copy, by what is learned."""
+def _gradients(copy: Gaussians, prior: ParameterPrior) -> Vector:
+    """Gradients of a copy made by `with_gradients`, by learned parameter."""
     return [prior.along(name, dr.grad(getattr(copy, name))) for name in prior.lam]

@@ -1,4 +1,4 @@
-"""Optimisers of the fit, each a row of a table: how one parameter moves, given its gradient."""
+"""Optimisers of a fit, by name."""
 
 from __future__ import annotations
 
@@ -13,41 +13,34 @@ ADAM_BETAS = (0.9, 0.999)
 """Decay of Adam's averages of the gradient and of its square (Kingma and Ba 2015)."""
 
 ADAM_EPSILON = 1e-3
-"""Adam's epsilon, (pixel value)^2 per unit of the parameter: a gradient of the summed squared error
-below it is noise, and a parameter that no image sees stays where the prior put it instead of
-walking full steps."""
-
+"""Adam's epsilon, (pixel value)^2 per unit of the parameter. Gradients of the summed squared error
+below it are noise, so parameters that no image sees stay where the prior put them."""
 
 NATURAL_BETA = 0.9
-"""Decay of the average of the gradient of `natural`."""
+"""Decay of the gradient's average in `natural`."""
 
 NATURAL_OVERLAP = 4.0
-"""By how much the exact diagonal is raised in `natural`. The diagonal says how an image changes
-with one parameter alone, while
-a pixel is blended from several splats that move at once: steps of the diagonal's own length would
-overshoot. A chosen constant."""
+"""Factor on the exact diagonal in `natural`. The diagonal is for one parameter alone, but the
+several splats of a pixel move together: without the factor, steps overshoot. A chosen constant."""
 
 LEAST_INFORMATION = 1e-6
-"""Least information that `natural` assumes, (pixel value per unit of the parameter)^2: without a
-prior, a parameter that no image sees has none, and one that is hardly seen would be moved by
-rounding errors."""
+"""Lower bound of the information in `natural`, (pixel value per unit of the parameter)^2. Without a
+prior, parameters that are hardly seen would otherwise be moved by rounding errors."""
 
 INFORMATION_PASSES = 10
-"""Passes from one computation of the information that an optimiser uses to the next; each costs
-about as much as a pass."""
+"""Passes between two computations of an optimiser's information, each as costly as a pass."""
 
 
 @dataclass(frozen=True)
 class Optimiser:
-    """How one array of parameters is moved.
+    """An update rule for one array of parameters.
 
-    buffers: how many arrays of the parameter's shape the optimiser keeps between steps; they start
-    at zero. step(value, gradient, information, buffers, rate, t) -> (new value, new buffers), all
-    Dr.Jit TensorXf of one shape but rate, a Float, and t, a Float that counts steps from 1. It is
-    recorded once and replayed, so it must be made of Dr.Jit operations alone.
-    uses_information: whether `information` is given, the largest entry of any one image's diagonal
-    of J^T J, with that image's share of lam, measured again every INFORMATION_PASSES passes; it is
-    None otherwise.
+    buffers: number of arrays of the parameter's shape kept between steps, zero at first.
+    step(value, gradient, information, buffers, rate, t) -> (new value, new buffers). All are Dr.Jit
+        TensorXf of one shape, but rate (Float) and t (Float, step number from 1). It is recorded
+        once and replayed, so it must consist of Dr.Jit operations.
+    uses_information: whether `information` is given: `Objective.largest_diagonal`, measured every
+        INFORMATION_PASSES passes. Otherwise it is None.
     """
 
     buffers: int
@@ -58,8 +51,7 @@ class Optimiser:
 def adam(
     value: Any, gradient: Any, information: Any, buffers: list[Any], rate: Any, t: Any
 ) -> tuple[Any, list[Any]]:
-    """Adam (Kingma and Ba 2015) with ADAM_BETAS and ADAM_EPSILON: steps of about the rate, whatever
-    the gradient."""
+    """Adam (Kingma and Ba 2015) with ADAM_BETAS and ADAM_EPSILON."""
     m, v = buffers
     beta1, beta2 = ADAM_BETAS
     unbias1, unbias2 = 1 - dr.power(mi.Float(beta1), t), 1 - dr.power(mi.Float(beta2), t)
@@ -71,15 +63,14 @@ def adam(
 def natural(
     value: Any, gradient: Any, information: Any, buffers: list[Any], rate: Any, t: Any
 ) -> tuple[Any, list[Any]]:
-    """Natural gradient with the exact diagonal of the Fisher information as its metric (Amari
-    1998), momentum, and steps of at most the rate, beyond which images are not linear in the
-    parameters. Where information is plenty, steps are short of that and shrink as the gradient
-    does; where there is none, the prior's lam keeps them finite.
+    """Natural gradient (Amari 1998) with momentum; its metric is the exact diagonal of the Fisher
+    information.
 
-    A step is made for one image, so its metric is the information of the image that says most about
-    the parameter. The mean
-    over the images would be too little for a parameter that few of them see: its steps would
-    overshoot by their number, and longer fits to many images diverge."""
+    Steps are at most as long as the rate, beyond which images are not linear in the parameters.
+
+    A step is for one image, so the metric is the information of the image that says most about the
+    parameter. With the mean over the images, parameters that few images see would overshoot.
+    """
     m = dr.lerp(gradient, buffers[0], NATURAL_BETA)
     curvature = NATURAL_OVERLAP * dr.maximum(information.array, LEAST_INFORMATION)
     update = dr.clip(m.array / curvature, -rate, rate)
@@ -90,4 +81,4 @@ OPTIMISERS: dict[str, Optimiser] = {
     "natural": Optimiser(1, natural, uses_information=True),
     "adam": Optimiser(2, adam),
 }
-"""Optimisers of the fit, by name (`mgs nbv --optimiser`). A program may add its own."""
+"""Optimisers by name (`mgs nbv --optimiser`). A program may add its own."""

@@ -296,7 +296,7 @@ def _worth(model: Gaussians, images: Images, settings: NbvSettings, cache: ListC
         train.alpha_weight,
     )
     fields, columns = as_drjit(model), kinds(degree, train.means)
-    away = _flat([part for part, _ in goal.pulls(fields)], len(model))
+    away = _flat([part for part, _ in goal.offsets(fields)], len(model))
     precision = _flat(goal.diagonal(fields), len(model))
     return worth(away, precision, lam, settings.pixel_noise, columns, goal.phi(fields))
 

@@ -10,12 +10,11 @@ from mgs.synth.rock import rock_shape
 from mgs.synth.scene_file import Arena, Lobe, Rock
 
 REACH = 400.0
-"""Half the side of the square terrain, metres; its edge is so far away that it looks like the
-horizon."""
+"""Half the side of the square terrain, metres; its edge looks like the horizon."""
 
 ROWS = 480
-"""Vertices along one side of the terrain. They are about 3 cm apart near the rock, and metres apart
-at the horizon."""
+"""Vertices along one side of the terrain, about 3 cm apart near the rock and metres at the horizon.
+"""
 
 TILE = 4.0
 """Side of the regolith's texture tile, metres."""
@@ -25,8 +24,7 @@ TEXELS = 1024
 
 
 def _grid() -> np.ndarray:
-    """Coordinates [ROWS], metres, of the terrain's grid lines along either axis: even within 7 m,
-    ever wider beyond."""
+    """Grid lines of the terrain along either axis [ROWS], metres: even within 7 m, wider beyond."""
     u = np.linspace(-1, 1, ROWS)
     return 7 * u + (REACH - 7) * u**9
 
@@ -34,11 +32,10 @@ def _grid() -> np.ndarray:
 def make_ground(
     settings: Arena, rock: trimesh.Trimesh, rng: np.random.Generator
 ) -> trimesh.Trimesh:
-    """The terrain as a mesh, metres, z about 0: gentle swells, dunes far away, ripples, and dust
-    heaped around the rock's foot.
+    """Terrain mesh, metres, z about 0: swells, far dunes, ripples, and dust at the rock's foot.
 
-    UVs are in units of a texture tile. The vertex attribute `blend` [V,1], from 0 to 1, is the
-    weight of the second tile of `regolith` in the mixture of both.
+    UVs are in units of a texture tile. Vertex attribute `blend` [V,1], 0 to 1: weight of the second
+    tile of `regolith`.
     """
     noise = Noise(rng)
     x, y = np.meshgrid(_grid(), _grid())
@@ -46,8 +43,7 @@ def make_ground(
     far = np.hypot(x, y)
     foot = rock.vertices[np.abs(rock.vertices[:, 2]) < 0.1 * rock.extents[2]][:, :2]
     radius = np.linalg.norm(foot, axis=1).mean() if len(foot) else 0.5 * rock.extents[:2].mean()
-    # The grid gets coarser with distance. Fine detail that it could not show fades out, and dunes
-    # replace it.
+    # Fine detail fades out as the grid gets coarser, and dunes replace it.
     swell = settings.undulation * noise.fractal(p, 2.5, 4, 0.45) * np.exp(-far / 12)
     swell += (0.3 + 10 * settings.undulation) * noise.octave(p, 40) * np.clip(far / 50 - 0.2, 0, 1)
     ripples = 0.006 * noise.fractal(p, 0.3, 2, 0.6) * (far < 7)
@@ -55,9 +51,8 @@ def make_ground(
     vertices = np.stack([x, y, swell + ripples + apron], -1).reshape(-1, 3)
 
     a = (np.arange(ROWS - 1)[:, None] * ROWS + np.arange(ROWS - 1)).ravel()
-    faces = np.concatenate(
-        [np.stack([a, a + 1, a + ROWS], 1), np.stack([a + 1, a + ROWS + 1, a + ROWS], 1)]
-    )
+    b, c, d = a + 1, a + ROWS, a + ROWS + 1
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
     visual = trimesh.visual.TextureVisuals(uv=vertices[:, :2] / TILE)
     mesh = trimesh.Trimesh(vertices, faces, visual=visual, process=False)
     blend = 0.5 + 0.5 * noise.fractal(p, 1.8, 5, 0.75)
@@ -66,8 +61,8 @@ def make_ground(
 
 
 def regolith(settings: Arena, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Two texture tiles that repeat without a seam, linear RGB [TEXELS,TEXELS,3]: fine pale dust,
-    and darker coarse grains."""
+    """Two seamless texture tiles, linear RGB [TEXELS,TEXELS,3]: fine pale dust, and darker coarse
+    grains."""
     fine, soft, tint = (tile(TEXELS, exponent, rng) for exponent in (0.35, 1.1, 1.3))
     grains = np.clip(tile(TEXELS, 0.2, rng, shortest=4) - 1.4, 0, 1)
     colour = np.asarray(settings.colour, np.float32)
@@ -80,32 +75,26 @@ def regolith(settings: Arena, rng: np.random.Generator) -> tuple[np.ndarray, np.
 def make_stones(
     settings: Arena, rock: trimesh.Trimesh, ground: trimesh.Trimesh, rng: np.random.Generator
 ) -> trimesh.Trimesh | None:
-    """Small stones scattered over the ground, as one mesh with the vertex attribute `color` (linear
+    """Small stones scattered over the ground, one mesh with the vertex attribute `color` (linear
     RGB).
 
-    None where the settings ask for no stones, or leave no room between the rock's clearance and
-    `spread`.
+    None if the settings ask for no stones, or leave no room between clearance and `spread`.
     """
     if not settings.stones:
         return None
     noise = Noise(rng)
     fine, coarse = ([_stone(noise, detail) for _ in range(8)] for detail in (0.04, 0.08))
-    keep_out = (
-        settings.clearance
-        * np.linalg.norm(rock.vertices[rock.vertices[:, 2] > 0][:, :2], axis=1).max()
-    )
+    above = rock.vertices[rock.vertices[:, 2] > 0]
+    keep_out = settings.clearance * np.linalg.norm(above[:, :2], axis=1).max()
     distance = settings.spread * rng.uniform(0, 1, 4 * settings.stones) ** 0.7
     azimuth = rng.uniform(0, 2 * np.pi, 4 * settings.stones)
-    at = np.stack([distance * np.cos(azimuth), distance * np.sin(azimuth)], 1)[distance > keep_out][
-        : settings.stones
-    ]
+    at = np.stack([distance * np.cos(azimuth), distance * np.sin(azimuth)], 1)
+    at = at[distance > keep_out][: settings.stones]
     if len(at) == 0:
         return None
-    # Sizes of broken rock follow a power law: the number of stones larger than s is proportional to
-    # s to the power -1.8.
-    sizes = np.minimum(
-        0.6 * settings.stone_size * rng.uniform(0, 1, len(at)) ** (-1 / 1.8), settings.largest_stone
-    )
+    # Broken rock follows a power law: the number of stones larger than s grows as s^-1.8.
+    sizes = 0.6 * settings.stone_size * rng.uniform(0, 1, len(at)) ** (-1 / 1.8)
+    sizes = np.minimum(sizes, settings.largest_stone)
     vertices, faces, colours, offset = [], [], [], 0
     for position, height, size in zip(at, _height_at(ground, at), sizes, strict=True):
         stone = (fine if size > 0.15 else coarse)[rng.integers(8)]
@@ -126,14 +115,12 @@ def make_stones(
 def _stone(noise: Noise, detail: float) -> trimesh.Trimesh:
     """One stone of size 1, a quarter of its height below z = 0, without texture."""
     lobe = Lobe(radii=(1.0, noise.rng.uniform(0.6, 0.9), noise.rng.uniform(0.4, 0.7)))
-    return rock_shape(
-        Rock(size=1.0, lobes=(lobe,), detail=detail, buried=0.25, cracks=0, relief=0.08), noise
-    )[0]
+    rock = Rock(size=1.0, lobes=(lobe,), detail=detail, buried=0.25, cracks=0, relief=0.08)
+    return rock_shape(rock, noise)[0]
 
 
 def _height_at(ground: trimesh.Trimesh, at: np.ndarray) -> np.ndarray:
-    """Height of the terrain [N] at points (x, y) [N,2], metres, interpolated bilinearly between its
-    vertices."""
+    """Height of the terrain [N], metres, at points (x, y) [N,2], interpolated bilinearly."""
     u = np.interp(at, _grid(), np.arange(ROWS))
     i = np.clip(u.astype(int), 0, ROWS - 2)
     (ix, iy), (fx, fy) = i.T, (u - i).T

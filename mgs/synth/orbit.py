@@ -1,44 +1,45 @@
-"""Cameras that fly around a rock at the origin and look at one target, its middle."""
+"""Cameras that fly around a rock at the origin and look at its middle."""
 
 from __future__ import annotations
 
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from mgs.camera import Camera, look_at
-from mgs.synth.scene_file import Orbit
+from mgs.errors import InputError
+from mgs.synth.scene_file import Orbit, SceneFile
+
+EVALUATION_ELEVATIONS = (5.0, 75.0)
+"""Elevations of the test views above the rock's middle, degrees: from just over the stones on the
+ground to steeply down on the rock."""
 
 
 def intrinsics(fov: float, width: int, height: int) -> np.ndarray:
-    """Pinhole K [3,3], pixels: horizontal field of view in degrees, square pixels, principal point
-    in the middle."""
+    """Pinhole K [3,3], pixels, square and centred; fov: horizontal field of view, degrees."""
     focal = width / 2 / np.tan(np.radians(fov) / 2)
     return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
 
 
 def orbit_positions(settings: Orbit, frames: int, target: np.ndarray) -> np.ndarray:
-    """Camera centres [frames,3], world, metres, in the order of flight: counter-clockwise, from
-    azimuth 0, which is +x.
+    """Camera centres [frames,3], world, metres, counter-clockwise from azimuth 0 (+x).
 
-    settings.kind is one of: circle, of fixed radius and altitude, as in the paper; rings, `turns`
-    circles at rising elevations; spiral, `turns` turns with rising elevation; hemisphere, positions
-    spread evenly between the two elevations (Fibonacci lattice), sorted by azimuth. Frame k is then
-    moved away from the target to settings.distances[k % len] times its distance.
-    target [3]: the point that all look at, world, metres.
+    settings.kind: circle, of fixed radius and altitude (paper); rings, `turns` circles at rising
+    elevations; spiral, `turns` turns of rising elevation; hemisphere, spread evenly between the
+    elevations (Fibonacci lattice), sorted by azimuth. Frame k is then moved away from the target
+    [3] to settings.distances[k % len] times its distance.
     """
     positions = _at_one_distance(settings, frames, target)
     return positions + (np.resize(settings.distances, frames)[:, None] - 1) * (positions - target)
 
 
 def _at_one_distance(settings: Orbit, frames: int, target: np.ndarray) -> np.ndarray:
-    """Camera centres [frames,3] as of `orbit_positions`, without the factors on their distances."""
+    """`orbit_positions` without the factors on distances."""
     step = np.arange(frames)
     if settings.kind == "circle":
         azimuth = 2 * np.pi * step / frames
-        x, y = (
-            target[0] + settings.radius * np.cos(azimuth),
-            target[1] + settings.radius * np.sin(azimuth),
-        )
+        x = target[0] + settings.radius * np.cos(azimuth)
+        y = target[1] + settings.radius * np.sin(azimuth)
         return np.stack([x, y, np.full(frames, settings.altitude)], 1)
     low, high = np.radians(settings.elevations)
     along = step / max(frames - 1, 1)
@@ -55,41 +56,72 @@ def _at_one_distance(settings: Orbit, frames: int, target: np.ndarray) -> np.nda
         order = np.argsort(azimuth)
         azimuth, elevation = azimuth[order], elevation[order]
     flat = settings.radius * np.cos(elevation)
-    return (
-        np.stack(
-            [flat * np.cos(azimuth), flat * np.sin(azimuth), settings.radius * np.sin(elevation)], 1
-        )
-        + target
-    )
+    x, y, z = flat * np.cos(azimuth), flat * np.sin(azimuth), settings.radius * np.sin(elevation)
+    return np.stack([x, y, z], 1) + target
 
 
 def orbit_cameras(
     settings: Orbit, frames: int, target: np.ndarray, fov: float, width: int, height: int
 ) -> list[Camera]:
-    """The cameras of an orbit. target [3]: the point that all look at, world, metres; fov:
-    horizontal, degrees."""
+    """Cameras of an orbit that look at `target` [3], world, metres; fov: horizontal, degrees."""
     K = intrinsics(fov, width, height)
-    return [
-        Camera(K, width, height, look_at(eye, target))
-        for eye in orbit_positions(settings, frames, target)
-    ]
+    positions = orbit_positions(settings, frames, target)
+    return [Camera(K, width, height, look_at(eye, target)) for eye in positions]
+
+
+def rock_cameras(
+    scene: SceneFile, size: tuple[int, int], frames: int, rock: trimesh.Trimesh
+) -> list[Camera]:
+    """Cameras of the scene's orbit, aimed at the middle of the rock above the ground. size:
+    (width, height), pixels.
+
+    Raises InputError if that part of the rock is not wholly inside a frame.
+    """
+    return _aimed(scene, scene.orbit, size, frames, rock, "frame")
+
+
+def evaluation_cameras(
+    scene: SceneFile, size: tuple[int, int], views: int, rock: trimesh.Trimesh
+) -> list[Camera]:
+    """Cameras of test views, spread evenly over a dome of EVALUATION_ELEVATIONS at the radius of
+    the scene's orbit. Raises InputError as `rock_cameras`."""
+    change = {"kind": "hemisphere", "elevations": EVALUATION_ELEVATIONS, "distances": (1,)}
+    dome = scene.orbit.model_copy(update=change)
+    return _aimed(scene, dome, size, views, rock, "test view")
+
+
+def _aimed(
+    scene: SceneFile,
+    orbit: Orbit,
+    size: tuple[int, int],
+    frames: int,
+    rock: trimesh.Trimesh,
+    what: str,
+) -> list[Camera]:
+    target = np.array([0, 0, rock.bounds[1, 2] / 2])
+    cameras = orbit_cameras(orbit, frames, target, scene.camera.fov, *size)
+    visible = rock.vertices[rock.vertices[:, 2] > 0]
+    for index, camera in enumerate(cameras):
+        pixels, z = camera.project(visible)
+        beyond = (pixels < 1).any() or (pixels > np.array(size) - 1).any()
+        if beyond or (z <= 0).any():
+            raise InputError(
+                f"scene: the rock is not wholly in {what} {index}; raise orbit.radius or camera.fov"
+            )
+    return cameras
 
 
 def perturb(
     cameras: list[Camera], position: float, rotation: float, rng: np.random.Generator
 ) -> list[Camera]:
-    """The cameras with an independent Gaussian error in each pose.
-
-    position: standard deviation along each axis, metres; rotation: standard deviation about each
-    axis, degrees.
-    """
+    """Cameras with independent Gaussian pose errors. position, rotation: standard deviations per
+    axis, metres and degrees."""
     noisy = []
     for camera in cameras:
         pose = camera.camera_to_world
         pose[:3, 3] += rng.normal(0, position, 3)
-        pose[:3, :3] = (
-            pose[:3, :3] @ Rotation.from_rotvec(rng.normal(0, np.radians(rotation), 3)).as_matrix()
-        )
+        turn = Rotation.from_rotvec(rng.normal(0, np.radians(rotation), 3)).as_matrix()
+        pose[:3, :3] = pose[:3, :3] @ turn
         world_to_camera = np.linalg.inv(pose).astype(np.float64)
         noisy.append(Camera(camera.K, camera.width, camera.height, world_to_camera))
     return noisy

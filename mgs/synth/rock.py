@@ -1,5 +1,4 @@
-"""Rocks as textured triangle meshes that stand in the ground z = 0: procedural ones from a seed, or
-any mesh from a file."""
+"""Rocks as textured meshes that stand in the ground z = 0: procedural, or from a mesh file."""
 
 from __future__ import annotations
 
@@ -19,19 +18,17 @@ from mgs.synth.noise import Noise
 from mgs.synth.scene_file import Rock
 
 MAX_GRID = 10**8
-"""Largest number of points of the grid on which a rock's body is computed: more would take tens of
-gigabytes."""
+"""Most points of the grid of a rock's body: more would take tens of gigabytes."""
 
 CELL = 6
 """Texels along one side of a cell of the texture; two triangles share a cell."""
 
 
 def make_rock(settings: Rock, rng: np.random.Generator) -> trimesh.Trimesh:
-    """A weathered procedural rock: ellipsoids cut by planes, meshed by marching cubes, displaced,
-    and painted with an albedo.
+    """Weathered procedural rock: ellipsoids cut by planes, marching cubes, displacement, albedo.
 
-    Returns a mesh in world coordinates (metres, +Z up), partly below z = 0, with UVs and an sRGB
-    base-colour texture. Raises InputError where `detail` is too coarse or too fine for the rock.
+    Returns a mesh in the world (metres, +Z up), partly below z = 0, with UVs and an sRGB texture.
+    Raises InputError if `detail` is too coarse or too fine for the rock.
     """
     noise = Noise(rng)
     mesh, height = rock_shape(settings, noise)
@@ -39,8 +36,8 @@ def make_rock(settings: Rock, rng: np.random.Generator) -> trimesh.Trimesh:
 
 
 def rock_shape(settings: Rock, noise: Noise) -> tuple[trimesh.Trimesh, np.ndarray]:
-    """The rock's geometry without texture, standing in the ground, and the displacement [V],
-    metres, of each vertex."""
+    """The rock without texture, standing in the ground, and the displacement of each vertex [V],
+    metres."""
     mesh = _body(settings, noise).subdivide()
     height = _relief(mesh, settings, noise)
     mesh.vertices += height[:, None] * mesh.vertex_normals
@@ -48,11 +45,8 @@ def rock_shape(settings: Rock, noise: Noise) -> tuple[trimesh.Trimesh, np.ndarra
 
 
 def up_axis(path: str | Path) -> str:
-    """The axis of a mesh file that is taken as up where the user does not name it, "y" or "z".
-
-    glTF and GLB are +Y up by their format. Other formats have no rule: OBJ is taken as +Y up,
-    because most of its files are, and all others as +Z up, as our world is.
-    """
+    """Default up axis of a mesh file, "y" or "z": glTF and GLB are +Y up by their format; OBJ is
+    taken as +Y, as most are; all others as +Z."""
     return "y" if Path(path).suffix.lower() in (*GLTF, ".obj") else "z"
 
 
@@ -62,10 +56,9 @@ def load_rock(
     """Read a mesh file as the rock, with its texture, scale it to `settings.size` and stand it in
     the ground.
 
-    Faces without area and faces that are there twice (whichever way round) are left out: the
-    normals of two opposite faces cancel, and a vertex without a normal has no shading.
-    up: "y" or "z", the file's up axis; by default as `up_axis`. Returns the mesh, +Z up, and the
-    scale that was applied. Raises InputError as `load_mesh`, and where all vertices are one point.
+    up: "y" or "z", by default `up_axis`. Returns the mesh, +Z up, and the scale. Faces without area
+    and repeated faces are removed: normals of opposite faces cancel, and a vertex without normal
+    has no shading. Raises InputError as `load_mesh`, and if all vertices are one point.
     """
     mesh = load_mesh(path)
     _leave_out_bad_faces(mesh)
@@ -78,23 +71,22 @@ def load_rock(
 
 
 def _leave_out_bad_faces(mesh: trimesh.Trimesh) -> None:
-    """Leave out, in place, the faces that are not `distinct_faces`, and then the vertices of no
-    face. A mesh without such faces
-    is not touched. The vertices of a face that is left out get new normals: two opposite faces may
-    have spoilt those they had. All other vertices keep the file's normals."""
+    """Remove, in place, all but the `distinct_faces`, and unused vertices. Vertices of removed
+    faces get new normals, since opposite faces may have spoilt theirs; all others keep the file's.
+    """
     kept = distinct_faces(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
     if len(kept) == len(mesh.faces):
         return
     normals, spoilt = mesh.vertex_normals.copy(), np.unique(np.delete(mesh.faces, kept, axis=0))
     mesh.update_faces(kept)
     normals[spoilt] = mesh.vertex_normals[spoilt]
-    mesh.vertex_normals = normals  # type: ignore[method-assign]  # mypy does not see that it is a property
+    mesh.vertex_normals = normals  # type: ignore[method-assign]  # a property
     mesh.remove_unreferenced_vertices()
 
 
 def _stand(mesh: trimesh.Trimesh, settings: Rock) -> trimesh.Trimesh:
     """Scale a mesh to the settings' size, centre it over the origin, and bury the share `buried` of
-    its height."""
+    it."""
     mesh.apply_scale(settings.size / mesh.extents.max())
     low, high = mesh.bounds
     middle = (low + high) / 2
@@ -103,39 +95,37 @@ def _stand(mesh: trimesh.Trimesh, settings: Rock) -> trimesh.Trimesh:
 
 
 def _body(settings: Rock, noise: Noise) -> trimesh.Trimesh:
-    """Ellipsoids, each cut by random planes, joined smoothly and meshed; scaled to the settings'
-    size."""
+    """Ellipsoids, cut by random planes, joined smoothly, meshed, scaled to the settings' size."""
     low = np.min([np.subtract(lobe.centre, lobe.radii) for lobe in settings.lobes], axis=0)
     high = np.max([np.add(lobe.centre, lobe.radii) for lobe in settings.lobes], axis=0)
     extent = float((high - low).max())
-    step = (
-        2.2 * settings.detail / settings.size * extent
-    )  # marching cubes' edges are 0.9 steps long, and are halved
+    # Edges of marching cubes are 0.9 steps long, and are halved.
+    step = 2.2 * settings.detail / settings.size * extent
     origin = low - 0.15 * extent
     shape = np.ceil((high - low + 0.3 * extent) / step) + 1
     if shape.prod() > MAX_GRID:
         raise InputError(
-            f"scene: rock.detail {settings.detail} m is too fine for a rock of {settings.size} m; raise it"
+            f"scene: rock.detail {settings.detail} m is too fine for a rock of "
+            f"{settings.size} m; raise it"
         )
     shape = shape.astype(int)
-    points = (
-        origin + step * np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
-    ).astype(np.float32)
+    nodes = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
+    points = (origin + step * nodes).astype(np.float32)
     points += 0.05 * np.stack([noise.octave(points, 1.1) for _ in range(3)], -1)
     distance = np.full(shape, 1e3)
     for lobe in settings.lobes:
         local = (points - np.asarray(lobe.centre, np.float32)) / np.asarray(lobe.radii, np.float32)
         inside = np.linalg.norm(local, axis=-1) - 1
         for normal in noise.rng.standard_normal((settings.facets, 3)):
-            cut = local @ (normal / np.linalg.norm(normal)).astype(np.float32) - noise.rng.uniform(
-                0.62, 0.92
-            )
+            along = local @ (normal / np.linalg.norm(normal)).astype(np.float32)
+            cut = along - noise.rng.uniform(0.62, 0.92)
             inside = _smooth_max(inside, cut, 0.05)
         distance = -_smooth_max(-distance, -inside * min(lobe.radii), 0.12)
     distance = gaussian_filter(distance, 0.7)
     if distance.min() >= 0:  # nothing is inside
         raise InputError(
-            f"scene: rock.detail {settings.detail} m is too coarse for a rock of {settings.size} m; lower it"
+            f"scene: rock.detail {settings.detail} m is too coarse for a rock of "
+            f"{settings.size} m; lower it"
         )
     vertices, faces, _, _ = marching_cubes(distance, 0.0, spacing=(step,) * 3)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
@@ -145,42 +135,32 @@ def _body(settings: Rock, noise: Noise) -> trimesh.Trimesh:
 
 
 def _smooth_max(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
-    """The maximum of a and b, rounded off where they differ by less than `width` (polynomial smooth
-    maximum)."""
+    """Maximum of a and b, rounded off where they differ by less than `width` (polynomial)."""
     h = np.clip(0.5 + 0.5 * (a - b) / width, 0, 1)
     return b + (a - b) * h + width * h * (1 - h)
 
 
 def _relief(mesh: trimesh.Trimesh, settings: Rock, noise: Noise) -> np.ndarray:
-    """Displacement of each vertex along its normal [V], metres: ridges, rough and smooth patches,
-    pits, cracks, strata."""
+    """Displacement along the vertex normals [V], metres: ridges, rough patches, pits, cracks,
+    strata."""
     p = np.asarray(mesh.vertices, np.float32)
     size, amplitude = settings.size, settings.relief * settings.size
-    warped = p + 0.06 * size * np.stack(
-        [noise.fractal(p, 0.4 * size, 2) for _ in range(3)], -1
-    ).astype(np.float32)
+    warp = np.stack([noise.fractal(p, 0.4 * size, 2) for _ in range(3)], -1)
+    warped = p + 0.06 * size * warp.astype(np.float32)
     broken = np.clip(0.6 + 0.5 * noise.octave(p, 0.5 * size), 0.15, 1.3)
-    height = amplitude * (
-        0.2 * noise.fractal(p, 0.5 * size, 2) - 0.15 * noise.ridged(warped, 0.3 * size, 2)
-    )
-    height += amplitude * (
-        0.4 * noise.fracture(warped, 0.3 * size)
-        + 0.18 * broken * noise.fracture(warped, 0.11 * size)
-    )
-    height += (
-        amplitude
-        * broken
-        * (0.06 * noise.fracture(p, 0.04 * size) + 0.05 * noise.fractal(p, 0.045 * size, 4, 0.75))
-    )
+    ridges = 0.2 * noise.fractal(p, 0.5 * size, 2) - 0.15 * noise.ridged(warped, 0.3 * size, 2)
+    height = amplitude * ridges
+    faces = 0.4 * noise.fracture(warped, 0.3 * size)
+    height += amplitude * (faces + 0.18 * broken * noise.fracture(warped, 0.11 * size))
+    fine = 0.06 * noise.fracture(p, 0.04 * size) + 0.05 * noise.fractal(p, 0.045 * size, 4, 0.75)
+    height += amplitude * broken * fine
     height -= 0.006 * size * np.clip(noise.octave(p, 0.045 * size) - 1.5, 0, 1)
-    crack = np.exp(-((noise.octave(warped, 0.8 * size) / 0.025) ** 2)) + 0.6 * np.exp(
-        -((noise.octave(warped, 0.5 * size) / 0.03) ** 2)
-    )
+    crack = np.exp(-((noise.octave(warped, 0.8 * size) / 0.025) ** 2))
+    crack = crack + 0.6 * np.exp(-((noise.octave(warped, 0.5 * size) / 0.03) ** 2))
     height -= settings.cracks * size * crack * np.clip(0.5 + noise.octave(p, 0.6 * size), 0, 1)
     if settings.layers:
-        level = settings.layers * (p[:, 2] - p[:, 2].min()) / np.ptp(
-            p[:, 2]
-        ) + 0.35 * noise.fractal(p, 0.8 * size, 3)
+        z = p[:, 2]
+        level = settings.layers * (z - z.min()) / np.ptp(z) + 0.35 * noise.fractal(p, 0.8 * size, 3)
         height += 0.009 * size * _smoothstep(0.3, 0.6, np.abs(2 * (level % 1) - 1))
     return height
 
@@ -188,19 +168,15 @@ def _relief(mesh: trimesh.Trimesh, settings: Rock, noise: Noise) -> np.ndarray:
 def _bake(
     mesh: trimesh.Trimesh, height: np.ndarray, settings: Rock, noise: Noise
 ) -> trimesh.Trimesh:
-    """The mesh with a texture of its albedo, in which every two triangles have a square cell of
-    their own.
+    """The mesh with a texture of its albedo, in which every two triangles have a square cell.
 
-    The albedo is a function of position, so it is evaluated at every texel. Because each triangle
-    has its own place, no surface
-    needs to be unwrapped: this works for any shape, and stretches nothing. Returns a mesh whose
-    faces share no vertices.
+    The albedo is a function of position, evaluated at every texel. No unwrapping is needed, so this
+    works for any shape and stretches nothing. The result's faces share no vertices.
     """
     n_faces = len(mesh.faces)
     cells = np.arange((n_faces + 1) // 2)
     across = int(np.ceil(np.sqrt(len(cells))))
-    # The first triangle of a cell has its right angle at the cell's origin; the second is the
-    # first, turned by 180 degrees.
+    # The right angle of a cell's first triangle is at its origin; the second is turned by 180°.
     j, i = (a.ravel() for a in np.mgrid[:CELL, :CELL])
     turned = i + j > CELL - 1
     u, v = (np.where(turned, CELL - 1 - a, a) / (CELL - 2) for a in (i, j))
@@ -212,9 +188,8 @@ def _bake(
         a, b, c = (values.astype(np.float32)[mesh.faces[:, k]][face] for k in range(3))
         return w[:, 0] * a + w[:, 1] * b + w[:, 2] * c
 
-    colour = _albedo(
-        at_texels(mesh.vertices), at_texels(mesh.vertex_normals), at_texels(height), settings, noise
-    )
+    points, normals = at_texels(mesh.vertices), at_texels(mesh.vertex_normals)
+    colour = _albedo(points, normals, at_texels(height), settings, noise)
     texture = np.zeros((across * CELL, across * CELL, 3), np.float32)
     row, column = CELL * (cells // across)[:, None] + j, CELL * (cells % across)[:, None] + i
     texture[row, column] = colour
@@ -223,9 +198,7 @@ def _bake(
     corners = np.stack([first, CELL - 1 - first])[np.arange(n_faces) % 2] + 0.5
     cell = np.arange(n_faces) // 2
     uv = (corners + CELL * np.stack([cell % across, cell // across], -1)[:, None]) / (across * CELL)
-    uv[..., 1] = (
-        1 - uv[..., 1]
-    )  # in trimesh, as in OBJ files, v points upwards from the image's last row
+    uv[..., 1] = 1 - uv[..., 1]  # in trimesh v points upwards from the image's last row
     image = Image.fromarray(np.round(255 * srgb_from_linear(texture)).astype(np.uint8))
     material = trimesh.visual.material.PBRMaterial(
         baseColorTexture=image, metallicFactor=0.0, roughnessFactor=0.9
@@ -255,23 +228,21 @@ def _albedo(
         band = np.sin(2 * np.pi * level) + 0.8 * np.sin(2 * np.pi * 2.7 * level + 1)
         patches = 0.4 * patches + 1.3 * band
     mix = _smoothstep(-1.2, 1.2, patches)
-    grains = 0.15 * noise.fractal(p, 0.02 * size, 3, 0.9) - 0.35 * _smoothstep(
-        1.5, 2.2, noise.octave(p, 0.012 * size)
-    )
+    grains = 0.15 * noise.fractal(p, 0.02 * size, 3, 0.9)
+    grains = grains - 0.35 * _smoothstep(1.5, 2.2, noise.octave(p, 0.012 * size))
     hollow = _smoothstep(1.0, -2.5, height / (settings.relief * size + 1e-9) * 3)
     if settings.plain_half:
         textured = _smoothstep(-0.05, 0.05, p[..., 0] / size)
         mix, grains = 0.6 + textured * (mix - 0.6), textured * grains
     colour = dark + (light - dark) * mix[..., None]
     colour = colour * (1 + grains - 0.35 * hollow)[..., None]
-    settled = 0.65 * _smoothstep(
-        0.4, 1.1, normal[..., 2] + 0.3 * noise.fractal(p, 0.12 * size, 4, 0.7)
-    )
+    upward = normal[..., 2] + 0.3 * noise.fractal(p, 0.12 * size, 4, 0.7)
+    settled = 0.65 * _smoothstep(0.4, 1.1, upward)
     return np.clip(colour + (dust - colour) * settled[..., None], 0.01, 0.9)
 
 
 def _smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
-    """0 at x = low and before, 1 at x = high and beyond, and a cubic curve between; low may be
-    greater than high."""
+    """Cubic curve from 0 at x = low to 1 at x = high, constant beyond; low may be greater than
+    high."""
     t = np.clip((x - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)

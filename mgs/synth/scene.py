@@ -1,5 +1,4 @@
-"""The Mitsuba scene: rock, ground, sun and sky, and one camera that moves. It is loaded once; only
-the sensor changes.
+"""The Mitsuba scene: rock, ground, sun and sky, loaded once, and one camera that moves.
 
 The variant must be set before this module is imported (`mgs.runtime.start`).
 """
@@ -23,33 +22,31 @@ from mgs.synth.arena import make_ground, make_stones, regolith
 from mgs.synth.scene_file import Rock, SceneFile, Sky
 
 MAX_DEPTH = 4
-"""Longest light path, in Mitsuba's count: direct light and two bounces. In the shade, light that
-rock and ground throw on each other matters."""
+"""Longest light path in Mitsuba's count: direct light and two bounces, which matter in the shade.
+"""
 
 GUIDES_PER_SAMPLE = 2
-"""Samples of the denoiser's guides (albedo and normals) for each sample of light. Guides are cheap;
-with so many samples they are nearly free of noise and may be declared clean, and then the denoiser
-keeps the texture that they show."""
+"""Samples of the denoiser's guides (albedo, normals) per sample of light. They are cheap; with so
+many they are declared clean, and the denoiser keeps the texture that they show."""
 
 MARGIN = 16
 """Pixels around the rock's bounding box that the denoiser of the rock alone sees too."""
 
 COVERAGE_RAYS = 255
-"""Rays through a pixel that measure which share of it the rock covers. Shares of 255 are exact in
-an 8-bit image, and the number is odd, so that one of the rays goes through the centre."""
+"""Rays through a pixel that measure its coverage by the rock. Shares of 255 are exact in 8 bits;
+the number is odd, so that one ray goes through the centre."""
 
 _MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""Mitsuba's camera frame is x to the image's left, y up, z forward."""
+"""Mitsuba's camera axes are x to the image's left, y up, z forward."""
 
 
 @dataclass(frozen=True)
 class Rendered:
-    """One frame. Radiance is linear RGB; the exposure is not applied.
+    """One frame, linear radiance before exposure.
 
-    rgb: [H,W,3], mean over the pixel. rock: [H,W,4], the same for the rock alone, premultiplied by
-    alpha, and alpha, the share
-    of the pixel that the rock covers. depth: [H,W] z-depth, metres, 0 = sky. mask: bool [H,W],
-    whether the rock is seen. Depth and mask are taken along the rays through the pixel centres.
+    rgb: [H,W,3], mean over the pixel. rock: [H,W,4], the rock alone, premultiplied by alpha, and
+    alpha, its share of the pixel. depth: [H,W] z-depth, metres, 0 = sky. mask: bool [H,W]. Depth
+    and mask are taken along the rays through the pixel centres.
     """
 
     rgb: np.ndarray
@@ -58,16 +55,14 @@ class Rendered:
     mask: np.ndarray
 
 
-class Scene:
-    """A rock on its arena under sun and sky. All cameras that see it must have the size and the K
-    of the one given first."""
+class MitsubaScene:
+    """A rock on its arena under sun and sky. All its cameras must have the size and the K of the
+    first."""
 
     def __init__(
         self, settings: SceneFile, rock: trimesh.Trimesh, camera: Camera, seed: int
     ) -> None:
-        from mgs.synth.rock_layer import (
-            RockLayer,
-        )  # not at the top: its class belongs to the variant that is set by now
+        from mgs.synth.rock_layer import RockLayer  # needs the variant that is set by now
 
         ground = make_ground(settings.arena, rock, generator(seed, "ground"))
         stones = make_stones(settings.arena, rock, ground, generator(seed, "stones"))
@@ -93,12 +88,11 @@ class Scene:
         )
 
     def render(self, camera: Camera, spp: int, seed: int, denoise: bool) -> Rendered:
-        """Path-trace one frame with `spp` samples per pixel; with `denoise`, Open Image Denoise
-        takes out the noise.
+        """Path-trace one frame with `spp` samples per pixel; denoise: by Open Image Denoise.
 
-        In pixels that the rock covers wholly, the picture of the rock alone is the image itself. At
-        the outline it is denoised on its own, with albedo and normals of the rock alone to guide
-        the denoiser.
+        Pixels that the rock covers wholly are the same in the image and in the picture of the rock
+        alone. At the outline the latter is denoised on its own, guided by albedo and normals of the
+        rock alone.
         """
         from mgs.synth.rock_layer import continued, render_layers, with_coverage
 
@@ -114,33 +108,29 @@ class Scene:
             )
             rgb = _denoise(rgb, guides)
             if alpha.any():
-                box = _around(
-                    alpha > 0
-                )  # the denoiser takes as long for black pixels as for others
+                box = _around(alpha > 0)  # black pixels would cost the denoiser as much as others
                 noisy = continued(rock[box], alpha[box])
-                clean = _denoise(
-                    noisy, continued(with_coverage(rock_guides, share, alpha)[box], alpha[box])
-                )
+                rock_guides = with_coverage(rock_guides, share, alpha)
+                clean = _denoise(noisy, continued(rock_guides[box], alpha[box]))
                 rock[box] = np.maximum(rock[box] + clean - noisy, 0)
         inside, outside = alpha[..., None] == 1, alpha[..., None] == 0
         rock = np.where(inside, rgb, np.where(outside, 0, rock))
         return Rendered(rgb, np.dstack([rock, alpha]), depth, mask)
 
     def cast(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """z-depth, float32 [H,W], metres, 0 = sky, and the rock's mask, bool [H,W], of rays through
-        the pixel centres."""
+        """z-depth, float32 [H,W], metres, 0 = sky, and rock mask, bool [H,W], along the pixel
+        centres."""
         rays = camera.unproject(np.ones((camera.height, camera.width))) - camera.position
         size = (camera.height, camera.width)
         z, mask = self._first_hits(camera, rays.reshape(-1, 3))
         return z.reshape(size), mask.reshape(size)
 
     def coverage(self, camera: Camera, mask: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """The share of each pixel's area that the rock covers, float32 [H,W].
+        """Share of each pixel's area that the rock covers, float32 [H,W].
 
-        mask: bool [H,W], whether the pixel's centre shows the rock. share: [H,W], the share of a
-        few random rays that meet it. Through pixels at the outline of the mask, and where mask and
-        share differ, COVERAGE_RAYS evenly spaced rays are cast; elsewhere the coverage is 1 or 0,
-        as the mask is.
+        mask: bool [H,W], rock at the pixel's centre. share: [H,W], share of a few random rays that
+        meet the rock. COVERAGE_RAYS rays are cast through pixels at the outline of the mask and
+        where mask and share differ; elsewhere the coverage is the mask.
         """
         from mgs.synth.rock_layer import lattice
 
@@ -148,65 +138,47 @@ class Scene:
         rows, columns = np.nonzero(boundary(mask) | (share != mask))
         if not len(rows):
             return alpha
-        u, v = (
-            pixel[:, None] + offset
-            for pixel, offset in zip((columns, rows), lattice(COVERAGE_RAYS).T, strict=True)
-        )
-        K = camera.K
-        local = np.stack(
-            [(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1
-        ).reshape(-1, 3)
-        on_rock = self._first_hits(camera, local @ camera.world_to_camera[:3, :3])[1].reshape(
-            len(rows), -1
-        )
-        on_rock[:, COVERAGE_RAYS // 2] = mask[
-            rows, columns
-        ]  # the ray through the centre: coverage and mask never contradict
+        offsets, K = lattice(COVERAGE_RAYS).T, camera.K
+        u, v = columns[:, None] + offsets[0], rows[:, None] + offsets[1]
+        local = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1)
+        rays = local.reshape(-1, 3) @ camera.world_to_camera[:3, :3]
+        on_rock = self._first_hits(camera, rays)[1].reshape(len(rows), -1)
+        # The ray through the centre, so that coverage and mask never contradict.
+        on_rock[:, COVERAGE_RAYS // 2] = mask[rows, columns]
         alpha[rows, columns] = on_rock.mean(1)
         return alpha
 
     def _first_hits(self, camera: Camera, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """z-depth of what rays from the camera meet first, float32 [N], metres, 0 = sky; and
-        whether it is the rock, bool [N].
-
-        rays [N,3]: directions in world axes, each as long as reaches a z-depth of 1.
-        """
+        """First hits of rays [N,3], world axes, of z-depth 1: their z-depth, float32 [N], metres, 0
+        = sky, and whether they are the rock, bool [N]."""
         length = np.linalg.norm(rays, axis=1)
         origin = mi.Point3f(*camera.position.tolist())
-        directions = mi.Vector3f(
-            *(mi.Float(padded(column)) for column in (rays / length[:, None]).T)
-        )
-        dr.make_opaque(
-            origin
-        )  # a number that the compiler knows would cost a new kernel for every camera
+        unit = (rays / length[:, None]).T
+        directions = mi.Vector3f(*(mi.Float(padded(column)) for column in unit))
+        dr.make_opaque(origin)  # a literal would compile a new kernel for every camera
         hit = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, directions))
-        dr.eval(hit)  # otherwise each array that is read below would trace the rays again
+        dr.eval(hit)  # otherwise each array read below would trace the rays again
         z = np.where(hit.is_valid().numpy(), hit.t.numpy() / length, 0)
         return z.astype(np.float32), (hit.shape == mi.ShapePtr(self.rock)).numpy()
 
 
 def _around(mask: np.ndarray) -> tuple[slice, ...]:
-    """Rows and columns of the bounding box of the true pixels of a mask [H,W], widened by MARGIN;
-    at least one must be true."""
-    return tuple(
-        slice(max(place.min() - MARGIN, 0), place.max() + 1 + MARGIN) for place in np.nonzero(mask)
-    )
+    """Slices of the bounding box of a mask [H,W] with a true pixel, widened by MARGIN."""
+    return tuple(slice(max(i.min() - MARGIN, 0), i.max() + 1 + MARGIN) for i in np.nonzero(mask))
 
 
 def _denoise(rgb: np.ndarray, guides: np.ndarray) -> np.ndarray:
-    """rgb [H,W,3] after Open Image Denoise. guides [H,W,9]: RGB, which is not used, albedo and
-    normal."""
+    """Denoise rgb [H,W,3]. guides [H,W,9]: RGB (unused), albedo, normal."""
     import pyoidn
 
     albedo, normal = np.clip(guides[..., 3:6], 0, 1), np.clip(guides[..., 6:], -1, 1)
-    return pyoidn.denoise(
-        np.ascontiguousarray(rgb), albedo=albedo, normal=normal, hdr=True, clean_aux=True
-    )
+    rgb = np.ascontiguousarray(rgb)
+    return pyoidn.denoise(rgb, albedo=albedo, normal=normal, hdr=True, clean_aux=True)
 
 
 def sensor_dict(camera: Camera) -> dict[str, Any]:
-    """The camera as a Mitsuba perspective sensor. Its box filter makes a pixel the mean over its
-    own area, and no more."""
+    """Mitsuba perspective sensor of a camera. Its box filter makes a pixel the mean over its own
+    area."""
     K, w, h = camera.K, camera.width, camera.height
     film = {
         "type": "hdrfilm",
@@ -229,23 +201,20 @@ def sensor_dict(camera: Camera) -> dict[str, Any]:
 
 
 def _to_world(camera: Camera) -> np.ndarray:
-    """The camera's pose [4,4] as Mitsuba's sensors have it."""
+    """Pose [4,4] of a camera with Mitsuba's axes."""
     return camera.camera_to_world @ _MITSUBA_FROM_OPENCV
 
 
 def _sunsky(sky: Sky) -> dict[str, Any]:
     elevation, azimuth = np.radians([sky.sun_elevation, sky.sun_azimuth])
-    sun = [
-        np.cos(elevation) * np.cos(azimuth),
-        np.cos(elevation) * np.sin(azimuth),
-        np.sin(elevation),
-    ]
-    scales = {"sun_scale": sky.sun_scale, "sky_scale": sky.sky_scale}
+    flat = np.cos(elevation)
+    sun = [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)]
     return {
         "type": "sunsky",
         "sun_direction": [float(x) for x in sun],
         "turbidity": sky.turbidity,
-        **scales,
+        "sun_scale": sky.sun_scale,
+        "sky_scale": sky.sky_scale,
     }
 
 
@@ -254,8 +223,8 @@ def _bitmap(linear: np.ndarray) -> dict[str, Any]:
 
 
 def _rock_bsdf(rock: trimesh.Trimesh, settings: Rock) -> dict[str, Any]:
-    """The rock's material; its colour is the mesh's texture, or else its vertex colours, or else
-    the light mineral."""
+    """Material of the rock, coloured by the mesh's texture, else its vertex colours, else the light
+    mineral."""
     visual: Any = rock.visual
     image = getattr(visual, "material", None) and _texture_image(visual.material)
     if image is not None and visual.uv is not None:
@@ -275,18 +244,24 @@ def _rock_bsdf(rock: trimesh.Trimesh, settings: Rock) -> dict[str, Any]:
 
 
 def _texture_image(material: Any) -> Any:
-    """The base-colour image of a trimesh material (PBR or simple), or None."""
+    """Base-colour image of a trimesh material (PBR or simple), or None."""
     return getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
 
 
 def _mesh(name: str, mesh: trimesh.Trimesh, bsdf: dict[str, Any]) -> Any:
-    """A trimesh mesh as a mi.Mesh, with normals, UVs and vertex attributes. In Mitsuba v points
-    down, in trimesh up."""
+    """A mi.Mesh of a trimesh mesh, with normals, UVs and attributes. v points down in Mitsuba, up
+    in trimesh."""
     uv = getattr(mesh.visual, "uv", None)
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict({"type": "twosided", "material": bsdf})
-    shape = mi.Mesh(name, len(mesh.vertices), len(mesh.faces), has_vertex_normals=True, has_vertex_texcoords=uv is not None,
-                    props=properties)  # fmt: skip
+    shape = mi.Mesh(
+        name,
+        len(mesh.vertices),
+        len(mesh.faces),
+        has_vertex_normals=True,
+        has_vertex_texcoords=uv is not None,
+        props=properties,
+    )
     for attribute, values in mesh.vertex_attributes.items():
         flat: Any = np.ravel(values)
         shape.add_attribute(f"vertex_{attribute}", np.shape(values)[1], flat)

@@ -1,5 +1,4 @@
-"""Scene files: one readable TOML per scene, validated. Lengths in metres, angles in degrees,
-colours linear RGB."""
+"""Scene files: one TOML per scene, validated. Lengths in metres, angles in degrees, linear RGB."""
 
 from __future__ import annotations
 
@@ -31,8 +30,7 @@ class _Strict(BaseModel):
 
 
 class Lobe(_Strict):
-    """One ellipsoid of the rock's body, before it is cut and weathered, in any unit: the whole rock
-    is scaled to its size."""
+    """One ellipsoid of the rock's body, in any unit: the whole rock is scaled to its size."""
 
     centre: tuple[float, float, float] = (0, 0, 0)
     radii: tuple[Positive, Positive, Positive] = (1, 1, 1)
@@ -61,10 +59,10 @@ class Rock(_Strict):
     dust: Colour = (0.42, 0.30, 0.20)
     """Dust on faces that look up."""
     specular: Fraction = 0.3
-    """Strength of the mirror-like reflection on top of the colour (Mitsuba's `principled`): 0 for
-    none, 0.5 as of glass."""
+    """Strength of the mirror-like reflection (Mitsuba's `principled`): 0 for none, 0.5 as of glass.
+    """
     roughness: Annotated[float, Field(gt=0, le=1)] = 0.8
-    """How far that reflection spreads: the smaller, the sharper the highlights."""
+    """Width of that reflection: the smaller, the sharper the highlights."""
     detail: Positive = 0.011
     """Length of a mesh edge, metres."""
 
@@ -104,12 +102,11 @@ class Lens(_Strict):
 
 
 class Orbit(_Strict):
-    """Positions of the cameras; every camera looks at the middle of the rock."""
+    """Positions of the cameras, which all look at the middle of the rock."""
 
     kind: OrbitKind = "circle"
     radius: Positive = 4.0
-    """Horizontal distance from the rock's axis (circle), or distance from its middle (the
-    others)."""
+    """Distance from the rock's axis (circle) or from its middle (the others)."""
     altitude: Annotated[float, Field(ge=0)] = 2.3
     """Height above the ground (circle)."""
     elevations: tuple[Elevation, Elevation] = (12, 65)
@@ -117,12 +114,12 @@ class Orbit(_Strict):
     turns: Positive = 3
     """Turns of the spiral, or number of rings."""
     distances: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1,)
-    """How far from the rock's middle the frames are in turn, as multiples of what they would be:
-    (1, 2, 3) mixes near and far views."""
+    """Factors on the distance from the rock's middle, in turn: (1, 2, 3) mixes near and far views.
+    """
 
 
 class Sensor(_Strict):
-    """Errors of the sensors that `mgs survey` flies with; `mgs synth-orbit` has none."""
+    """Errors of the sensors of `mgs survey`; `mgs synth-orbit` has none."""
 
     noise: Annotated[float, Field(ge=0)] = 1.0
     """Factor on the depth camera's noise (`mgs.survey.depth_sensor`)."""
@@ -145,7 +142,7 @@ class SceneFile(_Strict):
 def load_scene_file(scene: str | Path) -> SceneFile:
     """Read a scene by its name (`boulder`) or path (`my.toml`).
 
-    Raises InputError where it does not exist, is not TOML, or has an unknown key or a value out of
+    Raises InputError if it does not exist, is not TOML, or has an unknown key or a value out of
     range.
     """
     path = scene_path(scene)
@@ -157,32 +154,27 @@ def load_scene_file(scene: str | Path) -> SceneFile:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise InputError(
-                f"{path}: unknown key {key!r}; choose one of {', '.join(_keys_beside(first['loc']))}"
-            ) from None
+            known = ", ".join(_keys_beside(first["loc"]))
+            raise InputError(f"{path}: unknown key {key!r}; choose one of {known}") from None
         raise InputError(
             f"{path}: {key}: {first['msg']} (is {first['input']!r}); correct it"
         ) from None
 
 
 def _keys_beside(where: tuple[int | str, ...]) -> list[str]:
-    """The keys that may stand in a scene file beside the key at `where`, a path such as ("rock",
-    "lobes", 0, "radius")."""
+    """Keys allowed beside the key at `where`, a path such as ("rock", "lobes", 0, "radius")."""
     section: Any = SceneFile
     for part in where[:-1]:
-        if isinstance(
-            part, str
-        ):  # a number is an index into a list, whose entries are all of one kind
+        if isinstance(part, str):  # a number is an index into a list of one kind
             kind = section.model_fields[part].annotation
             section = next(iter(get_args(kind)), kind)
     return list(section.model_fields)
 
 
 def sensor_of(dataset: Path) -> Sensor:
-    """The sensor settings of the scene that a dataset was rendered from; the default where it has
-    no config.json.
+    """Sensor settings of the scene that a dataset was rendered from; defaults without config.json.
 
-    Raises InputError where config.json is damaged.
+    Raises InputError if config.json is damaged.
     """
     path = dataset / "config.json"
     recorded = read_json(path) if path.is_file() else {}
