@@ -20,6 +20,8 @@ from mgs.run.settings import PRESETS, NbvSettings, with_defaults
 from mgs.study import case, oracle
 from mgs.study.chart import fits, run, scoring, timing
 
+DEFAULTS = {**NbvSettings.model_fields, **TrainSettings.model_fields}
+
 
 def test_times_are_ratios_to_a_reference_that_is_timed_beside_each_call(monkeypatch):
     """A machine that becomes four times as slow: the ratio stays."""
@@ -69,11 +71,11 @@ def test_commands_of_points_say_what_was_measured(size):
     for point in points:
         said, made = parsed(point.command("DATA", "PRIOR", size.seeds)), point.settings(size.seeds)
         train = made.pop("train")
-        rates = dict(pair.split("=") for pair in said["rate"] or [])
+        rates = dict(pair.split("=") for pair in said["rates"] or [])
         assert said["alpha_weight"] == 0
         for key, value in (made | train).items():
             if key != "rates":
-                assert said[key] == value
+                assert (DEFAULTS[key].default if said[key] is None else said[key]) == value
         assert {kind: float(rate) for kind, rate in rates.items()} == train["rates"]
         settings = NbvSettings(dataset="DATA", prior="PRIOR", **made, train=train)
         assert settings.train_at(1).passes == min(point.warm_passes, point.passes)

@@ -26,9 +26,9 @@ from mgs.policy.registry import policy_named
 from mgs.prior.build import load_prior
 from mgs.run.folder import State as RunState
 from mgs.run.folder import read_checkpoint, read_settings, write_checkpoint
-from mgs.run.loop import Loop
 from mgs.run.nbv import run_nbv
-from mgs.run.stations import real_stations
+from mgs.run.operations import operations_of
+from mgs.run.problem import Problem
 from mgs.splat import ListCache, fisher
 from mgs.study.chart.fits import Data
 from mgs.study.chart.timing import span, timed, with_seconds
@@ -55,9 +55,9 @@ class State:
         self.run, self.model, self.taken = now, now.gaussians, now.taken
         self.cameras, self.cache = [frame.camera for frame in data.frames], ListCache()
         self.left = [i for i in range(len(data)) if i not in self.taken]
-        stations = real_stations(data, load_prior(root / prior), settings)
-        self.loop = Loop(states / "run", settings, data, stations, lambda *_: None)
-        self.lam = settings.regularisation(stations.groups)
+        operations = operations_of(data, load_prior(root / prior), settings)
+        self.problem = Problem(data, settings, operations)
+        self.lam = self.problem.lam
 
     def information(
         self, view: int, estimator: str = "exact", shrink: int = 1, **options: Any
@@ -89,8 +89,8 @@ def by_blocks(state: State) -> Scores:
 
 def by_policy(state: State, name: str) -> Scores:
     """Scores of a policy that looks at poses and the prior's surface, as for the first choice."""
-    state.loop.look_anew()
-    return np.asarray(policy_named(name)(state.loop.context(state.run, state.left)), np.float64)
+    state.problem.__dict__.pop("visibility", None)
+    return np.asarray(policy_named(name)(state.problem.context(state.run, state.left)), np.float64)
 
 
 Way = tuple[str, Callable[[State], Scores]]
