@@ -1,6 +1,6 @@
 """Measure PSNR and CPU seconds of a frame against samples per pixel, with and without denoising.
 
-    python benchmarks/render_settings.py OUT.json OUT.png
+    python benchmarks/render_settings.py OUT.json
 
 Two views of the default scene, 640x480, against a reference of 1024 samples. Rows also have PSNR at
 the rock's outline, the pixels that it covers in part: of the rock alone in front of black, and of
@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from mgs import runtime
 from mgs.colour import srgb_from_linear
 from mgs.files import write_json
 from mgs.metrics import psnr
-from mgs.plotting import STYLE, new_figure, save_figure
 from mgs.provenance import command_line, versions
 from mgs.seeds import generator
 
@@ -85,33 +83,9 @@ def measure() -> list[dict[str, Any]]:
     return rows
 
 
-def plot(rows: list[dict[str, Any]], path: Path) -> None:
-    """Draw PSNR of the rock's pixels against CPU seconds of all cores together."""
-    import matplotlib
-
-    with matplotlib.rc_context(STYLE):
-        figure = new_figure(6.4, 4, dpi=130)
-        axes = figure.subplots()
-        labels = {True: "denoised (albedo and normal guides)", False: "plain"}
-        for (denoise, label), colour in zip(labels.items(), ("#0072B2", "#D55E00"), strict=True):
-            of = [row for row in rows if row["denoise"] == denoise]
-            x, y = [row["cpu_seconds"] for row in of], [row["psnr_rock"] for row in of]
-            axes.plot(x, y, "o-", color=colour, label=label)
-            for row, at in zip(of, zip(x, y, strict=True), strict=True):
-                where = {"xytext": (0, 7), "textcoords": "offset points", "ha": "center"}
-                axes.annotate(str(row["spp"]), at, fontsize=8, **where)
-        axes.set(xscale="log", xlabel="CPU seconds per frame (all cores together)")
-        axes.set(ylabel=f"PSNR on the rock against {REFERENCE_SPP} spp (dB)")
-        axes.margins(y=0.1)
-        axes.set_title(f"boulder, {SIZE[0]}x{SIZE[1]}, {os.cpu_count()} cores; numbers are spp")
-        axes.legend()
-        save_figure(figure, path)
-
-
 if __name__ == "__main__":
     rows = measure()
     machine = runtime.processor() | {"cores": os.cpu_count()}
     made = {"command": command_line(), "machine": machine, "versions": versions()}
     size = {"reference_spp": REFERENCE_SPP, "size": SIZE}
     write_json(sys.argv[1], made | size | {"settings": rows})
-    plot(rows, Path(sys.argv[2]))

@@ -1,18 +1,24 @@
 """`mgs_splat`: Gaussian splatting as a Mitsuba integrator.
 
-    scene = mi.load_dict({"type": "scene", "sensor": {...}, "integrator": {"type": "mgs_splat",
-    "filename": "splats.ply"}}) params = mi.traverse(scene)  # integrator.means, .log_scales,
-    .quats, .logit_opacities, .sh image = mi.render(scene, params)
+    integrator = {"type": "mgs_splat", "filename": "splats.ply"}
+    scene = mi.load_dict({"type": "scene", "sensor": {...}, "integrator": integrator})
+    params = mi.traverse(scene)  # integrator.means, .log_scales, .quats, .logit_opacities, .sh
+    image = mi.render(scene, params)
 
-Properties: `filename`, a 3DGS PLY; `colour_space`, "linear" or "srgb", in which its colours are
-blended (default: linear for files of mgs, srgb for other tools'); `background`, RGB behind the
-Gaussians in that space (default black); `depth`, a boolean: append the expected z-depth in metres
-as an AOV (default false). The image is linear, as Mitsuba's images are. The film decides about
-alpha (`pixel_format` rgb or rgba). Shapes, emitters, the sampler and the film's reconstruction
-filter play no part: a pixel is the value at its centre.
+Properties:
 
-Derivatives, in reverse and in forward mode, reach every parameter on which they are enabled. Not
-differentiated: the sensor.
+- `filename`: a 3DGS PLY.
+- `colour_space`: "linear" or "srgb", in which colours are blended. Default: linear for files of
+  mgs, srgb for those of other tools.
+- `background`: RGB behind the Gaussians in that space. Default: black.
+- `depth`: boolean, append the expected z-depth in metres as an AOV. Default: false.
+
+The image is linear, as all of Mitsuba's. The film adds alpha (`pixel_format` rgb or rgba). A pixel
+is the value at its centre; shapes, emitters, the sampler and the film's reconstruction filter have
+no effect.
+
+Reverse and forward mode reach each parameter with enabled gradients. The sensor is not
+differentiated.
 """
 
 from __future__ import annotations
@@ -32,8 +38,8 @@ from mgs.splat_ply import ply_colour_space, read_ply
 
 
 class MgsSplat(mi.CppADIntegrator):
-    """Draws Gaussians, which are its own parameters: Mitsuba has no Python shapes that could hold
-    them."""
+    """Integrator that renders Gaussians. They are its own parameters, since Mitsuba has no Python
+    shapes."""
 
     def __init__(self, props: Any) -> None:
         super().__init__(props)
@@ -54,15 +60,15 @@ class MgsSplat(mi.CppADIntegrator):
         self.cache = ListCache()
 
     def traverse(self, cb: Any) -> None:
-        """Show the five parameters, shapes as in `mgs.gaussians.Gaussians`."""
+        """Expose the five parameters, with shapes as in `mgs.gaussians.Gaussians`."""
         for field in fields(Gaussians):
             cb.put(field.name, getattr(self.gaussians, field.name), mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Any) -> None:
-        """Nothing to do: the block lists check themselves against the Gaussians at every use."""
+        """Do nothing: block lists are checked against the Gaussians at each use."""
 
     def aov_names(self) -> list[str]:
-        """Channels that follow colour and alpha."""
+        """Channels after colour and alpha."""
         return ["depth.z"] if self.depth else []
 
     def render(
@@ -74,7 +80,7 @@ class MgsSplat(mi.CppADIntegrator):
         develop: bool = True,
         evaluate: bool = True,
     ) -> Any:
-        """The sensor's image through its film, TensorXf [H,W,C]; `seed` and `spp` change nothing.
+        """Image of the sensor through its film, TensorXf [H,W,C]. `seed` and `spp` have no effect.
 
         Raises InputError for a sensor that is not `perspective`, or a parameter that
         `mgs.splat.rendering` refuses.
@@ -92,7 +98,7 @@ class MgsSplat(mi.CppADIntegrator):
     def render_backward(
         self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
     ) -> None:
-        """Take the gradient of an image back to the parameters."""
+        """Propagate the gradient of an image to the parameters."""
         with dr.resume_grad():
             image = self.render(scene, sensor)
             dr.set_grad(image, grad_in)
@@ -102,25 +108,21 @@ class MgsSplat(mi.CppADIntegrator):
     def render_forward(
         self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
     ) -> Any:
-        """How the image changes along the gradients set on the parameters, TensorXf [H,W,C]."""
+        """Change of the image along the gradients set on the parameters, TensorXf [H,W,C]."""
         with dr.resume_grad():
-            return dr.forward_to(
-                self.render(scene, sensor), flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
-            )
+            image = self.render(scene, sensor)
+            return dr.forward_to(image, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
 
     def _channels(self, image: Any, film: Any) -> Any:
-        """What an image block of this film holds: R G B, A where the film asks for it, filter
-        weight, AOVs. [H,W,C]."""
+        """Channels of an image block [H,W,C]: R G B, A if the film has it, filter weight, AOVs."""
         rgb = image.rgb
         if self.colour_space == "srgb":
             rgb = mi.TensorXf(mi.math.srgb_to_linear(rgb.array), rgb.shape)
-        alpha = [image.alpha] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
-        rest = [
-            *alpha,
-            dr.ones(mi.TensorXf, image.alpha.shape),
-            *([image.depth] if self.depth else []),
-        ]
-        return dr.concat([rgb, *(channel[..., None] for channel in rest)], axis=2)
+        channels = [image.alpha] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
+        channels.append(dr.ones(mi.TensorXf, image.alpha.shape))
+        if self.depth:
+            channels.append(image.depth)
+        return dr.concat([rgb, *(channel[..., None] for channel in channels)], axis=2)
 
     def to_string(self) -> str:
         """One line."""

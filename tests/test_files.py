@@ -1,4 +1,4 @@
-"""Outputs: whole or not at all, and a line where a disk says no."""
+"""Files and images: complete or absent, errors in one line, and every kind of PNG."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ from mgs.files import (
     atomic_path,
     check_writable,
     copy_file,
-    folder_or_nothing,
     locked,
     read_json,
     write_csv,
@@ -35,7 +34,7 @@ from mgs.images import read_exr, read_mask, read_png, read_rgba, read_values, wr
 
 
 class Stop(BaseException):
-    """As Ctrl-C is."""
+    """Like KeyboardInterrupt."""
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES])
@@ -54,10 +53,8 @@ def test_what_the_disk_says_is_one_line(tmp_path, number):
 
 
 def test_records_with_other_keys_share_one_csv(tmp_path):
-    assert (
-        write_csv(tmp_path / "a.csv", [{"a": 1, "b": None}, {"c": "x, y", "a": 0.5}])
-        == tmp_path / "a.csv"
-    )
+    records = [{"a": 1, "b": None}, {"c": "x, y", "a": 0.5}]
+    assert write_csv(tmp_path / "a.csv", records) == tmp_path / "a.csv"
     assert (tmp_path / "a.csv").read_bytes() == b'a,b,c\n1,,\n0.5,,"x, y"\n'
 
 
@@ -67,23 +64,22 @@ def test_an_unknown_row_is_named_with_those_there_are():
         row_named({"a": 1, "b": 2}, "c", "--it")
 
 
-@pytest.mark.skipif(
-    not Path("/dev/full").exists(), reason="needs Linux's device that is always full"
-)
-@pytest.mark.parametrize(
-    ("name", "write"),
-    [
-        ("a.json", lambda path: write_json(path, {"a": 1})),
-        ("a.png", lambda path: write_png(path, np.random.default_rng(0).random((90, 90, 3)))),
-        ("a.glb", lambda path: copy_file(Path(__file__), path)),
-        ("a.exr", lambda path: write_exr(path, {"Z": np.random.default_rng(0).random((90, 90))})),
-    ],
-)
-def test_a_full_disk_is_one_line(tmp_path, name, write):
+NOISE = np.random.default_rng(0).random((90, 90, 3))
+WRITERS = {
+    "a.json": lambda path: write_json(path, {"a": 1}),
+    "a.png": lambda path: write_png(path, NOISE),
+    "a.glb": lambda path: copy_file(Path(__file__), path),
+    "a.exr": lambda path: write_exr(path, {"Z": NOISE[..., 0]}),
+}
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's /dev/full")
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_is_one_line(tmp_path, name):
     stem, suffix = name.split(".")
     (tmp_path / f".{stem}.{os.getpid()}.part.{suffix}").symlink_to("/dev/full")
     with pytest.raises(InputError, match="No space left"):
-        write(tmp_path / name)
+        WRITERS[name](tmp_path / name)
     assert not list(tmp_path.iterdir())
 
 
@@ -124,10 +120,9 @@ def test_what_cannot_be_read_is_named_with_its_cause(tmp_path, case, name):
 
 def test_a_picture_that_is_none_is_named_alone(tmp_path):
     (tmp_path / "a.png").write_text("no pixels")
-    with pytest.raises(
-        InputError, match=f"^{tmp_path / 'a.png'}: not a readable image; give a PNG or JPEG"
-    ):
-        read_png(tmp_path / "a.png")
+    path = tmp_path / "a.png"
+    with pytest.raises(InputError, match=f"^{path}: not a readable image; give a PNG or JPEG"):
+        read_png(path)
 
 
 def test_depth_of_three_channels_is_refused(tmp_path):
@@ -154,15 +149,14 @@ def test_under_a_file(tmp_path):
 
 
 @pytest.mark.parametrize("there", [False, True])
-@pytest.mark.parametrize("folder", [folder_or_nothing, atomic_folder])
-def test_a_folder_that_fails_leaves_all_as_it_was(tmp_path, folder, there):
+def test_a_folder_that_fails_leaves_all_as_it_was(tmp_path, there):
     out = tmp_path / "new/deeper/out"
     if there:
         out.mkdir(parents=True)
     before = list(tmp_path.rglob("*"))
 
     def fill():
-        with folder(out) as made:
+        with atomic_folder(out) as made:
             (made / "sub").mkdir()
             (made / "sub/file").touch()
             (made / "file").touch()
@@ -173,10 +167,9 @@ def test_a_folder_that_fails_leaves_all_as_it_was(tmp_path, folder, there):
     assert list(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("folder", [folder_or_nothing, atomic_folder])
-def test_what_is_in_a_folder_is_never_touched(tmp_path, folder):
+def test_what_is_in_a_folder_is_never_touched(tmp_path):
     (tmp_path / "precious.txt").touch()
-    with pytest.raises(InputError, match="not empty"), folder(tmp_path):
+    with pytest.raises(InputError, match="not empty"), atomic_folder(tmp_path):
         pass
     assert (tmp_path / "precious.txt").exists()
 
@@ -196,13 +189,9 @@ def test_an_atomic_folder_appears_whole(tmp_path, there):
 def test_what_a_killed_process_left_of_an_atomic_folder_is_removed(tmp_path):
     with subprocess.Popen([sys.executable, "-c", ""]) as ended:
         pass
-    for owner, name in (
-        (ended.pid, "out"),
-        (os.getpid(), "out"),
-        (ended.pid, "other"),
-        ("mine", "out"),
-    ):
-        (tmp_path / f".{name}.{owner}.part/images").mkdir(parents=True)
+    dead, own = ended.pid, os.getpid()
+    for left in (f"out.{dead}", f"out.{own}", f"other.{dead}", "out.mine"):
+        (tmp_path / f".{left}.part/images").mkdir(parents=True)
     other = os.getppid()  # which runs
     (tmp_path / f".out.{other}.part").mkdir()
     with atomic_folder(tmp_path / "out") as made:
@@ -213,16 +202,14 @@ def test_what_a_killed_process_left_of_an_atomic_folder_is_removed(tmp_path):
 
 
 def encode_png(samples, bits, colour, palette=None, transparent=None):
-    """A PNG of samples [H,W,C], byte by byte from its specification; palette [K,3], transparent:
-    the bytes of tRNS."""
+    """Write a PNG of samples [H,W,C] by its specification. palette: [K,3]; transparent: tRNS."""
     big = samples.reshape(len(samples), -1).astype(">u2")
     if bits == 16:
         rows = [row.tobytes() for row in big]
     else:
         digits = (big[..., None] >> np.arange(bits)[::-1]) & 1
-        rows = [
-            row.tobytes() for row in np.packbits(digits.reshape(len(big), -1).astype(bool), axis=1)
-        ]
+        packed = np.packbits(digits.reshape(len(big), -1).astype(bool), axis=1)
+        rows = [row.tobytes() for row in packed]
     header = struct.pack(">IIBBBBB", samples.shape[1], samples.shape[0], bits, colour, 0, 0, 0)
     chunks = [(b"IHDR", header)]
     chunks += [] if palette is None else [(b"PLTE", palette.astype(np.uint8).tobytes())]
@@ -244,8 +231,7 @@ PNGS = [
     *((bits, GREY, True) for bits in (1, 8)),
     *((bits, RGB, True) for bits in (8, 16)),
 ]
-"""Every kind of PNG: bits per sample, colour type, and whether a colour (or colours of the palette)
-stands for transparent."""
+"""All kinds of PNG: bits per sample, colour type, whether a colour or palette is transparent."""
 
 
 @pytest.mark.parametrize(("bits", "colour", "transparent"), PNGS)
@@ -257,9 +243,8 @@ def test_every_kind_of_png(tmp_path, bits, colour, transparent):
         palette = rng.integers(0, 256, (levels, 3))
         alphas = rng.integers(0, 256, levels) if transparent else np.full(levels, 255)
         expected = np.dstack([palette[samples[..., 0]], alphas[samples[..., 0]]])
-        data = encode_png(
-            samples, bits, colour, palette, bytes(alphas.tolist()) if transparent else None
-        )
+        key = bytes(alphas.tolist()) if transparent else None
+        data = encode_png(samples, bits, colour, palette, key)
     else:
         scaled = samples * full // (levels - 1)
         rgb = scaled[..., :3] if colour in (RGB, RGBA) else np.repeat(scaled[..., :1], 3, axis=-1)
@@ -273,9 +258,8 @@ def test_every_kind_of_png(tmp_path, bits, colour, transparent):
     rgba = read_rgba(tmp_path / "a.png")
     assert rgba.dtype == (np.uint16 if bits == 16 else np.uint8)
     np.testing.assert_array_equal(rgba, expected)
-    np.testing.assert_allclose(
-        read_png(tmp_path / "a.png"), linear_from_srgb(expected[..., :3] / full), atol=1e-6
-    )
+    linear = linear_from_srgb(expected[..., :3] / full)
+    np.testing.assert_allclose(read_png(tmp_path / "a.png"), linear, atol=1e-6)
     grey = expected[..., :3] @ [0.299, 0.587, 0.114] / full
     sure = np.abs(grey - 0.5) > 1e-3
     np.testing.assert_array_equal(read_mask(tmp_path / "a.png")[sure], (grey > 0.5)[sure])
@@ -285,23 +269,20 @@ def test_every_kind_of_png(tmp_path, bits, colour, transparent):
 def test_a_transparent_grey_that_no_library_reads_right_is_refused(tmp_path, bits):
     samples = np.arange(4).reshape(2, 2, 1)
     (tmp_path / "a.png").write_bytes(encode_png(samples, bits, GREY, transparent=b"\0\1"))
-    with pytest.raises(
-        InputError, match=f"a.png: a grey of {bits} bits that stands for transparent"
-    ):
+    said = f"a.png: a grey of {bits} bits that stands for transparent"
+    with pytest.raises(InputError, match=said):
         read_png(tmp_path / "a.png")
 
 
 @pytest.mark.parametrize("mode", ["L", "RGB"])
 def test_jpeg(tmp_path, mode):
-    """Smooth values come back within the error of the compression."""
     ramp = np.linspace(20, 230, 32).astype(np.uint8)[None].repeat(24, 0)
     values = ramp if mode == "L" else np.dstack([ramp, 255 - ramp, ramp // 2])
     Image.fromarray(values).save(tmp_path / "a.jpg", quality=100, subsampling=0)
     rgba = read_rgba(tmp_path / "a.jpg")
     assert (rgba[..., 3] == 255).all()
-    np.testing.assert_allclose(
-        rgba[..., :3], values if mode == "RGB" else np.dstack([values] * 3), atol=3
-    )
+    expected = values if mode == "RGB" else np.dstack([values] * 3)
+    np.testing.assert_allclose(rgba[..., :3], expected, atol=3)
 
 
 @pytest.mark.parametrize(
@@ -310,19 +291,16 @@ def test_jpeg(tmp_path, mode):
 )
 def test_pixels_that_are_neither_grey_nor_rgb_of_8_or_16_bits_are_refused(tmp_path, mode, name):
     Image.new(mode, (4, 3)).save(tmp_path / name)
+    said = f"{name}: pixels of kind {mode} are not supported; convert it to grey or RGB"
     for read in (read_png, read_rgba, read_mask):
-        with pytest.raises(
-            InputError,
-            match=f"{name}: pixels of kind {mode} are not supported; convert it to grey or RGB",
-        ):
+        with pytest.raises(InputError, match=said):
             read(tmp_path / name)
 
 
 @pytest.mark.parametrize("colour", [GREY, RGB])
 def test_half_a_16_bit_png_is_refused(tmp_path, colour):
-    data = encode_png(
-        np.random.default_rng(0).integers(0, 65536, (40, 50, CHANNELS[colour])), 16, colour
-    )
+    samples = np.random.default_rng(0).integers(0, 65536, (40, 50, CHANNELS[colour]))
+    data = encode_png(samples, 16, colour)
     (tmp_path / "a.png").write_bytes(data[: len(data) // 2])
     with pytest.raises(InputError, match="not a readable image"):
         read_png(tmp_path / "a.png")
@@ -335,15 +313,13 @@ with locked(sys.argv[1]):
     print("locked", flush=True)
     sys.stdin.read()
 """
-"""A process that works on a folder until its standard input is closed."""
+"""Program that locks a folder until its standard input is closed."""
 
 
 @contextmanager
 def holder(folder):
-    command = [sys.executable, "-c", HOLDER, str(folder)]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
+    command, pipe = [sys.executable, "-c", HOLDER, str(folder)], subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
         assert process.stdout.readline() == "locked\n"
         yield process
 
@@ -351,11 +327,9 @@ def holder(folder):
 @pytest.mark.parametrize("end", ["itself", "killed"])
 def test_one_process_at_a_time_works_on_a_folder(tmp_path, end):
     with holder(tmp_path) as process:
-        for _ in range(2):  # being refused changes nothing
-            with (
-                pytest.raises(InputError, match=f"process {process.pid} works on it; wait until"),
-                locked(tmp_path),
-            ):
+        said = f"process {process.pid} works on it; wait until"
+        for _ in range(2):  # a refusal changes nothing
+            with pytest.raises(InputError, match=said), locked(tmp_path):
                 pass
         if end == "killed":
             process.send_signal(signal.SIGKILL)
@@ -366,8 +340,7 @@ def test_one_process_at_a_time_works_on_a_folder(tmp_path, end):
 
 
 def test_a_lock_that_its_owner_removed_is_no_lock(tmp_path, monkeypatch):
-    """Opened while another process had it, taken after that one had removed it: a third would find
-    no lock there."""
+    """Opened while another process had it, and locked after that one removed the file."""
     flock, calls = fcntl.flock, []
 
     def slow(file, operation):
@@ -379,10 +352,8 @@ def test_a_lock_that_its_owner_removed_is_no_lock(tmp_path, monkeypatch):
     monkeypatch.setattr(fcntl, "flock", slow)
     with locked(tmp_path):
         assert (tmp_path / ".lock").is_file()
-        with (
-            pytest.raises(InputError, match=f"process {os.getpid()} works on it"),
-            locked(tmp_path),
-        ):
+        said = f"process {os.getpid()} works on it"
+        with pytest.raises(InputError, match=said), locked(tmp_path):
             pass
     assert len(calls) == 3
 
@@ -394,17 +365,13 @@ def test_a_folder_that_cannot_be_locked(tmp_path):
 
 def test_a_png_holds_the_pixels_and_is_packed_fast(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8)
+    mask = pixels[..., 0] > 99
     write_png(tmp_path / "display.png", pixels / 255, linear=False)
     write_png(tmp_path / "bytes.png", pixels)
-    write_png(tmp_path / "mask.png", pixels[..., 0] > 99)
-    for name, expected in (
-        ("display", pixels),
-        ("bytes", pixels),
-        ("mask", np.where(pixels[..., 0] > 99, 255, 0)),
-    ):
+    write_png(tmp_path / "mask.png", mask)
+    fastest = b"\x78\x01"  # zlib's header
+    for name, expected in (("display", pixels), ("bytes", pixels), ("mask", 255 * mask)):
         content = (tmp_path / f"{name}.png").read_bytes()
         with Image.open(tmp_path / f"{name}.png") as image:
             assert np.array_equal(np.asarray(image), expected)
-        assert content[content.index(b"IDAT") + 4 :].startswith(
-            b"\x78\x01"
-        )  # zlib's header of its fastest level
+        assert content[content.index(b"IDAT") + 4 :].startswith(fastest)

@@ -31,7 +31,7 @@ def test_slices_of_dr_jit_fields():
 
 
 @pytest.mark.parametrize("name", vars(WHOLE))
-def test_gaussians_are_equal_where_every_number_is(name):
+def test_gaussians_are_equal_if_all_numbers_are(name):
     other = copy.deepcopy(WHOLE)
     assert WHOLE == other == as_drjit(WHOLE)
     values = getattr(other, name)
@@ -53,7 +53,7 @@ def test_gaussians_are_equal_where_every_number_is(name):
         {},
     ],
 )
-def test_cameras_are_equal_where_every_number_is(change):
+def test_cameras_are_equal_if_all_numbers_are(change):
     other = Camera(**{**vars(VIEW), **change})
     assert (other == VIEW) == (not change)
     assert len({VIEW, other}) == (2 if change else 1)

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 import synthetic
-from matplotlib.image import imread
+from refusals import refused
 
 from mgs.camera import Camera, look_at
 from mgs.cli.app import main
@@ -20,8 +20,9 @@ from mgs.report.evaluation import evaluate_run
 from mgs.run.folder import read_checkpoint
 from mgs.run.nbv import run_nbv
 from mgs.splat_ply import read_ply
-from mgs.study import parsimony
-from mgs.study.sweep import Cell
+from mgs.study import case, parsimony
+from mgs.study.case import Size
+from mgs.study.verdict import judged
 
 
 def square(side=20):
@@ -138,81 +139,42 @@ def test_views_are_spread_evenly_from_the_first_on():
     assert sorted(order) == list(range(0, 24, 2))
 
 
-def row(
-    asked, learned=parsimony.ALL, degree=0, psnr=25.0, parameters=100, predictive=1.0, evidence=1.0
-):
-    return {
-        "scene": "boulder", "asked": asked, "learned": learned, "degree": degree, "psnr_inside": psnr, "parameters": parameters,
-        "gaussians": parameters // 11, "predictive": predictive, "evidence": evidence, "seconds": 1.0, "next_error": 1 / psnr,
-    }  # fmt: skip
+def test_the_automatic_choice_is_compared_with_the_smallest_that_is_as_good():
+    def rows(*changed):
+        fixed = {"learned": parsimony.ALL, "degree": 0, "choice": parsimony.NUMBER}
+        return [
+            fixed | dict(zip(("asked", "psnr_inside", "parameters"), values, strict=False)) | more
+            for *values, more in (
+                ("100", 25, 110, {}), ("200", 26.05, 220, {}), ("400", 26.1, 440, {}),
+                ("auto", 25.5, 500, {}), ("auto", 24, 90, {"learned": "colour"}),
+                ("auto", 30, 50, {"choice": parsimony.PRUNED, "learned": "colour"}), *changed,
+            )
+        ]  # fmt: skip
 
-
-def rows(auto=26.0, parameters=200):
-    fixed = [
-        row("100", psnr=25, parameters=110),
-        row("200", psnr=26.05, parameters=220),
-        row("400", psnr=26.1, parameters=440),
-    ]
-    lean = {
-        key: value
-        for key, value in row("auto", "auto", psnr=auto, parameters=parameters).items()
-        if key != "evidence"
-    }
-    chosen = [row("auto", psnr=25.5, parameters=500, predictive=3), lean]
-    chosen += [
-        row("auto", learned, psnr=20 + i, predictive=i)
-        for i, learned in enumerate(parsimony.LEARNED)
-        if i < 3
-    ]
-    degrees = [
-        row("auto", degree=degree, psnr=27 - degree, parameters=1000, evidence=2 * degree)
-        for degree in (1, 2)
-    ]
-    return fixed + chosen + degrees
-
-
-def test_the_verdict_compares_with_the_smallest_that_is_as_good():
-    found = parsimony.verdict(rows())
-    assert (found["best"], found["auto"], found["smallest"], found["parameters"]) == (
-        26.1,
-        26.0,
-        220,
-        200,
-    )
+    auto = {"psnr_inside": 26.0, "parameters": 200}
+    found = parsimony.compared(rows(), auto)
+    assert (found["best"], found["number"], found["smallest"]) == (26.1, 25.5, 220)
     assert found["loss"] == pytest.approx(0.1)
-    assert found["number"] == 25.5
-    assert found["small"]
-    assert not parsimony.verdict(rows(parameters=221))["small"]
-    assert not parsimony.verdict(rows(auto=25.9))["close"]
-    assert parsimony.verdict(rows(auto=26.03))["close"]
-    kinds = [
-        *rows(),
-        row("auto", "+ opacity", psnr=26.05, parameters=90),
-    ]  # fewer kinds of parameters are a fixed choice, too
-    assert parsimony.verdict(kinds)["smallest"] == 90
-    assert found["chosen"]["learned by predictive"] == {"value": parsimony.ALL, "loss": 0.0}
-    assert found["chosen"]["degree by evidence"] == {"value": 2, "loss": 1.0}
-    assert found["chosen"]["gaussians by next_error"] == found["chosen"]["gaussians by psnr_inside"]
-    assert found["chosen"]["gaussians by psnr_inside"] == {"value": 40, "loss": 0.0}
+    assert found["over_smallest"] == pytest.approx(200 / 220)
+    kinds = rows(("auto", 26.05, 90, {"learned": "+ opacity"}))
+    assert parsimony.compared(kinds, auto)["smallest"] == 90
+    verdicts = [
+        judged(claim, [auto | found | {"run": run, "choice": parsimony.AUTOMATIC} for run in "ab"])
+        for claim in parsimony.CLAIMS
+    ]
+    assert [one["verdict"] for one in verdicts] == ["fails", "holds"]  # the loss is 0.1 + rounding
+    assert parsimony._holds(auto | found | {"loss": 0.0}) == "yes"
+    assert parsimony._holds(auto | found | {"loss": 0.2}) == "no: worse"
+    assert parsimony._holds({"loss": 0.0, "over_smallest": 2}) == "no: too many parameters"
 
 
 def test_every_need_of_a_cell_is_a_cell():
-    for size in parsimony.PRESETS.values():
+    for size in parsimony.SIZES.values():
         cells = parsimony.cells_of(size)
-        names = [cell.name for cell in cells]
-        assert (
-            len(set(names))
-            == len(names)
-            == len(size.scenes) * (1 + 2 * (len(size.counts) + 1) + 5 + 2)
-        )
-        assert all(set(cell.needs) <= set(names) for cell in cells)
-        assert all(isinstance(cell, Cell) for cell in cells)
-
-
-def test_the_likelihood_of_the_next_view_falls_with_its_error_and_with_too_close_a_fit():
-    same = parsimony.log_likelihood(0.01, 0.01)
-    assert same == pytest.approx(-0.5 * np.log(2 * np.pi * 0.01) - 0.5)
-    assert parsimony.log_likelihood(0.02, 0.001) < parsimony.log_likelihood(0.02, 0.01) < same
+        names = {cell.name for cell in cells}
+        assert len(names) == len(cells)
+        assert all(set(cell.needs) <= names for cell in cells)
+        assert all(json.loads(json.dumps(cell.arguments)) == cell.arguments for cell in cells)
 
 
 def test_the_command_does_the_study_and_goes_on(tmp_path, capsys, monkeypatch):
@@ -220,58 +182,40 @@ def test_the_command_does_the_study_and_goes_on(tmp_path, capsys, monkeypatch):
 
     def make_dataset(root, out, scene, **size):
         calls.append(scene)
-        write_data(out / "data")
+        write_data(out / "dataset")
         return {}
 
-    tiny_preset = parsimony.Preset(("boulder",), (60, 200), 48, 36, 12, 3, 4, seeds=3)
+    size = parsimony.ParsimonySize(("boulder",), (60, 200), Size(48, 36, 12, 3), 4, seeds=3)
     monkeypatch.setattr(parsimony, "DEGREES", (0, 1))
-    monkeypatch.setitem(parsimony.PRESETS, "quick", tiny_preset)
-    monkeypatch.setattr(parsimony, "make_dataset", make_dataset)
+    monkeypatch.setitem(parsimony.SIZES, "quick", size)
+    monkeypatch.setattr(case, "make_dataset", make_dataset)
     out = tmp_path / "out"
     for _ in range(2):
         with pytest.raises(SystemExit) as exit_:
             main(["parsimony", str(out)])
         assert exit_.value.code == 0
     assert calls == ["boulder"]
-    found = json.loads((out / "parsimony.json").read_text())
+    record = json.loads((out / "parsimony.json").read_text())
     with open(out / "parsimony.csv") as file:
-        table = list(csv.DictReader(file))
-    assert len(table) == len(found["rows"]) == 8
-    assert imread(out / "parsimony.png").shape[1] == 2000
-    by = {(one["asked"], one["learned"], one["degree"]): one for one in found["rows"]}
+        assert len(list(csv.DictReader(file))) == len(record["rows"]) == 12
+    assert (out / "parsimony.png").stat().st_size > 10_000
+    rows = [row for row in record["rows"] if row["choice"] != parsimony.PRUNED]
+    by = {(one["asked"], one.get("learned"), one["degree"]): one for one in rows}
+    number = by["auto", parsimony.ALL, 0]
     assert by["60", parsimony.ALL, 0]["parameters"] == 60 * 11
-    assert by["auto", "colour", 0]["parameters"] == 3 * by["auto", "colour", 0]["gaussians"]
-    assert (
-        by["auto", parsimony.ALL, 1]["parameters"]
-        == (12 + 8) * by["auto", parsimony.ALL, 0]["gaussians"]
-    )
+    assert by["auto", "colour", 0]["parameters"] == 3 * number["gaussians"]
+    assert by["auto", parsimony.ALL, 1]["parameters"] == (12 + 8) * number["gaussians"]
     assert by["200", parsimony.ALL, 0]["psnr_inside"] > by["60", parsimony.ALL, 0]["psnr_inside"]
-    lean = by["auto", "auto", 0]
-    assert 3 * lean["gaussians"] <= lean["parameters"] < by["auto", parsimony.ALL, 0]["parameters"]
-    assert set(found["scenes"]["boulder"]["lean"]["shares"]) == {
-        "colour",
-        "scale",
-        "rotation",
-        "opacity",
-    }
-    assert found["scenes"]["boulder"]["auto"] == lean["psnr_inside"]
-    for one in found["rows"]:
-        known = [
-            "psnr",
-            "seconds",
-            *(["next_error", "predictive", "evidence"] if one is not lean else []),
-        ]
-        assert np.isfinite([one[key] for key in known]).all()
-    for one in found["scenes"]["boulder"]["pruned"]:
-        assert one["actual"] <= one["noise"] * PIXEL_NOISE
+    auto = rows[-1]
+    assert auto["choice"] == parsimony.AUTOMATIC
+    assert 3 * auto["gaussians"] <= auto["parameters"] < number["parameters"]
+    assert set(auto["shares"]) == {"colour", "scale", "rotation", "opacity"}
+    assert auto["number"] == number["psnr_inside"]
+    pruned = [row for row in record["rows"] if row["choice"] == parsimony.PRUNED]
+    assert all(one["actual"] <= one["noise"] * PIXEL_NOISE for one in pruned)
+    assert [one["noise"] for one in pruned] == list(parsimony.PRUNE_NOISE)
     assert "boulder" in capsys.readouterr().out
-
-
-def test_an_unknown_preset_is_one_line(tmp_path, capsys):
-    with pytest.raises(SystemExit) as exit_:
-        main(["parsimony", str(tmp_path / "out"), "--preset", "huge"])
-    assert exit_.value.code == 2
-    assert "--preset 'huge': unknown" in capsys.readouterr().err
+    assert "--preset 'huge': unknown" in refused(capsys, ["parsimony", out, "--preset", "huge"])
 
 
 def test_a_run_is_pruned_beside_its_model(data, tmp_path, capsys):

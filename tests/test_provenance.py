@@ -1,4 +1,4 @@
-"""What results say about the command that made them."""
+"""Command line and versions in results."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mgs.provenance import command_line, versions
     [
         (["/usr/bin/mgs", "chart", "out"], "mgs chart out"),
         (["/lib/mgs/__main__.py", "chart", "out dir"], "mgs chart 'out dir'"),  # python -m mgs
-        (["benchmarks/planning.py", "a.json"], "planning.py a.json"),
+        (["benchmarks/ranking.py", "a.json"], "ranking.py a.json"),
     ],
 )
 def test_the_command_that_is_recorded_is_the_one_that_was_typed(monkeypatch, typed, said):
@@ -27,10 +27,8 @@ def test_the_command_that_is_recorded_is_the_one_that_was_typed(monkeypatch, typ
 def test_a_checkout_tells_its_commit(monkeypatch, tmp_path):
     def git(*words):
         who = ["-c", "user.name=nobody", "-c", "user.email=nobody@example.org"]
-        done = subprocess.run(
-            ["git", "-C", tmp_path, *who, *words], check=True, capture_output=True, text=True
-        )
-        return done.stdout.strip()
+        command = ["git", "-C", tmp_path, *who, *words]
+        return subprocess.check_output(command, text=True, stderr=subprocess.DEVNULL).strip()
 
     def told():
         provenance._commit.cache_clear()

@@ -1,5 +1,4 @@
-"""`mgs render`: PLY files of any order, encoding and degree, drawn through cameras without
-images."""
+"""`mgs render`: PLY files of any order, encoding and degree, drawn through cameras."""
 
 import json
 import struct
@@ -7,6 +6,7 @@ import struct
 import numpy as np
 import pytest
 from PIL import Image
+from refusals import refused
 
 from mgs.camera import Camera, look_at, opengl_from_opencv
 from mgs.cli import app
@@ -18,12 +18,8 @@ from mgs.splat_ply import ply_colour_space, read_ply, write_ply
 
 WIDTH, HEIGHT = 48, 32
 EYES = [(0.0, -2.0, 0.5), (1.6, 1.2, 0.4)]
-CAMERAS = [
-    Camera(
-        np.array([[55.0, 0, 24], [0, 55, 16], [0, 0, 1]]), WIDTH, HEIGHT, look_at(eye, (0, 0, 0))
-    )
-    for eye in EYES
-]
+K = np.array([[55.0, 0, 24], [0, 55, 16], [0, 0, 1]])
+CAMERAS = [Camera(K, WIDTH, HEIGHT, look_at(eye, (0, 0, 0))) for eye in EYES]
 
 
 def gaussians(degree: int, n: int = 40) -> Gaussians:
@@ -39,52 +35,36 @@ def gaussians(degree: int, n: int = 40) -> Gaussians:
 
 
 def columns(g: Gaussians) -> dict[str, np.ndarray]:
-    """The properties of the 3DGS layout, written out from its definition: f_rest holds all of red,
-    then green, then blue."""
+    """Properties of the 3DGS layout by its definition: f_rest holds all of red, then green, then
+    blue."""
     named = {name: g.means[:, i] for i, name in enumerate("xyz")}
     named |= {f"f_dc_{c}": g.sh[:, 0, c] for c in range(3)}
     rest = g.sh.shape[1] - 1
     named |= {f"f_rest_{c * rest + k}": g.sh[:, 1 + k, c] for c in range(3) for k in range(rest)}
-    named |= {f"scale_{i}": g.log_scales[:, i] for i in range(3)} | {
-        f"rot_{i}": g.quats[:, i] for i in range(4)
-    }
+    named |= {f"scale_{i}": g.log_scales[:, i] for i in range(3)}
+    named |= {f"rot_{i}": g.quats[:, i] for i in range(4)}
     return named | {"opacity": g.logit_opacities}
 
 
-def foreign_ply(path, g: Gaussians, encoding: str, extra: bool = True, seed: int = 0) -> None:
-    """A PLY as some other tool might write it: properties shuffled, properties that nobody asked
-    for, another element first."""
-    rng = np.random.default_rng(seed)
+def foreign_ply(path, g: Gaussians, encoding: str = "ascii", extra: bool = True, seed: int = 0):
+    """Write a PLY as another tool might: properties shuffled, unknown properties, another element
+    first."""
+    rng, n = np.random.default_rng(seed), len(g)
     named = {name: ("float", "f", values) for name, values in columns(g).items()}
     if extra:
-        named |= {
-            "red": ("uchar", "B", rng.integers(0, 255, len(g))),
-            "confidence": ("double", "d", rng.random(len(g))),
-        }
-        named |= {
-            "nx": ("float", "f", np.zeros(len(g))),
-            "f_rest_of_it": ("float", "f", np.ones(len(g))),
-        }
-        named |= {"label": ("int", "i", rng.integers(-9, 9, len(g)))}
+        named["red"] = "uchar", "B", rng.integers(0, 255, n)
+        named["confidence"] = "double", "d", rng.random(n)
+        named["nx"] = "float", "f", np.zeros(n)
+        named["f_rest_of_it"] = "float", "f", np.ones(n)
+        named["label"] = "int", "i", rng.integers(-9, 9, n)
     order = rng.permutation(sorted(named))
-    header = [
-        "ply",
-        f"format {encoding} 1.0",
-        "comment from another tool",
-        "element camera 1",
-        "property float focal",
-    ]
-    header += [
-        f"element vertex {len(g)}",
-        *(f"property {named[name][0]} {name}" for name in order),
-        "end_header",
-        "",
-    ]
+    header = ["ply", f"format {encoding} 1.0", "comment from another tool"]
+    header += ["element camera 1", "property float focal", f"element vertex {n}"]
+    header += [f"property {named[name][0]} {name}" for name in order] + ["end_header", ""]
     rows = list(zip(*(named[name][2].tolist() for name in order), strict=True))
     if encoding == "ascii":
-        body = "\n".join(
-            ["1.5", *(" ".join(repr(value) for value in row) for row in rows), ""]
-        ).encode()
+        lines = [" ".join(map(repr, row)) for row in rows]
+        body = "\n".join(["1.5", *lines, ""]).encode()
     else:
         endian = "<" if "little" in encoding else ">"
         layout = endian + "".join(named[name][1] for name in order)
@@ -93,22 +73,15 @@ def foreign_ply(path, g: Gaussians, encoding: str, extra: bool = True, seed: int
 
 
 def write_cameras(path, names=("images/a.png", "images/b.png"), cameras=CAMERAS) -> None:
-    """A transforms.json whose images do not exist."""
-    K = cameras[0].K
-    data = {
-        "fl_x": K[0, 0],
-        "fl_y": K[1, 1],
-        "cx": K[0, 2],
-        "cy": K[1, 2],
-        "w": cameras[0].width,
-        "h": cameras[0].height,
-    }
-    poses = [opengl_from_opencv(camera.world_to_camera).tolist() for camera in cameras]
+    """Write a transforms.json whose images do not exist."""
+    K, poses = cameras[0].K, [opengl_from_opencv(camera.world_to_camera) for camera in cameras]
+    lens = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    size = {"w": cameras[0].width, "h": cameras[0].height}
     frames = [
-        {"file_path": name, "transform_matrix": pose}
+        {"file_path": name, "transform_matrix": pose.tolist()}
         for name, pose in zip(names, poses, strict=True)
     ]
-    path.write_text(json.dumps(data | {"frames": frames}))
+    path.write_text(json.dumps(lens | size | {"frames": frames}))
 
 
 def pixels(path) -> np.ndarray:
@@ -116,26 +89,42 @@ def pixels(path) -> np.ndarray:
         return np.asarray(picture, np.float32) / 255
 
 
-def run(*arguments) -> None:
+def run(folder, *arguments, ply="x.ply", out="out") -> None:
+    """Render FOLDER/x.ply through FOLDER/transforms.json to FOLDER/out."""
+    places = [folder / ply, "--cameras", folder, "--out", folder / out]
     with pytest.raises(SystemExit) as end:
-        app.main(["render", *map(str, arguments)])
+        app.main(["render", *map(str, places), *map(str, arguments)])
     assert end.value.code in (0, None)
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_any_ply(tmp_path, degree, encoding):
-    """Every camera gets the picture of the model, whatever the order of its properties; other
-    tools' colours are sRGB."""
-    model = gaussians(degree)
-    foreign_ply(tmp_path / "x.ply", model, encoding, seed=degree)
+@pytest.fixture
+def folder(tmp_path):
+    """Folder with the cameras, for `run`."""
     write_cameras(tmp_path / "transforms.json")
-    run(tmp_path / "x.ply", "--cameras", tmp_path / "transforms.json", "--out", tmp_path / "out")
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.png", "b.png"]
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("degree", "encoding"),
+    [
+        (0, "ascii"),
+        (1, "binary_little_endian"),
+        (2, "binary_big_endian"),
+        (3, "ascii"),
+        (3, "binary_little_endian"),
+    ],
+)
+def test_any_ply(folder, degree, encoding):
+    """Each camera gets the image of the model in any order of properties; other tools' colours are
+    sRGB."""
+    model = gaussians(degree)
+    foreign_ply(folder / "x.ply", model, encoding, seed=degree)
+    run(folder)
+    assert sorted(path.name for path in (folder / "out").iterdir()) == ["a.png", "b.png"]
     for name, camera in zip("ab", CAMERAS, strict=True):
         truth = np.clip(np.asarray(render(model, camera).rgb), 0, 1)
         assert truth.max() > 0.3
-        np.testing.assert_allclose(pixels(tmp_path / f"out/{name}.png"), truth, atol=0.51 / 255)
+        np.testing.assert_allclose(pixels(folder / f"out/{name}.png"), truth, atol=0.51 / 255)
 
 
 SH_AS_PUBLISHED = [
@@ -161,266 +150,167 @@ the Gaussian."""
 
 
 def test_harmonics_are_those_of_3dgs(tmp_path):
-    """One opaque Gaussian before the camera, colour of degree 3 from the published polynomials: the
-    pixel at its centre."""
-    rng = np.random.default_rng(5)
-    sh = 0.12 * rng.normal(size=(1, 16, 3))
-    model = Gaussians(np.zeros((1, 3)), np.full((1, 3), -1.0), np.eye(4)[[0]], np.array([20.0]), sh)
-    foreign_ply(
-        tmp_path / "x.ply",
-        Gaussians(*(np.asarray(v, np.float32) for v in vars(model).values())),
-        "ascii",
-    )
+    """Colour of one opaque Gaussian at its centre, degree 3, against the published polynomials."""
+    sh = 0.12 * np.random.default_rng(5).normal(size=(1, 16, 3))
+    parts = np.zeros((1, 3)), np.full((1, 3), -1.0), np.eye(4)[[0]], np.array([20.0]), sh
+    foreign_ply(tmp_path / "x.ply", Gaussians(*(part.astype(np.float32) for part in parts)))
     K = np.array([[55.0, 0, 16.5], [0, 55, 16.5], [0, 0, 1]])
     cameras = [Camera(K, 33, 33, look_at(eye, (0, 0, 0))) for eye in EYES]
     write_cameras(tmp_path / "transforms.json", cameras=cameras)
-    run(tmp_path / "x.ply", "--cameras", tmp_path, "--out", tmp_path / "out")
+    run(tmp_path)
     for name, eye in zip("ab", EYES, strict=True):
         x, y, z = -np.array(eye) / np.linalg.norm(eye)
         colour = 0.5 + sum(basis(x, y, z) * sh[0, k] for k, basis in enumerate(SH_AS_PUBLISHED))
         assert ((colour > 0.02) & (colour < 0.98)).all()
-        np.testing.assert_allclose(
-            pixels(tmp_path / f"out/{name}.png")[16, 16], 0.999 * colour, atol=0.51 / 255
-        )
+        centre = pixels(tmp_path / f"out/{name}.png")[16, 16]
+        np.testing.assert_allclose(centre, 0.999 * colour, atol=0.51 / 255)
 
 
-def test_colour_spaces(tmp_path):
-    """Our own files are linear and say so; the option overrules; the EXR is linear in any case,
-    with alpha and depth."""
+def test_colour_spaces(folder):
+    """Our files are marked linear; the option overrules; the EXR is always linear, with alpha and
+    depth."""
     model = gaussians(1)
-    write_ply(tmp_path / "ours.ply", model)
-    foreign_ply(tmp_path / "theirs.ply", model, "ascii")
-    assert ply_colour_space(tmp_path / "ours.ply") == "linear"
-    assert ply_colour_space(tmp_path / "theirs.ply") == "srgb"
-    write_cameras(tmp_path / "transforms.json")
+    write_ply(folder / "ours.ply", model)
+    foreign_ply(folder / "theirs.ply", model)
+    assert ply_colour_space(folder / "ours.ply") == "linear"
+    assert ply_colour_space(folder / "theirs.ply") == "srgb"
     image = render(model, CAMERAS[0])
     truth, alpha, depth = (np.asarray(part) for part in (image.rgb, image.alpha, image.depth))
     as_linear, as_srgb = srgb_from_linear(truth), np.clip(truth, 0, 1)
-    cases = {
-        ("ours", "auto"): as_linear,
-        ("ours", "srgb"): as_srgb,
-        ("theirs", "auto"): as_srgb,
-        ("theirs", "linear"): as_linear,
-    }
-    for (file, space), display in cases.items():
-        out = tmp_path / f"{file}-{space}"
-        run(
-            tmp_path / f"{file}.ply",
-            "--cameras",
-            tmp_path,
-            "--out",
-            out,
-            "--colour-space",
-            space,
-            "--exr",
-        )
-        np.testing.assert_allclose(pixels(out / "a.png"), display, atol=0.51 / 255)
-        channels = read_exr(out / "a.exr")
+    assert np.abs(as_linear - as_srgb).max() > 0.1
+    for file, space, linear in (
+        ("ours", "auto", True),
+        ("ours", "srgb", False),
+        ("theirs", "auto", False),
+        ("theirs", "linear", True),
+    ):
+        out = f"{file}-{space}"
+        run(folder, "--colour-space", space, "--exr", ply=f"{file}.ply", out=out)
+        display = as_linear if linear else as_srgb
+        np.testing.assert_allclose(pixels(folder / out / "a.png"), display, atol=0.51 / 255)
+        channels = read_exr(folder / out / "a.exr")
         rgb = np.stack([channels[c] for c in "RGB"], -1)
-        np.testing.assert_allclose(
-            rgb, truth if display is as_linear else linear_from_srgb(truth), atol=1e-5
-        )
+        expected = truth if linear else linear_from_srgb(truth)
+        np.testing.assert_allclose(rgb, expected, atol=1e-5)
         np.testing.assert_allclose(channels["A"], alpha, atol=1e-6)
         np.testing.assert_allclose(channels["Z"], depth, rtol=1e-5)
-    assert np.abs(as_linear - as_srgb).max() > 0.1
 
 
 @pytest.mark.parametrize("space", ["linear", "srgb"])
-def test_background_is_as_displayed(tmp_path, space):
-    foreign_ply(tmp_path / "x.ply", gaussians(0, n=1), "ascii")
-    write_cameras(tmp_path / "transforms.json")
-    arguments = ["--colour-space", space, "--background", 1, 0.5, 0.25]
-    run(tmp_path / "x.ply", "--cameras", tmp_path, "--out", tmp_path / "out", *arguments)
-    np.testing.assert_allclose(
-        pixels(tmp_path / "out/a.png")[0, 0], [1, 0.5, 0.25], atol=0.51 / 255
-    )
+def test_background_is_as_displayed(folder, space):
+    foreign_ply(folder / "x.ply", gaussians(0, n=1))
+    run(folder, "--colour-space", space, "--background", 1, 0.5, 0.25)
+    corner = pixels(folder / "out/a.png")[0, 0]
+    np.testing.assert_allclose(corner, [1, 0.5, 0.25], atol=0.51 / 255)
 
 
-def test_width(tmp_path):
-    """Twice the width is the same view: every 2x2 pixels average to one of the small image's,
-    smooth as this one is."""
+def test_no_gaussians(folder):
+    foreign_ply(folder / "x.ply", gaussians(0, n=0))
+    run(folder, "--background", 0, 0, 1)
+    assert (pixels(folder / "out/a.png") == [0, 0, 1]).all()
+
+
+def test_width(folder):
+    """Twice the width is the same view: 2x2 pixels average to one of the small, smooth image."""
     model = gaussians(0)
     model.log_scales[:] = -1.2
-    foreign_ply(tmp_path / "x.ply", model, "ascii")
-    write_cameras(tmp_path / "transforms.json")
-    run(tmp_path / "x.ply", "--cameras", tmp_path, "--out", tmp_path / "small")
-    run(
-        tmp_path / "x.ply", "--cameras", tmp_path, "--out", tmp_path / "large", "--width", 2 * WIDTH
-    )
-    small, large = pixels(tmp_path / "small/a.png"), pixels(tmp_path / "large/a.png")
+    foreign_ply(folder / "x.ply", model)
+    run(folder, out="small")
+    run(folder, "--width", 2 * WIDTH, out="large")
+    small, large = pixels(folder / "small/a.png"), pixels(folder / "large/a.png")
     assert large.shape == (2 * HEIGHT, 2 * WIDTH, 3)
     assert np.ptp(small) > 0.3
     np.testing.assert_allclose(large.reshape(HEIGHT, 2, WIDTH, 2, 3).mean((1, 3)), small, atol=0.02)
 
 
-def test_images_of_one_name_in_two_folders(tmp_path):
-    foreign_ply(tmp_path / "x.ply", gaussians(0), "ascii")
-    write_cameras(tmp_path / "transforms.json", names=("left/0001.png", "right/0001.png"))
-    run(tmp_path / "x.ply", "--cameras", tmp_path, "--out", tmp_path / "out")
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
-        "0000_0001.png",
-        "0001_0001.png",
-    ]
+def test_images_of_one_name_in_two_folders(folder):
+    foreign_ply(folder / "x.ply", gaussians(0))
+    write_cameras(folder / "transforms.json", names=("left/0001.png", "right/0001.png"))
+    run(folder)
+    names = sorted(path.name for path in (folder / "out").iterdir())
+    assert names == ["0000_0001.png", "0001_0001.png"]
 
 
-def test_no_gaussians(tmp_path):
-    foreign_ply(tmp_path / "x.ply", gaussians(0, n=0), "ascii")
-    write_cameras(tmp_path / "transforms.json")
-    run(
-        tmp_path / "x.ply",
-        "--cameras",
-        tmp_path,
-        "--out",
-        tmp_path / "out",
-        "--background",
-        0,
-        0,
-        1,
-    )
-    assert (pixels(tmp_path / "out/a.png") == [0, 0, 1]).all()
+def replaced(old: str, new: str):
+    """Write x.ply anew, without extra properties, with a part of its text replaced."""
+
+    def change(folder):
+        foreign_ply(folder / "x.ply", gaussians(0, n=3), extra=False)
+        (folder / "x.ply").write_text((folder / "x.ply").read_text().replace(old, new))
+
+    return change
 
 
-def broken(change):
-    """A foreign PLY as text, changed."""
-
-    def make(tmp_path):
-        foreign_ply(tmp_path / "x.ply", gaussians(0, n=3), "ascii", extra=False)
-        (tmp_path / "x.ply").write_text(change((tmp_path / "x.ply").read_text()))
-
-    return make
+def written(name: str, text: str):
+    return lambda folder: (folder / name).write_text(text)
 
 
-def infinite_opacity(tmp_path):
+def framed(path: str):
+    """Write a transforms.json without intrinsics and with one frame of this path."""
+    frame = {"file_path": path, "transform_matrix": np.eye(4).tolist()}
+    return written("transforms.json", json.dumps({"frames": [frame]}))
+
+
+def infinite_opacity(folder):
     model = gaussians(0)
     model.logit_opacities[5] = np.inf
-    foreign_ply(tmp_path / "x.ply", model, "binary_little_endian")
+    foreign_ply(folder / "x.ply", model, "binary_little_endian")
 
 
+HUGE = "ply\nformat binary_little_endian 1.0\nelement vertex 9223372036854775808\n"
+ONE_FLOAT = "property float x\nend_header\n"
+UNREADABLE = "not a readable 3DGS PLY"
 BAD = {
-    "no PLY": (lambda tmp: (tmp / "x.ply").unlink(), [], "x.ply: no such file; give a 3DGS PLY"),
-    "not a PLY": (broken(lambda text: "solid " + text), [], "not a readable 3DGS PLY"),
-    "truncated": (broken(lambda text: text[:-60]), [], "not a readable 3DGS PLY"),
-    "a point cloud": (
-        broken(lambda text: text.replace("opacity", "quality")),
-        [],
-        "property 'opacity' is missing",
+    "no PLY": (lambda folder: (folder / "x.ply").unlink(), "x.ply: no such file; give a 3DGS PLY"),
+    "not a PLY": (replaced("ply\n", "solid ply\n"), UNREADABLE),
+    "truncated": (
+        lambda folder: (folder / "x.ply").write_text((folder / "x.ply").read_text()[:-60]),
+        UNREADABLE,
     ),
-    "odd f_rest": (
-        broken(lambda text: text.replace("opacity", "f_rest_0")),
-        [],
-        "1 f_rest properties fit no SH degree",
-    ),
-    "a list for a number": (
-        broken(
-            lambda text: text.replace("property float opacity", "property list uchar float opacity")
-        ),
-        [],
-        "x.ply: not a",
-    ),
-    "more vertices than memory": (
-        broken(lambda text: text.replace("element vertex 3", "element vertex 2147483648")),
-        [],
-        "not a readable 3DGS PLY",
-    ),
-    "more vertices than an integer": (
-        lambda tmp: (tmp / "x.ply").write_text(
-            "ply\nformat binary_little_endian 1.0\nelement vertex 9223372036854775808\nproperty float x\nend_header\n"
-        ),
-        [],
-        "not a readable 3DGS PLY",
-    ),
+    "a point cloud": (replaced("opacity", "quality"), "property 'opacity' is missing"),
+    "odd f_rest": (replaced("opacity", "f_rest_0"), "1 f_rest properties fit no SH degree"),
+    "a list for a number": (replaced("float opacity", "list uchar float opacity"), "x.ply: not a"),
+    "more vertices than memory": (replaced("vertex 3", "vertex 2147483648"), UNREADABLE),
+    "more vertices than an integer": (written("x.ply", HUGE + ONE_FLOAT), UNREADABLE),
     "no vertices": (
-        lambda tmp: (tmp / "x.ply").write_text(
-            "ply\nformat ascii 1.0\nelement point 0\nproperty float x\nend_header\n"
-        ),
-        [],
+        written("x.ply", "ply\nformat ascii 1.0\nelement point 0\n" + ONE_FLOAT),
         "it has no vertices",
     ),
     "infinite opacity": (
         infinite_opacity,
-        [],
         "logit_opacities is NaN or infinite, first at Gaussian 5",
     ),
     "no cameras": (
-        lambda tmp: (tmp / "transforms.json").unlink(),
-        [],
+        lambda folder: (folder / "transforms.json").unlink(),
         "transforms.json: no such file",
     ),
-    "frames of another shape": (
-        lambda tmp: (tmp / "transforms.json").write_text('{"frames": [1]}'),
-        [],
-        "frame 0 lacks file_path",
-    ),
-    "a path with a zero byte": (
-        lambda tmp: (tmp / "transforms.json").write_text(
-            json.dumps(
-                {"frames": [{"file_path": "a\0b.png", "transform_matrix": np.eye(4).tolist()}]}
-            )
-        ),
-        [],
+    "another shape": (written("transforms.json", '{"frames": [1]}'), "frame 0 lacks file_path"),
+    "a zero byte": (
+        framed("a\0b.png"),
         "frame 0 has a file_path that is no text or cannot be a path",
     ),
-    "brackets without end": (
-        lambda tmp: (tmp / "transforms.json").write_text("[" * 100_000),
-        [],
-        "transforms.json: not valid JSON",
-    ),
-    "a number of 5000 digits": (
-        lambda tmp: (tmp / "transforms.json").write_text('{"w": ' + "9" * 5000 + "}"),
-        [],
-        "transforms.json: not valid JSON",
-    ),
-    "no intrinsics": (
-        lambda tmp: (tmp / "transforms.json").write_text(
-            json.dumps({"frames": [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}]})
-        ),
-        [],
-        "frame 0 lacks fl_x; correct the intrinsics",
-    ),
-    "output not empty": (
-        lambda tmp: ((tmp / "out").mkdir(), (tmp / "out/kept").touch()),
-        [],
-        "the output folder is not empty",
-    ),
-    "background": (
-        lambda tmp: None,
-        ["--background", "255", "255", "255"],
-        "must be three numbers from 0 to 1",
-    ),
+    "no intrinsics": (framed("a.png"), "frame 0 lacks fl_x; correct the intrinsics"),
+    "open brackets": (written("transforms.json", "[" * 100_000), "not valid JSON"),
+    "5000 digits": (written("transforms.json", '{"w": ' + "9" * 5000 + "}"), "not valid JSON"),
+    "not empty": (lambda folder: (folder / "out/kept").mkdir(parents=True), "is not empty"),
+    "background": (lambda folder: None, "must be three numbers from 0 to 1"),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input(tmp_path, capsys, case):
-    """One line, exit code 2, nothing written."""
-    change, arguments, message = BAD[case]
-    foreign_ply(tmp_path / "x.ply", gaussians(0), "ascii")
-    write_cameras(tmp_path / "transforms.json")
-    change(tmp_path)
-    before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(SystemExit) as end:
-        app.main(
-            [
-                "render",
-                str(tmp_path / "x.ply"),
-                "--cameras",
-                str(tmp_path / "transforms.json"),
-                "--out",
-                str(tmp_path / "out"),
-                *arguments,
-            ]
-        )
-    assert end.value.code == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    assert lines[0].startswith("mgs: ")
-    assert message in lines[0]
-    assert sorted(tmp_path.rglob("*")) == before
+def test_bad_input_is_one_line_and_nothing_is_written(folder, capsys, case):
+    change, message = BAD[case]
+    foreign_ply(folder / "x.ply", gaussians(0))
+    change(folder)
+    arguments = ["render", folder / "x.ply", "--cameras", folder / "transforms.json"]
+    arguments += ["--out", folder / "out"]
+    if case == "background":
+        arguments += ["--background", 255, 255, 255]
+    assert message in refused(capsys, arguments, folder)
 
 
-def test_a_ply_written_by_us_is_read_back(tmp_path):
-    for degree in range(4):
-        model = gaussians(degree)
-        write_ply(tmp_path / "x.ply", model)
-        for name, values in vars(read_ply(tmp_path / "x.ply")).items():
-            np.testing.assert_array_equal(values, getattr(model, name))
+@pytest.mark.parametrize("degree", range(4))
+def test_a_ply_written_by_us_is_read_back(tmp_path, degree):
+    model = gaussians(degree)
+    write_ply(tmp_path / "x.ply", model)
+    assert read_ply(tmp_path / "x.ply") == model

@@ -1,4 +1,4 @@
-"""The libLLVM that is chosen, and one clear line for every one that would not work."""
+"""Choice of libLLVM and variant, and one line for those that do not work."""
 
 import re
 import subprocess
@@ -32,8 +32,7 @@ def test_facts_of_the_processor():
 
 
 def fake(monkeypatch, libraries: dict[str, int | None]) -> None:
-    """Pretend that these libraries are what the system has, in Dr.Jit's order; None: does not
-    load."""
+    """Fake the libraries of the system, in Dr.Jit's order; None: does not load."""
 
     def load(path: str) -> Libllvm:
         version = libraries.get(path)
@@ -52,10 +51,8 @@ def test_order(monkeypatch):
     fake(monkeypatch, {"old": 14, "broken": None, "good": 19})
     assert runtime.find_libllvm().path == "good"
     fake(monkeypatch, {"old": 15, "older": 14})
-    with pytest.raises(
-        InputError,
-        match=r"old: is version 15, older than 19; install version 19 or newer.*apt-get.*conda",
-    ):
+    said = r"old: is version 15, older than 19; install version 19 or newer.*apt-get.*conda"
+    with pytest.raises(InputError, match=said):
         runtime.find_libllvm()
     fake(monkeypatch, {})
     with pytest.raises(InputError, match="none found; install version 19"):
@@ -65,9 +62,8 @@ def test_order(monkeypatch):
 def test_an_explicit_choice_is_honoured(monkeypatch):
     fake(monkeypatch, {"good": 19, "old": 15})
     monkeypatch.setenv(runtime.LIBRARY_VARIABLE, "old")
-    with pytest.raises(
-        InputError, match="is version 15, older than 19, but DRJIT_LIBLLVM_PATH names it"
-    ):
+    said = "is version 15, older than 19, but DRJIT_LIBLLVM_PATH names it"
+    with pytest.raises(InputError, match=said):
         runtime.find_libllvm()
     monkeypatch.setenv(runtime.LIBRARY_VARIABLE, "")
     assert runtime.find_libllvm().path == "good"
@@ -80,6 +76,13 @@ def test_versions_are_compared_as_numbers(tmp_path):
     assert names == ["libLLVM.so.22.1", "libLLVM.so.19.1", "libLLVM-15.so.1", "libLLVM-9.so.1"]
 
 
+def python(program: str, **environment: str) -> subprocess.CompletedProcess:
+    """Run a program in a new process, where an abort shows as a negative exit code."""
+    command = [sys.executable, "-c", program]
+    variables = environment or None
+    return subprocess.run(command, env=variables, capture_output=True, text=True, timeout=120)
+
+
 @pytest.mark.parametrize(
     ("library", "message"),
     [
@@ -90,62 +93,30 @@ def test_versions_are_compared_as_numbers(tmp_path):
     + [(path, f"is version 1[0-8], older than {MIN_LLVM}") for path in OLD],
 )
 def test_bad_libraries_are_one_line_and_exit_code_2(library, message):
-    """In a process of its own: an abort would show as a negative exit code."""
     code = "from mgs.cli.app import main; import sys; sys.argv = ['mgs', 'doctor']; main()"
-    environment = {runtime.LIBRARY_VARIABLE: library, "PATH": "/usr/bin:/bin", "COLUMNS": "400"}
-    result = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60
-    )
+    variables = {runtime.LIBRARY_VARIABLE: library, "PATH": "/usr/bin:/bin", "COLUMNS": "400"}
+    result = python(code, **variables)
     assert result.returncode == 2, result.stderr
-    lines = [line for line in result.stdout.splitlines() if line.startswith("wrong:")]
-    assert len(lines) == 1
-    assert re.search(message, lines[0])
-    assert runtime.LIBRARY_VARIABLE in lines[0]
+    (line,) = [line for line in result.stdout.splitlines() if line.startswith("wrong:")]
+    assert re.search(message, line)
+    assert runtime.LIBRARY_VARIABLE in line
 
 
 def test_start_raises_instead_of_aborting():
-    code = "from mgs import runtime\ntry:\n    runtime.start()\nexcept runtime.InputError as error:\n    print(error)"
-    environment = {runtime.LIBRARY_VARIABLE: OLD[0] if OLD else "/nowhere.so"}
-    result = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60
+    library = OLD[0] if OLD else "/nowhere.so"
+    code = (
+        "from mgs import runtime\n"
+        "try:\n    runtime.start()\nexcept runtime.InputError as error:\n    print(error)"
     )
+    result = python(code, **{runtime.LIBRARY_VARIABLE: library})
     assert result.returncode == 0, result.stderr
-    assert result.stdout.startswith(f"libLLVM {environment[runtime.LIBRARY_VARIABLE]}: ")
+    assert result.stdout.startswith(f"libLLVM {library}: ")
     assert f"{runtime.LIBRARY_VARIABLE} names it" in result.stdout
 
 
-@pytest.mark.parametrize(
-    ("program", "printed"),
-    [
-        ("runtime.start(); print(mi.variant())", "llvm_ad_rgb"),
-        ("mi.set_variant('llvm_ad_rgb'); runtime.start(); print(mi.variant())", "llvm_ad_rgb"),
-        ("render(one, camera); print(mi.variant())", "llvm_ad_rgb"),
-        (
-            "mi.set_variant('scalar_rgb')\ntry: runtime.start()\nexcept InputError as e: print(mi.variant(), e)",
-            SCALAR,
-        ),
-        (
-            "mi.set_variant('scalar_rgb')\ntry: render(one, camera)\nexcept InputError as e: print(mi.variant(), e)",
-            SCALAR,
-        ),
-        ("mesh_depth(mesh)(camera); print(mi.variant())", "llvm_ad_rgb"),
-        (
-            "mi.set_variant('scalar_rgb')\ntry: mesh_depth(mesh)\nexcept InputError as e: print(mi.variant(), e)",
-            SCALAR,
-        ),
-        (
-            "mi.set_variant('scalar_rgb')\ntry: fisher(one, camera)\nexcept InputError as e: print(mi.variant(), e)",
-            SCALAR,
-        ),
-        (
-            "mi.set_variant('llvm_ad_spectral')\ntry: runtime.start()\nexcept InputError as e: print(e)",
-            "llvm_ad_spectral is set",
-        ),
-    ],
-)
-def test_the_users_variant_stays(program, printed):
-    """Where it cannot be computed with, that is one line; where none is set, ours is."""
-    prepare = """
+CALLS = ("runtime.start()", "render(one, camera)", "fisher(one, camera)", "mesh_depth(mesh)")
+LLVM = "llvm_ad_rgb"
+PREPARE = """
 import numpy as np, mitsuba as mi
 from mgs import runtime
 from mgs.camera import Camera
@@ -158,7 +129,22 @@ one = Gaussians(*(np.ones(shape, np.float32) for shape in ((1, 3), (1, 3), (1, 4
 camera = Camera(np.diag([20.0, 20.0, 1.0]), 16, 12, np.eye(4))
 mesh = Mesh(np.eye(3) + [0, 0, 2], np.array([[0, 1, 2]]), np.ones(1, bool))
 """
-    done = subprocess.run(
-        [sys.executable, "-c", prepare + program], capture_output=True, text=True, timeout=120
-    )
+
+
+@pytest.mark.parametrize(
+    ("set_before", "call", "printed"),
+    [
+        (None, "runtime.start()", LLVM),
+        (LLVM, "runtime.start()", LLVM),
+        (None, "render(one, camera)", LLVM),
+        (None, "mesh_depth(mesh)(camera)", LLVM),
+        *(("scalar_rgb", call, SCALAR) for call in CALLS),
+        ("llvm_ad_spectral", "runtime.start()", "llvm_ad_spectral is set"),
+    ],
+)
+def test_the_users_variant_stays(set_before, call, printed):
+    """An unusable variant is refused in one line; without one, `start` sets ours."""
+    program = PREPARE + (f"mi.set_variant('{set_before}')\n" if set_before else "")
+    program += f"try:\n    {call}\n    print(mi.variant())\n"
+    done = python(f"{program}except InputError as error:\n    print(mi.variant(), error)")
     assert printed in done.stdout, done.stderr

@@ -1,4 +1,4 @@
-"""Statistics over rocks, against known answers and brute force."""
+"""Statistics and verdicts of studies, against known answers and brute force; tables and plots."""
 
 from itertools import product
 
@@ -7,7 +7,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mgs.study.statistics import MOST_ROCKS, area, holm, images_to_reach, interval, permutation_p
+from mgs.plotting import STYLE, save_figure
+from mgs.study import output
+from mgs.study.output import Panel, draw_panels, table, with_interval
+from mgs.study.statistics import (
+    MOST_ROCKS,
+    area,
+    holm,
+    images_to_reach,
+    interval,
+    pareto_front,
+    permutation_p,
+)
+from mgs.study.verdict import Claim, Outcome, judged, outcome, paired, single, verdict_table
 
 numbers = st.floats(-10, 10, allow_nan=False).map(lambda x: round(x, 3))
 
@@ -81,3 +93,94 @@ def test_a_level_is_reached_between_two_points_or_never():
     assert images_to_reach([4, 5, 7], [20, 21, 23], 20) == 4
     assert images_to_reach([4, 5, 7], [20, 19, 23], 19.5) == 4
     assert images_to_reach([4, 5, 7], [20, 21, 23], 23.1) is None
+
+
+@given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=12))
+def test_a_point_is_on_the_front_unless_another_beats_it(points):
+    costs, gains = zip(*points, strict=True)
+    on = pareto_front(costs, gains)
+    for i, (cost, gain) in enumerate(points):
+        beaten = any(c <= cost and g >= gain and (c, g) != (cost, gain) for c, g in points)
+        assert on[i] != beaten
+    assert pareto_front([1, np.nan, 2], [1, 5, 2]).tolist() == [True, False, True]
+
+
+def claim(side, bound=1.0):
+    return Claim("it is so", lambda rows: [row["x"] for row in rows], "dB", side, bound)
+
+
+@pytest.mark.parametrize(
+    ("values", "above", "below"),
+    [
+        ([2.0, 2.1, 1.9], "holds", "fails"),
+        ([0.0, 0.1, -0.1], "fails", "holds"),
+        ([0.0, 2.0, 1.1], "depends", "depends"),
+        ([5.0], "depends", "depends"),
+        ([], "depends", "depends"),
+        ([1.0, 1.0], "holds", "holds"),  # on the bound itself
+    ],
+)
+def test_a_verdict_follows_from_the_interval_alone(values, above, below):
+    rows = [{"x": value} for value in values]
+    assert judged(claim("above"), rows)["verdict"] == above
+    assert judged(claim("below"), rows)["verdict"] == below
+    assert judged(claim("above"), rows)["runs"] == len(values)
+    assert f"| it is so | **{above}** |" in verdict_table([judged(claim("above"), rows)])
+
+
+EFFECTS = st.lists(st.floats(-100, 100), min_size=2, max_size=9)
+
+
+@given(EFFECTS, st.floats(-100, 100))
+def test_mirrored_claims_agree_and_opposite_claims_never_both_fail(values, bound):
+    mirrored = interval([-value for value in values])
+    above = outcome("above", bound, interval(values))
+    assert above == outcome("below", -bound, mirrored)
+    assert {above, outcome("below", bound, interval(values))} != {Outcome.FAILS}
+
+
+def test_runs_are_paired_by_their_name():
+    rows = [
+        {"run": run, "kind": kind, "v": value}
+        for run, kind, value in (
+            ("a", "x", 3.0), ("a", "y", 1.0), ("b", "x", 9.0), ("c", "y", 1.0), ("c", "x", 1.5)
+        )
+    ]  # fmt: skip
+    assert paired("v", {"kind": "x"}, {"kind": "y"})(rows) == [2.0, 0.5]
+    assert single("v", {"kind": "x"})(rows) == [3.0, 9.0, 1.5]
+
+
+def test_columns_are_formats_or_functions_and_missing_values_are_dashes():
+    columns = {"name": "name", "dB": "psnr:.2f", "twice": lambda row: str(2 * row["n"])}
+    text = table(columns, [{"name": "a", "psnr": 1.239, "n": 2}, {"name": "b", "n": 1}])
+    assert text.splitlines()[2:] == ["| a | 1.24 | 4 |", "| b | – | 2 |"]
+    assert with_interval({"d": 1.0, "d_low": 0.5, "d_high": 1.5}, "d") == "+1.00 [+0.50, +1.50]"
+    assert with_interval({"d": 1.0, "d_low": None}, "d") == "+1.00"
+    assert with_interval({}, "d") == "–"
+
+
+def test_panels_cut_no_point_off(tmp_path, monkeypatch):
+    rng, figures = np.random.default_rng(0), []
+    rows = [
+        {"run": run, "policy": policy, "views": k + 2, "size": 2.0**k, "name": f"long name {k}",
+         "tau": 1.0 if policy == "d-optimal" else rng.random()}
+        for run in "ab" for policy in ("d-optimal", "uniform") for k in range(13)
+    ]  # fmt: skip
+    panels = (
+        Panel("views", "tau", "views", "Kendall's tau", "policy"),
+        Panel("size", "tau", "size", "Kendall's tau", None, True),
+        Panel("name", "tau", "a name for each", "Kendall's tau", "policy"),
+        Panel("missing", "tau", "no rows", "Kendall's tau"),
+    )
+    monkeypatch.setattr(
+        output, "save_figure", lambda *how: (save_figure(*how), figures.append(how[0]))
+    )
+    draw_panels(tmp_path / "it.png", panels, rows)
+    (figure,) = figures
+    assert len(figure.axes) == 3
+    for axis in figure.axes:
+        box, radius = axis.get_window_extent(), STYLE["lines.markersize"] / 72 * figure.dpi / 2
+        for line in axis.lines:
+            x, y = axis.transData.transform(line.get_xydata()).T
+            assert box.x0 + radius < x.min() <= x.max() < box.x1 - radius
+            assert box.y0 + radius < y.min() <= y.max() < box.y1 - radius

@@ -1,5 +1,4 @@
-"""`mgs stress`: the rule of the verdicts both ways on made-up numbers, the faults, and a small run
-of the whole."""
+"""`mgs stress`: its experiments on small ellipsoids, the faults, and a small run of the command."""
 
 import csv
 import json
@@ -7,377 +6,211 @@ import json
 import numpy as np
 import pytest
 import synthetic
-import tiny
-from hypothesis import given
-from hypothesis import strategies as st
 from refusals import refused
 
 from mgs.cli.app import main
 from mgs.data.dataset import load_dataset, write_transforms
-from mgs.metrics import agreement
 from mgs.prior.build import build_prior, save_prior
 from mgs.prior.settings import PriorSettings
-from mgs.study.stress import alarms, endurance, faults, numbers, registry, spread
-from mgs.study.stress.convergence import CONVERGENCE
-from mgs.study.stress.experiment import Experiment, Panel, rock_cell
-from mgs.study.stress.lab import PRESETS, greedy, open_lab
-from mgs.study.stress.scales import SCALES
-from mgs.study.stress.verdict import Claim, Outcome, interval, judged, outcome, paired, roc_area
-from mgs.study.sweep import Cell, cell_folder
+from mgs.study.output import Panel
+from mgs.study.stress import faults, run
+from mgs.study.stress.fits import CONVERGENCE, convergence, free_means
+from mgs.study.stress.lab import SIZES, Experiment, open_lab, rock_cell
+from mgs.study.sweep import Cell
+from mgs.study.verdict import Claim, judged
 
-EFFECTS = st.lists(st.floats(-100, 100), min_size=2, max_size=9)
-
-
-def claim(side, bound=1.0):
-    return Claim("it is so", lambda rows: [row["x"] for row in rows], "dB", side, bound, "rock")
-
-
-@pytest.mark.parametrize(
-    ("values", "above", "below"),
-    [
-        ([2.0, 2.1, 1.9], "holds", "fails"),
-        ([0.0, 0.1, -0.1], "fails", "holds"),
-        ([0.0, 2.0, 1.1], "depends", "depends"),
-        ([5.0], "depends", "depends"),
-        ([], "depends", "depends"),
-        ([1.0, 1.0], "holds", "holds"),  # on the bound itself
-    ],
-)
-def test_a_verdict_follows_from_the_interval_alone(values, above, below):
-    rows = [{"x": value} for value in values]
-    assert judged(claim("above"), rows)["verdict"] == above
-    assert judged(claim("below"), rows)["verdict"] == below
-    assert judged(claim("above"), rows)["runs"] == len(values)
-
-
-def test_the_interval_is_students():
-    assert interval([1.0]) is None
-    assert interval([0.0, 2.0]) == pytest.approx(
-        (1 - 12.706, 1 + 12.706), abs=1e-3
-    )  # t(0.975, 1) = 12.706, error 1
-
-
-@given(EFFECTS, st.floats(-100, 100))
-def test_turned_round_a_claim_has_the_same_verdict(values, bound):
-    mirrored = interval([-value for value in values])
-    assert outcome("above", bound, interval(values)) == outcome("below", -bound, mirrored)
-
-
-@given(EFFECTS, st.floats(-100, 100))
-def test_a_claim_and_its_opposite_never_both_fail(values, bound):
-    both = {outcome("above", bound, interval(values)), outcome("below", bound, interval(values))}
-    assert both != {Outcome.FAILS}
-
-
-def test_runs_are_paired_by_their_name():
-    rows = [
-        {"run": "a", "kind": "x", "v": 3.0}, {"run": "a", "kind": "y", "v": 1.0}, {"run": "b", "kind": "x", "v": 9.0},
-        {"run": "c", "kind": "y", "v": 1.0}, {"run": "c", "kind": "x", "v": 1.5},
-    ]  # fmt: skip
-    assert paired("v", {"kind": "x"}, {"kind": "y"})(rows) == [2.0, 0.5]
-
-
-def test_the_roc_area_is_the_probability_that_a_failed_run_has_the_larger_value():
-    assert roc_area([1, 2, 3, 4], [False, False, True, True]) == 1
-    assert roc_area([3, 4, 1, 2], [False, False, True, True]) == 0
-    assert roc_area([1, 1], [True, False]) == 0.5
-    assert roc_area([1, 2], [True, True]) is None
-
-
-@given(st.lists(st.tuples(st.integers(0, 5), st.booleans()), min_size=1, max_size=12))
-def test_a_sign_turned_round_has_the_other_area(pairs):
-    values, failed = [value for value, _ in pairs], [bad for _, bad in pairs]
-    area, other = roc_area(values, failed), roc_area([-value for value in values], failed)
-    assert area is None or area + other == pytest.approx(1)
-
-
-def test_agreement_of_rankings():
-    reference = np.array([1.0, 2.0, 4.0])
-    assert agreement(reference, reference) == {"tau": 1, "regret": 0}
-    assert agreement(np.array([3.0, 2.0, 1.0]), reference) == {"tau": -1, "regret": 0.75}
-    assert agreement(np.zeros(3), reference)["tau"] == 0
+FOLDERS = {"dataset": "dataset", "prior": "prior"}
 
 
 def fit_rows(kind, values):
-    """Rows of the experiment on convergence for two runs with these qualities after 1, 2, 3 ...
-    passes."""
+    """Rows of two runs with these qualities after 1, 2, 3 ... passes."""
+    row = {"fit": kind, "criterion": "d-optimal", "tau": 1.0, "regret": 0.0}
     return [
-        {
-            "run": run,
-            "fit": kind,
-            "criterion": "d-optimal",
-            "passes": p,
-            "psnr_mask": v + 0.01 * run,
-            "tau": 1.0,
-            "regret": 0.0,
-        }
-        for run in (0, 1)
+        row | {"run": r, "passes": p, "psnr_mask": v + 0.01 * r}
+        for r in (0, 1)
         for p, v in enumerate(values, 1)
     ]
 
 
 def test_overfitting_is_what_the_longest_fit_lost():
     no_prior, with_prior = CONVERGENCE.claims[2:]
-    assert judged(no_prior, fit_rows("no prior", [20, 25, 23]))["verdict"] == "holds"
-    assert judged(no_prior, fit_rows("no prior", [20, 23, 25]))["verdict"] == "fails"
-    assert judged(with_prior, fit_rows("with the prior", [20, 23, 25]))["verdict"] == "holds"
-    assert judged(with_prior, fit_rows("with the prior", [20, 25, 23]))["verdict"] == "fails"
+    for values, verdicts in (
+        ([20, 25, 23], ("holds", "fails")),
+        ([20, 23, 25], ("fails", "holds")),
+    ):
+        assert judged(no_prior, fit_rows("no prior", values))["verdict"] == verdicts[0]
+        assert judged(with_prior, fit_rows("with the prior", values))["verdict"] == verdicts[1]
 
 
-def test_one_lambda_is_judged_by_its_worst_value():
-    def rows(worst):
-        exponents = range(-10, 3)
-        return [
-            {
-                "run": run,
-                "what": "one lambda",
-                "setting": 10.0**e,
-                "regret": worst if e == 2 else 0.0,
-                "tau": 1.0,
-            }
-            for run in "ab"
-            for e in exponents
-        ]
+def test_detectors_are_judged_by_false_and_missed_alarms():
+    def rows(sign):
+        clean = {"run": "a", "size": 6, "fault": "none", "failed": False, "sign exposure": 0.01}
+        failed = {"run": "a", "size": 1, "fault": "exposure", "failed": True, "sign exposure": sign}
+        return [clean, failed, failed | {"failed": False}]
 
-    assert judged(SCALES.claims[0], rows(0.5))["verdict"] == "fails"
-    assert judged(SCALES.claims[0], rows(0.01))["verdict"] == "holds"
+    assert (faults.caught(rows(9.0)), faults.caught(rows(0.0))) == ([1.0], [0.0])
+    assert faults.false_alarms(rows(9.0)) == [0.0]
+    noisy = [row | {"sign exposure": 9.0} for row in rows(9.0)]
+    assert faults.false_alarms(noisy + noisy) == [1.0], "a clean run of two experiments counts once"
 
 
-def test_memory_that_grows_is_told_from_memory_that_levels_off():
-    (bounded,) = endurance.ENDURANCE.claims
-    level = [{"step": i, "megabytes": 500 + 100 * min(i, 40)} for i in range(100)]
-    leak = [{"step": i, "megabytes": 500.0 + i} for i in range(100)]
-    assert judged(bounded, level)["verdict"] == "holds"
-    assert judged(bounded, leak)["verdict"] == "fails"
-    assert judged(bounded, leak)["effect"] == pytest.approx(1, abs=0.05)
+def test_claims_and_cells_of_all_experiments_are_complete():
+    from importlib import import_module
 
-
-def alarm_rows(sign_of_failed):
-    """Runs of three scenes: one clean, one failed by exposure, one harmless; the sign of the failed
-    one is given."""
-    rows = []
-    for scene in "abc":
-        clean = {"scene": scene, "run": scene, "size": 6, "fault": "none", "failed": False}
-        rows.append(clean | {"sign exposure": 0.01, "sign coverage": 0.05})
-        rows.append(
-            {
-                "scene": scene,
-                "fault": "exposure",
-                "failed": True,
-                "sign exposure": sign_of_failed,
-                "sign coverage": 0.05,
-            }
-        )
-        rows.append(
-            {
-                "scene": scene,
-                "fault": "exposure",
-                "failed": False,
-                "sign exposure": 0.02,
-                "sign coverage": 0.05,
-            }
-        )
-    return rows
-
-
-def test_detectors_are_judged_both_ways():
-    assert alarms.areas(alarm_rows(0.8), "exposure") == [1.0] * 3
-    assert alarms.areas(alarm_rows(0.0), "exposure") == [0.0] * 3
-    assert alarms.any_area(alarm_rows(0.8)) == [1.0] * 3
-    assert alarms.any_area(alarm_rows(0.0))[0] < 0.5
-    assert alarms.caught(alarm_rows(0.8)) == [1.0] * 3
-    assert alarms.caught(alarm_rows(0.0)) == [0.0] * 3
-    assert alarms.false_alarms(alarm_rows(0.8)) == [0.0] * 3
-    noisy = [row | {"sign exposure": 0.9} for row in alarm_rows(0.8)]
-    assert alarms.false_alarms(noisy) == [1.0] * 3
-    assert alarms.false_alarms(noisy + noisy) == [1.0] * 3, (
-        "a clean run of two experiments counts once"
-    )
-    curve = {(row["false alarms"], row["caught"]) for row in alarms.roc_curves(alarm_rows(0.8))}
-    assert {(0.0, 1.0), (1.0, 1.0)} <= curve
-
-
-def test_the_spread_of_models_is_that_of_their_pixels():
-    images = np.zeros((4, 100, 3))
-    assert spread.spread_of(images) == 0
-    images[::2] = 0.2
-    assert spread.spread_of(images) == pytest.approx(0.1)
-    assert spread.spread_of(images + np.linspace(0, 1, 100)[None, :, None]) == pytest.approx(0.1), (
-        "pixels may differ"
-    )
-
-
-def test_every_claim_names_what_its_panels_and_bounds_need():
-    for name, experiment in registry.EXPERIMENTS.items():
-        assert experiment.claims, name
-        assert experiment.panels
+    for name, experiment in run.EXPERIMENTS.items():
+        assert experiment.panels, name
         for one in experiment.claims:
             assert one.hypothesis.endswith(".")
-            assert np.isfinite(one.bound)
             assert judged(one, [])["verdict"] == "depends"
+    for size in SIZES.values():
+        cells = [cell for one in run.EXPERIMENTS.values() for cell in one.cells(size)]
+        by_name = {cell.name: cell for cell in cells}
+        for cell in cells:
+            module, _, function = cell.task.partition(":")
+            assert callable(getattr(import_module(module), function))
+            assert by_name[cell.name] == cell
+            assert set(cell.needs) <= set(by_name)
+            assert json.loads(json.dumps(cell.arguments)) == cell.arguments
+    *_, cell = rock_cell("n", "m:f", SIZES["quick"], ("boulder", 0), x=1)
+    assert cell.arguments["scene"] == "boulder-0"
+    assert cell.arguments["x"] == 1
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """A study's folder with two small rocks, as the cells of datasets leave them."""
+    """Folder with the dataset and the prior of a small rock."""
     folder = tmp_path_factory.mktemp("study")
-    for name in ("ellipsoid-0", "ellipsoid-1"):
-        out = cell_folder(folder, f"dataset/{name}")
-        dataset = synthetic.write_dataset(out / "dataset", synthetic.orbit_cameras(10, 48, 36))
-        tests = synthetic.write_dataset(
-            out / "dataset/test", synthetic.orbit_cameras(3, 48, 36, altitude=2.0)
-        )
-        write_transforms(out / "dataset/test", tests.frames)
-        save_prior(out / "prior", build_prior(dataset, PriorSettings(gaussians=300))[0])
+    dataset = synthetic.write_dataset(folder / "dataset", synthetic.orbit_cameras(10, 48, 36))
+    cameras = synthetic.orbit_cameras(3, 48, 36, altitude=2.0)
+    tests = synthetic.write_dataset(folder / "dataset/test", cameras)
+    write_transforms(folder / "dataset/test", tests.frames)
+    save_prior(folder / "prior", build_prior(dataset, PriorSettings(gaussians=300))[0])
     return folder
 
 
 @pytest.fixture
-def frame(root):
-    return faults.captured(
-        load_dataset(cell_folder(root, "dataset/ellipsoid-0") / "dataset").frames[0]
-    )
+def lab(root):
+    return open_lab(root / "dataset", root / "prior")
 
 
 @pytest.mark.parametrize("name", faults.IMAGE_FAULTS)
-def test_a_fault_of_images_is_a_pure_function_that_grows_with_its_size(frame, name):
+def test_a_fault_of_images_is_a_pure_function_that_grows_with_its_size(root, name):
+    frame = faults.captured(load_dataset(root / "dataset").frames[0])
+    arrays = ("pixels", "rgba", "z", "rock")
     function, sizes = faults.IMAGE_FAULTS[name]
-    before = [a.copy() for a in (frame.pixels, frame.rgba, frame.z, frame.rock)]
+    before = [getattr(frame, one).copy() for one in arrays]
     changes = []
     for size in sizes:
         spoiled, again = (function(frame, size, np.random.default_rng(3)) for _ in range(2))
-        for field in ("pixels", "rgba", "z", "rock"):
-            assert np.array_equal(getattr(spoiled, field), getattr(again, field))
-            assert getattr(spoiled, field).shape == getattr(frame, field).shape
-            assert np.isfinite(getattr(spoiled, field)).all()
+        for one in arrays:
+            assert np.array_equal(getattr(spoiled, one), getattr(again, one))
+            assert getattr(spoiled, one).shape == getattr(frame, one).shape
+            assert np.isfinite(getattr(spoiled, one)).all()
         moved = np.abs(spoiled.camera.world_to_camera - frame.camera.world_to_camera).sum()
-        changed = [
-            np.abs(a.astype(float) - b).sum()
-            for a, b in ((spoiled.rgba, frame.rgba), (spoiled.z, frame.z))
-        ]
-        changes.append(moved + sum(changed))
+        pairs = ((spoiled.rgba, frame.rgba), (spoiled.z, frame.z))
+        changes.append(moved + sum(np.abs(a.astype(float) - b).sum() for a, b in pairs))
     assert 0 < changes[0] < changes[1] < changes[2]
     assert all(
-        np.array_equal(a, b)
-        for a, b in zip(before, (frame.pixels, frame.rgba, frame.z, frame.rock), strict=True)
+        np.array_equal(a, getattr(frame, one)) for a, one in zip(before, arrays, strict=True)
     )
 
 
 @pytest.mark.parametrize("name", faults.PRIOR_FAULTS)
-def test_a_fault_of_the_prior_leaves_the_prior_as_it_was(root, name):
+def test_a_fault_of_the_prior_leaves_the_prior_as_it_was(lab, name):
     function, sizes = faults.PRIOR_FAULTS[name]
-    prior = open_lab(root, "ellipsoid-0").prior
+    prior = lab.prior
     before, moved = prior.points.copy(), []
     for size in sizes:
         spoiled = function(prior, size, np.random.default_rng(1))
-        assert len(spoiled.points) == len(spoiled.normals)
-        assert spoiled.backed <= len(spoiled.points)
+        assert len(spoiled.points) == len(spoiled.normals) >= spoiled.backed
         lost = len(prior.points) - len(spoiled.points)
         moved.append(lost or float(np.linalg.norm(spoiled.points - prior.points, axis=1).mean()))
     assert 0 < moved[0] < moved[1] < moved[2]
     assert np.array_equal(prior.points, before)
 
 
-def test_signs_of_a_good_fit_and_of_a_shifted_prior(root):
-    lab = open_lab(root, "ellipsoid-0")
+def test_signs_of_a_good_fit_and_of_a_shifted_prior(lab):
     _, good = faults.signs_of(lab, lab.even(5))
     shifted = faults.shifted(lab.prior, 0.4, np.random.default_rng(0))
     _, bad = faults.signs_of(lab.changed(prior=shifted), lab.even(5))
     assert bad["prior"] > 2 * good["prior"]
 
 
-def test_even_views_turn(root):
-    lab = open_lab(root, "ellipsoid-0")
+def test_even_views_turn(lab):
     assert lab.even(5) == [0, 2, 4, 6, 8]
     assert sorted(lab.even(5, 0.5)) == [1, 3, 5, 7, 9]
 
 
-def test_greedy_takes_only_what_is_allowed(root):
-    lab = open_lab(root, "ellipsoid-0")
-    for policy in ("d-optimal", "uniform"):
-        views = greedy(lab, [0], [0, 1, 2, 3], 2, policy)
-        assert len(set(views)) == 3
-        assert set(views) <= {0, 1, 2, 3}
+def test_fits_are_measured(root):
+    rows = free_means(root, root, "rock", **FOLDERS, turns_=1, counts=[4])["rows"]
+    by = {row["means"]: row for row in rows}
+    assert by["frozen"]["drift"] == 0 < by["free"]["drift"]
+    assert by["frozen"]["tau"] == by["frozen, no prior"]["tau"] == pytest.approx(1)
+    rows = convergence(root, root, "rock", **FOLDERS, turns_=1, passes=[1, 5])["rows"]
+    last = [row for row in rows if row["passes"] == 5]
+    assert all(row["tau"] == pytest.approx(1) and row["regret"] == 0 for row in last)
+    with_prior = [r["psnr"] for r in rows if r["fit"] == "with the prior" and "psnr" in r]
+    assert with_prior[0] < with_prior[1]
 
 
-def test_an_extreme_case_that_is_not_finite_would_be_found(root, monkeypatch):
-    lab = open_lab(root, "ellipsoid-0")
-    model = lab.start(lab.even(4))
-    assert numbers._tried((model, lab.cameras[0], None))["finite"] == 1
-    monkeypatch.setattr(numbers, "fisher", lambda *_: np.array([np.nan]))
-    assert numbers._tried((model, lab.cameras[0], None))["finite"] == 0
-    spoiled = tiny.Gaussians(
-        model.means * np.nan, model.log_scales, model.quats, model.logit_opacities, model.sh
-    )
-    assert "NaN" in numbers._tried((spoiled, lab.cameras[0], None))["refused"]
+def test_faults_are_measured_against_the_clean_run(root, monkeypatch):
+    monkeypatch.setattr(faults, "PRIOR_FAULTS", {"shifted prior": (faults.shifted, (0.4,))})
+    monkeypatch.setattr(faults, "IMAGE_FAULTS", {"image noise": (faults.image_noise, (0.3,))})
+    for name in ("SHORT_FITS", "FREE_VIEWS", "ONE_POSE"):
+        monkeypatch.setattr(faults, name, getattr(faults, name)[:1])
+    rows = faults.faults(root, root, "rock", **FOLDERS, kinds="prior", others=[FOLDERS], repeats=1)
+    clean, shifted, same = rows["rows"]
+    assert (clean["fault"], clean["lost"], clean["failed"]) == ("none", 0, False)
+    assert shifted["lost"] > faults.FAILURE
+    assert shifted["failed"]
+    assert same["lost"] == 0, "the prior of the same rock"
+    rows = faults.faults(root, root, "rock", **FOLDERS, kinds="images", others=[], repeats=1)
+    kinds = [row["fault"] for row in rows["rows"]]
+    assert kinds == ["none", "image noise", "few passes", "none", "free means", "one bad pose"]
 
 
 CALLS = []
 
 
 def toy(root, out, scene, lift):
-    """A task of one row per run."""
+    """Task with one row per run."""
     CALLS.append(scene)
-    return {
-        "rows": [
-            {"run": f"{scene}, {k}", "kind": kind, "x": lift + k / 10}
-            for k in (0, 1)
-            for kind in ("a", "b")
-        ]
-    }
+    rows = [{"run": f"{scene}, {k}", "kind": "a", "x": lift + k / 10} for k in (0, 1)]
+    return {"rows": rows}
 
 
-def test_a_run_writes_its_files_goes_on_and_keeps_earlier_experiments(tmp_path, monkeypatch):
+def test_a_run_writes_its_files_continues_and_keeps_earlier_experiments(
+    tmp_path, monkeypatch, capsys
+):
     def experiment(name, lift):
-        def cells(preset):
-            return [
-                Cell(f"{name}/{scene}", "test_stress:toy", {"scene": scene, "lift": lift})
-                for scene in "ab"
-            ]
+        task = "test_stress:toy"
+        cells = [Cell(f"{name}/{s}", task, {"scene": s, "lift": lift}) for s in "ab"]
+        claim = Claim("It is so.", lambda rows: [r["x"] for r in rows], "dB", "above", 1.0)
+        panels = (Panel("kind", "x", "kind", "x"),)
+        return Experiment("Is it so?", lambda size: cells, (claim,), panels)
 
-        return Experiment("Is it so?", cells, (claim("above"),), (Panel("kind", "x", "kind", "x"),))
-
-    monkeypatch.setattr(
-        registry, "EXPERIMENTS", {"one": experiment("one", 2.0), "two": experiment("two", 0.0)}
-    )
+    table = {"one": experiment("one", 2.0), "two": experiment("two", 0.0)}
+    monkeypatch.setattr(run, "EXPERIMENTS", table)
     CALLS.clear()
-    told = []
 
-    def run(names):
-        return registry.run_stress(
-            tmp_path, PRESETS["quick"], names, "mgs stress", lambda *a: told.append(a)
-        )
+    def verdicts(*arguments):
+        with pytest.raises(SystemExit) as ended:
+            main(["stress", str(tmp_path / "out"), *arguments])
+        assert ended.value.code == 0
+        found = json.loads((tmp_path / "out/verdicts.json").read_text())["experiments"]
+        return [(one["name"], one["claims"][0]["verdict"]) for one in found]
 
-    assert [e["name"] for e in run(["one"])["experiments"]] == ["one"]
-    verdicts = run(["two"])
-    assert [(e["name"], e["claims"][0]["verdict"]) for e in verdicts["experiments"]] == [
-        ("one", "holds"),
-        ("two", "fails"),
-    ]
-    assert json.loads((tmp_path / "verdicts.json").read_text()) == verdicts
-    assert len(list(csv.DictReader((tmp_path / "stability.csv").read_text().splitlines()))) == 16
-    assert "| one | it is so | **holds** | 2.05 (" in (tmp_path / "stability.md").read_text()
-    assert (tmp_path / "one.png").is_file()
-    run(["one", "two"])
+    assert verdicts("--only", "one") == [("one", "holds")]
+    assert verdicts("--only", "two") == [("one", "holds"), ("two", "fails")]
+    said = capsys.readouterr().out
+    assert "  holds    It is so. 2.05 (" in said
+    assert "4 runs" in said
+    assert verdicts() == [("one", "holds"), ("two", "fails")]
     assert CALLS == ["a", "b", "a", "b"]
-    assert len(told) == 4
-
-
-def test_cells_of_all_experiments_have_tasks_that_are_there_and_needs_that_are_made():
-    from importlib import import_module
-
-    for preset in PRESETS.values():
-        datasets = {cell.name: cell for cell in registry.datasets(preset)}
-        for experiment in registry.EXPERIMENTS.values():
-            for cell in [*experiment.cells(preset), *experiment.data(preset)]:
-                module, _, function = cell.task.partition(":")
-                assert callable(getattr(import_module(module), function))
-                assert set(cell.needs) <= set(datasets)
-                json.dumps(cell.arguments)
-    assert rock_cell("n", "m:f", PRESETS["quick"], "boulder", 0, x=1).arguments == {
-        "scene": "boulder-0",
-        "x": 1,
-    }
+    with open(tmp_path / "out/stability.csv") as file:
+        assert len(list(csv.DictReader(file))) == 8
+    assert "| It is so. | **holds** | 2.05 (" in (tmp_path / "out/stability.md").read_text()
+    assert (tmp_path / "out/one.png").is_file()
 
 
 @pytest.mark.parametrize(
@@ -390,17 +223,3 @@ def test_cells_of_all_experiments_have_tasks_that_are_there_and_needs_that_are_m
 def test_what_is_unknown_is_one_line(options, words, tmp_path, capsys):
     assert words in refused(capsys, ["stress", str(tmp_path / "out"), *options])
     assert not (tmp_path / "out").exists()
-
-
-def test_the_command_prints_its_verdicts(tmp_path, monkeypatch, capsys):
-    toy_experiment = Experiment(
-        "Is it so?", lambda preset: [Cell("one/a", "test_stress:toy", {"scene": "a", "lift": 2.0})], (claim("above"),),
-        (Panel("kind", "x", "kind", "x"),),
-    )  # fmt: skip
-    monkeypatch.setattr(registry, "EXPERIMENTS", {"one": toy_experiment})
-    with pytest.raises(SystemExit) as ended:
-        main(["stress", str(tmp_path / "out")])
-    assert ended.value.code == 0
-    said = capsys.readouterr().out
-    assert "holds" in said
-    assert "4 runs" in said

@@ -1,7 +1,6 @@
 #!/bin/sh
-# Resolve the dependencies of pyproject.toml anew, with its extra view, its groups dev and docs, and the build back end; write
-# requirements.lock.
-# Python 3.11: the lowest version supported, so that the pins hold for all.
+# Resolve the dependencies of pyproject.toml (with the extra view, the groups dev and docs, and the build back end) and write
+# requirements.lock. Python 3.11 is the lowest version supported, so the pins hold for all.
 set -eu
 venv=$(mktemp -d)
 trap 'rm -rf "$venv"' EXIT

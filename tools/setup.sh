@@ -1,6 +1,6 @@
 #!/bin/sh
-# Make the virtual environment $1 with the locked versions, and see to a libLLVM that Dr.Jit can use.
-# Run by `make`, from the top of the checkout. Exit code 2 and one line where a person has to do something.
+# Make the virtual environment $1 with the locked versions, and find or install a libLLVM for Dr.Jit.
+# Run by `make`, from the top of the checkout. Exits with code 2 and one line if the user has to act.
 set -eu
 venv=$1
 say() { printf 'set-up: %s\n' "$*"; }
@@ -22,7 +22,7 @@ for candidate in ${PYTHON:-python3 python3.13 python3.12 python3.11}; do
 done
 [ -n "$python" ] || stop "no Python 3.11 or newer found; install one (apt-get install python3 python3-venv), or: make PYTHON=/path/to/python3.11"
 
-# libLLVM first: it needs nothing but Python, and without it there is no point in downloading anything.
+# libLLVM first: the check needs only Python, and without libLLVM no download is of use.
 find_llvm() { "$python" -c 'from mgs.runtime import find_libllvm; print(find_libllvm())' 2>"$log"; }
 if ! llvm=$(find_llvm); then
     reason=$(tail -n 1 "$log" | sed 's/^[A-Za-z.]*InputError: //')
@@ -33,7 +33,7 @@ if ! llvm=$(find_llvm); then
 fi
 say "libLLVM $llvm"
 
-# The environment; Debian keeps ensurepip in a package of its own.
+# The environment. Debian has ensurepip in a separate package.
 if ! "$venv/bin/python" -m pip --version >/dev/null 2>&1; then
     say "$("$python" --version) into $venv"
     rm -rf "$venv"
@@ -50,7 +50,7 @@ say "installing $(grep -c == requirements.lock) packages, versions as in require
 "$venv/bin/python" -m pip install $quiet --disable-pip-version-check --no-input -r requirements.lock
 "$venv/bin/python" -m pip install -qq --disable-pip-version-check --no-input --no-deps --no-build-isolation -e .
 
-# pymeshlab's wheel wants libGL and libOpenGL of the system, though nothing is drawn with them.
+# pymeshlab's wheel loads the system's libGL and libOpenGL, though it draws nothing here.
 if ! "$venv/bin/python" -c 'import pymeshlab' 2>"$log"; then
     reason="pymeshlab does not load ($(tail -n 1 "$log")); install libGL (apt-get install libgl1 libopengl0)"
     can_apt || stop "$reason"

@@ -15,7 +15,6 @@ import typer
 
 from mgs import __version__
 from mgs.cli.bench import bench
-from mgs.cli.chart import chart
 from mgs.cli.dataset import dataset
 from mgs.cli.demo import demo
 from mgs.cli.diagnose import diagnose
@@ -23,14 +22,12 @@ from mgs.cli.doctor import doctor
 from mgs.cli.evaluate import evaluate
 from mgs.cli.import_data import import_data
 from mgs.cli.nbv import nbv
-from mgs.cli.parsimony import parsimony
 from mgs.cli.prior import prior
 from mgs.cli.prune import prune
 from mgs.cli.refit import refit
 from mgs.cli.render import render
 from mgs.cli.report import report
-from mgs.cli.reproduce import reproduce
-from mgs.cli.stress import stress
+from mgs.cli.studies import chart, parsimony, reproduce, stress
 from mgs.cli.survey import survey
 from mgs.cli.synth_orbit import synth_orbit
 from mgs.cli.view import view

@@ -1,2 +1,1 @@
-"""The mesh prior: from a cloud to ground and rock, a mesh of the rock, samples of its surface, and
-the Gaussians to start from."""
+"""The mesh prior: rock mesh, samples of its surface, and the initial Gaussians."""

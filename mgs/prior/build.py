@@ -1,9 +1,7 @@
-"""The mesh prior (paper, section III-A): built from a dataset or from a given mesh, written to a
-folder and read back.
+"""The mesh prior (paper, section III-A): build it from a dataset or a mesh, save and load it.
 
-Building it goes from the cloud of a dataset to ground plane, rock, Poisson mesh, and samples of the
-mesh's surface. Without depth, `mgs.prior.photographs` builds the mesh, of triangulated points or of
-masks.
+Steps: cloud, ground plane, rock, Poisson mesh, samples of its surface. Without depth,
+`mgs.prior.photographs` builds the mesh from triangulated points or from masks.
 """
 
 from __future__ import annotations
@@ -29,7 +27,7 @@ from mgs.files import atomic_path, new_folder, read_json, write_json
 from mgs.prior.hull import MOST_PIXELS
 from mgs.prior.photographs import Surface, check_masks, source_of, surface_of
 from mgs.prior.resolution import Resolution, resolution
-from mgs.prior.segmentation import Plane, SegmentedCloud, segment_dataset
+from mgs.prior.segmentation import SegmentedCloud, segment_dataset
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import poisson_mesh, sample_surface, spread_first
 from mgs.prior.truth import error_to_truth
@@ -38,17 +36,14 @@ from mgs.seeds import derive_seed
 
 @dataclass(frozen=True)
 class Prior:
-    """A mesh of the rock, and N samples of its surface.
+    """A mesh of the rock and N samples of its seen faces.
 
-    mesh: the mesh; its faces that count as seen were sampled. points: [N,3] samples in the world,
-    metres. normals: [N,3] unit.
-    spacing: sqrt(sampled area / N), metres: about the distance between neighbouring samples.
-    depth_tolerance: by how much a depth image may differ from the prior and still show the same
-    surface, metres. It is the largest of three rms distances of the cloud from the mesh, a voxel,
-    and two standard deviations of the depth images; for a given mesh, the spacing.
-    numbers: what prior.json holds.
-    backed: the first so many points, which are spread evenly by themselves, have a Gaussian behind
-    them too (`mgs.prior.initial`). up: unit vector that points upwards in the world.
+    points: [N,3] world, metres. normals: [N,3] unit. spacing: sqrt(sampled area / N), metres, about
+    the distance between neighbours. depth_tolerance: largest difference between a depth image and
+    the prior that counts as the same surface, metres: three rms distances of the cloud from the
+    mesh, a voxel, or two standard deviations of depth noise, whichever is largest; the spacing for
+    a given mesh. numbers: contents of prior.json. backed: number of first points, evenly spread by
+    themselves, that have a Gaussian behind them too (`mgs.prior.initial`). up: unit vector.
     """
 
     mesh: Mesh
@@ -64,81 +59,73 @@ class Prior:
 def build_prior(
     dataset: Dataset,
     settings: PriorSettings,
-    on_stage: Callable[[str], None] | None = None,
+    on_stage: Callable[[str], None] = lambda stage: None,
     *,
     source: str | None = None,
     points: Path | None = None,
     up: Up | Literal["auto"] | None = None,
 ) -> tuple[Prior, SegmentedCloud | None]:
-    """Build the prior of a dataset from its depth images, from triangulated points, or from its
-    masks.
+    """Build the prior of a dataset. Returns it, and the cloud of its mesh (None for a hull).
 
-    on_stage(name) is called as each stage starts. source: "depth", "points" or "hull"; None: the
-    first of these that the
-    dataset has. points: a PLY file of points, in place of the dataset's. up: which way is up;
-    "auto": the normal of the ground plane where one was found; None, or no such plane: as the
-    dataset says. Returns the prior, and the cloud that its mesh was built from, None for a hull.
-    Raises InputError as `source_of`, `check_masks`, `surface_of` and `segment_dataset` (nothing to
-    build it from, too few photographs, no rock, two equal rocks), `poisson_mesh` (no closed
-    surface) and `sample_surface` (too few or too many samples), or if no frame sees the mesh; and
-    NoSurface, which has the cloud, where points give no surface.
+    on_stage: called with the name of each stage. source: "depth", "points" or "hull"; by default
+    the first that the dataset has. points: PLY file in place of the dataset's points. up: unit
+    vector; "auto" is the normal of the ground plane, if there is one; None the dataset's. Raises
+    InputError as `source_of`, `check_masks`, `surface_of`, `segment_dataset`, `poisson_mesh` and
+    `sample_surface`, and if no frame sees the mesh; NoSurface, which holds the cloud, if points
+    give no surface.
     """
-    tell = on_stage or (lambda stage: None)
     chosen = source_of(dataset, source, points)
-    surface = (
-        _of_depth(dataset, settings, tell)
-        if chosen == "depth"
-        else surface_of(dataset, chosen, settings, tell, points)
-    )
+    if chosen == "depth":
+        surface = _depth_surface(dataset, settings, on_stage)
+    else:
+        surface = surface_of(dataset, chosen, settings, on_stage, points)
     mesh, segmented, cell = surface.mesh, surface.segmented, surface.cell
-    tell("surface samples")
-    residual, noise = 0.0, 0.0
+    on_stage("surface samples")
+    residual, noise, plane = 0.0, 0.0, None
     if segmented is not None:
-        residual = float(
-            np.sqrt(
-                np.mean(distances_to_mesh(segmented.rock_points, mesh.vertices, mesh.faces) ** 2)
-            )
-        )
-        noise = segmented.cloud.noise
+        distances = distances_to_mesh(segmented.rock_points, mesh.vertices, mesh.faces)
+        residual = float(np.sqrt(np.mean(distances**2)))
+        noise, plane = segmented.cloud.noise, segmented.plane
     tolerance = max(3 * residual, cell, 2 * noise)
     mesh = _seen_by(mesh, dataset.frames, tolerance)
-    pixel = cell if chosen == "depth" else _pixel(dataset.frames, mesh.vertices.mean(0))
-    resolved = _resolved(mesh, settings, [frame.camera for frame in dataset.frames])
+    cameras = [frame.camera for frame in dataset.frames]
+    resolved = resolution(mesh, cameras) if settings.resolved_by_cameras else None
+    pixel = cell if chosen == "depth" else _pixel(cameras, mesh.vertices.mean(0))
     samples, normals, spacing, backed = _samples(mesh, settings, resolved, pixel)
-    plane = None if segmented is None else segmented.plane
-    ground_up = None if plane is None else unit_up(plane.normal)
-    upward = (ground_up if up == "auto" else up) or dataset.up
-    numbers = {
-        "from": chosen,
-        "frames": len(dataset.frames),
-        **surface.numbers,
-        **({} if segmented is None or plane is None else _plane_numbers(plane, segmented.ground)),
-        "fit_rms": residual,
-        "depth_tolerance": tolerance,
-        **_sample_numbers(mesh, samples, spacing, backed, resolved),
-        **_world_numbers(upward, dataset.unit),
-        "settings": asdict(settings),
-    }
+    upward = up if up is not None and up != "auto" else dataset.up
+    numbers = {"from": chosen, "frames": len(dataset.frames), **surface.numbers}
+    if segmented is not None and plane is not None:
+        upward = unit_up(plane.normal) if up == "auto" else upward
+        numbers |= {
+            "plane_inliers": int(segmented.ground.sum()),
+            "plane_sigma": plane.sigma,
+            "plane_tolerance": plane.tolerance,
+            "plane_normal": plane.normal.tolist(),
+        }
+    numbers |= {"fit_rms": residual, "depth_tolerance": tolerance}
+    numbers |= _sample_numbers(mesh, samples, spacing, backed, resolved)
+    numbers |= {"up": list(upward), "unit": dataset.unit, "settings": asdict(settings)}
     truth = dataset.root / "rock.glb"
     if truth.is_file() and chosen == "depth" and segmented is not None:
-        tell("distance to the true rock")
+        on_stage("distance to the true rock")
         numbers["truth"] = error_to_truth(
             samples, spacing, mesh, truth, dataset.frames, segmented, settings.seed
         )
     return Prior(mesh, samples, normals, spacing, tolerance, numbers, backed, upward), segmented
 
 
-def _of_depth(dataset: Dataset, settings: PriorSettings, tell: Callable[[str], None]) -> Surface:
-    """The surface by the source "depth"."""
-    segmented = segment_dataset(dataset, settings, tell)
+def _depth_surface(
+    dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None]
+) -> Surface:
+    """The surface of the source "depth"."""
+    segmented = segment_dataset(dataset, settings, on_stage)
     check_masks(dataset.frames)
     cloud, plane = segmented.cloud, segmented.plane
     assert plane is not None
-    tell("Poisson mesh")
+    on_stage("Poisson mesh")
+    points, normals = segmented.rock_points, segmented.rock_normals
     cell = max(cloud.voxel, settings.noise)
-    mesh, depth = poisson_mesh(
-        segmented.rock_points, segmented.rock_normals, cell, plane, settings.poisson_depth
-    )
+    mesh, depth = poisson_mesh(points, normals, cell, plane, settings.poisson_depth)
     numbers = {
         "pixels": cloud.pixels,
         "points": len(cloud.points),
@@ -146,59 +133,34 @@ def _of_depth(dataset: Dataset, settings: PriorSettings, tell: Callable[[str], N
         "depth_noise": cloud.noise,
         "eps": segmented.eps,
         "clusters": segmented.clusters,
-        "cluster_size": len(segmented.rock_points),
+        "cluster_size": len(points),
         "poisson_depth": depth,
     }
     return Surface(mesh, cloud.voxel, segmented, numbers)
 
 
-def _plane_numbers(plane: Plane, ground: np.ndarray) -> dict[str, Any]:
-    """What prior.json holds of the ground plane; ground: [P] bool, the points on it."""
-    return {
-        "plane_inliers": int(ground.sum()),
-        "plane_sigma": plane.sigma,
-        "plane_tolerance": plane.tolerance,
-        "plane_normal": plane.normal.tolist(),
-    }
-
-
-def _world_numbers(up: Up, unit: str) -> dict[str, Any]:
-    """What prior.json holds of the world: which way is up, and what a length of 1 is."""
-    return {"up": list(up), "unit": unit}
-
-
-def _pixel(frames: Sequence[Frame], point: np.ndarray) -> float:
-    """The median size of a pixel of the frames at a point [3], in units of the world."""
-    return float(
-        np.median([np.linalg.norm(f.camera.position - point) / f.camera.K[0, 0] for f in frames])
-    )
-
-
-def _resolved(mesh: Mesh, settings: PriorSettings, cameras: Sequence[Camera]) -> Resolution | None:
-    """What the cameras resolve of a mesh, where the settings leave the number of Gaussians to it.
-    Raises InputError as `resolution`."""
-    return resolution(mesh, cameras) if settings.resolved_by_cameras else None
+def _pixel(cameras: Sequence[Camera], point: np.ndarray) -> float:
+    """Median size of a pixel at a point [3], units of the world."""
+    return float(np.median([np.linalg.norm(c.position - point) / c.K[0, 0] for c in cameras]))
 
 
 def _samples(
     mesh: Mesh, settings: PriorSettings, resolved: Resolution | None, pixel: float
 ) -> tuple[np.ndarray, np.ndarray, float, int]:
-    """(points [N,3], unit normals [N,3], spacing in metres, how many of the first are backed) of a
-    surface.
+    """Samples of a surface: points [N,3], unit normals [N,3], spacing in metres, number backed.
 
-    resolved: what `_resolved` found. pixel: that a density counts by, metres. Raises InputError as
-    `sample_surface`.
+    resolved: sets the spacing if given. pixel: unit of `settings.density`, metres. Raises
+    InputError as `sample_surface`.
     """
     asked, share = settings.gaussians, settings.backing
     total = asked if isinstance(asked, int) else None
     count = None if total is None else total - round(total * share / (1 + share))
+    if resolved:
+        spacing = resolved.spacing
+    else:
+        spacing = settings.spacing or pixel / (settings.density or 1.0) ** 0.5
     seed = derive_seed(settings.seed, "prior/samples")
-    asked_spacing = (
-        resolved.spacing
-        if resolved
-        else settings.spacing or pixel / (settings.density or 1.0) ** 0.5
-    )
-    points, normals, spacing = sample_surface(mesh, seed, count=count, spacing=asked_spacing)
+    points, normals, spacing = sample_surface(mesh, seed, count=count, spacing=spacing)
     backed = round(share * len(points)) if total is None else total - len(points)
     order = spread_first(points, backed, spacing)
     return points[order], normals[order], spacing, backed
@@ -207,8 +169,7 @@ def _samples(
 def _sample_numbers(
     mesh: Mesh, points: np.ndarray, spacing: float, backed: int, resolved: Resolution | None
 ) -> dict[str, Any]:
-    """What prior.json holds of the mesh and of its samples [N,3]; areas in square metres, distances
-    in metres."""
+    """Items of prior.json about the mesh and its samples [N,3]; square metres, metres."""
     nearest = cKDTree(points).query(points, 2)[0][:, 1]
     return {
         "mesh_faces": len(mesh.faces),
@@ -230,61 +191,54 @@ def prior_from_mesh(
     unit: str = "m",
     cameras: Sequence[Camera] = (),
 ) -> Prior:
-    """The prior of a given mesh in world coordinates, all of whose surface is sampled. up, unit,
-    cameras: of the dataset it is for; the cameras are read only where the number of Gaussians is
-    left to them.
+    """Prior of a given mesh in world coordinates, sampled all over.
 
-    Raises InputError as `read_mesh`, `resolution` and `sample_surface`, and for the settings that
-    only a mesh built from a
-    cloud has: noise, holes, poisson_depth and density.
+    up, unit, cameras: of the dataset; the cameras decide the number of Gaussians if the settings do
+    not. Raises InputError as `read_mesh`, `resolution` and `sample_surface`, and for settings that
+    only a cloud has: noise, holes, poisson_depth and density.
     """
     settings.refuse_shaping("--mesh gives one")
     mesh = read_mesh(path)
     if settings.density is not None:
         raise InputError(
-            f"{path}: a density counts by the voxels of a cloud, which a mesh has not; give a number or a spacing"
+            f"{path}: a density counts by the voxels of a cloud, which a mesh has not; "
+            "give a number or a spacing"
         )
-    resolved = _resolved(mesh, settings, cameras)
+    resolved = resolution(mesh, cameras) if settings.resolved_by_cameras else None
     points, normals, spacing, backed = _samples(mesh, settings, resolved, 0.0)
-    done = {
-        key: value
-        for key, value in asdict(settings).items()
-        if key in ("gaussians", "spacing", "seed", "backing")
-    }
+    used = {key: getattr(settings, key) for key in ("gaussians", "spacing", "seed", "backing")}
     numbers = {
         "from": "mesh",
         "mesh": str(path),
         "depth_tolerance": spacing,
         **_sample_numbers(mesh, points, spacing, backed, resolved),
-        **_world_numbers(up, unit),
-        "settings": done,
+        "up": list(up),
+        "unit": unit,
+        "settings": used,
     }
     return Prior(mesh, points, normals, spacing, spacing, numbers, backed, up)
 
 
 def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:
-    """The mesh, of which only those faces still count as seen that have a corner some frame sees
-    inside its rock mask.
+    """The mesh, with only those faces seen that have a corner which some frame sees inside its rock
+    mask.
 
-    What no frame sees is buried in the ground, or closes a gap that frames look through, or cannot
-    be seen from any candidate
-    view. Gaussians there would be of no use, or would show where they should not. tolerance:
-    depth_tolerance of the prior, metres. If no frame has depth, the depth of the mesh itself says
-    what hides what. Raises InputError if no frame sees any of the mesh.
+    Other faces are buried, close a gap that frames look through, or are hidden from every view, so
+    Gaussians there would be useless or wrong. tolerance: as `visible`, metres. If no frame has
+    depth, the depth of the mesh decides. Raises InputError if no frame sees the mesh.
     """
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
     with_depth = [frame for frame in frames if frame.depth_path is not None]
-    of_mesh = None if with_depth else mesh_depth(mesh)
+    depth_of_mesh = None if with_depth else mesh_depth(mesh)
     seen, normals = np.zeros(len(mesh.vertices), bool), mesh.vertex_normals
     for frame in with_depth or frames:
         camera = frame.camera
-        if of_mesh:  # of a large photograph every few pixels will do
+        if depth_of_mesh:
             camera = shrunk_to(camera, MOST_PIXELS)[0]
-        depth = of_mesh(camera) if of_mesh else frame.depth()
-        seen |= visible(mesh.vertices, normals, camera, depth, tolerance) & in_mask(
-            mesh.vertices, frame
-        )
+        depth = depth_of_mesh(camera) if depth_of_mesh else frame.depth()
+        in_view = visible(mesh.vertices, normals, camera, depth, tolerance)
+        seen |= in_view & in_mask(mesh.vertices, frame)
     narrowed = mesh.seen & seen[mesh.faces].any(1)
     if not narrowed.any():
         raise InputError("prior: no frame sees the mesh in its rock mask; check masks and poses")
@@ -292,8 +246,7 @@ def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:
 
 
 def save_prior(out: str | Path, prior: Prior) -> Path:
-    """Write a prior into a new folder: mesh.ply, points.ply (x y z nx ny nz) and prior.json.
-    Returns the folder.
+    """Write mesh.ply, points.ply (x y z nx ny nz) and prior.json into a new folder, and return it.
 
     Raises InputError if the folder is not empty or cannot be written.
     """
@@ -308,10 +261,10 @@ def save_prior(out: str | Path, prior: Prior) -> Path:
 
 
 def load_prior(folder: str | Path) -> Prior:
-    """Read a prior from a folder that `save_prior` wrote.
+    """Read a prior that `save_prior` wrote. All faces of its mesh count as seen, since the file
+    does not say which were sampled.
 
-    All of its mesh counts as seen, because the file does not say which part was sampled. Raises
-    InputError if the folder or a file is missing, or a file is damaged or holds NaN.
+    Raises InputError if the folder or a file is missing, damaged or holds NaN.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -324,35 +277,28 @@ def load_prior(folder: str | Path) -> Prior:
         raise InputError(f"{path}: no such file; make the prior again with `mgs prior`")
     try:
         data = PlyData.read(str(path))["vertex"].data
-        columns = np.stack(
-            [np.asarray(data[name], np.float64) for name in ("x", "y", "z", "nx", "ny", "nz")], 1
-        )
+        names = ("x", "y", "z", "nx", "ny", "nz")
+        columns = np.stack([np.asarray(data[name], np.float64) for name in names], 1)
         spacing, tolerance = float(numbers["spacing"]), float(numbers["depth_tolerance"])
-        backed = int(numbers.get("backed", 0))  # older priors have no backing
-        up = unit_up(numbers["up"]) if "up" in numbers else PLUS_Z
+        backed, up = int(numbers["backed"]), unit_up(numbers["up"])
     except (PlyParseError, KeyError, ValueError, TypeError, UnicodeDecodeError) as error:
         raise InputError(
             f"{folder}: not a readable prior ({error}); make it again with `mgs prior`"
         ) from None
     if not np.isfinite(columns).all() or len(columns) < 2:
         raise InputError(
-            f"{path}: has NaN values, or fewer than two points; make the prior again with `mgs prior`"
+            f"{path}: has NaN values, or fewer than two points; "
+            "make the prior again with `mgs prior`"
         )
     if not (0 < spacing < np.inf and 0 < tolerance < np.inf):
         raise InputError(
-            f"{folder / 'prior.json'}: spacing and depth_tolerance must be positive metres; make the prior again"
+            f"{folder / 'prior.json'}: spacing and depth_tolerance must be positive metres; "
+            "make the prior again"
         )
     if not 0 <= backed <= len(columns):
         raise InputError(
             f"{folder / 'prior.json'}: backed must be a number of the points; make the prior again"
         )
-    return Prior(
-        read_mesh(folder / "mesh.ply"),
-        columns[:, :3],
-        columns[:, 3:],
-        spacing,
-        tolerance,
-        numbers,
-        backed,
-        up,
-    )
+    mesh = read_mesh(folder / "mesh.ply")
+    points, normals = columns[:, :3], columns[:, 3:]
+    return Prior(mesh, points, normals, spacing, tolerance, numbers, backed, up)

@@ -1,15 +1,10 @@
-"""Exposure that differs between photographs: a gain for each image and channel, from what they show
-of the same surface.
+"""Exposure differences between photographs: a gain per image and channel, before any fit.
 
-A camera that sets its exposure and white balance anew multiplies the linear RGB of a whole image by
-a gain per channel. Where two images show the same samples of the prior's surface, the ratio of the
-mean colours there is the ratio of their gains. The gains of all images together are the
-least-squares solution of the ratios of all pairs: gain compensation (Brown and Lowe 2007,
-"Automatic Panoramic Image Stitching using Invariant Features", section 6), here of logarithms, so
-that it is linear.
-
-This needs nothing but poses, the surface and the images themselves, so the gains are known before a
-fit.
+Automatic exposure and white balance multiply the linear RGB of an image by a gain per channel.
+Where two images show the same surface samples, the ratio of mean colours is the ratio of their
+gains. All gains are the least-squares solution over all pairs (Brown and Lowe 2007, "Automatic
+Panoramic Image Stitching using Invariant Features", section 6), here of logarithms, so it is
+linear.
 """
 
 from __future__ import annotations
@@ -26,54 +21,44 @@ if TYPE_CHECKING:
     from mgs.prior.build import Prior
 
 SAMPLES = 4000
-"""About how many samples of the surface are compared, at most; spread evenly over those of the
-prior."""
+"""About the most surface samples compared, evenly spread over the prior's."""
 
 SQUARENESS = 4
-"""A sample counts in an image with this power of the cosine of the angle between its normal and the
-view: surfaces shine at
-grazing angles, and errors of the surface move them most there. Measured on the dataset of the demo,
-whose exposure is constant: the gains of 12 views are wrong by 1 % (rms); by 6 % where all samples
-count alike."""
+"""Exponent of the cosine between normal and view in a sample's weight: surfaces shine at grazing
+angles, and errors of the surface matter most there. On the demo's dataset, of constant exposure,
+gains of 12 views err by 1 % rms, and by 6 % with equal weights."""
 
 SATURATED = 0.9
-"""Brightest colour that is compared, linear RGB: a channel that is clipped at 1 says nothing of its
-gain."""
+"""Brightest colour compared, linear RGB: a clipped channel says nothing of its gain."""
 
 DARK = 1e-3
-"""Least mean brightness of samples that two images share, linear RGB, from which a ratio is
-taken."""
+"""Least mean brightness of shared samples, linear RGB, for a ratio."""
 
 RATIO_STD = 0.1
-"""Standard deviation of the logarithm of the ratio that a single sample gives. A chosen
-constant."""
+"""Standard deviation of the log ratio from one sample. A chosen constant."""
 
 GAIN_STD = 0.5
-"""Standard deviation of the logarithm of a gain before any image is seen, 0.7 stops. It decides
-only where images share few samples, or none."""
+"""Prior standard deviation of a log gain, 0.7 stops. It matters only for images that share few
+samples."""
 
 
 def solve_gains(colours: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The gains of images, [V,3]; in every channel their geometric mean is 1.
+    """Gains of images [V,3], of geometric mean 1 in every channel.
 
-    colours: [V,S,3] linear RGB of S samples of the surface as V images show them, NaN where an
-    image does not show a sample;
-    weights: [V,S], 0 to 1, how much each counts. With l the logarithms of the gains of a channel,
-    n_ij the sum over samples of the product of their weights in images i and j, and d_ij the
-    logarithm of the ratio of their mean colours under these weights, the sum over pairs of n_ij
-    (l_i - l_j - d_ij)^2 / RATIO_STD^2 plus the sum over images of l_i^2 / GAIN_STD^2 is least.
+    colours: [V,S,3] linear RGB of S surface samples in V images, NaN where not shown; weights:
+    [V,S], 0 to 1. With log gains l, n_ij = sum over samples of w_i w_j, and d_ij the log ratio of
+    the weighted mean colours, minimises the sum over pairs of n_ij (l_i - l_j - d_ij)^2 /
+    RATIO_STD^2 plus the sum over images of l_i^2 / GAIN_STD^2.
     """
     known = (np.nan_to_num(colours, nan=np.inf) <= SATURATED).all(axis=2)
     weights = np.where(known, weights, 0.0)
     values = np.where(known[..., None], colours, 0.0) * weights[..., None]
     shared = weights @ weights.T
-    sums = np.stack(
-        [values[..., c] @ weights.T for c in range(3)], -1
-    )  # of the colours of i, in what it shares with j
+    # Of the colours of i, over the samples that it shares with j.
+    sums = np.stack([values[..., c] @ weights.T for c in range(3)], -1)
     means = sums / np.maximum(shared, 1e-12)[..., None]
-    lit = (np.minimum(means, means.swapaxes(0, 1)) >= DARK).all(axis=2) & ~np.eye(
-        len(means), dtype=bool
-    )
+    lit = (np.minimum(means, means.swapaxes(0, 1)) >= DARK).all(axis=2)
+    lit &= ~np.eye(len(means), dtype=bool)
     precision = np.where(lit, shared, 0) / RATIO_STD**2
     ratio = np.log(np.maximum(means, DARK) / np.maximum(means.swapaxes(0, 1), DARK))
     matrix = np.diag(precision.sum(axis=1) + GAIN_STD**-2) - precision
@@ -82,22 +67,20 @@ def solve_gains(colours: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def without_gain(target: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """A target [H,W,C], colours and what `mgs.data.dataset.target_of` has beside them, with its
-    colours divided by the gains [3] of the three channels; float32."""
+    """A target [H,W,C] (`target_of`) with its colours divided by the gains [3]; float32."""
     return target / np.append(gain, np.ones(target.shape[-1] - 3)).astype(np.float32)
 
 
 def exposure_of(prior: Prior) -> Callable[[Sequence[Frame]], np.ndarray]:
-    """A function that gives the gains [V,3] of frames by `solve_gains`; it reads every frame once.
+    """Return gains(frames): [V,3] by `solve_gains`; every frame is read once.
 
-    Raises InputError if a file of a frame cannot be read.
+    gains raises InputError if a file of a frame cannot be read.
     """
     some = slice(None, None, max(1, -(-len(prior.points) // SAMPLES)))
     points, normals = prior.points[some], prior.normals[some]
     depth, known = depth_of(prior), dict[str, tuple[np.ndarray, np.ndarray]]()
 
     def shown(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-        """Colours [S,3], NaN where not seen, and weights [S]."""
         colours = np.full((len(points), 3), np.nan)
         seen, rgb = seen_colours(points, normals, frame, depth(frame), prior.depth_tolerance)
         colours[seen] = rgb

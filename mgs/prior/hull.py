@@ -1,16 +1,15 @@
-"""The visual hull: the largest body that fits into the masks of all frames (Laurentini 1994), by
-space carving on a grid.
+"""The visual hull: the largest body inside the masks of all frames (Laurentini 1994), by carving.
 
-A point of space has a value for each frame: how far its projection lies inside the mask's outline,
-in pixels, times the size of a pixel at the point. The least of these values is positive inside the
-hull, negative outside, and about the distance to the hull's surface near it; marching cubes find
-the surface between the nodes of the grid.
+A point has a value per frame: its projection's distance inside the mask's outline, pixels, times
+the size of a pixel there. The least value is positive inside the hull, negative outside, and about
+the distance to its surface nearby; marching cubes find the surface.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter, label
@@ -19,41 +18,38 @@ from mgs.camera import Camera
 from mgs.data.dataset import Frame
 from mgs.data.lens import shrunk_to
 from mgs.data.meshes import Mesh
+from mgs.data.visibility import in_image
 from mgs.errors import InputError
+from mgs.survey.fusion import nearest_point
 
-COARSE = 48
-"""Cells along an edge of the first grid. It is refined near the surface only, REFINEMENTS times, by
-two each time."""
-
-REFINEMENTS = 2
+COARSE, REFINEMENTS = 48, 2
+"""Cells along an edge of the first grid, which is refined near the surface REFINEMENTS times by
+two."""
 
 NEAR_SURFACE = 3.0
-"""Nodes of a refined grid whose interpolated value is less than this many of its cells are computed
-anew. The others are too far from the surface to change it."""
+"""Nodes of a refined grid are evaluated anew if their interpolated value is below this many cells.
+"""
 
 ROW = 4096
-"""Points are handed to OpenCV in rows of this length."""
+"""Points are passed to OpenCV in rows of this length."""
 
 MOST_PIXELS = 1_000_000
-"""Of a mask to carve with: 4 MB of memory each. Outlines are then finer than the grid still."""
+"""Most pixels of a mask to carve with: 4 MB each, and outlines still finer than the grid."""
 
 MARGIN = 1.3
 """Half edge of the grid over the largest radius of the object that a mask shows."""
 
 LEAST_VIEWS = 3
-"""A point that fewer frames have in their image is outside: nothing says that it belongs to the
-object."""
+"""A point in the image of fewer frames is outside."""
 
 AGREEMENT = 0.8
-"""Least median share of a mask that the hull must fill. Where masks and poses fit, it is above
-0.95."""
+"""Least median share of a mask that the hull must fill; above 0.95 where masks and poses fit."""
 
 
 @dataclass(frozen=True)
 class Hull:
-    """A visual hull. mesh: its surface, closed, in the world; cell: edge of the finest grid cells,
-    in units of the world;
-    agreement: for each frame the share of its mask that the hull fills."""
+    """mesh: closed surface, world; cell: finest grid cell, units of the world; agreement: share of
+    each frame's mask that the hull fills."""
 
     mesh: Mesh
     cell: float
@@ -61,11 +57,10 @@ class Hull:
 
 
 def visual_hull(frames: Sequence[Frame], tell: Callable[[str], None] = lambda stage: None) -> Hull:
-    """The visual hull of the masks of frames, smoothed by no more than half a cell.
+    """Visual hull of the masks of frames, smoothed by at most half a cell.
 
-    Raises InputError if all masks are empty or full, if the masks share no point of space, or if
-    the hull fills too little of the masks because poses and masks do not fit; the message names
-    frames.
+    Raises InputError if all masks are empty or full, if they share no point of space, or if the
+    hull fills too little of them, because poses and masks do not fit; the message names frames.
     """
     from skimage.measure import marching_cubes
 
@@ -77,14 +72,12 @@ def visual_hull(frames: Sequence[Frame], tell: Callable[[str], None] = lambda st
     if field.max() <= 0:
         kept = np.unravel_index(np.argmin(carved), carved.shape)
         point = (lo + edge / cells * np.array(kept))[None]
-        against = [
-            frame.name
-            for frame, view in zip(frames, views, strict=True)
-            if not 0 < view(point)[0] < np.inf
-        ]
+        values = zip(frames, (view(point)[0] for view in views), strict=True)
+        against = [frame.name for frame, value in values if not 0 < value < np.inf]
         raise InputError(
-            f"prior: the masks share no point of space (at best {len(against)} of {len(frames)} frames, such as {against[0]}, "
-            "are against it); poses and masks do not fit, or the object moved; correct or remove frames"
+            f"prior: the masks share no point of space (at best {len(against)} of {len(frames)} "
+            f"frames, such as {against[0]}, are against it); poses and masks do not fit, "
+            "or the object moved; correct or remove frames"
         )
     for _ in range(REFINEMENTS):
         field, cells = _refined(field), 2 * cells
@@ -107,23 +100,20 @@ class _View:
     distance: np.ndarray
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """How far inside the silhouette points [N,3] are, in units of the world; +inf where they
-        are not in the image."""
+        """Distance of points [N,3] inside the silhouette, units of the world; +inf outside the
+        image."""
         import cv2
 
         if len(points) == 0:
             return np.zeros(0)
         pixels, z = self.camera.project(points)
-        inside = (
-            (z > 0)
-            & (pixels > 0).all(1)
-            & (pixels < [self.camera.width, self.camera.height]).all(1)
-        )
+        inside = in_image(self.camera, pixels, z)
         padded = np.zeros((-(-len(points) // ROW) * ROW, 2), np.float32)
         padded[: len(points)] = np.where(inside[:, None], pixels - 0.5, 0)
         at = padded.reshape(-1, ROW, 2)  # OpenCV takes images of up to 32,767 rows
+        remap: Any = cv2.remap  # its stub takes no None
         found = [
-            cv2.remap(self.distance, part, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+            remap(self.distance, part, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             for part in np.array_split(at, -(-len(at) // ROW))
         ]
         value = np.concatenate(found).ravel()[: len(points)] * (z / self.camera.K[0, 0])
@@ -131,38 +121,27 @@ class _View:
 
 
 def _view(frame: Frame) -> _View:
-    """The view of a frame. All are kept in memory, so a mask of more than MOST_PIXELS is made
-    smaller."""
+    """View of a frame, with a mask of at most MOST_PIXELS, since all are kept in memory."""
     camera, smaller = shrunk_to(frame.camera, MOST_PIXELS)
-    return _View(
-        camera, _signed_distance(smaller(frame.mask().astype(np.uint8) * 255, True) >= 128)
-    )
+    mask = smaller(frame.mask().astype(np.uint8) * 255, True) >= 128
+    return _View(camera, _signed_distance(mask))
 
 
 def _signed_distance(mask: np.ndarray) -> np.ndarray:
-    """Distance [H,W] of pixel centres from the outline of a mask, pixels, positive inside,
-    float32."""
-    inside = (
-        distance_transform_edt(mask) - 0.5
-        if not mask.all()
-        else np.full(mask.shape, float(max(mask.shape)))
-    )
-    outside = (
-        distance_transform_edt(~mask) - 0.5
-        if mask.any()
-        else np.full(mask.shape, float(max(mask.shape)))
-    )
+    """Distance [H,W] of pixel centres from a mask's outline, pixels, positive inside, float32."""
+    far = np.full(mask.shape, float(max(mask.shape)))
+    inside = far if mask.all() else distance_transform_edt(mask) - 0.5
+    outside = distance_transform_edt(~mask) - 0.5 if mask.any() else far
     return np.where(mask, inside, -outside).astype(np.float32)
 
 
 def _bounds(frames: Sequence[Frame]) -> tuple[np.ndarray, float]:
-    """(lowest corner [3], edge) of the cube to carve in: around the point nearest to the rays
+    """Lowest corner [3] and edge of the cube to carve in, around the point nearest to the rays
     through the masks' centres.
 
-    Frames with an empty mask, and with one that fills the image, say nothing of it. Raises
-    InputError if all are such.
+    Raises InputError if every mask is empty or fills its image.
     """
-    A, b, cones = np.zeros((3, 3)), np.zeros(3), []
+    rays, cones = [], []
     for frame in frames:
         mask = frame.mask()
         if not mask.any() or mask.all():
@@ -171,44 +150,38 @@ def _bounds(frames: Sequence[Frame]) -> tuple[np.ndarray, float]:
         pixels = np.stack([columns, rows], 1) + 0.5
         middle, K = (pixels.min(0) + pixels.max(0)) / 2, frame.camera.K
         ray = frame.camera.world_to_camera[:3, :3].T @ np.linalg.solve(K, [*middle, 1])
-        ray /= np.linalg.norm(ray)
-        across = np.eye(3) - np.outer(ray, ray)
-        A, b = A + across, b + across @ frame.camera.position
-        cones.append((frame.camera, np.linalg.norm(pixels - middle, axis=1).max() / K[0, 0]))
+        rays.append(ray / np.linalg.norm(ray))
+        tangent = np.linalg.norm(pixels - middle, axis=1).max() / K[0, 0]
+        cones.append((frame.camera.position, tangent))
     if not cones:
         raise InputError(
-            "prior: every mask is empty or fills its image; give masks that are white on the object only"
+            "prior: every mask is empty or fills its image; "
+            "give masks that are white on the object only"
         )
-    centre = np.linalg.lstsq(A, b, rcond=1e-9)[0]
-    half = MARGIN * max(
-        np.linalg.norm(camera.position - centre) * tangent for camera, tangent in cones
-    )
+    centre = nearest_point([position for position, _ in cones], rays)
+    half = MARGIN * max(np.linalg.norm(at - centre) * tangent for at, tangent in cones)
     return centre - half, float(2 * half)
 
 
 def _inside(views: Sequence[_View], points: np.ndarray, reach: float) -> np.ndarray:
-    """The least value of points [N,3] over the views, cut to +-reach, float32 [N]; -reach where
-    fewer than LEAST_VIEWS have the point in their image."""
+    """Least value of points [N,3] over the views, clipped to +-reach, float32 [N]; -reach if fewer
+    than LEAST_VIEWS have the point in their image."""
     least, count = np.full(len(points), np.inf), np.zeros(len(points), int)
     left = np.arange(len(points))
     for view in views:
         value = view(points[left])
         count[left] += np.isfinite(value)
         least[left] = np.minimum(least[left], value)
-        left = left[
-            least[left] > -reach
-        ]  # what is carved away deeper than this is far from the surface
-    carved = least <= -reach
-    return np.where(
-        carved | (count < min(LEAST_VIEWS, len(views))), -reach, np.minimum(least, reach)
-    ).astype(np.float32)
+        left = left[least[left] > -reach]  # what is carved deeper is far from the surface
+    outside = (least <= -reach) | (count < min(LEAST_VIEWS, len(views)))
+    return np.where(outside, -reach, np.minimum(least, reach)).astype(np.float32)
 
 
 def _first_grid(
     views: Sequence[_View], lo: np.ndarray, edge: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The values of the nodes of the coarse grid, and how many views carve each away, [n,n,n] with
-    n = COARSE + 1; all views where fewer than LEAST_VIEWS have the node in their image."""
+    """Values of the nodes of the coarse grid, and how many views carve each, [n,n,n] with n =
+    COARSE + 1; all views if fewer than LEAST_VIEWS have the node in their image."""
     nodes = np.stack(np.meshgrid(*[np.arange(COARSE + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
     points = lo + edge / COARSE * nodes
     carved, count = np.zeros(len(points), int), np.zeros(len(points), int)
@@ -218,9 +191,8 @@ def _first_grid(
         count += np.isfinite(value)
     carved[count < min(LEAST_VIEWS, len(views))] = len(views)
     shape = (COARSE + 1,) * 3
-    return _inside(views, points, 2 * NEAR_SURFACE * edge / COARSE).reshape(shape), carved.reshape(
-        shape
-    )
+    field = _inside(views, points, 2 * NEAR_SURFACE * edge / COARSE)
+    return field.reshape(shape), carved.reshape(shape)
 
 
 def _refined(field: np.ndarray) -> np.ndarray:
@@ -235,7 +207,7 @@ def _refined(field: np.ndarray) -> np.ndarray:
 
 
 def _largest(field: np.ndarray) -> np.ndarray:
-    """The field, negative outside of the largest connected piece in which it is positive."""
+    """The field, made negative outside its largest connected positive piece."""
     pieces, _ = label(field > 0)
     sizes = np.bincount(pieces.ravel())
     sizes[0] = 0
@@ -243,8 +215,8 @@ def _largest(field: np.ndarray) -> np.ndarray:
 
 
 def _checked_agreement(frames: Sequence[Frame], views: Sequence[_View], mesh: Mesh) -> np.ndarray:
-    """For each frame the share of its mask that the mesh fills. Raises InputError where the median
-    is below AGREEMENT."""
+    """Share of each frame's mask that the mesh fills. Raises InputError if the median is below
+    AGREEMENT."""
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
     depth = mesh_depth(mesh)
@@ -256,7 +228,8 @@ def _checked_agreement(frames: Sequence[Frame], views: Sequence[_View], mesh: Me
     if not np.nanmedian(agreement) >= AGREEMENT:
         worst = frames[int(np.nanargmin(agreement))].name
         raise InputError(
-            f"prior: the masks carve away most of the object (the hull fills {np.nanmedian(agreement):.0%} of a mask, "
-            f"{np.nanmin(agreement):.0%} in frame {worst}); poses and masks do not fit, correct or remove frames"
+            f"prior: the masks carve away most of the object (the hull fills "
+            f"{np.nanmedian(agreement):.0%} of a mask, {np.nanmin(agreement):.0%} in frame "
+            f"{worst}); poses and masks do not fit, correct or remove frames"
         )
     return agreement

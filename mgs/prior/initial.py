@@ -1,12 +1,10 @@
-"""The prior and some frames -> initial Gaussians (paper, section III-A), with a backing that keeps
-the rock opaque.
+"""Initial Gaussians from the prior and some frames (paper, section III-A), with an opaque backing.
 
-Nothing in an image asks for an opaque surface. Where only a layer of Gaussians on the surface is
-fitted, as in the paper, bright patches turn see-through, and what shines through is the far side of
-the rock, another part of it from every camera. But a mesh prior knows that the rock is solid behind
-its surface. So every second Gaussian on the surface has an opaque one a spacing behind it, larger,
-so that together they close; all are fitted alike. What shines through the surface then ends on the
-rock's own colour, one spacing deep. benchmarks/backing.py measures it.
+No image asks for an opaque surface. With one layer of Gaussians, as in the paper, bright patches
+become transparent, and the far side of the rock shines through, a different part in every camera.
+The mesh prior knows that the rock is solid. So every second Gaussian on the surface has a larger,
+opaque one a spacing behind it; all are fitted alike, and what shines through is the rock's own
+colour. docs/fit.md has the measurements.
 """
 
 from __future__ import annotations
@@ -33,42 +31,37 @@ IN_PLANE_SCALE = 0.65
 """Standard deviation of a Gaussian along the surface, over the spacing of the samples."""
 
 INITIAL_OPACITY = 0.9
-"""Opacity of a Gaussian. IN_PLANE_SCALE and INITIAL_OPACITY are chosen together, such that the far
-side of the rock is hidden from the first render on. Let Gaussians of standard deviation s and
-opacity o lie on a plane, one per spacing^2. The logarithm of the transmittance of a ray across the
-plane is on average the integral over the plane of ln(1 - o exp(-r^2 / (2 s^2))) / spacing^2, which
-is -2 pi (s / spacing)^2 Li2(o), with the dilogarithm Li2. For 0.65 and 0.9 that is -3.45: 3 % of
-the light passes. In an image it is less, because the renderer widens each Gaussian by EPS2D. An
-opacity of 0.99 would hide more, but there the derivative of the opacity by its logit, o (1 - o), is
-almost zero; at 0.9 it is 0.09."""
+"""Opacity of a Gaussian, chosen with IN_PLANE_SCALE so that the far side is hidden from the start.
+
+For Gaussians of standard deviation s and opacity o, one per spacing^2, the mean log transmittance
+of a ray across the surface is -2 pi (s / spacing)^2 Li2(o), with the dilogarithm Li2: -3.45, or 3 %
+of the light, for 0.65 and 0.9. EPS2D makes it less. Opacity 0.99 would hide more, but its
+derivative by its logit, o (1 - o), is almost zero; at 0.9 it is 0.09.
+"""
 
 INSET = 0.6
-"""How far below the surface a Gaussian lies, in pixels on the rock. The renderer widens every
-footprint by EPS2D, about half a pixel, so that Gaussians on the surface would draw a rock that is
-larger than the true one. A chosen constant (docs/fit.md)."""
+"""Depth of a Gaussian below the surface, pixels on the rock: EPS2D widens every footprint by about
+half a pixel, which would draw the rock too large. A chosen constant (docs/fit.md)."""
 
 THICKNESS = 0.1
-"""Standard deviation of a Gaussian across the surface, over the spacing. It is flat, but thick
-enough for its projection to be numerically well conditioned."""
+"""Standard deviation of a Gaussian across the surface, over the spacing: flat, but well
+conditioned."""
 
 BACKING_DEPTH = 1.0
-"""How far behind its Gaussian on the surface one of the backing lies, over the spacing of the
-surface's."""
+"""Distance of the backing behind the surface's Gaussians, over their spacing."""
 
 BACKING_SCALE = (0.8, 0.8, 0.2)
-"""Standard deviations of a backing Gaussian along the surface and along the normal, over the
-spacing of the backing's own: more overlap than on the surface, since gaps are what it is there to
-prevent."""
+"""Standard deviations of a backing Gaussian along the surface and the normal, over the backing's
+spacing: more overlap than on the surface, to leave no gaps."""
 
 BACKING_OPACITY = 0.99
 
 GREY = 0.5
-"""Colour of a Gaussian that no frame sees, linear RGB in every channel: all its spherical harmonics
-are zero."""
+"""Linear RGB of a Gaussian that no frame sees: all its spherical harmonics are zero."""
 
 
 Colours = tuple[np.ndarray, np.ndarray]
-"""What `seen_colours` returns."""
+"""Result of `seen_colours`."""
 
 
 def initial_gaussians(
@@ -78,19 +71,15 @@ def initial_gaussians(
     gains: np.ndarray | None = None,
     colours: Callable[[Frame], Colours] | None = None,
 ) -> tuple[Gaussians, np.ndarray]:
-    """One flat Gaussian for each of the N samples of a prior, with a colour averaged over the
-    frames that see the sample; then one behind each of the first `prior.backed` samples, of the
-    same colour.
+    """One flat Gaussian per sample of a prior, in its mean colour, then one behind each backed
+    sample.
 
-    A frame sees a sample that lies inside its rock mask, whose normal points towards the camera,
-    and whose depth agrees with the depth image, up to `prior.depth_tolerance` and the slope of the
-    surface within a pixel. For a frame without depth image the depth of the prior's mesh is used. A
-    sample that no frame sees is grey.
-    inset: how far below its sample a Gaussian lies, over the `pixel_on` the prior. gains: [V,3] of
-    the frames' exposures, by which their colours are divided (`mgs.prior.exposure`). colours:
-    `colours_of` the prior, where it is kept between calls. Returns (N + backed Gaussians of degree
-    0, seen [N] bool: which samples some frame sees). Raises InputError if a file of a frame cannot
-    be read, and as `mesh_depth` where a frame has no depth image.
+    A frame sees a sample that lies in its rock mask, faces the camera and agrees with the depth
+    image (or the depth of the mesh, without one) up to `prior.depth_tolerance` and the slope. A
+    sample that no frame sees is grey. inset: depth below the sample, over `pixel_on`. gains: [V,3]
+    exposures that divide the colours (`mgs.prior.exposure`). colours: `colours_of` the prior, if
+    kept between calls. Returns (N + backed Gaussians of degree 0, seen [N] bool). Raises InputError
+    if a file of a frame cannot be read, and as `mesh_depth`.
     """
     n = len(prior.points)
     total, count = np.zeros((n, 3)), np.zeros(n)
@@ -114,19 +103,17 @@ def initial_gaussians(
 
 
 def warm_start(model: Gaussians, before: Gaussians, start: Gaussians) -> Gaussians:
-    """The model from which a fit goes on after images were added.
+    """Model to continue a fit from after images were added.
 
-    model: the result of the fit before, to the images taken until then. before, start: the
-    Gaussians before any training, in the mean colours of those images, and of all images now
-    (`initial_gaussians`). Each colour of the model is changed by the difference of the two; all
-    else stays as it was fitted. So a Gaussian that no image showed before has the colour of the new
-    images at once, for which a fit would need many passes.
+    model: result of the fit so far. before, start: `initial_gaussians` of the images until then,
+    and of all images now. Colours change by the difference of the two, so a Gaussian that is newly
+    seen takes its new colour at once; all else stays as fitted.
     """
     return replace(model, sh=model.sh + (start.sh - before.sh))
 
 
 def colours_of(prior: Prior) -> Callable[[Frame], Colours]:
-    """A function that gives `seen_colours` of a frame for the samples of a prior."""
+    """Return colours(frame): `seen_colours` for the samples of a prior."""
     depth = depth_of(prior)
     return lambda frame: seen_colours(
         prior.points, prior.normals, frame, depth(frame), prior.depth_tolerance
@@ -134,25 +121,23 @@ def colours_of(prior: Prior) -> Callable[[Frame], Colours]:
 
 
 def pixel_on(prior: Prior, cameras: Sequence[Camera]) -> float:
-    """Size of a pixel on the surface, metres: z-depth over focal length, the median over the
-    samples and then over the cameras that have some in front of them; 0 where none has."""
-    depths = [(camera, camera.project(prior.points)[1]) for camera in cameras]
-    sizes = [
-        np.median(z[z > 0]) / np.sqrt(camera.K[0, 0] * camera.K[1, 1])
-        for camera, z in depths
-        if (z > 0).any()
-    ]
+    """Size of a pixel on the surface, metres: z-depth over focal length, median over samples, then
+    over cameras that have some in front; 0 if none has."""
+    sizes = []
+    for camera in cameras:
+        z = camera.project(prior.points)[1]
+        if (z > 0).any():
+            sizes.append(np.median(z[z > 0]) / np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
     return float(np.median(sizes)) if sizes else 0.0
 
 
 def initial_normals(prior: Prior) -> np.ndarray:
-    """The normal of each of the Gaussians of `initial_gaussians`, [N + backed,3], unit: of its
-    sample, or of the sample that it stands behind."""
+    """Unit normals [N + backed,3] of the Gaussians of `initial_gaussians`."""
     return np.concatenate([prior.normals, prior.normals[: prior.backed]])
 
 
 def _with_backing(surface: Gaussians, prior: Prior) -> Gaussians:
-    """The surface's Gaussians, then those behind the first `prior.backed` of them."""
+    """The surface's Gaussians, then those behind the first `prior.backed`."""
     count = prior.backed
     if count == 0:
         return surface
@@ -166,21 +151,18 @@ def _with_backing(surface: Gaussians, prior: Prior) -> Gaussians:
         logit_opacities=np.full(count, logit(BACKING_OPACITY), np.float32),
         sh=over.sh,
     )
+    names = [field.name for field in fields(Gaussians)]
     return Gaussians(
-        *(
-            np.concatenate([getattr(g, field.name) for g in (surface, backing)])
-            for field in fields(Gaussians)
-        )
+        *(np.concatenate([getattr(surface, name), getattr(backing, name)]) for name in names)
     )
 
 
 def sees(
     points: np.ndarray, normals: np.ndarray, frame: Frame, depth: np.ndarray, tolerance: float
 ) -> np.ndarray:
-    """Which points [N] of a surface a frame sees inside its mask, bool.
+    """Whether a frame sees surface points [N] inside its mask, bool.
 
-    normals, depth [H,W], tolerance: as in `mgs.data.visibility.visible`. Raises InputError if the
-    mask cannot be read.
+    normals, depth [H,W], tolerance: as `visible`. Raises InputError if the mask cannot be read.
     """
     return visible(points, normals, frame.camera, depth, tolerance) & in_mask(points, frame)
 
@@ -188,21 +170,19 @@ def sees(
 def seen_colours(
     points: np.ndarray, normals: np.ndarray, frame: Frame, depth: np.ndarray, tolerance: float
 ) -> Colours:
-    """(which points [N] of a surface a frame `sees`; the colours of these there, [seen,3] linear
-    RGB). Raises InputError if a file cannot be read."""
+    """Which surface points [N] a frame `sees`, and the colours of these, [seen,3] linear RGB.
+    Raises InputError if a file cannot be read."""
     seen = sees(points, normals, frame, depth, tolerance)
     pixels, _ = frame.camera.project(points[seen])
     at, rgb = [pixels[:, 1] - 0.5, pixels[:, 0] - 0.5], frame.rgb()
-    return seen, np.stack(
-        [map_coordinates(rgb[..., k], at, order=1, mode="nearest") for k in range(3)], 1
-    )
+    colours = [map_coordinates(rgb[..., k], at, order=1, mode="nearest") for k in range(3)]
+    return seen, np.stack(colours, 1)
 
 
 def depth_of(prior: Prior) -> Callable[[Frame], np.ndarray]:
-    """A function that gives the depth image [H,W] of a frame, metres: its own, or where it has
-    none, that of the prior's mesh.
+    """Return depth(frame): [H,W], metres, the frame's own, or that of the prior's mesh.
 
-    Raises InputError as `mesh_depth`, when the mesh is first needed, and as `Frame.depth`.
+    depth raises InputError as `mesh_depth` and `Frame.depth`.
     """
 
     @cache
@@ -215,11 +195,8 @@ def depth_of(prior: Prior) -> Callable[[Frame], np.ndarray]:
 
 
 def with_share_seen(prior: Prior, seed_frames: Sequence[Frame]) -> Prior:
-    """The prior with one more of its `numbers`, seen_by_seeds: the share of its samples that some
-    of the seed frames see.
-
-    The others would start grey. Raises InputError if a depth image or a mask cannot be read.
-    """
+    """The prior with `numbers` of seen_by_seeds: the share of samples that some seed frame sees;
+    the rest would start grey. Raises InputError if a depth image or mask cannot be read."""
     depth = depth_of(prior)
     seen = np.logical_or.reduce(
         [sees(prior.points, prior.normals, f, depth(f), prior.depth_tolerance) for f in seed_frames]

@@ -1,5 +1,4 @@
-"""Photographs without depth -> the surface of the object: of triangulated points, of the masks'
-visual hull, or of both."""
+"""Surfaces from photographs without depth: of triangulated points, the visual hull, or both."""
 
 from __future__ import annotations
 
@@ -24,42 +23,39 @@ from mgs.prior.surface import closed_poisson, intersection, poisson_mesh
 from mgs.survey.fusion import focus, voxel_means
 
 SOURCES = ("depth", "mesh", "points", "hull")
-"""What a prior can be made of."""
+"""Sources of a prior."""
 
 CLOUD = "sparse.ply"
-"""File of a dataset in which `mgs import` keeps the points that came with the cameras."""
+"""File of a dataset with the points that came with its cameras."""
 
 LEAST_PHOTOGRAPHS = 8
-"""Fewest photographs without depth that a surface is built of."""
+"""Fewest photographs without depth for a surface."""
 
 LEAST_OVERLAP = 0.5
-"""Least share of the cameras that must have in their image the point that all of them look at."""
+"""Least share of cameras that have in their image the point that all look at."""
 
 GAP = 4.0
-"""Where the surface of the hull is farther than this many distances between neighbours from every
-point of the cloud, the hull stands in for the points."""
+"""Where the hull is farther than this many point spacings from every point, it replaces the points.
+"""
 
 CELL_OF_SPACING = 0.5
-"""What the Poisson reconstruction takes for the distance between points, over that of the cloud:
-its cells are then 0.75 of it.
-Measured: larger cells lose detail, and smaller ones gain nothing."""
+"""Cloud spacing passed to the Poisson reconstruction, over the real one: its cells are then 0.75
+spacings. Larger cells lose detail, smaller ones gain nothing (measured)."""
 
 BEYOND_POINTS = 0.15
-"""A face farther than this from every point, over the extent of the points, closes the surface
-where nothing was seen, and is not sampled. With a hull or a ground plane there is no such need."""
+"""Faces farther than this from every point, over the extent of the points, only close the surface
+and are not sampled. With a hull or a ground plane there is no need."""
 
 
 ONE_SIDED = 0.5
-"""Least length of the mean normal of points that were seen from one side; it is 0 all around an
-object, and 1 of a wall."""
+"""Least length of the mean normal of points seen from one side: 0 all around an object, 1 for a
+wall."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A surface that was built of photographs. mesh: closed, in the world. cell: how finely it is
-    known, units of the world.
-    segmented: the cloud that it was built from, if there is one. numbers: what prior.json holds of
-    how it was built."""
+    """A surface and its origin. mesh: closed, world. cell: resolution, units of the world.
+    segmented: the cloud, if any. numbers: items of prior.json."""
 
     mesh: Mesh
     cell: float
@@ -68,28 +64,25 @@ class Surface:
 
 
 def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = None) -> str:
-    """What to build the prior of a dataset from: what was asked for, or by what the dataset holds:
-    depth, points, masks.
+    """Source of a dataset's prior: the one asked for, else the first of depth, points and hull.
 
-    points: a given cloud. Raises InputError where there is nothing to build it from, or not what
-    was asked for.
+    points: file of a given cloud. Raises InputError if there is no source, or not the one asked
+    for.
     """
     has = {
         "depth": any(frame.depth_path for frame in dataset.frames),
         "points": points is not None or (dataset.root / CLOUD).is_file(),
         "hull": has_masks(dataset.frames),
     }
-    if asked is None and points is None:
-        asked = next((name for name, there in has.items() if there), None)
-    asked = "points" if points is not None and asked is None else asked
+    if asked is None:
+        available = (name for name, there in has.items() if there)
+        asked = "points" if points is not None else next(available, None)
     if asked is not None and has.get(asked):
         return asked
     lacks = {"depth": "no depth images", "points": f"no points ({CLOUD})", "hull": "no masks"}
     if asked not in (None, *SOURCES):
         raise InputError(f"--from {asked!r}: is unknown; choose one of {', '.join(SOURCES)}")
-    missing = (
-        " and ".join(lacks.values()) if asked is None else lacks.get(asked, "no mesh of its own")
-    )
+    missing = lacks.get(asked, "no mesh of its own") if asked else " and ".join(lacks.values())
     ways = {
         "depth": "import data with depth",
         "hull": "import with --masks DIR for --from hull",
@@ -102,23 +95,23 @@ def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = 
 
 
 def check_photographs(frames: Sequence[Frame]) -> None:
-    """Raises InputError where photographs without depth cannot show a surface: fewer than
-    LEAST_PHOTOGRAPHS, or cameras that do not look at one thing."""
+    """Raise InputError for under LEAST_PHOTOGRAPHS, or cameras that do not look at one thing."""
     if len(frames) < LEAST_PHOTOGRAPHS:
         raise InputError(
-            f"prior: {len(frames)} photographs without depth are too few; take at least {LEAST_PHOTOGRAPHS}, from all sides"
+            f"prior: {len(frames)} photographs without depth are too few; "
+            f"take at least {LEAST_PHOTOGRAPHS}, from all sides"
         )
     point = focus(frames).point[None]
     seen = [bool(in_image(frame.camera, *frame.camera.project(point))[0]) for frame in frames]
     if np.mean(seen) < LEAST_OVERLAP:
         raise InputError(
-            f"prior: the photographs do not overlap: of {len(frames)} cameras only {sum(seen)} have in their image what all "
-            "look at; walk around the object, or check the poses"
+            f"prior: the photographs do not overlap: of {len(frames)} cameras only {sum(seen)} "
+            "have in their image what all look at; walk around the object, or check the poses"
         )
 
 
 def check_masks(frames: Sequence[Frame]) -> None:
-    """Raises InputError where there are masks, and no pixel of any of them is the object."""
+    """Raise InputError if there are masks, and all are black."""
     if has_masks(frames) and not any(frame.mask().any() for frame in frames):
         raise InputError("prior: the masks are black in every frame; white is the object")
 
@@ -127,26 +120,26 @@ def surface_of(
     dataset: Dataset,
     source: str,
     settings: PriorSettings,
-    tell: Callable[[str], None],
+    on_stage: Callable[[str], None],
     points: Path | None = None,
 ) -> Surface:
-    """The surface by the source "points" or "hull". points: the cloud's file, if not the dataset's
+    """Surface of the source "points" or "hull". points: file of the cloud, by default the dataset's
     own.
 
-    With masks the hull bounds what points give, and closes it where there are none. Raises
-    InputError as `check_photographs`, `check_masks`, `visual_hull`, `read_cloud` and
-    `segment_points`, and NoSurface where the surface cannot be closed.
+    With masks, the hull bounds the surface of the points and closes it. Raises InputError as
+    `check_photographs`, `check_masks`, `visual_hull`, `read_cloud` and `segment_points`, and
+    NoSurface if the surface cannot be closed.
     """
     check_photographs(dataset.frames)
     check_masks(dataset.frames)
     if source == "hull":
         settings.refuse_shaping("a hull is carved from masks")
-        carved = visual_hull(dataset.frames, tell)
+        carved = visual_hull(dataset.frames, on_stage)
         return Surface(carved.mesh, carved.cell, None, _hull_numbers(carved))
     cloud = read_cloud(points or dataset.root / CLOUD)
-    segmented = segment_points(cloud, dataset, settings, tell)
-    hull = visual_hull(dataset.frames, tell) if has_masks(dataset.frames) else None
-    tell("Poisson mesh")
+    segmented = segment_points(cloud, dataset, settings, on_stage)
+    hull = visual_hull(dataset.frames, on_stage) if has_masks(dataset.frames) else None
+    on_stage("Poisson mesh")
     spacing = spacing_of(segmented.rock_points)
     try:
         mesh, depth = _closed(segmented, hull, spacing, settings)
@@ -163,17 +156,15 @@ def surface_of(
         "cloud_spacing": spacing,
         "poisson_depth": depth,
     }
-    return Surface(
-        mesh, spacing, segmented, numbers | ({} if hull is None else _hull_numbers(hull))
-    )
+    numbers |= {} if hull is None else _hull_numbers(hull)
+    return Surface(mesh, spacing, segmented, numbers)
 
 
 def _closed(
     segmented: SegmentedCloud, hull: Hull | None, spacing: float, settings: PriorSettings
 ) -> tuple[Mesh, int]:
-    """A closed mesh of the object's points, and the depth of the octree: bounded by the hull, or
-    cut at the ground, or behind what was seen from one side, and with the faces marked as not seen
-    that close it far from every point."""
+    """Closed mesh of the object's points, and the octree depth: bounded by the hull, or cut at the
+    ground, or closed behind points seen from one side, with far faces marked as not seen."""
     points, normals = segmented.rock_points, segmented.rock_normals
     cell = CELL_OF_SPACING * spacing
     if segmented.plane is not None:
@@ -181,10 +172,8 @@ def _closed(
     if hull is not None:
         body, body_normals = _thinned(hull.mesh, spacing)
         gap = cKDTree(points).query(body)[0] > GAP * spacing
-        points, normals = (
-            np.concatenate([points, body[gap]]),
-            np.concatenate([normals, body_normals[gap]]),
-        )
+        points = np.concatenate([points, body[gap]])
+        normals = np.concatenate([normals, body_normals[gap]])
         mesh, depth = closed_poisson(points, normals, cell, settings.poisson_depth)
         return intersection(mesh, hull.mesh), depth
     try:
@@ -200,9 +189,8 @@ def _closed(
 
 
 def _back_of(points: np.ndarray, normals: np.ndarray, spacing: float) -> Plane | None:
-    """A plane behind points [N,3] that were seen from one side, such as those of a building's
-    front: their surface is a sheet, which closes where it is mirrored in this plane and cut at it.
-    None where the normals [N,3] face all sides."""
+    """Plane behind points [N,3] seen from one side, such as a building's front: mirroring the sheet
+    in it closes the surface. None if the normals [N,3] face all sides."""
     towards = normals.mean(0)
     if np.linalg.norm(towards) < ONE_SIDED:
         return None
@@ -212,11 +200,10 @@ def _back_of(points: np.ndarray, normals: np.ndarray, spacing: float) -> Plane |
 
 
 def _thinned(mesh: Mesh, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points of a mesh about so far apart, and their unit normals, [M,3]."""
+    """Points of a mesh about `spacing` apart, and their unit normals, [M,3]."""
     points, index = voxel_means(mesh.vertices, spacing)
-    normals = np.stack(
-        [np.bincount(index, mesh.vertex_normals[:, k], len(points)) for k in range(3)], 1
-    )
+    sums = [np.bincount(index, column, len(points)) for column in mesh.vertex_normals.T]
+    normals = np.stack(sums, 1)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     kept = length[:, 0] > 1e-6
     return points[kept], (normals / np.maximum(length, 1e-12))[kept]

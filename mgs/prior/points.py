@@ -1,9 +1,8 @@
-"""Triangulated points -> the points of the object, with normals.
+"""Points of the object, with normals, from a triangulated cloud.
 
 Clouds of real photographs are uneven: dense on texture, empty on plain parts, with wrong points
-anywhere, and often without ground. So points are judged one by one (track, reprojection error),
-then by masks where there are some, otherwise by the ground plane where there is one and by clusters
-that follow density (HDBSCAN), and last by their neighbours.
+anywhere, often without ground. Points are judged one by one (track, reprojection error), then by
+masks, else by ground plane and density clusters (HDBSCAN), and last by their neighbours.
 """
 
 from __future__ import annotations
@@ -34,65 +33,60 @@ from mgs.survey.depth_sensor import SIGMA_FROM_MAD
 from mgs.survey.fusion import REACH, Cloud, focus
 
 LEAST_TRACK = 3
-"""Fewest images that must have seen a point: two can agree by chance."""
+"""Fewest images that saw a point: two can agree by chance."""
 
 ERROR_LIMIT = 2.5
-"""Largest reprojection error of a point: the median plus this many robust standard deviations."""
+"""Largest reprojection error, robust standard deviations above the median."""
 
 MASK_SHARE = 0.95
-"""Least share of the frames that have a point in their image in whose mask it must fall
-(`mask_share`)."""
+"""Least `mask_share` of a point."""
 
 MASK_SLACK = 2
-"""Pixels by which masks are widened for this, for the errors of points and poses."""
+"""Dilation of the masks for it, pixels, for errors of points and poses."""
 
 LEAST_POINTS = 100
-"""Fewest points of the object from which a surface is built."""
+"""Fewest points of the object for a surface."""
 
 CLUSTER_SHARE = 0.02
-"""HDBSCAN's min_cluster_size as a share of the points; at least CLUSTER_SAMPLES of them."""
+"""HDBSCAN's min_cluster_size over the number of points; at least CLUSTER_SAMPLES."""
 
 CLUSTER_SAMPLES = 10
-"""HDBSCAN's min_samples: the neighbours that the density at a point is measured by."""
+"""HDBSCAN's min_samples."""
 
 JOINED = 4.0
-"""Clusters with points nearer to each other than this many distances between neighbouring points
-are one: texture that comes and goes makes several of one object."""
+"""Clusters closer than this many point spacings are one: varying texture splits an object."""
 
 GROWN, GROWN_NEIGHBOURS = 0.15, 4
-"""Above a ground plane, points that are joined to the cluster belong to it too: DBSCAN with eps
-this share of the cluster's extent, and min_samples. A part with few points, for instance in shade,
-is no cluster of its own, but nothing else stands there."""
+"""Points above a ground plane that DBSCAN joins to the cluster belong to it: eps over the cluster's
+extent, and min_samples. A part with few points, as in shade, is no cluster of its own."""
 
 PLANE_TILT = 45.0
-"""Largest angle between the ground plane's normal and the dataset's up, degrees: the front of a
-building is a plane as well."""
+"""Largest angle between the ground's normal and the dataset's up, degrees: a facade is a plane too.
+"""
 
 PLANE_VOXEL = 0.25
-"""What the ground plane takes for the voxel of a cloud, over the distance between its points:
-points of a fused cloud are as far from the plane as their voxels are large, triangulated ones are
-better than they are dense."""
+"""Voxel passed to `ground_plane`, over the point spacing: triangulated points are more exact than
+dense."""
 
 NEIGHBOURS = 16
-"""Neighbours that a point is compared with to see whether it lies off the surface."""
+"""Neighbours that decide whether a point lies off the surface."""
 
 OFF_SURFACE = 3.0
-"""Largest distance of a point from the plane of its neighbours, in robust standard deviations of
-this distance."""
+"""Largest distance of a point from the plane of its neighbours, robust standard deviations."""
 
 ALONE = 5.0
-"""Largest distance of a point to the eighth of its neighbours, over the median of this distance."""
+"""Largest distance to the eighth neighbour, over its median."""
 
 
 def spacing_of(points: np.ndarray) -> float:
-    """The distance between neighbours in a regular grid as dense as points [N,3]: in a random
-    cloud, twice the median distance to the nearest neighbour."""
+    """Spacing of a regular grid as dense as points [N,3]: in a random cloud, twice the median
+    distance to the nearest neighbour."""
     return 2 * float(np.median(cKDTree(points).query(points, 2)[0][:, 1]))
 
 
 def reliable(cloud: SparseCloud) -> np.ndarray:
-    """Which points are triangulated well, bool [N]: by their track and reprojection error, where
-    these are known."""
+    """Which points are well triangulated by track and reprojection error, as far as known, bool
+    [N]."""
     kept = np.ones(len(cloud.points), bool)
     if cloud.track is not None:
         kept &= cloud.track >= LEAST_TRACK
@@ -104,7 +98,7 @@ def reliable(cloud: SparseCloud) -> np.ndarray:
 
 
 def on_surface(points: np.ndarray) -> np.ndarray:
-    """Which points [N,3] have neighbours, and lie near the plane through them; bool [N]."""
+    """Which points [N,3] have neighbours and lie near the plane through them, bool [N]."""
     count = min(NEIGHBOURS + 1, len(points))
     distance, index = cKDTree(points).query(points, count)
     around = points[index[:, 1:]]
@@ -113,34 +107,30 @@ def on_surface(points: np.ndarray) -> np.ndarray:
     normals = np.linalg.eigh(np.einsum("nki,nkj->nij", across, across))[1][..., 0]
     off = np.abs(np.einsum("nk,nk->n", points - middle, normals))
     apart = distance[:, min(8, count - 1)]
-    return (off < OFF_SURFACE * SIGMA_FROM_MAD * np.median(off)) & (
-        apart < ALONE * np.median(apart)
-    )
+    near = off < OFF_SURFACE * SIGMA_FROM_MAD * np.median(off)
+    return near & (apart < ALONE * np.median(apart))
 
 
 def main_cluster(points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, int]:
-    """Which points [N,3] belong to the cluster of the largest total weight [N], by HDBSCAN
-    (Campello et al. 2013, scikit-learn), and how many clusters there are. All points, and 0, where
-    no part is denser than another.
+    """Points [N,3] of the cluster of largest total weight [N], bool [N], and the number of
+    clusters; all points and 0 if no part is denser.
 
-    Points that HDBSCAN gives to no cluster, because few are around them, belong to the one that
-    they are next to."""
+    HDBSCAN (Campello et al. 2013, scikit-learn). Points that it gives to no cluster, because few
+    are around them, belong to the one next to them.
+    """
     from sklearn.cluster import HDBSCAN
 
     least = max(CLUSTER_SAMPLES, int(CLUSTER_SHARE * len(points)))
     if len(points) < 2 * least:
         return np.ones(len(points), bool), 0
-    labels = HDBSCAN(min_cluster_size=least, min_samples=CLUSTER_SAMPLES, copy=True).fit_predict(
-        points
-    )
+    clustering = HDBSCAN(min_cluster_size=least, min_samples=CLUSTER_SAMPLES, copy=True)
+    labels = clustering.fit_predict(points)
     if labels.max() < 0:
         return np.ones(len(points), bool), 0
     pairs = labels[cKDTree(points).query_pairs(JOINED * spacing_of(points), output_type="ndarray")]
     pairs = pairs[(pairs >= 0).all(1)]
     count = int(labels.max()) + 1
-    touching = coo_array(
-        (np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count)
-    )
+    touching = coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), shape=(count, count))
     pieces, piece = connected_components(touching, directed=False)
     joined = np.where(labels >= 0, piece[labels], -1)
     total = np.bincount(joined[joined >= 0], weight[joined >= 0], pieces)
@@ -150,15 +140,14 @@ def main_cluster(points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, in
 
 
 def segment_points(
-    sparse: SparseCloud, dataset: Dataset, settings: PriorSettings, tell: Callable[[str], None]
+    sparse: SparseCloud, dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None]
 ) -> SegmentedCloud:
-    """The object in a triangulated cloud. With masks: what lies inside all of them. Without: what
-    stands above the ground, or where there is none, the densest thing near what the cameras look
-    at.
+    """The object in a triangulated cloud: the points inside all masks; without masks, what stands
+    above the ground; without ground, the densest thing near what the cameras look at.
 
-    tell(name) is called as each stage starts. Raises NoSurface where too few points are left.
+    on_stage: called with the name of each stage. Raises NoSurface if too few points are left.
     """
-    tell("points")
+    on_stage("points")
     frames = dataset.frames
     good = reliable(sparse)
     points, views = sparse.points[good], views_of(sparse, [frame.camera for frame in frames])[good]
@@ -169,15 +158,13 @@ def segment_points(
         kept = (share >= MASK_SHARE) & (count >= LEAST_TRACK)
         where = "inside the masks; give masks and poses that fit, or --from hull"
     else:
-        tell("ground plane and clusters")
+        on_stage("ground plane and clusters")
         plane = _plane_or_none(cloud, frames, dataset.up, settings)
-        ground = (
-            np.zeros(len(points), bool)
-            if plane is None
-            else np.abs(plane.height(points)) <= plane.tolerance
-        )
+        if plane is not None:
+            ground = np.abs(plane.height(points)) <= plane.tolerance
         kept, clusters = _cluster_looked_at(cloud, frames, plane)
-        where = f"in one cluster {'above the ground' if plane else 'near what the cameras look at'}; give masks of the object"
+        where = "above the ground" if plane else "near what the cameras look at"
+        where = f"in one cluster {where}; give masks of the object"
     if kept.sum() >= LEAST_POINTS:
         kept[kept] = on_surface(points[kept])
     if kept.sum() < LEAST_POINTS:
@@ -186,9 +173,8 @@ def segment_points(
             points,
             kept,
         )
-    rock, left = degrade(
-        points[kept], settings.noise, settings.holes, generator(settings.seed, "prior/degrade")
-    )
+    rng = generator(settings.seed, "prior/degrade")
+    rock, left = degrade(points[kept], settings.noise, settings.holes, rng)
     normals = estimate_normals(rock[left], views[kept][left], settings.noise / cloud.voxel)
     return SegmentedCloud(cloud, plane, ground, rock[left], normals, 0.0, clusters)
 
@@ -196,8 +182,8 @@ def segment_points(
 def _plane_or_none(
     cloud: Cloud, frames: Sequence[Frame], up: Up, settings: PriorSettings
 ) -> Plane | None:
-    """The ground plane, where a fifth of the points near what the cameras look at lie on one that
-    all cameras are above, and that is about level."""
+    """The ground plane, if it is about level, below all cameras, and holds a fifth of the points
+    near what they look at; else None."""
     target = focus(frames)
     near = np.linalg.norm(cloud.points - target.point, axis=1) < REACH * target.distance
     fine = PLANE_VOXEL * cloud.voxel
@@ -214,19 +200,17 @@ def _plane_or_none(
 def _cluster_looked_at(
     cloud: Cloud, frames: Sequence[Frame], plane: Plane | None
 ) -> tuple[np.ndarray, int]:
-    """Which points [N] are the object's where there are no masks, and the number of clusters among
-    those in question.
+    """Object points without masks, bool [N], and the number of clusters in question.
 
-    A cluster weighs more the higher its points stand above the ground, and the nearer they are to
-    what the cameras look at: a long low rise of the ground has more points than a rock.
+    Points weigh more the higher above the ground and the nearer to what the cameras look at, since
+    a long low rise of the ground has more points than a rock.
     """
     target = focus(frames)
     away = np.linalg.norm(cloud.points - target.point, axis=1) / target.distance
     height = np.ones(len(away)) if plane is None else plane.height(cloud.points)
     kept = (away < REACH) & (height > (0 if plane is None else plane.tolerance))
-    inside, clusters = main_cluster(
-        cloud.points[kept], (height * (1 - np.minimum(away / REACH, 1)))[kept]
-    )
+    weight = height * (1 - np.minimum(away / REACH, 1))
+    inside, clusters = main_cluster(cloud.points[kept], weight[kept])
     if plane is not None and inside.sum() >= LEAST_POINTS:
         inside = _grown(cloud.points[kept], inside)
     kept[kept] = inside
@@ -234,8 +218,7 @@ def _cluster_looked_at(
 
 
 def _grown(points: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Which points [N,3] above the ground belong to a cluster [N] bool, or are joined to it
-    (GROWN)."""
+    """Points [N,3] above the ground in a cluster [N] bool, or joined to it (GROWN)."""
     from sklearn.cluster import DBSCAN
 
     eps = GROWN * float(np.ptp(points[inside], axis=0).max())

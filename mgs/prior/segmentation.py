@@ -1,5 +1,4 @@
-"""Segmentation: the fused cloud -> the ground plane (RANSAC) and the points of the rock above it
-(DBSCAN), with normals."""
+"""Segmentation of the fused cloud: ground plane (RANSAC), rock points (DBSCAN), normals."""
 
 from __future__ import annotations
 
@@ -18,49 +17,44 @@ from mgs.survey.depth_sensor import SIGMA_FROM_MAD
 from mgs.survey.fusion import FILTERED_SHARE, Cloud, focus, fuse_frames, voxel_means
 
 PLANE_TOLERANCE = 0.02
-"""Largest distance of an inlier of RANSAC from the plane, as a share of the cameras' distance:
-larger than the grain of a floor, smaller than a rock."""
+"""Largest distance of RANSAC's inliers from the plane, over the cameras' distance: more than the
+grain of a floor, less than a rock."""
 
 PLANE_REACH = 0.5
-"""The plane is refined on its inliers within this distance of the focus, as a multiple of the
-cameras' distance. Real ground is not flat, and only the ground near the rock matters."""
+"""Radius around the focus in which the plane is refined, over the cameras' distance: real ground is
+not flat, and only the ground near the rock matters."""
 
 PLANE_MIN_SHARE = 0.2
-"""Least share of the cloud that must lie on the plane for it to count as the ground."""
+"""Least share of the cloud on the plane for it to be the ground."""
 
 CLUSTER_POINTS = 20_000
-"""DBSCAN sees a cloud that is averaged on a coarser grid to at most this many points; each point of
-the full cloud then takes the label of the nearest one."""
+"""Most points that DBSCAN sees; the full cloud takes the labels of their nearest ones."""
 
 CLUSTER_NEIGHBOURS = 8
-"""DBSCAN's min_samples. Its eps is twice the median distance of points to the neighbour of this
-number."""
+"""DBSCAN's min_samples. Its eps is twice the median distance to the neighbour of this number."""
 
 EQUAL_SIZE = 0.8
-"""Clusters with at least this share of the points of the largest one count as equally large. Among
-those, the one nearest to the focus is the rock."""
+"""Clusters of at least this share of the largest one count as equally large; the nearest to the
+focus is the rock."""
 
 NEARER = 1.25
-"""Two equally large clusters are told apart only if one is this many times as far from the focus as
-the other."""
+"""Least ratio of distances from the focus that tells equally large clusters apart."""
 
 NORMAL_NEIGHBOURS = (16, 128)
-"""Number of neighbours that the plane for a normal is fitted to: the least, in a cloud without
-noise, and the most."""
+"""Neighbours for a normal: without noise, and at most."""
 
 FLOOR_UPRIGHT = 0.9
-"""A cosine of the angle between a point's normal and the ground's. Points of the rock's cluster
-that are nearer to the ground than two plane tolerances, and whose cosine is larger, are taken for
-ground that rises at the foot of the rock."""
+"""Points of the rock's cluster within two plane tolerances of the ground, and with a larger cosine
+of the angle between their normal and the ground's, are ground that rises at the foot of the rock.
+"""
 
 
 @dataclass(frozen=True)
 class Plane:
-    """The ground plane: all points x with normal . x = offset, in metres.
+    """The ground plane normal . x = offset, metres.
 
-    normal: [3] unit, on the side of the cameras. sigma: standard deviation of the inliers'
-    distances (robust), metres.
-    tolerance: points less than this above the plane, or below it, belong to the ground; metres.
+    normal: [3] unit, on the side of the cameras. sigma: robust standard deviation of the inliers'
+    distances, metres. tolerance: points below this height are ground, metres.
     """
 
     normal: np.ndarray
@@ -69,13 +63,12 @@ class Plane:
     tolerance: float
 
     def height(self, points: np.ndarray) -> np.ndarray:
-        """Distance of points [N,3] from the plane [N], metres; negative below it."""
+        """Signed distance of points [N,3] from the plane [N], metres."""
         return points @ self.normal - self.offset
 
 
 class NoSurface(InputError):
-    """No surface can be built of a cloud. points: [P,3] of it; kept: [P] bool, those that were
-    taken for the object."""
+    """A cloud gives no surface. points: [P,3]; kept: [P] bool, taken for the object."""
 
     def __init__(self, message: str, points: np.ndarray, kept: np.ndarray) -> None:
         super().__init__(message)
@@ -83,14 +76,14 @@ class NoSurface(InputError):
 
 
 class _PlaneModel:
-    """A plane, with the methods that skimage.measure.ransac wants of a model."""
+    """A plane, as a model for skimage.measure.ransac."""
 
     def __init__(self, normal: np.ndarray, offset: float) -> None:
         self.normal, self.offset = normal, offset
 
     @classmethod
     def from_estimate(cls, points: np.ndarray) -> _PlaneModel:
-        """The plane that fits points [N,3] best in the least-squares sense."""
+        """Least-squares plane of points [N,3]."""
         centre = points.mean(0)
         normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
         return cls(normal, float(normal @ centre))
@@ -101,25 +94,21 @@ class _PlaneModel:
 
 
 def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
-    """The plane that holds most points of a cloud, by RANSAC (Fischler and Bolles 1981,
-    scikit-image).
+    """Plane that holds most points of a cloud, by RANSAC (Fischler and Bolles 1981, scikit-image).
 
-    RANSAC sees at most 10,000 points, drawn by the seed. The plane is then fitted to all its
-    inliers near what the cameras of `frames` look at, three times; each time the limit for inliers
-    shrinks to three of their standard deviations, but not below two voxels.
-    Raises InputError if the plane holds less than a fifth of the cloud, or none of the cloud near
-    the focus.
+    RANSAC sees at most 10,000 points, drawn by the seed. The plane is then refined three times on
+    its inliers near what the cameras look at, within three of their standard deviations, but at
+    least two voxels. Raises InputError if the plane holds under a fifth of the cloud, or nothing
+    near the focus.
     """
     from skimage.measure import ransac
 
     target = focus(frames)
     tolerance = PLANE_TOLERANCE * target.distance
     rng = np.random.default_rng(seed)
-    sample = (
-        cloud.points
-        if len(cloud.points) <= 10_000
-        else rng.choice(cloud.points, 10_000, replace=False)
-    )
+    sample = cloud.points
+    if len(sample) > 10_000:
+        sample = rng.choice(sample, 10_000, replace=False)
     if len(sample) < 3:
         raise InputError(
             f"cloud: only {len(sample)} points; too few for a plane, give more depth frames"
@@ -128,11 +117,11 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
     share = 0.0 if inliers is None else float(np.mean(inliers))
     if share < PLANE_MIN_SHARE:
         raise InputError(
-            f"cloud: no ground plane (the best holds {share:.0%} of the cloud); show ground, or give --mesh"
+            f"cloud: no ground plane (the best holds {share:.0%} of the cloud); "
+            "show ground, or give --mesh"
         )
-    around = cloud.points[
-        np.linalg.norm(cloud.points - target.point, axis=1) < PLANE_REACH * target.distance
-    ]
+    away = np.linalg.norm(cloud.points - target.point, axis=1)
+    around = cloud.points[away < PLANE_REACH * target.distance]
     for _ in range(3):
         residual = model.residuals(around)
         core = np.abs(residual) < tolerance
@@ -140,9 +129,8 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
             raise InputError(
                 "cloud: no ground around what the cameras look at; show ground, or give --mesh"
             )
-        sigma = SIGMA_FROM_MAD * float(
-            np.median(np.abs(residual[core] - np.median(residual[core])))
-        )
+        spread = np.abs(residual[core] - np.median(residual[core]))
+        sigma = SIGMA_FROM_MAD * float(np.median(spread))
         tolerance = min(tolerance, max(3 * sigma, 2 * cloud.voxel))
         model = _PlaneModel.from_estimate(around[core & (np.abs(residual) < tolerance)])
     cameras = np.stack([frame.camera.position for frame in frames])
@@ -157,16 +145,14 @@ def rock_cluster(
     name: str = "cloud",
     weight: Callable[[np.ndarray], np.ndarray] = lambda points: np.ones(len(points)),
 ) -> tuple[np.ndarray, float, int]:
-    """Which of the points above the ground [N,3] belong to the rock, by DBSCAN (Ester et al. 1996,
+    """Which points above the ground [N,3] are the rock, by DBSCAN (Ester et al. 1996,
     scikit-learn).
 
-    voxel: distance between neighbouring points; target: [3] what the cameras look at; all in
-    metres. name: what messages call
-    the cloud. weight: a function of points [N,3] that gives what each counts [N]. The cluster that
-    counts most is the rock; if others are nearly as large (EQUAL_SIZE), the one of these that is
-    nearest to the target. Returns (inside [N] bool, DBSCAN's eps in metres, number of clusters).
-    Raises InputError if there is no cluster, or if two clusters are equally large and about equally
-    near.
+    voxel: distance between neighbours; target: [3] what the cameras look at; metres. name: of the
+    cloud, for messages. weight: points [N,3] -> [N], what each counts. The rock is the cluster that
+    counts most, or of several nearly as large ones (EQUAL_SIZE) the nearest to the target. Returns
+    (inside [N] bool, eps in metres, number of clusters). Raises InputError if there is no cluster,
+    or two are equally large and about equally near.
     """
     from sklearn.cluster import DBSCAN
 
@@ -176,14 +162,16 @@ def rock_cluster(
         thin = voxel_means(points, cell)[0]
     if len(thin) <= CLUSTER_NEIGHBOURS:
         raise InputError(
-            f"{name}: no rock in the cloud ({len(points)} points above the ground plane); aim the cameras at one"
+            f"{name}: no rock in the cloud ({len(points)} points above the ground plane); "
+            "aim the cameras at one"
         )
     eps = 2 * float(np.median(cKDTree(thin).query(thin, CLUSTER_NEIGHBOURS + 1)[0][:, -1]))
     labels = DBSCAN(eps=eps, min_samples=CLUSTER_NEIGHBOURS).fit_predict(thin)
     count = int(labels.max()) + 1
     if count == 0:
         raise InputError(
-            f"{name}: no rock in the cloud (only scattered points above the ground plane); aim the cameras at one"
+            f"{name}: no rock in the cloud (only scattered points above the ground plane); "
+            "aim the cameras at one"
         )
     sizes = np.bincount(labels[labels >= 0], weight(thin)[labels >= 0])
     large = np.flatnonzero(sizes >= EQUAL_SIZE * sizes.max())
@@ -192,8 +180,8 @@ def rock_cluster(
     if len(large) > 1 and away[order[1]] < NEARER * away[order[0]]:
         first, second = ((labels == large[k]).sum() for k in order[:2])
         raise InputError(
-            f"{name}: clusters of {first} and {second} points are equally large and equally near to what the cameras look at; "
-            "aim them at one rock"
+            f"{name}: clusters of {first} and {second} points are equally large and equally near "
+            "to what the cameras look at; aim them at one rock"
         )
     rock = int(large[order[0]])
     distance, nearest = cKDTree(thin).query(points, distance_upper_bound=eps)
@@ -204,11 +192,11 @@ def rock_cluster(
 def degrade(
     points: np.ndarray, noise: float, holes: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Make the points of a rock [N,3] worse on purpose: add noise, and cut holes into them.
+    """Add noise to the points of a rock [N,3], and cut holes into them, to study the effect.
 
-    noise: standard deviation of the Gaussian noise added to each coordinate, metres. holes: share
-    of the points to remove, in balls around random points with a radius of a tenth of the rock's
-    extent, until this share is reached. Returns (points [N,3], kept [N] bool).
+    noise: standard deviation per coordinate, metres. holes: share of points removed, in balls
+    around random points, with a radius of a tenth of the extent. Returns (points [N,3], kept [N]
+    bool).
     """
     kept = np.ones(len(points), bool)
     radius = 0.1 * float(np.ptp(points, axis=0).max())
@@ -219,12 +207,11 @@ def degrade(
 
 
 def estimate_normals(points: np.ndarray, views: np.ndarray, roughness: float = 0.0) -> np.ndarray:
-    """Unit normals [N,3] of points [N,3]: of the plane through each point's neighbours (Hoppe et
-    al. 1992).
+    """Unit normals [N,3] of points [N,3], of the plane through their neighbours (Hoppe et al.
+    1992).
 
-    They are turned towards the cameras: views [N,3] are directions to these. roughness: noise of
-    the points over the distance between neighbouring points; the more, the more neighbours are
-    taken.
+    views [N,3]: directions to the cameras, which decide the sign. roughness: noise over the
+    distance between neighbours; the more, the more neighbours are used.
     """
     least, most = NORMAL_NEIGHBOURS
     count = min(int(least * (1 + 2 * roughness)), most, len(points))
@@ -238,11 +225,9 @@ def estimate_normals(points: np.ndarray, views: np.ndarray, roughness: float = 0
 class SegmentedCloud:
     """A cloud of P points, divided into ground, rock and the rest.
 
-    cloud: the fused cloud; plane: its ground plane, None where it was not needed or there is none;
-    ground: [P] bool, which points lie on the plane.
-    rock_points, rock_normals: [M,3] the rock's points, metres, and their unit normals, as the mesh
-    is built from them: degraded, if that was asked for, and without the ground at the rock's foot.
-    eps (metres), clusters: DBSCAN's parameter, and how many clusters it found.
+    plane: None if there is none or it was not needed. ground: [P] bool, points on the plane.
+    rock_points, rock_normals: [M,3] points, metres, and unit normals of which the mesh is built:
+    degraded if asked for, without the ground at the rock's foot. eps (metres), clusters: DBSCAN's.
     """
 
     cloud: Cloud
@@ -257,10 +242,10 @@ class SegmentedCloud:
 def segment_dataset(
     dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None]
 ) -> SegmentedCloud:
-    """Fuse the depth images of a dataset into a cloud, and find the ground and the rock in it.
+    """Fuse the depth images of a dataset into a cloud, and find the ground and the rock.
 
-    on_stage(name) is called as each stage starts. Raises InputError as `fuse_frames`,
-    `ground_plane` and `rock_cluster`.
+    on_stage: called with the name of each stage. Raises InputError as `fuse_frames`, `ground_plane`
+    and `rock_cluster`.
     """
     on_stage("cloud")
     cloud = fuse_frames(dataset.frames)
@@ -271,23 +256,19 @@ def segment_dataset(
     on_stage("rock cluster")
     target = focus(dataset.frames).point
 
-    def weight(
-        points: np.ndarray,
-    ) -> np.ndarray:  # a low rise of the ground may have more points than a rock
-        return plane.height(points) * (
-            mask_share(points, dataset.frames)[0] if has_masks(dataset.frames) else 1
-        )
+    def weight(points: np.ndarray) -> np.ndarray:
+        height = plane.height(points)  # a low rise of the ground may have more points than a rock
+        masked = has_masks(dataset.frames)
+        return height * (mask_share(points, dataset.frames)[0] if masked else 1)
 
     inside, eps, clusters = rock_cluster(
         cloud.points[above], cloud.voxel, target, str(dataset.root), weight
     )
     points, views = cloud.points[above][inside], cloud.views[above][inside]
-    points, kept = degrade(
-        points, settings.noise, settings.holes, generator(settings.seed, "prior/degrade")
-    )
+    rng = generator(settings.seed, "prior/degrade")
+    points, kept = degrade(points, settings.noise, settings.holes, rng)
     points, views = points[kept], views[kept]
-    normals = estimate_normals(
-        points, views, (FILTERED_SHARE * cloud.noise + settings.noise) / cloud.voxel
-    )
+    roughness = (FILTERED_SHARE * cloud.noise + settings.noise) / cloud.voxel
+    normals = estimate_normals(points, views, roughness)
     floor = (plane.height(points) < 2 * plane.tolerance) & (normals @ plane.normal > FLOOR_UPRIGHT)
     return SegmentedCloud(cloud, plane, ground, points[~floor], normals[~floor], eps, clusters)

@@ -12,24 +12,17 @@ from mgs.errors import InputError
 
 @dataclass(frozen=True)
 class PriorSettings:
-    """What a prior is asked to be.
+    """Settings of a prior.
 
-    gaussians: number of Gaussians, on the surface and behind it. spacing: distance between samples
-    on the surface in metres,
-    instead of a number. density: instead of both, samples on the surface for each square of the
-    edge of the cloud's voxels, which is about the size of a pixel on the rock; read only without
-    them. With none of the three, or where the number is "auto": as many as the closest pixel of a
-    frame can tell apart (`mgs.prior.resolution`).
-    backing: Gaussians behind the surface for each sample on it (`mgs.prior.initial`). With 0 all
-    lie on it, as in the paper.
-    poisson_depth: depth of the octree of the Poisson reconstruction; None chooses it such that its
-    finest cells have an edge of
-    1.5 voxels or less.
-    noise (metres), holes (share of points): by how much the rock's points are made worse on
-    purpose, to study the effect (`mgs.prior.segmentation.degrade`).
-    seed: root of every random draw.
-    Raises InputError if the number is below 2, the spacing is not positive, both are given, or
-    backing, noise or holes are out of range.
+    gaussians: number of Gaussians, on the surface and behind it; "auto": as many as the closest
+    pixel of a frame can tell apart (`mgs.prior.resolution`), also the default without spacing and
+    density. spacing: distance between samples, metres, instead of a number. density: samples per
+    square voxel of the cloud, about a pixel on the rock, instead of both. backing: Gaussians behind
+    the surface per sample (`mgs.prior.initial`); 0 as in the paper. poisson_depth: octree depth of
+    the Poisson reconstruction; None: finest cells of at most 1.5 voxels. noise (metres), holes
+    (share of points): degrade the rock's points (`mgs.prior.segmentation.degrade`). seed: root
+    seed. Raises InputError if the number is below 2, the spacing or density is not positive, number
+    and spacing are both given, or backing, noise or holes are out of range.
     """
 
     gaussians: int | Literal["auto"] | None = None
@@ -43,18 +36,14 @@ class PriorSettings:
 
     @property
     def resolved_by_cameras(self) -> bool:
-        """Whether the number of Gaussians is left to what the cameras can tell apart."""
-        return self.gaussians == "auto" or (self.gaussians, self.spacing, self.density) == (
-            None,
-            None,
-            None,
-        )
+        """Whether the cameras decide the number of Gaussians."""
+        given = (self.gaussians, self.spacing, self.density)
+        return self.gaussians == "auto" or given == (None, None, None)
 
     def refuse_shaping(self, why: str) -> None:
-        """Raises InputError where noise, holes or a Poisson depth are asked for, which shape a mesh
-        that is built of a cloud.
+        """Raise InputError if noise, holes or a Poisson depth are set, which need a cloud.
 
-        why: the end of the message, what the surface is made of instead.
+        why: end of the message, what the surface is made of instead.
         """
         options = {
             "--prior-noise": self.noise > 0,
@@ -69,7 +58,8 @@ class PriorSettings:
     def __post_init__(self) -> None:
         if isinstance(self.gaussians, int) and self.gaussians < 2:
             raise InputError(
-                f"prior: {self.gaussians} Gaussians are too few for a model; ask for more with --gaussians"
+                f"prior: {self.gaussians} Gaussians are too few for a model; "
+                "ask for more with --gaussians"
             )
         if self.spacing is not None and not self.spacing > 0:
             raise InputError(f"prior: spacing {self.spacing} m must be positive; correct --spacing")
@@ -85,9 +75,11 @@ class PriorSettings:
             )
         if not 0 <= self.holes <= 0.9:
             raise InputError(
-                f"prior: holes {self.holes} is a share of the rock's points, 0 to 0.9; correct --holes"
+                f"prior: holes {self.holes} is a share of the rock's points, 0 to 0.9; "
+                "correct --holes"
             )
         if not 0 <= self.backing <= 1:
             raise InputError(
-                f"prior: backing {self.backing} is a number of Gaussians per sample, 0 to 1; correct --backing"
+                f"prior: backing {self.backing} is a number of Gaussians per sample, 0 to 1; "
+                "correct --backing"
             )

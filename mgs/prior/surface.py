@@ -1,5 +1,5 @@
-"""The surface: the rock's points -> a watertight mesh (Poisson reconstruction) -> evenly spread
-samples (blue noise)."""
+"""The surface: watertight mesh of the rock's points (Poisson) and evenly spread samples (blue
+noise)."""
 
 from __future__ import annotations
 
@@ -16,105 +16,102 @@ from mgs.errors import InputError
 from mgs.prior.segmentation import Plane
 
 POISSON_SCALE = 2.0
-"""Edge of the cube that Poisson reconstruction works in, over the extent of the points. Below the
-open underside of the points the surface bulges out; with pymeshlab's own value, 1.1, it leaves the
-cube there and is not closed."""
+"""Edge of the cube of the Poisson reconstruction, over the extent of the points. Below the open
+underside the surface bulges out; with pymeshlab's default, 1.1, it leaves the cube and is not
+closed."""
 
 POISSON_CELL = 1.5
-"""Largest edge of the finest cells of the reconstruction, over the cloud's voxel. Finer cells fit
-noise and take longer; half the edge gained nothing."""
+"""Largest edge of the finest cells, over the voxel. Finer cells fit noise; half the edge gained
+nothing."""
 
 POISSON_DEPTHS = (5, 10)
-"""Least and largest depth of the octree that is chosen automatically. A caller may ask for 3 to 12;
-beyond, pymeshlab crashes."""
+"""Least and largest octree depth chosen automatically. Beyond 12, pymeshlab crashes."""
+
+CUBES = ((1, 0), (2, 1))
+"""Cubes to try: factor on POISSON_SCALE, and on the octree depth what keeps the cells' size."""
 
 OVERSAMPLING = 5
-"""Number of random candidates for each sample."""
+"""Random candidates per sample."""
 
 SAMPLE_BYTES = 3400
-"""Memory that sampling takes for each sample, bytes, most of it for pairs of candidates (measured:
-3.3 to 3.5 kB for 10^5 to 10^6 samples)."""
+"""Memory per sample, bytes, mostly for pairs of candidates (measured: 3.3 to 3.5 kB for 10^5 to
+10^6 samples)."""
 
 
 def poisson_mesh(
     points: np.ndarray, normals: np.ndarray, voxel: float, plane: Plane, depth: int | None
 ) -> tuple[Mesh, int]:
-    """A watertight mesh of the rock: its screened Poisson surface, cut flat at the ground plane.
+    """Watertight screened Poisson surface of the rock, cut flat at the ground plane, and octree
+    depth.
 
-    points, normals: [M,3] of the rock, metres and unit vectors; voxel: distance between
-    neighbouring points, metres; depth: of the octree, None to choose it such that its finest cells
-    have an edge of at most 1.5 voxels. Poisson reconstruction closes the underside, where there are
-    no points, with a bulge that no data supports. The cut replaces the bulge by a flat base on the
-    ground, which does not count as seen. Returns (mesh, depth of the octree). Raises InputError if
-    the depth is not within 3 to 12, or there is no closed surface
-    above the ground. Sources: Kazhdan and Hoppe 2013, by pymeshlab; the cut by manifold3d.
+    points, normals: [M,3], metres and unit vectors; voxel: distance between neighbours, metres;
+    depth: of the octree, None for finest cells of at most 1.5 voxels. The reconstruction closes the
+    underside with a bulge that no data supports; the cut replaces it by a flat base, not seen.
+    Raises InputError if the depth is not within 3 to 12, or there is no closed surface above the
+    ground. Sources: Kazhdan and Hoppe 2013, by pymeshlab; the cut by manifold3d.
     """
     solid, depth = _closed_solid(points, normals, voxel, depth, plane)
-    solid = max(
-        solid.trim_by_plane(plane.normal, plane.offset).decompose(),
-        key=lambda part: part.volume(),
-        default=None,
-    )
+    pieces = solid.trim_by_plane(plane.normal, plane.offset).decompose()
+    solid = max(pieces, key=lambda part: part.volume(), default=None)
     if solid is None or solid.is_empty():
         raise InputError(
-            f"prior: Poisson at depth {depth} gives nothing above the ground; give more frames, or --from hull"
+            f"prior: Poisson at depth {depth} gives nothing above the ground; "
+            "give more frames, or --from hull"
         )
     mesh = _from_solid(solid)
-    base = (np.abs(plane.height(mesh.vertices)) < 1e-6 * np.ptp(mesh.vertices, axis=0).max())[
-        mesh.faces
-    ].all(1)
-    return replace(mesh, seen=~base), depth
+    limit = 1e-6 * np.ptp(mesh.vertices, axis=0).max()
+    on_ground = np.abs(plane.height(mesh.vertices)) < limit
+    return replace(mesh, seen=~on_ground[mesh.faces].all(1)), depth
 
 
 def closed_poisson(
     points: np.ndarray, normals: np.ndarray, voxel: float, depth: int | None
 ) -> tuple[Mesh, int]:
-    """The largest piece of the watertight screened Poisson surface of points all around an object.
+    """Largest piece of the watertight Poisson surface of points all around an object, and octree
+    depth.
 
-    Arguments, result and errors as `poisson_mesh`, without the plane and the cut."""
+    Arguments and errors as `poisson_mesh`, without plane and cut.
+    """
     solid, depth = _closed_solid(points, normals, voxel, depth, None)
     return _from_solid(max(solid.decompose(), key=lambda part: part.volume())), depth
 
 
 def intersection(a: Mesh, b: Mesh) -> Mesh:
-    """The largest piece of what two watertight meshes have in common (manifold3d). Raises
-    InputError if that is nothing."""
+    """Largest piece of the intersection of two watertight meshes (manifold3d). Raises InputError if
+    empty."""
     pieces = (_to_solid(a.vertices, a.faces) ^ _to_solid(b.vertices, b.faces)).decompose()
     if not pieces:
         raise InputError(
-            "prior: the points and the hull of the masks have nothing in common; poses, points or masks are wrong"
+            "prior: the points and the hull of the masks have nothing in common; "
+            "poses, points or masks are wrong"
         )
     return _from_solid(max(pieces, key=lambda part: part.volume()))
 
 
 def _to_solid(vertices: np.ndarray, faces: np.ndarray) -> Any:
-    """A solid of manifold3d; its status says whether the mesh is closed."""
+    """Solid of manifold3d; its status says whether the mesh is closed."""
     import manifold3d
 
-    # It takes only arrays that it could write to, so they are copied.
-    return manifold3d.Manifold(
-        manifold3d.Mesh64(np.array(vertices, np.float64), np.array(faces, np.uint64))
-    )
+    # It takes writable arrays only, so they are copied.
+    mesh = manifold3d.Mesh64(np.array(vertices, np.float64), np.array(faces, np.uint64))
+    return manifold3d.Manifold(mesh)
 
 
 def _from_solid(solid: Any) -> Mesh:
     cut = solid.to_mesh64()
-    vertices, faces = (
-        np.asarray(cut.vert_properties)[:, :3],
-        np.asarray(cut.tri_verts).astype(np.int64),
-    )
+    vertices = np.asarray(cut.vert_properties)[:, :3]
+    faces = np.asarray(cut.tri_verts).astype(np.int64)
     return Mesh(vertices, faces, np.ones(len(faces), bool))
 
 
 def _closed_solid(
     points: np.ndarray, normals: np.ndarray, voxel: float, depth: int | None, plane: Plane | None
 ) -> tuple[Any, int]:
-    """The Poisson surface as a solid of manifold3d, and the depth of the octree.
+    """Poisson surface as a solid of manifold3d, and the octree depth.
 
-    Under an open cloud the surface may leave the cube. Then larger cubes are tried, at last with
-    the points mirrored in the ground plane too, which closes any surface that stands on it; the
-    cells keep their size. Raises InputError if the depth is not within 3 to 12, or none of that
-    gives a closed surface.
+    Under an open cloud the surface may leave the cube. Then a larger cube is tried, and last the
+    points are mirrored in the ground plane too; cells keep their size. Raises InputError if the
+    depth is not within 3 to 12, or no try gives a closed surface.
     """
     import manifold3d
     import pymeshlab
@@ -128,17 +125,11 @@ def _closed_solid(
         depth = int(np.clip(np.ceil(np.log2(cells)), *POISSON_DEPTHS))
     both = points, normals
     if plane is not None:
-        image = (
-            points - 2 * plane.height(points)[:, None] * plane.normal,
-            normals - 2 * (normals @ plane.normal)[:, None] * plane.normal,
-        )
-        both = np.concatenate([points, image[0]]), np.concatenate([normals, image[1]])
-    for scale, finer, (p, n) in [
-        (1, 0, (points, normals)),
-        (2, 1, (points, normals)),
-        (1, 0, both),
-        (2, 1, both),
-    ]:
+        mirrored = points - 2 * plane.height(points)[:, None] * plane.normal
+        turned = normals - 2 * (normals @ plane.normal)[:, None] * plane.normal
+        both = np.concatenate([points, mirrored]), np.concatenate([normals, turned])
+    tries = [(p, n, scale, finer) for p, n in ((points, normals), both) for scale, finer in CUBES]
+    for p, n, scale, finer in tries:
         meshes = pymeshlab.MeshSet()
         meshes.add_mesh(pymeshlab.Mesh(p, v_normals_matrix=n))
         meshes.generate_surface_reconstruction_screened_poisson(
@@ -151,24 +142,22 @@ def _closed_solid(
             if solid.status() == manifold3d.Error.NoError and not solid.is_empty():
                 return solid, depth
     raise InputError(
-        f"prior: Poisson at depth {depth} gives no closed surface; try another --poisson-depth, more frames, or --from hull"
+        f"prior: Poisson at depth {depth} gives no closed surface; "
+        "try another --poisson-depth, more frames, or --from hull"
     )
 
 
 def sample_surface(
     mesh: Mesh, seed: int, *, count: int | None = None, spacing: float | None = None
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Samples of the part of a mesh that counts as seen, with about the same distance between all
-    neighbours (blue noise).
+    """Evenly spread samples (blue noise) of the seen part of a mesh.
 
-    Give either count N, or spacing in metres: then N is the area divided by spacing^2, rounded.
-    From 5 N random candidates, points are taken one after the other unless they are nearer than a
-    radius to one taken before (Poisson disks). The radius is the largest that leaves at least N; of
-    the few too many, those nearest to a neighbour are dropped.
-    Returns (points [N,3], unit normals [N,3], spacing in metres: the square root of area / N).
-    Raises InputError for fewer than two samples, for more than the memory holds, and if float32, in
-    which Gaussians are kept, cannot tell neighbouring samples apart at their distance from the
-    origin.
+    Give count N, or spacing in metres for N = area / spacing^2. Of 5 N random candidates, points
+    are taken in turn unless closer than a radius to one taken before (Poisson disks). The radius is
+    the largest that leaves at least N; the few too many, nearest to a neighbour, are dropped.
+    Returns (points [N,3], unit normals [N,3], spacing: sqrt(area / N), metres). Raises InputError
+    for fewer than two samples, more than memory holds, and if float32 cannot tell neighbours apart
+    at their distance from the origin.
     """
     areas = np.where(mesh.seen, mesh.areas, 0.0)
     area = float(areas.sum())
@@ -182,8 +171,9 @@ def sample_surface(
     furthest = float(np.abs(mesh.vertices[mesh.faces[mesh.seen]]).max())
     if furthest * np.finfo(np.float32).eps > spacing / 10:
         raise InputError(
-            f"prior: float32 does not resolve samples {spacing:.3g} m apart at {furthest:.3g} m from the origin; "
-            "move the mesh and the cameras to the origin, or ask for fewer Gaussians"
+            f"prior: float32 does not resolve samples {spacing:.3g} m apart at {furthest:.3g} m "
+            "from the origin; move the mesh and the cameras to the origin, or ask for fewer "
+            "Gaussians"
         )
     rng = np.random.default_rng(seed)
     face = rng.choice(len(areas), OVERSAMPLING * count, p=areas / area)
@@ -193,52 +183,43 @@ def sample_surface(
     points = np.einsum("nk,nki->ni", weights, mesh.vertices[mesh.faces[face]])
     keep = _blue_noise(points, count, spacing)
     normals = np.einsum("nk,nki->ni", weights[keep], mesh.vertex_normals[mesh.faces[face[keep]]])
-    # At a fold the normals of a face's corners may cancel; the face's own normal takes their place.
+    # At a fold the normals of a face's corners may cancel; its own normal replaces them.
     flat = np.linalg.norm(normals, axis=1) < 1e-6
-    corners = mesh.vertices[mesh.faces[face[keep[flat]]]]
-    normals[flat] = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals[flat] = mesh.crosses[face[keep[flat]]]
     return points[keep], normals / np.linalg.norm(normals, axis=1, keepdims=True), spacing
 
 
 def spread_first(points: np.ndarray, count: int, spacing: float) -> np.ndarray:
-    """An order of points in which the first `count` are evenly spread by themselves: indices [N].
-
-    points [N,3]: evenly spread, `spacing` metres apart.
-    """
-    first = (
-        _blue_noise(points, count, spacing * np.sqrt(len(points) / count))
-        if count
-        else np.zeros(0, int)
-    )
+    """Order of points [N,3], `spacing` metres apart, whose first `count` are evenly spread by
+    themselves: indices [N]."""
+    if not count:
+        return np.arange(len(points))
+    first = _blue_noise(points, count, spacing * np.sqrt(len(points) / count))
     return np.concatenate([first, np.setdiff1d(np.arange(len(points)), first)])
 
 
 def _checked_count(samples: float) -> int:
-    """A number of samples, rounded. Raises InputError if it is below 2, or would take more memory
-    than the machine has."""
-    needed, there = (
-        Decimal(samples) * SAMPLE_BYTES,
-        os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"),
-    )
+    """Rounded number of samples. Raises InputError if below 2, or beyond the machine's memory."""
+    needed = Decimal(samples) * SAMPLE_BYTES
+    there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if needed > there:
         raise InputError(
-            f"prior: N = {Decimal(samples):.4g} samples take about {needed / 10**9:.3g} GB of memory, and this machine has "
-            f"{there / 1e9:.3g} GB; ask for fewer Gaussians (or a larger --spacing)"
+            f"prior: N = {Decimal(samples):.4g} samples take about {needed / 10**9:.3g} GB of "
+            f"memory, and this machine has {there / 1e9:.3g} GB; "
+            "ask for fewer Gaussians (or a larger --spacing)"
         )
     count = round(samples)
     if count < 2:
         raise InputError(
-            f"prior: {count} samples are too few for a model; ask for more Gaussians (or a smaller --spacing)"
+            f"prior: {count} samples are too few for a model; "
+            "ask for more Gaussians (or a smaller --spacing)"
         )
     return count
 
 
 def _blue_noise(points: np.ndarray, count: int, spacing: float) -> np.ndarray:
-    """Choose `count` of the random points [N,3] in the way that `sample_surface` describes; returns
-    their indices [count].
-
-    About the largest possible radius is found by bisection; it is less than the spacing, metres.
-    """
+    """Choose `count` of random points [N,3] as `sample_surface` describes: indices [count]. The
+    radius is found by bisection and less than the spacing, metres."""
     pairs = cKDTree(points).query_pairs(0.95 * spacing, output_type="ndarray")
     distance = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     low, high = 0.0, 0.95 * spacing
@@ -257,12 +238,10 @@ def _blue_noise(points: np.ndarray, count: int, spacing: float) -> np.ndarray:
 
 
 def _independent(pairs: np.ndarray, n: int) -> np.ndarray:
-    """Take 0, 1, ... n-1 in this order, leaving out each that forms one of the `pairs` [P,2] with
-    one taken before.
+    """Take 0, 1, ... n-1 in turn, except partners in `pairs` [P,2] of one taken before.
 
-    Returns those taken. They are found in a few vectorised rounds. In each, a number is taken if no
-    smaller one that is still undecided forms a pair with it, and the partners of all numbers taken
-    are left out.
+    Vectorised rounds: a number is taken if it has no smaller undecided partner; partners of taken
+    numbers are dropped.
     """
     low, high = pairs.min(1), pairs.max(1)
     undecided, kept = np.ones(n, bool), np.zeros(n, bool)

@@ -1,4 +1,4 @@
-"""How far a prior is from the true rock, for datasets that hold the true rock (rock.glb)."""
+"""Distance of a prior from the true rock, for datasets that hold it (rock.glb)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mgs.prior.segmentation import SegmentedCloud
 from mgs.seeds import derive_seed
 
 TRUTH_SAMPLES = 50_000
-"""Number of random points on the true rock whose distance to the prior is measured."""
+"""Random points on the true rock whose distance to the prior is measured."""
 
 
 def error_to_truth(
@@ -27,20 +27,15 @@ def error_to_truth(
     segmented: SegmentedCloud,
     seed: int,
 ) -> dict[str, float]:
-    """How far a prior is from the true rock, metres.
+    """Distances between a prior and the true rock, metres.
 
-    points: [N,3] the prior's samples; spacing: theirs, metres; mesh: the prior's; truth: file of
-    the true rock; frames: of the dataset, with depth; segmented: the cloud that the mesh was built
-    from; seed: root of the random points.
-    Returns these numbers, of which the first two are named as in Knapitsch et al. 2017:
+    points: [N,3] samples, `spacing` metres apart; truth: file of the rock; frames: with depth;
+    segmented: the cloud of the mesh; seed: root of the random points. Returns:
 
-    - accuracy: mean distance from the prior's samples to the true surface.
-    - completeness: mean distance from the true surface, as far as some frame sees it, to the
-    prior's mesh.
-    - chamfer: the mean of these two.
-    - hausdorff: the largest distance in either direction.
-    - visible_within_2_spacing: share of the true surface that some frame sees which is within two
-    spacings of the mesh.
+    - accuracy, completeness (Knapitsch et al. 2017): mean distance from the samples to the true
+      surface, and from the seen true surface to the mesh;
+    - chamfer: the mean of the two; hausdorff: the largest distance in either direction;
+    - visible_within_2_spacing: share of the seen true surface within two spacings of the mesh;
     - visible_share: share of the true surface above the ground that some frame sees.
 
     Raises InputError if the rock's file or a depth image cannot be read, or no frame sees the rock.
@@ -49,23 +44,21 @@ def error_to_truth(
 
     known = read_mesh(truth)
     true = trimesh.Trimesh(known.vertices, known.faces, process=False)
-    surface, face = trimesh.sample.sample_surface(
-        true, TRUTH_SAMPLES, seed=derive_seed(seed, "prior/truth")
-    )
-    exposed = (
-        np.ones(len(surface), bool)
-        if segmented.plane is None
-        else segmented.plane.height(np.asarray(surface)) > 0
-    )
-    surface, normals = np.asarray(surface)[exposed], true.face_normals[face[exposed]]
+    sample_seed = derive_seed(seed, "prior/truth")
+    surface, face = trimesh.sample.sample_surface(true, TRUTH_SAMPLES, seed=sample_seed)
+    surface, normals = np.asarray(surface), true.face_normals[face]
+    if segmented.plane is not None:
+        exposed = segmented.plane.height(surface) > 0
+        surface, normals = surface[exposed], normals[exposed]
     tolerance = max(spacing / 2, 2 * segmented.cloud.noise)
     seen = np.zeros(len(surface), bool)
     for frame in frames:
-        # Both sides of a face count, because the faces of a scanned rock may be wound either way.
+        # Faces of a scanned rock may be wound either way.
         seen |= visible(surface, normals, frame.camera, frame.depth(), tolerance, two_sided=True)
     if not seen.any():
         raise InputError(
-            f"{truth}: no frame sees the true rock; it is another dataset's, or in another coordinate system"
+            f"{truth}: no frame sees the true rock; "
+            "it is another dataset's, or in another coordinate system"
         )
     there = distances_to_mesh(points, true.vertices, true.faces)
     back = distances_to_mesh(surface[seen], mesh.vertices, mesh.faces)

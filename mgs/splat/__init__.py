@@ -1,13 +1,12 @@
 """Gaussian splatting on Dr.Jit: render, differentiate, and measure information.
 
-`render` draws Gaussians, and Dr.Jit can differentiate it in both directions. `jvp` says how an
-image changes as the Gaussians change in a given way. `fisher` gives the information that a view
-carries about each Gaussian. A `ListCache` kept between calls makes all three faster for cameras
-seen before.
+`render` draws Gaussians, differentiably in both directions. `jvp` gives the derivative of an image
+along a change of the Gaussians. `fisher` gives the information of a view about each Gaussian. A
+`ListCache` passed to all calls makes them faster for cameras seen before. They start Dr.Jit
+themselves (`mgs.runtime.start`).
 
-`render`, `jvp` and `fisher` start Dr.Jit themselves (`mgs.runtime.start`): importing this package
-needs nothing before it. `import mgs.splat.plugins` registers the Mitsuba integrator `mgs_splat`
-(plugins/mgs_splat.py), which draws the same images.
+`import mgs.splat.plugins` registers the Mitsuba integrator `mgs_splat` (plugins/mgs_splat.py),
+which draws the same images.
 """
 
 from mgs.splat.information import ESTIMATORS, MEANS, fisher, groups

@@ -1,13 +1,13 @@
-"""How a pixel changes with each parameter of a Gaussian, up to what differs from pixel to pixel,
-and sums over pixels of it.
+"""Derivatives of a pixel by the parameters of a Gaussian, and their sums over pixels.
 
 The derivative of channel c of a pixel by any parameter is s_c q + w g_c. Here q, the derivative of
-ln alpha, is a polynomial of second order in xi and eta, and g_c that of the splat's colour; their
-coefficients depend on the Gaussian and the camera alone. So entries of the Fisher information are
-made from moments, which are sums over pixels of |s|^2 or w s_c times monomials of xi and eta, and
-from the sum of w^2 (`mgs.splat.kernels.fisher`). A polynomial is a dict {(a, b): coefficient of
-xi^a eta^b}, and
-moments are kept in dicts with the same keys. Symbols: docs/notation.md.
+ln alpha, is a polynomial of second order in xi and eta, and g_c is the derivative of the splat's
+colour. Their coefficients depend on Gaussian and camera alone. So the Fisher information follows
+from moments, sums over pixels of |s|^2 or w s_c times monomials of xi and eta, and from the sum of
+w^2 (`mgs.splat.kernels.fisher`).
+
+A polynomial is a dict {(a, b): coefficient of xi^a eta^b}; moments are dicts with the same keys.
+Symbols: docs/notation.md.
 """
 
 from __future__ import annotations
@@ -39,12 +39,13 @@ Polynomial = Mapping[Powers, Any]
 
 @dataclass
 class Geometry:
-    """How pixels depend on all parameters of a Gaussian but its mean; Dr.Jit arrays [N].
+    """Derivatives by all parameters of a Gaussian but its mean; Dr.Jit arrays [N].
 
-    shape: for the 3 log-scales and the 4 numbers of the quaternion, the derivative of ln alpha, a
-    polynomial in xi^2, xi eta and eta^2. logit: the derivative of ln alpha by the opacity logit, 1
-    - opacity. basis: the K values of the spherical
-    harmonics. positive: for r, g, b 1, or 0 where the colour is clamped at 0 and has no derivative.
+    shape: derivative of ln alpha by each of 3 log-scales and 4 quaternion entries, polynomials in
+        xi^2, xi eta and eta^2.
+    logit: derivative of ln alpha by the opacity logit, 1 - opacity.
+    basis: values of the K spherical harmonics.
+    positive: for r, g, b: 1, or 0 where the colour is clamped at 0.
     """
 
     shape: Sequence[Polynomial]
@@ -55,9 +56,11 @@ class Geometry:
 
 @dataclass
 class ByMean:
-    """Derivatives as a mean moves along some direction, per metre: of ln alpha, a polynomial
-    without a constant, and of the splat's colour, for r, g, b. The last is 0 for SH degree 0, of
-    which `colour` is an empty list."""
+    """Derivatives by a displacement of the mean along some direction, per metre.
+
+    log_alpha: of ln alpha, a polynomial without constant.
+    colour: of r, g, b of the splat; empty for SH degree 0.
+    """
 
     log_alpha: Polynomial
     colour: list[Any]
@@ -65,8 +68,11 @@ class ByMean:
 
 @dataclass
 class Moments:
-    """Sums over pixels, Dr.Jit Float64 [N]: w2 is sum w^2; squared, moments with |s|^2; mixed, for
-    r, g, b moments with w s_c, or an empty list where they are not needed."""
+    """Sums over pixels, Dr.Jit Float64 [N].
+
+    w2: of w^2. squared: moments with |s|^2. mixed: for r, g, b, moments with w s_c; empty if not
+    needed.
+    """
 
     w2: Any
     squared: Polynomial
@@ -74,20 +80,18 @@ class Moments:
 
 
 def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
-    """The derivatives of the footprint in closed form, in whitened coordinates x = (xi, eta), in
-    which they are of order one.
+    """Derivatives of the footprint in closed form, in whitened coordinates x = (xi, eta).
 
-    With s_i the standard deviation along local axis i and b_i the image of that axis in whitened
-    pixels per metre, ln alpha changes with log-scale i by 4 ln2^2 s_i^2 (b_i.x)^2, and with a
-    rotation about local axis k by 4 ln2^2 (s_i^2 - s_j^2) (b_i.x) (b_j.x), where (i, j, k) is (0,
-    1, 2) or a cyclic shift of it. A change dq of a quaternion q of norm n rotates the local axes by
+    Let s_i be the standard deviation along local axis i, and b_i the image of that axis, whitened
+    pixels per metre. The derivative of ln alpha by log-scale i is 4 ln2^2 s_i^2 (b_i.x)^2. That by
+    a rotation about local axis k is 4 ln2^2 (s_i^2 - s_j^2) (b_i.x) (b_j.x), with (i, j, k) a
+    cyclic shift of (0, 1, 2). A change dq of a quaternion q of norm n rotates the local axes by
     (2/n) Im(conj(q/n) dq).
-    gaussians: TensorXf fields; camera: `camera_array`; splats: their projection.
+
+    gaussians: TensorXf fields. camera: `camera_array`. splats: their projection.
     """
-    mean, quats = (
-        mi.Vector3d(rows_as_vectors(gaussians.means, mi.Vector3f)),
-        mi.Vector4d(rows_as_vectors(gaussians.quats, mi.Vector4f)),
-    )
+    mean = mi.Vector3d(rows_as_vectors(gaussians.means, mi.Vector3f))
+    quats = mi.Vector4d(rows_as_vectors(gaussians.quats, mi.Vector4f))
     log_scales = mi.Vector3d(rows_as_vectors(gaussians.log_scales, mi.Vector3f))
     _, unit, _ = axes2d(mean, quats, camera)
     scales = dr.exp(dr.clip(log_scales, *LOG_SCALE_RANGE))
@@ -120,12 +124,11 @@ def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
 
 
 def by_means(gaussians: Gaussians, camera: Any) -> list[ByMean]:
-    """Derivatives by the coordinates x, y, z of the means, by Dr.Jit's forward AD of the
-    projection.
+    """Derivatives by the coordinates x, y, z of the means, by forward AD of the projection.
 
-    With a mean move the centre of its splat, its footprint (through the projection's Jacobian, as
-    in `project64`) and, for
-    an SH degree above 0, its colour. gaussians: TensorXf fields; camera: `camera_array`.
+    They include the change of the splat's centre, of its footprint (through the projection's
+    Jacobian) and, above SH degree 0, of its colour. gaussians: TensorXf fields. camera:
+    `camera_array`.
     """
     columns = []
     values = {field.name: dr.detach(getattr(gaussians, field.name)) for field in fields(gaussians)}
@@ -135,21 +138,20 @@ def by_means(gaussians: Gaussians, camera: Any) -> list[ByMean]:
             dr.enable_grad(means)
             dr.set_grad(means, mi.TensorXf(padded(np.tile(axis, (len(gaussians), 1)))))
             splats = project64(Gaussians(**{**values, "means": means}), camera)
-            dr.forward_to(
-                splats, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
-            )  # the opacity does not depend on the means
+            # AllowNoGrad: the opacity does not depend on the means.
+            dr.forward_to(splats, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
             tangents, splats = dr.grad(splats), dr.detach(splats)
         polynomial = log_alpha_tangent(tangents, splats)
-        del polynomial[0, 0]  # the part that comes from the opacity
+        del polynomial[0, 0]  # the part of the opacity
         columns.append(ByMean(polynomial, tangents.colour if gaussians.sh_degree else []))
     return columns
 
 
 def along_normals(columns: list[ByMean], normals: np.ndarray) -> ByMean:
-    """Derivatives as the means move along unit normals, float64 [N,3], from those by x, y, z.
+    """Derivatives along unit normals, float64 [N,3], from those by x, y, z.
 
-    They are combined here, in double: rounded to float32, a normal that points to the camera would
-    be turned a little to the side, where a small splat is up to thousands of times as sensitive.
+    Combined in double: rounding a normal that points to the camera would turn it to the side, where
+    a small splat is up to thousands of times as sensitive.
     """
     parts = [mi.Float64(padded(part, np.float64)) for part in normals.T]
     polynomial = {
@@ -157,18 +159,17 @@ def along_normals(columns: list[ByMean], normals: np.ndarray) -> ByMean:
         for powers in POWERS[1:]
     }
     by_axis = zip(*(c.colour for c in columns), strict=True)
-    return ByMean(
-        polynomial, [sum(n * g for n, g in zip(parts, channel, strict=True)) for channel in by_axis]
-    )
+    colour = [sum(n * g for n, g in zip(parts, channel, strict=True)) for channel in by_axis]
+    return ByMean(polynomial, colour)
 
 
 def weighted_sum(p: Polynomial, moments: Polynomial) -> Any:
-    """The sum over pixels of a polynomial, from the moments."""
+    """Sum over pixels of a polynomial, from the moments."""
     return sum(coefficient * moments[powers] for powers, coefficient in p.items())
 
 
 def product_sum(p: Polynomial, q: Polynomial, moments: Polynomial) -> Any:
-    """The sum over pixels of the product of two polynomials, from the moments."""
+    """Sum over pixels of the product of two polynomials, from the moments."""
     product: dict[Powers, Any] = {}
     for i, a in enumerate(POWERS):
         for b in POWERS[i:]:
@@ -180,17 +181,16 @@ def product_sum(p: Polynomial, q: Polynomial, moments: Polynomial) -> Any:
 
 
 def mean_product(mean: ByMean, q: Polynomial, sums: Moments) -> Any:
-    """The sum over pixels and channels of the derivative by a mean times s_c q, that by a parameter
-    of the footprint."""
+    """Sum over pixels and channels of the derivative by a mean times s_c q, with q that of a
+    parameter of the footprint."""
     total = product_sum(mean.log_alpha, q, sums.squared)
-    return sum(
-        (g * weighted_sum(q, mixed) for g, mixed in zip(mean.colour, sums.mixed, strict=False)),
-        total,
-    )
+    for g, mixed in zip(mean.colour, sums.mixed, strict=False):
+        total += g * weighted_sum(q, mixed)
+    return total
 
 
 def means_product(a: ByMean, b: ByMean, sums: Moments) -> Any:
-    """The sum over pixels and channels of the product of the derivatives by two means."""
+    """Sum over pixels and channels of the product of the derivatives by two means."""
     total = product_sum(a.log_alpha, b.log_alpha, sums.squared)
     for g, h, mixed in zip(a.colour, b.colour, sums.mixed, strict=False):
         total += (

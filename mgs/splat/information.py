@@ -1,13 +1,11 @@
-"""Fisher information that one view carries about each Gaussian, by one of several estimators
-(`ESTIMATORS`).
+"""Fisher information of a view about each Gaussian, by one of several estimators (`ESTIMATORS`).
 
-A pixel is taken as the rendered value plus noise of variance 1. The information is then J^T J,
-where J is the Jacobian of the rgb image, all pixels and channels, with respect to the parameters.
+A pixel is the rendered value plus noise of variance 1. The information is then J^T J, with the
+Jacobian J of the rgb image, all pixels and channels, by the parameters.
 
-The P = 3K + 8 columns of a Gaussian: 3K spherical-harmonic coefficients (coefficient by
-coefficient, r g b in each), 3 log-scales, 4 of the quaternion, 1 opacity logit. The means are
-frozen and have no columns, unless asked for (`MEANS`): then 1
-or 3 more follow. Symbols: docs/notation.md.
+A Gaussian has P = 3K + 8 columns: 3K spherical-harmonic coefficients (coefficient by coefficient,
+r g b in each), 3 log-scales, 4 of the quaternion, 1 opacity logit; then 0, 1 or 3 of the mean
+(`MEANS`). Symbols: docs/notation.md.
 """
 
 from __future__ import annotations
@@ -43,42 +41,36 @@ from mgs.splat.rendering import ListCache, as_colour, as_drjit, render, splats_a
 from mgs.splat.walking import pack, packet_count, sums_by_splat
 
 MEANS = {"frozen": 0, "normal": 1, "free": 3}
-"""What the means may do, and the number of their columns: stay; move along a given normal of each
-Gaussian (the offset, in metres); move freely (x, y, z in the world, metres)."""
+"""Number of columns of the means: frozen; moving along a given normal (offset, metres); free
+(x, y, z in the world, metres)."""
 
 ALPHA_WEIGHT_MAX = 1e12
-"""(linear RGB)^2. Largest (sigma_rgb / sigma_alpha)^2: beyond it, sums over pixels might leave
-float32."""
+"""Largest (sigma_rgb / sigma_alpha)^2, (linear RGB)^2. Beyond it, sums over pixels might leave
+the range of float32."""
 
 MAX_SUMS = 1 << 31
-"""Most sums of all (splat, block) pairs of a view, since kernels index them with 31 bits."""
+"""Most sums of all (splat, block) pairs of a view; kernels index them with 31 bits."""
 
 BLOCK_BYTES = 1800
-"""Peak memory of a view's blocks for each Gaussian, SH degree 0, apart from its pairs: 1,700
+"""Peak memory of a view's blocks per Gaussian, SH degree 0, without its pairs; 1,700
 measured."""
 
 EXACT = ("exact", "block")
-"""The estimators that know the means and alpha."""
+"""Estimators that support means and alpha."""
 
 
 def groups(sh_degree: int, means: str = "frozen") -> dict[str, slice]:
-    """Columns of each group of parameters, for colours of this SH degree: "colour", "scale",
-    "rotation", "opacity", and "mean" if these are not frozen. Raises InputError if `means` is not a
-    name in `MEANS`."""
-    of_mean = row_named(MEANS, means, "means")
-    sizes = {
-        "colour": 3 * (sh_degree + 1) ** 2,
-        "scale": 3,
-        "rotation": 4,
-        "opacity": 1,
-        "mean": of_mean,
-    }
-    ends = np.cumsum(list(sizes.values())).tolist()
-    return {
-        name: slice(end - size, end)
-        for (name, size), end in zip(sizes.items(), ends, strict=True)
-        if size
-    }
+    """Columns of each kind of parameter, for colours of this SH degree: "colour", "scale",
+    "rotation", "opacity", and "mean" unless frozen. Raises InputError if `means` is not a name in
+    `MEANS`."""
+    of_mean, colour = row_named(MEANS, means, "means"), 3 * (sh_degree + 1) ** 2
+    sizes = {"colour": colour, "scale": 3, "rotation": 4, "opacity": 1, "mean": of_mean}
+    columns, end = {}, 0
+    for name, size in sizes.items():
+        if size:
+            columns[name] = slice(end, end + size)
+        end += size
+    return columns
 
 
 @one_at_a_time
@@ -93,24 +85,24 @@ def fisher(
     alpha_weight: float = 0.0,
     **options: Any,
 ) -> np.ndarray:
-    """Fisher information that one view carries about each Gaussian: float32 [N,P], or [N,P,P] for
-    the estimator `block`.
+    """Fisher information of one view about each Gaussian: float32 [N,P], or [N,P,P] for the
+    estimator `block`.
 
-    Entries are in (linear RGB / unit of the parameter)^2. The camera's image is not needed: the
-    information depends on the model and the pose alone. The array may be a view of a larger one
-    (its rows are padded in memory).
-    gaussians, background, cache: as in `render`. estimator: a name in `ESTIMATORS`. options:
-    `probes` and `seed` of `hutchinson`; the others have none.
-    means: a name in `MEANS`; `groups` says which columns are whose. normals: [N,3], world, of any
-    length but 0, the directions in which `means="normal"` moves them; read only then. They are
-    given, not taken from the Gaussians' own axes, since those turn as the model is fitted, and
-    information summed over views must be about one and the same direction.
-    alpha_weight: the ratio of noise variances (sigma_rgb / sigma_alpha)^2, up to 1e12, with which a
-    pixel's alpha is observed beside its colour; 0: it is not.
-    Raises InputError for an unknown estimator, where `render` does, for blocks of 2^31 numbers or
-    more or that memory has no room for, for unusable means,
-    normals or alpha_weight, which only the estimators `exact` and `block` know, and with means for
-    too many pairs (`MAX_SUMS`).
+    Entries are in (linear RGB / unit of the parameter)^2. They depend on model and pose alone, not
+    on the camera's image. The array may be a view of a larger one (padded rows).
+
+    gaussians, background, cache: as in `render`.
+    estimator: a name in `ESTIMATORS`. options: `probes` and `seed` of `hutchinson`.
+    means: a name in `MEANS`.
+    normals: directions for means="normal" [N,3], world, of any length but 0. They are given, not
+        taken from the Gaussians' axes, because those turn during a fit, and information summed over
+        views must be about the same direction.
+    alpha_weight: (sigma_rgb / sigma_alpha)^2, up to 1e12, if a pixel's alpha is observed beside its
+        colour; 0: it is not.
+
+    Raises InputError for an unknown estimator; as `render`; for blocks of 2^31 numbers or more, or
+    too large for the memory; for unusable means, normals or alpha_weight, or an estimator that does
+    not support them; and with means for too many pairs (`MAX_SUMS`).
     """
     compute = row_named(ESTIMATORS, estimator, "estimator")
     gaussians.check_shapes()
@@ -122,23 +114,22 @@ def fisher(
     if MEANS[means] or alpha_weight:
         if estimator not in EXACT:
             raise InputError(
-                f"fisher: the estimator {estimator!r} knows neither means nor alpha; use {' or '.join(EXACT)}"
+                f"fisher: the estimator {estimator!r} knows neither means nor alpha; "
+                f"use {' or '.join(EXACT)}"
             )
         unit = unit_normals(n, normals) if means == "normal" else None
         options |= {"means": means, "normals": unit, "alpha_weight": alpha_weight}
     if n == 0:
         return np.zeros((0, size, size) if estimator == "block" else (0, size), np.float32)
-    if (
-        estimator == "block" and n * (size * size + 3) >= 1 << 31
-    ):  # each row is written in packets of four numbers
-        raise InputError(
-            f"fisher: blocks of {n:,} Gaussians of SH degree {gaussians.sh_degree} would take {n * size * size / 2**28:.1f} "
-            "GiB, and 8 are the most; take fewer Gaussians, a lower degree, or the estimator `exact`"
-        )
     if estimator == "block":
-        of_degree = BLOCK_BYTES * (size / 11) ** 2
+        if n * (size * size + 3) >= 1 << 31:  # rows are written in packets of four numbers
+            raise InputError(
+                f"fisher: blocks of {n:,} Gaussians of SH degree {gaussians.sh_degree} would take "
+                f"{n * size * size / 2**28:.1f} GiB, and 8 are the most; take fewer Gaussians, "
+                "a lower degree, or the estimator `exact`"
+            )
         check_room(
-            n * of_degree,
+            n * BLOCK_BYTES * (size / 11) ** 2,
             f"fisher: blocks of {n:,} Gaussians",
             "take fewer Gaussians, or the estimator `exact`",
         )
@@ -146,7 +137,7 @@ def fisher(
 
 
 def unit_normals(n: int, normals: Any) -> np.ndarray:
-    """Normals, float64 [N,3], of length 1. Raises InputError where they are missing or unusable."""
+    """Normals of length 1, float64 [N,3]. Raises InputError if they are missing or unusable."""
     if normals is None:
         raise InputError(
             "fisher: means='normal' needs normals [N,3], the direction in which each mean may move"
@@ -158,7 +149,8 @@ def unit_normals(n: int, normals: Any) -> np.ndarray:
     bad = ~(np.isfinite(length) & (length > 0))
     if bad.any():
         raise InputError(
-            f"fisher: a normal is zero, NaN or infinite, first at Gaussian {np.argmax(bad)}; repair it"
+            "fisher: a normal is zero, NaN or infinite, "
+            f"first at Gaussian {np.argmax(bad)}; repair it"
         )
     return values / length
 
@@ -173,23 +165,19 @@ def _sums(
     normals: np.ndarray | None,
     alpha_weight: float,
 ) -> tuple[Moments, Geometry, list[ByMean]]:
-    """The sums of `kernels.fisher`, and the derivatives that turn them into entries of the
-    information, those by means apart.
-
-    means, normals, alpha_weight: as in `exact`.
-    """
+    """Sums of `kernels.fisher`, and the derivatives that turn them into entries of the information.
+    means, normals, alpha_weight: as in `exact`."""
     device = camera_array(camera)
     splats, lists, packed = splats_and_lists(gaussians, camera, cache)
     moving = means != "frozen"
-    cross = block or (
-        moving and gaussians.sh_degree > 0
-    )  # as a mean moves, SH of higher degree change colour, too
+    cross = block or (moving and gaussians.sh_degree > 0)  # then colour depends on the mean
     count = kernels.fisher_sums(cross, moving)
     room = 4 * packet_count(count)
     if len(lists.splat) * room >= MAX_SUMS:
         raise InputError(
-            f"view: {len(lists.splat):,} pairs of a Gaussian and a block of pixels are too many for Fisher information with "
-            f"means, which takes fewer than {MAX_SUMS // room:,}; take fewer or smaller Gaussians, or a smaller image"
+            f"view: {len(lists.splat):,} pairs of a Gaussian and a block of pixels are too many "
+            f"for Fisher information with means, which takes fewer than {MAX_SUMS // room:,}; "
+            "take fewer or smaller Gaussians, or a smaller image"
         )
     if block:
         exact = project64(gaussians, device)
@@ -220,21 +208,18 @@ def exact(
     normals: np.ndarray | None = None,
     alpha_weight: float = 0.0,
 ) -> np.ndarray:
-    """The diagonal of J^T J, exactly, for all parameters, in one pass over the image: seven sums
-    per splat, and no Jacobian.
+    """Exact diagonal of J^T J, in one pass over the image: seven sums per splat, no Jacobian.
 
-    With means it takes 16 sums, or 34 for an SH degree above 0, of which colours depend on the
-    mean. means, alpha_weight: as in `fisher`. normals: float64 [N,3] of length 1 for
-    means="normal", else None.
+    With means it takes 16 sums, or 34 above SH degree 0. means, alpha_weight: as in `fisher`.
+    normals: float64 [N,3] of length 1 for means="normal", else None.
     """
-    sums, g, by_mean = _sums(
-        gaussians, camera, background, cache, False, means, normals, alpha_weight
-    )
-    columns_ = [sums.w2 * basis * basis * positive for basis in g.basis for positive in g.positive]
-    columns_ += [dr.maximum(product_sum(m, m, sums.squared), 0) for m in g.shape]
-    columns_.append(g.logit * g.logit * sums.squared[0, 0])
-    columns_ += [dr.maximum(means_product(mean, mean, sums), 0) for mean in by_mean]
-    return _interleaved(dict(enumerate(columns_)), len(columns_), len(gaussians))
+    how = means, normals, alpha_weight
+    sums, g, by_mean = _sums(gaussians, camera, background, cache, False, *how)
+    columns = [sums.w2 * basis * basis * positive for basis in g.basis for positive in g.positive]
+    columns += [dr.maximum(product_sum(m, m, sums.squared), 0) for m in g.shape]
+    columns.append(g.logit * g.logit * sums.squared[0, 0])
+    columns += [dr.maximum(means_product(mean, mean, sums), 0) for mean in by_mean]
+    return _interleaved(dict(enumerate(columns)), len(columns), len(gaussians))
 
 
 def block(
@@ -246,15 +231,11 @@ def block(
     normals: np.ndarray | None = None,
     alpha_weight: float = 0.0,
 ) -> np.ndarray:
-    """The diagonal blocks of J^T J, [N,P,P], exactly, in one pass over the image: 22 sums per
-    splat, with means 34.
-
-    means, normals, alpha_weight: as in `exact`.
-    """
-    sums, g, by_mean = _sums(
-        gaussians, camera, background, cache, True, means, normals, alpha_weight
-    )
-    dr.eval(g, by_mean)  # once, as several kernels may write the blocks
+    """Exact diagonal blocks of J^T J [N,P,P], in one pass over the image: 22 sums per splat, with
+    means 34. means, normals, alpha_weight: as in `exact`."""
+    how = means, normals, alpha_weight
+    sums, g, by_mean = _sums(gaussians, camera, background, cache, True, *how)
+    dr.eval(g, by_mean)  # several kernels may write the blocks
     colour = [(basis, c) for basis in g.basis for c in range(3)]
     k = len(colour)
     upper: dict[tuple[int, int], Any] = {}
@@ -267,10 +248,10 @@ def block(
             upper[i, k + j] = scaled * weighted_sum(m, sums.mixed[c])
         upper[i, k + 7] = scaled * sums.mixed[c][0, 0] * g.logit
         for j, mean in enumerate(by_mean):
-            by_colour = [sums.w2 * mean.colour[c]] if mean.colour else []
-            upper[i, k + 8 + j] = scaled * sum(
-                by_colour, weighted_sum(mean.log_alpha, sums.mixed[c])
-            )
+            total = weighted_sum(mean.log_alpha, sums.mixed[c])
+            if mean.colour:
+                total += sums.w2 * mean.colour[c]
+            upper[i, k + 8 + j] = scaled * total
     for i, m in enumerate(g.shape):
         for j in range(i, 7):
             upper[k + i, k + j] = product_sum(m, g.shape[j], sums.squared)
@@ -283,9 +264,8 @@ def block(
         for i, other in enumerate(by_mean[: j + 1]):
             upper[k + 8 + i, k + 8 + j] = means_product(other, mean, sums)
     size = k + 8 + len(by_mean)
-    both = {i * size + j: value for (i, j), value in upper.items()} | {
-        j * size + i: value for (i, j), value in upper.items()
-    }
+    both = {i * size + j: value for (i, j), value in upper.items()}
+    both |= {j * size + i: value for (i, j), value in upper.items()}
     flat = _interleaved(both, size * size, len(gaussians))
     return flat.reshape(-1, size, size)
 
@@ -297,19 +277,16 @@ def _gradient(
     background: Any,
     cache: ListCache | None,
 ) -> np.ndarray:
-    """J^T z of an image z, [N,P], by `dr.backward`. image_gradient(rgb) must return z, TensorXf
+    """J^T z of an image z [N,P], by `dr.backward`. image_gradient(rgb) returns z, TensorXf
     [H,W,3]."""
     with dr.resume_grad():
         learned = {name: dr.copy(dr.detach(getattr(gaussians, name))) for name in LEARNED}
         dr.enable_grad(list(learned.values()))
-        rgb = render(
-            Gaussians(dr.detach(gaussians.means), **learned), camera, background, cache
-        ).rgb
+        model = Gaussians(dr.detach(gaussians.means), **learned)
+        rgb = render(model, camera, background, cache).rgb
         dr.backward_from(dr.sum(rgb * image_gradient(dr.detach(rgb)), axis=None))
-        columns_ = [
-            np.asarray(dr.grad(value)).reshape(len(gaussians), -1) for value in learned.values()
-        ]
-    return np.concatenate(columns_, axis=1)
+        gradients = [np.asarray(dr.grad(value)) for value in learned.values()]
+    return np.concatenate([g.reshape(len(gaussians), -1) for g in gradients], axis=1)
 
 
 def hutchinson(
@@ -320,12 +297,11 @@ def hutchinson(
     probes: int = 8,
     seed: int = 0,
 ) -> np.ndarray:
-    """Mean of (J^T z)^2 over `probes` images z of independent +1 and -1. Its expectation is
+    """Mean of (J^T z)^2 over `probes` images z of independent +1 and -1, an unbiased estimate of
     diag(J^T J) (Hutchinson 1990).
 
-    Each camera has probes of its own, drawn from `seed` and the camera. With the same ones in every
-    view the errors of neighbouring views would be alike, and would add up in a sum over views.
-    Raises InputError for less than one probe.
+    The probes of a camera are drawn from `seed` and the camera. If views shared them, errors of
+    neighbouring views would be alike and would add up. Raises InputError for less than one probe.
     """
     if int(probes) != probes or probes < 1:
         raise InputError(f"hutchinson: probes {probes} must be a whole number from 1 up")
@@ -334,12 +310,9 @@ def hutchinson(
     for probe in range(int(probes)):
         rng = np.random.default_rng(derive_seed(seed, f"hutchinson/{camera.key.hex()}/{probe}"))
         z = rng.choice(np.array([-1, 1], np.float32), (camera.height, camera.width, 3))
-        squared = (
-            _gradient(
-                gaussians, lambda _, z=z: mi.TensorXf(padded(z)), camera, background, cache
-            ).astype(np.float64)
-            ** 2
-        )
+        image = mi.TensorXf(padded(z))
+        gradient = _gradient(gaussians, lambda _, image=image: image, camera, background, cache)
+        squared = gradient.astype(np.float64) ** 2
         total = squared if probe == 0 else total + squared
     return (total / probes).astype(np.float32)
 
@@ -347,41 +320,39 @@ def hutchinson(
 def loss_gradient(
     gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None
 ) -> np.ndarray:
-    """The paper's Eq. 7 as it is written: the squared gradient of one scalar "dummy photometric
-    loss" per image.
+    """The paper's Eq. 7 as written: the squared gradient of one scalar "dummy photometric loss" per
+    image.
 
-    The paper does not say which loss. Here it is the mean squared error against mid-grey, L = mean
-    (rgb - 0.5)^2. The result is not diag(J^T J), since gradients of different pixels cancel before
-    they are squared.
+    The paper does not state the loss. Here it is the mean squared error against mid-grey, mean
+    (rgb - 0.5)^2. The result is not diag(J^T J): gradients of different pixels cancel before they
+    are squared.
     """
-    return (
-        _gradient(
-            gaussians, lambda rgb: (rgb - 0.5) * (2 / len(rgb.array)), camera, background, cache
-        )
-        ** 2
-    )
+
+    def image_gradient(rgb: Any) -> Any:
+        return (rgb - 0.5) * (2 / len(rgb.array))
+
+    return _gradient(gaussians, image_gradient, camera, background, cache) ** 2
 
 
 SMALLEST = 1.2e-38
-"""Smallest normal float32. Entries smaller than this become 0: threads differ in how they flush
-denormals, and nothing else would differ between reruns."""
+"""Smallest normal float32. Smaller entries become 0, because threads flush denormals
+differently."""
 
 PACKETS = 32
-"""How many packets of four columns one kernel writes. LLVM takes minutes to compile a kernel that
-writes all 56 x 56 columns of blocks of SH degree 3."""
+"""Packets of four columns that one kernel writes. LLVM takes minutes to compile a kernel that
+writes all 56 x 56 columns of SH degree 3."""
 
 
-def _interleaved(columns_: dict[int, Any], size: int, n: int) -> np.ndarray:
-    """NumPy float32 [N, size] from its columns, Dr.Jit arrays [N] by index; columns not given are
-    0.
+def _interleaved(columns: dict[int, Any], size: int, n: int) -> np.ndarray:
+    """NumPy float32 [N, size] from Dr.Jit columns [N] by index; columns not given are 0.
 
-    A kernel writes four columns at a time, so rows are padded to a multiple of four; the result is
-    a view without the padding.
+    Rows are padded to a multiple of four, which a kernel writes at a time. The result is a view
+    without the padding.
     """
     packets = -(-size // 4)
     flat, row = dr.empty(mi.Float, n * packets * 4), dr.arange(mi.UInt32, n) * packets
     for packet in range(packets):
-        values = [mi.Float(columns_.get(4 * packet + i, 0)) for i in range(4)]
+        values = [mi.Float(columns.get(4 * packet + i, 0)) for i in range(4)]
         normal = mi.Vector4f(*(dr.select(dr.abs(value) < SMALLEST, 0, value) for value in values))
         dr.scatter(flat, normal, row + packet, mode=dr.ReduceMode.NoConflicts)
         if packet % PACKETS == PACKETS - 1:
@@ -395,6 +366,5 @@ ESTIMATORS: dict[str, Callable[..., np.ndarray]] = {
     "hutchinson": hutchinson,
     "loss-gradient": loss_gradient,
 }
-"""What `fisher` calls, by name: (gaussians with Dr.Jit fields, camera, background, cache,
-**options) -> NumPy [N,P], or [N,P,P] for `block`. A program may add its own
-(docs/howto/estimator.md)."""
+"""Estimators by name: (gaussians with Dr.Jit fields, camera, background, cache, **options) ->
+NumPy [N,P], or [N,P,P] for `block`. A program may add its own (docs/howto/estimator.md)."""

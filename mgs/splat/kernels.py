@@ -1,16 +1,13 @@
-"""The kernels: forward (the image), jvp (its tangents), adjoint (gradients), fisher (sums for the
-Fisher information), removal (how the image changes where one splat is removed).
+"""The kernels: forward (image), jvp (its tangents), adjoint (gradients), fisher (sums for the
+Fisher information), removal (change of the image when a splat is removed).
 
-`walking.py` has what they share and says how a lane draws its block of pixels. The last three need,
-for each splat at each
-pixel, the colour S composited behind it. They do not walk back to front for it: they draw the image
-front to back once more and subtract, S = C - (colour so far), where C is the finished pixel. The
-same instructions then take the same decisions (thresholds, finished pixels) as the forward kernel
-did, and nothing about them has to be stored.
+`walking.py` has the parts that they share. The last three need the colour S composited behind each
+splat at each pixel. They draw the image front to back once more and subtract: S = C - (colour so
+far), with C the finished pixel. The same instructions then make the same decisions (thresholds,
+finished pixels) as the forward kernel, and none need be stored.
 
-These three store their sums for each (splat, block) pair apart, and a second, small kernel adds
-those of each splat. There are
-no atomic additions, so that reruns are bitwise equal with any number of threads. Symbols:
+These three store sums for each (splat, block) pair, and a second kernel adds those of each splat.
+There are no atomic additions, so reruns are bitwise equal with any number of threads. Symbols:
 docs/notation.md.
 """
 
@@ -48,8 +45,8 @@ LN2 = 0.6931471805599453
 def _pixel_sums(
     lists: BlockLists, packed: Any, lane: Lane, T: list[Any], numbers: Callable[[Splats], list[Any]]
 ) -> Any:
-    """For each of a lane's pixels the list [T, sum w n, ...], with a sum for each of a splat's
-    numbers n; T as in `blend`."""
+    """[T, sum w n, ...] of each pixel of a lane, with a sum for each of a splat's numbers n. T: as
+    in `blend`."""
     count = len(numbers(unpack(packed, mi.UInt32(0))))
     pixels = [[t, *(dr.zeros(type(packed), len(lists.block)) for _ in range(count))] for t in T]
 
@@ -63,33 +60,28 @@ def _pixel_sums(
 
 @frozen(recorded_sizes)
 def forward(lists: BlockLists, packed: Any, whole: bool) -> tuple[Any, ...]:
-    """The image of packed splats. Returns Float arrays rgba [L*32*4] and, if `whole`, depth [L*32].
+    """Image of packed splats: Float arrays rgba [L*32*4] and, if `whole`, depth [L*32].
 
-    Pixels lie block by block, in a block row by row (`mgs.splat.rendering` puts them in the image's
-    order). Colour is sum w c, without the background; alpha is sum w; depth is sum w z, metres, not
-    yet divided by alpha.
+    Pixels are stored block by block, in a block row by row. Colour is sum w c, without background;
+    alpha is sum w; depth is sum w z, metres, not divided by alpha.
 
-    Mathematically alpha is 1 - T, too, and without `whole` it is computed so, which saves a sum.
-    But expected depth is a quotient by alpha, and in faint pixels the difference 1 - T would have
-    kept only its last few bits.
+    Without `whole`, alpha is computed as 1 - T, which saves a sum. For the expected depth, a
+    quotient by alpha, that difference has too few digits in faint pixels.
     """
     lane, T = lanes(lists)
     if whole:
-        pixels = _pixel_sums(
-            lists, packed, lane, T, lambda splat: [*splat.colour, mi.Float(1), splat.depth]
-        )
+        numbers = lambda splat: [*splat.colour, mi.Float(1), splat.depth]  # noqa: E731
+        pixels = _pixel_sums(lists, packed, lane, T, numbers)
         return _store_pixels(lists, [sums for _, *sums in pixels])
     pixels = _pixel_sums(lists, packed, lane, T, lambda splat: splat.colour)
     return _store_pixels(lists, [[*rgb, 1 - dr.abs(t)] for t, *rgb in pixels])
 
 
 def _store_pixels(lists: BlockLists, pixels: list[list[Any]]) -> tuple[Any, ...]:
-    """Write red, green, blue, alpha and, where given, depth of each pixel of the lanes' blocks, as
-    `forward` returns them."""
-    out = tuple(
-        dr.empty(mi.Float, len(lists.block) * PIXELS * size)
-        for size in ((4, 1) if len(pixels[0]) == 5 else (4,))
-    )
+    """Write red, green, blue, alpha and, if given, depth of each pixel in the layout of
+    `forward`."""
+    sizes = (4, 1) if len(pixels[0]) == 5 else (4,)
+    out = tuple(dr.empty(mi.Float, len(lists.block) * PIXELS * size) for size in sizes)
     for pixel, (r, g, b, a, *depth) in enumerate(pixels):
         for array, value in zip(out, (mi.Vector4f(r, g, b, a), *depth), strict=True):
             dr.scatter(array, value, lists.block * PIXELS + pixel, mode=dr.ReduceMode.NoConflicts)
@@ -97,36 +89,32 @@ def _store_pixels(lists: BlockLists, pixels: list[list[Any]]) -> tuple[Any, ...]
 
 
 POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-"""The powers (a, b) of the monomials xi^a eta^b up to second order. The derivative of ln alpha of a
+"""Powers (a, b) of the monomials xi^a eta^b up to second order. The derivative of ln alpha of a
 pixel by any parameter is a polynomial of these."""
 
 
 def log_alpha_tangent(tangents: Splats, splats: Splats) -> dict[tuple[int, int], Any]:
-    """How fast ln alpha of a pixel changes as the splats change along `tangents`: the coefficients
-    of its `POWERS`, arrays [N].
+    """Derivative of ln alpha of a pixel along `tangents` of the splats: coefficients of `POWERS`,
+    arrays [N].
 
-    By the chain rule through xi and eta. Where alpha is clamped, it does not change at all. Letters
-    p, k, e: see docs/notation.md.
+    By the chain rule through xi and eta. It does not hold where alpha is clamped. Letters p, k, e:
+    docs/notation.md.
     """
     k, p, e = splats.shear, splats.white_x, splats.white_y
     one = LN2 * tangents.log2_opacity
     xi = 2 * LN2 * p * (tangents.mean_x - k * tangents.mean_y)
     eta = 2 * LN2 * e * tangents.mean_y
-    xi_xi, xi_eta, eta_eta = (
-        -2 * LN2 / p * tangents.white_x,
-        2 * LN2 * p / e * tangents.shear,
-        -2 * LN2 / e * tangents.white_y,
-    )
+    xi_xi = -2 * LN2 / p * tangents.white_x
+    xi_eta = 2 * LN2 * p / e * tangents.shear
+    eta_eta = -2 * LN2 / e * tangents.white_y
     return dict(zip(POWERS, (one, xi, eta, xi_xi, xi_eta, eta_eta), strict=True))
 
 
 def pack_tangents(tangents: Splats, splats: Splats, place: Any) -> Any:
-    """The tangents of each splat side by side in memory, at the splat's `place`: Float [12 N],
-    evaluated.
+    """Pack the tangents of each splat at its `place`: Float [12 N], evaluated.
 
-    tangents: how fast each field of the splats changes (`_rest` fields are not read); splats: the
-    fields themselves. Packed are the coefficients of `log_alpha_tangent`, on (1, xi, eta, xi^2),
-    (xi eta, eta^2), and the tangents of depth and of the colour.
+    tangents: derivatives of the splats' fields (`_rest` fields are not read). Packed are the
+    coefficients of `log_alpha_tangent` and the tangents of depth and colour.
     """
     one, xi, eta, xi_xi, xi_eta, eta_eta = log_alpha_tangent(tangents, splats).values()
     return pack_parts(
@@ -136,16 +124,14 @@ def pack_tangents(tangents: Splats, splats: Splats, place: Any) -> Any:
 
 @frozen(recorded_sizes)
 def jvp(lists: BlockLists, packed: Any, packed_tangents: Any) -> tuple[Any, ...]:
-    """How the output of `forward` changes as the splats change along their tangents
-    (`pack_tangents`), in the same layout.
+    """Derivative of the output of `forward` along tangents of the splats (`pack_tangents`), in the
+    same layout.
 
-    This is the product J v of the Jacobian of `forward` and the tangents v, in one pass front to
-    back (forward-mode
-    differentiation): beside the transmittance T of each pixel its tangent dT is carried along. With
-    alpha' the tangent of a splat's alpha, dw = alpha' T + alpha dT is the tangent of its weight w,
-    dT of the next splat is dT - dw, and the colour changes by c dw + w dc. As dT = -(sum of dw so
-    far), which is minus the tangent of the pixel's alpha, it is not kept apart. Where alpha is
-    clamped at ALPHA_MAX or the splat is not drawn, alpha' is 0.
+    It is J v for the Jacobian J of `forward` and tangents v, in one pass front to back (forward
+    mode). With alpha' the tangent of a splat's alpha, T the transmittance and dT its tangent,
+    dw = alpha' T + alpha dT is the tangent of the weight w, the next splat's dT is dT - dw, and the
+    colour changes by c dw + w dc. dT = -(sum of dw so far), minus the tangent of the pixel's alpha,
+    so it is not stored. Where alpha is clamped at ALPHA_MAX or the splat is not drawn, alpha' is 0.
     """
     lane, T = lanes(lists)
     pixels = [[t, *(dr.zeros(mi.Float, len(lists.block)) for _ in range(5))] for t in T]
@@ -157,20 +143,12 @@ def jvp(lists: BlockLists, packed: Any, packed_tangents: Any) -> tuple[Any, ...]
         )
         return [*first, xi_xi, xi_eta, eta_eta], [*splat.colour, splat.depth], [*d_colour, d_depth]
 
-    def draw(
-        of_splat: tuple[list[Any], list[Any], list[Any]],
-        raw: Any,
-        xi: Any,
-        eta: Any,
-        pixel: list[Any],
-    ) -> list[Any]:
+    def draw(of_splat: Any, raw: Any, xi: Any, eta: Any, pixel: list[Any]) -> list[Any]:
         (one, by_xi, by_eta, xi_xi, xi_eta, eta_eta), numbers, tangents = of_splat
         transmittance, d_alpha_so_far, *sums = pixel
         alpha, w, after, room = blend(raw, transmittance)
-        constant, linear = (
-            dr.fma(dr.fma(eta_eta, eta, by_eta), eta, one),
-            dr.fma(xi_eta, eta, by_xi),
-        )
+        constant = dr.fma(dr.fma(eta_eta, eta, by_eta), eta, one)
+        linear = dr.fma(xi_eta, eta, by_xi)
         d_log_alpha = dr.fma(dr.fma(xi_xi, xi, linear), xi, constant)
         alpha = dr.select(room, alpha, 0)
         d_alpha = dr.select(raw <= ALPHA_MAX, alpha * d_log_alpha, 0)
@@ -182,9 +160,17 @@ def jvp(lists: BlockLists, packed: Any, packed_tangents: Any) -> tuple[Any, ...]
         return [after, d_alpha_so_far + dw, *sums]
 
     pixels = walk(lists, packed, lane, pixels, draw, start)
-    return _store_pixels(
-        lists, [[without_denormals(x) for x in (*rgb, alpha, z)] for _, alpha, *rgb, z in pixels]
-    )
+    ordered = ([*rgb, alpha, z] for _, alpha, *rgb, z in pixels)
+    return _store_pixels(lists, [[without_denormals(x) for x in values] for values in ordered])
+
+
+def _finished(pixels: Any, background: Any, real: Any) -> Any:
+    """Finished colours of pixels over a background (Color3f), from the [T, r, g, b] of
+    `_pixel_sums`."""
+    return [
+        [dr.fma(dr.abs(t), real(b), c) for c, b in zip(rgb, background, strict=True)]
+        for t, *rgb in pixels
+    ]
 
 
 def _slopes(
@@ -196,37 +182,30 @@ def _slopes(
     free: Any,
     last: Any = None,
 ) -> list[Any]:
-    """s_c = D_c alpha, the derivative of each channel of a pixel by ln alpha of one splat, as
-    Float.
+    """s_c = D_c alpha, the derivative of each channel of a pixel by ln alpha of one splat, Float.
 
-    colours: the splat's, c; behind: the colour S composited behind it; w, after: weight and
-    transmittance from `blend`.
-    free: mask of pixels where the splat is drawn and its alpha not clamped at ALPHA_MAX; elsewhere
-    the derivative is 0.
-    last: T_end, the transmittance of the finished pixel, times any factor. If given, T_end alpha /
-    (1 - alpha) is appended: the derivative of the pixel's own alpha, 1 - T_end, times the factor.
+    colours: of the splat, c. behind: the colour S composited behind it.
+    w, after: weight and transmittance from `blend`.
+    free: mask of pixels where the splat is drawn and alpha is not clamped; elsewhere it is 0.
+    last: T_end, the transmittance of the finished pixel, times any factor. If given,
+        T_end alpha / (1 - alpha) is appended, the derivative of the pixel's alpha, 1 - T_end.
 
-    In double precision it is computed as alpha / (1 - alpha) times the difference c T (1 - alpha) -
-    S: only this difference can cancel, so the rest may be single. In single precision 1 - alpha has
-    few digits left in opaque pixels, so it is computed as c w - S alpha / (1 - alpha), whose first
-    term does not contain it.
+    In double it is alpha / (1 - alpha) times the difference c T (1 - alpha) - S. Only the
+    difference can cancel, so the rest may be single. In single precision 1 - alpha has few digits
+    in opaque pixels, so c w - S alpha / (1 - alpha) is used, whose first term does not contain it.
     """
+    pairs = zip(colours, behind, strict=True)
     if type(alpha) is mi.Float64:
         odds = dr.select(free, mi.Float(w) / mi.Float(after), 0)
-        slopes = [
-            odds * mi.Float(dr.fma(c, after, -s)) for c, s in zip(colours, behind, strict=True)
-        ]
+        slopes = [odds * mi.Float(dr.fma(c, after, -s)) for c, s in pairs]
     else:
         odds = alpha / (1 - alpha)
-        slopes = [
-            dr.select(free, dr.fma(c, w, -s * odds), 0)
-            for c, s in zip(colours, behind, strict=True)
-        ]
+        slopes = [dr.select(free, dr.fma(c, w, -s * odds), 0) for c, s in pairs]
     return slopes if last is None else [*slopes, dr.select(free, odds * last, 0)]
 
 
 ADJOINT_SUMS = {False: 8, True: 10}
-"""Number of sums per splat of `adjoint`, by whether means have gradients."""
+"""Number of sums per splat of `adjoint`, without and with gradients of means."""
 
 
 @frozen(recorded_sizes)
@@ -238,12 +217,12 @@ def adjoint(
     means: bool,
     channels: int,
 ) -> Any:
-    """What `splat_gradient` needs to make the gradient of each splat: sums over pixels, to be read
-    through `sums_by_splat`.
+    """Sums over pixels for `splat_gradient`, to be read by `sums_by_splat`.
 
-    out, d_out: the output of `forward`, and the gradient dL of a loss with respect to it. channels:
-    on how many of red, green, blue, alpha and depth, in this order, the loss depends, at least 3;
-    of the others nothing is read, and without depth its sum is 0.
+    out, d_out: output of `forward`, and the gradient dL of a loss by it.
+    channels: how many of red, green, blue, alpha and depth the loss depends on, at least 3. The
+        others are not read; without depth its sum is 0.
+
     Sums: w dL for red, green, blue and depth (4). With s the derivative of the loss by ln alpha at
     the pixel: s times 1, xi^2, xi eta, eta^2 (4), and, if means have gradients, s times xi, eta
     (2).
@@ -255,9 +234,8 @@ def adjoint(
         rgba, d_rgba = (list(dr.gather(mi.Vector4f, a[0], places)) for a in (out, d_out))
         values, slopes = rgba[:channels], d_rgba[:channels]
         if channels == 5:
-            values, slopes = (
-                [*v, dr.gather(mi.Float, a[1], places)] for v, a in ((rgba, out), (d_rgba, d_out))
-            )
+            values = [*rgba, dr.gather(mi.Float, out[1], places)]
+            slopes = [*d_rgba, dr.gather(mi.Float, d_out[1], places)]
         dL.append(slopes)
         pixels.append([T[pixel], sum(v * d for v, d in zip(values, slopes, strict=True))])
     count = ADJOINT_SUMS[means]
@@ -272,9 +250,7 @@ def adjoint(
                 transmittance, behind = pixels[j * BLOCK_X + x]
                 dr_, dg, db, *others = dL[j * BLOCK_X + x]
                 alpha, w, after, room = blend(raw, transmittance)
-                c = (
-                    dr.fma(b, db, others[0]) if others else b * db
-                )  # the first of the others is that of alpha
+                c = dr.fma(b, db, others[0]) if others else b * db  # others: alpha, depth
                 if len(others) == 2:
                     c = dr.fma(splat.depth, others[1], c)
                     sums[3] = dr.fma(w, others[1], sums[3])
@@ -291,17 +267,15 @@ def adjoint(
             sums[4:] = [a + b for a, b in zip(sums[4:], moments, strict=True)]
         return new, alive, sums[:count]
 
-    return sums_by_place(
-        lists, walk_and_store(lists, packed, lane, pixels, visit, count), count, mi.Float
-    )
+    stored = walk_and_store(lists, packed, lane, pixels, visit, count)
+    return sums_by_place(lists, stored, count, mi.Float)
 
 
 def splat_gradient(sums: list[Any], splats: Splats) -> Splats:
-    """The gradient with respect to the splats' fields, from the sums of `adjoint`, by the chain
-    rule through xi and eta.
+    """Gradient by the splats' fields, from the sums of `adjoint`, by the chain rule through xi and
+    eta.
 
-    Gradients of mean_x and mean_y are None where the sums for them are missing. Letters p, k, e:
-    see docs/notation.md.
+    mean_x and mean_y are None if their sums are missing. Letters p, k, e: docs/notation.md.
     """
     red, green, blue, depth, one, xi_xi, xi_eta, eta_eta, *first = sums
     k, p, e = splats.shear, splats.white_x, splats.white_y
@@ -324,11 +298,11 @@ def splat_gradient(sums: list[Any], splats: Splats) -> Splats:
 
 
 def fisher_moments(cross: bool, means: bool) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """The powers (a, b) of the monomials xi^a eta^b that `fisher` sums: weighted with |s|^2, and
-    with w s_c for each channel c.
+    """Powers (a, b) of the monomials xi^a eta^b that `fisher` sums: weighted by |s|^2, and by w s_c
+    for each channel c.
 
-    cross: whether products of two parameters, one of them of the colour, are needed. means: whether
-    derivatives by the means are. Only these contain xi and eta to the first power.
+    cross: products with colours are needed. means: derivatives by the means are needed, which alone
+    contain xi and eta to the first power.
     """
     squared, mixed = [0, 4], [0, 2] if cross else []
     if cross or means:
@@ -343,14 +317,14 @@ def fisher_moments(cross: bool, means: bool) -> tuple[list[tuple[int, int]], lis
 
 
 def fisher_sums(cross: bool, means: bool) -> int:
-    """Number of sums per splat of `fisher`: 7 for the exact diagonal and 22 for blocks; with means
-    16, and 34 with `cross`."""
+    """Number of sums per splat of `fisher`: 7 for the exact diagonal, 22 for blocks; with means 16,
+    and 34 with `cross`."""
     squared, mixed = fisher_moments(cross, means)
     return 1 + len(squared) + 3 * len(mixed)
 
 
 def _monomial(in_xi: list[Any], power: tuple[int, int], eta: Any, eta2: Any) -> Any:
-    """The moment xi^a eta^b of one row of pixels, from its moments in xi; eta2 is eta^2."""
+    """The moment xi^a eta^b of one row of pixels, from its moments in xi. eta2 = eta^2."""
     a, b = power
     moment = in_xi[a]
     for factor in [eta2] * (b // 2) + [eta] * (b % 2):
@@ -367,32 +341,26 @@ def fisher(
     means: bool = False,
     alpha_weight: Any = None,
 ) -> Any:
-    """What `mgs.splat.information` needs for the Fisher information: sums over pixels, to be read
-    through `sums_by_splat`.
+    """Sums over pixels for `mgs.splat.information`, to be read by `sums_by_splat`.
 
-    With s_c = D_c alpha the derivative of channel c by ln alpha, and |s|^2 the sum of s_c^2 over
-    channels, they are w^2, and |s|^2 and, if `cross`, w s_r, w s_g and w s_b times the monomials of
-    `fisher_moments`.
-    background: Color3f, linear RGB. alpha_weight: None, or a Float [1]: alpha then counts as a
-    fourth channel of the pixel and adds alpha_weight s_alpha^2 to |s|^2, with s_alpha = T_end alpha
-    / (1 - alpha).
+    With s_c = D_c alpha the derivative of channel c by ln alpha, and |s|^2 the sum of s_c^2, they
+    are w^2, then the monomials of `fisher_moments` times |s|^2 and, if `cross`, times w s_r, w s_g
+    and w s_b.
 
-    Entries of blocks off the diagonal are sums that cancel. So for blocks give splats packed in
-    double (`project64`): pixels are then computed in double, and only the sums over the pixels of
-    one block are in single precision.
+    background: Color3f, linear RGB.
+    alpha_weight: Float [1], if alpha is a fourth channel, which adds alpha_weight s_alpha^2 to
+        |s|^2, with s_alpha = T_end alpha / (1 - alpha).
+
+    Off-diagonal entries of blocks are sums that cancel, so for blocks give splats packed in double
+    (`project64`). Pixels are then computed in double; only sums within a block are single.
     """
     real = type(packed)
     lane, T = lanes(lists)
     T = [real(t) for t in T]
     pixels = _pixel_sums(lists, packed, lane, T, lambda splat: splat.colour)
-    behind = [
-        [dr.fma(dr.abs(t), real(b), c) for c, b in zip(rgb, background, strict=True)]
-        for t, *rgb in pixels
-    ]
-    last = [
-        None if alpha_weight is None else mi.Float(dr.abs(t)) * dr.sqrt(alpha_weight)
-        for t, *_ in pixels
-    ]
+    behind, last = _finished(pixels, background, real), [None] * PIXELS
+    if alpha_weight is not None:
+        last = [mi.Float(dr.abs(t)) * dr.sqrt(alpha_weight) for t, *_ in pixels]
     dr.eval(behind, last)
     squared, mixed = fisher_moments(cross, means)
     count = fisher_sums(cross, means)
@@ -405,26 +373,21 @@ def fisher(
             cross_m = [[mi.Float(0)] * 3 for _ in range(3)]
             for x, (raw, xi) in enumerate(zip(row.raw_alpha, row.xi, strict=True)):
                 pixel = j * BLOCK_X + x
-                raw = computed_after(
-                    raw, [sums[0], *m, *(c for a in cross_m for c in a)] if x else sums if j else []
-                )
+                in_row = [sums[0], *m, *(c for a in cross_m for c in a)]
+                raw = computed_after(raw, in_row if x else sums if j else [])
                 transmittance, *behind = pixels[pixel]
                 alpha, w, after, room = blend(raw, transmittance)
                 behind = [dr.fma(-c, w, s) for c, s in zip(splat.colour, behind, strict=True)]
                 new.append([after, *behind])
                 alive |= room
-                slopes = _slopes(
-                    splat.colour, behind, alpha, w, after, room & (raw <= ALPHA_MAX), last[pixel]
-                )
+                free = room & (raw <= ALPHA_MAX)
+                slopes = _slopes(splat.colour, behind, alpha, w, after, free, last[pixel])
                 w, xi = mi.Float(w), mi.Float(xi)
                 sums[0] = dr.fma(w, w, sums[0])
                 square = sum(s * s for s in slopes)
                 xi2 = xi * xi
-                m[0], m[1], m[2] = (
-                    m[0] + square,
-                    dr.fma(square, xi, m[1]),
-                    dr.fma(square, xi2, m[2]),
-                )
+                m[0], m[1] = m[0] + square, dr.fma(square, xi, m[1])
+                m[2] = dr.fma(square, xi2, m[2])
                 power = square * xi2
                 m[3], m[4] = dr.fma(power, xi, m[3]), dr.fma(power, xi2, m[4])
                 for c, s in enumerate(slopes[:3] if cross else []):
@@ -439,36 +402,29 @@ def fisher(
         return new, alive, sums
 
     pixels = [[t, *c] for t, c in zip(T, behind, strict=True)]
-    return sums_by_place(
-        lists, walk_and_store(lists, packed, lane, pixels, visit, count), count, mi.Float64
-    )
+    stored = walk_and_store(lists, packed, lane, pixels, visit, count)
+    return sums_by_place(lists, stored, count, mi.Float64)
 
 
 @frozen(recorded_sizes)
 def removal(lists: BlockLists, packed: Any, background: Any) -> Any:
-    """For each splat the sum over pixels of alpha^2 |D|^2, to be read through `sums_by_splat` (one
-    sum, Float64).
+    """Sum over pixels of alpha^2 |D|^2 of each splat, to be read by `sums_by_splat` (one sum,
+    Float64).
 
-    The colour of a pixel is affine in the alpha of each splat, with slope D. Setting alpha to 0
-    therefore changes it by
-    -alpha D exactly, also where alpha is clamped at ALPHA_MAX: unlike a derivative, this sum has no
-    exception there. What the
-    removal does to the thresholds of other splats is left out. background: Color3f, linear RGB.
+    A pixel is affine in the alpha of each splat, with slope D. So setting alpha to 0 changes it by
+    exactly -alpha D, also where alpha is clamped. Effects on the thresholds of other splats are
+    ignored. background: Color3f, linear RGB.
     """
     lane, T = lanes(lists)
     pixels = _pixel_sums(lists, packed, lane, T, lambda splat: splat.colour)
-    behind = [
-        [dr.fma(dr.abs(t), b, c) for c, b in zip(rgb, background, strict=True)]
-        for t, *rgb in pixels
-    ]
+    behind = _finished(pixels, background, mi.Float)
     dr.eval(behind)
 
     def visit(splat: Splats, rows: list[Row], pixels: Any) -> Any:
         new, alive, total = [], mi.Bool(False), mi.Float(0)
         for pixel, (transmittance, *behind) in enumerate(pixels):
-            alpha, w, after, room = blend(
-                rows[pixel // BLOCK_X].raw_alpha[pixel % BLOCK_X], transmittance
-            )
+            raw = rows[pixel // BLOCK_X].raw_alpha[pixel % BLOCK_X]
+            alpha, w, after, room = blend(raw, transmittance)
             behind = [dr.fma(-c, w, s) for c, s in zip(splat.colour, behind, strict=True)]
             new.append([after, *behind])
             alive |= room
@@ -476,6 +432,5 @@ def removal(lists: BlockLists, packed: Any, background: Any) -> Any:
         return new, alive, [total]
 
     pixels = [[t, *c] for t, c in zip(T, behind, strict=True)]
-    return sums_by_place(
-        lists, walk_and_store(lists, packed, lane, pixels, visit, 1), 1, mi.Float64
-    )
+    stored = walk_and_store(lists, packed, lane, pixels, visit, 1)
+    return sums_by_place(lists, stored, 1, mi.Float64)

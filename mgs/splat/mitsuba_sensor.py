@@ -1,4 +1,4 @@
-"""A Mitsuba sensor as a `Camera`."""
+"""Convert a Mitsuba sensor to a `Camera`."""
 
 from __future__ import annotations
 
@@ -11,18 +11,16 @@ from mgs.camera import Camera
 from mgs.errors import InputError
 
 _MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""Mitsuba's camera looks along z with x to the image's left and y up, OpenCV's with x to the right
-and y down."""
+"""Mitsuba's camera has x to the image's left and y up, OpenCV's x to the right and y down."""
 
 
 def camera_from_sensor(sensor: Any) -> Camera:
-    """The pinhole camera of a Mitsuba `perspective` sensor. The image is the sensor's crop window.
+    """Camera of a Mitsuba `perspective` sensor; the image is the sensor's crop window.
 
-    `x_fov` is the horizontal field of view of the whole film, whatever the sensor's fov axis;
-    pixels are square. The principal point is 0.5 minus the sensor's offset, as a share of the whole
-    film. Near clip, far clip and shutter are ignored (the near plane is
-    `mgs.splat.constants.NEAR`). Raises InputError for any other sensor, and for a pose that is not
-    rigid.
+    `x_fov` is the horizontal field of view of the whole film, whatever the sensor's fov axis. The
+    principal point is 0.5 minus the sensor's offset, as a share of the film. Near clip, far clip
+    and shutter are ignored (near plane: `mgs.splat.constants.NEAR`). Raises InputError for any
+    other sensor, and for a pose that is not rigid.
     """
     params = mi.traverse(sensor)
     if "x_fov" not in params or sensor.needs_aperture_sample():
@@ -38,20 +36,17 @@ def camera_from_sensor(sensor: Any) -> Camera:
     to_world = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)
     if np.linalg.det(to_world[:3, :3]) < 0:
         raise InputError(
-            "sensor: to_world mirrors the image; take the negative scale out and flip the picture afterwards"
+            "sensor: to_world mirrors the image; "
+            "take the negative scale out and flip the picture afterwards"
         )
     try:
         world_to_camera = np.asarray(np.linalg.inv(to_world @ _MITSUBA_FROM_OPENCV), np.float64)
     except np.linalg.LinAlgError:
         raise InputError("sensor: to_world is singular; its rotation must be orthonormal") from None
-    return Camera(
-        np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]]),
-        int(columns),
-        int(rows),
-        world_to_camera,
-    )
+    K = np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]])
+    return Camera(K, int(columns), int(rows), world_to_camera)
 
 
 def _number(value: Any) -> float:
-    """The value of a Mitsuba Float that has one entry."""
+    """Value of a Mitsuba Float with one entry."""
     return float(np.asarray(value, np.float64).ravel()[0])

@@ -1,9 +1,7 @@
-"""Importing this module makes the Mitsuba plugins of mgs known to Mitsuba: `import
-mgs.splat.plugins`.
+"""Registers the Mitsuba plugins of mgs when imported.
 
-A plugin class belongs to one Mitsuba variant. So the files in `plugins/` are run for the variant
-that is set now, and again for every variant that is set later; the import may come before or after
-the variant is set.
+A plugin class belongs to one Mitsuba variant, so the files in `plugins/` run for the current
+variant and again for every variant set later.
 """
 
 from __future__ import annotations
@@ -19,11 +17,8 @@ from mgs.resources import resource_folder
 
 
 def register(*_: Any) -> None:
-    """Run every file in `plugins/`, under the module name `mgs_plugins.<file>`, if the variant is
-    differentiable and RGB.
-
-    Raises InputError where the installation lacks the folder.
-    """
+    """Run every file in `plugins/` as module `mgs_plugins.<file>`, if the variant is
+    differentiable and RGB. Raises InputError if the folder is missing."""
     if mi.variant() is None or not (dr.is_diff_v(mi.Float) and mi.is_rgb):
         return
     for path in sorted(resource_folder("plugins").glob("*.py")):

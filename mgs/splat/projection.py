@@ -1,28 +1,23 @@
-"""EWA projection: from N Gaussians and a camera to N splats, the 2D Gaussians in the image that the
-kernels draw.
+"""EWA projection of Gaussians to splats, the 2D Gaussians that the kernels draw. Differentiated by
+Dr.Jit, backward and forward.
 
-It is written in ordinary Dr.Jit operations, so Dr.Jit differentiates it by itself, backward and
-forward.
-
-A splat's footprint is not kept as a conic (the inverse of its 2D covariance) but as a *whitening*:
-a linear map of pixel offsets (dx, dy) from the splat's centre to coordinates (xi, eta) in which the
+A splat's footprint is stored not as a conic (inverse of its 2D covariance) but as a *whitening*: a
+linear map of pixel offsets (dx, dy) from the splat's centre to coordinates (xi, eta) in which the
 footprint is a circle,
 
     xi = white_x (dx - shear dy),   eta = white_y dy,   alpha = 2^(log2_opacity - xi^2 - eta^2).
 
-The map is the Cholesky factor of the conic, scaled so that the exponent is one of 2 instead of e.
-For thin footprints (1:1000) the terms of a conic cancel in float32; these do not. And where a splat
-is drawn, xi and eta are of order one, so that fourth powers of them, which the Fisher information
-sums, lose no digits either.
+It is the Cholesky factor of the conic, scaled so that the exponent is one of 2. For thin footprints
+(1:1000) the terms of a conic cancel in float32; these do not. Where a splat is drawn, xi and eta
+are of order one, so the fourth powers in the Fisher information lose no digits.
 
-The projection is computed in double precision and rounded to float32 once. It is work per Gaussian,
-not per pixel, so that costs little; in single precision its errors would be the largest of the
-whole renderer.
+The projection is computed in double and rounded to float32 once. In single precision its errors
+would be the largest of the renderer.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -40,20 +35,17 @@ LOG2E = 1.4426950408889634
 
 @dataclass
 class Splats:
-    """N projected Gaussians. Every field is a Dr.Jit array [N], Float from `project` and Float64
-    from `project64`.
+    """N projected Gaussians, Dr.Jit arrays [N]: Float from `project`, Float64 from `project64`.
 
-    mean_x, mean_y: centre, pixels from the image's corner. shear (no unit), white_x, white_y
-    (1/px): the whitening, see the module's docstring. log2_opacity: base-2 logarithm of the
-    opacity. depth: z-depth of the centre, metres.
+    mean_x, mean_y: centre, pixels from the image's corner.
+    shear (no unit), white_x, white_y (1/px): the whitening, see the module.
+    log2_opacity: base-2 logarithm of the opacity.
+    depth: z-depth of the centre, metres.
     red, green, blue: colour seen from the camera, linear RGB, at least 0.
-    visible: mask of centres in front of the near plane; where it is False, the fields above mean
-    nothing.
-    finite: mask of Gaussians with no parameter NaN or infinite and no colour coefficient beyond
-    `mgs.gaussians.SH_MAX`.
-    mean_x_rest, mean_y_rest (px), shear_rest: what rounding to float32 took away from mean_x,
-    mean_y and shear. In a 640x480 image that is up to 3e-5 px, and for the shear as much at the far
-    end of a long slanted footprint. Not differentiated.
+    visible: mask of centres in front of the near plane. The fields above mean nothing elsewhere.
+    finite: mask of Gaussians without NaN, infinity or colour coefficient beyond SH_MAX.
+    mean_x_rest, mean_y_rest (px), shear_rest: rounding errors of mean_x, mean_y and shear, up to
+        3e-5 px in a 640x480 image. Not differentiated.
     """
 
     mean_x: Any
@@ -79,18 +71,16 @@ class Splats:
 
 
 def camera_array(camera: Camera) -> Any:
-    """The camera as one Dr.Jit array of 23 Float64. Numbers in an array are not compiled into a
-    kernel, those of Python are.
+    """The camera as a Dr.Jit array of 23 Float64. Unlike Python numbers, these are not compiled
+    into a kernel.
 
-    Layout: rotation (9, row by row) and translation (3) of `world_to_camera`; fx, fy, cx, cy in
-    pixels; lower and upper bound of x/z, then of y/z (4, see `FRUSTUM_MARGIN`); position of the
-    camera in the world, metres (3).
+    Layout: rotation (9, row by row) and translation (3) of `world_to_camera`; fx, fy, cx, cy,
+    pixels; lower and upper bound of x/z, then of y/z (4, FRUSTUM_MARGIN); camera centre (3),
+    metres.
     """
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
-    margin_x, margin_y = (
-        FRUSTUM_MARGIN * 0.5 * camera.width / fx,
-        FRUSTUM_MARGIN * 0.5 * camera.height / fy,
-    )
+    margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / fx
+    margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / fy
     clamp = [
         -cx / fx - margin_x,
         (camera.width - cx) / fx + margin_x,
@@ -103,14 +93,14 @@ def camera_array(camera: Camera) -> Any:
 
 
 def _numbers(array: Any, first: int, end: int) -> list[Any]:
-    """Some numbers of a `camera_array`, each as an array of its own, which a kernel reads once for
-    all Gaussians. Each is copied in memory, so only those that are needed are asked for."""
+    """Numbers of a `camera_array`, each as an array of its own, read once for all Gaussians. Each
+    is copied, so ask only for those needed."""
     return [dr.gather(mi.Float64, array, mi.UInt32(i)) for i in range(first, end)]
 
 
 def rotation_columns(quats: Any) -> list[Any]:
-    """Columns of the rotation matrices of quaternions wxyz (Vector4d, any norm; zero is the
-    identity): three Vector3d."""
+    """Columns of the rotation matrices of quaternions wxyz, three Vector3d. Any norm; zero is the
+    identity."""
     quats = dr.select(is_rotation(quats), quats, mi.Vector4d(1, 0, 0, 0))
     w, x, y, z = quats * dr.rsqrt(dr.squared_norm(quats))
     return [
@@ -121,16 +111,15 @@ def rotation_columns(quats: Any) -> list[Any]:
 
 
 def is_rotation(quats: Any) -> Any:
-    """Mask [N] of the quaternions (Vector4d) that are not zero, to `QUAT_MIN`."""
+    """Mask [N] of quaternions (Vector4d) that are not zero, to `QUAT_MIN`."""
     return dr.max(dr.abs(dr.detach(quats))) > QUAT_MIN
 
 
 def sh_basis(means: Any, camera: Any, coefficients: int) -> list[Any]:
-    """Values of the K = `coefficients` real spherical harmonics in the directions from the camera
-    to the means.
+    """Real spherical harmonics in the directions from the camera to the means: K = `coefficients`
+    arrays Float64 [N], in the order and signs of 3DGS.
 
-    means: Vector3d, world, metres; camera: `camera_array`. Returns K arrays Float64 [N], in the
-    order and signs of 3DGS.
+    means: Vector3d, world, metres. camera: `camera_array`.
     """
     offset = means - mi.Vector3d(*_numbers(camera, 20, 23))
     directions = offset * dr.rsqrt(dr.maximum(dr.squared_norm(offset), 1e-24))
@@ -138,11 +127,10 @@ def sh_basis(means: Any, camera: Any, coefficients: int) -> list[Any]:
 
 
 def rows_as_vectors(tensor: Any, dtype: Any) -> Any:
-    """A TensorXf [N, size] as one array of N Dr.Jit vectors of the type `dtype`, which has that
-    size.
+    """A TensorXf [N, size] as N Dr.Jit vectors of type `dtype`.
 
-    Every number is read by one vector alone, and Dr.Jit is told so: the derivative needs no atomic
-    additions, whose order would change from run to run.
+    Every number is read by one vector alone, and NoConflicts says so: the derivative then needs no
+    atomic additions, whose order would change from run to run.
     """
     return dr.gather(
         dtype, tensor.array, dr.arange(mi.UInt32, tensor.shape[0]), mode=dr.ReduceMode.NoConflicts
@@ -150,39 +138,33 @@ def rows_as_vectors(tensor: Any, dtype: Any) -> Any:
 
 
 def axes2d(mean: Any, quats: Any, camera: Any) -> tuple[Any, list[Any], Any]:
-    """Centres and local axes of the Gaussians in the image, by the affine approximation of EWA
+    """Centres and local axes of Gaussians in the image, by the affine approximation of EWA
     splatting.
 
-    mean: Vector3d, world, metres; quats: Vector4d; camera: `camera_array`. Returns
-    (x px, y px, z-depth m) of the centres, with depth 1 where the centre is not visible, so that no
-    division fails; the image of each of the three local axes (unit vectors), pixels per metre,
-    three Vector2d; the mask of centres in front of the near plane.
+    mean: Vector3d, world, metres. quats: Vector4d. camera: `camera_array`.
+    Returns (x px, y px, z-depth m) of the centres, with depth 1 where not visible, to avoid
+    divisions by 0; the images of the three unit axes, pixels per metre, Vector2d; and the mask of
+    centres in front of the near plane.
     """
-    R, t = (
-        [mi.Vector3d(*_numbers(camera, 3 * i, 3 * i + 3)) for i in range(3)],
-        mi.Vector3d(*_numbers(camera, 9, 12)),
-    )
+    R = [mi.Vector3d(*_numbers(camera, 3 * i, 3 * i + 3)) for i in range(3)]
+    t = mi.Vector3d(*_numbers(camera, 9, 12))
     fx, fy, cx, cy, x0, x1, y0, y1 = _numbers(camera, 12, 20)
     x, y, z = (dr.dot(row, mean) + t[i] for i, row in enumerate(R))
     visible = z > NEAR
     z = dr.select(visible, z, 1)
     x, y, inv_z = x / z, y / z, dr.rcp(z)
-    T0, T1 = (
-        (R[0] - dr.clip(x, x0, x1) * R[2]) * (fx * inv_z),
-        (R[1] - dr.clip(y, y0, y1) * R[2]) * (fy * inv_z),
-    )
+    T0 = (R[0] - dr.clip(x, x0, x1) * R[2]) * (fx * inv_z)
+    T1 = (R[1] - dr.clip(y, y0, y1) * R[2]) * (fy * inv_z)
     unit = [mi.Vector2d(dr.dot(T0, c), dr.dot(T1, c)) for c in rotation_columns(quats)]
     return (fx * x + cx, fy * y + cy, z), unit, visible
 
 
 def whitening(axes: list[Any]) -> tuple[Any, Any, Any]:
-    """(shear, white_x, white_y) of the 2D covariance sum_i axis_i axis_i^T + EPS2D I = [a b; b c],
-    px^2.
+    """(shear, white_x, white_y) of the 2D covariance sum_i axis_i axis_i^T + EPS2D I, px^2.
 
     axes: the three semi-axes of the Gaussian in the image, pixels, Vector2d.
-    The determinant is computed as a sum of squared 2x2 minors of the axes (Cauchy-Binet formula).
-    All terms are positive, so that nothing cancels, however thin the footprint. Computed as a c -
-    b^2 it would.
+    The determinant is a sum of squared 2x2 minors of the axes (Cauchy-Binet formula). All terms are
+    positive, so nothing cancels, however thin the footprint.
     """
     c = sum(a.y * a.y for a in axes) + EPS2D
     b = sum(a.x * a.y for a in axes)
@@ -193,35 +175,27 @@ def whitening(axes: list[Any]) -> tuple[Any, Any, Any]:
 
 
 def _with_rest(value: Any) -> tuple[Any, Any]:
-    """A Float64 rounded to Float, and the difference that rounding made, a Float too (not
-    differentiated)."""
+    """A Float64 rounded to Float, and the rounding error as a Float (not differentiated)."""
     rounded = mi.Float(value)
     return rounded, mi.Float(dr.detach(value - mi.Float64(rounded)))
 
 
 def project64(gaussians: Gaussians, camera: Any) -> Splats:
-    """Project Gaussians (Dr.Jit TensorXf fields) through a `camera_array`. Float64 fields; the
-    three `_rest` fields are None.
+    """Project Gaussians (TensorXf fields) through a `camera_array`: Float64 fields, no rests.
 
-    Differentiable in every parameter. Source: EWA splatting (Zwicker et al. 2002) as 3DGS uses it
-    (Kerbl et al. 2023).
+    Differentiable in every parameter. Source: EWA splatting (Zwicker et al. 2002) as in 3DGS (Kerbl
+    et al. 2023).
     """
-    mean, quats = (
-        mi.Vector3d(rows_as_vectors(gaussians.means, mi.Vector3f)),
-        mi.Vector4d(rows_as_vectors(gaussians.quats, mi.Vector4f)),
-    )
+    mean = mi.Vector3d(rows_as_vectors(gaussians.means, mi.Vector3f))
+    quats = mi.Vector4d(rows_as_vectors(gaussians.quats, mi.Vector4f))
     log_scales = mi.Vector3d(rows_as_vectors(gaussians.log_scales, mi.Vector3f))
     logit = mi.Float64(gaussians.logit_opacities.array)
     (x, y, depth), unit, visible = axes2d(mean, quats, camera)
     scales = dr.exp(dr.clip(log_scales, *LOG_SCALE_RANGE))
     shear, white_x, white_y = whitening([a * s for a, s in zip(unit, scales, strict=True)])
     log2_opacity = LOG2E * (dr.minimum(logit, 0) - dr.log(1 + dr.exp(-dr.abs(logit))))
-    finite = (
-        dr.all(dr.isfinite(mean))
-        & dr.all(dr.isfinite(quats))
-        & dr.all(dr.isfinite(log_scales))
-        & dr.isfinite(logit)
-    )
+    finite = dr.all(dr.isfinite(mean)) & dr.all(dr.isfinite(quats))
+    finite &= dr.all(dr.isfinite(log_scales)) & dr.isfinite(logit)
     colour, index = mi.Color3d(0.5), dr.arange(mi.UInt32, len(gaussians))
     coefficients = gaussians.sh.shape[1]
     for i, basis in enumerate(sh_basis(mean, camera, coefficients)):
@@ -230,34 +204,24 @@ def project64(gaussians: Gaussians, camera: Any) -> Splats:
         )
         finite &= dr.all(dr.abs(sh) <= SH_MAX)
         colour += basis * mi.Color3d(sh)
-    colour = dr.maximum(colour, 0)
-    red, green, blue = colour
-    return Splats(
-        x, y, shear, white_x, white_y, log2_opacity, depth, red, green, blue, visible, finite
-    )
+    r, g, b = dr.maximum(colour, 0)
+    return Splats(x, y, shear, white_x, white_y, log2_opacity, depth, r, g, b, visible, finite)
 
 
 def project(gaussians: Gaussians, camera: Any) -> Splats:
-    """`project64` with every number rounded to Float, and the `_rest` fields set. Differentiable in
-    every parameter."""
+    """`project64` rounded to Float, with rests. Differentiable in every parameter."""
     exact = project64(gaussians, camera)
     mean_x, mean_x_rest = _with_rest(exact.mean_x)
     mean_y, mean_y_rest = _with_rest(exact.mean_y)
     shear, shear_rest = _with_rest(exact.shear)
-    return Splats(
+    names = ("white_x", "white_y", "log2_opacity", "depth", "red", "green", "blue")
+    return replace(
+        exact,
         mean_x=mean_x,
         mean_y=mean_y,
         shear=shear,
-        white_x=mi.Float(exact.white_x),
-        white_y=mi.Float(exact.white_y),
-        log2_opacity=mi.Float(exact.log2_opacity),
-        depth=mi.Float(exact.depth),
-        red=mi.Float(exact.red),
-        green=mi.Float(exact.green),
-        blue=mi.Float(exact.blue),
-        visible=exact.visible,
-        finite=exact.finite,
         mean_x_rest=mean_x_rest,
         mean_y_rest=mean_y_rest,
         shear_rest=shear_rest,
+        **{name: mi.Float(getattr(exact, name)) for name in names},
     )

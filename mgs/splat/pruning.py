@@ -1,5 +1,4 @@
-"""Which Gaussians a model can do without: how much the removal of each changes the images, and a
-prune that uses it."""
+"""Prune a model: remove the Gaussians whose removal changes the images least."""
 
 from __future__ import annotations
 
@@ -20,28 +19,23 @@ from mgs.splat.rendering import as_colour, as_drjit, render, splats_and_lists
 from mgs.splat.walking import sums_by_splat
 
 NEIGHBOURS = 8
-"""Of so many nearest Gaussians none is removed in the same round: they hide and replace each other,
-so that the removal of two changes more than both removals by themselves. About those that touch one
-on the surface, and the one behind it."""
+"""Number of nearest Gaussians of which no two are removed in the same round. They hide and
+replace each other, so that removing two changes more than the sum of both."""
 
 ROUNDS = 8
-"""Most rounds. In each, half of the change that is still allowed is spent, and what it came to is
-then measured."""
+"""Most rounds. Each spends half of the change that is still allowed, then measures it."""
 
 
 @one_at_a_time
 def removal_cost(
     gaussians: Gaussians, cameras: Sequence[Camera], background: Any = (0.0, 0.0, 0.0)
 ) -> np.ndarray:
-    """The squared change of the images of these cameras where one Gaussian is removed: float64 [N],
-    (linear RGB)².
+    """Squared change of the images when one Gaussian is removed, summed over the cameras: float64
+    [N], (linear RGB)².
 
-    It is sum alpha² |D|² over pixels (docs/notation.md), summed over the cameras: exact, since a
-    pixel is affine in each alpha.
-    Left out is what the removal does to thresholds: where a pixel was finished before
-    (TRANSMITTANCE_MIN), Gaussians that lay
-    too deep to be drawn may appear. gaussians, background: as in `mgs.splat.render`. Raises
-    InputError as `render`.
+    It is sum alpha² |D|² over pixels (docs/notation.md), exact because a pixel is affine in each
+    alpha. It ignores thresholds: Gaussians too deep to be drawn (TRANSMITTANCE_MIN) may appear.
+    gaussians, background: as in `mgs.splat.render`. Raises InputError as `render`.
     """
     cost = np.zeros(len(gaussians))
     if len(gaussians) == 0:
@@ -55,10 +49,12 @@ def removal_cost(
 
 @dataclass(frozen=True)
 class Pruned:
-    """kept: indices [M] of the Gaussians that stay. noise: rms change that was allowed, linear RGB.
-    predicted, actual: rms
-    change of the images by the whole set that was removed: predicted from `removal_cost`, and
-    measured; over the pixel values that the model covers."""
+    """Result of `prune`.
+
+    kept: indices of the remaining Gaussians [M].
+    noise: allowed rms change of pixel values, linear RGB.
+    predicted, actual: rms change, as predicted by `removal_cost` and as measured.
+    """
 
     kept: np.ndarray
     noise: float
@@ -67,16 +63,16 @@ class Pruned:
 
 
 def prune(gaussians: Gaussians, cameras: Sequence[Camera], noise: float) -> Pruned:
-    """Remove the Gaussians without which the images of these cameras change least, as many as the
-    noise allows.
+    """Remove as many Gaussians as the noise allows, those that change the images least.
 
-    noise: rms change of a pixel value that is allowed, linear RGB, over the pixels that the model
-    covers (each counts by its alpha). Predicted for a set is the sum of its members'
-    `removal_cost`, as if they did not overlap. So that this nearly holds, a round removes no two of
-    NEIGHBOURS. After each round the images are drawn and the costs measured anew; a round that went
-    beyond the noise is taken back, so the change that is measured never exceeds it.
-    gaussians: NumPy fields. Nothing is fitted. Raises InputError as `render`, and for a noise that
-    is not positive.
+    noise: allowed rms change of the pixel values that the model covers (each counts by its alpha),
+    linear RGB.
+
+    The predicted change of a set is the sum of `removal_cost`, as if its members did not overlap.
+    For this to be nearly true, a round removes no two of NEIGHBOURS. After each round the change
+    and the costs are measured again. A round that exceeds the noise is undone, so the measured
+    change never exceeds it. Nothing is fitted. gaussians: NumPy fields. Raises InputError as
+    `render`, and if the noise is not positive.
     """
     if not 0 < noise < np.inf:
         raise InputError(f"prune: noise {noise} must be positive, linear RGB; correct --noise")
@@ -97,16 +93,16 @@ def prune(gaussians: Gaussians, cameras: Sequence[Camera], noise: float) -> Prun
 
 
 def _images(gaussians: Gaussians, cameras: Sequence[Camera]) -> tuple[list[np.ndarray], float]:
-    """The images [H,W,3], float64, and the number of pixel values that the model covers: three
-    times the sum of alpha."""
+    """Images [H,W,3], float64, and the number of pixel values that the model covers: 3 times the
+    sum of alpha."""
     drawn = [render(gaussians, camera) for camera in cameras]
     covered = 3 * sum(float(np.asarray(image.alpha, np.float64).sum()) for image in drawn)
     return [np.asarray(image.rgb).astype(np.float64) for image in drawn], covered
 
 
 def _cheapest_apart(cost: np.ndarray, means: np.ndarray, allowed: float) -> list[int]:
-    """The cheapest Gaussians, taken one by one while their costs [N] add up to no more than is
-    allowed, no two of them among each other's NEIGHBOURS nearest; means [N,3]."""
+    """Cheapest Gaussians whose costs [N] add up to at most `allowed`, no two of them among each
+    other's NEIGHBOURS. means: [N,3]."""
     chosen: list[int] = []
     if len(cost) == 0:
         return chosen

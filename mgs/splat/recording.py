@@ -1,5 +1,5 @@
-"""Record a kernel once per set of sizes and replay it afterwards: tracing it anew takes longer than
-drawing a small image."""
+"""Record kernels once per set of sizes and replay them, since tracing takes longer than drawing a
+small image."""
 
 from __future__ import annotations
 
@@ -12,20 +12,18 @@ from typing import Any, TypeVar, cast
 import drjit as dr
 
 _one_at_a_time = threading.RLock()
-"""Held during every recording and replay, and by all that `one_at_a_time` decorates. Dr.Jit 1.5
-hangs or fails where two threads record at once; and the garbage collector, which must rest
-meanwhile, is one for the whole process."""
+"""Held during every recording, replay and function of `one_at_a_time`. Dr.Jit 1.5 hangs or fails
+if two threads record at once, and the garbage collector, off meanwhile, is one per process."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def one_at_a_time(function: Function) -> Function:
-    """Decorator: of all decorated functions together, one runs at a time; other threads wait.
+    """Decorator: of all decorated functions together, one runs at a time.
 
-    While Dr.Jit 1.5 replays a recording, it holds a lock of its own and calls Python. If Python
-    then switches to another thread which calls Dr.Jit, that one waits for the lock, the first one
-    for Python, and both wait for ever. The lock here covers everything between the start and the
-    end of a drawing, so that the other thread does not get so far.
+    While Dr.Jit 1.5 replays a recording, it holds a lock and calls Python. If another thread then
+    calls Dr.Jit, it waits for that lock while the first waits for Python: a deadlock. This lock
+    covers everything from the start to the end of a drawing.
     """
 
     @functools.wraps(function)
@@ -39,23 +37,20 @@ def one_at_a_time(function: Function) -> Function:
 def frozen(
     sizes: Callable[..., tuple[int, ...]],
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator: `dr.freeze`, which records the kernels of a function's first call and replays them
-    in later calls.
+    """Decorator: `dr.freeze`, which records a function's kernels at its first call and replays
+    them.
 
-    sizes(*arguments) must return the lengths of arrays and the plain numbers that a recording holds
-    as constants; a call with
-    other sizes is recorded anew. They are handed to Dr.Jit as one string. As numbers they would not
-    be safe: where a small number also occurs elsewhere among the inputs or the function's globals,
-    `dr.freeze` (Dr.Jit 1.5) only compares that it occurs again, not its value, and replays a
-    recording of other sizes.
+    sizes(*arguments) must return the array lengths and plain numbers that a recording holds as
+    constants; for other values the function is recorded again. They are passed to Dr.Jit as one
+    string, because `dr.freeze` (Dr.Jit 1.5) does not compare the values of numbers that occur
+    elsewhere among the inputs, and would replay a recording of other sizes.
 
-    Python's garbage collector is off during the call: if it frees a Mitsuba scene while Dr.Jit
-    records, the process ends ("enqueue_host_func(): this function cannot be recorded", Dr.Jit 1.5).
+    Python's garbage collector is off during the call: freeing a Mitsuba scene while Dr.Jit records
+    ends the process (Dr.Jit 1.5).
 
-    Threads: all decorated functions together run one at a time, with those of `one_at_a_time`. So
-    threads may draw at once if each has a `ListCache` of its own, and afterwards the collector is
-    on again if it was before. Not protected: a `ListCache` or a gradient that threads share, and a
-    thread that switches the collector on or off by itself.
+    Threads may draw at once if each has its own `ListCache`; decorated functions run one at a time.
+    Not protected: a `ListCache` or a gradient shared by threads, and threads that switch the
+    collector on or off.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:

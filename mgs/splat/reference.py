@@ -1,10 +1,10 @@
-"""The oracle: the same model in plain float64 NumPy, every Gaussian on every pixel, with the
-kernels' names and constants.
+"""Reference implementation in plain float64 NumPy: every Gaussian on every pixel, with the names
+and constants of the kernels.
 
-Each function has a fast twin in Dr.Jit and a test that compares the two. In some pixels float32 may
-decide otherwise than float64, for example whether an alpha is above a threshold; `margins` finds
-them, so that tests leave them out. Derivatives are written independently of the kernels, as dense
-Jacobians of alpha compositing, and are tested against central differences.
+Each function has a fast counterpart in Dr.Jit and a test that compares both. In some pixels float32
+may decide a threshold differently; `margins` finds them, so that tests can exclude them.
+Derivatives are written independently of the kernels, as dense Jacobians, and are tested against
+central differences.
 """
 
 from __future__ import annotations
@@ -31,9 +31,11 @@ from mgs.splat.constants import (
 
 @dataclass
 class Projected:
-    """means2d [N,2] px; cov2d [N,2,2] px^2, EPS2D included; depths [N] m, 1 where not visible;
-    opacities [N] in [0,1]; colours [N,3] linear RGB; visible [N] bool, in front of the near
-    plane."""
+    """Projected Gaussians.
+
+    means2d: [N,2] px. cov2d: [N,2,2] px^2, EPS2D included. depths: [N] m, 1 where not visible.
+    opacities: [N]. colours: [N,3] linear RGB. visible: [N] bool, in front of the near plane.
+    """
 
     means2d: np.ndarray
     cov2d: np.ndarray
@@ -44,8 +46,8 @@ class Projected:
 
 
 def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
-    """Real spherical harmonics of unit directions [N,3] -> [N,(degree+1)^2], in the order and sign
-    of the 3DGS file layout."""
+    """Real spherical harmonics of unit directions [N,3] -> [N,(degree+1)^2], in the order and signs
+    of 3DGS files."""
     x, y, z = directions.T
     xx, yy, zz = x * x, y * y, z * z
     basis = [np.full(len(x), 0.28209479177387814)]
@@ -74,10 +76,9 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
 
 
 def project(gaussians: Gaussians, camera: Camera) -> Projected:
-    """EWA projection (Zwicker et al. 2002) as 3DGS uses it (Kerbl et al. 2023), float64.
+    """EWA projection (Zwicker et al. 2002) as in 3DGS (Kerbl et al. 2023).
 
-    J is the Jacobian of the projection at each mean, T = J R the map from metres around it to
-    pixels, [N,2,3] each.
+    J [N,2,3] is the Jacobian of the projection at each mean, T = J R maps metres to pixels.
     """
     means = np.asarray(gaussians.means, np.float64)
     R, t = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
@@ -85,16 +86,13 @@ def project(gaussians: Gaussians, camera: Camera) -> Projected:
     x, y, z = (means @ R.T + t).T
     visible = z > NEAR
     z = np.where(visible, z, 1.0)
-    margin_x, margin_y = (
-        FRUSTUM_MARGIN * 0.5 * camera.width / fx,
-        FRUSTUM_MARGIN * 0.5 * camera.height / fy,
-    )
+    margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / fx
+    margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / fy
     tx = np.clip(x / z, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
     ty = np.clip(y / z, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
     zero = np.zeros_like(z)
-    J = np.stack(
-        [np.stack([fx / z, zero, -fx * tx / z], 1), np.stack([zero, fy / z, -fy * ty / z], 1)], 1
-    )
+    rows = np.stack([fx / z, zero, -fx * tx / z], 1), np.stack([zero, fy / z, -fy * ty / z], 1)
+    J = np.stack(rows, 1)
     T = J @ R
     scales = np.exp(np.clip(np.asarray(gaussians.log_scales, np.float64), *LOG_SCALE_RANGE))
     A = T @ (rotmat_from_quat(gaussians.quats) * scales[:, None, :])
@@ -109,20 +107,18 @@ def project(gaussians: Gaussians, camera: Camera) -> Projected:
 
 
 def _half_square(d: np.ndarray, cov: np.ndarray) -> np.ndarray:
-    """1/2 d^T cov^-1 d for each row d of [P,2]: minus the exponent of a Gaussian of covariance cov
-    [2,2]."""
+    """1/2 d^T cov^-1 d for each row d of [P,2]; cov: [2,2]."""
     return 0.5 * ((d @ np.linalg.inv(cov)) * d).sum(1)
 
 
 def composite(
     projected: Projected, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Front-to-back alpha compositing, for every pixel and splat; P = H*W pixels, row by row, and M
-    visible Gaussians.
+    """Front-to-back alpha compositing of M visible Gaussians on P = H*W pixels.
 
-    Returns order [M], indices of the visible Gaussians by depth, equal depths by index; alpha [P,M]
-    after all thresholds (0 where a splat is not drawn); T [P,M], the transmittance in front of each
-    splat; clipped [P,M], mask where alpha would be above ALPHA_MAX.
+    Returns order [M], visible Gaussians by depth, equal depths by index; alpha [P,M] after all
+    thresholds (0 where not drawn); T [P,M], transmittance in front of each splat; clipped [P,M],
+    mask where alpha exceeds ALPHA_MAX.
     """
     index = np.flatnonzero(projected.visible)
     order = index[np.argsort(projected.depths[index].astype(np.float32), kind="stable")]
@@ -134,9 +130,8 @@ def composite(
     T = np.ones(len(pixels))
     live = np.ones(len(pixels), bool)
     for i, j in enumerate(order):
-        raw = projected.opacities[j] * np.exp(
-            -_half_square(pixels - projected.means2d[j], projected.cov2d[j])
-        )
+        power = -_half_square(pixels - projected.means2d[j], projected.cov2d[j])
+        raw = projected.opacities[j] * np.exp(power)
         a = np.where(raw >= ALPHA_MIN, np.minimum(raw, ALPHA_MAX), 0.0)
         live &= (a == 0) | (T * (1 - a) > TRANSMITTANCE_MIN)
         a = np.where(live, a, 0.0)
@@ -154,9 +149,7 @@ def render(
     order, alpha, T, _ = composite(projected, camera)
     weights = alpha * T
     total = weights.sum(1)
-    rgb = weights @ projected.colours[order] + (1 - total)[:, None] * np.asarray(
-        background, np.float64
-    )
+    rgb = weights @ projected.colours[order] + (1 - total)[:, None] * np.array(background, float)
     depth = weights @ projected.depths[order] / np.where(total > 0, total, 1.0)
     shape = (camera.height, camera.width)
     return {
@@ -167,13 +160,12 @@ def render(
 
 
 def margins(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """[H,W]: the smallest relative error of the alphas with which some decision at the pixel could
-    come out differently.
+    """Smallest relative error of the alphas that could change a decision at each pixel [H,W].
 
-    Decisions are: whether alpha is below ALPHA_MIN; whether it is above ALPHA_MAX, where its
-    derivative jumps; whether the pixel is finished (a relative error of the alphas makes one of T
-    that is sum alpha / (1 - alpha) times as large); and which of two splats drawn in the pixel is
-    in front (0 where float32 may round their depths to the same number).
+    Decisions: whether alpha is below ALPHA_MIN; whether it is above ALPHA_MAX, where its derivative
+    jumps; whether the pixel is finished (a relative error of the alphas makes one of T that is sum
+    alpha / (1 - alpha) times as large); and which of two drawn splats is in front (0 if float32 may
+    round their depths to the same number).
     """
     p = project(gaussians, camera)
     order, alpha, _, _ = composite(p, camera)
@@ -188,9 +180,8 @@ def margins(gaussians: Gaussians, camera: Camera) -> np.ndarray:
         a = np.where(log_raw >= np.log(ALPHA_MIN), np.minimum(np.exp(log_raw), ALPHA_MAX), 0)
         amplification = amplification + a / (1 - a)
         after = np.log(T * (1 - a) / TRANSMITTANCE_MIN)
-        least = np.where(
-            live & (a > 0), np.minimum(least, np.abs(after) / np.maximum(amplification, 1)), least
-        )
+        near = np.abs(after) / np.maximum(amplification, 1)
+        least = np.where(live & (a > 0), np.minimum(least, near), least)
         live &= (a == 0) | (after > 0)
         T = np.where(live, T * (1 - a), T)
         before = order[i - 1]
@@ -208,11 +199,9 @@ def _moved(gaussians: Gaussians, name: str, step: np.ndarray) -> Gaussians:
 def _projection_jacobian(
     gaussians: Gaussians, camera: Camera, directions: np.ndarray, step: float = 1e-5
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Derivatives by the 3 log-scales, the 4 numbers of the quaternion, and the means along
-    `directions` [N,m,3] (metres).
-
-    Of means2d [N,7+m,2], cov2d [N,7+m,2,2] and colours [N,7+m,3]: central differences of `project`.
-    """
+    """Central differences of `project` by the 3 log-scales, the 4 entries of the quaternion and the
+    means along `directions` [N,m,3], metres: of means2d [N,7+m,2], cov2d [N,7+m,2,2] and colours
+    [N,7+m,3]."""
     moves = [("log_scales", row) for row in np.eye(3)] + [("quats", row) for row in np.eye(4)]
     moves += [("means", direction) for direction in directions.transpose(1, 0, 2)]
     derivatives = []
@@ -220,23 +209,14 @@ def _projection_jacobian(
         up, down = (
             project(_moved(gaussians, name, sign * step * direction), camera) for sign in (+1, -1)
         )
-        derivatives.append(
-            [
-                (a - b) / (2 * step)
-                for a, b in zip(_differentiated(up), _differentiated(down), strict=True)
-            ]
-        )
+        changes = (up.means2d - down.means2d, up.cov2d - down.cov2d, up.colours - down.colours)
+        derivatives.append([change / (2 * step) for change in changes])
     means2d, cov2d, colours = (np.stack(columns, 1) for columns in zip(*derivatives, strict=True))
     return means2d, cov2d, colours
 
 
-def _differentiated(projected: Projected) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return projected.means2d, projected.cov2d, projected.colours
-
-
 def mean_directions(n: int, means: str = "frozen", normals: np.ndarray | None = None) -> np.ndarray:
-    """The directions [N,m,3] that the columns of the means stand for; means, normals: as in
-    `mgs.splat.fisher`."""
+    """Directions [N,m,3] of the columns of the means. means, normals: as in `mgs.splat.fisher`."""
     if means == "normal":
         unit = np.asarray(normals, np.float64)
         return (unit / np.linalg.norm(unit, axis=1, keepdims=True))[:, None, :]
@@ -251,13 +231,11 @@ def jacobian(
     normals: np.ndarray | None = None,
     alpha_weight: float = 0.0,
 ) -> np.ndarray:
-    """Dense Jacobian of the rgb image, [H*W, 3, N, P]. For toy scenes only.
+    """Dense Jacobian of the rgb image [H*W, 3, N, P]. For toy scenes only.
 
-    The P = 3K + 8 columns are those of `mgs.gaussians.LEARNED`, and 1 or 3 of the means follow
-    unless they are frozen.
-    means, normals, alpha_weight: as in `mgs.splat.fisher`. With an alpha_weight above 0 there are
-    four channels, the last one alpha times its square root. It is composited as a colour is that
-    all Gaussians share, over a background of 0.
+    Columns: those of `mgs.gaussians.LEARNED`, then 0, 1 or 3 of the means. means, normals,
+    alpha_weight: as in `mgs.splat.fisher`. With an alpha_weight there are four channels, the last
+    one alpha times its square root, composited as a colour that all Gaussians share.
     """
     projected = project(gaussians, camera)
     order, alpha, T, clipped = composite(projected, camera)
@@ -269,15 +247,13 @@ def jacobian(
     extra = int(alpha_weight > 0)
     colours = np.concatenate([projected.colours, np.full((n, extra), np.sqrt(alpha_weight))], 1)
     contribution = weights[:, :, None] * colours[order]
-    image = contribution.sum(1) + (1 - weights.sum(1))[:, None] * np.append(
-        background, np.zeros(extra)
-    )
+    surround = np.append(background, np.zeros(extra))
+    image = contribution.sum(1) + (1 - weights.sum(1))[:, None] * surround
     behind = image[:, None, :] - np.cumsum(contribution, 1)
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
     pixels = np.stack([u.ravel(), v.ravel()], 1)
-    d_means2d, d_cov2d, d_colours = _projection_jacobian(
-        gaussians, camera, mean_directions(n, means, normals)
-    )
+    moves = mean_directions(n, means, normals)
+    d_means2d, d_cov2d, d_colours = _projection_jacobian(gaussians, camera, moves)
     J = np.zeros((len(pixels), 3 + extra, n, 3 * K + 1 + d_cov2d.shape[1]))
     for i, j in enumerate(order):
         drawn = np.flatnonzero(alpha[:, i])  # on other pixels the splat changes nothing
@@ -299,14 +275,14 @@ def jacobian(
 def fisher(
     gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.0), **options: Any
 ) -> np.ndarray:
-    """diag(J^T J) over pixels and channels, [N,P]; options: those of `jacobian`."""
+    """diag(J^T J) over pixels and channels [N,P]. options: of `jacobian`."""
     return (jacobian(gaussians, camera, background, **options) ** 2).sum((0, 1))
 
 
 def fisher_block(
     gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.0), **options: Any
 ) -> np.ndarray:
-    """The [N,P,P] diagonal blocks of J^T J; options: those of `jacobian`."""
+    """Diagonal blocks of J^T J [N,P,P]. options: of `jacobian`."""
     J = jacobian(gaussians, camera, background, **options)
     rows = J.reshape(J.shape[0] * J.shape[1], *J.shape[2:])
     return np.matmul(rows.transpose(1, 2, 0), rows.transpose(1, 0, 2))
@@ -315,14 +291,13 @@ def fisher_block(
 def removal_cost(
     gaussians: Gaussians, camera: Camera, background: Any = (0.0, 0.0, 0.0)
 ) -> np.ndarray:
-    """[N]: sum over pixels and channels of (alpha D)^2, the squared change of the image where one
-    Gaussian is left out."""
+    """Squared change of the image when one Gaussian is left out [N]: sum over pixels and channels
+    of (alpha D)^2."""
     projected = project(gaussians, camera)
     order, alpha, T, _ = composite(projected, camera)
     contribution = (alpha * T)[:, :, None] * projected.colours[order]
-    image = contribution.sum(1) + (1 - (alpha * T).sum(1))[:, None] * np.asarray(
-        background, np.float64
-    )
+    remaining = (1 - (alpha * T).sum(1))[:, None]
+    image = contribution.sum(1) + remaining * np.array(background, float)
     behind = image[:, None, :] - np.cumsum(contribution, 1)
     change = contribution - (alpha / (1 - alpha))[:, :, None] * behind
     cost = np.zeros(len(gaussians))

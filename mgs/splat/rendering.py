@@ -1,4 +1,4 @@
-"""Render Gaussians: one differentiable call, with block lists cached per camera."""
+"""Render Gaussians in one differentiable call, with block lists cached per camera."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from mgs.splat.recording import one_at_a_time
 from mgs.splat.walking import PIXELS, pack, sums_by_splat
 
 CACHE_BYTES = 1 << 30
-"""Default memory budget of a `ListCache`, bytes: enough for 100 cameras of 100,000 Gaussians at
+"""Default budget of a `ListCache`, bytes: enough for 100 cameras of 100,000 Gaussians at
 640x480."""
 
 
 @dataclass
 class Image:
-    """A rendered view, Dr.Jit TensorXf: rgb [H,W,3] linear over the background, alpha [H,W], depth
-    [H,W].
+    """A rendered view, Dr.Jit TensorXf.
 
-    depth: expected z-depth in metres, sum w z / sum w; 0 where alpha is 0.
+    rgb: linear, over the background [H,W,3]. alpha: [H,W]. depth: expected z-depth sum w z / sum w,
+    metres, 0 where alpha is 0 [H,W].
     """
 
     rgb: Any
@@ -41,35 +41,28 @@ class Image:
 
 
 REMEMBERED = 1 << 10
-"""For how many cameras a `ListCache` remembers when they were used last, at a few hundred bytes
-each: a run that sees new cameras at every step soon grows no more."""
+"""Number of cameras whose last use a `ListCache` remembers, a few hundred bytes each."""
 
 
 class ListCache:
     """Block lists per camera, kept between calls of `render` and `fisher` within a budget in bytes.
+    The lists of one camera are kept even if they exceed it.
 
-    The lists of one camera are kept even where they alone exceed the budget.
+    Every use checks that the lists still fit the Gaussians (`mgs.splat.blocks.changes`) and
+    rebuilds them if not, so caching never changes an image.
 
-    Lists that no longer fit the Gaussians are found out and rebuilt at every use (see
-    `mgs.splat.blocks.changes`), so keeping them never changes an image.
-
-    What is kept: cameras are mostly gone through again and again, in one order (to score views) or
-    in a new order each time (to fit). The camera used longest ago is then often the one needed
-    next, and a cache that always drops that one (LRU) may never find what it is asked for. Here a
-    new camera takes its place only if it was itself used less than half as long ago. Otherwise the
-    new lists are used once and dropped. So as many cameras stay as there is room for, and where the
-    caller turns to other cameras, these take over within three rounds.
+    Replacement: callers mostly go through their cameras again and again, in one order or a new one
+    each time. The camera used longest ago is then often needed next, so least-recently-used
+    replacement may never find anything. Here a new camera replaces the one used longest ago only if
+    it was itself used less than half as long ago. Otherwise its lists are used once and dropped. If
+    the caller turns to other cameras, these take over within three rounds.
     """
 
     def __init__(self, budget: int = CACHE_BYTES) -> None:
         self.budget = budget
         self.builds = 0
-        self._lists: OrderedDict[bytes, BlockLists] = (
-            OrderedDict()
-        )  # the one used longest ago first
-        self._used: dict[
-            bytes, int
-        ] = {}  # value of _clock at each camera's last use, its lists held or not
+        self._lists: OrderedDict[bytes, BlockLists] = OrderedDict()  # used longest ago first
+        self._used: dict[bytes, int] = {}  # _clock at the last use of each camera, held or not
         self._clock = 0  # counts the uses of all cameras
 
     @property
@@ -78,11 +71,11 @@ class ListCache:
         return sum(lists.nbytes for lists in self._lists.values())
 
     def get(self, camera: Camera, splats: Splats) -> tuple[BlockLists, Any]:
-        """Lists for detached splats seen by the camera, from the cache or new, and the splats
-        packed for them (`walking.pack`).
+        """Lists for detached splats seen by the camera, cached or new, and the packed splats
+        (`walking.pack`).
 
-        Raises InputError where a parameter is not finite, a colour beyond SH_MAX, or the view has
-        too many pairs.
+        Raises InputError if a parameter is not finite, a colour beyond SH_MAX, or the view has too
+        many pairs.
         """
         key = camera.key
         lists = self._lists.get(key)
@@ -100,7 +93,7 @@ class ListCache:
             packed = pack(splats, lists.place)
             worst = int(dr.max(change)[0])
             _raise_unless_finite(worst < not_finite)
-            if worst == blocks.RESHAPED:  # the places stay, and what is packed
+            if worst == blocks.RESHAPED:  # places and packed splats stay valid
                 lists = self._build(key, splats, camera, lists)
             elif worst == blocks.REORDERED:
                 lists = self._build(key, splats, camera)
@@ -114,37 +107,33 @@ class ListCache:
     def _build(
         self, key: bytes, splats: Splats, camera: Camera, older: BlockLists | None = None
     ) -> BlockLists:
-        """New lists, kept if there is room for them."""
+        """New lists, kept if there is room."""
         lists = blocks.build(splats, camera.width, camera.height, older)
         self.builds += 1
         self._keep(key, lists)
         return lists
 
     def _keep(self, key: bytes, lists: BlockLists) -> None:
-        """Hold new lists; then keep the budget, by dropping those used longest ago or the new ones
-        (see the class)."""
+        """Hold new lists, then drop those used longest ago or the new ones (see the class)."""
         self._lists[key] = lists
+        clock, used = self._clock, self._used
         while len(self._lists) > 1 and self.nbytes > self.budget:
             oldest = next(other for other in self._lists if other != key)
-            if (
-                key in self._used
-                and 2 * (self._clock - self._used[key]) < self._clock - self._used[oldest]
-            ):
+            if key in used and 2 * (clock - used[key]) < clock - used[oldest]:
                 del self._lists[oldest]
             else:
                 del self._lists[key]
                 break
-        if len(self._used) > REMEMBERED:
-            self._used = {other: self._used[other] for other in self._lists if other in self._used}
+        if len(used) > REMEMBERED:
+            self._used = {other: used[other] for other in self._lists if other in used}
 
 
 def as_colour(background: Any) -> Any:
-    """A background as Color3f, linear RGB: from one number, from three, or from a Dr.Jit colour,
-    which keeps its gradient.
+    """A background as Color3f, linear RGB: one number, three, or a Dr.Jit colour, which keeps its
+    gradient.
 
-    Numbers go to Dr.Jit through `dr.opaque`; otherwise they would be compiled into the kernel, one
-    kernel for each colour. Raises InputError for anything else, and for numbers that are not finite
-    or beyond SH_MAX.
+    Numbers pass through `dr.opaque`, so they are not compiled into kernels. Raises InputError for
+    anything else, and for numbers that are not finite or beyond SH_MAX.
     """
     if dr.is_jit_v(background):
         return mi.Color3f(background)
@@ -154,7 +143,8 @@ def as_colour(background: Any) -> Any:
         values = np.full(3, np.nan)
     if not (np.abs(values) <= SH_MAX).all():
         raise InputError(
-            f"background {background}: must be one or three numbers, linear RGB, up to {SH_MAX:,.0f}"
+            f"background {background}: must be one or three numbers, linear RGB, "
+            f"up to {SH_MAX:,.0f}"
         )
     return mi.Color3f(*(dr.opaque(mi.Float, float(value)) for value in values))
 
@@ -167,30 +157,27 @@ def _raise_unless_finite(finite: Any) -> None:
 
 
 def as_drjit(gaussians: Gaussians) -> Gaussians:
-    """The same Gaussians with TensorXf fields. Fields that are Dr.Jit arrays already are kept, with
-    their gradients.
+    """The same Gaussians with TensorXf fields. Dr.Jit fields stay as they are, with their
+    gradients.
 
-    Raises InputError where the shapes of the fields do not fit each other, with which a kernel
-    would read beyond the end of an array; and where no variant can be started
-    (`mgs.runtime.start`).
+    Raises InputError if the shapes of the fields do not fit each other, or no variant can be
+    started (`mgs.runtime.start`).
     """
     runtime.start()
     gaussians.check_shapes()
-    values = {f.name: getattr(gaussians, f.name) for f in fields(gaussians)}
-    return Gaussians(
-        **{k: v if dr.is_array_v(v) else mi.TensorXf(padded(v)) for k, v in values.items()}
-    )
+    values = (getattr(gaussians, f.name) for f in fields(gaussians))
+    return Gaussians(*(v if dr.is_array_v(v) else mi.TensorXf(padded(v)) for v in values))
 
 
 class _Rasterise(dr.CustomOp):
-    """Compositing as an operation of Dr.Jit's AD: splats -> red, green, blue, alpha, depth times
-    alpha, Float [H*W] each.
+    """Compositing as a Dr.Jit AD operation: splats -> red, green, blue, alpha, depth times alpha,
+    Float [H*W] each.
 
-    Its derivative is written by hand: Dr.Jit's own would have to store the state of every pixel
-    before every splat.
-    packed, lists: of these splats; places: from `_block_major`; means: whether mean_x and mean_y
-    have gradients; channels: how many of the outputs are wanted, from red on, at least 3. The
-    others are left out.
+    The derivative is written by hand. Dr.Jit's own would store the state of every pixel before
+    every splat.
+
+    packed, lists: of these splats. places: from `_block_major`. means: whether mean_x and mean_y
+    have gradients. channels: number of outputs, from red on, at least 3.
     """
 
     def eval(
@@ -208,7 +195,7 @@ class _Rasterise(dr.CustomOp):
         return self._in_order(self.out)
 
     def _in_order(self, out: tuple[Any, ...]) -> Any:
-        """The output of a kernel, block by block, as arrays of pixels row by row."""
+        """Output of a kernel, block by block, as arrays of pixels row by row."""
         pixel = dr.gather(mi.Vector4f, out[0], self.places, mode=dr.ReduceMode.NoConflicts)
         if self.channels < 5:
             return tuple(pixel)[: self.channels]
@@ -220,23 +207,21 @@ class _Rasterise(dr.CustomOp):
 
     def backward(self) -> None:
         r, g, b, *others = self.grad_out()
-        dr.eval(
-            r, g, b, others
-        )  # Dr.Jit 1.5 ends the process where a scatter's value awaits a scatter itself
+        # Dr.Jit 1.5 ends the process if a scatter's value depends on an unevaluated scatter.
+        dr.eval(r, g, b, others)
         alpha, *depth = others or [mi.Float(0)]
         d_out = tuple(dr.zeros(mi.Float, len(out)) for out in self.out)
         for array, value in zip(d_out, (mi.Vector4f(r, g, b, alpha), *depth), strict=True):
             dr.scatter(array, value, self.places, mode=dr.ReduceMode.NoConflicts)
-        placed = kernels.adjoint(
-            self.lists, self.packed, self.out, d_out, self.means, self.channels
-        )
+        how = self.means, self.channels
+        placed = kernels.adjoint(self.lists, self.packed, self.out, d_out, *how)
         sums = sums_by_splat(self.lists, placed, kernels.ADJOINT_SUMS[self.means])
         self.set_grad_in("splats", kernels.splat_gradient(sums, self.splats))
 
 
 def _block_major(width: int, height: int) -> Any:
-    """UInt32 [H*W]: index of each pixel, taken row by row, in the output of the kernels, which is
-    block by block."""
+    """Index of each pixel (row by row) in the output of the kernels (block by block), UInt32
+    [H*W]."""
     index = dr.arange(mi.UInt32, width * height)
     x, y = index % width, index // width
     block = (y // BLOCK_Y) * (-(-width // BLOCK_X)) + x // BLOCK_X
@@ -247,18 +232,17 @@ def splats_and_lists(
     gaussians: Gaussians, camera: Camera, cache: ListCache | None
 ) -> tuple[Splats, BlockLists, Any]:
     """Project Gaussians with Dr.Jit fields. Returns the splats, with gradients, their block lists,
-    and the splats packed.
+    and the packed splats.
 
-    Raises InputError where a parameter is not finite or a colour beyond SH_MAX, naming the
-    parameter and the Gaussian; and where the view has too many pairs.
+    Raises InputError if a parameter is not finite or a colour beyond SH_MAX, naming parameter and
+    Gaussian; and if the view has too many pairs.
     """
     splats = project(gaussians, camera_array(camera))
     try:
         return splats, *(cache or ListCache()).get(camera, dr.detach(splats))
     except InputError:
-        Gaussians(
-            *(np.asarray(dr.detach(getattr(gaussians, f.name))) for f in fields(gaussians))
-        ).check()
+        values = (np.asarray(dr.detach(getattr(gaussians, f.name))) for f in fields(gaussians))
+        Gaussians(*values).check()
         raise
 
 
@@ -269,20 +253,19 @@ def render(
     background: Any = (0.0, 0.0, 0.0),
     cache: ListCache | None = None,
 ) -> Image:
-    """Render Gaussians by EWA splatting (Kerbl et al. 2023, with the constants of
-    `mgs.splat.constants`).
+    """Render Gaussians by EWA splatting (Kerbl et al. 2023, with `mgs.splat.constants`).
 
-    gaussians: NumPy fields, or Dr.Jit TensorXf fields, any of which may have gradients enabled.
-    Derivatives by them are those of Dr.Jit, in reverse mode (`dr.backward`) and in forward mode
-    (`dr.forward`; `jvp` is a short way to it). Not
-    differentiated: the camera, the thresholds (alpha < 1/255, transmittance, ALPHA_MAX) and the
-    depth order.
-    background: linear RGB, one number or three, or a Dr.Jit colour, which may have gradients
-    enabled. cache: keep one between calls so that a camera seen again reuses its block lists.
-    `render` records its own kernels, so it cannot be called inside another `dr.freeze`.
-    Raises InputError where a parameter is NaN or infinite or a colour beyond SH_MAX, naming the
-    parameter and the first Gaussian; where a number of the background is (a Dr.Jit colour is not
-    looked at); and for a view of too many pairs (`mgs.splat.blocks.MAX_PAIRS`).
+    gaussians: NumPy fields, or TensorXf fields, any of which may have gradients enabled.
+    background: linear RGB, one number or three, or a Dr.Jit colour, with or without gradient.
+    cache: keep one between calls to reuse the block lists of cameras.
+
+    Differentiable by Dr.Jit in reverse mode (`dr.backward`) and forward mode (`dr.forward`, `jvp`).
+    Not differentiated: the camera, the thresholds (ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN) and the
+    depth order. It records its own kernels, so it cannot be called inside another `dr.freeze`.
+
+    Raises InputError if a parameter is not finite or a colour beyond SH_MAX, naming parameter and
+    first Gaussian; if a number of the background is (a Dr.Jit colour is not checked); and for a
+    view with too many pairs (`mgs.splat.blocks.MAX_PAIRS`).
     """
     runtime.start()
     colour = as_colour(background)
@@ -301,36 +284,31 @@ def jvp(
     background: Any = (0.0, 0.0, 0.0),
     cache: ListCache | None = None,
 ) -> Image:
-    """How the image changes as the Gaussians change along `tangents`: the product J v, in one pass
-    (forward-mode derivative).
+    """Derivative of the image along `tangents` of the Gaussians: J v in one pass (forward mode),
+    with J the Jacobian of `render`.
 
-    J is the Jacobian of `render`, with what it does not differentiate; v are the tangents.
-    gaussians, camera, background,
-    cache: as in `render`; gradients that are enabled on them play no part.
-    tangents: by name of a parameter ("means", "log_scales", "quats", "logit_opacities", "sh") an
-    array of the parameter's shape, NumPy or Dr.Jit, in its unit per unit of some t. Parameters that
-    are not named do not change. Returns the derivatives by t of rgb [H,W,3], alpha [H,W] and depth
-    [H,W], TensorXf. Raises InputError where `render` does, and for a tangent of an unknown name, of
-    a wrong shape or that is not finite.
+    gaussians, camera, background, cache: as in `render`; their gradients are ignored.
+    tangents: derivatives by some t, by name of a parameter ("means", "log_scales", "quats",
+        "logit_opacities", "sh"), NumPy or Dr.Jit of the parameter's shape. Others are constant.
+
+    Returns the derivatives by t of rgb [H,W,3], alpha [H,W] and depth [H,W], TensorXf. Raises
+    InputError as `render`, and for a tangent of an unknown name, of a wrong shape or not finite.
     """
     model = as_drjit(gaussians)
     given = {name: _checked_tangent(model, name, tangent) for name, tangent in tangents.items()}
     with dr.resume_grad():
-        watched = Gaussians(
-            **{f.name: dr.copy(dr.detach(getattr(model, f.name))) for f in fields(model)}
-        )
+        copy = Gaussians(*(dr.copy(dr.detach(getattr(model, f.name))) for f in fields(model)))
         for name, tangent in given.items():
-            dr.enable_grad(getattr(watched, name))
-            dr.set_grad(getattr(watched, name), tangent)
-        image = render(watched, camera, dr.detach(as_colour(background)), cache)
-        dr.forward_to(
-            image, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad
-        )  # none where nothing is given to change
+            dr.enable_grad(getattr(copy, name))
+            dr.set_grad(getattr(copy, name), tangent)
+        image = render(copy, camera, dr.detach(as_colour(background)), cache)
+        # AllowNoGrad: there may be no tangents.
+        dr.forward_to(image, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
         return dr.grad(image)
 
 
 def _checked_tangent(gaussians: Gaussians, name: str, tangent: Any) -> Any:
-    """The tangent of a parameter as a detached TensorXf. Raises InputError, see `jvp`."""
+    """A tangent as detached TensorXf. Raises InputError as `jvp`."""
     names = [f.name for f in fields(gaussians)]
     if name not in names:
         raise InputError(f"tangents: {name!r} is no parameter; choose from {', '.join(names)}")
@@ -355,32 +333,25 @@ def _checked_tangent(gaussians: Gaussians, name: str, tangent: Any) -> Any:
 
 
 def _empty(camera: Camera, background: Any) -> Image:
-    """The image of a model without Gaussians: the background. (Dr.Jit has no operations on arrays
-    of length 0.)"""
+    """Image of a model without Gaussians. (Dr.Jit has no operations on arrays of length 0.)"""
     shape = (camera.height, camera.width)
     rgb = background + dr.zeros(mi.Color3f, camera.height * camera.width)
-    return Image(
-        mi.TensorXf(dr.ravel(rgb), (*shape, 3)),
-        dr.zeros(mi.TensorXf, shape),
-        dr.zeros(mi.TensorXf, shape),
-    )
+    alpha, depth = dr.zeros(mi.TensorXf, shape), dr.zeros(mi.TensorXf, shape)
+    return Image(mi.TensorXf(dr.ravel(rgb), (*shape, 3)), alpha, depth)
 
 
 def composite(
     splats: Splats, packed: Any, lists: BlockLists, width: int, height: int, background: Any = 0.0
 ) -> Image:
-    """The image of projected splats over a background (Color3f), differentiable in the splats'
-    fields and the background.
+    """Image of projected splats over a background (Color3f), differentiable in the splats and the
+    background.
 
-    packed: the splats' numbers from `walking.pack`; lists: their block lists; width, height:
-    pixels.
+    packed: from `walking.pack`. lists: block lists. width, height: pixels.
     """
     r, g, b, alpha, weighted = _rasterised(splats, packed, lists, width, height, 5)
     rgb = mi.Color3f(r, g, b) + (1 - alpha) * background
     expected = dr.select(alpha > 0, weighted / dr.select(alpha > 0, alpha, 1), 0)
-    alpha = (
-        alpha + 0
-    )  # a variable that nothing else depends on: forward-mode AD clears the others when it is done
+    alpha = alpha + 0  # a leaf: forward-mode AD clears the gradients of inner variables
     shape = (height, width)
     return Image(
         mi.TensorXf(dr.ravel(rgb), (*shape, 3)),
@@ -392,11 +363,10 @@ def composite(
 def composite_channels(
     splats: Splats, packed: Any, lists: BlockLists, width: int, height: int, channels: int
 ) -> Any:
-    """The colours of `composite` over black and, with four channels instead of three, alpha:
-    TensorXf [H,W,channels], differentiable in the splats' fields.
+    """Colours of `composite` over black and, with four channels, alpha: TensorXf [H,W,channels],
+    differentiable in the splats.
 
-    It is what a fit needs, and takes less time: depth is neither summed nor differentiated, alpha
-    only where it is wanted.
+    Faster than `composite`: depth is left out, and alpha unless wanted.
     """
     pixels = _rasterised(splats, packed, lists, width, height, channels)
     vectors = mi.Color3f(*pixels) if channels == 3 else mi.Vector4f(*pixels)
@@ -406,14 +376,6 @@ def composite_channels(
 def _rasterised(
     splats: Splats, packed: Any, lists: BlockLists, width: int, height: int, channels: int
 ) -> Any:
-    """The outputs of `_Rasterise` for an image of this size, with gradients of the means where
-    these are enabled."""
-    return dr.custom(
-        _Rasterise,
-        splats,
-        packed,
-        lists,
-        _block_major(width, height),
-        dr.grad_enabled(splats.mean_x),
-        channels,
-    )
+    """Outputs of `_Rasterise`, with gradients of the means if enabled."""
+    places, means = _block_major(width, height), dr.grad_enabled(splats.mean_x)
+    return dr.custom(_Rasterise, splats, packed, lists, places, means, channels)

@@ -1,41 +1,40 @@
-"""How much model does a scene need? Quality and cost against the number of Gaussians, the kinds of
-parameter that are learned, and the degree of the colours' spherical harmonics; and whether a rule
-that sees no test view would have chosen well.
+"""`mgs parsimony`: how much model a scene needs.
 
-A fit sees views one after the other, spread evenly around the rock, as `mgs nbv` does: so each
-view, before it is fitted, is a
-free test. The rules:
-
-- resolution: N of `mgs prior --gaussians auto`, from the mesh and the cameras alone;
-- next error: the squared error of the next view inside the rock's mask, under the model of the
-views before it: its likelihood
-  with any fixed noise;
-- predictive: the mean log-likelihood of a pixel value of the same, with the noise of a pixel from
-the residual of the views
-  that were fitted: a model that fitted them too closely expects less error than it makes;
-- evidence: Laplace's approximation of the logarithm of the marginal likelihood of the images, up to
-a constant that is the same
-  for all: -Phi / sigma² - 1/2 sum log((H + lambda) / lambda), with Phi of `mgs.fit.objective` and
-  the exact diagonal H.
+Charts quality and cost against the number of Gaussians, the kinds of parameters that are learned,
+and the SH degree, and compares the automatic choice: N of `mgs prior --gaussians auto`, kinds and
+degree of `mgs refit`. A fit sees views one after the other, spread evenly around the rock, as in
+`mgs nbv`.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mgs.files import read_json
-from mgs.policy.criteria import DIRECTIONAL_STD
-from mgs.study.sweep import Cell, cell_folder, run_cells
+from mgs.data.dataset import Frame, load_dataset, target_of
+from mgs.fit.fitting import fit
+from mgs.fit.settings import RATES, TrainSettings
+from mgs.gaussians import Gaussians
+from mgs.policy.criteria import DIRECTIONAL_STD, PIXEL_NOISE
+from mgs.policy.poses import seed_views
+from mgs.prior.build import load_prior
+from mgs.prior.initial import initial_gaussians, warm_start
+from mgs.report.evidence import fit_lam, last_images, lean_fit, regularisation
+from mgs.run.settings import NbvSettings
+from mgs.splat import ListCache, fisher, groups
+from mgs.splat.pruning import prune
+from mgs.study.case import Case, Scene, Size, judge
+from mgs.study.output import Content, Panel, draw_panels, table, write_table
+from mgs.study.sweep import Cell, Report, run_cells
+from mgs.study.verdict import Claim, Row, judged, single, verdict_table
 
 AUTO = "auto"
-"""The number of Gaussians of `mgs prior`; of what is learned, and of the SH degree, what `mgs
-refit` chooses."""
+"""Automatic number of Gaussians."""
 
 LEARNED = {
     "colour": ("colour",),
@@ -43,299 +42,195 @@ LEARNED = {
     "+ scale": ("colour", "opacity", "scale"),
     "+ rotation": ("colour", "opacity", "scale", "rotation"),
 }
-"""Sets of kinds of parameters that are learned, by what each adds to the one before."""
+"""Kinds of parameters that are learned, by what each set adds to the one before."""
+
 ALL = "+ rotation"
 
 DEGREES = (0, 1, 2)
 
+NUMBER, KINDS, DEGREE, AUTOMATIC, PRUNED = (
+    "number of Gaussians",
+    "kinds learned",
+    "SH degree",
+    "automatic",
+    "pruned",
+)
+"""Values of the column `choice`: what differs among fixed choices; number, kinds and degree chosen
+automatically; and the fit with the automatic number, pruned."""
+
 PRUNE_NOISE = (0.1, 0.2, 0.5)
-"""Allowed change by pruning, over sigma_e, the noise of a pixel."""
+"""Allowed change by pruning, over the noise of a pixel."""
 
-RULES = {"psnr_inside": 1, "next_error": -1, "predictive": 1, "evidence": 1}
-"""Columns of a row by which a model may be chosen, the first with the test views in view; 1: more
-is better, -1: less."""
-
-GREY = (0.2, 0.2, 0.2)
+GREY = [0.2, 0.2, 0.2]
 VARIANTS: dict[str, dict[str, Any]] = {
     "shining boulder": {"specular": 0.5, "roughness": 0.3},
-    "plain boulder": {"colours": (GREY, GREY), "dust": GREY},
+    "plain boulder": {"colours": [GREY, GREY], "dust": GREY},
 }
-"""Boulders of which some keys of [rock] in the scene file are others."""
+"""Boulders with other values of keys of [rock] in the scene file."""
 
 SCENES = ("boulder", "strata", "pebbles", "contact-binary", *VARIANTS)
-"""On the first two the constants of the rule for N were chosen, on the others it is tested."""
+"""The first two were used to choose the constants of the rule for N; the others test it."""
 
 CLOSE = 0.1
-"""dB: models whose quality differs by less count as equally good."""
+"""Difference of quality, dB, up to which models count as equally good."""
 
 
 @dataclass(frozen=True)
-class Preset:
-    """Size of the study. counts: fixed numbers of Gaussians; views: images that are fitted, the
-    first `seeds` at once."""
+class ParsimonySize:
+    """Size of the study. counts: fixed numbers of Gaussians. views: images fitted, the first `seeds`
+    at once."""
 
     scenes: tuple[str, ...]
     counts: tuple[int, ...]
-    width: int
-    height: int
-    frames: int
-    tests: int
+    images: Size
     views: int
     seeds: int = 4
-    spp: int = 8
-    seed: int = 0
+
+    def case(self, scene: str, gaussians: int | str) -> Case:
+        """Case of a scene with a prior of so many Gaussians."""
+        changes = {"rock": VARIANTS[scene]} if scene in VARIANTS else {}
+        rock = Scene("boulder" if changes else scene, 0, changes, label=scene)
+        return Case(rock, self.images, {"gaussians": gaussians, "seed": 0})
 
 
-PRESETS = {
-    "quick": Preset(SCENES, (2500, 5000, 10_000, 20_000, 40_000), 160, 120, 16, 6, 8),
-    "full": Preset(SCENES, (10_000, 20_000, 40_000, 80_000, 160_000), 320, 240, 32, 12, 12),
+SIZES = {
+    "quick": ParsimonySize(SCENES, (2500, 5000, 10_000, 20_000, 40_000), Size(160, 120, 16, 6), 8),
+    "full": ParsimonySize(
+        SCENES, (10_000, 20_000, 40_000, 80_000, 160_000), Size(320, 240, 32, 12), 12
+    ),
 }
 
-
-def _cell(name: str, task: str, needs: Sequence[str], **arguments: Any) -> Cell:
-    """A cell of a task of this module. Fits are done alone, as their seconds are reported."""
-    return Cell(
-        name, f"mgs.study.parsimony:{task}", arguments, tuple(needs), alone=task.startswith("fit")
-    )
+Fixed = tuple[str, int | str, str, int]
+"""What differs, number of Gaussians, kinds learned, and SH degree of a fit."""
 
 
-def fit_name(scene: str, gaussians: int | str, learned: str, degree: int) -> str:
-    """The name of a fit's cell."""
+def fixed_choices(size: ParsimonySize) -> list[Fixed]:
+    """Fixed choices; the fit with the automatic number, all kinds and degree 0 is among the last
+    two."""
+    choices: list[Fixed] = [(NUMBER, n, ALL, 0) for n in size.counts]
+    choices += [(KINDS, AUTO, learned, 0) for learned in LEARNED]
+    return choices + [(DEGREE, AUTO, ALL, degree) for degree in DEGREES]
+
+
+def _fit_name(scene: str, gaussians: int | str, learned: str, degree: int) -> str:
     return f"fit/{scene}/{gaussians}-{'-'.join(LEARNED[learned])}-degree-{degree}"
 
 
-def cells_of(size: Preset) -> list[Cell]:
-    """All cells: of each scene a data set, its priors, the fits, and the pruning of the automatic
-    one."""
-    cells: list[Cell] = []
-    numbers: tuple[int | str, ...] = (*size.counts, AUTO)
+def cells_of(size: ParsimonySize) -> list[Cell]:
+    """Cells of each scene: dataset, priors, fits, and the fit of `mgs refit`."""
+    cells: dict[str, Cell] = {}
+
+    def add(name: str, task: str, case: Case, arguments: dict[str, Any]) -> None:
+        made = case.cells()
+        arguments = {**case.folders, "views": size.views, "seeds": size.seeds, **arguments}
+        needs = tuple(cell.name for cell in made)
+        cell = Cell(name, f"{__name__}:{task}", arguments, needs, alone=True)  # reports seconds
+        cells.update({one.name: one for one in (*made, cell)})
+
     for scene in size.scenes:
-        data = f"dataset/{scene}"
-        made = {
-            key: getattr(size, key) for key in ("width", "height", "frames", "tests", "spp", "seed")
-        }
-        cells.append(_cell(data, "make_dataset", (), scene=scene, **made))
-        for n in numbers:
-            cells.append(
-                _cell(
-                    f"prior/{scene}/{n}",
-                    "make_prior",
-                    [data],
-                    scene=scene,
-                    gaussians=n,
-                    seed=size.seed,
-                )
-            )
-        fits = [(n, ALL, 0) for n in numbers]
-        fits += [(AUTO, learned, 0) for learned in LEARNED if learned != ALL]
-        fits += [(AUTO, ALL, degree) for degree in DEGREES if degree]
-        for n, learned, degree in fits:
-            arguments: dict[str, Any] = {
-                "scene": scene,
-                "gaussians": n,
-                "learned": learned,
-                "degree": degree,
-            }
-            arguments |= {"views": size.views, "seeds": size.seeds}
+        for _, n, learned, degree in fixed_choices(size):
+            arguments: dict[str, Any] = {"learned": learned, "degree": degree}
             arguments |= {"directional_std": DIRECTIONAL_STD} if degree else {}
-            cells.append(
-                _cell(
-                    fit_name(scene, n, learned, degree),
-                    "fit_and_judge",
-                    [f"prior/{scene}/{n}"],
-                    **arguments,
-                )
+            arguments |= (
+                {"noises": list(PRUNE_NOISE)} if (n, learned, degree) == (AUTO, ALL, 0) else {}
             )
-        best = fit_name(scene, AUTO, ALL, 0)
-        cells.append(_cell(f"prune/{scene}", "prune_and_judge", [best], scene=scene, fit=best))
-        needs, arguments = (
-            [f"prior/{scene}/{AUTO}"],
-            {"scene": scene, "views": size.views, "seeds": size.seeds},
-        )
-        cells.append(_cell(f"lean/{scene}", "fit_lean_and_judge", needs, **arguments))
-    return cells
-
-
-def make_dataset(
-    root: Path,
-    out: Path,
-    scene: str,
-    width: int,
-    height: int,
-    frames: int,
-    tests: int,
-    spp: int,
-    seed: int,
-) -> Any:
-    """A task: the data set of a scene, in the cell's folder "data"."""
-    from mgs.study.material import made_dataset
-    from mgs.synth import rendering
-    from mgs.synth.scene_file import load_scene_file
-
-    loaded = load_scene_file("boulder" if scene in VARIANTS else scene)
-    loaded = loaded.model_copy(
-        update={"rock": loaded.rock.model_copy(update=VARIANTS.get(scene, {}))}
-    )
-    made_dataset(
-        out / "data", loaded, rendering.RenderPreset(width, height, frames, spp), seed, tests
-    )
-    return {}
-
-
-def make_prior(root: Path, out: Path, scene: str, gaussians: int | str, seed: int) -> Any:
-    """A task: a prior of so many Gaussians, or "auto", in the cell's folder "prior"."""
-    from mgs.study.material import made_prior
-
-    prior = made_prior(
-        out / "prior",
-        cell_folder(root, f"dataset/{scene}") / "data",
-        gaussians=gaussians,
-        seed=seed,
-    )
-    return {"gaussians": len(prior.points) + prior.backed, "spacing": prior.spacing} | {
-        key: prior.numbers[key] for key in ("sampled_area", "resolution") if key in prior.numbers
-    }
+            name = _fit_name(scene, n, learned, degree)
+            add(name, "fit_and_judge", size.case(scene, n), arguments)
+        add(f"lean/{scene}", "fit_lean_and_judge", size.case(scene, AUTO), {})
+    return list(cells.values())
 
 
 def views_in_order(positions: np.ndarray, centre: np.ndarray, views: int, seeds: int) -> list[int]:
-    """Indices of views spread evenly in azimuth, in an order in which the first `seeds` are spread
-    evenly too.
-
-    positions: [C,3] of the cameras, +Z up; centre: [3]."""
-    from mgs.policy.poses import seed_views
-
+    """Indices of views evenly spaced in azimuth, ordered so that the first `seeds` are evenly spaced
+    too. positions: [C,3] of the cameras, +Z up; centre: [3]."""
     spread = list(seed_views(positions, centre, views))
     step = max(views // seeds, 1)
     return [view for first in range(step) for view in spread[first::step]]
 
 
+def _frames(frames: Sequence[Frame], points: np.ndarray, views: int, seeds: int) -> list[Frame]:
+    positions = np.array([frame.camera.position for frame in frames])
+    return [frames[i] for i in views_in_order(positions, points.mean(0), views, seeds)]
+
+
 def fit_and_judge(
     root: Path,
     out: Path,
-    scene: str,
-    gaussians: int | str,
-    learned: str,
-    degree: int,
+    dataset: str,
+    prior: str,
     views: int,
     seeds: int,
+    learned: str,
+    degree: int,
     directional_std: float = DIRECTIONAL_STD,
-) -> Any:
-    """A task: fit views one after the other; what the test views, the next views and the evidence
-    say of the model.
-    directional_std: tau of colours of degrees above 0, which is a constant; named so that a result
-    of another is not taken."""
-    from mgs.data.dataset import load_dataset, target_of
-    from mgs.fit.fitting import fit
-    from mgs.fit.objective import objective
-    from mgs.fit.settings import RATES, TrainSettings
-    from mgs.gaussians import Gaussians
-    from mgs.policy.criteria import PIXEL_NOISE
-    from mgs.prior.build import load_prior
-    from mgs.prior.initial import initial_gaussians, warm_start
-    from mgs.report.evidence import fit_lam, regularisation
-    from mgs.run.settings import NbvSettings
-    from mgs.splat import ListCache, as_drjit, fisher, groups
-    from mgs.splat_ply import write_ply
+    noises: Sequence[float] = (),
+) -> dict[str, Any]:
+    """Task: fit views one after the other; returns quality and cost, and the same of the model
+    pruned at each of `noises`.
 
-    folder = cell_folder(root, f"dataset/{scene}") / "data"
-    dataset, kept = load_dataset(folder), cell_folder(root, f"prior/{scene}/{gaussians}") / "prior"
-    prior, cache, columns = load_prior(kept), ListCache(), groups(degree)
-    train = TrainSettings(
-        rates={kind: rate if kind in LEARNED[learned] else 0.0 for kind, rate in RATES.items()}
-    )
-    settings = NbvSettings(dataset=folder, prior=kept, train=train)
-    lam = regularisation(settings, degree)
+    directional_std: the constant tau of colours of degrees above 0, so that a result with another
+    value is not reused.
+    """
+    data, known = load_dataset(root / dataset), load_prior(root / prior)
+    rates = {kind: rate if kind in LEARNED[learned] else 0.0 for kind, rate in RATES.items()}
+    train = TrainSettings(rates=rates)
+    settings = NbvSettings(dataset=root / dataset, prior=root / prior, train=train)
+    lam, cache = regularisation(settings, degree), ListCache()
     by_kind = fit_lam(lam, degree)
-    positions = np.array([frame.camera.position for frame in dataset.frames])
-    frames = [
-        dataset.frames[i] for i in views_in_order(positions, prior.points.mean(0), views, seeds)
-    ]
+    frames = _frames(data.frames, known.points, views, seeds)
     cameras, targets = [frame.camera for frame in frames], [target_of(frame) for frame in frames]
 
     def start_of(count: int) -> Gaussians:
-        """The Gaussians before training, in the colours of the first `count` frames, as the loop of
-        `mgs nbv` has them."""
-        of_seeds, coloured = (initial_gaussians(prior, frames[:k])[0] for k in (seeds, count))
+        """Gaussians before training, in the colours of the first frames, as in `mgs nbv`."""
+        of_seeds, coloured = (initial_gaussians(known, frames[:k])[0] for k in (seeds, count))
         return replace(of_seeds, sh=coloured.sh).with_degree(degree)
 
     start = model = start_of(seeds)
-    fitted, following, seconds, passes = list[float](), list[float](), 0.0, 0
+    seconds, passes = 0.0, 0
     for step, count in enumerate(range(seeds, views + 1)):
         before, start = start, start_of(count)
-        model = warm_start(model, before, start)
-        began = time.perf_counter()
-        found = fit(
-            model,
-            cameras[:count],
-            targets[:count],
-            settings.train_at(step),
-            None,
-            cache,
-            start,
-            by_kind,
-        )
-        seconds, passes, model = (
-            seconds + time.perf_counter() - began,
-            passes + found.passes,
-            found.gaussians,
-        )
-        if count < views:
-            fitted.append(
-                float(np.mean([_squared_error(model, frame) for frame in frames[:count]]))
-            )
-            following.append(_squared_error(model, frames[count]))
-    learned_columns = np.concatenate(
-        [np.arange(columns[kind].start, columns[kind].stop) for kind in LEARNED[learned]]
-    )
-    H = sum(fisher(model, camera, cache=cache).astype(np.float64) for camera in cameras)[
-        :, learned_columns
-    ]  # type: ignore
-    phi = objective(model, cameras, targets, start, by_kind, cache).phi(as_drjit(model))
-    write_ply(out / "gaussians.ply", model)
-    return _quality(model, dataset) | {
-        "views": [frame.name for frame in frames],
+        model, settings_now = warm_start(model, before, start), settings.train_at(step)
+        began, some = time.perf_counter(), targets[:count]
+        found = fit(model, cameras[:count], some, settings_now, None, cache, start, by_kind)
+        seconds += time.perf_counter() - began
+        passes, model = passes + found.passes, found.gaussians
+    kinds = groups(degree)
+    columns = np.concatenate([np.r_[kinds[kind]] for kind in LEARNED[learned]])
+    information = [fisher(model, camera, cache=cache).astype(np.float64) for camera in cameras]
+    H = np.sum(information, axis=0)[:, columns]
+    pruned = []
+    for noise in noises:
+        left = prune(model, cameras, noise * PIXEL_NOISE)
+        row = {"noise": noise, "gaussians": len(left.kept), "actual": left.actual}
+        row |= {"predicted": left.predicted, "parameters": len(left.kept) * H.shape[1]}
+        pruned.append(row | _quality(model[left.kept], root / dataset))
+    return _quality(model, root / dataset) | {
         "gaussians": len(model),
         "parameters": int(H.size),
-        "informed": float((lam[learned_columns] < H).mean()),
+        "informed": float((lam[columns] < H).mean()),
         "seconds": seconds,
         "passes": passes,
-        "next_error": float(np.mean(following)),
-        "predictive": float(
-            np.mean([log_likelihood(*pair) for pair in zip(following, fitted, strict=True)])
-        ),
-        "evidence": float(-phi / PIXEL_NOISE**2 - 0.5 * np.log1p(H / lam[learned_columns]).sum()),
+        "pruned": pruned,
     }
 
 
-def fit_lean_and_judge(root: Path, out: Path, scene: str, views: int, seeds: int) -> Any:
-    """A task: `mgs.report.evidence.lean_fit` to as many views, with the automatic number of
-    Gaussians."""
-    from mgs.data.dataset import load_dataset
-    from mgs.fit.settings import TrainSettings
-    from mgs.prior.build import load_prior
-    from mgs.report.evidence import last_images, lean_fit
-    from mgs.run.settings import NbvSettings
-    from mgs.splat import ListCache
-
-    folder, kept = (
-        cell_folder(root, f"dataset/{scene}") / "data",
-        cell_folder(root, f"prior/{scene}/{AUTO}") / "prior",
-    )
-    dataset, prior = load_dataset(folder), load_prior(kept)
-    settings = NbvSettings(dataset=folder, prior=kept, seeds=seeds, train=TrainSettings())
-    positions = np.array([frame.camera.position for frame in dataset.frames])
-    frames = [
-        dataset.frames[i] for i in views_in_order(positions, prior.points.mean(0), views, seeds)
-    ]
-    images, began = last_images(settings, prior, frames), time.perf_counter()
+def fit_lean_and_judge(
+    root: Path, out: Path, dataset: str, prior: str, views: int, seeds: int
+) -> dict[str, Any]:
+    """Task: `mgs.report.evidence.lean_fit` to as many views."""
+    data, known = load_dataset(root / dataset), load_prior(root / prior)
+    where: dict[str, Any] = {"dataset": root / dataset, "prior": root / prior}
+    settings = NbvSettings(**where, seeds=seeds, train=TrainSettings())
+    frames = _frames(data.frames, known.points, views, seeds)
+    images, began = last_images(settings, known, frames), time.perf_counter()
     found = lean_fit(images, settings, cache=ListCache())
+    seconds = time.perf_counter() - began
     assert found.left_out is not None
-    whole = _quality(found.whole, dataset)
-    return _quality(found.gaussians, dataset) | {
-        "whole": whole,
+    return _quality(found.gaussians, root / dataset) | {
+        "whole": _quality(found.whole, root / dataset),
         "gaussians": len(found.gaussians),
         "parameters": found.parameters,
-        "seconds": time.perf_counter() - began,
+        "seconds": seconds,
         "degree": found.gaussians.sh_degree,
         "directional_gain": found.left_out.gain,
         "directional_error": found.left_out.error,
@@ -343,137 +238,96 @@ def fit_lean_and_judge(root: Path, out: Path, scene: str, views: int, seeds: int
     }
 
 
-def log_likelihood(error: float, variance: float) -> float:
-    """The mean logarithm of the likelihood of pixel values, in nats, from their mean squared error,
-    if each is the rendered one plus Gaussian noise of this variance; both (linear RGB)²."""
-    return -0.5 * float(np.log(2 * np.pi * variance)) - error / (2 * variance)
-
-
-def _squared_error(model: Any, frame: Any) -> float:
-    """Mean squared error of a frame's pixel values inside the rock's mask, linear RGB."""
-    from mgs.data.dataset import target_of
-    from mgs.metrics import masked_squares
-    from mgs.splat import render
-
-    rgb = np.asarray(render(model, frame.camera).rgb, np.float64)
-    return float(masked_squares(rgb, target_of(frame), frame.mask()).mean())
-
-
-def _quality(model: Any, dataset: Any) -> dict[str, float]:
-    """PSNR on the test views, dB: of the whole frame, and of the pixels that the rock covers
-    wholly."""
-    from mgs.report.evaluation import evaluate
-
-    found = evaluate(model, (), (), test_frames=dataset.test_views().frames)["test"]
+def _quality(model: Gaussians, dataset: Path) -> dict[str, float]:
+    """PSNR on the test views, dB: of the whole frame, and of pixels that the rock covers wholly."""
+    found = judge(model, load_dataset(dataset))
     return {"psnr": found["psnr"], "psnr_inside": found["psnr_inside"]}
 
 
-def prune_and_judge(root: Path, out: Path, scene: str, fit: str) -> Any:
-    """A task: prune the model of a fit at several noises, and judge what is left."""
-    from mgs.data.dataset import load_dataset
-    from mgs.policy.criteria import PIXEL_NOISE
-    from mgs.splat.pruning import prune
-    from mgs.splat_ply import read_ply
-
-    dataset = load_dataset(cell_folder(root, f"dataset/{scene}") / "data")
-    model = read_ply(cell_folder(root, fit) / "gaussians.ply")
-    views = read_json(cell_folder(root, fit) / "result.json")["found"]["views"]
-    cameras, rows = [frame.camera for frame in dataset.frames if frame.name in views], []
-    for share in PRUNE_NOISE:
-        found = prune(model, cameras, share * PIXEL_NOISE)
-        numbers = {
-            "noise": share,
-            "gaussians": len(found.kept),
-            "predicted": found.predicted,
-            "actual": found.actual,
-        }
-        rows.append(numbers | _quality(model[found.kept], dataset))
-    return {"rows": rows}
+def rows_of(size: ParsimonySize, found: Mapping[str, Any], scene: str) -> list[Row]:
+    """A row for each fixed choice on a scene, for each pruned model, and for the automatic choice
+    with its comparison (`compared`)."""
+    rows: list[Row] = []
+    for choice, n, learned, degree in fixed_choices(size):
+        numbers = dict(found[_fit_name(scene, n, learned, degree)])
+        pruned = numbers.pop("pruned")
+        about = {"run": scene, "choice": choice, "asked": str(n)}
+        rows.append(about | {"learned": learned, "degree": degree} | numbers)
+        if choice == KINDS:
+            rows += [about | {"choice": PRUNED} | row for row in pruned]
+    auto = {"run": scene, "choice": AUTOMATIC, "asked": AUTO, **found[f"lean/{scene}"]}
+    return [*rows, auto | compared(rows, auto)]
 
 
-def run_study(root: Path, size: Preset, report: Callable[[str, int, int], None]) -> dict[str, Any]:
-    """Do all cells that are not done, and return what they say: "rows", one for each fit, and
-    "scenes", `verdict` of each."""
-    found = run_cells(root, cells_of(size), report)
-    rows: list[dict[str, Any]] = []
-    for scene in size.scenes:
-        for cell in cells_of(size):
-            if cell.name.startswith(f"fit/{scene}/"):
-                asked = {key: cell.arguments[key] for key in ("scene", "learned", "degree")}
-                numbers = {key: value for key, value in found[cell.name].items() if key != "views"}
-                rows.append(asked | {"asked": str(cell.arguments["gaussians"])} | numbers)
-        numbers = {
-            key: value
-            for key, value in found[f"lean/{scene}"].items()
-            if not isinstance(value, dict)
-        }
-        rows.append({"scene": scene, "learned": AUTO, "asked": AUTO, **numbers})
-    scenes = {
-        scene: verdict([row for row in rows if row["scene"] == scene]) for scene in size.scenes
-    }
-    for scene in size.scenes:
-        scenes[scene] |= {
-            "prior": found[f"prior/{scene}/{AUTO}"],
-            "pruned": found[f"prune/{scene}"]["rows"],
-        }
-        scenes[scene] |= {"lean": found[f"lean/{scene}"]}
-    return {"rows": rows, "scenes": scenes}
+def compared(rows: Sequence[Row], auto: Row) -> Row:
+    """Comparison of the automatic choice with the fixed ones of a scene.
 
-
-def axes_of(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """The rows of one scene that differ in one thing alone: fixed "gaussians", "learned", "degree",
-    in order."""
-    plain = [row for row in rows if row["learned"] != AUTO and row["degree"] == 0]
-    return {
-        "gaussians": [row for row in plain if row["asked"] != AUTO],
-        "learned": sorted((row for row in plain if row["asked"] == AUTO), key=_kinds),
-        "degree": sorted(
-            (row for row in rows if row["asked"] == AUTO and row["learned"] == ALL),
-            key=lambda r: r["degree"],
-        ),
-    }
-
-
-def _kinds(row: dict[str, Any]) -> int:
-    return list(LEARNED).index(row["learned"])
-
-
-def verdict(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """What the rows of one scene say of the automatic choice, of N, of what is learned, and of the
-    SH degree.
-
-    best: the largest PSNR inside the rock of a fixed choice, dB: of N, all being learned, or of
-    kinds or a degree, with the
-    automatic N. number: that of the automatic N, all being learned. auto, loss: that of the
-    automatic choice of everything, and
-    how far it is below the best. parameters: of the automatic choice; smallest: the fewest of a
-    fixed choice within CLOSE of
-    the best. close, small: whether the loss is at most CLOSE, and the parameters at most the
-    smallest. chosen: for each axis and each rule the value that the rule would choose, and its loss
-    against the best of the axis, dB.
+    number: PSNR with the automatic N, all kinds learned, dB. best: largest PSNR of another fixed
+    choice. loss: how far the automatic choice is below it. smallest: fewest parameters of a fixed
+    choice within CLOSE of the best. over_smallest: parameters over these.
     """
-    auto = next(row for row in rows if row["learned"] == AUTO)
-    number = next(
-        row for row in rows if row["asked"] == AUTO and row["learned"] == ALL and row["degree"] == 0
-    )
-    fixed = [row for row in rows if row not in (auto, number)]
-    best = max(row["psnr_inside"] for row in fixed)
-    smallest = min(row["parameters"] for row in fixed if row["psnr_inside"] >= best - CLOSE)
-    chosen = {}
-    for axis, of in axes_of(rows).items():
-        top = max(row["psnr_inside"] for row in of)
-        for rule, sign in RULES.items():
-            row = max(of, key=lambda row: sign * row[rule])
-            chosen[f"{axis} by {rule}"] = {"value": row[axis], "loss": top - row["psnr_inside"]}
-    loss = best - auto["psnr_inside"]
+
+    def is_number(row: Row) -> bool:
+        return (row["asked"], row["learned"], row["degree"]) == (AUTO, ALL, 0)
+
+    fixed = [row for row in rows if row["choice"] != PRUNED]
+    number = next(row for row in fixed if is_number(row))
+    others = [row for row in fixed if not is_number(row)]
+    best = max(row["psnr_inside"] for row in others)
+    smallest = min(row["parameters"] for row in others if row["psnr_inside"] >= best - CLOSE)
     return {
-        "best": best,
         "number": number["psnr_inside"],
-        "auto": auto["psnr_inside"],
-        "loss": loss,
-        "parameters": auto["parameters"],
+        "best": best,
+        "loss": best - auto["psnr_inside"],
         "smallest": smallest,
-        "close": loss <= CLOSE,
-        "small": auto["parameters"] <= smallest,
-        "chosen": chosen,
+        "over_smallest": auto["parameters"] / smallest,
     }
+
+
+CLAIMS = (
+    Claim(
+        "The automatic choice is at most 0.1 dB below the best fixed choice.",
+        single("loss", {"choice": AUTOMATIC}), "dB", "below", CLOSE, "scene",
+    ),
+    Claim(
+        "It has no more parameters than the smallest fixed choice within 0.1 dB of the best.",
+        single("over_smallest", {"choice": AUTOMATIC}), "times", "below", 1.0, "scene",
+    ),
+)  # fmt: skip
+
+COLUMNS: dict[str, Content] = {
+    "scene": "run",
+    "best fixed (dB)": "best:.2f",
+    "automatic (dB)": "psnr_inside:.2f",
+    "parameters": "parameters:,",
+    "smallest fixed within 0.1 dB": "smallest:,",
+    "holds": lambda row: _holds(row),
+}
+
+
+def _holds(row: Row) -> str:
+    if row["loss"] > CLOSE:
+        return "no: worse"
+    return "yes" if row["over_smallest"] <= 1 else "no: too many parameters"
+
+
+def run_study(
+    out: Path, size: ParsimonySize, report: Report, command: str, preset: str
+) -> tuple[list[Row], list[Row]]:
+    """Do all cells that are not done, and write parsimony.json, .csv, .md and .png. Returns the rows
+    of the automatic choices, and the judged claims."""
+    found = run_cells(out, cells_of(size), report)
+    rows = [row for scene in size.scenes for row in rows_of(size, found, scene)]
+    priors = {scene: found[size.case(scene, AUTO).prior_name] for scene in size.scenes}
+    claims = [judged(claim, rows) for claim in CLAIMS]
+    choices = [row for row in rows if row["choice"] == AUTOMATIC]
+    text = f"{table(COLUMNS, choices)}\n{verdict_table(claims)}"
+    more = {"preset": preset, "priors": priors, "claims": claims}
+    write_table(out, "parsimony", rows, text, command, **more)
+    label, axes = "PSNR inside the rock (dB)", ("parameters", "psnr_inside")
+    panels = [
+        Panel(*axes, "parameters", label, "choice", True, (("run", scene),), scene)
+        for scene in size.scenes
+    ]
+    draw_panels(out / "parsimony.png", panels, rows)
+    return choices, claims

@@ -1,33 +1,38 @@
-"""The paper's results, and what it leaves open, each with the cells of work that it is made of: one
-table, RESULTS.
+"""`mgs reproduce`: the paper's Table I and what it leaves open, each result with its runs.
 
-A cell is a dataset, a prior or a run; cells that several results need are done once.
+A result is a row of RESULTS; its cells are datasets, priors and runs. Cells that several results
+need are done once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+import shutil
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from mgs.data.dataset import TEST_FOLDER, load_dataset, write_transforms
+from mgs.errors import InputError
+from mgs.files import atomic_folder
 from mgs.policy import from_file as policy_file
-from mgs.run.inputs import policy_record
+from mgs.policy.registry import policy_named
+from mgs.run.inputs import file_digest, policy_record
+from mgs.study.case import Case, Scene, Size
 from mgs.study.statistics import MOST_ROCKS
-from mgs.study.sweep import Cell
+from mgs.study.sweep import CELLS, Cell, names_of
 
 SCENES = ("boulder", "contact-binary", "low-sun", "pebbles", "strata")
 
 DEVELOPED_ON = ("boulder", "contact-binary")
-"""Scenes on whose rocks of seed 0 the settings of policies were chosen; the other scenes had no
-part in that choice."""
+"""Scenes whose rocks of seed 0 were used to choose settings of policies."""
 
 SEEDS = 4
 """Seed views of a run, as in the paper."""
 
 POLICIES = (
-    "paper", "d-optimal", "directional-i", "directional-d", "fisherrf", "cover", "coverage", "completeness", "farthest",
-    "uniform", "random",
+    "paper", "d-optimal", "directional-i", "directional-d", "fisherrf", "cover", "coverage",
+    "completeness", "farthest", "uniform", "random",
 )  # fmt: skip
 """Policies that are compared over rocks."""
 
@@ -40,318 +45,51 @@ PAIRS = (
     ("d-optimal", "coverage"),
     ("cover", "fisherrf"),
 )
-"""Pairs of policies, named before they were measured over rocks, whose difference is tested.
-`paper`, `d-optimal` and `coverage` are what the paper compares, and COVER's authors compare it with
-FisherRF."""
+"""Pairs of policies whose difference is tested, named before they were measured over rocks. The
+paper compares `paper`, `d-optimal` and `coverage`; COVER's authors compare it with FisherRF."""
 
 LEADER = "directional-i"
-"""The policy whose difference from every other is told for each pool."""
+"""Policy whose difference from every other is reported for each pool."""
 
 DRAWS = 3
 """Runs of the policy `random` for one row of a table."""
 
 TABLE_POLICIES = (
-    "paper", "d-optimal", "coverage", "uniform", "directional-i", "fisherrf", "farthest", "random", "directional-d",
+    "paper", "d-optimal", "coverage", "uniform", "directional-i", "fisherrf", "farthest", "random",
+    "directional-d",
 )  # fmt: skip
-"""Rows of Table I; what the paper compares comes first, because the table is written as its rows
-are done."""
+"""Policies of Table I; those of the paper first, because the table grows as its runs are done."""
 
 SLOW_POLICIES = ("block-d",)
-"""Further rows, which take longest: at the paper's size a choice by 11x11 blocks takes a third of a
-minute."""
+"""Last policies of Table I: a choice by 11x11 blocks takes 20 seconds at the paper's size."""
 
 ALL_VIEWS, FEWER, AS_3DGS = "all views", "coverage, fewer images", "all views, as 3DGS"
-"""Rows of Table I that are no policies: `uniform` until no frame is left; as the paper counts, 54
-images against 50; and a fit that is not held to a surface (`mgs.study.free_fit`)."""
+"""Rows of Table I that are no policies: `uniform` until no frame is left; coverage with
+FEWER_IMAGES fewer images, as the paper counts; and a fit that is not held to a surface."""
 
 FEWER_IMAGES = 4
-"""By how many images coverage has fewer there."""
 
 POOLS: dict[str, dict[str, Any]] = {
-    "ring": {"orbit": "circle"},
-    "hemisphere": {"orbit": "hemisphere"},
-    "rings": {"orbit": "rings"},
-    "biased arc": {"orbit": "circle", "every": 6},
-    "five nearest": {"orbit": "circle", "nearest": 5},
-    "mixed distances": {"orbit": "hemisphere", "distances": (1, 2, 3)},
+    "ring": {"kind": "circle"},
+    "hemisphere": {"kind": "hemisphere"},
+    "rings": {"kind": "rings"},
+    "biased arc": {"kind": "circle", "every": 6},
+    "five nearest": {"kind": "circle", "nearest": 5},
+    "mixed distances": {"kind": "hemisphere", "distances": [1, 2, 3]},
 }
-"""Candidates to choose from. orbit, distances: as in `mgs.synth.scene_file.Orbit`; every: half of a
-ring of 3/2 as many frames, and of its other half one frame of so many; nearest: the setting of `mgs
-nbv`."""
+"""Pools of candidates. kind, distances: as in `mgs.synth.scene_file.Orbit`; every: all frames of
+half a ring and one in so many of its other half, from a ring of 3/2 as many frames; nearest: the
+setting of `mgs nbv`."""
 
 SEED_COUNTS = (1, 2, 3, 4, 6, 8)
 SEED_POLICIES = ("d-optimal", "paper")
 
-
-@dataclass(frozen=True)
-class Size:
-    """Images, in pixels; numbers of frames, samples per pixel, test views, Gaussians, views chosen
-    beyond the seeds, and of these, how many are chosen before the model is fitted again."""
-
-    width: int
-    height: int
-    frames: int
-    spp: int
-    test_views: int
-    gaussians: int
-    budget: int
-    batch: int = 1
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """A file with a rock, and its hash when the study began (`mgs.run.inputs.file_digest`)."""
-
-    file: Path
-    digest: str
-
-
-@dataclass(frozen=True)
-class Preset:
-    """How large a reproduction is. table: of Table I. rocks: of the results over many rocks. How
-    many rocks the curves, the study of seeds and that of pools have."""
-
-    table: Size
-    rocks: Size
-    curve_rocks: int = 12
-    seed_rocks: int = 5
-    pool_rocks: int = 3
-    own_policies: tuple[str, ...] = ()
-    """Policies of the user's own that the curves and the pools compare, too
-    (`mgs.study.reproduce_asked`)."""
-    meshes: tuple[Mesh, ...] = ()
-    """Rocks of the user's own, which then take the place of the procedural ones
-    (`mgs.study.reproduce_asked`)."""
-
-    @property
-    def policies(self) -> tuple[str, ...]:
-        """All that the curves and the pools compare."""
-        return (*POLICIES, *self.own_policies)
-
-
-PRESETS = {
-    "quick": Preset(Size(320, 240, 32, 8, 12, 10_000, 8), Size(240, 180, 32, 8, 12, 5_000, 8)),
-    "paper": Preset(
-        Size(640, 480, 100, 16, 24, 100_000, 50),
-        Size(320, 240, 48, 8, 24, 10_000, 20),
-        pool_rocks=5,
-    ),
-}
-
-
-@dataclass(frozen=True)
-class Rock:
-    """A scene, and the seed of the rock in it; or a mesh, called by its file's name, in MESH_SCENE.
-    index: its place among the rocks, also the seed of the runs on it."""
-
-    scene: str
-    seed: int
-    index: int = 0
-    mesh: Mesh | None = None
-
-    @property
-    def name(self) -> str:
-        """As it is called in folders."""
-        return f"{self.scene}-{self.seed if self.mesh is None else self.mesh.digest[:8]}"
-
-    def made_of(self) -> dict[str, Any]:
-        """What the task that renders is told of it."""
-        if self.mesh is None:
-            return {"scene": self.scene, "seed": self.seed}
-        return {"scene": MESH_SCENE, "seed": self.seed, "mesh": str(self.mesh.file)}
-
+ORACLE, FREE_FIT = "oracle", "free-fit"
+OTHER_TASKS = {ORACLE: "mgs.study.oracle:run_oracle", FREE_FIT: "mgs.study.free_fit:time_free_fit"}
+"""Tasks of runs that have no policy of `mgs nbv`."""
 
 MESH_SCENE = "boulder"
-"""The scene whose ground, light and orbits a mesh is given."""
-
-
-TABLE_ROCK = Rock("boulder", 0)
-"""The rock of Table I."""
-
-
-def rocks(preset: Preset, count: int) -> list[Rock]:
-    """The first so many rocks: the scenes in turn, with seeds from 1 on. On those of seed 0 the
-    policies were developed. Where the preset has meshes, these instead."""
-    if preset.meshes:
-        return [Rock(mesh.file.stem, 0, k, mesh) for k, mesh in enumerate(preset.meshes[:count])]
-    return [Rock(SCENES[k % len(SCENES)], 1 + k // len(SCENES), k) for k in range(count)]
-
-
-@dataclass(frozen=True)
-class Run:
-    """A run of a policy on the views of a rock: all that decides which cells it is made of."""
-
-    rock: Rock
-    size: Size
-    policy: str
-    seeds: int = SEEDS
-    budget: int | None = None
-    """None: that of the size."""
-    draw: int = 0
-    pool: str = "ring"
-    timed: bool = False
-    """Whether it is done alone, for its seconds and memory, and measured on all views."""
-
-    def cells(self) -> list[Cell]:
-        """Its cells; the last is the run itself."""
-        size, pool = self.size, POOLS[self.pool]
-        frames = size.frames * 3 // 2 if "every" in pool else size.frames
-        distances = pool.get("distances", ())
-        shape = "-".join(
-            [pool["orbit"], *map(str, distances), f"{frames}x{size.width}x{size.height}"]
-        )
-        views = {"test_views": size.test_views}
-        preset = {"width": size.width, "height": size.height, "frames": frames, "spp": size.spp}
-        where = self.rock.made_of() | {"orbit": pool["orbit"]}
-        where |= {"distances": list(distances)} if distances else {}
-        cells = [
-            Cell(
-                f"dataset/{self.rock.name}/{shape}",
-                "mgs.study.tasks:make_dataset",
-                where | views | {"preset": preset},
-            )
-        ]
-        survey = cells[0].name  # the prior is of the whole flight
-        prior = {"dataset": survey, "gaussians": size.gaussians, "seed": 0}
-        cells.append(
-            Cell(
-                f"prior/{self.rock.name}/{shape}-{size.gaussians}",
-                "mgs.study.tasks:make_prior",
-                prior,
-                (survey,),
-            )
-        )
-        if "every" in pool:
-            arc = {"ring": survey, "every": pool["every"]}
-            cells.append(
-                Cell(
-                    f"dataset/{self.rock.name}/arc-{shape}",
-                    "mgs.study.tasks:make_arc",
-                    arc,
-                    (survey,),
-                )
-            )
-        dataset, prior_name = cells[-1 if "every" in pool else 0].name, cells[1].name
-        task = OTHER_TASKS.get(
-            self.policy,
-            "mgs.study.tasks:time_policy" if self.timed else "mgs.study.tasks:run_policy",
-        )
-        return [
-            *cells,
-            Cell(
-                self.name,
-                task,
-                {"dataset": dataset, "prior": prior_name, "settings": self.settings()},
-                tuple(cell.name for cell in cells),
-                alone=self.timed,
-            ),
-        ]
-
-    @property
-    def name(self) -> str:
-        """Of its cell."""
-        size, settings = self.size, self.settings()
-        kind = "timed" if self.timed else "run"
-        shape = f"{size.frames}x{size.width}x{size.height}-{size.gaussians}"
-        views = f"{self.seeds}+{settings['budget']}-{settings['seed']}"
-        views += f"-by{settings['batch']}" if "batch" in settings else ""
-        version = "".join(
-            f"-{digest[:8]}" for digest in policy_record(self.policy).values()
-        )  # of a policy's file
-        return f"{kind}/{self.rock.name}/{self.pool.replace(' ', '-')}-{shape}/{self.label}{version}-{views}"
-
-    @property
-    def label(self) -> str:
-        """The policy as it is called in tables."""
-        return policy_file.label(self.policy)
-
-    def settings(self) -> dict[str, Any]:
-        """Of `mgs nbv`; those of OTHER_TASKS name no policy."""
-        budget = self.size.budget if self.budget is None else self.budget
-        policy: dict[str, Any] = {} if self.policy in OTHER_TASKS else {"policy": self.policy}
-        if policy and self.size.batch > 1:
-            policy["batch"] = self.size.batch
-        nearest = {"nearest": POOLS[self.pool]["nearest"]} if "nearest" in POOLS[self.pool] else {}
-        seed = self.rock.index + 1000 * self.draw
-        return {**policy, "seeds": self.seeds, "budget": budget, "seed": seed, **nearest}
-
-    def command(self) -> str:
-        """The `mgs nbv` that does the same, in the study's folder. Those of OTHER_TASKS have
-        none."""
-        if self.policy in OTHER_TASKS:
-            return ""
-        *_, cell = self.cells()
-        options = " ".join(f"--{key} {value}" for key, value in self.settings().items())
-        dataset, prior = (
-            f"cells/{cell.arguments['dataset']}/dataset",
-            f"cells/{cell.arguments['prior']}/prior",
-        )
-        return f"mgs nbv {dataset} --prior {prior} --out RUN --alpha-weight 0 {options}"
-
-
-ORACLE, FREE_FIT = "oracle", "free-fit"
-"""The policy that looks at the truth, `mgs.study.oracle`, and a fit to all views,
-`mgs.study.free_fit`."""
-
-OTHER_TASKS = {ORACLE: "mgs.study.oracle:run_oracle", FREE_FIT: "mgs.study.free_fit:time_free_fit"}
-"""What does the cell of these, which are no policies of `mgs nbv`."""
-
-
-def table_runs(preset: Preset) -> dict[str, Run]:
-    """Table I: a run for each row, by its label."""
-    size = preset.table
-    runs: dict[str, Run] = {}
-    for policy in TABLE_POLICIES:
-        draws = DRAWS if policy == "random" else 1
-        for draw in range(draws):
-            label = policy if draws == 1 else f"{policy}, draw {draw + 1}"
-            runs[label] = Run(TABLE_ROCK, size, policy, draw=draw, timed=True)
-    runs[FEWER] = Run(TABLE_ROCK, size, "coverage", budget=size.budget - FEWER_IMAGES, timed=True)
-    runs[ALL_VIEWS] = Run(TABLE_ROCK, size, "uniform", budget=size.frames - SEEDS, timed=True)
-    runs |= {policy: Run(TABLE_ROCK, size, policy, timed=True) for policy in SLOW_POLICIES}
-    runs[AS_3DGS] = Run(TABLE_ROCK, size, FREE_FIT, seeds=size.frames, budget=0, timed=True)
-    return runs
-
-
-def curve_runs(preset: Preset, count: int) -> list[Run]:
-    """PSNR(images): every policy on every rock."""
-    return [
-        Run(rock, preset.rocks, policy)
-        for rock in rocks(preset, count)
-        for policy in preset.policies
-    ]
-
-
-def seed_runs(preset: Preset, count: int) -> list[Run]:
-    """Numbers of seeds, at equal numbers of images in all, on so many rocks."""
-    total = SEEDS + preset.rocks.budget
-    return [
-        Run(rock, preset.rocks, policy, seeds=seeds, budget=total - seeds)
-        for rock in rocks(preset, count)
-        for policy in SEED_POLICIES
-        for seeds in SEED_COUNTS
-    ]
-
-
-def pool_runs(preset: Preset, count: int) -> list[Run]:
-    """Every policy on every pool of so many rocks; of `random` several draws."""
-    return [
-        Run(rock, preset.rocks, policy, draw=draw, pool=pool)
-        for pool in POOLS
-        for rock in rocks(preset, count)
-        for policy in preset.policies
-        for draw in range(DRAWS if policy == "random" else 1)
-    ]
-
-
-def oracle_runs(preset: Preset, count: int) -> list[Run]:
-    """The oracle on every pool of so many rocks."""
-    return [
-        Run(rock, preset.rocks, ORACLE, pool=pool)
-        for pool in POOLS
-        for rock in rocks(preset, count)
-    ]
-
+"""Scene whose ground, light and orbits a mesh gets."""
 
 MOST_POOL_ROCKS = 10
 """Two rocks of each scene. The twelfth is larger than the images of its hemisphere."""
@@ -361,53 +99,356 @@ FIGURE_POLICIES = ("paper", "d-optimal", "coverage", "uniform")
 
 
 @dataclass(frozen=True)
-class Result:
-    """What one name of --only stands for."""
+class RunSize:
+    """Images of the dataset, Gaussians of the prior, views chosen beyond the seeds, and how many of
+    these are chosen before the model is fitted again."""
 
-    runs: Callable[[Preset, int], list[Run]]
-    """(preset, number of rocks) -> the runs that it needs."""
-    rocks: Callable[[Preset], int]
-    """How many rocks it has by default."""
+    images: Size
+    gaussians: int
+    budget: int
+    batch: int = 1
+
+
+@dataclass(frozen=True)
+class Rock:
+    """A scene and the seed of its rock, or a mesh file and its hash in MESH_SCENE. index: place among
+    the rocks, and seed of the runs."""
+
+    scene: str
+    seed: int
+    index: int = 0
+    mesh: Path | None = None
+    digest: str = ""
+
+    @property
+    def name(self) -> str:
+        """Folder name."""
+        return f"{self.scene}-{self.digest[:8] if self.mesh else self.seed}"
+
+    def at(self, orbit: dict[str, Any]) -> Scene:
+        """Scene of the rock with values of the orbit's section."""
+        scene = MESH_SCENE if self.mesh else self.scene
+        mesh = str(self.mesh) if self.mesh else None
+        kind = "-".join([orbit["kind"], *map(str, orbit.get("distances", ()))])
+        return Scene(scene, self.seed, {"orbit": orbit}, mesh, f"{self.name}/{kind}")
+
+
+TABLE_ROCK = Rock("boulder", 0)
+"""Rock of Table I."""
+
+
+@dataclass(frozen=True)
+class ReproduceSize:
+    """Size of a reproduction: of the runs of Table I, of the runs over many rocks, and how many
+    rocks these results have.
+
+    own_policies: policies that curves and pools compare, too. meshes: rocks in place of the
+    procedural ones.
+    """
+
+    table: RunSize
+    rocks: RunSize
+    curve_rocks: int = 12
+    seed_rocks: int = 5
+    pool_rocks: int = 3
+    own_policies: tuple[str, ...] = ()
+    meshes: tuple[Rock, ...] = ()
+
+    @property
+    def policies(self) -> tuple[str, ...]:
+        """Policies that curves and pools compare."""
+        return (*POLICIES, *self.own_policies)
+
+    def some_rocks(self, count: int) -> list[Rock]:
+        """The first rocks: meshes, or the scenes in turn with seeds from 1 on. On rocks of seed 0
+        the policies were developed."""
+        if self.meshes:
+            return list(self.meshes[:count])
+        return [Rock(SCENES[k % len(SCENES)], 1 + k // len(SCENES), k) for k in range(count)]
+
+
+SIZES = {
+    "quick": ReproduceSize(
+        RunSize(Size(320, 240, 32, 12), 10_000, 8), RunSize(Size(240, 180, 32, 12), 5_000, 8)
+    ),
+    "paper": ReproduceSize(
+        RunSize(Size(640, 480, 100, 24, spp=16), 100_000, 50),
+        RunSize(Size(320, 240, 48, 24), 10_000, 20),
+        pool_rocks=5,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of a policy on the views of a rock. budget: by default that of the size. timed: it runs
+    alone, for its seconds and memory, and is measured on all views."""
+
+    rock: Rock
+    size: RunSize
+    policy: str
+    seeds: int = SEEDS
+    budget: int | None = None
+    draw: int = 0
+    pool: str = "ring"
+    timed: bool = False
+
+    @property
+    def case(self) -> Case:
+        """Case of the dataset and the prior; the prior is of the whole flight."""
+        pool, images = POOLS[self.pool], self.size.images
+        if "every" in pool:
+            images = replace(images, frames=images.frames * 3 // 2)
+        orbit = {"distances": [1]} | {k: pool[k] for k in ("kind", "distances") if k in pool}
+        settings = {"gaussians": self.size.gaussians, "seed": 0}
+        return Case(self.rock.at(orbit), images, settings)
+
+    def cells(self) -> list[Cell]:
+        """Cells of the run; the last is the run itself."""
+        case, pool = self.case, POOLS[self.pool]
+        cells, folders = case.cells(), case.folders
+        if "every" in pool:
+            arguments = {"ring": case.dataset, "every": pool["every"]}
+            arc = Cell(f"arc/{case.name}", f"{__name__}:make_arc", arguments, (cells[0].name,))
+            cells.append(arc)
+            folders["dataset"] = f"{CELLS}/{arc.name}/dataset"
+        usual = "time_policy" if self.timed else "run_policy"
+        task = OTHER_TASKS.get(self.policy, f"mgs.study.case:{usual}")
+        needs = tuple(cell.name for cell in cells)
+        arguments = {**folders, "settings": self.settings()}
+        return [*cells, Cell(self.name, task, arguments, needs, alone=self.timed)]
+
+    @property
+    def name(self) -> str:
+        """Name of its cell."""
+        images, settings = self.size.images, self.settings()
+        kind = "timed" if self.timed else "run"
+        shape = f"{images.frames}x{images.width}x{images.height}-{self.size.gaussians}"
+        views = f"{self.seeds}+{settings['budget']}-{settings['seed']}"
+        views += f"-by{settings['batch']}" if "batch" in settings else ""
+        version = "".join(f"-{digest[:8]}" for digest in policy_record(self.policy).values())
+        where = f"{kind}/{self.rock.name}/{self.pool.replace(' ', '-')}-{shape}"
+        return f"{where}/{self.label}{version}-{views}"
+
+    @property
+    def label(self) -> str:
+        """Name of the policy in tables."""
+        return policy_file.label(self.policy)
+
+    def settings(self) -> dict[str, Any]:
+        """Settings of `mgs nbv`; without a policy for OTHER_TASKS."""
+        settings: dict[str, Any] = {}
+        if self.policy not in OTHER_TASKS:
+            batch = {"batch": self.size.batch} if self.size.batch > 1 else {}
+            settings = {"policy": self.policy, **batch}
+        budget = self.size.budget if self.budget is None else self.budget
+        settings |= {"seeds": self.seeds, "budget": budget}
+        settings |= {"seed": self.rock.index + 1000 * self.draw}
+        nearest = POOLS[self.pool].get("nearest")
+        return settings | ({"nearest": nearest} if nearest else {})
+
+    def command(self) -> str:
+        """The `mgs nbv` that does the same in the study's folder; empty for OTHER_TASKS."""
+        if self.policy in OTHER_TASKS:
+            return ""
+        folders = self.cells()[-1].arguments
+        options = " ".join(f"--{key} {value}" for key, value in self.settings().items())
+        where = f"{folders['dataset']} --prior {folders['prior']} --out RUN"
+        return f"mgs nbv {where} --alpha-weight 0 {options}"
+
+
+def make_arc(root: Path, out: Path, ring: str, every: int) -> dict[str, Any]:
+    """Task: a dataset of all frames of the first half of a ring, and one in so many of the second
+    half, into OUT/dataset."""
+    source, folder = load_dataset(root / ring), out / "dataset"
+    half = len(source) // 2
+    kept = [frame for i, frame in enumerate(source.frames) if i < half or (i - half) % every == 0]
+    if not folder.is_dir():
+        with atomic_folder(folder) as unfinished:
+            copies = []
+            for frame in kept:
+                paths: dict[str, Any] = {}
+                for key, path in asdict(frame).items():
+                    if isinstance(path, Path):
+                        paths[key] = unfinished / path.relative_to(source.root)
+                        paths[key].parent.mkdir(parents=True, exist_ok=True)
+                        shutil.copyfile(path, paths[key])
+                copies.append(replace(frame, **paths))
+            shutil.copytree(source.root / TEST_FOLDER, unfinished / TEST_FOLDER)
+            write_transforms(unfinished, copies, source.up, source.unit)
+    return {"frames": len(kept)}
+
+
+def table_runs(size: ReproduceSize) -> dict[str, Run]:
+    """Runs of Table I by the label of their row."""
+    one, runs = size.table, dict[str, Run]()
+    for policy in TABLE_POLICIES:
+        draws = DRAWS if policy == "random" else 1
+        for draw in range(draws):
+            label = policy if draws == 1 else f"{policy}, draw {draw + 1}"
+            runs[label] = Run(TABLE_ROCK, one, policy, draw=draw, timed=True)
+    runs[FEWER] = Run(TABLE_ROCK, one, "coverage", budget=one.budget - FEWER_IMAGES, timed=True)
+    runs[ALL_VIEWS] = Run(TABLE_ROCK, one, "uniform", budget=one.images.frames - SEEDS, timed=True)
+    runs |= {policy: Run(TABLE_ROCK, one, policy, timed=True) for policy in SLOW_POLICIES}
+    runs[AS_3DGS] = Run(TABLE_ROCK, one, FREE_FIT, seeds=one.images.frames, budget=0, timed=True)
+    return runs
+
+
+def curve_runs(size: ReproduceSize, count: int) -> list[Run]:
+    """Every policy on every rock."""
+    rocks = size.some_rocks(count)
+    return [Run(rock, size.rocks, policy) for rock in rocks for policy in size.policies]
+
+
+def seed_runs(size: ReproduceSize, count: int) -> list[Run]:
+    """Numbers of seeds, at equal numbers of images."""
+    total = SEEDS + size.rocks.budget
+    return [
+        Run(rock, size.rocks, policy, seeds=seeds, budget=total - seeds)
+        for rock in size.some_rocks(count)
+        for policy in SEED_POLICIES
+        for seeds in SEED_COUNTS
+    ]
+
+
+def pool_runs(size: ReproduceSize, count: int) -> list[Run]:
+    """Every policy on every pool; several draws of `random`."""
+    return [
+        Run(rock, size.rocks, policy, draw=draw, pool=pool)
+        for pool in POOLS
+        for rock in size.some_rocks(count)
+        for policy in size.policies
+        for draw in range(DRAWS if policy == "random" else 1)
+    ]
+
+
+def oracle_runs(size: ReproduceSize, count: int) -> list[Run]:
+    """The oracle on every pool."""
+    rocks = size.some_rocks(count)
+    return [Run(rock, size.rocks, ORACLE, pool=pool) for pool in POOLS for rock in rocks]
+
+
+@dataclass(frozen=True)
+class Result:
+    """A result that --only can name.
+
+    runs(size, rocks): the runs that it needs. rocks: attribute of the size with its default number
+    of rocks; None: it has one. optional: only done if asked for. most: most rocks.
+    """
+
+    runs: Callable[[ReproduceSize, int], list[Run]]
+    rocks: str | None = None
     optional: bool = False
-    """Done only if it is asked for."""
     most: int = MOST_ROCKS
-    """Most rocks that can be asked for."""
-    grows: bool = False
-    """Written anew after every cell, of the runs that are done by then."""
+
+    def count(self, size: ReproduceSize) -> int:
+        """Default number of rocks."""
+        return getattr(size, self.rocks) if self.rocks else 1
+
+    def cells(self, size: ReproduceSize, count: int) -> list[Cell]:
+        """Cells over so many rocks, each once."""
+        cells = (cell for run in self.runs(size, count) for cell in run.cells())
+        return list({cell.name: cell for cell in cells}.values())
 
 
 RESULTS = {
-    "table1": Result(
-        lambda preset, _: list(table_runs(preset).values()), lambda preset: 1, grows=True
-    ),
-    "figures": Result(
-        lambda preset, _: [table_runs(preset)[policy] for policy in FIGURE_POLICIES],
-        lambda preset: 1,
-    ),
-    "curves": Result(curve_runs, lambda preset: preset.curve_rocks),
-    "seeds": Result(seed_runs, lambda preset: preset.seed_rocks),
-    "pools": Result(pool_runs, lambda preset: preset.pool_rocks, most=MOST_POOL_ROCKS),
+    "table1": Result(lambda size, _: list(table_runs(size).values())),
+    "figures": Result(lambda size, _: [table_runs(size)[policy] for policy in FIGURE_POLICIES]),
+    "curves": Result(curve_runs, "curve_rocks"),
+    "seeds": Result(seed_runs, "seed_rocks"),
+    "pools": Result(pool_runs, "pool_rocks", most=MOST_POOL_ROCKS),
     "oracle": Result(
-        lambda preset, count: pool_runs(preset, count) + oracle_runs(preset, count),
-        lambda preset: preset.pool_rocks,
+        lambda size, count: pool_runs(size, count) + oracle_runs(size, count),
+        "pool_rocks",
         optional=True,
         most=MOST_POOL_ROCKS,
     ),
 }
-"""Every result by its name, in the order in which they are made."""
-
-
-def cells_of(name: str, preset: Preset, count: int) -> list[Cell]:
-    """The cells of a result over so many rocks, each once."""
-    return list(
-        {
-            cell.name: cell for run in RESULTS[name].runs(preset, count) for cell in run.cells()
-        }.values()
-    )
+"""Every result by name, in the order in which they are made."""
 
 
 def pairs_of(policies: Iterable[str]) -> tuple[tuple[str, str], ...]:
-    """The pairs of policies whose difference is tested: PAIRS, and those of the user's own policies
-    with the same two."""
+    """Pairs of policies whose difference is tested: PAIRS, and the user's own policies with two
+    baselines."""
     own = [policy for policy in policies if policy not in POLICIES]
     return (*PAIRS, *((policy, other) for policy in own for other in ("uniform", "farthest")))
+
+
+def results_of(only: str | None) -> list[str]:
+    """Names of the results of an option --only; all that are not optional if None."""
+    if only is None:
+        return [name for name, result in RESULTS.items() if not result.optional]
+    return names_of(only, RESULTS)
+
+
+def rocks_of(name: str, size: ReproduceSize, asked: int | None) -> int:
+    """Number of rocks of a result. asked: of the option --rocks. Raises InputError if out of
+    range."""
+    result = RESULTS[name]
+    if asked is None or result.rocks is None:
+        return result.count(size)
+    most = len(size.meshes) or result.most
+    if not 1 <= asked <= most:
+        raise InputError(f"--rocks {asked}: {name} can have 1 to {most}")
+    return asked
+
+
+def with_options(
+    size: ReproduceSize,
+    names: Sequence[str],
+    policies: Sequence[str],
+    meshes: Sequence[Path],
+    batch: int,
+) -> ReproduceSize:
+    """Size with the options --policy, --mesh and --batch. names: the results to make.
+
+    Raises InputError where an option is for none of these results, a policy is unknown or compared
+    anyway, two policies or meshes have the same name, a mesh cannot be read, or they are too many.
+    """
+    labels = list(POLICIES)
+    for policy in policies:
+        if not {"curves", "pools"} & set(names):
+            raise InputError(
+                f"--policy {policy}: is for curves and pools, and --only leaves both out"
+            )
+        if policy in POLICIES:
+            raise InputError(f"--policy {policy}: is compared anyway")
+        if policy_file.label(policy) in labels:
+            raise InputError(
+                f"--policy {policy}: there is one of this name already; "
+                "leave it out, or rename its file"
+            )
+        labels.append(policy_file.label(policy))
+        policy_named(policy)
+    size = replace(size, own_policies=tuple(policy_file.absolute(policy) for policy in policies))
+    if batch > 1:
+        if not {"table1", "figures"} & set(names):
+            raise InputError(
+                f"--batch {batch}: is for table1 and figures, and --only leaves both out"
+            )
+        size = replace(size, table=replace(size.table, batch=batch))
+    return _with_meshes(size, names, meshes) if meshes else size
+
+
+def _with_meshes(
+    size: ReproduceSize, names: Sequence[str], meshes: Sequence[Path]
+) -> ReproduceSize:
+    if len(meshes) > MOST_ROCKS:
+        raise InputError(
+            f"--mesh: {len(meshes)} files; differences are tested over {MOST_ROCKS} rocks at most, "
+            "leave some out"
+        )
+    if all(RESULTS[name].rocks is None for name in names):
+        raise InputError(
+            f"--mesh {meshes[0]}: is for results over many rocks, and --only leaves them out"
+        )
+    rocks: list[Rock] = []
+    for k, mesh in enumerate(meshes):
+        if mesh.stem in [rock.scene for rock in rocks]:
+            raise InputError(
+                f"--mesh {mesh}: there is one of this name already; "
+                "leave it out, or rename its file"
+            )
+        rocks.append(Rock(mesh.stem, 0, k, mesh.resolve(), file_digest(mesh)))
+    count = len(rocks)
+    return replace(size, meshes=tuple(rocks), curve_rocks=count, seed_rocks=count, pool_rocks=count)

@@ -1,175 +1,213 @@
-"""What the cells of a reproduction say together: rows of numbers, written as CSV, JSON, Markdown
-and figures."""
+"""Tables and figures of a reproduction, from the results of its cells."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mgs.files import atomic_path, write_csv, write_json
+from mgs.files import write_csv, write_json
 from mgs.provenance import versions
 from mgs.report.evaluation import evaluate_run
+from mgs.report.tables import markdown
 from mgs.report.writing import write_report
-from mgs.runtime import processor
 from mgs.study import reproduce
-from mgs.study.reproduce import ORACLE, Preset, Run
-from mgs.study.reproduce_figures import curves_figure, pools_figure, seeds_figure
-from mgs.study.reproduce_tables import (
-    pools_markdown,
-    seeds_markdown,
-    statistics_markdown,
-    table_markdown,
-)
+from mgs.study.output import Panel, draw_panels, table, with_interval, write_table
+from mgs.study.reproduce import LEADER, ORACLE, ReproduceSize, Run
 from mgs.study.statistics import area, holm, images_to_reach, interval, permutation_p
-from mgs.study.sweep import cell_folder, found
+from mgs.study.sweep import Report, cell_folder, found, run_cells
+from mgs.study.verdict import Claim, Row, judged, paired
 
 Found = Mapping[str, Mapping[str, Any]]
-"""What each cell found, by its name."""
+"""Results of cells by name."""
 
-Rows = list[dict[str, Any]]
+Rows = list[Row]
 
 MEASURES = ("test_psnr", "test_psnr_mask")
-"""What statistics are made of: mean PSNR over the test views, dB, of the full frame (the first, by
-which policies are judged), and inside the rock's mask."""
+"""Mean PSNR over the test views, dB: of the full frame, by which policies are judged, and inside the
+rock's mask."""
+
+PAPER_TABLE = (("D-Optimal NBV", 54, 25.97, 0.9654), ("Coverage-Greedy", 50, 26.06, 0.9648))
+"""Table I of the paper: method, images, PSNR in dB and SSIM over all 100 views of its own rock,
+which is not ours."""
+
+TABLE_COLUMNS = {
+    "policy": "row",
+    "images": "images",
+    "test views (dB)": "test.psnr:.2f",
+    "SSIM": "test.ssim:.4f",
+    "test views, rock (dB)": "test.psnr_mask:.2f",
+    "all views (dB)": "all.psnr:.2f",
+    "all SSIM": "all.ssim:.4f",
+    "held out (dB)": "held_out.psnr:.2f",
+    "a choice (s)": "choice_seconds:.2f",
+    "run (s)": "seconds:.0f",
+    "memory (MB)": "peak_megabytes:.0f",
+}
 
 
-def paired(values: Mapping[int, float], others: Mapping[int, float]) -> list[float]:
-    """Differences of two policies, for each rock that both have, by the rocks' indices."""
-    return [values[k] - others[k] for k in sorted(values.keys() & others.keys())]
+def known_runs(root: Path, runs: Sequence[Run]) -> dict[str, dict[str, Any]]:
+    """Results of the runs that are done."""
+    results = {run.name: found(root, run.cells()[-1]) for run in runs}
+    return {name: result for name, result in results.items() if result is not None}
 
 
-def summary(values: Sequence[float]) -> dict[str, float | None]:
-    """Mean over rocks, and the 95 % t interval of that mean; None where there is only one rock."""
-    low, high = interval(values) or (None, None)
-    return {"mean": float(np.mean(values)), "low": low, "high": high}
-
-
-def flat(key: str, values: Sequence[float]) -> dict[str, float | None]:
-    """A `summary` as entries of a row: KEY, KEY_low, KEY_high."""
-    return {
-        f"{key}{'' if name == 'mean' else '_' + name}": value
-        for name, value in summary(values).items()
-    }
-
-
-def ahead(differences: Sequence[float]) -> dict[str, Any]:
-    """Differences of two policies over rocks as entries of a row: how many `rocks`, on how many the
-    first is `ahead`, and their mean, `flat`."""
-    count = sum(difference > 0 for difference in differences)
-    return {"rocks": len(differences), "ahead": count, **flat("difference", differences)}
-
-
-def table_rows(found: Found, preset: Preset) -> Rows:
+def table_rows(results: Found, size: ReproduceSize) -> Rows:
     """Table I: a row for each run that is done."""
     rows = []
-    for label, run in reproduce.table_runs(preset).items():
-        if run.name not in found:
+    for label, run in reproduce.table_runs(size).items():
+        if run.name not in results:
             continue
-        numbers = found[run.name]
-        row: dict[str, Any] = {"row": label, "images": numbers["images"]}
+        numbers = results[run.name]
+        row: Row = {"row": label, "images": numbers["images"]}
         for views in ("test", "all", "held_out"):
-            row |= {
-                f"{views}.{name}": numbers[views][name]
-                for name in ("psnr", "ssim", "psnr_mask", "ssim_mask")
-            }
+            for metric in ("psnr", "ssim", "psnr_mask", "ssim_mask"):
+                row[f"{views}.{metric}"] = numbers[views][metric]
         row |= {key: numbers[key] for key in ("choice_seconds", "seconds", "peak_megabytes")}
         rows.append(row | {"command": run.command()})
     return rows
 
 
-def by_rock(found: Found, runs: Sequence[Run]) -> Rows:
-    """A row for each step of each run: rock, scene, pool, policy, seeds, images, and the
-    MEASURES."""
+def table_text(rows: Rows, left: Sequence[str]) -> str:
+    """Table I with the paper's rows, and the mean of the draws of `random`. left: rows to come."""
+    shown: Rows = [
+        {"row": f"the paper's {name}, on its rock", "images": n, "all.psnr": psnr, "all.ssim": ssim}
+        for name, n, psnr, ssim in PAPER_TABLE
+    ]
+    draws = [row for row in rows if row["row"].startswith("random,")]
+    for row in rows:
+        if row not in draws:
+            shown.append(row)
+        elif row is draws[0]:
+            numbers = [key for key, value in row.items() if isinstance(value, float)]
+            mean = {key: float(np.mean([draw[key] for draw in draws])) for key in numbers}
+            shown.append(row | mean | {"row": f"random, mean of {len(draws)}"})
+    to_come = f"\nNot done yet: {'; '.join(left)}.\n" if left else ""
+    return table(TABLE_COLUMNS, shown) + to_come
+
+
+def by_rock(results: Found, runs: Sequence[Run]) -> Rows:
+    """A row for each step of each run, with the MEASURES and the coverage."""
     rows = []
     for run in runs:
-        numbers = found[run.name]
-        for k, images in enumerate(numbers["images"]):
-            row = {
-                "rock": run.rock.index,
-                "scene": run.rock.scene,
-                "rock_seed": run.rock.seed,
-                "pool": run.pool,
-            }
-            row |= {"policy": run.label, "draw": run.draw, "seeds": run.seeds, "images": images}
-            rows.append(row | {key: numbers[key][k] for key in (*MEASURES, "coverage")})
+        about = {
+            "rock": run.rock.index,
+            "scene": run.rock.scene,
+            "rock_seed": run.rock.seed,
+            "pool": run.pool,
+            "policy": run.label,
+            "draw": run.draw,
+            "seeds": run.seeds,
+        }
+        curves = [results[run.name][key] for key in ("images", *MEASURES, "coverage")]
+        for images, psnr, psnr_mask, coverage in zip(*curves, strict=True):
+            measured = dict(zip(MEASURES, (psnr, psnr_mask), strict=True))
+            rows.append(about | {"images": images} | measured | {"coverage": coverage})
     return rows
 
 
-def curve_rows(found: Found, runs: Sequence[Run]) -> Rows:
-    """A row for each policy and number of images: means over the rocks with intervals, and the
-    difference from `uniform`."""
-    rows = []
-    values = {(run.label, run.rock.index): found[run.name] for run in runs}
-    indices = sorted({rock for _, rock in values})
-    for policy in dict.fromkeys(run.label for run in runs):
-        for k, images in enumerate(values[policy, indices[0]]["images"]):
-            row: dict[str, Any] = {"policy": policy, "images": images, "rocks": len(indices)}
-            for key in MEASURES:
-                own, uniform = (
-                    [values[name, rock][key][k] for rock in indices] for name in (policy, "uniform")
-                )
-                row |= flat(key, own) | flat(
-                    f"{key}_over_uniform", np.subtract(own, uniform).tolist()
-                )
-            rows.append(row)
-    return rows
+def last_rows(results: Found, runs: Sequence[Run]) -> Rows:
+    """A row for each run: its last step, and KEY_area, the mean of each curve. Draws of a policy
+    are averaged."""
+    drawn: dict[tuple[Any, ...], Rows] = {}
+    for run in runs:
+        row = by_rock(results, [run])[-1] | {"run": run.rock.name}
+        for key in MEASURES:
+            row[f"{key}_area"] = area(results[run.name]["images"], results[run.name][key])
+        drawn.setdefault((run.pool, run.rock.index, run.label, run.seeds), []).append(row)
+    measured = [f"{key}{end}" for key in MEASURES for end in ("", "_area")]
+    return [
+        rows[0] | {key: float(np.mean([row[key] for row in rows])) for key in measured}
+        for rows in drawn.values()
+    ]
 
 
-def curve_statistics(found: Found, runs: Sequence[Run]) -> dict[str, Any]:
-    """For each of MEASURES the area under PSNR(images) by policy and rock, and the tests of pairs
-    (`reproduce.pairs_of`).
+def with_differences(
+    rows: Rows, name: str, reference: Row, same: Sequence[str], keys: Sequence[str] = MEASURES
+) -> Rows:
+    """Rows with KEY_NAME, the difference of each key from the row that has the entries `reference`
+    and the same values of `same`; unchanged where there is none."""
+    known = {
+        tuple(row[key] for key in same): row for row in rows if reference.items() <= row.items()
+    }
+    made = []
+    for row in rows:
+        other = known.get(tuple(row[key] for key in same))
+        gains = {f"{key}_{name}": row[key] - other[key] for key in keys} if other else {}
+        made.append(row | gains)
+    return made
 
-    In "reach", how many images a policy needs for what `random` has with all of them, the mean over
-    the rocks on which it gets there, and how many these are; without `random` there is none. A pair
-    also has, in "elsewhere", its differences on rocks of the scenes that are not in
-    `reproduce.DEVELOPED_ON`; None where there are none.
+
+def summary(rows: Rows, by: Sequence[str], keys: Sequence[str]) -> Rows:
+    """A row for each combination of `by`: number of rocks, and KEY, KEY_low, KEY_high, the mean of
+    each key over rocks and its 95 % interval (None for one rock)."""
+    groups: dict[tuple[Any, ...], Rows] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[key] for key in by), []).append(row)
+    made = []
+    for values, group in groups.items():
+        one: Row = dict(zip(by, values, strict=True)) | {"rocks": len(group)}
+        for key in keys:
+            if key in group[0]:
+                numbers = [row[key] for row in group]
+                low, high = interval(numbers) or (None, None)
+                ends = {f"{key}_low": low, f"{key}_high": high}
+                one |= {key: float(np.mean(numbers)), **ends}
+        made.append(one)
+    return made
+
+
+def _keys(*names: str) -> list[str]:
+    """MEASURES, and each with the name of a difference."""
+    return [f"{key}{end}" for end in ("", *(f"_{name}" for name in names)) for key in MEASURES]
+
+
+def statistics_of(results: Found, runs: Sequence[Run]) -> dict[str, Any]:
+    """For each of MEASURES the area under the curve by policy and the tests of pairs of policies.
+
+    "area": mean over rocks; "area_by_rock"; "reach": mean number of images to what `random` ends
+    with, and on how many rocks it is reached; "pairs": judged claims (`mgs.study.verdict`) that the
+    first policy is ahead, with the differences by rock, the p-values, and the same "elsewhere", on
+    scenes not in DEVELOPED_ON.
     """
-    result: dict[str, Any] = {}
-    elsewhere = {run.rock.index for run in runs if run.rock.scene not in reproduce.DEVELOPED_ON}
+    rows = last_rows(results, runs)
+    elsewhere = [row for row in rows if row["scene"] not in reproduce.DEVELOPED_ON]
+    statistics: dict[str, Any] = {}
     for key in MEASURES:
-        areas: dict[str, dict[int, float]] = {}
-        for run in runs:
-            areas.setdefault(run.label, {})[run.rock.index] = area(
-                found[run.name]["images"], found[run.name][key]
-            )
+        areas: dict[str, list[float]] = {}
+        for row in rows:
+            areas.setdefault(row["policy"], []).append(row[f"{key}_area"])
         pairs: Rows = []
         for policy, other in reproduce.pairs_of(areas):
-            differences = paired(areas[policy], areas[other])
-            there = paired({k: v for k, v in areas[policy].items() if k in elsewhere}, areas[other])
-            pair = {
-                "policy": policy,
-                "other": other,
-                **ahead(differences),
-                "differences": differences,
-            }
-            pair["elsewhere"] = ahead(there) if there else None
-            pairs.append(pair | {"p": permutation_p(differences)})
+            effects = paired(f"{key}_area", {"policy": policy}, {"policy": other})
+            claim = Claim(f"{policy} is ahead of {other}.", effects, "dB", "above", 0.0, "rock")
+            there = _ahead(claim, elsewhere) if elsewhere else None
+            pair = {"policy": policy, "other": other, **_ahead(claim, rows), "elsewhere": there}
+            pairs.append(pair | {"p": permutation_p(pair["differences"])})
         p_values = [pair["p"] for pair in pairs]
-        corrected = (
-            p_values if None in p_values else holm(p_values)
-        )  # None: of one rock nothing can be claimed
-        means = {policy: summary(list(values.values())) for policy, values in areas.items()}
-        by_index = {policy: [values[k] for k in sorted(values)] for policy, values in areas.items()}
+        corrected = p_values if None in p_values else holm(p_values)  # None: one rock
         pairs = [pair | {"p_holm": p} for pair, p in zip(pairs, corrected, strict=True)]
-        result[key] = {
-            "area": means,
-            "area_by_rock": by_index,
-            "reach": _reach(found, runs, key),
-            "pairs": pairs,
-        }
-    return result
+        means = {policy: float(np.mean(values)) for policy, values in areas.items()}
+        reach = _reach(results, runs, key)
+        statistics[key] = {"area": means, "area_by_rock": areas, "reach": reach, "pairs": pairs}
+    return statistics
 
 
-def _reach(found: Found, runs: Sequence[Run], key: str) -> dict[str, dict[str, Any]]:
-    """By policy, the entry "reach" of `curve_statistics`."""
-    levels = {run.rock.index: found[run.name][key][-1] for run in runs if run.label == "random"}
+def _ahead(claim: Claim, rows: Rows) -> Row:
+    """A judged claim with its differences by rock, and on how many of them the first is ahead."""
+    differences = claim.effects(rows)
+    ahead = sum(difference > 0 for difference in differences)
+    return judged(claim, rows) | {"ahead": ahead, "differences": differences}
+
+
+def _reach(results: Found, runs: Sequence[Run], key: str) -> dict[str, Row]:
+    levels = {run.rock.index: results[run.name][key][-1] for run in runs if run.label == "random"}
     needed: dict[str, list[float]] = {}
     for run in runs:
         if run.rock.index in levels:
-            own, curve = needed.setdefault(run.label, []), found[run.name]
+            own, curve = needed.setdefault(run.label, []), results[run.name]
             images = images_to_reach(curve["images"], curve[key], levels[run.rock.index])
             own += [] if images is None else [images]
     return {
@@ -178,201 +216,266 @@ def _reach(found: Found, runs: Sequence[Run], key: str) -> dict[str, dict[str, A
     }
 
 
+def statistics_text(statistics: Mapping[str, Any]) -> str:
+    """Two tables: areas of each policy, and the tests of pairs."""
+    measures = list(zip(MEASURES, ("full frame", "rock"), strict=True))
+    areas = [
+        {"policy": policy}
+        | {key: statistics[key]["area"][policy] for key in MEASURES}
+        | {f"{key}_reach": _reach_text(statistics[key], policy) for key in MEASURES}
+        for policy in statistics[MEASURES[0]]["area"]
+    ]
+    columns = {"policy": "policy"}
+    columns |= {f"area, {what} (dB)": f"{key}:.2f" for key, what in measures}
+    columns |= {
+        "images for what random ends with": "test_psnr_reach",
+        "the same, rock": "test_psnr_mask_reach",
+    }
+    pairs = [pair | {"of": what} for key, what in measures for pair in statistics[key]["pairs"]]
+    pair_columns: dict[str, str | Callable[[Row], str]] = {
+        "pair": lambda pair: f"{pair['policy']} − {pair['other']}",
+        "PSNR of": "of",
+        "difference of areas (dB)": _difference,
+        "is ahead": "verdict",
+        "p": "p:.2g",
+        "p, Holm": "p_holm:.2g",
+        "on scenes that chose no setting": lambda pair: (
+            _difference(pair["elsewhere"]) if pair["elsewhere"] else "–"
+        ),
+    }
+    return f"{table(columns, areas)}\n{table(pair_columns, pairs)}"
+
+
+def _difference(pair: Row) -> str:
+    """Difference, its interval, and on how many rocks the first policy is ahead."""
+    low, high = pair["interval"] or (None, None)
+    text = with_interval({"d": pair["effect"], "d_low": low, "d_high": high}, "d")
+    return f"{text}, {pair['ahead']} of {pair['runs']}"
+
+
+def _reach_text(of: Mapping[str, Any], policy: str) -> str:
+    reached = of["reach"].get(policy)
+    if reached is None or reached["images"] is None:
+        return "–"
+    rocks = len(of["area_by_rock"][policy])
+    some = f" ({reached['rocks']} of {rocks} rocks)" if reached["rocks"] < rocks else ""
+    return f"{reached['images']:.1f}{some}"
+
+
 def largest_gap(taken: Sequence[int], frames: int) -> float:
-    """The largest angle, degrees, between neighbours among the frames taken of a ring of so many,
-    evenly spaced."""
+    """Largest angle, degrees, between neighbours among the frames taken of an evenly spaced ring."""
     turned = np.sort(taken)
     return float(np.diff(turned, append=turned[0] + frames).max() * 360 / frames)
 
 
-def seed_rows(found: Found, runs: Sequence[Run]) -> Rows:
-    """A row for each policy and number of seeds: the model of all images, and its difference from
-    that of four seeds; gap,
-    gap_max: mean and largest `largest_gap` of the rocks."""
-    rows = []
-    last = {(run.policy, run.seeds, run.rock.index): found[run.name] for run in runs}
-    indices = sorted({rock for *_, rock in last})
-    for policy in reproduce.SEED_POLICIES:
-        for seeds in reproduce.SEED_COUNTS:
-            row: dict[str, Any] = {"policy": policy, "seeds": seeds, "rocks": len(indices)}
-            row |= {"images": last[policy, seeds, indices[0]]["images"][-1]}
-            row |= {
-                "first_coverage": float(
-                    np.mean([last[policy, seeds, rock]["coverage"][0] for rock in indices])
-                )
-            }
-            gaps = [
-                largest_gap(last[policy, seeds, rock]["taken"], runs[0].size.frames)
-                for rock in indices
-            ]
-            row |= {"gap": float(np.mean(gaps)), "gap_max": max(gaps)}
-            for key in MEASURES:
-                own, four = (
-                    [last[policy, n, rock][key][-1] for rock in indices]
-                    for n in (seeds, reproduce.SEEDS)
-                )
-                row |= flat(key, own) | flat(f"{key}_over_four", np.subtract(own, four).tolist())
-            rows.append(row)
-    return rows
+SEED_COLUMNS: dict[str, str | Callable[[Row], str]] = {
+    "policy": "policy",
+    "seeds": "seeds",
+    "they see (%)": lambda row: f"{100 * row['first_coverage']:.1f}",
+    "largest gap (most), degrees": lambda row: f"{row['gap']:.0f} ({row['gap_max']:.0f})",
+    "test views (dB)": "test_psnr:.2f",
+    "over four seeds (dB)": lambda row: with_interval(row, "test_psnr_over_four"),
+    "rock (dB)": lambda row: with_interval(row, "test_psnr_mask_over_four"),
+}
 
 
-def by_policy(values: Iterable[tuple[Run, float]]) -> dict[str, dict[int, float]]:
-    """The mean of a value of runs over the draws of each policy and rock, by policy and the rock's
-    index."""
-    drawn: dict[str, dict[int, list[float]]] = {}
-    for run, value in values:
-        drawn.setdefault(run.label, {}).setdefault(run.rock.index, []).append(value)
-    return {
-        policy: {rock: float(np.mean(values)) for rock, values in of.items()}
-        for policy, of in drawn.items()
-    }
+def seed_rows(results: Found, runs: Sequence[Run]) -> tuple[Rows, Rows]:
+    """A row for each policy and number of seeds, and the rows by rock: the last model, its difference
+    from four seeds, coverage of the seeds, and `largest_gap` (mean, most)."""
+    rows = with_differences(
+        last_rows(results, runs), "over_four", {"seeds": reproduce.SEEDS}, ("policy", "rock")
+    )
+    for row, run in zip(rows, runs, strict=True):
+        numbers = results[run.name]
+        row |= {"first_coverage": numbers["coverage"][0]}
+        row |= {"gap": largest_gap(numbers["taken"], run.size.images.frames)}
+    keys = [*_keys("over_four"), "first_coverage", "gap"]
+    means = summary(rows, ("policy", "seeds", "images"), keys)
+    for mean in means:
+        alike = [r for r in rows if (r["policy"], r["seeds"]) == (mean["policy"], mean["seeds"])]
+        mean["gap_max"] = max(row["gap"] for row in alike)
+    return means, rows
 
 
-def pool_rows(found: Found, runs: Sequence[Run], oracle: Sequence[Run]) -> Rows:
-    """A row for each pool and policy: the last model, its difference from the mean of the draws of
-    `random`, by how much the LEADER is ahead of it, there and in the area under its curve, and the
-    share of what the oracle gains over `random` that it
-    gets. None: without an oracle or a leader, or where the oracle gains nothing."""
-    rows: Rows = []
-    policies = list(dict.fromkeys(run.label for run in [*runs, *oracle]))
-    for pool in reproduce.POOLS:
-        inside = [run for run in [*runs, *oracle] if run.pool == pool]
-        last, areas = {}, {}
+def pool_rows(results: Found, runs: Sequence[Run]) -> tuple[Rows, Rows]:
+    """A row for each pool and policy, and the rows by rock: the last model, its difference from
+    `random` and by how much LEADER is ahead of it, there and in the area under the curve; KEY_share
+    of what the oracle gains over `random`, None without an oracle or a gain."""
+    rows = last_rows(results, runs)
+    rows = with_differences(rows, "over_random", {"policy": "random"}, ("pool", "rock"))
+    every = _keys("area")
+    rows = with_differences(rows, "over_leader", {"policy": LEADER}, ("pool", "rock"), every)
+    for row in rows:
+        if row["policy"] != LEADER and f"{every[0]}_over_leader" in row:
+            row |= {f"{key}_led": -row[f"{key}_over_leader"] for key in every}
+    led = [f"{key}_led" for key in every]
+    means = summary(rows, ("pool", "policy"), [*_keys("over_random"), *led])
+    oracle = {mean["pool"]: mean for mean in means if mean["policy"] == ORACLE}
+    for mean in means:
         for key in MEASURES:
-            curves = [(run, found[run.name]["images"], found[run.name][key]) for run in inside]
-            last[key] = by_policy((run, curve[-1]) for run, _, curve in curves)
-            areas[key] = by_policy((run, area(images, curve)) for run, images, curve in curves)
-        for policy in policies:
-            row: dict[str, Any] = {
-                "pool": pool,
-                "policy": policy,
-                "rocks": len(last[MEASURES[0]].get(policy, {})),
-            }
-            for key in MEASURES:
-                mean = {name: last[key].get(name, {}) for name in policies}
-                gained = paired(mean[policy], mean["random"])
-                won = (
-                    float(np.mean(paired(mean[ORACLE], mean["random"]))) if ORACLE in mean else 0.0
-                )
-                row |= flat(key, [mean[policy][k] for k in sorted(mean[policy])]) | flat(
-                    f"{key}_over_random", gained
-                )
-                led = (
-                    paired(mean[reproduce.LEADER], mean[policy]) if reproduce.LEADER in mean else []
-                )
-                if policy != reproduce.LEADER and led:
-                    row |= flat(f"{key}_led", led)
-                    row |= flat(
-                        f"{key}_area_led", paired(areas[key][reproduce.LEADER], areas[key][policy])
-                    )
-                row[f"{key}_share"] = float(np.mean(gained)) / won if won > 0 else None
-            rows.append(row)
-    return rows
+            won = oracle.get(mean["pool"], {}).get(f"{key}_over_random", 0)
+            mean[f"{key}_share"] = mean[f"{key}_over_random"] / won if won > 0 else None
+    return means, rows
 
 
-def _write(
-    out: Path, name: str, rows: Rows, markdown: str, command: str, **more: Any
-) -> list[Path]:
-    """NAME.csv of rows, NAME.md of a table of them, NAME.json with both; all say by which command
-    they were made."""
-    csv_rows = [row if "command" in row else row | {"command": command} for row in rows]
-    record = (
-        {"command": command, "versions": versions()} | more | {"rows": rows, "markdown": markdown}
-    )
-    write_json(out / f"{name}.json", record)
-    with atomic_path(out / f"{name}.md") as temporary:
-        temporary.write_text(f"{markdown}\n`{command}`\n", encoding="utf-8")
-    return [write_csv(out / f"{name}.csv", csv_rows), out / f"{name}.json", out / f"{name}.md"]
-
-
-def write_table(
-    root: Path, out: Path, found: Found, preset: Preset, count: int, command: str
-) -> list[Path]:
-    """table1.csv, .json and .md, of the runs that are done; the last two name the others."""
-    rows = table_rows(found, preset)
-    left = [
-        label for label in reproduce.table_runs(preset) if label not in {row["row"] for row in rows}
+def pools_text(rows: Rows) -> str:
+    """Tables with a line for each policy and a column for each pool."""
+    tables = [
+        matrix(rows, "test views (dB)", lambda row: f"{row['test_psnr']:.2f}"),
+        matrix(rows, f"{LEADER} over it (dB)", lambda row: with_interval(row, "test_psnr_led")),
+        matrix(rows, "inside the rock (dB)", lambda row: with_interval(row, "test_psnr_mask_led")),
+        matrix(
+            rows,
+            "over the whole curve (dB)",
+            lambda row: with_interval(row, "test_psnr_area_led"),
+        ),
     ]
-    return _write(
-        out, "table1", rows, table_markdown(rows, left), command, machine=processor(), left=left
-    )
+    if any(row["test_psnr_share"] is not None for row in rows):
+        tables.append(matrix(rows, "share of the oracle's", _share))
+    return "\n".join(tables)
+
+
+def _share(row: Row) -> str:
+    return "–" if row["test_psnr_share"] is None else f"{row['test_psnr_share']:.0%}"
+
+
+def matrix(rows: Rows, title: str, cell: Callable[[Row], str]) -> str:
+    """Table of the rows of pools, with a line for each policy and a column for each pool."""
+    pools, policies = (list(dict.fromkeys(row[key] for row in rows)) for key in ("pool", "policy"))
+    cells = {(row["policy"], row["pool"]): cell(row) for row in rows}
+    lines = [[policy, *(cells.get((policy, pool), "–") for pool in pools)] for policy in policies]
+    return markdown([title, *pools], lines)
+
+
+def write_table1(
+    root: Path, out: Path, results: Found, size: ReproduceSize, count: int, command: str
+) -> list[Path]:
+    """table1.csv, .json and .md of the runs that are done."""
+    rows = table_rows(results, size)
+    done = {row["row"] for row in rows}
+    left = [label for label in reproduce.table_runs(size) if label not in done]
+    return write_table(out, "table1", rows, table_text(rows, left), command, left=left)
 
 
 def write_figures(
-    root: Path, out: Path, found: Found, preset: Preset, count: int, command: str
+    root: Path, out: Path, results: Found, size: ReproduceSize, count: int, command: str
 ) -> list[Path]:
-    """What `mgs report` draws, of some runs of Table I."""
-    runs = [
-        cell_folder(root, run.name) / "run"
-        for run in reproduce.RESULTS["figures"].runs(preset, count)
-    ]
+    """Report on some runs of Table I, as `mgs report` draws it."""
+    needed = reproduce.RESULTS["figures"].runs(size, count)
+    runs = [cell_folder(root, run.name) / "run" for run in needed]
     for run in runs:
-        evaluate_run(run)  # what is measured stays; this draws
+        evaluate_run(run)  # draws; the metrics are there already
     return write_report(out / "figures", runs)
 
 
 def write_curves(
-    root: Path, out: Path, found: Found, preset: Preset, count: int, command: str
+    root: Path, out: Path, results: Found, size: ReproduceSize, count: int, command: str
 ) -> list[Path]:
     """curves.csv, .json, .md and .png; curves_by_rock.csv; statistics.json."""
-    runs = reproduce.curve_runs(preset, count)
-    rows = curve_rows(found, runs)
-    statistics = curve_statistics(found, runs)
-    write_json(
-        out / "statistics.json",
-        {"command": command, "versions": versions(), "rocks": count} | statistics,
+    runs = reproduce.curve_runs(size, count)
+    rows, statistics = by_rock(results, runs), statistics_of(results, runs)
+    over = with_differences(rows, "over_uniform", {"policy": "uniform"}, ("rock", "images"))
+    about = {"command": command, "versions": versions(), "rocks": count}
+    write_json(out / "statistics.json", about | statistics)
+    label = "PSNR on the test views (dB)"
+    panels = (
+        Panel("images", "test_psnr", "images", label, "policy"),
+        Panel(
+            "images", "test_psnr_over_uniform", "images", "difference from uniform (dB)", "policy"
+        ),
     )
-    each = write_csv(out / "curves_by_rock.csv", by_rock(found, runs))
-    curves_figure(out / "curves.png", rows)
-    written = _write(out, "curves", rows, statistics_markdown(statistics), command, rocks=count)
+    draw_panels(out / "curves.png", panels, over)
+    each = write_csv(out / "curves_by_rock.csv", rows)
+    means = summary(over, ("policy", "images"), _keys("over_uniform"))
+    text = statistics_text(statistics)
+    written = write_table(out, "curves", means, text, command, rocks=count)
     return [*written, each, out / "statistics.json", out / "curves.png"]
 
 
 def write_seeds(
-    root: Path, out: Path, found: Found, preset: Preset, count: int, command: str
+    root: Path, out: Path, results: Found, size: ReproduceSize, count: int, command: str
 ) -> list[Path]:
     """seeds.csv, .json, .md and .png; seeds_by_rock.csv."""
-    runs = reproduce.seed_runs(preset, count)
-    rows = seed_rows(found, runs)
-    seeds_figure(out / "seeds.png", rows)
-    each = write_csv(out / "seeds_by_rock.csv", by_rock(found, runs))
-    return [
-        *_write(out, "seeds", rows, seeds_markdown(rows), command, rocks=count),
-        each,
+    runs = reproduce.seed_runs(size, count)
+    means, rows = seed_rows(results, runs)
+    label = "PSNR over four seeds (dB)"
+    draw_panels(
         out / "seeds.png",
-    ]
+        (Panel("seeds", "test_psnr_over_four", "seed views", label, "policy"),),
+        rows,
+    )
+    each = write_csv(out / "seeds_by_rock.csv", by_rock(results, runs))
+    written = write_table(out, "seeds", means, table(SEED_COLUMNS, means), command, rocks=count)
+    return [*written, each, out / "seeds.png"]
 
 
 def write_pools(
-    root: Path, out: Path, found: Found, preset: Preset, count: int, command: str
+    root: Path, out: Path, results: Found, size: ReproduceSize, count: int, command: str
 ) -> list[Path]:
-    """pools.csv, .json, .md and .png; pools_by_rock.csv. With the oracle, where it is done."""
-    runs, oracle = reproduce.pool_runs(preset, count), reproduce.oracle_runs(preset, count)
-    known = dict(found) | known_runs(root, oracle)
-    done = oracle if all(run.name in known for run in oracle) else []
-    rows = pool_rows(known, runs, done)
-    pools_figure(out / "pools.png", rows)
-    each = write_csv(out / "pools_by_rock.csv", by_rock(known, [*runs, *done]))
-    return [
-        *_write(out, "pools", rows, pools_markdown(rows), command, rocks=count),
-        each,
+    """pools.csv, .json, .md and .png; pools_by_rock.csv; with the oracle where it is done."""
+    oracle = reproduce.oracle_runs(size, count)
+    known = dict(results) | known_runs(root, oracle)
+    runs = reproduce.pool_runs(size, count)
+    runs += oracle if all(run.name in known for run in oracle) else []
+    means, rows = pool_rows(known, runs)
+    label = "PSNR on the test views, over random (dB)"
+    draw_panels(
         out / "pools.png",
-    ]
+        (Panel("pool", "test_psnr_over_random", "pool", label, "policy"),),
+        [row for row in rows if row["policy"] != "random"],
+    )
+    each = write_csv(out / "pools_by_rock.csv", by_rock(known, runs))
+    written = write_table(out, "pools", means, pools_text(means), command, rocks=count)
+    return [*written, each, out / "pools.png"]
 
 
-def known_runs(root: Path, runs: Sequence[Run]) -> dict[str, dict[str, Any]]:
-    """What the runs found, of those that are done. root: the study's folder."""
-    results = {run.name: found(root, run.cells()[-1]) for run in runs}
-    return {name: result for name, result in results.items() if result is not None}
+Writer = Callable[[Path, Path, Found, ReproduceSize, int, str], list[Path]]
 
-
-WRITERS: dict[str, Callable[[Path, Path, Found, Preset, int, str], list[Path]]] = {
-    "table1": write_table,
+WRITERS: dict[str, Writer] = {
+    "table1": write_table1,
     "figures": write_figures,
     "curves": write_curves,
     "seeds": write_seeds,
     "pools": write_pools,
     "oracle": write_pools,
 }
-"""What writes each of `mgs.study.reproduce.RESULTS`: f(study's folder, folder for the results, what
-the cells found, preset, number of rocks, the command that makes it) returns the files."""
+"""Writers of results: f(study's folder, folder for the results, results of cells, size, number of
+rocks, command) returns the files written."""
+
+
+def make(
+    out: Path,
+    name: str,
+    preset: str,
+    size: ReproduceSize,
+    count: int,
+    report: Report,
+    workers: int = 1,
+    scheduler: str | None = None,
+) -> list[Path]:
+    """Do the cells of a result over so many rocks and write it into OUT/results; returns the files.
+    Table I is written anew before each cell, from the runs that are done."""
+    result = reproduce.RESULTS[name]
+    command = f"mgs reproduce --preset {preset} --only {name}"
+    command += f" --rocks {count}" if result.count(size) > 1 else ""
+    if name in ("curves", "pools"):
+        command += "".join(f" --policy {_from_here(policy)}" for policy in size.own_policies)
+    if result.rocks:
+        command += "".join(f" --mesh {rock.mesh.name}" for rock in size.meshes if rock.mesh)
+    elif size.table.batch > 1:
+        command += f" --batch {size.table.batch}"
+
+    def tell(cell: str, done: int, total: int) -> None:
+        if name == "table1" and (so_far := known_runs(out, result.runs(size, count))):
+            WRITERS[name](out, out / "results", so_far, size, count, command)
+        report(cell, done, total)
+
+    cells = result.cells(size, count)
+    results = run_cells(out, cells, tell, workers=workers, scheduler=scheduler)
+    return WRITERS[name](out, out / "results", results, size, count, command)
+
+
+def _from_here(policy: str) -> str:
+    """A policy, its file as a path from the current folder where it lies below it."""
+    path, here = Path(policy), Path.cwd()
+    return str(path.relative_to(here)) if path.is_relative_to(here) else path.name

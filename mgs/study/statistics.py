@@ -1,5 +1,4 @@
-"""Statistics of paired differences, one for each rock: the rock is what is replicated, so draws and
-views are no samples."""
+"""Statistics of studies. Rocks are the replicates: draws and views of one rock are no samples."""
 
 from __future__ import annotations
 
@@ -9,26 +8,20 @@ import numpy as np
 from scipy import stats
 
 MOST_ROCKS = 20
-"""The permutation test enumerates all 2^n sign flips; with more rocks that would take long."""
+"""Most differences of a permutation test, which enumerates all 2^n sign flips."""
 
 
 def area(images: Sequence[float], values: Sequence[float]) -> float:
-    """Area under values(images) over the length of the axis: the mean of the curve, in the unit of
-    the values.
-
-    images: numbers of images, rising. A curve of one point is its value.
-    """
+    """Mean of the curve values(images), in the unit of the values: its area over the length of the
+    axis. images: rising. A curve of one point is its value."""
     if len(images) == 1:
         return float(values[0])
     return float(np.trapezoid(values, images) / (images[-1] - images[0]))
 
 
 def images_to_reach(images: Sequence[float], values: Sequence[float], level: float) -> float | None:
-    """Number of images at which a curve first reaches a level, on straight lines between its
-    points; None if it never does.
-
-    images: numbers of images, rising.
-    """
+    """Number of images at which the curve values(images) first reaches a level, with linear
+    interpolation; None if it never does. images: rising."""
     for k, value in enumerate(values):
         if value >= level:
             if k == 0:
@@ -40,7 +33,7 @@ def images_to_reach(images: Sequence[float], values: Sequence[float], level: flo
 
 def interval(numbers: Sequence[float]) -> tuple[float, float] | None:
     """Student's t interval of 95 % of the mean of independent numbers, (low, high); None for fewer
-    than two of them."""
+    than two."""
     if len(numbers) < 2:
         return None
     values = np.asarray(numbers, np.float64)
@@ -49,12 +42,10 @@ def interval(numbers: Sequence[float]) -> tuple[float, float] | None:
 
 
 def permutation_p(differences: Sequence[float]) -> float | None:
-    """Two-sided p-value of the exact paired permutation test: under the hypothesis that two
-    policies are alike, each difference could as well have the other sign. None for fewer than two
-    differences; at most MOST_ROCKS of them.
+    """Two-sided p-value of the exact paired permutation test: the share of the 2^n sign flips whose
+    mean is at least as far from 0 as the observed one. None for fewer than two differences.
 
-    The share of the 2^n sign flips whose mean is at least as far from 0 as the one observed, so 2 /
-    2^n at least (1 if all differences are 0).
+    Raises ValueError for more than MOST_ROCKS differences.
     """
     count = len(differences)
     if count < 2:
@@ -64,20 +55,28 @@ def permutation_p(differences: Sequence[float]) -> float | None:
     result = stats.permutation_test(
         (np.asarray(differences, np.float64),),
         lambda sample, axis: np.mean(sample, axis=axis),
-        permutation_type="samples", vectorized=True, n_resamples=2**count, batch=1 << 14,
-    )  # fmt: skip
+        permutation_type="samples",
+        vectorized=True,
+        n_resamples=2**count,
+        batch=1 << 14,
+    )
     return float(min(result.pvalue, 1.0))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Holm's correction for several tests: the adjusted p-values, in the order given.
-
-    Whoever rejects all hypotheses whose adjusted value is at most alpha rejects a true one with a
-    probability of at most alpha.
-    """
+    """P-values adjusted by Holm's correction for several tests, in the order given."""
     order = sorted(range(len(p_values)), key=lambda k: p_values[k])
     adjusted, largest = [0.0] * len(p_values), 0.0
     for rank, k in enumerate(order):
         largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[k]))
         adjusted[k] = largest
     return adjusted
+
+
+def pareto_front(costs: Sequence[float], gains: Sequence[float]) -> np.ndarray:
+    """Mask [n] of the points that no other point beats: at most the cost, at least the gain, and
+    one of both better. Points with NaN are not on the front; of equal points all are."""
+    cost, gain = np.asarray(costs, np.float64), np.asarray(gains, np.float64)
+    no_worse = (cost[None] <= cost[:, None]) & (gain[None] >= gain[:, None])
+    better = (cost[None] < cost[:, None]) | (gain[None] > gain[:, None])
+    return np.asarray(~(no_worse & better).any(axis=1) & ~np.isnan(cost) & ~np.isnan(gain))

@@ -1,15 +1,10 @@
-"""A depth camera with the noise of a real one, and the filter that the survey applies to what it
-measures.
+"""A depth camera with the noise of the Kinect (structured light, 640x480), and the survey's filter.
 
-The numbers are those published for the Kinect (structured light, images of 640x480):
-
-- axial noise (along the camera's axis) and lateral noise (across it): Nguyen, Izadi and Lovell,
-"Modeling Kinect sensor noise
-  for improved 3D reconstruction and tracking", 3DIMPVT 2012;
+- axial and lateral noise (along and across the camera's axis): Nguyen, Izadi and Lovell, "Modeling
+  Kinect sensor noise for improved 3D reconstruction and tracking", 3DIMPVT 2012;
 - quantisation: Khoshelham and Elberink, "Accuracy and resolution of Kinect depth data", Sensors
-12(2), 2012;
-- returns that are lost on grazing surfaces: there is no published curve; ours rises linearly with
-the angle.
+  12(2), 2012;
+- lost returns on grazing surfaces: no published curve; ours rises linearly with the angle.
 
 Depth images are [H,W] z-depth in metres, 0 = no return.
 """
@@ -21,38 +16,32 @@ import numpy as np
 from mgs.camera import Camera
 
 AXIAL_FLOOR, AXIAL_GROWTH, AXIAL_START = 0.0012, 0.0019, 0.4
-"""Axial noise has the standard deviation AXIAL_FLOOR + AXIAL_GROWTH (z - AXIAL_START)^2 at the
-depth z, all in metres (Nguyen
-et al., eq. 3): 26 mm at 4 m."""
+"""Axial noise at depth z: AXIAL_FLOOR + AXIAL_GROWTH (z - AXIAL_START)^2, standard deviation,
+metres (Nguyen et al., eq. 3): 26 mm at 4 m."""
 
-LATERAL_FLOOR, LATERAL_GROWTH = 0.8, 0.035
-"""Lateral noise has the standard deviation LATERAL_FLOOR + LATERAL_GROWTH theta / (pi/2 - theta),
-in pixels of an image that is REFERENCE_WIDTH wide, where theta is the angle between the view and
-the surface's normal (Nguyen et al., eq. 1)."""
-
-REFERENCE_WIDTH = 640
-"""Width in pixels of the images that the lateral noise was measured on."""
+LATERAL_FLOOR, LATERAL_GROWTH, REFERENCE_WIDTH = 0.8, 0.035, 640
+"""Lateral noise at angle theta between view and normal: LATERAL_FLOOR + LATERAL_GROWTH theta /
+(pi/2 - theta), standard deviation, pixels of an image REFERENCE_WIDTH wide (Nguyen et al., eq. 1).
+"""
 
 QUANTUM = 2.85e-3
-"""Depth z is measured in steps of QUANTUM z^2, metres (Khoshelham and Elberink, section 4.2:
-2.85e-5 in centimetres): 46 mm at 4 m."""
+"""Depth z comes in steps of QUANTUM z^2, metres (Khoshelham and Elberink, section 4.2: 2.85e-5 in
+centimetres): 46 mm at 4 m."""
 
 DROP_OUT = (np.radians(65.0), np.radians(85.0))
-"""Angles between the view and the surface's normal, radians: at the first one returns begin to be
-lost, from the second one on all are lost. Between them the share of lost returns rises linearly.
-Chosen constants."""
+"""Angles between view and normal, radians, at which none and all returns are lost; linear in
+between. Chosen constants."""
 
 SIGMA_FROM_MAD = 1.4826
-"""Standard deviation of a normal distribution divided by its median absolute deviation. Estimates
-of noise use the median, which a few outliers do not change."""
+"""Standard deviation over median absolute deviation of a normal distribution: robust noise
+estimates use the median."""
 
 
 def normals_from_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """Unit normals [H,W,3] of the surface in a depth image [H,W], in the world, turned towards the
-    camera.
+    """Unit normals [H,W,3], world, towards the camera, of a depth image [H,W].
 
-    They are computed from the differences between the right and left, and the lower and upper
-    neighbours of a pixel. A pixel that lacks depth or one of these neighbours has the normal zero.
+    From differences between opposite neighbours; zero where the pixel or one of its four neighbours
+    has no depth.
     """
     points = camera.unproject(depth)
     padded = np.pad(points, ((1, 1), (1, 1), (0, 0)), mode="edge")
@@ -61,14 +50,8 @@ def normals_from_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
     down = padded[2:, 1:-1] - padded[:-2, 1:-1]
     normal = np.cross(down, across)
     norm = np.linalg.norm(normal, axis=-1)
-    whole = (
-        valid[1:-1, 2:]
-        & valid[1:-1, :-2]
-        & valid[2:, 1:-1]
-        & valid[:-2, 1:-1]
-        & (depth > 0)
-        & (norm > 0)
-    )
+    beside = valid[1:-1, 2:] & valid[1:-1, :-2] & valid[2:, 1:-1] & valid[:-2, 1:-1]
+    whole = beside & (depth > 0) & (norm > 0)
     normal = np.where(whole[..., None], normal / np.where(norm > 0, norm, 1.0)[..., None], 0.0)
     facing = np.einsum("hwk,hwk->hw", normal, camera.position - points)
     return normal * np.where(facing < 0, -1.0, 1.0)[..., None]
@@ -77,42 +60,30 @@ def normals_from_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
 def noisy_depth(
     depth: np.ndarray, camera: Camera, rng: np.random.Generator, scale: float = 1.0
 ) -> np.ndarray:
-    """What the sensor measures [H,W] where the true depth image is `depth` [H,W]; metres, 0 = no
-    return.
+    """Measurement [H,W] of a true depth image [H,W]; metres, 0 = no return.
 
-    In this order: each pixel shows the depth of a pixel nearby (lateral noise), axial noise is
-    added, the depth is rounded to its steps, and returns are lost. Silhouettes and the rim of the
-    image, which have no normal, count as grazing surfaces.
-    scale: factor on every standard deviation and on the steps. Below 1 it also moves both angles of
-    DROP_OUT towards 90 degrees; at 0 the true depth is returned.
+    In order: lateral noise (the depth of a pixel nearby), axial noise, quantisation, lost returns.
+    Pixels without a normal (silhouettes, image rim) count as grazing. scale: factor on standard
+    deviations and steps; below 1 it also moves DROP_OUT towards 90 degrees; at 0 the depth is
+    exact.
     """
     if scale <= 0:
         return depth.copy()
     h, w = depth.shape
     normals = normals_from_depth(depth, camera)
     view = camera.position - camera.unproject(depth)
-    cosine = np.einsum("hwk,hwk->hw", normals, view) / np.maximum(
-        np.linalg.norm(view, axis=-1), 1e-9
-    )
-    angle = np.arccos(np.clip(cosine, 0, 1))
-    finite = np.minimum(
-        angle, np.radians(85.0)
-    )  # at 90 degrees the lateral noise would be infinite
-    lateral = (
-        scale
-        * (LATERAL_FLOOR + LATERAL_GROWTH * finite / (np.pi / 2 - finite))
-        * w
-        / REFERENCE_WIDTH
-    )
+    length = np.maximum(np.linalg.norm(view, axis=-1), 1e-9)
+    angle = np.arccos(np.clip(np.einsum("hwk,hwk->hw", normals, view) / length, 0, 1))
+    finite = np.minimum(angle, np.radians(85.0))  # lateral noise is infinite at 90 degrees
+    lateral = LATERAL_FLOOR + LATERAL_GROWTH * finite / (np.pi / 2 - finite)
+    lateral = scale * lateral * w / REFERENCE_WIDTH
     rows, columns = np.mgrid[:h, :w]
-    rows = np.clip(np.round(rows + lateral * rng.standard_normal((h, w))), 0, h - 1).astype(int)
-    columns = np.clip(np.round(columns + lateral * rng.standard_normal((h, w))), 0, w - 1).astype(
-        int
-    )
+    rows = np.round(rows + lateral * rng.standard_normal((h, w)))
+    columns = np.round(columns + lateral * rng.standard_normal((h, w)))
+    rows, columns = np.clip(rows, 0, h - 1).astype(int), np.clip(columns, 0, w - 1).astype(int)
     z = depth[rows, columns]
-    measured = z + scale * (
-        AXIAL_FLOOR + AXIAL_GROWTH * (z - AXIAL_START) ** 2
-    ) * rng.standard_normal((h, w))
+    axial = AXIAL_FLOOR + AXIAL_GROWTH * (z - AXIAL_START) ** 2
+    measured = z + scale * axial * rng.standard_normal((h, w))
     quantum = np.maximum(scale * QUANTUM * z * z, 1e-9)
     measured = quantum * np.round(measured / quantum)
     start = np.pi / 2 - min(scale, 1.0) * (np.pi / 2 - DROP_OUT[0])
@@ -122,29 +93,25 @@ def noisy_depth(
 
 
 def depth_noise(depth: np.ndarray) -> float:
-    """Estimate the standard deviation of the noise in a depth image [H,W], metres.
+    """Standard deviation of the noise in a depth image [H,W], metres; 0 if under 100 pixels can be
+    used.
 
-    It is measured on the second differences of neighbours within a row, to which a smooth surface
-    contributes little. 0 if fewer than a hundred pixels have both neighbours.
+    Estimated from second differences within rows, to which smooth surfaces contribute little.
     """
     whole = (depth[:, :-2] > 0) & (depth[:, 1:-1] > 0) & (depth[:, 2:] > 0)
     second = (depth[:, :-2] - 2 * depth[:, 1:-1] + depth[:, 2:])[whole]
+    if len(second) < 100:
+        return 0.0
     # The second difference of independent noise has 1 + 4 + 1 = 6 times its variance.
-    return (
-        SIGMA_FROM_MAD * float(np.median(np.abs(second))) / np.sqrt(6)
-        if len(second) >= 100
-        else 0.0
-    )
+    return SIGMA_FROM_MAD * float(np.median(np.abs(second))) / np.sqrt(6)
 
 
 def filter_depth(depth: np.ndarray, sigma: float) -> np.ndarray:
-    """Smooth a depth image [H,W], metres, by a bilateral filter over 7x7 pixels: noise is averaged,
-    edges stay sharp.
+    """Smooth a depth image [H,W], metres, by a 7x7 bilateral filter, which keeps edges and lost
+    returns.
 
-    Pixels without return stay so. sigma: standard deviation of the noise, metres; at 0 the image is
-    returned as it is.
-    Source: Tomasi and Manduchi 1998, by OpenCV; the first step of KinectFusion (Newcombe et al.
-    2011).
+    sigma: standard deviation of the noise, metres; at 0 the image is returned. Source: Tomasi and
+    Manduchi 1998, by OpenCV; the first step of KinectFusion (Newcombe et al. 2011).
     """
     import cv2
 

@@ -1,5 +1,4 @@
-"""The picture of a survey, survey.png: trajectories from above, position error of each frame, depth
-error, fused cloud."""
+"""The figure of a survey: trajectories, position error per frame, depth error, fused cloud."""
 
 from __future__ import annotations
 
@@ -20,10 +19,10 @@ COLOURS = {"odometry": "#d1495b", "registered": "#edae49", "optimised": "#00798c
 def draw_survey(
     path: str | Path, dataset: Dataset, survey: Survey, cloud: Cloud, numbers: dict[str, Any]
 ) -> None:
-    """Write the picture of a survey of this dataset as a PNG; the file appears complete.
+    """Write the figure of a survey as a PNG, atomically.
 
-    cloud: fused from the survey; numbers: from `mgs.survey.flight.survey_numbers`. Raises
-    InputError if it cannot be written.
+    cloud: fused from the survey; numbers: from `survey_numbers`. Raises InputError if it cannot be
+    written.
     """
     import matplotlib
 
@@ -37,34 +36,20 @@ def draw_survey(
         _trajectories(axes[0], survey)
         _errors(axes[1], survey, numbers)
         _depth_error(axes[2], dataset, survey, numbers)
-        axes[3].scatter(
-            *points[::stride, :2].T,
-            c=points[::stride, 2],
-            s=0.4,
-            cmap="viridis",
-            linewidths=0,
-            rasterized=True,
-        )
-        axes[3].set(
-            xlim=around[0] + np.array([-reach, reach]),
-            ylim=around[1] + np.array([-reach, reach]),
-            aspect="equal",
-        )
-        axes[3].set(
-            title=f"fused cloud from above: {len(cloud.points):,} points",
-            xlabel="x, m",
-            ylabel="y, m",
-        )
+        x, y, z = points[::stride].T
+        axes[3].scatter(x, y, c=z, s=0.4, cmap="viridis", linewidths=0, rasterized=True)
+        axes[3].set(xlim=(around[0] - reach, around[0] + reach), xlabel="x, m", aspect="equal")
+        axes[3].set(ylim=(around[1] - reach, around[1] + reach), ylabel="y, m")
+        axes[3].set_title(f"fused cloud from above: {len(cloud.points):,} points")
         save_figure(figure, path)
 
 
 def _trajectories(axis, survey: Survey) -> None:
-    """The true flight and its estimates from above, and the frames that closed loops."""
+    """True and estimated flight from above, and loop closures."""
     axis.plot(*survey.truth[:, :2, 3].T, color="0.6", lw=5, label="truth", solid_capstyle="round")
     for name, colour in COLOURS.items():
-        axis.plot(
-            *getattr(survey, name)[:, :2, 3].T, ".-", color=colour, lw=1.2, ms=4, label=STAGES[name]
-        )
+        x, y = getattr(survey, name)[:, :2, 3].T
+        axis.plot(x, y, ".-", color=colour, lw=1.2, ms=4, label=STAGES[name])
     for k, loop in enumerate(survey.loops):
         ends = survey.optimised[[loop.i, loop.j], :2, 3]
         axis.plot(*ends.T, color="k", lw=1.5, label="loop closures" if k == 0 else None)
@@ -74,16 +59,12 @@ def _trajectories(axis, survey: Survey) -> None:
 
 
 def _errors(axis, survey: Survey, numbers: dict[str, Any]) -> None:
-    """Position error of every frame but the first, whose pose is known, on a logarithmic axis."""
+    """Position error of every frame but the first, whose pose is known, log scale."""
     for name, colour in COLOURS.items():
         offset = np.linalg.norm(getattr(survey, name)[:, :3, 3] - survey.truth[:, :3, 3], axis=1)
-        rms = numbers["error"][name]["ate_rms"]
-        axis.semilogy(
-            np.arange(1, len(offset)),
-            1e3 * np.maximum(offset[1:], 1e-4),
-            color=colour,
-            label=f"{STAGES[name]}: rms {1e3 * rms:.0f} mm",
-        )
+        label = f"{STAGES[name]}: rms {1e3 * numbers['error'][name]['ate_rms']:.0f} mm"
+        error = 1e3 * np.maximum(offset[1:], 1e-4)
+        axis.semilogy(np.arange(1, len(offset)), error, color=colour, label=label)
     axis.set(title="position error against truth", xlabel="frame", ylabel="mm")
     axis.margins(y=0.25)
     axis.legend(fontsize=8, loc="lower right")
@@ -99,8 +80,5 @@ def _depth_error(axis, dataset: Dataset, survey: Survey, numbers: dict[str, Any]
     axis.spines[:].set_visible(False)
     picture = axis.imshow(error, cmap="RdBu", vmin=-limit, vmax=limit, interpolation="nearest")
     axis.figure.colorbar(picture, ax=axis, shrink=0.7, label="mm; blue: too far")
-    axis.set(
-        title=f"depth error of frame 0; grey: no return\n{numbers['returns_lost']:.0%} of all returns lost",
-        xticks=[],
-        yticks=[],
-    )
+    lost = f"{numbers['returns_lost']:.0%} of all returns lost"
+    axis.set(title=f"depth error of frame 0; grey: no return\n{lost}", xticks=[], yticks=[])

@@ -1,8 +1,7 @@
 """The survey: a flight along the dataset's orbit with a noisy depth camera and drifting odometry.
 
-The measured depth images are registered to each other, which gives a consistent trajectory. The
-pose of the first frame is taken as known; all other poses are estimated. Poses are [4,4]
-camera-to-world, metres.
+Registering the measured depth images gives a consistent trajectory. The first pose is known, all
+others are estimated. Poses are [4,4] camera-to-world, metres.
 """
 
 from __future__ import annotations
@@ -34,18 +33,16 @@ STAGES = {
     "registered": "registered, before loop closure",
     "optimised": "after loop closure",
 }
-"""The three estimates of the trajectory that a `Survey` holds, in the order in which they are made:
-field -> what to call it."""
+"""Estimated trajectories of a `Survey`, in the order in which they are made: field -> label."""
 
 
 @dataclass(frozen=True)
 class SurveySettings:
-    """What a survey is flown with.
+    """Settings of a survey.
 
-    sensor: factor on the noise of the depth camera, 0 measures exact depth; drift: factor on the
-    errors of odometry;
-    exact_poses: no odometry and no registration, the poses are those flown; seed: root of every
-    random draw. Raises InputError if a factor is negative or not finite.
+    sensor: factor on the depth camera's noise, 0 is exact; drift: factor on the errors of odometry;
+    exact_poses: use the true poses; seed: root seed. Raises InputError if a factor is negative or
+    not finite.
     """
 
     sensor: float = 1.0
@@ -62,13 +59,11 @@ class SurveySettings:
 
 @dataclass(frozen=True)
 class Survey:
-    """What a flight of F frames gave.
+    """Result of a flight of F frames.
 
-    truth: [F,4,4] poses as flown. odometry, registered, optimised: [F,4,4] poses as estimated, by
-    the STAGES.
-    depths: F depth images [H,W] as measured, metres, 0 = no return.
-    edges: the F - 1 registrations of consecutive frames. loops: the loop closures that were
-    accepted.
+    truth: [F,4,4] poses as flown; odometry, registered, optimised: [F,4,4] estimates (STAGES).
+    depths: F measured depth images [H,W], metres, 0 = no return. edges: the F - 1 registrations of
+    consecutive frames; loops: accepted loop closures.
     """
 
     truth: np.ndarray
@@ -83,15 +78,13 @@ class Survey:
 def fly(
     dataset: Dataset,
     settings: SurveySettings,
-    on_stage: Callable[[str, int, int], None] | None = None,
+    on_stage: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> Survey:
-    """Survey a dataset that has depth images. on_stage(name, done, total) is called as the work
-    goes on.
+    """Survey a dataset that has depth images. on_stage: called (name, done, total).
 
-    Raises InputError if there are fewer than three frames, one has no depth image or too few
+    Raises InputError if there are fewer than three frames, or one has no depth image or too few
     returns to be registered.
     """
-    tell = on_stage or (lambda stage, done, total: None)
     frames = dataset.frames
     if len(frames) < 3:
         raise InputError(
@@ -99,15 +92,9 @@ def fly(
         )
     depths = []
     for k, frame in enumerate(frames):
-        tell("depth", k, len(frames))
-        depths.append(
-            noisy_depth(
-                frame.depth(),
-                frame.camera,
-                generator(settings.seed, f"survey/{frame.name}"),
-                settings.sensor,
-            )
-        )
+        on_stage("depth", k, len(frames))
+        rng = generator(settings.seed, f"survey/{frame.name}")
+        depths.append(noisy_depth(frame.depth(), frame.camera, rng, settings.sensor))
     truth = np.stack([frame.camera.camera_to_world for frame in frames])
     if settings.exact_poses:
         return Survey(truth, truth, truth, truth, depths, [], [])
@@ -119,19 +106,18 @@ def fly(
     ]
     edges = []
     for k in range(len(frames) - 1):
-        tell("registration", k, len(frames) - 1)
+        on_stage("registration", k, len(frames) - 1)
         edge = register(clouds, k, k + 1, steps[k], grid, (1.0,))
-        # A result far from odometry's has slid along a smooth surface, or failed.
+        # A result far from odometry has slid along a smooth surface, or failed.
         trusted = agrees(edge.relative, steps[k], settings.drift, grid)
         edges.append(edge if trusted else replace(edge, relative=steps[k], registered=False))
     registered = chain(truth[0], np.stack([edge.relative for edge in edges]))
     loops = []
     candidates = loop_candidates(registered)
     for k, (i, j) in enumerate(candidates):
-        tell("loop closure", k, len(candidates))
-        edge = register(
-            clouds, i, j, np.linalg.inv(registered[i]) @ registered[j], grid, (4.0, 2.0, 1.0)
-        )
+        on_stage("loop closure", k, len(candidates))
+        guess = np.linalg.inv(registered[i]) @ registered[j]
+        edge = register(clouds, i, j, guess, grid, (4.0, 2.0, 1.0))
         if edge.overlap >= CLOSURE_OVERLAP:
             loops.append(edge)
     optimised = optimise(registered, steps, edges, loops, settings.drift, grid)
@@ -139,12 +125,10 @@ def fly(
 
 
 def trajectory_error(poses: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    """Absolute trajectory error (Sturm et al. 2012) of poses [F,4,4] against the true ones [F,4,4],
-    which share the first pose.
+    """Absolute trajectory error (Sturm et al. 2012) of poses [F,4,4] against true ones [F,4,4].
 
-    ate_rms, ate_max: root mean square and largest distance of the positions, metres; rotation_rms:
-    root mean square angle, degrees; aligned_rms: as ate_rms, after the rigid motion that brings the
-    two trajectories closest (Umeyama 1991).
+    ate_rms, ate_max: distance of the positions, metres; rotation_rms: degrees; aligned_rms: as
+    ate_rms, after the rigid motion that aligns the trajectories best (Umeyama 1991).
     """
     offset = np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1)
     turn = np.einsum("fki,fkj->fij", poses[:, :3, :3], truth[:, :3, :3])
@@ -162,13 +146,12 @@ def trajectory_error(poses: np.ndarray, truth: np.ndarray) -> dict[str, float]:
 
 
 def survey_numbers(dataset: Dataset, survey: Survey, settings: SurveySettings) -> dict[str, Any]:
-    """What survey.json holds of a survey of this dataset, lengths in metres.
+    """Contents of survey.json, lengths in metres.
 
-    path_length: way flown; depth_error_on_rock: robust standard deviation of the measured depth's
-    error within the rock's masks; returns_lost: share of the pixels with true depth that have no
-    measured one; steps_by_odometry: number of steps where registration failed;
-    registration_overlap: of every step; loops: [i, j, overlap] each; error: `trajectory_error` of
-    each of the STAGES.
+    path_length: of the flight; depth_error_on_rock: robust standard deviation of the depth error in
+    the rock's masks; returns_lost: share of pixels with true depth and no measured one;
+    steps_by_odometry: number of failed registrations; registration_overlap: of every step; loops:
+    [i, j, overlap] each; error: `trajectory_error` of each of the STAGES.
     """
     error = [
         (measured - frame.depth())[(measured > 0) & frame.mask()]

@@ -1,5 +1,4 @@
-"""The folder that a survey is written to: itself a dataset, with estimated poses and measured
-depth."""
+"""The folder of a survey: itself a dataset, with estimated poses and measured depth."""
 
 from __future__ import annotations
 
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mgs.data.clouds import SparseCloud, write_cloud
-from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
+from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.files import copy_file, write_json
 from mgs.images import write_exr
 from mgs.survey import figure
@@ -21,10 +20,10 @@ from mgs.survey.fusion import fuse_frames
 def save_survey(
     out: Path, dataset: Dataset, survey: Survey, settings: SurveySettings
 ) -> dict[str, Any]:
-    """Write everything that a survey gave into the folder `out`, and return what survey.json holds.
+    """Write a survey into the folder `out`: the dataset of `write_survey`, cloud.ply, survey.json
+    and survey.png. Returns the contents of survey.json.
 
-    That is the dataset of `write_survey`, its fused cloud cloud.ply, the numbers survey.json and
-    the picture survey.png. Raises InputError as `fuse_frames`, and if a file cannot be written.
+    Raises InputError as `fuse_frames`, and if a file cannot be written.
     """
     numbers = survey_numbers(dataset, survey, settings)
     cloud = fuse_frames(write_survey(out, dataset, survey).frames)
@@ -36,33 +35,28 @@ def save_survey(
 
 
 def write_survey(out: Path, dataset: Dataset, survey: Survey) -> Dataset:
-    """Write a survey of a dataset as another dataset, into the folder `out`, and load it.
+    """Write a survey of a dataset as a dataset into the folder `out`, and load it.
 
-    It has the images (the rock's too) and masks of the dataset surveyed, the depth images that were
-    measured, the poses that were estimated, and the true rock (rock.glb) if there is one. Where the
-    dataset surveyed is on demand, as the survey of an on-demand dataset is, no image is copied.
-    Raises InputError if a file cannot be read or written.
+    Images, masks and the true rock (rock.glb) are copied, except images of on-demand frames; depth
+    is measured and poses are estimated. Raises InputError if a file cannot be read or written.
     """
     frames = []
     for frame, pose, depth in zip(dataset.frames, survey.optimised, survey.depths, strict=True):
-        estimated = replace(frame.camera, world_to_camera=np.linalg.inv(pose))
-        # Files are named after their frame: only frames are sure to have different names.
-        image = out / "images" / f"{frame.name}{frame.image_path.suffix}"
-        mask = frame.mask_path and out / "masks" / f"{frame.name}{frame.mask_path.suffix}"
-        rock = frame.rock_path and out / "rock" / f"{frame.name}{frame.rock_path.suffix}"
+        # Files are named after their frame, since only frames are sure to have different names.
+        paths: dict[str, Any] = {}
+        for kind, field in (
+            ("images", "image_path"),
+            ("masks", "mask_path"),
+            ("rock", "rock_path"),
+        ):
+            path = getattr(frame, field)
+            paths[field] = path and out / kind / f"{frame.name}{path.suffix}"
+            if path and not (frame.on_demand and kind == "images"):
+                copy_file(path, paths[field])
         measured = out / "depth" / f"{frame.name}.exr"
-        if not frame.on_demand:
-            copy_file(frame.image_path, image)
-        if mask and frame.mask_path:
-            copy_file(frame.mask_path, mask)
-        if rock and frame.rock_path:
-            copy_file(frame.rock_path, rock)
         write_exr(measured, {"Z": depth})
-        frames.append(
-            Frame(
-                frame.name, estimated, frame.timestamp, image, measured, mask, rock, frame.on_demand
-            )
-        )
+        camera = replace(frame.camera, world_to_camera=np.linalg.inv(pose))
+        frames.append(replace(frame, camera=camera, depth_path=measured, **paths))
     truth = dataset.root / "rock.glb"
     if truth.is_file():
         copy_file(truth, out / "rock.glb")

@@ -1,5 +1,4 @@
-"""Depth images -> one cloud of points in the world, averaged on a grid; and what the cameras of a
-dataset look at."""
+"""Fusion of depth images into one cloud on a grid; and what the cameras of a dataset look at."""
 
 from __future__ import annotations
 
@@ -14,35 +13,28 @@ from mgs.errors import InputError
 from mgs.survey.depth_sensor import depth_noise, filter_depth
 
 MAX_FUSED_PIXELS = 6_000_000
-"""About how many pixels are fused at most. If there are more, only every second, third ... row and
-column of each image is used. Of 100 frames of 640x480, each voxel is then still seen ten times."""
+"""About the most pixels that are fused; beyond, rows and columns are skipped. Of 100 frames of
+640x480, each voxel is then still seen ten times."""
 
 EDGE_JUMP = 0.05
-"""Largest difference between the depths in the neighbourhood of a pixel, as a share of the pixel's
-own depth. Pixels beyond it
-are left out: they lie on a silhouette, where a depth may be a mixture of two surfaces, or the
-camera sees the surface at a grazing angle."""
+"""Largest depth difference in the neighbourhood of a pixel, over its depth. Beyond it lie
+silhouettes, where a depth may mix two surfaces, and grazing views."""
 
 REACH = 1.0
-"""Radius of the cloud around the focus, as a multiple of the cameras' distance from it. Points
-farther away are left out, because the ground there says nothing of the ground under the rock."""
+"""Radius of the cloud around the focus, over the cameras' distance from it. The ground farther away
+says nothing of the ground under the rock."""
 
 FILTERED_SHARE = 0.5
-"""Noise that the bilateral filter leaves, as a share of the noise before. It was measured to be
-0.27; this leaves a margin."""
+"""Noise left by the bilateral filter, over the noise before; measured 0.27, with a margin."""
 
 
 @dataclass(frozen=True)
 class Cloud:
     """A fused cloud of N points.
 
-    points: [N,3] in the world, metres.
-    views: [N,3] unit vectors, the mean direction from each point to the cameras that saw it.
-    voxel: edge of a cell of the grid on which points were averaged, metres: about the distance
-    between neighbouring points.
-    noise: standard deviation of the measured depths, before they were filtered and averaged,
-    metres.
-    pixels: how many depths were fused.
+    points: [N,3] world, metres. views: [N,3] unit, mean direction to the cameras that saw each
+    point. voxel: cell of the grid, metres, about the distance between neighbours. noise: standard
+    deviation of the measured depths before filtering, metres. pixels: number of fused depths.
     """
 
     points: np.ndarray
@@ -54,57 +46,59 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Focus:
-    """What the cameras look at. point: [3] in the world, metres; distance: the median of the
-    cameras' distances from it, metres."""
+    """What the cameras look at. point: [3] world, metres; distance: median distance of the cameras,
+    metres."""
 
     point: np.ndarray
     distance: float
 
 
 def focus(frames: Sequence[Frame]) -> Focus:
-    """The point nearest to the optical axes of all cameras, in the least-squares sense, and how far
-    the cameras are from it."""
+    """Point nearest to all optical axes (least squares), and the cameras' distance from it."""
+    cameras = [frame.camera for frame in frames]
+    positions = [camera.position for camera in cameras]
+    point = nearest_point(positions, [camera.world_to_camera[2, :3] for camera in cameras])
+    return Focus(point, float(np.median([np.linalg.norm(eye - point) for eye in positions])))
+
+
+def nearest_point(positions: Sequence[np.ndarray], directions: Sequence[np.ndarray]) -> np.ndarray:
+    """Point [3] nearest to lines in the least-squares sense. positions, directions (unit): [3]."""
     A, b = np.zeros((3, 3)), np.zeros(3)
-    for frame in frames:
-        axis = frame.camera.world_to_camera[2, :3]
-        across = np.eye(3) - np.outer(axis, axis)
-        A, b = A + across, b + across @ frame.camera.position
-    point = np.linalg.lstsq(A, b, rcond=1e-9)[0]
-    return Focus(
-        point, float(np.median([np.linalg.norm(frame.camera.position - point) for frame in frames]))
-    )
+    for position, direction in zip(positions, directions, strict=True):
+        across = np.eye(3) - np.outer(direction, direction)
+        A, b = A + across, b + across @ position
+    return np.linalg.lstsq(A, b, rcond=1e-9)[0]
 
 
 def usable_depth(depth: np.ndarray, size: int = 3) -> np.ndarray:
-    """A depth image [H,W], metres, with pixels on silhouettes and at grazing angles set to 0 (see
-    EDGE_JUMP).
+    """Depth image [H,W], metres, with pixels on silhouettes and at grazing angles set to 0
+    (EDGE_JUMP).
 
-    size: width and height of the neighbourhood that is looked at, pixels. A pixel with a neighbour
-    that has no return is set to 0 too: returns are lost at grazing angles, and those that are left
-    there are the worst. With such pixels kept, the registration of a survey drifted twice as far.
+    size: of the neighbourhood, pixels. Pixels beside a lost return are set to 0 too: returns are
+    lost at grazing angles, and those left there are the worst. With them, registration drifted
+    twice as far.
     """
     jump = maximum_filter(depth, size) - minimum_filter(depth, size)
     return np.where(jump <= EDGE_JUMP * depth, depth, 0.0)
 
 
 def fuse_frames(frames: Sequence[Frame]) -> Cloud:
-    """Fuse the depth images of frames into one cloud.
+    """Fuse the depth images of frames into one cloud, averaged on a grid.
 
-    The points of all images are averaged on a grid, whose cells are as large as a pixel appears on
-    the rock, or larger if the depths are noisy. If the noise (`depth_noise`) is more than a quarter
-    of a cell, the images are smoothed first by `filter_depth`.
-    Raises InputError if a frame has no depth image or cannot be read, or no depth can be used.
+    A cell is as large as a pixel on the rock, or larger if the depths are noisy. With `depth_noise`
+    over a quarter of a cell, the images are smoothed first by `filter_depth`. Raises InputError if
+    a frame has no depth image or cannot be read, or no depth can be used.
     """
     depths = [frame.depth() for frame in frames]
     returns = [depth[depth > 0] for depth in depths]
     total = sum(map(len, returns))
     if total == 0:
         raise InputError(
-            "cloud: no depth image has a return (all pixels are 0); check the depth files or their unit (metres)"
+            "cloud: no depth image has a return (all pixels are 0); "
+            "check the depth files or their unit (metres)"
         )
     stride = max(1, int(np.ceil(np.sqrt(total / MAX_FUSED_PIXELS))))
-    # The lower quartile of the depths is about that of the rock, which stands in front of the
-    # ground that fills most of a frame.
+    # The lower quartile of depths is about that of the rock; most of a frame is ground behind it.
     near = [
         np.quantile(z, 0.25) / frame.camera.K[0, 0]
         for frame, z in zip(frames, returns, strict=True)
@@ -135,19 +129,15 @@ def fuse_frames(frames: Sequence[Frame]) -> Cloud:
 
 
 def _group_means(values: np.ndarray, index: np.ndarray, groups: int) -> np.ndarray:
-    """Means [groups,3] of values [N,3] over the groups that `index` [N] assigns them to, 0 to
-    groups - 1."""
-    count = np.bincount(index, minlength=groups)
-    return (
-        np.stack([np.bincount(index, values[:, k], groups) for k in range(3)], 1) / count[:, None]
-    )
+    """Means [groups,3] of values [N,3] over groups given by `index` [N]."""
+    sums = np.stack([np.bincount(index, values[:, k], groups) for k in range(3)], 1)
+    return sums / np.bincount(index, minlength=groups)[:, None]
 
 
 def voxel_means(points: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
     """Average points [N,3] on a grid with cells of edge `voxel`, metres.
 
-    Returns the mean point of each cell that has points [M,3], and for each point the index of its
-    cell among these [N].
+    Returns the mean point of each occupied cell [M,3], and each point's index among these [N].
     """
     if len(points) == 0:
         return points, np.zeros(0, int)

@@ -1,8 +1,7 @@
-"""Odometry that drifts: the camera's motion from frame to frame, as a drone would estimate it
-without looking back.
+"""Drifting odometry: a drone's estimate of its camera's motion from frame to frame.
 
-Poses are [4,4] camera-to-world, metres. A step is a pose of the next camera in the axes of the
-camera before.
+Poses are [4,4] camera-to-world, metres. A step is the pose of the next camera in the axes of the
+one before.
 """
 
 from __future__ import annotations
@@ -10,23 +9,19 @@ from __future__ import annotations
 import numpy as np
 
 DRIFT_SCALE, DRIFT_YAW = 0.01, np.radians(0.3)
-"""Errors that are the same in every step of a flight (a bias): translations are longer by the share
-DRIFT_SCALE, and the heading turns by DRIFT_YAW, radians, about the vertical."""
+"""Bias of every step: relative error of translations, and yaw about the vertical, radians."""
 
 DRIFT_SHAKE, DRIFT_TURN = 0.01, np.radians(0.2)
-"""Errors that are drawn anew for every step: standard deviation of the translation in each axis, as
-a share of the step's
-length, and of the rotation about each axis, radians. For comparison: visual-inertial odometry
-drifts by about one per cent of the way flown (Delmerico and Scaramuzza, ICRA 2018, table III)."""
+"""Random errors of each step, standard deviations per axis: of the translation over the step's
+length, and of the rotation, radians. Visual-inertial odometry drifts by about one per cent of the
+way (Delmerico and Scaramuzza, ICRA 2018, table III)."""
 
 TRUST = 5.0
-"""A motion that differs from odometry by more than this many of odometry's standard deviations is
-not believed."""
+"""Largest accepted difference from odometry, in its standard deviations."""
 
 
 def drifting_odometry(truth: np.ndarray, drift: float, rng: np.random.Generator) -> np.ndarray:
-    """The steps [F-1,4,4] that odometry reports for a flight along the camera-to-world poses
-    `truth` [F,4,4].
+    """Steps [F-1,4,4] that odometry reports for a flight along poses `truth` [F,4,4].
 
     drift: factor on all errors; 0 gives the true steps.
     """
@@ -44,7 +39,7 @@ def drifting_odometry(truth: np.ndarray, drift: float, rng: np.random.Generator)
 
 
 def chain(first: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Camera-to-world poses [F,4,4] from the first pose [4,4] and the steps [F-1,4,4]."""
+    """Poses [F,4,4] from the first pose [4,4] and the steps [F-1,4,4]."""
     poses = [first]
     for step in steps:
         poses.append(poses[-1] @ step)
@@ -52,27 +47,24 @@ def chain(first: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 
 def step_deviation(step: np.ndarray, drift: float) -> tuple[float, float]:
-    """How far odometry may be off in one step [4,4]: (standard deviation of the rotation, radians,
-    of the translation, metres).
+    """Standard deviations of odometry in one step [4,4]: rotation, radians, and translation,
+    metres.
 
-    The biases count as if they were standard deviations.
+    Biases count as if they were standard deviations.
     """
-    return drift * (DRIFT_YAW + DRIFT_TURN), drift * (DRIFT_SCALE + DRIFT_SHAKE) * float(
-        np.linalg.norm(step[:3, 3])
-    )
+    length = float(np.linalg.norm(step[:3, 3]))
+    return drift * (DRIFT_YAW + DRIFT_TURN), drift * (DRIFT_SCALE + DRIFT_SHAKE) * length
 
 
 def agrees(measured: np.ndarray, odometry: np.ndarray, drift: float, grid: float) -> bool:
     """Whether a measured step [4,4] is within TRUST standard deviations of odometry's [4,4].
 
-    The limits are widened by what a measurement itself may be off: half a degree, and one cell of
-    the registration's grid, `grid` metres.
+    The limits are widened by the error of a measurement: half a degree, and one cell of the
+    registration's grid, `grid` metres.
     """
     difference = np.linalg.inv(odometry) @ measured
     turn = np.arccos(np.clip((np.trace(difference[:3, :3]) - 1) / 2, -1, 1))
     turn_deviation, shift_deviation = step_deviation(odometry, drift)
-    turn_limit, shift_limit = (
-        TRUST * turn_deviation + np.radians(0.5),
-        TRUST * shift_deviation + grid,
-    )
+    turn_limit = TRUST * turn_deviation + np.radians(0.5)
+    shift_limit = TRUST * shift_deviation + grid
     return bool(np.linalg.norm(difference[:3, 3]) < shift_limit and turn < turn_limit)

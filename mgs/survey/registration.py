@@ -1,8 +1,8 @@
-"""Registration: from depth images, how the cameras of a flight stand to each other.
+"""Registration: relative poses of a flight's cameras from their depth images.
 
-Three steps: the point clouds of two frames are laid over each other (GICP), frames that see the
-same place again are found (loop closure), and all these relative poses together are reconciled
-(pose graph). Poses are [4,4] camera-to-world, metres.
+Point clouds of two frames are aligned (GICP), frames that see the same place again are found (loop
+closure), and all relative poses are reconciled (pose graph). Poses are [4,4] camera-to-world,
+metres.
 """
 
 from __future__ import annotations
@@ -21,49 +21,45 @@ from mgs.survey.fusion import usable_depth
 from mgs.survey.odometry import step_deviation
 
 GRID = 0.007
-"""Edge of a cell of the grid on which the points of a frame are averaged, over the distance of the
-cameras from what they look
-at: 3 cm at 4 m."""
+"""Cell of the grid on which a frame's points are averaged, over the cameras' distance from what
+they look at: 3 cm at 4 m."""
 
 MATCH = 4.0
-"""Largest distance between points that are matched, in grid cells."""
+"""Largest distance between matched points, grid cells."""
 
 NEIGHBOURS = 40
-"""Number of neighbours from which the covariance of each point is computed."""
+"""Neighbours from which the covariance of a point is computed."""
 
 EDGE = 5
-"""Pixels are left out whose neighbourhood of EDGE x EDGE pixels spans two surfaces
-(`mgs.survey.fusion.usable_depth`). On silhouettes the sensor reports points that lie on neither of
-them ("flying pixels"). These move with the camera instead of
-standing still in the world, so they pull every measured motion towards zero: with them, the error
-of a step was twenty times larger."""
+"""Neighbourhood of `usable_depth`, pixels. On silhouettes the sensor reports "flying pixels", which
+move with the camera and pull every measured motion towards zero: with them, the error of a step was
+twenty times larger."""
 
 RANGE = 1.6
-"""Depths are left out that are larger than this many times the lower quartile of the frame's
-depths: with the depth, the noise and the steps of the sensor grow."""
+"""Largest depth used, over the lower quartile of the frame's depths: noise and steps grow with
+depth."""
 
 CLOSURE_GAP = 5
-"""Frames that are fewer than this many steps apart in the flight are neighbours, and do not close a
-loop."""
+"""Fewest steps between two frames that close a loop."""
 
 CLOSURE_RANGE = 1.5
-"""Two frames may close a loop if their estimated positions are nearer to each other than this many
-median steps, plus CLOSURE_DRIFT times the way flown between them."""
+"""Two frames may close a loop if their estimated positions are closer than this many median steps,
+plus CLOSURE_DRIFT times the way between them."""
 
 CLOSURE_DRIFT = 0.02
-"""Drift that registered poses may have, over the way flown."""
+"""Drift of registered poses over the way flown."""
 
 CLOSURE_OVERLAP = 0.5
-"""Share of a frame's points that must be matched for a loop to be accepted."""
+"""Least share of a frame's points that must match for a loop."""
 
 
 @dataclass(frozen=True)
 class Edge:
     """A measured relative pose, an edge of the pose graph.
 
-    i, j: numbers of the two frames; relative: [4,4] pose of camera j in the axes of camera i,
-    metres; overlap: share of the points of frame j that have a match in frame i; registered: False
-    if the registration failed and `relative` is odometry's.
+    i, j: frame numbers; relative: [4,4] pose of camera j in the axes of camera i, metres; overlap:
+    share of the points of frame j that match frame i; registered: False if `relative` is
+    odometry's.
     """
 
     i: int
@@ -74,11 +70,11 @@ class Edge:
 
 
 def registration_cloud(frame: Frame, depth: np.ndarray, grid: float) -> tuple[Any, Any]:
-    """The points of a frame's depth image [H,W] in the axes of its camera, filtered and averaged on
-    a grid of `grid` metres.
+    """Points of a frame's depth image [H,W], in the axes of its camera, filtered and averaged on a
+    grid.
 
-    Returns them as small_gicp wants them: a cloud with covariances, and a search tree. Raises
-    InputError if fewer than a hundred pixels are left.
+    grid: metres. Returns small_gicp's cloud with covariances, and its search tree. Raises
+    InputError if fewer than 100 pixels are left.
     """
     import small_gicp
 
@@ -89,7 +85,8 @@ def registration_cloud(frame: Frame, depth: np.ndarray, grid: float) -> tuple[An
     points = own.unproject(z)[z > 0]
     if len(points) < 100:
         raise InputError(
-            f"survey: frame {frame.name} has only {len(points)} depth returns; it cannot be registered"
+            f"survey: frame {frame.name} has only {len(points)} depth returns; "
+            "it cannot be registered"
         )
     return small_gicp.preprocess_points(
         points, downsampling_resolution=grid, num_neighbors=NEIGHBOURS, num_threads=1
@@ -99,11 +96,11 @@ def registration_cloud(frame: Frame, depth: np.ndarray, grid: float) -> tuple[An
 def register(
     clouds: list, i: int, j: int, guess: np.ndarray, grid: float, reaches: tuple[float, ...]
 ) -> Edge:
-    """Lay frame j over frame i by GICP (Segal et al. 2009, small_gicp), starting from the relative
-    pose `guess` [4,4].
+    """Align frame j with frame i by GICP (Segal et al. 2009, small_gicp), from the relative pose
+    `guess`.
 
-    clouds: of all frames, by `registration_cloud`. reaches: factors on the distance of matches,
-    MATCH; the registration runs once for each, from the result of the one before.
+    clouds: `registration_cloud` of all frames. reaches: factors on MATCH; one run each, from the
+    result of the run before.
     """
     import small_gicp
 
@@ -125,11 +122,8 @@ def register(
 
 
 def loop_candidates(poses: np.ndarray) -> list[tuple[int, int]]:
-    """Pairs of frames that may see the same place again.
-
-    They are no neighbours in the flight, and by their estimated poses [F,4,4] close together and
-    within 30 degrees of looking the same way.
-    """
+    """Pairs of frames that may see the same place again: no neighbours in the flight, close
+    together by their estimated poses [F,4,4], and looking within 30 degrees of the same way."""
     position, axis = poses[:, :3, 3], poses[:, :3, 2]
     step = float(np.median(np.linalg.norm(np.diff(position, axis=0), axis=1)))
     distance = np.linalg.norm(position[:, None] - position[None], axis=-1)
@@ -147,27 +141,24 @@ def optimise(
     drift: float,
     grid: float,
 ) -> np.ndarray:
-    """Reconcile all relative poses by pose graph optimisation (gtsam, Levenberg-Marquardt); the
-    first pose stays where it is.
+    """Reconcile relative poses by pose graph optimisation (gtsam, Levenberg-Marquardt): [F,4,4].
 
-    initial: poses [F,4,4] to start from, returned as they are if there are no loops. odometry:
-    steps [F-1,4,4], with the standard deviations of `step_deviation` for the factor `drift`. edges,
-    loops: registrations of consecutive frames and accepted loops; their standard deviations are a
-    fifth of a grid cell (`grid`, metres), and the angle that moves a point 50
-    cells away by as much (measured: 6 mm and 0.08 degrees with cells of 30 mm). Loops have a Huber
-    loss, so that a wrong one has little weight. Returns poses [F,4,4].
+    initial: poses [F,4,4], returned unchanged without loops; the first one is fixed. odometry:
+    steps [F-1,4,4], with `step_deviation` for the factor `drift`. edges, loops: with standard
+    deviations of a fifth of a cell (`grid`, metres), and the angle that moves a point 50 cells away
+    by as much (measured: 6 mm and 0.08 degrees with cells of 30 mm). Loops have a Huber loss,
+    against wrong ones.
     """
     import gtsam
 
     if not loops:
         return initial
-    # gtsam orders the standard deviations of a pose as rotation, then translation.
+    # gtsam's order: rotation, then translation.
     fine = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([0.2 / 50, 0.2 * grid], 3))
     robust = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(1.345), fine)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.add(
-        gtsam.PriorFactorPose3(0, gtsam.Pose3(initial[0]), gtsam.noiseModel.Constrained.All(6))
-    )
+    fixed = gtsam.noiseModel.Constrained.All(6)
+    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(initial[0]), fixed))
     for k, pose in enumerate(initial):
         values.insert(k, gtsam.Pose3(pose))
     for k, step in enumerate(odometry):

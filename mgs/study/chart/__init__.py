@@ -1,1 +1,1 @@
-"""The charts of speed against accuracy, and the presets on scenes that the charts do not use."""
+"""Charts of speed against accuracy."""

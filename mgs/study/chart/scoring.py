@@ -1,15 +1,13 @@
 """Speed against accuracy of scoring: how well cheaper scores agree with the exact ones, and what
 they save.
 
-A *state* is a model fitted to some images, from which the next view is to be chosen. A *choice*
-computes the information of the views taken and scores every candidate. The reference is the choice
-of `mgs nbv --policy d-optimal`: exact diagonal, whole images, all Gaussians, information of the
-views taken measured anew at the model of the state.
+A *state* is a model fitted to some images, from which the next view is chosen. A *choice* computes
+the information of the views taken and scores every candidate. The reference is the choice of
+`mgs nbv --policy d-optimal`: exact diagonal, whole images, all Gaussians.
 """
 
 from __future__ import annotations
 
-import functools
 import shutil
 from collections.abc import Callable
 from functools import partial
@@ -22,257 +20,140 @@ from numpy.typing import NDArray
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.fit.settings import COLOURS_ALONE
-from mgs.gaussians import Gaussians
 from mgs.metrics import agreement
-from mgs.policy.criteria import d_optimal
-from mgs.run.folder import read_checkpoint
-from mgs.seeds import generator
-from mgs.study.chart.plan import DENSITY, PLANS, Data, Plan
-from mgs.study.chart.timing import timed
-from mgs.study.sweep import Cell, cell_folder
-
-AGES = (2, 4)
-"""How many steps ago the model was fitted at which old information, or old scores, were
-measured."""
+from mgs.policy.criteria import block_log_determinant, d_optimal
+from mgs.policy.registry import policy_named
+from mgs.prior.build import load_prior
+from mgs.run.folder import State as RunState
+from mgs.run.folder import read_checkpoint, read_settings, write_checkpoint
+from mgs.run.nbv import run_nbv
+from mgs.run.operations import operations_of
+from mgs.run.problem import Problem
+from mgs.splat import ListCache, fisher
+from mgs.study.chart.fits import Data
+from mgs.study.chart.timing import span, timed, with_seconds
+from mgs.study.output import Content
+from mgs.study.sweep import Cell, Results, cell_folder
+from mgs.study.verdict import Row
 
 STATES = (4, 8)
 """Steps of a d-optimal run after which a choice is studied."""
 
+Scores = NDArray[np.float64]
+
 
 class State:
-    """The state of a run after some steps, and after `age` steps less.
+    """A run after some steps: model, indices of the views taken and left, all cameras, lambda."""
 
-    state: as the loop has it; model, old: Gaussians then and before; taken, taken_before: indices
-    of frames; cameras: of all frames; left: the candidates; lam: [P].
-    """
-
-    def __init__(
-        self, root: Path, dataset: str, prior: str, runs: Path, step: int, age: int
-    ) -> None:
-        from mgs.prior.build import load_prior
-        from mgs.run.folder import read_settings
-        from mgs.run.loop import Loop
-        from mgs.run.stations import real_stations
-        from mgs.splat import ListCache
-
-        data, settings = load_dataset(root / dataset), read_settings(runs / "run")
-        now, before = (read_checkpoint(runs / str(k)) for k in (step, step - age))
-        if now is None or before is None:
+    def __init__(self, root: Path, dataset: str, prior: str, states: Path, step: int) -> None:
+        data, settings = load_dataset(root / dataset), read_settings(states / "run")
+        now = read_checkpoint(states / str(step))
+        if now is None:
             raise InputError(
-                f"{runs}: states are missing; delete that folder and give the command again"
+                f"{states}: states are missing; delete that folder and give the command again"
             )
-        self.state, self.model, self.old, self.taken, self.taken_before = (
-            now,
-            now.gaussians,
-            before.gaussians,
-            now.taken,
-            before.taken,
-        )
+        self.run, self.model, self.taken = now, now.gaussians, now.taken
         self.cameras, self.cache = [frame.camera for frame in data.frames], ListCache()
         self.left = [i for i in range(len(data)) if i not in self.taken]
-        self.folders = [runs / str(k) for k in range(step + 1)]
-        stations = real_stations(data, load_prior(root / prior), settings)
-        self.loop = Loop(runs / "run", settings, data, stations, lambda *_: None)
-        self.lam = settings.regularisation(stations.groups)
-
-    @functools.cached_property
-    def old_information(self) -> NDArray[np.float64]:
-        """Information of the views taken by now, measured at the older model."""
-        return self.summed(self.taken, model=self.old)
-
-    @functools.cached_property
-    def first_information(self) -> NDArray[np.float64]:
-        """Information of the views taken by now, that of each as it was measured at the first model
-        that was fitted to it."""
-        parts, known = [], 0
-        for folder in self.folders:
-            then = read_checkpoint(folder)
-            assert then is not None
-            parts.append(self.summed(then.taken[known:], model=then.gaussians))
-            known = len(then.taken)
-        return np.sum(parts, axis=0)
-
-    @functools.cached_property
-    def old_scores(self) -> NDArray[np.float64]:
-        """Scores of the candidates as they were then."""
-        H = self.summed(self.taken_before, model=self.old)
-        return np.array(
-            [d_optimal(self.information(i, model=self.old), H, self.lam) for i in self.left]
-        )
+        operations = operations_of(data, load_prior(root / prior), settings)
+        self.problem = Problem(data, settings, operations)
+        self.lam = self.problem.lam
 
     def information(
-        self,
-        view: int,
-        model: Gaussians | None = None,
-        estimator: str = "exact",
-        shrink: int = 1,
-        **options: Any,
-    ) -> NDArray[np.float64]:
-        """What one view says, [N,P]; shrink: from an image of so many times less width and height,
-        whose information is multiplied by how many pixels fewer it has."""
-        from mgs.splat import fisher
-
+        self, view: int, estimator: str = "exact", shrink: int = 1, **options: Any
+    ) -> Any:
+        """Information of a view [N,P]; shrink: from an image of so many times less width and
+        height, multiplied by the ratio of the numbers of pixels."""
         camera = self.cameras[view]
         small = camera if shrink == 1 else camera.resized(camera.width // shrink)
-        F = fisher(
-            self.model if model is None else model, small, estimator, cache=self.cache, **options
-        )
+        F = fisher(self.model, small, estimator, cache=self.cache, **options)
         return F * np.float32(camera.width * camera.height / (small.width * small.height))
 
-    def summed(self, views: list[int], **how: Any) -> NDArray[np.float64]:
-        """Information of some views together."""
-        return np.sum([self.information(i, **how) for i in views], axis=0, dtype=np.float64)
+    def summed(self, **how: Any) -> Any:
+        """Information of the views taken together."""
+        return np.sum([self.information(i, **how) for i in self.taken], axis=0, dtype=np.float64)
 
 
-Score = Callable[[State], NDArray[np.float64]]
-"""(state) -> scores of its candidates, by their order in `left`."""
+def by_information(state: State, **how: Any) -> Scores:
+    """D-optimal scores with information measured in some way (`State.information`)."""
+    H = state.summed(**how)
+    return np.array([d_optimal(state.information(i, **how), H, state.lam) for i in state.left])
 
 
-def scored(state: State, columns: slice = slice(None), **how: Any) -> NDArray[np.float64]:
-    """D-optimal scores with information measured in some way (`State.information`), by some
-    columns."""
-    H, lam = state.summed(state.taken, **how), state.lam[columns]
-    return np.array(
-        [d_optimal(state.information(i, **how)[:, columns], H[:, columns], lam) for i in state.left]
-    )
+def by_blocks(state: State) -> Scores:
+    """Scores of the policy `block-d`."""
+    H, lam = state.summed(estimator="block"), state.lam
+    blocks = (state.information(i, estimator="block") for i in state.left)
+    return np.array([block_log_determinant(H + F, lam) for F in blocks])
 
 
-def of_subset(state: State, share: float) -> NDArray[np.float64]:
-    """Scores of a model of only a random share of the Gaussians, which is also what hides the
-    others."""
-    n = len(state.model)
-    kept = np.sort(generator(0, "chart/subset").choice(n, max(1, round(share * n)), replace=False))
-    return scored(state, model=state.model[kept])
+def by_policy(state: State, name: str) -> Scores:
+    """Scores of a policy that looks at poses and the prior's surface, as for the first choice."""
+    state.problem.__dict__.pop("visibility", None)
+    return np.asarray(policy_named(name)(state.problem.context(state.run, state.left)), np.float64)
 
 
-def stale(state: State) -> NDArray[np.float64]:
-    """Scores beside old information of the views taken, which is there already; that of the
-    candidates is new."""
-    return np.array(
-        [d_optimal(state.information(i), state.old_information, state.lam) for i in state.left]
-    )
+Way = tuple[str, Callable[[State], Scores]]
+"""Family and function of a way to score."""
+
+WAYS: dict[str, Way] = {
+    "exact": ("reference", by_information),
+    "block": ("estimator", by_blocks),
+    "loss-gradient": ("estimator", partial(by_information, estimator="loss-gradient")),
+    **{
+        f"size 1/{shrink}": ("resolution", partial(by_information, shrink=shrink))
+        for shrink in (2, 4, 8)
+    },
+    **{
+        name: ("surface", partial(by_policy, name=name))
+        for name in ("coverage", "directional-d", "directional-i")
+    },
+    **{name: ("poses", partial(by_policy, name=name)) for name in ("uniform", "farthest")},
+}
 
 
-def incremental(state: State) -> NDArray[np.float64]:
-    """Scores where information of each view taken is measured once, when it is taken; that of the
-    candidates is new."""
-    return np.array(
-        [d_optimal(state.information(i), state.first_information, state.lam) for i in state.left]
-    )
+def way(name: str) -> Way:
+    """A row of WAYS, or "hutchinson PROBES"."""
+    if name in WAYS:
+        return WAYS[name]
+    probes = int(name.rpartition(" ")[2])
+    return "estimator", partial(by_information, estimator="hutchinson", probes=probes)
 
 
-def lazy(state: State) -> NDArray[np.float64]:
-    """Candidates in the order of their old scores, scored anew until the best new score is above
-    the next old one.
-
-    Gains fall as views are taken if the model stays as it is, so that an old score is an upper
-    bound (Minoux 1978). Here the model is fitted in between, and it is none. The old scores are
-    there already, and no part of the time.
-    """
-    H, scores, best = state.summed(state.taken), state.old_scores.copy(), -np.inf
-    for k in np.argsort(-state.old_scores, kind="stable"):
-        if best > state.old_scores[k]:
-            break
-        scores[k] = d_optimal(state.information(state.left[k]), H, state.lam)
-        best = max(best, float(scores[k]))
-    return scores
+def _names(data: Data) -> list[str]:
+    return [*WAYS, *(f"hutchinson {k}" for k in data.size.probes)]
 
 
-def by_policy(state: State, name: str) -> NDArray[np.float64]:
-    """Scores by a policy that looks at poses and the prior's surface, all computed anew, as for the
-    first choice."""
-    from mgs.policy.registry import policy_named
-
-    state.loop.look_anew()
-    return np.asarray(policy_named(name)(state.loop.context(state.state, state.left)), np.float64)
+def _cell_name(name: str) -> str:
+    return f"scoring/{name.replace(' ', '-').replace('/', '-')}"
 
 
-def block_scores(state: State) -> NDArray[np.float64]:
-    """Scores by the exact blocks (`mgs.policy.registry.block_d`)."""
-    from mgs.policy.criteria import block_log_determinant
-
-    H = state.summed(state.taken, estimator="block")
-    return np.array(
-        [
-            block_log_determinant(H + state.information(i, estimator="block"), state.lam)
-            for i in state.left
-        ]
-    )
-
-
-def variants(plan: Plan) -> dict[str, tuple[str, Score]]:
-    """The ways to score: {name: (family, function)}. A number at the end of `stale` and `lazy` is
-    the age of what is old."""
-    found: dict[str, tuple[str, Score]] = {
-        "exact": ("reference", scored),
-        "block": ("estimator", block_scores),
-    }
-    for k in plan.probes:
-        found[f"hutchinson {k}"] = ("estimator", partial(scored, estimator="hutchinson", probes=k))
-    found["loss-gradient"] = ("estimator", partial(scored, estimator="loss-gradient"))
-    for shrink in (2, 4, 8):
-        found[f"size 1/{shrink}"] = ("resolution", partial(scored, shrink=shrink))
-    for part in (2, 4, 10):
-        found[f"1/{part} of Gaussians"] = ("subset", partial(of_subset, share=1 / part))
-    found["colour only"] = ("columns", partial(scored, columns=slice(0, 3)))
-    found["incremental"] = ("stale", incremental)
-    for age in AGES:
-        found[f"stale {age}"], found[f"lazy {age}"] = ("stale", stale), ("lazy", lazy)
-    for name in ("coverage", "directional-d", "directional-i"):
-        found[name] = ("surface", partial(by_policy, name=name))
-    for name in ("uniform", "farthest"):
-        found[name] = ("poses", partial(by_policy, name=name))
-    return found
+def cells(data: Data, repeats: int) -> list[Cell]:
+    """The states, and a cell for each way to score them."""
+    case, task = data.case(), f"{__name__}:make_states"
+    made = case.cells()
+    needs = tuple(cell.name for cell in made)
+    given = {**case.folders, "seeds": data.size.seeds, "steps": list(STATES)}
+    states = Cell("scoring/states", task, given, needs)
+    where = {**case.folders, "states": states.name, "steps": list(STATES), "repeats": repeats}
+    return [*made, states] + [
+        Cell(_cell_name(n), f"{__name__}:measure", where | {"name": n}, (states.name,), alone=True)
+        for n in _names(data)
+    ]
 
 
-def cells(plan: Plan, data: Data, repeats: int, preset: str) -> list[Cell]:
-    """The states, and a cell for each way to score them. preset: the name of the plan."""
-    prior = data.prior(DENSITY)
-    where = {"dataset": data.folder, "prior": f"cells/{prior.name}/prior"}
-    states = Cell(
-        f"scoring/{data.label}/states",
-        "mgs.study.chart.scoring:make_states",
-        {**where, "seeds": plan.seeds},
-        (prior.name,),
-    )
-    found = [*data.cells, prior, states]
-    for name in variants(plan):
-        arguments = {
-            **where,
-            "states": states.name,
-            "variant": name,
-            "preset": preset,
-            "repeats": repeats,
-        }
-        found.append(
-            Cell(
-                cell_name(data, name),
-                "mgs.study.chart.scoring:measure",
-                arguments,
-                (states.name,),
-                alone=True,
-            )
-        )
-    return found
-
-
-def cell_name(data: Data, variant: str) -> str:
-    """The name of the cell of a way to score."""
-    return f"scoring/{data.label}/{variant.replace(' ', '-').replace('/', '-')}"
-
-
-def make_states(root: Path, out: Path, dataset: str, prior: str, seeds: int) -> dict[str, Any]:
-    """Run d-optimal once, and keep its state after every step in a folder of the step's number."""
-    from mgs.run.folder import State as Kept
-    from mgs.run.folder import write_checkpoint
-    from mgs.run.nbv import run_nbv
-
-    def keep(state: Kept) -> None:
-        write_checkpoint(out / str(len(state.steps) - 1), state)
-
-    for folder in out.iterdir():  # what an interrupted call left
+def make_states(
+    root: Path, out: Path, dataset: str, prior: str, seeds: int, steps: list[int]
+) -> dict[str, Any]:
+    """Task: run d-optimal once, and keep its state after some steps in folders of their numbers."""
+    for folder in out.iterdir():  # of an interrupted call
         shutil.rmtree(folder)
-    given: dict[str, Any] = {"seeds": seeds, "budget": max(STATES), "train": COLOURS_ALONE}
+
+    def keep(state: RunState) -> None:
+        if len(state.steps) - 1 in steps:
+            write_checkpoint(out / str(len(state.steps) - 1), state)
+
+    given: dict[str, Any] = {"seeds": seeds, "budget": max(steps), "train": COLOURS_ALONE}
     state = run_nbv(root / dataset, out / "run", prior=root / prior, on_step=keep, **given)
     return {"taken": state.taken}
 
@@ -283,42 +164,38 @@ def measure(
     dataset: str,
     prior: str,
     states: str,
-    variant: str,
-    preset: str,
+    steps: list[int],
+    name: str,
     repeats: int,
 ) -> dict[str, Any]:
-    """Time a way to score over all states. Returns times (`timed`) of one candidate, and the scores
-    in each state."""
-    _, score = variants(PLANS[preset])[variant]
-    last = variant.rpartition(" ")[2]
-    age = int(last) if variant.startswith(("stale", "lazy")) else min(AGES)
-    there = [State(root, dataset, prior, cell_folder(root, states), step, age) for step in STATES]
+    """Task: time a way to score over all states. Returns times (`timed`) of one candidate, and the
+    scores in each state."""
+    _, score = way(name)
+    there = [State(root, dataset, prior, cell_folder(root, states), step) for step in steps]
     scores, times = timed(lambda: [score(state) for state in there], repeats)
-    candidates = sum(len(state.left) for state in there)
-    return {
-        name: value if name == "reference" else value / candidates for name, value in times.items()
-    } | {"scores": [values.tolist() for values in scores]}
+    count = sum(len(state.left) for state in there)
+    times = {k: v if k == "reference" else v / count for k, v in times.items()}
+    return times | {"scores": [values.tolist() for values in scores]}
 
 
-def rows(plan: Plan, data: Data, found: dict[str, Any], command: str) -> list[dict[str, Any]]:
-    """A row for each way to score: its time, and its agreement with the exact scores, mean over the
-    states."""
-    exact, made = found[cell_name(data, "exact")]["scores"], []
-    for name, (family, _) in variants(plan).items():
-        result = found[cell_name(data, name)]
-        agree = [
-            agreement(*map(np.array, pair)) for pair in zip(result["scores"], exact, strict=True)
-        ]
-        tau, regret = (float(np.mean([one[key] for one in agree])) for key in ("tau", "regret"))
-        times = {key: value for key, value in result.items() if key != "scores"}
-        made.append(
-            {
-                "variant": name,
-                "family": family,
-                **times,
-                "tau": tau,
-                "regret": regret,
-                "command": command,
-            }
-        )
-    return made
+def rows(data: Data, root: Path, found: Results, unit: float) -> list[Row]:
+    """A row for each way to score: its time over that of the exact scores, and its agreement with
+    them, mean over the states."""
+    exact, made = found[_cell_name("exact")], list[Row]()
+    for name in _names(data):
+        result = dict(found[_cell_name(name)])
+        pairs = zip(result.pop("scores"), exact["scores"], strict=True)
+        agree = [agreement(np.array(mine), np.array(reference)) for mine, reference in pairs]
+        row = {"variant": name, "family": way(name)[0], **result}
+        row |= {"over_exact": row["ratio"] / exact["ratio"]}
+        made.append(row | {k: float(np.mean([one[k] for one in agree])) for k in ("tau", "regret")})
+    return with_seconds(made, unit)
+
+
+COLUMNS: dict[str, Content] = {
+    "scores": "variant",
+    "ms a candidate": lambda row: span(row, 1e3),
+    "over exact": "over_exact:.2f",
+    "Kendall's tau": "tau:.2f",
+    "regret": "regret:.1%",
+}

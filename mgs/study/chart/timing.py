@@ -1,48 +1,43 @@
-"""Times that can be compared although the machine is busy with other work, now more and now less.
+"""Times that can be compared although the machine is busy with other work.
 
-A call is timed several times, and each time a fixed piece of work, the *reference*, is timed just
-before it in the same process. What slows the machine down slows both, so their ratio stays, and the
-median of the ratios is what the charts show.
-They show it as seconds: the ratio times the reference's median over the whole study.
+Each timed call follows a fixed piece of work, the *reference*, in the same process. What slows the
+machine slows both, so the median of their ratios stays the same. Charts show seconds: the ratio
+times the median seconds of the reference over the whole study.
 """
 
 from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 import numpy as np
 
 from mgs import runtime
 from mgs.memory import padded
+from mgs.study.verdict import Row
 
 REFERENCE_GAUSSIANS, REFERENCE_SIZE, REFERENCE_CALLS = 10_000, (320, 240), 10
-"""The reference: so many images of so many Gaussians of a rock, of this width and height, with
-their gradients."""
+"""Gaussians, image size and number of renders with gradients of the reference."""
 
 LEAST_SECONDS, MOST_REPEATS = 0.8, 15
-"""A call is timed again until its times add up to so many seconds, at most so often."""
+"""A call is repeated until its times add up to so many seconds, at most so often."""
 
 Result = TypeVar("Result")
 
 
 @functools.cache
 def _reference() -> Callable[[], Any]:
-    """The reference, ready to be called: its Gaussians made and its kernels compiled."""
+    """The reference, with its kernels compiled."""
     runtime.start()
     import mitsuba as mi
 
     from mgs.bench.core import gradient, surface_camera, surface_gaussians
     from mgs.splat import ListCache, as_drjit
 
-    gaussians = surface_gaussians(REFERENCE_GAUSSIANS)
-    camera, device, cache = (
-        surface_camera(gaussians, *REFERENCE_SIZE),
-        as_drjit(gaussians),
-        ListCache(),
-    )
+    gaussians, cache = surface_gaussians(REFERENCE_GAUSSIANS), ListCache()
+    camera, device = surface_camera(gaussians, *REFERENCE_SIZE), as_drjit(gaussians)
     weights = mi.TensorXf(padded(np.ones((camera.height, camera.width, 3))))
 
     def call() -> None:
@@ -55,8 +50,7 @@ def _reference() -> Callable[[], Any]:
 
 
 def _clock(call: Callable[[], Result]) -> tuple[Result, float, float]:
-    """What a call returns, its wall-clock seconds, and the seconds of all cores that this process
-    spent."""
+    """Result of a call, its seconds, and the seconds of all cores of this process."""
     wall, cpu = time.perf_counter(), time.process_time()
     result = call()
     return result, time.perf_counter() - wall, time.process_time() - cpu
@@ -65,14 +59,11 @@ def _clock(call: Callable[[], Result]) -> tuple[Result, float, float]:
 def timed(
     call: Callable[[], Result], repeats: int, reference: Callable[[], Any] | None = None
 ) -> tuple[Result, dict[str, float]]:
-    """Call a function once untimed, which compiles its kernels, and then `repeats` times, each
-    after the reference; more often where that takes less than LEAST_SECONDS together, since short
-    times scatter most.
+    """Call a function once untimed, which compiles its kernels, and then `repeats` times or more.
 
-    It must return NumPy arrays or plain values, so that nothing is left to be computed when it
-    returns. Returns the last result; and medians over the repeats: wall and cpu (seconds),
-    reference (wall-clock seconds of the reference), ratio (wall over reference), and the extremes
-    ratio_low and ratio_high.
+    The function must return NumPy arrays or plain values, so that nothing is left to compute.
+    Returns its result, and medians: wall and cpu, seconds; reference, seconds; ratio, wall over
+    reference, with its extremes ratio_low and ratio_high.
     """
     reference = reference or _reference()
     result = call()
@@ -93,11 +84,20 @@ def timed(
     }
 
 
-def with_seconds(rows: Sequence[dict[str, Any]], unit: float) -> list[dict[str, Any]]:
-    """Rows with `seconds`, `seconds_low` and `seconds_high`: their ratios times the seconds of the
-    reference. Rows without a ratio stay as they are."""
-    names = {"seconds": "ratio", "seconds_low": "ratio_low", "seconds_high": "ratio_high"}
-    return [
-        row | {name: row[ratio] * unit for name, ratio in names.items() if ratio in row}
-        for row in rows
-    ]
+def with_seconds(rows: Iterable[Row], unit: float) -> list[Row]:
+    """Rows with seconds, seconds_low and seconds_high: their ratios times the seconds of the
+    reference."""
+    ends = ("", "_low", "_high")
+    return [row | {f"seconds{end}": row[f"ratio{end}"] * unit for end in ends} for row in rows]
+
+
+def span(row: Row, scale: float = 1.0) -> str:
+    """Seconds of a row, times a scale, with their extremes, as text."""
+    low, value, high = (
+        _three_digits(scale * row[key]) for key in ("seconds_low", "seconds", "seconds_high")
+    )
+    return value if low == high else f"{value} ({low} to {high})"
+
+
+def _three_digits(value: float) -> str:
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"

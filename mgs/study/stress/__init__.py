@@ -1,2 +1,1 @@
-"""Where methods fail: experiments as data, with hypotheses that were fixed before and verdicts that
-follow from numbers."""
+"""Stress tests: experiments that try to make the methods fail, each with claims and verdicts."""

@@ -1,8 +1,7 @@
-"""Faults of the data and of the prior, one pure function each; what they cost, and which signs tell
-of them.
+"""Faults of images and of priors, what they cost, and whether the detectors of a run report them.
 
-A run counts as failed if its PSNR on the test views, which no fault touches, is more than FAILURE
-dB below that of the clean run on the same rock and views.
+A run has failed if its PSNR on the test views, which no fault touches, is more than FAILURE below
+that of the clean run on the same rock and views.
 """
 
 from __future__ import annotations
@@ -14,32 +13,34 @@ from typing import Any
 
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, shift
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from mgs.camera import Camera
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data.dataset import Frame, target_of
 from mgs.fit.settings import PASSES
+from mgs.gaussians import Gaussians
 from mgs.policy.criteria import coverage
 from mgs.prior.build import Prior
 from mgs.run import detectors
+from mgs.run.detectors import DETECTORS
 from mgs.seeds import generator
 from mgs.splat import render
-from mgs.study.stress.experiment import turns
-from mgs.study.stress.lab import Lab, Preset, open_lab
-from mgs.study.stress.verdict import Row
+from mgs.study.output import Panel
+from mgs.study.stress.lab import Experiment, Lab, StressSize, open_lab, rock_cell, turns
 from mgs.study.sweep import Cell
+from mgs.study.verdict import Claim, Row, single
 
 FAILURE = 1.0
-"""dB."""
+"""Loss of PSNR, dB, above which a run has failed."""
 
 VIEWS = 6
 
 
 @dataclass(frozen=True)
 class Captured(Frame):
-    """A frame whose pixels are in memory, so that they can be spoiled. pixels: linear RGB [H,W,3];
-    rgba: the rock alone, premultiplied [H,W,4]; z: depth [H,W], metres; rock: its mask [H,W]."""
+    """A frame with its pixels in memory. pixels: linear RGB [H,W,3]; rgba: the rock alone,
+    premultiplied [H,W,4]; z: depth [H,W], metres; rock: mask [H,W]."""
 
     pixels: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
     rgba: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 4)))
@@ -47,19 +48,19 @@ class Captured(Frame):
     rock: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), bool))
 
     def rgb(self) -> np.ndarray:
-        """As `Frame.rgb`."""
+        """Linear RGB [H,W,3]."""
         return self.pixels
 
     def depth(self) -> np.ndarray:
-        """As `Frame.depth`."""
+        """Depth [H,W], metres."""
         return self.z
 
     def mask(self) -> np.ndarray:
-        """As `Frame.mask`."""
+        """Mask of the rock [H,W]."""
         return self.rock
 
     def target(self) -> tuple[np.ndarray, np.ndarray]:
-        """As `Frame.target`."""
+        """Image of the rock alone [H,W,4], and weights of the pixels [H,W]."""
         return self.rgba, np.ones(self.rgba.shape[:2], np.float32)
 
 
@@ -72,148 +73,127 @@ def captured(frame: Frame) -> Captured:
 
 
 ImageFault = Callable[[Captured, float, np.random.Generator], Captured]
-"""(frame, size of the fault, generator) -> the frame, spoiled."""
+"""Function (frame, size of the fault, generator) that returns a spoiled frame."""
 
 PriorFault = Callable[[Prior, float, np.random.Generator], Prior]
+"""Function (prior, size of the fault, generator) that returns a spoiled prior."""
 
 
 def _colours(frame: Captured, change: Callable[[np.ndarray], np.ndarray]) -> Captured:
-    """The same change of linear colour in the image and in the image of the rock alone."""
+    """Change linear colours in the image and in the image of the rock alone."""
     alpha = frame.rgba[..., 3:]
     rock = np.clip(change(frame.rgba[..., :3]), 0, None) * (alpha > 0)
     rgba = np.concatenate([rock, alpha], axis=-1, dtype=np.float32)
-    return replace(
-        frame, pixels=np.clip(change(frame.pixels), 0, None).astype(np.float32), rgba=rgba
-    )
+    pixels = np.clip(change(frame.pixels), 0, None).astype(np.float32)
+    return replace(frame, pixels=pixels, rgba=rgba)
 
 
 def pose_noise(frame: Captured, size: float, rng: np.random.Generator) -> Captured:
-    """size: degrees about each axis of the camera; its position is off by as much as keeps the rock
-    in sight, 1 cm a degree."""
+    """Pose error. size: degrees about each axis of the camera, and centimetres."""
     pose = frame.camera.world_to_camera.copy()
     turn = Rotation.from_rotvec(np.deg2rad(size) * rng.normal(size=3)).as_matrix()
     pose[:3] = turn @ pose[:3]
     pose[:3, 3] += 0.01 * size * rng.normal(size=3)
-    return replace(
-        frame, camera=Camera(frame.camera.K, frame.camera.width, frame.camera.height, pose)
-    )
+    return replace(frame, camera=replace(frame.camera, world_to_camera=pose))
 
 
 def image_noise(frame: Captured, size: float, rng: np.random.Generator) -> Captured:
-    """size: standard deviation of noise on sRGB values."""
+    """Noise of sRGB values. size: standard deviation."""
     noise = rng.normal(0, size, frame.pixels.shape)
-    return _colours(
-        frame,
-        lambda rgb: linear_from_srgb(np.clip(srgb_from_linear(np.clip(rgb, 0, 1)) + noise, 0, 1)),
-    )
+
+    def change(rgb: np.ndarray) -> np.ndarray:
+        return linear_from_srgb(np.clip(srgb_from_linear(np.clip(rgb, 0, 1)) + noise, 0, 1))
+
+    return _colours(frame, change)
 
 
 def exposure(frame: Captured, size: float, rng: np.random.Generator) -> Captured:
-    """size: standard deviation of the exposure in stops."""
+    """Varying exposure. size: standard deviation in stops."""
     factor = 2.0 ** rng.normal(0, size)
     return _colours(frame, lambda rgb: np.minimum(rgb * factor, 1))
 
 
 def motion_blur(frame: Captured, size: float, rng: np.random.Generator) -> Captured:
-    """size: length of the motion, pixels, in a random direction."""
+    """Motion in a random direction. size: length in pixels."""
     angle = rng.uniform(0, 2 * np.pi)
     offsets = np.linspace(-size / 2, size / 2, 2 * int(size) + 1)
     steps = [(t * np.sin(angle), t * np.cos(angle), 0) for t in offsets]
-    moved = np.mean([shift(frame.rgba, step, order=1, mode="nearest") for step in steps], axis=0)
-    pixels = np.mean([shift(frame.pixels, step, order=1, mode="nearest") for step in steps], axis=0)
-    return replace(
-        frame,
-        pixels=pixels.astype(np.float32),
-        rgba=moved.astype(np.float32),
-        rock=moved[..., 3] >= 0.5,
+    rgba, pixels = (
+        np.mean([shift(one, step, order=1, mode="nearest") for step in steps], axis=0)
+        for one in (frame.rgba, frame.pixels)
     )
+    return _blurred(frame, pixels, rgba)
 
 
 def defocus(frame: Captured, size: float, rng: np.random.Generator) -> Captured:
-    """size: standard deviation of the blur, pixels."""
-    rgba = gaussian_filter(frame.rgba, (size, size, 0)).astype(np.float32)
-    return replace(
-        frame,
-        pixels=gaussian_filter(frame.pixels, (size, size, 0)),
-        rgba=rgba,
-        rock=rgba[..., 3] >= 0.5,
-    )
+    """Blur. size: standard deviation in pixels."""
+    pixels, rgba = (gaussian_filter(one, (size, size, 0)) for one in (frame.pixels, frame.rgba))
+    return _blurred(frame, pixels, rgba)
+
+
+def _blurred(frame: Captured, pixels: np.ndarray, rgba: np.ndarray) -> Captured:
+    rock = rgba[..., 3] >= 0.5
+    pixels, rgba = pixels.astype(np.float32), rgba.astype(np.float32)
+    return replace(frame, pixels=pixels, rgba=rgba, rock=rock)
 
 
 def missing_depth(frame: Captured, size: float, rng: np.random.Generator) -> Captured:
-    """size: share of the pixels without a return, in patches. The prior was built before; depth
-    colours the Gaussians."""
+    """Depth missing in patches; the prior was built before. size: share of the pixels."""
     patches = gaussian_filter(rng.normal(size=frame.z.shape), 4)
-    return replace(
-        frame, z=np.where(patches < np.quantile(patches, size), 0, frame.z).astype(np.float32)
-    )
+    z = np.where(patches < np.quantile(patches, size), 0, frame.z).astype(np.float32)
+    return replace(frame, z=z)
 
 
 def shifted_mask(frame: Captured, size: float, rng: np.random.Generator) -> Captured:
-    """size: pixels by which the mask is off, in a random direction; what it cuts out is taken for
-    the rock."""
+    """Mask moved in a random direction. size: pixels."""
     angle = rng.uniform(0, 2 * np.pi)
-    return _masked(
-        frame,
-        shift(frame.rgba[..., 3], (size * np.sin(angle), size * np.cos(angle)), order=1) >= 0.5,
-    )
+    offset = (size * np.sin(angle), size * np.cos(angle))
+    return _masked(frame, shift(frame.rgba[..., 3], offset, order=1) >= 0.5)
 
 
 def wrong_mask(frame: Captured, size: float, rng: np.random.Generator) -> Captured:
-    """size: pixels by which the mask is too large, or, in every second frame, too small."""
-    grow, count = rng.random() < 0.5, int(size)
-    found = (binary_dilation if grow else binary_erosion)(frame.rock, iterations=count)
-    return _masked(frame, found)
+    """Mask too large, or, in every second frame, too small. size: pixels."""
+    change = binary_dilation if rng.random() < 0.5 else binary_erosion
+    return _masked(frame, change(frame.rock, iterations=int(size)))
 
 
 def _masked(frame: Captured, mask: np.ndarray) -> Captured:
-    """The frame with the rock cut out of its image by another mask."""
+    """The rock cut out of the image by another mask."""
     alpha = mask.astype(np.float32)[..., None]
-    return replace(
-        frame,
-        rock=mask,
-        rgba=np.concatenate([frame.pixels * alpha, alpha], axis=-1, dtype=np.float32),
-    )
+    rgba = np.concatenate([frame.pixels * alpha, alpha], axis=-1, dtype=np.float32)
+    return replace(frame, rock=mask, rgba=rgba)
 
 
 IMAGE_FAULTS: dict[str, tuple[ImageFault, tuple[float, ...]]] = {
-    "pose noise": (pose_noise, (0.25, 1.0, 4.0)),  # degrees
-    "image noise": (image_noise, (0.02, 0.1, 0.3)),  # of sRGB range
-    "exposure": (exposure, (0.1, 0.3, 1.0)),  # stops
-    "motion blur": (motion_blur, (2.0, 5.0, 12.0)),  # pixels
-    "defocus": (defocus, (0.5, 1.5, 4.0)),  # pixels
-    "missing depth": (missing_depth, (0.2, 0.6, 0.95)),  # of pixels
-    "shifted mask": (shifted_mask, (1.0, 4.0, 10.0)),  # pixels
-    "wrong mask": (wrong_mask, (1.0, 3.0, 8.0)),  # pixels
+    "pose noise": (pose_noise, (0.25, 1.0, 4.0)),
+    "image noise": (image_noise, (0.02, 0.1, 0.3)),
+    "exposure": (exposure, (0.1, 0.3, 1.0)),
+    "motion blur": (motion_blur, (2.0, 5.0, 12.0)),
+    "defocus": (defocus, (0.5, 1.5, 4.0)),
+    "missing depth": (missing_depth, (0.2, 0.6, 0.95)),
+    "shifted mask": (shifted_mask, (1.0, 4.0, 10.0)),
+    "wrong mask": (wrong_mask, (1.0, 3.0, 8.0)),
 }
-"""By name: the fault, and its sizes from small to large."""
-
-
-def _of_points(prior: Prior, points: np.ndarray, normals: np.ndarray | None = None) -> Prior:
-    return replace(prior, points=points, normals=prior.normals if normals is None else normals)
+"""Faults by name, and their sizes from small to large."""
 
 
 def noisy_prior(prior: Prior, size: float, rng: np.random.Generator) -> Prior:
-    """size: standard deviation of noise along the normals, spacings."""
+    """Noise along the normals. size: standard deviation in spacings."""
     off = size * prior.spacing * rng.normal(size=(len(prior.points), 1))
-    return _of_points(prior, prior.points + off * prior.normals)
+    return replace(prior, points=prior.points + off * prior.normals)
 
 
 def smoothed_prior(prior: Prior, size: float, rng: np.random.Generator) -> Prior:
-    """size: how many times each point moves to the mean of its 32 nearest, as an over-smoothed
-    Poisson mesh would lie."""
-    from scipy.spatial import cKDTree
-
+    """Over-smoothed surface. size: how many times a point moves to the mean of its 32 nearest."""
     points = prior.points
     near = cKDTree(points).query(points, k=min(32, len(points)))[1]
     for _ in range(int(size)):
         points = points[near].mean(axis=1)
-    return _of_points(prior, points)
+    return replace(prior, points=points)
 
 
 def holes(prior: Prior, size: float, rng: np.random.Generator) -> Prior:
-    """size: share of the surface that is missing, around one random point. The Gaussians that are
-    left stay as they are."""
+    """Surface missing around a random point. size: share of the surface."""
     n = len(prior.points)
     away = np.linalg.norm(prior.points - prior.points[rng.integers(n)], axis=1)
     kept = away > np.quantile(away, size)
@@ -222,145 +202,128 @@ def holes(prior: Prior, size: float, rng: np.random.Generator) -> Prior:
 
 
 def shifted(prior: Prior, size: float, rng: np.random.Generator) -> Prior:
-    """size: metres, in a random horizontal direction."""
+    """Prior moved in a random horizontal direction. size: metres."""
     angle = rng.uniform(0, 2 * np.pi)
-    return _of_points(prior, prior.points + size * np.array([np.cos(angle), np.sin(angle), 0]))
+    offset = size * np.array([np.cos(angle), np.sin(angle), 0])
+    return replace(prior, points=prior.points + offset)
 
 
 def scaled(prior: Prior, size: float, rng: np.random.Generator) -> Prior:
-    """size: factor about the centre."""
+    """Prior scaled about its centre. size: factor."""
     centre = prior.points.mean(0)
-    return _of_points(prior, centre + size * (prior.points - centre))
+    return replace(prior, points=centre + size * (prior.points - centre))
 
 
 def turned(prior: Prior, size: float, rng: np.random.Generator) -> Prior:
-    """size: degrees about the vertical through the centre."""
+    """Prior turned about the vertical through its centre. size: degrees."""
     centre, turn = prior.points.mean(0), Rotation.from_euler("z", size, degrees=True).as_matrix()
-    return _of_points(prior, centre + (prior.points - centre) @ turn.T, prior.normals @ turn.T)
+    points = centre + (prior.points - centre) @ turn.T
+    return replace(prior, points=points, normals=prior.normals @ turn.T)
 
 
 PRIOR_FAULTS: dict[str, tuple[PriorFault, tuple[float, ...]]] = {
-    "noisy prior": (noisy_prior, (0.5, 2.0, 6.0)),  # spacings
-    "smoothed prior": (smoothed_prior, (2.0, 10.0, 40.0)),  # rounds
-    "holes": (holes, (0.05, 0.2, 0.5)),  # of the surface
-    "shifted prior": (shifted, (0.02, 0.1, 0.4)),  # m
-    "scaled prior": (scaled, (1.02, 1.1, 1.4)),  # times
-    "turned prior": (turned, (3.0, 15.0, 90.0)),  # degrees
+    "noisy prior": (noisy_prior, (0.5, 2.0, 6.0)),
+    "smoothed prior": (smoothed_prior, (2.0, 10.0, 40.0)),
+    "holes": (holes, (0.05, 0.2, 0.5)),
+    "shifted prior": (shifted, (0.02, 0.1, 0.4)),
+    "scaled prior": (scaled, (1.02, 1.1, 1.4)),
+    "turned prior": (turned, (3.0, 15.0, 90.0)),
 }
-"""By name, as IMAGE_FAULTS."""
+"""Faults by name, and their sizes from small to large."""
+
+ANOTHER = "another rock's prior"
 
 SHORT_FITS = (1, 2, 5)
-"""Passes of fits that are stopped too early, as a fault of their own."""
+"""Passes of fits that are stopped too early, as a fault."""
 
 FREE_VIEWS, FREE_PASSES = (2, 4), 40
-"""Views and passes of fits whose means are free and held by no prior, as another."""
+"""Views and passes of fits whose means are free and held by no prior, as a fault."""
 
 ONE_POSE = (1.0, 4.0)
-"""Degrees of `pose_noise` in a single view."""
+"""Sizes of `pose_noise` in a single view."""
 
 
 def signs_of(
     lab: Lab, taken: Sequence[int], passes: int = PASSES, means: str = "frozen"
-) -> tuple[Any, dict[str, float]]:
-    """A fit, and the signs that the loop would have of it after its first step."""
+) -> tuple[Gaussians, dict[str, float]]:
+    """A fit, and the signs that the loop would compute after its first step."""
     start = lab.start(taken)
-    found = lab.fit(taken, passes, means, with_prior=means == "frozen", start=start)
-    lam, views = lab.lam(), []
+    fit = lab.fit(taken, passes, means, with_prior=means == "frozen", start=start)
     surface = np.sum(lab.information(start, taken), axis=0)[: len(lab.prior.points)]
+    views = []
     for frame in (lab.frames[i] for i in taken):
         old, new = (
-            render(model, frame.camera, cache=lab.cache) for model in (start, found.gaussians)
+            render(model, frame.camera, cache=lab.cache) for model in (start, fit.gaussians)
         )
-        target, mask, margin = (
-            target_of(frame),
-            frame.mask(),
-            detectors.outline_margin(start, frame.camera),
-        )
-        before = detectors.before_fit(
-            target, mask, np.asarray(old.rgb), np.asarray(old.alpha), margin
-        )
+        target, mask = target_of(frame), frame.mask()
+        margin = detectors.outline_margin(start, frame.camera)
+        shown, alpha = np.asarray(old.rgb), np.asarray(old.alpha)
+        before = detectors.before_fit(target, mask, shown, alpha, margin)
         views.append(detectors.view_signs(target, mask, np.asarray(new.rgb), before))
-    drift = detectors.means_drift(found.gaussians.means, start.means, start.log_scales)
-    return found.gaussians, detectors.step_signs(
-        views, found.losses, coverage(surface, lam), [], drift
-    )
+    drift = detectors.means_drift(fit.gaussians.means, start.means, start.log_scales)
+    seen = coverage(surface, lab.lam())
+    return fit.gaussians, detectors.step_signs(views, fit.losses, seen, [], drift)
 
 
-def _row(
-    lab: Lab, run: str, fault: str, size: float, clean: Mapping[str, Any] | None, *arguments: Any
-) -> Row:
-    model, signs = signs_of(lab, *arguments)
-    quality = lab.quality(model)
-    reference = quality["psnr"] if clean is None else clean["psnr"]
-    lost = reference - quality["psnr"]
-    named = {
-        "run": run,
-        "scene": run.split(",")[0],
-        "fault": fault,
-        "size": size,
-        "label": f"{fault} {size:g}",
-    }
-    return (
-        named
-        | quality
-        | {"lost": lost, "failed": bool(lost > FAILURE)}
-        | {f"sign {name}": value for name, value in signs.items()}
-    )
+def _row(lab: Lab, run: str, fault: str, size: float, clean: Row | None, *how: Any) -> Row:
+    """Row of one fit. clean: that of the clean run; how: arguments of `signs_of`."""
+    model, signs = signs_of(lab, *how)
+    row: Row = {"run": run, "scene": run.split(",")[0], "fault": fault, "size": size}
+    row |= {"label": f"{fault} {size:g}", **lab.quality(model)}
+    lost = (row if clean is None else clean)["psnr"] - row["psnr"]
+    row |= {"lost": lost, "failed": bool(lost > FAILURE)}
+    return row | {f"sign {name}": value for name, value in signs.items()}
 
 
 def faults(
-    root: Path, out: Path, scene: str, kinds: str, others: list[str], repeats: int
+    root: Path,
+    out: Path,
+    scene: str,
+    dataset: str,
+    prior: str,
+    kinds: str,
+    others: list[dict[str, str]],
+    repeats: int,
 ) -> dict[str, Any]:
-    """Fits to evenly spread views with every fault of a kind ("images" or "prior") at every size,
-    beside clean ones.
+    """Clean fits to evenly spread views, and fits with every fault of a kind at every size.
 
-    others: rocks whose priors are tried in the place of the right one. repeats: draws of faults,
-    each with views of its own.
+    kinds: "images" or "prior". others: datasets and priors of other rocks, whose priors are tried
+    in place of the right one. repeats: draws of faults, each with views of its own.
     """
-    opened, rows = open_lab(root, scene), []
+    opened, rows = open_lab(root / dataset, root / prior), []
     lab = opened.changed(frames=tuple(captured(frame) for frame in opened.frames))
     table: Mapping[str, Any] = IMAGE_FAULTS if kinds == "images" else PRIOR_FAULTS
-    for run, turn in turns(repeats):
-        named, taken = f"{scene}, {run}", lab.even(VIEWS, turn)
-        clean = _row(lab, named, "none", VIEWS, None, taken)
+    for name, turn in turns(repeats):
+        run, taken = f"{scene}, {name}", lab.even(VIEWS, turn)
+        clean = _row(lab, run, "none", VIEWS, None, taken)
         rows.append(clean)
         for fault, (function, sizes) in table.items():
             for size in sizes:
-                rng = generator(0, f"stress/{named}/{fault}/{size}")
-                rows.append(
-                    _row(
-                        _spoiled(lab, taken, kinds, function, size, rng),
-                        named,
-                        fault,
-                        size,
-                        clean,
-                        taken,
-                    )
-                )
+                rng = generator(0, f"stress/{run}/{fault}/{size}")
+                spoiled = _spoiled(lab, taken, kinds, function, size, rng)
+                rows.append(_row(spoiled, run, fault, size, clean, taken))
         if kinds == "images":
-            rows += _fit_faults(lab, named, taken, turn, clean)
-        else:
-            wrong = {
-                k: lab.changed(prior=open_lab(root, name).prior) for k, name in enumerate(others)
-            }
-            rows += [_row(wrong[k], named, "another rock's prior", k, clean, taken) for k in wrong]
+            rows += _fit_faults(lab, run, taken, turn, clean)
+            continue
+        for k, other in enumerate(others):
+            wrong = open_lab(root / other["dataset"], root / other["prior"]).prior
+            rows.append(_row(lab.changed(prior=wrong), run, ANOTHER, k, clean, taken))
     return {"rows": rows}
 
 
 def _spoiled(
     lab: Lab, taken: Sequence[int], kinds: str, function: Any, size: float, rng: np.random.Generator
 ) -> Lab:
-    """The lab with the fault: in the frames that are fitted, or in the prior."""
+    """The lab with the fault in the frames that are fitted, or in the prior."""
     if kinds == "prior":
         return lab.changed(prior=function(lab.prior, size, rng))
-    return lab.changed(
-        frames=tuple(function(f, size, rng) if i in taken else f for i, f in enumerate(lab.frames))
-    )
+    frames = (function(f, size, rng) if i in taken else f for i, f in enumerate(lab.frames))
+    return lab.changed(frames=tuple(frames))
 
 
 def _fit_faults(lab: Lab, run: str, taken: Sequence[int], turn: float, clean: Row) -> list[Row]:
-    """Fits of too few passes, fits with free means on few views, with their own clean runs, and one
-    view with a wrong pose."""
+    """Fits of too few passes, fits with free means on few views beside clean ones, and fits with one
+    wrong pose."""
     rows = [_row(lab, run, "few passes", passes, clean, taken, passes) for passes in SHORT_FITS]
     for count in FREE_VIEWS:
         few = lab.even(count, turn)
@@ -368,26 +331,105 @@ def _fit_faults(lab: Lab, run: str, taken: Sequence[int], turn: float, clean: Ro
         rows += [frozen, _row(lab, run, "free means", count, frozen, few, FREE_PASSES, "free")]
     for size in ONE_POSE:
         rng = generator(0, f"stress/{run}/one bad pose/{size}")
-        rows.append(
-            _row(
-                _spoiled(lab, taken[:1], "images", pose_noise, size, rng),
-                run,
-                "one bad pose",
-                size,
-                clean,
-                taken,
-            )
-        )
+        spoiled = _spoiled(lab, taken[:1], "images", pose_noise, size, rng)
+        rows.append(_row(spoiled, run, "one bad pose", size, clean, taken))
     return rows
 
 
-def fault_cells(preset: Preset, kinds: str) -> list[Cell]:
-    """A cell for each rock of the preset, the others too."""
-    rocks = [f"{scene}-{seed}" for scene, seed in (*preset.rocks, *preset.others)]
-    needs = tuple(f"dataset/{rock}" for rock in rocks)
-    cells = []
+def fault_cells(size: StressSize, kinds: str) -> list[Cell]:
+    """Cells of a kind of faults on all rocks of a size."""
+    rocks, cells = (*size.rocks, *size.others), []
     for k, rock in enumerate(rocks):
-        others = [rocks[(k + 1) % len(rocks)], rocks[(k + 2) % len(rocks)]]
-        arguments = {"scene": rock, "kinds": kinds, "others": others, "repeats": preset.repeats}
-        cells.append(Cell(f"faults-{kinds}/{rock}", f"{__name__}:faults", arguments, needs))
+        others = [size.case(*rocks[(k + step) % len(rocks)]) for step in (1, 2)]
+        *made, cell = rock_cell(
+            f"faults-{kinds}",
+            f"{__name__}:faults",
+            size,
+            rock,
+            kinds=kinds,
+            others=[case.folders for case in others],
+            repeats=size.repeats,
+        )
+        made += [one for case in others for one in case.cells()]
+        cells += [*made, replace(cell, needs=tuple(dict.fromkeys(one.name for one in made)))]
     return cells
+
+
+def _harm(fault: str, size: float, words: str, bound: float = 1.0, harmless: bool = False) -> Claim:
+    """Claim that a fault of this size costs the bound or more; harmless: at most the bound."""
+    amount = f"at most {bound:g} dB" if harmless else f"{bound:g} dB or more"
+    lost = single("lost", {"fault": fault, "size": size})
+    hypothesis = f"{words} costs {amount} on the test views."
+    return Claim(hypothesis, lost, "dB", "below" if harmless else "above", bound, "rock and draw")
+
+
+LOST = Panel("label", "lost", "fault and its size", "PSNR lost on test views (dB)")
+
+DATA_FAULTS = Experiment(
+    "Which faults of the images spoil a model?",
+    lambda size: fault_cells(size, "images"),
+    (
+        _harm("pose noise", 1.0, "Pose noise of 1 degree and 1 cm"),
+        _harm("image noise", 0.1, "Image noise of a tenth of the range", harmless=True),
+        _harm("exposure", 0.3, "Exposure that varies by 0.3 stops"),
+        _harm("motion blur", 5.0, "Motion blur of 5 pixels"),
+        _harm("defocus", 1.5, "Defocus of 1.5 pixels"),
+        _harm("missing depth", 0.6, "Depth missing in 60 % of the pixels (with the prior as it was)",
+              0.5, harmless=True),
+        _harm("shifted mask", 4.0, "A mask that is off by 4 pixels"),
+        _harm("wrong mask", 3.0, "A mask that is 3 pixels too large or too small"),
+    ),
+    (LOST,),
+)  # fmt: skip
+
+PRIOR_EXPERIMENT = Experiment(
+    "Which faults of the prior spoil a model?",
+    lambda size: fault_cells(size, "prior"),
+    (
+        _harm("noisy prior", 2.0, "Noise of 2 spacings on the prior's points"),
+        _harm("smoothed prior", 10.0, "Over-smoothing the prior (10 rounds)", harmless=True),
+        _harm("holes", 0.2, "A hole of a fifth of the surface"),
+        _harm("shifted prior", 0.1, "A prior that is shifted by 10 cm"),
+        _harm("scaled prior", 1.1, "A prior that is 10 % too large"),
+        _harm("turned prior", 15.0, "A prior that is turned by 15 degrees"),
+        _harm(ANOTHER, 0, "The prior of another rock"),
+    ),
+    (LOST,),
+)
+
+
+def _alarm(row: Row) -> float:
+    """1 where any sign is beyond its limit in `mgs.run.detectors`, else 0."""
+    found = ((row.get(f"sign {sign}"), detector.limit) for sign, detector in DETECTORS.items())
+    return float(any(value is not None and value > limit for value, limit in found))
+
+
+def false_alarms(rows: Sequence[Row]) -> list[float]:
+    """Alarms of clean runs, 1 or 0. Clean runs of both kinds of faults are the same and count
+    once."""
+    clean = {(row["run"], row["size"]): row for row in rows if row["fault"] == "none"}
+    return [_alarm(row) for row in clean.values()]
+
+
+def caught(rows: Sequence[Row]) -> list[float]:
+    """Alarms of failed runs, 1 or 0."""
+    return [_alarm(row) for row in rows if row["failed"]]
+
+
+ALARMS = Experiment(
+    "Do the detectors tell failed runs from good ones?",
+    lambda size: [*fault_cells(size, "images"), *fault_cells(size, "prior")],
+    (
+        Claim(
+            "At most one in thirty clean runs raises an alarm.",
+            false_alarms, "share", "below", 1 / 30, "clean run",
+        ),
+        Claim(
+            "At least nine of ten failed runs raise an alarm.",
+            caught, "share", "above", 0.9, "failed run",
+        ),
+    ),
+    (
+        Panel("fault", "failed", "fault, at all its sizes", "runs that failed (share)"),
+    ),
+)  # fmt: skip

@@ -1,0 +1,243 @@
+"""`mgs reproduce`, `stress`, `parsimony` and `chart`: the studies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from mgs.study.sweep import Report
+
+Size = TypeVar("Size")
+
+Out = Annotated[
+    Path, typer.Argument(help="Folder for everything; the same command again continues.")
+]
+Workers = Annotated[int, typer.Option(min=1, help="Worker processes, which share the cores.")]
+
+
+@contextmanager
+def _study(
+    out: Path, sizes: Mapping[str, Size], preset: str
+) -> Iterator[tuple[Size, Console, Report]]:
+    """Context of every study: locks its folder and records its preset; gives the size, a console,
+    and the callback that prints each cell that begins.
+
+    Raises InputError for an unknown preset, and if the folder is of another preset, holds something
+    else, cannot be written or is in use.
+    """
+    from rich.console import Console
+
+    from mgs import runtime
+    from mgs.errors import InputError, row_named
+    from mgs.files import check_new_folder, check_writable, locked, read_json, write_json
+
+    size, console = row_named(sizes, preset, "--preset"), Console(highlight=False)
+    record = check_writable(out) / "study.json"
+    if not record.is_file():
+        check_new_folder(out)
+        write_json(record, {"preset": preset})
+    elif (there := read_json(record)) != {"preset": preset}:
+        was = there.get("preset") if isinstance(there, dict) else None
+        raise InputError(
+            f"{out}: was begun with --preset {was}, not {preset}; give that, or another folder"
+        )
+    runtime.start()
+
+    def report(cell: str, done: int, total: int) -> None:
+        console.print(f"{done}/{total} {cell}", style="dim", soft_wrap=True)
+
+    with locked(out):
+        yield size, console, report
+
+
+def reproduce(
+    out: Out = Path("reproduced"),
+    preset: Annotated[
+        str,
+        typer.Option(
+            help="quick: Table I of 12 of 32 views, 320x240. paper: of 54 of 100 views, 640x480."
+        ),
+    ] = "quick",
+    only: Annotated[
+        str | None,
+        typer.Option(
+            help="Which results, as table1,curves: table1, figures, curves, seeds, pools, oracle. "
+            "Default: all but oracle."
+        ),
+    ] = None,
+    rocks: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Number of rocks of curves, seeds, pools and oracle. Default: the preset's."
+        ),
+    ] = None,
+    policy: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="A further policy for curves and pools: a name, or FILE.py:FUNCTION. "
+            "May be given several times."
+        ),
+    ] = None,
+    mesh: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="A rock of your own for results over many rocks, in place of the procedural ones. "
+            "May be given several times."
+        ),
+    ] = None,
+    batch: Annotated[
+        int,
+        typer.Option(
+            min=1, help="Of Table I and the figures: views chosen before the model is fitted again."
+        ),
+    ] = 1,
+    workers: Workers = 1,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(help="Use the workers of this Dask scheduler instead, as tcp://HOST:8786."),
+    ] = None,
+) -> None:
+    """Make the results of docs/results.md: Table I at equal numbers of images, PSNR against images
+    over many rocks with statistics, numbers of seeds, pools of candidates, and an oracle that sees
+    the truth.
+
+    Every dataset, prior and run is a cell, done once and kept in OUT/cells; the results are written
+    to OUT/results. Runs whose seconds are reported run alone: let nothing else run meanwhile.
+    """
+    from mgs.errors import InputError, row_named
+    from mgs.study import reproduce as study
+    from mgs.study.reproduce_results import make
+
+    names = study.results_of(only)
+    size = row_named(study.SIZES, preset, "--preset")
+    size = study.with_options(size, names, policy or [], mesh or [], batch)
+    counts = {name: study.rocks_of(name, size, rocks) for name in names}
+    if scheduler is not None and workers != 1:
+        raise InputError(
+            "--workers starts workers here, and --scheduler uses those of a scheduler; "
+            "give one of them"
+        )
+    with _study(out, study.SIZES, preset) as (_, console, report):
+        for name, count in counts.items():
+
+            def tell(cell: str, done: int, total: int, name: str = name) -> None:
+                report(f"{name} {cell}", done, total)
+
+            written = make(out, name, preset, size, count, tell, workers, scheduler)
+            files = ", ".join(str(path) for path in written)
+            console.print(f"{name}: wrote {files}", soft_wrap=True)
+
+
+def stress(
+    out: Out = Path("out/stress"),
+    preset: Annotated[
+        str,
+        typer.Option(
+            help="quick: minutes on two cores with --workers 2. "
+            "full: more rocks, larger images, more runs; hours."
+        ),
+    ] = "quick",
+    workers: Workers = 1,
+    only: Annotated[
+        str | None, typer.Option(help="Names of experiments, separated by commas. Default: all.")
+    ] = None,
+) -> None:
+    """Try to make the methods fail: experiments with a hypothesis each, and a verdict that follows
+    from the numbers by a rule.
+
+    Writes stability.csv (all numbers), verdicts.json, stability.md (the verdicts as tables) and a
+    plot of each experiment.
+    """
+    from mgs.provenance import command_line
+    from mgs.study.stress.lab import SIZES
+    from mgs.study.stress.run import EXPERIMENTS, run_stress
+    from mgs.study.sweep import names_of
+
+    names = names_of(only, EXPERIMENTS)
+    with _study(out, SIZES, preset) as (size, console, report):
+        for experiment in run_stress(out, size, names, command_line(), report, workers):
+            console.print(f"{experiment['name']}: {experiment['question']}", soft_wrap=True)
+            _print_claims(console, experiment["claims"])
+    console.print(f"wrote {out}: verdicts.json, stability.csv, stability.md, plots", soft_wrap=True)
+
+
+def parsimony(
+    out: Out = Path("parsimony"),
+    preset: Annotated[
+        str,
+        typer.Option(
+            help="quick: six scenes of small images, ten minutes. "
+            "full: the same of 320x240, half an hour."
+        ),
+    ] = "quick",
+) -> None:
+    """Chart quality and cost against the number of Gaussians, the kinds of parameters learned, and
+    the SH degree, with the automatic choice marked.
+
+    Renders the scenes, fits each model view by view, and judges it on test views that no model
+    sees. Writes parsimony.json, parsimony.csv, parsimony.md and parsimony.png.
+    """
+    from rich.table import Table
+
+    from mgs.provenance import command_line
+    from mgs.study import parsimony as study
+    from mgs.study.output import text_of
+
+    with _study(out, study.SIZES, preset) as (size, console, report):
+        choices, claims = study.run_study(out, size, report, command_line(), preset)
+    table = Table(*study.COLUMNS)
+    for row in choices:
+        table.add_row(*(text_of(content, row) for content in study.COLUMNS.values()))
+    console.print(table)
+    _print_claims(console, claims)
+    console.print(f"wrote {out}: parsimony.json, .csv, .md and .png", soft_wrap=True)
+
+
+def chart(
+    out: Out = Path("chart"),
+    dataset: Annotated[
+        Path | None,
+        typer.Option(help="A dataset with test views, in place of the one that is rendered."),
+    ] = None,
+    preset: Annotated[
+        str, typer.Option(help="quick: about ten minutes on two quiet cores. full: hours.")
+    ] = "quick",
+    only: Annotated[str | None, typer.Option(help="Some of fit,scoring. Default: all.")] = None,
+    repeats: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Timings of each point; the median counts. Default: quick 2, full 3."
+        ),
+    ] = None,
+) -> None:
+    """Chart speed against accuracy: of fits and runs, and of scoring.
+
+    Writes KIND.csv, KIND.json, KIND.md and KIND.png of each chart; each row names the command that
+    makes it again. Points are timed one after another: let nothing else run meanwhile.
+    """
+    from mgs.study.chart.fits import SIZES
+    from mgs.study.chart.run import CHARTS, check_dataset, run_chart
+    from mgs.study.sweep import names_of
+
+    kinds = names_of(only, CHARTS)
+    check_dataset(dataset)
+    with _study(out, SIZES, preset) as (_, console, report):
+        found = run_chart(out, preset, kinds, repeats, dataset, report)
+    for kind, (rows, claims) in found.items():
+        console.print(f"{kind}: {len(rows)} rows in {out / f'{kind}.csv'}", soft_wrap=True)
+        _print_claims(console, claims)
+
+
+def _print_claims(console: Console, claims: list[dict[str, Any]]) -> None:
+    from mgs.study.verdict import effect
+
+    for one in claims:
+        text = f"{one['hypothesis']} {effect(one)}, {one['runs']} runs"
+        console.print(f"  {one['verdict']:8} {text}", soft_wrap=True)

@@ -1,0 +1,262 @@
+"""Cases: a rock at one size with one prior, and what studies do with it.
+
+A case names the cells that render its dataset and build its prior. The functions with the arguments
+(root, out, ...) are tasks of `mgs.study.sweep.Cell`; `dataset` and `prior` are folders below the
+study's folder, or absolute. All tasks continue after an interruption.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass, field
+from multiprocessing import get_context, parent_process
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+from mgs.data.dataset import Dataset, load_dataset
+from mgs.errors import InputError
+from mgs.files import atomic_folder
+from mgs.fit.settings import COLOURS_ALONE
+from mgs.gaussians import Gaussians
+from mgs.prior.build import build_prior, load_prior, save_prior
+from mgs.prior.settings import PriorSettings
+from mgs.report.evaluation import evaluate, evaluate_run
+from mgs.run.folder import State
+from mgs.run.nbv import resume_nbv, run_nbv
+from mgs.study.sweep import CELLS, Cell
+
+CURVES = ("images", "coverage", "test_psnr", "test_psnr_mask")
+"""Entries of each step that `run_policy` returns."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A rock with its ground, light and orbit.
+
+    name: scene file. seed: of the rock. changes: values in place of the file's, by section and key.
+    mesh: file of a rock in place of the procedural one. label: folder name.
+    """
+
+    name: str
+    seed: int = 0
+    changes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    mesh: str | None = None
+    label: str = ""
+
+
+@dataclass(frozen=True)
+class Size:
+    """Width and height of images in pixels, number of frames and of test views, samples per pixel."""
+
+    width: int
+    height: int
+    frames: int
+    tests: int
+    spp: int = 8
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene at one size, with the settings of its prior (`PriorSettings`). given: a dataset that
+    exists already, in place of the scene's."""
+
+    scene: Scene
+    size: Size
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    given: Path | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the scene at its size, for folders."""
+        label = self.scene.label or f"{self.scene.name}-{self.scene.seed}"
+        size = self.size
+        return label if self.given else f"{label}/{size.frames}x{size.width}x{size.height}"
+
+    @property
+    def dataset(self) -> str:
+        """Folder of the dataset."""
+        return str(self.given) if self.given else f"{CELLS}/dataset/{self.name}/dataset"
+
+    @property
+    def prior(self) -> str:
+        """Folder of the prior."""
+        return f"{CELLS}/{self.prior_name}/prior"
+
+    @property
+    def prior_name(self) -> str:
+        """Name of the prior's cell."""
+        return "-".join(
+            [
+                f"prior/{self.name}",
+                *(f"{v:g}" if isinstance(v, float) else str(v) for v in self.settings.values()),
+            ]
+        )
+
+    @property
+    def folders(self) -> dict[str, str]:
+        """The arguments `dataset` and `prior` of tasks."""
+        return {"dataset": self.dataset, "prior": self.prior}
+
+    def cells(self) -> list[Cell]:
+        """Cells that make the dataset and the prior."""
+        cells = []
+        if not self.given:
+            scene = self.scene
+            arguments = {"scene": scene.name, "seed": scene.seed, "changes": scene.changes}
+            arguments |= {"size": asdict(self.size), "mesh": scene.mesh}
+            cells.append(Cell(f"dataset/{self.name}", f"{__name__}:make_dataset", arguments))
+        arguments = {"dataset": self.dataset, **self.settings}
+        needs = tuple(cell.name for cell in cells)
+        return [*cells, Cell(self.prior_name, f"{__name__}:make_prior", arguments, needs)]
+
+
+def make_dataset(
+    root: Path,
+    out: Path,
+    scene: str,
+    seed: int,
+    size: dict[str, int],
+    changes: dict[str, dict[str, Any]] | None = None,
+    mesh: str | None = None,
+) -> dict[str, Any]:
+    """Render the dataset of a `Scene` and a `Size` into OUT/dataset, as `mgs synth-orbit` does."""
+    from mgs.synth.rendering import RenderPreset, synthesise  # needs a variant of Mitsuba
+    from mgs.synth.scene_file import SceneFile, load_scene_file
+
+    folder = out / "dataset"
+    images = RenderPreset(size["width"], size["height"], size["frames"], size["spp"])
+    if not (folder / "transforms.json").is_file():
+        sections = load_scene_file(scene).model_dump()
+        for section, values in (changes or {}).items():
+            sections[section] |= values
+        changed = SceneFile.model_validate(sections)
+        synthesise(folder, changed, images, seed, mesh, test_views=size["tests"])
+    return {"frames": len(load_dataset(folder))}
+
+
+def make_prior(root: Path, out: Path, dataset: str, **settings: Any) -> dict[str, Any]:
+    """Build a prior into OUT/prior. settings: of `PriorSettings`."""
+    folder = out / "prior"
+    if not (folder / "prior.json").is_file():  # written last
+        shutil.rmtree(folder, ignore_errors=True)
+        built, _ = build_prior(load_dataset(root / dataset), PriorSettings(**settings))
+        with atomic_folder(folder) as unfinished:
+            save_prior(unfinished, built)
+    prior = load_prior(folder)
+    numbers = {
+        key: prior.numbers[key] for key in ("sampled_area", "resolution") if key in prior.numbers
+    }
+    return {"gaussians": len(prior.points) + prior.backed, "spacing": prior.spacing} | numbers
+
+
+def test_views_of(dataset: Dataset) -> Dataset:
+    """Test views of a dataset. Raises InputError where it has none."""
+    tests = dataset.test_views()
+    if tests is None:
+        raise InputError(
+            f"{dataset.root}: has no test views, by which models are judged; "
+            "make them with `--test-views`"
+        )
+    return tests
+
+
+def judge(model: Gaussians, dataset: Dataset) -> dict[str, float]:
+    """Mean metrics of a model over the test views of a dataset (`mgs.report.evaluation`)."""
+    metrics: dict[str, float] = evaluate(model, (), (), test_frames=test_views_of(dataset).frames)[
+        "test"
+    ]
+    return metrics
+
+
+def run_or_resume(
+    root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]
+) -> State:
+    """Last state of the run in OUT/run, which is started or continued. settings: of `mgs nbv`."""
+    for leftover in out.glob(".run.*.part"):  # of a process killed before the run began
+        shutil.rmtree(leftover)
+    run = out / "run"
+    if (run / "config.json").is_file():
+        return resume_nbv(run)
+    given = {**settings, "train": {**COLOURS_ALONE, **settings.get("train", {})}}
+    return run_nbv(root / dataset, run, prior=root / prior, **given)
+
+
+def run_policy(
+    root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]
+) -> dict[str, Any]:
+    """Run a policy. Returns a list for each of CURVES, one number for each fit, and "taken", the
+    indices of the frames in the order taken."""
+    state = run_or_resume(root, out, dataset, prior, {"evaluate_every": 1, **settings})
+    fitted = [step for step in state.steps if "loss" in step]
+    return {key: [step[key] for step in fitted] for key in CURVES} | {"taken": state.taken}
+
+
+def time_policy(
+    root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]
+) -> dict[str, Any]:
+    """Run a policy in a new process, and measure its last model on all views.
+
+    Returns "images"; "test", "all" and "held_out" of `evaluate`; "seconds" of all steps without
+    evaluation; "choice_seconds", the mean of one choice (None without any); "peak_megabytes" of the
+    process at the end of the run.
+    """
+    return in_new_process(_timed, out, root, out, dataset, prior, settings)
+
+
+def _timed(
+    root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]
+) -> dict[str, Any]:
+    steps = run_or_resume(root, out, dataset, prior, settings).steps
+    peak = peak_megabytes()
+    metrics = evaluate_run(out / "run", pictures=False)
+    choices = [step["seconds"]["score"] for step in steps[1:]]
+    spent = [
+        step["seconds"][stage] for step in steps for stage in step["seconds"] if stage != "evaluate"
+    ]
+    return {key: metrics[key] for key in ("images", "test", "all", "held_out")} | {
+        "seconds": sum(spent),
+        "choice_seconds": sum(choices) / len(choices) if choices else None,
+        "peak_megabytes": peak,
+    }
+
+
+def in_new_process(
+    task: Callable[..., dict[str, Any]], out: Path, *arguments: Any
+) -> dict[str, Any]:
+    """Result of a function called in a new process, whose memory is its own. out: named in messages.
+
+    Raises InputError if that process is killed, and what the function raises.
+    """
+    with ProcessPoolExecutor(1, get_context("spawn"), initializer=_end_with_parent) as pool:
+        try:
+            return pool.submit(task, *arguments).result()
+        except BrokenProcessPool:
+            raise InputError(
+                f"{out}: its process was killed (is there too little memory?); "
+                "give the command again"
+            ) from None
+
+
+def _end_with_parent() -> None:
+    """End this process silently at Ctrl-C, and when the process that started it has ended."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    parent = parent_process()
+    assert parent
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    Thread(target=wait, daemon=True).start()
+
+
+def peak_megabytes() -> float:
+    """Most memory that this process has held, megabytes. `getrusage` would include the parent's."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) * 1.024e-3

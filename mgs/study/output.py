@@ -1,0 +1,198 @@
+"""Output of studies: tables as CSV, JSON and Markdown, and plots of rows with intervals."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import cycle
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mgs.files import atomic_path, write_csv, write_json
+from mgs.plotting import STYLE, new_figure, save_figure
+from mgs.provenance import versions
+from mgs.report.figures import POLICY_STYLE
+from mgs.report.tables import markdown
+from mgs.runtime import processor
+from mgs.study.statistics import interval
+from mgs.study.verdict import Row
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Content = str | Callable[[Row], str]
+"""Content of a column: a format such as "psnr:.2f" (key and format), or a function of the row."""
+
+
+def table(columns: Mapping[str, Content], rows: Iterable[Row]) -> str:
+    """Markdown table of rows. columns: content by heading."""
+    return markdown(
+        list(columns), [[text_of(cell, row) for cell in columns.values()] for row in rows]
+    )
+
+
+def text_of(cell: Content, row: Row) -> str:
+    """Text of a column's content for a row; a dash for a missing value."""
+    if not isinstance(cell, str):
+        return cell(row)
+    key, _, form = cell.partition(":")
+    value = row.get(key)
+    return "–" if value is None else format(value, form)
+
+
+def with_interval(row: Row, key: str) -> str:
+    """A difference and its 95 % interval (entries KEY_low, KEY_high), where there is one; a dash
+    without the difference."""
+    if row.get(key) is None:
+        return "–"
+    if row[f"{key}_low"] is None:
+        return f"{row[key]:+.2f}"
+    return f"{row[key]:+.2f} [{row[f'{key}_low']:+.2f}, {row[f'{key}_high']:+.2f}]"
+
+
+def write_table(
+    out: Path, name: str, rows: Sequence[Row], text: str, command: str, **more: Any
+) -> list[Path]:
+    """Write NAME.csv of rows, NAME.md of a text, and NAME.json with both, the command, the machine
+    and more entries. Returns the paths."""
+    record = {"command": command, "machine": processor(), "versions": versions(), **more}
+    write_json(out / f"{name}.json", record | {"rows": rows, "markdown": text})
+    with atomic_path(out / f"{name}.md") as temporary:
+        temporary.write_text(f"{text}\n`{command}`\n", encoding="utf-8")
+    with_command = [row if "command" in row else row | {"command": command} for row in rows]
+    return [write_csv(out / f"{name}.csv", with_command), out / f"{name}.json", out / f"{name}.md"]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Plot of rows: the mean of column y over rows with its 95 % interval, against column x.
+
+    by: column with a line for each value. log: x is logarithmic. only: entries that a row must
+    have. Text in column x gives one line of the plot for each value.
+    """
+
+    x: str
+    y: str
+    x_label: str
+    y_label: str
+    by: str | None = None
+    log: bool = False
+    only: tuple[tuple[str, Any], ...] = ()
+    title: str = ""
+
+
+WIDTH, HEIGHT, PER_NAME, PER_LETTER = 2.7, 2.7, 0.17, 0.06
+"""Size of a plot against numbers, height of a name and width of its letters; inches."""
+
+COLUMNS = 3
+"""Most plots side by side."""
+
+
+def draw_panels(path: Path, panels: Sequence[Panel], rows: Sequence[Row]) -> None:
+    """Draw the panels that have rows into one figure. Raises InputError if the file cannot be
+    written."""
+    import matplotlib
+
+    drawn = [(panel, chosen) for panel in panels if (chosen := _rows_of(panel, rows))]
+    columns = min(COLUMNS, len(drawn))
+    lines = [drawn[k : k + columns] for k in range(0, len(drawn), columns)]
+    heights = [max(_size(*plot)[1] for plot in line) for line in lines]
+    widths = [max(_size(*plot)[0] for plot in drawn[k::columns]) for k in range(columns)]
+    ratios = {"width_ratios": widths, "height_ratios": heights}
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(sum(widths), sum(heights))
+        axes = figure.subplots(len(lines), columns, squeeze=False, gridspec_kw=ratios).ravel()
+        for axis, (panel, chosen) in zip(axes, drawn, strict=False):
+            (_draw_lines if _numeric(panel, chosen) else _draw_names)(axis, panel, chosen)
+            axis.set_title(panel.title)
+            if panel.by:
+                axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.02), ncols=2)
+        for axis in axes[len(drawn) :]:
+            axis.remove()
+        save_figure(figure, path)
+
+
+def _rows_of(panel: Panel, rows: Sequence[Row]) -> list[Row]:
+    needed = {panel.x, panel.y, panel.by or panel.x}
+    return [r for r in rows if needed <= r.keys() and all(r.get(k) == v for k, v in panel.only)]
+
+
+def _numeric(panel: Panel, rows: Sequence[Row]) -> bool:
+    return not isinstance(rows[0][panel.x], str)
+
+
+def _groups(panel: Panel, rows: Sequence[Row]) -> list[Any]:
+    return list(dict.fromkeys(row[panel.by] for row in rows)) if panel.by else [None]
+
+
+def _size(panel: Panel, rows: Sequence[Row]) -> tuple[float, float]:
+    """Width and height of a plot with its legend, inches."""
+    groups, names = len(_groups(panel, rows)), list(dict.fromkeys(row[panel.x] for row in rows))
+    legend = 0.17 * ((groups + 1) // 2) if panel.by else 0.0
+    if _numeric(panel, rows):
+        return WIDTH, HEIGHT + legend
+    height = 0.8 + PER_NAME * len(names) * max(1.0, 0.7 * groups)
+    return WIDTH - 0.4 + PER_LETTER * max(map(len, names)), height + legend
+
+
+def _styles(groups: Sequence[Any]) -> list[dict[str, Any]]:
+    """Keywords for matplotlib: policies as in all figures, other groups in the order of the same
+    table."""
+    of_policies = all(group in POLICY_STYLE for group in groups)
+    looks = [POLICY_STYLE[one] for one in groups] if of_policies else cycle(POLICY_STYLE.values())
+    pairs = zip(groups, looks, strict=False)
+    return [{"color": c, "marker": m, "label": group} for group, (c, m) in pairs]
+
+
+def _points(panel: Panel, rows: Sequence[Row], group: Any) -> tuple[list[Any], np.ndarray]:
+    """Values of x, and [3,X] for each of them: mean of y, low and high end of its interval."""
+    values: dict[Any, list[float]] = {}
+    for row in rows:
+        if panel.by is None or row[panel.by] == group:
+            values.setdefault(row[panel.x], []).append(float(row[panel.y]))
+    means = [float(np.mean(of_x)) for of_x in values.values()]
+    ends = [interval(of_x) or (m, m) for of_x, m in zip(values.values(), means, strict=True)]
+    return list(values), np.array([(m, *pair) for m, pair in zip(means, ends, strict=True)]).T
+
+
+def _draw_lines(axis: Axes, panel: Panel, rows: Sequence[Row]) -> None:
+    """Lines through the means against a number, with their intervals as bands."""
+    groups = _groups(panel, rows)
+    crowded = len({row[panel.x] for row in rows}) > 30
+    for group, style in zip(groups, _styles(groups), strict=True):
+        xs, points = _points(panel, rows, group)
+        order = np.argsort(xs)
+        x, (mean, low, high) = np.asarray(xs, float)[order], points[:, order]
+        axis.plot(x, mean, **(style | {"marker": ""} if crowded else style))
+        axis.fill_between(x, low, high, color=style["color"], alpha=0.15, linewidth=0)
+    if panel.log:
+        axis.set_xscale("log")
+        values = sorted({float(row[panel.x]) for row in rows})
+        if len(values) < 8 and max(values) < 1e4 and min(values) > 1e-3:
+            axis.set_xticks(values, [f"{value:.3g}" for value in values])
+            axis.minorticks_off()
+    axis.set(xlabel=panel.x_label, ylabel=textwrap.fill(panel.y_label, 31))
+
+
+def _draw_names(axis: Axes, panel: Panel, rows: Sequence[Row]) -> None:
+    """A line for each name: the mean as a point, its interval as a bar."""
+    groups = _groups(panel, rows)
+    names = list(dict.fromkeys(row[panel.x] for row in rows))
+    for k, (group, style) in enumerate(zip(groups, _styles(groups), strict=True)):
+        shown, (mean, low, high) = _points(panel, rows, group)
+        offset = (k - (len(groups) - 1) / 2) * 0.6 / len(groups)
+        place = [names.index(name) + offset for name in shown]
+        bars = np.abs([mean - low, high - mean])
+        axis.errorbar(mean, place, xerr=bars, capsize=2, **(style | {"linestyle": "none"}))
+    axis.set_ylim(len(names) - 0.4, -0.6)
+    axis.set_yticks(range(len(names)), names, fontsize=8)
+    axis.tick_params(axis="y", length=0)
+    if all(0 <= float(row[panel.y]) <= 1 for row in rows):  # a share: its scale begins at zero
+        axis.update_datalim([(0.0, 0.0)])
+    axis.margins(x=0.08)
+    axis.autoscale(axis="x")
+    y_label = textwrap.fill(panel.x_label, 12 + len(names))
+    axis.set(xlabel=textwrap.fill(panel.y_label, 40), ylabel=y_label)
