@@ -14,7 +14,7 @@ from mgs.data.dataset import Dataset
 from mgs.fit.settings import COLOURS_ALONE
 from mgs.run import recording
 from mgs.run.folder import open_run
-from mgs.run.loop import Chooser, fit_views, reachable
+from mgs.run.loop import Chooser, fit_views
 from mgs.run.nbv import start_run
 from mgs.run.operations import operations_of, psnr_measure
 from mgs.run.problem import Problem, no_progress
@@ -29,7 +29,7 @@ def oracle(tests: Dataset) -> Chooser:
     judge = psnr_measure(tests, ListCache())
 
     def choose(problem: Problem, state: Fitted, fisher: Any = None) -> tuple[int, float]:
-        left = reachable(problem, state.taken)
+        left = problem.reachable(state.taken)
         fits = (fit_views(problem, [*state.taken, frame], state) for frame in left)
         worth = [judge(fit.gaussians, [])["psnr"] for fit in fits]
         best = max(range(len(left)), key=lambda k: worth[k])
