@@ -239,7 +239,7 @@ def viewing(*arguments):
     )
     try:
         line, warned = process.stdout.readline(), False
-        if "everyone who reaches this address" in line:
+        if "with its token, can look" in line:
             line, warned = process.stdout.readline(), True
         found = re.search(r"open (http://\S+) in a browser", line)
         assert found, line + process.stderr.read()
