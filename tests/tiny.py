@@ -183,8 +183,12 @@ def write_prior(out: Path) -> Path:
     n = _normals()
     mesh = Mesh(n[:3], np.array([[0, 1, 2]]), np.zeros(1, bool))
     return save_prior(
-        out, Prior(mesh, n, n, 0.5, 0.2, {"spacing": 0.5, "depth_tolerance": 0.2, "n": POINTS})
-    )
+        out,
+        Prior(
+            mesh, n, n, 0.5, 0.2,
+            {"spacing": 0.5, "depth_tolerance": 0.2, "n": POINTS, "backed": 0, "up": [0.0, 0.0, 1.0]},
+        ),
+    )  # fmt: skip
 
 
 def write_run(out: Path, root: Path, prior: Path) -> Path:

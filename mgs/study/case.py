@@ -52,7 +52,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Size:
-    """Width and height of images in pixels, number of frames and of test views, samples per pixel."""
+    """Width and height of images in pixels, numbers of frames and test views, samples per pixel."""
 
     width: int
     height: int
@@ -229,7 +229,7 @@ def _timed(
 def in_new_process(
     task: Callable[..., dict[str, Any]], out: Path, *arguments: Any
 ) -> dict[str, Any]:
-    """Result of a function called in a new process, whose memory is its own. out: named in messages.
+    """Result of a function called in a new process, whose memory is its own. out: for messages.
 
     Raises InputError if that process is killed, and what the function raises.
     """

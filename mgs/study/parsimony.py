@@ -77,8 +77,8 @@ CLOSE = 0.1
 
 @dataclass(frozen=True)
 class ParsimonySize:
-    """Size of the study. counts: fixed numbers of Gaussians. views: images fitted, the first `seeds`
-    at once."""
+    """Size of the study. counts: fixed numbers of Gaussians. views: images that are fitted, the
+    first `seeds` at once."""
 
     scenes: tuple[str, ...]
     counts: tuple[int, ...]
@@ -141,8 +141,8 @@ def cells_of(size: ParsimonySize) -> list[Cell]:
 
 
 def views_in_order(positions: np.ndarray, centre: np.ndarray, views: int, seeds: int) -> list[int]:
-    """Indices of views evenly spaced in azimuth, ordered so that the first `seeds` are evenly spaced
-    too. positions: [C,3] of the cameras, +Z up; centre: [3]."""
+    """Indices of views evenly spaced in azimuth, ordered so that the first `seeds` are evenly
+    spaced too. positions: [C,3] of the cameras, +Z up; centre: [3]."""
     spread = list(seed_views(positions, centre, views))
     step = max(views // seeds, 1)
     return [view for first in range(step) for view in spread[first::step]]
@@ -314,8 +314,8 @@ def _holds(row: Row) -> str:
 def run_study(
     out: Path, size: ParsimonySize, report: Report, command: str, preset: str
 ) -> tuple[list[Row], list[Row]]:
-    """Do all cells that are not done, and write parsimony.json, .csv, .md and .png. Returns the rows
-    of the automatic choices, and the judged claims."""
+    """Do all cells that are not done, and write parsimony.json, .csv, .md and .png. Returns the
+    rows of the automatic choices, and the judged claims."""
     found = run_cells(out, cells_of(size), report)
     rows = [row for scene in size.scenes for row in rows_of(size, found, scene)]
     priors = {scene: found[size.case(scene, AUTO).prior_name] for scene in size.scenes}
