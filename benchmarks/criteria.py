@@ -39,6 +39,8 @@ from mgs.prior.build import load_prior
 from mgs.provenance import command_line, versions
 from mgs.run import folder as run_folder
 from mgs.run.inputs import array_digest
+from mgs.run.loop import fit_views
+from mgs.run.problem import Problem
 
 METRIC = "psnr_mask"
 
@@ -47,7 +49,7 @@ class Bench:
     """Last state of a run, whose candidates can be scored and fitted."""
 
     def __init__(self, run: Path) -> None:
-        from mgs.run.stations import real_stations
+        from mgs.run.operations import operations_of
 
         self.run, self.settings = run, run_folder.read_settings(run)
         state = run_folder.read_checkpoint(run)
@@ -62,22 +64,20 @@ class Bench:
         self.metric = f"test_{METRIC}" if self.dataset.test_views() else METRIC
         self.left = [i for i in range(len(self.dataset)) if i not in state.taken]
         self.model = array_digest(asdict(state.gaussians).values())
-        self.stations = real_stations(self.dataset, self.prior, self.settings)
+        self.operations = operations_of(self.dataset, self.prior, self.settings)
 
-    def loop(self, order: int) -> Any:
-        """Loop of the run; fits take the images in another order for each number."""
-        from mgs.run.loop import Loop
-
+    def problem(self, order: int) -> Problem:
+        """Problem of the run; fits take the images in another order for each number."""
         train = self.settings.train.model_copy(update={"seed": self.settings.train.seed + order})
         settings = self.settings.model_copy(update={"train": train})
-        return Loop(self.run, settings, self.dataset, self.stations, lambda *_: None)
+        return Problem(self.dataset, settings, self.operations)
 
     def scores(self, policies: Sequence[str]) -> dict[str, list[float]]:
         """Scores of the candidates by policy, and their distance from the views taken, which
         decides ties."""
-        loop, found = self.loop(0), {}
+        problem, found = self.problem(0), {}
         for name in policies:
-            context = loop.context(self.state, self.left)  # with its own random draws
+            context = problem.context(self.state, self.left)  # with its own random draws
             found[name] = np.asarray(policy_named(name)(context), np.float64).tolist()
         farthest = farthest_pose(context.candidates, context.taken, context.centre, context.rng)
         return found | {"(farthest)": farthest.tolist()}
@@ -87,10 +87,9 @@ class Bench:
         is."""
         taken, model = self.state.taken, self.state.gaussians
         if candidate is not None:
-            loop, taken = self.loop(order), [*taken, candidate]
-            step, targets = len(self.state.steps), loop.targets(taken)
-            model = loop.fit(self.state, taken, targets, step, lambda *_: None).gaussians
-        return float(self.stations.measure(model, taken)[self.metric])
+            taken = [*taken, candidate]
+            model = fit_views(self.problem(order), taken, self.state).gaussians
+        return float(self.operations.measure(model, taken)[self.metric])
 
 
 def study(out: Path, runs: Sequence[Path], orders: int, policies: Sequence[str]) -> dict[str, Any]:

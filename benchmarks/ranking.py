@@ -18,12 +18,14 @@ from typing import Any
 import numpy as np
 
 from mgs import runtime
-from mgs.bench.fit import STATES, make_case
+from mgs.bench.fit import STATES, Case, make_case
 from mgs.data.dataset import load_dataset
 from mgs.files import read_json, write_json
 from mgs.fit.settings import ALPHA_WEIGHT
 from mgs.metrics import agreement
 from mgs.policy.criteria import CRITERIA
+from mgs.prior.build import build_prior
+from mgs.prior.settings import PriorSettings
 from mgs.provenance import command_line, versions
 
 PASSES = (5, 10, 20, 40, 50, 100, 150, 300, 500, 1000, 4000)
@@ -34,17 +36,16 @@ FITTED = [
 """Criteria compared. e-optimal is 0 while any parameter is unobserved, so it ranks nothing here."""
 
 
-def measure(root: Path, how: str, count: int) -> dict[str, Any]:
+def measure(case: Case, state: str) -> dict[str, Any]:
     """Fit one state with each number of passes: the scores of all candidates, by passes and
     criterion."""
-    case = make_case(load_dataset(root), GAUSSIANS, how, count, ALPHA_WEIGHT)
     found: dict[str, Any] = {}
     for passes in PASSES:
         model = case.fit(passes=passes, tolerance=0.0).gaussians
         found[str(passes)] = {
             name: case.scores(model, CRITERIA[name].score).tolist() for name in FITTED
         }
-        print(root, how, count, passes, flush=True)
+        print(state, passes, flush=True)
     return found
 
 
@@ -67,10 +68,12 @@ def main(out: Path, roots: list[Path]) -> None:
     runtime.start()
     states = read_json(out)["states"] if out.is_file() else {}
     for root in roots:
+        dataset = load_dataset(root)
+        prior, _ = build_prior(dataset, PriorSettings(gaussians=GAUSSIANS))
         for how, count in STATES:
             name = f"{root}: {count} {how}"
             if name not in states:
-                states[name] = measure(root, how, count)
+                states[name] = measure(make_case(dataset, prior, how, count, ALPHA_WEIGHT), name)
                 made = {"command": command_line(), "versions": versions()}
                 write_json(out, made | {"rows": compare(states), "states": states})
     for row in compare(states):

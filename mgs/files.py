@@ -158,46 +158,32 @@ def new_folder(path: str | Path) -> Path:
 
 
 @contextmanager
-def folder_or_nothing(path: str | Path) -> Iterator[Path]:
-    """Context manager: makes a new folder for its block, and undoes it if the block fails.
-
-    The folder and the parents made for it are then removed; a folder that was there empty is
-    emptied. Raises InputError as `new_folder`.
-    """
-    path = check_new_folder(path)
-    made = [folder for folder in (path, *path.parents) if not folder.exists()]
-    new_folder(path)
-    try:
-        yield path
-    except BaseException:
-        if made:
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            for child in path.iterdir():
-                shutil.rmtree(child) if child.is_dir() else child.unlink()
-        with suppress(OSError):
-            for folder in made[1:]:
-                folder.rmdir()
-        raise
-
-
-@contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Context manager: a temporary folder beside `path`, renamed to it after the block.
 
-    So a folder named `path` is always complete. Removes temporary folders of processes that were
-    killed. Raises InputError as `new_folder`.
+    So a folder named `path` is always complete. If the block fails, the temporary folder and the
+    parents made for it are removed; so are those of processes that were killed. Raises InputError
+    as `new_folder`.
     """
     path = check_new_folder(path).resolve()
     for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
         if not _is_running(leftover.name.split(".")[-2]):
             shutil.rmtree(leftover, ignore_errors=True)
-    with folder_or_nothing(path.with_name(f".{path.name}.{os.getpid()}.part")) as temporary:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    made = [folder for folder in path.parents if not folder.exists()]
+    new_folder(temporary)
+    try:
         yield temporary
         try:
             os.replace(temporary, path)
         except OSError as error:
             raise not_writable(path, error) from None
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        with suppress(OSError):
+            for folder in made:
+                folder.rmdir()
+        raise
 
 
 def _is_running(process: str) -> bool:

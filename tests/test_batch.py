@@ -22,7 +22,7 @@ from mgs.policy import criteria
 from mgs.policy import registry as policies
 from mgs.report.writing import write_report
 from mgs.run import folder as run_folder
-from mgs.run import loop
+from mgs.run import loop, problem, recording
 from mgs.study import case
 
 OF_A_FIT = {"uncertainty", "iterations", "loss", "stop_reason"}
@@ -46,8 +46,8 @@ def loaded(tmp_path_factory):
 
 
 def run(out: Path, dataset, stations=None, **values) -> run_folder.State:
-    return loop.run(
-        out, tiny.start(out, dataset, **values), dataset, stations or tiny.stations(), tiny.silent
+    return recording.run(
+        out, tiny.start(out, dataset, **values), dataset, stations or tiny.operations(), tiny.silent
     )
 
 
@@ -57,7 +57,9 @@ def lines(out: Path) -> list[dict]:
 
 def test_a_study_has_a_number_for_each_fit_of_a_run(loaded, tmp_path, monkeypatch):
     measure = lambda gaussians, taken: {"test_psnr": 10 + len(taken), "test_psnr_mask": len(taken)}  # noqa: E731
-    state = run(tmp_path / "run", loaded, tiny.stations(measure=measure), batch=2, evaluate_every=1)
+    state = run(
+        tmp_path / "run", loaded, tiny.operations(measure=measure), batch=2, evaluate_every=1
+    )
     monkeypatch.setattr(case, "run_or_resume", lambda *arguments: state)
     curves = case.run_policy(tmp_path, tmp_path, "dataset", "prior", {"batch": 2})
     assert curves["taken"] == state.taken
@@ -74,9 +76,9 @@ def test_a_step_is_a_view_and_the_last_of_a_batch_has_its_fit(loaded, tmp_path):
         return tiny.fit(gaussians, start, cameras, *rest)
 
     settings = tiny.start(tmp_path / "run", loaded, batch=2, evaluate_every=3)
-    stations = tiny.stations(fit=fit)
+    stations = tiny.operations(fit=fit)
     on_step = lambda state: told.append(len(state.taken))  # noqa: E731
-    state = loop.run(tmp_path / "run", settings, loaded, stations, tiny.silent, on_step)
+    state = recording.run(tmp_path / "run", settings, loaded, stations, tiny.silent, on_step)
     assert fits == told == [3, 5, 7, 8], "the budget of 5 views is no multiple of 2"
     steps = lines(tmp_path / "run")
     assert [step["step"] for step in steps] == list(range(6))
@@ -122,11 +124,11 @@ def test_a_batch_measures_each_candidate_once_if_there_is_room(loaded, tmp_path,
         measured.append((gaussians.sh.tobytes(), camera.key))
         return tiny.fisher(gaussians, camera)
 
-    monkeypatch.setattr(loop, "IMAGE_BYTES", room)
+    monkeypatch.setattr(problem, "IMAGE_BYTES", room)
     state = run(
         tmp_path / "run",
         loaded,
-        replace(tiny.stations(), fisher=fisher, exact=tiny.fisher),
+        replace(tiny.operations(), fisher=fisher, exact=tiny.fisher),
         budget=6,
         batch=3,
     )
@@ -148,7 +150,11 @@ def test_what_a_pose_sees_of_the_surface_is_measured_once_for_all_choices(loaded
         return tiny.fisher(gaussians, camera)
 
     run(
-        tmp_path / "run", loaded, replace(tiny.stations(), exact=exact), policy="coverage", budget=4
+        tmp_path / "run",
+        loaded,
+        replace(tiny.operations(), exact=exact),
+        policy="coverage",
+        budget=4,
     )
     taken, candidates = 3 + 4, 12 - 3
     assert len(measured) == taken + candidates
@@ -164,9 +170,9 @@ def test_a_batch_counts_as_taken_for_every_policy(loaded, tmp_path, policy, near
     """Where the fit changes nothing that a policy looks at, a batch has the views that are chosen
     one by one."""
     stations = (
-        tiny.stations()
+        tiny.operations()
         if policy not in AT_THE_MODEL
-        else tiny.stations(fit=lambda g, *rest: tiny.Fit(g, 0.1, 1))
+        else tiny.operations(fit=lambda g, *rest: tiny.Fit(g, 0.1, 1))
     )
     runs = [
         run(tmp_path / str(k), loaded, stations, policy=policy, nearest=nearest, batch=k)
@@ -190,13 +196,13 @@ def test_no_image_is_read_before_the_batch_is_complete(loaded, tmp_path, monkeyp
             module, name, lambda path, f=function: opened.add(Path(path).stem) or f(path)
         )
     at_choice = []
-    choose = loop.Loop.choose
+    choose = loop.choose
 
-    def watched(self, state):
+    def watched(problem, state, fisher=None):
         at_choice.append((set(opened), len(state.taken)))
-        return choose(self, state)
+        return choose(problem, state, fisher)
 
-    monkeypatch.setattr(loop.Loop, "choose", watched)
+    monkeypatch.setattr(loop, "choose", watched)
     state = run(tmp_path / "run", loaded, policy=policy, batch=2)
     names = [loaded.frames[i].name for i in state.taken]
     assert [count for _, count in at_choice] == [3, 4, 5, 6, 7]
@@ -216,9 +222,11 @@ def test_a_batch_that_was_interrupted_is_chosen_again(loaded, tmp_path, when):
 
     out = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
-        run(out, loaded, tiny.stations(fit=fit), batch=2)
+        run(out, loaded, tiny.operations(fit=fit), batch=2)
     assert len(lines(out)) == 1 + 2 * (when - 2), "a batch is finished as a whole, or not at all"
-    state = loop.run(out, run_folder.read_settings(out), loaded, tiny.stations(), tiny.silent)
+    state = recording.run(
+        out, run_folder.read_settings(out), loaded, tiny.operations(), tiny.silent
+    )
     assert state.taken == whole.taken
     assert (out / "gaussians.ply").read_bytes() == (tmp_path / "whole/gaussians.ply").read_bytes()
 
@@ -249,7 +257,7 @@ def test_a_batch_whose_fit_diverges_is_named_by_its_last_step(loaded, tmp_path):
         )
 
     with pytest.raises(InputError, match=r"the fit of step 4 diverged.*; steps 0 to 2 are kept"):
-        run(tmp_path / "run", loaded, tiny.stations(fit=fit), batch=2)
+        run(tmp_path / "run", loaded, tiny.operations(fit=fit), batch=2)
     assert len(lines(tmp_path / "run")) == 3
 
 

@@ -20,7 +20,15 @@ def root(tmp_path_factory):
     return folder
 
 
-def test_the_figures_are_those_of_the_fits(root, monkeypatch):
+@pytest.fixture(scope="module")
+def make(root):
+    """Function of the kind and number of views and the weight of alpha that makes a case."""
+    dataset = bench.load_dataset(root)
+    prior, _ = bench.build_prior(dataset, bench.PriorSettings(gaussians=200))
+    return lambda *state: bench.make_case(dataset, prior, *state)
+
+
+def test_the_figures_are_those_of_the_fits(root, make, monkeypatch):
     monkeypatch.setattr(bench, "SIZES", (200, 400))
     monkeypatch.setattr(bench, "VIEWS", 4)
     monkeypatch.setattr(bench, "STATES", (("even", 3), ("random", 4)))
@@ -30,7 +38,7 @@ def test_the_figures_are_those_of_the_fits(root, monkeypatch):
     figures, end = found["figures"], found["end"]
     assert figures.keys() == bench.TARGETS.keys()
     assert len(said) == 3
-    case = bench.make_case(bench.load_dataset(root), 200, "even", 4, 0.1)
+    case = make("even", 4, 0.1)
     fitted = case.fit()
     frames, spacing = case.dataset.frames, case.prior.spacing
     names = [frames[i].name for i in case.taken]
@@ -53,17 +61,15 @@ def test_the_figures_are_those_of_the_fits(root, monkeypatch):
     assert found["ranking_tau_half"] == pytest.approx(sum(row["tau_half"] for row in rows) / 2)
 
 
-def test_alpha_is_part_of_the_fit_and_of_its_objective(root):
-    cases = [
-        bench.make_case(bench.load_dataset(root), 200, "even", 4, weight) for weight in (0, 0.1)
-    ]
+def test_alpha_is_part_of_the_fit_and_of_its_objective(make):
+    cases = [make("even", 4, weight) for weight in (0, 0.1)]
     assert [case.objective().alpha_weight for case in cases] == [0, 0.1]
     assert cases[0].fit().gaussians != cases[1].fit().gaussians
 
 
-def test_a_ranking_agrees_with_itself(root, monkeypatch):
+def test_a_ranking_agrees_with_itself(make, monkeypatch):
     monkeypatch.setattr(bench, "LONGER", 1)
-    case = bench.make_case(bench.load_dataset(root), 200, "random", 4, 0.0)
+    case = make("random", 4, 0.0)
     shorter = case.fit(passes=TrainSettings().passes // 2, tolerance=0.0)
     scores = [case.scores(fit.gaussians) for fit in (shorter, case.fit())]
     assert bench._ranking(case) == {

@@ -424,7 +424,7 @@ def test_bad_scenes_and_options_are_refused(small, poses, prior, tmp_path, capsy
     assert "give a DATASET or --capture" in refused(
         capsys, ["nbv", poses.root, "--capture", "boulder", *out], tmp_path
     )
-    assert "--capture out" in refused(
+    assert "--capture: --resume takes its settings" in refused(
         capsys, ["nbv", "--resume", tmp_path, "--capture", "boulder"], tmp_path
     )
     assert "--budget 6 exceeds its 5" in refused(

@@ -19,6 +19,8 @@ from mgs.run.nbv import start_run
 from mgs.run.settings import PRESETS, NbvSettings, with_defaults
 from mgs.study import case, chart, oracle, timing
 
+DEFAULTS = {**NbvSettings.model_fields, **TrainSettings.model_fields}
+
 
 def test_times_are_ratios_to_a_reference_that_is_timed_beside_each_call(monkeypatch):
     """A machine that becomes four times as slow: the ratio stays."""
@@ -68,8 +70,17 @@ def test_commands_of_points_say_what_was_measured(size):
     for point in points:
         said, made = parsed(point.command("DATA", "PRIOR", size.seeds)), point.settings(size.seeds)
         train = made.pop("train")
+<<<<<<< HEAD
         assert {key: said[key] for key in made | train} == made | train
         assert said["alpha_weight"] == 0
+=======
+        rates = dict(pair.split("=") for pair in said["rates"] or [])
+        assert said["alpha_weight"] == 0
+        for key, value in (made | train).items():
+            if key != "rates":
+                assert (DEFAULTS[key].default if said[key] is None else said[key]) == value
+        assert {kind: float(rate) for kind, rate in rates.items()} == train["rates"]
+>>>>>>> main
         settings = NbvSettings(dataset="DATA", prior="PRIOR", **made, train=train)
         assert settings.train_at(1).passes == min(point.warm_passes, point.passes)
     data = chart.Data(size)

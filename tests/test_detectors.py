@@ -3,7 +3,6 @@ and reported."""
 
 import shutil
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ from mgs.prior.settings import PriorSettings
 from mgs.report.page_facts import measured, read_shown
 from mgs.report.runs import read_run
 from mgs.run import folder as run_folder
-from mgs.run import loop
+from mgs.run import recording
 from mgs.run.detectors import (
     DETECTORS,
     Before,
@@ -29,6 +28,7 @@ from mgs.run.detectors import (
     before_fit,
     means_drift,
     outline_margin,
+    residual,
     step_signs,
     view_signs,
 )
@@ -209,7 +209,7 @@ def test_a_prior_in_the_wrong_place_is_said_before_anything_else_is_known(rock, 
 def test_a_loop_without_renders_has_no_signs(dataset, tmp_path):
     loaded = load_dataset(dataset)
     settings = tiny.start(tmp_path / "run", loaded)
-    state = loop.run(tmp_path / "run", settings, loaded, tiny.stations(), tiny.silent)
+    state = recording.run(tmp_path / "run", settings, loaded, tiny.operations(), tiny.silent)
     assert not any("signs" in line or "warnings" in line for line in state.steps)
 
 
@@ -288,13 +288,7 @@ def test_new_images_are_held_against_the_model_before_them(rock, tmp_path):
 
 
 def test_an_image_of_which_no_colour_is_known_has_no_residual():
-    one = SimpleNamespace(mask=lambda: np.ones((2, 3), bool))
-    run = SimpleNamespace(
-        stations=SimpleNamespace(look=lambda *_: (np.zeros((2, 3, 3)), None)),
-        frames=[one],
-        cameras=[None],
-    )
-    target = np.full((2, 3, 4), 0.5)
-    assert loop.Loop.residual(run, None, [0], [target]) == {"residual": 0.5}
+    target, mask = np.full((2, 3, 4), 0.5), np.ones((2, 3), bool)
+    assert residual([(np.zeros((2, 3, 3)), target, mask)]) == 0.5
     target[..., 3] = 0
-    assert loop.Loop.residual(run, None, [0], [target]) == {}
+    assert residual([(np.zeros((2, 3, 3)), target, mask)]) is None

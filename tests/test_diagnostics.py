@@ -15,7 +15,7 @@ from mgs.images import read_exr
 from mgs.policy import criteria
 from mgs.report import diagnostics
 from mgs.run import folder as run_folder
-from mgs.run import loop
+from mgs.run import recording
 from mgs.splat import groups
 
 CHANNELS = {
@@ -111,7 +111,7 @@ def run(tmp_path_factory):
     root = tmp_path_factory.mktemp("diagnostics")
     dataset = load_dataset(tiny.write_dataset(root / "data"))
     settings = tiny.start(root / "run", dataset)
-    loop.run(root / "run", settings, dataset, tiny.stations(), tiny.silent)
+    recording.run(root / "run", settings, dataset, tiny.operations(), tiny.silent)
     return root / "run"
 
 

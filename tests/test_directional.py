@@ -12,7 +12,8 @@ from mgs.colour import SH_C0
 from mgs.data.dataset import load_dataset
 from mgs.policy import criteria, directional
 from mgs.policy.directional import Views, gains
-from mgs.run import loop
+from mgs.run import loop, recording
+from mgs.run.problem import Problem
 from mgs.splat import reference
 
 N, LAM = 4, (0.02 / 1.0) ** 2
@@ -161,9 +162,9 @@ def test_a_flight_is_planned_without_looking_at_any_fit(dataset, tmp_path, polic
 
     loaded, states = load_dataset(dataset), []
     for name, fit in (("run", tiny.fit), ("forgetful", forgetful)):
-        out, stations = tmp_path / name, tiny.stations(fit=fit)
+        out, stations = tmp_path / name, tiny.operations(fit=fit)
         settings = tiny.start(out, loaded, policy=policy, budget=3)
-        states.append(loop.run(out, settings, loaded, stations, tiny.silent))
+        states.append(recording.run(out, settings, loaded, stations, tiny.silent))
     scores = [[step["score"] for step in state.steps] for state in states]
     assert (states[0].taken, scores[0]) == (states[1].taken, scores[1])
     start, cameras = tiny.initial([]), tiny.orbit()
@@ -194,12 +195,12 @@ def test_what_poses_see_is_measured_once_and_again_when_it_is_forgotten(dataset,
         return tiny.fisher(gaussians, camera)
 
     settings = tiny.start(tmp_path / "run", loaded, policy=policy)
-    run = loop.Loop(tmp_path / "run", settings, loaded, tiny.stations(exact=exact), tiny.silent)
-    state, counts = run.first(), []
+    problem = Problem(loaded, settings, tiny.operations(exact=exact))
+    state, counts = loop.learn(problem, problem.seeds), []
     for forget in (False, False, True, True):
         if forget:
-            run.look_anew()
+            problem.__dict__.pop("visibility")
         looked.clear()
-        run.choose(state)
+        loop.choose(problem, state)
         counts.append(len(looked))
     assert counts[1] == 0 < counts[0] == counts[2] == counts[3]

@@ -25,10 +25,10 @@ from mgs.splat_ply import read_ply
 OPTIONS = ["--gaussians", "300", "--seeds", "3", "--budget", "4", "--passes", "6", "--seed", "1"]
 STRUCK = """
 import os, signal
-from mgs.run import stations
+from mgs.run import operations
 from mgs.cli.app import main
 
-fit, fits = stations.fit, []
+fit, fits = operations.fit, []
 
 def struck(gaussians, cameras, targets, settings, on_pass, *rest):
     fits.append(len(cameras))
@@ -40,7 +40,7 @@ def struck(gaussians, cameras, targets, settings, on_pass, *rest):
 
     return fit(gaussians, cameras, targets, settings, blow, *rest)
 
-stations.fit = struck
+operations.fit = struck
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts what runs in the background deaf to it
 main()
 """
@@ -114,7 +114,7 @@ def test_the_run_is_whole(dataset, run):
 def test_learning_helps_and_so_do_more_images(dataset, run):
     from mgs.prior.build import load_prior
     from mgs.prior.initial import initial_gaussians
-    from mgs.run.stations import psnr_measure
+    from mgs.run.operations import psnr_measure
     from mgs.splat import ListCache
 
     loaded, lines = load_dataset(dataset), steps(run)

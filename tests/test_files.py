@@ -25,7 +25,6 @@ from mgs.files import (
     atomic_path,
     check_writable,
     copy_file,
-    folder_or_nothing,
     locked,
     read_json,
     write_csv,
@@ -150,15 +149,14 @@ def test_under_a_file(tmp_path):
 
 
 @pytest.mark.parametrize("there", [False, True])
-@pytest.mark.parametrize("folder", [folder_or_nothing, atomic_folder])
-def test_a_folder_that_fails_leaves_all_as_it_was(tmp_path, folder, there):
+def test_a_folder_that_fails_leaves_all_as_it_was(tmp_path, there):
     out = tmp_path / "new/deeper/out"
     if there:
         out.mkdir(parents=True)
     before = list(tmp_path.rglob("*"))
 
     def fill():
-        with folder(out) as made:
+        with atomic_folder(out) as made:
             (made / "sub").mkdir()
             (made / "sub/file").touch()
             (made / "file").touch()
@@ -169,10 +167,9 @@ def test_a_folder_that_fails_leaves_all_as_it_was(tmp_path, folder, there):
     assert list(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("folder", [folder_or_nothing, atomic_folder])
-def test_what_is_in_a_folder_is_never_touched(tmp_path, folder):
+def test_what_is_in_a_folder_is_never_touched(tmp_path):
     (tmp_path / "precious.txt").touch()
-    with pytest.raises(InputError, match="not empty"), folder(tmp_path):
+    with pytest.raises(InputError, match="not empty"), atomic_folder(tmp_path):
         pass
     assert (tmp_path / "precious.txt").exists()
 

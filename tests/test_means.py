@@ -24,7 +24,7 @@ from mgs.report.convergence import remaining_decrease
 from mgs.report.diagnostics import diagnose_run
 from mgs.rotation import quat_from_normals
 from mgs.run import folder as run_folder
-from mgs.run import stations
+from mgs.run import operations
 from mgs.run.nbv import resume_nbv, run_nbv, start_run
 from mgs.run.settings import NbvSettings
 from mgs.splat import MEANS, as_drjit, fisher, groups, render
@@ -190,15 +190,15 @@ def whole(request, files, tmp_path_factory):
 
 
 def test_units_are_spacings_of_the_prior_unless_given(files, tmp_path):
-    made = start_run(files[0], tmp_path / "run", **options(files, "normal"))
+    made = start_run(files[0], tmp_path / "run", **options(files, "normal")).settings
     assert made.prior_std["mean"] == MEAN_STD * 0.5
     assert made.train.rates["mean"] == MEAN_RATE * 0.5
     assert run_folder.read_settings(tmp_path / "run") == made
     train = {"means": "normal", "rates": {"mean": 0.01}}
     given = options(files, "normal", prior_std={"mean": 0.3}, train=train)
-    own = start_run(files[0], tmp_path / "own", **given)
+    own = start_run(files[0], tmp_path / "own", **given).settings
     assert (own.prior_std["mean"], own.train.rates["mean"]) == (0.3, 0.01)
-    frozen = start_run(files[0], tmp_path / "frozen", **options(files, "frozen"))
+    frozen = start_run(files[0], tmp_path / "frozen", **options(files, "frozen")).settings
     assert "mean" not in frozen.prior_std
 
 
@@ -229,7 +229,7 @@ def test_criteria_see_the_means_and_coverage_does_not(files, whole):
 
 def test_interrupted_and_resumed_the_run_is_the_same(files, whole, tmp_path, monkeypatch):
     means, out, state = whole
-    real, calls = stations.fit, []
+    real, calls = operations.fit, []
 
     def struck(*arguments):
         calls.append(1)
@@ -237,7 +237,7 @@ def test_interrupted_and_resumed_the_run_is_the_same(files, whole, tmp_path, mon
             raise KeyboardInterrupt
         return real(*arguments)
 
-    monkeypatch.setattr(stations, "fit", struck)
+    monkeypatch.setattr(operations, "fit", struck)
     with pytest.raises(KeyboardInterrupt):
         run_nbv(files[0], tmp_path / "run", **options(files, means))
     resumed = resume_nbv(tmp_path / "run")
@@ -257,8 +257,11 @@ def test_policies_choose_with_learned_means(files, tmp_path, policy):
     ("given", "message"),
     [
         (["--means", "loose"], "--means loose: Input should be 'frozen', 'normal' or 'free'"),
-        (["--means", "free", "--estimator", "hutchinson"], "--estimator hutchinson knows nothing"),
-        (["--means", "free", "--policy", "paper"], "--policy paper knows nothing of means"),
+        (
+            ["--means", "free", "--estimator", "hutchinson"],
+            "--estimator hutchinson has no information",
+        ),
+        (["--means", "free", "--policy", "paper"], "--policy paper has no information about means"),
         (["--means", "normal", "--prior-std", "mean=0"], "--prior-std mean=0.0: Input should be"),
     ],
 )

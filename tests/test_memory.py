@@ -26,7 +26,7 @@ from mgs.fit import objective
 from mgs.memory import PADDING, Deferred, kept_within, padded
 from mgs.prior.build import build_prior, save_prior
 from mgs.prior.settings import PriorSettings
-from mgs.run import loop, stations
+from mgs.run import operations, problem
 from mgs.run.nbv import run_nbv
 
 
@@ -91,9 +91,9 @@ def test_a_run_holds_few_images_at_once_and_finds_the_same(
     monkeypatch.setattr(Frame, "target", watched)
     found, most = [], []
     for name, budget in (("kept", 1 << 30), ("read again", 0)):
-        for module in (loop, objective, stations):
+        for module in (problem, objective, operations):
             monkeypatch.setattr(module, "IMAGE_BYTES", budget)
-        monkeypatch.setattr(loop, "target_of", lambda *frame: live.watch(TARGET_OF(*frame)))
+        monkeypatch.setattr(problem, "target_of", lambda *frame: live.watch(TARGET_OF(*frame)))
         gc.collect()
         live.now = live.most = 0
         settings = {"policy": "uniform", "seeds": 6, "budget": 3, "evaluate_every": 1}
@@ -107,7 +107,7 @@ def test_a_run_holds_few_images_at_once_and_finds_the_same(
     assert np.array_equal(kept.H, again.H)
 
 
-TARGET_OF = loop.target_of
+TARGET_OF = problem.target_of
 
 
 def test_stations_before_a_run_hold_few_images_at_once(

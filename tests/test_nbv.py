@@ -21,7 +21,7 @@ from mgs.fit.stopping import StopReason
 from mgs.policy import criteria
 from mgs.policy import registry as policies
 from mgs.run import folder as run_folder
-from mgs.run import loop
+from mgs.run import loop, recording
 from mgs.splat_ply import read_ply
 
 
@@ -32,7 +32,7 @@ def dataset(tmp_path_factory):
 
 def run(out, dataset, stations=None, **values):
     settings = tiny.start(out, dataset, **values)
-    return loop.run(out, settings, dataset, stations or tiny.stations(), tiny.silent)
+    return recording.run(out, settings, dataset, stations or tiny.operations(), tiny.silent)
 
 
 def lines(out: Path) -> list[dict]:
@@ -67,11 +67,11 @@ def test_run_writes_what_it_did(dataset, tmp_path, policy):
 
 def test_d_optimal_takes_the_best_candidate_at_every_step(dataset, tmp_path):
     state = run(tmp_path / "run", dataset, budget=1)
-    before = loop.run(
+    before = recording.run(
         tmp_path / "seeds",
         tiny.start(tmp_path / "seeds", dataset, budget=0),
         dataset,
-        tiny.stations(),
+        tiny.operations(),
         tiny.silent,
     )
     lam = criteria.regularisation(tiny.GROUPS)
@@ -102,7 +102,7 @@ def test_coverage_is_of_the_surface_and_does_not_depend_on_training(dataset, tmp
         assert share == criteria.coverage(H, lam)
     assert covered == sorted(covered)
     assert 0 < covered[0] < covered[-1]
-    forgot = run(tmp_path / "forgot", dataset, tiny.stations(fit=forgetful), policy="coverage")
+    forgot = run(tmp_path / "forgot", dataset, tiny.operations(fit=forgetful), policy="coverage")
     assert forgot.taken == state.taken
 
 
@@ -123,7 +123,7 @@ def test_fits_start_in_the_colours_of_all_images_taken(dataset, tmp_path):
         drawn.append(found.gaussians)
         return found
 
-    run(tmp_path / "run", dataset, tiny.stations(initial=initial, fit=fit), budget=2)
+    run(tmp_path / "run", dataset, tiny.operations(initial=initial, fit=fit), budget=2)
     assert len(handed) == 3
     for step, (model, start) in enumerate(handed):
         np.testing.assert_array_equal(start.sh, initial([None] * (3 + step)).sh)
@@ -138,7 +138,7 @@ def test_fits_start_in_the_colours_of_all_images_taken(dataset, tmp_path):
 def test_a_tie_goes_to_the_farthest_camera(dataset, tmp_path):
     """Where every view sees everything, coverage has nothing to say after the seeds: the views must
     spread all the same."""
-    stations = tiny.stations(
+    stations = tiny.operations(
         fisher=lambda gaussians, camera: np.ones((tiny.POINTS, 11), np.float32)
     )
     state = run(tmp_path / "run", dataset, stations, policy="coverage", seeds=1, budget=3)
@@ -168,13 +168,13 @@ def test_candidate_images_are_never_read_before_they_are_chosen(
             module, name, lambda path, f=function: opened.add(Path(path).stem) or f(path)
         )
     at_choice = []
-    choose = loop.Loop.choose
+    choose = loop.choose
 
-    def watched(self, state):
+    def watched(problem, state, fisher=None):
         at_choice.append((set(opened), {dataset.frames[i].name for i in state.taken}))
-        return choose(self, state)
+        return choose(problem, state, fisher)
 
-    monkeypatch.setattr(loop.Loop, "choose", watched)
+    monkeypatch.setattr(loop, "choose", watched)
     state = run(tmp_path / "run", dataset, policy=policy)
     assert len(at_choice) == 5
     assert all(seen == taken for seen, taken in at_choice)
@@ -208,7 +208,7 @@ def test_one_candidate_in_memory_at_a_time(dataset, tmp_path):
         alive.append(weakref.ref(F))
         return F
 
-    run(tmp_path / "run", dataset, tiny.stations(fisher=fisher))
+    run(tmp_path / "run", dataset, tiny.operations(fisher=fisher))
     assert len(alive) > 50
 
 
@@ -270,7 +270,9 @@ def test_killed_at_any_moment_then_resumed_takes_the_same_views(
     written = lines(out) if (out / "steps.jsonl").exists() else []
     assert written == committed[: len(written)]
     assert len(committed) - len(written) <= 1
-    resumed = loop.run(out, run_folder.read_settings(out), dataset, tiny.stations(), tiny.silent)
+    resumed = recording.run(
+        out, run_folder.read_settings(out), dataset, tiny.operations(), tiny.silent
+    )
     assert resumed.taken == whole.taken
     assert timeless(lines(out)) == timeless(steps)
     assert (out / "gaussians.ply").read_bytes() == ply
@@ -288,10 +290,12 @@ def test_interrupted_by_the_keyboard_then_resumed(dataset, tmp_path, uninterrupt
 
     out = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
-        run(out, dataset, tiny.stations(fit=fit), seed=3)
+        run(out, dataset, tiny.operations(fit=fit), seed=3)
     assert len(lines(out)) == 3
     assert (
-        loop.run(out, run_folder.read_settings(out), dataset, tiny.stations(), tiny.silent).taken
+        recording.run(
+            out, run_folder.read_settings(out), dataset, tiny.operations(), tiny.silent
+        ).taken
         == uninterrupted[0].taken
     )
 
@@ -316,14 +320,16 @@ def test_a_fit_that_diverges_ends_the_run_which_can_go_on(
 
     out = tmp_path / "run"
     with pytest.raises(InputError, match=named) as stop:
-        run(out, dataset, tiny.stations(fit=fit), seed=3)
+        run(out, dataset, tiny.operations(fit=fit), seed=3)
     said = str(stop.value)
     assert "diverged: its loss was 0.0123 at the start, and 0.5, nan in the last passes" in said
     assert f"`train.rates` in {out / 'config.json'}" in said
     assert f"mgs nbv --resume {out}" in said
     assert "\n" not in said
     assert ((out / "steps.jsonl").exists() and len(lines(out))) == broken
-    resumed = loop.run(out, run_folder.read_settings(out), dataset, tiny.stations(), tiny.silent)
+    resumed = recording.run(
+        out, run_folder.read_settings(out), dataset, tiny.operations(), tiny.silent
+    )
     assert resumed.taken == uninterrupted[0].taken
     assert (out / "gaussians.ply").read_bytes() == uninterrupted[1]
 
@@ -335,11 +341,11 @@ def test_resuming_a_finished_run_changes_nothing(dataset, tmp_path):
     def never(*arguments):
         raise AssertionError("nothing is left to do")
 
-    again = loop.run(
+    again = recording.run(
         tmp_path / "run",
         run_folder.read_settings(tmp_path / "run"),
         dataset,
-        tiny.stations(fit=never, fisher=never),
+        tiny.operations(fit=never, fisher=never),
         tiny.silent,
     )
     assert again.taken == state.taken
@@ -349,7 +355,7 @@ def test_resuming_a_finished_run_changes_nothing(dataset, tmp_path):
 @pytest.mark.parametrize("score", [math.nan, math.inf])
 def test_a_policy_that_gives_no_number_is_named(dataset, tmp_path, monkeypatch, score):
     monkeypatch.setitem(criteria.CRITERIA, "mine", criteria.Criterion(lambda F, H, lam: score))
-    with pytest.raises(InputError, match="policy mine: gave a score that is NaN or infinite"):
+    with pytest.raises(InputError, match="policy mine: returned a score that is NaN or infinite"):
         run(tmp_path / "run", dataset, policy="mine")
     assert len(lines(tmp_path / "run")) == 1
 

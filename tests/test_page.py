@@ -20,7 +20,7 @@ from mgs.report import page_pictures
 from mgs.report.evaluation import evaluate_run
 from mgs.report.page import write_page
 from mgs.report.page_plots import corners_at
-from mgs.run import loop
+from mgs.run import recording
 from mgs.run.folder import read_checkpoint, read_settings
 
 
@@ -34,10 +34,10 @@ def runs(tmp_path_factory):
     dataset = load_dataset(tiny.write_dataset(root / "data"))
     for policy, budget in (("d-optimal", 3), ("random", 1)):
         settings = tiny.start(root / policy, dataset, policy=policy, budget=3, evaluate_every=1)
-        stations = tiny.stations(
+        stations = tiny.operations(
             measure=lambda gaussians, taken: {"psnr": float(len(taken)), "test": {"lpips": 0.25}}
         )
-        loop.run(
+        recording.run(
             root / policy,
             settings.model_copy(update={"budget": budget}),
             dataset,

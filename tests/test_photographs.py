@@ -40,6 +40,7 @@ from mgs.prior.build import build_prior, load_prior
 from mgs.prior.hull import visual_hull
 from mgs.prior.points import main_cluster, on_surface
 from mgs.prior.settings import PriorSettings
+from mgs.run import recording
 
 
 @pytest.fixture(autouse=True)
@@ -361,8 +362,6 @@ def test_up_is_found_in_a_turned_world_of_cameras_held_nearly_level(
 def test_policies_measure_azimuths_about_the_up_axis(tmp_path: Path) -> None:
     import tiny
 
-    from mgs.run import loop
-
     taken = []
     turn = np.linalg.qr(np.random.default_rng(4).standard_normal((3, 3)))[0]
     turn *= np.linalg.det(turn)
@@ -378,8 +377,12 @@ def test_policies_measure_azimuths_about_the_up_axis(tmp_path: Path) -> None:
         turned = load_dataset(root)
         assert np.allclose(turned.up, rotation[:, 2])
         run_settings = tiny.start(tmp_path / f"run-{name}", turned, policy="uniform")
-        state = loop.run(
-            tmp_path / f"run-{name}", run_settings, turned, tiny.stations(up=turned.up), tiny.silent
+        state = recording.run(
+            tmp_path / f"run-{name}",
+            run_settings,
+            turned,
+            tiny.operations(up=turned.up),
+            tiny.silent,
         )
         taken.append(state.taken)
     # Azimuths start from another direction in the tilted world, so the views may be shifted, but

@@ -13,7 +13,7 @@ from mgs.errors import InputError
 from mgs.policy import from_file
 from mgs.policy.registry import check_policy, policy_named
 from mgs.report.runs import read_run
-from mgs.run import loop
+from mgs.run import recording
 from mgs.run.folder import read_settings
 from mgs.run.nbv import start_run
 
@@ -74,7 +74,7 @@ def file(tmp_path):
 
 def run(out, dataset, **values):
     settings = tiny.start(out, dataset, **({"budget": 3} | values))
-    return loop.run(out, settings, dataset, tiny.stations(), tiny.silent)
+    return recording.run(out, settings, dataset, tiny.operations(), tiny.silent)
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_a_policy_that_cannot_be_loaded_is_one_line(dataset, file, tmp_path, nam
     ("function", "message"),
     [
         ("broken", r"line 41 of .*mine\.py failed: ZeroDivisionError: division by zero"),
-        ("few", r"gave scores of shape \(1,\) to 9 candidates"),
+        ("few", r"returned scores of shape \(1,\) for 9 candidates"),
     ],
 )
 def test_a_policy_that_fails_keeps_the_steps_before(dataset, file, tmp_path, function, message):
@@ -155,7 +155,7 @@ def test_a_run_goes_on_with_the_same_file_only(dataset, file, tmp_path, monkeypa
     run(half, loaded, policy=f"{file}:poses", budget=1)
     assert read_run(half).policy == "mine.py:poses"
     settings = read_settings(half).model_copy(update={"budget": 2})
-    further = lambda: loop.run(half, settings, loaded, tiny.stations(), tiny.silent)  # noqa: E731
+    further = lambda: recording.run(half, settings, loaded, tiny.operations(), tiny.silent)  # noqa: E731
     file.write_text(FUNCTIONS + "\n")
     with pytest.raises(InputError, match=r"mine\.py:poses: its file has changed since .*half was"):
         further()

@@ -31,7 +31,7 @@ from mgs.report.evaluation import evaluate
 from mgs.report.figures import POLICY_STYLE
 from mgs.report.page_plots import SYMBOLS
 from mgs.report.runs import compare_runs, read_run
-from mgs.run import loop
+from mgs.run import recording
 from mgs.run.folder import load_run
 
 
@@ -63,11 +63,11 @@ def write_runs(root):
     for policy in ("d-optimal", "random"):
         out = root / policy
         settings = tiny.start(out, dataset, policy=policy, evaluate_every=1)
-        loop.run(
+        recording.run(
             out,
             settings,
             dataset,
-            tiny.stations(
+            tiny.operations(
                 measure=lambda gaussians, taken: {
                     f"{views}psnr{mask}": len(taken) * (1 + len(views + mask))
                     for views in sets

@@ -21,7 +21,7 @@ from mgs.report.page_facts import read_shown
 from mgs.report.runs import read_run
 from mgs.report.tables import markdown_table, table_numbers
 from mgs.run import folder as run_folder
-from mgs.run import loop
+from mgs.run import recording
 from mgs.run.ending import run_end, why_ended
 from mgs.run.settings import NbvSettings
 
@@ -32,8 +32,8 @@ def loaded(tmp_path_factory):
 
 
 def run(out: Path, dataset, stations=None, **values) -> run_folder.State:
-    return loop.run(
-        out, tiny.start(out, dataset, **values), dataset, stations or tiny.stations(), tiny.silent
+    return recording.run(
+        out, tiny.start(out, dataset, **values), dataset, stations or tiny.operations(), tiny.silent
     )
 
 
@@ -41,8 +41,8 @@ def resume(out: Path, dataset, stations=None, **changes) -> run_folder.State:
     """Go on with a run, with some of its settings changed in its config.json."""
     config = json.loads((out / "config.json").read_text())
     write_json(out / "config.json", config | {"settings": config["settings"] | changes})
-    return loop.run(
-        out, run_folder.read_settings(out), dataset, stations or tiny.stations(), tiny.silent
+    return recording.run(
+        out, run_folder.read_settings(out), dataset, stations or tiny.operations(), tiny.silent
     )
 
 
@@ -101,7 +101,7 @@ def test_a_run_stops_before_it_takes_a_view_that_would_tell_little(loaded, tmp_p
         fits.append(1)
         return tiny.fit(*arguments)
 
-    state = run(tmp_path / "run", loaded, tiny.stations(fit=fit), stop_gain=limit)
+    state = run(tmp_path / "run", loaded, tiny.operations(fit=fit), stop_gain=limit)
     assert state.taken == whole.taken[:5]
     assert len(fits) == 3, "the seeds and two views"
     next_name = loaded.frames[whole.taken[5]].name
@@ -141,7 +141,7 @@ def test_resuming_a_run_that_has_ended_does_nothing_until_its_rule_is_changed(
     state = run(out, loaded, **{key: value})
     assert (len(state.taken), state.steps[-1]["ended"]["reason"]) == (5, rule)
     before = {path.name: path.read_bytes() for path in out.iterdir()}
-    again = resume(out, loaded, tiny.stations(fit=never, fisher=never))
+    again = resume(out, loaded, tiny.operations(fit=never, fisher=never))
     assert again.taken == state.taken
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
     last = resume(out, loaded, **{key: other})

@@ -15,7 +15,7 @@ from mgs.errors import InputError
 from mgs.policy import criteria
 from mgs.policy import poses as pose_policies
 from mgs.run import folder as run_folder
-from mgs.run import loop
+from mgs.run import recording
 
 METRES = st.floats(-100, 100)
 
@@ -26,7 +26,9 @@ def loaded(tmp_path_factory):
 
 
 def run(out, dataset, **values) -> run_folder.State:
-    return loop.run(out, tiny.start(out, dataset, **values), dataset, tiny.stations(), tiny.silent)
+    return recording.run(
+        out, tiny.start(out, dataset, **values), dataset, tiny.operations(), tiny.silent
+    )
 
 
 @given(
@@ -94,7 +96,7 @@ def test_dear_travel_makes_the_path_shorter_and_cheap_travel_changes_nothing(loa
 def test_what_cannot_be_divided_by_a_cost_is_refused(loaded, tmp_path, monkeypatch):
     negative = lambda candidates, *rest: -np.ones(len(candidates))  # noqa: E731
     monkeypatch.setitem(pose_policies.POSE_POLICIES, "mine", negative)
-    with pytest.raises(InputError, match="policy mine: gave negative scores, which --travel"):
+    with pytest.raises(InputError, match="policy mine: returned negative scores, which --travel"):
         run(tmp_path / "run", loaded, policy="mine", travel=1.0)
     assert len(run(tmp_path / "free", loaded, policy="mine").taken) == 8
 

@@ -29,7 +29,7 @@ from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset
 from mgs.gaussians import Gaussians
 from mgs.report.evaluation import evaluate_run
-from mgs.run import loop
+from mgs.run import recording
 from mgs.run.folder import read_settings
 from mgs.splat import render
 from mgs.splat_ply import write_ply
@@ -42,8 +42,8 @@ def steps(run, budget):
     """Let a run on stand-in stations go on to this many chosen views."""
     settings = read_settings(run)
     dataset = load_dataset(settings.dataset)
-    loop.run(
-        run, settings.model_copy(update={"budget": budget}), dataset, tiny.stations(), tiny.silent
+    recording.run(
+        run, settings.model_copy(update={"budget": budget}), dataset, tiny.operations(), tiny.silent
     )
 
 

@@ -26,7 +26,7 @@ from mgs.report.evaluation import evaluate
 from mgs.report.page import write_page
 from mgs.report.runs import up_of
 from mgs.report.writing import write_report
-from mgs.run import loop
+from mgs.run import recording
 from mgs.run.folder import load_run, read_settings
 from mgs.view import layers
 from mgs.view.subject import read_subject
@@ -49,9 +49,9 @@ def make_run(root: Path, tilted: bool) -> Path:
     def turned(g: Gaussians) -> Gaussians:
         return replace(g, means=(g.means @ turn.T).astype(np.float32))
 
-    stations = tiny.stations(initial=lambda frames: turned(tiny.initial(frames)), up=dataset.up)
+    stations = tiny.operations(initial=lambda frames: turned(tiny.initial(frames)), up=dataset.up)
     settings = tiny.start(root / "run", dataset, policy="uniform")
-    loop.run(root / "run", settings, dataset, stations, tiny.silent)
+    recording.run(root / "run", settings, dataset, stations, tiny.silent)
     gaussians, _, trained, _ = load_run(root / "run")
 
     def black(g: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

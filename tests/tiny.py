@@ -23,7 +23,7 @@ from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_exr, write_png
 from mgs.rotation import quat_from_normals
 from mgs.run import folder as run_folder
-from mgs.run import loop
+from mgs.run import problem, recording
 from mgs.run.settings import NbvSettings
 
 FRAMES, POINTS, WIDTH, HEIGHT = 12, 40, 16, 12
@@ -154,7 +154,7 @@ def fit(
     return Fit(fitted, float(np.abs(rgb - g.rgb).mean()), 7)
 
 
-def stations(**replaced) -> loop.Stations:
+def operations(**replaced) -> problem.Operations:
     """Stand-ins for every station; any of them replaced."""
     parts = {
         "initial": initial,
@@ -163,7 +163,7 @@ def stations(**replaced) -> loop.Stations:
         "estimate": estimate,
         "measure": lambda gaussians, taken: {"psnr": float(len(taken))},
     }
-    return loop.Stations(centre=np.zeros(3), groups=GROUPS, **(parts | replaced))
+    return problem.Operations(centre=np.zeros(3), groups=GROUPS, **(parts | replaced))
 
 
 def start(out: Path, dataset: Dataset, **values) -> NbvSettings:
@@ -185,10 +185,14 @@ def write_prior(out: Path) -> Path:
     return save_prior(
         out,
         Prior(
-            mesh, n, n, 0.5, 0.2,
-            {"spacing": 0.5, "depth_tolerance": 0.2, "n": POINTS, "backed": 0, "up": [0.0, 0.0, 1.0]},
+            mesh,
+            n,
+            n,
+            0.5,
+            0.2,
+            {"spacing": 0.5, "depth_tolerance": 0.2, "n": POINTS, "backed": 0, "up": [0, 0, 1]},
         ),
-    )  # fmt: skip
+    )
 
 
 def write_run(out: Path, root: Path, prior: Path) -> Path:
@@ -199,10 +203,10 @@ def write_run(out: Path, root: Path, prior: Path) -> Path:
 
     dataset, known = load_dataset(root), load_prior(prior)
     settings = start(out, dataset, prior=prior, budget=2)
-    parts = stations(
+    parts = operations(
         prior=prior_digest(known), initial=lambda frames: initial_gaussians(known, frames)[0]
     )
-    loop.run(out, settings.model_copy(update={"budget": 0}), dataset, parts, silent)
+    recording.run(out, settings.model_copy(update={"budget": 0}), dataset, parts, silent)
     return out
 
 
@@ -210,7 +214,7 @@ def silent(stage: str, done: int, total: int) -> None:
     """No progress bar."""
 
 
-def die_at(moment: str, count: int) -> loop.Stations:
+def die_at(moment: str, count: int) -> problem.Operations:
     """Stations of which one kills this process, as the system would, when it is called for the
     count-th time."""
     calls = {"n": 0}
@@ -225,7 +229,7 @@ def die_at(moment: str, count: int) -> loop.Stations:
         return call
 
     if moment in ("fit", "fisher", "initial"):
-        return stations(**{moment: dying(globals()[moment])})
+        return operations(**{moment: dying(globals()[moment])})
     if moment == "before the lines are written":
         run_folder.write_steps = dying(run_folder.write_steps)
     if moment == "while the checkpoint is written":
@@ -240,7 +244,7 @@ def die_at(moment: str, count: int) -> loop.Stations:
             savez(file, **arrays)
 
         np.savez = half_then_die
-    return stations()
+    return operations()
 
 
 if __name__ == "__main__":
@@ -250,4 +254,4 @@ if __name__ == "__main__":
         if folder.exists()
         else start(folder, loaded, policy=sys.argv[3], seed=3)
     )
-    loop.run(folder, chosen, loaded, die_at(sys.argv[4], int(sys.argv[5])), silent)
+    recording.run(folder, chosen, loaded, die_at(sys.argv[4], int(sys.argv[5])), silent)

@@ -43,9 +43,10 @@ over that of image and gradient. tiny_forward_ms: milliseconds.
 WARM_UP = 2
 """Untimed calls before the timed ones: they compile kernels and allocate memory."""
 
-SECOND_OPERATION = re.compile(r"call <.*@llvm\.fma")
-OPERATION = re.compile(r" (?:fadd|fsub|fmul|fdiv) <|call <.*(?:@llvm\.(?:fma|sqrt)|rcp14|rsqrt14)")
-"""Floating-point instructions of LLVM. An FMA counts twice."""
+CALL = r"call <.*@llvm\."
+OPERATION = re.compile(rf" (?:fadd|fsub|fmul|fdiv) <|{CALL}(?:fma|sqrt|x86\.\w+\.(?:rcp|rsqrt))")
+SECOND_OPERATION = re.compile(rf"{CALL}fma")
+"""Floating-point instructions of LLVM's code; an FMA counts twice."""
 
 LOOP = re.compile(r"^l_(\d+)_cond:(.*?)^l_\1_end:", re.MULTILINE | re.DOTALL)
 """A loop of a compiled kernel."""

@@ -114,7 +114,8 @@ def bench_fit(
     """
     dataset = load_dataset(root)
     report(f"accuracy of {' and '.join(f'{n:,}' for n in SIZES)} Gaussians on {VIEWS} views")
-    cases = {n: make_case(dataset, n, "even", VIEWS, alpha_weight) for n in SIZES}
+    priors = {n: build_prior(dataset, PriorSettings(gaussians=n))[0] for n in SIZES}
+    cases = {n: make_case(dataset, priors[n], "even", VIEWS, alpha_weight) for n in SIZES}
     fits = {n: case.fit() for n, case in cases.items()}
     means = {n: case.measure(fits[n].gaussians) for n, case in cases.items()}
     tests = {n: case.measure(fits[n].gaussians, test=True) for n, case in cases.items()}
@@ -122,9 +123,8 @@ def bench_fit(
     report("the end of the fit: predicted and found")
     end = _end_of_fit(cases[small], fits[small])
     report(f"ranking of candidates from {len(STATES)} states")
-    ranking = [
-        _ranking(make_case(dataset, small, how, count, alpha_weight)) for how, count in STATES
-    ]
+    states = [make_case(dataset, priors[small], *state, alpha_weight) for state in STATES]
+    ranking = [_ranking(case) for case in states]
 
     def mean(name: str) -> float:
         return float(np.mean([row[name] for row in ranking]))
@@ -153,9 +153,8 @@ def _lam_by_kind() -> dict[str, float]:
     return lam_by_kind(regularisation(groups(0)), groups(0))
 
 
-def make_case(dataset: Dataset, gaussians: int, how: str, count: int, alpha_weight: float) -> Case:
+def make_case(dataset: Dataset, prior: Prior, how: str, count: int, alpha_weight: float) -> Case:
     """Take `count` views, "even" in azimuth or "random"."""
-    prior, _ = build_prior(dataset, PriorSettings(gaussians=gaussians))
     positions = np.array([frame.camera.position for frame in dataset.frames])
     taken: Sequence[int] = seed_views(positions, prior.points.mean(0), count)
     if how == "random":

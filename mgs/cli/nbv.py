@@ -2,28 +2,48 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
 
-from mgs.fit.settings import ALPHA_WEIGHT, PASSES, RATES, WARM_PASSES
-from mgs.policy.criteria import PIXEL_NOISE, PRIOR_STD
+from mgs.fit.settings import TrainSettings
 from mgs.policy.registry import policy_names
 from mgs.run.ending import fit_line, why_ended
-from mgs.run.settings import PRESETS
+from mgs.run.settings import PRESETS, NbvSettings
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from mgs.run.folder import State
+    from mgs.run.folder import Run
+    from mgs.run.state import State
 
 DIGITS = {"psnr": 2, "ssim": 4, "psnr_mask": 2, "ssim_mask": 4}
 """Decimals of the qualities that are printed."""
 
+PANELS = {
+    "Main options": ("policy", "budget", "seeds"),
+    "Choosing": ("batch", "nearest", "travel", "stop_gain", "stop_uncertainty"),
+    "Fitting": ("passes", "warm_passes", "means", "exposure", "alpha_weight", "optimiser", "rates"),
+    "Advanced": ("estimator", "lam", "pixel_noise", "prior_std", "evaluate_every", "seed"),
+}
+"""Settings with an option of the same name (`rates`: --rate), by panel of the help."""
 
-def _numbers(defaults: dict[str, float]) -> str:
-    return ", ".join(f"{kind}={value:g}" for kind, value in defaults.items())
+METAVARS = {
+    "batch": "K",
+    "travel": "METRES",
+    "stop_gain": "GAIN",
+    "stop_uncertainty": "SHARE",
+    "alpha_weight": "WEIGHT",
+    "rates": "KIND=NUMBER",
+    "prior_std": "KIND=NUMBER",
+}
+
+MORE_HELP = {
+    "policy": f" Policies: {', '.join(policy_names())}.",
+    "alpha_weight": " Default: 0.1, or 0 where frames have neither mask nor alpha.",
+}
 
 
 def nbv(
@@ -32,162 +52,55 @@ def nbv(
         Path | None,
         typer.Argument(help="Dataset folder (transforms.json). Not needed with --resume."),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="New folder for the run.")] = None,
-    capture: Annotated[
-        str | None,
-        typer.Option(
-            metavar="SCENE",
-            help="In place of DATASET, a scene (name or .toml): an image is rendered only when it is chosen.",
-        ),
+    out: Annotated[
+        Path | None,
+        typer.Option(help="New folder for the run.", rich_help_panel="Main options"),
     ] = None,
     prior: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of `mgs prior`; default DATASET/prior, or built inside the run where there is none."
+            help="Folder of `mgs prior`. Default: DATASET/prior, or one built in the run.",
+            rich_help_panel="Main options",
+        ),
+    ] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN",
+            help="Continue this run, with the settings in its config.json.",
+            rich_help_panel="Main options",
+        ),
+    ] = None,
+    capture: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SCENE",
+            help="In place of DATASET: a scene (name or .toml), rendered when a view is chosen.",
+            rich_help_panel="Data",
         ),
     ] = None,
     gaussians: Annotated[
         str | None,
         typer.Option(
             metavar="N|auto",
-            help="Build a prior of this many Gaussians (`mgs prior`) inside the run.",
+            help="Build a prior of this many Gaussians in the run (`mgs prior`).",
+            rich_help_panel="Data",
         ),
-    ] = None,
-    policy: Annotated[
-        str,
-        typer.Option(
-            help=f"One of {', '.join(policy_names())}; or FILE.py:FUNCTION, a function of your own."
-        ),
-    ] = "d-optimal",
-    nearest: Annotated[
-        int | None,
-        typer.Option(
-            help="Move only to one of so many views that are nearest to the last one. Default: to any."
-        ),
-    ] = None,
-    travel: Annotated[
-        float | None,
-        typer.Option(
-            metavar="METRES",
-            help="Distance that costs as much as taking an image: scores are divided by 1 + distance/METRES.",
-        ),
-    ] = None,
-    budget: Annotated[
-        int | None,
-        typer.Option(
-            help="Most views chosen beyond the seeds; default 50, or all candidates where they are fewer."
-        ),
-    ] = None,
-    batch: Annotated[
-        int,
-        typer.Option(
-            metavar="K",
-            help="Choose so many views, one after the other, before their images are read and fitted.",
-        ),
-    ] = 1,
-    stop_gain: Annotated[
-        float | None,
-        typer.Option(
-            metavar="GAIN",
-            help="End the run before a view whose `information_gain` (Eq. 7, in steps.jsonl) is less than this.",
-        ),
-    ] = None,
-    stop_uncertainty: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SHARE",
-            help="End the run when no more than this share (0 to 1) of the prior's variance is left.",
-        ),
-    ] = None,
-    seeds: Annotated[
-        int, typer.Option(help="Views at evenly spaced azimuths that start the model.")
-    ] = 4,
-    seed: Annotated[int, typer.Option(min=0, help="Root of every random draw.")] = 0,
-    estimator: Annotated[
-        str,
-        typer.Option(
-            help="How Fisher information is computed: exact, hutchinson, or loss-gradient (the paper's)."
-        ),
-    ] = "exact",
-    lam: Annotated[
-        float | None,
-        typer.Option(
-            help="One lambda for all parameters, as in the paper; default: (pixel noise / prior std)^2."
-        ),
-    ] = None,
-    pixel_noise: Annotated[
-        float, typer.Option(help="Residual of a pixel, linear RGB: sets lambda of every criterion.")
-    ] = PIXEL_NOISE,
-    prior_std: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="KIND=NUMBER",
-            help=f"Prior standard deviation of a kind of parameter; default: {_numbers(PRIOR_STD)}.",
-        ),
-    ] = None,
-    means: Annotated[
-        str,
-        typer.Option(
-            help="What the means may do: frozen (stay), normal (move along the prior's normals), or free."
-        ),
-    ] = "frozen",
-    optimiser: Annotated[
-        str, typer.Option(help="Optimiser of the fit: natural or adam.")
-    ] = "natural",
-    alpha_weight: Annotated[
-        float | None,
-        typer.Option(
-            metavar="WEIGHT",
-            help="Weight of a pixel's alpha in the fit, (sigma_rgb / sigma_alpha)^2; 0: none, as in the paper. Default: "
-            f"{ALPHA_WEIGHT}, or 0 where frames have neither mask nor alpha.",
-        ),
-    ] = None,
-    rate: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="KIND=NUMBER",
-            help=f"Learning rate of a kind of parameter; default: {_numbers(RATES)}. 0: not learned.",
-        ),
-    ] = None,
-    exposure: Annotated[
-        bool,
-        typer.Option(
-            "--exposure",
-            help="Exposure and white balance differ between images: estimate a gain of each image and channel.",
-        ),
-    ] = False,
-    passes: Annotated[
-        int | None, typer.Option(help=f"Most passes over the images in any fit; default {PASSES}.")
-    ] = None,
-    warm_passes: Annotated[
-        int | None,
-        typer.Option(help=f"Most passes of the fits after the first; default {WARM_PASSES}."),
     ] = None,
     preset: Annotated[
         str | None,
         typer.Option(
-            help=f"Defaults of passes and of the number of Gaussians: {', '.join(PRESETS)}. Other options win."
+            help=f"Defaults of passes and of the number of Gaussians: {', '.join(PRESETS)}.",
+            rich_help_panel="Fitting",
         ),
     ] = None,
-    evaluate_every: Annotated[
-        int,
-        typer.Option(
-            help="Measure PSNR every so many chosen views, of a batch at its end; 0: only at the end of the run."
-        ),
-    ] = 0,
-    resume: Annotated[
-        Path | None,
-        typer.Option(help="Continue this run; every other setting comes from its config.json."),
-    ] = None,
+    **options: Any,
 ) -> None:
-    """Fit to the seeds, then choose a view (with --batch several), read its image and fit again,
-    until the budget is spent, or
-    --stop-gain or --stop-uncertainty ends the run.
+    """Choose the next best views: fit to the seeds, choose a view, read its image, fit again.
 
-    Writes config.json, steps.jsonl (a line for the seeds, then one for each chosen view),
-    checkpoint.npz, gaussians.ply and metrics.json into the run folder. Once the folder is there, a
-    run that was interrupted at any moment, kill -9 included, goes on with --resume and takes the
-    same views; before that, give the same command again.
+    Ends when the budget is spent, or with --stop-gain or --stop-uncertainty. Writes config.json,
+    steps.jsonl (a line for each view), checkpoint.npz, gaussians.ply and metrics.json into the run
+    folder. An interrupted run continues with --resume, and takes the same views.
     """
     from rich.console import Console
 
@@ -195,42 +108,18 @@ def nbv(
     from mgs.errors import InputError
 
     console = Console(highlight=False)
+    given = {name: options[name] for name in options if options[name] not in (None, [])}
     if resume is not None:
-        if dataset is not None or out is not None or capture is not None:
-            raise InputError(
-                "nbv: --resume RUN continues RUN as it was started; leave DATASET, --out and --capture out"
-            )
-        for name in context.params:
-            source = context.get_parameter_source(name)
-            if name != "resume" and source is not None and source.name == "COMMANDLINE":
-                option = f"--{name.replace('_', '-')}"
-                raise InputError(
-                    f"nbv: {option}: --resume takes its settings from {resume / 'config.json'}; change it there"
-                )
+        refuse_others(context, resume)
         resume_and_print(resume, console)
         return
     if (dataset is None) == (capture is None) or out is None:
         raise InputError("nbv: give a DATASET or --capture SCENE, and --out RUN; or --resume RUN")
-    train: dict[str, Any] = {
-        "means": means, "optimiser": optimiser, "rates": pairs("--rate", rate),
-    }  # fmt: skip
-    train |= {
-        name: value
-        for name, value in {"passes": passes, "alpha_weight": alpha_weight}.items()
-        if value is not None
-    }
-    settings: dict[str, Any] = {
-        "policy": policy, "nearest": nearest, "travel": travel, "batch": batch, "stop_gain": stop_gain,
-        "stop_uncertainty": stop_uncertainty, "seeds": seeds, "seed": seed, "estimator": estimator, "lam": lam,
-        "pixel_noise": pixel_noise, "prior_std": pairs("--prior-std", prior_std), "evaluate_every": evaluate_every,
-        "exposure": exposure, "train": train,
-    }  # fmt: skip
-    settings |= {
-        name: value
-        for name, value in {"budget": budget, "warm_passes": warm_passes}.items()
-        if value is not None
-    }
-    start_and_print(
+    settings, train = dict[str, Any](), dict[str, Any]()
+    for name, value in given.items():
+        where = train if name in TrainSettings.model_fields and name != "seed" else settings
+        where[name] = pairs(name, value) if isinstance(value, list) else value
+    run = start_and_print(
         dataset,
         out,
         console,
@@ -239,81 +128,113 @@ def nbv(
         gaussians=parse_gaussians(gaussians),
         preset=preset,
         **settings,
+        train=train,
     )
-    resume_and_print(out, console)
+    resume_and_print(run, console)
 
 
-def pairs(option: str, given: list[str] | None) -> dict[str, float]:
-    """`KIND=NUMBER` options as a table. Raises InputError for one that is not of this form."""
+def with_settings_as_options(function: Any) -> Any:
+    """Give a command an option for each setting in PANELS; only options given reach `**options`."""
+    signature = inspect.signature(function, eval_str=True)
+    parameters = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+    for panel, names in PANELS.items():
+        parameters += [_option(name, panel) for name in names]
+    function.__signature__ = signature.replace(parameters=parameters)
+    function.__annotations__ = {p.name: p.annotation for p in parameters}
+    return function
+
+
+def _option(name: str, panel: str) -> inspect.Parameter:
+    """The option of a setting: type, help and default from its model."""
+    model = NbvSettings if name in NbvSettings.model_fields else TrainSettings
+    hint, field = get_type_hints(model)[name], model.model_fields[name]
+    kind = next((part for part in get_args(hint) if part in (int, float, str)), hint)
+    kind = {int: int, float: float, bool: bool, dict[str, float]: list[str]}.get(kind, str)
+    text, default = (field.description or "") + MORE_HELP.get(name, ""), field.default
+    if isinstance(default, dict):
+        kind, default = list[str], ", ".join(f"{k}={v:g}" for k, v in default.items())
+    if default is not None and not isinstance(default, bool) and "Default:" not in text:
+        text += f" Default: {default}."
+    flags = ["--exposure"] if kind is bool else ["--rate"] if name == "rates" else []
+    option = typer.Option(
+        *flags, metavar=METAVARS.get(name), help=text, rich_help_panel=panel, show_default=False
+    )
+    annotation: Any = Annotated[kind | None, option]  # type: ignore[valid-type]
+    return inspect.Parameter(
+        name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation
+    )
+
+
+with_settings_as_options(nbv)
+
+
+def refuse_others(context: typer.Context, resume: Path) -> None:
+    """Raises InputError where an option is given beside --resume."""
     from mgs.errors import InputError
 
-    table = {}
-    for text in given or []:
+    for name in context.params:
+        source = context.get_parameter_source(name)
+        if name == "resume" or source is None or source.name != "COMMANDLINE":
+            continue
+        option = (
+            name if name == "dataset" else f"--{name.replace('_', '-')}".replace("rates", "rate")
+        )
+        where = f"--resume takes its settings from {resume / 'config.json'}; change it there"
+        raise InputError(f"nbv: {option.upper() if name == 'dataset' else option}: {where}")
+
+
+def pairs(name: str, given: list[str]) -> dict[str, float]:
+    """Parse `KIND=NUMBER` options. Raises InputError for one that is not of this form."""
+    from mgs.errors import InputError
+
+    option, table = {"rates": "--rate", "prior_std": "--prior-std"}[name], {}
+    for text in given:
         kind, _, number = text.partition("=")
         try:
             table[kind] = float(number)
         except ValueError:
-            raise InputError(
-                f"{option} {text}: expected KIND=NUMBER, as in {option} colour=0.01"
-            ) from None
+            form = f"expected KIND=NUMBER, as in {option} colour=0.01"
+            raise InputError(f"{option} {text}: {form}") from None
     return table
 
 
-def start_and_print(dataset: Path | None, out: Path, console: Console, **settings: Any) -> None:
-    """`mgs.run.nbv.start_run` under a spinner; says which prior it found."""
+def start_and_print(dataset: Path | None, out: Path, console: Console, **settings: Any) -> Run:
+    """`mgs.run.nbv.start_run` with its progress; print which prior was found in the dataset."""
+    from mgs.cli.progress import progress_bar
     from mgs.run.nbv import start_run
 
-    with console.status("starting") as status:
-        found = start_run(
-            dataset, out, progress=lambda stage, done, total: status.update(stage), **settings
-        )
-    if (
-        settings.get("prior") is None
-        and dataset is not None
-        and found.prior.parent == dataset.resolve()
-    ):
-        console.print(f"prior: {found.prior}", soft_wrap=True)
+    with progress_bar("starting", console) as progress:
+        run = start_run(dataset, out, progress=progress, **settings)
+    found = run.settings.prior
+    if settings.get("prior") is None and dataset and found.parent == dataset.resolve():
+        console.print(f"prior: {found}", soft_wrap=True)
+    return run
 
 
-def resume_and_print(out: Path, console: Console, pictures: bool = False) -> None:
-    """Run or resume the loop in a run folder, evaluate (with pictures where asked), print the
-    table."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+def resume_and_print(run: Path | Run, console: Console, pictures: bool = False) -> None:
+    """Run or resume the loop of a run, evaluate (with pictures where asked), print the table."""
+    from functools import partial
 
+    from mgs.cli.progress import progress_bar
     from mgs.report.evaluation import evaluate_run
-    from mgs.run.folder import read_settings
+    from mgs.run.folder import Run, open_run
     from mgs.run.nbv import resume_nbv
 
-    settings = read_settings(out)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=console, transient=True) as bar:
-        whole = bar.add_task(f"{out.name}: images", total=settings.seeds + settings.budget)
-        part = bar.add_task("reading", total=1)
-
-        def progress(stage: str, done: int, total: int) -> None:
-            bar.update(part, description=stage, completed=done, total=total)
+    run = run if isinstance(run, Run) else open_run(run)
+    total = run.settings.seeds + run.settings.budget
+    with progress_bar("reading", console) as progress:
 
         def on_step(state: State) -> None:
-            bar.update(whole, completed=len(state.taken))
+            progress.whole(f"{run.folder.name}: images", len(state.taken), total)
             line = state.steps[-1]
             for warning in line.get("warnings", []):
-                bar.print(f"step {line['step']}: {warning}", soft_wrap=True)
+                progress.print(f"step {line['step']}: {warning}")
 
-        state = resume_nbv(
-            out,
-            on_step=on_step,
-            progress=progress,
-            say=lambda text: bar.print(text, soft_wrap=True),
-        )
+        state = resume_nbv(run, on_step, progress)
         metrics = evaluate_run(
-            out, pictures=pictures, progress=lambda done, total: progress("evaluating", done, total)
+            run.folder, pictures=pictures, progress=partial(progress, "evaluating")
         )
-    print_run(out, state, metrics, console)
+    print_run(run.folder, state, metrics, console)
 
 
 def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console) -> None:

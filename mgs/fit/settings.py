@@ -50,23 +50,20 @@ def complete(given: Any, defaults: Mapping[str, float]) -> Any:
 class TrainSettings(BaseModel):
     """Settings of `mgs.fit.fitting.fit`."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     means: Literal["frozen", "normal", "free"] = "frozen"
-    """Whether means stay, as in the paper, move along the prior's normals, or move freely."""
+    """How means move: frozen, as in the paper; normal, along the prior's normals; or free."""
     optimiser: str = "natural"
-    """A name in `mgs.fit.optimisers.OPTIMISERS`."""
+    """Optimiser of the fit: natural (gradient over Fisher information) or adam."""
     passes: Annotated[int, Field(ge=1)] = PASSES
-    """Most passes over the images."""
+    """Most passes over the images in any fit."""
     tolerance: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.01
-    """The fit has settled when two passes in a row lower the loss by less than this share
-    (`mgs.fit.stopping.stop_reason`)."""
+    """The fit has settled when two passes in a row lower the loss by less than this share."""
     rates: dict[str, Annotated[float, Field(ge=0, allow_inf_nan=False)]] = RATES
-    """Learning rate of each kind of parameter, by default that of RATES; 0 freezes a kind. That of
-    `mean`, metres, is required if means are learned; `mgs nbv` sets it (`with_spacing`)."""
+    """Learning rate of a kind of parameter, 0: not learned; of `mean` in metres, where it moves."""
     alpha_weight: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)] = 0.0
-    """(sigma_rgb / sigma_alpha)^2, the weight of alpha as a fourth channel of a pixel; 0: no alpha.
-    Runs use ALPHA_WEIGHT by default. The criteria ignore it (docs/fit.md)."""
+    """Weight of alpha as a fourth channel of a pixel, (sigma_rgb / sigma_alpha)^2; 0: none."""
     decay: Positive = 0.1
     """Factor by which the rates fall over `passes`."""
     seed: Annotated[int, Field(ge=0)] = 0

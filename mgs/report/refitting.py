@@ -82,7 +82,8 @@ def refit_run(
     settings, state = read_settings(run), read_checkpoint(run)
     assert state is not None  # the model was read from it
     prior = load_prior(settings.prior)
-    inputs.check(run, state, settings, dataset, inputs.prior_digest(prior), say)
+    digest = inputs.prior_digest(prior)
+    inputs.check_unchanged(run, state.inputs, digest, settings, dataset)
     by_name = {frame.name: frame for frame in dataset.frames}
     images = last_images(settings, prior, [by_name[name] for name in taken])
     found = lean_fit(images, settings, learn, sh, loss, say=say)

@@ -11,7 +11,7 @@ the largest value that was seen there, or, where a comment says so, by something
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from mgs.camera import Camera
 from mgs.gaussians import Gaussians
+from mgs.metrics import masked_squares
 
 DARK = 1e-3
 """Linear RGB, added to brightnesses before they are compared: in the dark, a ratio says nothing."""
@@ -120,6 +121,15 @@ def view_signs(
     truth, drawn = target[counted][:, :3].astype(np.float64), rendered[counted].astype(np.float64)
     squared, variance = float(np.mean((truth - drawn) ** 2)), float(truth.var(axis=0).mean())
     return ViewSigns(before, squared / max(variance, 1e-12), squared**0.5)
+
+
+def residual(views: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> float | None:
+    """Root mean square difference inside the masks, linear RGB; None where no pixel counts.
+
+    views: (render [H,W,3], target [H,W,4 or more] with weights, mask [H,W]) of each.
+    """
+    squares = np.concatenate([masked_squares(*view) for view in views])
+    return float(np.sqrt(squares.mean())) if len(squares) else None
 
 
 def step_signs(

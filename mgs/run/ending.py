@@ -1,4 +1,4 @@
-"""Why a run ended, and what is said about the end of a run and of its last fit."""
+"""Why a run ended, and the messages about the end of a run and of its fits."""
 
 from __future__ import annotations
 
@@ -12,28 +12,37 @@ if TYPE_CHECKING:
     from mgs.run.settings import NbvSettings
 
 
-def diverged(out: Path, step: int, kept: int, losses: Sequence[float]) -> str:
-    """What to say of a fit that diverged: the loss of the model it started from, and of its last
-    passes.
+class FitDivergedError(Exception):
+    """A fit diverged. step: of the loop, 0 for the seeds. losses: of the start, then each pass."""
 
-    out: the run's folder. step: that of the fit. kept: how many steps are finished.
+    def __init__(self, step: int, losses: Sequence[float]) -> None:
+        super().__init__(f"the fit of step {step} diverged")
+        self.step, self.losses = step, losses
+
+
+def diverged(out: Path, step: int, kept: int, losses: Sequence[float]) -> str:
+    """Message for a fit that diverged: its first and last losses, and how to go on.
+
+    step: that of the fit. kept: number of finished steps.
     """
     first, *passes = (f"{loss:.3g}" for loss in losses)
     fit = "the fit to the seeds" if step == 0 else f"the fit of step {step}"
     left = {0: "", 1: "; step 0 is kept"}.get(kept, f"; steps 0 to {kept - 1} are kept")
     rates = "`train.rates`" if step == 0 else "`warm_rate` or `train.rates`"
     return (
-        f"{out}: {fit} diverged: its loss was {first} at the start, and {', '.join(passes[-3:])} in the last passes; "
-        f"lower the learning rates ({rates} in {out / 'config.json'}) and go on with `mgs nbv --resume {out}`{left}"
+        f"{out}: {fit} diverged: its loss was {first} at the start, and {', '.join(passes[-3:])} "
+        f"in the last passes; lower the learning rates ({rates} in {out / 'config.json'}) "
+        f"and go on with `mgs nbv --resume {out}`{left}"
     )
 
 
 def fit_line(fit: dict[str, Any], stop_reason: str) -> str:
-    """What to say of the last fit: whether it has converged, or how far from its end it stopped."""
+    """Describe the last fit: whether it converged, and how far its objective could still fall."""
     share = f"{100 * fit['predicted_decrease']:.2g} %"
-    if fit["converged"]:
-        return f"last fit: converged; its objective could fall by {share} yet, as predicted from its curvature"
-    return f"last fit: stopped early ({stop_reason}); its objective could fall by {share} yet, as predicted from its curvature"
+    how = "converged" if fit["converged"] else f"stopped early ({stop_reason})"
+    return (
+        f"last fit: {how}; its objective could fall by {share} yet, as predicted from its curvature"
+    )
 
 
 class RunEnd(StrEnum):
@@ -47,30 +56,25 @@ class RunEnd(StrEnum):
 def run_end(
     settings: NbvSettings, views: int, uncertainty: float, refused: Mapping[str, Any] | None
 ) -> dict[str, Any] | None:
-    """`ended` of steps.jsonl, where the run ends here: the `reason`, and the numbers that decided;
-    None: it goes on.
+    """`ended` of steps.jsonl where the run ends here: the `reason` and its numbers; else None.
 
-    views: chosen so far. uncertainty: the mean over all parameters of the variance that is left,
-    over that of the prior.
-    refused: where the view to be taken next is known already, its `name` and `information_gain`.
+    views: chosen so far. uncertainty: mean variance that is left, over that of the prior.
+    refused: `name` and `information_gain` of the next view, where it is known.
     """
     if views >= settings.budget:
         return {"reason": str(RunEnd.BUDGET), "views": views}
     if settings.stop_uncertainty is not None and uncertainty <= settings.stop_uncertainty:
         numbers = {"uncertainty": uncertainty, "limit": settings.stop_uncertainty}
         return {"reason": str(RunEnd.UNCERTAINTY), "views": views, **numbers}
-    if (
-        settings.stop_gain is not None
-        and refused
-        and refused.get("information_gain", math.inf) < settings.stop_gain
-    ):
-        view = {key: refused[key] for key in ("name", "information_gain")}
+    gain = refused.get("information_gain", math.inf) if refused else math.inf
+    if refused and settings.stop_gain is not None and gain < settings.stop_gain:
+        view = {"name": refused["name"], "information_gain": gain}
         return {"reason": str(RunEnd.GAIN), "views": views, **view, "limit": settings.stop_gain}
     return None
 
 
 def why_ended(ended: Mapping[str, Any]) -> str:
-    """What to say of the end of a run, after "the run has ended: ". ended: as in steps.jsonl."""
+    """Reason of a run's end in words, after "the run has ended: ". ended: as in steps.jsonl."""
     views = f"{ended['views']} chosen view{'' if ended['views'] == 1 else 's'}"
     if ended["reason"] == RunEnd.BUDGET:
         return f"its budget is spent, {views}"

@@ -1,103 +1,119 @@
-"""The folder of a run: what is in it, how it is read and written.
+"""The folder of a run: its files, how they are read and written.
 
-- `config.json`: settings, versions and the names of all frames; written first;
-- `checkpoint.npz`: the whole state after the last finished step, replaced atomically: this is the
-commit of a step;
-- `steps.jsonl`: one line a step, rebuilt from the checkpoint, so it can lag behind by a killed step
-but never disagree;
+- `config.json`: settings, versions and the names of all frames; written first.
+- `checkpoint.npz`: the state after the last finished step, replaced atomically: the commit.
+- `steps.jsonl`: one line a step, written after the checkpoint.
 - `gaussians.ply`: the model, once the run has ended.
 
-A step is one chosen view, whatever the size of a batch; only the last step of a batch has a fit,
-and what is measured after it. A line of `steps.jsonl` holds: `step` (0 = the seeds), `frame` and
-`name` of the chosen view (null at step 0, which has `seeds` and `seed_names` instead), `images`
-(how many are taken by then), `score` (the policy's own number; of random, the draw),
-`information_gain` (Eq. 7 of the chosen view by the run's estimator, whatever the policy),
-`coverage` (Eq. 9 of all images), `uncertainty` (the mean over all parameters of the variance that
-is left, over that of the prior), `iterations`, `loss` and `stop_reason` of the fit, and from step 1
-`residual`, by how much the new images differed from the model before it; with the setting
-`exposure`, under that name, the gains (red, green, blue) by which the image of each frame was
-divided; `signs` of what may go wrong (`mgs.run.detectors`) and, where one of them has just gone
-beyond its limit, `warnings`, sentences; `seconds` per stage, and, where the step was evaluated,
-mean PSNR in dB over all views (`psnr`; `psnr_mask` in the rock mask), over those never trained on
-(`held_out_psnr`, `held_out_psnr_mask`), and over the test views of the dataset where it has some
-(`test_psnr`, `test_psnr_mask`). The last line of a run that has ended has `ended`, which says why
-(`mgs.run.ending.run_end`).
+A step is one chosen view; of a batch only the last step has a fit. A line of `steps.jsonl` holds:
+
+- `step`: 0 for the seeds. `frame`, `name`: the chosen view; at step 0 `seeds`, `seed_names`.
+- `images`: number of views taken. `score`: the policy's own number.
+- `information_gain`: Eq. 7 of the chosen view by the run's estimator, whatever the policy.
+- `coverage`: Eq. 9. `uncertainty`: mean variance that is left, over that of the prior.
+- `iterations`, `loss`, `stop_reason`: of the fit.
+- `residual`: rms difference of the new images to the model before, linear RGB.
+- `exposure`: gains (red, green, blue) by frame name, with the setting `exposure`.
+- `signs`, `warnings`: of `mgs.run.detectors`. `seconds`: by stage.
+- `psnr`, `psnr_mask` over all views, `held_out_...`, `test_...`, dB: where it was evaluated.
+- `ended`: in the last line of a run that has ended (`mgs.run.ending.run_end`).
 """
 
 from __future__ import annotations
 
 import json
 import zipfile
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mgs.data.dataset import Dataset, load_dataset
-from mgs.errors import InputError, row_named
+from mgs.data.dataset import Dataset, Frame, load_dataset
+from mgs.errors import InputError
 from mgs.files import atomic_path, read_json, write_json
 from mgs.gaussians import Gaussians
 from mgs.policy.from_file import label
-from mgs.policy.registry import policy_named
+from mgs.prior.build import Prior, load_prior
 from mgs.provenance import versions
-from mgs.run.settings import NbvSettings, validated
+from mgs.run.settings import NbvSettings, check_settings, validated
+from mgs.run.state import State
 
 DATASET = "dataset"
 """Folder of a run that holds its dataset, where the run captures images (`mgs nbv --capture`)."""
 
 
-@dataclass
-class State:
-    """What is known after a step.
+class Run:
+    """A run folder; what it was made of is read when first asked for, and once.
 
-    gaussians: the fitted model. H [N,P]: information of the training set at that model. surface
-    [S,P]: its information about the S Gaussians on the prior's surface as they were before
-    training, which is what the views see of the surface; of learned
-    means, H has columns and surface has none. taken:
-    frame indices in the order in which they were taken. steps: all lines of steps.jsonl. inputs:
-    what the run was made from, a record of `mgs.run.inputs`, empty in runs of versions that kept
-    none.
+    folder: the run. settings: from its config.json. Properties raise InputError where a file is
+    missing or damaged; `state` where no step is finished yet; `dataset` where its frames changed.
     """
 
-    gaussians: Gaussians
-    H: np.ndarray
-    surface: np.ndarray
-    taken: list[int]
-    steps: list[dict[str, Any]]
-    inputs: dict[str, Any] = field(default_factory=dict)
+    def __init__(
+        self,
+        folder: Path,
+        settings: NbvSettings,
+        dataset: Dataset | None = None,
+        prior: Prior | None = None,
+    ) -> None:
+        self.folder, self.settings = folder, settings
+        self._dataset, self._prior = dataset, prior
+
+    @cached_property
+    def dataset(self) -> Dataset:
+        """The dataset of the run."""
+        if self._dataset is not None:
+            return self._dataset
+        dataset = load_dataset(self.settings.dataset)
+        check_same_frames(self.folder, dataset)
+        return dataset
+
+    @cached_property
+    def prior(self) -> Prior:
+        """The prior of the run."""
+        if self._prior is not None:
+            return self._prior
+
+        path = self.settings.prior
+        if not path.is_dir():
+            where = f"{self.folder / 'config.json'}: prior {path}"
+            raise InputError(f"{where} is not there; if it was moved, correct `prior` there")
+        return load_prior(path)
+
+    @cached_property
+    def state(self) -> State:
+        """The state after the last finished step."""
+        state = read_checkpoint(self.folder)
+        if state is None:
+            resume = f"`mgs nbv --resume {self.folder}`"
+            raise InputError(f"{self.folder}: has no finished step yet; continue it with {resume}")
+        return state
+
+    @property
+    def taken(self) -> list[Frame]:
+        """The frames trained on, in the order of their choice."""
+        return [self.dataset.frames[i] for i in self.state.taken]
+
+    @property
+    def label(self) -> str:
+        """Name of the policy."""
+        return label(self.settings.policy)
 
 
-def check_settings(settings: NbvSettings, frames: int) -> None:
-    """Raises InputError where the policy, the estimator or the optimiser is unknown, estimator or
-    policy knows nothing of means that are learned, or the dataset has too few frames for the seeds
-    and the budget."""
-    from mgs.fit.optimisers import OPTIMISERS  # these two need Dr.Jit, which reading a run does not
-    from mgs.splat import ESTIMATORS
+def open_run(folder: str | Path) -> Run:
+    """Open a run folder.
 
-    diagonal = [name for name in ESTIMATORS if name != "block"]
-    policy_named(settings.policy)
-    if settings.estimator not in diagonal:
-        known = ", ".join(diagonal)
-        raise InputError(
-            f"--estimator {settings.estimator}: gives no diagonal, or is unknown; choose one of {known}"
-        )
-    blind = [f"--estimator {settings.estimator}"] if settings.estimator != "exact" else []
-    blind += ["--policy paper"] if settings.policy == "paper" else []
-    if settings.train.means != "frozen" and blind:
-        raise InputError(
-            f"--means {settings.train.means}: {blind[0]} knows nothing of means; leave out either"
-        )
-    row_named(OPTIMISERS, settings.train.optimiser, "--optimiser")
-    if frames < settings.seeds:
-        raise InputError(
-            f"{settings.dataset}: has {frames} frames, fewer than {settings.seeds} seeds; lower --seeds"
-        )
-    left = frames - settings.seeds
-    if settings.budget > left:
-        raise InputError(
-            f"{settings.dataset}: --budget {settings.budget} exceeds its {left} candidates; lower --budget"
-        )
+    Raises InputError as `read_config`, where a setting is wrong, and where the dataset is gone.
+    """
+    folder = Path(folder)
+    path = folder / "config.json"
+    settings = validated(NbvSettings, read_config(folder)["settings"], path)
+    if not settings.dataset.is_dir():
+        where = f"{path}: dataset {settings.dataset} is not there"
+        raise InputError(f"{where}; if it was moved, correct `dataset` in this file")
+    return Run(folder, settings)
 
 
 def start(out: Path, settings: NbvSettings, dataset: Dataset) -> None:
@@ -112,8 +128,7 @@ def start(out: Path, settings: NbvSettings, dataset: Dataset) -> None:
 
 
 def read_config(out: Path) -> dict[str, Any]:
-    """What config.json of a run folder holds. Raises InputError where there is no run, and where
-    its config.json is damaged."""
+    """Read config.json of a run. Raises InputError where there is none, or it is damaged."""
     path = out / "config.json"
     if not path.is_file():
         raise InputError(
@@ -126,32 +141,25 @@ def read_config(out: Path) -> dict[str, Any]:
 
 
 def holds_run(out: Path) -> bool:
-    """Whether a folder holds a run that can be read. A dataset has a config.json, too, but no
-    settings of a run."""
+    """Whether a folder holds a run. A dataset has a config.json too, without settings of a run."""
     try:
         read_config(out)
-    except (InputError, OSError):  # OSError: not even the name can be looked up
+    except (InputError, OSError):  # OSError: a name that is too long
         return False
     return True
 
 
 def read_settings(out: Path) -> NbvSettings:
-    """Settings of a run folder. Raises InputError as `read_config`, where a setting is wrong, and
-    if the dataset is gone."""
-    path = out / "config.json"
-    settings = validated(NbvSettings, read_config(out)["settings"], path)
-    if not settings.dataset.is_dir():
-        raise InputError(
-            f"{path}: dataset {settings.dataset} is not there; if it was moved, correct `dataset` in this file"
-        )
-    return settings
+    """Settings of a run folder. Raises InputError as `open_run`."""
+    return open_run(out).settings
 
 
 def check_same_frames(out: Path, dataset: Dataset) -> None:
-    """Raises InputError where the dataset is no longer the one the run was started on."""
-    if read_json(out / "config.json").get("frames") != [frame.name for frame in dataset.frames]:
+    """Raises InputError where the dataset has other frames than the run was started on."""
+    if read_config(out).get("frames") != [frame.name for frame in dataset.frames]:
         raise InputError(
-            f"{dataset.root}: its frames differ from those {out} was started on; restore them or start a new run"
+            f"{dataset.root}: its frames differ from those {out} was started on; "
+            "restore them or start a new run"
         )
 
 
@@ -175,49 +183,28 @@ def write_steps(out: Path, state: State) -> None:
 
 
 def read_checkpoint(out: Path) -> State | None:
-    """State after the last finished step; None before the first. Raises InputError where the file
-    is damaged."""
+    """Read the state after the last finished step; None before the first.
+
+    Raises InputError where the file is damaged.
+    """
     path = out / "checkpoint.npz"
     if not path.is_file():
         return None
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as data:
-            record = json.loads(
-                str(data["json"]), parse_constant=lambda _: None
-            )  # older runs could hold NaN
-            gaussians = Gaussians(
-                *(data[name] for name in ("means", "log_scales", "quats", "logit_opacities", "sh"))
-            )
-            return State(
-                gaussians,
-                data["H"],
-                data["surface"],
-                record["taken"],
-                record["steps"],
-                record.get("inputs", {}),
-            )
+            record = json.loads(str(data["json"]))
+            gaussians = Gaussians(*(data[field.name] for field in fields(Gaussians)))
+            return State(gaussians, data["H"], data["surface"], **record)
     except (zipfile.BadZipFile, KeyError, ValueError, OSError, EOFError) as error:
         raise InputError(
             f"{path}: not a readable checkpoint ({error}); delete it to start the run from its seeds"
         ) from None
 
 
-def load_run(run: Path) -> tuple[Gaussians, Dataset, list[str], str]:
+def load_run(folder: Path) -> tuple[Gaussians, Dataset, list[str], str]:
     """(model, dataset, names of the views trained on in order, policy) of a run folder.
 
-    Raises InputError where the run is missing, it has no finished step, or its dataset has changed.
+    Raises InputError as `open_run` and `Run`.
     """
-    settings = read_settings(run)
-    state = read_checkpoint(run)
-    if state is None:
-        raise InputError(
-            f"{run}: has no finished step yet; continue it with `mgs nbv --resume {run}`"
-        )
-    dataset = load_dataset(settings.dataset)
-    check_same_frames(run, dataset)
-    return (
-        state.gaussians,
-        dataset,
-        [dataset.frames[i].name for i in state.taken],
-        label(settings.policy),
-    )
+    run = open_run(folder)
+    return run.state.gaussians, run.dataset, [frame.name for frame in run.taken], run.label

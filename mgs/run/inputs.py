@@ -1,15 +1,14 @@
-"""What a run was made from, as hashes: a resumed run goes on from the same, or not at all.
+"""What a run was made from, as hashes: a resumed run goes on from the same inputs, or not at all.
 
-A record holds `prior`: the hash of the prior; `cameras`: of the pose and the intrinsics of every
-frame, by its name; `files`: of the files of each frame taken, by its name and their kind; `policy`:
-of the file of a policy of the user's own, if it is one. Files of frames that were not taken are
-never opened.
+A record holds the hash of the `prior`; `cameras`, of pose and intrinsics of every frame by name;
+`files`, of the files of each frame taken, by name and kind; `policy`, of the user's policy file.
+Files of frames that were not taken are never opened.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,20 +18,19 @@ from mgs.camera import Camera
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.up import PLUS_Z
 from mgs.errors import InputError
-from mgs.policy import from_file as policy_file
+from mgs.policy import from_file
 
 if TYPE_CHECKING:
     from mgs.prior.build import Prior
-    from mgs.run.folder import State
     from mgs.run.settings import NbvSettings
 
 DECIMALS = 9
-"""Of poses (metres, cosines) and intrinsics (pixels): the last bits of an inverse matrix differ
-between machines."""
+"""Decimals of poses (metres, cosines) and intrinsics (pixels): the last bits of an inverse matrix
+differ between machines."""
 
 
 def array_digest(arrays: Iterable[np.ndarray]) -> str:
-    """BLAKE2b hash of arrays, their shapes and types included: 32 hexadecimal digits."""
+    """BLAKE2b hash of arrays with their shapes and types: 32 hexadecimal digits."""
     found = hashlib.blake2b(digest_size=16)
     for array in arrays:
         found.update(f"{array.dtype.str} {array.shape};".encode())
@@ -46,36 +44,26 @@ def file_digest(path: Path) -> str:
         with open(path, "rb") as file:
             return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
     except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror or error}); restore it"
-        ) from None
+        reason = error.strerror or error
+        raise InputError(f"{path}: cannot be read ({reason}); restore it") from None
 
 
 def prior_digest(prior: Prior) -> str:
-    """Hash of what a run takes from a prior: points, normals, spacing and depth tolerance; which
-    way is up, where not +Z."""
+    """Hash of what a run takes from a prior: points, normals, spacing, tolerance, backing, up."""
     up = [np.array(prior.up)] if prior.up != PLUS_Z else []
-    return array_digest(
-        [
-            prior.points,
-            prior.normals,
-            np.array([prior.spacing, prior.depth_tolerance, prior.backed]),
-            *up,
-        ]
-    )
+    numbers = np.array([prior.spacing, prior.depth_tolerance, prior.backed])
+    return array_digest([prior.points, prior.normals, numbers, *up])
 
 
 def camera_digest(camera: Camera) -> str:
     """Hash of a camera's pose, intrinsics and image size."""
     size = np.array([camera.width, camera.height])
-    return array_digest(
-        [np.round(m, DECIMALS) + 0.0 for m in (camera.world_to_camera, camera.K, size)]
-    )  # + 0.0: no -0
+    arrays = (camera.world_to_camera, camera.K, size)
+    return array_digest([np.round(m, DECIMALS) + 0.0 for m in arrays])  # + 0.0: no negative zero
 
 
 def frame_digests(frame: Frame, kinds: Iterable[str]) -> dict[str, str | None]:
-    """Hashes of the files of a frame, of those kinds: `image`, `mask`, `rock`, `depth`; None of one
-    that it has not.
+    """Hashes of the files of a frame by kind: `image`, `mask`, `rock`, `depth`; None of no file.
 
     Raises InputError as `file_digest`.
     """
@@ -93,72 +81,37 @@ def _path(frame: Frame, kind: str) -> Path | None:
     }[kind]
 
 
-def check(
-    out: Path,
-    state: State,
-    settings: NbvSettings,
-    dataset: Dataset,
-    prior: str,
-    say: Callable[[str], None],
-) -> None:
-    """Raises InputError where a run cannot go on from what it was made from; says so where that was
-    never recorded."""
-    if state.inputs:
-        check_unchanged(out, state.inputs, prior, settings.prior, dataset)
-        check_same_policy(out, state.inputs, settings.policy)
-    elif len(state.steps) <= settings.budget:
-        say(
-            f"{out}: was started by a version that kept no record of its inputs; it goes on with the files as they are now"
-        )
-
-
 def check_unchanged(
-    out: Path, record: dict[str, Any], prior: str, prior_path: Path, dataset: Dataset
+    out: Path, record: dict[str, Any], prior: str, settings: NbvSettings, dataset: Dataset
 ) -> None:
-    """Raises InputError, naming the first thing that changed, where a record is not of this prior
-    (its hash) and dataset."""
+    """Raises InputError that names the first input of a run which changed since its record.
+
+    prior: hash of the prior as it is now.
+    """
     if record["prior"] != prior:
-        raise InputError(changed_prior(out, prior_path))
+        raise InputError(changed_prior(out, settings.prior))
+    changed = f"changed since {out} was started; restore"
+    if record.get("policy") != policy_record(settings.policy).get("policy"):
+        raise InputError(f"policy {settings.policy}: its file has {changed} it, or start a new run")
     for frame in dataset.frames:
         if record["cameras"].get(frame.name) != camera_digest(frame.camera):
-            where = f"{dataset.root / 'transforms.json'}: the pose or the intrinsics of frame {frame.name} have"
-            raise InputError(
-                f"{where} changed since {out} was started; restore them, or start a new run"
-            )
+            where = f"{dataset.root / 'transforms.json'}: the camera of frame {frame.name} has"
+            raise InputError(f"{where} {changed} it, or start a new run")
         known = record["files"].get(frame.name, {})
         for kind, digest in frame_digests(frame, known).items():
             if digest != known[kind]:
-                file = (
-                    _path(frame, kind)
-                    or f"{dataset.root / 'transforms.json'}: the {kind} of frame {frame.name}"
-                )
-                raise InputError(
-                    f"{file} has changed since {out} took it; restore it, or start a new run"
-                )
+                where = f"{dataset.root / 'transforms.json'}: the {kind} of frame {frame.name}"
+                file = _path(frame, kind) or where
+                raise InputError(f"{file} has changed since {out} took it; restore it")
 
 
 def policy_record(policy: str) -> dict[str, str]:
-    """The hash of a policy's file, as an entry of a record; nothing for a policy that is in no
-    file."""
-    return (
-        {"policy": file_digest(policy_file.file_of(policy))} if policy_file.in_file(policy) else {}
-    )
-
-
-def check_same_policy(out: Path, record: dict[str, Any], policy: str) -> None:
-    """Raises InputError where the file of the policy is another than that of the record."""
-    if record.get("policy") != policy_record(policy).get("policy"):
-        raise InputError(
-            f"policy {policy}: its file has changed since {out} was started; restore it, or start a new run"
-        )
+    """The hash of a policy's file, as an entry of a record; empty for a policy of ours."""
+    if not from_file.in_file(policy):
+        return {}
+    return {"policy": file_digest(from_file.file_of(policy))}
 
 
 def changed_prior(out: Path, prior: Path) -> str:
-    """What to say where the prior is another one."""
+    """Message for a prior that is not the run's."""
     return f"{prior}: is not the prior that {out} was started on; restore it, or start a new run"
-
-
-def moved_start(out: Path, prior: Path) -> str:
-    """What to say where Gaussians do not lie where a run of this prior starts them."""
-    other = f"{out} is of a version of mgs that puts Gaussians elsewhere"
-    return f"{prior}: is not the prior that {out} was started on, or {other}; restore it, or start a new run"

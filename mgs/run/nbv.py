@@ -1,4 +1,4 @@
-"""The whole of `mgs nbv` for programs: start a run, run it, resume it. Prints nothing."""
+"""`mgs nbv` for programs: start a run, resume it, or both. Prints nothing."""
 
 from __future__ import annotations
 
@@ -13,72 +13,46 @@ from mgs import runtime
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.errors import InputError, row_named
 from mgs.files import atomic_folder
-from mgs.fit.settings import ALPHA_WEIGHT
 from mgs.policy.from_file import absolute
+from mgs.policy.registry import policy_named
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.settings import PriorSettings
-from mgs.run import loop
-from mgs.run.folder import (
-    DATASET,
-    State,
-    check_same_frames,
+from mgs.run import recording
+from mgs.run.folder import DATASET, Run, holds_run, open_run, start
+from mgs.run.operations import operations_of
+from mgs.run.problem import Problem, Progress, no_progress
+from mgs.run.settings import (
+    ALPHA_WEIGHT,
+    PRESETS,
+    NbvSettings,
     check_settings,
-    holds_run,
-    read_settings,
-    start,
+    validated,
+    with_defaults,
 )
-from mgs.run.settings import PRESETS, NbvSettings, validated, with_defaults
-from mgs.run.stations import real_stations
+from mgs.run.state import State
 from mgs.splat.constants import NEAR
 from mgs.synth.scene_file import load_scene_file
 
 CAPTURE_PRESET = "quick"
-"""Size and number of the images that a run captures, a row of `mgs.synth.rendering.PRESETS`."""
+"""Row of `mgs.synth.rendering.PRESETS`: size and number of the images that a run captures."""
 
 CAPTURE_TEST_VIEWS = 12
-"""Number of test views that judge a run with captured images, which has no view that is held
-out."""
-
-
-def _silent(*_: Any) -> None:
-    """What is called where nobody listens."""
+"""Test views of a run that captures its images, which has no held-out views."""
 
 
 def run_nbv(
     dataset: str | Path | None,
     out: str | Path,
     *,
-    capture: str | Path | None = None,
-    prior: str | Path | None = None,
-    gaussians: int | Literal["auto"] | None = None,
-    preset: str | None = None,
-    on_step: Callable[[State], None] = _silent,
-    progress: Callable[[str, int, int], None] = _silent,
-    say: Callable[[str], None] = _silent,
+    on_step: Callable[[State], None] = lambda state: None,
+    progress: Progress = no_progress,
     **settings: Any,
 ) -> State:
     """Choose views one by one, as the paper does: `start_run`, then `resume_nbv`.
 
-    dataset: a dataset folder. out: the run's folder, new. capture, prior, gaussians, preset,
-    settings: see `start_run`.
-    on_step(state): called after every step, or batch of steps, that is finished and on disk;
-    state.steps[-1] is its (last) line of steps.jsonl.
-    progress(stage, done, total): called while a step is worked on. say(text): called with what a
-    person should know.
-    Returns the last state: gaussians, H, taken (frame indices in the order of their choice), steps.
-    Raises InputError as `start_run` and `resume_nbv`.
+    dataset, out, settings: as `start_run`. Callbacks, result and errors: as `resume_nbv`.
     """
-    start_run(
-        dataset,
-        out,
-        capture=capture,
-        prior=prior,
-        gaussians=gaussians,
-        preset=preset,
-        progress=progress,
-        **settings,
-    )
-    return resume_nbv(out, on_step=on_step, progress=progress, say=say)
+    return resume_nbv(start_run(dataset, out, progress=progress, **settings), on_step, progress)
 
 
 def start_run(
@@ -89,104 +63,104 @@ def start_run(
     prior: str | Path | None = None,
     gaussians: int | Literal["auto"] | None = None,
     preset: str | None = None,
-    progress: Callable[[str, int, int], None] = _silent,
+    progress: Progress = no_progress,
     **settings: Any,
-) -> NbvSettings:
-    """Check everything, find or build the prior, and write the run's config.json with every setting
-    resolved.
+) -> Run:
+    """Check everything, find or build the prior, and write config.json of a new run folder `out`.
 
-    capture: a scene (`mgs.synth.scene_file.load_scene_file`) in place of a dataset, which is None
-    then. The run has a dataset of its own, OUT/dataset, as `mgs synth-orbit --on-demand` writes it
-    with the run's seed: the poses of the scene's orbit, images of which are rendered when they are
-    chosen, and CAPTURE_TEST_VIEWS test views.
-    prior: folder of a prior; without it DATASET/prior where there is one, otherwise a prior is
-    built inside the run, of this many `gaussians` (`mgs.prior.settings.PriorSettings`; by default,
-    as many as the images can tell apart); of an on-demand
-    dataset it is built of its survey. preset: a row of `mgs.run.settings.PRESETS`, whose values are
-    the defaults of what is
-    not given. settings: fields of `mgs.run.settings.NbvSettings`; the budget is 50 views, or all
-    candidates where they are fewer; where `train` does not name alpha_weight, it is ALPHA_WEIGHT,
-    or 0 where frames have neither mask nor alpha. Leaves no folder behind where it fails. Raises
-    InputError where the output folder is not empty, a setting is wrong, the dataset is too small
-    for it, the dataset, the scene or the prior is missing or damaged, or the cameras are so near to
-    the prior that it would not be drawn.
+    capture: a scene (`mgs.synth.scene_file.load_scene_file`) in place of a dataset: the run renders
+    an image only when its view is chosen, and has its own OUT/dataset with CAPTURE_TEST_VIEWS.
+    prior: a folder; default DATASET/prior where there is one, else a prior of `gaussians` is built
+    in the run (default: as many as the images resolve). preset: a row of `PRESETS`, defaults of
+    what is not given. settings: fields of `NbvSettings`; by default the budget is 50 views or all
+    candidates, and alpha_weight is ALPHA_WEIGHT, or 0 where frames have neither mask nor alpha.
+
+    Leaves no folder behind where it fails. Raises InputError where the folder is not empty, a
+    setting is invalid, the dataset is too small, an input is missing or damaged, or the cameras are
+    too near to the prior to draw it.
     """
     out = Path(out)
     if (dataset is None) == (capture is None):
         raise InputError("nbv: give either a DATASET or --capture SCENE")
     if holds_run(out):
-        raise InputError(
-            f"{out}: holds a run; `mgs nbv --resume {out}` goes on with it; for another, choose a new folder"
-        )
-    dataset = out / DATASET if dataset is None else Path(dataset)
+        resume = f"`mgs nbv --resume {out}` continues it"
+        raise InputError(f"{out}: holds a run; {resume}; for another, choose a new folder")
+    root = out / DATASET if dataset is None else Path(dataset)
     if prior is not None and gaussians is not None:
-        raise InputError(
-            "nbv: --gaussians is for a prior that is built here; leave it out, or leave out --prior"
-        )
-    if prior is None and gaussians is None and (dataset / "prior/prior.json").is_file():
-        prior = dataset / "prior"
+        raise InputError("nbv: --gaussians builds a prior; leave it out, or leave out --prior")
+    if prior is None and gaussians is None and (root / "prior/prior.json").is_file():
+        prior = root / "prior"
     row = None if preset is None else row_named(PRESETS, preset, "--preset")
-    loaded = load_dataset(dataset) if capture is None else None
-    outlined = loaded is None or all(frame.mask_path or frame.rock_path for frame in loaded.frames)
-    settings = with_defaults(settings, row, ALPHA_WEIGHT if outlined else 0.0)
+    loaded = load_dataset(root) if capture is None else None
     where = out / "prior" if prior is None else Path(prior)
-    given = validated(
-        NbvSettings, {"dataset": dataset.resolve(), "prior": where.resolve(), **settings}
-    )
-    count = _candidates(capture) if capture is not None else len(loaded or ())
-    own_seed = "seed" in given.train.model_fields_set
-    resolved: dict[str, Any] = {"policy": absolute(given.policy)}
-    resolved |= {
-        "train": given.train if own_seed else given.train.model_copy(update={"seed": given.seed})
-    }
-    if "budget" not in settings:
-        resolved["budget"] = min(given.budget, max(0, count - given.seeds))
-    complete = given.model_copy(update=resolved)
+    given = _with_defaults(settings, row, loaded)
+    known = validated(NbvSettings, {"dataset": root.resolve(), "prior": where.resolve(), **given})
+    count = len(loaded) if loaded else _candidates(capture)
+    complete = _resolved(known, count, "budget" in settings)
+    policy_named(complete.policy)  # a user's file fails here, before there is a folder
     check_settings(complete, count)
     found = None if prior is None else load_prior(prior)
     with atomic_folder(out) as unfinished:
         frames = loaded or _poses(unfinished / DATASET, str(capture), complete.seed, progress)
-        if found is None:
-            asked = PriorSettings(
-                gaussians=gaussians, seed=complete.seed, density=row.density if row else None
-            )
-            found, _ = build_prior(
-                frames.survey(), asked, on_stage=lambda stage: progress(f"prior: {stage}", 0, 1)
-            )
-            save_prior(unfinished / "prior", found)
-        _check_near(found, frames, where)
-        complete = complete.with_spacing(found.spacing)
+        built = found or _built_prior(unfinished, frames, gaussians, row, complete.seed, progress)
+        _check_near(built, frames, where)
+        complete = complete.with_spacing(built.spacing)
         start(unfinished, complete, frames)
-    return complete
+    return Run(out, complete, loaded, found)
+
+
+def _with_defaults(settings: dict[str, Any], row: Any, loaded: Dataset | None) -> dict[str, Any]:
+    """Settings with the preset's defaults, and alpha fitted where all frames have an outline."""
+    outlined = loaded is None or all(frame.mask_path or frame.rock_path for frame in loaded.frames)
+    return with_defaults(settings, row, ALPHA_WEIGHT if outlined else 0.0)
+
+
+def _resolved(given: NbvSettings, count: int, budget_given: bool) -> NbvSettings:
+    """Settings that hold in any folder: the policy's whole path, the fit's seed, the budget."""
+    resolved: dict[str, Any] = {"policy": absolute(given.policy)}
+    if "seed" not in given.train.model_fields_set:
+        resolved["train"] = given.train.model_copy(update={"seed": given.seed})
+    if not budget_given:
+        resolved["budget"] = min(given.budget, max(0, count - given.seeds))
+    return given.model_copy(update=resolved)
+
+
+def _built_prior(
+    unfinished: Path, frames: Dataset, gaussians: Any, row: Any, seed: int, progress: Progress
+) -> Prior:
+    """Build a prior of a dataset, or of its survey, into the run's folder."""
+    asked = PriorSettings(gaussians=gaussians, seed=seed, density=row.density if row else None)
+    built, _ = build_prior(
+        frames.survey(), asked, on_stage=lambda stage: progress(f"prior: {stage}", 0, 1)
+    )
+    save_prior(unfinished / "prior", built)
+    return built
 
 
 def _check_near(prior: Prior, dataset: Dataset, where: Path) -> None:
-    """Raises InputError where most cameras are nearer to the prior than NEAR: a length of 1 then
-    stands for many metres. where: the folder of the prior."""
+    """Raises InputError where most cameras are nearer to the prior than NEAR: a wrong unit."""
     positions = np.stack([frame.camera.position for frame in dataset.frames])
     nearest = float(np.median(cKDTree(prior.points).query(positions)[0]))
     if nearest < NEAR:
         raise InputError(
-            f"{where}: the cameras are {nearest:.2g} {dataset.unit} from it, and nothing nearer than {NEAR} is drawn; import "
-            "the data with --unit M, the metres in a length of 1, and build the prior again"
+            f"{where}: the cameras are {nearest:.2g} {dataset.unit} from it, and nothing nearer "
+            f"than {NEAR} is drawn; import the data with --unit M, the metres in a length of 1, "
+            "and build the prior again"
         )
 
 
-def _candidates(scene: str | Path) -> int:
-    """Number of poses that a run captures a scene from. Raises InputError where there is no such
-    scene, or its file is bad."""
-    load_scene_file(scene)
+def _candidates(scene: str | Path | None) -> int:
+    """Number of poses of a captured scene. Raises InputError as `load_scene_file`."""
+    load_scene_file(str(scene))
     runtime.start()
     from mgs.synth.rendering import PRESETS
 
     return PRESETS[CAPTURE_PRESET].frames
 
 
-def _poses(
-    folder: Path, scene: str | Path, seed: int, progress: Callable[[str, int, int], None]
-) -> Dataset:
-    """The on-demand dataset of a run that captures a scene, written into a folder."""
-    from mgs.synth.rendering import synthesise  # which needs the variant that `_candidates` sets
+def _poses(folder: Path, scene: str, seed: int, progress: Progress) -> Dataset:
+    """Write the on-demand dataset of a run that captures a scene."""
+    from mgs.synth.rendering import synthesise  # needs the variant that `_candidates` sets
 
     def rendered(done: int, total: int) -> None:
         progress("rendering test views", done, total)
@@ -198,28 +172,25 @@ def _poses(
 
 
 def resume_nbv(
-    out: str | Path,
-    *,
-    on_step: Callable[[State], None] = _silent,
-    progress: Callable[[str, int, int], None] = _silent,
-    say: Callable[[str], None] = _silent,
+    run: str | Path | Run,
+    on_step: Callable[[State], None] = lambda state: None,
+    progress: Progress = no_progress,
 ) -> State:
-    """Run the loop in a run's folder from where it stands to its end. A finished run gives the same
-    files again.
+    """Run the loop in a run folder from where it stands to its end.
 
-    Why it ended is `ended` of the last of state.steps (`mgs.run.ending.run_end`).
-
-    Callbacks and result as `run_nbv`. Raises InputError where the folder holds no run, its dataset
-    or prior is missing or has changed, another process works on it, or a fit diverged (the steps
-    before it are kept).
+    on_step(state): called after every step, or batch of steps, that is finished and on disk.
+    progress(stage, done, total): called during a step. Returns the last state: gaussians, H, taken
+    (frame indices in the order of their choice), steps (lines of steps.jsonl; the last has `ended`).
+    A finished run gives the same again. Raises InputError where the folder holds no run, its
+    inputs are missing or changed, another process works on it, or a fit diverged.
     """
-    out = Path(out)
-    settings = read_settings(out)
-    if not settings.prior.is_dir():
-        raise InputError(
-            f"{out / 'config.json'}: prior {settings.prior} is not there; if it was moved, correct `prior` there"
-        )
-    dataset = load_dataset(settings.dataset)
-    check_same_frames(out, dataset)
-    stations = real_stations(dataset, load_prior(settings.prior), settings)
-    return loop.run(out, settings, dataset, stations, progress, on_step, say)
+    run = run if isinstance(run, Run) else open_run(run)
+    operations = operations_of(run.dataset, run.prior, run.settings)
+    return recording.run(run.folder, run.settings, run.dataset, operations, progress, on_step)
+
+
+def problem_of(run: str | Path | Run, progress: Progress = no_progress) -> Problem:
+    """The selection problem of a run folder, for the functions of `mgs.run.loop`."""
+    run = run if isinstance(run, Run) else open_run(run)
+    operations = operations_of(run.dataset, run.prior, run.settings)
+    return Problem(run.dataset, run.settings, operations, progress)

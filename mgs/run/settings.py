@@ -1,5 +1,7 @@
-"""Settings of a run: validated once, frozen, and written whole beside the results. Needs neither
-Mitsuba nor Dr.Jit."""
+"""Settings of a run: validated once, frozen, written whole beside the results.
+
+The docstring of a field is the help of its option of `mgs nbv`. Needs neither Mitsuba nor Dr.Jit.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from mgs.errors import InputError
+from mgs.errors import InputError, row_named
 from mgs.fit.settings import (
     ALPHA_WEIGHT,
     MEAN_RATE,
@@ -24,186 +26,182 @@ from mgs.fit.settings import (
     complete,
 )
 from mgs.policy.criteria import MEAN_STD, PIXEL_NOISE, PRIOR_STD, regularisation
+from mgs.policy.registry import check_policy
 
 
 @dataclass(frozen=True)
-class Preset:
-    """A point of the chart of speed against accuracy (docs/speed-accuracy.md): defaults that give
-    way to what is given."""
+class RunPreset:
+    """Defaults that trade speed for accuracy (docs/speed-accuracy.md); other options win.
+
+    passes: `TrainSettings.passes`. warm_passes: `NbvSettings.warm_passes`. density:
+    `mgs.prior.settings.PriorSettings.density` of a prior built in the run, without a number given.
+    """
 
     passes: int
-    """`TrainSettings.passes`."""
     warm_passes: int
-    """`NbvSettings.warm_passes`."""
     density: float
-    """`mgs.prior.settings.PriorSettings.density` of a prior that is built inside the run without a
-    number of Gaussians."""
 
 
 PRESETS = {
-    "fast": Preset(passes=5, warm_passes=3, density=1 / 4),
-    "balanced": Preset(passes=PASSES, warm_passes=WARM_PASSES, density=1 / 2),
-    "accurate": Preset(passes=PASSES, warm_passes=WARM_PASSES, density=3 / 4),
+    "fast": RunPreset(passes=5, warm_passes=3, density=1 / 4),
+    "balanced": RunPreset(passes=PASSES, warm_passes=WARM_PASSES, density=1 / 2),
+    "accurate": RunPreset(passes=PASSES, warm_passes=WARM_PASSES, density=3 / 4),
 }
-"""What `mgs nbv --preset` knows, by name: chosen with the charts of docs/speed-accuracy.md, which
-name them."""
 
 
 class NbvSettings(BaseModel):
-    """Everything that decides what `mgs nbv` does; the same settings give the same choice of
-    views."""
+    """Everything that decides what `mgs nbv` does: equal settings choose equal views."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     dataset: Path
+    """Folder of the dataset."""
     prior: Path
+    """Folder of the prior."""
     policy: str = "d-optimal"
-    """A name of `mgs.policy.registry.policy_names`, or FILE.py:FUNCTION; looked up when the loop
-    starts: a finished run is read without it."""
+    """Policy that scores the candidates (`mgs.policy.registry`), or FILE.py:FUNCTION of your own."""
     nearest: Annotated[int, Field(ge=1)] | None = None
-    """The next view is one of so many that are nearest to the view taken last (at first, to the
-    last seed); None: any view."""
+    """Choose among this many views nearest to the last one. Default: all."""
     travel: Scale | None = None
-    """Distance from view to view, metres, that costs as much as an image: scores are divided by 1 +
-    distance / travel; None: moving costs nothing (`mgs.policy.poses.travel_cost`)."""
+    """Distance in metres that costs as much as an image: scores are over 1 + distance / METRES."""
     estimator: str = "exact"
-    """A row of `mgs.splat.ESTIMATORS` that gives [N,P]: how the Fisher information that criteria
-    see is computed."""
+    """Estimator of the Fisher information: exact, hutchinson, or loss-gradient (the paper's)."""
     budget: Annotated[int, Field(ge=0)] = 50
-    """Most views that are chosen beyond the seeds."""
+    """Most views to choose beyond the seeds. Default: 50, or all candidates where they are fewer."""
     batch: Annotated[int, Field(ge=1)] = 1
-    """Views that are chosen before their images are read and the model is fitted again; the last
-    batch may be smaller."""
+    """Views to choose before their images are read and fitted; the last batch may be smaller."""
     stop_gain: Positive | None = None
-    """The run ends where the view to be taken next has a smaller `information_gain` than this (Eq.
-    7); None: never for that reason (`mgs.fit.stopping.run_end`)."""
+    """End the run before a view whose `information_gain` (Eq. 7) is below this."""
     stop_uncertainty: Annotated[float, Field(gt=0, lt=1)] | None = None
-    """The run ends where no more than this share of the prior's variance is left
-    (`mgs.policy.criteria.uncertainty`, averaged);
-    None: never for that reason."""
+    """End the run when at most this share (0 to 1) of the prior's variance is left."""
     seeds: Annotated[int, Field(ge=1)] = 4
-    """Views at evenly spaced azimuths that start the model."""
+    """Number of views, evenly spaced in azimuth, that start the model."""
     seed: Annotated[int, Field(ge=0)] = 0
     """Root of every random draw."""
     lam: Annotated[float, Field(ge=1e-30, le=1e30, allow_inf_nan=False)] | None = None
-    """One lambda for all parameters, as in the paper; None: (pixel_noise / prior_std)^2 of each
-    kind of parameter."""
+    """One lambda for all parameters, as in the paper. Default: (pixel noise / prior std)^2."""
     pixel_noise: Scale = PIXEL_NOISE
-    """sigma_e in lambda = (sigma_e / tau)^2, linear RGB; `mgs.policy.criteria.regularisation`."""
+    """Standard deviation of a pixel's residual, linear RGB; sets lambda of every criterion."""
     prior_std: dict[str, Scale] = PRIOR_STD
-    """tau of each kind of parameter; kinds left out take those of `mgs.policy.criteria.PRIOR_STD`.
-    That of `mean`, metres, is read only where means are learned, and must be there then; `mgs nbv`
-    sets it (`with_spacing`)."""
+    """Prior standard deviation of a kind of parameter; of `mean` in metres, where means are learned."""
     evaluate_every: Annotated[int, Field(ge=0)] = 0
-    """Measure PSNR on all views after every so many steps, or at the end of the batch that such a
-    step is in; 0 = only at the end of the run. Never feeds back into the choice."""
+    """Measure PSNR after every so many views; 0: at the end only. Never affects the choice."""
     warm_passes: Annotated[int, Field(ge=1)] = WARM_PASSES
-    """Most passes of the fits after the first, if `train.passes` is not less."""
+    """Most passes of the fits after the first; `passes` where that is less."""
     warm_rate: Positive = 1.0
     """Learning rates of the fits after the first, over those of the first."""
     exposure: bool = False
-    """Estimate a gain per image and channel before every fit, and fit to the images divided by it
-    (`mgs.prior.exposure`)."""
+    """Estimate a gain per image and channel, where exposure or white balance differ."""
     train: TrainSettings = TrainSettings()
-    """How each fit is done."""
+    """Settings of each fit."""
 
     _every_kind = field_validator("prior_std", mode="before")(
         lambda given: complete(given, PRIOR_STD)
     )
 
     def train_at(self, step: int) -> TrainSettings:
-        """How the fit of a step is done: that of the seeds, step 0, as `train` says, the others
-        with what is warm."""
+        """Settings of the fit of a step: `train` for step 0, with the warm values afterwards."""
         if step == 0:
             return self.train
         rates = {kind: self.warm_rate * rate for kind, rate in self.train.rates.items()}
-        return self.train.model_copy(
-            update={"rates": rates, "passes": min(self.warm_passes, self.train.passes)}
-        )
+        passes = min(self.warm_passes, self.train.passes)
+        return self.train.model_copy(update={"rates": rates, "passes": passes})
 
     def regularisation(self, groups: dict[str, slice]) -> NDArray[np.float64]:
-        """lambda of every column of the Fisher information, [P]: what the criteria of this run see.
-        groups: their kinds.
+        """lambda [P] of the columns of the Fisher information; groups: columns by kind.
 
-        Raises InputError where there is no tau of one of these kinds.
+        Raises InputError where `prior_std` lacks one of these kinds.
         """
         if missing := [kind for kind in groups if kind not in self.prior_std]:
-            raise InputError(
-                f"prior_std: has no number for {missing[0]}, which is learned; give one, metres"
-            )
+            raise InputError(f"prior_std: has no number for {missing[0]}; give one, metres")
         by_kind = regularisation(groups, self.pixel_noise, self.prior_std)
         return by_kind if self.lam is None else np.full_like(by_kind, self.lam)
 
     def with_spacing(self, spacing: float) -> NbvSettings:
-        """The settings for a prior whose samples are so far apart, metres: where means are learned,
-        with a tau and a rate of theirs, unless these are given already."""
+        """The settings with a rate and a prior std of learned means, from the samples' spacing, m.
+
+        What is given stays; nothing changes where means are frozen.
+        """
         if self.train.means == "frozen":
             return self
-        train = self.train.model_copy(
-            update={"rates": {"mean": MEAN_RATE * spacing} | self.train.rates}
-        )
-        return self.model_copy(
-            update={"train": train, "prior_std": {"mean": MEAN_STD * spacing} | self.prior_std}
-        )
+        rates = {"mean": MEAN_RATE * spacing} | self.train.rates
+        train = self.train.model_copy(update={"rates": rates})
+        prior_std = {"mean": MEAN_STD * spacing} | self.prior_std
+        return self.model_copy(update={"train": train, "prior_std": prior_std})
 
 
 def with_defaults(
-    values: Mapping[str, Any], preset: Preset | None = None, alpha_weight: float = ALPHA_WEIGHT
+    values: Mapping[str, Any], preset: RunPreset | None = None, alpha_weight: float = ALPHA_WEIGHT
 ) -> dict[str, Any]:
-    """Fields of NbvSettings with this alpha_weight and the defaults of a preset in them. What
-    `values` holds stays as it is."""
+    """Add this alpha_weight and a preset's values to fields of NbvSettings that do not have them."""
     train = values.get("train", {})
     given = train.model_dump(exclude_unset=True) if isinstance(train, TrainSettings) else train
     if not isinstance(given, Mapping):
-        return dict(values)  # what is wrong with it is for `validated` to say
-    with_alpha = {"alpha_weight": alpha_weight, **given}
-    if preset is None:
-        return {**values, "train": with_alpha}
-    return {
-        "warm_passes": preset.warm_passes,
-        **values,
-        "train": {"passes": preset.passes, **with_alpha},
-    }
+        return dict(values)  # `validated` reports it
+    passes = {} if preset is None else {"passes": preset.passes}
+    warm = {} if preset is None else {"warm_passes": preset.warm_passes}
+    return {**warm, **values, "train": {**passes, "alpha_weight": alpha_weight, **given}}
 
 
 Model = TypeVar("Model", bound=BaseModel)
 
-OPTIONS = (
-    "policy", "nearest", "travel", "estimator", "budget", "batch", "stop_gain", "stop_uncertainty", "seeds", "seed", "lam",
-    "pixel_noise", "evaluate_every", "means", "optimiser", "alpha_weight", "exposure", "passes", "warm_passes",
-)  # fmt: skip
-"""Settings that `mgs nbv` has an option for, of the same name."""
-
 
 def validated(model: type[Model], values: dict[str, Any], file: Path | None = None) -> Model:
-    """Build settings, from the options of a command or from `settings` of a file. Raises InputError
-    with one line for the first value that is wrong, which names the option, or the file and the
-    key."""
+    """Build settings from options, or from `settings` of a file.
+
+    Raises InputError for the first invalid value; it names the option, or the file and the key.
+    """
     try:
         return model(**values)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        parts, message = (
-            [str(part) for part in first["loc"]],
-            first["msg"].removeprefix("Value error, "),
-        )
+        parts = [str(part) for part in first["loc"]]
+        message = first["msg"].removeprefix("Value error, ")
         if file is not None:
             key = ".".join(["settings", *parts])
-            raise InputError(
-                f"{file}: {key}: {message}; correct it, or start the run anew"
-            ) from None
-        raise InputError(f"{_named(parts, first['input'])}: {message}") from None
+            message = f"{file}: {key}: {message}; correct it, or start the run anew"
+            raise InputError(message) from None
+        raise InputError(f"{option_of(parts, first['input'])}: {message}") from None
 
 
-def _named(parts: list[str], value: Any) -> str:
-    """How a wrong setting is called: as it is given to `mgs nbv`, or by its key where that has no
-    option for it."""
+NO_OPTION = ("warm_rate", "tolerance", "decay", "dataset", "prior")
+"""Settings without an option of their own."""
+
+
+def option_of(parts: list[str], value: Any) -> str:
+    """Name a setting and its value as on the command line, or by key where it has no option."""
     key, *kind = [part for part in parts if part != "train"]
-    option = {
-        "rates": "--rate",
-        "prior_std": "--prior-std",
-        **{name: f"--{name.replace('_', '-')}" for name in OPTIONS},
-    }.get(key)
-    if option is None:
+    known = NbvSettings.model_fields.keys() | TrainSettings.model_fields.keys()
+    if key in NO_OPTION or key not in known:
         return f"setting {'.'.join(parts)} = {value!r}"
+    option = f"--{key.replace('_', '-').replace('rates', 'rate')}"
     return f"{option} {kind[0]}={value}" if kind else f"{option} {value}"
+
+
+def check_settings(settings: NbvSettings, frames: int) -> None:
+    """Raises InputError where settings do not go together, or a dataset has too few frames.
+
+    Unknown are: a policy, an estimator without a diagonal, an optimiser; an estimator or a policy
+    that has no columns of learned means; seeds and budget beyond the number of frames.
+    """
+    from mgs.fit.optimisers import OPTIMISERS  # loads Dr.Jit, as the next
+    from mgs.splat import ESTIMATORS
+
+    diagonal = [name for name in ESTIMATORS if name != "block"]
+    check_policy(settings.policy)
+    if settings.estimator not in diagonal:
+        known = ", ".join(diagonal)
+        raise InputError(f"--estimator {settings.estimator}: unknown; choose one of {known}")
+    fixed = [f"--estimator {settings.estimator}"] if settings.estimator != "exact" else []
+    fixed += ["--policy paper"] if settings.policy == "paper" else []
+    if settings.train.means != "frozen" and fixed:
+        message = f"{fixed[0]} has no information about means; leave out either"
+        raise InputError(f"--means {settings.train.means}: {message}")
+    row_named(OPTIMISERS, settings.train.optimiser, "--optimiser")
+    left, where = frames - settings.seeds, settings.dataset
+    if left < 0:
+        few = f"has {frames} frames, fewer than {settings.seeds} seeds; lower --seeds"
+        raise InputError(f"{where}: {few}")
+    if settings.budget > left:
+        many = f"--budget {settings.budget} exceeds its {left} candidates; lower --budget"
+        raise InputError(f"{where}: {many}")

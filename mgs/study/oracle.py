@@ -10,48 +10,32 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from mgs.data.dataset import Dataset, load_dataset
+from mgs.data.dataset import Dataset
 from mgs.fit.settings import COLOURS_ALONE
-from mgs.prior.build import load_prior
-from mgs.run.folder import State, read_checkpoint, read_settings, write_checkpoint
-from mgs.run.loop import Loop, Progress, Stations
+from mgs.run import recording
+from mgs.run.folder import open_run
+from mgs.run.loop import Chooser, fit_views, reachable
 from mgs.run.nbv import start_run
-from mgs.run.settings import NbvSettings
-from mgs.run.stations import psnr_measure, real_stations
+from mgs.run.operations import operations_of, psnr_measure
+from mgs.run.problem import Problem, no_progress
+from mgs.run.state import Fitted, State
 from mgs.splat import ListCache
 from mgs.study.case import CURVES, test_views_of
 
 
-class Oracle(Loop):
-    """The loop, in which the choice is made by fitting every candidate in reach and looking at the
-    test views."""
+def oracle(tests: Dataset) -> Chooser:
+    """A chooser: fits every candidate in reach, takes the best on the test views; its score is the
+    mean PSNR over them, dB. Of equals the first."""
+    judge = psnr_measure(tests, ListCache())
 
-    def __init__(
-        self,
-        out: Path,
-        settings: NbvSettings,
-        dataset: Dataset,
-        tests: Dataset,
-        stations: Stations,
-        progress: Progress,
-    ) -> None:
-        super().__init__(out, settings, dataset, stations, progress)
-        self.judge = psnr_measure(tests, ListCache())
-
-    def choose(self, state: State) -> tuple[int, float]:
-        """The frame whose fit has the highest mean PSNR over the test views, and that PSNR in dB;
-        of equals the first."""
-        left = self.reachable(state)
-        worth = [self.worth(state, frame) for frame in left]
+    def choose(problem: Problem, state: Fitted, fisher: Any = None) -> tuple[int, float]:
+        left = reachable(problem, state.taken)
+        fits = (fit_views(problem, [*state.taken, frame], state) for frame in left)
+        worth = [judge(fit.gaussians, [])["psnr"] for fit in fits]
         best = max(range(len(left)), key=lambda k: worth[k])
         return left[best], worth[best]
 
-    def worth(self, state: State, frame: int) -> float:
-        """Mean PSNR over the test views, dB, of the very fit that the loop does once it takes this
-        frame."""
-        taken = [*state.taken, frame]
-        fit = self.fit(state, taken, self.targets(taken), len(state.steps), lambda done, most: None)
-        return self.judge(fit.gaussians, [])["psnr"]
+    return choose
 
 
 def run_oracle(
@@ -73,17 +57,12 @@ def run_oracle(
     return {key: [step[key] for step in state.steps] for key in CURVES} | {"taken": state.taken}
 
 
-def choose_all(run: Path) -> State:
+def choose_all(folder: Path) -> State:
     """Run or resume the oracle in a run folder to the end of its budget. Raises InputError if there
     are no test views."""
-    settings = read_settings(run)
-    loaded = load_dataset(settings.dataset)
-    tests = test_views_of(loaded)
-    stations = real_stations(loaded, load_prior(settings.prior), settings)
-    oracle = Oracle(run, settings, loaded, tests, stations, lambda stage, done, total: None)
-    state = oracle.marked(read_checkpoint(run) or oracle.first())
-    write_checkpoint(run, state)
-    while "ended" not in state.steps[-1]:
-        state = oracle.next(state)
-        write_checkpoint(run, state)
-    return state
+    run = open_run(folder)
+    chooser = oracle(test_views_of(run.dataset))
+    operations = operations_of(run.dataset, run.prior, run.settings)
+    return recording.run(
+        folder, run.settings, run.dataset, operations, no_progress, chooser=chooser
+    )

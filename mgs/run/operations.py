@@ -1,4 +1,4 @@
-"""The real stations of the loop, put together in one place."""
+"""The operations of a run on the splat core, and the PSNR that a run measures."""
 
 from __future__ import annotations
 
@@ -20,20 +20,16 @@ from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of
 from mgs.prior.initial import Colours, colours_of, initial_gaussians, initial_normals
 from mgs.run.inputs import prior_digest
-from mgs.run.loop import Stations
+from mgs.run.problem import Operations
 from mgs.run.settings import NbvSettings
 from mgs.splat import ListCache, fisher, groups, render
 
 
-def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stations:
-    """Stations on the splat core, starting from the prior; the rock is at the prior's centre of
-    mass."""
+def operations_of(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Operations:
+    """Operations on the splat core; the centre is the prior's centre of mass."""
     cache, means = ListCache(), settings.train.means
-    columns = groups(0, means)
-    by_kind, normals = (
-        lam_by_kind(settings.regularisation(columns), columns),
-        initial_normals(prior),
-    )
+    columns, normals = groups(0, means), initial_normals(prior)
+    lam = lam_by_kind(settings.regularisation(columns), columns)
     exposure = exposure_of(prior) if settings.exposure else None
     colours = kept_colours(dataset, prior)
 
@@ -49,45 +45,42 @@ def real_stations(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Stat
         train: TrainSettings,
         on_pass: Callable[[int, int], None],
     ) -> Fit:
-        return fit(gaussians, cameras, targets, train, on_pass, cache, start, by_kind, normals)
+        return fit(gaussians, cameras, targets, train, on_pass, cache, start, lam, normals)
 
-    def information(gaussians: Gaussians, camera: Camera, estimator: str) -> np.ndarray:
+    def estimate(gaussians: Gaussians, camera: Camera, estimator: str) -> np.ndarray:
         return fisher(gaussians, camera, estimator, cache=cache, means=means, normals=normals)
 
-    def look(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    def render_view(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         image = render(gaussians, camera, cache=cache)
         return np.asarray(image.rgb), np.asarray(image.alpha)
 
-    return Stations(
+    return Operations(
         centre=prior.points.mean(axis=0),
         groups=columns,
         initial=initial,
         fit=run_fit,
-        fisher=lambda gaussians, camera: information(gaussians, camera, settings.estimator),
-        estimate=information,
+        fisher=lambda gaussians, camera: estimate(gaussians, camera, settings.estimator),
+        estimate=estimate,
         exact=lambda gaussians, camera: fisher(gaussians, camera, cache=cache),
-        look=look,
+        render=render_view,
         measure=psnr_measure(dataset, cache, settings.exposure),
         exposure=exposure,
         on_surface=len(prior.points),
         up=prior.up,
         prior=prior_digest(prior),
-        capture=capture_of(dataset) if dataset.on_demand else lambda frame: None,
+        capture=_capture(dataset) if dataset.on_demand else lambda frame: None,
     )
 
 
-def capture_of(dataset: Dataset) -> Callable[[Frame], None]:
-    """`mgs.synth.capture.capture_of`, imported here because only runs that capture need it, and a
-    variant before it."""
+def _capture(dataset: Dataset) -> Callable[[Frame], None]:
     runtime.start()
-    from mgs.synth import capture
+    from mgs.synth.capture import capture_of  # needs a variant, and only on-demand datasets need it
 
-    return capture.capture_of(dataset)
+    return capture_of(dataset)
 
 
 def kept_colours(dataset: Dataset, prior: Prior) -> Callable[[Frame], Colours]:
-    """`mgs.prior.initial.colours_of` the prior, whose results for frames of the dataset are kept
-    within IMAGE_BYTES."""
+    """`mgs.prior.initial.colours_of` the prior, with results kept within IMAGE_BYTES."""
     of, index = colours_of(prior), {frame.name: i for i, frame in enumerate(dataset.frames)}
     kept = kept_within(
         IMAGE_BYTES,

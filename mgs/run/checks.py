@@ -1,0 +1,88 @@
+"""Entries of steps.jsonl that tell whether a run goes wrong: `residual`, `signs` and `warnings`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from mgs.camera import Camera
+from mgs.gaussians import Gaussians
+from mgs.run import detectors
+from mgs.run.loop import targets
+from mgs.run.problem import Problem
+from mgs.run.state import Learned
+
+
+class Checks:
+    """Compares renders with the images taken. render(gaussians, camera) -> RGB, alpha."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        render: Callable[[Gaussians, Camera], tuple[np.ndarray, np.ndarray]],
+    ) -> None:
+        self.problem, self.render = problem, render
+        self.before_fit = cache(self._before_fit)
+
+    def residual(self, learned: Learned, before: Gaussians, new: list[int]) -> dict[str, float]:
+        """`residual` of a step: rms difference of new images to the model before, linear RGB.
+
+        Inside the mask; to be compared with the setting `pixel_noise`. Empty where no pixel counts.
+        """
+        problem = self.problem
+        shown = targets(problem, learned.taken, learned.gains)[-len(new) :]
+        found = detectors.residual(
+            (
+                self.render(before, problem.cameras[i])[0],
+                target,
+                problem.frames[i].mask(),
+            )
+            for i, target in zip(new, shown, strict=True)
+        )
+        return {} if found is None else {"residual": found}
+
+    def signs(self, learned: Learned, steps: list[dict[str, Any]]) -> dict[str, Any]:
+        """`signs` of the last step and `warnings` where one exceeds its limit for the first time."""
+        problem, gains, fit = self.problem, learned.gains, learned.fit
+        views = []
+        shown = targets(problem, learned.taken, gains)
+        for k, (i, target) in enumerate(zip(learned.taken, shown, strict=True)):
+            packed, before = self.before_fit(i)
+            size = target.shape[0] * target.shape[1]
+            mask = np.unpackbits(packed, count=size).astype(bool).reshape(target.shape[:2])
+            if gains is not None:  # the estimated gain explains this part
+                exposure = before.exposure - float(np.log(gains[k].mean()))
+                before = replace(before, exposure=exposure)
+            rendered = self.render(fit.gaussians, problem.cameras[i])[0]
+            views.append(detectors.view_signs(target, mask, rendered, before))
+        scores = [
+            step["information_gain"] for step in steps if step["information_gain"] is not None
+        ]
+        start, coverage = problem.start, steps[-1]["coverage"]
+        drift = detectors.means_drift(fit.gaussians.means, start.means, start.log_scales)
+        signs = detectors.step_signs(views, fit.losses, coverage, scores, drift)
+        before_this = next(
+            (step["signs"] for step in reversed(steps[:-1]) if "signs" in step), None
+        )
+        said = detectors.alarms(signs, before_this)
+        return {"signs": signs, "warnings": said} if said else {"signs": signs}
+
+    def _before_fit(self, frame: int) -> tuple[np.ndarray, detectors.Before]:
+        """Mask of a frame taken, one bit a pixel, and its signs before any training.
+
+        Gaussians that no seed saw get the frame's own colours: grey would look like a change of
+        exposure.
+        """
+        problem = self.problem
+        mask, camera = problem.frames[frame].mask(), problem.cameras[frame]
+        margin = detectors.outline_margin(problem.start, camera)
+        grey = ~problem.start.sh.any(axis=(1, 2), keepdims=True)
+        own = problem.coloured((frame,)).sh
+        start = replace(problem.start, sh=np.where(grey, own, problem.start.sh))
+        rendered, alpha = self.render(start, camera)
+        signs = detectors.before_fit(problem.image(frame), mask, rendered, alpha, margin)
+        return np.packbits(mask), signs

@@ -1,0 +1,216 @@
+"""What stays fixed during a run: frames, surface, settings, policy, and the operations on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mgs.camera import Camera
+from mgs.data.dataset import Dataset, Frame, target_of
+from mgs.data.up import PLUS_Z, Up, upright
+from mgs.gaussians import Gaussians
+from mgs.memory import IMAGE_BYTES, kept_within
+from mgs.policy import criteria, poses
+from mgs.policy.context import Policy, PolicyContext
+from mgs.policy.from_file import label
+from mgs.policy.registry import policy_named
+from mgs.policy.visibility import Visibility
+from mgs.run.settings import NbvSettings
+from mgs.seeds import generator
+
+if TYPE_CHECKING:
+    from mgs.fit.fitting import Fit
+    from mgs.fit.settings import TrainSettings
+    from mgs.run.state import Fitted
+
+Progress = Callable[[str, int, int], None]
+"""Called as progress(stage, done, total)."""
+
+
+def no_progress(stage: str, done: int, total: int) -> None:
+    """Default callback: does nothing."""
+
+
+@dataclass(frozen=True)
+class Operations:
+    """What the loop computes with: deterministic functions, NumPy in and out (`mgs.run.operations`).
+
+    centre: [3] middle of the rock, metres. groups: columns of the Fisher information by kind of
+    parameter (`mgs.splat.groups`). up: unit vector that points upwards in the world.
+    on_surface: number of Gaussians on the surface, the first ones; None: all.
+    prior: hash of what `initial` starts from (`mgs.run.inputs.prior_digest`).
+
+    initial(frames) -> Gaussians before training, in the colours of these frames.
+    exposure(frames) -> gains [V,3] that colours are divided by; None: images are taken as they are.
+    fit(gaussians, start, cameras, targets, train, on_pass) -> Fit (`mgs.fit.fitting.fit`).
+    fisher(gaussians, camera) -> information of a view [N,P], by the estimator of the run.
+    estimate(gaussians, camera, estimator) -> the same by any row of `mgs.splat.ESTIMATORS`.
+    exact(gaussians, camera) -> exact information [N,P]; None: as `fisher`.
+    render(gaussians, camera) -> linear RGB [H,W,3] and alpha [H,W]; None: no detectors.
+    measure(gaussians, taken) -> entries of steps.jsonl (`mgs.run.operations.psnr_measure`).
+    capture(frame): makes the frame's images where they do not exist yet.
+    """
+
+    centre: np.ndarray
+    groups: dict[str, slice]
+    initial: Callable[[list[Frame]], Gaussians]
+    fit: Callable[
+        [
+            Gaussians,
+            Gaussians,
+            list[Camera],
+            Sequence[np.ndarray],
+            TrainSettings,
+            Callable[[int, int], None],
+        ],
+        Fit,
+    ]
+    fisher: Callable[[Gaussians, Camera], np.ndarray]
+    estimate: Callable[[Gaussians, Camera, str], np.ndarray]
+    measure: Callable[[Gaussians, list[int]], dict[str, float]]
+    exposure: Callable[[Sequence[Frame]], np.ndarray] | None = None
+    exact: Callable[[Gaussians, Camera], np.ndarray] | None = None
+    render: Callable[[Gaussians, Camera], tuple[np.ndarray, np.ndarray]] | None = None
+    on_surface: int | None = None
+    up: Up = PLUS_Z
+    prior: str = ""
+    capture: Callable[[Frame], None] = lambda frame: None
+
+
+class Problem:
+    """A selection problem: which of the frames to take, and how the model is fitted to them.
+
+    Positions, centre and points are in coordinates in which +Z is up, metres. lam [P]: lambda of
+    the run; prior_lam: the same without columns of means and without `--lambda`, for the surface.
+    What depends on images (`start`) is computed when first asked for.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        settings: NbvSettings,
+        operations: Operations,
+        progress: Progress = no_progress,
+        policy: Policy | None = None,
+    ) -> None:
+        self.dataset, self.settings = dataset, settings
+        self.operations, self.progress = operations, progress
+        self.frames = dataset.frames
+        self.cameras = [frame.camera for frame in dataset.frames]
+        self.policy = policy or policy_named(settings.policy)
+        self.turn = upright(operations.up)
+        self.positions = np.array([camera.position for camera in self.cameras]) @ self.turn.T
+        self.centre = self.turn @ operations.centre
+        kinds = {kind: at for kind, at in operations.groups.items() if kind != "mean"}
+        self.prior_lam = criteria.regularisation(kinds, settings.pixel_noise, settings.prior_std)
+        self.lam = settings.regularisation(operations.groups)
+        self.seeds = poses.seed_views(self.positions, self.centre, settings.seeds)
+        with_alpha = settings.train.alpha_weight > 0
+        self.image = kept_within(
+            IMAGE_BYTES, lambda i: target_of(self.frames[i], with_alpha), lambda image: image.nbytes
+        )
+        self._start_of = lru_cache(maxsize=2)(self.coloured)
+
+    @cached_property
+    def start(self) -> Gaussians:
+        """The Gaussians before training, in the colours of the seeds, whose images this reads."""
+        self.make_images(self.seeds)
+        return self.operations.initial([self.frames[i] for i in self.seeds])
+
+    @cached_property
+    def on_surface(self) -> int:
+        """Number of Gaussians on the prior's surface: the first ones."""
+        count = self.operations.on_surface
+        return len(self.start) if count is None else count
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """[S,3] means of the Gaussians on the surface before training."""
+        return self.start.means[: self.on_surface] @ self.turn.T
+
+    @cached_property
+    def visibility(self) -> Visibility:
+        """What each pose sees of the surface."""
+
+        def progress(done: int, total: int) -> None:
+            self.progress("scoring candidates", done, total)
+
+        lam = float(self.prior_lam[0])
+        look = self._exact_on_surface
+        return Visibility(self.cameras, look, self.points, self.centre, lam, self.turn, progress)
+
+    def start_of(self, taken: Sequence[int]) -> Gaussians:
+        """The Gaussians before training, in the colours of all views taken."""
+        return self._start_of(tuple(taken))
+
+    def coloured(self, taken: tuple[int, ...]) -> Gaussians:
+        """`start_of`, computed anew."""
+        sh = self.operations.initial([self.frames[i] for i in taken]).sh
+        return replace(self.start, sh=sh)
+
+    def make_images(self, views: Sequence[int]) -> None:
+        """Make the images of these frames where they do not exist yet."""
+        for done, i in enumerate(views):
+            self.progress("capturing", done, len(views))
+            self.operations.capture(self.frames[i])
+
+    def surface_information(self, frame: int) -> np.ndarray:
+        """Exact information [S,P] of a view about the surface before training."""
+        return self._exact_on_surface(self.cameras[frame])
+
+    def _exact_on_surface(self, camera: Camera) -> np.ndarray:
+        fisher = self.operations.exact or self.operations.fisher
+        return fisher(self.start, camera)[: self.on_surface, : len(self.prior_lam)]
+
+    def view_information(self, model: Gaussians) -> Callable[[int], np.ndarray]:
+        """A function frame -> information [N,P] of its view at a model.
+
+        Results are kept while there is room where views are chosen in batches: all choices of a
+        batch are about one model.
+        """
+        room = IMAGE_BYTES if self.settings.batch > 1 else 0
+        fisher, cameras = self.operations.fisher, self.cameras
+        return kept_within(room, lambda i: fisher(model, cameras[i]), lambda F: F.nbytes)
+
+    def context(
+        self,
+        state: Fitted,
+        left: list[int],
+        fisher: Callable[[int], np.ndarray] | None = None,
+    ) -> PolicyContext:
+        """What the policy may use to choose among the frames in `left`.
+
+        fisher(frame): information of its view at the model, computed by default.
+        """
+        fisher = fisher or self.view_information(state.gaussians)
+        step = len(state.taken) - self.settings.seeds + 1
+
+        def shown(view: int) -> int:
+            done = left.index(view) if view in left else 0
+            self.progress("scoring candidates", done, len(left))
+            return view
+
+        estimate = self.operations.estimate
+        self.progress("scoring candidates", 0, len(left))
+        return PolicyContext(
+            positions=self.positions,
+            candidate_frames=left,
+            taken_frames=state.taken,
+            centre=self.centre,
+            rng=generator(self.settings.seed, f"{label(self.settings.policy)}/{step}"),
+            H=state.H,
+            lam=self.lam,
+            points=self.points,
+            surface_H=state.surface,
+            prior_lam=self.prior_lam,
+            information=lambda view: fisher(shown(view)),
+            surface_information=lambda view: self.visibility.information(shown(view)),
+            estimate=lambda view, name: estimate(state.gaussians, self.cameras[shown(view)], name),
+            seen=lambda view: self.visibility.seen(shown(view)),
+            dome=lambda: self.visibility.dome(),
+            gains=lambda *given: self.visibility.gains(*given),
+        )
