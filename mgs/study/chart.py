@@ -21,9 +21,9 @@ from mgs.data.dataset import load_dataset
 from mgs.fit.settings import COLOURS_ALONE, PASSES, WARM_PASSES
 from mgs.plotting import STYLE, new_figure, save_figure
 from mgs.report.figures import line_styles
-from mgs.run.folder import State
 from mgs.run.nbv import run_nbv
 from mgs.run.settings import PRESETS
+from mgs.run.state import State
 from mgs.study.case import Case, Scene, Size, judge, test_views_of
 from mgs.study.output import Content, table, write_table
 from mgs.study.statistics import pareto_front
