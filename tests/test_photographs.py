@@ -428,7 +428,7 @@ def test_lengths_of_unknown_unit_are_not_called_metres(
 
 def test_a_smaller_image_is_the_mean_of_its_blocks_and_rays_stay() -> None:
     camera = Camera(np.array([[50.0, 0, 31.3], [0, 49.0, 22.9], [0, 0, 1]]), 65, 47, np.eye(4))
-    small, undo = shrunk(camera, lambda pixels, smooth: pixels, 3)
+    small, undo = shrunk(camera, 3)
     pixels = np.random.default_rng(0).integers(0, 256, (47, 65, 4), np.uint8)
     shown = undo(pixels, True)
     assert (small.width, small.height) == (21, 15)

@@ -298,23 +298,6 @@ def test_error_to_truth_sees_a_wrong_prior(built, dataset: Dataset) -> None:
     assert error["hausdorff"] == pytest.approx(0.05, abs=0.02)
 
 
-def test_error_to_truth_of_a_dataset_of_an_older_mgs(
-    built, dataset: Dataset, tmp_path: Path
-) -> None:
-    """Its rock.glb is +Z up and without the mark of today's."""
-    from mgs.prior.truth import error_to_truth
-
-    prior, rock = built
-    synthetic.rock_mesh().export(tmp_path / "rock.glb")
-    old, new = (
-        error_to_truth(
-            prior.points, prior.spacing, prior.mesh, root / "rock.glb", dataset.frames, rock, 0
-        )
-        for root in (tmp_path, dataset.root)
-    )
-    assert old == new
-
-
 def test_prior_round_trip_and_determinism(built, dataset: Dataset, tmp_path: Path) -> None:
     prior = built[0]
     again, _ = build_prior(dataset, PriorSettings(gaussians=1500, backing=0))

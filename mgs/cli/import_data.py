@@ -8,10 +8,10 @@ from typing import Annotated
 import typer
 
 MANY_PIXELS = 2_000_000
-"""Images with more pixels than this are worth a word on --downscale."""
+"""Pixels of an image beyond which --downscale is recommended."""
 
 EXPOSURE_DIFFERS = 0.1
-"""Stops by which the exposure of photographs must differ, by their EXIF, to be worth a word."""
+"""Difference of exposure by EXIF, stops, beyond which --exposure is recommended."""
 
 
 def import_data(
@@ -34,20 +34,21 @@ def import_data(
     mesh: Annotated[
         Path | None,
         typer.Option(
-            help="Make masks by projecting this mesh of the rock. World coordinates; a GLB is turned from +Y up."
+            help="Mesh of the rock whose projections give the masks. World coordinates; "
+            "a GLB is turned from +Y up."
         ),
     ] = None,
     downscale: Annotated[
         int,
         typer.Option(
             min=1,
-            help="Make blocks of so many pixels each way into one, as 4 for photographs of 12 megapixels.",
+            help="Side of the pixel blocks that become one, as 4 for photographs of 12 megapixels.",
         ),
     ] = 1,
     up: Annotated[
         str,
         typer.Option(
-            help="Which way is up: X,Y,Z in the source's world, or auto: as the cameras were held."
+            help="Upward direction: X,Y,Z in the source's world, or auto: as cameras were held."
         ),
     ] = "auto",
     unit: Annotated[
@@ -61,25 +62,27 @@ def import_data(
         typer.Option(
             min=2,
             metavar="N",
-            help="Set every Nth image apart as a test view, by name, from the first on; 8 is usual.",
+            help="Make every Nth image a test view, by name, from the first on; 8 is usual.",
         ),
     ] = None,
     split: Annotated[
-        str, typer.Option(help="Which split of NeRF-synthetic data to import: train, val or test.")
+        str, typer.Option(help="Split of NeRF-synthetic data to import: train, val or test.")
     ] = "train",
 ) -> None:
     """Make a dataset of your own data: cameras and images, and depth and masks if there are any.
     Lens distortion is undone.
 
-    Masks are taken from --masks, --mesh, the source's own mask files or the images' alpha: the
-    first of these that there is. Where alpha has values between empty and full, it is kept, in
-    images of the rock alone (rock/). Points that came with the cameras are kept for `mgs prior`, in
-    sparse.ply. An interrupted import goes on where it stopped when the same command is given again.
+    Masks come from --masks, --mesh, the source's own mask files or the images' alpha: the first of
+    these that there is. Alpha with values between empty and full is kept, in images of the rock
+    alone (rock/). Points that came with the cameras are kept for `mgs prior`, in sparse.ply. The
+    same command continues an interrupted import.
     """
+    from functools import partial
+
     from rich.console import Console
-    from rich.progress import Progress
 
     from mgs.cli.options import parse_up
+    from mgs.cli.progress import progress_bar
     from mgs.data.dataset import TEST_FOLDER
     from mgs.data.importers import import_source
     from mgs.data.meshes import GLTF
@@ -99,8 +102,7 @@ def import_data(
     tests, listed = None, found.missing + len(found.shots)
     if test_every is not None:
         found, tests = found.set_apart(test_every)
-    with Progress(console=console, transient=True) as progress:
-        bar = progress.add_task("importing")
+    with progress_bar("importing", console) as progress:
         result = import_source(
             found,
             out,
@@ -109,7 +111,7 @@ def import_data(
             downscale=downscale,
             up=upward,
             tests=tests,
-            on_frame=lambda done, total: progress.update(bar, completed=done, total=total),
+            on_frame=partial(progress, "importing"),
         )
     if mesh is not None and mesh.suffix.lower() in GLTF:
         console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
@@ -117,33 +119,35 @@ def import_data(
         notes.print(f"mgs: {found.missing} of {listed} listed images do not exist; skipped them")
     if found.no_cloud:
         notes.print(
-            f"mgs: the points that {source.name} names, {found.no_cloud}, do not exist; imported without them"
+            f"mgs: the points that {source.name} names, {found.no_cloud}, do not exist; "
+            "imported without them"
         )
-    keys = ("mask_path", "rock_path", "depth_path")
-    masked, layered, deep = (
-        sum(bool(getattr(frame, key)) for frame in result.frames) for key in keys
-    )
-    undone = sum(shot.distortion.any() for shot in found.shots)
     axis = ", ".join(f"{value:.4g}" for value in upward)
     lengths = "metres" if result.unit == "m" else f"in {result.unit}s (no --unit was given)"
     console.print(f"up is ({axis}): {reason}; lengths are {lengths}")
     stops = [value for shot in found.shots if (value := exif_exposure(shot.image)) is not None]
     if stops and max(stops) - min(stops) > EXPOSURE_DIFFERS:
         notes.print(
-            f"mgs: by their EXIF, exposure differs by up to {max(stops) - min(stops):.1f} stops between photographs; "
-            "`mgs nbv --exposure` estimates a gain for each"
+            f"mgs: by their EXIF, exposure differs by up to {max(stops) - min(stops):.1f} stops "
+            "between photographs; `mgs nbv --exposure` estimates a gain for each"
         )
-    points = 0 if found.sparse is None else len(found.sparse.points)
     camera = result.frames[0].camera
     if camera.width * camera.height > MANY_PIXELS:
         notes.print(
-            f"mgs: images of {camera.width}x{camera.height} take long to fit; --downscale 2 or more makes them smaller"
+            f"mgs: images of {camera.width}x{camera.height} take long to fit; "
+            "--downscale 2 or more makes them smaller"
         )
+    masked = sum(frame.mask_path is not None for frame in result.frames)
+    layered = sum(frame.rock_path is not None for frame in result.frames)
+    deep = sum(frame.depth_path is not None for frame in result.frames)
+    undone = sum(shot.distortion.any() for shot in found.shots)
+    points = 0 if found.sparse is None else len(found.sparse.points)
     console.print(
-        f"{found.kind}: {len(result)} frames, {masked} with mask, {layered} with alpha, {deep} with depth, "
-        f"{undone} undistorted, {points:,} points; wrote {out}"
+        f"{found.kind}: {len(result)} frames, {masked} with mask, {layered} with alpha, "
+        f"{deep} with depth, {undone} undistorted, {points:,} points; wrote {out}"
     )
     if tests is not None:
         console.print(
-            f"test views: {len(tests.shots)} images, which are no candidates; wrote {out / TEST_FOLDER}"
+            f"test views: {len(tests.shots)} images, which are no candidates; "
+            f"wrote {out / TEST_FOLDER}"
         )

@@ -1,5 +1,4 @@
-"""`mgs prior`: from depth images, points, masks or a mesh to a mesh of the rock, and samples of its
-surface."""
+"""`mgs prior`: from depth images, points, masks or a mesh to a rock mesh and samples of it."""
 
 from __future__ import annotations
 
@@ -10,23 +9,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from rich.status import Status
-
     from mgs.data.dataset import Dataset, Frame
     from mgs.prior.build import Prior
     from mgs.prior.segmentation import SegmentedCloud
     from mgs.prior.settings import PriorSettings
 
 SEEDS = 4
-"""Number of seed frames in the paper, and of those for which the share of samples that they see is
-printed."""
+"""Seed frames in the paper; the table says what share of the samples they see."""
 
 WHY = {
     "depth": ": the dataset has depth images",
     "points": ": the dataset has points (sparse.ply) and no depth",
     "hull": ": the dataset has masks, and neither depth nor points",
 }
-"""What is said of a source that nobody asked for."""
+"""Reason for a source that was not asked for."""
 
 
 def prior(
@@ -38,61 +34,59 @@ def prior(
         str | None,
         typer.Option(
             metavar="N|auto",
-            help="Number of Gaussians, on the surface and behind it. Default: auto, what the closest pixel resolves.",
+            help="Number of Gaussians, on the surface and behind it. "
+            "Default: auto, what the closest pixel resolves.",
         ),
     ] = None,
     spacing: Annotated[
-        float | None,
-        typer.Option(help="Distance between samples, metres, instead of N."),
+        float | None, typer.Option(help="Distance between samples, metres, instead of N.")
     ] = None,
     source: Annotated[
         str | None,
         typer.Option(
             "--from",
-            help="depth, mesh, points or hull (of the masks). Default: the first of depth, points, hull that there is.",
+            help="depth, mesh, points or hull (of the masks). "
+            "Default: the first of depth, points, hull that there is.",
         ),
     ] = None,
     points: Annotated[
         Path | None,
-        typer.Option(
-            help="Build it of the points in this PLY file. World coordinates of the dataset."
-        ),
+        typer.Option(help="PLY file of points to build it from, world coordinates."),
     ] = None,
     up: Annotated[
         str | None,
         typer.Option(
-            help="Which way is up: X,Y,Z, or auto: the ground plane's normal. Default: as the dataset says."
+            help="Upward direction: X,Y,Z, or auto: the ground plane's normal. "
+            "Default: as the dataset says."
         ),
     ] = None,
     mesh: Annotated[
         Path | None,
         typer.Option(
-            help="Sample this mesh instead of building one. World coordinates, metres; a GLB is turned from +Y up."
+            help="Mesh to sample instead of building one. World coordinates, metres; "
+            "a GLB is turned from +Y up."
         ),
     ] = None,
     backing: Annotated[
         float,
         typer.Option(
-            help="Gaussians behind the surface for each one on it, to keep it opaque. 0: none, as in the paper."
+            help="Gaussians behind the surface for each one on it, to keep it opaque. "
+            "0: none, as in the paper."
         ),
     ] = 0.5,
     poisson_depth: Annotated[
         int | None,
         typer.Option(
-            help="Octree depth of the Poisson surface, 3 to 12. Default: by the density of the cloud."
+            help="Octree depth of the Poisson surface, 3 to 12. Default: by the cloud's density."
         ),
     ] = None,
     prior_noise: Annotated[
         float,
-        typer.Option(
-            help="Make the rock's points worse on purpose: noise of this standard deviation, metres."
-        ),
+        typer.Option(help="Degrade the rock's points: standard deviation of noise, metres."),
     ] = 0.0,
     holes: Annotated[
         float,
-        typer.Option(
-            help="Make them worse on purpose: cut round holes until this share of the points is removed."
-        ),
+        typer.Option(help="Degrade the rock's points: share to remove, in round holes."),
     ] = 0.0,
     seed: Annotated[
         int, typer.Option(min=0, help="Root seed: the same seed gives the same prior.")
@@ -100,15 +94,15 @@ def prior(
 ) -> None:
     """Build a mesh of the rock, and sample N points on it.
 
-    From depth images: fuse them into a cloud, find the ground plane and the rock above it,
-    reconstruct the rock's surface (Poisson). From points that came with the cameras: the same, of
-    those inside the masks or above the ground. From a hull: the largest body that fits into all
-    masks. Then spread samples evenly over what some frame saw. Writes mesh.ply, points.ply,
-    prior.json and prior.png.
+    From depth images: fuse a cloud, find the ground plane and the rock above it, reconstruct its
+    surface (Poisson). From points that came with the cameras: the same, of those inside the masks
+    or above the ground. From a hull: the largest body inside all masks. Then spread samples evenly
+    over what some frame saw. Writes mesh.ply, points.ply, prior.json and prior.png.
     """
     from rich.console import Console
 
     from mgs.cli.options import parse_gaussians, parse_up
+    from mgs.cli.progress import progress_bar
     from mgs.data.dataset import load_dataset
     from mgs.data.meshes import GLTF
     from mgs.errors import InputError
@@ -126,31 +120,26 @@ def prior(
             "prior: --mesh gives the surface, and --from or --points build one; give one of them"
         )
     loaded = load_dataset(dataset)
-    folder = check_new_folder(
-        out if out is not None else dataset / "prior"
-    )  # before the work, not after it
-    settings = PriorSettings(
-        parse_gaussians(gaussians), spacing, poisson_depth, prior_noise, holes, seed, backing
-    )
-    with console.status("reading") as status:
+    # Checked before the work, not after it.
+    folder = check_new_folder(out if out is not None else dataset / "prior")
+    number = parse_gaussians(gaussians)
+    settings = PriorSettings(number, spacing, poisson_depth, prior_noise, holes, seed, backing)
+    with progress_bar(console=console) as progress:
+        segmented = None
         if mesh is not None:
             cameras = [frame.camera for frame in loaded.frames]
-            result, segmented = (
-                prior_from_mesh(mesh, settings, axis or loaded.up, loaded.unit, cameras),
-                None,
-            )
+            result = prior_from_mesh(mesh, settings, axis or loaded.up, loaded.unit, cameras)
             if mesh.suffix.lower() in GLTF:
                 console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
         else:
             upward: Any = "auto" if up == "auto" else axis
             chosen = source_of(loaded, source, points)
             console.print(f"prior from {chosen}" + ("" if source or points else WHY[chosen]))
-            result, segmented = _built(
-                loaded, settings, folder, status, source=chosen, points=points, up=upward
-            )
-        status.update("prior: what four seed frames see")
+            options = {"source": chosen, "points": points, "up": upward}
+            result, segmented = _built(loaded, settings, folder, progress, **options)
+        progress("seed frames")
         result = with_share_seen(result, _seed_frames(loaded, result))
-        status.update("prior: picture")
+        progress("figure")
         with atomic_folder(folder) as unfinished:
             save_prior(unfinished, result)
             draw_prior(unfinished / "prior.png", result, segmented)
@@ -161,10 +150,13 @@ def prior(
 
 
 def _built(
-    dataset: Dataset, settings: PriorSettings, folder: Path, status: Status, **options: Any
+    dataset: Dataset,
+    settings: PriorSettings,
+    folder: Path,
+    on_stage: Callable[[str], None],
+    **options: Any,
 ) -> tuple[Prior, SegmentedCloud | None]:
-    """`build_prior` with its stages shown; a refused cloud is drawn beside `folder`, and the
-    picture is named in the error."""
+    """`build_prior`. A refused cloud is drawn beside `folder`, and the error names the picture."""
     import numpy as np
 
     from mgs.errors import InputError
@@ -173,9 +165,7 @@ def _built(
     from mgs.prior.segmentation import NoSurface
 
     try:
-        return build_prior(
-            dataset, settings, lambda stage: status.update(f"prior: {stage}"), **options
-        )
+        return build_prior(dataset, settings, on_stage, **options)
     except NoSurface as refused:
         picture = folder.with_name(f"{folder.name}-refused.png")
         draw_refused(picture, refused.points, refused.kept, np.array(dataset.up))
@@ -183,7 +173,7 @@ def _built(
 
 
 def _seed_frames(dataset: Dataset, prior: Prior) -> list[Frame]:
-    """The frames that `mgs nbv` would take as its SEEDS seeds, or all frames if there are fewer."""
+    """The frames that `mgs nbv` would take as its SEEDS seeds, or all if there are fewer."""
     import numpy as np
 
     from mgs.data.up import upright
@@ -191,23 +181,17 @@ def _seed_frames(dataset: Dataset, prior: Prior) -> list[Frame]:
 
     turn = upright(prior.up)
     positions = np.stack([frame.camera.position for frame in dataset.frames]) @ turn.T
-    return [
-        dataset.frames[k]
-        for k in seed_views(positions, turn @ prior.points.mean(0), min(SEEDS, len(dataset)))
-    ]
+    middle = turn @ prior.points.mean(0)
+    return [dataset.frames[k] for k in seed_views(positions, middle, min(SEEDS, len(dataset)))]
 
 
 def _table(numbers: dict[str, Any]) -> Any:
-    """The table that is printed, from the numbers of prior.json."""
+    """Table of the numbers of prior.json."""
     from rich.table import Table
 
     metres = numbers["unit"] == "m"
-    n, spacing, area, unit = (
-        numbers["n"],
-        numbers["spacing"],
-        numbers["sampled_area"],
-        "m" if metres else "unit",
-    )
+    unit = "m" if metres else "unit"
+    n, spacing, area = numbers["n"], numbers["spacing"], numbers["sampled_area"]
     table = Table("station", "number", title="Mesh prior")
 
     def length(value: float) -> str:
@@ -216,104 +200,79 @@ def _table(numbers: dict[str, Any]) -> Any:
     if "points" in numbers:
         _add_cloud_rows(table, numbers, length)
     if "hull_cell" in numbers:
-        table.add_row(
-            "visual hull",
-            f"cells of {length(numbers['hull_cell'])}, fills {numbers['hull_fills_masks']:.1%} of the masks",
-        )
+        filled = f"fills {numbers['hull_fills_masks']:.1%} of the masks"
+        table.add_row("visual hull", f"cells of {length(numbers['hull_cell'])}, {filled}")
     if "poisson_depth" in numbers:
-        table.add_row(
-            "mesh (Poisson)",
-            f"{numbers['mesh_faces']:,} faces, octree depth {numbers['poisson_depth']}, watertight",
-        )
+        depth = f"octree depth {numbers['poisson_depth']}"
+        table.add_row("mesh (Poisson)", f"{numbers['mesh_faces']:,} faces, {depth}, watertight")
         table.add_row("cloud to mesh, rms", length(numbers["fit_rms"]))
-    part = (
-        ""
-        if "mesh" in numbers
-        else f" sampled (what some frame saw), of {numbers['mesh_area']:.4f} {unit}²"
-    )
-    table.add_row("area, A", f"{area:.4f} {unit}²{part}")
+    whole = f" sampled (what some frame saw), of {numbers['mesh_area']:.4f} {unit}²"
+    table.add_row("area, A", f"{area:.4f} {unit}²{'' if 'mesh' in numbers else whole}")
     table.add_row("samples, N = A / spacing²", f"{n:,} = {area:.4f} / {spacing:.6f}²")
-    table.add_row(
-        "Gaussians",
-        f"{n + numbers['backed']:,}: a sample each, and {numbers['backed']:,} behind the surface",
-    )
-    mean, least = (
-        numbers[key] / spacing for key in ("nearest_neighbour_mean", "nearest_neighbour_min")
-    )
+    behind = f"a sample each, and {numbers['backed']:,} behind the surface"
+    table.add_row("Gaussians", f"{n + numbers['backed']:,}: {behind}")
+    mean, least = (numbers[f"nearest_neighbour_{key}"] / spacing for key in ("mean", "min"))
     table.add_row("nearest neighbour over spacing", f"mean {mean:.2f}, least {least:.2f}")
-    table.add_row(
-        f"samples that {SEEDS} evenly spaced frames see",
-        f"{numbers['seen_by_seeds']:.1%}; the rest starts grey",
-    )
+    seen = f"{numbers['seen_by_seeds']:.1%}; the rest starts grey"
+    table.add_row(f"samples that {SEEDS} evenly spaced frames see", seen)
     table.add_row("up", _up(numbers))
     truth = numbers.get("truth")
     if truth is None:
-        table.add_row(
-            "distance to the true rock", "not measured: needs depth, and rock.glb in the dataset"
-        )
+        lacks = "not measured: needs depth, and rock.glb in the dataset"
+        table.add_row("distance to the true rock", lacks)
         return table
     table.add_section()
     for name in ("accuracy", "completeness", "chamfer", "hausdorff"):
         table.add_row(f"{name} to the true rock", f"{1e3 * truth[name]:.2f} mm")
-    table.add_row(
-        "true surface seen by some frame",
-        f"{truth['visible_share']:.2%} of what is above the ground",
-    )
+    share = f"{truth['visible_share']:.2%} of what is above the ground"
+    table.add_row("true surface seen by some frame", share)
     table.add_row("seen surface within 2 spacings", f"{truth['visible_within_2_spacing']:.2%}")
     return table
 
 
 def _reason(numbers: dict[str, Any]) -> str:
-    """Why there are so many Gaussians, where their number was left to the images."""
+    """Reason for the number of Gaussians, if the cameras decided it."""
     from mgs.prior.resolution import PIXELS_PER_SAMPLE
 
-    pixel, n, backed = numbers["resolution"]["pixel"], numbers["n"], numbers["backed"]
+    pixel, count = numbers["resolution"]["pixel"], numbers["n"] + numbers["backed"]
     size = f"{1e3 * pixel:.2f} mm" if numbers["unit"] == "m" else f"{pixel:.4g} unit"
     return (
-        f"{n + backed:,} Gaussians, since the closest pixel covers {size} of the surface, and samples nearer than "
-        f"{PIXELS_PER_SAMPLE:g} pixels gain too little"
+        f"{count:,} Gaussians, since the closest pixel covers {size} of the surface, and samples "
+        f"nearer than {PIXELS_PER_SAMPLE:g} pixels gain too little"
     )
 
 
 def _up(numbers: dict[str, Any]) -> str:
-    """Which way is up, and how far the ground plane's normal is from it where there is a plane."""
+    """The up vector, and its angle from the ground plane's normal, if any."""
     from mgs.data.up import degrees_between, unit_up
 
     up = unit_up(numbers["up"])
     text = f"({', '.join(f'{value:.3g}' for value in up)})"
     if "plane_normal" not in numbers:
         return text
-    return f"{text}; the ground plane's normal is {degrees_between(up, unit_up(numbers['plane_normal'])):.1f}° from it"
+    angle = degrees_between(up, unit_up(numbers["plane_normal"]))
+    return f"{text}; the ground plane's normal is {angle:.1f}° from it"
 
 
 def _add_cloud_rows(table: Any, numbers: dict[str, Any], length: Callable[[float], str]) -> None:
-    """The rows of a mesh that was built from a cloud."""
+    """Add the rows of a mesh that was built from a cloud."""
+    points, size = f"{numbers['points']:,}", f"{numbers['cluster_size']:,}"
     if "pixels" in numbers:
         table.add_row("depth pixels in the cloud", f"{numbers['pixels']:,}")
         table.add_row("noise of a depth pixel", length(numbers["depth_noise"]))
-        table.add_row(
-            "points of the fused cloud",
-            f"{numbers['points']:,} on a {length(numbers['voxel'])} grid",
-        )
+        grid = f"{points} on a {length(numbers['voxel'])} grid"
+        table.add_row("points of the fused cloud", grid)
     else:
-        table.add_row(
-            "points", f"{numbers['points']:,}, {numbers['points_kept']:,} of them well triangulated"
-        )
+        table.add_row("points", f"{points}, {numbers['points_kept']:,} of them well triangulated")
     if "plane_normal" in numbers:
-        within = (
-            f"within {length(numbers['plane_tolerance'])} (sigma {length(numbers['plane_sigma'])})"
-        )
+        sigma = f"(sigma {length(numbers['plane_sigma'])})"
+        within = f"within {length(numbers['plane_tolerance'])} {sigma}"
         table.add_row("ground plane inliers (RANSAC)", f"{numbers['plane_inliers']:,} {within}")
+    one_of = f"one of {numbers['clusters']} clusters"
     if "eps" in numbers:
-        found = f"one of {numbers['clusters']} clusters, eps {length(numbers['eps'])}"
-        table.add_row("rock cluster (DBSCAN)", f"{numbers['cluster_size']:,} points, {found}")
-    elif "points_kept" in numbers:
-        chosen = (
-            f"one of {numbers['clusters']} clusters (HDBSCAN)"
-            if numbers["clusters"]
-            else "inside the masks"
-        )
-        table.add_row(
-            "points of the rock",
-            f"{numbers['cluster_size']:,} {chosen}, {length(numbers['cloud_spacing'])} apart",
-        )
+        found = f"{one_of}, eps {length(numbers['eps'])}"
+        table.add_row("rock cluster (DBSCAN)", f"{size} points, {found}")
+    else:
+        chosen = f"{one_of} (HDBSCAN)" if numbers["clusters"] else "inside the masks"
+        apart = f"{length(numbers['cloud_spacing'])} apart"
+        table.add_row("points of the rock", f"{size} {chosen}, {apart}")

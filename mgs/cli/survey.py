@@ -10,7 +10,7 @@ import typer
 
 
 class Poses(StrEnum):
-    """Where the poses of the survey come from."""
+    """Source of the survey's poses."""
 
     estimated = "estimated"
     exact = "exact"
@@ -32,7 +32,8 @@ def survey(
     sensor_noise: Annotated[
         float | None,
         typer.Option(
-            help="Factor on the depth camera's noise; 0: exact depth. Default: as the dataset's scene says, else 1."
+            help="Factor on the depth camera's noise; 0: exact depth. "
+            "Default: as the dataset's scene says, else 1."
         ),
     ] = None,
     drift: Annotated[
@@ -45,16 +46,14 @@ def survey(
         int, typer.Option(min=0, help="Root seed: the same seed gives the same survey.")
     ] = 0,
 ) -> None:
-    """Fly a dataset's orbit with a noisy depth camera and drifting odometry; register the frames,
-    close loops, fuse the cloud.
+    """Survey a dataset's orbit: noisy depth, drifting odometry, registration, loop closure, fusion.
 
     The result is a dataset again, with estimated poses and measured depth, so `mgs prior OUT`
-    builds the prior that such a flight would have given. The folder also holds cloud.ply,
-    survey.json and survey.png.
+    builds the prior of such a flight. The folder also holds cloud.ply, survey.json and survey.png.
     """
     from rich.console import Console
-    from rich.progress import Progress
 
+    from mgs.cli.progress import progress_bar
     from mgs.data.dataset import load_dataset
     from mgs.files import atomic_folder, check_new_folder
     from mgs.survey.flight import SurveySettings, fly
@@ -63,45 +62,35 @@ def survey(
 
     console = Console()
     frames = load_dataset(dataset)
-    folder = check_new_folder(
-        out if out is not None else dataset / "survey"
-    )  # before the work, not after it
+    # Checked before the work, not after it.
+    folder = check_new_folder(out if out is not None else dataset / "survey")
     sensor = sensor_of(dataset)
-    noise, drift = (
-        own if given is None else given
-        for given, own in ((sensor_noise, sensor.noise), (drift, sensor.drift))
-    )
+    noise = sensor.noise if sensor_noise is None else sensor_noise
+    drift = sensor.drift if drift is None else drift
     settings = SurveySettings(noise, drift, poses is Poses.exact, seed)
-    with Progress(console=console, transient=True) as progress:
-        bar = progress.add_task("survey")
-        flown = fly(
-            frames,
-            settings,
-            lambda name, done, total: progress.update(
-                bar, description=name, completed=done, total=total
-            ),
-        )
-    with atomic_folder(folder) as unfinished, console.status("writing"):
-        numbers = save_survey(unfinished, frames, flown, settings)
+    with progress_bar("survey", console) as progress:
+        flown = fly(frames, settings, progress)
+        progress("writing")
+        with atomic_folder(folder) as unfinished:
+            numbers = save_survey(unfinished, frames, flown, settings)
     console.print(_table(numbers))
     console.print(
-        f"wrote {folder}: a dataset with estimated poses and measured depth, cloud.ply, survey.json, survey.png"
+        f"wrote {folder}: a dataset with estimated poses and measured depth, "
+        "cloud.ply, survey.json, survey.png"
     )
 
 
 def _table(numbers: dict[str, Any]) -> Any:
-    """The table that is printed, from the numbers of survey.json."""
+    """Table of the numbers of survey.json."""
     from rich.table import Table
 
     from mgs.survey.flight import STAGES
 
     table = Table("survey", "number", title="Survey")
-    table.add_row(
-        "frames, length of the flight", f"{numbers['frames']}, {numbers['path_length']:.1f} m"
-    )
-    table.add_row(
-        "depth error on the rock (robust sigma)", f"{1e3 * numbers['depth_error_on_rock']:.1f} mm"
-    )
+    flight = f"{numbers['frames']}, {numbers['path_length']:.1f} m"
+    table.add_row("frames, length of the flight", flight)
+    error = f"{1e3 * numbers['depth_error_on_rock']:.1f} mm"
+    table.add_row("depth error on the rock (robust sigma)", error)
     table.add_row("returns lost", f"{numbers['returns_lost']:.1%}")
     table.add_row("points of the fused cloud", f"{numbers['points']:,}")
     if numbers["settings"]["exact_poses"]:
@@ -111,7 +100,8 @@ def _table(numbers: dict[str, Any]) -> Any:
     table.add_row("loop closures", ", ".join(f"{i}-{j}" for i, j, _ in numbers["loops"]) or "none")
     table.add_section()
     for name, label in STAGES.items():
-        error = numbers["error"][name]
-        text = f"{1e3 * error['ate_rms']:.1f} mm rms, {1e3 * error['ate_max']:.1f} mm at most, {error['rotation_rms']:.2f} degrees"
+        found = numbers["error"][name]
+        text = f"{1e3 * found['ate_rms']:.1f} mm rms, {1e3 * found['ate_max']:.1f} mm at most"
+        text = f"{text}, {found['rotation_rms']:.2f} degrees"
         table.add_row(f"trajectory error, {label}", text)
     return table

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +12,7 @@ import typer
 
 
 class Axis(StrEnum):
-    """The axis of a mesh that points upwards."""
+    """Up axis of a mesh."""
 
     y = "y"
     z = "z"
@@ -34,7 +35,7 @@ def synth_orbit(
     mesh_up: Annotated[
         Axis | None,
         typer.Option(
-            help="Axis of --mesh that points up. Default: y for GLB (its rule) and OBJ, z for others."
+            help="Up axis of --mesh. Default: y for GLB (its rule) and OBJ, z for others."
         ),
     ] = None,
     preset: Annotated[
@@ -52,15 +53,15 @@ def synth_orbit(
     test_views: Annotated[
         int,
         typer.Option(
-            min=0,
-            help="Number of views on a dome around the rock, to judge models by; written to OUT/test.",
+            min=0, help="Number of views on a dome, to judge models by; written to OUT/test."
         ),
     ] = 0,
     on_demand: Annotated[
         bool,
         typer.Option(
             "--on-demand",
-            help="Render test views and a survey, but no frame: `mgs nbv OUT` renders those it takes.",
+            help="Render test views and a survey, but no frame: `mgs nbv OUT` renders those it "
+            "takes.",
         ),
     ] = False,
     pose_noise: Annotated[
@@ -79,16 +80,16 @@ def synth_orbit(
     masks and exact poses.
 
     Writes transforms.json (as nerfstudio has it), images/, depth/, masks/, rock/ (images of the
-    rock alone, with alpha), the true rock as rock.glb, config.json and contact_sheet.png. An
-    interrupted run goes on where it stopped when the same command is given again.
+    rock alone, with alpha), the true rock as rock.glb, config.json and contact_sheet.png. The same
+    command continues an interrupted run.
 
     With --on-demand it writes poses, test views and a survey (depth and masks, OUT/survey), and an
-    image of a frame exists only once a run of `mgs nbv` has taken it.
+    image of a frame exists only after a run of `mgs nbv` has taken it.
     """
     from rich.console import Console
-    from rich.progress import Progress
 
     from mgs import runtime
+    from mgs.cli.progress import progress_bar
     from mgs.errors import InputError, row_named
     from mgs.synth.scene_file import ORBITS, load_scene_file
 
@@ -99,33 +100,38 @@ def synth_orbit(
     if orbit is not None:
         if orbit not in ORBITS:
             raise InputError(f"--orbit {orbit!r}: unknown; choose one of {', '.join(ORBITS)}")
-        settings = settings.model_copy(
-            update={"orbit": settings.orbit.model_copy(update={"kind": orbit})}
-        )
+        chosen = settings.orbit.model_copy(update={"kind": orbit})
+        settings = settings.model_copy(update={"orbit": chosen})
     if mesh_up is not None and mesh is None:
         raise InputError("--mesh-up: says how a mesh stands, but there is none; give --mesh too")
     given = {"spp": spp, "frames": frames, **_parse_size(size)}
     images = row_named(PRESETS, preset, "--preset")
     images = replace(images, **{key: value for key, value in given.items() if value is not None})
     noise = PoseNoise(pose_noise, rotation_noise) if pose_noise or rotation_noise else None
+    views = f"{images.frames} frames" + (", none rendered" if on_demand else "")
+    views += f" and {test_views} test views" if test_views else ""
+    stage = f"{views}, {images.width}x{images.height}"
     console = Console()
-    with Progress(console=console) as bar:
-        frames_of_orbit = f"{images.frames} frames" + (", none rendered" if on_demand else "")
-        views = frames_of_orbit + (f" and {test_views} test views" if test_views else "")
-        total = test_views + (0 if on_demand else images.frames)
-        task = bar.add_task(f"{views}, {images.width}x{images.height}", total=total)
+    with progress_bar(stage, console) as progress:
         synthesise(
-            out, settings, images, seed, mesh, noise,
-            progress=lambda done, total: bar.update(task, completed=done), say=console.print,
-            mesh_up=mesh_up and mesh_up.value, test_views=test_views, on_demand=on_demand,
-        )  # fmt: skip
+            out,
+            settings,
+            images,
+            seed,
+            mesh,
+            noise,
+            progress=partial(progress, stage),
+            say=console.print,
+            mesh_up=mesh_up and mesh_up.value,
+            test_views=test_views,
+            on_demand=on_demand,
+        )
     look = "" if on_demand and not test_views else f"; look at {out / 'contact_sheet.png'}"
     console.print(f"{out}: {views}{look}")
 
 
-def _parse_size(size: str | None) -> dict[str, int | None]:
-    """Width and height of an option like 320x240, {} if it was not given. Raises InputError for
-    anything else."""
+def _parse_size(size: str | None) -> dict[str, int]:
+    """Width and height of an option like 320x240; {} for None. Raises InputError if malformed."""
     import re
 
     from mgs.camera import MAX_PIXELS
@@ -137,6 +143,7 @@ def _parse_size(size: str | None) -> dict[str, int | None]:
     width, height = (int(side) for side in found.groups()) if found else (0, 0)
     if not 0 < width * height <= MAX_PIXELS:
         raise InputError(
-            f"--size {size!r}: expected WIDTHxHEIGHT, at most {MAX_PIXELS:,} pixels in all, as in 320x240"
+            f"--size {size!r}: expected WIDTHxHEIGHT, at most {MAX_PIXELS:,} pixels in all, "
+            "as in 320x240"
         )
     return {"width": width, "height": height}

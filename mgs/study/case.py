@@ -182,7 +182,7 @@ def run_or_resume(
         shutil.rmtree(leftover)
     run = out / "run"
     if (run / "config.json").is_file():
-        return resume_nbv(run)
+        return resume_nbv(run, policy=settings["policy"])
     given = {**settings, "train": {**COLOURS_ALONE, **settings.get("train", {})}}
     return run_nbv(root / dataset, run, prior=root / prior, **given)
 

@@ -11,7 +11,7 @@ from mgs.data.dataset import Dataset
 from mgs.fit.settings import COLOURS_ALONE
 from mgs.run import recording
 from mgs.run.folder import open_run
-from mgs.run.loop import Chooser, fit_views, reachable
+from mgs.run.loop import Chooser, fit_views
 from mgs.run.nbv import start_run
 from mgs.run.operations import operations_of, psnr_measure
 from mgs.run.problem import Problem, no_progress
@@ -26,7 +26,7 @@ def oracle(tests: Dataset) -> Chooser:
     measure = psnr_measure(tests, ListCache())
 
     def choose(problem: Problem, state: Fitted, fisher: Any = None) -> tuple[int, float]:
-        left = reachable(problem, state.taken)
+        left = problem.reachable(state.taken)
         fits = (fit_views(problem, [*state.taken, frame], state) for frame in left)
         scores = [measure(fit.gaussians, [])["psnr"] for fit in fits]
         best = max(range(len(left)), key=lambda k: scores[k])
