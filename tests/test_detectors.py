@@ -52,7 +52,7 @@ def test_a_good_step_says_nothing():
 BAD = {
     "unconverged": ({"losses": (1.0, 0.8, 0.6, 0.4, 0.3)}, "still fell by 29.3 % a pass"),
     "worse": ({"losses": (1.0, 1.3, 1.2, 1.2, 1.2)}, "at least 20 % above"),
-    "prior": ({"views": (replace(GOOD, before=replace(FITS, outline=0.6)),) * 4}, "60.0 % of the pixels"),
+    "prior": ({"views": (replace(GOOD, before=replace(FITS, outline=0.6)),) * 4}, "60.0 % of the covered pixels"),
     "residual": ({"views": (replace(GOOD, unexplained=0.9),) * 4}, "90 % of the images' variance"),
     "exposure": ({"views": (GOOD, GOOD, GOOD, replace(GOOD, before=replace(FITS, exposure=0.01 + np.log(2))))}, "2.00 times"),
     "pose": ({"views": (GOOD, GOOD, GOOD, replace(GOOD, before=replace(FITS, offset=0.2)))}, "20.0 % of the rock's size"),

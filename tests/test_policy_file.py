@@ -6,6 +6,7 @@ import json
 
 import pytest
 import tiny
+from refusals import refused
 
 import mgs
 from mgs.data.dataset import load_dataset
@@ -193,3 +194,21 @@ def test_a_file_is_executed_once_until_it_changes(tmp_path):
         policy_named(f"{path}:poses")
         policy_named(f"{path}:poses")
         assert log.read_text() == count * "x"
+
+
+def test_a_run_folder_runs_no_program_that_was_not_named(dataset, file, tmp_path, capsys):
+    """A stranger's run names a policy file: it is not executed, neither before nor after checks."""
+    prior, out = tiny.write_prior(tmp_path / "prior"), tmp_path / "run"
+    start_run(dataset, out, prior=prior, policy=f"{file}:poses", budget=2, seeds=3)
+    evil, proof = tmp_path / "evil.py", tmp_path / "proof"
+    evil.write_text(f"open({str(proof)!r}, 'w')\ndef f(candidates): return [1] * len(candidates)\n")
+    config = json.loads((out / "config.json").read_text())
+    config["settings"]["policy"] = f"{evil}:f"
+    (out / "config.json").write_text(json.dumps(config))
+    for options in ([], ["--policy", f"{file}:poses"]):
+        said = refused(capsys, ["nbv", "--resume", out, *options], tmp_path)
+        assert f"{evil}:f" in said
+    assert not proof.exists()
+    config["settings"]["policy"] = f"{file}:poses"
+    (out / "config.json").write_text(json.dumps(config))
+    assert len(mgs.resume_nbv(out, policy=f"{file}:poses").taken) == 5

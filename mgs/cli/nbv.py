@@ -111,7 +111,7 @@ def nbv(
     given = {name: options[name] for name in options if options[name] not in (None, [])}
     if resume is not None:
         refuse_others(context, resume)
-        resume_and_print(resume, console)
+        resume_and_print(resume, console, given.get("policy"))
         return
     if (dataset is None) == (capture is None) or out is None:
         raise InputError("nbv: give a DATASET or --capture SCENE, and --out RUN; or --resume RUN")
@@ -130,7 +130,7 @@ def nbv(
         **settings,
         train=train,
     )
-    resume_and_print(run, console)
+    resume_and_print(run, console, run.settings.policy)
 
 
 def with_settings_as_options(function: Any) -> Any:
@@ -174,7 +174,7 @@ def refuse_others(context: typer.Context, resume: Path) -> None:
 
     for name in context.params:
         source = context.get_parameter_source(name)
-        if name == "resume" or source is None or source.name != "COMMANDLINE":
+        if name in ("resume", "policy") or source is None or source.name != "COMMANDLINE":
             continue
         option = (
             name if name == "dataset" else f"--{name.replace('_', '-')}".replace("rates", "rate")
@@ -211,8 +211,13 @@ def start_and_print(dataset: Path | None, out: Path, console: Console, **setting
     return run
 
 
-def resume_and_print(run: Path | Run, console: Console, pictures: bool = False) -> None:
-    """Run or resume the loop of a run, evaluate (with pictures where asked), print the table."""
+def resume_and_print(
+    run: Path | Run, console: Console, policy: str | None = None, pictures: bool = False
+) -> None:
+    """Run or resume the loop of a run, evaluate (with pictures where asked), print the table.
+
+    policy: FILE.py:FUNCTION where the run has a policy of the user's own.
+    """
     from functools import partial
 
     from mgs.cli.progress import progress_bar
@@ -230,7 +235,7 @@ def resume_and_print(run: Path | Run, console: Console, pictures: bool = False) 
             for warning in line.get("warnings", []):
                 progress.print(f"step {line['step']}: {warning}")
 
-        state = resume_nbv(run, on_step, progress)
+        state = resume_nbv(run, on_step, progress, policy)
         metrics = evaluate_run(
             run.folder, pictures=pictures, progress=partial(progress, "evaluating")
         )

@@ -35,9 +35,9 @@ def view(
     mesh and cameras.
 
     While the camera moves, the browser draws the Gaussians, without view-dependent colour. While it
-    rests, it shows the image
-    of the kernel. Layers: colour, alpha, depth, and of a run the information, the uncertainty, and
-    what is unobserved. A click on a camera shows its image and its numbers. Ctrl-C ends it.
+    rests, the kernel's image is shown. Layers: colour, alpha, depth, and of a run information,
+    uncertainty, and what is unobserved. A click on a camera shows its image and its numbers. Ctrl-C
+    ends it.
     """
     import time
 
@@ -49,7 +49,8 @@ def view(
     try:
         if host not in LOCAL:
             typer.echo(
-                f"--host {host}: everyone who reaches this address can see the data and use the controls"
+                f"--host {host}: everyone who reaches this address can see the data "
+                "and use the controls"
             )
         shown = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
         typer.echo(f"open http://{shown}:{viewer.port} in a browser; Ctrl-C ends it")

@@ -12,7 +12,6 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.gaussians import Gaussians
 from mgs.run import detectors
-from mgs.run.loop import targets
 from mgs.run.problem import Problem
 from mgs.run.state import Learned
 
@@ -34,7 +33,7 @@ class Checks:
         Inside the mask; to be compared with the setting `pixel_noise`. Empty where no pixel counts.
         """
         problem = self.problem
-        shown = targets(problem, learned.taken, learned.gains)[-len(new) :]
+        shown = problem.targets(learned.taken, learned.gains)[-len(new) :]
         found = detectors.residual(
             (
                 self.render(before, problem.cameras[i])[0],
@@ -49,7 +48,7 @@ class Checks:
         """`signs` of the last step and `warnings` where one exceeds its limit for the first time."""
         problem, gains, fit = self.problem, learned.gains, learned.fit
         views = []
-        shown = targets(problem, learned.taken, gains)
+        shown = problem.targets(learned.taken, gains)
         for k, (i, target) in enumerate(zip(learned.taken, shown, strict=True)):
             packed, before = self.before_fit(i)
             size = target.shape[0] * target.shape[1]

@@ -15,10 +15,7 @@ import numpy as np
 from mgs.errors import InputError
 from mgs.fit.stopping import StopReason
 from mgs.gaussians import Gaussians
-from mgs.memory import Deferred
 from mgs.policy import criteria, poses
-from mgs.policy.context import PolicyContext
-from mgs.prior.exposure import without_gain
 from mgs.prior.initial import warm_start
 from mgs.run.ending import FitDivergedError
 from mgs.run.problem import Problem
@@ -76,7 +73,8 @@ def learn(
 ) -> Learned:
     """Capture the views that are new in `taken`, fit to all of them, sum their information.
 
-    surface: `Fitted.surface` of `taken`, where it is known. Raises FitDivergedError, and InputError where a frame cannot be read.
+    surface: `Fitted.surface` of `taken`, where it is known. Raises FitDivergedError, and InputError
+    where a frame cannot be read.
     """
     new = taken[len(before.taken) :] if before else taken
     if surface is None:
@@ -103,15 +101,6 @@ def capture(problem: Problem, new: Sequence[int], taken: Sequence[int]) -> np.nd
     return problem.operations.exposure([problem.frames[i] for i in taken])
 
 
-def targets(
-    problem: Problem, taken: Sequence[int], gains: np.ndarray | None = None
-) -> Sequence[np.ndarray]:
-    """Targets of a fit to frames (`mgs.data.dataset.target_of`); colours are over `gains` [V,3]."""
-    if gains is None:
-        return Deferred(taken, problem.image)
-    return Deferred(range(len(taken)), lambda k: without_gain(problem.image(taken[k]), gains[k]))
-
-
 def fit_views(
     problem: Problem,
     taken: list[int],
@@ -126,7 +115,7 @@ def fit_views(
         step = len(taken) - problem.settings.seeds
         model = warm_start(before.gaussians, problem.start_of(before.taken), start)
     cameras = [problem.cameras[i] for i in taken]
-    given = targets(problem, taken, gains)
+    given = problem.targets(taken, gains)
     train, on_pass = problem.settings.train_at(step), partial(problem.progress, "fitting")
     return problem.operations.fit(model, start, cameras, given, train, on_pass)
 
@@ -188,7 +177,7 @@ def choose(
     at the model, computed by default. Raises InputError where the policy returns no valid score.
     """
     fisher = fisher or problem.view_information(state.gaussians)
-    context = problem.context(state, reachable(problem, state.taken), fisher)
+    context = problem.context(state, problem.reachable(state.taken), fisher)
     scores = np.asarray(problem.policy(context), np.float64)
     farthest = poses.farthest_pose(context.candidates, context.taken, context.centre, context.rng)
     where = f"policy {problem.settings.policy}: returned"
@@ -197,27 +186,10 @@ def choose(
             f"{where} scores of shape {scores.shape} for {len(context.candidate_frames)} candidates; "
             "return one number for each"
         )
-    weighed = scores / travel_cost(problem, context)
+    weighed = scores / problem.travel_cost(context)
     best = max(range(len(scores)), key=lambda k: (weighed[k], farthest[k]))
     if np.isnan(scores).any() or np.isinf(scores[best]):
         raise InputError(f"{where} a score that is NaN or infinite (docs/howto/policy.md)")
     if problem.settings.travel is not None and scores[best] < 0:
         raise InputError(f"{where} negative scores, which --travel cannot divide; leave it out")
     return context.candidate_frames[best], float(scores[best])
-
-
-def reachable(problem: Problem, taken: Sequence[int]) -> list[int]:
-    """Frames not taken; with the setting `nearest`, as many of them, nearest to the last view."""
-    left = [i for i in range(len(problem.frames)) if i not in taken]
-    if problem.settings.nearest is None:
-        return left
-    here = problem.positions[taken[-1]]
-    near = poses.nearest_poses(problem.positions[left], here, problem.settings.nearest)
-    return [left[k] for k in near]
-
-
-def travel_cost(problem: Problem, context: PolicyContext) -> np.ndarray:
-    """Travel cost of each candidate [C]; ones without the setting `travel`."""
-    if problem.settings.travel is None:
-        return np.ones(len(context.candidate_frames))
-    return poses.travel_cost(context.candidates, context.taken[-1], problem.settings.travel)

@@ -13,7 +13,7 @@ from mgs import runtime
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.errors import InputError, row_named
 from mgs.files import atomic_folder
-from mgs.policy.from_file import absolute
+from mgs.policy.from_file import absolute, in_file
 from mgs.policy.registry import policy_named
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.settings import PriorSettings
@@ -52,7 +52,8 @@ def run_nbv(
 
     dataset, out, settings: as `start_run`. Callbacks, result and errors: as `resume_nbv`.
     """
-    return resume_nbv(start_run(dataset, out, progress=progress, **settings), on_step, progress)
+    run = start_run(dataset, out, progress=progress, **settings)
+    return resume_nbv(run, on_step, progress, run.settings.policy)
 
 
 def start_run(
@@ -175,22 +176,40 @@ def resume_nbv(
     run: str | Path | Run,
     on_step: Callable[[State], None] = lambda state: None,
     progress: Progress = no_progress,
+    policy: str | None = None,
 ) -> State:
     """Run the loop in a run folder from where it stands to its end.
 
-    on_step(state): called after every step, or batch of steps, that is finished and on disk.
+    policy: FILE.py:FUNCTION, required where the run has a policy of the user's own: the file is
+    code, and a folder is not trusted to name it. on_step(state): called after every step, or batch of steps, that is finished and on disk.
     progress(stage, done, total): called during a step. Returns the last state: gaussians, H, taken
     (frame indices in the order of their choice), steps (lines of steps.jsonl; the last has `ended`).
     A finished run gives the same again. Raises InputError where the folder holds no run, its
-    inputs are missing or changed, another process works on it, or a fit diverged.
+    inputs are missing or changed, another process works on it, a fit diverged, or `policy` is not
+    the run's.
     """
     run = run if isinstance(run, Run) else open_run(run)
+    check_named(run, policy)
     operations = operations_of(run.dataset, run.prior, run.settings)
     return recording.run(run.folder, run.settings, run.dataset, operations, progress, on_step)
 
 
-def problem_of(run: str | Path | Run, progress: Progress = no_progress) -> Problem:
-    """The selection problem of a run folder, for the functions of `mgs.run.loop`."""
+def check_named(run: Run, policy: str | None) -> None:
+    """Raises InputError where a run's policy is a user's file and `policy` does not name it."""
+    own = run.settings.policy
+    if policy is not None and absolute(policy) != own:
+        raise InputError(f"--policy {policy}: is not the policy of {run.folder}, {own}")
+    if in_file(own) and policy is None:
+        resume = f"`mgs nbv --resume {run.folder} --policy {own}`"
+        raise InputError(f"{run.folder}: its policy is a program, {own}; to run it: {resume}")
+
+
+def problem_of(
+    run: str | Path | Run, progress: Progress = no_progress, policy: str | None = None
+) -> Problem:
+    """The selection problem of a run, for the functions of `mgs.run.loop`. Arguments and errors as
+    `resume_nbv`."""
     run = run if isinstance(run, Run) else open_run(run)
+    check_named(run, policy)
     operations = operations_of(run.dataset, run.prior, run.settings)
     return Problem(run.dataset, run.settings, operations, progress)

@@ -13,12 +13,13 @@ from mgs.camera import Camera
 from mgs.data.dataset import Dataset, Frame, target_of
 from mgs.data.up import PLUS_Z, Up, upright
 from mgs.gaussians import Gaussians
-from mgs.memory import IMAGE_BYTES, kept_within
+from mgs.memory import IMAGE_BYTES, Deferred, kept_within
 from mgs.policy import criteria, poses
 from mgs.policy.context import Policy, PolicyContext
 from mgs.policy.from_file import label
 from mgs.policy.registry import policy_named
 from mgs.policy.visibility import Visibility
+from mgs.prior.exposure import without_gain
 from mgs.run.settings import NbvSettings
 from mgs.seeds import generator
 
@@ -151,6 +152,29 @@ class Problem:
         """`start_of`, computed anew."""
         sh = self.operations.initial([self.frames[i] for i in taken]).sh
         return replace(self.start, sh=sh)
+
+    def targets(
+        self, taken: Sequence[int], gains: np.ndarray | None = None
+    ) -> Sequence[np.ndarray]:
+        """Targets of a fit to frames (`mgs.data.dataset.target_of`); colours over `gains` [V,3]."""
+        if gains is None:
+            return Deferred(taken, self.image)
+        return Deferred(range(len(taken)), lambda k: without_gain(self.image(taken[k]), gains[k]))
+
+    def reachable(self, taken: Sequence[int]) -> list[int]:
+        """Frames not taken; with the setting `nearest`, that many nearest to the last view."""
+        left = [i for i in range(len(self.frames)) if i not in taken]
+        if self.settings.nearest is None:
+            return left
+        here = self.positions[taken[-1]]
+        near = poses.nearest_poses(self.positions[left], here, self.settings.nearest)
+        return [left[k] for k in near]
+
+    def travel_cost(self, context: PolicyContext) -> np.ndarray:
+        """Travel cost of each candidate [C]; ones without the setting `travel`."""
+        if self.settings.travel is None:
+            return np.ones(len(context.candidate_frames))
+        return poses.travel_cost(context.candidates, context.taken[-1], self.settings.travel)
 
     def make_images(self, views: Sequence[int]) -> None:
         """Make the images of these frames where they do not exist yet."""

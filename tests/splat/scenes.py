@@ -1,13 +1,21 @@
-"""Random scenes for the splat tests, and how a gradient is compared with the true one."""
+"""Random scenes for the splat tests, and comparisons."""
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
 
+import drjit as dr
 import numpy as np
 
 from mgs.camera import Camera, look_at
 from mgs.gaussians import Gaussians
+from mgs.splat import as_drjit
 from mgs.splat.reference import margins
 
 PARAMETERS = ("means", "log_scales", "quats", "logit_opacities", "sh")
@@ -23,12 +31,8 @@ def make_camera(
     the middle)."""
     width, height = size
     cx, cy = centre if centre is not None else (0.52 * width, 0.47 * height)
-    return Camera(
-        np.array([[focal, 0, cx], [0, 1.1 * focal, cy], [0, 0, 1]]),
-        width,
-        height,
-        look_at(eye, target),
-    )
+    K = np.array([[focal, 0, cx], [0, 1.1 * focal, cy], [0, 0, 1]])
+    return Camera(K, width, height, look_at(eye, target))
 
 
 def make_gaussians(
@@ -57,20 +61,63 @@ def place(camera: Camera, pixels, depths) -> np.ndarray:
 
 def double(gaussians: Gaussians) -> Gaussians:
     """A float64 copy, for central differences of the oracle."""
-    return Gaussians(
-        **{f.name: np.array(getattr(gaussians, f.name), np.float64) for f in fields(gaussians)}
-    )
+    return Gaussians(*(np.array(value, np.float64) for value in vars(gaussians).values()))
 
 
 def changed(gaussians: Gaussians, **values) -> Gaussians:
     """The Gaussians with some parameters replaced."""
-    return replace(
-        gaussians, **{name: np.asarray(value, np.float32) for name, value in values.items()}
+    single = {name: np.asarray(value, np.float32) for name, value in values.items()}
+    return replace(gaussians, **single)
+
+
+def with_gradients(gaussians: Gaussians, names=PARAMETERS) -> Gaussians:
+    """A Dr.Jit copy with gradients enabled for some parameters."""
+    model = as_drjit(gaussians)
+    for name in names:
+        setattr(model, name, dr.copy(getattr(model, name)))
+        dr.enable_grad(getattr(model, name))
+    return model
+
+
+def gradients_of(model: Gaussians, names=PARAMETERS) -> dict[str, np.ndarray]:
+    return {name: np.asarray(dr.grad(getattr(model, name))) for name in names}
+
+
+def parameter_columns(degree: int) -> list[tuple[str, tuple[int, ...]]]:
+    """(parameter, index) of each column of the Fisher information."""
+    columns = [("sh", (k, c)) for k in range((degree + 1) ** 2) for c in range(3)]
+    columns += [("log_scales", (i,)) for i in range(3)] + [("quats", (i,)) for i in range(4)]
+    return [*columns, ("logit_opacities", ())]
+
+
+@contextmanager
+def thread_count(count: int) -> Iterator[None]:
+    """Run kernels with this number of threads."""
+    before = dr.thread_count()
+    dr.set_thread_count(count)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(before)
+
+
+def in_own_process(code: str, *arguments: str, **environment: str) -> str:
+    """Output of Python code that runs in the folder `tests`."""
+    done = subprocess.run(
+        [sys.executable, "-c", "from mgs import runtime\n" + code, *arguments],
+        cwd=Path(__file__).parents[1],
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
     )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def calm(make, camera: Camera, seed: int, least: float = 3e-5) -> Gaussians:
-    """The first scene make(seed), make(seed + 1000) ... in which no pixel is within `least` of a
+    """The first scene make(seed), make(seed + 1000), ... without a pixel within `least` of a
     decision."""
     for attempt in range(200):
         gaussians = make(seed + 1000 * attempt)

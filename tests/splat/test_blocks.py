@@ -1,4 +1,4 @@
-"""Block lists: complete, ordered, and never able to change an image, however old they are."""
+"""Block lists are complete, ordered, and never change an image, however old they are."""
 
 import sys
 
@@ -38,7 +38,15 @@ from mgs.splat.blocks import (
 from mgs.splat.projection import camera_array, project
 from mgs.splat.walking import PIXELS, packet_count
 
-from .scenes import PARAMETERS, changed, make_camera, make_gaussians, place
+from .scenes import (
+    PARAMETERS,
+    changed,
+    gradients_of,
+    make_camera,
+    make_gaussians,
+    place,
+    with_gradients,
+)
 
 
 def projected(gaussians, camera):
@@ -62,13 +70,12 @@ def pairs_of(lists) -> set[tuple[int, int]]:
 
 
 def needed_pairs(gaussians, camera) -> set[tuple[int, int]]:
-    """The pairs with a pixel where the splat is above the threshold of alpha, by the oracle,
-    whatever is in front of it."""
+    """Pairs with a pixel where the splat alone is above the threshold of alpha, by the
+    reference."""
     needed = set()
     across = -(-camera.width // BLOCK_X)
     for j in range(len(gaussians)):
-        one = type(gaussians)(*(getattr(gaussians, name)[j : j + 1] for name in vars(gaussians)))
-        y, x = np.nonzero(reference.render(one, camera)["alpha"] > 0)
+        y, x = np.nonzero(reference.render(gaussians[j : j + 1], camera)["alpha"] > 0)
         needed |= {(j, int(b)) for b in (y // BLOCK_Y) * across + x // BLOCK_X}
     return needed
 
@@ -78,12 +85,11 @@ def needed_pairs(gaussians, camera) -> set[tuple[int, int]]:
     [*((seed, (-6.0, -1.0)) for seed in range(4)), (4, (-9.0, 0.5)), (5, (-2.0, 1.0))],
 )
 def test_lists_hold_every_pair_and_little_more(seed, scales):
-    """Of small splats, of needles and of splats as large as the image, many of them partly outside
-    it."""
+    """For small splats, needles and splats as large as the image."""
     camera, g = make_camera(), make_gaussians(60, seed, log_scales=scales)
     needed, listed = needed_pairs(g, camera), pairs_of(lists_of(g, camera)[0])
     assert needed <= listed
-    assert len(listed) < 1.25 * len(needed), "ellipse and block touch, but no pixel centre: rare"
+    assert len(listed) < 1.25 * len(needed)
 
 
 def test_lists_are_in_depth_order_and_slots_of_a_splat_contiguous():
@@ -104,36 +110,29 @@ def test_lists_are_in_depth_order_and_slots_of_a_splat_contiguous():
 
 
 def test_memory_and_lanes_go_by_tile():
-    """Splats are stored by the tile of their centre, then block, then depth; lanes go by tile,
-    longest list first in each."""
-    camera, g = (
-        make_camera((300, 200), focal=300.0),
-        make_gaussians(500, 9, log_scales=(-5.0, -3.0)),
-    )
+    """Splats by the tile of their centre, then block, then depth; lanes by tile, then longest
+    list."""
+    camera = make_camera((300, 200), focal=300.0)
+    g = make_gaussians(500, 9, log_scales=(-5.0, -3.0))
     lists, splats = lists_of(g, camera)
     across = -(-camera.width // BLOCK_X)
     u, v, z = (
         np.asarray(a, np.float64)[np.argsort(np.asarray(lists.place))]
         for a in (splats.mean_x, splats.mean_y, splats.depth)
     )
-    bx, by = (
-        np.clip(u // BLOCK_X, 0, across - 1),
-        np.clip(v // BLOCK_Y, 0, camera.height // BLOCK_Y - 1),
-    )
+    bx = np.clip(u // BLOCK_X, 0, across - 1)
+    by = np.clip(v // BLOCK_Y, 0, camera.height // BLOCK_Y - 1)
     tile = by // TILE * -(-across // TILE) + bx // TILE
     assert len(set(tile)) > 4
     np.testing.assert_array_equal(np.lexsort((z, bx, by, tile)), np.arange(len(g)))
-    block, length = (
-        np.asarray(lists.block).astype(int),
-        (np.asarray(lists.end) - np.asarray(lists.start)).astype(int),
-    )
+    block = np.asarray(lists.block).astype(int)
+    length = (np.asarray(lists.end) - np.asarray(lists.start)).astype(int)
     tile = block // across // TILE * -(-across // TILE) + block % across // TILE
     np.testing.assert_array_equal(np.lexsort((-length, tile)), np.arange(len(block)))
 
 
 def test_a_new_camera_compiles_nothing():
-    """The kernels that build lists are the same for every camera, though the numbers of pairs
-    differ."""
+    """Though the number of pairs differs from camera to camera."""
     g = as_drjit(make_gaussians(300, 3, log_scales=(-5.0, -3.0)))
     seen = []
     for angle in np.linspace(0, 0.3, 4):
@@ -141,32 +140,24 @@ def test_a_new_camera_compiles_nothing():
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             dr.eval(render(g, camera).rgb)
-            seen.append(
-                {
-                    entry["hash"]
-                    for entry in dr.kernel_history()
-                    if entry["type"] == dr.KernelType.JIT
-                }
-            )
+            history = dr.kernel_history()
+        seen.append({entry["hash"] for entry in history if entry["type"] == dr.KernelType.JIT})
     assert seen[0]
     assert seen[1] == seen[2] == seen[3]
 
 
 def test_kernels_are_recorded_once_whether_lists_are_new_kept_or_rebuilt(monkeypatch):
-    """A recording also depends on which of its inputs are one and the same array, as the splats and
-    the footprints of new lists may be, and those of kept lists are not. No kernel must be recorded
-    twice for that."""
+    """A recording depends on which inputs are the same array, as splats and footprints of new lists
+    may be, and those of kept lists are not."""
     camera, g, cache, recorded = make_camera((46, 31)), make_gaussians(37, 3), ListCache(), []
     walk = walking._walk_until_done
-    monkeypatch.setattr(
-        walking, "_walk_until_done", lambda *arguments: recorded.append(1) or walk(*arguments)
-    )
+    counted = lambda *arguments: recorded.append(1) or walk(*arguments)  # noqa: E731
+    monkeypatch.setattr(walking, "_walk_until_done", counted)
     for growth, builds in ((0, 1), (0, 1), (0.05, 2), (0.05, 2), (0.4, 3)):
-        drawn = as_drjit(changed(g, log_scales=g.log_scales + np.float32(growth)))
-        dr.enable_grad(drawn.log_scales)
-        image = render(drawn, camera, cache=cache)
+        grown = changed(g, log_scales=g.log_scales + np.float32(growth))
+        image = render(with_gradients(grown, ["log_scales"]), camera, cache=cache)
         dr.backward(dr.sum(image.rgb, axis=None))
-        fisher(changed(g, log_scales=g.log_scales + np.float32(growth)), camera, cache=cache)
+        fisher(grown, camera, cache=cache)
         assert cache.builds == builds
     assert len(recorded) == 4, "forward, adjoint, and the two walks of Fisher"
 
@@ -174,14 +165,13 @@ def test_kernels_are_recorded_once_whether_lists_are_new_kept_or_rebuilt(monkeyp
 def test_depth_order_is_a_stable_sort():
     rng = np.random.default_rng(0)
     depth = rng.choice(rng.uniform(0.01, 50, 300), 1000).astype(np.float32)
-    np.testing.assert_array_equal(
-        np.asarray(depth_order(mi.Float(depth))), np.argsort(depth, kind="stable")
-    )
+    found = np.asarray(depth_order(mi.Float(depth)))
+    np.testing.assert_array_equal(found, np.argsort(depth, kind="stable"))
 
 
 def test_changes_are_found_where_they_matter():
-    """One splat is reshaped, one moved in depth, one reshaped that is never drawn; all others only
-    get other colours."""
+    """One splat is reshaped, one moved in depth, one reshaped but never drawn; colours count
+    not."""
     camera = make_camera()
     g = make_gaussians(40, 1, logits=(1, 3))
     g = changed(g, logit_opacities=np.where(np.arange(40) == 7, -9.0, g.logit_opacities))
@@ -192,17 +182,21 @@ def test_changes_are_found_where_they_matter():
     drawn = np.asarray(built.level) > 0
     assert drawn[[3, 5]].all()
     assert not drawn[7]
-    found = np.asarray(
-        changes(built, projected(changed(g, log_scales=turned, means=moved, sh=g.sh + 1), camera))
-    )
+    after = projected(changed(g, log_scales=turned, means=moved, sh=g.sh + 1), camera)
     expected = np.zeros(40, int)
     expected[3], expected[5] = RESHAPED, REORDERED
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(np.asarray(changes(built, after)), expected)
 
 
 def images(gaussians, camera, cache=None) -> list[np.ndarray]:
     image = render(gaussians, camera, (0.2, 0.4, 0.6), cache)
     return [np.asarray(image.rgb), np.asarray(image.alpha), np.asarray(image.depth)]
+
+
+def assert_cached_is_cold(gaussians, camera, cache) -> None:
+    """Images with a cache are bitwise those without."""
+    for a, b in zip(images(gaussians, camera, cache), images(gaussians, camera), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 @settings(derandomize=True, deadline=None, max_examples=12)
@@ -213,14 +207,12 @@ def images(gaussians, camera, cache=None) -> list[np.ndarray]:
     teleport=st.booleans(),
 )
 def test_stale_lists_never_change_an_image(seed, drift, names, teleport):
-    """Parameters drift, jump behind the camera and back; the cached render is bitwise the cold one,
-    gradients' sums too."""
+    """Parameters drift, jump behind the camera and back."""
     camera, g = make_camera(), make_gaussians(60, seed, log_scales=(-5.0, -1.5))
     rng, cache = np.random.default_rng(seed), ListCache()
     behind = place(camera, rng.uniform(0, 30, (60, 2)), np.full(60, -1.5))
     for step in range(6):
-        for a, b in zip(images(g, camera, cache), images(g, camera), strict=True):
-            np.testing.assert_array_equal(a, b)
+        assert_cached_is_cold(g, camera, cache)
         if step in (2, 4):
             np.testing.assert_array_equal(fisher(g, camera, cache=cache), fisher(g, camera))
         values = {
@@ -229,15 +221,13 @@ def test_stale_lists_never_change_an_image(seed, drift, names, teleport):
         }
         if teleport:
             jump = rng.random(60) < 0.3
-            values["means"] = np.where(
-                jump[:, None], behind if step % 2 else rng.uniform(-0.6, 0.6, (60, 3)), g.means
-            )
+            there = behind if step % 2 else rng.uniform(-0.6, 0.6, (60, 3))
+            values["means"] = np.where(jump[:, None], there, g.means)
         g = changed(g, **values)
 
 
 def test_lists_are_reused_until_a_footprint_changes(monkeypatch):
-    """Colours change no list. Scales do, but not the depth order, which is only found anew where a
-    mean moves."""
+    """Colours change no list; scales do, but only means change the depth order."""
     camera, g, cache = make_camera(), make_gaussians(60, 3), ListCache()
     sorts = []
     monkeypatch.setattr(blocks, "depth_order", lambda depth: sorts.append(1) or depth_order(depth))
@@ -259,13 +249,11 @@ def test_lists_are_reused_until_a_footprint_changes(monkeypatch):
 @settings(derandomize=True, deadline=None, max_examples=12)
 @given(seed=st.integers(0, 2**31), large=st.floats(-2.5, -0.5), shrink=st.floats(0.5, 5))
 def test_splats_that_shrank_are_not_drawn_where_they_were(seed, large, shrink):
-    """Their blocks of before may lie hundreds of their widths away."""
     camera, cache = make_camera((140, 70), focal=140.0), ListCache()
     g = make_gaussians(12, seed, log_scales=(large - 0.5, large), logits=(0, 4))
     render(g, camera, cache=cache)
     small = changed(g, log_scales=g.log_scales - shrink)
-    for a, b in zip(images(small, camera, cache), images(small, camera), strict=True):
-        np.testing.assert_array_equal(a, b)
+    assert_cached_is_cold(small, camera, cache)
     for estimator in ("exact", "block"):
         cached = fisher(small, camera, estimator, cache=cache)
         np.testing.assert_array_equal(cached, fisher(small, camera, estimator))
@@ -274,26 +262,18 @@ def test_splats_that_shrank_are_not_drawn_where_they_were(seed, large, shrink):
 
 def test_each_camera_has_its_own_lists():
     g, cache = make_gaussians(60, 3), ListCache()
-    cameras = [
-        make_camera(),
-        make_camera(eye=(1, 1, 1)),
-        make_camera(focal=40.0),
-        make_camera((24, 16)),
-        make_camera(centre=(9, 9)),
-    ]
+    options = {}, {"eye": (1, 1, 1)}, {"focal": 40.0}, {"size": (24, 16)}, {"centre": (9, 9)}
+    cameras = [make_camera(**values) for values in options]
     for _ in range(2):
         for camera in cameras:
-            for a, b in zip(images(g, camera, cache), images(g, camera), strict=True):
-                np.testing.assert_array_equal(a, b)
+            assert_cached_is_cold(g, camera, cache)
     assert cache.builds == len(cameras)
 
 
 def test_another_number_of_gaussians_is_another_scene():
     camera, cache = make_camera(), ListCache()
     for n in (60, 16, 60):
-        g = make_gaussians(n, 4)
-        for a, b in zip(images(g, camera, cache), images(g, camera), strict=True):
-            np.testing.assert_array_equal(a, b)
+        assert_cached_is_cold(make_gaussians(n, 4), camera, cache)
 
 
 RING = [
@@ -305,11 +285,9 @@ SHUFFLED = [np.random.default_rng(i).permutation(12) for i in range(6)]
 
 
 def misses(passes, room: int) -> list[int]:
-    """How many lists each pass over cameras of the ring had to build, in a cache with room for so
-    many of them."""
-    splats = projected(
-        make_gaussians(60, 3), RING[0]
-    )  # any lists serve: what is kept depends on sizes alone
+    """Number of lists that each pass over cameras of the ring builds, in a cache with so much
+    room."""
+    splats = projected(make_gaussians(60, 3), RING[0])
     cache = ListCache()
     cache.get(RING[0], splats)
     cache, built = ListCache(budget=room * cache.nbytes), []
@@ -347,8 +325,7 @@ def test_cache_remembers_a_bounded_number_of_uses(monkeypatch):
 
 def test_one_view_larger_than_the_budget_still_renders():
     g, camera, cache = make_gaussians(60, 3), make_camera(), ListCache(budget=1)
-    for a, b in zip(images(g, camera, cache), images(g, camera), strict=True):
-        np.testing.assert_array_equal(a, b)
+    assert_cached_is_cold(g, camera, cache)
     images(g, make_camera(focal=40.0), cache)
     assert cache.builds == 2
 
@@ -358,16 +335,13 @@ def test_one_view_larger_than_the_budget_still_renders():
     [((65536, 4), 1 << 19, "blocks"), ((4, 65536), 1 << 18, "rows of blocks")],
 )
 def test_pairs_are_counted_in_64_bits(size, n, what):
-    """2^32 of them, which 32 bits count as none; refused before memory is taken for them."""
+    """2^32 pairs, which 32 bits count as none, are refused before memory is taken."""
     camera, one = make_camera(size, focal=100.0), make_gaussians(1, 0, spread=0)
     many = Gaussians(*(np.repeat(getattr(one, name), n, 0) for name in vars(one)))
     many.log_scales[:], many.logit_opacities[:] = 9, 2
-    with pytest.raises(
-        InputError,
-        match=f"view: 4,294,967,296 pairs of a Gaussian and one of its {what} .* 512.0 GiB",
-    ) as error:
+    said = f"^view: 4,294,967,296 pairs of a Gaussian and one of its {what} .* 512.0 GiB.*$"
+    with pytest.raises(InputError, match=said):
         render(many, camera)
-    assert "\n" not in str(error.value)
 
 
 def test_a_view_has_a_bounded_number_of_pairs(monkeypatch):
@@ -376,33 +350,26 @@ def test_a_view_has_a_bounded_number_of_pairs(monkeypatch):
     monkeypatch.setattr(blocks, "MAX_PAIRS", count)
     images(g, camera)
     monkeypatch.setattr(blocks, "MAX_PAIRS", count - 1)
+    said = f"view: {count:,} pairs .* {count - 1:,} are the most; draw fewer or smaller"
     for call in (render, fisher):
-        with pytest.raises(
-            InputError,
-            match=f"view: {count:,} pairs .* {count - 1:,} are the most; draw fewer or smaller",
-        ):
+        with pytest.raises(InputError, match=said):
             call(g, camera)
 
 
 def test_what_memory_has_no_room_for_is_refused(monkeypatch, tmp_path):
-    """Before it is taken; what fits is drawn as ever, and a system that says nothing is trusted."""
     camera, g = make_camera(), make_gaussians(60, 3)
     count = len(pairs_of(lists_of(g, camera)[0]))
     spare = tmp_path / "meminfo"
     monkeypatch.setattr(memory, "MEMORY_FILE", spare)
     monkeypatch.setattr(memory, "LITTLE", 0)
     whole = np.asarray(render(g, camera).rgb)
+    pairs, blocks_said = (
+        f"view: {count:,} pairs .* GiB are free; draw fewer",
+        "fisher: blocks of 60 G",
+    )
     for room, call, said in (
-        (
-            count * blocks.PAIR_BYTES // 2,
-            render,
-            f"view: {count:,} pairs .* GiB are free; draw fewer or smaller",
-        ),
-        (
-            60 * information.BLOCK_BYTES // 2,
-            fisher_of_blocks,
-            "fisher: blocks of 60 Gaussians may take .* take fewer Gaussians",
-        ),
+        (count * blocks.PAIR_BYTES // 2, render, pairs),
+        (60 * information.BLOCK_BYTES // 2, fisher_of_blocks, blocks_said),
     ):
         spare.write_text(f"MemTotal:  9 kB\nMemAvailable:  {room // 1024} kB\n")
         with pytest.raises(InputError, match=said):
@@ -418,9 +385,7 @@ def test_what_drjit_keeps_for_later_is_given_back_before_anything_is_refused(mon
     monkeypatch.setattr(memory, "_spare", lambda: 3e9 if given_back else 1e9)
     memory.check_room(2e9, "much", "take less")
     assert given_back == [True]
-    with pytest.raises(
-        InputError, match=r"more may take 3\.7 GiB, and 2\.8 GiB are free; take less"
-    ):
+    with pytest.raises(InputError, match=r"more may take 3\.7 GiB, and 2\.8 GiB are free; take"):
         memory.check_room(4e9, "more", "take less")
 
 
@@ -429,10 +394,9 @@ def fisher_of_blocks(gaussians, camera):
 
 
 def test_places_in_buffers_stay_below_31_bits():
-    """Of the most pairs, the most Gaussians and the largest images."""
-    most = max(
-        kernels.ADJOINT_SUMS[True], kernels.fisher_sums(True, False)
-    )  # with means it is checked apart
+    """For the most pairs, the most Gaussians and the largest images. (Sums with means have a check
+    of their own.)"""
+    most = max(kernels.ADJOINT_SUMS[True], kernels.fisher_sums(True, False))
     assert blocks._room(blocks.MAX_PAIRS) * 4 * packet_count(most) < 1 << 31
     assert MAX_GAUSSIANS * max(3 * 16, 4 * packet_count(kernels.fisher_sums(True, True))) < 1 << 31
     for width in (1, 9, MAX_PIXELS // MAX_SIDE, 12_345, MAX_SIDE):
@@ -449,34 +413,24 @@ def test_what_is_too_large_for_the_kernels_is_refused_at_once():
     one = make_gaussians(1, 0, 3)
 
     def many(n):
-        return Gaussians(
-            *(
-                np.broadcast_to(getattr(one, name), (n, *getattr(one, name).shape[1:]))
-                for name in vars(one)
-            )
-        )
+        return Gaussians(*(np.broadcast_to(v[0], (n, *v.shape[1:])) for v in vars(one).values()))
 
     for call in (render, fisher):
         with pytest.raises(InputError, match="gaussians: 33,554,433 are more than 33,554,432"):
             call(many(MAX_GAUSSIANS + 1), make_camera())
-    with pytest.raises(
-        InputError,
-        match=r"blocks of 700,000 Gaussians of SH degree 3 would take 8\.2 GiB, and 8 are the most",
-    ):
+    with pytest.raises(InputError, match=r"blocks of 700,000 .* would take 8\.2 GiB, and 8 are"):
         fisher(many(700_000), make_camera(), "block")
 
 
 @pytest.mark.parametrize("tile", [1, 3, 1000])
 def test_the_size_of_tiles_changes_no_bit(tile, monkeypatch):
-    """Tiles decide in which order splats are stored and blocks drawn: no image, gradient or
-    information may depend on them."""
     camera, g = make_camera((150, 70), focal=150.0), make_gaussians(80, 7, log_scales=(-5.0, -1.5))
 
     def everything():
-        watched = as_drjit(g)
-        dr.enable_grad(watched.means, watched.quats)
-        dr.backward(dr.sum(dr.square(render(watched, camera).rgb), axis=None))
-        gradients = [np.asarray(dr.grad(value)) for value in (watched.means, watched.quats)]
+        names = "means", "quats"
+        model = with_gradients(g, names)
+        dr.backward(dr.sum(dr.square(render(model, camera).rgb), axis=None))
+        gradients = gradients_of(model, names).values()
         return [*images(g, camera), *gradients, fisher(g, camera), fisher(g, camera, "block")]
 
     expected = everything()

@@ -1,56 +1,46 @@
-"""The same input gives bitwise the same image, gradient and Fisher information: reruns, 1 or 2
-threads, a new process."""
+"""Bitwise equal images, gradients and Fisher information: reruns, threads, processes."""
 
 import hashlib
 import json
-import subprocess
-import sys
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from mgs.splat import ListCache, as_drjit, fisher, render
+from mgs.splat import ListCache, fisher, render
 
-from .scenes import PARAMETERS, make_camera, make_gaussians
+from .scenes import (
+    gradients_of,
+    in_own_process,
+    make_camera,
+    make_gaussians,
+    thread_count,
+    with_gradients,
+)
 
 BACKGROUND = (0.1, 0.2, 0.7)
 
 
-def results(threads: int | None = None, degree: int = 1) -> dict[str, bytes]:
-    """Bytes of every output: images, gradients of all parameters, Fisher information by every
-    estimator."""
-    before = dr.thread_count()
-    if threads is not None:
-        dr.set_thread_count(threads)
-    try:
-        camera = make_camera((200, 150), focal=200.0)
-        gaussians = make_gaussians(1500, 11, degree, log_scales=(-6.0, -2.5))
-        watched = as_drjit(gaussians)
-        for name in PARAMETERS:
-            setattr(watched, name, dr.copy(getattr(watched, name)))
-            dr.enable_grad(getattr(watched, name))
-        image = render(watched, camera, BACKGROUND)
-        out = {
-            name: np.asarray(dr.detach(getattr(image, name))) for name in ("rgb", "alpha", "depth")
-        }
-        loss = dr.sum(dr.square(image.rgb - 0.3), axis=None) + dr.sum(
-            image.alpha * image.depth, axis=None
-        )
-        dr.backward(loss)
-        out |= {f"d {name}": np.asarray(dr.grad(getattr(watched, name))) for name in PARAMETERS}
-        cache = ListCache()
-        for estimator in ("exact", "block", "loss-gradient"):
-            out[estimator] = fisher(gaussians, camera, estimator, BACKGROUND, cache)
-        for estimator in ("exact", "block"):
-            out[f"{estimator}, means and alpha"] = fisher(
-                gaussians, camera, estimator, BACKGROUND, cache, means="free", alpha_weight=0.3
-            )
-        assert all(np.isfinite(a).all() and np.any(a) for a in out.values())
-        return {name: a.tobytes() for name, a in out.items()}
-    finally:
-        dr.set_thread_count(before)
+def results(degree: int = 1) -> dict[str, bytes]:
+    """Bytes of images, gradients of all parameters, and Fisher information by every estimator."""
+    camera = make_camera((200, 150), focal=200.0)
+    gaussians = make_gaussians(1500, 11, degree, log_scales=(-6.0, -2.5))
+    model = with_gradients(gaussians)
+    image = render(model, camera, BACKGROUND)
+    out = {name: np.asarray(dr.detach(value)) for name, value in vars(image).items()}
+    of_depth = dr.sum(image.alpha * image.depth, axis=None)
+    dr.backward(dr.sum(dr.square(image.rgb - 0.3), axis=None) + of_depth)
+    out |= {f"d {name}": value for name, value in gradients_of(model).items()}
+    cache = ListCache()
+    for estimator in ("exact", "block", "loss-gradient"):
+        out[estimator] = fisher(gaussians, camera, estimator, BACKGROUND, cache)
+    options = {"means": "free", "alpha_weight": 0.3}
+    for estimator in ("exact", "block"):
+        found = fisher(gaussians, camera, estimator, BACKGROUND, cache, **options)
+        out[f"{estimator}, means and alpha"] = found
+    assert all(np.isfinite(a).all() and np.any(a) for a in out.values())
+    return {name: a.tobytes() for name, a in out.items()}
 
 
 def differing(a: dict, b: dict) -> list[str]:
@@ -69,46 +59,37 @@ def test_reruns_are_bitwise_equal(first):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_threads_change_nothing(first, threads):
-    assert differing(first, results(threads)) == []
+    with thread_count(threads):
+        assert differing(first, results()) == []
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1e-20, 1e-28, 1e-36])
 def test_faint_gradients_are_deterministic_too(scale):
-    """Denormal numbers are flushed by some threads and not by others: they must not reach a
-    result."""
+    """Some threads flush denormal numbers, so these must not reach a result."""
     camera = make_camera((200, 150), focal=200.0)
     gaussians = make_gaussians(1500, 11, 1, log_scales=(-6.0, -2.5))
-    weight = mi.TensorXf(
-        np.float32(scale) * np.random.default_rng(0).normal(size=(150, 200, 3)).astype(np.float32)
-    )
+    weight = np.random.default_rng(0).normal(size=(150, 200, 3)).astype(np.float32)
     gradients = []
     for threads in (1, 2):
-        before = dr.thread_count()
-        dr.set_thread_count(threads)
-        watched = as_drjit(gaussians)
-        for name in PARAMETERS:
-            setattr(watched, name, dr.copy(getattr(watched, name)))
-            dr.enable_grad(getattr(watched, name))
-        dr.backward(dr.sum(render(watched, camera).rgb * weight, axis=None))
-        gradients.append(
-            {name: np.asarray(dr.grad(getattr(watched, name))).tobytes() for name in PARAMETERS}
-        )
-        dr.set_thread_count(before)
+        with thread_count(threads):
+            model = with_gradients(gaussians)
+            rgb = render(model, camera).rgb
+            dr.backward(dr.sum(rgb * mi.TensorXf(np.float32(scale) * weight), axis=None))
+            found = gradients_of(model)
+        gradients.append({name: value.tobytes() for name, value in found.items()})
     assert differing(*gradients) == []
 
 
 def test_faint_information_is_deterministic_too():
-    """Splats of a micrometre far away carry information that float32 can only hold as a
-    denormal."""
+    """Distant splats of a micrometre, whose information would be denormal in float32."""
     camera = make_camera((200, 150), focal=200.0, eye=(180.0, 40.0, 90.0))
     gaussians = make_gaussians(3000, 12, 0, log_scales=(-16.0, -12.0), logits=(-4, 20))
     information = []
     for threads in (1, 2):
-        before = dr.thread_count()
-        dr.set_thread_count(threads)
-        information.append({e: fisher(gaussians, camera, e).tobytes() for e in ("exact", "block")})
-        dr.set_thread_count(before)
-        values = fisher(gaussians, camera, "block")
+        with thread_count(threads):
+            found = {e: fisher(gaussians, camera, e) for e in ("exact", "block")}
+        information.append({e: values.tobytes() for e, values in found.items()})
+        values = found["block"]
         assert not ((values != 0) & (np.abs(values) < np.finfo(np.float32).tiny)).any()
     assert differing(*information) == []
 
@@ -120,10 +101,9 @@ def test_hutchinson_draws_the_same_probes():
 
 
 def test_garbage_is_not_collected_while_a_kernel_is_recorded():
-    """A Mitsuba scene that Python frees during a recording would end the process: so in a process
-    of its own."""
+    """Freeing a Mitsuba scene during a recording would end the process."""
     code = """
-from mgs import runtime; runtime.start()
+runtime.start()
 import gc
 import mitsuba as mi
 from mgs.splat import kernels, render
@@ -143,23 +123,13 @@ kernels.walk = littering
 render(make_gaussians(20, 0), make_camera())
 print("drawn")
 """
-    root = __file__.rsplit("/splat/", 1)[0]
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=root,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert done.stdout == "drawn\n", done.stderr
+    assert in_own_process(code) == "drawn\n"
 
 
 def test_threads_may_draw_at_once():
-    """Same bits as one after the other; the collector is off in every recording and on in the end.
-    In a process of its own, since two recordings at a time hang or end it."""
+    """With the bits of one after the other; the collector is off in every recording."""
     code = """
-from mgs import runtime; runtime.start()
+runtime.start()
 import gc
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -187,35 +157,17 @@ assert gc.isenabled()
 assert at_once == [draw(i) for i in range(8)]
 print("drawn")
 """
-    root = __file__.rsplit("/splat/", 1)[0]
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=root,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert done.stdout == "drawn\n", done.stderr
+    assert in_own_process(code) == "drawn\n"
 
 
 def test_another_process_with_one_thread_agrees(first):
-    """A fresh process: no recorded kernels, another thread pool, another memory layout."""
-    code = (
-        "from mgs import runtime; runtime.start()\n"
-        "import json, hashlib\n"
-        "from splat.test_determinism import results\n"
-        "print(json.dumps({k: hashlib.sha256(v).hexdigest() for k, v in results(1).items()}))\n"
-    )
-    root = __file__.rsplit("/splat/", 1)[0]
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=root,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    other = json.loads(done.stdout.splitlines()[-1])
+    code = """
+runtime.start()
+import json, hashlib
+from splat.scenes import thread_count
+from splat.test_determinism import results
+with thread_count(1):
+    print(json.dumps({k: hashlib.sha256(v).hexdigest() for k, v in results().items()}))
+"""
+    other = json.loads(in_own_process(code).splitlines()[-1])
     assert differing({k: hashlib.sha256(v).hexdigest() for k, v in first.items()}, other) == []

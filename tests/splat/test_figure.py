@@ -1,5 +1,4 @@
-"""The picture of docs/splatting.md is drawn from the kernels' own data, so it is drawn again
-whenever those change."""
+"""The picture of docs/splatting.md shows the kernels' own data."""
 
 import importlib.util
 from pathlib import Path
@@ -28,9 +27,8 @@ def script():
 def test_the_figure_of_the_splat_kernel_shows_what_the_oracle_says(script, tmp_path, monkeypatch):
     """Blocks, list lengths and sums of the showcase, read back from the figure."""
     drawn, save = [], script.save_figure
-    monkeypatch.setattr(
-        script, "save_figure", lambda figure, path: (drawn.append(figure), save(figure, path))
-    )
+    keep = lambda figure, path: (drawn.append(figure), save(figure, path))  # noqa: E731
+    monkeypatch.setattr(script, "save_figure", keep)
     script.main(str(tmp_path / "figure.png"), COUNT)
     assert (tmp_path / "figure.png").is_file()
     (figure,) = drawn
@@ -42,9 +40,7 @@ def test_the_figure_of_the_splat_kernel_shows_what_the_oracle_says(script, tmp_p
     chosen = script.showcase(gaussians, camera)
     one = type(gaussians)(*(value[[chosen]] for value in vars(gaussians).values()))
     y, x = np.nonzero(reference.render(one, camera)["alpha"])
-    touched = set(
-        zip((x // BLOCK_X * BLOCK_X).tolist(), (y // BLOCK_Y * BLOCK_Y).tolist(), strict=True)
-    )
+    touched = {(i // BLOCK_X * BLOCK_X, j // BLOCK_Y * BLOCK_Y) for i, j in zip(x, y, strict=True)}
     corners = {patch.get_xy() for patch in footprint.patches if isinstance(patch, Rectangle)}
     assert touched <= corners
     assert len(corners) < 1.5 * len(touched)
@@ -52,9 +48,8 @@ def test_the_figure_of_the_splat_kernel_shows_what_the_oracle_says(script, tmp_p
 
     lengths = np.asarray(lists.images[0].get_array())
     order, alpha, _, _ = reference.composite(reference.project(gaussians, camera), camera)
-    tiles = alpha.reshape(
-        camera.height // BLOCK_Y, BLOCK_Y, camera.width // BLOCK_X, BLOCK_X, len(order)
-    )
+    shape = camera.height // BLOCK_Y, BLOCK_Y, camera.width // BLOCK_X, BLOCK_X, len(order)
+    tiles = alpha.reshape(shape)
     assert (lengths >= (tiles > 0).any((1, 3)).sum(-1)).all()
     assert sum(bar.get_height() for bar in lanes.patches) == lengths.sum()
 

@@ -1,5 +1,4 @@
-"""Fisher information of the means, and of alpha as a fourth channel: against the oracle, `jvp`, and
-a colour in its place."""
+"""Fisher information of the means, and of alpha as a fourth channel."""
 
 import numpy as np
 import pytest
@@ -17,9 +16,7 @@ from .test_robustness import CASES
 
 MOVING = ("normal", "free")
 CORRELATION = 1e-5
-"""Tolerance of blocks, as a share of sqrt(H_ii H_jj). Their columns have different units here (a
-pixel changes by 1e3 a metre, and by 1 a unit of colour), so that no entry is small or large by
-itself."""
+"""Tolerance of blocks, as a share of sqrt(H_ii H_jj), because columns have different units."""
 
 
 def normals_of(gaussians, seed=0) -> np.ndarray:
@@ -30,26 +27,17 @@ def normals_of(gaussians, seed=0) -> np.ndarray:
 def assert_means_close(
     gaussians, camera, means, alpha_weight=0.0, background=BACKGROUND, normals=None, what=""
 ):
-    """Both estimators against the oracle: diagonals group by group, relatively; blocks as a share
-    of sqrt(H_ii H_jj)."""
-    options = {
-        "means": means,
-        "normals": normals_of(gaussians) if normals is None else normals,
-        "alpha_weight": alpha_weight,
-    }
+    """Both exact estimators against the reference: diagonals relatively, blocks as a share of
+    sqrt(H_ii H_jj)."""
+    normals = normals_of(gaussians) if normals is None else normals
+    options = {"means": means, "normals": normals, "alpha_weight": alpha_weight}
     expected = reference.fisher_block(gaussians, camera, background, **options)
     exact = fisher(gaussians, camera, "exact", background, **options)
     block = fisher(gaussians, camera, "block", background, **options)
     for name, columns in groups(gaussians.sh_degree, means).items():
-        assert_close(
-            exact[:, columns], diagonal(expected)[:, columns], f"{what} {means} {name} exact"
-        )
-        assert_close(
-            diagonal(block)[:, columns],
-            diagonal(expected)[:, columns],
-            f"{what} {means} {name} block",
-        )
-    size = np.sqrt(diagonal(expected)[:, :, None] * diagonal(expected)[:, None, :])
+        for found in (exact, diagonal(block)):
+            assert_close(found[:, columns], diagonal(expected)[:, columns], f"{what} {name}")
+    size = scale_of(expected)
     seen = size > 1e-6 * size.max()
     error = (np.abs(block - expected)[seen] / size[seen]).max()
     print(f"{what} {means} block, worst error over sqrt(H_ii H_jj) {error:.1e}")
@@ -57,17 +45,18 @@ def assert_means_close(
     np.testing.assert_array_equal(block, block.transpose(0, 2, 1))
 
 
+def scale_of(blocks) -> np.ndarray:
+    """sqrt(H_ii H_jj) of every entry."""
+    return np.sqrt(diagonal(blocks)[:, :, None] * diagonal(blocks)[:, None, :])
+
+
 @pytest.mark.parametrize("means", MOVING)
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_means_against_brute_force(degree, means):
-    """Two weights of alpha after each other, which one recorded kernel must tell apart, and
-    none."""
     camera = make_camera()
     g = calm(lambda seed: make(seed, degree), camera, 20 + degree)
-    for alpha_weight in (0.0, 0.3, 4.0):
-        assert_means_close(
-            g, camera, means, alpha_weight, what=f"degree {degree}, alpha {alpha_weight}"
-        )
+    for weight in (0.0, 0.3, 4.0):
+        assert_means_close(g, camera, means, weight, what=f"degree {degree}, alpha {weight}")
 
 
 @pytest.mark.parametrize("means", MOVING)
@@ -103,7 +92,7 @@ def test_means_of_other_scenes_and_cameras(n, style, size, eye, means):
 def test_means_of_any_scene(
     seed, degree, scale, stretch, logit, azimuth, height, means, to_camera, alpha_weight
 ):
-    """Normals that point to the camera are the hardest: moving along them changes little."""
+    """Normals that point to the camera are the hardest."""
     camera = make_camera(eye=(2 * np.cos(azimuth), 2 * np.sin(azimuth), height))
     style = {"log_scales": (scale - stretch, scale), "logits": (logit - 4, logit)}
     g = calm(lambda s: make(s, degree, **style), camera, seed)
@@ -113,19 +102,15 @@ def test_means_of_any_scene(
 
 @pytest.mark.parametrize("degree", [0, 2])
 def test_information_is_the_size_of_tangents(degree):
-    """v^T F v = |J v|^2 with J v from the tangent kernel: for each coordinate of a mean, along
-    normals, and for random v of all parameters of one Gaussian."""
+    """v^T F v = |J v|^2, with J v from the tangent kernel."""
     camera, weight = make_camera(), 0.3
     g = make_gaussians(8, 40 + degree, degree, log_scales=(-4.0, -1.0))
     normals = normals_of(g)
     unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    blocks = fisher(g, camera, "block", BACKGROUND, means="free", alpha_weight=weight).astype(
-        np.float64
-    )
-    free, normal = (
-        fisher(g, camera, "exact", BACKGROUND, means=means, normals=normals, alpha_weight=weight)
-        for means in ("free", "normal")
-    )
+    options = {"normals": normals, "alpha_weight": weight}
+    blocks = fisher(g, camera, "block", BACKGROUND, means="free", **options).astype(np.float64)
+    free = fisher(g, camera, "exact", BACKGROUND, means="free", **options)
+    normal = fisher(g, camera, "exact", BACKGROUND, means="normal", **options)
 
     def squared(j, **tangents):
         """|J v|^2 where Gaussian j alone changes."""
@@ -139,9 +124,8 @@ def test_information_is_the_size_of_tangents(degree):
     rng, k = np.random.default_rng(degree), 3 * (degree + 1) ** 2
     for j in range(len(g)):
         for i in range(3):
-            np.testing.assert_allclose(
-                free[j, k + 8 + i], squared(j, means=np.eye(3)[i]), rtol=1e-4
-            )
+            expected = squared(j, means=np.eye(3)[i])
+            np.testing.assert_allclose(free[j, k + 8 + i], expected, rtol=1e-4)
         np.testing.assert_allclose(normal[j, k + 8], squared(j, means=unit[j]), rtol=1e-4)
         v = (rng.normal(size=k + 11) / np.sqrt(np.diag(blocks[j]) + 1e-12)).astype(np.float32)
         parts = [v[:k].reshape(-1, 3), v[k : k + 3], v[k + 3 : k + 7], v[k + 7], v[k + 8 :]]
@@ -152,8 +136,7 @@ def test_information_is_the_size_of_tangents(degree):
 @pytest.mark.parametrize("estimator", ["exact", "block"])
 @pytest.mark.parametrize("means", MEANS)
 def test_alpha_is_a_colour_that_all_share_over_black(means, estimator):
-    """What alpha adds is the information of a red image of the same Gaussians, as parameters of the
-    footprint see it."""
+    """Alpha adds the information of a red image about the footprints."""
     camera, weight = make_camera(), 0.7
     g = make_gaussians(30, 8, log_scales=(-4.0, -1.0))
     options = {"means": means, "normals": normals_of(g)}
@@ -161,32 +144,20 @@ def test_alpha_is_a_colour_that_all_share_over_black(means, estimator):
     without = fisher(g, camera, estimator, BACKGROUND, **options)
     with_alpha = fisher(g, camera, estimator, BACKGROUND, alpha_weight=weight, **options)
     alone = fisher(red, camera, estimator, **options)
-    np.testing.assert_allclose(
-        with_alpha[:, :3], without[:, :3], rtol=1e-5, atol=1e-5 * np.abs(without[:, :3]).max()
-    )
-    footprint = (
-        (slice(None), slice(3, None))
-        if estimator == "exact"
-        else (slice(None), slice(3, None), slice(3, None))
-    )
+    atol = 1e-5 * np.abs(without[:, :3]).max()
+    np.testing.assert_allclose(with_alpha[:, :3], without[:, :3], rtol=1e-5, atol=atol)
+    footprint = (slice(None), *[slice(3, None)] * (without.ndim - 1))
     found, expected = with_alpha[footprint], (without + weight * alone)[footprint]
-    assert (np.abs(weight * alone[footprint]) > 0.1 * np.abs(expected)).mean() > 0.2, (
-        "alpha adds nothing to speak of"
-    )
-    if estimator == "block":
-        size = np.sqrt(diagonal(expected)[:, :, None] * diagonal(expected)[:, None, :])
-        assert (np.abs(found - expected) <= 2 * CORRELATION * size).all()
-    else:
-        assert (np.abs(found - expected) <= TOLERANCE * expected).all()
+    assert (np.abs(weight * alone[footprint]) > 0.1 * np.abs(expected)).mean() > 0.2
+    block = estimator == "block"
+    bound = 2 * CORRELATION * scale_of(expected) if block else TOLERANCE * expected
+    assert (np.abs(found - expected) <= bound).all()
 
 
 def test_nothing_is_summed_that_is_not_asked_for():
-    sums = {
-        (cross, means): kernels.fisher_sums(cross, means)
-        for cross in (False, True)
-        for means in (False, True)
-    }
-    assert sums == {(False, False): 7, (True, False): 22, (False, True): 16, (True, True): 34}
+    cases = {(False, False): 7, (True, False): 22, (False, True): 16, (True, True): 34}
+    for (cross, means), sums in cases.items():
+        assert kernels.fisher_sums(cross, means) == sums
 
 
 @pytest.mark.parametrize("estimator", ["exact", "block"])
@@ -218,9 +189,8 @@ def test_groups_of_means_come_last(degree):
         g, none = make_gaussians(5, 1, degree), make_gaussians(0, 1, degree)
         P = last + count
         assert fisher(g, make_camera(), means=means, normals=normals_of(g)).shape == (5, P)
-        assert fisher(
-            none, make_camera(), "block", means=means, normals=np.zeros((0, 3))
-        ).shape == (0, P, P)
+        empty = fisher(none, make_camera(), "block", means=means, normals=np.zeros((0, 3)))
+        assert empty.shape == (0, P, P)
 
 
 def test_unseen_means_and_clamped_alphas_carry_no_information():
@@ -233,13 +203,8 @@ def test_unseen_means_and_clamped_alphas_carry_no_information():
     assert (exact[[3, 4]] == 0).all()
     assert (block[[3, 4]] == 0).all()
     assert (exact[5, -3:] > 0).all()
-    wide = changed(
-        g[:1],
-        means=np.zeros((1, 3)),
-        log_scales=np.full((1, 3), 6.0),
-        logit_opacities=[20.0],
-        sh=0 * g.sh[:1],
-    )
+    shape = {"means": np.zeros((1, 3)), "log_scales": np.full((1, 3), 6.0)}
+    wide = changed(g[:1], logit_opacities=[20.0], sh=0 * g.sh[:1], **shape)
     assert (fisher(wide, camera, means="free", alpha_weight=2.0)[:, 12:] == 0).all()
 
 
@@ -255,32 +220,14 @@ def test_extreme_scenes_give_finite_information(name):
     [
         ({"means": "fixed"}, "means 'fixed': unknown; choose one of frozen, normal, free"),
         ({"means": "normal"}, r"fisher: means='normal' needs normals \[N,3\]"),
-        (
-            {"means": "normal", "normals": np.ones((4, 3))},
-            r"fisher: normals have shape \(4, 3\), expected \(5, 3\)",
-        ),
-        (
-            {"means": "normal", "normals": np.eye(5, 3)},
-            "fisher: a normal is zero, NaN or infinite, first at Gaussian 3",
-        ),
-        (
-            {"means": "normal", "normals": np.full((5, 3), np.nan)},
-            "fisher: a normal is zero, NaN or infinite, first at Gaussian 0",
-        ),
-        ({"alpha_weight": -0.1}, "fisher: alpha_weight -0.1 must be from 0 to 1e[+]12"),
-        ({"alpha_weight": np.nan}, "fisher: alpha_weight nan must be from 0 to 1e[+]12"),
-        (
-            {"alpha_weight": 1e13},
-            "fisher: alpha_weight 1e[+]?13|alpha_weight 10000000000000.0 must be",
-        ),
-        (
-            {"estimator": "hutchinson", "means": "free"},
-            "fisher: the estimator 'hutchinson' knows neither means nor alpha; use exact or block",
-        ),
-        (
-            {"estimator": "loss-gradient", "alpha_weight": 1},
-            "fisher: the estimator 'loss-gradient' knows neither means nor alpha",
-        ),
+        ({"means": "normal", "normals": np.ones((4, 3))}, r"normals have shape \(4, 3\), expected"),
+        ({"means": "normal", "normals": np.eye(5, 3)}, "normal is zero, .* first at Gaussian 3"),
+        ({"means": "normal", "normals": np.full((5, 3), np.nan)}, "NaN .* first at Gaussian 0"),
+        ({"alpha_weight": -0.1}, r"fisher: alpha_weight -0\.1 must be from 0 to 1e[+]12"),
+        ({"alpha_weight": np.nan}, "fisher: alpha_weight nan must be"),
+        ({"alpha_weight": 1e13}, r"fisher: alpha_weight 10000000000000\.0 must be"),
+        ({"estimator": "hutchinson", "means": "free"}, "'hutchinson' knows neither means nor"),
+        ({"estimator": "loss-gradient", "alpha_weight": 1}, "'loss-gradient' knows neither"),
     ],
 )
 def test_unusable_options_are_one_line(options, message):
@@ -290,12 +237,8 @@ def test_unusable_options_are_one_line(options, message):
 
 
 def test_too_many_sums_are_refused(monkeypatch):
-    """The limit is lowered, since no test can afford to reach it."""
     camera, g = make_camera(), make_gaussians(16, 5)
     monkeypatch.setattr(information, "MAX_SUMS", 1024 * 24 + 1)
     fisher(g, camera, "block")
-    with pytest.raises(
-        InputError,
-        match=r"view: 1,024 pairs of a Gaussian and a block .* which takes fewer than 682; take fewer",
-    ):
+    with pytest.raises(InputError, match=r"view: 1,024 pairs .* which takes fewer than 682; take"):
         fisher(g, camera, "block", means="free")

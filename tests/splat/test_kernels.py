@@ -1,8 +1,4 @@
-"""Arithmetic that the kernels do themselves, and the order in which they do it."""
-
-import os
-import subprocess
-import sys
+"""Arithmetic of the kernels, and the order of their instructions."""
 
 import drjit as dr
 import mitsuba as mi
@@ -14,16 +10,14 @@ from mgs.splat.blocks import BLOCK_X, BLOCK_Y
 from mgs.splat.projection import camera_array, project
 from mgs.splat.walking import CENTRE, computed_after, exp2
 
-from .scenes import make_camera, make_gaussians, place
+from .scenes import in_own_process, make_camera, make_gaussians, place
 
 
 @pytest.mark.parametrize(("real", "bound"), [("Float", 1e-7), ("Float64", 3e-9)])
 def test_exp2_is_as_exact_as_it_says(real, bound):
     real = getattr(mi, real)
-    x = np.concatenate(
-        [np.random.default_rng(0).uniform(-120, 120, 100_000), np.arange(-119.5, 120, 0.5)]
-    )
-    x = np.asarray(real(x), np.float64)
+    x = np.random.default_rng(0).uniform(-120, 120, 100_000)
+    x = np.asarray(real(np.concatenate([x, np.arange(-119.5, 120, 0.5)])), np.float64)
     error = np.asarray(exp2(real(x)), np.float64) / np.exp2(x) - 1
     assert np.abs(error).max() < bound
     assert np.asarray(exp2(real(0.0)))[0] == 1
@@ -31,8 +25,7 @@ def test_exp2_is_as_exact_as_it_says(real, bound):
 
 @pytest.mark.parametrize("real", ["Float", "Float64"])
 def test_exp2_far_below_is_nothing(real):
-    """Pixels far from a splat: exponents of any size, down to -inf, give what no threshold of alpha
-    lets through."""
+    """Far from a splat, exponents down to -inf give less than any threshold of alpha."""
     real = getattr(mi, real)
     values = np.asarray(exp2(real([-120.5, -127, -150, -1100, -1e10, -3e38, -np.inf])))
     assert (values > 0).all()
@@ -49,22 +42,16 @@ def built(gaussians, camera):
 
 @pytest.mark.parametrize("log_scales", [(-9.0, -6.0), (-7.0, 1.0), (-3.0, -1.0)])
 def test_no_alpha_underflows_on_the_way_through_a_block(log_scales):
-    """What `block_rows` relies on: at the centre of every row of every block that lists a splat,
-    the exponent is above -113. Points, needles and broad footprints, with exponents as far below
-    zero as they get."""
-    splats, lists, _ = built(
-        make_gaussians(400, 5, log_scales=log_scales, logits=(5, 9)), make_camera((200, 120), 160)
-    )
+    """`block_rows` needs an exponent above -113 at the centre of every row of a listed block."""
+    g = make_gaussians(400, 5, log_scales=log_scales, logits=(5, 9))
+    splats, lists, _ = built(g, make_camera((200, 120), 160))
     start, end = np.asarray(lists.start), np.asarray(lists.end)
     of = np.empty(len(np.asarray(lists.place)), int)
     of[np.asarray(lists.place)] = np.arange(len(of))
     lane = np.repeat(np.arange(len(start)), end - start)
     pair = np.concatenate([np.arange(a, b) for a, b in zip(start, end, strict=True)])
-    splat, block, across = (
-        of[np.asarray(lists.splat)[pair]],
-        np.asarray(lists.block)[lane],
-        int(lists.blocks_x[0]),
-    )
+    splat, block = of[np.asarray(lists.splat)[pair]], np.asarray(lists.block)[lane]
+    across = int(lists.blocks_x[0])
     u, v, k, p, e, opacity = (
         np.asarray(getattr(splats, name), np.float64)[splat]
         for name in ("mean_x", "mean_y", "shear", "white_x", "white_y", "log2_opacity")
@@ -86,21 +73,17 @@ def test_splats_are_drawn_alike_one_or_several_at_a_time(monkeypatch):
     found = []
     for together in (1, 2, 3):
         monkeypatch.setattr(walking, "TOGETHER", together)
-        images = [
-            *kernels.forward.__wrapped__(lists, packed, True),
-            *kernels.jvp.__wrapped__(lists, packed, tangents),
-        ]
+        images = kernels.forward.__wrapped__(lists, packed, True)
+        images += kernels.jvp.__wrapped__(lists, packed, tangents)
         found.append([np.asarray(image).tobytes() for image in images])
     assert found[0] == found[1] == found[2]
 
 
 def test_the_order_of_instructions_changes_no_bit(tmp_path):
-    """With LLVM's machine scheduler and without: each in a process of its own, with no kernels on
-    the disk."""
+    """With and without LLVM's machine scheduler, each with an empty cache of kernels."""
     code = """
 import hashlib, sys
 import numpy as np
-from mgs import runtime
 if sys.argv[1] == "llvm":
     runtime._keep_order = lambda: None
 runtime.start()
@@ -110,27 +93,13 @@ gaussians, camera = make_gaussians(40, 1), make_camera()
 images = [np.asarray(render(gaussians, camera).rgb), fisher(gaussians, camera)]
 print(hashlib.sha256(b"".join(image.tobytes() for image in images)).hexdigest())
 """
-    root = __file__.rsplit("/splat/", 1)[0]
-    said = []
-    kernels = []
+    said, kernels = [], []
     for order in ("llvm", "ours"):
-        (tmp_path / order).mkdir()
-        run, environment = (
-            [sys.executable, "-c", code, order],
-            {**os.environ, "DRJIT_CACHE_DIR": str(tmp_path / order)},
-        )
-        done = subprocess.run(
-            run, cwd=root, env=environment, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        kernels.append(
-            {
-                path.name: path.read_bytes()
-                for path in (tmp_path / order).rglob("*")
-                if path.is_file()
-            }
-        )
-        said.append(done.stdout)
+        folder = tmp_path / order
+        folder.mkdir()
+        said.append(in_own_process(code, order, DRJIT_CACHE_DIR=str(folder)))
+        files = (path for path in folder.rglob("*") if path.is_file())
+        kernels.append({path.name: path.read_bytes() for path in files})
     assert said[0] == said[1]
     assert kernels[0].keys() == kernels[1].keys()
     assert any(kernels[0][name] != kernels[1][name] for name in kernels[0]), "the order is another"
@@ -147,14 +116,11 @@ def test_what_comes_after_is_the_same_number():
 
 @pytest.mark.parametrize("log_scales", [(-7.0, 1.0), (-3.0, -1.0)])
 def test_alphas_of_a_block_follow_from_one_another(log_scales):
-    """Against 2^exponent in double precision, wherever something is drawn."""
-    _, lists, packed = built(
-        make_gaussians(300, 2, log_scales=log_scales, logits=(-1, 6)), make_camera((80, 60), 80)
-    )
+    """The first pair of each lane, against 2^exponent in double precision."""
+    g = make_gaussians(300, 2, log_scales=log_scales, logits=(-1, 6))
+    _, lists, packed = built(g, make_camera((80, 60), 80))
     lane, _ = walking.lanes(lists)
-    _, splat, rows = walking.pair_at(
-        lists, packed, lane, mi.UInt32(lane.start), 0
-    )  # the first pair of each lane
+    _, splat, rows = walking.pair_at(lists, packed, lane, mi.UInt32(lane.start), 0)
     there = np.asarray(lists.end) > np.asarray(lists.start)
     u, v, k, p, e, opacity = (
         np.asarray(getattr(splat, name), np.float64)[there]
@@ -176,8 +142,7 @@ def test_alphas_of_a_block_follow_from_one_another(log_scales):
 
 
 def test_a_footprint_that_single_precision_misplaces_draws_nothing_wrong():
-    """Huge, close to the camera, its centre ten million pixels away: lists, which are made in
-    single precision, may name blocks that it does not reach."""
+    """Its centre is up to 3e7 pixels away, so its lists may name blocks that it does not reach."""
     camera = make_camera((64, 48), 600)
     depth = 0.05
     for offset in (1e5, 1e6, 1e7, 3e7):

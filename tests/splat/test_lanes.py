@@ -1,8 +1,4 @@
-"""Kernels do not depend on how many lanes a register has."""
-
-import subprocess
-import sys
-from pathlib import Path
+"""Kernels do not depend on the number of lanes of a register."""
 
 import numpy as np
 import pytest
@@ -10,25 +6,24 @@ import pytest
 from mgs import runtime
 from mgs.splat import fisher, render
 
-from .scenes import make_camera, make_gaussians
+from .scenes import in_own_process, make_camera, make_gaussians
 
 CODE = """
 import ctypes, sys
 from pathlib import Path
 import drjit as dr
 import numpy as np
-from mgs import runtime
 runtime.start()
 core = ctypes.CDLL(str(Path(dr.__file__).parent / "libdrjit-core.so"))
 set_target = core._Z19jit_llvm_set_targetPKcS0_j  # jit_llvm_set_target, a C++ function
 set_target.argtypes, set_target.restype = [ctypes.c_char_p, ctypes.c_char_p, ctypes.c_uint], None
 set_target(b"haswell", b"", 8)
 assert runtime.processor()["simd_width"] == 8
-sys.path.append("tests")
 from splat.scenes import make_camera, make_gaussians
 from mgs.splat import fisher, render
 camera, gaussians = make_camera(), make_gaussians(60, 4)
-np.savez(sys.argv[1], rgb=np.asarray(render(gaussians, camera).rgb), fisher=fisher(gaussians, camera))
+rgb = np.asarray(render(gaussians, camera).rgb)
+np.savez(sys.argv[1], rgb=rgb, fisher=fisher(gaussians, camera))
 """
 
 
@@ -36,11 +31,7 @@ def test_eight_lanes_draw_the_same_image_and_information_as_sixteen(tmp_path):
     runtime.start()
     if runtime.processor()["simd_width"] != 16:
         pytest.skip("this processor has no registers of sixteen lanes")
-    subprocess.run(
-        [sys.executable, "-c", CODE, str(tmp_path / "x.npz")],
-        cwd=Path(__file__).parents[2],
-        check=True,
-    )
+    in_own_process(CODE, str(tmp_path / "x.npz"))
     camera, gaussians = make_camera(), make_gaussians(60, 4)
     narrow = np.load(tmp_path / "x.npz")
     np.testing.assert_array_equal(narrow["rgb"], np.asarray(render(gaussians, camera).rgb))

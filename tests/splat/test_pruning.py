@@ -1,5 +1,4 @@
-"""What the removal of a Gaussian costs, against rendering without it, and pruning that counts on
-it."""
+"""Cost of removing a Gaussian, against rendering without it; pruning by this cost."""
 
 from dataclasses import replace
 
@@ -24,19 +23,16 @@ def without(gaussians, j):
 def brute_force(gaussians, camera):
     """Squared change of the float64 image as each Gaussian is left out in turn."""
     whole = reference.render(gaussians, camera, BACKGROUND)["rgb"]
-    return np.array([
-        ((reference.render(without(gaussians, j), camera, BACKGROUND)["rgb"] - whole) ** 2).sum() for j in range(len(gaussians))
-    ])  # fmt: skip
+    left = [without(gaussians, j) for j in range(len(gaussians))]
+    images = [reference.render(others, camera, BACKGROUND)["rgb"] for others in left]
+    return np.array([((image - whole) ** 2).sum() for image in images])
 
 
 def never_finished(seed, n=12, logits=(-3.0, 1.0)):
-    """A scene in which no pixel is finished before its last splat: so no removal makes others
-    appear."""
+    """A scene in which no pixel is finished, so that no removal makes splats appear."""
     g = make_gaussians(n, seed, log_scales=(-4.0, -1.0), logits=logits)
     g.logit_opacities[1:] = np.minimum(g.logit_opacities[1:], -0.5)
-    g.logit_opacities[0] = (
-        8.0  # clamped at ALPHA_MAX, where derivatives are 0 and the removal costs most
-    )
+    g.logit_opacities[0] = 8.0  # clamped at ALPHA_MAX, where derivatives are 0
     return g
 
 
@@ -61,8 +57,6 @@ def test_alpha_is_clamped_in_such_scenes_and_no_pixel_is_finished():
 
 
 def test_any_scene_and_several_cameras_against_the_oracle():
-    """Also where pixels are finished: the formula is the same, whatever the removal would
-    uncover."""
     cameras = [make_camera(), make_camera(eye=(-0.5, 2.1, 0.9))]
     g = make_gaussians(60, 5, degree=1, log_scales=(-4.0, -1.0))
     expected = sum(reference.removal_cost(g, camera, BACKGROUND) for camera in cameras)
@@ -72,8 +66,7 @@ def test_any_scene_and_several_cameras_against_the_oracle():
 
 
 def wall(side=9, spacing=0.12):
-    """Splats on a surface, and others of about the same colours behind it, as a prior puts them:
-    some of them can go."""
+    """Splats on a surface, and others of similar colours behind it."""
     y, z = (spacing * (grid.ravel() - side / 2) for grid in np.mgrid[:side, :side])
     n = side * side
     g = make_gaussians(2 * n, 1, logits=(2.0, 2.2))
@@ -91,16 +84,10 @@ def test_what_is_pruned_changes_images_by_about_what_was_predicted():
     assert NEIGHBOURS < len(found.kept) < len(g)
     assert found.actual <= found.noise == 0.01
     covered = 3 * sum(float(np.asarray(render(g, camera).alpha).sum()) for camera in cameras)
-    change = sum(
-        (
-            (
-                np.asarray(render(g[found.kept], camera).rgb, np.float64)
-                - np.asarray(render(g, camera).rgb)
-            )
-            ** 2
-        ).sum()
-        for camera in cameras
-    )
+    change = 0.0
+    for camera in cameras:
+        pruned, whole = (np.asarray(render(h, camera).rgb, float) for h in (g[found.kept], g))
+        change += ((pruned - whole) ** 2).sum()
     assert found.actual == pytest.approx(np.sqrt(change / covered), rel=1e-4)
     assert 0.5 < (found.actual / found.predicted) ** 2 < 2
     more = prune(g, cameras, 0.03)
