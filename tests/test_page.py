@@ -216,7 +216,7 @@ def test_what_is_not_there_is_left_out(runs, tmp_path):
 
 
 def test_test_views_are_compared_and_their_metrics_shown(runs, tmp_path):
-    """Those of the dataset's folder `test`, under names that cannot be mistaken for those of its
+    """The dataset's folder `test`, under names that cannot be mistaken for those of its
     own views."""
     run = shutil.copytree(runs[0], tmp_path / "run")
     config = read_json(run / "config.json")

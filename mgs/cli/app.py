@@ -120,7 +120,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _hint(command: str) -> str:
-    """How to continue an interrupted command, if it can continue."""
+    """End of the line of an interrupted command: the way to continue, if there is one."""
     if command in RESUMABLE:
         return "; run the same command again to continue"
     resume = "; `mgs nbv --resume RUN` continues a run whose folder is there"
