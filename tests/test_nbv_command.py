@@ -306,10 +306,7 @@ def test_scales_of_lambda_are_finite(dataset, tmp_path, values):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            ["--estimator", "block"],
-            "--estimator block: unknown; choose one of exact, hutchinson",
-        ),
+        (["--estimator", "block"], "--estimator block: unknown; choose one of exact, hutchinson"),
         (["--estimator", "guess"], "--estimator guess: unknown"),
         (["--optimiser", "hope"], "--optimiser 'hope': unknown; choose one of natural, adam"),
         (["--lam", "0"], "--lam 0.0: Input should be greater than or equal to"),
