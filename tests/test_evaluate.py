@@ -41,6 +41,12 @@ def images():
     return a, np.clip(a + rng.normal(0, 0.05, a.shape), 0, 1)
 
 
+def flat(gaussians, camera):
+    """A renderer of one grey, opaque, at 1 m."""
+    one = np.ones((camera.height, camera.width), np.float32)
+    return np.repeat(0.2 * one[..., None], 3, axis=2), one, one
+
+
 def test_psnr_of_a_constant_error():
     a = np.full((8, 8, 3), 0.5)
     assert psnr(a, a + 0.1) == pytest.approx(20.0)
@@ -66,18 +72,14 @@ def test_ssim_follows_its_definition(images):
     one = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
     window = np.outer(one, one)[..., None] / np.outer(one, one).sum()
     p, q = (image[y - 5 : y + 6, x - 5 : x + 6] for image in (a, b))
-    mean_p, mean_q = (window * p).sum((0, 1)), (window * q).sum((0, 1))
-    var_p, var_q = (
-        (window * p * p).sum((0, 1)) - mean_p**2,
-        (window * q * q).sum((0, 1)) - mean_q**2,
-    )
-    cov = (window * p * q).sum((0, 1)) - mean_p * mean_q
-    c1, c2 = 0.01**2, 0.03**2
-    expected = (
-        (2 * mean_p * mean_q + c1)
-        * (2 * cov + c2)
-        / ((mean_p**2 + mean_q**2 + c1) * (var_p + var_q + c2))
-    )
+
+    def mean(values):
+        return (window * values).sum((0, 1))
+
+    mean_p, mean_q, c1, c2 = mean(p), mean(q), 0.01**2, 0.03**2
+    var_p, var_q = mean(p * p) - mean_p**2, mean(q * q) - mean_q**2
+    above = (2 * mean_p * mean_q + c1) * (2 * (mean(p * q) - mean_p * mean_q) + c2)
+    expected = above / ((mean_p**2 + mean_q**2 + c1) * (var_p + var_q + c2))
     mask = np.zeros(a.shape[:2], bool)
     mask[y, x] = True
     assert ssim(a, b, mask) == pytest.approx(expected.mean(), abs=1e-12)
@@ -99,26 +101,17 @@ def test_bad_images_are_named():
         ssim(np.zeros((8, 40, 3)), np.zeros((8, 40, 3)))
 
 
-def grey(n: int = 1) -> Gaussians:
-    return Gaussians(
-        np.zeros((n, 3), "f4"),
-        np.zeros((n, 3), "f4"),
-        np.eye(4, dtype="f4")[[0] * n],
-        np.zeros(n, "f4"),
-        sh_from_rgb(np.ones((n, 3))),
-    )
+def grey() -> Gaussians:
+    parts = np.zeros((1, 3), "f4"), np.zeros((1, 3), "f4"), np.eye(1, 4, dtype="f4")
+    return Gaussians(*parts, np.zeros(1, "f4"), sh_from_rgb(np.ones((1, 3))))
 
 
 @pytest.mark.parametrize(("pixels", "most"), [(4_000_000, 4), (1, 1)])
 def test_views_are_measured_beside_each_other_but_large_ones_alone(
     tmp_path, monkeypatch, pixels, most
 ):
-    dataset, lock, active, seen = (
-        write_dataset(tmp_path / "data", orbit_cameras(8)),
-        threading.Lock(),
-        [0],
-        [],
-    )
+    dataset, lock = write_dataset(tmp_path / "data", orbit_cameras(8)), threading.Lock()
+    active, seen = [0], []
 
     def measured(frame, rendered, spacing, folder):
         with lock:
@@ -131,9 +124,7 @@ def test_views_are_measured_beside_each_other_but_large_ones_alone(
 
     monkeypatch.setattr(evaluation, "_measured", measured)
     monkeypatch.setattr(evaluation, "PIXELS_AT_ONCE", pixels)
-    result = evaluate(
-        grey(), dataset.frames, (), renderer=lambda gaussians, camera: (np.zeros(1),) * 3
-    )
+    result = evaluate(grey(), dataset.frames, (), renderer=lambda *_: (np.zeros(1),) * 3)
     assert [view["psnr"] for view in result["views"]] == list(range(8)), "in their order"
     assert len(seen) == 8
     assert (max(seen) == 1) if most == 1 else (1 < max(seen) <= most)
@@ -162,42 +153,28 @@ def test_what_a_renderer_returns_is_freed_by_the_thread_that_draws(tmp_path, mon
 def test_evaluate(tmp_path):
     """A model that renders one grey: each metric is that of the grey image, and the averages leave
     out what was trained on."""
-    dataset = write_dataset(tmp_path / "data", orbit_cameras(4))
-
-    def renderer(gaussians, camera):
-        shape = (camera.height, camera.width)
-        return (
-            np.full((*shape, 3), 0.2, np.float32),
-            np.ones(shape, np.float32),
-            np.ones(shape, np.float32),
-        )
-
-    calls = []
+    dataset, calls = write_dataset(tmp_path / "data", orbit_cameras(4)), []
     result = evaluate(
         grey(),
         dataset.frames,
         {"kf_0001"},
-        renderer=renderer,
+        renderer=flat,
         pictures=tmp_path / "renders",
         progress=lambda done, total: calls.append((done, total)),
     )
-    assert [view["name"] for view in result["views"]] == [
-        "kf_0000",
-        "kf_0001",
-        "kf_0002",
-        "kf_0003",
-    ]
+    assert [view["name"] for view in result["views"]] == [f"kf_000{i}" for i in range(4)]
     assert [view["trained"] for view in result["views"]] == [False, True, False, False]
     assert (result["images"], result["all"]["count"], result["held_out"]["count"]) == (1, 4, 3)
     truth = srgb_from_linear(dataset.frames[2].masked_rgb())
-    flat = srgb_from_linear(np.full_like(truth, 0.2))
+    shown = srgb_from_linear(np.full_like(truth, 0.2))
     mask, known = dataset.frames[2].mask(), dataset.frames[2].target()[1] > 0
     assert 0 < mask.mean() < 1
     assert 0.9 < known.mean() < 1  # all but the outline of a mask without an image of the rock
-    assert result["views"][2]["psnr"] == pytest.approx(psnr(truth, flat, known))
-    assert result["views"][2]["ssim"] == pytest.approx(ssim(truth, flat, known))
-    assert result["views"][2]["ssim_mask"] == pytest.approx(ssim(truth, flat, mask & known))
-    assert result["views"][2]["psnr_inside"] == pytest.approx(psnr(truth, flat, mask & known))
+    view = result["views"][2]
+    assert view["psnr"] == pytest.approx(psnr(truth, shown, known))
+    assert view["ssim"] == pytest.approx(ssim(truth, shown, known))
+    assert view["ssim_mask"] == pytest.approx(ssim(truth, shown, mask & known))
+    assert view["psnr_inside"] == pytest.approx(psnr(truth, shown, mask & known))
     for name in METRICS:
         values = [view[name] for view in result["views"]]
         assert result["all"][name] == pytest.approx(np.mean(values))
@@ -262,17 +239,9 @@ def test_a_surface_is_measured_as_far_as_the_truth_is_known():
 
 
 def test_where_nothing_is_drawn_the_model_is_infinitely_deep():
-    truth, mask, nothing = np.ones((2, 2, 4)), np.ones((2, 2), bool), np.zeros((2, 2))
-    found = compare_surface(
-        truth,
-        nothing,
-        nothing,
-        mask,
-        np.ones((2, 2)),
-        fractional=True,
-        true_depth=np.full((2, 2), 3.0),
-        spacing=0.1,
-    )
+    truth, one = np.ones((2, 2, 4)), np.ones((2, 2))
+    surface = {"fractional": True, "true_depth": 3 * one, "spacing": 0.1}
+    found = compare_surface(truth, 0 * one, 0 * one, one > 0, one, **surface)
     assert math.isnan(found.pop("depth_error"))
     assert set(found.values()) == {1.0}
 
@@ -283,36 +252,17 @@ def test_test_views_are_measured_and_drawn_apart(tmp_path):
     tests = write_dataset(tmp_path / "data/test", orbit_cameras(3, 40, 30))
     assert dataset.test_views().frames == tests.frames
 
-    def renderer(gaussians, camera):
-        shape = (camera.height, camera.width)
-        return (
-            np.full((*shape, 3), 0.2, np.float32),
-            np.ones(shape, np.float32),
-            np.ones(shape, np.float32),
-        )
+    def measured(frames, **options):
+        return evaluate(grey(), frames, ["kf_0001"], renderer=flat, **options)
 
-    def measured(frames, test_frames=(), pictures=None):
-        return evaluate(
-            grey(),
-            frames,
-            ["kf_0001"],
-            test_frames=test_frames,
-            renderer=renderer,
-            pictures=pictures,
-        )
-
-    result, without, alone = (
-        measured(dataset.frames, tests.frames, tmp_path / "out"),
-        measured(dataset.frames),
-        measured(tests.frames),
-    )
+    out = tmp_path / "out"
+    result = measured(dataset.frames, test_frames=tests.frames, pictures=out)
+    without, alone = measured(dataset.frames), measured(tests.frames)
     assert {key: result[key] for key in without} == without
     assert result["test"] == alone["all"]
     assert result["test"]["count"] == 3
     assert result["test_views"] == [view | {"trained": False} for view in alone["views"]]
-    assert {
-        path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.png")
-    } == {
+    assert {path.relative_to(out).as_posix() for path in out.rglob("*.png")} == {
         *(f"kf_000{i}.png" for i in range(4)),
         *(f"test/kf_000{i}.png" for i in range(3)),
     }
@@ -445,44 +395,31 @@ def brighten(path):
     np.savez(path, **arrays | {"sh": arrays["sh"] + np.float32(0.1)})
 
 
-@pytest.mark.parametrize(
-    ("what", "change"),
-    [
-        ("model", lambda run, dataset: brighten(run / "checkpoint.npz")),
-        (
-            "image",
-            lambda run, dataset: write_png(
-                dataset / "images/kf_0003.png", np.ones((tiny.HEIGHT, tiny.WIDTH, 3))
-            ),
-        ),
-        (
-            "mask",
-            lambda run, dataset: write_png(
-                dataset / "masks/kf_0003.png", np.ones((tiny.HEIGHT, tiny.WIDTH), bool)
-            ),
-        ),
-        (
-            "depth",
-            lambda run, dataset: write_exr(
-                dataset / "depth/kf_0003.exr", {"Z": np.ones((12, 16), np.float32)}
-            ),
-        ),
-        (
-            "spacing",
-            lambda run, dataset: write_json(run.parent / "prior/prior.json", {"spacing": 0.01}),
-        ),
-        ("older version", lambda run, dataset: write_json(run / "metrics.json", {"images": 3})),
-        ("damaged", lambda run, dataset: (run / "metrics.json").write_text("{")),
-    ],
-)
-def test_what_has_changed_is_measured_again(dataset, prior, tmp_path, work, what, change):
+CHANGES = {
+    "model": lambda run, dataset: brighten(run / "checkpoint.npz"),
+    "image": lambda run, dataset: write_png(
+        dataset / "images/kf_0003.png", np.ones((tiny.HEIGHT, tiny.WIDTH, 3))
+    ),
+    "mask": lambda run, dataset: write_png(
+        dataset / "masks/kf_0003.png", np.ones((tiny.HEIGHT, tiny.WIDTH), bool)
+    ),
+    "depth": lambda run, dataset: write_exr(
+        dataset / "depth/kf_0003.exr", {"Z": np.ones((12, 16), np.float32)}
+    ),
+    "spacing": lambda run, dataset: write_json(run.parent / "prior/prior.json", {"spacing": 0.01}),
+    "damaged": lambda run, dataset: (run / "metrics.json").write_text("{"),
+}
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_what_has_changed_is_measured_again(dataset, prior, tmp_path, work, what):
     run = tiny.write_run(tmp_path / "run", dataset, prior)
     before = evaluate_run(run)
-    change(run, dataset)
+    CHANGES[what](run, dataset)
     work()
     after = evaluate_run(run, pictures=False)
     assert work() == (12, 0)
-    assert (after["all"] == before["all"]) == (what in ("older version", "damaged"))
+    assert (after["all"] == before["all"]) == (what == "damaged")
     assert after["pictures"] is False  # those that are there may be of another model
     evaluate_run(run)
     assert work() == (0, 12)
@@ -510,29 +447,20 @@ def test_a_run_is_measured_on_the_test_views_of_its_dataset(dataset, prior, tmp_
         evaluate_run(run)
 
 
-@pytest.mark.parametrize(
-    ("numbers", "said"),
-    [
-        (None, "is not there"),
-        ({"spacing": "wide"}, InputError),
-        ({"spacing": -1}, InputError),
-        ([], InputError),
-    ],
-)
-def test_without_the_priors_spacing_nothing_is_called_too_deep(
-    dataset, prior, tmp_path, numbers, said
-):
+def test_without_the_prior_nothing_is_called_too_deep(dataset, prior, tmp_path):
     run, lines = tiny.write_run(tmp_path / "run", dataset, prior), []
-    if numbers is None:
-        prior.rename(tmp_path / "elsewhere")
-        found = evaluate_run(run, pictures=False, say=lines.append)["all"]
-        assert "depth_error" in found
-        assert not [name for name in found if name.startswith("too_deep")]
-        assert (
-            lines[1]
-            == f"{prior}: is not there, so the shares that are too deep, in its spacings, are left out"
-        )
-        return
+    prior.rename(tmp_path / "elsewhere")
+    found = evaluate_run(run, pictures=False, say=lines.append)["all"]
+    assert "depth_error" in found
+    assert not [name for name in found if name.startswith("too_deep")]
+    missing = "is not there, so the shares that are too deep, in its spacings, are left out"
+    assert lines[1] == f"{prior}: {missing}"
+    assert lines[2].endswith("so it is left out how far the fit is from its end")
+
+
+@pytest.mark.parametrize("numbers", [{"spacing": "wide"}, {"spacing": -1}, []])
+def test_a_damaged_spacing_is_named(dataset, prior, tmp_path, numbers):
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
     write_json(prior / "prior.json", numbers)
-    with pytest.raises(said, match=r"prior\.json: spacing must be positive metres"):
+    with pytest.raises(InputError, match=r"prior\.json: spacing must be positive metres"):
         evaluate_run(run)

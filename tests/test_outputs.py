@@ -40,22 +40,27 @@ def writers(dataset: Path, prior: Path, splats: Path, out: Path) -> dict[str, li
     }
 
 
-@pytest.mark.parametrize("command", writers(*[Path()] * 4))
+IN_THE_WAY = {
+    "not empty": lambda tmp_path: occupied(tmp_path / "out"),
+    "is a file": lambda tmp_path: a_file(tmp_path / "out"),
+    "under a file": lambda tmp_path: a_file(tmp_path / "file") / "out",
+    "long name": lambda tmp_path: tmp_path / ("long" * 99),
+    "read only": read_only,
+}
+COMMANDS_THAT_WRITE = list(writers(*[Path()] * 4))
+
+
 @pytest.mark.parametrize(
-    ("make", "named"),
-    [
-        (lambda tmp_path: occupied(tmp_path / "out"), "not empty"),
-        (lambda tmp_path: a_file(tmp_path / "out"), "is a file"),
-        (lambda tmp_path: a_file(tmp_path / "file") / "out", "cannot be written"),
-        (lambda tmp_path: tmp_path / ("long" * 99), "cannot be written"),
-        (read_only, "cannot be written"),
-    ],
+    ("command", "place"),
+    [(command, place) for command in COMMANDS_THAT_WRITE for place in ("not empty", "read only")]
+    + [("render", place) for place in ("is a file", "under a file", "long name")],
 )
-def test_output_that_is_in_the_way(capsys, dataset, prior, tmp_path, command, make, named):
+def test_output_that_is_in_the_way(capsys, dataset, prior, tmp_path, command, place):
     write_ply(tmp_path / "splats.ply", tiny.initial([]))
-    out = make(tmp_path)
+    out = IN_THE_WAY[place](tmp_path)
     before = listing(tmp_path)
-    assert named in refused(capsys, writers(dataset, prior, tmp_path / "splats.ply", out)[command])
+    line = refused(capsys, writers(dataset, prior, tmp_path / "splats.ply", out)[command])
+    assert (place if place in ("not empty", "is a file") else "cannot be written") in line
     assert listing(tmp_path) == before
 
 

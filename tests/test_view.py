@@ -35,7 +35,7 @@ from mgs.splat import render
 from mgs.splat_ply import write_ply
 from mgs.view import layers
 from mgs.view.server import Viewer, check_address, window_camera
-from mgs.view.subject import fitted, read_subject
+from mgs.view.subject import read_subject, scaled
 
 
 def steps(run, budget):
@@ -128,7 +128,7 @@ def test_a_world_of_large_numbers_is_shown_smaller(run):
     that."""
     subject = read_subject(run)
     assert subject.scale == 1
-    assert fitted(subject) is subject
+    assert scaled(subject) is subject
 
     g = subject.gaussians
     large = replace(
@@ -142,7 +142,7 @@ def test_a_world_of_large_numbers_is_shown_smaller(run):
         ],
         mesh=replace(subject.mesh, vertices=1000 * subject.mesh.vertices),
     )
-    shown = fitted(large)
+    shown = scaled(large)
     assert np.ptp(shown.mesh.vertices) == pytest.approx(shown.scale * np.ptp(large.mesh.vertices))
     for layer in ("colour", "depth", "uncertainty"):
         picture, depth, ends = layers.kernel_image(shown, shown.views[1].frame.camera, layer)
@@ -199,7 +199,6 @@ def test_the_camera_of_a_window(eye, target, fov, width, height):
     np.testing.assert_allclose(
         camera.project([top])[0][0], [camera.width / 2, 0], atol=1e-3 * camera.height
     )
-    assert window_camera(SimpleNamespace(image_width=0, image_height=5)) is None
 
 
 def test_refusals(capsys, run, dataset, prior, tmp_path, monkeypatch):
@@ -239,7 +238,7 @@ def viewing(*arguments):
     )
     try:
         line, warned = process.stdout.readline(), False
-        if "everyone who reaches this address" in line:
+        if "with its token, can look" in line:
             line, warned = process.stdout.readline(), True
         found = re.search(r"open (http://\S+) in a browser", line)
         assert found, line + process.stderr.read()

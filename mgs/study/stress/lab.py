@@ -120,7 +120,7 @@ def cells_per_rock(
 
 
 def turns(count: int) -> list[tuple[str, float]]:
-    """Names of sets of views of one rock, and the share of their spacing by which they are turned."""
+    """Names of sets of views, and the share of their spacing by which each is turned."""
     return [(f"turn {k}", k / count) for k in range(count)]
 
 
@@ -215,7 +215,7 @@ class Lab:
         return np.array([score(F, H, lam) for F in self.information(model, left, means)])
 
     def quality(self, model: Gaussians) -> dict[str, float]:
-        """PSNR on the test views, dB: of whole images (`psnr`), and inside the rock (`psnr_mask`)."""
+        """PSNR on the test views, dB: of whole images (psnr), and inside the rock (psnr_mask)."""
         found = judge(model, self.dataset)
         return {"psnr": found["psnr"], "psnr_mask": found["psnr_mask"]}
 
