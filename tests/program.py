@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from mgs.cli.app import main
-from mgs.files import write_json
 
 
 def command(*arguments) -> None:
@@ -31,4 +30,5 @@ def timeless(lines: list[dict]) -> list[dict]:
 def change_settings(run: Path, **values) -> None:
     """Change settings in the config.json of a run."""
     config = json.loads((run / "config.json").read_text())
-    write_json(run / "config.json", config | {"settings": config["settings"] | values})
+    config["settings"] |= values
+    (run / "config.json").write_text(json.dumps(config))

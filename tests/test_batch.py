@@ -15,9 +15,16 @@ from mgs.run import problem, recording
 from mgs.study import case
 
 OF_A_FIT = {"uncertainty", "iterations", "loss", "stop_reason"}
-AT_THE_MODEL = set(
-    "d-optimal t-optimal a-optimal e-optimal fisherrf i-optimal block-d paper".split()
-)
+AT_THE_MODEL = {
+    "d-optimal",
+    "t-optimal",
+    "a-optimal",
+    "e-optimal",
+    "fisherrf",
+    "i-optimal",
+    "block-d",
+    "paper",
+}
 """Policies that use information at the fitted model."""
 
 
@@ -137,7 +144,7 @@ def test_a_batch_ends_before_a_view_below_the_gain_limit(loaded, tmp_path):
 
 def test_table_report_and_page_of_a_run_in_batches(dataset, prior, tmp_path, capsys):
     out = tmp_path / "run"
-    options = "--budget 3 --batch 2 --passes 1 --evaluate-every 1".split()
+    options = ["--budget", "3", "--batch", "2", "--passes", "1", "--evaluate-every", "1"]
     command("nbv", dataset, "--prior", prior, "--out", out, *options)
     rows = [line.split() for line in capsys.readouterr().out.splitlines() if line.strip()]
     rows = [row for row in rows if row[0].isdigit()]
