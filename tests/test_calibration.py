@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from splat.scenes import calm, make_camera, make_gaussians
 
@@ -45,12 +45,12 @@ def test_parameter_variance_is_that_of_the_oracles_jacobian(degree):
     J = reference.jacobian(gaussians, camera)
     variance = np.random.default_rng(1).uniform(0.01, 0.1, J.shape[-2:])
     expected = (np.square(J) * variance).sum(axis=(2, 3))
-    rng, draws = np.random.default_rng(2), 2000
+    rng, draws = np.random.default_rng(2), 500
     found = predicted_error.parameter_variance(gaussians, camera, variance, rng, draws)
     expected = expected.reshape(found.shape)
     seen = expected > 1e-3 * expected.max()
     ratio = found[seen] / expected[seen]
-    assert abs(ratio.mean() - 1) < 0.02
+    assert abs(ratio.mean() - 1) < 0.03
     assert np.abs(ratio - 1).max() < 6 * np.sqrt(2 / draws)
 
 
@@ -116,6 +116,7 @@ def test_calibration_finds_the_weights_of_the_terms():
     assert inside.mean() == pytest.approx(0.9, abs=1e-3)
 
 
+@settings(max_examples=20)
 @given(st.floats(1e-8, 1e8), st.floats(1e-8, 1e8))
 def test_calibration_does_not_depend_on_units(unit, scale):
     rng = np.random.default_rng(0)
@@ -170,8 +171,8 @@ def test_sigma_of_maps_has_their_shape():
 )
 def test_runs_that_cannot_be_calibrated(trained, changes, said, tmp_path):
     frames = tuple(Frame(name, make_camera(), 0.0, None, None, None) for name in "abcdefgh")
-    settings = NbvSettings(dataset="d", prior="p", **changes)
-    run = Run(tmp_path, settings, Dataset(tmp_path, frames))
+    given_settings = NbvSettings(dataset="d", prior="p", **changes)
+    run = Run(tmp_path, given_settings, Dataset(tmp_path, frames))
     run.state = SimpleNamespace(taken=range(trained))
     with pytest.raises(InputError, match=said):
         predicted_error._views(run)

@@ -61,7 +61,7 @@ def cameras_around(gaussians, views=VIEWS):
 
 
 def images_of(truth, start, noise=0.002, views=VIEWS):
-    """What the truth looks like, with noise, and where a fit starts."""
+    """Images of the truth, with noise, and the start of a fit."""
     rng, cameras = np.random.default_rng(0), cameras_around(truth, views)
     targets = [np.asarray(render(truth, camera).rgb) for camera in cameras]
     noisy = [target + rng.normal(0, noise, target.shape) for target in targets]

@@ -7,9 +7,10 @@ Each command has a file beside this one. A command imports what it needs when it
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Callable
 from inspect import cleandoc
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -31,7 +32,7 @@ from mgs.cli.studies import chart, parsimony, reproduce, stress
 from mgs.cli.survey import survey
 from mgs.cli.synth_orbit import synth_orbit
 from mgs.cli.view import view
-from mgs.errors import InputError
+from mgs.errors import InputError, Notice
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C: by convention 128 plus the number of the signal, SIGINT."""
@@ -101,6 +102,8 @@ def main(arguments: list[str] | None = None) -> None:
     Always raises SystemExit, except that errors of the program itself pass through.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
+    warnings.simplefilter("always", Notice)
+    warnings.showwarning = _print_warning  # type: ignore[assignment]
     try:
         code = app(arguments or ["--help"], prog_name="mgs", standalone_mode=False)
     except InputError as error:
@@ -119,8 +122,14 @@ def main(arguments: list[str] | None = None) -> None:
     raise SystemExit(code or 0)
 
 
+def _print_warning(message: Any, category: type, filename: str, line: int, *_: Any) -> None:
+    """Print a Notice as one line of ours, other warnings as Python does."""
+    text = f"mgs: {message}\n" if category is Notice else None
+    sys.stderr.write(text or warnings.formatwarning(message, category, filename, line))
+
+
 def _hint(command: str) -> str:
-    """How to continue an interrupted command, if it can continue."""
+    """End of the line of an interrupted command: the way to continue, if there is one."""
     if command in RESUMABLE:
         return "; run the same command again to continue"
     resume = "; `mgs nbv --resume RUN` continues a run whose folder is there"

@@ -193,8 +193,8 @@ def worth(
 
 
 def paying(found: Worth, sizes: Mapping[str, int], loss: float) -> dict[str, Mask]:
-    """Which Gaussians should learn each kind, {kind: [N]}: those that gain, without those that gain
-    least per parameter while Phi rises by at most `loss` dB in all.
+    """Choose the Gaussians that learn each kind, {kind: [N]}: those that gain, without those that
+    gain least per parameter while Phi rises by at most `loss` dB in all.
 
     sizes: {kind: parameters of a Gaussian}; only these kinds are decided.
     """
@@ -277,7 +277,7 @@ def directional_gain(
 def _squared_error(model: Gaussians, camera: Camera, target: np.ndarray, cache: ListCache) -> float:
     """Mean squared error of the pixels whose colour is known, (linear RGB)^2."""
     rgb = np.asarray(render(model, camera, cache=cache).rgb, np.float64)
-    return float(masked_squares(rgb, target, np.ones(rgb.shape[:2], bool)).mean())
+    return float(masked_squares(rgb, target).mean())
 
 
 def _worth(model: Gaussians, images: Images, settings: NbvSettings, cache: ListCache) -> Worth:

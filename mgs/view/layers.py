@@ -14,6 +14,7 @@ from mgs.colour import srgb_from_linear
 from mgs.gaussians import Gaussians
 from mgs.report.diagnostics import PANELS, VISIBLE, view_maps
 from mgs.rotation import rotmat_from_quat
+from mgs.view.access import plain
 from mgs.view.subject import SCALARS, Subject
 
 FAR = 160.0
@@ -90,11 +91,11 @@ def scale(subject: Subject, layer: str) -> tuple[float, float]:
 
 def legend(layer: str, ends: tuple[float, float], unit: str) -> str:
     """Meaning of the colours of a layer, in one line. unit: name of a length of 1."""
-    low, high = ends
+    (low, high), name = ends, plain(unit)
     return {
         "colour": "The colours of the model.",
         "alpha": "Opacity: black 0, white 1.",
-        "depth": f"Depth: dark {low:.3g} {unit}, bright {high:.3g} {unit}. "
+        "depth": f"Depth: dark {low:.3g} {name}, bright {high:.3g} {name}. "
         "Grey while the camera moves.",
         "information": f"Information gained: dark 0, bright {high:.0f} nats and more.",
         "uncertainty": "Variance left over that of the prior: blue 0, all known; yellow 1, "

@@ -26,6 +26,7 @@ from mgs.errors import InputError
 from mgs.report.page_plots import FRUSTUM
 from mgs.rotation import rotmat_from_quat
 from mgs.view import layers
+from mgs.view.access import Access, plain
 from mgs.view.subject import View, read_subject
 
 REST = 0.2
@@ -36,6 +37,9 @@ FOLLOW = 1.0
 
 PIXELS = 1e6
 """Most pixels of an image of the kernel; a larger window shows it enlarged."""
+
+LARGEST_NUMBER = 1e6
+"""Bound of every number that a browser window sends: pixels, and lengths of the shown world."""
 
 PREVIEW = 480
 """Width of the image that a click on a camera shows, pixels."""
@@ -108,7 +112,8 @@ class Viewer:
         check_address(host, port)
         # A window may be closed while its image is drawn; viser then warns.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-        with redirect_stdout(StringIO()):  # viser prints a greeting and every window
+        self.access = Access(host)
+        with redirect_stdout(StringIO()), self.access.guarding():  # viser prints a greeting
             self.server = viser.ViserServer(host, port, label="mgs", verbose=False)
         self.port = self.server.get_port()
         if port not in (0, self.port):  # taken since the check: viser then takes the next one
@@ -142,7 +147,10 @@ class Viewer:
         for client in list(self.clients.values()):
             due = client.drawn != (client.moved, self.version) and now >= client.moved + REST
             if due and self.subject.gaussians is not None:
-                self._draw(client)
+                try:
+                    self._draw(client)
+                except Exception:  # whatever a window sent, the others go on
+                    client.drawn = (client.moved, self.version)
 
     def _stamp(self) -> list[int]:
         """Times of change of the files that a step or `mgs eval` writes."""
@@ -235,7 +243,7 @@ class Viewer:
     def _show_views(self) -> None:
         """Show title, cameras and the path between the chosen ones."""
         subject, scene = self.subject, self.server.scene
-        self.title.content = f"**{subject.title}**"
+        self.title.content = f"**{plain(subject.title)}**"
         if not subject.views:
             return
         centre, _ = self._extent()
@@ -279,18 +287,20 @@ class Viewer:
     def select(self, name: str) -> None:
         """Show the facts and the image of a view, or the error if the image cannot be read."""
         by_name = {view.frame.name: view for view in self.subject.views}
+        if name not in by_name:  # no window of ours sends it
+            return
         if self.selected in self.frusta:
             self.frusta[self.selected].color = COLOURS[by_name[self.selected].role]
         self.selected, view = name, by_name[name]
         self.frusta[name].color = SELECTED
         role = f"chosen at step {view.step}" if view.role == "chosen" else view.role
-        facts = [f"- {key}: {value}" for key, value in view.facts]
-        self.facts.content = "\n".join([f"**{name}**: {role}", "", *facts])
+        facts = [f"- {plain(key)}: {plain(value)}" for key, value in view.facts]
+        self.facts.content = "\n".join([f"**{plain(name)}**: {role}", "", *facts])
         try:
             image = np.round(srgb_from_linear(view.frame.rgb()) * 255).astype(np.uint8)
         except InputError as error:
             self.image.visible = False
-            self.facts.content += f"\n\n{error}"
+            self.facts.content += f"\n\n{plain(str(error))}"
             return
         every = max(1, image.shape[1] // PREVIEW)
         self.image.image = np.ascontiguousarray(image[::every, ::every])
@@ -339,7 +349,9 @@ class Viewer:
     def _draw(self, client: _Client) -> None:
         """Draw the layer for a browser whose camera rests: its Gaussians, and the kernel's image in
         their place."""
-        asked, layer, subject = (client.moved, self.version), self.layer.value, self.subject
+        asked, subject = (client.moved, self.version), self.subject
+        known = layers.layers(subject)
+        layer = self.layer.value if self.layer.value in known else known[0]
         g = subject.gaussians
         assert g is not None
         if client.splats is None or layer != client.layer:
@@ -370,10 +382,15 @@ class Viewer:
 
 
 def window_camera(camera: Any) -> Camera | None:
-    """Camera of a browser window (viser's CameraHandle), with at most PIXELS; None if the window
-    has no size."""
-    width, height = camera.image_width, camera.image_height
-    if width < 1 or height < 1:
+    """Camera of a browser window (viser's CameraHandle), with at most PIXELS.
+
+    None where what the window sent is no camera: a size, field of view or pose out of range.
+    """
+    width, height, wxyz = camera.image_width, camera.image_height, np.asarray(camera.wxyz, float)
+    numbers = [width, height, camera.fov, *wxyz, *np.asarray(camera.position, float)]
+    if not np.isfinite(numbers).all() or np.abs(numbers).max() > LARGEST_NUMBER:
+        return None
+    if min(width, height) < 1 or not 0.01 < camera.fov < 3.1 or np.linalg.norm(wxyz) < 1e-3:
         return None
     shrink = min(1.0, math.sqrt(PIXELS / (width * height)))
     width, height = max(1, round(width * shrink)), max(1, round(height * shrink))
