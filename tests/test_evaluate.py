@@ -315,7 +315,7 @@ def test_ssim_of_a_frame_leaves_out_its_border_and_ssim_of_a_mask_does_not():
 
 @pytest.fixture
 def work(monkeypatch):
-    """How many views were measured, and how many drawn, since last asked."""
+    """A function: number of views measured, and number drawn, since its last call."""
     calls = []
     for name in ("compare", "write_comparison"):
 
@@ -446,7 +446,7 @@ def test_without_the_prior_nothing_is_called_too_deep(dataset, prior, tmp_path):
     assert not [name for name in found if name.startswith("too_deep")]
     missing = "is not there, so the shares that are too deep, in its spacings, are left out"
     assert lines[1] == f"{prior}: {missing}"
-    assert lines[2].endswith("so it is left out how far the fit is from its end")
+    assert lines[2].endswith("so it is not measured whether the last fit converged")
 
 
 @pytest.mark.parametrize("numbers", [{"spacing": "wide"}, {"spacing": -1}, []])

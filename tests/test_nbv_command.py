@@ -14,7 +14,8 @@ from program import change_settings, command
 from refusals import refused
 from rich.console import Console
 
-from mgs.cli.nbv import print_run, start_and_print
+from mgs.cli.nbv import start_and_print
+from mgs.cli.printing import print_run
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import locked, write_json

@@ -160,8 +160,7 @@ SIDES = st.integers(1, 5000)
 
 @given(POINTS, POINTS, st.floats(0.3, 2), SIDES, SIDES)
 def test_the_camera_of_a_window(eye, target, fov, width, height):
-    """What it looks at is in the middle of the image, and what lies at the rim of its field of view
-    at the rim."""
+    """Its target is in the middle of the image, and the rim of its field of view at the rim."""
     if np.linalg.norm(np.subtract(eye, target)) < 0.1:
         return
     pose = np.linalg.inv(look_at(eye, target))
@@ -270,7 +269,8 @@ def test_a_run_is_followed_from_its_beginning(dataset, prior, tmp_path):
 
 SPLAT_CORNERS = """geometry => {
     const corners = geometry.attributes.position;
-    return geometry.type === "InstancedBufferGeometry" && corners.itemSize === 2 && corners.array.every(Number.isFinite);
+    return geometry.type === "InstancedBufferGeometry" && corners.itemSize === 2
+        && corners.array.every(Number.isFinite);
 }"""
 """Whether a geometry of three.js is that of viser's Gaussians."""
 
@@ -415,7 +415,7 @@ def test_a_ply_in_a_browser_at_phone_width(browser, run, tmp_path):
         tab.get_by_text("splats.ply").wait_for()
 
         def drawn():
-            """What is between the notice of viser, above, and the panel, below."""
+            """The part of the screen between the notice of viser and the panel."""
             return screenshot(tab)[180:540]
 
         def at_rest():

@@ -129,7 +129,7 @@ def _print_warning(message: Any, category: type, filename: str, line: int, *_: A
 
 
 def _hint(command: str) -> str:
-    """How to continue an interrupted command, if it can continue."""
+    """End of the line of an interrupted command: the way to continue, if there is one."""
     if command in RESUMABLE:
         return "; run the same command again to continue"
     resume = "; `mgs nbv --resume RUN` continues a run whose folder is there"

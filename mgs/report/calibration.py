@@ -1,5 +1,5 @@
-"""How true predicted errors are: functions of errors and of the standard deviations that were
-predicted for them, both [n].
+"""Accuracy of predicted errors: functions of errors and of their predicted standard deviations,
+both [n].
 
 AUSE and the calibration follow the usual definitions for uncertainty maps (sparsification curves;
 probability integral transform; continuous ranked probability score of a normal distribution).
@@ -105,7 +105,7 @@ def fit_calibration(terms: Mapping[str, Array], errors: Array) -> Calibration:
 def judged(
     errors: Array, sigma: Array, widths: Mapping[float, float], rng: np.random.Generator
 ) -> dict[str, Any]:
-    """How well sigma [n] predicted the signed errors [n].
+    """Measures of how well sigma [n] predicted the signed errors [n].
 
     - ause: for absolute and squared errors ("mae", "mse"), with that of a constant sigma, and of
       this sigma on errors drawn from it ("perfect").

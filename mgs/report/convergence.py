@@ -1,4 +1,4 @@
-"""How far from its minimum the fit of a run stopped: the predicted further fall of the objective.
+"""Predicted further fall of the objective of a run's last fit.
 
 A fit stops long before the minimum, because by then held-out images no longer improve and the
 ranking of candidates hardly changes (docs/fit.md). The loss from pass to pass does not show how far

@@ -272,21 +272,21 @@ def evaluate_run(
 
 
 def _fit(run: Run, progress: Progress, say: Callable[[str], None]) -> dict[str, Any]:
-    """How far the last fit is from its minimum, as the entry "fit". It is left out, with a line of
-    why, if the prior is gone or the run's Gaussians do not start from it."""
+    """Entry "fit": distance of the last fit from its minimum (`remaining_decrease`). Left out, with
+    the reason as a line, if the prior is gone or does not fit the run."""
     from mgs.report.convergence import remaining_decrease
 
     try:
         model, settings = run.state.gaussians, run.settings
         return {"fit": remaining_decrease(model, settings, run.prior, run.taken, progress)}
     except InputError as error:
-        say(f"{error}; so it is left out how far the fit is from its end")
+        say(f"{error}; so it is not measured whether the last fit converged")
         return {}
 
 
 def _informed(run: Run) -> dict[str, dict[str, int]]:
-    """By kind of parameter: how many there are ("of"), and about how many of them the views say
-    more than the prior does ("informed", H > lambda)."""
+    """Number of parameters by kind ("of"), and number of those about which the views say more than
+    the prior ("informed", H > lambda)."""
     from mgs.splat import groups
 
     state, settings = run.state, run.settings

@@ -193,8 +193,8 @@ def worth(
 
 
 def paying(found: Worth, sizes: Mapping[str, int], loss: float) -> dict[str, Mask]:
-    """Which Gaussians should learn each kind, {kind: [N]}: those that gain, without those that gain
-    least per parameter while Phi rises by at most `loss` dB in all.
+    """Choose the Gaussians that learn each kind, {kind: [N]}: those that gain, without those that
+    gain least per parameter while Phi rises by at most `loss` dB in all.
 
     sizes: {kind: parameters of a Gaussian}; only these kinds are decided.
     """

@@ -20,12 +20,11 @@ import numpy as np
 from mgs.data.dataset import load_dataset
 from mgs.fit.settings import COLOURS_ALONE, PASSES, WARM_PASSES
 from mgs.plotting import STYLE, new_figure, save_figure
-from mgs.report.figures import line_styles
 from mgs.run.nbv import run_nbv
 from mgs.run.settings import PRESETS
 from mgs.run.state import State
 from mgs.study.case import Case, Scene, Size, judge, test_views_of
-from mgs.study.output import Content, table, write_table
+from mgs.study.output import Content, group_styles, logarithmic, table, write_table
 from mgs.study.statistics import pareto_front
 from mgs.study.sweep import Cell, Report, Results, run_cells
 from mgs.study.timing import span, timed, with_seconds
@@ -327,7 +326,6 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
     """Draw seconds against PSNR and SSIM for points of the usual number of images: by the last of
     their factors, with the front and the names of presets."""
     import matplotlib
-    from matplotlib.ticker import LogLocator, NullFormatter
 
     most = Counter(row["images"] for row in rows).most_common(1)[0][0]
     rows = [row | {"factor": row["factors"].split("; ")[-1]} for row in rows]
@@ -340,7 +338,7 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
         for axes, (metric, flag, label) in zip(panels, metrics, strict=True):
             front = sorted((row["seconds"], row[metric]) for row in rows if row[flag])
             axes.step(*zip(*front, strict=True), where="post", color="black", lw=1, label="front")
-            for name, style in zip(names, line_styles(names), strict=True):
+            for name, style in zip(names, group_styles(names), strict=True):
                 of = [row for row in rows if row["factor"] == name]
                 low, x, high = (
                     np.array([row[f"seconds{end}"] for row in of]) for end in ("_low", "", "_high")
@@ -350,10 +348,7 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
             for row in rows:
                 at = row["seconds"], row[metric]
                 axes.annotate(row["preset"], at, (6, -9), textcoords="offset points", fontsize=8)
-            axes.set_xscale("log")
-            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axes.xaxis.set_major_formatter("{x:g}")
-            axes.xaxis.set_minor_formatter(NullFormatter())
+            logarithmic(axes)
             axes.margins(0.08)
             axes.set(xlabel=f"seconds, {most} images", ylabel=label)
         handles, labels = panels[0].get_legend_handles_labels()

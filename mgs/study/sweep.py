@@ -149,6 +149,8 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
     settings = {
         "distributed.worker.profile.enabled": False,
         "distributed.comm.timeouts.connect": CONNECT_SECONDS,
+        # Poisson surfaces start a thread for each core, which would keep all workers waiting.
+        "distributed.nanny.pre-spawn-environ.OMP_WAIT_POLICY": "passive",
     }
     silent = logging.CRITICAL + 1  # killed workers are retried, and errors of cells are raised
     loggers = [logging.getLogger(name) for name in ("distributed", "tornado.application")]

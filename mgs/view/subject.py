@@ -45,7 +45,7 @@ class View:
 
 @dataclass(frozen=True)
 class Subject:
-    """What the viewer shows.
+    """Contents of the viewer.
 
     gaussians: the model; None before the first finished step. space: "linear" or "srgb", in which
     its colours are blended. scalars: name -> [N], of SCALARS; empty for a PLY. views: of the
