@@ -21,10 +21,17 @@ from mgs.data.sources import read_source
 from mgs.data.up import degrees_between, unit_up
 from mgs.files import read_json
 from mgs.images import write_exr, write_png
+from mgs.prior import hull
 from mgs.prior.build import Prior, build_prior
 from mgs.prior.settings import PriorSettings
 
 WIDTH, HEIGHT = 128, 96
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """Hulls on a grid of half the usual fineness."""
+    monkeypatch.setattr(hull, "COARSE", 24)
 
 
 def toy() -> trimesh.Trimesh:
@@ -164,7 +171,7 @@ def prior_of(source: Path, out: Path, masks: bool) -> tuple[Dataset, Prior, np.n
 
 
 @pytest.mark.parametrize("masks", [True, False])
-def test_a_toy_on_a_table(capture: Callable[[str], Path], tmp_path: Path, masks: bool) -> None:
+def test_a_toy_on_a_table(capture, tmp_path, masks):
     _, prior, distance = prior_of(capture("toy"), tmp_path / "d", masks)
     assert ("plane_normal" in prior.numbers) != masks
     if not masks:
@@ -176,7 +183,7 @@ def test_a_toy_on_a_table(capture: Callable[[str], Path], tmp_path: Path, masks:
     assert (size < 0.6).all()
 
 
-def test_the_front_of_a_building(capture: Callable[[str], Path], tmp_path: Path) -> None:
+def test_the_front_of_a_building(capture, tmp_path):
     """Its wall is a plane that all cameras are in front of, and is not taken for the ground."""
     dataset, prior, distance = prior_of(capture("building"), tmp_path / "d", False)
     assert "plane_normal" not in prior.numbers

@@ -61,9 +61,7 @@ def slow_gains(colours: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), views=st.integers(1, 7))
-def test_gains_are_the_least_squares_solution_of_the_ratios_of_all_pairs(
-    seed: int, views: int
-) -> None:
+def test_gains_are_the_least_squares_solution_of_the_ratios_of_all_pairs(seed, views):
     rng = np.random.default_rng(seed)
     gains = np.exp(rng.normal(0, 0.3, (views, 3)))
     colours = shown(rng, views, 90, gains) * rng.lognormal(0, 0.2, (views, 90, 1))
@@ -75,14 +73,14 @@ def test_gains_are_the_least_squares_solution_of_the_ratios_of_all_pairs(
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), views=st.integers(2, 9))
-def test_gains_of_a_matt_surface_are_found(seed: int, views: int) -> None:
+def test_gains_of_a_matt_surface_are_found(seed, views):
     rng = np.random.default_rng(seed)
     gains = np.exp(rng.normal(0, 0.3, (views, 3)))
     found = solve_gains(shown(rng, views, 400, gains), np.ones((views, 400)))
     assert np.allclose(found, normalised(gains), rtol=2e-3)  # GAIN_STD pulls them to 1 by this much
 
 
-def test_images_that_share_nothing_or_only_darkness_or_light_have_a_gain_of_one() -> None:
+def test_images_that_share_nothing_or_only_darkness_or_light_have_a_gain_of_one():
     colours = np.full((2, 200, 3), np.nan)
     colours[0, :100], colours[1, 100:] = 0.3, 0.1
     assert np.array_equal(solve_gains(colours, np.ones((2, 200))), np.ones((2, 3)))
@@ -93,7 +91,7 @@ def test_images_that_share_nothing_or_only_darkness_or_light_have_a_gain_of_one(
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_a_corrected_render_is_the_nearest_of_all_that_differ_by_gains(seed: int) -> None:
+def test_a_corrected_render_is_the_nearest_of_all_that_differ_by_gains(seed):
     rng = np.random.default_rng(seed)
     truth, rendered, mask = rng.random((5, 6, 3)), rng.random((5, 6, 3)), rng.random((5, 6)) < 0.7
     corrected = colour_corrected(truth, rendered, mask)
@@ -163,7 +161,7 @@ def runs(rock: Path, varied: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     return made
 
 
-def test_a_run_finds_the_gains_of_its_images(runs: Runs, varied: Path) -> None:
+def test_a_run_finds_the_gains_of_its_images(runs, varied):
     state, out = runs["with"]
     dataset = load_dataset(varied)
     true = dict(zip([frame.name for frame in dataset.frames], gain_of(dataset), strict=True))
@@ -179,8 +177,8 @@ def test_a_run_finds_the_gains_of_its_images(runs: Runs, varied: Path) -> None:
 
 
 def test_a_fit_with_gains_is_nearly_as_good_as_one_of_constant_exposure_and_without_it_is_worse(
-    runs: Runs,
-) -> None:
+    runs,
+):
     metrics = {name: read_json(out / "metrics.json")["held_out"] for name, (_, out) in runs.items()}
     corrected = {name: found["psnr_mask_corrected"] for name, found in metrics.items()}
     assert corrected["with"] > corrected["constant"] - 0.5
@@ -191,9 +189,7 @@ def test_a_fit_with_gains_is_nearly_as_good_as_one_of_constant_exposure_and_with
     assert not any("corrected" in key for key in runs["constant"][0].steps[-1])
 
 
-def test_the_alarm_of_exposure_is_silent_where_gains_explain_it(
-    runs: Runs,
-) -> None:
+def test_the_alarm_of_exposure_is_silent_where_gains_explain_it(runs):
     alarmed = {}
     for name, (state, _) in runs.items():
         warnings = [warning for line in state.steps for warning in line.get("warnings", [])]
@@ -201,7 +197,7 @@ def test_the_alarm_of_exposure_is_silent_where_gains_explain_it(
     assert alarmed == {"constant": False, "without": True, "with": False}
 
 
-def test_an_interrupted_run_goes_on_bit_for_bit(varied: Path, runs: Runs, tmp_path: Path) -> None:
+def test_an_interrupted_run_goes_on_bit_for_bit(varied, runs, tmp_path):
     class Killed(Exception):
         pass
 
@@ -220,16 +216,12 @@ def test_an_interrupted_run_goes_on_bit_for_bit(varied: Path, runs: Runs, tmp_pa
     assert [line["exposure"] for line in one.steps] == [line["exposure"] for line in other.steps]
 
 
-def test_the_distance_of_a_fit_from_its_end_is_that_of_the_corrected_images(
-    runs: Runs,
-) -> None:
+def test_the_distance_of_a_fit_from_its_end_is_that_of_the_corrected_images(runs):
     phi = {name: read_json(out / "metrics.json")["fit"]["phi"] for name, (_, out) in runs.items()}
     assert phi["with"] < 1.1 * phi["constant"] < 0.7 * phi["without"]
 
 
-def test_the_table_has_the_corrected_columns_only_where_a_run_estimated_exposure(
-    runs: Runs,
-) -> None:
+def test_the_table_has_the_corrected_columns_only_where_a_run_estimated_exposure(runs):
     for name, there in (("with", True), ("without", False)):
         table = markdown_table(table_numbers([runs[name][1]]))
         assert ("exposure fitted to each view" in table) == there
@@ -247,7 +239,7 @@ def photograph(path: Path, time: float | None, speed: int = 100, number: float =
     return path
 
 
-def test_stops_of_exif_are_those_of_time_speed_and_aperture(tmp_path: Path) -> None:
+def test_stops_of_exif_are_those_of_time_speed_and_aperture(tmp_path):
     stops = exif_exposure(photograph(tmp_path / "a.jpg", 0.01))
     assert stops is not None
     for change, expected in (((0.02,), 1), ((0.01, 400), 2), ((0.01, 100, 4.0), -2)):
@@ -261,9 +253,7 @@ def test_stops_of_exif_are_those_of_time_speed_and_aperture(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("differs", [True, False])
-def test_an_import_tells_of_exposure_that_differs(
-    rock: Path, tmp_path: Path, capsys, differs: bool
-) -> None:
+def test_an_import_tells_of_exposure_that_differs(rock, tmp_path, capsys, differs):
     frames = []
     (tmp_path / "src/images").mkdir(parents=True)
     for k, frame in enumerate(load_dataset(rock).frames[:8]):

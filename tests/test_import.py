@@ -27,7 +27,7 @@ from mgs.data.sources import read_source
 from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.images import write_png
-from mgs.prior.build import build_prior, load_prior
+from mgs.prior.build import build_prior
 from mgs.prior.settings import PriorSettings
 
 DISTORTION = np.array([-0.15, 0.04, 0.002, -0.003, 0.0])
@@ -68,7 +68,7 @@ def dataset(tmp_path: Path) -> Dataset:
     return synthetic.write_dataset(tmp_path / "data")
 
 
-def test_a_dataset_imports_as_itself(dataset: Dataset, tmp_path: Path) -> None:
+def test_a_dataset_imports_as_itself(dataset, tmp_path):
     copy = _import(dataset.root, tmp_path / "copy")
     same_cameras(dataset, copy)
     for one, other in zip(dataset.frames, copy.frames, strict=True):
@@ -79,7 +79,7 @@ def test_a_dataset_imports_as_itself(dataset: Dataset, tmp_path: Path) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
-def test_any_camera_and_any_pixels_survive(data: st.DataObject, tmp_path_factory) -> None:
+def test_any_camera_and_any_pixels_survive(data, tmp_path_factory):
     root = tmp_path_factory.mktemp("any")
     number = st.floats(-1, 1)
     frames = []
@@ -100,9 +100,7 @@ def test_any_camera_and_any_pixels_survive(data: st.DataObject, tmp_path_factory
 
 
 @pytest.mark.parametrize("binary", [True, False])
-def test_colmap_gives_cameras_and_points_for_a_prior(
-    dataset: Dataset, tmp_path: Path, binary: bool
-) -> None:
+def test_colmap_gives_cameras_and_points_for_a_prior(dataset, tmp_path, binary):
     synthetic.write_colmap(dataset, tmp_path / "colmap", binary)
     copy = _import(tmp_path / "colmap", tmp_path / "copy")
     same_cameras(dataset, copy)
@@ -137,9 +135,7 @@ def agrees_with_masks(dataset: Dataset) -> bool:
 
 
 @pytest.mark.parametrize("kind", ["8 bit", "16 bit"])
-def test_a_soft_alpha_becomes_images_of_the_rock_alone(
-    dataset: Dataset, tmp_path: Path, kind: str
-) -> None:
+def test_a_soft_alpha_becomes_images_of_the_rock_alone(dataset, tmp_path, kind):
     images = _with_alpha(dataset, kind)
     copy = _import(dataset.root, tmp_path / "copy")
     assert agrees_with_masks(copy)
@@ -159,8 +155,8 @@ def test_a_soft_alpha_becomes_images_of_the_rock_alone(
 
 @pytest.mark.parametrize("case", ["binary", "masks", "mesh", "mask files"])
 def test_without_a_soft_alpha_that_gives_the_mask_there_are_no_images_of_the_rock(
-    dataset: Dataset, tmp_path: Path, case: str
-) -> None:
+    dataset, tmp_path, case
+):
     _with_alpha(dataset, "binary" if case == "binary" else "8 bit")
     given = {
         "masks": {"masks": dataset.root / "masks"},
@@ -175,7 +171,7 @@ def test_without_a_soft_alpha_that_gives_the_mask_there_are_no_images_of_the_roc
     assert not (copy.root / "rock").exists()
 
 
-def test_a_soft_alpha_is_undistorted_without_a_fringe(dataset: Dataset, tmp_path: Path) -> None:
+def test_a_soft_alpha_is_undistorted_without_a_fringe(dataset, tmp_path):
     """A grey rock over transparent black: resampled straight, its rim would turn dark."""
     edit(dataset.root, lambda data: (without_masks(data), data.update(LENS)))
     for frame in dataset.frames:
@@ -192,7 +188,7 @@ def test_a_soft_alpha_is_undistorted_without_a_fringe(dataset: Dataset, tmp_path
         assert np.abs(straight - 128).max() < 1
 
 
-def test_nerf_synthetic_with_alpha(dataset: Dataset, tmp_path: Path) -> None:
+def test_nerf_synthetic_with_alpha(dataset, tmp_path):
     import json
 
     root, camera, records = tmp_path / "lego", dataset.frames[0].camera, []
@@ -218,7 +214,7 @@ def test_nerf_synthetic_with_alpha(dataset: Dataset, tmp_path: Path) -> None:
         assert np.array_equal(one.mask(), other.mask())
 
 
-def test_distortion_is_undone(tmp_path: Path) -> None:
+def test_distortion_is_undone(tmp_path):
     camera = Camera(np.array([[110.0, 0, 83], [0, 108.0, 57], [0, 0, 1]]), 160, 120, np.eye(4))
     shift = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     pixels = np.indices((120, 160), np.float64)[::-1].reshape(2, -1).T[:, None]
@@ -245,7 +241,7 @@ def test_distortion_is_undone(tmp_path: Path) -> None:
     assert 0.3 < copy.mask().sum() / source.mask().sum() < 3
 
 
-def test_depth_and_images_of_16_bits(dataset: Dataset, tmp_path: Path) -> None:
+def test_depth_and_images_of_16_bits(dataset, tmp_path):
     written = np.random.default_rng(0).integers(0, 65536, (48, 64, 4), np.uint16)
 
     def change(data: dict[str, Any]) -> None:
@@ -268,9 +264,7 @@ def test_depth_and_images_of_16_bits(dataset: Dataset, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "kind", ["plain", "alpha", "grey", "palette", "16 bit", "jpeg", "distorted"]
 )
-def test_only_an_image_that_stays_as_it_is_is_copied(
-    dataset: Dataset, tmp_path: Path, kind: str
-) -> None:
+def test_only_an_image_that_stays_as_it_is_is_copied(dataset, tmp_path, kind):
     path = dataset.frames[0].image_path
     with Image.open(path) as image:
         pixels = np.asarray(image)
@@ -290,7 +284,7 @@ def test_only_an_image_that_stays_as_it_is_is_copied(
     assert np.array_equal(copy.rgb(), replace(copy, image_path=path).rgb()) == (kind != "distorted")
 
 
-def test_what_is_missing_is_skipped_and_said(dataset: Dataset, tmp_path: Path, capsys) -> None:
+def test_what_is_missing_is_skipped_and_said(dataset, tmp_path, capsys):
     for frame in dataset.frames[:3]:
         frame.image_path.unlink()
     edit(dataset.root, lambda data: data.update(ply_file_path="sparse_pc.ply"))
@@ -305,7 +299,7 @@ def test_what_is_missing_is_skipped_and_said(dataset: Dataset, tmp_path: Path, c
     assert not (tmp_path / "copy/sparse.ply").exists()
 
 
-def test_images_are_set_apart_as_test_views(dataset: Dataset, tmp_path: Path, capsys) -> None:
+def test_images_are_set_apart_as_test_views(dataset, tmp_path, capsys):
     arguments = ["import", dataset.root, "--test-every", "3", "--out"]
     out = tmp_path / "out"
     assert run(*arguments, out) == 0
@@ -328,7 +322,7 @@ def test_images_are_set_apart_as_test_views(dataset: Dataset, tmp_path: Path, ca
     assert "--test-every 3 of 1 images leaves none to choose from" in said(capsys)[1]
 
 
-def test_masks_by_projecting_a_mesh_or_from_files(dataset: Dataset, tmp_path: Path) -> None:
+def test_masks_by_projecting_a_mesh_or_from_files(dataset, tmp_path):
     edit(dataset.root, without_masks)
     for path in list((dataset.root / "masks").iterdir())[::2]:
         path.rename(path.with_name(f"{path.name}.png"))  # as COLMAP names them: 0001.jpg.png
@@ -347,26 +341,17 @@ def test_masks_by_projecting_a_mesh_or_from_files(dataset: Dataset, tmp_path: Pa
         assert (a.mask() & ~mask).sum() < 0.15 * mask.sum()
 
 
-def test_a_prior_of_a_given_mesh(dataset: Dataset, tmp_path: Path) -> None:
-    mesh = ["--mesh", dataset.root / "rock.glb", "--gaussians", 300, "--backing", 0]
-    assert run("prior", dataset.root, *mesh, "--out", tmp_path / "prior") == 0
-    prior = load_prior(tmp_path / "prior")
-    assert len(prior.points) == 300
-    assert np.abs(synthetic.level(prior.points)).max() < 0.01
-    assert (tmp_path / "prior/prior.png").is_file()
-
-
 @pytest.mark.parametrize("command", [["import"], ["prior", "--gaussians", 300]])
 def test_a_mesh_is_said_to_be_turned_only_where_it_could_be_read(
-    dataset: Dataset, tmp_path: Path, command: list, capsys
-) -> None:
+    dataset, tmp_path, command, capsys
+):
     (tmp_path / "broken.glb").write_text("this is no mesh")
     for mesh, read in ((tmp_path / "broken.glb", False), (dataset.root / "rock.glb", True)):
         run(*command, dataset.root, "--out", tmp_path / "out", "--mesh", mesh)
         assert ("turned from +Y up" in said(capsys)[0]) == read
 
 
-def test_an_empty_mask_in_every_frame_is_one_line(dataset: Dataset) -> None:
+def test_an_empty_mask_in_every_frame_is_one_line(dataset):
     empty = dataset.root / "masks/empty.png"
     write_png(empty, np.zeros((48, 64), bool))
     frames = tuple(replace(frame, mask_path=empty) for frame in dataset.frames)
@@ -479,7 +464,7 @@ BAD: dict[str, tuple[Spoil, list[str], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_one_line_and_leaves_nothing(case: str, tmp_path: Path, capfd) -> None:
+def test_bad_input_is_one_line_and_leaves_nothing(case, tmp_path, capfd):
     spoil, options, message = BAD[case]
     root = synthetic.write_dataset(tmp_path / "src").root
     (root / "rock").mkdir()

@@ -66,9 +66,7 @@ def ends_as_one_go(arguments: list, out: Path) -> None:
 @pytest.mark.parametrize(
     ("blow", "code"), [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 130)]
 )
-def test_struck_in_the_middle_and_given_again(
-    many: list, tmp_path: Path, blow: int, code: int, monkeypatch
-) -> None:
+def test_struck_in_the_middle_and_given_again(many, tmp_path, blow, code, monkeypatch):
     """A real process, a real signal; then no finished frame is read again."""
     out = tmp_path / "out"
     program = [sys.executable, "-c", STRUCK.format(blow=int(blow)), *map(str, many), str(out)]
@@ -110,8 +108,8 @@ def stopped(arguments: list, out: Path, monkeypatch) -> Path:
 
 
 def test_an_unfinished_import_of_something_else_is_refused(
-    source: Path, many: list, tmp_path: Path, monkeypatch, capsys
-) -> None:
+    source, many, tmp_path, monkeypatch, capsys
+):
     out = stopped(many, tmp_path / "out", monkeypatch)
     said(capsys)
     other = synthetic.write_dataset(tmp_path / "other").root
@@ -124,17 +122,13 @@ def test_an_unfinished_import_of_something_else_is_refused(
     assert "unfinished dataset" in refused(capsys, [*many, out], out)
 
 
-def test_a_frame_whose_files_changed_is_made_again(
-    source: Path, many: list, tmp_path: Path, monkeypatch
-) -> None:
+def test_a_frame_whose_files_changed_is_made_again(source, many, tmp_path, monkeypatch):
     out = stopped(many, tmp_path / "out", monkeypatch)
     write_png(source / "images/kf_0000.png", np.full((48, 64, 3), 0.5))
     ends_as_one_go(many, out)
 
 
-def test_a_damaged_image_in_the_middle_keeps_the_frames_before(
-    source: Path, many: list, tmp_path: Path, capsys
-) -> None:
+def test_a_damaged_image_in_the_middle_keeps_the_frames_before(source, many, tmp_path, capsys):
     out, image = tmp_path / "out", source / "images/kf_0004.png"
     whole = image.read_bytes()
     image.write_bytes(whole[:100])
@@ -145,7 +139,7 @@ def test_a_damaged_image_in_the_middle_keeps_the_frames_before(
     ends_as_one_go(many, out)
 
 
-def test_killed_before_the_first_frame(many: list, tmp_path: Path) -> None:
+def test_killed_before_the_first_frame(many, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out/.import.1.part.json").touch()
     assert run(*many, tmp_path / "out") == 0

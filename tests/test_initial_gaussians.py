@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,7 +45,7 @@ def prior(dataset: Dataset) -> Prior:
     return build_prior(dataset, PriorSettings(gaussians=2000, backing=0))[0]
 
 
-def test_shapes_scales_and_rotations(prior: Prior, dataset: Dataset) -> None:
+def test_shapes_scales_and_rotations(prior, dataset):
     gaussians, seen = initial_gaussians(prior, dataset.frames[::3])
     assert gaussians.check() is gaussians
     for name in ("means", "log_scales", "quats", "sh"):
@@ -64,9 +63,7 @@ def test_shapes_scales_and_rotations(prior: Prior, dataset: Dataset) -> None:
     assert np.allclose(gaussians.opacities, INITIAL_OPACITY, atol=1e-6)
 
 
-def test_a_warm_start_gives_new_images_to_what_none_saw_before(
-    prior: Prior, dataset: Dataset
-) -> None:
+def test_a_warm_start_gives_new_images_to_what_none_saw_before(prior, dataset):
     """A newly seen Gaussian takes the new colour plus what was learned; all else stays."""
     (before, seen_before), (start, seen) = (
         initial_gaussians(prior, dataset.frames[:k]) for k in (1, 2)
@@ -83,7 +80,7 @@ def test_a_warm_start_gives_new_images_to_what_none_saw_before(
     assert found.sh.dtype == np.float32
 
 
-def test_a_pixel_on_the_surface(prior: Prior) -> None:
+def test_a_pixel_on_the_surface(prior):
     """depth / focal length; of several cameras the median, of none in front 0."""
     K = np.array([[100.0, 0, 20], [0, 100.0, 15], [0, 0, 1]])
     centre, x = np.median(prior.points, axis=0), np.array([1.0, 0, 0])
@@ -96,7 +93,7 @@ def test_a_pixel_on_the_surface(prior: Prior) -> None:
     assert pixel_on(prior, [turned]) == 0
 
 
-def test_outlines_are_where_they_are_in_the_images(dataset: Dataset, prior: Prior) -> None:
+def test_outlines_are_where_they_are_in_the_images(dataset, prior):
     """Drawn from below the surface the rock covers about its masks; from the surface, more."""
 
     def excess(inset: float) -> float:
@@ -110,7 +107,7 @@ def test_outlines_are_where_they_are_in_the_images(dataset: Dataset, prior: Prio
     assert excess(0) > 2 * abs(excess(INSET))
 
 
-def test_one_layer_hides_what_is_behind_it() -> None:
+def test_one_layer_hides_what_is_behind_it():
     """The mean log-transmittance of INITIAL_OPACITY, in closed form and over a lattice."""
     dilogarithm = spence(1 - INITIAL_OPACITY)
     closed = -2 * np.pi * IN_PLANE_SCALE**2 * dilogarithm
@@ -123,7 +120,7 @@ def test_one_layer_hides_what_is_behind_it() -> None:
     assert np.exp(closed) < 0.04
 
 
-def test_colours_are_those_of_the_seen_surface(prior: Prior, dataset: Dataset) -> None:
+def test_colours_are_those_of_the_seen_surface(prior, dataset):
     gaussians, seen = initial_gaussians(prior, dataset.frames)
     # 12 views from above see all but the foot of the rock, where a pixel's mask may miss.
     assert seen[prior.points[:, 2] > 0.1].mean() > 0.99
@@ -132,7 +129,7 @@ def test_colours_are_those_of_the_seen_surface(prior: Prior, dataset: Dataset) -
     assert np.quantile(error, 0.99) < 0.1  # a pixel at the rim mixes rock and ground
 
 
-def test_the_far_side_of_one_frame_stays_grey(prior: Prior, dataset: Dataset) -> None:
+def test_the_far_side_of_one_frame_stays_grey(prior, dataset):
     frame = dataset.frames[0]
     gaussians, seen = initial_gaussians(prior, [frame])
     towards = np.einsum("nk,nk->n", prior.normals, frame.camera.position - prior.points)
@@ -142,7 +139,7 @@ def test_the_far_side_of_one_frame_stays_grey(prior: Prior, dataset: Dataset) ->
     assert np.allclose(gaussians.rgb[~seen], GREY, atol=1e-6)
 
 
-def test_the_mesh_stands_in_for_missing_depth(prior: Prior, dataset: Dataset) -> None:
+def test_the_mesh_stands_in_for_missing_depth(prior, dataset):
     frames = dataset.frames[::3]
     _, by_depth = initial_gaussians(prior, frames)
     without = [replace(frame, depth_path=None) for frame in frames]
@@ -152,9 +149,7 @@ def test_the_mesh_stands_in_for_missing_depth(prior: Prior, dataset: Dataset) ->
     assert np.quantile(error, 0.95) < 0.08
 
 
-def test_colours_are_averaged_and_the_mask_counts(
-    prior: Prior, dataset: Dataset, tmp_path: Path
-) -> None:
+def test_colours_are_averaged_and_the_mask_counts(prior, dataset, tmp_path):
     frame = dataset.frames[0]
     shape = (frame.camera.height, frame.camera.width, 3)
     images = []
@@ -171,7 +166,7 @@ def test_colours_are_averaged_and_the_mask_counts(
     assert np.allclose(gaussians.rgb, GREY, atol=1e-6)
 
 
-def test_behind_the_surface_lies_an_opaque_backing(dataset: Dataset) -> None:
+def test_behind_the_surface_lies_an_opaque_backing(dataset):
     """A third of the Gaussians, evenly spread, a spacing inside, opaque, coloured as above them."""
     prior = build_prior(dataset, PriorSettings(gaussians=1200))[0]
     gaussians, seen = initial_gaussians(prior, dataset.frames)
@@ -197,9 +192,7 @@ def joined(a: Gaussians, b: Gaussians) -> Gaussians:
     return Gaussians(*(np.concatenate([getattr(a, name), getattr(b, name)]) for name in vars(a)))
 
 
-def test_the_backing_survives_the_file_and_is_part_of_what_a_run_goes_on_from(
-    dataset: Dataset, tmp_path: Path
-) -> None:
+def test_the_backing_survives_the_file_and_is_part_of_what_a_run_goes_on_from(dataset, tmp_path):
     prior = build_prior(dataset, PriorSettings(gaussians=300))[0]
     loaded = load_prior(save_prior(tmp_path / "prior", prior))
     assert loaded.backed == prior.backed == 100

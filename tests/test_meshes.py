@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -75,7 +74,7 @@ BAD_MESHES: dict[str, tuple[str, str | None, str]] = {
 
 
 @pytest.mark.parametrize("case", BAD_MESHES)
-def test_bad_mesh_is_one_line(dataset: Dataset, tmp_path: Path, case: str, capsys) -> None:
+def test_bad_mesh_is_one_line(dataset, tmp_path, case, capsys):
     name, content, message = BAD_MESHES[case]
     if content is not None:
         (tmp_path / name).write_text(content)
@@ -102,27 +101,26 @@ MEMORY = f"N = {GB} samples take about {GB} GB of memory, and this machine has [
         ("--gaussians 100 --poisson-depth 0", "--poisson-depth.*--mesh"),
     ],
 )
-def test_options_that_do_not_fit_a_mesh_are_one_line(
-    dataset: Dataset, options: str, message: str, capsys
-) -> None:
+def test_options_that_do_not_fit_a_mesh_are_one_line(dataset, options, message, capsys):
     mesh = ["--mesh", dataset.root / "rock.glb"]
     line = refused(capsys, ["prior", dataset.root, *mesh, *options.split()], dataset.root)
     assert re.search(message, line)
 
 
-def test_a_mesh_that_is_small_and_far_away_is_one_line(tmp_path: Path) -> None:
+def test_a_mesh_that_is_small_and_far_away_is_one_line(tmp_path):
     (tmp_path / "a.obj").write_text(obj("1e6 0 0", "1000001 0 0", "1e6 1 0"))
     with pytest.raises(InputError, match="float32 does not resolve"):
         prior_from_mesh(tmp_path / "a.obj", PriorSettings(gaussians=100))
 
 
-def test_the_record_of_a_given_mesh_says_what_was_done(
-    dataset: Dataset, tmp_path: Path, capsys
-) -> None:
+def test_the_record_of_a_given_mesh_says_what_was_done(dataset, tmp_path, capsys):
     options = ["--mesh", dataset.root / "rock.glb", "--gaussians", 100, "--seed", 3]
     assert run("prior", dataset.root, *options, "--out", tmp_path / "p") == 0
     used = {"gaussians": 100, "spacing": None, "seed": 3, "backing": 0.5}
-    assert load_prior(tmp_path / "p").numbers["settings"] == used
+    prior = load_prior(tmp_path / "p")
+    assert prior.numbers["settings"] == used
+    assert np.abs(synthetic.level(prior.points)).max() < 0.01
+    assert (tmp_path / "p/prior.png").is_file()
     assert "some frame saw" not in said(capsys)[0]
 
 
@@ -167,7 +165,7 @@ def _spoilt(how: str) -> trimesh.Trimesh:
         "some faces inside out, no vertex shared",
     ],
 )
-def test_a_mesh_that_can_be_mended_gives_the_same_prior(tmp_path: Path, how: str) -> None:
+def test_a_mesh_that_can_be_mended_gives_the_same_prior(tmp_path, how):
     synthetic.rock_mesh().export(tmp_path / "rock.ply")
     _spoilt(how).export(tmp_path / "spoilt.ply")
     right, found = (
@@ -185,7 +183,7 @@ def test_a_mesh_that_can_be_mended_gives_the_same_prior(tmp_path: Path, how: str
     assert octant.min() > 15
 
 
-def test_a_single_triangle_and_a_fold_are_sampled(dataset: Dataset, tmp_path: Path) -> None:
+def test_a_single_triangle_and_a_fold_are_sampled(dataset, tmp_path):
     (tmp_path / "one.obj").write_text(f"{TRIANGLE}f 1 3 2\n")
     options = ["--mesh", tmp_path / "one.obj", "--gaussians", 40, "--out", tmp_path / "p"]
     assert run("prior", dataset.root, *options) == 0
@@ -197,7 +195,7 @@ def test_a_single_triangle_and_a_fold_are_sampled(dataset: Dataset, tmp_path: Pa
     assert np.allclose(np.abs(normals), [0, 0, 1])
 
 
-def test_a_mesh_with_holes_is_sampled(tmp_path: Path) -> None:
+def test_a_mesh_with_holes_is_sampled(tmp_path):
     mesh = synthetic.rock_mesh()
     mesh.update_faces(np.random.default_rng(0).random(len(mesh.faces)) > 0.2)
     mesh.export(tmp_path / "holes.ply")

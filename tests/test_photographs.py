@@ -34,7 +34,6 @@ from mgs.prior.build import build_prior, load_prior
 from mgs.prior.hull import visual_hull
 from mgs.prior.points import _grown, main_cluster, on_surface, reliable
 from mgs.prior.settings import PriorSettings
-from mgs.run import recording
 
 Make = Callable[[str], Path]
 
@@ -97,7 +96,7 @@ def floating(root: Path, cameras: list[Camera]) -> Dataset:
 # The visual hull
 
 
-def test_the_hull_of_a_convex_body_seen_from_all_sides_is_that_body(tmp_path: Path) -> None:
+def test_the_hull_of_a_convex_body_seen_from_all_sides_is_that_body(tmp_path):
     dataset = floating(tmp_path / "d", lattice(30))
     found = visual_hull(dataset.frames)
     body = trimesh.Trimesh(found.mesh.vertices, found.mesh.faces, process=False)
@@ -111,9 +110,7 @@ def test_the_hull_of_a_convex_body_seen_from_all_sides_is_that_body(tmp_path: Pa
         assert binary_dilation(frame.mask(), iterations=1)[row, column].all()
 
 
-def test_a_finer_grid_and_masks_in_blocks_give_the_same_hull(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_finer_grid_and_masks_in_blocks_give_the_same_hull(tmp_path, monkeypatch):
     dataset = floating(tmp_path / "d", lattice(16))
     usual = visual_hull(dataset.frames)
     with monkeypatch.context() as patch:
@@ -129,7 +126,7 @@ def test_a_finer_grid_and_masks_in_blocks_give_the_same_hull(
     assert away.max() < 1.5 * 3.0 / 90  # pixels
 
 
-def test_masks_that_do_not_fit_are_one_line_that_names_a_frame(tmp_path: Path) -> None:
+def test_masks_that_do_not_fit_are_one_line_that_names_a_frame(tmp_path):
     dataset = floating(tmp_path / "d", lattice(12))
     wrong = np.zeros((72, 96), bool)
     wrong[:5, :5] = True
@@ -150,7 +147,7 @@ def test_masks_that_do_not_fit_are_one_line_that_names_a_frame(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("kind", "masks"), [("colmap-binary", True), ("colmap-text", False), ("nerfstudio", False)]
 )
-def test_real_clouds_give_the_rock(data: Make, tmp_path: Path, kind: str, masks: bool) -> None:
+def test_real_clouds_give_the_rock(data, tmp_path, kind, masks):
     source, truth = read_source(data(kind)), read_json(data(kind) / "truth.json")
     up, _ = source.up_or_estimate()
     folder = data(kind) / "masks" if masks else None
@@ -170,9 +167,7 @@ def test_real_clouds_give_the_rock(data: Make, tmp_path: Path, kind: str, masks:
         assert np.array_equal(prior.points, again.points)
 
 
-def test_tracks_and_errors_are_kept_and_wrong_points_are_left_out(
-    data: Make, tmp_path: Path
-) -> None:
+def test_tracks_and_errors_are_kept_and_wrong_points_are_left_out(data, tmp_path):
     import_source(read_source(data("colmap-binary")), tmp_path / "d")
     cloud = read_cloud(tmp_path / "d/sparse.ply")
     assert cloud.track.min() >= 2
@@ -182,7 +177,7 @@ def test_tracks_and_errors_are_kept_and_wrong_points_are_left_out(
     assert cloud.track[kept].min() >= 3
 
 
-def test_points_of_any_ply_can_be_given(data: Make, tmp_path: Path) -> None:
+def test_points_of_any_ply_can_be_given(data, tmp_path):
     dataset = import_source(read_source(data("nerf-synthetic")), tmp_path / "d")
     scale = read_json(data("nerf-synthetic") / "truth.json")["scale"]
     sphere = np.random.default_rng(0).standard_normal((3000, 3))
@@ -195,7 +190,7 @@ def test_points_of_any_ply_can_be_given(data: Make, tmp_path: Path) -> None:
     assert np.abs(synthetic.level(prior.points / scale)).mean() < 0.03
 
 
-def test_a_point_alone_or_off_the_surface_is_found() -> None:
+def test_a_point_alone_or_off_the_surface_is_found():
     rng = np.random.default_rng(0)
     sheet = np.column_stack([rng.uniform(0, 1, (800, 2)), 0.002 * rng.standard_normal(800)])
     strays = np.array([[0.5, 0.5, 0.05], [3.0, 3.0, 0.0]])
@@ -204,7 +199,7 @@ def test_a_point_alone_or_off_the_surface_is_found() -> None:
     assert not kept[800:].any()
 
 
-def test_a_cluster_of_uneven_density_is_one_and_scattered_points_are_not_of_it() -> None:
+def test_a_cluster_of_uneven_density_is_one_and_scattered_points_are_not_of_it():
     rng = np.random.default_rng(1)
     dense, thin = rng.uniform(0, 1, (1500, 3)), rng.uniform([0.95, 0, 0], [2, 1, 1], (300, 3))
     other = rng.uniform([6, 0, 0], [6.5, 0.5, 0.5], (600, 3))
@@ -216,7 +211,7 @@ def test_a_cluster_of_uneven_density_is_one_and_scattered_points_are_not_of_it()
     assert not inside[1800:].any()
 
 
-def test_a_cloud_without_views_is_taken_to_be_seen_by_the_nearest_cameras() -> None:
+def test_a_cloud_without_views_is_taken_to_be_seen_by_the_nearest_cameras():
     cameras = lattice(40)
     normals = np.random.default_rng(2).standard_normal((200, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -225,7 +220,7 @@ def test_a_cloud_without_views_is_taken_to_be_seen_by_the_nearest_cameras() -> N
     assert np.einsum("nk,nk->n", views, normals).min() > 0.5
 
 
-def test_a_cloud_survives_its_file_and_of_points_in_one_place_one_is_kept(tmp_path: Path) -> None:
+def test_a_cloud_survives_its_file_and_of_points_in_one_place_one_is_kept(tmp_path):
     rng = np.random.default_rng(3)
     points, views, error = rng.random((9, 3)), rng.random((9, 3)), rng.random(9)
     cloud = SparseCloud(points, views, rng.integers(2, 9, 9).astype(float), error)
@@ -246,7 +241,7 @@ def test_a_cloud_survives_its_file_and_of_points_in_one_place_one_is_kept(tmp_pa
         read_cloud(tmp_path / "c.ply")
 
 
-def test_a_refused_cloud_leaves_a_picture(data: Make, tmp_path: Path, capsys) -> None:
+def test_a_refused_cloud_leaves_a_picture(data, tmp_path, capsys):
     source = data("colmap-binary")
     root = import_source(read_source(source), tmp_path / "d", masks=source / "masks").root
     write_cloud(tmp_path / "far.ply", SparseCloud(np.random.default_rng(0).uniform(5, 6, (300, 3))))
@@ -263,7 +258,7 @@ def test_a_refused_cloud_leaves_a_picture(data: Make, tmp_path: Path, capsys) ->
 @given(st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(lambda v: np.linalg.norm(v) > 0.1))
 @example([0.0, 2.0**-24, -1.0])
 @example([0.0, 0.0, -1.0])
-def test_upright_is_the_rotation_that_turns_up_to_z(vector: list[float]) -> None:
+def test_upright_is_the_rotation_that_turns_up_to_z(vector):
     up = unit_up(vector)
     turn = upright(up)
     assert np.allclose(turn @ turn.T, np.eye(3), atol=1e-9)
@@ -274,9 +269,7 @@ def test_upright_is_the_rotation_that_turns_up_to_z(vector: list[float]) -> None
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), altitude=st.floats(0.2, 5), arc=st.floats(1.0, 6.28))
-def test_up_is_found_in_a_turned_world_of_cameras_held_nearly_level(
-    seed: int, altitude: float, arc: float
-) -> None:
+def test_up_is_found_in_a_turned_world_of_cameras_held_nearly_level(seed, altitude, arc):
     rng = np.random.default_rng(seed)
     turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
     turn *= np.linalg.det(turn)
@@ -292,42 +285,7 @@ def test_up_is_found_in_a_turned_world_of_cameras_held_nearly_level(
     assert degrees_between(up_of_cameras(cameras), unit_up(up)) < 5
 
 
-def test_policies_measure_azimuths_about_the_up_axis(tmp_path: Path) -> None:
-    import tiny
-
-    taken = []
-    turn = np.linalg.qr(np.random.default_rng(4).standard_normal((3, 3)))[0]
-    turn *= np.linalg.det(turn)
-    for name, rotation in (("level", np.eye(3)), ("tilted", turn)):
-        root = tiny.write_dataset(tmp_path / name)
-        dataset = load_dataset(root)
-        frames = []
-        for frame in dataset.frames:
-            pose = frame.camera.world_to_camera.copy()
-            pose[:3, :3] = pose[:3, :3] @ rotation.T
-            frames.append(replace(frame, camera=replace(frame.camera, world_to_camera=pose)))
-        write_transforms(root, frames, unit_up(rotation[:, 2]))
-        turned = load_dataset(root)
-        assert np.allclose(turned.up, rotation[:, 2])
-        run_settings = tiny.start(tmp_path / f"run-{name}", turned, policy="uniform")
-        state = recording.run(
-            tmp_path / f"run-{name}",
-            run_settings,
-            turned,
-            tiny.operations(up=turned.up),
-            tiny.silent,
-        )
-        taken.append(state.taken)
-    # Azimuths start from another direction in the tilted world, so the views may be shifted, but
-    # their gaps are the same.
-    gaps = [
-        sorted(np.diff(sorted([*views, views[0] + 12])))
-        for views in ([sorted(t)[0:] for t in taken])
-    ]
-    assert gaps[0] == gaps[1]
-
-
-def test_the_unit_scales_cameras_and_points_to_metres(data: Make, tmp_path: Path) -> None:
+def test_the_unit_scales_cameras_and_points_to_metres(data, tmp_path):
     source = data("colmap-binary")
     assert run("import", source, "--out", tmp_path / "raw") == 0
     assert run("import", source, "--out", tmp_path / "metres", "--unit", str(1 / 0.37)) == 0
@@ -339,7 +297,7 @@ def test_the_unit_scales_cameras_and_points_to_metres(data: Make, tmp_path: Path
     assert np.allclose(points[0] / 0.37, points[1], atol=1e-5)
 
 
-def test_lengths_of_unknown_unit_are_not_called_metres(data: Make, tmp_path: Path, capsys) -> None:
+def test_lengths_of_unknown_unit_are_not_called_metres(data, tmp_path, capsys):
     assert run("import", data("nerf-synthetic"), "--out", tmp_path / "d", "--up", "0,0,2") == 0
     assert "up is (0, 0, 1): as --up says; lengths are in units" in said(capsys)[0]
     assert run("prior", tmp_path / "d", "--gaussians", "300", "--up", "0,1,0") == 0
@@ -353,7 +311,7 @@ def test_lengths_of_unknown_unit_are_not_called_metres(data: Make, tmp_path: Pat
 # Photographs of a phone
 
 
-def test_a_smaller_image_is_the_mean_of_its_blocks_and_rays_stay() -> None:
+def test_a_smaller_image_is_the_mean_of_its_blocks_and_rays_stay():
     camera = Camera(np.array([[50.0, 0, 31.3], [0, 49.0, 22.9], [0, 0, 1]]), 65, 47, np.eye(4))
     small, undo = shrunk(camera, 3)
     pixels = np.random.default_rng(0).integers(0, 256, (47, 65, 4), np.uint8)
@@ -368,7 +326,7 @@ def test_a_smaller_image_is_the_mean_of_its_blocks_and_rays_stay() -> None:
     )
 
 
-def test_downscaled_import(data: Make, tmp_path: Path) -> None:
+def test_downscaled_import(data, tmp_path):
     source = ["import", data("rgbd"), "--masks", data("rgbd") / "masks", "--out"]
     assert run(*source, tmp_path / "d", "--downscale", "2") == 0
     frame = load_dataset(tmp_path / "d").frames[0]
@@ -378,7 +336,7 @@ def test_downscaled_import(data: Make, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("orientation", [5, 6, 7, 8])
-def test_a_phone_held_upright(exact: Path, tmp_path: Path, orientation: int) -> None:
+def test_a_phone_held_upright(exact, tmp_path, orientation):
     """The file lies on its side and says so; cameras are those of the upright photograph."""
     turned = tmp_path / "src"
     dataset = load_dataset(exact)
@@ -402,7 +360,7 @@ def test_a_phone_held_upright(exact: Path, tmp_path: Path, orientation: int) -> 
 # Masks of the prior
 
 
-def test_masks_are_made_of_the_prior(data: Make, tmp_path: Path) -> None:
+def test_masks_are_made_of_the_prior(data, tmp_path):
     source = data("colmap-binary")
     true = import_source(read_source(source), tmp_path / "true", masks=source / "masks")
     assert run("import", source, "--out", tmp_path / "d") == 0
@@ -416,7 +374,7 @@ def test_masks_are_made_of_the_prior(data: Make, tmp_path: Path) -> None:
     assert run("dataset", "masks", tmp_path / "d") == 2
 
 
-def test_outlines_move_to_where_the_colour_changes() -> None:
+def test_outlines_move_to_where_the_colour_changes():
     v, u = np.mgrid[:80, :100]
     disc = np.hypot(v - 40, u - 50) < 25
     rgb = np.where(disc[..., None], [0.6, 0.2, 0.1], [0.1, 0.3, 0.6])
@@ -517,7 +475,7 @@ REFUSED: dict[str, tuple[Callable[[Path, Make], object], list[str], str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_be_used_is_one_line(case: str, data: Make, tmp_path: Path, capfd) -> None:
+def test_what_cannot_be_used_is_one_line(case, data, tmp_path, capfd):
     make, options, message = REFUSED[case]
     make(tmp_path / "d", data)
     capfd.readouterr()
@@ -525,9 +483,7 @@ def test_what_cannot_be_used_is_one_line(case: str, data: Make, tmp_path: Path, 
     one_line(capfd.readouterr().err, message, tmp_path / "d/prior")
 
 
-def test_a_world_in_which_nothing_would_be_drawn_is_one_line(
-    data: Make, tmp_path: Path, capfd
-) -> None:
+def test_a_world_in_which_nothing_would_be_drawn_is_one_line(data, tmp_path, capfd):
     """A prior has no unit, but the kernels draw nothing that is nearer than 0.01."""
     assert run("import", data("nerf-synthetic"), "--out", tmp_path / "d", "--unit", "0.005") == 0
     assert run("prior", tmp_path / "d", "--gaussians", "300") == 0
@@ -537,14 +493,12 @@ def test_a_world_in_which_nothing_would_be_drawn_is_one_line(
     one_line(capfd.readouterr().err, message, tmp_path / "run")
 
 
-def test_mask_files_must_not_be_there_yet(exact: Path, tmp_path: Path) -> None:
+def test_mask_files_must_not_be_there_yet(exact, tmp_path):
     with pytest.raises(InputError, match="has a mask already"):
         make_masks(load_dataset(exact), read_mesh(exact / "rock.glb"), 0.1)
 
 
-def test_photographs_repeat_by_seed(
-    exact: Path, data: Make, photographs: ModuleType, tmp_path: Path
-) -> None:
+def test_photographs_repeat_by_seed(exact, data, photographs, tmp_path):
     folders = [data("nerfstudio"), tmp_path / "same", tmp_path / "other"]
     photographs.make(exact, folders[1], "nerfstudio", 0)
     photographs.make(exact, folders[2], "nerfstudio", 1)

@@ -52,7 +52,7 @@ def as_mesh(mesh: trimesh.Trimesh, offset=0.0) -> Mesh:
     return Mesh(vertices, faces, np.ones(len(faces), bool))
 
 
-def test_fused_cloud_lies_on_the_surfaces(dataset: Dataset) -> None:
+def test_fused_cloud_lies_on_the_surfaces(dataset):
     cloud = fuse_frames(dataset.frames)
     off_rock = np.abs(synthetic.level(cloud.points)) * synthetic.AXES.min()
     distance = np.minimum(np.abs(cloud.points[:, 2]), off_rock)
@@ -69,7 +69,7 @@ def test_fused_cloud_lies_on_the_surfaces(dataset: Dataset) -> None:
     assert abs(plane.offset) < 1e-3
 
 
-def test_ground_plane_of_a_tilted_noisy_floor(dataset: Dataset) -> None:
+def test_ground_plane_of_a_tilted_noisy_floor(dataset):
     rng = np.random.default_rng(0)
     normal = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
     xy = rng.uniform(-2, 2, (20_000, 2))
@@ -87,7 +87,7 @@ def test_ground_plane_of_a_tilted_noisy_floor(dataset: Dataset) -> None:
         ground_plane(Cloud(points, points, 0.05, 0.0, 4000), dataset.frames, seed=0)
 
 
-def test_the_largest_cluster_wins_and_a_low_rise_weighs_little() -> None:
+def test_the_largest_cluster_wins_and_a_low_rise_weighs_little():
     rng = np.random.default_rng(3)
     large, small = rng.uniform(0, 1, (3000, 3)), 3.0 * X + rng.uniform(0, 0.3, (300, 3))
     inside, eps, count = rock_cluster(np.concatenate([small, large]), 0.05, 3.0 * X)
@@ -103,7 +103,7 @@ def test_the_largest_cluster_wins_and_a_low_rise_weighs_little() -> None:
     assert not inside[:6000].any()
 
 
-def test_a_wide_low_sheet_over_the_ground_is_closed() -> None:
+def test_a_wide_low_sheet_over_the_ground_is_closed():
     """Its Poisson surface alone leaves the cube at the open underside."""
     xy = np.random.default_rng(7).uniform(-1, 1, (5_000, 2))
     height = 0.02 + 0.04 * np.cos(np.pi / 2 * xy[:, 0]) * np.cos(np.pi / 2 * xy[:, 1])
@@ -117,7 +117,7 @@ def test_a_wide_low_sheet_over_the_ground_is_closed() -> None:
     assert distances_to_mesh(points[inner], mesh.vertices, mesh.faces).max() < 0.01
 
 
-def test_of_two_equal_clusters_the_one_looked_at_wins_and_a_tie_is_an_error() -> None:
+def test_of_two_equal_clusters_the_one_looked_at_wins_and_a_tie_is_an_error():
     blob = np.random.default_rng(4).uniform(-0.5, 0.5, (2000, 3))
     both = np.concatenate([blob - 2 * X, blob + 2 * X])
     inside, _, _ = rock_cluster(both, 0.05, np.array([1.5, 0.0, 0.0]))
@@ -127,7 +127,7 @@ def test_of_two_equal_clusters_the_one_looked_at_wins_and_a_tie_is_an_error() ->
         rock_cluster(both, 0.05, np.zeros(3))
 
 
-def test_normals_of_a_sphere_point_at_the_cameras() -> None:
+def test_normals_of_a_sphere_point_at_the_cameras():
     points = np.random.default_rng(5).standard_normal((4000, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     normals = estimate_normals(points, points)
@@ -137,7 +137,7 @@ def test_normals_of_a_sphere_point_at_the_cameras() -> None:
 
 
 @pytest.mark.parametrize("count", [2, 3, 137, 5000])
-def test_samples_are_exactly_n_on_the_surface_and_blue(count: int) -> None:
+def test_samples_are_exactly_n_on_the_surface_and_blue(count):
     mesh = _ball()
     points, normals, spacing = sample_surface(mesh, 7, count=count)
     assert points.shape == normals.shape == (count, 3)
@@ -152,7 +152,7 @@ def test_samples_are_exactly_n_on_the_surface_and_blue(count: int) -> None:
         assert nearest.mean() > 0.75 * spacing
 
 
-def test_spacing_sets_n_by_area_and_the_unseen_is_left_out() -> None:
+def test_spacing_sets_n_by_area_and_the_unseen_is_left_out():
     mesh = _ball()
     below = mesh.vertices[mesh.faces].mean(1)[:, 2] < 0.5
     half = Mesh(mesh.vertices, mesh.faces, ~below)
@@ -165,13 +165,13 @@ def test_spacing_sets_n_by_area_and_the_unseen_is_left_out() -> None:
     assert not np.array_equal(a, c)
 
 
-def test_distances_to_mesh_are_exact() -> None:
+def test_distances_to_mesh_are_exact():
     cube = trimesh.creation.box((2, 2, 2))
     points = np.array([[0, 0, 3.0], [2.0, 2.0, 0.0], [0.0, 0.0, 0.4]])
     assert np.allclose(distances_to_mesh(points, cube.vertices, cube.faces), [2, np.sqrt(2), 0.6])
 
 
-def test_visible_is_the_near_side() -> None:
+def test_visible_is_the_near_side():
     camera = synthetic.orbit_cameras(1, 160, 120)[0]
     depth, _, _ = synthetic.cast(camera, [(synthetic.CENTRE, synthetic.AXES)])
     mesh = synthetic.rock_mesh()
@@ -187,7 +187,7 @@ def test_visible_is_the_near_side() -> None:
 
 
 @pytest.mark.parametrize("far", [0.0, 1e6])
-def test_depth_of_a_box_is_exact(far: float) -> None:
+def test_depth_of_a_box_is_exact(far):
     """Against the slabs of the box in closed form; float32 even a thousand kilometres from the
     origin."""
     size, middle = np.array([1.0, 0.7, 0.5]), np.array([far, -far, 0.3])
@@ -206,7 +206,7 @@ def test_depth_of_a_box_is_exact(far: float) -> None:
     assert np.allclose(found[both], near[both], rtol=2e-6, atol=0)
 
 
-def test_depth_of_a_mesh_that_comes_within_a_micrometre_of_the_camera_plane() -> None:
+def test_depth_of_a_mesh_that_comes_within_a_micrometre_of_the_camera_plane():
     """The sheet x = z - 0.5 of the camera's frame, from z = 1e-6 to 4; a splat of its nearest point
     would fill any image."""
     camera = Camera(np.array([[800.0, 0, 320], [0, 800.0, 240], [0, 0, 1]]), 640, 480, np.eye(4))
@@ -216,7 +216,7 @@ def test_depth_of_a_mesh_that_comes_within_a_micrometre_of_the_camera_plane() ->
     assert np.allclose(found, np.broadcast_to(0.5 / (1 - slope), (480, 640)), rtol=1e-5)
 
 
-def test_prior_is_near_the_truth(built) -> None:
+def test_prior_is_near_the_truth(built):
     prior, rock = built
     numbers, voxel = prior.numbers, rock.cloud.voxel
     truth = numbers["truth"]
@@ -239,7 +239,7 @@ def test_prior_is_near_the_truth(built) -> None:
     assert np.quantile(cosine, 0.01) > np.cos(np.radians(10))
 
 
-def test_error_to_truth_sees_a_wrong_prior(built, dataset: Dataset) -> None:
+def test_error_to_truth_sees_a_wrong_prior(built, dataset):
     prior, rock = built
     moved = Mesh(prior.mesh.vertices + 0.05 * Z, prior.mesh.faces, prior.mesh.seen)
     points, truth = prior.points + 0.05 * Z, dataset.root / "rock.glb"
@@ -248,7 +248,7 @@ def test_error_to_truth_sees_a_wrong_prior(built, dataset: Dataset) -> None:
     assert error["hausdorff"] == pytest.approx(0.05, abs=0.02)
 
 
-def test_prior_round_trip_and_determinism(built, dataset: Dataset, tmp_path: Path) -> None:
+def test_prior_round_trip_and_determinism(built, dataset, tmp_path):
     prior = built[0]
     again, _ = build_prior(dataset, PriorSettings(gaussians=1500, backing=0))
     assert np.array_equal(prior.points, again.points)
@@ -261,7 +261,7 @@ def test_prior_round_trip_and_determinism(built, dataset: Dataset, tmp_path: Pat
     assert trimesh.load(tmp_path / "prior/mesh.ply").is_watertight
 
 
-def test_command_writes_everything(dataset: Dataset, tmp_path: Path, capsys) -> None:
+def test_command_writes_everything(dataset, tmp_path, capsys):
     assert run("prior", dataset.root, "--out", tmp_path / "p", "--gaussians", "500") == 0
     files = {"mesh.ply", "points.ply", "prior.json", "prior.png"}
     assert {path.name for path in (tmp_path / "p").iterdir()} == files
@@ -330,7 +330,7 @@ NOTHING = "has no depth images and no points (sparse.ply) and no masks; import d
         (faceless_truth, "no faces"),
     ],
 )
-def test_bad_input_is_one_line_and_leaves_nothing(make, message: str, tmp_path, capsys) -> None:
+def test_bad_input_is_one_line_and_leaves_nothing(make, message, tmp_path, capsys):
     make(tmp_path / "data")
     assert message in refused(capsys, ["prior", tmp_path / "data"], tmp_path / "data")
 
@@ -351,13 +351,13 @@ def test_bad_input_is_one_line_and_leaves_nothing(make, message: str, tmp_path, 
         ("--poisson-depth 30", "poisson-depth"),
     ],
 )
-def test_bad_options_are_one_line(built, dataset, options: str, message: str, capsys) -> None:
+def test_bad_options_are_one_line(built, dataset, options, message, capsys):
     before = listing(dataset.root)
     assert message in refused(capsys, ["prior", dataset.root, *options.split()])
     assert listing(dataset.root) == before
 
 
-def test_one_frame_with_depth_gives_what_it_saw(tmp_path: Path) -> None:
+def test_one_frame_with_depth_gives_what_it_saw(tmp_path):
     """Its cloud is open on the far side: Poisson closes it, and only what the frame saw is
     sampled."""
     dataset = synthetic.write_dataset(tmp_path)
@@ -380,7 +380,7 @@ def test_one_frame_with_depth_gives_what_it_saw(tmp_path: Path) -> None:
         ("json", "not a readable prior .*'spacing'"),
     ],
 )
-def test_damaged_prior_is_one_line(built, tmp_path: Path, damage: str, message: str) -> None:
+def test_damaged_prior_is_one_line(built, tmp_path, damage, message):
     folder = save_prior(tmp_path / "prior", built[0])
     points = folder / "points.ply"
     if damage == "missing":
@@ -397,14 +397,14 @@ def test_damaged_prior_is_one_line(built, tmp_path: Path, damage: str, message: 
     assert "\n" not in str(error.value)
 
 
-def test_no_prior_and_no_dataset_are_one_line(tmp_path: Path, capsys) -> None:
+def test_no_prior_and_no_dataset_are_one_line(tmp_path, capsys):
     with pytest.raises(InputError, match="no such prior"):
         load_prior(tmp_path / "elsewhere")
     assert "no such dataset folder" in refused(capsys, ["prior", tmp_path / "nowhere"])
     assert not (tmp_path / "nowhere").exists()
 
 
-def test_error_grows_with_noise_holes_and_a_coarse_poisson(built, dataset: Dataset) -> None:
+def test_error_grows_with_noise_holes_and_a_coarse_poisson(built, dataset):
     def error(**options) -> dict[str, float]:
         settings = PriorSettings(gaussians=1500, backing=0, **options)
         return build_prior(dataset, settings)[0].numbers["truth"]
@@ -415,7 +415,7 @@ def test_error_grows_with_noise_holes_and_a_coarse_poisson(built, dataset: Datas
     assert exact["chamfer"] < error(poisson_depth=4)["chamfer"]
 
 
-def test_holes_remove_the_share_asked_for() -> None:
+def test_holes_remove_the_share_asked_for():
     points = np.random.default_rng(0).random((5000, 3))
     moved, kept = degrade(points, 0.0, 0.3, np.random.default_rng(1))
     assert np.array_equal(moved, points)

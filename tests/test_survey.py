@@ -67,7 +67,7 @@ def _wall(z: float, tilt: float = 0.0) -> tuple[np.ndarray, Camera]:
 
 
 @pytest.mark.parametrize("z", [1.0, 2.0, 4.0])
-def test_axial_noise_grows_as_published(z: float) -> None:
+def test_axial_noise_grows_as_published(z):
     depth, camera = _wall(z)
     measured = noisy_depth(depth, camera, np.random.default_rng(0))
     error = (measured - depth)[measured > 0]
@@ -79,7 +79,7 @@ def test_axial_noise_grows_as_published(z: float) -> None:
     assert abs(error.mean()) < 0.5 * QUANTUM * z * z
 
 
-def test_sensor_scale_and_missing_returns() -> None:
+def test_sensor_scale_and_missing_returns():
     depth, camera = _wall(3.0)
     depth[:100] = 0
     rng = np.random.default_rng(0)
@@ -96,7 +96,7 @@ def test_sensor_scale_and_missing_returns() -> None:
 @pytest.mark.parametrize(
     ("degrees", "least", "most"), [(30, 0, 0.01), (75, 0.3, 0.7), (84, 0.85, 1)]
 )
-def test_grazing_returns_are_lost(degrees: float, least: float, most: float) -> None:
+def test_grazing_returns_are_lost(degrees, least, most):
     depth, camera = _wall(2.0, np.radians(degrees))
     depth = np.where((depth > 0) & (depth < 5), depth, 0)
     centre = np.s_[200:280, 300:340]
@@ -104,7 +104,7 @@ def test_grazing_returns_are_lost(degrees: float, least: float, most: float) -> 
     assert least <= lost <= most
 
 
-def test_normals_from_depth_of_the_ground_and_the_rock() -> None:
+def test_normals_from_depth_of_the_ground_and_the_rock():
     camera = synthetic.orbit_cameras(1, 160, 120)[0]
     depth, mask, points = synthetic.cast(camera, [(synthetic.CENTRE, synthetic.AXES)])
     normals = normals_from_depth(depth, camera)
@@ -117,7 +117,7 @@ def test_normals_from_depth_of_the_ground_and_the_rock() -> None:
     assert np.median(agreement) > 0.999
 
 
-def test_noise_is_measured_and_filtered_without_blurring_edges() -> None:
+def test_noise_is_measured_and_filtered_without_blurring_edges():
     depth, _ = _wall(2.0)
     depth[:, 320:] = 3.0
     noisy = depth + 0.02 * np.random.default_rng(0).standard_normal(depth.shape)
@@ -137,7 +137,7 @@ def _circle(count: int = 24, turns: float = 1.0) -> np.ndarray:
     return np.stack([np.linalg.inv(look_at(eye, [0, 0, 0])) for eye in eyes])
 
 
-def test_odometry_without_drift_is_exact_and_with_it_drifts() -> None:
+def test_odometry_without_drift_is_exact_and_with_it_drifts():
     truth = _circle()
     exact = drifting_odometry(truth, 0.0, np.random.default_rng(0))
     assert np.allclose(chain(truth[0], exact), truth, atol=1e-12)
@@ -148,7 +148,7 @@ def test_odometry_without_drift_is_exact_and_with_it_drifts() -> None:
     assert 0 < drift[0] < drift[1] < drift[2]
 
 
-def test_loops_are_where_the_flight_returns() -> None:
+def test_loops_are_where_the_flight_returns():
     circle = _circle()
     assert (0, 23) in loop_candidates(circle)
     assert all(j - i >= 20 for i, j in loop_candidates(circle))
@@ -158,7 +158,7 @@ def test_loops_are_where_the_flight_returns() -> None:
     assert (0, 12) not in twice
 
 
-def test_trajectory_error_of_known_displacements() -> None:
+def test_trajectory_error_of_known_displacements():
     truth = _circle()
     moved = truth.copy()
     moved[:, :3, 3] += [0.3, 0, 0.4]
@@ -185,7 +185,7 @@ def _graph(truth: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[Edge]]:
     return biased, chain(truth[0], biased), edges
 
 
-def test_a_loop_closure_spreads_the_error_and_a_wrong_one_is_outvoted() -> None:
+def test_a_loop_closure_spreads_the_error_and_a_wrong_one_is_outvoted():
     truth = _circle()
     steps, registered, edges = _graph(truth)
     inverse = np.linalg.inv(truth)
@@ -202,7 +202,7 @@ def test_a_loop_closure_spreads_the_error_and_a_wrong_one_is_outvoted() -> None:
     assert trajectory_error(optimised, truth)["ate_rms"] < before["ate_rms"]
 
 
-def test_registration_and_loop_closure_beat_odometry(dataset: Dataset, survey) -> None:
+def test_registration_and_loop_closure_beat_odometry(dataset, survey):
     settings = SurveySettings(sensor=0.2, drift=1.0)
     numbers = survey_numbers(dataset, survey, settings)
     error = {name: value["ate_rms"] for name, value in numbers["error"].items()}
@@ -214,7 +214,7 @@ def test_registration_and_loop_closure_beat_odometry(dataset: Dataset, survey) -
     json.dumps(numbers)
 
 
-def test_the_survey_repeats_by_seed(dataset: Dataset, survey) -> None:
+def test_the_survey_repeats_by_seed(dataset, survey):
     again = fly(dataset, SurveySettings(sensor=0.2, drift=1.0))
     assert np.array_equal(again.optimised, survey.optimised)
     assert all(np.array_equal(a, b) for a, b in zip(again.depths, survey.depths, strict=True))
@@ -222,7 +222,7 @@ def test_the_survey_repeats_by_seed(dataset: Dataset, survey) -> None:
     assert not np.array_equal(other.depths[0], survey.depths[0])
 
 
-def test_a_featureless_orbit_falls_back_on_odometry(tmp_path: Path) -> None:
+def test_a_featureless_orbit_falls_back_on_odometry(tmp_path):
     """Registration slides on a smooth ellipsoid, and must not make odometry worse."""
     flat = synthetic.write_dataset(tmp_path)
     survey = fly(flat, SurveySettings(sensor=0.0, drift=1.0))
@@ -234,16 +234,14 @@ def test_a_featureless_orbit_falls_back_on_odometry(tmp_path: Path) -> None:
     assert optimised < 1.5 * odometry
 
 
-def test_exact_poses_keep_the_truth(dataset: Dataset) -> None:
+def test_exact_poses_keep_the_truth(dataset):
     survey = fly(dataset, SurveySettings(sensor=1.0, exact_poses=True))
     assert np.array_equal(survey.optimised, survey.truth)
     assert not survey.loops
     assert not np.array_equal(survey.depths[0], dataset.frames[0].depth())
 
 
-def test_the_survey_is_a_dataset_and_gives_a_prior(
-    dataset: Dataset, survey, tmp_path: Path
-) -> None:
+def test_the_survey_is_a_dataset_and_gives_a_prior(dataset, survey, tmp_path):
     result = write_survey(tmp_path, dataset, survey)
     assert [frame.name for frame in result.frames] == [frame.name for frame in dataset.frames]
     assert np.allclose(result.frames[5].camera.camera_to_world, survey.optimised[5], atol=1e-9)
@@ -254,7 +252,7 @@ def test_the_survey_is_a_dataset_and_gives_a_prior(
     assert exact.numbers["truth"]["accuracy"] < prior.numbers["truth"]["accuracy"] < 0.04
 
 
-def test_files_of_one_name_in_different_folders_stay_apart(tmp_path: Path) -> None:
+def test_files_of_one_name_in_different_folders_stay_apart(tmp_path):
     dataset = synthetic.write_dataset(tmp_path / "data")
     for frame in dataset.frames:
         (tmp_path / "data/frames" / frame.name).mkdir(parents=True)
@@ -276,7 +274,7 @@ def test_files_of_one_name_in_different_folders_stay_apart(tmp_path: Path) -> No
         assert np.array_equal(surveyed.target()[0], flown.target()[0])
 
 
-def test_command_writes_a_dataset_with_its_figure(tmp_path: Path, capsys) -> None:
+def test_command_writes_a_dataset_with_its_figure(tmp_path, capsys):
     cameras = synthetic.orbit_cameras(12, 64, 48)
     root = synthetic.write_dataset(tmp_path / "data", cameras, ROCKS).root
     write_json(root / "config.json", {"scene": {"sensor": {"noise": 5.0, "drift": 0.5}}})
@@ -320,16 +318,14 @@ def occupied(root: Path) -> None:
         (occupied, [], "not empty"),
     ],
 )
-def test_bad_input_is_one_line_and_leaves_nothing(
-    spoil, options: list[str], message: str, tmp_path: Path, capsys
-) -> None:
+def test_bad_input_is_one_line_and_leaves_nothing(spoil, options, message, tmp_path, capsys):
     root = synthetic.write_dataset(tmp_path / "data").root
     if spoil:
         spoil(root)
     assert message in refused(capsys, ["survey", root, *options], root)
 
 
-def test_duplicate_frames_are_no_trouble(tmp_path: Path) -> None:
+def test_duplicate_frames_are_no_trouble(tmp_path):
     """A hovering drone: the same pose twice."""
     dataset = synthetic.write_dataset(tmp_path, synthetic.orbit_cameras(12, 96, 72), ROCKS)
     again = replace(dataset.frames[1], name="again", timestamp=0.7)

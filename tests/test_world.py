@@ -80,9 +80,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, Figure]:
     return found
 
 
-def test_the_orbit_of_a_tilted_world_is_drawn_as_that_of_the_upright_one(
-    runs: list[Path], drawn: dict[str, Figure], tmp_path: Path
-) -> None:
+def test_the_orbit_of_a_tilted_world_is_drawn_as_that_of_the_upright_one(runs, drawn, tmp_path):
     shown, labels = [], [("x (m)", "y (m)"), ("horizontal (unit)", "horizontal, across (unit)")]
     for run, names in zip(runs, labels, strict=True):
         write_report(tmp_path / "report", [run])
@@ -94,7 +92,7 @@ def test_the_orbit_of_a_tilted_world_is_drawn_as_that_of_the_upright_one(
         np.testing.assert_allclose(tilted, level, atol=1e-5)
 
 
-def test_the_page_draws_it_upright_too_and_names_the_unit(runs: list[Path], tmp_path: Path) -> None:
+def test_the_page_draws_it_upright_too_and_names_the_unit(runs, tmp_path):
     data = []
     for run in runs:
         write_page(tmp_path / "page.html", [run])
@@ -116,22 +114,20 @@ def test_the_page_draws_it_upright_too_and_names_the_unit(runs: list[Path], tmp_
     assert "(m)" not in text.split("<script")[0]
 
 
-def test_maps_of_depth_name_the_unit(runs: list[Path], drawn: dict[str, Figure]) -> None:
+def test_maps_of_depth_name_the_unit(runs, drawn):
     for run, unit in zip(runs, ("m", "unit"), strict=True):
         diagnostics.diagnose_run(run, ["kf_0001"])
         assert f"depth ({unit})" in [axis.get_title() for axis in drawn["kf_0001.png"].axes]
 
 
-def test_the_viewer_knows_both(runs: list[Path]) -> None:
+def test_the_viewer_knows_both(runs):
     for run, up, unit in zip(runs, (PLUS_Z, UP), ("m", "unit"), strict=True):
         subject = read_subject(run)
         assert subject.up == pytest.approx(up)
         assert f"3 {unit}" in layers.legend("depth", (1.0, 3.0), subject.unit)
 
 
-def test_the_axis_of_the_prior_goes_before_that_of_the_dataset(
-    runs: list[Path], tmp_path: Path
-) -> None:
+def test_the_axis_of_the_prior_goes_before_that_of_the_dataset(runs, tmp_path):
     dataset = load_dataset(read_settings(runs[1]).dataset)
     assert up_of(tmp_path, dataset) == dataset.up
     write_json(tmp_path / "prior.json", {"up": [0, 2, 0]})
