@@ -30,16 +30,15 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from mgs import runtime
-from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import read_json, write_json
 from mgs.policy.poses import farthest_pose
 from mgs.policy.registry import policy_named, policy_names
-from mgs.prior.build import load_prior
 from mgs.provenance import command_line, versions
-from mgs.run import folder as run_folder
+from mgs.run.folder import open_run
 from mgs.run.inputs import array_digest
 from mgs.run.loop import fit_views
+from mgs.run.nbv import problem_of
 from mgs.run.problem import Problem
 
 METRIC = "psnr_mask"
@@ -48,23 +47,13 @@ METRIC = "psnr_mask"
 class Bench:
     """Last state of a run, whose candidates can be scored and fitted."""
 
-    def __init__(self, run: Path) -> None:
-        from mgs.run.operations import operations_of
-
-        self.run, self.settings = run, run_folder.read_settings(run)
-        state = run_folder.read_checkpoint(run)
-        if state is None:
-            raise InputError(f"{run}: has no finished step; continue it with `mgs nbv --resume`")
-        self.state = state
-        self.dataset, self.prior = (
-            load_dataset(self.settings.dataset),
-            load_prior(self.settings.prior),
-        )
-        run_folder.check_same_frames(run, self.dataset)
+    def __init__(self, folder: Path) -> None:
+        run = open_run(folder)
+        self.state, self.dataset, self.settings = run.state, run.dataset, run.settings
         self.metric = f"test_{METRIC}" if self.dataset.test_views() else METRIC
-        self.left = [i for i in range(len(self.dataset)) if i not in state.taken]
-        self.model = array_digest(asdict(state.gaussians).values())
-        self.operations = operations_of(self.dataset, self.prior, self.settings)
+        self.left = [i for i in range(len(self.dataset)) if i not in self.state.taken]
+        self.model = array_digest(asdict(self.state.gaussians).values())
+        self.operations = problem_of(run).operations
 
     def problem(self, order: int) -> Problem:
         """Problem of the run; fits take the images in another order for each number."""

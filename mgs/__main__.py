@@ -1,5 +1,25 @@
-"""`python -m mgs`."""
+"""The program `mgs`, and `python -m mgs`: end with one line where Ctrl-C comes during the start."""
 
-from mgs.cli.app import main
+from __future__ import annotations
 
-main()
+import sys
+
+
+def main() -> None:
+    """Run `mgs.cli.app.main`. Raises SystemExit."""
+    try:
+        from mgs.cli.app import main as run
+
+        run()
+    except BaseException as error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, KeyboardInterrupt):
+            cause = cause.__cause__ or cause.__context__
+        if cause is None or isinstance(error, SystemExit):
+            raise
+        print("mgs: interrupted", file=sys.stderr)
+        raise SystemExit(130) from None
+
+
+if __name__ == "__main__":
+    main()

@@ -15,6 +15,10 @@ class InputError(ValueError):
     """
 
 
+class Notice(UserWarning):
+    """Something that a user should know and that ends nothing. Commands print it as one line."""
+
+
 def row_named(table: Mapping[str, Row], name: str, what: str) -> Row:
     """Look a name up in a table. what: the option for the message, as in --preset.
 

@@ -22,9 +22,6 @@ from mgs.memory import check_room
 PNG_BIT_DEPTH = 24
 """Index of the byte of a PNG file that holds the bits of a sample (PNG specification, 11.2.1)."""
 
-ORIENTATION = 0x0112
-"""EXIF tag of the orientation of the camera (EXIF 2.3, 4.6.4)."""
-
 EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
 """Pillow's pixel modes that it converts to 8-bit RGBA without loss: grey, palette and RGB, with and
 without alpha."""
@@ -132,8 +129,10 @@ def exif_orientation(path: str | Path) -> int:
 
     Raises InputError as `read_rgba`.
     """
+    from PIL import ExifTags
+
     image, _ = _open_image(Path(path))
-    found = image.getexif().get(ORIENTATION, 1)
+    found = image.getexif().get(ExifTags.Base.Orientation, 1)
     return found if found in range(1, 9) else 1
 
 

@@ -1,5 +1,4 @@
-"""A headless Chromium for the tests, by playwright: the system's own, as playwright's cannot be
-installed everywhere."""
+"""A headless Chromium of this machine, driven by playwright."""
 
 from __future__ import annotations
 
@@ -18,7 +17,7 @@ SOFTWARE_GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--igno
 
 @contextmanager
 def chromium() -> Iterator[Any]:
-    """Context manager that gives a browser of playwright; skips the test where there is none."""
+    """Yield a browser of playwright; skip the test if there is none."""
     playwright = pytest.importorskip(
         "playwright.sync_api", reason="playwright is not installed (pip install playwright)"
     )
@@ -42,27 +41,28 @@ def opened(
     scheme: str = "light",
     known: Callable[[Any], bool] = lambda message: False,
 ) -> Iterator[tuple[Any, list[str]]]:
-    """Context manager that opens an address in a window of this size, and gives the page and what
-    went wrong on it: errors on its console but those that are known, exceptions, and requests to
-    places other than the address's own host and the disk.
+    """Open an address in a window of this size; yields the page and a list of what went wrong on
+    it: console errors, exceptions, and requests to other hosts.
 
-    known: of an error on the console, a ConsoleMessage of playwright, whether it is left out."""
+    known: whether a ConsoleMessage of playwright is an error to pass over.
+    """
     context = browser.new_context(
         viewport={"width": width, "height": height}, color_scheme=scheme, has_touch=width < 600
     )
     page, wrong = context.new_page(), []
-    page.on(
-        "console",
-        lambda message: (
-            wrong.append(message.text) if message.type == "error" and not known(message) else None
-        ),
-    )
-    page.on("pageerror", lambda error: wrong.append(str(error)))
     own = ("data:", "blob:", "file:", "about:", address, address.replace("http", "ws"))
-    page.on(
-        "request",
-        lambda request: wrong.append(request.url) if not request.url.startswith(own) else None,
-    )
+
+    def on_console(message: Any) -> None:
+        if message.type == "error" and not known(message):
+            wrong.append(message.text)
+
+    def on_request(request: Any) -> None:
+        if not request.url.startswith(own):
+            wrong.append(request.url)
+
+    page.on("console", on_console)
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.on("request", on_request)
     page.goto(address)
     try:
         yield page, wrong

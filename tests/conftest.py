@@ -1,5 +1,4 @@
-"""Shared test set-up: the variant is set once, before any test module that imports kernels; and a
-tiny dataset to spoil."""
+"""Shared set-up: sets the variant before any test module imports kernels, and common fixtures."""
 
 import importlib
 import shutil
@@ -11,9 +10,8 @@ from hypothesis import settings
 from mgs import runtime
 
 runtime.start()
-settings.register_profile(
-    "mgs", deadline=None
-)  # no test is timed: the machine may be busy, and a first call loads libraries
+# No deadline: the machine may be busy, and a first call loads libraries.
+settings.register_profile("mgs", deadline=None)
 settings.load_profile("mgs")
 
 import tiny  # noqa: E402
@@ -38,8 +36,7 @@ def prior(tmp_path):
 
 @pytest.fixture(scope="module")
 def coarse_arena():
-    """A ground of few vertices and texels: how fine it is decides most of a scene's cost and
-    nothing that is tested."""
+    """A ground of few vertices and texels, since it is most of a scene's cost."""
     from mgs.synth import arena
 
     with pytest.MonkeyPatch.context() as patched:
@@ -50,7 +47,7 @@ def coarse_arena():
 
 @pytest.fixture(scope="session")
 def photographs():
-    """tools/photographs.py, which is no part of the package."""
+    """The module tools/photographs.py."""
     with pytest.MonkeyPatch.context() as patched:
         patched.syspath_prepend(Path(__file__).parent.parent / "tools")
         return importlib.import_module("photographs")

@@ -1,4 +1,4 @@
-"""What every refusal has in common, and places that a command must keep out of."""
+"""Checks of every refusal, and places that a command must keep out of."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mgs.cli.app import main
 
 
 def listing(root: Path) -> dict[str, bytes | None]:
-    """Every file under a folder with its content, every folder with None."""
+    """Every file below a folder with its content, every folder with None."""
     paths = (root, *root.rglob("*")) if root.exists() else ()
     return {
         str(path.relative_to(root)): path.read_bytes() if path.is_file() else None for path in paths
@@ -18,7 +18,8 @@ def listing(root: Path) -> dict[str, bytes | None]:
 
 
 def refused(capsys, arguments: list, out: Path | None = None) -> str:
-    """Run `mgs ARGUMENTS`, check that it is refused as it should be, return the line."""
+    """Run `mgs ARGUMENTS`; check that one line is printed, the exit code is 2, and `out` is
+    unchanged; return the line."""
     before = listing(out) if out else None
     with pytest.raises(SystemExit) as stop:
         main([str(argument) for argument in arguments])

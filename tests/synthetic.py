@@ -1,5 +1,4 @@
-"""A small analytic RGB-D dataset: an ellipsoid half buried in a plane, ray-cast in closed form. No
-renderer is needed."""
+"""A small RGB-D dataset in closed form: an ellipsoid half buried in a plane."""
 
 from __future__ import annotations
 
@@ -18,7 +17,7 @@ CENTRE = np.array([0.1, -0.05, 0.2])
 AXES = np.array([0.6, 0.5, 0.45])
 """Centre and semi-axes of the rock, metres; the ground is z = 0."""
 GROUND = 4.0
-"""Half edge of the square arena, metres: beyond it there is no return."""
+"""Half edge of the square arena, metres; beyond it there is no depth."""
 
 
 def orbit_cameras(
@@ -32,24 +31,19 @@ def orbit_cameras(
 
 
 def albedo(points: np.ndarray) -> np.ndarray:
-    """Smooth colour of a world point, linear RGB in [0.1, 0.9]: any error of a projection shows in
-    it."""
-    return 0.5 + 0.4 * np.sin(
-        np.stack([4 * points[..., 0], 3 * points[..., 1] + 1, 5 * points[..., 2] + 2], -1)
-    )
+    """Smooth colour of a world point, linear RGB in [0.1, 0.9]."""
+    return 0.5 + 0.4 * np.sin(points * [4, 3, 5] + [0, 1, 2])
 
 
 def level(points: np.ndarray) -> np.ndarray:
-    """Which ellipsoid of the rock's shape each point [N,3] lies on, less 1: 0 on the rock's
-    surface, negative inside."""
+    """Scale of the ellipsoid through each point [N,3], less 1: 0 on the rock, negative inside."""
     return np.sqrt((((points - CENTRE) / AXES) ** 2).sum(1)) - 1
 
 
 def cast(
     camera: Camera, rocks: list[tuple[np.ndarray, np.ndarray]]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Exact z-depth [H,W] (0 = sky), rock mask [H,W] and world points [H,W,3] of ellipsoids
-    (centre, axes) on z = 0."""
+    """z-depth [H,W] (0: sky), mask [H,W], world points [H,W,3] of ellipsoids (centre, axes)."""
     directions = camera.unproject(np.ones((camera.height, camera.width))) - camera.position
     with np.errstate(divide="ignore", invalid="ignore"):
         ground = -camera.position[2] / directions[..., 2]
@@ -80,24 +74,19 @@ def write_dataset(
     *,
     depth: bool = True,
 ) -> Dataset:
-    """Write and load a dataset of the ellipsoids; the true rock is the first. depth=False leaves
-    the depth images out."""
+    """Write and load a dataset of the ellipsoids; rock.glb is the first of them."""
     rocks = [(CENTRE, AXES)] if rocks is None else rocks
     frames = []
     for i, camera in enumerate(cameras or orbit_cameras()):
         z, mask, points = cast(camera, rocks)
-        frame = Frame(
-            f"kf_{i:04d}",
-            camera,
-            0.5 * i,
-            root / f"images/kf_{i:04d}.png",
-            mask_path=root / f"masks/kf_{i:04d}.png",
-        )
-        write_png(frame.image_path, np.where(z[..., None] > 0, albedo(points), 0.0))
-        write_png(root / f"masks/kf_{i:04d}.png", mask)
+        name = f"kf_{i:04d}"
+        image, mask_path = root / f"images/{name}.png", root / f"masks/{name}.png"
+        frame = Frame(name, camera, 0.5 * i, image, mask_path=mask_path)
+        write_png(image, np.where(z[..., None] > 0, albedo(points), 0.0))
+        write_png(mask_path, mask)
         if depth:
-            frame = replace(frame, depth_path=root / f"depth/kf_{i:04d}.exr")
-            write_exr(root / f"depth/kf_{i:04d}.exr", {"Z": z})
+            frame = replace(frame, depth_path=root / f"depth/{name}.exr")
+            write_exr(frame.depth_path, {"Z": z})
         frames.append(frame)
     if rocks:
         (root / "rock.glb").write_bytes(to_glb(rock_mesh(*rocks[0])))
@@ -106,20 +95,15 @@ def write_dataset(
 
 
 def write_colmap(dataset: Dataset, root: Path, binary: bool) -> None:
-    """Export to COLMAP with pycolmap: one camera, and points on the rock and the ground, tracked
-    where seen."""
+    """Export to COLMAP: one camera, and points on the rock and the ground, tracked where seen."""
     import pycolmap
 
     model = pycolmap.Reconstruction()
     first = dataset.frames[0].camera
     K = first.K
-    lens = pycolmap.Camera(
-        model="PINHOLE",
-        width=first.width,
-        height=first.height,
-        params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
-        camera_id=1,
-    )
+    size = {"width": first.width, "height": first.height}
+    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    lens = pycolmap.Camera(model="PINHOLE", **size, params=params, camera_id=1)
     model.add_camera_with_trivial_rig(lens)
     rng = np.random.default_rng(0)
     sphere = rng.standard_normal((6000, 3))
@@ -130,14 +114,12 @@ def write_colmap(dataset: Dataset, root: Path, binary: bool) -> None:
     for k, frame in enumerate(dataset.frames, 1):
         pose = pycolmap.Rigid3d(frame.camera.world_to_camera[:3])
         pixels = frame.camera.project(points)[0]
-        image = pycolmap.Image(
-            name=frame.image_path.name, keypoints=pixels, camera_id=1, image_id=k
-        )
+        named = {"name": frame.image_path.name, "camera_id": 1, "image_id": k}
+        image = pycolmap.Image(keypoints=pixels, **named)
         model.add_image_with_trivial_frame(image, pose)
     normals = np.where(points[:, 2:] > 0, (points - CENTRE) / AXES**2, [0, 0, 1])
-    facing = np.stack(
-        [((frame.camera.position - points) * normals).sum(1) > 0 for frame in dataset.frames]
-    )
+    eyes = [frame.camera.position for frame in dataset.frames]
+    facing = np.stack([((eye - points) * normals).sum(1) > 0 for eye in eyes])
     for i, point in enumerate(points):
         track = pycolmap.Track()
         for k in np.flatnonzero(facing[:, i]):

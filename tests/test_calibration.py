@@ -1,9 +1,11 @@
 """Predicted errors: their terms against the oracle, and the measures of calibration on errors whose
 truth is known."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from splat.scenes import calm, make_camera, make_gaussians
 
@@ -20,7 +22,8 @@ from mgs.report.calibration import (
     judged,
     sparsification,
 )
-from mgs.run import folder as run_folder
+from mgs.run.folder import Run
+from mgs.run.settings import NbvSettings
 from mgs.splat import reference
 
 N = 20_000
@@ -42,30 +45,27 @@ def test_parameter_variance_is_that_of_the_oracles_jacobian(degree):
     J = reference.jacobian(gaussians, camera)
     variance = np.random.default_rng(1).uniform(0.01, 0.1, J.shape[-2:])
     expected = (np.square(J) * variance).sum(axis=(2, 3))
-    found = predicted_error.parameter_variance(
-        gaussians, camera, variance, np.random.default_rng(2), draws=2000
-    )
+    rng, draws = np.random.default_rng(2), 500
+    found = predicted_error.parameter_variance(gaussians, camera, variance, rng, draws)
     expected = expected.reshape(found.shape)
     seen = expected > 1e-3 * expected.max()
     ratio = found[seen] / expected[seen]
-    assert abs(ratio.mean() - 1) < 0.02
-    assert np.abs(ratio - 1).max() < 6 * np.sqrt(2 / 2000)
+    assert abs(ratio.mean() - 1) < 0.03
+    assert np.abs(ratio - 1).max() < 6 * np.sqrt(2 / draws)
 
 
 def test_residual_variance_is_the_weighted_mean_over_pixels(tmp_path):
     camera = make_camera((20, 14))
     gaussians = calm(lambda seed: make_gaussians(5, seed, log_scales=(-2.5, -1.5)), camera, 5)
-    write_png(
-        tmp_path / "truth.png", np.random.default_rng(0).random((14, 20, 3)).astype(np.float32)
-    )
+    truth = np.random.default_rng(0).random((14, 20, 3)).astype(np.float32)
+    write_png(tmp_path / "truth.png", truth)
     frame = Frame("truth", camera, 0.0, tmp_path / "truth.png", None, None)
     found = predicted_error.residual_variance(gaussians, [frame, frame])
     weights = np.stack(  # of each Gaussian: the image in which it alone is white, by the oracle
         [reference.render(one_white(gaussians, j), camera)["rgb"][..., 0] for j in range(5)]
     )
-    error = np.square(reference.render(gaussians, camera)["rgb"] - frame.target()[0][..., :3]).mean(
-        -1
-    )
+    rendered = reference.render(gaussians, camera)["rgb"]
+    error = np.square(rendered - frame.target()[0][..., :3]).mean(-1)
     expected = (weights * error).sum((1, 2)) / weights.sum((1, 2))
     np.testing.assert_allclose(found, expected, rtol=1e-4)
 
@@ -77,9 +77,12 @@ def one_white(gaussians, j):
     return predicted_error._coloured(gaussians, grey)
 
 
+def judge(errors, sigma):
+    return judged(errors, sigma, calibration.NORMAL, np.random.default_rng(1))
+
+
 def test_a_true_sigma_is_found_to_be_true():
-    errors, sigma = known()
-    found = judged(errors, sigma, calibration.NORMAL, np.random.default_rng(1))
+    found = judge(*known())
     for level in calibration.LEVELS:
         assert np.abs(np.array(found["held"][str(level)]) - level).max() < 0.02
     area = found["ause"]["mae"]
@@ -92,19 +95,12 @@ def test_a_true_sigma_is_found_to_be_true():
 
 def test_a_sigma_half_as_large_and_one_that_knows_nothing_are_found_out():
     errors, sigma = known()
-    half = judged(errors, sigma / 2, calibration.NORMAL, np.random.default_rng(1))
-    assert half["held"]["0.9"][0] < 0.7
-    shuffled = judged(
-        errors,
-        np.random.default_rng(2).permutation(sigma),
-        calibration.NORMAL,
-        np.random.default_rng(1),
-    )
+    assert judge(errors, sigma / 2)["held"]["0.9"][0] < 0.7
+    shuffled = judge(errors, np.random.default_rng(2).permutation(sigma))
     area = shuffled["ause"]["mae"]
     assert abs(area["ause"] - area["constant"]) < 0.05
     assert abs(shuffled["spearman"]) < 0.05
-    constant = judged(errors, np.full(N, 0.1), calibration.NORMAL, np.random.default_rng(1))
-    assert constant["spearman"] == 0
+    assert judge(errors, np.full(N, 0.1))["spearman"] == 0
 
 
 def test_calibration_finds_the_weights_of_the_terms():
@@ -116,24 +112,19 @@ def test_calibration_finds_the_weights_of_the_terms():
     assert found.weights["b"] == pytest.approx(3, rel=0.1)
     assert found.weights["idle"] < 0.15
     assert found.widths[0.9] == pytest.approx(calibration.NORMAL[0.9], rel=0.03)
-    sigma = found.sigma({"a": a, "b": b, "idle": idle})
-    assert float(np.mean(np.abs(errors) <= found.widths[0.9] * sigma)) == pytest.approx(
-        0.9, abs=1e-3
-    )
+    inside = np.abs(errors) <= found.widths[0.9] * found.sigma({"a": a, "b": b, "idle": idle})
+    assert inside.mean() == pytest.approx(0.9, abs=1e-3)
 
 
+@settings(max_examples=20)
 @given(st.floats(1e-8, 1e8), st.floats(1e-8, 1e8))
 def test_calibration_does_not_depend_on_units(unit, scale):
     rng = np.random.default_rng(0)
     term = rng.uniform(0.1, 2, 500)
     errors = np.sqrt(term) * rng.standard_normal(500)
-    plain, scaled = (
-        fit_calibration({"t": term}, errors),
-        fit_calibration({"t": scale * term}, unit * errors),
-    )
-    np.testing.assert_allclose(
-        scaled.sigma({"t": scale * term}), unit * plain.sigma({"t": term}), rtol=1e-3
-    )
+    plain = fit_calibration({"t": term}, errors).sigma({"t": term})
+    scaled = fit_calibration({"t": scale * term}, unit * errors).sigma({"t": scale * term})
+    np.testing.assert_allclose(scaled, unit * plain, rtol=1e-3)
 
 
 def test_exact_fits_do_not_break_the_calibration():
@@ -164,30 +155,24 @@ def test_crps_against_the_integral_that_defines_it():
 
 
 def test_sigma_of_maps_has_their_shape():
-    terms = {"parameters": np.full((4, 5, 3), 2.0)}
-    np.testing.assert_allclose(
-        Calibration({"parameters": 2.0, "noise": 5.0}, {}).sigma(terms), np.full((4, 5, 3), 3.0)
-    )
+    found = Calibration({"parameters": 2.0, "noise": 5.0}, {})
+    sigma = found.sigma({"parameters": np.full((4, 5, 3), 2.0)})
+    np.testing.assert_allclose(sigma, np.full((4, 5, 3), 3.0))
 
 
 @pytest.mark.parametrize(
-    ("trained", "means", "said"),
+    ("trained", "changes", "said"),
     [
-        (
-            ["a"] * 5,
-            "frozen",
-            "has 5 images; --calibrate leaves out a third of them, and needs 6 or more",
-        ),
-        (list("abcdefg"), "free", "learns means"),
-        (list("abcdefgh"), "frozen", "was trained on all views there are"),
+        (5, {}, "has 5 images; --calibrate leaves out a third of them, and needs 6 or more"),
+        (7, {"train": {"means": "free"}}, "learns means"),
+        (7, {"exposure": True}, "estimates exposure"),
+        (8, {}, "was trained on all views there are"),
     ],
 )
-def test_runs_that_cannot_be_calibrated(trained, means, said, tmp_path):
-    dataset = Dataset(
-        tmp_path, tuple(Frame(name, make_camera(), 0.0, None, None, None) for name in "abcdefgh")
-    )
-    settings = run_folder.NbvSettings(
-        dataset="d", prior="p", train={"means": means, "rates": {"mean": 1}}, prior_std={"mean": 1}
-    )
+def test_runs_that_cannot_be_calibrated(trained, changes, said, tmp_path):
+    frames = tuple(Frame(name, make_camera(), 0.0, None, None, None) for name in "abcdefgh")
+    given_settings = NbvSettings(dataset="d", prior="p", **changes)
+    run = Run(tmp_path, given_settings, Dataset(tmp_path, frames))
+    run.state = SimpleNamespace(taken=range(trained))
     with pytest.raises(InputError, match=said):
-        predicted_error._views("run", settings, dataset, trained)
+        predicted_error._views(run)

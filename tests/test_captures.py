@@ -1,6 +1,5 @@
-"""Two captures of the kinds that people have: a toy on a table, and the front of a building, which
-is seen from one side and without any ground. Both are made here, with outliers, noise, parts
-without points, and a tilted world of unknown scale."""
+"""Two captures with outliers, noise, parts without points, and a tilted world of unknown scale: a
+toy on a table, and the front of a building, seen from one side and without ground."""
 
 from __future__ import annotations
 
@@ -13,7 +12,7 @@ import pytest
 import trimesh
 
 from mgs.camera import Camera, look_at
-from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
+from mgs.data.dataset import Dataset, Frame, write_transforms
 from mgs.data.importers import import_source
 from mgs.data.masks import make_masks
 from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh, to_glb
@@ -22,10 +21,17 @@ from mgs.data.sources import read_source
 from mgs.data.up import degrees_between, unit_up
 from mgs.files import read_json
 from mgs.images import write_exr, write_png
+from mgs.prior import hull
 from mgs.prior.build import Prior, build_prior
 from mgs.prior.settings import PriorSettings
 
 WIDTH, HEIGHT = 128, 96
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """Hulls on a grid of half the usual fineness."""
+    monkeypatch.setattr(hull, "COARSE", 24)
 
 
 def toy() -> trimesh.Trimesh:
@@ -52,13 +58,9 @@ def table() -> trimesh.Trimesh:
 
 
 def building() -> trimesh.Trimesh:
-    """A front 6 m wide and 4 m high that faces -y: a wall with windows that stand out, two columns,
-    a porch, a cornice."""
-    boxes = [
-        ((6, 0.6, 4), (0, 0.3, 2)),
-        ((6.4, 0.9, 0.3), (0, 0.15, 4.1)),
-        ((1.6, 0.7, 0.3), (0, -0.3, 2.3)),
-    ]
+    """A front 6 m wide and 4 m high that faces -y: wall, windows, two columns, porch, cornice."""
+    boxes = [((6, 0.6, 4), (0, 0.3, 2)), ((6.4, 0.9, 0.3), (0, 0.15, 4.1))]
+    boxes += [((1.6, 0.7, 0.3), (0, -0.3, 2.3))]
     boxes += [((0.8, 0.2, 1.2), (x, -0.1, z)) for x in (-2.1, 2.1) for z in (1.1, 3)]
     parts = [
         trimesh.creation.box(size, trimesh.transformations.translation_matrix(place))
@@ -72,8 +74,7 @@ def building() -> trimesh.Trimesh:
 
 
 def albedo(x: np.ndarray) -> np.ndarray:
-    """Colour of points [...,3]: a pattern that fades out and comes back, so that whole parts have
-    no feature to be found on."""
+    """Colour of points [...,3]: a pattern that fades, so that whole parts have no features."""
     strength = 0.45 * np.clip(0.8 + np.sin(1.7 * x[..., :1] + 2.3 * x[..., 2:]), 0, 1)
     pattern = np.sign(np.sin(19 * x) * np.sin(23 * x[..., [1, 2, 0]] + 1))
     return 0.5 + strength * pattern
@@ -105,47 +106,34 @@ def _cameras(eyes: list[np.ndarray], target: tuple[float, float, float]) -> list
     return [Camera(K, WIDTH, HEIGHT, look_at(eye, target)) for eye in eyes]
 
 
-KINDS = (("images", "png"), ("depth", "exr"), ("masks", "png"))
-
-
 def write(
     root: Path,
     thing: trimesh.Trimesh,
     around: trimesh.Trimesh | None,
     cameras: list[Camera],
     grain: float,
-) -> Dataset:
-    """A dataset of exact images, depth and masks of `thing`, with `around` beside it. grain: length
-    of the pattern, metres."""
-    own, whole = (
-        _depth(mesh)
-        for mesh in (thing, thing if around is None else trimesh.util.concatenate([thing, around]))
-    )
+) -> None:
+    """A dataset of exact images, depth and masks of `thing` among `around`. grain: length of the
+    pattern, metres."""
+    own = _depth(thing)
+    whole = own if around is None else _depth(trimesh.util.concatenate([thing, around]))
     frames = []
     for k, camera in enumerate(cameras):
         depth, name = whole(camera), f"{k:03d}"
-        mask = (depth > 0) & np.isclose(own(camera), depth, rtol=1e-4)
-        frame = Frame(
-            name, camera, float(k), *(root / f"{kind}/{name}.{end}" for kind, end in KINDS)
-        )
-        write_png(
-            root / f"images/{name}.png",
-            np.where(depth[..., None] > 0, albedo(camera.unproject(depth) / grain), 0.05),
-        )
-        write_exr(root / f"depth/{name}.exr", {"Z": depth.astype(np.float32)})
-        write_png(root / f"masks/{name}.png", mask)
+        image, mask_path = (root / f"{kind}/{name}.png" for kind in ("images", "masks"))
+        frame = Frame(name, camera, float(k), image, root / f"depth/{name}.exr", mask_path)
+        colour = albedo(camera.unproject(depth) / grain)
+        write_png(image, np.where(depth[..., None] > 0, colour, 0.05))
+        write_exr(frame.depth_path, {"Z": depth.astype(np.float32)})
+        write_png(mask_path, (depth > 0) & np.isclose(own(camera), depth, rtol=1e-4))
         frames.append(frame)
     (root / "rock.glb").write_bytes(to_glb(thing))
     write_transforms(root, frames)
-    return load_dataset(root)
 
 
 def _depth(mesh: trimesh.Trimesh) -> Callable[[Camera], np.ndarray]:
-    return mesh_depth(
-        Mesh(
-            np.asarray(mesh.vertices, float), np.asarray(mesh.faces), np.ones(len(mesh.faces), bool)
-        )
-    )
+    faces = np.asarray(mesh.faces)
+    return mesh_depth(Mesh(np.asarray(mesh.vertices, float), faces, np.ones(len(faces), bool)))
 
 
 @pytest.fixture(scope="module")
@@ -178,15 +166,12 @@ def prior_of(source: Path, out: Path, masks: bool) -> tuple[Dataset, Prior, np.n
     prior, _ = build_prior(dataset, PriorSettings(gaussians=1500, backing=0))
     assert trimesh.Trimesh(prior.mesh.vertices, prior.mesh.faces).is_watertight
     true = read_mesh(source / "truth.ply")
-    return (
-        dataset,
-        prior,
-        distances_to_mesh(prior.points, true.vertices, true.faces) / truth["scale"],
-    )
+    distance = distances_to_mesh(prior.points, true.vertices, true.faces)
+    return dataset, prior, distance / truth["scale"]
 
 
 @pytest.mark.parametrize("masks", [True, False])
-def test_a_toy_on_a_table(capture: Callable[[str], Path], tmp_path: Path, masks: bool) -> None:
+def test_a_toy_on_a_table(capture, tmp_path, masks):
     _, prior, distance = prior_of(capture("toy"), tmp_path / "d", masks)
     assert ("plane_normal" in prior.numbers) != masks
     if not masks:
@@ -198,15 +183,13 @@ def test_a_toy_on_a_table(capture: Callable[[str], Path], tmp_path: Path, masks:
     assert (size < 0.6).all()
 
 
-def test_the_front_of_a_building(capture: Callable[[str], Path], tmp_path: Path) -> None:
+def test_the_front_of_a_building(capture, tmp_path):
     """Its wall is a plane that all cameras are in front of, and is not taken for the ground."""
     dataset, prior, distance = prior_of(capture("building"), tmp_path / "d", False)
     assert "plane_normal" not in prior.numbers
     assert distance.mean() < 0.06  # a pixel is 42 mm
     assert np.quantile(distance, 0.9) < 0.15
     scale = read_json(capture("building") / "truth.json")["scale"]
-    assert (
-        prior.numbers["sampled_area"] / scale**2 > 12
-    )  # most of the front, which is 24 square metres, has points
+    assert prior.numbers["sampled_area"] / scale**2 > 12  # of 24 square metres
     masked = make_masks(dataset, prior.mesh, 0.1)
     assert all(0.2 < frame.mask().mean() < 0.95 for frame in masked.frames)

@@ -1,4 +1,4 @@
-"""`mgs chart`: times, commands of rows, ways to score, presets; and a whole chart of a tiny rock."""
+"""`mgs chart`: times, commands of rows, presets; and a whole chart of a tiny rock."""
 
 import csv
 import json
@@ -17,8 +17,7 @@ from mgs.fit.settings import ALPHA_WEIGHT, COLOURS_ALONE, TrainSettings
 from mgs.prior.settings import PriorSettings
 from mgs.run.nbv import start_run
 from mgs.run.settings import PRESETS, NbvSettings, with_defaults
-from mgs.study import case, oracle
-from mgs.study.chart import fits, run, scoring, timing
+from mgs.study import case, chart, oracle, timing
 
 DEFAULTS = {**NbvSettings.model_fields, **TrainSettings.model_fields}
 
@@ -62,28 +61,22 @@ def parsed(line):
     return COMMANDS[words[1]].make_context(words[1], words[2:]).params
 
 
-@pytest.mark.parametrize("size", fits.SIZES.values(), ids=fits.SIZES)
+@pytest.mark.parametrize("size", chart.SIZES.values(), ids=chart.SIZES)
 def test_commands_of_points_say_what_was_measured(size):
-    points = fits.points_of(fits.Data(size))
+    points = [point for kind in chart.KINDS for point in chart.points_of(size, kind)]
     assert len({point.name for point in points}) == len(points)
-    assert set(fits.preset_points(size)) == set(PRESETS)
-    assert set(fits.preset_points(size).values()) <= set(points)
+    assert set(chart.preset_points(size)) == set(PRESETS)
+    assert set(chart.preset_points(size).values()) <= set(points)
     for point in points:
         said, made = parsed(point.command("DATA", "PRIOR", size.seeds)), point.settings(size.seeds)
         train = made.pop("train")
-        rates = dict(pair.split("=") for pair in said["rates"] or [])
         assert said["alpha_weight"] == 0
         for key, value in (made | train).items():
-            if key != "rates":
-                assert (DEFAULTS[key].default if said[key] is None else said[key]) == value
-        assert {kind: float(rate) for kind, rate in rates.items()} == train["rates"]
+            assert (DEFAULTS[key].default if said[key] is None else said[key]) == value
         settings = NbvSettings(dataset="DATA", prior="PRIOR", **made, train=train)
         assert settings.train_at(1).passes == min(point.warm_passes, point.passes)
-
-
-def test_cells_of_all_charts_are_complete():
-    data = fits.Data(fits.SIZES["full"])
-    cells = [cell for chart in run.CHARTS.values() for cell in chart.cells(data, 3)]
+    data = chart.Data(size)
+    cells = [cell for kind in chart.KINDS for cell in data.cells(kind, 3)]
     by_name = {cell.name: cell for cell in cells}
     assert all(by_name[cell.name] == cell for cell in cells)
     assert all(need in by_name for cell in cells for need in cell.needs)
@@ -91,11 +84,11 @@ def test_cells_of_all_charts_are_complete():
 
 
 def test_a_preset_that_is_beaten_by_a_run_of_its_time_fails():
-    row = {"factors": "crossed, run", "preset": "", "seconds": 1.0, "psnr": 30.0}
+    row = {"factors": "number and passes", "preset": "", "seconds": 1.0, "psnr": 30.0}
     better = [row | {"seconds": 1.04, "psnr": 30.5}, row | {"seconds": 1.1, "psnr": 40.0}]
-    fast = [row | {"seconds": 0.5, "psnr": 20.0, "preset": "fast"}]
-    rows = [row | {"preset": "balanced"}, *better, *fast, row | {"factors": "policy, run"}]
-    assert fits.preset_losses(rows) == [0.5, 0.0]
+    fast = row | {"seconds": 0.5, "psnr": 20.0, "preset": "fast", "factors": "preset"}
+    other = row | {"factors": "policy", "psnr": 50.0}
+    assert chart.preset_losses([row | {"preset": "balanced"}, *better, fast, other]) == [0.5, 0.0]
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -123,14 +116,13 @@ def test_studies_fit_colours_alone(dataset, prior, tmp_path, monkeypatch):
     def begin(*_, train, **__):
         raise Begun(train["alpha_weight"])
 
-    for module in (case, fits, scoring):
+    for module in (case, chart):
         monkeypatch.setattr(module, "run_nbv", begin)
     monkeypatch.setattr(oracle, "start_run", begin)
     settings, where = {"train": {"passes": 2}}, (tmp_path, tmp_path / "out", dataset, prior)
     (tmp_path / "out").mkdir()
     for call in (
-        lambda: fits.measure(tmp_path, tmp_path / "out", dataset, dataset, prior, settings, 1),
-        lambda: scoring.make_states(*where, 3, [1]),
+        lambda: chart.measure(*where, settings, 1),
         lambda: case.run_or_resume(*where, {}),
         lambda: case.run_or_resume(*where, settings),
         lambda: oracle.run_oracle(*where, settings),
@@ -194,16 +186,12 @@ def small(dataset, monkeypatch):
     """A size of few points on the tiny dataset, with a prior that is there already and a reference
     that costs nothing."""
     tiny.write_dataset(dataset / "test", frames=3)
-    size = replace(fits.SIZES["quick"], densities=(1 / 8,), passes=(2,), image_counts=(3,))
-    size = replace(size, seeds=3, count=4, probes=(1,))
-    point = fits.Point(4, passes=2)
-    presets = list(fits.preset_points(size).values())[:1]
-    some = {"crossed": [point, replace(point, learned="colour")], "crossed, run": presets}
-    monkeypatch.setitem(fits.SIZES, "quick", size)
-    monkeypatch.setattr(fits, "factors", lambda data: some)
-    monkeypatch.setattr(scoring, "STATES", (2, 3))
-    few = ("exact", "block", "size 1/2", "directional-d")
-    monkeypatch.setattr(scoring, "WAYS", {name: scoring.WAYS[name] for name in few})
+    size = replace(chart.SIZES["quick"], densities=(1 / 8,), passes=(2,), seeds=3, count=4)
+    point = chart.Point(4, passes=2)
+    presets = list(chart.preset_points(size).values())[:1]
+    some = {"both": [point, replace(point, passes=1)], "preset": presets}
+    monkeypatch.setitem(chart.SIZES, "quick", size)
+    monkeypatch.setattr(chart, "factors", lambda size: some)
     monkeypatch.setattr(timing, "_reference", lambda: lambda: sum(range(1000)))
 
     def made(root, out, dataset, density):
@@ -225,25 +213,19 @@ def test_a_chart_is_measured_once_and_written(small, tmp_path, capsys):
         times.append({p: p.stat().st_mtime_ns for p in out.glob("cells/**/result.json")})
     assert "/prior" not in told  # the second time all was there
     assert times[0] == times[1]
-    written = {kind: json.loads((out / f"{kind}.json").read_text()) for kind in ("fit", "scoring")}
+    written = {kind: json.loads((out / f"{kind}.json").read_text()) for kind in chart.KINDS}
     for kind, record in written.items():
         rows = list(csv.DictReader((out / f"{kind}.csv").read_text().splitlines()))
         assert len(rows) == len(record["rows"])
         assert all(parsed(row["command"]) for row in rows)
+        assert any(row["front"] for row in record["rows"])
         command = f"mgs chart {out} --only {kind} --preset quick --repeats 1 --dataset {small}"
         assert record["command"] == command
         assert command in (out / f"{kind}.md").read_text()
         assert (out / f"{kind}.png").stat().st_size > 10_000
-    by_name = {row["variant"]: row for row in written["scoring"]["rows"]}
-    assert by_name["exact"]["tau"] == pytest.approx(1)
-    assert (by_name["exact"]["regret"], by_name["exact"]["over_exact"]) == (0, 1)
-    assert by_name["size 1/2"]["tau"] > 0.5
-    assert set(by_name) == {*scoring.WAYS, "hutchinson 1"}
-    points = written["fit"]["rows"]
-    assert [row["total_passes"] for row in points[:2]] == [2, 2]
-    assert any(row["front"] for row in points)
-    assert written["fit"]["claims"][0]["runs"] == 1
-    assert "| **fast**: " in (out / "fit.md").read_text()
+    assert [row["total_passes"] for row in written["fit"]["rows"]] == [2, 1]
+    assert written["run"]["claims"][0]["runs"] == 1
+    assert "| **fast**: " in (out / "run.md").read_text()
 
 
 def test_what_cannot_be_charted_is_refused_in_one_line(capsys, dataset, tmp_path):
@@ -251,7 +233,7 @@ def test_what_cannot_be_charted_is_refused_in_one_line(capsys, dataset, tmp_path
     for options, line in (
         (["--dataset", dataset], "has no test views"),
         (["--preset", "slow"], "--preset 'slow': unknown; choose one of quick, full"),
-        (["--only", "fit,speed"], "--only 'speed': unknown; choose some of fit,scoring"),
+        (["--only", "fit,speed"], "--only 'speed': unknown; choose some of fit,run"),
     ):
         assert line in refused(capsys, ["chart", out, *options])
     assert not out.exists()

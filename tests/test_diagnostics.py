@@ -19,20 +19,9 @@ from mgs.run import recording
 from mgs.splat import groups
 
 CHANNELS = {
-    "R",
-    "G",
-    "B",
-    "A",
-    "Z",
-    "fisher.colour",
-    "fisher.scale",
-    "fisher.rotation",
-    "fisher.opacity",
-} | {
-    "information",
-    "uncertainty",
-    "unobserved",
-}
+    "R", "G", "B", "A", "Z", "fisher.colour", "fisher.scale", "fisher.rotation", "fisher.opacity",
+    "information", "uncertainty", "unobserved",
+}  # fmt: skip
 
 
 def test_scalars_follow_their_formulas():
@@ -50,9 +39,8 @@ def test_scalars_follow_their_formulas():
     j = 3
     expected = sum(0.5 * np.log((H[j, k] + lam[k]) / lam[k]) for k in range(11))
     assert scalars["information"][j] == pytest.approx(expected)
-    assert scalars["uncertainty"][j] == pytest.approx(
-        np.mean([lam[k] / (H[j, k] + lam[k]) for k in range(11)])
-    )
+    expected = np.mean([lam[k] / (H[j, k] + lam[k]) for k in range(11)])
+    assert scalars["uncertainty"][j] == pytest.approx(expected)
 
 
 def two_in_a_row() -> tuple[Gaussians, Camera]:
@@ -60,14 +48,13 @@ def two_in_a_row() -> tuple[Gaussians, Camera]:
     transparent."""
     K = np.array([[40.0, 0, 16.5], [0, 40.0, 12.5], [0, 0, 1]])
     camera = Camera(K, 33, 25, look_at((0, -2, 0), (0, 0, 0)))
-    means = np.array([[0, 0, 0], [0, 1, 0]], np.float32)
-    gaussians = Gaussians(
-        means,
-        np.log(np.full((2, 3), 1.0, np.float32)),
+    parts = (
+        np.array([[0, 0, 0], [0, 1, 0]], np.float32),
+        np.zeros((2, 3), np.float32),
         np.eye(4, dtype="f4")[[0, 0]],
         np.array([0, 9], "f4"),
-        sh_from_rgb(np.ones((2, 3))),
     )
+    gaussians = Gaussians(*parts, sh_from_rgb(np.ones((2, 3))))
     return gaussians, camera
 
 
@@ -75,11 +62,8 @@ def test_maps_are_means_over_what_a_pixel_shows():
     """At the centre the weights are 1/2 and nearly 1/2, so the map is the mean of the two values,
     whatever their magnitude."""
     gaussians, camera = two_in_a_row()
-    scalars = {
-        "information": np.array([1e-4, 3e-4]),
-        "large": np.array([4e6, 0]),
-        "flat": np.array([7.0, 7.0]),
-    }
+    values = {"information": (1e-4, 3e-4), "large": (4e6, 0), "flat": (7.0, 7.0)}
+    scalars = {name: np.array(pair) for name, pair in values.items()}
     maps = diagnostics.view_maps(gaussians, camera, scalars)
     near, far = 0.5, 0.5 * (1 / (1 + np.exp(-9.0)))
     assert maps["A"][12, 16] == pytest.approx(near + far, abs=1e-3)
@@ -117,13 +101,8 @@ def run(tmp_path_factory):
 
 def test_files(run):
     written = diagnostics.diagnose_run(run, ["kf_0001", "kf_0007"])
-    assert [path.name for path in written] == [
-        "information.ply",
-        "kf_0001.exr",
-        "kf_0001.png",
-        "kf_0007.exr",
-        "kf_0007.png",
-    ]
+    names = ["kf_0001.exr", "kf_0001.png", "kf_0007.exr", "kf_0007.png"]
+    assert [path.name for path in written] == ["information.ply", *names]
     channels = read_exr(run / "diagnostics/kf_0007.exr")
     assert set(channels) == CHANNELS
     assert {values.shape for values in channels.values()} == {(tiny.HEIGHT, tiny.WIDTH)}
@@ -149,7 +128,6 @@ def test_views(run):
     assert not {frame.name for frame in chosen} & set(trained)
     everything = [frame.name for frame in frames]
     assert len(diagnostics.choose_views(frames, everything, None)) == diagnostics.VIEWS
-    with pytest.raises(
-        InputError, match="kf_9999: no such frame; the dataset has kf_0000 to kf_0011"
-    ):
+    named = "kf_9999: no such frame; the dataset has kf_0000 to kf_0011"
+    with pytest.raises(InputError, match=named):
         diagnostics.diagnose_run(run, ["kf_9999"])

@@ -1,4 +1,4 @@
-"""An import that was interrupted, and the same command again: the same dataset, bit for bit."""
+"""An interrupted import, and the same command again: the same dataset, bit for bit."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import synthetic
 import trimesh
+from commands import run, said
 from refusals import listing, refused
 
-from mgs.cli.app import main
 from mgs.data import importers
 from mgs.files import read_json, write_json
 from mgs.images import write_png
@@ -36,76 +36,63 @@ def strike(path, *arguments, **options):
 importers.write_png = strike
 main()
 """
-"""The program, which sends itself a signal when it has written three images, and all of the fourth
-frame but its image."""
-
-
-def _imported(arguments: list[str]) -> None:
-    with pytest.raises(SystemExit) as exit_:
-        main(["import", *arguments])
-    assert exit_.value.code == 0
+"""The program, which signals itself after three images and all of the fourth frame but its
+image."""
 
 
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
     """Eight distorted frames with depth."""
     root = synthetic.write_dataset(tmp_path / "data").root
-    write_json(
-        root / "transforms.json",
-        read_json(root / "transforms.json") | {"k1": -0.15, "k2": 0.04, "p1": 0.002},
-    )
+    path = root / "transforms.json"
+    write_json(path, read_json(path) | {"k1": -0.15, "k2": 0.04, "p1": 0.002})
     return root
 
 
 @pytest.fixture
-def many(source: Path) -> list[str]:
+def many(source: Path) -> list:
     """Its arguments, with masks from a mesh."""
-    return [str(source), "--mesh", str(source / "rock.glb")]
+    return ["import", source, "--mesh", source / "rock.glb", "--out"]
+
+
+def ends_as_one_go(arguments: list, out: Path) -> None:
+    """Finish the import in `out`, and compare it with one that was not interrupted."""
+    whole = out.with_name("whole")
+    assert run(*arguments, out) == 0
+    assert run(*arguments, whole) == 0
+    assert listing(out) == listing(whole)
 
 
 @pytest.mark.parametrize(
-    ("blow", "code"),
-    [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGTERM, -signal.SIGTERM), (signal.SIGINT, 130)],
+    ("blow", "code"), [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 130)]
 )
-def test_struck_in_the_middle_and_given_again(
-    many: list[str], tmp_path: Path, blow: int, code: int, monkeypatch
-) -> None:
-    """A real process, a real signal; then the same folder, bit for bit, and no finished frame read
-    again."""
+def test_struck_in_the_middle_and_given_again(many, tmp_path, blow, code, monkeypatch):
+    """A real process, a real signal; then no finished frame is read again."""
     out = tmp_path / "out"
-    program = [
-        sys.executable,
-        "-c",
-        STRUCK.format(blow=int(blow)),
-        "import",
-        *many,
-        "--out",
-        str(out),
-    ]
+    program = [sys.executable, "-c", STRUCK.format(blow=int(blow)), *map(str, many), str(out)]
     # A shell starts what runs in the background deaf to SIGINT.
     hearing = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     process = subprocess.run(program, capture_output=True, text=True, preexec_fn=hearing)
     assert process.returncode == code, process.stderr
-    said = "mgs: interrupted; run the same command again to continue\n"
-    assert process.stderr.endswith(said) if blow == signal.SIGINT else "mgs:" not in process.stderr
+    message = "mgs: interrupted; run the same command again to continue\n"
+    assert process.stderr.endswith(message) == (blow == signal.SIGINT)
     assert not (out / "transforms.json").exists()
     assert len(list((out / "images").iterdir())) == 3
     (out / "images/.kf_0003.1.part.png").touch()  # as a kill in the middle of writing leaves it
     kept = {path: path.stat().st_mtime_ns for path in (out / "images").glob("kf_*")}
 
     read, load = [], importers.read_rgba
-    monkeypatch.setattr(
-        importers, "read_rgba", lambda path: (read.append(path.stem), load(path))[1]
-    )
-    _imported([*many, "--out", str(out)])
+    with monkeypatch.context() as patch:
+        patch.setattr(importers, "read_rgba", lambda path: (read.append(path.stem), load(path))[1])
+        assert run(*many, out) == 0
     assert read == [f"kf_{k:04d}" for k in range(3, 8)]
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
-    _imported([*many, "--out", str(tmp_path / "whole")])
+    assert run(*many, tmp_path / "whole") == 0
     assert listing(out) == listing(tmp_path / "whole")
 
 
-def _stopped(arguments: list[str], monkeypatch) -> None:
-    """An import that ends after two frames."""
+def stopped(arguments: list, out: Path, monkeypatch) -> Path:
+    """The folder of an import that ended after two frames."""
     write, calls = importers.write_png, []
 
     def stop(path: Path, *rest: Any, **options: Any) -> None:
@@ -116,61 +103,44 @@ def _stopped(arguments: list[str], monkeypatch) -> None:
 
     with monkeypatch.context() as patch:
         patch.setattr(importers, "write_png", stop)
-        with pytest.raises(SystemExit) as exit_:
-            main(["import", *arguments])
-    assert exit_.value.code == 130
+        assert run(*arguments, out) == 130
+    return out
 
 
 def test_an_unfinished_import_of_something_else_is_refused(
-    source: Path, many: list[str], tmp_path: Path, monkeypatch, capsys
-) -> None:
-    out = tmp_path / "out"
-    _stopped([*many, "--out", str(out)], monkeypatch)
-    capsys.readouterr()
+    source, many, tmp_path, monkeypatch, capsys
+):
+    out = stopped(many, tmp_path / "out", monkeypatch)
+    said(capsys)
     other = synthetic.write_dataset(tmp_path / "other").root
     trimesh.creation.icosphere(subdivisions=2).export(tmp_path / "ball.ply")
-    for arguments in (
-        [source],
-        [other],
-        [source, "--masks", f"{source}/masks"],
-        [source, "--mesh", tmp_path / "ball.ply"],
-    ):
+    masks, ball = ["--masks", source / "masks"], ["--mesh", tmp_path / "ball.ply"]
+    for arguments in ([source], [other], [source, *masks], [source, *ball]):
         line = refused(capsys, ["import", *arguments, "--out", out], out)
         assert "unfinished dataset of other settings or sources" in line
     write_json(source / "transforms.json", read_json(source / "transforms.json") | {"cx": 30.0})
-    assert "unfinished dataset" in refused(capsys, ["import", *many, "--out", out], out)
+    assert "unfinished dataset" in refused(capsys, [*many, out], out)
 
 
-def test_a_frame_whose_files_changed_is_made_again(
-    source: Path, many: list[str], tmp_path: Path, monkeypatch
-) -> None:
-    out, image = tmp_path / "out", source / "images/kf_0000.png"
-    _stopped([*many, "--out", str(out)], monkeypatch)
-    write_png(image, np.full((48, 64, 3), 0.5))
-    _imported([*many, "--out", str(out)])
-    _imported([*many, "--out", str(tmp_path / "whole")])
-    assert listing(out) == listing(tmp_path / "whole")
+def test_a_frame_whose_files_changed_is_made_again(source, many, tmp_path, monkeypatch):
+    out = stopped(many, tmp_path / "out", monkeypatch)
+    write_png(source / "images/kf_0000.png", np.full((48, 64, 3), 0.5))
+    ends_as_one_go(many, out)
 
 
-def test_a_damaged_image_in_the_middle_keeps_the_frames_before(
-    source: Path, many: list[str], tmp_path: Path, capsys
-) -> None:
+def test_a_damaged_image_in_the_middle_keeps_the_frames_before(source, many, tmp_path, capsys):
     out, image = tmp_path / "out", source / "images/kf_0004.png"
     whole = image.read_bytes()
     image.write_bytes(whole[:100])
-    with pytest.raises(SystemExit) as exit_:
-        main(["import", *many, "--out", str(out)])
-    assert exit_.value.code == 2
-    assert "kf_0004.png: not a readable image" in capsys.readouterr().err
+    assert run(*many, out) == 2
+    assert "kf_0004.png: not a readable image" in said(capsys)[1]
     assert len(list((out / "images").iterdir())) == 4
     image.write_bytes(whole)
-    _imported([*many, "--out", str(out)])
-    _imported([*many, "--out", str(tmp_path / "whole")])
-    assert listing(out) == listing(tmp_path / "whole")
+    ends_as_one_go(many, out)
 
 
-def test_killed_before_the_first_frame(many: list[str], tmp_path: Path) -> None:
+def test_killed_before_the_first_frame(many, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out/.import.1.part.json").touch()
-    _imported([*many, "--out", str(tmp_path / "out")])
+    assert run(*many, tmp_path / "out") == 0
     assert not list((tmp_path / "out").glob(".*"))

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+import synthetic
 from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 from scipy.special import spence
-
-sys.path.insert(0, str(Path(__file__).parent))
-import synthetic
 
 from mgs.camera import Camera, look_at
 from mgs.data.dataset import Dataset
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
+from mgs.images import write_png
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.initial import (
     GREY,
@@ -39,9 +36,8 @@ from mgs.splat import render
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return synthetic.write_dataset(
-        tmp_path_factory.mktemp("orbit"), synthetic.orbit_cameras(12, 96, 72)
-    )
+    cameras = synthetic.orbit_cameras(12, 96, 72)
+    return synthetic.write_dataset(tmp_path_factory.mktemp("orbit"), cameras)
 
 
 @pytest.fixture(scope="module")
@@ -49,13 +45,11 @@ def prior(dataset: Dataset) -> Prior:
     return build_prior(dataset, PriorSettings(gaussians=2000, backing=0))[0]
 
 
-def test_shapes_scales_and_rotations(prior: Prior, dataset: Dataset) -> None:
+def test_shapes_scales_and_rotations(prior, dataset):
     gaussians, seen = initial_gaussians(prior, dataset.frames[::3])
     assert gaussians.check() is gaussians
-    assert all(
-        getattr(gaussians, name).dtype == np.float32
-        for name in ("means", "log_scales", "quats", "sh")
-    )
+    for name in ("means", "log_scales", "quats", "sh"):
+        assert getattr(gaussians, name).dtype == np.float32
     assert seen.shape == (2000,)
     off = gaussians.means - prior.points
     pixel = pixel_on(prior, [frame.camera for frame in dataset.frames[::3]])
@@ -69,11 +63,8 @@ def test_shapes_scales_and_rotations(prior: Prior, dataset: Dataset) -> None:
     assert np.allclose(gaussians.opacities, INITIAL_OPACITY, atol=1e-6)
 
 
-def test_a_warm_start_gives_new_images_to_what_none_saw_before(
-    prior: Prior, dataset: Dataset
-) -> None:
-    """A Gaussian that only the new image sees takes its colour from it, up to what the model had
-    made of it; one that it does not see, and everything but colours, stays as it was fitted."""
+def test_a_warm_start_gives_new_images_to_what_none_saw_before(prior, dataset):
+    """A newly seen Gaussian takes the new colour plus what was learned; all else stays."""
     (before, seen_before), (start, seen) = (
         initial_gaussians(prior, dataset.frames[:k]) for k in (1, 2)
     )
@@ -89,9 +80,8 @@ def test_a_warm_start_gives_new_images_to_what_none_saw_before(
     assert found.sh.dtype == np.float32
 
 
-def test_a_pixel_on_the_surface(prior: Prior) -> None:
-    """At the middle of the rock a pixel spans depth / focal length; of several cameras the median,
-    of none in front nothing."""
+def test_a_pixel_on_the_surface(prior):
+    """depth / focal length; of several cameras the median, of none in front 0."""
     K = np.array([[100.0, 0, 20], [0, 100.0, 15], [0, 0, 1]])
     centre, x = np.median(prior.points, axis=0), np.array([1.0, 0, 0])
     near, far, turned = (
@@ -103,30 +93,22 @@ def test_a_pixel_on_the_surface(prior: Prior) -> None:
     assert pixel_on(prior, [turned]) == 0
 
 
-def test_outlines_are_where_they_are_in_the_images(dataset: Dataset, prior: Prior) -> None:
-    """Drawn from below the surface, the rock before any training covers about as much as its masks;
-    from the surface, more."""
+def test_outlines_are_where_they_are_in_the_images(dataset, prior):
+    """Drawn from below the surface the rock covers about its masks; from the surface, more."""
 
     def excess(inset: float) -> float:
         gaussians = initial_gaussians(prior, dataset.frames[::3], inset)[0]
-        return (
-            float(
-                np.mean(
-                    [
-                        np.asarray(render(gaussians, f.camera).alpha).sum() / f.mask().sum()
-                        for f in dataset.frames
-                    ]
-                )
-            )
-            - 1
-        )
+        shares = []
+        for frame in dataset.frames:
+            alpha = np.asarray(render(gaussians, frame.camera).alpha)
+            shares.append(alpha.sum() / frame.mask().sum())
+        return float(np.mean(shares)) - 1
 
     assert excess(0) > 2 * abs(excess(INSET))
 
 
-def test_one_layer_hides_what_is_behind_it() -> None:
-    """The mean log-transmittance stated in `mgs.prior.initial`, in closed form and by summing over
-    a lattice."""
+def test_one_layer_hides_what_is_behind_it():
+    """The mean log-transmittance of INITIAL_OPACITY, in closed form and over a lattice."""
     dilogarithm = spence(1 - INITIAL_OPACITY)
     closed = -2 * np.pi * IN_PLANE_SCALE**2 * dilogarithm
     x = np.arange(-8, 8) + 0.0
@@ -138,7 +120,7 @@ def test_one_layer_hides_what_is_behind_it() -> None:
     assert np.exp(closed) < 0.04
 
 
-def test_colours_are_those_of_the_seen_surface(prior: Prior, dataset: Dataset) -> None:
+def test_colours_are_those_of_the_seen_surface(prior, dataset):
     gaussians, seen = initial_gaussians(prior, dataset.frames)
     # 12 views from above see all but the foot of the rock, where a pixel's mask may miss.
     assert seen[prior.points[:, 2] > 0.1].mean() > 0.99
@@ -147,7 +129,7 @@ def test_colours_are_those_of_the_seen_surface(prior: Prior, dataset: Dataset) -
     assert np.quantile(error, 0.99) < 0.1  # a pixel at the rim mixes rock and ground
 
 
-def test_the_far_side_of_one_frame_stays_grey(prior: Prior, dataset: Dataset) -> None:
+def test_the_far_side_of_one_frame_stays_grey(prior, dataset):
     frame = dataset.frames[0]
     gaussians, seen = initial_gaussians(prior, [frame])
     towards = np.einsum("nk,nk->n", prior.normals, frame.camera.position - prior.points)
@@ -157,22 +139,17 @@ def test_the_far_side_of_one_frame_stays_grey(prior: Prior, dataset: Dataset) ->
     assert np.allclose(gaussians.rgb[~seen], GREY, atol=1e-6)
 
 
-def test_the_mesh_stands_in_for_missing_depth(prior: Prior, dataset: Dataset) -> None:
+def test_the_mesh_stands_in_for_missing_depth(prior, dataset):
     frames = dataset.frames[::3]
     _, by_depth = initial_gaussians(prior, frames)
-    gaussians, by_mesh = initial_gaussians(
-        prior, [replace(frame, depth_path=None) for frame in frames]
-    )
+    without = [replace(frame, depth_path=None) for frame in frames]
+    gaussians, by_mesh = initial_gaussians(prior, without)
     assert (by_depth == by_mesh).mean() > 0.93
     error = np.abs(gaussians.rgb - synthetic.albedo(prior.points))[by_mesh]
     assert np.quantile(error, 0.95) < 0.08
 
 
-def test_colours_are_averaged_and_the_mask_counts(
-    prior: Prior, dataset: Dataset, tmp_path: Path
-) -> None:
-    from mgs.images import write_png
-
+def test_colours_are_averaged_and_the_mask_counts(prior, dataset, tmp_path):
     frame = dataset.frames[0]
     shape = (frame.camera.height, frame.camera.width, 3)
     images = []
@@ -184,17 +161,13 @@ def test_colours_are_averaged_and_the_mask_counts(
     write_png(tmp_path / "empty.png", np.zeros(shape[:2], bool))
     _, seen = initial_gaussians(prior, [replace(frame, mask_path=tmp_path / "empty.png")])
     assert not seen.any()
-
-
-def test_no_seed_frames_is_all_grey(prior: Prior) -> None:
     gaussians, seen = initial_gaussians(prior, [])
     assert not seen.any()
     assert np.allclose(gaussians.rgb, GREY, atol=1e-6)
 
 
-def test_behind_the_surface_lies_an_opaque_backing(dataset: Dataset) -> None:
-    """A third of the Gaussians, spread evenly, a spacing inside, of the colour above them: opaque
-    without the rest."""
+def test_behind_the_surface_lies_an_opaque_backing(dataset):
+    """A third of the Gaussians, evenly spread, a spacing inside, opaque, coloured as above them."""
     prior = build_prior(dataset, PriorSettings(gaussians=1200))[0]
     gaussians, seen = initial_gaussians(prior, dataset.frames)
     assert (len(gaussians), len(prior.points), len(seen), prior.backed) == (1200, 800, 800, 400)
@@ -202,20 +175,15 @@ def test_behind_the_surface_lies_an_opaque_backing(dataset: Dataset) -> None:
     inward = np.einsum("nk,nk->n", surface.means[over] - backing.means, prior.normals[over])
     np.testing.assert_allclose(inward, prior.spacing, rtol=1e-3)
     np.testing.assert_array_equal(backing.sh, surface.sh[over])
-    apart = [
-        cKDTree(points).query(points, 2)[0][:, 1] for points in (prior.points, prior.points[over])
-    ]
-    assert (
-        apart[1].min() > 1.1 * apart[0].mean()
-    )  # a subset at random would have neighbours as near as all have
+    both = prior.points, prior.points[over]
+    apart = [cKDTree(points).query(points, 2)[0][:, 1] for points in both]
+    assert apart[1].min() > 1.1 * apart[0].mean()  # a random subset would have nearer neighbours
 
     faded = replace(surface, logit_opacities=np.full(800, -3, np.float32))
     for frame in dataset.frames[:3]:
         inner = binary_erosion(frame.mask(), iterations=3)
-        alpha, hidden = (
-            np.asarray(render(g, frame.camera).alpha)[inner]
-            for g in (faded, joined(faded, backing))
-        )
+        models = faded, joined(faded, backing)
+        alpha, hidden = (np.asarray(render(g, frame.camera).alpha)[inner] for g in models)
         assert alpha.mean() < 0.6
         assert hidden.min() > 0.9
 
@@ -224,9 +192,7 @@ def joined(a: Gaussians, b: Gaussians) -> Gaussians:
     return Gaussians(*(np.concatenate([getattr(a, name), getattr(b, name)]) for name in vars(a)))
 
 
-def test_the_backing_survives_the_file_and_is_part_of_what_a_run_goes_on_from(
-    dataset: Dataset, tmp_path: Path
-) -> None:
+def test_the_backing_survives_the_file_and_is_part_of_what_a_run_goes_on_from(dataset, tmp_path):
     prior = build_prior(dataset, PriorSettings(gaussians=300))[0]
     loaded = load_prior(save_prior(tmp_path / "prior", prior))
     assert loaded.backed == prior.backed == 100
@@ -236,8 +202,5 @@ def test_the_backing_survives_the_file_and_is_part_of_what_a_run_goes_on_from(
     (tmp_path / "prior/prior.json").write_text(json.dumps(numbers | {"backed": 1000}))
     with pytest.raises(InputError, match="backed must be a number of the points"):
         load_prior(tmp_path / "prior")
-    with pytest.raises(
-        InputError,
-        match=r"backing 1.5 is a number of Gaussians per sample, 0 to 1; correct --backing",
-    ):
-        build_prior(dataset, PriorSettings(gaussians=300, backing=1.5))
+    with pytest.raises(InputError, match="0 to 1; correct --backing"):
+        PriorSettings(gaussians=300, backing=1.5)

@@ -132,7 +132,7 @@ def test_stations_before_a_run_hold_few_images_at_once(
 
 
 AT_THE_END = """
-import ctypes, dataclasses, mmap
+import ctypes, mmap
 import numpy as np
 import tiny, mgs
 from mgs.splat import fisher, render
@@ -142,13 +142,14 @@ def at_the_end(values):
     values = np.ascontiguousarray(values, np.float32)
     size = -(-values.nbytes // mmap.PAGESIZE) * mmap.PAGESIZE
     pages = np.frombuffer(mmap.mmap(-1, size + mmap.PAGESIZE), np.uint8)
-    assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(pages.ctypes.data + size), mmap.PAGESIZE, 0) == 0
+    end = ctypes.c_void_p(pages.ctypes.data + size)
+    assert ctypes.CDLL(None).mprotect(end, mmap.PAGESIZE, 0) == 0
     copy = pages[size - values.nbytes : size].view(np.float32).reshape(values.shape)
     copy[:] = values
     return copy
 
 model, camera = tiny.initial([]), tiny.orbit(1)[0]
-moved = dataclasses.replace(model, **{f.name: at_the_end(getattr(model, f.name)) for f in dataclasses.fields(model)})
+moved = mgs.Gaussians(**{name: at_the_end(values) for name, values in vars(model).items()})
 assert np.array_equal(np.asarray(render(moved, camera).rgb), np.asarray(render(model, camera).rgb))
 assert np.array_equal(fisher(moved, camera), fisher(model, camera))
 print("drawn")

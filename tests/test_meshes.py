@@ -1,27 +1,29 @@
-"""Meshes of any kind, given by hand: the right prior, or one line that says what is wrong."""
+"""Given meshes of any kind: the right prior, or one line that says what is wrong."""
 
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 import synthetic
 import trimesh
+from commands import run, said
 from refusals import refused
 
-from mgs.cli.app import main
 from mgs.data.dataset import Dataset
 from mgs.data.meshes import Mesh
+from mgs.errors import InputError
 from mgs.prior.build import load_prior, prior_from_mesh
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import sample_surface
+from mgs.synth.rock import load_rock
+from mgs.synth.scene_file import Rock
 
 
-@pytest.fixture
-def dataset(tmp_path: Path) -> Dataset:
-    return synthetic.write_dataset(tmp_path / "data")
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return synthetic.write_dataset(tmp_path_factory.mktemp("meshes") / "data")
 
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
@@ -39,132 +41,87 @@ end_header
 0 1 0
 {last}
 """
+NO_AREA = "none of its faces has an area"
+
+
+def ply(faces: int, last: str) -> str:
+    return PLY.format(faces=faces, last=last)
+
+
+def obj(a: str, b: str, c: str) -> str:
+    return f"v {a}\nv {b}\nv {c}\nf 1 2 3\n"
+
+
 BAD_MESHES: dict[str, tuple[str, str | None, str]] = {
     "missing": ("a.ply", None, "no such mesh"),
     "empty file, PLY": ("a.ply", "", "not a readable mesh"),
     "empty file, OBJ": ("a.obj", "", "no faces"),
     "empty file, GLB": ("a.glb", "", "not a readable mesh"),
     "damaged": ("a.ply", "ply\nformat nonsense", "not a readable mesh"),
-    "point cloud, PLY": ("a.ply", PLY.format(faces=0, last="0 0 1"), "has no faces"),
+    "unknown format": ("a.xyz9", "1 2 3", "not a readable mesh"),
+    "point cloud, PLY": ("a.ply", ply(0, "0 0 1"), "has no faces"),
     "point cloud, XYZ": ("a.xyz", "0 0 0\n1 1 1\n2 0 1\n", "has no faces"),
     "lines": ("a.obj", f"{TRIANGLE}l 1 2 3\n", "has no faces"),
-    "NaN vertex": ("a.obj", "v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "vertex 0 is NaN"),
-    "infinite vertex": (
-        "a.obj",
-        "v 0 0 0\nv inf 0 0\nv 0 1 0\nf 1 2 3\n",
-        "vertex 1 is NaN or infinite",
-    ),
-    "NaN vertex of no face": (
-        "a.ply",
-        PLY.format(faces=1, last="nan 0 0\n3 0 1 2"),
-        "vertex 3 is NaN",
-    ),
-    "vertex out of numbers": (
-        "a.obj",
-        "v 0 0 0\nv 1e200 0 0\nv 0 1e200 0\nf 1 2 3\n",
-        "further than",
-    ),
-    "vertex that is not there": (
-        "a.ply",
-        PLY.format(faces=1, last="0 0 1\n3 0 1 9"),
-        "names vertex 9 of 4",
-    ),
-    "vertex of negative number": (
-        "a.ply",
-        PLY.format(faces=1, last="0 0 1\n3 0 1 -1"),
-        "names vertex -1 of 4",
-    ),
-    "no area": ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "none of its faces has an area"),
-    "all one point": (
-        "a.obj",
-        "v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n",
-        "none of its faces has an area",
-    ),
-    "small and far away": (
-        "a.obj",
-        "v 1e6 0 0\nv 1000001 0 0\nv 1e6 1 0\nf 1 2 3\n",
-        "float32 does not resolve",
-    ),
+    "NaN vertex": ("a.obj", obj("0 0 nan", "1 0 0", "0 1 0"), "vertex 0 is NaN"),
+    "infinite vertex": ("a.obj", obj("0 0 0", "inf 0 0", "0 1 0"), "vertex 1 is NaN or infinite"),
+    "NaN vertex of no face": ("a.ply", ply(1, "nan 0 0\n3 0 1 2"), "vertex 3 is NaN"),
+    "vertex too far": ("a.obj", obj("0 0 0", "1e200 0 0", "0 1e200 0"), "further than"),
+    "vertex that is not there": ("a.ply", ply(1, "0 0 1\n3 0 1 9"), "names vertex 9 of 4"),
+    "negative vertex": ("a.ply", ply(1, "0 0 1\n3 0 1 -1"), "names vertex -1 of 4"),
+    "no area": ("a.obj", obj("0 0 0", "1 0 0", "2 0 0"), NO_AREA),
+    "all one point": ("a.obj", obj("1 1 1", "1 1 1", "1 1 1"), NO_AREA),
 }
 
 
 @pytest.mark.parametrize("case", BAD_MESHES)
-def test_bad_mesh_is_one_line(
-    dataset: Dataset, tmp_path: Path, case: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_mesh_is_one_line(dataset, tmp_path, case, capsys):
     name, content, message = BAD_MESHES[case]
     if content is not None:
         (tmp_path / name).write_text(content)
-    line = refused(
-        capsys, ["prior", dataset.root, "--mesh", tmp_path / name, "--gaussians", 100], dataset.root
-    )
-    assert message in line
-    if case != "small and far away":  # of which a mask can well be made
-        out = tmp_path / "out"
-        assert message in refused(
-            capsys, ["import", dataset.root, "--out", out, "--mesh", tmp_path / name], out
-        )
+    mesh, out = ["--mesh", tmp_path / name], ["--out", tmp_path / "out"]
+    assert message in refused(capsys, ["prior", dataset.root, *mesh, *out, "--gaussians", 100])
+    assert message in refused(capsys, ["import", dataset.root, *mesh, *out])
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(InputError, match=re.escape(message)):
+        load_rock(tmp_path / name, Rock())
+
+
+GB = r"[\d.e+Infinity]+"
+MEMORY = f"N = {GB} samples take about {GB} GB of memory, and this machine has [\\d.]+ GB"
 
 
 @pytest.mark.parametrize(
-    "options", [["--spacing", "1e-6"], ["--spacing", "1e-300"], ["--gaussians", "1" + 30 * "0"]]
+    ("options", "message"),
+    [
+        ("--spacing 1e-6", MEMORY),
+        ("--spacing 1e-300", MEMORY),
+        (f"--gaussians 1{30 * '0'}", MEMORY),
+        ("--gaussians 100 --prior-noise 0.01", "--prior-noise.*--mesh"),
+        ("--gaussians 100 --holes 0.2", "--holes.*--mesh"),
+        ("--gaussians 100 --poisson-depth 0", "--poisson-depth.*--mesh"),
+    ],
 )
-def test_more_samples_than_memory_holds_is_one_line(
-    dataset: Dataset, options: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    line = refused(
-        capsys, ["prior", dataset.root, "--mesh", dataset.root / "rock.glb", *options], dataset.root
-    )
-    assert re.search(
-        r"N = [\d.e+Infinity]+ samples take about [\d.e+Infinity]+ GB of memory, and this machine has [\d.]+ GB",
-        line,
-    )
+def test_options_that_do_not_fit_a_mesh_are_one_line(dataset, options, message, capsys):
+    mesh = ["--mesh", dataset.root / "rock.glb"]
+    line = refused(capsys, ["prior", dataset.root, *mesh, *options.split()], dataset.root)
+    assert re.search(message, line)
 
 
-@pytest.mark.parametrize(
-    "options", [["--prior-noise", "0.01"], ["--holes", "0.2"], ["--poisson-depth", "0"]]
-)
-def test_what_a_given_mesh_has_no_use_for_is_refused(
-    dataset: Dataset, options: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = [
-        "prior",
-        dataset.root,
-        "--mesh",
-        dataset.root / "rock.glb",
-        "--gaussians",
-        100,
-        *options,
-    ]
-    line = refused(capsys, arguments, dataset.root)
-    assert options[0] in line
-    assert "--mesh" in line
+def test_a_mesh_that_is_small_and_far_away_is_one_line(tmp_path):
+    (tmp_path / "a.obj").write_text(obj("1e6 0 0", "1000001 0 0", "1e6 1 0"))
+    with pytest.raises(InputError, match="float32 does not resolve"):
+        prior_from_mesh(tmp_path / "a.obj", PriorSettings(gaussians=100))
 
 
-def test_the_record_of_a_given_mesh_says_what_was_done(
-    dataset: Dataset, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as exit_:
-        main(
-            [
-                "prior",
-                str(dataset.root),
-                "--mesh",
-                str(dataset.root / "rock.glb"),
-                "--gaussians",
-                "100",
-                "--seed",
-                "3",
-            ]
-        )
-    assert exit_.value.code == 0
-    assert load_prior(dataset.root / "prior").numbers["settings"] == {
-        "gaussians": 100,
-        "spacing": None,
-        "seed": 3,
-        "backing": 0.5,
-    }
-    assert "some frame saw" not in capsys.readouterr().out
+def test_the_record_of_a_given_mesh_says_what_was_done(dataset, tmp_path, capsys):
+    options = ["--mesh", dataset.root / "rock.glb", "--gaussians", 100, "--seed", 3]
+    assert run("prior", dataset.root, *options, "--out", tmp_path / "p") == 0
+    used = {"gaussians": 100, "spacing": None, "seed": 3, "backing": 0.5}
+    prior = load_prior(tmp_path / "p")
+    assert prior.numbers["settings"] == used
+    assert np.abs(synthetic.level(prior.points)).max() < 0.01
+    assert (tmp_path / "p/prior.png").is_file()
+    assert "some frame saw" not in said(capsys)[0]
 
 
 def _spoilt(how: str) -> trimesh.Trimesh:
@@ -177,10 +134,8 @@ def _spoilt(how: str) -> trimesh.Trimesh:
     elif how == "faces twice, the second time inside out":
         faces = np.concatenate([faces, faces[:, ::-1]])
     elif how == "all of it twice, with vertices of its own":
-        vertices, faces = (
-            np.concatenate([vertices, vertices]),
-            np.concatenate([faces, faces[:, ::-1] + len(vertices)]),
-        )
+        faces = np.concatenate([faces, faces[:, ::-1] + len(vertices)])
+        vertices = np.concatenate([vertices, vertices])
     elif how == "faces of one point, faces without area":
         line = [[0, 1, len(vertices)]]
         vertices = np.concatenate([vertices, (vertices[:1] + vertices[1:2]) / 2])
@@ -210,7 +165,7 @@ def _spoilt(how: str) -> trimesh.Trimesh:
         "some faces inside out, no vertex shared",
     ],
 )
-def test_a_mesh_that_can_be_mended_gives_the_same_prior(tmp_path: Path, how: str) -> None:
+def test_a_mesh_that_can_be_mended_gives_the_same_prior(tmp_path, how):
     synthetic.rock_mesh().export(tmp_path / "rock.ply")
     _spoilt(how).export(tmp_path / "spoilt.ply")
     right, found = (
@@ -228,36 +183,19 @@ def test_a_mesh_that_can_be_mended_gives_the_same_prior(tmp_path: Path, how: str
     assert octant.min() > 15
 
 
-def test_a_single_triangle_and_a_fold_are_sampled(dataset: Dataset, tmp_path: Path) -> None:
+def test_a_single_triangle_and_a_fold_are_sampled(dataset, tmp_path):
     (tmp_path / "one.obj").write_text(f"{TRIANGLE}f 1 3 2\n")
-    with pytest.raises(SystemExit) as exit_:
-        main(
-            [
-                "prior",
-                str(dataset.root),
-                "--mesh",
-                str(tmp_path / "one.obj"),
-                "--gaussians",
-                "40",
-                "--out",
-                str(tmp_path / "p"),
-            ]
-        )
-    assert exit_.value.code == 0
-    assert np.allclose(
-        load_prior(tmp_path / "p").normals, [0, 0, -1]
-    )  # as it is wound, and drawn though none faces the viewer
+    options = ["--mesh", tmp_path / "one.obj", "--gaussians", 40, "--out", tmp_path / "p"]
+    assert run("prior", dataset.root, *options) == 0
+    # As it is wound, and drawn though no face is towards the viewer.
+    assert np.allclose(load_prior(tmp_path / "p").normals, [0, 0, -1])
     # Two triangles folded flat onto each other: the normals of their vertices cancel.
-    fold = Mesh(
-        np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]),
-        np.array([[0, 1, 2], [0, 2, 1]]),
-        np.ones(2, bool),
-    )
-    normals = sample_surface(fold, 0, count=40)[1]
+    corners, faces = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 1]])
+    normals = sample_surface(Mesh(corners, faces, np.ones(2, bool)), 0, count=40)[1]
     assert np.allclose(np.abs(normals), [0, 0, 1])
 
 
-def test_a_mesh_with_holes_is_sampled(tmp_path: Path, dataset: Dataset) -> None:
+def test_a_mesh_with_holes_is_sampled(tmp_path):
     mesh = synthetic.rock_mesh()
     mesh.update_faces(np.random.default_rng(0).random(len(mesh.faces)) > 0.2)
     mesh.export(tmp_path / "holes.ply")

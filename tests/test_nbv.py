@@ -1,5 +1,4 @@
-"""The loop alone, on NumPy stand-ins for its stations (tests/tiny.py); the real stations meet in
-test_end_to_end.py."""
+"""The loop in a folder with the operations of tests/tiny.py, one view or a batch at a time."""
 
 from __future__ import annotations
 
@@ -8,20 +7,25 @@ import math
 import signal
 import subprocess
 import sys
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tiny
+from program import steps, timeless
+from tiny import resume, run
 
+import mgs.data.dataset
+import mgs.run.inputs
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.fit.stopping import StopReason
 from mgs.policy import criteria
-from mgs.policy import registry as policies
+from mgs.policy.registry import policy_names
 from mgs.run import folder as run_folder
-from mgs.run import loop, recording
+from mgs.run import loop
 from mgs.splat_ply import read_ply
 
 
@@ -30,97 +34,87 @@ def dataset(tmp_path_factory):
     return load_dataset(tiny.write_dataset(tmp_path_factory.mktemp("tiny") / "dataset"))
 
 
-def run(out, dataset, stations=None, **values):
-    settings = tiny.start(out, dataset, **values)
-    return recording.run(out, settings, dataset, stations or tiny.operations(), tiny.silent)
+@pytest.fixture(scope="module")
+def uninterrupted(dataset, tmp_path_factory):
+    """A whole run, its PLY and its steps."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    return run(out, dataset, seed=3), (out / "gaussians.ply").read_bytes(), steps(out)
 
 
-def lines(out: Path) -> list[dict]:
-    return [json.loads(line) for line in (out / "steps.jsonl").read_text().splitlines()]
-
-
-def timeless(steps: list[dict]) -> list[dict]:
-    return [{key: value for key, value in step.items() if key != "seconds"} for step in steps]
-
-
-@pytest.mark.parametrize("policy", policies.policy_names())
+@pytest.mark.parametrize("policy", policy_names())
 def test_run_writes_what_it_did(dataset, tmp_path, policy):
-    state = run(tmp_path / "run", dataset, policy=policy)
-    steps = lines(tmp_path / "run")
-    assert [step["step"] for step in steps] == list(range(6))
-    assert steps[0]["seeds"] == state.taken[:3]
-    assert steps[0]["seed_names"] == [dataset.frames[i].name for i in state.taken[:3]]
-    assert [step["frame"] for step in steps[1:]] == state.taken[3:]
-    assert [step["name"] for step in steps[1:]] == [dataset.frames[i].name for i in state.taken[3:]]
+    state, names = run(tmp_path / "run", dataset, policy=policy), [f.name for f in dataset.frames]
+    lines = steps(tmp_path / "run")
+    assert [line["step"] for line in lines] == list(range(6))
+    assert lines[0]["seeds"] == state.taken[:3]
+    assert lines[0]["seed_names"] == [names[i] for i in state.taken[:3]]
+    assert [line["frame"] for line in lines[1:]] == state.taken[3:]
+    assert [line["name"] for line in lines[1:]] == [names[i] for i in state.taken[3:]]
     assert len(set(state.taken)) == len(state.taken)
-    assert [step["images"] for step in steps] == list(range(3, 9))
-    assert all(step["stop_reason"] == "settled" and step["iterations"] == 7 for step in steps)
-    assert {"capture", "fit", "information"} <= set(steps[1]["seconds"])
-    assert "psnr" not in steps[1]
+    assert [line["images"] for line in lines] == list(range(3, 9))
+    assert all(line["stop_reason"] == "settled" and line["iterations"] == 7 for line in lines)
+    assert {"capture", "fit", "information"} <= set(lines[1]["seconds"])
+    assert "psnr" not in lines[1]
     config = json.loads((tmp_path / "run/config.json").read_text())
     assert config["settings"]["policy"] == policy
     assert {"mgs", "python", "mitsuba", "drjit", "numpy"} == set(config["versions"]) - {"commit"}
-    np.testing.assert_array_equal(
-        read_ply(tmp_path / "run/gaussians.ply").means, state.gaussians.means
-    )
+    model = read_ply(tmp_path / "run/gaussians.ply")
+    np.testing.assert_array_equal(model.means, state.gaussians.means)
 
 
-def test_d_optimal_takes_the_best_candidate_at_every_step(dataset, tmp_path):
-    state = run(tmp_path / "run", dataset, budget=1)
-    before = recording.run(
-        tmp_path / "seeds",
-        tiny.start(tmp_path / "seeds", dataset, budget=0),
-        dataset,
-        tiny.operations(),
-        tiny.silent,
-    )
-    lam = criteria.regularisation(tiny.GROUPS)
-    H = sum(
-        tiny.fisher(before.gaussians, dataset.frames[i].camera).astype(float) for i in before.taken
-    )
-    np.testing.assert_allclose(before.H, H)
-    left = [i for i in range(len(dataset)) if i not in before.taken]
-    gains = [
-        criteria.d_optimal(tiny.fisher(before.gaussians, dataset.frames[i].camera), H, lam)
-        for i in left
-    ]
-    assert state.taken[-1] == left[int(np.argmax(gains))]
-    assert state.steps[-1]["score"] == state.steps[-1]["information_gain"] == max(gains)
+@pytest.mark.parametrize("batch", [1, 3])
+def test_views_are_the_best_at_the_model_and_given_the_batch_so_far(dataset, tmp_path, batch):
+    """Every view has the largest gain, given the information of those before it at one model."""
+    before = run(tmp_path / "seeds", dataset, budget=0)
+    state = run(tmp_path / "run", dataset, budget=batch, batch=batch)
+    lam, taken = criteria.regularisation(tiny.GROUPS), list(before.taken)
+
+    def information(model, views):
+        return [tiny.fisher(model, dataset.frames[i].camera).astype(float) for i in views]
+
+    H = before.H
+    np.testing.assert_allclose(H, sum(information(before.gaussians, taken)))
+    for line in state.steps[1:]:
+        left = [i for i in range(len(dataset)) if i not in taken]
+        F = information(before.gaussians, left)
+        gains = [criteria.d_optimal(one, H, lam) for one in F]
+        best = int(np.argmax(gains))
+        assert line["frame"] == left[best]
+        assert line["score"] == line["information_gain"] == gains[best]
+        H, taken = H + F[best], [*taken, left[best]]
+    np.testing.assert_allclose(state.H, sum(information(state.gaussians, taken)))
 
 
 def test_coverage_is_of_the_surface_and_does_not_depend_on_training(dataset, tmp_path):
-    def forgetful(*arguments):
+    def blacken(*arguments):
         fit = tiny.fit(*arguments)
-        fit.gaussians.sh[:] = -100  # black: no information is left at the trained model
+        fit.gaussians.sh[:] = -100  # no information is left at the trained model
         return fit
 
     state = run(tmp_path / "run", dataset, policy="coverage")
-    covered = [step["coverage"] for step in state.steps]
+    covered = [line["coverage"] for line in state.steps]
     start, lam = tiny.initial([]), criteria.regularisation(tiny.GROUPS)
     for step, share in enumerate(covered):
         H = sum(tiny.fisher(start, dataset.frames[i].camera) for i in state.taken[: 3 + step])
         assert share == criteria.coverage(H, lam)
     assert covered == sorted(covered)
     assert 0 < covered[0] < covered[-1]
-    forgot = run(tmp_path / "forgot", dataset, tiny.operations(fit=forgetful), policy="coverage")
-    assert forgot.taken == state.taken
+    black = run(tmp_path / "black", dataset, tiny.operations(fit=blacken), policy="coverage")
+    assert black.taken == state.taken
 
 
 def test_fits_start_in_the_colours_of_all_images_taken(dataset, tmp_path):
-    """Before every fit the prior's colours are those of all frames taken, and the model moves with
-    them; the surface that is scored, and the means, stay those of the seeds."""
-    handed, drawn = [], []
+    """The model moves with the prior's colours; means stay those of the seeds."""
+    handed, fitted = [], []
 
     def initial(frames):
-        g = tiny.initial(frames)
-        return replace(
-            g, sh=g.sh + np.float32(len(frames)), means=g.means + np.float32(len(frames))
-        )
+        g, count = tiny.initial(frames), np.float32(len(frames))
+        return replace(g, sh=g.sh + count, means=g.means + count)
 
     def fit(gaussians, start, *others):
         handed.append((gaussians, start))
         found = tiny.fit(gaussians, start, *others)
-        drawn.append(found.gaussians)
+        fitted.append(found.gaussians)
         return found
 
     run(tmp_path / "run", dataset, tiny.operations(initial=initial, fit=fit), budget=2)
@@ -128,78 +122,58 @@ def test_fits_start_in_the_colours_of_all_images_taken(dataset, tmp_path):
     for step, (model, start) in enumerate(handed):
         np.testing.assert_array_equal(start.sh, initial([None] * (3 + step)).sh)
         np.testing.assert_array_equal(start.means, initial([None] * 3).means)
-        expected = (
-            start if step == 0 else replace(drawn[step - 1], sh=drawn[step - 1].sh + np.float32(1))
-        )
-        np.testing.assert_allclose(model.sh, expected.sh, atol=1e-5)
+        expected = start.sh if step == 0 else fitted[step - 1].sh + np.float32(1)
+        np.testing.assert_allclose(model.sh, expected, atol=1e-5)
         np.testing.assert_array_equal(model.means, start.means)
 
 
 def test_a_tie_goes_to_the_farthest_camera(dataset, tmp_path):
-    """Where every view sees everything, coverage has nothing to say after the seeds: the views must
-    spread all the same."""
-    stations = tiny.operations(
-        fisher=lambda gaussians, camera: np.ones((tiny.POINTS, 11), np.float32)
-    )
-    state = run(tmp_path / "run", dataset, stations, policy="coverage", seeds=1, budget=3)
-    assert [step["score"] for step in state.steps[1:]] == [0, 0, 0]
+    """Views spread where every view sees everything and coverage has no preference."""
+    same = tiny.operations(fisher=lambda *_: np.ones((tiny.POINTS, 11), np.float32))
+    state = run(tmp_path / "run", dataset, same, policy="coverage", seeds=1, budget=3)
+    assert [line["score"] for line in state.steps[1:]] == [0, 0, 0]
     assert sorted(state.taken) == [0, 3, 6, 9]
 
 
-@pytest.mark.parametrize("policy", policies.policy_names())
-def test_candidate_images_are_never_read_before_they_are_chosen(
-    dataset, tmp_path, monkeypatch, policy
-):
-    """Every image that is opened is logged; at each choice the opened ones must be exactly those
-    taken."""
-    import mgs.data.dataset
-    import mgs.run.inputs
-
-    opened: set[str] = set()
-    places = [
+@pytest.mark.parametrize("batch", [1, 2])
+@pytest.mark.parametrize("policy", policy_names())
+def test_images_are_read_only_once_a_batch_is_chosen(dataset, tmp_path, monkeypatch, policy, batch):
+    opened, at_choice, choose = set(), [], loop.choose
+    for module, name in (
         (mgs.data.dataset, "read_png"),
         (mgs.data.dataset, "read_mask"),
         (mgs.data.dataset, "read_exr"),
         (mgs.run.inputs, "file_digest"),
-    ]
-    for module, name in places:
-        function = getattr(module, name)
-        monkeypatch.setattr(
-            module, name, lambda path, f=function: opened.add(Path(path).stem) or f(path)
-        )
-    at_choice = []
-    choose = loop.choose
+    ):
+        logged = lambda path, f=getattr(module, name): opened.add(Path(path).stem) or f(path)  # noqa: E731
+        monkeypatch.setattr(module, name, logged)
 
     def watched(problem, state, fisher=None):
-        at_choice.append((set(opened), {dataset.frames[i].name for i in state.taken}))
+        at_choice.append((set(opened), len(state.taken)))
         return choose(problem, state, fisher)
 
     monkeypatch.setattr(loop, "choose", watched)
-    state = run(tmp_path / "run", dataset, policy=policy)
-    assert len(at_choice) == 5
-    assert all(seen == taken for seen, taken in at_choice)
-    assert opened == {dataset.frames[i].name for i in state.taken}
+    state = run(tmp_path / "run", dataset, policy=policy, batch=batch)
+    names = [dataset.frames[i].name for i in state.taken]
+    known = {1: (3, 4, 5, 6, 7), 2: (3, 3, 5, 5, 7)}[batch]
+    assert [count for _, count in at_choice] == [3, 4, 5, 6, 7]
+    assert [seen for seen, _ in at_choice] == [set(names[:count]) for count in known]
+    assert opened == set(names)
 
 
-def test_poisoned_candidates_do_not_change_the_choice(tmp_path):
-    """The files of views that are never chosen may hold anything: same views, same model."""
-    root = tiny.write_dataset(tmp_path / "dataset")
-    dataset = load_dataset(root)
+def test_damaged_files_of_other_views_change_nothing(tmp_path):
+    dataset = load_dataset(tiny.write_dataset(tmp_path / "dataset"))
     clean = run(tmp_path / "clean", dataset)
-    for i, frame in enumerate(dataset.frames):
-        if i not in clean.taken:
-            for path in (frame.image_path, frame.depth_path, frame.mask_path):
-                path.write_bytes(b"poison")
-    poisoned = run(tmp_path / "poisoned", dataset)
-    assert poisoned.taken == clean.taken
-    np.testing.assert_array_equal(poisoned.gaussians.sh, clean.gaussians.sh)
+    for i in set(range(len(dataset))) - set(clean.taken):
+        frame = dataset.frames[i]
+        for path in (frame.image_path, frame.depth_path, frame.mask_path):
+            path.write_bytes(b"damaged")
+    again = run(tmp_path / "again", dataset)
+    assert again.taken == clean.taken
+    np.testing.assert_array_equal(again.gaussians.sh, clean.gaussians.sh)
 
 
 def test_one_candidate_in_memory_at_a_time(dataset, tmp_path):
-    """Streaming: when the next candidate's information is asked for, the previous one has been let
-    go."""
-    import weakref
-
     alive: list[weakref.ref] = []
 
     def fisher(gaussians, camera):
@@ -213,155 +187,116 @@ def test_one_candidate_in_memory_at_a_time(dataset, tmp_path):
 
 
 def test_random_depends_on_the_seed_only(dataset, tmp_path):
-    taken = [
-        run(tmp_path / str(i), dataset, policy="random", seed=seed).taken
-        for i, seed in enumerate((1, 1, 2))
-    ]
-    assert taken[0] == taken[1]
-    assert taken[0] != taken[2]
+    one, same, other = (
+        run(tmp_path / name, dataset, policy="random", seed=seed).taken
+        for name, seed in {"a": 1, "b": 1, "c": 2}.items()
+    )
+    assert one == same != other
 
 
 def test_evaluation_is_logged_and_changes_nothing(dataset, tmp_path):
     plain = run(tmp_path / "plain", dataset)
     measured = run(tmp_path / "measured", dataset, evaluate_every=2)
-    assert ["psnr" in step for step in measured.steps] == [True, False, True, False, True, False]
+    assert ["psnr" in line for line in measured.steps] == [True, False, True, False, True, False]
     assert measured.taken == plain.taken
 
 
-MOMENTS = [
-    ("initial", 1),
-    ("fit", 1),
-    ("fit", 4),
-    ("fisher", 2),
-    ("fisher", 40),
-    ("before the lines are written", 1),
-    ("before the lines are written", 3),
-    ("while the checkpoint is written", 1),
-    ("while the checkpoint is written", 3),
-]
-
-
-@pytest.fixture(scope="module")
-def uninterrupted(dataset, tmp_path_factory):
-    out = tmp_path_factory.mktemp("whole") / "run"
-    return run(out, dataset, seed=3), (out / "gaussians.ply").read_bytes(), lines(out)
-
-
-@pytest.mark.parametrize(("moment", "count"), MOMENTS)
-def test_killed_at_any_moment_then_resumed_takes_the_same_views(
+@pytest.mark.parametrize(
+    ("moment", "count"),
+    [
+        ("initial", 1),
+        ("fit", 4),
+        ("fisher", 2),
+        ("fisher", 40),
+        ("before the lines are written", 1),
+        ("before the lines are written", 3),
+        ("while the checkpoint is written", 1),
+        ("while the checkpoint is written", 3),
+    ],
+)
+def test_a_killed_run_that_is_resumed_takes_the_same_views(
     dataset, tmp_path, uninterrupted, moment, count
 ):
-    whole, ply, steps = uninterrupted
+    whole, ply, lines = uninterrupted
     out = tmp_path / "run"
-    command = [
-        sys.executable,
-        tiny.__file__,
-        str(dataset.root),
-        str(out),
-        "d-optimal",
-        moment,
-        str(count),
-    ]
+    command = [sys.executable, tiny.__file__, dataset.root, out, moment, str(count)]
     process = subprocess.run(command, capture_output=True, text=True)
     assert process.returncode == -signal.SIGKILL, process.stderr
     half = run_folder.read_checkpoint(out)
-    # The lines may lag behind the checkpoint, never run ahead of it or differ.
+    # The lines may be one behind the checkpoint, never ahead of it.
     committed = half.steps if half else []
-    written = lines(out) if (out / "steps.jsonl").exists() else []
+    written = steps(out) if (out / "steps.jsonl").exists() else []
     assert written == committed[: len(written)]
     assert len(committed) - len(written) <= 1
-    resumed = recording.run(
-        out, run_folder.read_settings(out), dataset, tiny.operations(), tiny.silent
-    )
-    assert resumed.taken == whole.taken
-    assert timeless(lines(out)) == timeless(steps)
+    assert resume(out, dataset).taken == whole.taken
+    assert timeless(steps(out)) == timeless(lines)
     assert (out / "gaussians.ply").read_bytes() == ply
     assert not list(out.glob(".*"))
 
 
-def test_interrupted_by_the_keyboard_then_resumed(dataset, tmp_path, uninterrupted):
+@pytest.mark.parametrize(("batch", "fits", "kept"), [(1, 4, 3), (2, 2, 1), (2, 3, 3)])
+def test_an_interrupted_run_keeps_whole_batches(dataset, tmp_path, batch, fits, kept):
+    """Interrupted in a fit, then resumed: the same views and model."""
+    whole = run(tmp_path / "whole", dataset, batch=batch)
     calls = []
 
     def fit(*arguments):
         calls.append(1)
-        if len(calls) == 4:
+        if len(calls) == fits:
             raise KeyboardInterrupt
         return tiny.fit(*arguments)
 
     out = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
-        run(out, dataset, tiny.operations(fit=fit), seed=3)
-    assert len(lines(out)) == 3
-    assert (
-        recording.run(
-            out, run_folder.read_settings(out), dataset, tiny.operations(), tiny.silent
-        ).taken
-        == uninterrupted[0].taken
-    )
+        run(out, dataset, tiny.operations(fit=fit), batch=batch)
+    assert len(steps(out)) == kept
+    assert resume(out, dataset).taken == whole.taken
+    assert (out / "gaussians.ply").read_bytes() == (tmp_path / "whole/gaussians.ply").read_bytes()
 
 
 @pytest.mark.parametrize(
-    ("broken", "named"),
+    ("images", "batch", "kept", "named"),
     [
-        (0, "the fit to the seeds"),
-        (1, "the fit of step 1 .*step 0 is kept"),
-        (3, "steps 0 to 2 are kept"),
+        (3, 1, 0, "the fit to the seeds"),
+        (4, 1, 1, "the fit of step 1 .*step 0 is kept"),
+        (6, 1, 3, "steps 0 to 2 are kept"),
+        (7, 2, 3, "the fit of step 4 diverged.*; steps 0 to 2 are kept"),
     ],
 )
 def test_a_fit_that_diverges_ends_the_run_which_can_go_on(
-    dataset, tmp_path, uninterrupted, broken, named
+    dataset, tmp_path, images, batch, kept, named
 ):
     def fit(gaussians, start, cameras, *rest):
         found = tiny.fit(gaussians, start, cameras, *rest)
-        if len(cameras) < 3 + broken:
+        if len(cameras) < images:
             return found
         found.gaussians.sh[:] = np.nan
         return replace(found, losses=(0.01234, 0.5, math.nan), stop_reason=StopReason.DIVERGED)
 
     out = tmp_path / "run"
     with pytest.raises(InputError, match=named) as stop:
-        run(out, dataset, tiny.operations(fit=fit), seed=3)
+        run(out, dataset, tiny.operations(fit=fit), batch=batch)
     said = str(stop.value)
     assert "diverged: its loss was 0.0123 at the start, and 0.5, nan in the last passes" in said
     assert f"`train.rates` in {out / 'config.json'}" in said
     assert f"mgs nbv --resume {out}" in said
     assert "\n" not in said
-    assert ((out / "steps.jsonl").exists() and len(lines(out))) == broken
-    resumed = recording.run(
-        out, run_folder.read_settings(out), dataset, tiny.operations(), tiny.silent
-    )
-    assert resumed.taken == uninterrupted[0].taken
-    assert (out / "gaussians.ply").read_bytes() == uninterrupted[1]
-
-
-def test_resuming_a_finished_run_changes_nothing(dataset, tmp_path):
-    state = run(tmp_path / "run", dataset)
-    before = (tmp_path / "run/steps.jsonl").read_bytes()
-
-    def never(*arguments):
-        raise AssertionError("nothing is left to do")
-
-    again = recording.run(
-        tmp_path / "run",
-        run_folder.read_settings(tmp_path / "run"),
-        dataset,
-        tiny.operations(fit=never, fisher=never),
-        tiny.silent,
-    )
-    assert again.taken == state.taken
-    assert (tmp_path / "run/steps.jsonl").read_bytes() == before
+    assert ((out / "steps.jsonl").exists() and len(steps(out))) == kept
+    whole = run(tmp_path / "whole", dataset, batch=batch)
+    assert resume(out, dataset).taken == whole.taken
+    assert (out / "gaussians.ply").read_bytes() == (tmp_path / "whole/gaussians.ply").read_bytes()
 
 
 @pytest.mark.parametrize("score", [math.nan, math.inf])
-def test_a_policy_that_gives_no_number_is_named(dataset, tmp_path, monkeypatch, score):
+def test_a_policy_that_returns_no_number_is_named(dataset, tmp_path, monkeypatch, score):
     monkeypatch.setitem(criteria.CRITERIA, "mine", criteria.Criterion(lambda F, H, lam: score))
     with pytest.raises(InputError, match="policy mine: returned a score that is NaN or infinite"):
         run(tmp_path / "run", dataset, policy="mine")
-    assert len(lines(tmp_path / "run")) == 1
+    assert len(steps(tmp_path / "run")) == 1
 
 
-def test_damaged_or_missing_runs_are_told_apart(dataset, tmp_path):
-    with pytest.raises(InputError, match=r"holds no run"):
+def test_missing_and_damaged_runs_have_messages_of_their_own(dataset, tmp_path):
+    with pytest.raises(InputError, match="holds no run"):
         run_folder.read_settings(tmp_path)
     out = tmp_path / "run"
     run(out, dataset, budget=0)

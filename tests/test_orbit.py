@@ -18,9 +18,7 @@ def test_every_camera_has_the_target_in_the_middle(kind):
         pixel, z = camera.project(TARGET[None])
         np.testing.assert_allclose(pixel[0], [48, 36], atol=1e-9)
         assert z[0] > 0
-        assert (
-            camera.world_to_camera[1, 2] < 0
-        )  # image down is world down: no camera is upside down
+        assert camera.world_to_camera[1, 2] < 0  # no camera is upside down
 
 
 def test_circle_is_the_papers_orbit():
@@ -52,8 +50,6 @@ def test_distances_are_taken_in_turn(kind):
 
 
 def test_hemisphere_is_even():
-    """Nearest-neighbour distances of a Fibonacci lattice are within a factor of two and a half of
-    each other."""
     p = orbit_positions(Orbit(kind="hemisphere", radius=1, elevations=(0, 90)), 100, np.zeros(3))
     distance = np.linalg.norm(p[:, None] - p[None], axis=-1) + 9 * np.eye(100)
     nearest = distance.min(1)
@@ -70,9 +66,7 @@ def test_pose_noise_has_the_stated_size():
     noisy = perturb(cameras, 0.02, 0.5, np.random.default_rng(0))
     moved = np.array([b.position - a.position for a, b in zip(cameras, noisy, strict=True)])
     assert moved.std(0) == pytest.approx([0.02] * 3, rel=0.15)
-    turns = [
-        b.world_to_camera[:3, :3] @ a.world_to_camera[:3, :3].T
-        for a, b in zip(cameras, noisy, strict=True)
-    ]
+    poses = [[c.world_to_camera[:3, :3] for c in each] for each in (cameras, noisy)]
+    turns = np.array(poses[1]) @ np.array(poses[0]).swapaxes(1, 2)
     angles = np.degrees(np.arccos(np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1)))
     assert np.sqrt((angles**2).mean() / 3) == pytest.approx(0.5, rel=0.1)

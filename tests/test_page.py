@@ -11,45 +11,38 @@ import numpy as np
 import pytest
 import tiny
 from browser import chromium, opened
+from program import command
+from program import steps as read_steps
 from refusals import refused
 
 from mgs.camera import Camera
 from mgs.data.dataset import load_dataset
-from mgs.files import write_json
+from mgs.files import read_json, write_json
 from mgs.report import page_pictures
 from mgs.report.evaluation import evaluate_run
 from mgs.report.page import write_page
 from mgs.report.page_plots import corners_at
 from mgs.run import recording
-from mgs.run.folder import read_checkpoint, read_settings
+from mgs.run.folder import open_run
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """Two runs on stand-in stations: one finished and measured, one stopped two steps before its
     end."""
-    root = tmp_path_factory.mktemp(
-        "a <b> & c"
-    )  # what a page must escape, in an address and in text
+    root = tmp_path_factory.mktemp("a <b> & c")  # to be escaped, in an address and in text
     dataset = load_dataset(tiny.write_dataset(root / "data"))
+    parts = tiny.operations(
+        measure=lambda gaussians, taken: {"psnr": float(len(taken)), "test": {"lpips": 0.25}}
+    )
     for policy, budget in (("d-optimal", 3), ("random", 1)):
-        settings = tiny.start(root / policy, dataset, policy=policy, budget=3, evaluate_every=1)
-        stations = tiny.operations(
-            measure=lambda gaussians, taken: {"psnr": float(len(taken)), "test": {"lpips": 0.25}}
-        )
-        recording.run(
-            root / policy,
-            settings.model_copy(update={"budget": budget}),
-            dataset,
-            stations,
-            tiny.silent,
-        )
+        out = root / policy
+        settings = tiny.start(out, dataset, policy=policy, budget=3, evaluate_every=1)
+        settings = settings.model_copy(update={"budget": budget})
+        recording.run(out, settings, dataset, parts, tiny.silent)
     metrics = evaluate_run(root / "d-optimal", pictures=False)
-    fit = {
-        "phi": 1.0,
-        "predicted_decrease": 0.004,
-        "converged": True,
-    }  # stand-ins have no objective to measure it by
+    # A stand-in: there is no prior to measure it by.
+    fit = {"phi": 1.0, "predicted_decrease": 0.004, "converged": True}
     write_json(root / "d-optimal/metrics.json", metrics | {"fit": fit})
     (root / "d-optimal/diagnostics").mkdir()
     (root / "d-optimal/diagnostics/kf_0001.exr").write_bytes(b"")
@@ -67,19 +60,21 @@ def page(runs):
 class Parsed(HTMLParser):
     """Links, addresses that are loaded, text outside of scripts, and the data of a page."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, path) -> None:
         super().__init__()
-        self.links, self.loaded, self.said, self.inside, self.data = [], [], [], [], ""
-        self.feed(text)
+        self.links, self.loaded, self.inside = [], [], []
+        self.said, self.json = [], ""
+        self.feed(path.read_text())
         self.text = " ".join(" ".join(self.said).split())
+        self.data = json.loads(self.json)
 
     def handle_starttag(self, tag, attrs):
         values = dict(attrs)
         self.inside.append((tag, values.get("id")))
-        self.links += [values["href"]] if tag == "a" else []
-        self.loaded += (
-            [values["src"]] if values.get("src") else [values["href"]] if tag == "link" else []
-        )
+        if tag == "a":
+            self.links.append(values["href"])
+        elif address := values.get("src") or (tag == "link" and values["href"]):
+            self.loaded.append(address)
 
     def handle_endtag(self, tag):
         while self.inside and self.inside.pop()[0] != tag:
@@ -88,21 +83,21 @@ class Parsed(HTMLParser):
     def handle_data(self, data):
         tag, name = self.inside[-1] if self.inside else ("", None)
         if name == "data":
-            self.data += data
+            self.json += data
         elif tag not in ("script", "style"):
             self.said.append(data)
 
 
 def test_the_page_says_what_the_files_say(page, runs):
-    parsed = Parsed(page.read_text())
-    data, metrics = json.loads(parsed.data), json.loads((runs[0] / "metrics.json").read_text())
+    parsed, metrics = Parsed(page), read_json(runs[0] / "metrics.json")
+    data = parsed.data
     assert parsed.loaded == ["data:,"]
     for group in ("all", "held_out"):
         assert f"{metrics[group]['psnr']:.2f}" in parsed.text
     assert "2 of" not in parsed.text.split("random")[0]
     assert "Unfinished: 4 of 6 views are taken" in parsed.text
     assert "Not measured: `mgs eval" in parsed.text
-    steps = [json.loads(line) for line in (runs[0] / "steps.jsonl").read_text().splitlines()]
+    steps = read_steps(runs[0])
     assert "Last fit: converged; its objective could fall by 0.4 % yet" in parsed.text
     assert "stopped early" not in parsed.text
     plots = {plot["title"]: plot["data"] for plot in data["plots"]}
@@ -110,40 +105,28 @@ def test_the_page_says_what_the_files_say(page, runs):
     assert gain["y"] == [step["information_gain"] for step in steps[1:]]
     assert len(both["y"]) == 1
     assert plots["Surface coverage (Fig. 3)"][0]["y"] == [100 * step["coverage"] for step in steps]
-    assert plots["test lpips after each step"][1]["y"] == [
-        0.25,
-        0.25,
-    ]  # a metric of which the page was told nothing
+    assert plots["test lpips after each step"][1]["y"] == [0.25, 0.25]  # a metric it does not know
     views = data["runs"][0]["views"]
     taken = [*steps[0]["seed_names"], *(step["name"] for step in steps[1:])]
     assert [view["name"] for view in views] == taken
     psnr = {view["name"]: f"{view['psnr']:.2f} dB" for view in metrics["views"]}
-    assert [view["pictures"][1]["caption"] for view in views] == [
-        f"render, {psnr[name]}" for name in taken
-    ]
-    assert {key for view in views for key in dict(view["facts"])} >= {
-        "information gain",
-        "surface coverage",
-        "PSNR (dB)",
-    }
-    for one in data["runs"]:
-        for view in one["views"]:
-            for picture in view["pictures"]:
-                assert picture["alt"]
-                assert data["pictures"][picture["name"]].startswith("data:image/webp;base64,")
-    trained = {view["name"] for one in data["runs"] for view in one["views"]}
+    captions = [view["pictures"][1]["caption"] for view in views]
+    assert captions == [f"render, {psnr[name]}" for name in taken]
+    facts = {key for view in views for key in dict(view["facts"])}
+    assert facts >= {"information gain", "surface coverage", "PSNR (dB)"}
+    shown = [view for one in data["runs"] for view in one["views"]]
+    for picture in (picture for view in shown for picture in view["pictures"]):
+        assert picture["alt"]
+        assert data["pictures"][picture["name"]].startswith("data:image/webp;base64,")
+    trained = {view["name"] for view in shown}
     assert not trained & {view["view"] for view in data["compared"]}
 
 
 def test_links_lead_to_the_files(page, runs):
-    links = Parsed(page.read_text()).links
+    links = Parsed(page).links
     assert all((page.parent / unquote(link)).is_file() for link in links)
-    assert {link.rsplit("/", 1)[-1] for link in links} >= {
-        "gaussians.ply",
-        "kf_0001.exr",
-        "config.json",
-        "metrics.json",
-    }
+    names = {link.rsplit("/", 1)[-1] for link in links}
+    assert names >= {"gaussians.ply", "kf_0001.exr", "config.json", "metrics.json"}
     assert sum(link.endswith("gaussians.ply") for link in links) == 2
 
 
@@ -166,36 +149,33 @@ def test_uncertainty_falls_with_every_view(runs, monkeypatch):
     from mgs.policy.criteria import regularisation
     from mgs.splat import fisher, groups
 
-    run, shown = runs[0], {}
+    run, shown = open_run(runs[0]), {}
     monkeypatch.setattr(
         page_pictures.Album,
         "add_uncertainty",
         lambda self, name, values, alpha: shown.update({name: values}),
     )
-    state, dataset = read_checkpoint(run), load_dataset(read_settings(run).dataset)
-    frames = [dataset.frames[i] for i in state.taken]
+    frames, model = run.taken, run.state.gaussians
     album = page_pictures.new_album(frames, 10)
-    settings = read_settings(run)
-    noise = settings.pixel_noise, settings.prior_std
-    page_pictures.draw_taken(album, "a", state.gaussians, frames, noise, lambda: None)
+    noise = run.settings.pixel_noise, run.settings.prior_std
+    page_pictures.draw_taken(album, "a", model, frames, noise, lambda: None)
     lam = regularisation(groups(0), *noise)
     H = np.zeros((tiny.POINTS, 11))
     for frame in frames:
         before = shown[f"before/{frame.name}/a"]
-        H += fisher(state.gaussians, frame.camera)
+        H += fisher(model, frame.camera)
         after = shown[f"after/{frame.name}/a"]
         assert before.max() <= 1 + 1e-5
         assert (after <= before + 1e-6).all()
     seen = after > 0
     least = (lam / (H + lam)).mean(axis=1).min()
     assert after[seen].min() >= least - 1e-5
-    np.testing.assert_array_equal(
-        shown[f"before/{frames[0].name}/a"] > 0.99, shown[f"before/{frames[0].name}/a"] > 0
-    )
+    first = shown[f"before/{frames[0].name}/a"]
+    np.testing.assert_array_equal(first > 0.99, first > 0)
 
 
 def test_pictures_stay_within_their_share(monkeypatch, runs):
-    dataset = load_dataset(read_settings(runs[0]).dataset)
+    dataset = open_run(runs[0]).dataset
     album = page_pictures.new_album(dataset.frames, 1)
     rows, columns = album.window
     mask = np.logical_or.reduce([frame.mask() for frame in dataset.frames])
@@ -218,22 +198,18 @@ def test_what_is_not_there_is_left_out(runs, tmp_path):
     """No model and no metrics of it: no pictures, no numbers, and a note for each."""
     run = shutil.copytree(runs[0], tmp_path / "run")
     (run / "checkpoint.npz").unlink()
-    metrics = json.loads((run / "metrics.json").read_text())
-    (run / "metrics.json").write_text(json.dumps(metrics | {"images": 5}))
+    metrics = read_json(run / "metrics.json")
+    write_json(run / "metrics.json", metrics | {"images": 5})
     write_page(tmp_path / "with.html", [run])
-    data = json.loads(Parsed((tmp_path / "with.html").read_text()).data)
+    data = Parsed(tmp_path / "with.html").data
     assert data["pictures"]
-    assert not any(
-        "psnr" in key
-        for view in data["runs"][0]["views"]
-        for key in view["pictures"][1]["caption"].split()
-    )
+    captions = [view["pictures"][1]["caption"] for view in data["runs"][0]["views"]]
+    assert set(captions) == {"render"}
     (run / "gaussians.ply").unlink()
     write_page(tmp_path / "without.html", [run])
-    parsed = Parsed((tmp_path / "without.html").read_text())
-    data = json.loads(parsed.data)
-    assert data["pictures"] == {}
-    assert data["compared"] == []
+    parsed = Parsed(tmp_path / "without.html")
+    assert parsed.data["pictures"] == {}
+    assert parsed.data["compared"] == []
     assert "metrics.json is of 5 images, the model of 6" in parsed.text
     assert "holds no model" in parsed.text
     assert f"{metrics['held_out']['psnr']:.4f}" not in parsed.text
@@ -241,22 +217,20 @@ def test_what_is_not_there_is_left_out(runs, tmp_path):
 
 
 def test_test_views_are_compared_and_their_metrics_shown(runs, tmp_path):
-    """Those of the dataset's folder `test`, under names that cannot be mistaken for those of its
+    """The dataset's folder `test`, under names that cannot be mistaken for those of its
     own views."""
     run = shutil.copytree(runs[0], tmp_path / "run")
-    config = json.loads((run / "config.json").read_text())
+    config = read_json(run / "config.json")
     shutil.copytree(config["settings"]["dataset"], tmp_path / "data")
     tiny.write_dataset(tmp_path / "data/test", frames=3)
     config["settings"]["dataset"] = str(tmp_path / "data")
-    (run / "config.json").write_text(json.dumps(config))
-    metrics = json.loads((run / "metrics.json").read_text())
+    write_json(run / "config.json", config)
     view = {"name": "kf_0001", "trained": False, "psnr": 12.345, "psnr_mask": 10.5, "ssim": 0.5}
-    (run / "metrics.json").write_text(
-        json.dumps(metrics | {"test": {"count": 1, "psnr": 12.345}, "test_views": [view]})
-    )
+    measured = {"test": {"count": 1, "psnr": 12.345}, "test_views": [view]}
+    write_json(run / "metrics.json", read_json(run / "metrics.json") | measured)
     write_page(tmp_path / "page.html", [run])
-    parsed = Parsed((tmp_path / "page.html").read_text())
-    data = json.loads(parsed.data)
+    parsed = Parsed(tmp_path / "page.html")
+    data = parsed.data
     tests = {
         view["view"]: view["sides"] for view in data["compared"] if view["view"].startswith("test/")
     }
@@ -268,23 +242,19 @@ def test_test_views_are_compared_and_their_metrics_shown(runs, tmp_path):
 
 
 def test_the_command(runs, tmp_path, capsys):
-    from mgs.cli.app import main
-
-    with pytest.raises(SystemExit) as stop:
-        main(["report", str(runs[1]), "--html", str(tmp_path / "page.html")])
-    assert stop.value.code == 0
-    assert re.search(
-        r"wrote .*page\.html \(\d+\.\d MB\)", capsys.readouterr().out.replace("\n", "")
-    )
+    command("report", runs[1], "--html", tmp_path / "page.html")
+    said = capsys.readouterr().out.replace("\n", "")
+    assert re.search(r"wrote .*page\.html \(\d+\.\d MB\)", said)
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
     (tmp_path / "file").write_text("")
-    assert "cannot be written" in refused(
-        capsys, ["report", runs[0], "--html", tmp_path / "file/page.html"], tmp_path
-    )
-    assert "is a folder" in refused(capsys, ["report", runs[0], "--html", tmp_path], tmp_path)
-    assert "holds no run" in refused(
-        capsys, ["report", tmp_path, "--html", tmp_path / "x.html"], tmp_path
-    )
+    wrong = {
+        tmp_path / "file/page.html": "cannot be written",
+        tmp_path: "is a folder",
+    }
+    for path, named in wrong.items():
+        assert named in refused(capsys, ["report", runs[0], "--html", path], tmp_path)
+    line = refused(capsys, ["report", tmp_path, "--html", tmp_path / "x.html"], tmp_path)
+    assert "holds no run" in line
 
 
 @pytest.fixture(scope="module")
@@ -320,9 +290,8 @@ def test_the_page_in_a_browser(browser, page, width, height, scheme):
         for _ in range(3):
             tab.keyboard.press("ArrowRight")
         assert fact("taken as") == "step 1"
-        tab.wait_for_function(
-            "[...document.querySelectorAll('#pictures img')].every(i => i.complete && i.naturalWidth)"
-        )
+        images = "[...document.querySelectorAll('#pictures img')]"
+        tab.wait_for_function(f"{images}.every(i => i.complete && i.naturalWidth)")
         assert all(fact("view") in alt for alt, *_ in shown())
         marked = tab.evaluate("document.getElementById('orbit-0').data.at(-1).x[0]")
         assert marked == pytest.approx(tab.evaluate("data.runs[0].views[3].eye[0]"))
@@ -334,12 +303,9 @@ def test_the_page_in_a_browser(browser, page, width, height, scheme):
         divider.scroll_into_view_if_needed()
         box = divider.bounding_box()
         tab.mouse.click(box["x"] + 0.25 * box["width"], box["y"] + 0.5 * box["height"])
-        at = float(
-            tab.evaluate(
-                "getComputedStyle(document.getElementById('divider')).getPropertyValue('--at')"
-            ).strip("%")
-        )
-        assert at == pytest.approx(25, abs=3)
+        style = "getComputedStyle(document.getElementById('divider'))"
+        at = tab.evaluate(f"{style}.getPropertyValue('--at')").strip("%")
+        assert float(at) == pytest.approx(25, abs=3)
         before = tab.locator("#compare-b").get_attribute("src")
         tab.locator("#compare-right").select_option("2")
         assert tab.locator("#compare-b").get_attribute("src") != before

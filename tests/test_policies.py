@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -34,19 +34,10 @@ def test_d_optimal_is_the_exact_log_determinant_difference(F, H):
     assert found == pytest.approx(after - before, rel=1e-9, abs=1e-9)
 
 
-@given(information, information, any_criterion)
-def test_no_view_loses_information(F, H, name):
-    assert criteria.CRITERIA[name].score(F, H, LAM) >= 0
-
-
-@given(information, any_criterion)
-def test_a_view_that_sees_nothing_gains_nothing(H, name):
-    assert criteria.CRITERIA[name].score(np.zeros_like(H), H, LAM) == 0
-
-
 @given(information, information, information, any_criterion)
-def test_seeing_more_is_never_worse(F, more, H, name):
+def test_scores_are_never_negative_and_grow_with_what_is_seen(F, more, H, name):
     score = criteria.CRITERIA[name].score
+    assert score(np.zeros_like(H), H, LAM) == 0 <= score(F, H, LAM)
     assert score(F + more, H, LAM) >= score(F, H, LAM) * (1 - 1e-12)
 
 
@@ -69,38 +60,12 @@ def test_units_do_not_matter_when_lambda_carries_them(F, H, unit, name):
     assert changed == pytest.approx(score(F, H, LAM), rel=1e-9)
 
 
-@settings(max_examples=30)
-@given(arrays(np.float64, (6, N, 11), elements=st.floats(0, 10, allow_subnormal=False)))
-def test_greedy_d_optimal_reaches_its_guarantee(views):
-    """Monotone and submodular, so greedy is within 1 - 1/e of the best pair (Nemhauser et al.
-    1978)."""
-    H = np.zeros((N, 11))
-
-    def value(chosen):
-        return criteria.d_optimal(views[list(chosen)].sum(0), H, LAM)
-
-    first = max(range(6), key=lambda i: value([i]))
-    second = max((i for i in range(6) if i != first), key=lambda i: value([first, i]))
-    best = max(value([i, j]) for i in range(6) for j in range(i))
-    assert value([first, second]) >= (1 - 1 / np.e) * best - 1e-12
-
-
 def test_regularisation_is_the_priors_information_per_group():
     tau = {"colour": 1, "scale": 2, "rotation": 0.5, "opacity": 10}
     lam = criteria.regularisation(groups(0), pixel_noise=0.1, prior_std=tau)
     assert lam == pytest.approx([0.01] * 3 + [0.0025] * 3 + [0.04] * 4 + [0.0001])
     by_kind = {"colour": 0.01, "scale": 0.0025, "rotation": 0.04, "opacity": 0.0001}
     assert criteria.lam_by_kind(lam, groups(0)) == pytest.approx(by_kind)
-
-
-def test_gain_is_twice_the_mutual_information_of_a_linear_gaussian_model():
-    """y = J theta + e with diagonal J^T J: I(theta; y) = 1/2 log det(I + J Sigma J^T / sigma^2)."""
-    rng = np.random.default_rng(0)
-    j, sigma = rng.normal(size=11), criteria.PIXEL_NOISE
-    tau = sigma / np.sqrt(LAM)
-    mutual = 0.5 * np.linalg.slogdet(np.eye(11) + np.diag((j * tau / sigma) ** 2))[1]
-    found = criteria.d_optimal(j[None] ** 2, np.zeros((1, 11)), LAM)
-    assert found == pytest.approx(2 / 11 * mutual)
 
 
 def test_coverage_counts_newly_observed_gaussians():
@@ -191,7 +156,7 @@ def context_of(models, H, **given):
 
 
 def test_context_policies_use_their_own_estimator():
-    """For the views taken, too. The pool of `i-optimal` is all poses, also those out of reach."""
+    """Both for candidates and views taken. `i-optimal` averages over all poses."""
     rng, scales = np.random.default_rng(0), {"exact": 1, "loss-gradient": 1e-9}
     models = {name: rng.random((4, N, 11)) * scale for name, scale in scales.items()}
     J = rng.normal(size=(4, N, 14, 11))

@@ -1,7 +1,8 @@
 """A model with no more parameters than its images pay for: the evidence, the choice of a degree,
-and a run fitted anew."""
+and a refitted run."""
 
 import dataclasses
+import shutil
 
 import numpy as np
 import pytest
@@ -9,11 +10,12 @@ import synthetic
 from hypothesis import given
 from hypothesis import strategies as st
 from plyfile import PlyData
+from program import change_settings, command
+from refusals import refused
 from scipy.stats import multivariate_normal
 
 from mgs.bench.core import surface_camera, surface_gaussians
 from mgs.camera import Camera, look_at
-from mgs.cli.app import main
 from mgs.errors import InputError
 from mgs.fit.fitting import fit
 from mgs.fit.settings import TrainSettings
@@ -26,13 +28,14 @@ from mgs.report.evidence import (
     LeftOut,
     Worth,
     kinds,
+    last_images,
     lean_fit,
     paying,
     regularisation,
     worth,
 )  # fmt: skip
 from mgs.report.refitting import REFITTED, refit_run
-from mgs.run.folder import load_run
+from mgs.run.folder import load_run, open_run
 from mgs.run.nbv import run_nbv
 from mgs.run.settings import NbvSettings
 from mgs.splat import render
@@ -58,7 +61,7 @@ def cameras_around(gaussians, views=VIEWS):
 
 
 def images_of(truth, start, noise=0.002, views=VIEWS):
-    """What the truth looks like, with noise, and where a fit starts."""
+    """Images of the truth, with noise, and the start of a fit."""
     rng, cameras = np.random.default_rng(0), cameras_around(truth, views)
     targets = [np.asarray(render(truth, camera).rgb) for camera in cameras]
     noisy = [target + rng.normal(0, noise, target.shape) for target in targets]
@@ -83,17 +86,11 @@ def test_the_gain_is_the_logarithm_of_the_ratio_of_two_marginal_likelihoods(
     precision = slope @ slope + lam
     away = (slope @ seen) / precision  # the most probable parameter
     noise = sigma**2 * np.eye(pixels)
-    with_it = multivariate_normal(np.zeros(pixels), noise + tau**2 * np.outer(slope, slope)).logpdf(
-        seen
-    )
-    without = multivariate_normal(np.zeros(pixels), noise).logpdf(seen)
+    zero, both = np.zeros(pixels), noise + tau**2 * np.outer(slope, slope)
+    with_it = multivariate_normal(zero, both).logpdf(seen)
+    without = multivariate_normal(zero, noise).logpdf(seen)
     found = worth(
-        np.array([[away]]),
-        np.array([[precision]]),
-        np.array([lam]),
-        sigma,
-        {"one": slice(0, 1)},
-        1.0,
+        np.array([[away]]), np.array([[precision]]), np.array([lam]), sigma, {"one": slice(0, 1)}, 1
     )
     assert found.gain["one"][0] == pytest.approx(with_it - without, rel=1e-6, abs=1e-6)
     at_start, at_end = seen @ seen / 2, np.square(seen - slope * away).sum() / 2 + lam * away**2 / 2
@@ -114,8 +111,7 @@ def test_what_pays_least_is_left_out_as_long_as_it_is_allowed(n, loss, seed):
     assert spent <= allowed + 1e-9
     per_number = {kind: gain[kind] / size for kind, size in sizes.items()}
     most = max(
-        (per_number[kind][left_out[kind]].max() for kind in sizes if left_out[kind].any()),
-        default=-np.inf,
+        (value for kind in sizes for value in per_number[kind][left_out[kind]]), default=-np.inf
     )
     others = [
         (per_number[kind][i], rise[kind][i]) for kind in sizes for i in np.flatnonzero(kept[kind])
@@ -133,31 +129,26 @@ def test_only_those_gaussians_learn_a_kind_that_are_asked_to(optimiser):
     cameras = cameras_around(start, 3)
     targets = [np.full((32, 40, 3), 0.3, np.float32)] * 3
     train = TrainSettings(passes=3, optimiser=optimiser)
-    some = np.arange(len(start)) % 3 == 0
-    found = fit(
-        start, cameras, targets, train, learns={"scale": some[:, None], "opacity": some}
-    ).gaussians
+    some, n = np.arange(len(start)) % 3 == 0, len(start)
+    masks = {"scale": some[:, None], "opacity": some}
+    found = fit(start, cameras, targets, train, learns=masks).gaussians
     whole = fit(start, cameras, targets, train).gaussians
     assert np.array_equal(found.log_scales[~some], start.log_scales[~some])
     assert np.array_equal(found.logit_opacities[~some], start.logit_opacities[~some])
     moved = (whole.log_scales != start.log_scales).any(axis=1)
     assert moved.sum() > 100
     assert np.array_equal((found.log_scales != start.log_scales).any(axis=1), moved & some)
-    everyone = {
-        "scale": np.ones((len(start), 1), bool),
-        "colour": np.ones((len(start), 1, 1), bool),
-    }
+    everyone = {"scale": np.ones((n, 1), bool), "colour": np.ones((n, 1, 1), bool)}
     assert fit(start, cameras, targets, train, learns=everyone).gaussians == whole
 
 
 def test_scales_are_learned_where_they_are_wrong(tmp_path):
     truth = model()
     wrong = np.arange(len(truth)) % 10 == 0
-    start = dataclasses.replace(
-        truth, log_scales=truth.log_scales + 0.3 * wrong[:, None].astype(np.float32)
-    )
-    told = []
-    found = lean_fit(images_of(truth, start), settings(tmp_path), sh="0", say=told.append)
+    off = 0.3 * wrong[:, None].astype(np.float32)
+    start = dataclasses.replace(truth, log_scales=truth.log_scales + off)
+    told, images, given = [], images_of(truth, start), settings(tmp_path)
+    found = lean_fit(images, given, sh="0", say=told.append)
     scale, colour = found.learned["scale"], found.learned["colour"]
     assert scale[wrong & colour].mean() > 2 * scale[~wrong & colour].mean()
     assert found.left_out is None
@@ -166,14 +157,13 @@ def test_scales_are_learned_where_they_are_wrong(tmp_path):
         held = ~found.learned[kind]
         assert np.array_equal(getattr(found.gaussians, name)[held], getattr(start, name)[held])
     sizes = {"colour": 3, "scale": 3, "rotation": 4, "opacity": 1}
-    assert found.parameters == sum(
-        int(found.learned[kind].sum()) * size for kind, size in sizes.items()
-    )
+    counts = {kind: int(mask.sum()) for kind, mask in found.learned.items()}
+    assert found.parameters == sum(counts[kind] * size for kind, size in sizes.items())
     assert told == ["fitting all parameters", "fitting what the images pay for"]
-    everything = lean_fit(images_of(truth, start), settings(tmp_path), learn="all", sh="0")
+    everything = lean_fit(images, given, learn="all", sh="0")
     assert found.parameters < everything.parameters == 11 * colour.sum()
     assert found.whole == everything.whole == everything.gaussians
-    more = lean_fit(images_of(truth, start), settings(tmp_path), sh="0", loss=0.0)
+    more = lean_fit(images, given, sh="0", loss=0.0)
     assert found.parameters < more.parameters < everything.parameters
 
 
@@ -190,9 +180,8 @@ def test_colours_have_a_degree_where_the_truth_has_one(tmp_path, shine, degree):
     start = model()
     truth = start.with_degree(1)  # with colours of its own
     start.sh *= 0.8  # so that there is something to learn
-    truth.sh[:, 1:] = shine * np.random.default_rng(1).normal(
-        size=(1, 3, 1)
-    )  # all of them shine in the same direction
+    # All of them shine in the same direction.
+    truth.sh[:, 1:] = shine * np.random.default_rng(1).normal(size=(1, 3, 1))
     found = lean_fit(images_of(truth, start), settings(tmp_path), learn="all")
     assert found.gaussians.sh_degree == degree
     assert found.left_out.pays == bool(degree)
@@ -215,17 +204,19 @@ def test_a_gain_within_its_own_error_does_not_pay():
 
 
 def test_each_view_is_left_out_once_with_its_neighbours(tmp_path, monkeypatch):
-    start = model(60)
-    images, fitted, judged = images_of(start, start), [], []
-    images = dataclasses.replace(images, order=[3, 1, 0, 2, 5, 4, 7, 6])
-    monkeypatch.setattr(
-        evidence, "fitted", lambda images, views, *_: fitted.append(list(views)) or start
-    )
-    monkeypatch.setattr(
-        evidence,
-        "_squared_error",
-        lambda model, camera, target, cache: judged.append(camera) or 1.0,
-    )
+    start, fitted, judged = model(60), [], []
+    images = dataclasses.replace(images_of(start, start), order=[3, 1, 0, 2, 5, 4, 7, 6])
+
+    def fit_to(images, views, *_):
+        fitted.append(list(views))
+        return start
+
+    def error_at(model, camera, target, cache):
+        judged.append(camera)
+        return 1.0
+
+    monkeypatch.setattr(evidence, "fitted", fit_to)
+    monkeypatch.setattr(evidence, "_squared_error", error_at)
     evidence.directional_gain(images, settings(tmp_path), None)
     left = [sorted(set(range(VIEWS)) - set(views)) for views in fitted[::2]]
     assert left == [[1, 3], [0, 2], [4, 5], [6, 7]]
@@ -235,10 +226,8 @@ def test_each_view_is_left_out_once_with_its_neighbours(tmp_path, monkeypatch):
 
 def test_lambda_of_each_kind(tmp_path):
     lam, of = regularisation(settings(tmp_path), 2), kinds(2)
-    assert of == {
-        "colour": slice(0, 3), DIRECTIONAL: slice(3, 27), "scale": slice(27, 30), "rotation": slice(30, 34),
-        "opacity": slice(34, 35),
-    }  # fmt: skip
+    assert list(of) == ["colour", DIRECTIONAL, "scale", "rotation", "opacity"]
+    assert [columns.stop for columns in of.values()] == [3, 27, 30, 34, 35]
     assert np.allclose(lam[of["colour"]], 0.02**2)
     assert np.allclose(lam[of[DIRECTIONAL]], (0.02 / 0.03) ** 2)
     assert np.allclose(lam[of["opacity"]], 0.01**2)
@@ -255,31 +244,26 @@ def run(tmp_path_factory):
 
 def test_a_run_is_refitted_beside_its_model(run, capsys):
     before = {file.name: file.read_bytes() for file in run.iterdir() if file.is_file()}
-    with pytest.raises(SystemExit) as exit_:
-        main(["refit", str(run)])
-    assert exit_.value.code == 0
+    command("refit", run)
     said = capsys.readouterr().out
     after = {file.name: file.read_bytes() for file in run.iterdir() if file.is_file()}
     refitted = after.pop(REFITTED)
     assert after == before
     vertices = PlyData.read(str(run / REFITTED))["vertex"].data
     marks = {
-        name: vertices[name].astype(bool)
+        name.removeprefix("learned_"): vertices[name].astype(bool)
         for name in vertices.dtype.names
         if name.startswith("learned_")
     }
-    assert {"learned_colour", "learned_scale", "learned_rotation", "learned_opacity"} <= set(marks)
+    assert {"colour", "scale", "rotation", "opacity"} <= set(marks)
     columns = {"colour": 3, "directional": 9, "scale": 3, "rotation": 4, "opacity": 1}
-    parameters = sum(
-        int(mask.sum()) * columns[name.removeprefix("learned_")] for name, mask in marks.items()
-    )
+    parameters = sum(int(mask.sum()) * columns[kind] for kind, mask in marks.items())
     assert f"{parameters:,} parameters are learned" in said
     assert 1200 <= parameters < 4400
     model, whole = read_ply(run / REFITTED), load_run(run)[0]
     assert np.array_equal(model.means, whole.means)
-    assert (
-        len(np.unique(model.logit_opacities[~marks["learned_opacity"]])) <= 2
-    )  # the prior's, on the surface and behind it
+    priors = np.unique(model.logit_opacities[~marks["opacity"]])
+    assert len(priors) <= 2  # on the surface, and behind it
     assert "PSNR on the test views" in said
     found = refit_run(run)
     assert (run / REFITTED).read_bytes() == refitted
@@ -292,35 +276,20 @@ def test_a_run_is_refitted_beside_its_model(run, capsys):
 
 
 def test_the_images_of_the_last_fit_are_those_of_the_run(run):
-    from mgs.prior.build import load_prior
-    from mgs.report.convergence import remaining_decrease
-    from mgs.report.evidence import last_images
-    from mgs.run.folder import read_settings
-
-    whole, dataset, taken, _ = load_run(run)
-    by_name, given = {frame.name: frame for frame in dataset.frames}, read_settings(run)
-    frames = [by_name[name] for name in taken]
-    images = last_images(given, load_prior(given.prior), frames)
+    opened = open_run(run)
+    images = last_images(opened.settings, opened.prior, opened.taken)
     positions = np.array([images.cameras[i].position for i in images.order])
     around = np.unwrap(np.arctan2(positions[:, 1], positions[:, 0]))
     assert (np.diff(around) > 0).all()
     assert around[-1] - around[0] < 2 * np.pi
-    assert remaining_decrease(whole, given, load_prior(given.prior), frames)["phi"] > 0
-    assert np.array_equal(images.start(range(len(images))).means, whole.means)
+    start = images.start(range(len(images)))
+    assert np.array_equal(start.means, opened.state.gaussians.means)
 
 
 @pytest.mark.parametrize("means", ["normal", "free"])
 def test_a_run_that_learns_means_is_refitted_too(run, tmp_path, means):
-    data = run.parent / "data"
-    run_nbv(
-        data,
-        tmp_path / "run",
-        gaussians=150,
-        budget=1,
-        policy="uniform",
-        train={"means": means},
-        exposure=True,
-    )
+    small = {"gaussians": 150, "budget": 1, "policy": "uniform", "exposure": True}
+    run_nbv(run.parent / "data", tmp_path / "run", train={"means": means}, **small)
     found = refit_run(tmp_path / "run", sh="0")
     assert found.before == 150 * {"normal": 12, "free": 14}[means]
     vertices = PlyData.read(str(tmp_path / "run" / REFITTED))["vertex"].data
@@ -340,22 +309,12 @@ def test_a_run_that_learns_means_is_refitted_too(run, tmp_path, means):
     ],
 )
 def test_what_cannot_be_chosen_is_one_line(run, capsys, options, said):
-    with pytest.raises(SystemExit) as exit_:
-        main(["refit", str(run), *options])
-    assert exit_.value.code == 2
-    assert said in capsys.readouterr().err
+    assert said in refused(capsys, ["refit", run, *options])
 
 
 def test_a_prior_that_is_gone_is_one_line(run, tmp_path):
-    import shutil
-
     shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns(REFITTED))
-    config = (
-        (tmp_path / "run/config.json")
-        .read_text()
-        .replace(str(run / "prior"), str(tmp_path / "nowhere"))
-    )
-    (tmp_path / "run/config.json").write_text(config)
+    change_settings(tmp_path / "run", prior=str(tmp_path / "nowhere"))
     with pytest.raises(InputError, match="nowhere"):
         refit_run(tmp_path / "run")
     assert not (tmp_path / "run" / REFITTED).exists()

@@ -8,7 +8,6 @@ import trimesh
 from PIL import Image
 
 from mgs.data.meshes import read_mesh, to_glb
-from mgs.errors import InputError
 from mgs.seeds import generator
 from mgs.synth.noise import Noise
 from mgs.synth.rock import load_rock, make_rock
@@ -42,9 +41,8 @@ def test_rock_stands_in_the_ground_at_its_size():
 def test_rock_is_a_function_of_the_seed():
     a, b, c = (make_rock(COARSE, generator(seed, "rock")) for seed in (1, 1, 2))
     np.testing.assert_array_equal(a.vertices, b.vertices)
-    assert (
-        a.visual.material.baseColorTexture.tobytes() == b.visual.material.baseColorTexture.tobytes()
-    )
+    textures = [rock.visual.material.baseColorTexture.tobytes() for rock in (a, b)]
+    assert textures[0] == textures[1]
     assert len(a.vertices) != len(c.vertices) or not np.allclose(a.vertices, c.vertices)
 
 
@@ -55,12 +53,10 @@ def test_glb_round_trip_keeps_geometry_and_colours(tmp_path):
     assert scale == pytest.approx(1)
     np.testing.assert_allclose(back.vertices, rock.vertices, atol=1e-6)
     np.testing.assert_allclose(back.vertex_normals, rock.vertex_normals, atol=1e-6)
-    np.testing.assert_array_equal(
-        back.visual.to_color().vertex_colors, rock.visual.to_color().vertex_colors
-    )
-    np.testing.assert_array_equal(
-        read_mesh(tmp_path / "rock.glb").vertices, rock.vertices.astype(np.float32)
-    )
+    colours = (mesh.visual.to_color().vertex_colors for mesh in (back, rock))
+    np.testing.assert_array_equal(*colours)
+    read = read_mesh(tmp_path / "rock.glb")
+    np.testing.assert_array_equal(read.vertices, rock.vertices.astype(np.float32))
 
 
 def test_glb_is_y_up_as_its_format_has_it(tmp_path):
@@ -76,8 +72,7 @@ def test_glb_is_y_up_as_its_format_has_it(tmp_path):
 
 @pytest.mark.parametrize("suffix", ["glb", "obj", "ply"])
 def test_given_mesh_is_scaled_and_stood_up(tmp_path, suffix):
-    """A centimetre-sized box, longest side up in its own format's convention, comes out metres
-    tall."""
+    """A centimetre-sized box, longest side up by its format, comes out metres tall."""
     up = [0.01, 0.01, 0.03] if suffix == "ply" else [0.01, 0.03, 0.01]
     trimesh.creation.box(up).export(tmp_path / f"box.{suffix}")
     rock, scale = load_rock(tmp_path / f"box.{suffix}", Rock(size=1.5, buried=0.0))
@@ -108,50 +103,22 @@ def test_photo_texture_is_kept(tmp_path):
     np.testing.assert_allclose(rock.visual.uv, uv, atol=1e-6)
 
 
-def _nan_ply(path):
-    path.write_text(
-        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-        "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 nan 0\n0 1 0\n3 0 1 2\n"
-    )
-
-
-@pytest.mark.parametrize(
-    ("name", "write", "message"),
-    [
-        ("missing.glb", lambda p: None, "no such mesh"),
-        ("garbage.glb", lambda p: p.write_bytes(b"not a mesh"), "not a readable mesh"),
-        ("points.ply", lambda p: trimesh.PointCloud(np.eye(3)).export(p), "no faces"),
-        ("nan.ply", _nan_ply, "vertex 1 is NaN"),
-        ("rock.xyz9", lambda p: p.write_text("1 2 3"), "not a readable mesh"),
-    ],
-)
-def test_bad_meshes(tmp_path, name, write, message):
-    write(tmp_path / name)
-    with pytest.raises(InputError, match=message) as error:
-        load_rock(tmp_path / name, Rock())
-    assert "\n" not in str(error.value)
-
-
 @pytest.mark.parametrize(
     ("suffix", "options"),
     [("glb", {"include_normals": True}), ("obj", {"include_normals": True}), ("ply", {})],
 )
 def test_a_rock_whose_faces_are_there_twice_has_normals(tmp_path, suffix, options):
-    """Faces and their reverse share vertices, where their normals cancel; the file may hold what is
-    left of them."""
+    """Faces and their reverse share vertices, where their normals cancel."""
     ball = trimesh.creation.icosphere(subdivisions=2)
     doubled = np.concatenate([ball.faces, ball.faces[:, ::-1], [[0, 0, 1]]])
-    trimesh.Trimesh(ball.vertices, doubled, process=False).export(
-        tmp_path / f"rock.{suffix}", **options
-    )
+    twice = trimesh.Trimesh(ball.vertices, doubled, process=False)
+    twice.export(tmp_path / f"rock.{suffix}", **options)
     rock, _ = load_rock(tmp_path / f"rock.{suffix}", Rock(), "z")
     assert len(rock.faces) == len(ball.faces)
     np.testing.assert_allclose(np.linalg.norm(rock.vertex_normals, axis=1), 1, atol=1e-6)
     outward = rock.vertices - rock.bounds.mean(0)
-    cosines = np.einsum(
-        "vk,vk->v", rock.vertex_normals, outward / np.linalg.norm(outward, axis=1, keepdims=True)
-    )
-    assert cosines.min() > 0.99
+    outward = outward / np.linalg.norm(outward, axis=1, keepdims=True)
+    assert np.einsum("vk,vk->v", rock.vertex_normals, outward).min() > 0.99
 
 
 def test_leaving_out_a_face_keeps_the_normals_and_uv_of_the_file(tmp_path):
@@ -168,6 +135,5 @@ def test_leaving_out_a_face_keeps_the_normals_and_uv_of_the_file(tmp_path):
     np.testing.assert_array_equal(mended.visual.uv, good.visual.uv)
     assert set(good.faces[0]) == {0, 1, 2}  # of no other face
     np.testing.assert_array_equal(mended.vertex_normals[3:], good.vertex_normals[3:])
-    assert not np.array_equal(
-        good.vertex_normals[3:6], np.tile(good.face_normals[1], (3, 1))
-    )  # new ones would differ
+    new = np.tile(good.face_normals[1], (3, 1))
+    assert not np.array_equal(good.vertex_normals[3:6], new)

@@ -11,55 +11,50 @@ from scipy.spatial import cKDTree
 from mgs.camera import Camera, look_at
 from mgs.colour import linear_from_srgb
 from mgs.errors import InputError
+from mgs.files import write_json
 from mgs.seeds import generator
 from mgs.synth import arena
 from mgs.synth.arena import make_ground, make_stones
 from mgs.synth.rock import make_rock
 from mgs.synth.rock_layer import RockLayer, continued, lattice, render_layers, with_coverage
 from mgs.synth.scene import MitsubaScene, sensor_dict
-from mgs.synth.scene_file import Arena, Rock, SceneFile, load_scene_file
+from mgs.synth.scene_file import Arena, Rock, SceneFile, Sensor, load_scene_file, sensor_of
 
 K = np.array([[70.0, 0, 30.5], [0, 70.0, 27.25], [0, 0, 1]])
 
 
 def test_known_point_lands_on_its_pixel():
-    """A small bright ball off every axis, an off-centre principal point: the rendered centroid is
-    the projection."""
+    """A small bright ball off every axis, and an off-centre principal point."""
     camera = Camera(K, 64, 48, look_at([3.0, -1.0, 1.5], [0.1, 0.2, 0.3]))
     point = np.array([0.25, -0.2, 0.45])
-    ball = {
-        "type": "sphere",
-        "center": point.tolist(),
-        "radius": 0.05,
-        "light": {"type": "area", "radiance": 1.0},
-    }
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "direct"},
-            "sensor": sensor_dict(camera),
-            "ball": ball,
-        }
-    )
+    light = {"type": "area", "radiance": 1.0}
+    ball = {"type": "sphere", "center": point.tolist(), "radius": 0.05, "light": light}
+    integrator = {"type": "direct"}
+    scene = {"type": "scene", "integrator": integrator, "sensor": sensor_dict(camera), "ball": ball}
+    scene = mi.load_dict(scene)
     image = np.array(mi.render(scene, spp=256)).sum(-1)
     v, u = np.mgrid[:48, :64] + 0.5
     centroid = np.array([(image * u).sum(), (image * v).sum()]) / image.sum()
     np.testing.assert_allclose(centroid, camera.project(point[None])[0][0], atol=0.05)
 
 
-def test_colour_and_depth_agree_on_the_silhouette():
-    """Path-traced albedo (Mitsuba's sensor) and the depth rays (NumPy camera) see the same rock
-    after the sensor moved."""
-    rock = trimesh.creation.icosphere(3, 0.7)
+def red_ball(subdivisions: int) -> trimesh.Trimesh:
+    """A red ball of radius 0.7 around (0.1, 0, 0.5)."""
+    rock = trimesh.creation.icosphere(subdivisions, 0.7)
     rock.apply_translation([0.1, 0, 0.5])
-    rock.visual = trimesh.visual.ColorVisuals(
-        rock, vertex_colors=np.tile([255, 0, 0, 255], (len(rock.vertices), 1))
-    )
-    cameras = [
-        Camera(K, 64, 48, look_at(eye, [0, 0, 0.6])) for eye in ([3, 0, 1.5], [-1, 2.5, 2.0])
-    ]
-    settings = SceneFile(arena=Arena(colour=(0.3, 0.3, 0.3), stones=0))
-    scene = MitsubaScene(settings, rock, cameras[0], seed=0)
+    colours = np.tile([255, 0, 0, 255], (len(rock.vertices), 1))
+    rock.visual = trimesh.visual.ColorVisuals(rock, vertex_colors=colours)
+    return rock
+
+
+GREY_GROUND = SceneFile(arena=Arena(colour=(0.3, 0.3, 0.3), stones=0))
+
+
+def test_colour_and_depth_agree_on_the_silhouette():
+    """Mitsuba's sensor and the depth rays (NumPy camera) see the same rock after a move."""
+    eyes = [3, 0, 1.5], [-1, 2.5, 2.0]
+    cameras = [Camera(K, 64, 48, look_at(eye, [0, 0, 0.6])) for eye in eyes]
+    scene = MitsubaScene(GREY_GROUND, red_ball(3), cameras[0], seed=0)
     for index, camera in enumerate(cameras):
         rendered = scene.render(camera, spp=16, seed=index, denoise=False)
         redness = rendered.rgb[..., 0] / np.maximum(rendered.rgb.sum(-1), 1e-6)
@@ -70,8 +65,7 @@ def test_colour_and_depth_agree_on_the_silhouette():
 
 
 def test_texture_lies_on_the_rock_as_in_the_mesh(monkeypatch):
-    """Mitsuba's albedo at each pixel is the colour that the exported mesh has at that point (a
-    flipped v would be noise)."""
+    """Mitsuba's albedo is the colour of the exported mesh there; a flipped v would be noise."""
     monkeypatch.setattr(arena, "ROWS", 60)  # the ground is not looked at
     monkeypatch.setattr(arena, "TEXELS", 64)
     rock = make_rock(Rock(detail=0.04), generator(0, "rock"))
@@ -88,16 +82,8 @@ def test_texture_lies_on_the_rock_as_in_the_mesh(monkeypatch):
 
 @pytest.fixture(scope="module")
 def ball():
-    """A red ball of radius 0.7 around (0.1, 0, 0.5) on grey ground, and a camera."""
-    rock = trimesh.creation.icosphere(5, 0.7)
-    rock.apply_translation([0.1, 0, 0.5])
-    rock.visual = trimesh.visual.ColorVisuals(
-        rock, vertex_colors=np.tile([255, 0, 0, 255], (len(rock.vertices), 1))
-    )
     camera = Camera(K, 64, 48, look_at([3, 0, 1.5], [0, 0, 0.6]))
-    return MitsubaScene(
-        SceneFile(arena=Arena(colour=(0.3, 0.3, 0.3), stones=0)), rock, camera, seed=0
-    ), camera
+    return MitsubaScene(GREY_GROUND, red_ball(5), camera, seed=0), camera
 
 
 def test_the_image_is_that_of_the_inner_integrator_and_the_rock_a_part_of_it(ball):
@@ -113,8 +99,7 @@ def test_the_image_is_that_of_the_inner_integrator_and_the_rock_a_part_of_it(bal
 
 
 def test_light_of_rock_and_of_all_else_adds_up_to_the_image(ball):
-    """The layer of the ground, lit in the same scene by the same random numbers, is the rest of the
-    image."""
+    """The layer of the ground, by the same random numbers, is the rest of the image."""
     scene, _ = ball
     image, rock, _ = render_layers(scene.scene, scene.path, 8, seed=1)
     ground = next(shape for shape in scene.scene.shapes() if shape.id() == "ground")
@@ -135,15 +120,8 @@ def test_coverage_is_the_area_that_the_outline_cuts_off(ball):
     centre = np.array([0.1, 0, 0.5]) - camera.position
     for dv in offset:
         for du in offset:
-            local = np.stack(
-                [
-                    (u + du - K[0, 2]) / K[0, 0],
-                    (v + dv - K[1, 2]) / K[1, 1],
-                    np.ones_like(u, float),
-                ],
-                -1,
-            )
-            rays = local @ camera.world_to_camera[:3, :3]
+            x, y = (u + du - K[0, 2]) / K[0, 0], (v + dv - K[1, 2]) / K[1, 1]
+            rays = np.stack([x, y, np.ones_like(x)], -1) @ camera.world_to_camera[:3, :3]
             along = rays @ centre
             expected += along**2 > (rays**2).sum(-1) * (centre @ centre - 0.7**2)
     rim = (expected > 0) & (expected < 1e4)
@@ -154,9 +132,8 @@ def test_coverage_is_the_area_that_the_outline_cuts_off(ball):
     np.testing.assert_array_equal(np.round(alpha * 255), alpha * 255)
     assert (alpha[mask] > 0).all()
     assert (alpha[~mask] < 1).all()
-    np.testing.assert_array_equal(
-        scene.coverage(camera, np.zeros_like(mask), np.zeros(mask.shape, np.float32)), 0
-    )
+    nowhere = scene.coverage(camera, np.zeros_like(mask), np.zeros(mask.shape, np.float32))
+    np.testing.assert_array_equal(nowhere, 0)
     assert (depth[mask] > 0).all()
 
 
@@ -171,45 +148,36 @@ def test_lattice_is_even_and_has_the_centre():
 
 
 def test_a_rock_of_one_colour_keeps_it():
-    """Whatever share of the samples met it, its light is its colour times the coverage; and its
-    continuation is its colour."""
+    """Its light is colour times coverage, whatever share of samples met it; so is its
+    continuation."""
     colour, coverage = np.array([0.1, 0.2, 0.4], np.float32), np.zeros((6, 7), np.float32)
     coverage[1:5, 2:6], coverage[0, 2:6] = 1, 0.25
     share = np.random.default_rng(0).binomial(4, coverage).astype(np.float32) / 4
     assert (share[0, 2:6] == 0).any()
     expected = coverage[..., None] * colour
-    np.testing.assert_allclose(
-        with_coverage(share[..., None] * colour, share, coverage), expected, atol=1e-6
-    )
-    np.testing.assert_allclose(
-        continued(expected, coverage), np.broadcast_to(colour, expected.shape), atol=1e-5
-    )
+    found = with_coverage(share[..., None] * colour, share, coverage)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    everywhere = np.broadcast_to(colour, expected.shape)
+    np.testing.assert_allclose(continued(expected, coverage), everywhere, atol=1e-5)
 
 
 def test_a_specular_rock_shines_where_it_mirrors_the_sun_and_nowhere_else():
-    """The highlight of a ball lies where its normal halves the angle between the sun and the
-    camera."""
+    """A ball's highlight lies where its normal halves the angle between sun and camera."""
     camera = Camera(K, 64, 48, look_at([3, 0, 1.5], [0, 0, 0.6]))
     images = {}
     for specular in (0.0, 0.5):
         rock = trimesh.creation.icosphere(4, 0.7)
         rock.apply_translation([0, 0, 0.7])
         settings = SceneFile(rock=Rock(specular=specular, roughness=0.2), arena=Arena(stones=0))
-        images[specular] = MitsubaScene(settings, rock, camera, seed=0).render(
-            camera, spp=16, seed=0, denoise=False
-        )
+        scene = MitsubaScene(settings, rock, camera, seed=0)
+        images[specular] = scene.render(camera, spp=16, seed=0, denoise=False)
     seen = images[0.0].mask & images[0.5].mask
     diffuse = images[0.0].rgb[seen].mean(-1)
     gained = images[0.5].rgb[seen].mean(-1) - diffuse
     sky = SceneFile().sky
     elevation, azimuth = np.radians([sky.sun_elevation, sky.sun_azimuth])
-    sun = np.array(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ]
-    )
+    flat = np.cos(elevation)
+    sun = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
     points = camera.unproject(images[0.0].depth)[seen]
     normal, view = (points - [0, 0, 0.7]) / 0.7, camera.position - points
     half = sun + view / np.linalg.norm(view, axis=1, keepdims=True)
@@ -219,13 +187,11 @@ def test_a_specular_rock_shines_where_it_mirrors_the_sun_and_nowhere_else():
 
 
 def test_the_rock_alone_is_the_image_inside_and_its_own_colour_at_the_rim(ball):
-    """Against many samples: the denoised layer at its rim is far nearer to the truth than image
-    times mask."""
+    """At its rim the denoised layer is far nearer to many samples than image times mask."""
     scene, camera = ball
     rendered = scene.render(camera, 8, 0, denoise=True)
-    truth = np.mean(
-        [scene.render(camera, 64, 10 + i, denoise=False).rock for i in range(4)], axis=0
-    )
+    many = [scene.render(camera, 64, 10 + i, denoise=False).rock for i in range(4)]
+    truth = np.mean(many, axis=0)
     rgb, alpha = rendered.rock[..., :3], rendered.rock[..., 3]
     rim = (alpha > 0) & (alpha < 1)
     error = np.sqrt(((rgb - truth[..., :3])[rim] ** 2).mean())
@@ -233,10 +199,8 @@ def test_the_rock_alone_is_the_image_inside_and_its_own_colour_at_the_rim(ball):
     assert error < 0.4 * by_mask
     assert not rgb[alpha == 0].any()
     np.testing.assert_array_equal(rgb[alpha == 1], rendered.rgb[alpha == 1])
-    green = rgb[rim][:, 1].sum() / rgb[rim][:, 0].sum()
-    assert green == pytest.approx(
-        truth[rim][:, 1].sum() / truth[rim][:, 0].sum(), abs=0.02
-    )  # no grey of the ground
+    green, true = (x[rim][:, 1].sum() / x[rim][:, 0].sum() for x in (rgb, truth))
+    assert green == pytest.approx(true, abs=0.02)  # no grey of the ground
 
 
 @pytest.mark.parametrize(
@@ -265,20 +229,13 @@ def test_no_stones_where_the_rock_keeps_them_out():
     assert make_stones(Arena(spread=2, stones=9), rock, ground, rng) is not None
 
 
-def test_unknown_scene_names_the_known_ones():
+def test_scenes_are_known_by_name_and_the_boulder_is_the_default():
     with pytest.raises(InputError, match="boulder"):
         load_scene_file("boulders")
-
-
-def test_the_boulder_is_the_default_scene():
     assert load_scene_file("boulder").model_copy(update={"description": ""}) == SceneFile()
 
 
 def test_the_sensor_of_a_dataset_is_its_scenes(tmp_path):
-    from mgs.errors import InputError
-    from mgs.files import write_json
-    from mgs.synth.scene_file import Sensor, sensor_of
-
     assert sensor_of(tmp_path) == Sensor()
     write_json(tmp_path / "config.json", {"scene": {"sensor": {"noise": 2.5, "drift": 0.0}}})
     assert sensor_of(tmp_path) == Sensor(noise=2.5, drift=0.0)

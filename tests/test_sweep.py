@@ -104,30 +104,7 @@ def die(root, out):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def test_two_workers_of_which_one_is_killed_find_what_a_serial_run_finds(tmp_path):
-    squares = [Cell(str(x), "test_sweep:add_slowly", {"x": x}) for x in range(4)]
-    killed = Cell("killed", "test_sweep:add_slowly", {"x": 7, "killed": True}, ("0",))
-    last = Cell("last", "test_sweep:add", {"x": 1, "to": None}, ("killed", "3"))
-    told = []
-    parallel = run_cells(
-        tmp_path / "parallel", [*squares, killed, last], lambda *what: told.append(what), workers=2
-    )
-    (tmp_path / "serial/cells/killed").mkdir(parents=True)
-    (tmp_path / "serial/cells/killed/begun").touch()
-    serial = run_cells(tmp_path / "serial", [*squares, killed, last], silent)
-    assert parallel == serial
-    assert list(parallel) == list(serial)
-    assert [name for name, _, _ in told][-1] == "last"
-    assert len(told) == 6
-    for name in serial:
-        files = [
-            (tmp_path / kind / "cells" / name / "result.json").read_bytes()
-            for kind in ("parallel", "serial")
-        ]
-        assert files[0] == files[1]
-
-
-def real_run(root, out, data, policy, killed=False):
+def real_run(root, out, data, killed=False):
     """A task: `mgs nbv`; its process is killed after the first choice of the first attempt, if
     asked for."""
     from mgs.run.inputs import array_digest
@@ -139,60 +116,11 @@ def real_run(root, out, data, policy, killed=False):
         if killed and first and len(state.steps) == 2:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    given = {"gaussians": 150, "seeds": 2, "budget": 3, "policy": policy}
+    given = {"gaussians": 150, "seeds": 2, "budget": 2}
     state = run_nbv(data, run, on_step=on_step, **given) if first else resume_nbv(run)
     arrays = [*vars(state.gaussians).values(), state.H, state.surface]
-    return {
-        "taken": state.taken,
-        "arrays": array_digest(arrays),
-        "losses": [step["loss"] for step in state.steps],
-    }
-
-
-def test_real_runs_of_two_workers_are_bit_for_bit_those_of_a_serial_run(tmp_path):
-    import synthetic
-
-    data = synthetic.write_dataset(tmp_path / "data", synthetic.orbit_cameras(8, 48, 36)).root
-    cells = [
-        Cell(p, "test_sweep:real_run", {"data": str(data), "policy": p})
-        for p in ("d-optimal", "random")
-    ]
-    cells.append(
-        Cell(
-            "killed",
-            "test_sweep:real_run",
-            {"data": str(data), "policy": "d-optimal", "killed": True},
-        )
-    )
-    parallel = run_cells(tmp_path / "parallel", cells, silent, workers=2)
-    serial = run_cells(tmp_path / "serial", cells[:2], silent)
-    assert {name: parallel[name] for name in serial} == serial
-    assert parallel["killed"] == serial["d-optimal"] != serial["random"]
-    assert len(serial["d-optimal"]["taken"]) == 5
-
-
-@pytest.fixture(scope="module")
-def scheduler():
-    """Address of a Dask scheduler with two worker processes."""
-    with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
-        LocalCluster(
-            n_workers=2, threads_per_worker=1, host="127.0.0.1", memory_limit=0,
-            dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL + 1,
-        ) as cluster,
-    ):  # fmt: skip
-        yield cluster.scheduler_address
-
-
-SURFACES = """
-import sys
-from pathlib import Path
-from mgs.study.sweep import Cell, run_cells
-
-if __name__ == "__main__":
-    cells = [Cell(f"surface/{i}", "test_sweep:surface", {}) for i in range(2)]
-    run_cells(Path(sys.argv[1]), cells, lambda *_: None, workers=2)
-"""
+    losses = [step["loss"] for step in state.steps]
+    return {"taken": state.taken, "arrays": array_digest(arrays), "losses": losses}
 
 
 def surface(root, out):
@@ -207,16 +135,65 @@ def surface(root, out):
     return {}
 
 
-def test_workers_that_made_a_surface_end_in_silence(tmp_path):
-    (tmp_path / "program.py").write_text(SURFACES)
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join([os.path.dirname(__file__), os.getcwd()])
-    }
-    command = [sys.executable, tmp_path / "program.py", tmp_path / "study"]
+def mixed(data, killed):
+    """Cells of several kinds; where asked for, two of them kill their process once."""
+    more = {"killed": True} if killed else {}
+    cells = [Cell(str(x), "test_sweep:add_slowly", {"x": x}) for x in range(4)]
+    cells.append(Cell("killed", "test_sweep:add_slowly", {"x": 7} | more, ("0",)))
+    cells.append(Cell("last", "test_sweep:add", {"x": 1, "to": None}, ("killed", "3")))
+    cells += [Cell(f"surface/{k}", "test_sweep:surface") for k in range(2)]
+    return [*cells, Cell("run", "test_sweep:real_run", {"data": str(data)} | more)]
+
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from test_sweep import mixed, run_cells
+
+if __name__ == "__main__":
+    with open(sys.argv[2], "w") as told:
+        cells = mixed(sys.argv[3], True)
+        run_cells(Path(sys.argv[1]), cells, lambda name, *_: print(name, file=told), workers=2)
+"""
+
+
+def test_two_workers_that_are_killed_find_silently_what_a_serial_run_finds(tmp_path):
+    import synthetic
+
+    data = synthetic.write_dataset(tmp_path / "data", synthetic.orbit_cameras(8, 48, 36)).root
+    program, told = tmp_path / "program.py", tmp_path / "told.txt"
+    program.write_text(PROGRAM)
+    paths = os.pathsep.join([os.path.dirname(__file__), os.getcwd()])
+    command = [sys.executable, program, tmp_path / "parallel", told, data]
     done = subprocess.run(
-        command, env=environment, capture_output=True, text=True, timeout=120, check=False
+        command,
+        env=os.environ | {"PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    names = told.read_text().split()
+    assert len(names) == len(set(names)) == 9
+    assert names.index("last") > max(names.index("killed"), names.index("3"))
+    serial = run_cells(tmp_path / "serial", mixed(data, False), silent)
+    assert len(serial["run"]["taken"]) == 4
+    for cell in mixed(data, True):
+        assert found(tmp_path / "parallel", cell) == serial[cell.name]
+
+
+@pytest.fixture(scope="module")
+def scheduler():
+    """Address of a Dask scheduler with two worker processes."""
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, host="127.0.0.1", memory_limit=0,
+            dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL + 1,
+        ) as cluster,
+    ):  # fmt: skip
+        yield cluster.scheduler_address
 
 
 def test_a_cell_that_must_be_alone_runs_here_and_beside_nothing(tmp_path, scheduler):

@@ -27,24 +27,21 @@ from scipy.spatial.transform import Rotation
 from mgs.camera import Camera, look_at
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset
-from mgs.gaussians import Gaussians
 from mgs.report.evaluation import evaluate_run
 from mgs.run import recording
-from mgs.run.folder import read_settings
+from mgs.run.folder import open_run
 from mgs.splat import render
 from mgs.splat_ply import write_ply
 from mgs.view import layers
 from mgs.view.server import Viewer, check_address, window_camera
-from mgs.view.subject import fitted, read_subject
+from mgs.view.subject import read_subject, scaled
 
 
 def steps(run, budget):
-    """Let a run on stand-in stations go on to this many chosen views."""
-    settings = read_settings(run)
-    dataset = load_dataset(settings.dataset)
-    recording.run(
-        run, settings.model_copy(update={"budget": budget}), dataset, tiny.operations(), tiny.silent
-    )
+    """Let a run on stand-ins go on to this many chosen views."""
+    opened = open_run(run)
+    settings = opened.settings.model_copy(update={"budget": budget})
+    recording.run(run, settings, opened.dataset, tiny.operations(), tiny.silent)
 
 
 @pytest.fixture(scope="module")
@@ -66,20 +63,13 @@ def test_a_run_is_read(run):
     assert [view.step for view in subject.taken] == [0, 0, 0, 1, 2]
     assert len(subject.views) == tiny.FRAMES
     assert subject.mesh is not None
-    assert layers.layers(subject) == [
-        "colour",
-        "alpha",
-        "depth",
-        "information",
-        "uncertainty",
-        "unobserved",
-    ]
+    names = ["colour", "alpha", "depth", "information", "uncertainty", "unobserved"]
+    assert layers.layers(subject) == names
     facts = dict(subject.taken[-1].facts)
     assert facts["images then"] == "5"
     assert facts["PSNR of the model here"].endswith(" dB")
-    assert "PSNR of the model here" in dict(
-        next(v for v in subject.views if v.role == "candidate").facts
-    )
+    candidate = next(view for view in subject.views if view.role == "candidate")
+    assert "PSNR of the model here" in dict(candidate.facts)
 
 
 @pytest.mark.parametrize("space", ["linear", "srgb"])
@@ -91,14 +81,10 @@ def test_a_ply_is_read(run, tmp_path, space):
     subject = read_subject(path)
     assert (subject.space, subject.views, subject.mesh) == (space, [], None)
     assert layers.layers(subject) == ["colour", "alpha", "depth"]
-    expected = (
-        srgb_from_linear(subject.gaussians.rgb)
-        if space == "linear"
-        else np.clip(subject.gaussians.rgb, 0, 1)
-    )
-    np.testing.assert_allclose(
-        layers.gaussian_colours(subject, "colour"), 255 * expected, atol=0.51
-    )
+    rgb = subject.gaussians.rgb
+    expected = srgb_from_linear(rgb) if space == "linear" else np.clip(rgb, 0, 1)
+    colours = layers.gaussian_colours(subject, "colour")
+    np.testing.assert_allclose(colours, 255 * expected, atol=0.51)
 
 
 def test_what_the_kernel_draws(run):
@@ -128,49 +114,43 @@ def test_a_world_of_large_numbers_is_shown_smaller(run):
     that."""
     subject = read_subject(run)
     assert subject.scale == 1
-    assert fitted(subject) is subject
+    assert scaled(subject) is subject
 
-    g = subject.gaussians
+    g, factor = subject.gaussians, 1000
+    larger = g.log_scales + np.float32(np.log(factor))
+    views = [
+        replace(view, frame=replace(view.frame, camera=view.frame.camera.scaled(factor)))
+        for view in subject.views
+    ]
     large = replace(
         subject,
-        gaussians=replace(
-            g, means=1000 * g.means, log_scales=g.log_scales + np.float32(np.log(1000))
-        ),
-        views=[
-            replace(view, frame=replace(view.frame, camera=view.frame.camera.scaled(1000)))
-            for view in subject.views
-        ],
-        mesh=replace(subject.mesh, vertices=1000 * subject.mesh.vertices),
+        gaussians=replace(g, means=factor * g.means, log_scales=larger),
+        views=views,
+        mesh=replace(subject.mesh, vertices=factor * subject.mesh.vertices),
     )
-    shown = fitted(large)
+    shown = scaled(large)
     assert np.ptp(shown.mesh.vertices) == pytest.approx(shown.scale * np.ptp(large.mesh.vertices))
     for layer in ("colour", "depth", "uncertainty"):
-        picture, depth, ends = layers.kernel_image(shown, shown.views[1].frame.camera, layer)
-        expected, _, (low, high) = layers.kernel_image(
-            subject, subject.views[1].frame.camera, layer
-        )
+        cameras = shown.views[1].frame.camera, subject.views[1].frame.camera
+        picture, depth, ends = layers.kernel_image(shown, cameras[0], layer)
+        expected, _, true_ends = layers.kernel_image(subject, cameras[1], layer)
         np.testing.assert_allclose(picture, expected, atol=2)
         assert depth[depth < layers.FAR].max() < 2.5 * 40
-        assert ends == pytest.approx(
-            (1000 * low, 1000 * high) if layer == "depth" else (low, high), rel=1e-4
-        )
+        scale = factor if layer == "depth" else 1
+        assert ends == pytest.approx(tuple(scale * end for end in true_ends), rel=1e-4)
 
 
 def test_covariances_have_the_scales_and_the_axes(run):
     subject = read_subject(run)
     g = subject.gaussians
-    values, vectors = np.linalg.eigh(layers.covariances(subject).astype(np.float64))
-    np.testing.assert_allclose(
-        values, np.sort(np.exp(2 * g.log_scales.astype(np.float64)), axis=1), rtol=1e-4
-    )
-    assert vectors.shape == (len(g), 3, 3)
-    flat = Gaussians(g.means, g.log_scales - np.array([0, 0, 3]), g.quats, g.logit_opacities, g.sh)
-    _, vectors = np.linalg.eigh(
-        layers.covariances(SimpleNamespace(gaussians=flat)).astype(np.float64)
-    )
-    normals = g.means / np.linalg.norm(
-        g.means, axis=1, keepdims=True
-    )  # the stand-in's discs lie on a sphere
+    values, _ = np.linalg.eigh(layers.covariances(subject).astype(np.float64))
+    variances = np.exp(2 * g.log_scales.astype(np.float64))
+    np.testing.assert_allclose(values, np.sort(variances, axis=1), rtol=1e-4)
+    flat = replace(g, log_scales=g.log_scales - np.array([0, 0, 3]))
+    found = layers.covariances(SimpleNamespace(gaussians=flat)).astype(np.float64)
+    _, vectors = np.linalg.eigh(found)
+    # The stand-in's discs lie on a sphere.
+    normals = g.means / np.linalg.norm(g.means, axis=1, keepdims=True)
     np.testing.assert_allclose(np.abs((vectors[:, :, 0] * normals).sum(1)), 1, atol=1e-4)
 
 
@@ -180,8 +160,7 @@ SIDES = st.integers(1, 5000)
 
 @given(POINTS, POINTS, st.floats(0.3, 2), SIDES, SIDES)
 def test_the_camera_of_a_window(eye, target, fov, width, height):
-    """What it looks at is in the middle of the image, and what lies at the rim of its field of view
-    at the rim."""
+    """Its target is in the middle of the image, and the rim of its field of view at the rim."""
     if np.linalg.norm(np.subtract(eye, target)) < 0.1:
         return
     pose = np.linalg.inv(look_at(eye, target))
@@ -192,38 +171,34 @@ def test_the_camera_of_a_window(eye, target, fov, width, height):
     camera = window_camera(handle)
     assert camera.width * camera.height <= 1e6 + camera.width + camera.height
     (pixel,), (z,) = camera.project([target])
-    np.testing.assert_allclose(
-        pixel, [camera.width / 2, camera.height / 2], atol=1e-3 * camera.height
-    )
+    middle, near = camera.width / 2, {"atol": 1e-3 * camera.height}
+    np.testing.assert_allclose(pixel, [middle, camera.height / 2], **near)
     top = pose[:3, 3] + z * (pose[:3, 2] - np.tan(fov / 2) * pose[:3, 1])
-    np.testing.assert_allclose(
-        camera.project([top])[0][0], [camera.width / 2, 0], atol=1e-3 * camera.height
-    )
-    assert window_camera(SimpleNamespace(image_width=0, image_height=5)) is None
+    np.testing.assert_allclose(camera.project([top])[0][0], [middle, 0], **near)
 
 
 def test_refusals(capsys, run, dataset, prior, tmp_path, monkeypatch):
-    assert "no such run folder or PLY file" in refused(capsys, ["view", tmp_path / "none.ply"])
-    assert "holds no run" in refused(capsys, ["view", tmp_path])
-    assert "--port" in refused(capsys, ["view", run, "--port", 70000])
-    assert "--port" in refused(capsys, ["view", run, "--port", "many"])
+    def view(*arguments):
+        return refused(capsys, ["view", *arguments])
+
     (tmp_path / "file.ply").write_text("no PLY")
-    assert "file.ply" in refused(capsys, ["view", tmp_path / "file.ply"])
-    assert "--follow needs the folder of a run" in refused(
-        capsys, ["view", tmp_path / "file.ply", "--follow"]
-    )
-    assert "cannot be served there" in refused(
-        capsys, ["view", run, "--host", "192.0.2.1"]
-    )  # of an example network, not ours
+    assert "no such run folder or PLY file" in view(tmp_path / "none.ply")
+    assert "holds no run" in view(tmp_path)
+    assert "--port" in view(run, "--port", 70000)
+    assert "--port" in view(run, "--port", "many")
+    assert "file.ply" in view(tmp_path / "file.ply")
+    assert "--follow needs the folder of a run" in view(tmp_path / "file.ply", "--follow")
+    # An address of an example network, not ours.
+    assert "cannot be served there" in view(run, "--host", "192.0.2.1")
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        assert "in use" in refused(capsys, ["view", run, "--port", taken.getsockname()[1]])
+        assert "in use" in view(run, "--port", taken.getsockname()[1])
     tiny.start(tmp_path / "begun", load_dataset(dataset), prior=prior)
-    assert "no finished step yet" in refused(capsys, ["view", tmp_path / "begun"])
+    assert "no finished step yet" in view(tmp_path / "begun")
     assert read_subject(tmp_path / "begun", follow=True).gaussians is None
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert "pip install viser" in refused(capsys, ["view", run])
+    assert "pip install viser" in view(run)
     check_address("127.0.0.1", 0)
 
 
@@ -239,7 +214,7 @@ def viewing(*arguments):
     )
     try:
         line, warned = process.stdout.readline(), False
-        if "everyone who reaches this address" in line:
+        if "with its token, can look" in line:
             line, warned = process.stdout.readline(), True
         found = re.search(r"open (http://\S+) in a browser", line)
         assert found, line + process.stderr.read()
@@ -257,15 +232,12 @@ def test_a_window_that_is_closed_while_its_image_is_drawn_is_not_warned_of(run):
     from viser.infra._async_message_buffer import AsyncMessageBuffer
 
     said = "on a closed connection"
-    assert said in Path(sys.modules[AsyncMessageBuffer.__module__].__file__).read_text(), (
-        "viser words it otherwise now"
-    )
+    source = Path(sys.modules[AsyncMessageBuffer.__module__].__file__).read_text()
+    assert said in source, "viser words it otherwise now"
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
         viewer = Viewer(run, port=0)
-        warnings.warn(
-            f"Queued a BackgroundImageMessage {said} (e.g. via a handle of a client)", stacklevel=1
-        )
+        warnings.warn(f"Queued a BackgroundImageMessage {said} (e.g. of a client)", stacklevel=1)
         warnings.warn("another", stacklevel=1)
         viewer.close()
     assert [str(one.message) for one in heard] == ["another"]
@@ -297,7 +269,8 @@ def test_a_run_is_followed_from_its_beginning(dataset, prior, tmp_path):
 
 SPLAT_CORNERS = """geometry => {
     const corners = geometry.attributes.position;
-    return geometry.type === "InstancedBufferGeometry" && corners.itemSize === 2 && corners.array.every(Number.isFinite);
+    return geometry.type === "InstancedBufferGeometry" && corners.itemSize === 2
+        && corners.array.every(Number.isFinite);
 }"""
 """Whether a geometry of three.js is that of viser's Gaussians."""
 
@@ -308,9 +281,8 @@ def of_viser(message) -> bool:
     The corners of its squares have two coordinates each. three.js reads three of each, past the end
     of the last, and says that the radius of what it read is NaN. The same complaint about anything
     else would be ours."""
-    return "Computed radius is NaN" in message.text and bool(
-        message.args[1].evaluate(SPLAT_CORNERS)
-    )
+    known = "Computed radius is NaN" in message.text
+    return known and bool(message.args[1].evaluate(SPLAT_CORNERS))
 
 
 WIDTH, HEIGHT = 1000, 640
@@ -323,9 +295,8 @@ def start_camera(subject) -> Camera:
     offset = first.position - centre
     focal = HEIGHT * first.K[1, 1] / first.height
     K = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
-    return Camera(
-        K, WIDTH, HEIGHT, look_at(centre + 1.6 * offset + [0, 0, np.linalg.norm(offset)], centre)
-    )
+    eye = centre + 1.6 * offset + [0, 0, np.linalg.norm(offset)]
+    return Camera(K, WIDTH, HEIGHT, look_at(eye, centre))
 
 
 def screenshot(tab) -> np.ndarray:
@@ -370,9 +341,8 @@ def test_the_viewer_in_a_browser(browser, run):
     camera = start_camera(subject)
     centre = camera.project(subject.gaussians.means)[0].mean(0)
     v, u = np.mgrid[:HEIGHT, :WIDTH]
-    inside = (np.abs(u - centre[0]) < 60) & (
-        np.abs(v - centre[1]) < 60
-    )  # where nothing else is drawn
+    # Where nothing else is drawn.
+    inside = (np.abs(u - centre[0]) < 60) & (np.abs(v - centre[1]) < 60)
 
     def off(picture):
         return np.abs(picture - expected)[inside].mean()
@@ -395,22 +365,19 @@ def test_the_viewer_in_a_browser(browser, run):
 
         tab.get_by_label("Cameras", exact=True).first.check(force=True)
         chosen = next(view for view in subject.taken if view.role == "chosen")
-        free = [
-            (view, x, y)
-            for view in subject.views
-            for (x, y), z in [
-                [values[0] for values in camera.project([view.frame.camera.position])]
-            ]
-            if z > 0
-            and 30 < x < 600
-            and 250 < y < HEIGHT - 30  # neither under the panel nor under the notice of viser
-        ]
+        free = []
+        for view in subject.views:
+            ((x, y),), (z,) = camera.project([view.frame.camera.position])
+            # Neither under the panel nor under the notice of viser.
+            if z > 0 and 30 < x < 600 and 250 < y < HEIGHT - 30:
+                free.append((view, x, y))
         clicked, x, y = free[-1]
         tab.wait_for_timeout(1500)
         tab.mouse.click(x, y)
         tab.get_by_text(f"{clicked.frame.name}:").wait_for()
         # The frame's image comes after the words, in place of another or as a new one.
-        size = "([w, h]) => { const i = [...document.images].at(-1); return i.naturalWidth == w && i.naturalHeight == h }"
+        last = "const i = [...document.images].at(-1)"
+        size = f"([w, h]) => {{ {last}; return i.naturalWidth == w && i.naturalHeight == h }}"
         tab.wait_for_function(size, arg=[tiny.WIDTH, tiny.HEIGHT], timeout=30_000)
         image = tab.locator("img").last
         shown = np.asarray(Image.open(io.BytesIO(image.screenshot())).convert("RGB")).astype(float)
@@ -421,9 +388,8 @@ def test_the_viewer_in_a_browser(browser, run):
         tab.get_by_text("surface coverage then").wait_for()
 
         tab.get_by_text("Look from there").click()
-        there = chosen.frame.camera.resized(
-            round(chosen.frame.camera.width * HEIGHT / chosen.frame.camera.height)
-        )
+        own = chosen.frame.camera
+        there = own.resized(round(own.width * HEIGHT / own.height))
         narrow = layers.kernel_image(subject, there, "colour")[0].astype(int)
         rows, columns = slice(260, 460), slice(WIDTH // 2 - 100, WIDTH // 2 + 50)
         shift = (WIDTH - there.width) // 2
@@ -449,7 +415,7 @@ def test_a_ply_in_a_browser_at_phone_width(browser, run, tmp_path):
         tab.get_by_text("splats.ply").wait_for()
 
         def drawn():
-            """What is between the notice of viser, above, and the panel, below."""
+            """The part of the screen between the notice of viser and the panel."""
             return screenshot(tab)[180:540]
 
         def at_rest():
@@ -457,9 +423,8 @@ def test_a_ply_in_a_browser_at_phone_width(browser, run, tmp_path):
             while True:
                 tab.wait_for_timeout(1500)
                 picture = drawn()
-                if (
-                    np.abs(picture - before).mean() < 0.01 and picture.std() > 5
-                ) or time.monotonic() > until:
+                still = np.abs(picture - before).mean() < 0.01 and picture.std() > 5
+                if still or time.monotonic() > until:
                     return picture
                 before = picture
 

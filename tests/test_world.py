@@ -1,19 +1,16 @@
-"""Reports of a world whose up axis is not +Z, and whose unit of length nobody knows: figures, page,
-maps, viewer."""
+"""Reports of a world whose up axis is not +Z and whose unit is unknown: figures, page, maps,
+viewer."""
 
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
-
-sys.path.insert(0, str(Path(__file__).parent))
 import tiny
+from matplotlib.figure import Figure
 
 from mgs import plotting
 from mgs.camera import Camera
@@ -67,29 +64,25 @@ def make_run(root: Path, tilted: bool) -> Path:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    return [
-        make_run(tmp_path_factory.mktemp(name), name == "tilted") for name in ("level", "tilted")
-    ]
+    return [make_run(tmp_path_factory.mktemp("run"), tilted) for tilted in (False, True)]
 
 
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, Figure]:
     """The last figure of each name that was saved."""
     found: dict[str, Figure] = {}
+
+    def keep(figure: Figure, path: Path) -> None:
+        found[Path(path).name] = figure
+
     for module in (figures, plotting):
-        monkeypatch.setattr(
-            module, "save_figure", lambda figure, path: found.update({Path(path).name: figure})
-        )
+        monkeypatch.setattr(module, "save_figure", keep)
     return found
 
 
-def test_the_orbit_of_a_tilted_world_is_drawn_as_that_of_the_upright_one(
-    runs: list[Path], drawn: dict[str, Figure], tmp_path: Path
-) -> None:
-    shown = []
-    for run, names in zip(
-        runs, (("x (m)", "y (m)"), ("horizontal (unit)", "horizontal, across (unit)")), strict=True
-    ):
+def test_the_orbit_of_a_tilted_world_is_drawn_as_that_of_the_upright_one(runs, drawn, tmp_path):
+    shown, labels = [], [("x (m)", "y (m)"), ("horizontal (unit)", "horizontal, across (unit)")]
+    for run, names in zip(runs, labels, strict=True):
         write_report(tmp_path / "report", [run])
         axis = drawn["orbit.png"].axes[0]
         assert (axis.get_xlabel(), axis.get_ylabel()) == names
@@ -99,52 +92,42 @@ def test_the_orbit_of_a_tilted_world_is_drawn_as_that_of_the_upright_one(
         np.testing.assert_allclose(tilted, level, atol=1e-5)
 
 
-def test_the_page_draws_it_upright_too_and_names_the_unit(runs: list[Path], tmp_path: Path) -> None:
+def test_the_page_draws_it_upright_too_and_names_the_unit(runs, tmp_path):
     data = []
     for run in runs:
         write_page(tmp_path / "page.html", [run])
         text = (tmp_path / "page.html").read_text()
-        data.append(
-            json.loads(text.split('type="application/json">')[1].split("</script>")[0])["runs"][0]
-        )
+        embedded = text.split('type="application/json">')[1].split("</script>")[0]
+        data.append(json.loads(embedded)["runs"][0])
     level, tilted = data
     for one, other in zip(level["orbit"]["data"], tilted["orbit"]["data"], strict=True):
         for axis in "xyz":
-            np.testing.assert_allclose(
-                np.array(other[axis], float),
-                np.array(one[axis], float),
-                atol=2e-4,
-                err_msg=one["name"],
-            )
-    np.testing.assert_allclose(
-        [v["eye"] for v in tilted["views"]], [v["eye"] for v in level["views"]], atol=1e-9
-    )
-    titles = [
-        [orbit["layout"]["scene"][f"{a}axis"]["title"]["text"] for a in "xyz"]
-        for orbit in (level["orbit"], tilted["orbit"])
-    ]
-    assert titles[0] == ["x (m)", "y (m)", "z (m)"]
-    assert titles[1] == ["horizontal (unit)", "horizontal, across (unit)", "up (unit)"]
+            drawn = (np.array(line[axis], float) for line in (other, one))
+            np.testing.assert_allclose(*drawn, atol=2e-4, err_msg=one["name"])
+    eyes = ([view["eye"] for view in run["views"]] for run in (tilted, level))
+    np.testing.assert_allclose(*eyes, atol=1e-9)
+    scenes = (run["orbit"]["layout"]["scene"] for run in data)
+    titles = [[scene[f"{axis}axis"]["title"]["text"] for axis in "xyz"] for scene in scenes]
+    upright_names = ["horizontal (unit)", "horizontal, across (unit)", "up (unit)"]
+    assert titles == [["x (m)", "y (m)", "z (m)"], upright_names]
     assert "depth error (unit)" in text
     assert "(m)" not in text.split("<script")[0]
 
 
-def test_maps_of_depth_name_the_unit(runs: list[Path], drawn: dict[str, Figure]) -> None:
+def test_maps_of_depth_name_the_unit(runs, drawn):
     for run, unit in zip(runs, ("m", "unit"), strict=True):
         diagnostics.diagnose_run(run, ["kf_0001"])
         assert f"depth ({unit})" in [axis.get_title() for axis in drawn["kf_0001.png"].axes]
 
 
-def test_the_viewer_knows_both(runs: list[Path]) -> None:
+def test_the_viewer_knows_both(runs):
     for run, up, unit in zip(runs, (PLUS_Z, UP), ("m", "unit"), strict=True):
         subject = read_subject(run)
         assert subject.up == pytest.approx(up)
         assert f"3 {unit}" in layers.legend("depth", (1.0, 3.0), subject.unit)
 
 
-def test_the_axis_of_the_prior_goes_before_that_of_the_dataset(
-    runs: list[Path], tmp_path: Path
-) -> None:
+def test_the_axis_of_the_prior_goes_before_that_of_the_dataset(runs, tmp_path):
     dataset = load_dataset(read_settings(runs[1]).dataset)
     assert up_of(tmp_path, dataset) == dataset.up
     write_json(tmp_path / "prior.json", {"up": [0, 2, 0]})

@@ -1,8 +1,7 @@
-"""A rock of a few pixels: a dataset on disk and NumPy stand-ins for the stations of the loop, so
-the loop is tested alone.
+"""A rock of a few pixels: a dataset on disk, and the operations of the loop in NumPy.
 
-As a program, `python tiny.py DATASET OUT POLICY MOMENT COUNT` starts a run and kills itself
-(SIGKILL) at the COUNT-th MOMENT.
+`python tiny.py DATASET OUT MOMENT COUNT` starts a run and kills itself (SIGKILL) at the COUNT-th
+MOMENT (`dying_operations`).
 """
 
 from __future__ import annotations
@@ -25,6 +24,7 @@ from mgs.rotation import quat_from_normals
 from mgs.run import folder as run_folder
 from mgs.run import problem, recording
 from mgs.run.settings import NbvSettings
+from mgs.run.state import State
 
 FRAMES, POINTS, WIDTH, HEIGHT = 12, 40, 16, 12
 GROUPS = {
@@ -44,27 +44,17 @@ def orbit(frames: int = FRAMES) -> list[Camera]:
 
 
 def write_dataset(root: Path, frames: int = FRAMES) -> Path:
-    """A bumpy-coloured sphere on black, with exact depth and masks."""
+    """A coloured unit sphere on black, with exact depth and masks."""
     records = []
     for i, camera in enumerate(orbit(frames)):
-        v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-        rays = np.stack(
-            [
-                (u - camera.K[0, 2]) / camera.K[0, 0],
-                (v - camera.K[1, 2]) / camera.K[1, 1],
-                np.ones_like(u),
-            ],
-            -1,
-        )
-        directions = rays @ camera.camera_to_world[:3, :3].T
+        directions = camera.unproject(np.ones((HEIGHT, WIDTH))) - camera.position
         a, b = (directions**2).sum(-1), directions @ camera.position
         root_term = b**2 - a * (camera.position @ camera.position - 1)
         mask = root_term > 0
         depth = np.where(mask, (-b - np.sqrt(np.maximum(root_term, 0))) / a, 0)
         points = camera.unproject(depth)
-        rgb = np.where(mask[..., None], 0.4 + 0.3 * np.sin(5 * points + [0, 1, 2]), 0).astype(
-            np.float32
-        )
+        colour = 0.4 + 0.3 * np.sin(5 * points + [0, 1, 2])
+        rgb = np.where(mask[..., None], colour, 0).astype(np.float32)
         name = f"kf_{i:04d}"
         paths = root / f"images/{name}.png", root / f"depth/{name}.exr", root / f"masks/{name}.png"
         frame = Frame(name, camera, 0.5 * i, *paths)
@@ -96,37 +86,26 @@ def _normals() -> np.ndarray:
 def initial(seed_frames: list[Frame]) -> Gaussians:
     """Grey discs on the sphere."""
     n = _normals()
-    quats = quat_from_normals(n).astype(np.float32)
-    scales = np.full((POINTS, 3), -1.5, np.float32)
-    return Gaussians(
-        n.astype(np.float32),
-        scales,
-        quats,
-        np.zeros(POINTS, np.float32),
-        sh_from_rgb(np.full((POINTS, 3), 0.5)),
-    )
+    means, quats = n.astype(np.float32), quat_from_normals(n).astype(np.float32)
+    scales, opacities = np.full((POINTS, 3), -1.5, np.float32), np.zeros(POINTS, np.float32)
+    return Gaussians(means, scales, quats, opacities, sh_from_rgb(np.full((POINTS, 3), 0.5)))
 
 
 def _facing(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """How squarely each point of the sphere faces the camera, 0 where it is turned away."""
+    """Cosine between normal and camera, less 0.2; 0 where a point of the sphere is turned away."""
     to_camera = camera.position - gaussians.means
-    return np.maximum(
-        (gaussians.means * to_camera).sum(1) / np.linalg.norm(to_camera, axis=1) - 0.2, 0
-    )
+    cosine = (gaussians.means * to_camera).sum(1) / np.linalg.norm(to_camera, axis=1)
+    return np.maximum(cosine - 0.2, 0)
 
 
 def fisher(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """Facing points are informative, brighter ones more so: the choice depends on the fitted model,
-    as the real one does."""
-    brightness = gaussians.rgb.mean(1)
-    return (_facing(gaussians, camera) ** 2 * brightness)[:, None].astype(np.float32) * np.linspace(
-        1, 2, 11, dtype=np.float32
-    )
+    """Information [POINTS,11] of a view: larger for bright points, so it depends on the model."""
+    each = _facing(gaussians, camera) ** 2 * gaussians.rgb.mean(1)
+    return each[:, None].astype(np.float32) * np.linspace(1, 2, 11, dtype=np.float32)
 
 
 def estimate(gaussians: Gaussians, camera: Camera, estimator: str) -> np.ndarray:
-    """Of every estimator the same information, as blocks without correlations where blocks are
-    asked for."""
+    """The information of `fisher`, by any estimator; of `block` as diagonal blocks."""
     F = fisher(gaussians, camera)
     return F[:, None] * np.eye(11, dtype=np.float32) if estimator == "block" else F
 
@@ -139,7 +118,7 @@ def fit(
     train: TrainSettings,
     on_pass,
 ) -> Fit:
-    """Each point's colour moves half way to the mean of its pixels."""
+    """Move each point's colour half way to the mean of its pixels."""
     on_pass(0, 1)
     total, weight = np.zeros((POINTS, 3)), np.full(POINTS, 1e-6)
     for camera, target in zip(cameras, targets, strict=True):
@@ -155,7 +134,7 @@ def fit(
 
 
 def operations(**replaced) -> problem.Operations:
-    """Stand-ins for every station; any of them replaced."""
+    """The operations of this module, with some replaced."""
     parts = {
         "initial": initial,
         "fit": fit,
@@ -168,11 +147,21 @@ def operations(**replaced) -> problem.Operations:
 
 def start(out: Path, dataset: Dataset, **values) -> NbvSettings:
     """Begin a run folder with these settings over small defaults."""
-    settings = NbvSettings(
-        **({"dataset": dataset.root, "prior": dataset.root, "budget": 5, "seeds": 3} | values)
-    )
+    defaults = {"dataset": dataset.root, "prior": dataset.root, "budget": 5, "seeds": 3}
+    settings = NbvSettings(**(defaults | values))
     run_folder.start(out, settings, dataset)
     return settings
+
+
+def run(out: Path, dataset: Dataset, parts: problem.Operations | None = None, **values) -> State:
+    """Start a run and run it to its end; its last state. values: settings."""
+    return recording.run(out, start(out, dataset, **values), dataset, parts or operations(), silent)
+
+
+def resume(out: Path, dataset: Dataset, parts: problem.Operations | None = None) -> State:
+    """Run a started run to its end; its last state."""
+    settings = run_folder.read_settings(out)
+    return recording.run(out, settings, dataset, parts or operations(), silent)
 
 
 def write_prior(out: Path) -> Path:
@@ -182,21 +171,12 @@ def write_prior(out: Path) -> Path:
 
     n = _normals()
     mesh = Mesh(n[:3], np.array([[0, 1, 2]]), np.zeros(1, bool))
-    return save_prior(
-        out,
-        Prior(
-            mesh,
-            n,
-            n,
-            0.5,
-            0.2,
-            {"spacing": 0.5, "depth_tolerance": 0.2, "n": POINTS, "backed": 0, "up": [0, 0, 1]},
-        ),
-    )
+    numbers = {"spacing": 0.5, "depth_tolerance": 0.2, "n": POINTS, "backed": 0, "up": [0, 0, 1]}
+    return save_prior(out, Prior(mesh, n, n, 0.5, 0.2, numbers))
 
 
 def write_run(out: Path, root: Path, prior: Path) -> Path:
-    """A run folder of the seeds alone, on the stand-ins."""
+    """A run folder of the seeds alone, by the operations of this module."""
     from mgs.prior.build import load_prior
     from mgs.prior.initial import initial_gaussians
     from mgs.run.inputs import prior_digest
@@ -214,9 +194,8 @@ def silent(stage: str, done: int, total: int) -> None:
     """No progress bar."""
 
 
-def die_at(moment: str, count: int) -> problem.Operations:
-    """Stations of which one kills this process, as the system would, when it is called for the
-    count-th time."""
+def dying_operations(moment: str, count: int) -> problem.Operations:
+    """Operations; the count-th call of one of them, or of a write, kills this process."""
     calls = {"n": 0}
 
     def dying(function):
@@ -249,9 +228,4 @@ def die_at(moment: str, count: int) -> problem.Operations:
 
 if __name__ == "__main__":
     loaded, folder = load_dataset(sys.argv[1]), Path(sys.argv[2])
-    chosen = (
-        run_folder.read_settings(folder)
-        if folder.exists()
-        else start(folder, loaded, policy=sys.argv[3], seed=3)
-    )
-    recording.run(folder, chosen, loaded, die_at(sys.argv[4], int(sys.argv[5])), silent)
+    run(folder, loaded, dying_operations(sys.argv[3], int(sys.argv[4])), seed=3)

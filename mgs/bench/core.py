@@ -10,6 +10,7 @@ import re
 import resource
 import time
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -60,11 +61,7 @@ def surface_gaussians(n: int, seed: int = 0) -> Gaussians:
     """
     import trimesh
 
-    from mgs.synth.noise import Noise
-    from mgs.synth.rock import rock_shape
-    from mgs.synth.scene_file import load_scene_file
-
-    mesh, _ = rock_shape(load_scene_file("boulder").rock, Noise(generator(seed, "bench/rock")))
+    mesh = _rock(seed)
     points, faces = trimesh.sample.sample_surface(mesh, n, seed=derive_seed(seed, "bench/points"))
     spacing = np.sqrt(mesh.area / n)
     return Gaussians(
@@ -74,6 +71,16 @@ def surface_gaussians(n: int, seed: int = 0) -> Gaussians:
         logit_opacities=np.full(n, 1.0, np.float32),
         sh=sh_from_rgb(generator(seed, "bench/colours").uniform(0.1, 0.6, (n, 3))),
     )
+
+
+@cache
+def _rock(seed: int) -> Any:
+    """Mesh of the default rock. It takes seconds, and tests use it often."""
+    from mgs.synth.noise import Noise
+    from mgs.synth.rock import rock_shape
+    from mgs.synth.scene_file import load_scene_file
+
+    return rock_shape(load_scene_file("boulder").rock, Noise(generator(seed, "bench/rock")))[0]
 
 
 def surface_camera(gaussians: Gaussians, width: int, height: int) -> Camera:

@@ -1,7 +1,7 @@
 """The program `mgs`: its commands, and how they end.
 
-Beside this file there is one for each command. Commands import what they need when they are called,
-so that `mgs --help` does not wait for Mitsuba.
+Each command has a file beside this one. A command imports what it needs when it is called, so that
+`mgs --help` does not wait for Mitsuba.
 """
 
 from __future__ import annotations
@@ -11,9 +11,10 @@ import errno
 import io
 import os
 import sys
+import warnings
 from collections.abc import Callable
 from inspect import cleandoc
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -35,7 +36,7 @@ from mgs.cli.studies import chart, parsimony, reproduce, stress
 from mgs.cli.survey import survey
 from mgs.cli.synth_orbit import synth_orbit
 from mgs.cli.view import view
-from mgs.errors import InputError
+from mgs.errors import InputError, Notice
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C: by convention 128 plus the number of the signal, SIGINT."""
@@ -76,29 +77,17 @@ COMMANDS: dict[str, Callable[..., None]] = {
 }
 """All commands, in about the order in which they are used."""
 
-_AGAIN = "run the same command again to continue"
-GOES_ON = {
-    "synth-orbit": _AGAIN,
-    "import": _AGAIN,
-    "demo": _AGAIN,
-    "reproduce": _AGAIN,
-    "chart": _AGAIN,
-    "stress": _AGAIN,
-    "parsimony": _AGAIN,
-    "nbv": "`mgs nbv --resume RUN` continues a run whose folder is there",
-}
-"""What is printed after Ctrl-C, for the commands that can go on where they stopped. The others
-start anew."""
+RESUMABLE = ("synth-orbit", "import", "demo", "reproduce", "chart", "stress", "parsimony")
+"""Commands that continue where they stopped when they are given again."""
 
 app = typer.Typer(name="mgs", add_completion=False, pretty_exceptions_enable=False)
 
 
 def _help(docstring: str | None) -> str:
-    """A docstring with each paragraph in one line, so that the help screen breaks lines at the
-    width of the terminal only."""
-    return "\n\n".join(
-        " ".join(paragraph.split()) for paragraph in cleandoc(docstring or "").split("\n\n")
-    )
+    """Join the lines of each paragraph, so that the help breaks lines only at the terminal's
+    width."""
+    paragraphs = cleandoc(docstring or "").split("\n\n")
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
 
 
 for name, command in COMMANDS.items():
@@ -106,35 +95,33 @@ for name, command in COMMANDS.items():
 
 
 def _print_version(wanted: bool) -> None:
-    """What the option --version does."""
+    """Callback of --version."""
     if wanted:
         typer.echo(f"mgs {__version__}")
         raise typer.Exit
 
 
+VersionOption = typer.Option(
+    "--version", callback=_print_version, is_eager=True, help="Print the version and stop."
+)
+
+
 @app.callback()
-def _program(
-    version: Annotated[
-        bool,
-        typer.Option(
-            "--version", callback=_print_version, is_eager=True, help="Print the version and stop."
-        ),
-    ] = False,
-) -> None:
+def _program(version: Annotated[bool, VersionOption] = False) -> None:
     """Active Gaussian splatting: exact Fisher information and next-best-view selection."""
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run a command and end the process. arguments: those of the command line, by default the
-    process's own.
+    """Run a command and end the process. arguments: of the command line; default: the process's.
 
-    Bad input and wrong options print one line, with exit code 2; an interruption prints one line,
-    with exit code 130. Always raises SystemExit, but for errors of the program itself, which pass
-    through.
+    Bad input and wrong options print one line and end with exit code 2, an interruption with 130.
+    Always raises SystemExit, except that errors of the program itself pass through.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may lack characters of the tables
         sys.stdout.reconfigure(errors="replace")
+    warnings.simplefilter("always", Notice)
+    warnings.showwarning = _print_warning  # type: ignore[assignment]
     try:
         code = app(arguments or ["--help"], prog_name="mgs", standalone_mode=False)
         sys.stdout.flush()
@@ -145,9 +132,8 @@ def main(arguments: list[str] | None = None) -> None:
     except InputError as error:
         raise _stop(str(error), 2) from None
     except typer.TyperException as error:
-        raise _stop(
-            " ".join(error.format_message().replace("Value error, ", "").split()), 2
-        ) from None
+        message = error.format_message().replace("Value error, ", "")
+        raise _stop(" ".join(message.split()), 2) from None
     except typer.Abort:
         raise _stop("stopped", 1) from None
     except Exception as error:
@@ -155,14 +141,26 @@ def main(arguments: list[str] | None = None) -> None:
             raise
         code = INTERRUPTED
     if code == INTERRUPTED:  # typer turns Ctrl-C into this exit code and prints nothing
-        hint = GOES_ON.get(arguments[0]) if arguments else None
-        raise _stop(f"interrupted; {hint}" if hint else "interrupted", INTERRUPTED)
+        raise _stop(f"interrupted{_hint(arguments[0] if arguments else '')}", INTERRUPTED)
     raise SystemExit(code or 0)
 
 
+def _print_warning(message: Any, category: type, filename: str, line: int, *_: Any) -> None:
+    """Print a Notice as one line of ours, other warnings as Python does."""
+    text = f"mgs: {message}\n" if category is Notice else None
+    sys.stderr.write(text or warnings.formatwarning(message, category, filename, line))
+
+
+def _hint(command: str) -> str:
+    """End of the line of an interrupted command: the way to continue, if there is one."""
+    if command in RESUMABLE:
+        return "; run the same command again to continue"
+    resume = "; `mgs nbv --resume RUN` continues a run whose folder is there"
+    return resume if command == "nbv" else ""
+
+
 def _from_interrupt(error: BaseException | None) -> bool:
-    """Whether Ctrl-C is the cause of an exception. If it comes during a call of Dr.Jit, that raises
-    an exception of its own."""
+    """Whether Ctrl-C caused an exception: during a call, Dr.Jit raises one of its own."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
@@ -180,7 +178,6 @@ def _system_error(error: OSError) -> str:
 
 
 def _stop(message: str, code: int) -> SystemExit:
-    """Print one line to the standard error, and return the exception that ends the process with
-    this exit code."""
+    """Print one line to standard error; return the exception that ends the process."""
     print(f"mgs: {message}", file=sys.stderr)
     return SystemExit(code)

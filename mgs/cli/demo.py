@@ -1,4 +1,4 @@
-"""`mgs demo`: the whole way on a small rock."""
+"""`mgs demo`: all steps on a small rock."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ GAUSSIANS = 10_000
 """About one Gaussian per pixel of the rock at 320x240."""
 
 TEST_VIEWS = 12
-"""Views on a dome around the rock, on which the policies are judged: enough to see it from all
-sides, and not many to render beside the 32 of the orbit."""
+"""Test views on a dome around the rock: enough to see it from all sides, and few beside the 32 of
+the orbit."""
 
 BUDGET = 8
 """Views beyond the four seeds, the same for every policy."""
@@ -27,7 +27,7 @@ def demo(
     ] = Path("demo"),
     seed: Annotated[int, typer.Option(min=0, help="Root seed.")] = 0,
 ) -> None:
-    """The whole way in minutes: render a rock orbit, build the prior, choose views by five
+    """Run all steps in minutes: render a rock orbit, build the prior, choose views by five
     policies, compare, draw."""
     import time
 
@@ -40,7 +40,8 @@ def demo(
     from mgs.cli.prior import prior
     from mgs.cli.synth_orbit import synth_orbit
     from mgs.files import check_new_folder, check_writable
-    from mgs.report.tables import table_numbers
+    from mgs.report.runs import compare_runs
+    from mgs.report.tables import comparison_rows
     from mgs.report.writing import write_report
 
     runtime.start()
@@ -67,18 +68,19 @@ def demo(
             settings = {"policy": policy, "budget": BUDGET, "seed": seed, "evaluate_every": 1}
             start_and_print(dataset, run, console, prior=folder, **settings)
         resume_and_print(run, console, pictures=True)
-    heading("4/5 what the views told about each Gaussian")
+    heading("4/5 what the views say about each Gaussian")
     diagnose(runs[0])
     heading("5/5 the report")
-    written = write_report(report, runs)
-    print_quality(console, table_numbers(runs))
+    compared = compare_runs(runs)
+    written = write_report(report, compared)
+    print_quality(console, comparison_rows(compared))
     console.print(f"done in {time.monotonic() - started:.0f} s; look at:")
     for picture in (dataset / "contact_sheet.png", folder / "prior.png", *written):
         console.print(f"  {picture}", soft_wrap=True)
 
 
 def check_seed(dataset: Path, runs: list[Path], seed: int) -> None:
-    """Raises InputError where the dataset or a run is there already, of another seed."""
+    """Raises InputError if the dataset or a run exists with another seed."""
     from mgs.errors import InputError
     from mgs.files import read_json
     from mgs.run.folder import read_settings
@@ -89,5 +91,6 @@ def check_seed(dataset: Path, runs: list[Path], seed: int) -> None:
     for folder, found in recorded.items():
         if found != seed:
             raise InputError(
-                f"{folder}: was made with --seed {found}, not {seed}; give that seed, or another folder"
+                f"{folder}: was made with --seed {found}, not {seed}; "
+                "give that seed, or another folder"
             )

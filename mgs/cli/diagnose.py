@@ -13,7 +13,8 @@ def diagnose(
     views: Annotated[
         str | None,
         typer.Option(
-            help="Names of frames to draw, as in kf_0003,kf_0010. Default: a few that were not trained on."
+            help="Names of frames to draw, as in kf_0003,kf_0010. "
+            "Default: a few that were not trained on."
         ),
     ] = None,
     calibrate: Annotated[

@@ -1,4 +1,4 @@
-"""`mgs eval`: how good the model of a run is, and its renders beside the truth."""
+"""`mgs eval`: quality of the model of a run, and its renders beside the truth."""
 
 from __future__ import annotations
 
@@ -20,10 +20,9 @@ def evaluate(
     """Measure the model on the test views, on all views, and on the views never trained on; write
     RUN/metrics.json, and renders beside truth.
 
-    What is there already of this very model and dataset is kept, and not measured or drawn again.
-    The truth is the rock on black. PSNR and SSIM are over the full frame, and over the pixels of
-    the rock only. metrics.json also has the errors of alpha and depth, where the dataset has their
-    truth.
+    Metrics and pictures of this very model and dataset are kept, and not made again. The truth is
+    the rock on black. PSNR and SSIM are over the full frame, and over the pixels of the rock only.
+    metrics.json also has the errors of alpha and depth, where the dataset has their truth.
     """
     from functools import partial
 
@@ -33,16 +32,16 @@ def evaluate(
     from mgs.cli.printing import print_quality
     from mgs.cli.progress import progress_bar
     from mgs.report.evaluation import evaluate_run
-    from mgs.report.tables import table_numbers
+    from mgs.report.runs import Comparison, read_run
+    from mgs.report.tables import comparison_rows
+    from mgs.run.folder import open_run
 
     runtime.start()
     said: list[str] = []
+    opened = open_run(run)
     with progress_bar() as bar:
-        evaluate_run(
-            run,
-            pictures=pictures,
-            progress=partial(bar, "rendering and comparing"),
-            say=said.append,
-        )
-    print_quality(Console(), table_numbers([run]))
+        progress = partial(bar, "rendering and comparing")
+        evaluate_run(opened, pictures=pictures, progress=progress, say=said.append)
+    rows = comparison_rows(Comparison({opened.label: read_run(run)}, opened.dataset))
+    print_quality(Console(), rows)
     typer.echo("\n".join(said))

@@ -10,7 +10,6 @@ import typer
 
 from mgs.fit.settings import TrainSettings
 from mgs.policy.registry import policy_names
-from mgs.run.ending import fit_line, why_ended
 from mgs.run.settings import PRESETS, NbvSettings
 
 if TYPE_CHECKING:
@@ -18,9 +17,6 @@ if TYPE_CHECKING:
 
     from mgs.run.folder import Run
     from mgs.run.state import State
-
-DIGITS = {"psnr": 2, "ssim": 4, "psnr_mask": 2, "ssim_mask": 4}
-"""Decimals of the qualities that are printed."""
 
 PANELS = {
     "Main options": ("policy", "budget", "seeds"),
@@ -220,6 +216,7 @@ def resume_and_print(
     """
     from functools import partial
 
+    from mgs.cli.printing import print_run
     from mgs.cli.progress import progress_bar
     from mgs.report.evaluation import evaluate_run
     from mgs.run.folder import Run, open_run
@@ -240,69 +237,3 @@ def resume_and_print(
             run.folder, pictures=pictures, progress=partial(progress, "evaluating")
         )
     print_run(run.folder, state, metrics, console)
-
-
-def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console) -> None:
-    """The steps as a table, then the quality of the model. Names too long for the console have a
-    table of their own."""
-    from rich.table import Column, Table
-    from rich.text import Text
-
-    columns = ("step", "image", "score", "coverage", "iterations", "loss", "stopped", "seconds")
-    rows = []
-    for line in state.steps:
-        names = [line["name"]] if line["name"] else line["seed_names"]
-        score = "" if line["score"] is None else f"{line['score']:.4g}"
-        rows.append((
-            str(line["step"]), "\n".join(names), score, f"{100 * line['coverage']:.2f} %",
-            *((str(line["iterations"]), f"{line['loss']:.3g}", line["stop_reason"]) if "loss" in line else ("", "", "")),
-            f"{sum(line['seconds'].values()):.1f}",
-        ))  # fmt: skip
-
-    def table(*shown: int) -> Table:
-        made = Table(
-            *(Column(columns[i], no_wrap=i != 1, overflow="fold") for i in shown), box=None
-        )
-        for row in rows:
-            made.add_row(*(Text(row[i]) for i in shown))
-        return made
-
-    whole = table(*range(len(columns)))
-    if (
-        console.measure(whole, options=console.options.update(max_width=1 << 16)).maximum
-        <= console.width
-    ):
-        console.print(whole)
-    else:
-        console.print(table(0, *range(2, len(columns))))
-        console.print(table(0, 1))
-    every = "all views" if metrics.get("held_out", {}).get("count") else "views trained on"
-    for name, label in (
-        ("test", "test views"),
-        ("all", every),
-        ("held_out", "views never trained on"),
-    ):
-        mean = metrics.get(name, {"count": 0})
-        if mean["count"]:
-            shown = {
-                key: "–" if mean[key] is None else f"{mean[key]:.{digits}f}"
-                for key, digits in DIGITS.items()
-            }
-            console.print(
-                f"{label} ({mean['count']}): PSNR {shown['psnr']} dB, SSIM {shown['ssim']}; "
-                f"inside the rock mask PSNR {shown['psnr_mask']} dB, SSIM {shown['ssim_mask']}"
-            )
-            if any("exposure" in step for step in state.steps):
-                found = [
-                    "–" if mean.get(key) is None else f"{mean[key]:.2f}"
-                    for key in ("psnr_corrected", "psnr_mask_corrected")
-                ]
-                console.print(
-                    f"{label}, with a gain per channel fitted to each view itself: PSNR {found[0]} dB; "
-                    f"inside the rock mask {found[1]} dB"
-                )
-    if "fit" in metrics:
-        console.print(fit_line(metrics["fit"], state.steps[-1]["stop_reason"]))
-    if state.steps and "ended" in state.steps[-1]:
-        console.print(f"the run has ended: {why_ended(state.steps[-1]['ended'])}", soft_wrap=True)
-    console.print(f"wrote {out}", soft_wrap=True)

@@ -14,17 +14,15 @@ def prune(
     run: Annotated[Path, typer.Argument(help="Folder that `mgs nbv` wrote.")],
     noise: Annotated[
         float,
-        typer.Option(
-            help="How much the images that were taken may change: rms of a pixel value, linear RGB."
-        ),
+        typer.Option(help="Allowed change of the training images: rms of a pixel, linear RGB."),
     ] = PRUNE_NOISE,
 ) -> None:
     """Leave out the Gaussians of a run without which its images hardly change; write
     RUN/gaussians_pruned.ply.
 
-    What the removal of each Gaussian changes is known exactly; what the removal of all of them
-    together changes is measured, and stays within --noise. Nothing is fitted again, and the run
-    itself stays as it is.
+    The change by the removal of each Gaussian is known exactly; the change by the removal of all of
+    them together is measured, and stays within --noise. Nothing is fitted again, and the run itself
+    stays as it is.
     """
     from rich.console import Console
 
@@ -33,17 +31,18 @@ def prune(
     from mgs.report.pruning import PRUNED, prune_run
 
     runtime.start()
-    console = Console(highlight=False)
     with progress_bar() as bar:
         found = prune_run(run, noise, bar)
     share = 1 - found.after / found.before
-    console.print(f"{found.before:,} Gaussians, {found.after:,} stay: {share:.0%} are left out")
-    console.print(
-        f"rms change of a pixel value: predicted {found.predicted:.2g}, measured {found.actual:.2g}, allowed {noise:.2g}"
-    )
+    lines = [
+        f"{found.before:,} Gaussians, {found.after:,} stay: {share:.0%} are left out",
+        f"rms change of a pixel value: predicted {found.predicted:.2g}, "
+        f"measured {found.actual:.2g}, allowed {noise:.2g}",
+    ]
     if found.psnr:
         before, after = found.psnr
-        console.print(
+        lines.append(
             f"PSNR on the {found.views} views: {before:.2f} dB before, {after:.2f} dB after"
         )
-    console.print(f"wrote {run / PRUNED}", soft_wrap=True)
+    for line in [*lines, f"wrote {run / PRUNED}"]:
+        Console(highlight=False).print(line, soft_wrap=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,26 +18,25 @@ def refit(
     learn: Annotated[
         str,
         typer.Option(
-            help="auto: each Gaussian learns the kinds of parameters that the evidence pays for; all: all of them."
+            help="auto: each Gaussian learns the kinds of parameters that the evidence pays for; "
+            "all: all of them."
         ),
     ] = "auto",
     sh: Annotated[
         str,
         typer.Option(
-            help="SH degree of the colours: 0, or auto: 1 where that foretells views left out better."
+            help="SH degree of the colours: 0, or auto: 1 if that predicts views left out better."
         ),
     ] = "auto",
     loss: Annotated[
         float,
-        typer.Option(
-            help="By how much the objective of the fit may rise where parameters are left out, dB."
-        ),
+        typer.Option(help="Allowed rise of the objective by parameters that are left out, dB."),
     ] = LEARN_LOSS,
 ) -> None:
     """Fit the views of a run once more, with no more parameters than they pay for; write
     RUN/gaussians_refitted.ply.
 
-    What pays is decided without a test view: which kinds of parameters a Gaussian learns by the
+    No test view is used for it: the kinds of parameters that a Gaussian learns are chosen by the
     evidence, the marginal likelihood of the images, and by --loss; the SH degree by views that are
     left out. Parameters that are not learned keep the prior's values, and are marked in the file.
     The run itself stays as it is.
@@ -49,38 +48,35 @@ def refit(
     from mgs.report.refitting import REFITTED, refit_run
 
     runtime.start()
-    console, asked = Console(highlight=False), {"learn": learn, "sh": sh, "loss": loss}
+    options: Any = {"learn": learn, "sh": sh, "loss": loss}
     with progress_bar() as bar:
-        found = refit_run(run, say=bar, **asked)  # type: ignore[arg-type]
-    for line in lines(found):
-        console.print(line, soft_wrap=True)
-    console.print(f"wrote {run / REFITTED}", soft_wrap=True)
+        found = refit_run(run, say=bar, **options)
+    for line in [*_lines(found), f"wrote {run / REFITTED}"]:
+        Console(highlight=False).print(line, soft_wrap=True)
 
 
-def lines(found: RefittedRun) -> list[str]:
-    """The lines that the command prints."""
-    said = [
-        f"{found.after:,} parameters are learned, {found.after / found.before:.0%} of the run's {found.before:,}"
+def _lines(found: RefittedRun) -> list[str]:
+    """Describe a refitted run."""
+    share = found.after / found.before
+    shares = ", ".join(f"{kind} {share:.0%}" for kind, share in found.shares.items())
+    lines = [
+        f"{found.after:,} parameters are learned, {share:.0%} of the run's {found.before:,}",
+        f"learned by: {shares} of the Gaussians",
     ]
-    said.append(
-        "learned by: "
-        + ", ".join(f"{kind} {share:.0%}" for kind, share in found.shares.items())
-        + " of the Gaussians"
-    )
     if found.left_out:
         more = "more" if found.left_out.pays else "not more"
-        gain = f"{found.left_out.gain:+.3f} dB, {more} than its standard error of {found.left_out.error:.3f}"
-        said.append(
-            f"SH degree {found.sh_degree}: on views left out, neighbours together, degree 1 gains {gain}"
+        lines.append(
+            f"SH degree {found.sh_degree}: on views left out, neighbours together, degree 1 gains "
+            f"{found.left_out.gain:+.3f} dB, {more} than its standard error of "
+            f"{found.left_out.error:.3f}"
         )
     else:
-        said.append("SH degree 0: no other was tried")
-    if found.psnr:
-        own, whole, lean = found.psnr
-        said.append(
-            f"PSNR on the {found.views} views: {lean:.2f} dB, {whole:.2f} dB where all parameters are fitted in the same way; "
-            f"of the run's own model {own:.2f} dB"
-        )
-    else:
-        said.append("PSNR: there are no views on which to compare the models")
-    return said
+        lines.append("SH degree 0: no other was tried")
+    if not found.psnr:
+        return [*lines, "PSNR: there are no views on which to compare the models"]
+    own, whole, lean = found.psnr
+    lines.append(
+        f"PSNR on the {found.views} views: {lean:.2f} dB, {whole:.2f} dB where all parameters are "
+        f"fitted in the same way; of the run's own model {own:.2f} dB"
+    )
+    return lines

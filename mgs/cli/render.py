@@ -10,7 +10,7 @@ import typer
 
 
 class ColourSpace(StrEnum):
-    """The space in which the colours of a model are to be blended."""
+    """Space in which the colours of a model are blended."""
 
     auto = "auto"
     linear = "linear"
@@ -21,7 +21,8 @@ def render(
     splats: Annotated[
         Path,
         typer.Argument(
-            help="3DGS PLY of SH degree 0 to 3, binary, ascii or compressed, of mgs or another tool."
+            help="3DGS PLY of SH degree 0 to 3, binary, ascii or compressed, "
+            "of mgs or another tool."
         ),
     ],
     cameras: Annotated[
@@ -39,8 +40,9 @@ def render(
     colour_space: Annotated[
         ColourSpace,
         typer.Option(
-            help="Space in which the PLY's colours are to be blended: mgs trains in linear RGB, most other tools in sRGB. "
-            "auto: linear for files that mgs wrote (their header says so), srgb for all others."
+            help="Space in which the PLY's colours are blended: mgs trains in linear RGB, most "
+            "other tools in sRGB. auto: linear for files that mgs wrote (their header says so), "
+            "srgb for all others."
         ),
     ] = ColourSpace.auto,
     background: Annotated[
@@ -55,7 +57,8 @@ def render(
         bool,
         typer.Option(
             "--exr",
-            help="Write an OpenEXR too: linear R G B, opacity A, expected z-depth Z in metres (0: nothing).",
+            help="Write an OpenEXR too: linear R G B, opacity A, expected z-depth Z in metres "
+            "(0: nothing).",
         ),
     ] = False,
 ) -> None:
@@ -75,9 +78,8 @@ def render(
     from mgs.splat_ply import ply_colour_space, read_ply
 
     if not all(0 <= value <= 1 for value in background):
-        raise InputError(
-            f"--background {' '.join(map(str, background))}: must be three numbers from 0 to 1"
-        )
+        given = " ".join(map(str, background))
+        raise InputError(f"--background {given}: must be three numbers from 0 to 1")
     views = [
         (name, camera.resized(width) if width else camera) for name, camera in load_cameras(cameras)
     ]
@@ -86,14 +88,8 @@ def render(
     runtime.start()
     with folder_locked(out), progress_bar() as bar:
         check_new_folder(out)
-        draw_views(
-            out,
-            gaussians,
-            views,
-            space,
-            background,
-            exr,
-            progress=partial(bar, "rendering"),
-        )
-    degree = f"SH degree {gaussians.sh_degree}, colours in {'linear RGB' if space == 'linear' else 'sRGB'}"
-    typer.echo(f"wrote {len(views)} views of {len(gaussians):,} Gaussians ({degree}) to {out}")
+        progress = partial(bar, "rendering")
+        draw_views(out, gaussians, views, space, background, exr, progress)
+    colours = "linear RGB" if space == "linear" else "sRGB"
+    model = f"{len(gaussians):,} Gaussians (SH degree {gaussians.sh_degree}, colours in {colours})"
+    typer.echo(f"wrote {len(views)} views of {model} to {out}")

@@ -19,9 +19,7 @@ def report(
     ] = None,
     figures: Annotated[
         str | None,
-        typer.Option(
-            metavar="png|pdf|svg", help="What the figures are written as.", show_default="png"
-        ),
+        typer.Option(metavar="png|pdf|svg", help="Format of the figures.", show_default="png"),
     ] = None,
     html: Annotated[
         Path | None,
@@ -34,14 +32,12 @@ def report(
     """Compare runs: draw the orbit, information gain, coverage, PSNR against images and one test
     view, and make a table.
 
-    Where the dataset has no test views, a view is drawn that the fewest runs were trained on, and
-    PSNR is over all views.
+    Without test views in the dataset, a view is drawn that the fewest runs were trained on, and
+    PSNR is over all views. Figures need runs that are finished and measured by `mgs eval`; nothing
+    is computed again.
 
-    The figures are taken from the files of runs that are finished and measured by `mgs eval`;
-    nothing is computed anew.
-
-    The page of --html is made of what is there, also of an unfinished run: for its pictures, the
-    model that the run folder holds is drawn.
+    The page of --html takes unfinished runs too. Its pictures are drawn from the model that the run
+    folder holds.
     """
     from mgs.errors import InputError
     from mgs.files import check_writable
@@ -60,7 +56,7 @@ def report(
 
 
 def _write_figures(runs: list[Path], out: Path, kind: str) -> None:
-    """Write the figures and the table, print the table, and say what was left out."""
+    """Write the figures and the table, and print the table."""
     from rich.console import Console
 
     from mgs.cli.printing import print_quality
@@ -70,27 +66,25 @@ def _write_figures(runs: list[Path], out: Path, kind: str) -> None:
     from mgs.report.writing import write_report
     from mgs.run.ending import why_ended
 
-    check_writable(out / "table.md")  # before the figures are drawn, not after it
+    check_writable(out / "table.md")  # before the work
     compared = compare_runs(runs)
     written = write_report(out, compared, kind)
     rows = comparison_rows(compared)
     print_quality(Console(), rows)
     for row, run in zip(rows, compared.runs.values(), strict=True):
-        if run.ended:
-            length = f"{row['path']:.2f} {row['unit']}"
-            typer.echo(
-                f"{row['policy']}: a path of {length}; the run has ended: {why_ended(run.ended)}"
-            )
-    for path in written:
-        typer.echo(f"wrote {path}")
-    if not any(path.stem == "psnr" for path in written):
+        path = f"a path of {row['path']:.2f} {row['unit']}"
+        typer.echo(f"{row['policy']}: {path}; the run has ended: {why_ended(run.ended or {})}")
+    for file in written:
+        typer.echo(f"wrote {file}")
+    if not any(file.stem == "psnr" for file in written):
         typer.echo(
-            "PSNR against images is left out: it needs that all runs were made with --evaluate-every"
+            "PSNR against images is left out: "
+            "it needs that all runs were made with --evaluate-every"
         )
 
 
 def _write_page(runs: list[Path], html: Path) -> None:
-    """Write the page, with a progress bar, and print its size."""
+    """Write the page, and print its size."""
     from functools import partial
 
     from mgs import runtime

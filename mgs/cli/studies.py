@@ -209,7 +209,7 @@ def chart(
     preset: Annotated[
         str, typer.Option(help="quick: about ten minutes on two quiet cores. full: hours.")
     ] = "quick",
-    only: Annotated[str | None, typer.Option(help="Some of fit,scoring. Default: all.")] = None,
+    only: Annotated[str | None, typer.Option(help="fit or run. Default: both.")] = None,
     repeats: Annotated[
         int | None,
         typer.Option(
@@ -217,16 +217,15 @@ def chart(
         ),
     ] = None,
 ) -> None:
-    """Chart speed against accuracy: of fits and runs, and of scoring.
+    """Chart speed against accuracy: of single fits and of whole runs.
 
-    Writes KIND.csv, KIND.json, KIND.md and KIND.png of each chart; each row names the command that
+    Writes KIND.csv, KIND.json, KIND.md and KIND.png of each; each row names the command that
     makes it again. Points are timed one after another: let nothing else run meanwhile.
     """
-    from mgs.study.chart.fits import SIZES
-    from mgs.study.chart.run import CHARTS, check_dataset, run_chart
+    from mgs.study.chart import KINDS, SIZES, check_dataset, run_chart
     from mgs.study.sweep import names_of
 
-    kinds = names_of(only, CHARTS)
+    kinds = names_of(only, KINDS)
     check_dataset(dataset)
     with _study(out, SIZES, preset) as (_, console, report):
         found = run_chart(out, preset, kinds, repeats, dataset, report)

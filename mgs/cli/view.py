@@ -7,9 +7,6 @@ from typing import Annotated
 
 import typer
 
-LOCAL = ("127.0.0.1", "localhost", "::1")
-"""Hosts that only this machine reaches."""
-
 
 def view(
     subject: Annotated[
@@ -35,9 +32,9 @@ def view(
     mesh and cameras.
 
     While the camera moves, the browser draws the Gaussians, without view-dependent colour. While it
-    rests, it shows the image
-    of the kernel. Layers: colour, alpha, depth, and of a run the information, the uncertainty, and
-    what is unobserved. A click on a camera shows its image and its numbers. Ctrl-C ends it.
+    rests, the kernel's image is shown. Layers: colour, alpha, depth, and of a run information,
+    uncertainty, and what is unobserved. A click on a camera shows its image and its numbers. Ctrl-C
+    ends it.
     """
     import time
 
@@ -47,12 +44,12 @@ def view(
     runtime.start()
     viewer = Viewer(subject, host, port, follow)
     try:
-        if host not in LOCAL:
-            typer.echo(
-                f"--host {host}: everyone who reaches this address can see the data and use the controls"
-            )
+        token = viewer.access.token
+        if token:
+            typer.echo(f"--host {host}: whoever has the address below, with its token, can look")
         shown = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
-        typer.echo(f"open http://{shown}:{viewer.port} in a browser; Ctrl-C ends it")
+        query = f"/?token={token}" if token else ""
+        typer.echo(f"open http://{shown}:{viewer.port}{query} in a browser; Ctrl-C ends it")
         while True:
             viewer.tick()
             time.sleep(0.05)

@@ -8,6 +8,8 @@ Three tables hold them, by what their functions use: information
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,9 +49,7 @@ def i_optimal(context: PolicyContext) -> Array:
     H, lam, count = context.H, context.lam, len(context.positions)
     others = [i for i in range(count) if i not in context.taken_frames]
     mean = (H + sum(context.information(i) for i in others)) / count
-    return np.array(
-        [i_optimality(context.information(i), H, lam, mean) for i in context.candidate_frames]
-    )
+    return _each(context, lambda i: i_optimality(context.information(i), H, lam, mean))
 
 
 def block_d(context: PolicyContext) -> Array:
@@ -57,12 +57,8 @@ def block_d(context: PolicyContext) -> Array:
     estimator of the run."""
     H, lam = _summed(context, "block"), context.lam
     before = block_log_determinant(H, lam)
-    return np.array(
-        [
-            block_log_determinant(H + context.estimate(i, "block"), lam) - before
-            for i in context.candidate_frames
-        ]
-    )
+    after = _each(context, lambda i: block_log_determinant(H + context.estimate(i, "block"), lam))
+    return after - before
 
 
 def paper(context: PolicyContext) -> Array:
@@ -72,9 +68,7 @@ def paper(context: PolicyContext) -> Array:
     `loss-gradient`, lambda is PAPER_LAM.
     """
     H, lam = _summed(context, "loss-gradient"), np.full_like(context.lam, PAPER_LAM)
-    return np.array(
-        [d_optimal(context.estimate(i, "loss-gradient"), H, lam) for i in context.candidate_frames]
-    )
+    return _each(context, lambda i: d_optimal(context.estimate(i, "loss-gradient"), H, lam))
 
 
 def cover(context: PolicyContext) -> Array:
@@ -87,17 +81,18 @@ def cover(context: PolicyContext) -> Array:
     """
     least = context.prior_lam[0] / SH_C0**2
     taken = [(context.positions[i], context.seen(i) > least) for i in context.taken_frames]
-    scores = []
-    for i in context.candidate_frames:
-        weights = context.seen(i)
+
+    def score(frame: int) -> float:
+        weights = context.seen(frame)
         some = np.flatnonzero(weights)
         points, weights = context.points[some], weights[some]
-        here, apart = _directions(points, context.positions[i]), np.ones(len(some))
+        here, apart = _directions(points, context.positions[frame]), np.ones(len(some))
         for position, known in taken:
             angle = (1 - (here * _directions(points, position)).sum(1)) / 2
             apart = np.where(known[some], np.minimum(apart, angle), apart)
-        scores.append((apart * weights).sum() / max(weights.sum(), 1e-12))
-    return np.array(scores)
+        return float((apart * weights).sum() / max(weights.sum(), 1e-12))
+
+    return _each(context, score)
 
 
 def _directions(points: Array, position: Array) -> Array:
@@ -110,7 +105,12 @@ def completeness(context: PolicyContext) -> Array:
     """Completeness after ActiveSplat (2024): squared blending weights of the surface's Gaussians
     that no view has `observed`, summed. Zero once all are, as with `coverage`."""
     unknown = ~observed(context.surface_H, context.prior_lam)
-    return np.array([context.seen(i)[unknown].sum() for i in context.candidate_frames])
+    return _each(context, lambda i: context.seen(i)[unknown].sum())
+
+
+def _each(context: PolicyContext, score: Callable[[int], float]) -> Array:
+    """Score of each candidate [C]."""
+    return np.array([score(i) for i in context.candidate_frames])
 
 
 def _summed(context: PolicyContext, estimator: str) -> NDArray[np.float64]:
@@ -167,12 +167,12 @@ def policy_named(name: str) -> Policy:
 
 
 def _of_criterion(criterion: Criterion) -> Policy:
-    """A criterion as a policy. The information of one candidate is in memory at a time."""
+    """A criterion as a policy."""
 
-    def scores(context: PolicyContext) -> NDArray[np.float64]:
+    def scores(context: PolicyContext) -> Array:
         F, H, lam = context.information, context.H, context.lam
         if criterion.at == "prior":
             F, H, lam = context.surface_information, context.surface_H, context.prior_lam
-        return np.array([criterion.score(F(i), H, lam) for i in context.candidate_frames])
+        return _each(context, lambda i: criterion.score(F(i), H, lam))
 
     return scores

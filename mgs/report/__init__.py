@@ -1,1 +1,1 @@
-"""What came out of runs: metrics, maps, tables, figures; and pictures of any model."""
+"""Results of runs: metrics, maps, tables, figures; and pictures of any model."""

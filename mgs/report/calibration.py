@@ -1,5 +1,5 @@
-"""Are predicted errors true? Pure functions: errors and the standard deviations that were predicted
-for them, both [n].
+"""Accuracy of predicted errors: functions of errors and of their predicted standard deviations,
+both [n].
 
 AUSE and the calibration follow the usual definitions for uncertainty maps (sparsification curves;
 probability integral transform; continuous ranked probability score of a normal distribution).
@@ -20,53 +20,50 @@ from scipy.stats import norm, spearmanr
 Array = NDArray[np.floating]
 
 LEVELS = (0.5, 0.9)
-"""Shares of the errors that the intervals shall hold."""
+"""Shares of the errors that intervals should hold."""
 
 STEPS = 100
-"""Points of a sparsification curve: 0, 1, ... 99 % of the pixels are left out."""
+"""Points of a sparsification curve: 0, 1, ..., 99 % of the pixels are left out."""
 
 BINS = 20
-"""Of the histogram of the probability integral transform."""
+"""Bins of the histogram of the probability integral transform."""
 
 NORMAL = {level: float(norm.ppf(0.5 + level / 2)) for level in LEVELS}
 """Half-widths of intervals of a normal distribution, standard deviations."""
 
 
 def sparsification(errors: Array, sigma: Array) -> Array:
-    """Mean error of the pixels that are left when those of the largest sigma are left out, over the
-    mean of all, [STEPS].
+    """Mean error without the pixels of the largest sigma, over the mean of all, [STEPS].
 
-    errors: [n], 0 or more. Where all errors are 0 the curve is 0.
+    errors: [n], 0 or more. If all errors are 0, the curve is 0.
     """
     total = errors.sum()
     if total == 0:
         return np.zeros(STEPS)
     left_out = (np.arange(STEPS) * len(errors)) // STEPS
-    sums = np.concatenate(
-        [[0.0], np.cumsum(errors[np.argsort(-sigma, kind="stable")], dtype=np.float64)]
-    )
+    largest_first = errors[np.argsort(-sigma, kind="stable")]
+    sums = np.concatenate([[0.0], np.cumsum(largest_first, dtype=np.float64)])
     curve: Array = (total - sums[left_out]) / (len(errors) - left_out) * (len(errors) / total)
     return curve
 
 
 def ause(errors: Array, sigma: Array) -> float:
-    """Area between the sparsification curve by sigma and the best one, by the errors themselves.
-    errors: [n], 0 or more."""
+    """Area between the sparsification curves by sigma and by the errors themselves. errors: [n], 0
+    or more."""
     return float((sparsification(errors, sigma) - sparsification(errors, errors)).mean())
 
 
 def ause_of_constant(errors: Array) -> float:
-    """AUSE of a sigma that tells no pixel from another, which leaves out pixels at random: its
-    curve is 1 in the mean."""
+    """AUSE of a constant sigma, which leaves out pixels at random: its curve is 1 in the mean."""
     return float((1 - sparsification(errors, errors)).mean())
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """How terms of a predicted variance are weighed, and how wide intervals are.
+    """Weights of the terms of a predicted variance, and widths of intervals.
 
-    weights: by the name of a term, and "noise", a variance. widths: half-width of the interval of
-    each of LEVELS, in sigmas.
+    weights: by the name of a term; "noise" is a constant variance. widths: half-width of the
+    interval of each of LEVELS, in sigmas.
     """
 
     weights: Mapping[str, float]
@@ -80,11 +77,11 @@ class Calibration:
 
 
 def fit_calibration(terms: Mapping[str, Array], errors: Array) -> Calibration:
-    """Weights that make the errors most probable, if they are normal with the weighted sum of the
-    terms as their variance.
+    """Fit the weights by maximum likelihood: errors are normal, with the weighted sum of the terms
+    as variance.
 
-    terms: name -> [n], variances; errors: [n], signed. The widths are the quantiles of |error| /
-    sigma, so that long tails do not need to be normal.
+    terms: name -> [n], variances; errors: [n], signed. Widths are quantiles of |error| / sigma, so
+    tails need not be normal.
     """
     columns = np.stack([*terms.values(), np.ones(len(errors))], axis=1).astype(np.float64)
     scale = np.maximum(columns.mean(axis=0), np.finfo(np.float32).tiny)
@@ -108,15 +105,15 @@ def fit_calibration(terms: Mapping[str, Array], errors: Array) -> Calibration:
 def judged(
     errors: Array, sigma: Array, widths: Mapping[float, float], rng: np.random.Generator
 ) -> dict[str, Any]:
-    """How well sigma [n] predicted the signed errors [n].
+    """Measures of how well sigma [n] predicted the signed errors [n].
 
-    ause: for absolute and squared errors ("mae", "mse"), with that of a constant sigma, and of this
-    sigma if it were perfect:
-    on errors drawn from it. spearman, pearson: of sigma with the absolute error. held: share of the
-    errors inside the interval
-    of each of LEVELS, over all pixels and over thirds of them by sigma. crps: mean, of normal
-    distributions, and that of one
-    sigma for all. pit: shares of the probability integral transform in BINS bins.
+    - ause: for absolute and squared errors ("mae", "mse"), with that of a constant sigma, and of
+      this sigma on errors drawn from it ("perfect").
+    - spearman, pearson: correlations of sigma with the absolute error.
+    - held: share of the errors inside the interval of each of LEVELS, over all pixels and over
+      thirds of them by sigma.
+    - crps, crps_constant: mean, of sigma and of one sigma for all.
+    - pit: shares of the probability integral transform in BINS bins.
     """
     drawn = sigma * rng.standard_normal(len(sigma))
     areas = {
@@ -133,18 +130,27 @@ def judged(
         str(level): [float((np.abs(z[part]) <= width).mean()) for part in parts]
         for level, width in widths.items()
     }
-    rms = float(np.sqrt(np.square(errors).mean()))
+    rms, varies, size = _rms(errors), np.ptp(sigma) > 0, np.abs(errors)
     return {
-        "count": len(errors), "rms": rms, "mean_sigma": float(np.sqrt(np.square(sigma).mean())), "ause": areas,
-        "spearman": float(spearmanr(sigma, np.abs(errors)).statistic) if np.ptp(sigma) > 0 else 0.0,
-        "pearson": float(np.corrcoef(sigma, np.abs(errors))[0, 1]) if np.ptp(sigma) > 0 else 0.0,
-        "held": held, "crps": crps(errors, sigma), "crps_constant": crps(errors, np.full(len(errors), max(rms, 1e-30))),
+        "count": len(errors),
+        "rms": rms,
+        "mean_sigma": _rms(sigma),
+        "ause": areas,
+        "spearman": float(spearmanr(sigma, size).statistic) if varies else 0.0,
+        "pearson": float(np.corrcoef(sigma, size)[0, 1]) if varies else 0.0,
+        "held": held,
+        "crps": crps(errors, sigma),
+        "crps_constant": crps(errors, np.full(len(errors), max(rms, 1e-30))),
         "pit": (np.histogram(ndtr(z), BINS, (0, 1))[0] / len(z)).tolist(),
-    }  # fmt: skip
+    }
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.square(values).mean()))
 
 
 def crps(errors: Array, sigma: Array) -> float:
     """Mean continuous ranked probability score of normal distributions around 0, in the unit of the
-    errors (the smaller, the better)."""
+    errors; smaller is better."""
     z = errors / sigma
     return float((sigma * (z * (2 * ndtr(z) - 1) + 2 * norm.pdf(z) - 1 / np.sqrt(np.pi))).mean())

@@ -1,10 +1,9 @@
-"""How near its end the fit of a run stopped: a prediction of how much lower the objective could
-still get.
+"""Predicted further fall of the objective of a run's last fit.
 
-A fit is stopped long before the minimum: the images held out are as good by then, and the ranking
-of candidates changes little (docs/fit.md). What a loss does from pass to pass says nothing about
-how far away the minimum is. The Newton decrease does: half of g^T (J^T J + lam)^-1 g, exact where
-images are linear in the parameters.
+A fit stops long before the minimum, because by then held-out images no longer improve and the
+ranking of candidates hardly changes (docs/fit.md). The loss from pass to pass does not show how far
+away the minimum is. The Newton decrease does: half of g^T (J^T J + lam)^-1 g, exact where images
+are linear in the parameters.
 """
 
 from __future__ import annotations
@@ -22,8 +21,8 @@ from mgs.run.settings import NbvSettings
 from mgs.splat import as_drjit, groups
 
 CG_ITERATIONS = 20
-"""Iterations of conjugate gradients; `mgs bench fit` compares what they predict with what a longer
-fit finds."""
+"""Iterations of conjugate gradients; `mgs bench fit` compares their prediction with a longer
+fit."""
 
 CONVERGED_SHARE = 0.02
 """A fit has converged if the objective is predicted to fall by at most this share of itself."""
@@ -36,12 +35,13 @@ def remaining_decrease(
     frames: Sequence[Frame],
     progress: Callable[[int, int], None] = lambda done, most: None,
 ) -> dict[str, Any]:
-    """The objective of the last fit of a run, and by how much it is predicted to fall yet.
+    """Objective of the last fit of a run, and its predicted further fall.
 
     gaussians: the fitted model; frames: those taken, in their order, so the seeds first.
+
     Returns "phi" (`mgs.fit.objective`, squared pixel values); "predicted_decrease", the Newton
-    decrease after CG_ITERATIONS, a share of phi; and "converged", whether that is at most
-    CONVERGED_SHARE. Raises InputError where a frame cannot be read.
+    decrease after CG_ITERATIONS as a share of phi; and "converged", whether that is at most
+    CONVERGED_SHARE. Raises InputError if a frame cannot be read.
     """
     images, train = last_images(settings, prior, frames), settings.train
     kinds = groups(0, train.means)

@@ -1,25 +1,18 @@
-"""Maps of what the training views of a run say about its model, and where: for views (EXR, PNG) and
-for Gaussians (PLY).
+"""Maps of what the training views of a run say about its model: for views (EXR, PNG) and for
+Gaussians (PLY).
 
 H [N,P] is the diagonal of the Fisher information, summed over the training views. lam [P] is the
-information of the prior about each parameter (`mgs.policy.criteria.regularisation`). From these,
-every Gaussian has the following numbers, its
-*scalars*:
+information of the prior about each parameter (`mgs.policy.criteria.regularisation`). Every Gaussian
+has these numbers, its scalars:
 
-- `fisher.colour`, `fisher.scale`, `fisher.rotation`, `fisher.opacity`, and `fisher.mean` where the
-run learns the means: the
-  sum of H over its parameters of that kind, in (pixel value / parameter)^2. The preview has no
-  panel of the last.
-- `information`: 1/2 sum_k log(1 + H_k / lam_k) over its parameters k, in nats: what the training
-views say about it. All kinds
-  of parameters have the same unit here.
-- `uncertainty`: the mean over its parameters of lam_k / (H_k + lam_k): the variance that is left
-over the variance of the
-  prior. 1 means that nothing is known, 0 that everything is.
-- `unobserved`: 1 if no training view sees its place on the surface, otherwise 0, by the same rule
-as the coverage of a run
-  (`mgs.policy.criteria.observed`). The rule looks at the information about the colours of the
-  Gaussians before training, because training hides some Gaussians behind others.
+- `fisher.colour`, `fisher.scale`, `fisher.rotation`, `fisher.opacity`, and `fisher.mean` if the run
+  learns means: sum of H over its parameters of that kind, in (pixel value / parameter)^2.
+- `information`: 1/2 sum_k log(1 + H_k / lam_k) over its parameters k, nats.
+- `uncertainty`: mean over its parameters of lam_k / (H_k + lam_k), the variance that is left over
+  the variance of the prior: 1 if nothing is known, 0 if everything is.
+- `unobserved`: 1 if no training view sees its place on the surface, else 0, by the rule of the
+  coverage of a run (`mgs.policy.criteria.observed`). That rule looks at the Gaussians before
+  training, because training hides some Gaussians behind others.
 
 A map of a scalar v shows in each pixel the mean over the Gaussians that the pixel shows, with their
 blending weights w: sum w v / sum w; 0 in pixels that show none.
@@ -28,6 +21,7 @@ blending weights w: sum w v / sum w; 0 in pixels that show none.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +35,7 @@ from mgs.files import atomic_path
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_exr
 from mgs.policy import criteria
-from mgs.run import folder as run_folder
+from mgs.run.folder import Run, open_run
 
 VIEWS = 3
 """Number of views that are drawn if none are named."""
@@ -60,13 +54,12 @@ def gaussian_scalars(
     prior_lam: np.ndarray,
     groups: dict[str, slice],
 ) -> dict[str, np.ndarray]:
-    """The scalars that the module's docstring lists, name -> [N].
+    """The scalars of the module's docstring, name -> [N].
 
-    H: [N,P] information of the training views about the fitted model, by the estimator of the run;
+    H: [N,P] information of the training views about the fitted model, by the run's estimator.
     surface: [S,P] their exact information about the Gaussians on the surface before training (both
-    as in `mgs.run.folder.State`). lam: [P] the lambda that the run's criteria see; prior_lam: [P]
-    information of the prior, which coverage is judged by. groups: columns of each kind of parameter
-    (`mgs.splat.groups`).
+    as in a run's state). lam: [P] lambda of the run's criteria. prior_lam: [P] information of the
+    prior, which coverage is judged by. groups: columns of each kind (`mgs.splat.groups`).
     """
     scalars = {
         f"fisher.{name}": H[:, columns].sum(axis=1, dtype=np.float64)
@@ -80,39 +73,42 @@ def gaussian_scalars(
     return scalars
 
 
+def run_scalars(run: Run) -> dict[str, np.ndarray]:
+    """`gaussian_scalars` of the model of a run."""
+    from mgs.splat import groups
+
+    state, settings, degree = run.state, run.settings, run.state.gaussians.sh_degree
+    columns = groups(degree, settings.train.means)
+    prior_lam = criteria.regularisation(groups(degree), settings.pixel_noise, settings.prior_std)
+    lam = settings.regularisation(columns)
+    return gaussian_scalars(state.H, state.surface, lam, prior_lam, columns)
+
+
 def view_maps(
     gaussians: Gaussians, camera: Camera, scalars: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """The channels of one view, name -> float32 [H,W]: R G B (linear colour on black), A (opacity),
-    Z (expected z-depth, metres) and a map of each scalar.
+    """Channels of one view, name -> float32 [H,W]: R G B (linear colour on black), A (opacity), Z
+    (expected z-depth, metres) and a map of each scalar.
 
-    scalars: name -> [N]. They are drawn in place of the colours of the Gaussians, three at a time.
-    The map of `unobserved` is 1 where unobserved Gaussians have more than half of the weight,
-    otherwise 0.
+    scalars: name -> [N]. They are drawn in place of the colours, three at a time. The map of
+    `unobserved` is 1 where unobserved Gaussians have more than half of the weight, else 0.
     """
     from mgs.splat import ListCache, render
 
     cache = ListCache()
     image = render(gaussians, camera, cache=cache)
     rgb, alpha = np.asarray(image.rgb), np.asarray(image.alpha)
-    maps = {
-        "R": rgb[..., 0],
-        "G": rgb[..., 1],
-        "B": rgb[..., 2],
-        "A": alpha,
-        "Z": np.asarray(image.depth),
-    }
+    maps = {channel: rgb[..., i] for i, channel in enumerate("RGB")}
+    maps |= {"A": alpha, "Z": np.asarray(image.depth)}
     names, shown = list(scalars), np.where(alpha > 0, alpha, 1.0)
     for first in range(0, len(names), 3):
         three = names[first : first + 3]
-        # Divided by the largest value: float32 keeps its precision with colours of about 1,
-        # whatever the unit of the scalar.
+        # Divided by the largest value: float32 is precise for colours of about 1.
         largest = [max(float(scalars[name].max(initial=0)), 1e-30) for name in three]
         values = np.zeros((len(gaussians), 3))
         for i, name in enumerate(three):
             values[:, i] = scalars[name] / largest[i]
-        g = gaussians
-        coloured = Gaussians(g.means, g.log_scales, g.quats, g.logit_opacities, sh_from_rgb(values))
+        coloured = replace(gaussians, sh=sh_from_rgb(values))
         mean = np.asarray(render(coloured, camera, cache=cache).rgb) / shown[..., None]
         for i, name in enumerate(three):
             maps[name] = (mean[..., i] * largest[i]).astype(np.float32)
@@ -124,33 +120,24 @@ def view_maps(
 def write_information_ply(
     path: str | Path, gaussians: Gaussians, scalars: dict[str, np.ndarray]
 ) -> None:
-    """Write a PLY with a vertex for each Gaussian: x y z, red green blue, and every scalar; the
-    file appears complete.
+    """Write a PLY with a vertex for each Gaussian, for MeshLab or CloudCompare: x y z, red green
+    blue, and every scalar.
 
-    The colours show the information, from 0 to its largest value (colour map viridis). Dots in
-    names become underscores. It
-    opens in MeshLab and CloudCompare. scalars: name -> [N]. Raises InputError if the file cannot be
-    written.
+    Colours show the information, from 0 to its largest value (colour map viridis). Dots in names
+    become underscores. scalars: name -> [N]. Raises InputError if the file cannot be written.
     """
     import matplotlib
     from plyfile import PlyData, PlyElement
 
     information = scalars["information"]
-    rgb = matplotlib.colormaps["viridis"](
-        information / max(float(information.max(initial=0)), 1e-30), bytes=True
-    )[:, :3]
-    names = [name.replace(".", "_") for name in scalars]
-    layout = (
-        [(axis, "f4") for axis in "xyz"]
-        + [(c, "u1") for c in ("red", "green", "blue")]
-        + [(name, "f4") for name in names]
-    )
+    share = information / max(float(information.max(initial=0)), 1e-30)
+    rgb = matplotlib.colormaps["viridis"](share, bytes=True)
+    columns = {axis: (gaussians.means[:, i], "f4") for i, axis in enumerate("xyz")}
+    columns |= {name: (rgb[:, i], "u1") for i, name in enumerate(("red", "green", "blue"))}
+    columns |= {name.replace(".", "_"): (values, "f4") for name, values in scalars.items()}
+    layout = [(name, kind) for name, (_, kind) in columns.items()]
     vertices = np.empty(len(gaussians), dtype=layout)
-    for i, axis in enumerate("xyz"):
-        vertices[axis] = gaussians.means[:, i]
-    for i, channel in enumerate(("red", "green", "blue")):
-        vertices[channel] = rgb[:, i]
-    for name, values in zip(names, scalars.values(), strict=True):
+    for name, (values, _) in columns.items():
         vertices[name] = values
     with atomic_path(path) as temporary:
         PlyData([PlyElement.describe(vertices, "vertex")]).write(str(temporary))
@@ -166,8 +153,7 @@ PANELS = {
     "information": ("information gained (nats)", "viridis"),
     "uncertainty": ("posterior / prior variance", "cividis"),
 }
-"""Panels of a preview: channel -> title and colour map. The colour maps are perceptually
-uniform."""
+"""Panels of a preview: channel -> title and colour map, which is perceptually uniform."""
 
 
 def write_preview(
@@ -176,8 +162,8 @@ def write_preview(
     """Write the preview of one view as a PNG: its render and the PANELS with colour bars, cropped
     to the model.
 
-    maps: as `view_maps` gives them, of all scalars; title: of the render; unit: what a length of 1
-    is called. Raises InputError if the file cannot be written.
+    maps: `view_maps` of all scalars; title: of the render; unit: name of a length of 1. Raises
+    InputError if the file cannot be written.
     """
     import matplotlib
 
@@ -192,11 +178,11 @@ def write_preview(
         axes = figure.subplots(3, 3).flat
         axes[0].imshow(srgb_from_linear(rgb)[window], interpolation="nearest")
         axes[0].set_title(title)
-        for axis, (channel, (label, colours)) in zip(axes[1:], PANELS.items(), strict=True):
+        for axis, (channel, (label, name)) in zip(axes[1:], PANELS.items(), strict=True):
             values = np.ma.masked_where(~visible, maps[channel])[window]
-            shown = axis.imshow(
-                values, cmap=_on_grey(colours), norm=_norm(channel, values), interpolation="nearest"
-            )
+            colours = matplotlib.colormaps[name].with_extremes(bad="#e8e8e8")
+            norm = _norm(channel, values)
+            shown = axis.imshow(values, cmap=colours, norm=norm, interpolation="nearest")
             axis.set_title(f"{label} ({unit})" if channel == "Z" else label)
             ticks = [0, 1] if channel == "unobserved" else None
             figure.colorbar(shown, ax=axis, shrink=0.85, aspect=16, pad=0.02, ticks=ticks)
@@ -205,17 +191,10 @@ def write_preview(
         save_figure(figure, path)
 
 
-def _on_grey(name: str) -> Any:
-    """The colour map of this name, with light grey for masked pixels."""
-    import matplotlib
-
-    return matplotlib.colormaps[name].with_extremes(bad="#e8e8e8")
-
-
 def _norm(channel: str, values: np.ma.MaskedArray) -> Any:
-    """The scale of a channel's colours: logarithmic for Fisher information, which spans many powers
-    of ten; from 0 to 1 for the uncertainty and for `unobserved`; otherwise from the least to about
-    the largest of the values [H,W] that are not masked."""
+    """Colour scale of a channel: logarithmic for Fisher information, which spans many powers of
+    ten; from 0 to 1 for `uncertainty` and `unobserved`; else from the least to about the largest of
+    the unmasked values [H,W]."""
     from matplotlib.colors import LogNorm, Normalize
 
     data = values.compressed()
@@ -231,18 +210,19 @@ def _norm(channel: str, values: np.ma.MaskedArray) -> Any:
 def choose_views(
     frames: Sequence[Frame], trained: Sequence[str], wanted: Sequence[str] | None
 ) -> list[Frame]:
-    """The frames to draw: those named in `wanted`, or, without it, VIEWS frames spread evenly over
-    those not trained on.
+    """The frames to draw: those named in `wanted`, or else VIEWS frames spread evenly over those
+    not trained on.
 
-    trained: names of the frames that were trained on; if these are all, the choice is among all
-    frames. Raises InputError for a name that no frame has.
+    trained: names of the training frames; if these are all, the choice is among all frames. Raises
+    InputError for a name that no frame has.
     """
     if wanted:
         by_name = {frame.name: frame for frame in frames}
         for name in wanted:
             if name not in by_name:
                 raise InputError(
-                    f"--views {name}: no such frame; the dataset has {frames[0].name} to {frames[-1].name}"
+                    f"--views {name}: no such frame; "
+                    f"the dataset has {frames[0].name} to {frames[-1].name}"
                 )
         return [by_name[name] for name in wanted]
     pool = [frame for frame in frames if frame.name not in trained] or list(frames)
@@ -253,44 +233,29 @@ def choose_views(
 def diagnose_run(
     run: str | Path,
     wanted: Sequence[str] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Path]:
-    """Write the folder RUN/diagnostics: information.ply, and NAME.exr and NAME.png for each view.
-    Returns the paths of the files.
+    """Write RUN/diagnostics: information.ply, and NAME.exr and NAME.png of each view. Returns the
+    paths.
 
-    wanted: names of frames, see `choose_views`; progress: called as progress(views done, views in
-    all). Raises InputError as `mgs.run.folder.load_run` (no run, no finished step, a dataset that
-    has changed), and for an unknown view.
+    wanted: names of frames (`choose_views`). progress: called as progress(views done, all). Raises
+    InputError for an unknown view, and as `open_run`.
     """
-    from mgs.splat import groups
-
-    run = Path(run)
-    gaussians, dataset, trained, _ = run_folder.load_run(run)
-    frames = choose_views(dataset.frames, trained, wanted)
-    settings, state = run_folder.read_settings(run), run_folder.read_checkpoint(run)
-    assert state is not None
-    columns = groups(gaussians.sh_degree, settings.train.means)
-    prior_lam = criteria.regularisation(
-        groups(gaussians.sh_degree), settings.pixel_noise, settings.prior_std
-    )
-    scalars = gaussian_scalars(
-        state.H, state.surface, settings.regularisation(columns), prior_lam, columns
-    )
-    out = run / "diagnostics"
+    opened = open_run(run)
+    gaussians, trained = opened.state.gaussians, [frame.name for frame in opened.taken]
+    frames = choose_views(opened.dataset.frames, trained, wanted)
+    scalars, out = run_scalars(opened), opened.folder / "diagnostics"
     write_information_ply(out / "information.ply", gaussians, scalars)
     written = [out / "information.ply"]
     for done, frame in enumerate(frames):
-        if progress:
-            progress(done, len(frames))
+        progress(done, len(frames))
         maps = view_maps(gaussians, frame.camera, scalars)
-        write_exr(out / f"{frame.name}.exr", maps)
-        seen = "trained on" if frame.name in trained else "never trained on"
-        if (
-            settings.estimator != "exact"
-        ):  # then the maps are not in the units that their panels name
-            seen += f"; by {settings.estimator}"
-        write_preview(out / f"{frame.name}.png", maps, f"{frame.name}, {seen}", dataset.unit)
-        written += [out / f"{frame.name}.exr", out / f"{frame.name}.png"]
-    if progress:
-        progress(len(frames), len(frames))
+        title = f"{frame.name}, {'' if frame.name in trained else 'never '}trained on"
+        if opened.settings.estimator != "exact":  # its numbers are not in the units of the panels
+            title += f"; by {opened.settings.estimator}"
+        files = [out / f"{frame.name}.exr", out / f"{frame.name}.png"]
+        write_exr(files[0], maps)
+        write_preview(files[1], maps, title, opened.dataset.unit)
+        written += files
+    progress(len(frames), len(frames))
     return written

@@ -1,25 +1,20 @@
-"""No more parameters than the images pay for: which kinds of them each Gaussian learns, and the SH
-degree of the colours.
+"""A model with no more parameters than its images pay for: which kinds each Gaussian learns, and
+the SH degree of the colours.
 
-Kinds of parameters are chosen by the evidence, the marginal likelihood of the images: the
-likelihood, averaged over the prior of the parameters. A model with more parameters fits the images
-better, and spreads its prior over more images that were not taken. In Laplace's approximation at a
-fit, with the exact diagonal H, learning a parameter, where all else stays as it is, adds
+Kinds of parameters are chosen by the evidence: the likelihood of the images, averaged over the
+prior of the parameters. In Laplace's approximation at a fit, with the exact diagonal H, learning
+one parameter with all else fixed adds
 
     gain = 1/2 (H + lam) delta^2 / sigma^2 - 1/2 log((H + lam) / lam)
 
-nats to the log evidence (MacKay 1992), with lam = (sigma / tau)^2, and delta how far the fit moved
-the parameter from its
-start: what the images gain by it, less what it costs. Of what gains something, the least is left
-out, too, as long as Phi, the
-objective of the fit, should not rise by more than is allowed: without the parameter it rises by 1/2
-(H + lam) delta^2.
+nats to the log evidence (MacKay 1992). Here lam = (sigma / tau)^2, and delta is how far the fit
+moved the parameter from its start. Parameters that gain least are left out too, as long as Phi, the
+objective of the fit, rises by no more than is allowed. Each of them raises it by
+1/2 (H + lam) delta^2.
 
-Whether colours depend on the direction at all, so have spherical harmonics of degree 1, is no
-question to the images that are
-fitted: they lie on the orbit, and what is wanted is how the rock looks from elsewhere. It is chosen
-by blocked cross-validation (Roberts et al. 2017): views that are neighbours in azimuth are left out
-together, so that the others have to foretell views that lie beyond them.
+The SH degree cannot be chosen by images of the orbit, because it matters for views from elsewhere.
+It is chosen by blocked cross-validation (Roberts et al. 2017): views that are neighbours in azimuth
+are left out together, so that the others must predict views beyond them.
 """
 
 from __future__ import annotations
@@ -40,6 +35,7 @@ from mgs.fit.objective import Vector, objective
 from mgs.fit.stopping import StopReason
 from mgs.gaussians import Gaussians
 from mgs.memory import Deferred
+from mgs.metrics import masked_squares
 from mgs.policy.criteria import DIRECTIONAL_STD, LEARN_LOSS
 from mgs.policy.poses import azimuths
 from mgs.prior.build import Prior
@@ -49,11 +45,10 @@ from mgs.run.settings import NbvSettings
 from mgs.splat import ListCache, as_drjit, groups, render
 
 DIRECTIONAL = "directional"
-"""What the colour coefficients of degrees above 0 are called beside the other kinds of
-parameters."""
+"""Kind of the colour coefficients of degrees above 0."""
 
 BLOCKS = 4
-"""Blocks of neighbouring views, each of which is left out of the fit once."""
+"""Blocks of neighbouring views; each is left out of a fit once."""
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -61,13 +56,13 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Images:
-    """What a model is fitted to, and from where.
+    """Input of a fit to V views.
 
-    cameras: V of them. targets: one of each, [H,W,4] with the weights of the pixels, or [H,W,5]
-    with alpha after them, as in `mgs.fit.fitting.fit`. start(views): the Gaussians before any
-    training, of degree 0, in the colours of these views,
-    indices. order: [V] indices of the views, so that neighbours in azimuth follow each other.
-    normals: [N,3], read only where means move along them."""
+    targets: of each view, [H,W,4] with the weights of the pixels, or [H,W,5] with alpha after them
+    (`mgs.fit.fitting.fit`). start(views): the Gaussians before training, of degree 0, in the
+    colours of these views (indices). order: [V] indices of the views by azimuth. normals: [N,3],
+    needed only where means move along them.
+    """
 
     cameras: Sequence[Camera]
     targets: Sequence[np.ndarray]
@@ -81,19 +76,18 @@ class Images:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What degree 1 does to the squared error of views that were left out, dB; above 0 where it is
-    the better model.
+    """Gain of SH degree 1 over degree 0 in the squared error of views left out, dB.
 
-    gain: the mean over the views; error: its standard error, as if views of one block, which share
-    their fits, were independent."""
+    gain: mean over the views. error: its standard error; views of one block, which share their
+    fits, count as independent.
+    """
 
     gain: float
     error: float
 
     @property
     def pays(self) -> bool:
-        """Whether the gain is larger than its standard error: of models that are as good as that
-        the smallest is taken."""
+        """Whether the gain is larger than its standard error."""
         return self.gain > self.error
 
 
@@ -101,10 +95,10 @@ class LeftOut:
 class LeanModel:
     """A model in which each Gaussian learned only what pays.
 
-    learned: {kind: [N]} which Gaussians learned it. parameters: how many numbers that is. whole:
-    the model of the first fit, in
-    which all did. left_out: why the colours are of the degree that they are; None where there was
-    no choice."""
+    whole: the model of the first fit, which learned everything. learned: {kind: [N]} whether each
+    Gaussian learned it. parameters: number of learned parameters. left_out: None if the degree was
+    not chosen.
+    """
 
     gaussians: Gaussians
     whole: Gaussians
@@ -114,36 +108,30 @@ class LeanModel:
 
 
 def last_images(settings: NbvSettings, prior: Prior, frames: Sequence[Frame]) -> Images:
-    """What the last fit of a run was given. frames: those taken, in their order, so the seeds
-    first. Raises InputError where a frame cannot be read."""
+    """Input of the last fit of a run. frames: those taken, in their order, so the seeds first.
+    Raises InputError if a frame cannot be read."""
     gains = exposure_of(prior)(frames) if settings.exposure else np.ones((len(frames), 3))
-    of_seeds, with_alpha = (
-        initial_gaussians(prior, frames[: settings.seeds])[0],
-        settings.train.alpha_weight > 0,
-    )
+    with_alpha = settings.train.alpha_weight > 0
+    of_seeds = initial_gaussians(prior, frames[: settings.seeds])[0]
 
-    def start(
-        views: Sequence[int],
-    ) -> Gaussians:  # as in the loop: means of the seeds' start, colours of all views
-        return replace(
-            of_seeds,
-            sh=initial_gaussians(prior, [frames[i] for i in views], gains=gains[list(views)])[0].sh,
-        )
+    def start(views: Sequence[int]) -> Gaussians:
+        shown = [frames[i] for i in views]
+        return replace(of_seeds, sh=initial_gaussians(prior, shown, gains=gains[list(views)])[0].sh)
 
-    targets = Deferred(
-        range(len(frames)), lambda k: without_gain(target_of(frames[k], with_alpha), gains[k])
-    )
+    def target(view: int) -> np.ndarray:
+        return without_gain(target_of(frames[view], with_alpha), gains[view])
+
     turn, cameras = upright(prior.up), [frame.camera for frame in frames]
     positions = np.array([camera.position for camera in cameras]) @ turn.T
-    order = np.argsort(
-        azimuths(positions, turn @ prior.points.mean(axis=0)), kind="stable"
-    ).tolist()
+    around = azimuths(positions, turn @ prior.points.mean(axis=0))
+    order = np.argsort(around, kind="stable").tolist()
+    targets = Deferred(range(len(frames)), target)
     return Images(cameras, targets, start, order, initial_normals(prior))
 
 
 def kinds(sh_degree: int, means: str = "frozen") -> dict[str, slice]:
-    """Columns of the Fisher information by kind of parameter, as `mgs.splat.groups`, but colours of
-    degrees above 0 are a kind of their own."""
+    """Columns of the Fisher information by kind, as `mgs.splat.groups`, with colours of degrees
+    above 0 as a kind of their own."""
     of = groups(sh_degree, means)
     if sh_degree == 0:
         return of
@@ -152,34 +140,32 @@ def kinds(sh_degree: int, means: str = "frozen") -> dict[str, slice]:
 
 
 def regularisation(settings: NbvSettings, sh_degree: int) -> NDArray[np.float64]:
-    """lam [P] of a run's settings, in the columns of `kinds`; a run itself has colours of degree
-    0."""
+    """lam [P] of a run's settings, in the columns of `kinds`, rounded to float32 as in the fit."""
     of = kinds(sh_degree, settings.train.means)
     lam = settings.regularisation(groups(sh_degree, settings.train.means))
     if DIRECTIONAL in of:
         lam[of[DIRECTIONAL]] = lam[0] / DIRECTIONAL_STD**2
-    return lam.astype(np.float32).astype(
-        np.float64
-    )  # as the fit has it, so that no information is exactly none
+    return lam.astype(np.float32).astype(np.float64)
 
 
 def fit_lam(lam: Array, sh_degree: int, means: str = "frozen") -> dict[str, float | np.ndarray]:
     """lam [P] in the columns of `kinds`, as `mgs.fit.fitting.fit` takes it."""
+    columns = groups(sh_degree, means)
     by_kind: dict[str, float | np.ndarray] = {
-        kind: float(lam[of][0]) for kind, of in groups(sh_degree, means).items()
+        kind: float(lam[of][0]) for kind, of in columns.items()
     }
     if sh_degree:
-        by_kind["colour"] = lam[groups(sh_degree)["colour"]].reshape(1, -1, 3)
+        by_kind["colour"] = lam[columns["colour"]].reshape(1, -1, 3)
     return by_kind
 
 
 @dataclass(frozen=True)
 class Worth:
-    """What each kind of each Gaussian's parameters is worth, {kind: [N]}, and what can be spared.
+    """Worth of each kind of each Gaussian's parameters.
 
-    gain: what it adds to the log evidence, nats. rise: by how much Phi rises without it, (pixel
-    value)^2. phi: Phi itself.
-    unseen: [N] Gaussians about which no image says anything."""
+    gain: {kind: [N]} gain of log evidence, nats. rise: {kind: [N]} rise of Phi without it, (pixel
+    value)^2. phi: Phi itself. unseen: [N] Gaussians that no image shows.
+    """
 
     gain: dict[str, NDArray[np.float64]]
     rise: dict[str, NDArray[np.float64]]
@@ -190,33 +176,33 @@ class Worth:
 def worth(
     away: Array, precision: Array, lam: Array, sigma: float, of: Mapping[str, slice], phi: float
 ) -> Worth:
-    """What parameters are worth by the formulas of this module: nothing, where the images say
-    nothing of the kind.
+    """Worth of parameters by the formulas of this module; 0 if the images say nothing of the kind.
 
-    away: [N,P] how far each is from its start; precision: [N,P] the diagonal of J^T J + lam, in
-    which all pixels count; lam: [P]; sigma: noise of a pixel, linear RGB; of: columns by kind; phi:
-    as in `Worth`."""
+    away: [N,P] distance of each from its start. precision: [N,P] diagonal of J^T J + lam over all
+    pixels. lam: [P]. sigma: noise of a pixel, linear RGB. of: columns by kind. phi: objective.
+    """
     rise = 0.5 * precision * np.square(away)
     gain = rise / sigma**2 - 0.5 * np.log(precision / lam)
-    told = {
-        kind: (precision > lam)[:, columns].any(axis=1) for kind, columns in of.items()
-    }  # not only by the prior
-    gains = {
-        kind: np.where(told[kind], gain[:, columns].sum(axis=1), 0.0)
-        for kind, columns in of.items()
-    }
-    rises = {kind: rise[:, columns].sum(axis=1) for kind, columns in of.items()}
-    return Worth(gains, rises, phi, ~np.any(list(told.values()), axis=0))
+    gains, rises, unseen = {}, {}, np.ones(len(away), bool)
+    for kind, columns in of.items():
+        seen = (precision > lam)[:, columns].any(axis=1)
+        gains[kind] = np.where(seen, gain[:, columns].sum(axis=1), 0.0)
+        rises[kind] = rise[:, columns].sum(axis=1)
+        unseen &= ~seen
+    return Worth(gains, rises, phi, unseen)
 
 
 def paying(found: Worth, sizes: Mapping[str, int], loss: float) -> dict[str, Mask]:
-    """{kind: [N]} what is learned of some kinds: that whose gain is above 0, without those that
-    gain least for each number, as long as Phi rises by no more than `loss`, dB, in all. sizes:
-    {kind: numbers of a Gaussian}."""
+    """Choose the Gaussians that learn each kind, {kind: [N]}: those that gain, without those that
+    gain least per parameter while Phi rises by at most `loss` dB in all.
+
+    sizes: {kind: parameters of a Gaussian}; only these kinds are decided.
+    """
     gain = np.stack([found.gain[kind] / size for kind, size in sizes.items()]).ravel()
     rise, kept = np.stack([found.rise[kind] for kind in sizes]).ravel(), gain > 0
     least = np.flatnonzero(kept)[np.argsort(gain[kept], kind="stable")]
-    kept[least[np.cumsum(rise[least]) <= (10 ** (loss / 10) - 1) * found.phi]] = False
+    allowed = (10 ** (loss / 10) - 1) * found.phi
+    kept[least[np.cumsum(rise[least]) <= allowed]] = False
     return dict(zip(sizes, kept.reshape(len(sizes), -1), strict=True))
 
 
@@ -231,43 +217,38 @@ def lean_fit(
 ) -> LeanModel:
     """Fit a model that has no more parameters than the images pay for.
 
-    Where sh is "auto", colours are of degree 1 if that pays on views left out (`LeftOut`), or else
-    of degree 0, as with fewer views than BLOCKS. A first fit learns everything. A last fit, from
-    the start, then learns of every Gaussian what is `paying`, of these kinds: DIRECTIONAL and,
-    where learn is "auto", opacity, scale, rotation and a mean that is learned. Colour of degree 0
-    is always learned, but by Gaussians that no image sees; kinds of which the run has a rate of 0
-    never are.
-    loss: as in `paying`. say(stage) is called as a stage starts. Raises InputError as `fitted`.
+    1. With sh "auto", choose degree 1 if it pays on views left out, else 0. Fewer views than BLOCKS
+       always get degree 0.
+    2. Fit everything, and find the worth of each kind of each Gaussian.
+    3. Fit once more from the start. DIRECTIONAL and, with learn "auto", all kinds but colour are
+       learned only where they are `paying` (loss: dB, as there). Colour of degree 0 is learned by
+       all Gaussians that some image shows. Kinds whose rate is 0 are never learned.
+
+    say(stage): called as a stage starts. Raises InputError as `fitted`.
     """
     cache, views = cache or ListCache(), range(len(images))
-    left_out = (
-        directional_gain(images, settings, cache, say)
-        if sh == "auto" and len(images) >= BLOCKS
-        else None
-    )
+    left_out = None
+    if sh == "auto" and len(images) >= BLOCKS:
+        left_out = directional_gain(images, settings, cache, say)
     degree = 1 if left_out and left_out.pays else 0
     say("fitting all parameters")
     whole = fitted(images, views, settings, degree, cache)
-    found, of = _worth(whole, images, settings, cache), kinds(degree, settings.train.means)
-    sizes = {kind: columns.stop - columns.start for kind, columns in of.items()}
+    found = _worth(whole, images, settings, cache)
+    columns = kinds(degree, settings.train.means)
+    sizes = {kind: of.stop - of.start for kind, of in columns.items()}
     rates = settings.train.rates | {DIRECTIONAL: settings.train.rates["colour"]}
-    asked = {
+    kept = {kind: ~found.unseen & (rates[kind] > 0) for kind in sizes}
+    decided = [
         kind
-        for kind in of
+        for kind in sizes
         if rates[kind] > 0 and (kind == DIRECTIONAL or (learn == "auto" and kind != "colour"))
-    }
-    kept = {kind: ~found.unseen & (rates[kind] > 0) for kind in of}
-    if asked:
-        kept |= paying(found, {kind: size for kind, size in sizes.items() if kind in asked}, loss)
+    ]
+    if decided:
+        kept |= paying(found, {kind: sizes[kind] for kind in decided}, loss)
     say("fitting what the images pay for")
     last = fitted(images, views, settings, degree, cache, kept)
-    return LeanModel(
-        last,
-        whole,
-        kept,
-        sum(int(mask.sum()) * sizes[kind] for kind, mask in kept.items()),
-        left_out,
-    )
+    parameters = sum(int(mask.sum()) * sizes[kind] for kind, mask in kept.items())
+    return LeanModel(last, whole, kept, parameters, left_out)
 
 
 def directional_gain(
@@ -276,47 +257,52 @@ def directional_gain(
     cache: ListCache,
     say: Callable[[str], None] = lambda stage: None,
 ) -> LeftOut:
-    """What colours of degree 1 gain over those of degree 0 on views left out: BLOCKS fits of each
-    degree, each without some views that follow each other in `images.order`. say(stage) is called
-    as a stage starts."""
+    """Gain of colours of degree 1 over degree 0 on views left out: fits of both degrees without
+    each of BLOCKS blocks of neighbours in `images.order`."""
     decibels = []
     for done, block in enumerate(np.array_split(np.asarray(images.order), BLOCKS)):
         say(f"fitting without some views, {done + 1} of {BLOCKS}")
         rest = [i for i in images.order if i not in block]
         models = [fitted(images, rest, settings, degree, cache) for degree in (0, 1)]
         for i in block:
-            errors = [
+            flat, directional = (
                 _squared_error(model, images.cameras[i], images.targets[i], cache)
                 for model in models
-            ]
-            decibels.append(10 * np.log10(max(errors[0], 1e-30) / max(errors[1], 1e-30)))
-    return LeftOut(
-        float(np.mean(decibels)), float(np.std(decibels, ddof=1) / np.sqrt(len(decibels)))
-    )
+            )
+            decibels.append(10 * np.log10(max(flat, 1e-30) / max(directional, 1e-30)))
+    error = float(np.std(decibels, ddof=1) / np.sqrt(len(decibels)))
+    return LeftOut(float(np.mean(decibels)), error)
 
 
 def _squared_error(model: Gaussians, camera: Camera, target: np.ndarray, cache: ListCache) -> float:
-    """Mean squared error of the pixel values that are known, linear RGB."""
+    """Mean squared error of the pixels whose colour is known, (linear RGB)^2."""
     rgb = np.asarray(render(model, camera, cache=cache).rgb, np.float64)
-    return float(np.square(rgb - target[..., :3])[target[..., 3] > 0].mean())
+    return float(masked_squares(rgb, target).mean())
 
 
 def _worth(model: Gaussians, images: Images, settings: NbvSettings, cache: ListCache) -> Worth:
-    """What the parameters of a model are worth that was fitted to all images."""
-    degree, train, views = model.sh_degree, settings.train, range(len(images))
-    start, lam = images.start(views).with_degree(degree), regularisation(settings, degree)
-    given = images.cameras, images.targets, start, fit_lam(lam, degree, train.means)
-    goal, fields = (
-        objective(model, *given, cache, train.means, images.normals, train.alpha_weight),
-        as_drjit(model),
+    """Worth of the parameters of a model that was fitted to all images."""
+    degree, train = model.sh_degree, settings.train
+    lam = regularisation(settings, degree)
+    goal = objective(
+        model,
+        images.cameras,
+        images.targets,
+        images.start(range(len(images))).with_degree(degree),
+        fit_lam(lam, degree, train.means),
+        cache,
+        train.means,
+        images.normals,
+        train.alpha_weight,
     )
+    fields, columns = as_drjit(model), kinds(degree, train.means)
     away = _flat([part for part, _ in goal.offsets(fields)], len(model))
-    precision, of = _flat(goal.diagonal(fields), len(model)), kinds(degree, train.means)
-    return worth(away, precision, lam, settings.pixel_noise, of, goal.phi(fields))
+    precision = _flat(goal.diagonal(fields), len(model))
+    return worth(away, precision, lam, settings.pixel_noise, columns, goal.phi(fields))
 
 
 def _flat(vector: Vector, n: int) -> NDArray[np.float64]:
-    """[N,P] a number for every learned parameter, in the columns of the information."""
+    """A number for every learned parameter, [N,P] in the columns of `kinds`."""
     return np.concatenate([np.asarray(part, np.float64).reshape(n, -1) for part in vector], axis=1)
 
 
@@ -328,34 +314,38 @@ def fitted(
     cache: ListCache,
     kept: Mapping[str, Mask] | None = None,
 ) -> Gaussians:
-    """The Gaussians after a fit to some views, from the start. kept: as in `LeanModel.learned`;
-    without it, all is learned. Raises InputError as `mgs.fit.fitting.fit`, and where the fit
-    diverges."""
+    """Fit some views from the start; return the Gaussians.
+
+    kept: as `LeanModel.learned`; None: all is learned. Raises InputError as `mgs.fit.fitting.fit`,
+    and if the fit diverges.
+    """
     start, train = images.start(views).with_degree(degree), settings.train
-    by_kind = fit_lam(regularisation(settings, degree), degree, train.means)
-    learns = None if kept is None else _by_array(kept, start.sh.shape[1], train.means)
-    cameras, targets = (
+    found = fit(
+        start,
         [images.cameras[i] for i in views],
         Deferred(views, lambda i: images.targets[i]),
+        train,
+        cache=cache,
+        start=start,
+        lam=fit_lam(regularisation(settings, degree), degree, train.means),
+        normals=images.normals,
+        learns=None if kept is None else _masks(kept, start.sh.shape[1], train.means),
     )
-    found = fit(start, cameras, targets, train, None, cache, start, by_kind, images.normals, learns)
     if found.stop_reason == StopReason.DIVERGED:
         raise InputError(
-            f"refit: a fit diverged, its loss rose to {found.losses[-1]:.3g}; lower `train.rates` of the run"
+            f"refit: a fit diverged, its loss rose to {found.losses[-1]:.3g}; "
+            "lower `train.rates` of the run"
         )
     return found.gaussians
 
 
-def _by_array(kept: Mapping[str, Mask], coefficients: int, means: str) -> dict[str, np.ndarray]:
-    """Which Gaussians learn a kind, as masks that broadcast to what is learned. coefficients: of a
-    colour channel."""
-    flat = ("opacity", "mean") if means == "normal" else ("opacity",)  # one number a Gaussian, [N]
-    masks = {
-        kind: mask if kind in flat else mask[:, None]
-        for kind, mask in kept.items()
-        if kind != DIRECTIONAL
-    }
-    of_degrees = [masks["colour"]]
-    if DIRECTIONAL in kept:
-        of_degrees += [kept[DIRECTIONAL][:, None]] * (coefficients - 1)
-    return masks | {"colour": np.stack(of_degrees, axis=1)}
+def _masks(kept: Mapping[str, Mask], coefficients: int, means: str) -> dict[str, np.ndarray]:
+    """Masks of `LeanModel.learned` in shapes that broadcast to the learned arrays. coefficients: of
+    a colour channel."""
+    flat = ("opacity", "mean") if means == "normal" else ("opacity",)  # arrays of shape [N]
+    masks = {kind: mask if kind in flat else mask[:, None] for kind, mask in kept.items()}
+    directional = masks.pop(DIRECTIONAL, None)
+    colour = [masks["colour"]]
+    if directional is not None:
+        colour += [directional] * (coefficients - 1)
+    return masks | {"colour": np.stack(colour, axis=1)}

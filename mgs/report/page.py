@@ -212,8 +212,7 @@ def _pictures(one: Shown, view: str, images: int) -> list[dict[str, str]]:
 
 
 def _compared(shown: Sequence[Shown], frame: Frame) -> dict[str, Any]:
-    """What can stand on either side of the divider at a view: the truth, and the renders of all
-    runs."""
+    """Pictures for either side of the divider at a view: the truth, and the renders of all runs."""
     view = frame.name
     sides = [{"label": "truth", "name": f"truth/{view}", "alt": f"Truth at {view}."}]
     for one in shown:

@@ -75,7 +75,8 @@ def read_shown(label: str, run: RunFiles, dataset: Dataset) -> Shown:
 
 
 def _notes(run: RunFiles, drawn: bool, measured: bool) -> list[str]:
-    """What is unfinished or missing, whether the last fit converged, and warnings of the run."""
+    """Sentences about what is unfinished or missing, the end of the run and of its last fit, and
+    the run's warnings."""
     taken, planned = len(run.taken), run.settings["seeds"] + run.settings["budget"]
     if run.ended is None:
         notes = [

@@ -22,47 +22,37 @@ def draw_views(
     exr: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """Draw a model through every camera, and write one PNG for each into the folder `out`.
+    """Draw a model through every camera; write one PNG for each into the folder `out`.
 
-    views: (path of the view's image, camera); the picture takes the name of the image
-    (`file_names`). space: "linear" or "srgb", in which the model's colours are to be blended
-    (`mgs.splat_ply.ply_colour_space`). background: colour behind the
-    Gaussians, sRGB in [0,1]. exr: write an OpenEXR file too, with linear colour R G B over the
-    background, opacity A and expected z-depth Z in metres, 0 where nothing is drawn. progress:
-    called as progress(views done, views in all). Raises InputError as `mgs.splat.render`, and if a
-    file cannot be written.
+    views: (path of the view's image, camera); a picture takes the name of the image (`file_names`).
+    space: "linear" or "srgb", in which the model's colours are blended
+    (`mgs.splat_ply.ply_colour_space`). background: sRGB in [0,1]. exr: write an OpenEXR file too,
+    with linear R G B over the background, opacity A and expected z-depth Z in metres, 0 where
+    nothing is drawn. progress: called as progress(views done, all). Raises InputError as
+    `mgs.splat.render`, and if a file cannot be written.
     """
     from mgs.splat import as_drjit, render
 
-    model = as_drjit(gaussians)
-    behind = (
-        linear_from_srgb(background) if space == "linear" else np.asarray(background, np.float32)
-    )
+    model, linear = as_drjit(gaussians), space == "linear"
+    behind = linear_from_srgb(background) if linear else np.asarray(background, np.float32)
     names = file_names([path for path, _ in views])
     for done, (name, (_, camera)) in enumerate(zip(names, views, strict=True)):
         progress(done, len(views))
         image = render(model, camera, behind.tolist())
         rgb = np.asarray(image.rgb)
-        write_png(out / f"{name}.png", rgb, linear=space == "linear")
+        write_png(out / f"{name}.png", rgb, linear=linear)
         if exr:
-            r, g, b = np.moveaxis(rgb if space == "linear" else linear_from_srgb(rgb), -1, 0)
-            channels = {
-                "R": r,
-                "G": g,
-                "B": b,
-                "A": np.asarray(image.alpha),
-                "Z": np.asarray(image.depth),
-            }
+            r, g, b = np.moveaxis(rgb if linear else linear_from_srgb(rgb), -1, 0)
+            alpha, depth = np.asarray(image.alpha), np.asarray(image.depth)
+            channels = {"R": r, "G": g, "B": b, "A": alpha, "Z": depth}
             write_exr(out / f"{name}.exr", channels)
     progress(len(views), len(views))
 
 
 def file_names(paths: Sequence[str]) -> list[str]:
-    """A file name, without suffix, for each image path: the image's own, with a number before it if
-    some have the same name."""
+    """File names without suffix for image paths: their own, with a number before them if some are
+    equal."""
     stems = [Path(path).stem for path in paths]
-    return (
-        stems
-        if len(set(stems)) == len(stems)
-        else [f"{i:04d}_{stem}" for i, stem in enumerate(stems)]
-    )
+    if len(set(stems)) == len(stems):
+        return stems
+    return [f"{i:04d}_{stem}" for i, stem in enumerate(stems)]

@@ -166,7 +166,7 @@ def _read_steps(folder: Path) -> list[dict[str, Any]]:
 
 
 def _cause(error: ValueError) -> str:
-    """What is wrong with a line: a key and its error, or "no JSON"."""
+    """Error of a damaged line: its key and what it lacks, or "no JSON"."""
     if not isinstance(error, ValidationError):
         return "no JSON"
     first = error.errors(include_url=False)[0]

@@ -22,6 +22,7 @@ A step is one chosen view; of a batch only the last step has a fit. A line of `s
 from __future__ import annotations
 
 import json
+import warnings
 import zipfile
 from dataclasses import asdict, fields
 from functools import cached_property
@@ -31,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from mgs.data.dataset import Dataset, Frame, load_dataset
-from mgs.errors import InputError
+from mgs.errors import InputError, Notice
 from mgs.files import atomic_path, read_json, write_json
 from mgs.gaussians import Gaussians
 from mgs.policy.from_file import label
@@ -39,6 +40,7 @@ from mgs.prior.build import Prior, load_prior
 from mgs.provenance import versions
 from mgs.run.settings import NbvSettings, check_settings, validated
 from mgs.run.state import State
+from mgs.splat_ply import read_ply, write_ply
 
 DATASET = "dataset"
 """Folder of a run that holds its dataset, where the run captures images (`mgs nbv --capture`)."""
@@ -89,7 +91,22 @@ class Run:
         if state is None:
             resume = f"`mgs nbv --resume {self.folder}`"
             raise InputError(f"{self.folder}: has no finished step yet; continue it with {resume}")
+        if "ended" in state.steps[-1]:
+            self._repair(state)
         return state
+
+    def _repair(self, state: State) -> None:
+        """Write gaussians.ply again where it is not the model of the checkpoint, and warn."""
+        path = self.folder / "gaussians.ply"
+        try:
+            intact = read_ply(path) == state.gaussians
+        except InputError:
+            intact = False
+        if not intact:
+            write_ply(path, state.gaussians)
+            warnings.warn(
+                Notice(f"{path}: was damaged; restored from checkpoint.npz"), stacklevel=3
+            )
 
     @property
     def taken(self) -> list[Frame]:

@@ -27,8 +27,8 @@ from mgs.gaussians import Gaussians
 from mgs.prior.build import build_prior, load_prior, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.report.evaluation import evaluate, evaluate_run
-from mgs.run.folder import State
 from mgs.run.nbv import resume_nbv, run_nbv
+from mgs.run.state import State
 from mgs.study.sweep import CELLS, Cell
 
 CURVES = ("images", "coverage", "test_psnr", "test_psnr_mask")
@@ -52,7 +52,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Size:
-    """Width and height of images in pixels, number of frames and of test views, samples per pixel."""
+    """Width and height of images in pixels, numbers of frames and test views, samples per pixel."""
 
     width: int
     height: int
@@ -192,7 +192,11 @@ def run_policy(
 ) -> dict[str, Any]:
     """Run a policy. Returns a list for each of CURVES, one number for each fit, and "taken", the
     indices of the frames in the order taken."""
-    state = run_or_resume(root, out, dataset, prior, {"evaluate_every": 1, **settings})
+    return curves_of(run_or_resume(root, out, dataset, prior, {"evaluate_every": 1, **settings}))
+
+
+def curves_of(state: State) -> dict[str, Any]:
+    """Result of `run_policy` from the last state of a run."""
     fitted = [step for step in state.steps if "loss" in step]
     return {key: [step[key] for step in fitted] for key in CURVES} | {"taken": state.taken}
 
@@ -229,7 +233,7 @@ def _timed(
 def in_new_process(
     task: Callable[..., dict[str, Any]], out: Path, *arguments: Any
 ) -> dict[str, Any]:
-    """Result of a function called in a new process, whose memory is its own. out: named in messages.
+    """Result of a function called in a new process, whose memory is its own. out: for messages.
 
     Raises InputError if that process is killed, and what the function raises.
     """

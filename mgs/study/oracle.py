@@ -1,9 +1,6 @@
-"""An oracle that looks at the truth: at every step the view whose fit is best on the test views.
-What there is to be won.
-
-It is no policy: it reads the images of all candidates, and of the test views. It is greedy, so
-another choice could be better still.
-"""
+"""An oracle that sees the truth: at every step it takes the view whose fit is best on the test
+views. It reads the images of all candidates, so it is no policy; it is greedy, so better choices may
+exist."""
 
 from __future__ import annotations
 
@@ -20,20 +17,20 @@ from mgs.run.operations import operations_of, psnr_measure
 from mgs.run.problem import Problem, no_progress
 from mgs.run.state import Fitted, State
 from mgs.splat import ListCache
-from mgs.study.case import CURVES, test_views_of
+from mgs.study.case import curves_of, test_views_of
 
 
 def oracle(tests: Dataset) -> Chooser:
-    """A chooser: fits every candidate in reach, takes the best on the test views; its score is the
-    mean PSNR over them, dB. Of equals the first."""
-    judge = psnr_measure(tests, ListCache())
+    """Chooser that fits to every candidate in reach; its score is the mean PSNR over the test views,
+    dB. Of equals it takes the first."""
+    measure = psnr_measure(tests, ListCache())
 
     def choose(problem: Problem, state: Fitted, fisher: Any = None) -> tuple[int, float]:
         left = problem.reachable(state.taken)
         fits = (fit_views(problem, [*state.taken, frame], state) for frame in left)
-        worth = [judge(fit.gaussians, [])["psnr"] for fit in fits]
-        best = max(range(len(left)), key=lambda k: worth[k])
-        return left[best], worth[best]
+        scores = [measure(fit.gaussians, [])["psnr"] for fit in fits]
+        best = max(range(len(left)), key=lambda k: scores[k])
+        return left[best], scores[best]
 
     return choose
 
@@ -41,25 +38,17 @@ def oracle(tests: Dataset) -> Chooser:
 def run_oracle(
     root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]
 ) -> dict[str, Any]:
-    """A task, as `mgs.study.case.run_policy` with the same result. settings: without a policy.
-    Goes on where it stopped."""
+    """Task: start or resume a run of the oracle; returns what `mgs.study.case.run_policy` does.
+    settings: without a policy. Raises InputError if there are no test views."""
     run = out / "run"
     if not (run / "config.json").is_file():
-        where = root / prior
-        given = {
-            "policy": "random",
-            "evaluate_every": 1,
-            **settings,
-            "train": {**COLOURS_ALONE, **settings.get("train", {})},
-        }
-        start_run(root / dataset, run, prior=where, **given)
-    state = choose_all(run)
-    return {key: [step[key] for step in state.steps] for key in CURVES} | {"taken": state.taken}
+        train = {**COLOURS_ALONE, **settings.get("train", {})}
+        given = {"policy": "random", "evaluate_every": 1, **settings, "train": train}
+        start_run(root / dataset, run, prior=root / prior, **given)
+    return curves_of(_choose_all(run))
 
 
-def choose_all(folder: Path) -> State:
-    """Run or resume the oracle in a run folder to the end of its budget. Raises InputError if there
-    are no test views."""
+def _choose_all(folder: Path) -> State:
     run = open_run(folder)
     chooser = oracle(test_views_of(run.dataset))
     operations = operations_of(run.dataset, run.prior, run.settings)

@@ -92,8 +92,8 @@ COLUMNS = 3
 
 
 def draw_panels(path: Path, panels: Sequence[Panel], rows: Sequence[Row]) -> None:
-    """Draw the panels that have rows into one figure. Raises InputError if the file cannot be
-    written."""
+    """Draw the panels that have rows into one figure; panels with the same groups share a legend.
+    Raises InputError if the file cannot be written."""
     import matplotlib
 
     drawn = [(panel, chosen) for panel in panels if (chosen := _rows_of(panel, rows))]
@@ -102,16 +102,21 @@ def draw_panels(path: Path, panels: Sequence[Panel], rows: Sequence[Row]) -> Non
     heights = [max(_size(*plot)[1] for plot in line) for line in lines]
     widths = [max(_size(*plot)[0] for plot in drawn[k::columns]) for k in range(columns)]
     ratios = {"width_ratios": widths, "height_ratios": heights}
-    with matplotlib.rc_context(STYLE):
+    groups = [_groups(*plot) for plot in drawn]
+    shared = len(drawn) > 1 and all(one == groups[0] != [None] for one in groups)
+    with matplotlib.rc_context(STYLE | {"legend.fontsize": 8}):
         figure = new_figure(sum(widths), sum(heights))
         axes = figure.subplots(len(lines), columns, squeeze=False, gridspec_kw=ratios).ravel()
         for axis, (panel, chosen) in zip(axes, drawn, strict=False):
             (_draw_lines if _numeric(panel, chosen) else _draw_names)(axis, panel, chosen)
             axis.set_title(panel.title)
-            if panel.by:
-                axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.02), ncols=2)
+            if panel.by and not shared:
+                axis.legend(loc="lower center", bbox_to_anchor=(0.5, 1.02), ncols=2)
         for axis in axes[len(drawn) :]:
             axis.remove()
+        if shared:
+            handles, labels = axes[0].get_legend_handles_labels()
+            figure.legend(handles, labels, loc="outside upper center", ncols=2 * columns)
         save_figure(figure, path)
 
 
@@ -134,11 +139,11 @@ def _size(panel: Panel, rows: Sequence[Row]) -> tuple[float, float]:
     legend = 0.17 * ((groups + 1) // 2) if panel.by else 0.0
     if _numeric(panel, rows):
         return WIDTH, HEIGHT + legend
-    height = 0.8 + PER_NAME * len(names) * max(1.0, 0.7 * groups)
-    return WIDTH - 0.4 + PER_LETTER * max(map(len, names)), height + legend
+    height = 0.8 + PER_NAME * len(names) * max(1.0, 0.6 * groups)
+    return WIDTH + PER_LETTER * max(map(len, names)), height + legend
 
 
-def _styles(groups: Sequence[Any]) -> list[dict[str, Any]]:
+def group_styles(groups: Sequence[Any]) -> list[dict[str, Any]]:
     """Keywords for matplotlib: policies as in all figures, other groups in the order of the same
     table."""
     of_policies = all(group in POLICY_STYLE for group in groups)
@@ -162,26 +167,36 @@ def _draw_lines(axis: Axes, panel: Panel, rows: Sequence[Row]) -> None:
     """Lines through the means against a number, with their intervals as bands."""
     groups = _groups(panel, rows)
     crowded = len({row[panel.x] for row in rows}) > 30
-    for group, style in zip(groups, _styles(groups), strict=True):
+    for group, style in zip(groups, group_styles(groups), strict=True):
         xs, points = _points(panel, rows, group)
         order = np.argsort(xs)
         x, (mean, low, high) = np.asarray(xs, float)[order], points[:, order]
         axis.plot(x, mean, **(style | {"marker": ""} if crowded else style))
         axis.fill_between(x, low, high, color=style["color"], alpha=0.15, linewidth=0)
     if panel.log:
-        axis.set_xscale("log")
-        values = sorted({float(row[panel.x]) for row in rows})
-        if len(values) < 8 and max(values) < 1e4 and min(values) > 1e-3:
-            axis.set_xticks(values, [f"{value:.3g}" for value in values])
-            axis.minorticks_off()
+        logarithmic(axis)
+    elif all(isinstance(row[panel.x], int) for row in rows):
+        axis.xaxis.get_major_locator().set_params(integer=True)
     axis.set(xlabel=panel.x_label, ylabel=textwrap.fill(panel.y_label, 31))
+
+
+def logarithmic(axis: Axes) -> None:
+    """Make the x axis logarithmic, with plain numbers at 1, 2 and 5 where it spans few decades."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    low, high = axis.dataLim.intervalx
+    axis.set_xscale("log")
+    axis.xaxis.set_minor_formatter(NullFormatter())
+    if low > 1e-3 and high < min(1e6, 300 * low):
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.xaxis.set_major_formatter(lambda x, _: f"{x:g}" if x < 1e4 else f"{x / 1000:g}k")
 
 
 def _draw_names(axis: Axes, panel: Panel, rows: Sequence[Row]) -> None:
     """A line for each name: the mean as a point, its interval as a bar."""
     groups = _groups(panel, rows)
     names = list(dict.fromkeys(row[panel.x] for row in rows))
-    for k, (group, style) in enumerate(zip(groups, _styles(groups), strict=True)):
+    for k, (group, style) in enumerate(zip(groups, group_styles(groups), strict=True)):
         shown, (mean, low, high) = _points(panel, rows, group)
         offset = (k - (len(groups) - 1) / 2) * 0.6 / len(groups)
         place = [names.index(name) + offset for name in shown]
@@ -195,4 +210,4 @@ def _draw_names(axis: Axes, panel: Panel, rows: Sequence[Row]) -> None:
     axis.margins(x=0.08)
     axis.autoscale(axis="x")
     y_label = textwrap.fill(panel.x_label, 12 + len(names))
-    axis.set(xlabel=textwrap.fill(panel.y_label, 40), ylabel=y_label)
+    axis.set(xlabel=textwrap.fill(panel.y_label, 31), ylabel=y_label)

@@ -16,16 +16,19 @@ from typing import Any
 
 import numpy as np
 
-from mgs.data.dataset import Frame, load_dataset, target_of
-from mgs.fit.fitting import fit
+from mgs.data.dataset import Frame, load_dataset
+from mgs.fit.fitting import Fit, fit
 from mgs.fit.settings import RATES, TrainSettings
 from mgs.gaussians import Gaussians
 from mgs.policy.criteria import DIRECTIONAL_STD, PIXEL_NOISE
 from mgs.policy.poses import seed_views
 from mgs.prior.build import load_prior
-from mgs.prior.initial import initial_gaussians, warm_start
 from mgs.report.evidence import fit_lam, last_images, lean_fit, regularisation
+from mgs.run.loop import fit_views
+from mgs.run.operations import operations_of
+from mgs.run.problem import Problem
 from mgs.run.settings import NbvSettings
+from mgs.run.state import Fitted
 from mgs.splat import ListCache, fisher, groups
 from mgs.splat.pruning import prune
 from mgs.study.case import Case, Scene, Size, judge
@@ -77,8 +80,8 @@ CLOSE = 0.1
 
 @dataclass(frozen=True)
 class ParsimonySize:
-    """Size of the study. counts: fixed numbers of Gaussians. views: images fitted, the first `seeds`
-    at once."""
+    """Size of the study. counts: fixed numbers of Gaussians. views: images that are fitted, the
+    first `seeds` at once."""
 
     scenes: tuple[str, ...]
     counts: tuple[int, ...]
@@ -141,16 +144,11 @@ def cells_of(size: ParsimonySize) -> list[Cell]:
 
 
 def views_in_order(positions: np.ndarray, centre: np.ndarray, views: int, seeds: int) -> list[int]:
-    """Indices of views evenly spaced in azimuth, ordered so that the first `seeds` are evenly spaced
-    too. positions: [C,3] of the cameras, +Z up; centre: [3]."""
+    """Indices of views evenly spaced in azimuth, ordered so that the first `seeds` are evenly
+    spaced too. positions: [C,3] of the cameras, +Z up; centre: [3]."""
     spread = list(seed_views(positions, centre, views))
     step = max(views // seeds, 1)
     return [view for first in range(step) for view in spread[first::step]]
-
-
-def _frames(frames: Sequence[Frame], points: np.ndarray, views: int, seeds: int) -> list[Frame]:
-    positions = np.array([frame.camera.position for frame in frames])
-    return [frames[i] for i in views_in_order(positions, points.mean(0), views, seeds)]
 
 
 def fit_and_judge(
@@ -171,29 +169,24 @@ def fit_and_judge(
     directional_std: the constant tau of colours of degrees above 0, so that a result with another
     value is not reused.
     """
-    data, known = load_dataset(root / dataset), load_prior(root / prior)
     rates = {kind: rate if kind in LEARNED[learned] else 0.0 for kind, rate in RATES.items()}
     train = TrainSettings(rates=rates)
-    settings = NbvSettings(dataset=root / dataset, prior=root / prior, train=train)
+    settings = NbvSettings(dataset=root / dataset, prior=root / prior, seeds=seeds, train=train)
     lam, cache = regularisation(settings, degree), ListCache()
-    by_kind = fit_lam(lam, degree)
-    frames = _frames(data.frames, known.points, views, seeds)
-    cameras, targets = [frame.camera for frame in frames], [target_of(frame) for frame in frames]
-
-    def start_of(count: int) -> Gaussians:
-        """Gaussians before training, in the colours of the first frames, as in `mgs nbv`."""
-        of_seeds, coloured = (initial_gaussians(known, frames[:k])[0] for k in (seeds, count))
-        return replace(of_seeds, sh=coloured.sh).with_degree(degree)
-
-    start = model = start_of(seeds)
-    seconds, passes = 0.0, 0
-    for step, count in enumerate(range(seeds, views + 1)):
-        before, start = start, start_of(count)
-        model, settings_now = warm_start(model, before, start), settings.train_at(step)
-        began, some = time.perf_counter(), targets[:count]
-        found = fit(model, cameras[:count], some, settings_now, None, cache, start, by_kind)
-        seconds += time.perf_counter() - began
+    problem, spent = _problem(settings, degree, cache), list[float]()
+    order = views_in_order(problem.positions, problem.centre, views, seeds)
+    problem.seeds = order[:seeds]
+    for i in order:
+        problem.image(i)  # reads it, which is not timed
+    before, passes = None, 0
+    for count in range(seeds, views + 1):
+        began = time.perf_counter()
+        found = fit_views(problem, order[:count], before)
+        spent.append(time.perf_counter() - began)
         passes, model = passes + found.passes, found.gaussians
+        nothing = np.zeros((0, 0))  # no view is chosen by information
+        before = Fitted(model, nothing, nothing, order[:count])
+    cameras = [problem.cameras[i] for i in order]
     kinds = groups(degree)
     columns = np.concatenate([np.r_[kinds[kind]] for kind in LEARNED[learned]])
     information = [fisher(model, camera, cache=cache).astype(np.float64) for camera in cameras]
@@ -208,10 +201,27 @@ def fit_and_judge(
         "gaussians": len(model),
         "parameters": int(H.size),
         "informed": float((lam[columns] < H).mean()),
-        "seconds": seconds,
+        "seconds": sum(spent),
         "passes": passes,
         "pruned": pruned,
     }
+
+
+def _problem(settings: NbvSettings, degree: int, cache: ListCache) -> Problem:
+    """Problem of a run whose colours have this SH degree."""
+    data, prior = load_dataset(settings.dataset), load_prior(settings.prior)
+    usual = operations_of(data, prior, settings)
+    lam = fit_lam(regularisation(settings, degree), degree)
+
+    def fit_degree(
+        model: Gaussians, start: Gaussians, cameras: Any, targets: Any, train: Any, on_pass: Any
+    ) -> Fit:
+        return fit(model, cameras, targets, train, on_pass, cache, start, lam)
+
+    def initial(frames: list[Frame]) -> Gaussians:
+        return usual.initial(frames).with_degree(degree)
+
+    return Problem(data, settings, replace(usual, initial=initial, fit=fit_degree))
 
 
 def fit_lean_and_judge(
@@ -221,7 +231,9 @@ def fit_lean_and_judge(
     data, known = load_dataset(root / dataset), load_prior(root / prior)
     where: dict[str, Any] = {"dataset": root / dataset, "prior": root / prior}
     settings = NbvSettings(**where, seeds=seeds, train=TrainSettings())
-    frames = _frames(data.frames, known.points, views, seeds)
+    positions = np.array([frame.camera.position for frame in data.frames])
+    order = views_in_order(positions, known.points.mean(0), views, seeds)
+    frames = [data.frames[i] for i in order]
     images, began = last_images(settings, known, frames), time.perf_counter()
     found = lean_fit(images, settings, cache=ListCache())
     seconds = time.perf_counter() - began
@@ -314,8 +326,8 @@ def _holds(row: Row) -> str:
 def run_study(
     out: Path, size: ParsimonySize, report: Report, command: str, preset: str
 ) -> tuple[list[Row], list[Row]]:
-    """Do all cells that are not done, and write parsimony.json, .csv, .md and .png. Returns the rows
-    of the automatic choices, and the judged claims."""
+    """Do all cells that are not done, and write parsimony.json, .csv, .md and .png. Returns the
+    rows of the automatic choices, and the judged claims."""
     found = run_cells(out, cells_of(size), report)
     rows = [row for scene in size.scenes for row in rows_of(size, found, scene)]
     priors = {scene: found[size.case(scene, AUTO).prior_name] for scene in size.scenes}

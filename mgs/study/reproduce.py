@@ -111,8 +111,8 @@ class RunSize:
 
 @dataclass(frozen=True)
 class Rock:
-    """A scene and the seed of its rock, or a mesh file and its hash in MESH_SCENE. index: place among
-    the rocks, and seed of the runs."""
+    """A scene and the seed of its rock, or a mesh file and its hash in MESH_SCENE. index: place
+    among the rocks, and seed of the runs."""
 
     scene: str
     seed: int

@@ -26,8 +26,8 @@ Found = Mapping[str, Mapping[str, Any]]
 Rows = list[Row]
 
 MEASURES = ("test_psnr", "test_psnr_mask")
-"""Mean PSNR over the test views, dB: of the full frame, by which policies are judged, and inside the
-rock's mask."""
+"""Mean PSNR over the test views, dB: of the full frame, by which policies are judged, and inside
+the rock's mask."""
 
 PAPER_TABLE = (("D-Optimal NBV", 54, 25.97, 0.9654), ("Coverage-Greedy", 50, 26.06, 0.9648))
 """Table I of the paper: method, images, PSNR in dB and SSIM over all 100 views of its own rock,
@@ -263,7 +263,7 @@ def _reach_text(of: Mapping[str, Any], policy: str) -> str:
 
 
 def largest_gap(taken: Sequence[int], frames: int) -> float:
-    """Largest angle, degrees, between neighbours among the frames taken of an evenly spaced ring."""
+    """Largest angle between neighbours among the frames taken of an evenly spaced ring."""
     turned = np.sort(taken)
     return float(np.diff(turned, append=turned[0] + frames).max() * 360 / frames)
 
@@ -280,8 +280,8 @@ SEED_COLUMNS: dict[str, str | Callable[[Row], str]] = {
 
 
 def seed_rows(results: Found, runs: Sequence[Run]) -> tuple[Rows, Rows]:
-    """A row for each policy and number of seeds, and the rows by rock: the last model, its difference
-    from four seeds, coverage of the seeds, and `largest_gap` (mean, most)."""
+    """A row for each policy and number of seeds, and the rows by rock: the last model, its
+    difference from four seeds, coverage of the seeds, and `largest_gap` (mean, most)."""
     rows = with_differences(
         last_rows(results, runs), "over_four", {"seeds": reproduce.SEEDS}, ("policy", "rock")
     )

@@ -1,8 +1,8 @@
 """Resumable sweeps: cells of work, each done once.
 
-A cell is a function and its JSON arguments. Its result is kept in OUT/cells/NAME/result.json, beside
-the files it writes, and is reused as long as function and arguments stay the same. Cells run one
-after another in this process, or several at a time in Dask workers; the results are the same.
+A cell is a function and its JSON arguments. Its result is kept in OUT/cells/NAME/result.json,
+beside the files it writes, and is reused as long as function and arguments stay the same. Cells run
+one after another in this process, or several at a time in Dask workers; the results are the same.
 """
 
 from __future__ import annotations
@@ -117,9 +117,9 @@ def run_cells(
     workers: number of processes. One: this process does all cells. More: independent cells run at
     the same time and share the cores of this machine. scheduler: address of a Dask scheduler whose
     workers are used instead. They must see `root` under the same path and have one thread each,
-    because a cell is parallel in itself. Raises what a cell raises; InputError if the scheduler does
-    not answer, has no worker, or a worker with several threads, and if a cell's worker is killed
-    repeatedly. Finished cells are kept.
+    because a cell is parallel in itself. Raises what a cell raises; InputError if the scheduler
+    does not answer, has no worker, or a worker with several threads, and if a cell's worker is
+    killed repeatedly. Finished cells are kept.
     """
     root = root.resolve()  # workers may have another current folder
     by_name = {cell.name: cell for cell in cells}
@@ -149,6 +149,8 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
     settings = {
         "distributed.worker.profile.enabled": False,
         "distributed.comm.timeouts.connect": CONNECT_SECONDS,
+        # Poisson surfaces start a thread for each core, which would keep all workers waiting.
+        "distributed.nanny.pre-spawn-environ.OMP_WAIT_POLICY": "passive",
     }
     silent = logging.CRITICAL + 1  # killed workers are retried, and errors of cells are raised
     loggers = [logging.getLogger(name) for name in ("distributed", "tornado.application")]

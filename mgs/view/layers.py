@@ -1,8 +1,8 @@
-"""The layers of the viewer, as colours of Gaussians and as images of the kernel.
+"""Layers of the viewer, as colours of Gaussians and as images of the kernel.
 
-A browser draws Gaussians in sRGB, sorted as a whole and without spherical harmonics, so what it
-shows while the camera moves is an approximation. The kernel's images are the model as `mgs.render`
-draws it.
+A browser draws Gaussians in sRGB, sorted as a whole and without spherical harmonics: an
+approximation, shown while the camera moves. The kernel's images are the model as `mgs.render` draws
+it.
 """
 
 from __future__ import annotations
@@ -11,35 +11,40 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
+from mgs.gaussians import Gaussians
 from mgs.report.diagnostics import PANELS, VISIBLE, view_maps
 from mgs.rotation import rotmat_from_quat
+from mgs.view.access import plain
 from mgs.view.subject import SCALARS, Subject
 
 FAR = 160.0
-"""Depth of pixels that show no model, metres: what the browser draws over such a pixel is nearer.
-viser's images of depth end at 167 m."""
+"""Depth of pixels that show no model, metres: the browser draws its objects in front of it. viser's
+images of depth end at 167 m."""
 
 
 def layers(subject: Subject) -> list[str]:
-    """The layers that a subject has."""
+    """Names of the layers that a subject has."""
     return ["colour", "alpha", "depth", *(name for name in SCALARS if name in subject.scalars)]
+
+
+def _model(subject: Subject) -> Gaussians:
+    assert subject.gaussians is not None
+    return subject.gaussians
 
 
 def covariances(subject: Subject) -> np.ndarray:
     """Covariance matrices of the Gaussians in the world, m², float32 [N,3,3]."""
-    g = subject.gaussians
-    assert g is not None
+    g = _model(subject)
     axes = rotmat_from_quat(g.quats) * np.exp(g.log_scales.astype(np.float64))[:, None, :]
     return (axes @ axes.transpose(0, 2, 1)).astype(np.float32)
 
 
 def gaussian_colours(subject: Subject, layer: str) -> np.ndarray:
-    """Colours of the Gaussians in a layer, sRGB uint8 [N,3]. Of alpha all are white; of depth,
-    which is no property of a Gaussian, all are grey."""
-    g = subject.gaussians
-    assert g is not None
+    """Colours of the Gaussians in a layer, sRGB uint8 [N,3]: white for alpha; grey for depth, which
+    is no property of a Gaussian."""
+    g = _model(subject)
     if layer == "colour":
-        return np.round(_display(subject, g.rgb) * 255).astype(np.uint8)
+        return _eight_bits(_display(subject, g.rgb))
     if layer in subject.scalars:
         return painted(subject.scalars[layer], *scale(subject, layer), PANELS[layer][1])
     return np.full((len(g), 3), 255 if layer == "alpha" else 128, np.uint8)
@@ -48,52 +53,53 @@ def gaussian_colours(subject: Subject, layer: str) -> np.ndarray:
 def kernel_image(
     subject: Subject, camera: Camera, layer: str
 ) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-    """(sRGB uint8 [H,W,3], z-depth float32 [H,W], (low, high) of the colour scale) of a layer seen
-    from a camera. Lengths are those that are shown, but in the colour scale those of the world
-    (`Subject.scale`).
+    """Draw a layer from a camera: sRGB uint8 [H,W,3], z-depth float32 [H,W], and (low, high) of the
+    colour scale.
 
-    Behind the model it is black, and FAR away. Layers but colour and alpha are drawn where the
-    opacity is at least VISIBLE.
+    The camera and the depth have the lengths that are shown; a colour scale of depth has those of
+    the world (`Subject.scale`). Behind the model it is black, and FAR away. Layers other than
+    colour and alpha are drawn where the opacity is at least VISIBLE.
     """
-    g = subject.gaussians
-    assert g is not None
     scalars = {layer: subject.scalars[layer]} if layer in subject.scalars else {}
-    maps = view_maps(g, camera, scalars)
+    maps = view_maps(_model(subject), camera, scalars)
     seen = maps["A"] >= VISIBLE
     depth = np.where(seen, maps["Z"], FAR).astype(np.float32)
     if layer == "colour":
         rgb = np.stack([maps[channel] for channel in "RGB"], axis=-1)
-        return np.round(_display(subject, rgb) * 255).astype(np.uint8), depth, (0.0, 1.0)
+        return _eight_bits(_display(subject, rgb)), depth, (0.0, 1.0)
     if layer == "alpha":
-        grey = np.round(np.clip(maps["A"], 0, 1) * 255).astype(np.uint8)
+        grey = _eight_bits(np.clip(maps["A"], 0, 1))
         return np.stack([grey] * 3, axis=-1), depth, (0.0, 1.0)
     if layer == "depth":
         found = maps["Z"][seen]
         low, high = (float(found.min()), float(found.max())) if found.size else (0.0, 1.0)
         values, colours = maps["Z"], PANELS["Z"][1]
+        ends = low / subject.scale, high / subject.scale
     else:
-        (low, high), values, colours = scale(subject, layer), maps[layer], PANELS[layer][1]
-    ends = (low / subject.scale, high / subject.scale) if layer == "depth" else (low, high)
+        low, high = ends = scale(subject, layer)
+        values, colours = maps[layer], PANELS[layer][1]
     return painted(values, low, high, colours) * seen[..., None].astype(np.uint8), depth, ends
 
 
 def scale(subject: Subject, layer: str) -> tuple[float, float]:
-    """The values at the ends of the colour scale of a scalar: for the information from 0 to what
-    0.1 % of the Gaussians exceed, so the same from everywhere; for the others from 0 to 1."""
+    """Ends of the colour scale of a scalar: information from 0 to what 0.1 % of the Gaussians
+    exceed, the others from 0 to 1."""
     if layer != "information":
         return 0.0, 1.0
     return 0.0, max(float(np.quantile(subject.scalars[layer], 0.999)), 1e-9)
 
 
 def legend(layer: str, ends: tuple[float, float], unit: str) -> str:
-    """What the colours of a layer mean, in one line. unit: what a length of 1 is called."""
-    low, high = ends
+    """Meaning of the colours of a layer, in one line. unit: name of a length of 1."""
+    (low, high), name = ends, plain(unit)
     return {
         "colour": "The colours of the model.",
         "alpha": "Opacity: black 0, white 1.",
-        "depth": f"Depth: dark {low:.3g} {unit}, bright {high:.3g} {unit}. Grey while the camera moves.",
+        "depth": f"Depth: dark {low:.3g} {name}, bright {high:.3g} {name}. "
+        "Grey while the camera moves.",
         "information": f"Information gained: dark 0, bright {high:.0f} nats and more.",
-        "uncertainty": "Variance left over that of the prior: blue 0, all known; yellow 1, nothing.",
+        "uncertainty": "Variance left over that of the prior: blue 0, all known; yellow 1, "
+        "nothing.",
         "unobserved": "Yellow: no image has seen this part of the surface.",
     }[layer]
 
@@ -105,6 +111,10 @@ def painted(values: np.ndarray, low: float, high: float, colours: str) -> np.nda
 
     share = np.clip((np.asarray(values, np.float64) - low) / max(high - low, 1e-12), 0, 1)
     return np.ascontiguousarray(matplotlib.colormaps[colours](share, bytes=True)[..., :3])
+
+
+def _eight_bits(values: np.ndarray) -> np.ndarray:
+    return np.round(values * 255).astype(np.uint8)
 
 
 def _display(subject: Subject, rgb: np.ndarray) -> np.ndarray:

@@ -1,9 +1,8 @@
-"""The viewer: a local web server (viser) that shows a subject, and draws the kernel's own image
-where a camera rests.
+"""The viewer: a local web server (viser) that shows a subject, with the kernel's image where a
+camera rests.
 
-viser calls back from threads of its own. These only note what is wanted; everything is computed in
-`Viewer.tick`, which the thread that made the viewer calls again and again, because Mitsuba's
-variant belongs to a thread.
+viser calls back from its own threads. These only record requests; everything is computed in
+`Viewer.tick`, on the thread that made the viewer, because Mitsuba's variant belongs to a thread.
 """
 
 from __future__ import annotations
@@ -27,54 +26,61 @@ from mgs.errors import InputError
 from mgs.report.page_plots import FRUSTUM
 from mgs.rotation import rotmat_from_quat
 from mgs.view import layers
+from mgs.view.access import Access, plain
 from mgs.view.subject import View, read_subject
 
 REST = 0.2
-"""Seconds without a movement after which a camera rests."""
+"""Seconds without movement after which a camera counts as resting."""
 
 FOLLOW = 1.0
-"""Seconds between two looks at the run folder."""
+"""Seconds between two checks of the run folder."""
 
 PIXELS = 1e6
-"""Most pixels of an image of the kernel. In a larger window it is enlarged."""
+"""Most pixels of an image of the kernel; a larger window shows it enlarged."""
+
+LARGEST_NUMBER = 1e6
+"""Bound of every number that a browser window sends: pixels, and lengths of the shown world."""
 
 PREVIEW = 480
 """Width of the image that a click on a camera shows, pixels."""
 
 COLOURS = {"seed": (213, 94, 0), "chosen": (0, 158, 115), "candidate": (130, 130, 130)}
-"""Of cameras, by their role; sRGB."""
+"""Colours of cameras by role, sRGB."""
 
 SELECTED = (255, 220, 60)
 """Colour of the camera that was clicked."""
 
-LINE = 1.5
+THIN: dict[str, Any] = {"thickness": 1.5, "thickness_units": "screen"}
 """Thickness of lines, pixels of the screen."""
 
 BLACK = np.zeros((2, 2, 3), np.uint8)
-"""The background where there is no image of the kernel."""
+"""Background without an image of the kernel."""
 
 
 def check_address(host: str, port: int) -> None:
     """Raises InputError if no server can listen there: the port is taken or not allowed, or the
     host is not this machine."""
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM
-        )[0]
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+        family, kind, protocol, _, address = found[0]
         with socket.socket(family, kind, protocol) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
     except OSError as error:
         reason = error.strerror or str(error)
         raise InputError(
-            f"--host {host} --port {port}: cannot be served there ({reason}); choose another port or host"
+            f"--host {host} --port {port}: cannot be served there ({reason}); "
+            "choose another port or host"
         ) from None
 
 
 @dataclass
 class _Client:
-    """A browser window: its handle, its own copy of the Gaussians, when its camera last moved, and
-    what was drawn for it."""
+    """A browser window.
+
+    splats: its copy of the Gaussians. moved: time of the last movement of its camera. drawn:
+    (moved, version) of the last drawing. covered: whether the kernel's image is shown.
+    """
 
     handle: Any
     splats: Any
@@ -85,9 +91,9 @@ class _Client:
 
 
 class Viewer:
-    """Serves a run folder or a PLY, until `close`. `tick` has to be called again and again.
+    """Serve a run folder or a PLY until `close`. `tick` must be called repeatedly.
 
-    follow: look every FOLLOW seconds for a new step of the run. Raises InputError as `read_subject`
+    follow: look for a new step of the run every FOLLOW seconds. Raises InputError as `read_subject`
     and `check_address`, and if viser is not installed.
     """
 
@@ -104,14 +110,13 @@ class Viewer:
                 "mgs view: needs viser, which is not installed; `pip install viser`"
             ) from None
         check_address(host, port)
-        # A window may be closed while its image is drawn; viser then warns that nobody gets it.
+        # A window may be closed while its image is drawn; viser then warns.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-        with redirect_stdout(
-            StringIO()
-        ):  # viser greets, and names every window; the command says what is needed
+        self.access = Access(host)
+        with redirect_stdout(StringIO()), self.access.guarding():  # viser prints a greeting
             self.server = viser.ViserServer(host, port, label="mgs", verbose=False)
         self.port = self.server.get_port()
-        if port not in (0, self.port):  # taken since the check: viser then goes on to the next
+        if port not in (0, self.port):  # taken since the check: viser then takes the next one
             self.close()
             raise InputError(f"--port {port}: is in use; choose another one")
         self.clients: dict[int, _Client] = {}
@@ -131,7 +136,7 @@ class Viewer:
             self.server.stop()
 
     def tick(self) -> None:
-        """Do what is due now: read a new step, draw for the cameras that rest."""
+        """Read a new step, and draw for the cameras that rest."""
         now = time.monotonic()
         if self.follow and now >= self.next_look:
             self.next_look = now + FOLLOW
@@ -142,15 +147,18 @@ class Viewer:
         for client in list(self.clients.values()):
             due = client.drawn != (client.moved, self.version) and now >= client.moved + REST
             if due and self.subject.gaussians is not None:
-                self._draw(client)
+                try:
+                    self._draw(client)
+                except Exception:  # whatever a window sent, the others go on
+                    client.drawn = (client.moved, self.version)
 
     def _stamp(self) -> list[int]:
-        """Changes when a step is committed, and when the run was measured."""
+        """Times of change of the files that a step or `mgs eval` writes."""
         files = [self.path / name for name in ("checkpoint.npz", "metrics.json")]
         return [file.stat().st_mtime_ns if file.is_file() else 0 for file in files]
 
     def _scene(self) -> None:
-        """Backdrop, light, first camera, mesh."""
+        """Set up background, light, first camera, and mesh."""
         server, subject = self.server, self.subject
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         server.scene.set_up_direction(subject.up)
@@ -161,24 +169,21 @@ class Viewer:
         server.initial_camera.look_at = centre
         up, turn = np.array(subject.up), upright(subject.up)
         direction = turn.T @ np.array([1.0, -1.0, 0.8]) * 2 * size
-        if subject.views:  # as from the first camera, but from above and behind the cameras, so that they are seen too
+        if subject.views:  # above and behind the first camera, so that the cameras are seen too
             eye = subject.views[0].frame.camera.position
             direction = 1.6 * (eye - centre) + np.linalg.norm(eye - centre) * up
             server.initial_camera.fov = _vertical_fov(subject.views[0].frame.camera)
         server.initial_camera.position = centre + direction
         if subject.mesh is not None:
             mesh = subject.mesh
+            vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
             self.mesh = server.scene.add_mesh_simple(
-                "/mesh",
-                mesh.vertices.astype(np.float32),
-                mesh.faces.astype(np.uint32),
-                color=(150, 160, 175),
-                visible=False,
+                "/mesh", vertices, faces, color=(150, 160, 175), visible=False
             )
 
     def _extent(self) -> tuple[np.ndarray, float]:
-        """Middle of the subject, metres, and its size: the radius that holds 95 % of the Gaussians,
-        or the mesh."""
+        """Middle of the subject and its size: the radius that holds 95 % of the Gaussians, or of
+        the mesh or the cameras where there is no model."""
         subject = self.subject
         points = subject.gaussians.means if subject.gaussians is not None else None
         if points is None or len(points) == 0:
@@ -188,14 +193,11 @@ class Viewer:
         return centre, max(float(np.quantile(np.linalg.norm(points - centre, axis=1), 0.95)), 1e-6)
 
     def _controls(self) -> None:
-        """The panel."""
-        gui = self.server.gui
+        """Add the panel."""
+        gui, names = self.server.gui, layers.layers(self.subject)
         self.title = gui.add_markdown("")
-        self.layer: Any = gui.add_dropdown(
-            "Layer",
-            layers.layers(self.subject),
-            hint="What is drawn: by the kernel, and by the browser",
-        )
+        hint = "What is drawn: by the kernel, and by the browser"
+        self.layer: Any = gui.add_dropdown("Layer", names, hint=hint)
         self.legend = gui.add_markdown("")
         self.exact = gui.add_checkbox(
             "Exact at rest", True, hint="The kernel's own image while the camera rests"
@@ -223,7 +225,7 @@ class Viewer:
         self.image = gui.add_image(np.zeros((3, 4, 3), np.uint8), format="jpeg", visible=False)
 
     def _again(self) -> None:
-        """Have everything drawn anew."""
+        """Request that everything is drawn again."""
         self.version += 1
 
     def _renew(self) -> None:
@@ -239,9 +241,9 @@ class Viewer:
         self._again()
 
     def _show_views(self) -> None:
-        """Title, cameras and the way between them."""
+        """Show title, cameras and the path between the chosen ones."""
         subject, scene = self.subject, self.server.scene
-        self.title.content = f"**{subject.title}**"
+        self.title.content = f"**{plain(subject.title)}**"
         if not subject.views:
             return
         centre, _ = self._extent()
@@ -252,62 +254,60 @@ class Viewer:
         way = [view.frame.camera.position for view in subject.taken if view.role == "chosen"]
         if len(way) > 1:
             segments = np.stack([way[:-1], way[1:]], axis=1).astype(np.float32)
-            scene.add_line_segments(
-                "/cameras/way",
-                segments,
-                colors=COLOURS["chosen"],
-                thickness=LINE,
-                thickness_units="screen",
-            )
+            scene.add_line_segments("/cameras/way", segments, colors=COLOURS["chosen"], **THIN)
 
     def _show_camera(self, view: View, size: float) -> None:
-        """A camera as a pyramid that can be clicked, and the step of a chosen one beside it."""
+        """Show a camera as a pyramid that can be clicked, with the step of a chosen one."""
         from viser.transforms import SO3
 
         camera, name = view.frame.camera, view.frame.name
         pose = camera.camera_to_world
-        colour = SELECTED if name == self.selected else COLOURS[view.role]
         handle = self.server.scene.add_camera_frustum(
-            f"/cameras/views/{name}", _vertical_fov(camera), camera.width / camera.height,
-            scale=(0.3 if view.role == "candidate" else 0.6) * size, thickness=LINE, thickness_units="screen", color=colour,
-            wxyz=SO3.from_matrix(pose[:3, :3]).wxyz, position=pose[:3, 3],
-        )  # fmt: skip
+            f"/cameras/views/{name}",
+            _vertical_fov(camera),
+            camera.width / camera.height,
+            scale=(0.3 if view.role == "candidate" else 0.6) * size,
+            color=SELECTED if name == self.selected else COLOURS[view.role],
+            wxyz=SO3.from_matrix(pose[:3, :3]).wxyz,
+            position=pose[:3, 3],
+            **THIN,
+        )
         handle.on_click(lambda _: self._clicked(name))
         self.frusta[name] = handle
         if view.role == "chosen":
             self.server.scene.add_label(f"/cameras/views/{name}/step", str(view.step))
 
     def _clicked(self, name: str) -> None:
-        """A camera was clicked."""
+        """Select the view of a camera that was clicked."""
         if self.view.value == name:
             self.select(name)
         else:
             self.view.value = name  # which selects it
 
     def select(self, name: str) -> None:
-        """Show the image of a view and what is known about it; where the image cannot be read,
-        why."""
+        """Show the facts and the image of a view, or the error if the image cannot be read."""
         by_name = {view.frame.name: view for view in self.subject.views}
+        if name not in by_name:  # no window of ours sends it
+            return
         if self.selected in self.frusta:
             self.frusta[self.selected].color = COLOURS[by_name[self.selected].role]
         self.selected, view = name, by_name[name]
         self.frusta[name].color = SELECTED
         role = f"chosen at step {view.step}" if view.role == "chosen" else view.role
-        self.facts.content = "\n".join(
-            [f"**{name}**: {role}", "", *(f"- {key}: {value}" for key, value in view.facts)]
-        )
+        facts = [f"- {plain(key)}: {plain(value)}" for key, value in view.facts]
+        self.facts.content = "\n".join([f"**{plain(name)}**: {role}", "", *facts])
         try:
             image = np.round(srgb_from_linear(view.frame.rgb()) * 255).astype(np.uint8)
         except InputError as error:
             self.image.visible = False
-            self.facts.content += f"\n\n{error}"
+            self.facts.content += f"\n\n{plain(str(error))}"
             return
         every = max(1, image.shape[1] // PREVIEW)
         self.image.image = np.ascontiguousarray(image[::every, ::every])
         self.image.visible = True
 
     def _look(self, handle: Any) -> None:
-        """Put a browser's camera where the selected view's is."""
+        """Move a browser's camera to that of the selected view."""
         if handle is None:  # the window was closed meanwhile
             return
         if self.selected != self.view.value:
@@ -317,16 +317,15 @@ class Viewer:
 
         camera = view.frame.camera
         pose, centre = camera.camera_to_world, self._extent()[0]
+        eye = pose[:3, 3]
         with handle.atomic():
             handle.camera.wxyz = SO3.from_matrix(pose[:3, :3]).wxyz
-            handle.camera.position = pose[:3, 3]
-            handle.camera.look_at = pose[:3, 3] + pose[:3, 2] * float(
-                np.linalg.norm(centre - pose[:3, 3])
-            )
+            handle.camera.position = eye
+            handle.camera.look_at = eye + pose[:3, 2] * float(np.linalg.norm(centre - eye))
             handle.camera.fov = _vertical_fov(camera)
 
     def _connected(self, handle: Any) -> None:
-        """A browser window was opened."""
+        """Handle a browser window that was opened."""
         client = _Client(handle, None, time.monotonic())
         self.clients[handle.client_id] = client
 
@@ -337,11 +336,11 @@ class Viewer:
                 self._uncover(client)
 
     def _disconnected(self, handle: Any) -> None:
-        """A browser window was closed."""
+        """Handle a browser window that was closed."""
         self.clients.pop(handle.client_id, None)
 
     def _uncover(self, client: _Client) -> None:
-        """Show what the browser draws itself."""
+        """Show the Gaussians as the browser draws them."""
         client.covered = False
         client.handle.scene.set_background_image(BLACK)
         if client.splats is not None:
@@ -350,16 +349,20 @@ class Viewer:
     def _draw(self, client: _Client) -> None:
         """Draw the layer for a browser whose camera rests: its Gaussians, and the kernel's image in
         their place."""
-        asked, layer, subject = (client.moved, self.version), self.layer.value, self.subject
+        asked, subject = (client.moved, self.version), self.subject
+        known = layers.layers(subject)
+        layer = self.layer.value if self.layer.value in known else known[0]
         g = subject.gaussians
         assert g is not None
+        if client.splats is None or layer != client.layer:
+            colours = layers.gaussian_colours(subject, layer) / 255
         if client.splats is None:
+            covariances, opacities = layers.covariances(subject), g.opacities[:, None]
             client.splats = client.handle.scene.add_gaussian_splats(
-                "/gaussians", g.means, layers.covariances(subject), layers.gaussian_colours(subject, layer) / 255,
-                g.opacities[:, None], visible=False,
-            )  # fmt: skip
+                "/gaussians", g.means, covariances, colours, opacities, visible=False
+            )
         elif layer != client.layer:
-            client.splats.rgbs = layers.gaussian_colours(subject, layer) / 255
+            client.splats.rgbs = colours
         client.layer = layer
         camera = window_camera(client.handle.camera)
         if self.exact.value and self.gaussians.value and camera is not None:
@@ -369,23 +372,25 @@ class Viewer:
                 client.splats.visible, client.covered = False, True
                 client.handle.scene.set_background_image(image, format="png", depth=depth)
         else:
-            ends = (
-                layers.scale(subject, layer) if layer in subject.scalars else (math.nan, math.nan)
-            )
-            self.legend.content = (
-                layers.legend(layer, ends, subject.unit)
-                if layer != "depth"
-                else "Depth is drawn by the kernel, at rest."
-            )
+            ends = layers.scale(subject, layer)
+            text = "Depth is drawn by the kernel, at rest."
+            if layer != "depth":
+                text = layers.legend(layer, ends, subject.unit)
+            self.legend.content = text
             self._uncover(client)
         client.drawn = asked
 
 
 def window_camera(camera: Any) -> Camera | None:
-    """The camera of a browser window (viser's CameraHandle) as ours, with at most PIXELS; None
-    where the window has no size."""
-    width, height = camera.image_width, camera.image_height
-    if width < 1 or height < 1:
+    """Camera of a browser window (viser's CameraHandle), with at most PIXELS.
+
+    None where what the window sent is no camera: a size, field of view or pose out of range.
+    """
+    width, height, wxyz = camera.image_width, camera.image_height, np.asarray(camera.wxyz, float)
+    numbers = [width, height, camera.fov, *wxyz, *np.asarray(camera.position, float)]
+    if not np.isfinite(numbers).all() or np.abs(numbers).max() > LARGEST_NUMBER:
+        return None
+    if min(width, height) < 1 or not 0.01 < camera.fov < 3.1 or np.linalg.norm(wxyz) < 1e-3:
         return None
     shrink = min(1.0, math.sqrt(PIXELS / (width * height)))
     width, height = max(1, round(width * shrink)), max(1, round(height * shrink))
@@ -398,5 +403,5 @@ def window_camera(camera: Any) -> Camera | None:
 
 
 def _vertical_fov(camera: Camera) -> float:
-    """Vertical field of view of a camera, radians, as if its principal point were in the middle."""
+    """Vertical field of view of a camera, radians, with its principal point taken as central."""
     return 2 * math.atan(camera.height / 2 / camera.K[1, 1])

@@ -22,7 +22,8 @@ assert runtime.processor()["simd_width"] == 8
 from splat.scenes import make_camera, make_gaussians
 from mgs.splat import fisher, render
 camera, gaussians = make_camera(), make_gaussians(60, 4)
-np.savez(sys.argv[1], rgb=np.asarray(render(gaussians, camera).rgb), fisher=fisher(gaussians, camera))
+rgb = np.asarray(render(gaussians, camera).rgb)
+np.savez(sys.argv[1], rgb=rgb, fisher=fisher(gaussians, camera))
 """
 
 

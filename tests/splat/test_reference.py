@@ -1,5 +1,4 @@
-"""The oracle itself: camera convention, projection, derivatives against central differences, all in
-float64."""
+"""The reference itself: camera convention, projection, derivatives against central differences."""
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from mgs.rotation import rotmat_from_quat
 from mgs.splat import reference
 from mgs.splat.constants import EPS2D, FRUSTUM_MARGIN
 
-from .scenes import calm, double, make_camera, make_gaussians, place
+from .scenes import calm, double, make_camera, make_gaussians, parameter_columns, place
 
 BACKGROUND = (0.2, 0.7, 0.4)
 
@@ -44,8 +43,7 @@ def test_gaussian_lands_on_the_pixel_of_the_camera(pixel, depth):
 
 
 def test_covariance_is_that_of_the_camera_seen_by_differences():
-    """T Sigma T^T with T the derivative of `Camera.project`, by central differences: independent of
-    the EWA formula."""
+    """T Sigma T^T with T the derivative of `Camera.project`, independent of the EWA formula."""
     camera, g = make_camera(), double(make_gaussians(20, 1, spread=0.3))
     projected = reference.project(g, camera)
     A = rotmat_from_quat(g.quats) * np.exp(g.log_scales)[:, None, :]
@@ -54,9 +52,8 @@ def test_covariance_is_that_of_the_camera_seen_by_differences():
         T = (camera.project(g.means[j] + steps)[0] - camera.project(g.means[j] - steps)[0]).T / 2e-6
         cov = T @ A[j] @ A[j].T @ T.T + EPS2D * np.eye(2)
         np.testing.assert_allclose(projected.cov2d[j], cov, rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(
-            projected.means2d[j], camera.project(g.means[j : j + 1])[0][0], atol=1e-9
-        )
+        pixel = camera.project(g.means[j : j + 1])[0][0]
+        np.testing.assert_allclose(projected.means2d[j], pixel, atol=1e-9)
 
 
 def test_nearer_gaussian_hides_the_farther():
@@ -77,16 +74,14 @@ def test_nearer_gaussian_hides_the_farther():
 def test_background_shows_where_alpha_is_not():
     camera, g = make_camera(), make_gaussians(10, 3)
     black, over = reference.render(g, camera), reference.render(g, camera, BACKGROUND)
-    np.testing.assert_allclose(
-        over["rgb"] - black["rgb"], (1 - black["alpha"])[..., None] * BACKGROUND, atol=1e-12
-    )
+    expected = (1 - black["alpha"])[..., None] * BACKGROUND
+    np.testing.assert_allclose(over["rgb"] - black["rgb"], expected, atol=1e-12)
 
 
 def central(
     gaussians: Gaussians, camera, j: int, name: str, index, direction=1.0, step=1e-6
 ) -> np.ndarray:
-    """d (r, g, b, alpha) / d one number of Gaussian j, or several that change together along a
-    direction: [H*W,4]."""
+    """Derivative of (r, g, b, alpha) by a parameter of Gaussian j along a direction [H*W,4]."""
     ends = []
     for sign in (+1, -1):
         moved = double(gaussians)
@@ -94,6 +89,11 @@ def central(
         image = reference.render(moved, camera, BACKGROUND)
         ends.append(np.concatenate([image["rgb"], image["alpha"][..., None]], 2).reshape(-1, 4))
     return (ends[0] - ends[1]) / (2 * step)
+
+
+def assert_column(column, expected, what) -> None:
+    error = np.abs(column - expected).max()
+    assert error < 2e-8 * max(1.0, np.abs(expected).max() / 1e-2), (what, error)
 
 
 def opaque_in_the_middle(seed: int, degree: int = 0) -> Gaussians:
@@ -105,82 +105,62 @@ def opaque_in_the_middle(seed: int, degree: int = 0) -> Gaussians:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_jacobian_against_central_differences(degree):
-    """Every column of every Gaussian, background included; colours clamped at 0 and alphas clamped
-    at ALPHA_MAX among them."""
+    """Among them colours clamped at 0 and alphas clamped at ALPHA_MAX."""
     camera = make_camera((21, 14), focal=24)
     g = calm(lambda seed: opaque_in_the_middle(seed, degree), camera, 7)
     projected = reference.project(g, camera)
     assert (projected.colours == 0).any()
-    assert reference.composite(projected, camera)[3].any(), (
-        "no alpha above ALPHA_MAX, though one opacity is 1"
-    )
-    J = reference.jacobian(g, camera, BACKGROUND)
-    K = (degree + 1) ** 2
-    columns = [("sh", (k, c)) for k in range(K) for c in range(3)]
-    columns += (
-        [("log_scales", (i,)) for i in range(3)]
-        + [("quats", (i,)) for i in range(4)]
-        + [("logit_opacities", ())]
-    )
+    assert reference.composite(projected, camera)[3].any()
+    J, columns = reference.jacobian(g, camera, BACKGROUND), parameter_columns(degree)
     assert J.shape == (21 * 14, 3, 6, len(columns))
     for j in range(len(g)):
         for column, (name, index) in enumerate(columns):
             expected = central(g, camera, j, name, index)[:, :3]
-            error = np.abs(J[:, :, j, column] - expected).max()
-            assert error < 2e-8 * max(1.0, np.abs(expected).max() / 1e-2), (name, index, j, error)
+            assert_column(J[:, :, j, column], expected, (name, index, j))
 
 
 @pytest.mark.parametrize("centre", [None, (25.5, 3.0)])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_columns_of_means_and_rows_of_alpha_against_central_differences(degree, centre):
-    """All that the image does as means move: centre, footprint, colour. The second camera looks
-    past most of them, at some from beyond its margin, where the projection's Jacobian no longer
-    follows the mean."""
+    """The second camera sees some means beyond its margin, where the projection's Jacobian no
+    longer follows the mean."""
     camera, weight = make_camera((21, 14), focal=24, centre=centre), 0.3
     g = calm(lambda seed: opaque_in_the_middle(seed, degree), camera, 11)
     if centre:
-        drawn = reference.composite(reference.project(g, camera), camera)
-        beyond = camera.project(g.means[drawn[0][drawn[1].any(0)]])[0][:, 0] > 21 * (
-            1 + FRUSTUM_MARGIN / 2
-        )
-        assert beyond.any()
+        order, alpha, _, _ = reference.composite(reference.project(g, camera), camera)
+        pixels, _ = camera.project(g.means[order[alpha.any(0)]])
+        assert (pixels[:, 0] > 21 * (1 + FRUSTUM_MARGIN / 2)).any()
     normals = np.random.default_rng(degree).normal(size=(6, 3))
     frozen, free, normal = (
         reference.jacobian(g, camera, BACKGROUND, means=means, normals=normals, alpha_weight=weight)
         for means in ("frozen", "free", "normal")
     )
     P = 3 * (degree + 1) ** 2 + 8
-    assert [J.shape[1:] for J in (frozen, free, normal)] == [
-        (4, 6, P),
-        (4, 6, P + 3),
-        (4, 6, P + 1),
-    ]
+    assert frozen.shape[1:] == (4, 6, P)
+    assert [J.shape[-1] for J in (free, normal)] == [P + 3, P + 1]
     np.testing.assert_array_equal(free[..., :P], frozen)
     np.testing.assert_array_equal(normal[..., :P], frozen)
     np.testing.assert_array_equal(frozen[:, :3], reference.jacobian(g, camera, BACKGROUND))
     assert np.abs(free[..., P:]).max() > 0.1
     for j in range(6):
         unit = normals[j] / np.linalg.norm(normals[j])
-        columns = [(free, P + i, "means", (i,), 1.0) for i in range(3)] + [
-            (normal, P, "means", (), unit)
-        ]
+        columns = [(free, P + i, "means", (i,), 1.0) for i in range(3)]
+        columns += [(normal, P, "means", (), unit)]
         columns += [(frozen, P - 8 + i, "log_scales", (i,), 1.0) for i in range(3)]
         columns += [(frozen, P - 1, "logit_opacities", (), 1.0), (frozen, 0, "sh", (0, 0), 1.0)]
         for J, column, name, index, direction in columns:
             expected = central(g, camera, j, name, index, direction) * (1, 1, 1, np.sqrt(weight))
-            error = np.abs(J[:, :, j, column] - expected).max()
-            assert error < 2e-8 * max(1.0, np.abs(expected).max() / 1e-2), (name, index, j, error)
+            assert_column(J[:, :, j, column], expected, (name, index, j))
 
 
 def test_fisher_is_the_jacobian_squared():
     camera, g = make_camera((21, 14), focal=24), make_gaussians(4, 2, 1)
     J = reference.jacobian(g, camera, BACKGROUND).reshape(-1, 4, 20)
     block = reference.fisher_block(g, camera, BACKGROUND)
+    diagonal = reference.fisher(g, camera, BACKGROUND)
     for j in range(4):
         np.testing.assert_allclose(block[j], J[:, j].T @ J[:, j], atol=1e-12)
-        np.testing.assert_allclose(
-            reference.fisher(g, camera, BACKGROUND)[j], np.diag(block[j]), atol=1e-12
-        )
+        np.testing.assert_allclose(diagonal[j], np.diag(block[j]), atol=1e-12)
 
 
 def test_spherical_harmonics_are_orthonormal():
@@ -188,9 +168,7 @@ def test_spherical_harmonics_are_orthonormal():
     z, wz = np.polynomial.legendre.leggauss(8)
     phi = np.arange(16) * 2 * np.pi / 16
     s = np.sqrt(1 - z * z)
-    directions = np.stack(
-        [np.outer(s, np.cos(phi)), np.outer(s, np.sin(phi)), np.outer(z, np.ones(16))], -1
-    ).reshape(-1, 3)
-    Y = reference.sh_basis(directions, 3)
+    xyz = np.outer(s, np.cos(phi)), np.outer(s, np.sin(phi)), np.outer(z, np.ones(16))
+    Y = reference.sh_basis(np.stack(xyz, -1).reshape(-1, 3), 3)
     weights = np.repeat(wz, 16) * 2 * np.pi / 16
     np.testing.assert_allclose(Y.T @ (weights[:, None] * Y), np.eye(16), atol=1e-12)

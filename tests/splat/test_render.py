@@ -1,5 +1,4 @@
-"""Images against the float64 oracle: error where no decision flips, share of pixels where one does,
-thresholds."""
+"""Images against the float64 reference: errors, flipped pixels, thresholds."""
 
 import drjit as dr
 import mitsuba as mi
@@ -16,12 +15,10 @@ from mgs.splat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from .scenes import SIZE, changed, make_camera, make_gaussians, margins, place
 
 TOLERANCE = 2e-5
-"""Of rgb and alpha, absolute; of depth weighted by alpha, in units of the farthest splat's depth
-(it is one more colour)."""
+"""Absolute, of rgb and alpha; of depth weighted by alpha, in units of the largest depth."""
 
 NEAR = 3e-5
-"""Relative error of alpha that float32 may make: pixels whose decisions are nearer than this may
-flip."""
+"""Relative error of alpha in float32: pixels nearer to a decision than this may flip."""
 
 STYLES = {
     "mixed": {},
@@ -48,24 +45,19 @@ def errors(gaussians, camera, background) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def population():
-    """All random scenes, five styles by four SH degrees by three seeds: errors and decided masks,
-    [60, H, W]."""
-    results = []
+    """Errors and decided masks [60,H,W] of five styles by four SH degrees by three seeds."""
+    results, eyes = [], ((2.0, 0.4, 1.1), (-1.2, 1.5, 0.3), (0.1, -0.2, 2.5))
     for number, style in enumerate(STYLES.values()):
         for degree in range(4):
             for seed in range(3):
-                camera = make_camera(
-                    eye=((2.0, 0.4, 1.1), (-1.2, 1.5, 0.3), (0.1, -0.2, 2.5))[seed]
-                )
                 gaussians = make_gaussians(60, 100 * number + seed, degree, **style)
-                results.append(errors(gaussians, camera, (0.1, 0.5, 0.9)))
+                results.append(errors(gaussians, make_camera(eye=eyes[seed]), (0.1, 0.5, 0.9)))
     return np.stack([r[0] for r in results]), np.stack([r[1] for r in results])
 
 
 def test_error_where_nothing_flips(population, record_property):
     error, decided = population
     record_property("worst_error", float(error[decided].max() * TOLERANCE))
-    print(f"worst error of rgb and alpha: {error[decided].max() * TOLERANCE:.1e}")
     assert decided.mean() > 0.99
     assert error[decided].max() <= 1
 
@@ -74,7 +66,6 @@ def test_share_of_flipped_pixels(population, record_property):
     error, _ = population
     share = float((error > 1).mean())
     record_property("flipped_share", share)
-    print(f"flipped pixels: {share:.2e} of {error.size}")
     assert share < 1e-4
 
 
@@ -94,9 +85,8 @@ def test_share_of_flipped_pixels(population, record_property):
 def test_matches_oracle_for_any_scene(
     seed, n, size, degree, scale, stretch, logit, background, eye, focal
 ):
-    gaussians = make_gaussians(
-        n, seed, degree, (scale - stretch, scale), (logit - 3, logit), colour=1.0
-    )
+    style = (scale - stretch, scale), (logit - 3, logit)
+    gaussians = make_gaussians(n, seed, degree, *style, colour=1.0)
     camera = make_camera(size, focal, eye, target=(0.05, 0.02, 0.01))
     error, decided = errors(gaussians, camera, background)
     assert np.isfinite(error).all()
@@ -105,8 +95,7 @@ def test_matches_oracle_for_any_scene(
 
 @pytest.mark.parametrize("centre", [(320.0, 4.0), (-300.0, -200.0), (600.0, 240.0)])
 def test_error_at_the_edge_of_a_large_image(centre):
-    """Splats of a pixel's size, 640 pixels from the corner or far from the principal point, where
-    float32 pixels are coarse."""
+    """Splats of a pixel's size, far from the corner or the principal point."""
     camera = make_camera((640, 6), focal=600.0, centre=centre)
     for seed in range(4):
         rng = np.random.default_rng(seed)
@@ -141,8 +130,7 @@ def test_threshold_of_alpha(above):
 
 @pytest.mark.parametrize("above", [False, True])
 def test_threshold_of_transmittance(above):
-    """Three splats leave T1; a fourth would leave 1e-4 (1 +- 1e-3) and is drawn only if that is
-    above the limit."""
+    """A fourth splat would leave TRANSMITTANCE_MIN (1 +- 1e-3)."""
     camera = make_camera()
     last = 1 - TRANSMITTANCE_MIN * (1.001 if above else 0.999) / 0.1**3
     gaussians = stack(camera, [0.9, 0.9, 0.9, last])
@@ -177,10 +165,8 @@ def test_background_changes_no_alpha_and_no_depth():
 
 def test_adam_of_mitsuba_fits_an_image_through_the_renderer():
     """`mi.ad.Adam` on colours and opacities, from grey: the loss falls a hundredfold."""
-    camera, truth = (
-        make_camera(),
-        make_gaussians(16, 7, log_scales=(-2.5, -1.5), logits=(0, 3), colour=1.0),
-    )
+    camera = make_camera()
+    truth = make_gaussians(16, 7, log_scales=(-2.5, -1.5), logits=(0, 3), colour=1.0)
     target = dr.detach(render(truth, camera).rgb)
     model = as_drjit(changed(truth, sh=0 * truth.sh, logit_opacities=0 * truth.logit_opacities))
     optimiser = mi.ad.Adam(lr=0.1)

@@ -1,5 +1,4 @@
-"""Extreme input: finite, right against the oracle, and finite gradients; what is not a number is an
-error that names it."""
+"""Extreme input: finite and right results. Bad input: an error that names it."""
 
 import re
 from pathlib import Path
@@ -16,7 +15,18 @@ from mgs.gaussians import SH_MAX, Gaussians
 from mgs.splat import ESTIMATORS, ListCache, as_drjit, fisher, reference, render
 from mgs.splat.constants import NEAR
 
-from .scenes import PARAMETERS, SIZE, changed, compare, make_camera, make_gaussians, margins, place
+from .scenes import (
+    PARAMETERS,
+    SIZE,
+    changed,
+    compare,
+    gradients_of,
+    make_camera,
+    make_gaussians,
+    margins,
+    place,
+    with_gradients,
+)
 
 BACKGROUND = (0.2, 0.5, 0.7)
 CAMERA = make_camera()
@@ -34,19 +44,17 @@ def with_first(name: str, value, seed=0) -> Gaussians:
     return scene(seed, **{name: values})
 
 
+PIXELS = [(5, 5), (20, 13), (30, 20), (44, 2)]
+
+
 def behind_camera() -> Gaussians:
-    return with_first(
-        "means", place(CAMERA, [(5, 5), (20, 13), (30, 20), (44, 2)], [-1e-3, -0.5, -2, -100])
-    )
+    return with_first("means", place(CAMERA, PIXELS, [-1e-3, -0.5, -2, -100]))
 
 
 def around_near_plane() -> Gaussians:
-    """In front of it by a micrometre and behind it by as much; small enough that EWA means
-    something there."""
-    means = place(
-        CAMERA, [(5, 5), (20, 13), (30, 20), (44, 2)], [NEAR * 1.001, NEAR * 0.999, NEAR * 1.1, 0]
-    )
-    g = with_first("means", means)
+    """Small enough that EWA means something there."""
+    depths = [NEAR * 1.001, NEAR * 0.999, NEAR * 1.1, 0]
+    g = with_first("means", place(CAMERA, PIXELS, depths))
     g.log_scales[:4] = -8
     return g
 
@@ -84,22 +92,16 @@ CASES = {
 
 
 def gradients(gaussians, camera) -> dict[str, np.ndarray]:
-    watched = as_drjit(gaussians)
-    for name in PARAMETERS:
-        setattr(watched, name, dr.copy(getattr(watched, name)))
-        dr.enable_grad(getattr(watched, name))
-    image = render(watched, camera, BACKGROUND)
-    dr.backward(
-        dr.sum(image.rgb, axis=None)
-        + dr.sum(image.alpha, axis=None)
-        + dr.sum(image.depth * image.alpha, axis=None)
-    )
-    return {name: np.asarray(dr.grad(getattr(watched, name))) for name in PARAMETERS}
+    model = with_gradients(gaussians)
+    image = render(model, camera, BACKGROUND)
+    outputs = (image.rgb, image.alpha, image.depth * image.alpha)
+    dr.backward(sum(dr.sum(output, axis=None) for output in outputs))
+    return gradients_of(model)
 
 
 def assert_right(gaussians, camera, quats: bool = True) -> None:
-    """Image and Fisher against the oracle (quats=False: but for quaternions), gradients finite. No
-    pixel is near a decision."""
+    """Image and Fisher information as the reference has them, gradients finite. quats=False:
+    without the columns of quaternions."""
     image = render(gaussians, camera, BACKGROUND)
     with np.errstate(all="ignore"):
         truth = reference.render(gaussians, camera, BACKGROUND)
@@ -116,9 +118,7 @@ def assert_right(gaussians, camera, quats: bool = True) -> None:
         assert np.isfinite(gradient).all(), f"gradient of {name}"
     with np.errstate(all="ignore"):
         expected = reference.fisher_block(gaussians, camera, BACKGROUND)
-    found, blocks = (
-        fisher(gaussians, camera, estimator, BACKGROUND) for estimator in ("exact", "block")
-    )
+    found, blocks = (fisher(gaussians, camera, e, BACKGROUND) for e in ("exact", "block"))
     assert np.isfinite(found).all()
     assert np.isfinite(blocks).all()
     assert (found >= 0).all()
@@ -126,15 +126,12 @@ def assert_right(gaussians, camera, quats: bool = True) -> None:
     part = np.arange(11) if quats else np.array([0, 1, 2, 3, 4, 5, 10])
     square = np.ix_(np.arange(len(found)), part, part)
     for values, truths in ((found[:, part], diagonal[:, part]), (blocks[square], expected[square])):
-        big = (
-            np.abs(truths) >= 1e-6 * np.abs(truths).max()
-        )  # where nothing is seen all are, and must be 0
+        big = np.abs(truths) >= 1e-6 * np.abs(truths).max()  # if nothing is seen, all are 0
         np.testing.assert_allclose(values[big], truths[big], rtol=1e-3)
 
 
 BEYOND_DIFFERENCES = {"scales of e^30 and e^-30", "quaternions of norm 1e-9"}
-"""Where the oracle's central differences by quaternions miss: their step is beyond the quaternion,
-or turns a needle away."""
+"""Where the step of central differences exceeds the quaternion, or turns a needle away."""
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -144,8 +141,7 @@ def test_extreme_gaussians(name):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_needles_across_a_large_image(seed):
-    """A metre long, a tenth of a millimetre thick: half an image from its centre, xi is a small
-    difference of large numbers."""
+    """A metre long, a tenth of a millimetre thick: xi is a small difference of large numbers."""
     g = make_gaussians(6, seed, spread=0.3, logits=(0, 4))
     g.log_scales[:] = np.log([1, 1e-4, 1e-4])
     assert_right(g, make_camera((640, 120), focal=600))
@@ -153,10 +149,7 @@ def test_needles_across_a_large_image(seed):
 
 def test_splats_behind_the_camera_change_nothing():
     g = behind_camera()
-    rest = Gaussians(*(getattr(g, name)[4:] for name in vars(g)))
-    np.testing.assert_array_equal(
-        np.asarray(render(g, CAMERA).rgb), np.asarray(render(rest, CAMERA).rgb)
-    )
+    np.testing.assert_array_equal(render(g, CAMERA).rgb, render(g[4:], CAMERA).rgb)
 
 
 @pytest.mark.parametrize(
@@ -171,10 +164,8 @@ def test_any_image_size(size):
 
 
 def test_image_sizes_may_be_numpys_integers_and_are_whole():
-    camera = make_camera()
-    counted = Camera(
-        camera.K, np.int64(camera.width), np.uint16(camera.height), camera.world_to_camera
-    )
+    camera, (width, height) = make_camera(), SIZE
+    counted = Camera(camera.K, np.int64(width), np.uint16(height), camera.world_to_camera)
     np.testing.assert_array_equal(render(scene(2), counted).rgb, render(scene(2), camera).rgb)
     with pytest.raises(InputError, match="must be whole pixels"):
         Camera(camera.K, 45.5, 31, camera.world_to_camera)
@@ -195,9 +186,8 @@ def test_no_gaussians_is_the_background(degree):
     g = make_gaussians(0, 0, degree)
     for cache in (None, ListCache()):
         image = render(g, CAMERA, BACKGROUND, cache)
-        np.testing.assert_allclose(
-            np.asarray(image.rgb), np.broadcast_to(BACKGROUND, (SIZE[1], SIZE[0], 3)), atol=1e-7
-        )
+        expected = np.broadcast_to(BACKGROUND, (SIZE[1], SIZE[0], 3))
+        np.testing.assert_allclose(np.asarray(image.rgb), expected, atol=1e-7)
         assert not np.any(np.asarray(image.alpha))
         assert not np.any(np.asarray(image.depth))
     columns = 3 * (degree + 1) ** 2 + 8
@@ -217,35 +207,19 @@ def test_gradient_of_the_background_is_what_shines_through(n):
 
 
 def test_gradient_of_extreme_scenes_is_right_too():
-    """1:1000 and opacity logits of 20 at once: scales and colours against the oracle's Jacobian."""
+    """1:1000 and opacity logits of 20 at once."""
     g = thin(1e3)
     g.logit_opacities[::2] = 20
-    least = margins(g, CAMERA)
-    weights = np.where(
-        (least > 1e-4)[..., None], np.random.default_rng(0).normal(size=(SIZE[1], SIZE[0], 3)), 0
-    )
-    watched = as_drjit(g)
-    for name in PARAMETERS[1:]:
-        setattr(watched, name, dr.copy(getattr(watched, name)))
-        dr.enable_grad(getattr(watched, name))
-    dr.backward(
-        dr.sum(
-            render(watched, CAMERA, BACKGROUND).rgb * mi.TensorXf(weights.astype(np.float32)),
-            axis=None,
-        )
-    )
+    weights = np.random.default_rng(0).normal(size=(SIZE[1], SIZE[0], 3))
+    weights[margins(g, CAMERA) <= 1e-4] = 0
+    model = with_gradients(g, PARAMETERS[1:])
+    rgb = render(model, CAMERA, BACKGROUND).rgb
+    dr.backward(dr.sum(rgb * mi.TensorXf(weights.astype(np.float32)), axis=None))
     J = reference.jacobian(g, CAMERA, BACKGROUND)
     expected = np.tensordot(weights.reshape(-1, 3), J, axes=([0, 1], [0, 1]))
-    parts = {
-        "sh": slice(0, 3),
-        "log_scales": slice(3, 6),
-        "quats": slice(6, 10),
-        "logit_opacities": slice(10, 11),
-    }
-    for name, part in parts.items():
-        assert compare(np.asarray(dr.grad(getattr(watched, name))), expected[:, part])[0] < 1e-4, (
-            name
-        )
+    found, parts = gradients_of(model, PARAMETERS[1:]), np.split(expected, (3, 6, 10), axis=1)
+    for name, part in zip(("sh", *PARAMETERS[1:4]), parts, strict=True):
+        assert compare(found[name], part)[0] < 1e-4, name
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -264,14 +238,13 @@ def test_not_a_number_names_the_parameter_and_the_first_gaussian(name, value):
         lambda: fisher(g, CAMERA, "hutchinson"),
     ):
         with pytest.raises(
-            InputError, match=f"{name} is NaN or infinite, first at Gaussian 5"
-        ) as error:
+            InputError, match=f"^.*{name} is NaN or infinite, first at Gaussian 5.*$"
+        ):
             call()
-        assert "\n" not in str(error.value)
 
 
 def test_opacities_of_extreme_logits():
-    """0 and 1, without a warning of an overflow on the way; between them the sigmoid."""
+    """No warning of an overflow either."""
     logits = np.array([-3e38, -1000, -80, 0, 2, 1000], np.float32)
     g = changed(make_gaussians(len(logits), 0), logit_opacities=logits)
     expected = [0, 0, np.exp(-80.0), 0.5, 1 / (1 + np.exp(-2.0)), 1]
@@ -282,7 +255,6 @@ def test_opacities_of_extreme_logits():
 
 @pytest.mark.parametrize("colour", [3e38, -1e38, 1.01 * SH_MAX])
 def test_colours_beyond_measure_are_an_error(colour):
-    """Their information would be infinite and their gradients NaN; a background's, too."""
     g = scene()
     g.sh[5, 0, 1] = colour
     for call in (
@@ -291,13 +263,9 @@ def test_colours_beyond_measure_are_an_error(colour):
         lambda: fisher(g, CAMERA),
         lambda: fisher(g, CAMERA, "hutchinson"),
     ):
-        with pytest.raises(
-            InputError, match="sh is beyond 1,000,000, first at Gaussian 5; remove or repair it"
-        ):
+        with pytest.raises(InputError, match="sh is beyond 1,000,000, first at Gaussian 5; remove"):
             call()
-    with pytest.raises(
-        InputError, match="must be one or three numbers, linear RGB, up to 1,000,000"
-    ):
+    with pytest.raises(InputError, match="one or three numbers, linear RGB, up to 1,000,000"):
         fisher(scene(), CAMERA, background=(0, colour, 0))
 
 
@@ -336,13 +304,11 @@ def test_shapes_that_do_not_fit_are_an_error(name, shape):
 
 
 def test_no_variant_is_named_in_the_code():
-    """The same code runs on any variant: nothing in the kernels or the plugins names one, or its
-    backend's module."""
+    """Kernels and plugins run on any variant."""
     folders = [Path(mgs.splat.__file__).parent, Path(mgs.splat.__file__).parents[2] / "plugins"]
     files = [path for folder in folders for path in folder.rglob("*.py")]
     assert len(files) >= 6
+    variants = r"llvm_|cuda_|scalar_rgb|metal_|drjit\.(llvm|cuda)|set_variant"
     for path in files:
-        found = re.search(
-            r"llvm_|cuda_|scalar_rgb|metal_|drjit\.(llvm|cuda)|set_variant", path.read_text()
-        )
+        found = re.search(variants, path.read_text())
         assert found is None, f"{path} names {found.group()}"

@@ -322,8 +322,8 @@ def _spoiled(
 
 
 def _fit_faults(lab: Lab, run: str, taken: Sequence[int], turn: float, clean: Row) -> list[Row]:
-    """Fits of too few passes, fits with free means on few views beside clean ones, and fits with one
-    wrong pose."""
+    """Fits of too few passes, fits with free means on few views beside clean ones, and fits with
+    one wrong pose."""
     rows = [_row(lab, run, "few passes", passes, clean, taken, passes) for passes in SHORT_FITS]
     for count in FREE_VIEWS:
         few = lab.even(count, turn)

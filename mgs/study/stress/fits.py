@@ -77,7 +77,8 @@ FREE_MEANS = Experiment(
             _means(2, "free, no prior", "frozen, no prior"), "dB", "below", -1.0,
         ),
         Claim(
-            "On 4 views, frozen means lose 0.5 dB or more where no prior holds the other parameters.",
+            "On 4 views, frozen means lose 0.5 dB or more where no prior holds the other "
+            "parameters.",
             _means(4, "frozen, no prior", "frozen"), "dB", "below", -0.5,
         ),
         Claim(
@@ -93,7 +94,7 @@ FREE_MEANS = Experiment(
     (
         Panel("views", "psnr", "views", "PSNR on test views (dB)", "means"),
         Panel("views", "drift", "views", "drift of the means, rms (spacings)", "means"),
-        Panel("views", "tau", "views", "Kendall's tau with frozen means of the same prior", "means"),
+        Panel("views", "tau", "views", "Kendall's tau with frozen means, same prior", "means"),
     ),
 )  # fmt: skip
 
@@ -159,8 +160,8 @@ CONVERGENCE = Experiment(
             single("regret", _EARLY), "share", "below", 0.05,
         ),
         Claim(
-            "Without a prior on the parameters, the longest fit has lost 0.3 dB or more of rock PSNR "
-            "on the test views.",
+            "Without a prior on the parameters, the longest fit has lost 0.3 dB or more of rock "
+            "PSNR on the test views.",
             _lost("no prior"), "dB", "above", 0.3,
         ),
         Claim(

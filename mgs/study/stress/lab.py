@@ -40,7 +40,7 @@ class StressSize:
     images: of every dataset. gaussians: of each prior. rocks: (scene, seed) of all experiments.
     others: more of them, for some experiments. turns: sets of views of a rock, turned against one
     another. repeats: draws of each random fault. few_views: numbers of views with free means.
-    passes: lengths of fits. steps: of the test of memory.
+    passes: lengths of fits.
     """
 
     images: Size
@@ -51,7 +51,6 @@ class StressSize:
     repeats: int
     few_views: tuple[int, ...]
     passes: tuple[int, ...]
-    steps: int
 
     def case(self, scene: str, seed: int) -> Case:
         """Case of a rock."""
@@ -68,7 +67,6 @@ SIZES = {
         repeats=1,
         few_views=(2, 4, 8),
         passes=(1, 2, 5, 10, 20, 60, 120),
-        steps=150,
     ),
     "full": StressSize(
         images=Size(320, 240, 32, 12),
@@ -81,7 +79,6 @@ SIZES = {
         repeats=3,
         few_views=(2, 3, 4, 6, 8),
         passes=(1, 2, 5, 10, 20, 40, 80, 160, 320, 640),
-        steps=1000,
     ),
 }
 
@@ -120,7 +117,7 @@ def cells_per_rock(
 
 
 def turns(count: int) -> list[tuple[str, float]]:
-    """Names of sets of views of one rock, and the share of their spacing by which they are turned."""
+    """Names of sets of views, and the share of their spacing by which each is turned."""
     return [(f"turn {k}", k / count) for k in range(count)]
 
 
@@ -215,7 +212,7 @@ class Lab:
         return np.array([score(F, H, lam) for F in self.information(model, left, means)])
 
     def quality(self, model: Gaussians) -> dict[str, float]:
-        """PSNR on the test views, dB: of whole images (`psnr`), and inside the rock (`psnr_mask`)."""
+        """PSNR on the test views, dB: of whole images (psnr), and inside the rock (psnr_mask)."""
         found = judge(model, self.dataset)
         return {"psnr": found["psnr"], "psnr_mask": found["psnr_mask"]}
 

@@ -1,0 +1,356 @@
+"""`mgs chart`: speed against accuracy of fits and of whole runs.
+
+A point is one `mgs nbv`: its time, and its quality on the test views. A *fit* takes all its images
+at once, evenly spaced in azimuth; a *run* starts from the seeds and chooses the other images one by
+one. Factors are varied one at a time around the default; those that matter most are crossed.
+"""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.data.dataset import load_dataset
+from mgs.fit.settings import COLOURS_ALONE, PASSES, WARM_PASSES
+from mgs.plotting import STYLE, new_figure, save_figure
+from mgs.run.nbv import run_nbv
+from mgs.run.settings import PRESETS
+from mgs.run.state import State
+from mgs.study.case import Case, Scene, Size, judge, test_views_of
+from mgs.study.output import Content, group_styles, logarithmic, table, write_table
+from mgs.study.statistics import pareto_front
+from mgs.study.sweep import Cell, Report, Results, run_cells
+from mgs.study.timing import span, timed, with_seconds
+from mgs.study.verdict import Claim, Row, judged, verdict_table
+
+KINDS = ("fit", "run")
+
+SCENE = "boulder"
+"""Scene of the charts."""
+
+DENSITY = 1 / 8
+"""Density of the default prior (`PriorSettings`): about that of `mgs demo`."""
+
+QUALITIES = ("psnr", "ssim", "psnr_mask", "ssim_mask")
+"""Metrics of the test views in rows."""
+
+LATER_PASSES = {2: 2, 5: 3, 10: 5, 20: 10, 40: 20}
+"""Passes of later fits of a run, by passes of the first."""
+
+EQUAL_TIME, LOSS = 1.05, 0.1
+"""Factor up to which times count as equal, and loss in dB up to which a preset is as good as the
+best run of equal time."""
+
+
+@dataclass(frozen=True)
+class ChartSize:
+    """Size of the charts. images: of the dataset. count: images fitted, of which `seeds` are evenly
+    spaced. repeats: default number of timings. run_passes: of the first fit of runs. The other
+    fields are values of factors."""
+
+    images: Size
+    count: int
+    repeats: int
+    densities: tuple[float, ...]
+    passes: tuple[int, ...]
+    run_passes: tuple[int, ...]
+    image_counts: tuple[int, ...]
+    policies: tuple[str, ...]
+    seeds: int = 4
+
+
+SIZES = {
+    "quick": ChartSize(
+        images=Size(192, 144, 24, 8),
+        count=8,
+        repeats=2,
+        densities=(1 / 8, 1 / 4, 1 / 2, 3 / 4),
+        passes=(5, 10, 20),
+        run_passes=(5, 10),
+        image_counts=(4, 12),
+        policies=("directional-i", "random"),
+    ),
+    "full": ChartSize(
+        images=Size(320, 240, 32, 12),
+        count=12,
+        repeats=3,
+        densities=(1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4),
+        passes=(2, 5, 10, 20, 40),
+        run_passes=(5, 10, 20),
+        image_counts=(4, 6, 8, 16, 24),
+        policies=(
+            "directional-i", "directional-d", "fisherrf", "uniform", "farthest", "random", "paper"
+        ),
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Point:
+    """Settings of one `mgs nbv`. policy: empty for a fit of all images at once."""
+
+    images: int
+    density: float = DENSITY
+    passes: int = PASSES
+    warm_passes: int = WARM_PASSES
+    policy: str = ""
+    estimator: str = "exact"
+
+    @property
+    def kind(self) -> str:
+        """One of KINDS."""
+        return "run" if self.policy else "fit"
+
+    @property
+    def name(self) -> str:
+        """Name of its cell."""
+        parts = [f"d{1 / self.density:g}", f"i{self.images}", f"p{self.passes}"]
+        parts += [str(self.warm_passes), self.policy, self.estimator] if self.policy else []
+        return f"{self.kind}/{'-'.join(parts)}"
+
+    def settings(self, seeds: int) -> dict[str, Any]:
+        """Settings of `mgs nbv`, without COLOURS_ALONE."""
+        seeds = seeds if self.policy else self.images
+        return {
+            "policy": self.policy or "uniform",
+            "estimator": self.estimator,
+            "warm_passes": self.warm_passes,
+            "seeds": seeds,
+            "budget": self.images - seeds,
+            "train": {"passes": self.passes},
+        }
+
+    def command(self, dataset: Path, prior: Path, seeds: int) -> str:
+        """Command line that makes this model."""
+        given = self.settings(seeds)
+        options = given | given.pop("train") | {"alpha_weight": 0}
+        words = ["mgs", "nbv", str(dataset), "--prior", str(prior), "--out", "RUN"]
+        for name, value in options.items():
+            words += [f"--{name.replace('_', '-')}", str(value)]
+        return shlex.join(words)
+
+
+def factors(size: ChartSize) -> dict[str, list[Point]]:
+    """Points by factor; a point may be in several."""
+    fit, run = Point(size.count), Point(size.count, policy="d-optimal")
+    return {
+        "number of Gaussians": [replace(fit, density=d) for d in size.densities],
+        "passes": [replace(fit, passes=p) for p in size.passes],
+        "images": [replace(fit, images=n) for n in size.image_counts],
+        "both": [replace(fit, density=d, passes=p) for d in size.densities for p in size.passes],
+        "policy": [replace(run, policy=name) for name in ("d-optimal", *size.policies)],
+        "estimator": [replace(run, estimator=e) for e in ("hutchinson", "loss-gradient")],
+        "number and passes": [
+            replace(run, density=d, passes=p, warm_passes=LATER_PASSES[p])
+            for d in size.densities[-3:]
+            for p in size.run_passes
+        ],
+        "preset": list(preset_points(size).values()),
+    }
+
+
+def preset_points(size: ChartSize) -> dict[str, Point]:
+    """Runs of `mgs nbv --preset`."""
+    run = Point(size.count, policy="d-optimal")
+    return {name: replace(run, **asdict(row)) for name, row in PRESETS.items()}
+
+
+def points_of(size: ChartSize, kind: str) -> list[Point]:
+    """Points of a kind, each once."""
+    points = (point for some in factors(size).values() for point in some if point.kind == kind)
+    return list(dict.fromkeys(points))
+
+
+@dataclass(frozen=True)
+class Data:
+    """What is measured: the points of a size, on the rendered scene or on a given dataset."""
+
+    size: ChartSize
+    given: Path | None = None
+
+    def case(self, density: float) -> Case:
+        """Case with a prior of this density."""
+        label = self.given.name if self.given else ""
+        scene = Scene(SCENE, label=label)
+        return Case(scene, self.size.images, {"density": density}, self.given)
+
+    def cells(self, kind: str, repeats: int) -> list[Cell]:
+        """Cells of all points of a kind, and those they need."""
+        cells: dict[str, Cell] = {}
+        for point in points_of(self.size, kind):
+            case = self.case(point.density)
+            made, arguments = case.cells(), {**case.folders, "repeats": repeats}
+            arguments["settings"] = point.settings(self.size.seeds)
+            needs = tuple(cell.name for cell in made)
+            cell = Cell(point.name, f"{__name__}:measure", arguments, needs, alone=True)
+            cells |= {one.name: one for one in (*made, cell)}
+        return list(cells.values())
+
+    def rows(self, kind: str, root: Path, found: Results, unit: float) -> list[Row]:
+        """A row for each point of a kind: factors, settings, results, command, and whether it is on
+        the front of seconds against PSNR and SSIM among points of as many images. unit: seconds of
+        the reference."""
+        by_factor, rows = factors(self.size), list[Row]()
+        presets = {point: name for name, point in preset_points(self.size).items()}
+        for point in points_of(self.size, kind):
+            case = self.case(point.density)
+            names = [name for name in by_factor if point in by_factor[name]]
+            row: Row = {
+                "factors": "; ".join(names),
+                "preset": presets.get(point, ""),
+                **asdict(point),
+                **found[point.name],
+            }
+            row |= {"gaussians": found[case.prior_name]["gaussians"]}
+            where = root / case.dataset, root / case.prior
+            rows.append(row | {"command": point.command(*where, self.size.seeds)})
+        rows = with_seconds(rows, unit)
+        for count in {row["images"] for row in rows}:
+            alike = [row for row in rows if row["images"] == count]
+            seconds = [row["seconds"] for row in alike]
+            for column, metric in (("front", "psnr"), ("front_ssim", "ssim")):
+                front = pareto_front(seconds, [row[metric] for row in alike])
+                for row, on in zip(alike, front, strict=True):
+                    row[column] = bool(on)
+        return rows
+
+
+def measure(
+    root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any], repeats: int
+) -> dict[str, Any]:
+    """Task: time a run, files included, and judge its model. Returns times (`timed`), qualities and
+    passes of all fits together."""
+    given = settings | {"train": settings["train"] | COLOURS_ALONE}
+
+    def run() -> State:
+        shutil.rmtree(out / "run", ignore_errors=True)
+        return run_nbv(root / dataset, out / "run", prior=root / prior, **given)
+
+    state, times = timed(run, repeats)
+    shutil.rmtree(out / "run")
+    metrics = judge(state.gaussians, load_dataset(root / dataset))
+    return {
+        **times,
+        **{name: metrics[name] for name in QUALITIES},
+        "total_passes": sum(step["iterations"] // step["images"] for step in state.steps),
+        "image_passes": sum(step["iterations"] for step in state.steps),
+    }
+
+
+def preset_losses(rows: Sequence[Row]) -> list[float]:
+    """Effects: PSNR that each preset loses against the best run of equal time with other numbers of
+    Gaussians and passes, dB."""
+    grid = {"number and passes", "preset"}
+    runs = [row for row in rows if grid & set(row["factors"].split("; "))]
+    losses = []
+    for row in runs:
+        if row["preset"]:
+            equal = [one for one in runs if one["seconds"] <= EQUAL_TIME * row["seconds"]]
+            losses.append(max(one["psnr"] for one in equal) - row["psnr"])
+    return losses
+
+
+PRESET_CLAIM = Claim(
+    "A preset of `mgs nbv` loses at most 0.1 dB against the best run of equal time.",
+    preset_losses, "dB", "below", LOSS, "preset",
+)  # fmt: skip
+
+
+def _settings_text(row: Row) -> str:
+    passes = f"{row['passes']} passes" + (f", then {row['warm_passes']}" if row["policy"] else "")
+    name = f"**{row['preset']}**: " if row["preset"] else ""
+    estimator = "" if row["estimator"] == "exact" else row["estimator"]
+    parts = [f"{row['gaussians']:,} Gaussians", passes, row["policy"], estimator]
+    return name + ", ".join(part for part in parts if part)
+
+
+COLUMNS: dict[str, Content] = {
+    "on the front, or a preset": _settings_text,
+    "images": "images",
+    "seconds": span,
+    "PSNR (dB)": "psnr:.2f",
+    "SSIM": "ssim:.4f",
+    "PSNR, rock (dB)": "psnr_mask:.2f",
+}
+
+
+def check_dataset(dataset: Path | None) -> None:
+    """Raises InputError for a dataset that cannot be read or has no test views."""
+    if dataset is not None:
+        test_views_of(load_dataset(dataset))
+
+
+def run_chart(
+    out: Path,
+    preset: str,
+    kinds: Sequence[str],
+    repeats: int | None,
+    dataset: Path | None,
+    report: Report,
+) -> dict[str, tuple[list[Row], list[Row]]]:
+    """Measure fits, runs or both, and write KIND.csv, .json, .md and .png; returns rows and judged
+    claims by kind.
+
+    preset: of SIZES. repeats: by default those of the size. dataset: in place of the rendered one
+    (`check_dataset`).
+    """
+    size = SIZES[preset]
+    repeats = repeats or size.repeats
+    data, measured = Data(size, dataset.resolve() if dataset else None), {}
+    cells = {cell.name: cell for kind in kinds for cell in data.cells(kind, repeats)}
+    found = run_cells(out, cells.values(), report)
+    unit = float(np.median([one["reference"] for one in found.values() if "reference" in one]))
+    for kind in kinds:
+        words = ["mgs", "chart", str(out), "--only", kind, "--preset", preset]
+        words += ["--repeats", str(repeats), *(["--dataset", str(dataset)] if dataset else [])]
+        rows = data.rows(kind, out, found, unit)
+        claims = [judged(PRESET_CLAIM, rows)] if kind == "run" else []
+        shown = [row for row in rows if row["front"] or row["preset"]]
+        text = table(COLUMNS, sorted(shown, key=lambda row: (row["images"], row["seconds"])))
+        text += f"\n{verdict_table(claims)}" if claims else ""
+        more = {"preset": preset, "repeats": repeats, "reference_seconds": unit, "claims": claims}
+        write_table(out, kind, rows, text, shlex.join(words), **more)
+        draw(out / f"{kind}.png", rows)
+        measured[kind] = rows, claims
+    return measured
+
+
+def draw(path: Path, rows: Sequence[Row]) -> None:
+    """Draw seconds against PSNR and SSIM for points of the usual number of images: by the last of
+    their factors, with the front and the names of presets."""
+    import matplotlib
+
+    most = Counter(row["images"] for row in rows).most_common(1)[0][0]
+    rows = [row | {"factor": row["factors"].split("; ")[-1]} for row in rows]
+    rows = [row for row in rows if row["images"] == most]
+    names = list(dict.fromkeys(row["factor"] for row in rows))
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(10, 4)
+        panels = figure.subplots(1, 2)
+        metrics = (("psnr", "front", "PSNR on the test views, dB"), ("ssim", "front_ssim", "SSIM"))
+        for axes, (metric, flag, label) in zip(panels, metrics, strict=True):
+            front = sorted((row["seconds"], row[metric]) for row in rows if row[flag])
+            axes.step(*zip(*front, strict=True), where="post", color="black", lw=1, label="front")
+            for name, style in zip(names, group_styles(names), strict=True):
+                of = [row for row in rows if row["factor"] == name]
+                low, x, high = (
+                    np.array([row[f"seconds{end}"] for row in of]) for end in ("_low", "", "_high")
+                )
+                look = style | {"linestyle": "none"}
+                axes.errorbar(x, [row[metric] for row in of], xerr=[x - low, high - x], **look)
+            for row in rows:
+                at = row["seconds"], row[metric]
+                axes.annotate(row["preset"], at, (6, -9), textcoords="offset points", fontsize=8)
+            logarithmic(axes)
+            axes.margins(0.08)
+            axes.set(xlabel=f"seconds, {most} images", ylabel=label)
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        save_figure(figure, path)

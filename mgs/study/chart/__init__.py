@@ -1,1 +1,0 @@
-"""Charts of speed against accuracy."""

@@ -1,0 +1,89 @@
+"""Who may use the viewer, and text that a browser shows as it is.
+
+A browser lets every website open connections to servers on this machine. So a request must name
+this server as its host and, if it comes from a page, that page as its origin. On an address that
+others reach, the first request must have the token of the printed URL; a cookie carries it on.
+"""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from http import HTTPStatus
+from http.cookies import SimpleCookie
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+LOCAL = ("127.0.0.1", "localhost", "::1")
+"""Hosts that only this machine reaches."""
+
+COOKIE = "mgs_token"
+
+
+def plain(text: str) -> str:
+    """Escape text for Markdown and HTML: every character with a meaning becomes an entity."""
+    return "".join(c if c.isalnum() or c in " ,.:;/%" else f"&#{ord(c)};" for c in text)
+
+
+class Access:
+    """Decides which requests a server answers. host: the address it listens on.
+
+    token: None on an address of this machine alone.
+    """
+
+    def __init__(self, host: str) -> None:
+        self.host = host
+        self.token = None if host in LOCAL else secrets.token_urlsafe(16)
+
+    def refusal(self, path: str, headers: Any) -> str | None:
+        """Why a request is refused; None if it is answered. headers: of websockets."""
+        asked, origin = headers.get("Host", ""), headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc != asked:
+            return "the request comes from another website"
+        if self.token is None:
+            name = urlsplit(f"//{asked}").hostname
+            return None if name in LOCAL else "the request names another host"
+        if self.given(path) or self.kept(headers):
+            return None
+        return "open the address that mgs view printed, with its token"
+
+    def given(self, path: str) -> bool:
+        """Whether the URL of a request has the token."""
+        return self._is_token(parse_qs(urlsplit(path).query).get("token", [""])[0])
+
+    def kept(self, headers: Any) -> bool:
+        """Whether the cookie of a request has the token."""
+        found = SimpleCookie(headers.get("Cookie", "")).get(COOKIE)
+        return found is not None and self._is_token(found.value)
+
+    def _is_token(self, text: str) -> bool:
+        return self.token is not None and hmac.compare_digest(text.encode(), self.token.encode())
+
+    def answered(self, connection: Any, request: Any, answer: Callable[..., Any] | None) -> Any:
+        """The response to a request; None goes on to a websocket. answer: of the server."""
+        if why := self.refusal(request.path, request.headers):
+            return connection.respond(HTTPStatus.FORBIDDEN, f"mgs: {why}\n")
+        response = answer(connection, request) if answer else None
+        if response is not None and self.given(request.path):
+            cookie = f"{COOKIE}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+            response.headers["Set-Cookie"] = cookie
+        return response
+
+    @contextmanager
+    def guarding(self) -> Iterator[None]:
+        """A server of websockets that is started in this context answers as `answered`."""
+        from websockets.asyncio import server
+
+        serve = server.serve
+
+        def guarded(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+            answer = lambda connection, request: self.answered(connection, request, process_request)  # noqa: E731
+            return serve(*arguments, process_request=answer, **options)
+
+        server.serve = guarded  # type: ignore[assignment,misc]
+        try:
+            yield
+        finally:
+            server.serve = serve  # type: ignore[misc]

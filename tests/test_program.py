@@ -1,0 +1,50 @@
+"""The program as a whole: how it starts and ends, and what it repairs."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import tiny
+
+from mgs.run.folder import read_checkpoint
+from mgs.splat_ply import read_ply
+
+INTERRUPTED = """
+import builtins
+from mgs.__main__ import main
+real = builtins.__import__
+
+def interrupted(name, *rest):
+    if name == {module!r}:
+        raise KeyboardInterrupt
+    return real(name, *rest)
+
+builtins.__import__ = interrupted
+main()
+"""
+
+
+def test_ctrl_c_while_modules_are_imported_is_one_line():
+    for module in ("typer", "mgs.cli.bench", "pydantic"):
+        code = INTERRUPTED.format(module=module)
+        ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert (ended.returncode, ended.stderr) == (130, "mgs: interrupted\n")
+
+
+def test_a_damaged_model_is_restored_from_the_checkpoint(tmp_path):
+    dataset, prior = tiny.write_dataset(tmp_path / "dataset"), tiny.write_prior(tmp_path / "prior")
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    model, intact = run / "gaussians.ply", (run / "gaussians.ply").read_bytes()
+    flipped = bytearray(intact)
+    flipped[-40] ^= 0xFF
+    command = [sys.executable, "-m", "mgs", "eval", str(run), "--no-pictures"]
+    for damaged in (bytes(flipped), intact[:-100], b""):
+        model.write_bytes(damaged)
+        ended = subprocess.run(command, capture_output=True, text=True)
+        assert ended.returncode == 0, ended.stderr
+        said = f"mgs: {model}: was damaged; restored from checkpoint.npz"
+        assert said in ended.stderr.splitlines()
+        assert model.read_bytes() == intact
+    assert read_ply(model) == read_checkpoint(run).gaussians
+    assert "restored" not in subprocess.run(command, capture_output=True, text=True).stderr
