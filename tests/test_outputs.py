@@ -3,6 +3,7 @@ before any work."""
 
 from __future__ import annotations
 
+import importlib
 import os
 from pathlib import Path
 
@@ -10,10 +11,11 @@ import pytest
 import synthetic
 import tiny
 import typer
+from program import command
 from refusals import a_file, listing, occupied, refused
 
 from mgs import __version__
-from mgs.cli.app import COMMANDS, app, main
+from mgs.cli.app import COMMANDS, app
 from mgs.splat_ply import write_ply
 
 
@@ -64,29 +66,27 @@ def test_output_that_is_in_the_way(capsys, dataset, prior, tmp_path, command, pl
     assert listing(tmp_path) == before
 
 
-@pytest.mark.parametrize(("folder", "command"), [("renders", "eval"), ("diagnostics", "diagnose")])
-def test_a_file_where_a_run_keeps_its_pictures(capsys, dataset, prior, tmp_path, folder, command):
+def test_a_file_where_a_run_keeps_its_pictures(capsys, dataset, prior, tmp_path):
     run = tiny.write_run(tmp_path / "run", dataset, prior)
-    a_file(run / folder)
-    assert "cannot be written" in refused(capsys, [command, run], run)
+    for folder, name in (("renders", "eval"), ("diagnostics", "diagnose")):
+        a_file(run / folder)
+        assert "cannot be written" in refused(capsys, [name, run], run)
 
 
-@pytest.mark.parametrize("out", ["file", "file/report"])
-def test_a_report_under_a_file(capsys, dataset, prior, tmp_path, out):
-    run = tiny.write_run(tmp_path / "run", dataset, prior)
-    a_file(tmp_path / "file")
-    assert "cannot be written" in refused(
-        capsys, ["report", run, "--out", tmp_path / out], tmp_path
-    )
+def test_a_report_under_a_file(capsys, dataset, prior, tmp_path):
+    run, file = tiny.write_run(tmp_path / "run", dataset, prior), a_file(tmp_path / "file")
+    for out in (file, file / "report"):
+        line = refused(capsys, ["report", run, "--out", out], tmp_path)
+        assert "cannot be written" in line
 
 
 @pytest.mark.parametrize("option", ["--json", "--chart"])
-@pytest.mark.parametrize(
-    ("make", "named"),
-    [(lambda path: a_file(path) / "x", "cannot be written"), (occupied, "is a folder")],
-)
-def test_bench_knows_before_it_measures_that_it_cannot_write(capsys, tmp_path, option, make, named):
-    assert named in refused(capsys, ["bench", "scaling", option, make(tmp_path / "out")])
+def test_bench_knows_before_it_measures_that_it_cannot_write(capsys, tmp_path, option):
+    for path, named in (
+        (a_file(tmp_path / "file") / "x", "cannot be written"),
+        (occupied(tmp_path / "folder"), "is a folder"),
+    ):
+        assert named in refused(capsys, ["bench", "scaling", option, path])
 
 
 @pytest.mark.parametrize("command", ["nbv", "prior", "synth-orbit", "survey", "demo"])
@@ -106,46 +106,37 @@ def test_a_prior_that_fails_leaves_all_as_it_was(capsys, dataset, tmp_path, exis
     out = tmp_path / "new/deeper/prior"
     if existing:
         out.mkdir(parents=True)
-    before = listing(tmp_path)
-    refused(capsys, ["prior", dataset, "--out", out, "--gaussians", 1])
-    refused(
-        capsys, ["prior", dataset, "--out", out, "--mesh", tmp_path / "none.glb", "--gaussians", 9]
-    )
-    refused(capsys, ["nbv", dataset, "--out", out, "--gaussians", 1, "--budget", 1])
+    before, few = listing(tmp_path), ["--gaussians", 1]
+    refused(capsys, ["prior", dataset, "--out", out, *few])
+    refused(capsys, ["prior", dataset, "--out", out, "--mesh", tmp_path / "none.glb"])
+    refused(capsys, ["nbv", dataset, "--out", out, *few, "--budget", 1])
     assert listing(tmp_path) == before
 
 
-@pytest.mark.parametrize(
-    ("command", "option", "files"),
-    [
-        ("prior", ["--gaussians", "60"], {"mesh.ply", "points.ply", "prior.json", "prior.png"}),
-        (
-            "survey",
-            ["--poses", "exact"],
-            {"cloud.ply", "survey.json", "survey.png", "transforms.json", "rock.glb"},
-        ),
-    ],
-)
-def test_a_result_appears_whole(tmp_path, monkeypatch, command, option, files):
-    """Nothing under its name while its picture is drawn, from the other files; all of it
-    afterwards."""
-    from mgs.prior import figure as prior_figure
-    from mgs.survey import figure as survey_figure
+WHOLE = {
+    "prior": (["--gaussians", 60], "mesh.ply points.ply prior.json prior.png"),
+    "survey": (
+        ["--poses", "exact"],
+        "cloud.ply rock.glb survey.json survey.png transforms.json",
+    ),
+}
 
-    root = synthetic.write_dataset(tmp_path / "data").root
-    module, name = {"prior": prior_figure, "survey": survey_figure}[command], f"draw_{command}"
-    drawn, out, draw = [], tmp_path / "out", getattr(module, name)
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_a_result_appears_whole(tmp_path, monkeypatch, name):
+    """Nothing is under its name while its picture, the last file, is drawn."""
+    module = importlib.import_module(f"mgs.{name}.figure")
+    draw, drawn, out = getattr(module, f"draw_{name}"), [], tmp_path / "out"
+    root, (option, files) = synthetic.write_dataset(tmp_path / "data").root, WHOLE[name]
 
     def watched(path, *rest):
         drawn.append(len(list(path.parent.iterdir())) > 2 and not out.exists())
         draw(path, *rest)
 
-    monkeypatch.setattr(module, name, watched)
-    with pytest.raises(SystemExit) as exit_:
-        main([command, str(root), "--out", str(out), *option])
-    assert exit_.value.code == 0
+    monkeypatch.setattr(module, f"draw_{name}", watched)
+    command(name, root, "--out", out, *option)
     assert drawn == [True]
-    assert {path.name for path in out.iterdir() if path.is_file()} == files
+    assert sorted(path.name for path in out.iterdir() if path.is_file()) == files.split()
     assert not list(tmp_path.glob(".*"))
 
 
@@ -167,43 +158,33 @@ def test_wrong_options(capsys, case):
     assert named in refused(capsys, arguments)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        ([], "Usage"),
-        (["nbv", "--help"], "Usage"),
-        (["render", "--help"], "--background R G B"),
-        (["--version"], f"mgs {__version__}"),
-    ],
-)
-def test_help_and_version(capsys, arguments, said):
-    with pytest.raises(SystemExit) as stop:
-        main(arguments)
-    assert stop.value.code == 0
-    assert said in " ".join(capsys.readouterr().out.split())
+def printed(capsys, *arguments) -> str:
+    """Everything that `mgs ARGUMENTS` prints, in one line."""
+    command(*arguments)
+    return " ".join(capsys.readouterr().out.split())
+
+
+def test_help_and_version(capsys):
+    assert "Usage" in printed(capsys)
+    assert "Usage" in printed(capsys, "nbv", "--help")
+    assert "--background R G B" in printed(capsys, "render", "--help")
+    assert f"mgs {__version__}" in printed(capsys, "--version")
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_word_of_a_help_text_is_printed(capsys, monkeypatch, name):
     """rich takes a word in brackets, such as [colour=1], for markup and leaves it out."""
     monkeypatch.setenv("COLUMNS", "1000")
-    with pytest.raises(SystemExit):
-        main([name, "--help"])
-    printed = " ".join(capsys.readouterr().out.split())
-    command = typer.main.get_command(app).commands[name]
-    helps = [command.help, *(parameter.help for parameter in command.params)]
-    for text in filter(None, helps):
-        for paragraph in text.split("\n\n"):
-            assert " ".join(paragraph.split()) in printed
+    text = printed(capsys, name, "--help")
+    made = typer.main.get_command(app).commands[name]
+    for words in filter(None, [made.help, *(parameter.help for parameter in made.params)]):
+        for paragraph in words.split("\n\n"):
+            assert " ".join(paragraph.split()) in text
 
 
 def test_a_paragraph_of_a_help_text_is_one_line_in_a_wide_terminal(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "400")
-    with pytest.raises(SystemExit):
-        main(["diagnose", "--help"])
-    (line,) = [
-        line
-        for line in capsys.readouterr().out.splitlines()
-        if "Writes into RUN/diagnostics" in line
-    ]
+    command("diagnose", "--help")
+    lines = capsys.readouterr().out.splitlines()
+    (line,) = (line for line in lines if "Writes into RUN/diagnostics" in line)
     assert "coloured by its information." in line

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import tiny
 from browser import chromium, opened
+from program import command
+from program import steps as read_steps
 from refusals import refused
 
 from mgs.camera import Camera
-from mgs.cli.app import main
 from mgs.data.dataset import load_dataset
 from mgs.files import read_json, write_json
 from mgs.report import page_pictures
@@ -96,7 +97,7 @@ def test_the_page_says_what_the_files_say(page, runs):
     assert "2 of" not in parsed.text.split("random")[0]
     assert "Unfinished: 4 of 6 views are taken" in parsed.text
     assert "Not measured: `mgs eval" in parsed.text
-    steps = [json.loads(line) for line in (runs[0] / "steps.jsonl").read_text().splitlines()]
+    steps = read_steps(runs[0])
     assert "Last fit: converged; its objective could fall by 0.4 % yet" in parsed.text
     assert "stopped early" not in parsed.text
     plots = {plot["title"]: plot["data"] for plot in data["plots"]}
@@ -241,9 +242,7 @@ def test_test_views_are_compared_and_their_metrics_shown(runs, tmp_path):
 
 
 def test_the_command(runs, tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["report", str(runs[1]), "--html", str(tmp_path / "page.html")])
-    assert stop.value.code == 0
+    command("report", runs[1], "--html", tmp_path / "page.html")
     said = capsys.readouterr().out.replace("\n", "")
     assert re.search(r"wrote .*page\.html \(\d+\.\d MB\)", said)
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]

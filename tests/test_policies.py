@@ -156,7 +156,7 @@ def context_of(models, H, **given):
 
 
 def test_context_policies_use_their_own_estimator():
-    """For the views taken, too. The pool of `i-optimal` is all poses, also those out of reach."""
+    """Both for candidates and views taken. `i-optimal` averages over all poses."""
     rng, scales = np.random.default_rng(0), {"exact": 1, "loss-gradient": 1e-9}
     models = {name: rng.random((4, N, 11)) * scale for name, scale in scales.items()}
     J = rng.normal(size=(4, N, 14, 11))

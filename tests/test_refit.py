@@ -10,12 +10,12 @@ import synthetic
 from hypothesis import given
 from hypothesis import strategies as st
 from plyfile import PlyData
+from program import change_settings, command
 from refusals import refused
 from scipy.stats import multivariate_normal
 
 from mgs.bench.core import surface_camera, surface_gaussians
 from mgs.camera import Camera, look_at
-from mgs.cli.app import main
 from mgs.errors import InputError
 from mgs.fit.fitting import fit
 from mgs.fit.settings import TrainSettings
@@ -244,9 +244,7 @@ def run(tmp_path_factory):
 
 def test_a_run_is_refitted_beside_its_model(run, capsys):
     before = {file.name: file.read_bytes() for file in run.iterdir() if file.is_file()}
-    with pytest.raises(SystemExit) as exit_:
-        main(["refit", str(run)])
-    assert exit_.value.code == 0
+    command("refit", run)
     said = capsys.readouterr().out
     after = {file.name: file.read_bytes() for file in run.iterdir() if file.is_file()}
     refitted = after.pop(REFITTED)
@@ -316,9 +314,7 @@ def test_what_cannot_be_chosen_is_one_line(run, capsys, options, said):
 
 def test_a_prior_that_is_gone_is_one_line(run, tmp_path):
     shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns(REFITTED))
-    config = (run / "config.json").read_text()
-    config = config.replace(str(run / "prior"), str(tmp_path / "nowhere"))
-    (tmp_path / "run/config.json").write_text(config)
+    change_settings(tmp_path / "run", prior=str(tmp_path / "nowhere"))
     with pytest.raises(InputError, match="nowhere"):
         refit_run(tmp_path / "run")
     assert not (tmp_path / "run" / REFITTED).exists()

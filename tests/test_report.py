@@ -14,13 +14,14 @@ from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from PIL import Image
+from program import command
+from program import steps as read_steps
 from refusals import refused
 from rich.console import Console
 from skimage.color import rgb2lab
 
 from mgs import plotting
 from mgs.cli import printing
-from mgs.cli.app import main
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
@@ -80,10 +81,6 @@ def write_runs(root):
         )
         write_json(root / policy / "metrics.json", {"policy": policy} | metrics)
     return [root / "d-optimal", root / "random"]
-
-
-def read_steps(run):
-    return [json.loads(line) for line in (run / "steps.jsonl").read_text().splitlines()]
 
 
 def changed(run, out, metrics=None, steps=None, config=None):
@@ -173,9 +170,7 @@ def test_report_writes_every_figure(runs, tmp_path, drawn):
 
 
 def test_figures_are_written_as_asked_for(runs, tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["report", *map(str, runs), "--out", str(tmp_path / "report"), "--figures", "pdf"])
-    assert stop.value.code == 0
+    command("report", *runs, "--out", tmp_path / "report", "--figures", "pdf")
     assert "left out" not in capsys.readouterr().out
     names = {path.name for path in (tmp_path / "report").iterdir()}
     assert names == {*(f"{name}.pdf" for name in FIGURES), "table.md", "table.json"}
@@ -193,9 +188,7 @@ def test_figures_are_written_as_asked_for(runs, tmp_path, capsys):
 
 def test_a_figure_that_is_left_out_is_named(runs, tmp_path, capsys):
     copies = [changed(run, tmp_path / run.name, steps=without("psnr")) for run in runs]
-    with pytest.raises(SystemExit) as stop:
-        main(["report", *map(str, copies), "--out", str(tmp_path / "report")])
-    assert stop.value.code == 0
+    command("report", *copies, "--out", tmp_path / "report")
     left_out = "PSNR against images is left out: it needs that all runs were made with --evaluate"
     assert left_out in capsys.readouterr().out
     assert not (tmp_path / "report/psnr.png").exists()

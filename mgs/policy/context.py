@@ -18,7 +18,7 @@ directional I-optimality if over_dome, else D-optimality (`mgs.policy.directiona
 
 @dataclass(frozen=True)
 class PolicyContext:
-    """What is known when a view is chosen. Candidates' images are not part of it.
+    """Data for the choice of a view. Candidates' images are not part of it.
 
     Views are given by the index of their frame. Positions are in metres, with +Z up. In a batch,
     the views chosen before count as taken: H and surface_H include their information.

@@ -143,7 +143,7 @@ def gains(
 
 
 def of_points(views: Views, some: slice) -> Views:
-    """What views see of some of the Gaussians."""
+    """The same views for some of the Gaussians."""
     return Views(views.positions, views.seen[:, some])
 
 

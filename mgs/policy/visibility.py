@@ -1,5 +1,5 @@
-"""What poses see of the prior's surface. It depends on poses and surface alone, so it is measured
-once per run."""
+"""Visibility of the prior's surface from camera poses. It depends on poses and surface alone, so it
+is measured once per run."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mgs.policy.directional import Views, dome_cameras, squared_weights
 
 
 class Visibility:
-    """What the cameras of a run, and a dome of cameras, see of the Gaussians on a surface.
+    """Visibility of the Gaussians on a surface from the cameras of a run and from a dome.
 
     Each view is measured at its first use.
 

@@ -376,6 +376,6 @@ def _by_block(owner: Any, number: Any, numbers: int) -> tuple[Any, Any, Any, Any
 
 def _room(pairs: int) -> int:
     """Length of the lists of this many pairs, rounded up by at most an eighth: a kernel is recorded
-    anew for each length."""
+    for each length."""
     step = max(1024, 1 << max(pairs.bit_length() - 4, 0))
     return -(-max(pairs, 1) // step) * step

@@ -114,7 +114,7 @@ def fisher(
     if MEANS[means] or alpha_weight:
         if estimator not in EXACT:
             raise InputError(
-                f"fisher: the estimator {estimator!r} knows neither means nor alpha; "
+                f"fisher: the estimator {estimator!r} supports neither means nor alpha; "
                 f"use {' or '.join(EXACT)}"
             )
         unit = unit_normals(n, normals) if means == "normal" else None

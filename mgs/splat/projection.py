@@ -129,8 +129,8 @@ def sh_basis(means: Any, camera: Any, coefficients: int) -> list[Any]:
 def rows_as_vectors(tensor: Any, dtype: Any) -> Any:
     """A TensorXf [N, size] as N Dr.Jit vectors of type `dtype`.
 
-    Every number is read by one vector alone, and NoConflicts says so: the derivative then needs no
-    atomic additions, whose order would change from run to run.
+    NoConflicts is right because every number is read by one vector alone. The derivative then needs
+    no atomic additions, whose order would change from run to run.
     """
     return dr.gather(
         dtype, tensor.array, dr.arange(mi.UInt32, tensor.shape[0]), mode=dr.ReduceMode.NoConflicts

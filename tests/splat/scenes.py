@@ -60,7 +60,7 @@ def place(camera: Camera, pixels, depths) -> np.ndarray:
 
 
 def double(gaussians: Gaussians) -> Gaussians:
-    """A float64 copy, for central differences of the oracle."""
+    """A float64 copy, for central differences of the reference."""
     return Gaussians(*(np.array(value, np.float64) for value in vars(gaussians).values()))
 
 

@@ -127,7 +127,7 @@ print("drawn")
 
 
 def test_threads_may_draw_at_once():
-    """With the bits of one after the other; the collector is off in every recording."""
+    """The results are bitwise those of one thread; the collector is off in every recording."""
     code = """
 runtime.start()
 import gc

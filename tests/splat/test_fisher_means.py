@@ -226,8 +226,8 @@ def test_extreme_scenes_give_finite_information(name):
         ({"alpha_weight": -0.1}, r"fisher: alpha_weight -0\.1 must be from 0 to 1e[+]12"),
         ({"alpha_weight": np.nan}, "fisher: alpha_weight nan must be"),
         ({"alpha_weight": 1e13}, r"fisher: alpha_weight 10000000000000\.0 must be"),
-        ({"estimator": "hutchinson", "means": "free"}, "'hutchinson' knows neither means nor"),
-        ({"estimator": "loss-gradient", "alpha_weight": 1}, "'loss-gradient' knows neither"),
+        ({"estimator": "hutchinson", "means": "free"}, "'hutchinson' supports neither means"),
+        ({"estimator": "loss-gradient", "alpha_weight": 1}, "'loss-gradient' supports neither"),
     ],
 )
 def test_unusable_options_are_one_line(options, message):
