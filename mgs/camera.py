@@ -22,6 +22,10 @@ MAX_SIDE = 2**20
 """Largest width and height of an image, pixels. Beyond it float32 does not resolve pixel centres,
 and the renderer's blocks of pixels would make long narrow images far larger than MAX_PIXELS."""
 
+FURTHEST = 1e8
+"""Largest distance of a camera from the origin, in units of length, and largest entry of K, pixels.
+The centre of the Earth is 6.4e6 m away. Beyond this, float32 has no meaning."""
+
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL's camera axes are x right, y up, z backward: two are the negatives of OpenCV's."""
 
@@ -35,8 +39,8 @@ class Camera:
     - world_to_camera: [4,4] float64, rigid transform in metres, to OpenCV axes.
 
     Raises InputError if K or the pose is not finite, K has skew or a focal length that is not
-    positive, the width or height is not a whole number of at least 1, the image exceeds MAX_PIXELS
-    or MAX_SIDE, or the pose is not rigid.
+    positive, an entry exceeds FURTHEST, the width or height is not a whole number of at least 1,
+    the image exceeds MAX_PIXELS or MAX_SIDE, or the pose is not rigid.
     """
 
     K: NDArray[np.float64]
@@ -51,12 +55,12 @@ class Camera:
             whole = int(self.width) == self.width and int(self.height) == self.height
         except (ValueError, OverflowError):  # of NaN and of infinity
             whole = False
-        size = f"camera: image size {self.width}x{self.height} must be"
         if not whole:
-            raise InputError(f"{size} whole pixels")
+            raise InputError(f"camera: image size {self.width}x{self.height} must be whole pixels")
         # Dr.Jit does not accept NumPy's integers as sizes.
         object.__setattr__(self, "width", int(self.width))
         object.__setattr__(self, "height", int(self.height))
+        size = f"camera: image size {self.width}x{self.height} must be"
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "world_to_camera", pose)
         if K.shape != (3, 3) or not np.isfinite(K).all():
@@ -75,6 +79,11 @@ class Camera:
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise InputError(
                 "camera: the pose has NaN or infinite entries; correct its transform matrix"
+            )
+        if max(np.abs(K).max(), np.abs(pose).max()) > FURTHEST:
+            raise InputError(
+                f"camera: K or the pose has entries beyond {FURTHEST:g}; correct the focal length "
+                "or the position"
             )
         rotation = pose[:3, :3]
         rigid = (

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import csv
 import fcntl
-import glob
 import hashlib
 import json
 import os
 import shutil
+import stat
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -20,6 +20,7 @@ from tempfile import TemporaryFile
 from typing import Any, TextIO
 
 from mgs.errors import InputError
+from mgs.memory import check_room
 
 
 @contextmanager
@@ -69,9 +70,14 @@ def check_writable(path: str | Path) -> Path:
 def reading(path: Path, what: str = "file") -> Iterator[None]:
     """Context manager: turns an OSError of its block into an InputError.
 
-    Its line says that there is no such `what`, or why it cannot be read.
+    Its line says that there is no such `what`, or why it cannot be read. Pipes and devices are
+    refused, since reading one may never end, and files larger than the free memory.
     """
     try:
+        found = path.stat()
+        if stat.S_IFMT(found.st_mode) not in (stat.S_IFREG, stat.S_IFDIR):
+            raise InputError(f"{path}: is no regular file; give a file, not a pipe or a device")
+        check_room(found.st_size, f"{path}: reading it", "give a smaller file")
         yield
     except FileNotFoundError:
         raise InputError(f"{path}: no such {what}") from None
@@ -126,7 +132,7 @@ def read_json(path: str | Path) -> Any:
     with reading(path):
         data = path.read_bytes()
     try:
-        return json.loads(data.decode("utf-8-sig"))  # some tools write a byte-order mark
+        return json.loads(data.decode(json.detect_encoding(data)))  # UTF-8, -16 or -32
     except (ValueError, RecursionError) as error:  # RecursionError: nested too deeply
         raise InputError(
             f"{path}: not valid JSON ({error}); the file is damaged, write it again"
@@ -136,12 +142,14 @@ def read_json(path: str | Path) -> Any:
 def check_new_folder(path: str | Path) -> Path:
     """Check that `new_folder(path)` would succeed, and return the path as a Path. Makes nothing.
 
-    Raises InputError if `path` is a file, is a folder that is not empty, or could not be written.
+    Raises InputError if `path` is a file, is a folder that is not empty or in which another process
+    works, or could not be written.
     """
     path = check_writable(path)
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file, not a folder; choose another output folder")
-    if path.is_dir() and any(path.iterdir()):
+    if path.is_dir() and any(there.name != LOCK for there in path.iterdir()):
+        _check_unlocked(path / LOCK)
         raise InputError(f"{path}: the output folder is not empty; choose a new one or delete it")
     return path
 
@@ -161,43 +169,69 @@ def new_folder(path: str | Path) -> Path:
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Context manager: a temporary folder beside `path`, renamed to it after the block.
 
-    So a folder named `path` is always complete. If the block fails, the temporary folder and the
-    parents made for it are removed; so are those of processes that were killed. Raises InputError
-    as `new_folder`.
+    So a folder named `path` is always complete. The temporary folder is locked. If the block fails,
+    it and the parents made for it are removed; what a killed process left in it is removed first.
+    Raises InputError as `new_folder`, and if another process makes the same folder.
     """
     path = check_new_folder(path).resolve()
-    for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
-        if not _is_running(leftover.name.split(".")[-2]):
-            shutil.rmtree(leftover, ignore_errors=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    made = [folder for folder in path.parents if not folder.exists()]
-    new_folder(temporary)
+    temporary = path.with_name(f".{path.name}.part")
     try:
-        yield temporary
-        try:
-            os.replace(temporary, path)
-        except OSError as error:
-            raise not_writable(path, error) from None
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
+        with folder_locked(temporary):
+            try:
+                _clear(temporary)
+                yield temporary
+                try:
+                    (path / LOCK).unlink(missing_ok=True)  # of a killed process
+                    os.replace(temporary, path)
+                    (path / LOCK).unlink()
+                except OSError as error:
+                    raise not_writable(path, error) from None
+            except BaseException:
+                _clear(temporary)
+                raise
+    finally:
         with suppress(OSError):
-            for folder in made:
-                folder.rmdir()
-        raise
+            temporary.rmdir()
 
 
-def _is_running(process: str) -> bool:
-    """Whether another process has this id, or the text is no id. In a container all processes may
-    have the same id."""
+def _clear(folder: Path) -> None:
+    """Remove everything in a folder but its lock."""
+    with suppress(OSError):
+        for left in folder.iterdir():
+            if left.is_dir() and not left.is_symlink():
+                shutil.rmtree(left, ignore_errors=True)
+            elif left.name != LOCK:
+                left.unlink()
+
+
+@contextmanager
+def folder_locked(folder: str | Path) -> Iterator[None]:
+    """Context manager: makes a folder and its parents, and holds its lock. Afterwards, those that
+    it made and that are still empty are removed. Raises InputError as `locked`."""
+    folder = Path(folder)
     try:
-        if int(process) == os.getpid():
-            return False
-        os.kill(int(process), 0)
-    except ProcessLookupError:
-        return False
-    except (ValueError, OverflowError, PermissionError):
-        pass
-    return True
+        made = [each for each in (folder, *folder.parents) if not each.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise InputError(
+            f"{folder}: is a file, not a folder; choose another output folder"
+        ) from None
+    except OSError as error:
+        raise not_writable(folder, error) from None
+    try:
+        with locked(folder):
+            yield
+    finally:
+        with suppress(OSError):
+            for each in made:
+                each.rmdir()
+
+
+LOCK = ".lock"
+"""File in a folder that the process that works in it has locked."""
+
+_held: set[Path] = set()
+"""Locks that this process holds."""
 
 
 @contextmanager
@@ -208,15 +242,17 @@ def locked(folder: str | Path) -> Iterator[None]:
     written. The system keeps the lock on the file FOLDER/.lock and releases it when the process
     ends, so a file .lock that is left over locks nothing.
     """
-    path = Path(folder) / ".lock"
+    path = Path(folder) / LOCK
     try:
         file = _lock(path)
     except OSError as error:
         raise not_writable(path, error) from None
     with file:
+        _held.add(path.resolve())
         try:
             yield
         finally:
+            _held.discard(path.resolve())
             with suppress(OSError):
                 path.unlink()
 
@@ -227,13 +263,7 @@ def _lock(path: Path) -> TextIO:
     while True:  # until the locked file is the one of this name
         with ExitStack() as closed_on_failure:
             file = closed_on_failure.enter_context(open(path, "a+", encoding="ascii"))
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                file.seek(0)
-                raise InputError(
-                    f"{path.parent}: process {file.read()} works on it; wait until it has ended"
-                ) from None
+            _flock(path, file)
             try:
                 ours = os.path.samestat(os.fstat(file.fileno()), os.stat(path))
             except FileNotFoundError:
@@ -243,3 +273,22 @@ def _lock(path: Path) -> TextIO:
                 print(os.getpid(), end="", file=file, flush=True)
                 closed_on_failure.pop_all()
                 return file
+
+
+def _flock(path: Path, file: TextIO) -> None:
+    """Lock an open file. Raises InputError, with the process, if another one has locked it."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.seek(0)
+        raise InputError(
+            f"{path.parent}: process {file.read()} works on it; wait until it has ended"
+        ) from None
+
+
+def _check_unlocked(path: Path) -> None:
+    """Raise InputError if another process holds a lock, which is not taken."""
+    if path.resolve() in _held:
+        return
+    with suppress(OSError), open(path, encoding="ascii") as file:
+        _flock(path, file)

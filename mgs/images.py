@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import math
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mgs.camera import MAX_PIXELS, MAX_SIDE
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.errors import InputError
 from mgs.files import atomic_path, not_writable, reading
+from mgs.memory import check_room
 
 PNG_BIT_DEPTH = 24
 """Index of the byte of a PNG file that holds the bits of a sample (PNG specification, 11.2.1)."""
@@ -22,6 +28,12 @@ without alpha."""
 
 LUMA = np.array([0.299, 0.587, 0.114])
 """Weights of R, G and B in grey (ITU-R BT.601)."""
+
+EXR_MAGIC = b"v/1\1"
+"""First bytes of every OpenEXR file."""
+
+DECODED_BYTES = 16
+"""Most bytes that a pixel takes while an image is decoded: RGBA of 16 bits, and its file."""
 
 PNG_LEVEL = 1
 """zlib level, 1 to 9. Against Pillow's default of 6, a render of 0.56 Mpixel is as large and is
@@ -50,21 +62,61 @@ def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> No
         Image.fromarray(pixels).save(temporary, format="PNG", compress_level=PNG_LEVEL)
 
 
-def _open_image(path: Path) -> tuple[Any, bytes]:
-    """Decoded Pillow image and the bytes of its file. Raises InputError if it is missing,
-    unreadable or damaged."""
+def image_size(path: str | Path) -> tuple[int, int]:
+    """Width and height of an image or EXR file, pixels, read from its header alone.
+
+    Raises InputError if it is missing or unreadable, or has more pixels than MAX_PIXELS or the
+    free memory allows.
+    """
+    path = Path(path)
+    what = "EXR file" if path.suffix.lower() == ".exr" else "image"
+    with reading(path, what), path.open("rb") as file:
+        is_exr = file.read(4) == EXR_MAGIC
+    return _exr_size(path) if is_exr else _open_image(path, decode=False)[0].size
+
+
+def _check_pixels(path: Path, width: int, height: int, pixel_bytes: int) -> None:
+    """Raise InputError if an image has too many pixels to decode."""
+    size = f"{path}: has {width}x{height} pixels"
+    if width < 1 or height < 1 or width * height > MAX_PIXELS or max(width, height) > MAX_SIDE:
+        raise InputError(f"{size}; images hold 1 to {MAX_PIXELS:,}, resize it")
+    check_room(width * height * pixel_bytes, f"{size}, which", "resize it")
+
+
+@contextmanager
+def bounded_textures() -> Iterator[None]:
+    """Context manager in which Pillow refuses images of more than MAX_PIXELS by their header."""
+    from PIL import Image
+
+    Image.MAX_IMAGE_PIXELS = MAX_PIXELS
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", Image.DecompressionBombWarning)
+        yield
+
+
+def _open_image(path: Path, decode: bool = True) -> tuple[Any, bytes]:
+    """Pillow image, decoded or its header alone, and the bytes of its file.
+
+    Raises InputError if it is missing, unreadable, damaged, or too large.
+    """
     from PIL import Image, UnidentifiedImageError
 
     with reading(path, "image"):
-        data = path.read_bytes()
+        data = path.read_bytes() if decode else b""
     try:
-        with Image.open(BytesIO(data)) as image:
-            image.load()
+        with bounded_textures(), Image.open(BytesIO(data) if decode else path) as image:
+            _check_pixels(path, *image.size, DECODED_BYTES)
+            if decode:
+                image.load()
+    except InputError:
+        raise
+    except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
+        raise InputError(f"{path}: too large to read ({error}); resize it") from None
     except UnidentifiedImageError:
         raise InputError(
             f"{path}: not a readable image; give a PNG or JPEG, or write it again if it is damaged"
         ) from None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except (OSError, SyntaxError, ValueError) as error:
         raise InputError(
             f"{path}: not a readable image ({error}); the file is damaged, write it again"
         ) from None
@@ -181,18 +233,48 @@ def write_exr(path: str | Path, channels: dict[str, np.ndarray]) -> None:
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:
-    """Channels of an OpenEXR file, {name: float32 [H,W]}. Raises InputError if it is missing,
-    unreadable or damaged."""
+    """Channels of an OpenEXR file, {name: float32 [H,W]}. Raises InputError as `image_size`, and if
+    it is damaged."""
     import OpenEXR
 
     path = Path(path)
+    _exr_size(path)
+    with _reading_exr(path), OpenEXR.File(str(path), separate_channels=True) as file:
+        channels = file.channels().items()
+        return {name: np.asarray(one.pixels, np.float32) for name, one in channels}
+
+
+def _exr_size(path: Path) -> tuple[int, int]:
+    """Width and height in the header of an EXR file, pixels. Raises InputError as `image_size`."""
+    import OpenEXR
+
     with reading(path, "EXR file"), path.open("rb") as opened:
         opened.read(1)  # OpenEXR would not say why it cannot open a file
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = file.channels().items()
-            return {name: np.asarray(one.pixels, np.float32) for name, one in channels}
-    except (RuntimeError, OSError, ValueError, TypeError) as error:
-        raise InputError(
-            f"{path}: not a readable EXR ({error}); the file is damaged, write it again"
-        ) from None
+    with _reading_exr(path), OpenEXR.File(str(path), header_only=True) as file:
+        if len(file.parts) != 1:
+            raise ValueError(f"{len(file.parts)} parts instead of one")
+        low, high = (np.asarray(corner, np.int64) for corner in file.header()["dataWindow"])
+        channels = file.header()["channels"]
+        if any((one.xSampling, one.ySampling) != (1, 1) for one in channels):
+            raise ValueError("subsampled channels")
+    width, height = (int(side) for side in high - low + 1)
+    _check_pixels(path, width, height, 8 * len(channels))
+    return width, height
+
+
+@contextmanager
+def _reading_exr(path: Path) -> Iterator[None]:
+    """Context manager: turns errors of OpenEXR into an InputError, and drops the lines that it
+    prints to the standard error itself."""
+    with open(os.devnull, "wb") as nowhere:
+        kept = os.dup(2)
+        try:
+            os.dup2(nowhere.fileno(), 2)
+            yield
+        except (RuntimeError, OSError, ValueError, TypeError, KeyError, MemoryError) as error:
+            raise InputError(
+                f"{path}: not a readable EXR ({error}); the file is damaged, write it again"
+            ) from None
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)

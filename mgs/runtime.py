@@ -134,6 +134,8 @@ def start() -> None:
     """
     if "mitsuba" not in sys.modules:
         _choose_libllvm()
+    if "HOME" not in os.environ:  # Dr.Jit would print a line and compile every kernel anew
+        os.environ.setdefault("DRJIT_CACHE_DIR", os.path.expanduser("~/.drjit"))
     import mitsuba as mi
 
     if mi.variant() in _checked:

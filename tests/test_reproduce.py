@@ -436,15 +436,11 @@ def test_numbers_of_seeds_are_compared_at_equal_images(tmp_path):
     assert results.largest_gap([6, 0, 2, 4], 8) == 90
 
 
-def test_the_pool_of_mixed_distances_has_near_and_far_views(tmp_path):
-    run = Run(Rock("boulder", 1), ONE, "uniform", pool="mixed distances")
-    dataset, _, cell = run.cells()
+def test_a_pool_changes_the_orbit_of_the_scene():
+    dataset, _, cell = Run(Rock("boulder", 1), ONE, "uniform", pool="mixed distances").cells()
     assert dataset.name == "dataset/boulder-1/hemisphere-1-2-3/8x48x36"
-    assert run_cells(tmp_path, [dataset], silent)[dataset.name] == {"frames": 8}
-    loaded = load_dataset(tmp_path / cell.arguments["dataset"])
-    middle = np.linalg.norm(loaded.test_views().frames[0].camera.position)
-    reach = [np.linalg.norm(frame.camera.position) for frame in loaded.frames]
-    assert [round(r / middle) for r in reach] == [1, 2, 3, 1, 2, 3, 1, 2]
+    assert dataset.arguments["changes"]["orbit"] == {"kind": "hemisphere", "distances": [1, 2, 3]}
+    assert cell.arguments["dataset"] == f"cells/{dataset.name}/dataset"
 
 
 def test_the_pool_of_an_arc_is_half_dense_and_half_sparse(quick, tmp_path):

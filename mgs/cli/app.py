@@ -6,6 +6,10 @@ Each command has a file beside this one. A command imports what it needs when it
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import io
+import os
 import sys
 import warnings
 from collections.abc import Callable
@@ -36,6 +40,18 @@ from mgs.errors import InputError, Notice
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C: by convention 128 plus the number of the signal, SIGINT."""
+
+LONGEST_NAME = 200
+"""Characters of a file name that an error message shows."""
+
+CURES = {
+    errno.ENAMETOOLONG: "give a shorter name",
+    errno.ELOOP: "remove the symbolic links that lead to each other",
+    errno.EACCES: "choose a place that you may read and write",
+    errno.ENOSPC: "make room",
+    errno.EDQUOT: "make room",
+}
+"""Errors of the system that the user can correct, and how. All others are errors of the program."""
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "doctor": doctor,
@@ -102,10 +118,17 @@ def main(arguments: list[str] | None = None) -> None:
     Always raises SystemExit, except that errors of the program itself pass through.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may lack characters of the tables
+        sys.stdout.reconfigure(errors="replace")
     warnings.simplefilter("always", Notice)
     warnings.showwarning = _print_warning  # type: ignore[assignment]
     try:
         code = app(arguments or ["--help"], prog_name="mgs", standalone_mode=False)
+        sys.stdout.flush()
+    except OSError as error:
+        if error.errno not in CURES:
+            raise
+        raise _stop(_system_error(error), 2) from None
     except InputError as error:
         raise _stop(str(error), 2) from None
     except typer.TyperException as error:
@@ -141,6 +164,17 @@ def _from_interrupt(error: BaseException | None) -> bool:
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
+
+
+def _system_error(error: OSError) -> str:
+    """Line for an error of the system. If the standard output failed, what it still buffers is
+    dropped, so that Python does not fail again at its end."""
+    name = str(error.filename or "standard output")
+    if error.filename is None:
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    shown = name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}..."
+    return f"{shown}: {error.strerror}; {CURES[error.errno or 0]}"
 
 
 def _stop(message: str, code: int) -> SystemExit:

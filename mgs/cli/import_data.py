@@ -77,6 +77,7 @@ def import_data(
     alone (rock/). Points that came with the cameras are kept for `mgs prior`, in sparse.ply. The
     same command continues an interrupted import.
     """
+    import os
     from functools import partial
 
     from rich.console import Console
@@ -99,6 +100,7 @@ def import_data(
     found = found if unit is None else found.in_metres(unit)
     given = parse_up(up)
     upward, reason = found.up_or_estimate() if given is None else (given, "as --up says")
+    finished = os.path.isfile(out / "transforms.json")  # else the import refuses what is there
     tests, listed = None, found.missing + len(found.shots)
     if test_every is not None:
         found, tests = found.set_apart(test_every)
@@ -144,7 +146,8 @@ def import_data(
     points = 0 if found.sparse is None else len(found.sparse.points)
     console.print(
         f"{found.kind}: {len(result)} frames, {masked} with mask, {layered} with alpha, "
-        f"{deep} with depth, {undone} undistorted, {points:,} points; wrote {out}"
+        f"{deep} with depth, {undone} undistorted, {points:,} points; "
+        + (f"{out} is finished already" if finished else f"wrote {out}")
     )
     if tests is not None:
         console.print(

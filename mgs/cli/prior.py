@@ -106,7 +106,7 @@ def prior(
     from mgs.data.dataset import load_dataset
     from mgs.data.meshes import GLTF
     from mgs.errors import InputError
-    from mgs.files import atomic_folder, check_new_folder
+    from mgs.files import atomic_folder
     from mgs.prior.build import prior_from_mesh, save_prior
     from mgs.prior.figure import draw_prior
     from mgs.prior.initial import with_share_seen
@@ -120,11 +120,11 @@ def prior(
             "prior: --mesh gives the surface, and --from or --points build one; give one of them"
         )
     loaded = load_dataset(dataset)
-    # Checked before the work, not after it.
-    folder = check_new_folder(out if out is not None else dataset / "prior")
+    folder = out if out is not None else dataset / "prior"
     number = parse_gaussians(gaussians)
     settings = PriorSettings(number, spacing, poisson_depth, prior_noise, holes, seed, backing)
-    with progress_bar(console=console) as progress:
+    # The folder is checked and locked before the work.
+    with atomic_folder(folder) as unfinished, progress_bar(console=console) as progress:
         segmented = None
         if mesh is not None:
             cameras = [frame.camera for frame in loaded.frames]
@@ -140,9 +140,8 @@ def prior(
         progress("seed frames")
         result = with_share_seen(result, _seed_frames(loaded, result))
         progress("figure")
-        with atomic_folder(folder) as unfinished:
-            save_prior(unfinished, result)
-            draw_prior(unfinished / "prior.png", result, segmented)
+        save_prior(unfinished, result)
+        draw_prior(unfinished / "prior.png", result, segmented)
     console.print(_table(result.numbers))
     if "resolution" in result.numbers:
         console.print(_reason(result.numbers), soft_wrap=True)

@@ -73,7 +73,7 @@ def render(
     from mgs.cli.progress import progress_bar
     from mgs.data.dataset import load_cameras
     from mgs.errors import InputError
-    from mgs.files import new_folder
+    from mgs.files import check_new_folder, folder_locked
     from mgs.report.pictures import draw_views
     from mgs.splat_ply import ply_colour_space, read_ply
 
@@ -85,9 +85,9 @@ def render(
     ]
     gaussians = read_ply(splats)
     space = ply_colour_space(splats) if colour_space is ColourSpace.auto else colour_space.value
-    new_folder(out)
     runtime.start()
-    with progress_bar() as bar:
+    with folder_locked(out), progress_bar() as bar:
+        check_new_folder(out)
         progress = partial(bar, "rendering")
         draw_views(out, gaussians, views, space, background, exr, progress)
     colours = "linear RGB" if space == "linear" else "sRGB"

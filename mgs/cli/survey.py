@@ -55,24 +55,23 @@ def survey(
 
     from mgs.cli.progress import progress_bar
     from mgs.data.dataset import load_dataset
-    from mgs.files import atomic_folder, check_new_folder
+    from mgs.files import atomic_folder
     from mgs.survey.flight import SurveySettings, fly
     from mgs.survey.folder import save_survey
     from mgs.synth.scene_file import sensor_of
 
     console = Console()
     frames = load_dataset(dataset)
-    # Checked before the work, not after it.
-    folder = check_new_folder(out if out is not None else dataset / "survey")
+    folder = out if out is not None else dataset / "survey"
     sensor = sensor_of(dataset)
     noise = sensor.noise if sensor_noise is None else sensor_noise
     drift = sensor.drift if drift is None else drift
     settings = SurveySettings(noise, drift, poses is Poses.exact, seed)
-    with progress_bar("survey", console) as progress:
+    # The folder is checked and locked before the work.
+    with atomic_folder(folder) as unfinished, progress_bar("survey", console) as progress:
         flown = fly(frames, settings, progress)
         progress("writing")
-        with atomic_folder(folder) as unfinished:
-            numbers = save_survey(unfinished, frames, flown, settings)
+        numbers = save_survey(unfinished, frames, flown, settings)
     console.print(_table(numbers))
     console.print(
         f"wrote {folder}: a dataset with estimated poses and measured depth, "

@@ -15,8 +15,8 @@ from mgs.camera import Camera, opencv_from_opengl, opengl_from_opencv
 from mgs.data.rock_image import boundary, read_rock_image
 from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.errors import InputError
-from mgs.files import check_new_folder, check_writable, locked, read_json, write_json
-from mgs.images import read_exr, read_mask, read_png
+from mgs.files import check_new_folder, read_json, write_json
+from mgs.images import image_size, read_exr, read_mask, read_png
 
 PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 """Camera models of transforms.json that are pinholes if their distortion is zero."""
@@ -62,7 +62,7 @@ class Frame:
 
     def rgb(self) -> np.ndarray:
         """Linear RGB float32 [H,W,3]. Raises InputError if missing, damaged or of another size."""
-        return self._sized(self.image_path, read_png(self._existing(self.image_path)))
+        return read_png(self._existing(self.image_path))
 
     def depth(self) -> np.ndarray:
         """z-depth float32 [H,W], metres, 0 = no return. Raises InputError as `rgb`, and if the
@@ -73,7 +73,7 @@ class Frame:
             )
         channels = read_exr(self._existing(self.depth_path))
         depth = channels.get("Z", next(iter(channels.values())))
-        return np.nan_to_num(self._sized(self.depth_path, depth), nan=0.0, posinf=0.0, neginf=0.0)
+        return np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0)
 
     def mask(self) -> np.ndarray:
         """Rock mask, bool [H,W]: the mask file; else alpha >= 0.5 of the rock image; else all true.
@@ -82,7 +82,7 @@ class Frame:
         InputError as `rgb`.
         """
         if self.mask_path is not None:
-            return self._sized(self.mask_path, read_mask(self._existing(self.mask_path)))
+            return read_mask(self._existing(self.mask_path))
         if self.rock_path is not None:
             return self.target()[0][..., 3] >= 0.5
         return np.ones((self.camera.height, self.camera.width), bool)
@@ -96,7 +96,7 @@ class Frame:
         the mask has weight 0. With neither, alpha and weight are 1. Raises InputError as `rgb`.
         """
         if self.rock_path is not None:
-            rgba = self._sized(self.rock_path, read_rock_image(self._existing(self.rock_path)))
+            rgba = read_rock_image(self._existing(self.rock_path))
             return rgba, np.ones(rgba.shape[:2], np.float32)
         mask = self.mask()
         rgba = np.dstack([self.rgb(), np.ones(mask.shape, np.float32)]) * mask[..., None]
@@ -107,24 +107,23 @@ class Frame:
         return self.target()[0][..., :3]
 
     def _existing(self, path: Path) -> Path:
-        """Return `path`. Raises InputError if no run has taken this on-demand frame yet."""
+        """Return `path`, a file of the camera's size by its header.
+
+        Raises InputError if no run has taken this on-demand frame yet, and as `image_size`.
+        """
         if self.on_demand and not path.exists():
             raise InputError(
                 f"{path}: does not exist, since no run has taken frame {self.name} of this "
                 "on-demand dataset; `mgs nbv` takes what it chooses, and what `mgs prior` reads "
                 f"is in the dataset's folder {SURVEY_FOLDER}"
             )
-        return path
-
-    def _sized(self, path: Path, pixels: np.ndarray) -> np.ndarray:
-        """Return `pixels`. Raises InputError if they have another size than the camera."""
-        height, width = self.camera.height, self.camera.width
-        if pixels.shape[:2] != (height, width):
-            found = f"{pixels.shape[1]}x{pixels.shape[0]}"
+        (width, height), camera = image_size(path), self.camera
+        if (width, height) != (camera.width, camera.height):
             raise InputError(
-                f"{path}: is {found}, but transforms.json says {width}x{height}; correct either"
+                f"{path}: is {width}x{height}, but transforms.json says "
+                f"{camera.width}x{camera.height}; correct either"
             )
-        return pixels
+        return path
 
 
 @dataclass(frozen=True)
@@ -252,7 +251,7 @@ def _camera(path: Path, data: dict[str, Any], index: int, record: dict[str, Any]
     try:
         fl_x, fl_y, cx, cy, w, h = (both[key] for key in INTRINSICS)
         K = np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]], np.float64)
-        width, height = int(w or 0), int(h or 0)
+        width, height = float(w or 0), float(h or 0)
         pose = np.array(record["transform_matrix"], np.float64)
     except (TypeError, ValueError, OverflowError):
         raise InputError(
@@ -264,7 +263,7 @@ def _camera(path: Path, data: dict[str, Any], index: int, record: dict[str, Any]
             f"{where} has a transform_matrix that is not a finite 4x4 matrix; correct the pose"
         )
     try:
-        return Camera(K, width, height, opencv_from_opengl(pose))
+        return Camera(K, width, height, opencv_from_opengl(pose))  # type: ignore[arg-type]
     except np.linalg.LinAlgError:
         raise InputError(f"{where} has a singular transform_matrix; correct the pose") from None
     except InputError as error:
@@ -327,29 +326,27 @@ def write_transforms(
 
 
 def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:
-    """Whether `out` holds an unfinished dataset to continue; False if it is empty or missing.
+    """Whether `out`, whose lock is held, contains a dataset to continue; False if it is empty.
 
-    An unfinished dataset has the JSON file `record` but no transforms.json. The record must agree
-    with every item of `asked`. Temporary files of a killed process are removed. Raises InputError
-    if `out` holds anything else, is locked by another process, or cannot be written.
+    Such a dataset has the JSON file `record`, which must agree with every item of `asked`. It is
+    finished if it has a transforms.json. Temporary files of a killed process are removed. Raises
+    InputError if `out` holds anything else.
     """
-    check_writable(out)
-    begun = out / record
-    if begun.is_file() and not (out / "transforms.json").exists():
-        found = read_json(begun)
-        if not isinstance(found, dict) or any(found.get(key) != asked[key] for key in asked):
-            raise InputError(
-                f"{out}: holds an unfinished dataset of other settings or sources; "
-                "choose a new folder or delete it"
-            )
-        with locked(out):
-            for left in out.rglob(".*.part*"):
-                left.unlink()
-        return True
-    for left in out.glob(f".{begun.stem}.*.part{begun.suffix}"):  # killed while writing the record
+    for left in out.glob(f".{Path(record).stem}.*.part{Path(record).suffix}"):
+        left.unlink()  # of a process killed while writing the record
+    if not (out / record).is_file():
+        check_new_folder(out)
+        return False
+    found = read_json(out / record)
+    if not isinstance(found, dict) or any(found.get(key) != asked[key] for key in asked):
+        state = "a finished" if (out / "transforms.json").is_file() else "an unfinished"
+        raise InputError(
+            f"{out}: is not empty, but holds {state} dataset of other settings or sources; "
+            "choose a new folder or delete it"
+        )
+    for left in out.rglob(".*.part*"):
         left.unlink()
-    check_new_folder(out)
-    return False
+    return True
 
 
 def target_of(frame: Frame, with_alpha: bool = False) -> np.ndarray:

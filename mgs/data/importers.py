@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +14,13 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.data.clouds import write_cloud
 from mgs.data.dataset import TEST_FOLDER, Dataset, Frame, load_dataset, resumes, write_transforms
-from mgs.data.lens import Undo, fit_to_camera, shrunk, undistorter
+from mgs.data.lens import Undo, read_fitting, shrunk, undistorter
 from mgs.data.meshes import read_mesh
 from mgs.data.rock_image import premultiplied, write_rock_image
 from mgs.data.sources import Shot, Source, find_image
 from mgs.data.up import PLUS_Z, Up
 from mgs.errors import InputError
-from mgs.files import copy_file, fingerprint, locked, new_folder, write_json
+from mgs.files import copy_file, fingerprint, folder_locked, write_json
 from mgs.images import read_exr, read_mask, read_rgba, read_values, write_exr, write_png
 
 RECORD = "import.json"
@@ -50,7 +50,7 @@ def import_source(
     become the test views. on_frame: called (done, total) before each frame.
 
     When an interrupted import continues, a finished frame is made again only if one of its files
-    is newer; the result is the same bit for bit. Raises InputError as `read_mesh`; if a file is
+    is newer; the result is the same bit for bit. A finished import is loaded as it is. Raises InputError as `read_mesh`; if a file is
     missing, damaged or of another size than its camera; if `out` holds anything else or is locked
     by another process. Finished frames are kept.
     """
@@ -68,15 +68,13 @@ def import_source(
     }
     asked |= {"downscale": downscale} if downscale != 1 else {}
     asked |= {"test_views": len(tests.shots)} if tests is not None else {}
-    with ExitStack() as lock:
-        if resumes(out, RECORD, asked):
-            lock.enter_context(locked(out))
+    with folder_locked(out):
+        if resumes(out, RECORD, asked) and (out / "transforms.json").is_file():
+            return load_dataset(out)
 
         def begin() -> None:
             if not (out / RECORD).is_file():
-                new_folder(out)
                 write_json(out / RECORD, asked)
-                lock.enter_context(locked(out))
 
         frames = []
         for k, shot in enumerate(shots):
@@ -153,13 +151,15 @@ def _import_shot(
     files = [path for path in (shot.image, shot.depth, shot.mask, shot.rock) if path]
     newest = max(path.stat().st_mtime_ns for path in files if path.is_file())
     if not image.is_file() or image.stat().st_mtime_ns < newest:
-        rgba = fit_to_camera(shot.image, read_rgba(shot.image), shot.camera)
+        rgba = read_fitting(read_rgba, shot.image, shot.camera)
         mask, rock = _mask_and_rock(shot, rgba, undo) if silhouette is None else (None, None)
         if silhouette is not None:
             mask = silhouette(camera)
         depth = None
         if shot.depth is not None:
-            depth = fit_to_camera(shot.depth, _read_depth(shot.depth, shot.depth_unit), shot.camera)
+            depth = read_fitting(
+                partial(_read_depth, unit=shot.depth_unit), shot.depth, shot.camera
+            )
         begin()
         if depth_path is not None and depth is not None:
             write_exr(depth_path, {"Z": undo(depth, False)})
@@ -189,7 +189,7 @@ def _mask_and_rock(
     """
     given = None
     if shot.rock is not None:
-        given = fit_to_camera(shot.rock, read_rgba(shot.rock), shot.camera)
+        given = read_fitting(read_rgba, shot.rock, shot.camera)
     layer = rgba if given is None else given
     full = np.iinfo(layer.dtype).max
     alpha = layer[..., 3]
@@ -197,7 +197,7 @@ def _mask_and_rock(
         given = rgba
     rock = None if given is None else undo(premultiplied(given.astype(np.float32) / full), True)
     if shot.mask is not None:
-        mask = fit_to_camera(shot.mask, read_mask(shot.mask), shot.camera)
+        mask = read_fitting(read_mask, shot.mask, shot.camera)
         return undo(mask.astype(np.uint8) * 255, True) >= 128, rock
     return undo(alpha, True) > full // 2 if alpha.min() < full else None, rock
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.errors import InputError
-from mgs.images import exif_orientation
+from mgs.images import exif_orientation, image_size
 
 Undo = Callable[[np.ndarray, bool], np.ndarray]
 """undo(pixels, smooth): resample an image [H,W] or [H,W,C] to another camera, by interpolation if
@@ -86,20 +86,21 @@ def shrunk_to(camera: Camera, most: float) -> tuple[Camera, Undo]:
     return shrunk(camera, int(np.ceil(np.sqrt(camera.width * camera.height / most))))
 
 
-def fit_to_camera(path: Path, pixels: np.ndarray, camera: Camera) -> np.ndarray:
+def read_fitting(read: Callable[[Path], np.ndarray], path: Path, camera: Camera) -> np.ndarray:
     """Pixels of an image file, turned by its EXIF orientation if only that fits its camera's size.
 
     COLMAP ignores EXIF orientation and other programs apply it; the size shows which. Raises
-    InputError if neither size fits.
+    InputError, before anything is decoded, if neither size fits.
     """
-    wanted, found = (camera.height, camera.width), pixels.shape[:2]
-    if found != wanted and found == wanted[::-1] and (orientation := exif_orientation(path)) >= 5:
-        transposed = pixels.swapaxes(0, 1)
-        flips = {5: (), 6: (1,), 7: (0, 1), 8: (0,)}[orientation]
-        return np.ascontiguousarray(np.flip(transposed, flips))
-    if found != wanted:
+    wanted, found = (camera.width, camera.height), image_size(path)
+    orientation = exif_orientation(path) if found == wanted[::-1] != wanted else 1
+    if found != wanted and orientation < 5:
         raise InputError(
-            f"{path}: is {found[1]}x{found[0]}, but its camera is {camera.width}x{camera.height}; "
+            f"{path}: is {found[0]}x{found[1]}, but its camera is {camera.width}x{camera.height}; "
             "resize it or correct w and h"
         )
-    return pixels
+    pixels = read(path)
+    if orientation < 5:
+        return pixels
+    flips = {5: (), 6: (1,), 7: (0, 1), 8: (0,)}[orientation]
+    return np.ascontiguousarray(np.flip(pixels.swapaxes(0, 1), flips))

@@ -16,7 +16,7 @@ from mgs.data.colmap import is_model, read_model
 from mgs.data.dataset import FRAME_INTERVAL, PINHOLES, read_records
 from mgs.data.up import PLUS_Z, Up, degrees_between, unit_up, up_of_cameras
 from mgs.errors import InputError
-from mgs.images import read_rgba
+from mgs.images import image_size
 
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 """Coefficients of the OPENCV camera model, in OpenCV's order."""
@@ -203,9 +203,9 @@ def _transforms_camera(
     where = f"{path}: frame {index}"
     try:
         if "w" in record and "h" in record:
-            width, height = int(record["w"]), int(record["h"])
+            width, height = float(record["w"]), float(record["h"])
         else:
-            height, width = read_rgba(image).shape[:2]
+            width, height = image_size(image)
         if "fl_x" in record:
             fl_x = float(record["fl_x"])
         else:
@@ -230,7 +230,8 @@ def _transforms_camera(
             f"{where} has a pose or distortion that is not finite, or no 4x4 matrix; correct it"
         )
     try:
-        return Camera(K, width, height, opencv_from_opengl(pose)), distortion
+        camera = Camera(K, width, height, opencv_from_opengl(pose))  # type: ignore[arg-type]
+        return camera, distortion
     except (np.linalg.LinAlgError, InputError) as error:
         raise InputError(f"{where}: {error}; correct the pose") from None
 

@@ -27,6 +27,7 @@ from mgs.survey.registration import (
     register,
     registration_cloud,
 )
+from mgs.synth.scene_file import MOST_ERROR
 
 STAGES = {
     "odometry": "odometry alone",
@@ -41,8 +42,8 @@ class SurveySettings:
     """Settings of a survey.
 
     sensor: factor on the depth camera's noise, 0 is exact; drift: factor on the errors of odometry;
-    exact_poses: use the true poses; seed: root seed. Raises InputError if a factor is negative or
-    not finite.
+    exact_poses: use the true poses; seed: root seed. Raises InputError if a factor is not from 0
+    to MOST_ERROR.
     """
 
     sensor: float = 1.0
@@ -51,9 +52,10 @@ class SurveySettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not (0 <= self.sensor < np.inf and 0 <= self.drift < np.inf):
+        if not (0 <= self.sensor <= MOST_ERROR and 0 <= self.drift <= MOST_ERROR):
             raise InputError(
-                "survey: --sensor-noise and --drift are factors of 0 or more; correct them"
+                f"survey: --sensor-noise {self.sensor:g} and --drift {self.drift:g} are factors "
+                f"of 0 or more, at most {MOST_ERROR:g}; correct them"
             )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -30,20 +31,19 @@ from mgs.data.rock_image import write_rock_image
 from mgs.errors import InputError, row_named
 from mgs.files import (
     atomic_path,
-    check_new_folder,
-    check_writable,
     copy_file,
     fingerprint,
-    locked,
-    new_folder,
+    folder_locked,
+    reading,
     write_json,
 )
 from mgs.images import write_exr, write_png
+from mgs.memory import check_room
 from mgs.provenance import versions
 from mgs.seeds import derive_seed, generator
 from mgs.synth.orbit import evaluation_cameras, perturb, rock_cameras
 from mgs.synth.rock import load_rock, make_rock, up_axis
-from mgs.synth.scene import MitsubaScene
+from mgs.synth.scene import GUIDES_PER_SAMPLE, MitsubaScene
 from mgs.synth.scene_file import SceneFile, load_scene_file
 
 NOISY_FACTOR = 8
@@ -55,6 +55,18 @@ ROCK_EXPOSURE = 0.2
 MAX_CLIPPED = 0.2
 """Largest share of rock and ground pixels that the exposure may clip, so that a dark rock does not
 blow out bright ground. The scenes of mgs clip at most 0.04."""
+
+VIEW_SECONDS, SAMPLE_SECONDS = 0.1, 1e-6
+"""Estimated seconds of a view, and of a sample more, on two cores; a lower bound."""
+
+MOST_HOURS = 24 * 90
+"""Longest estimate that is accepted; a longer one is a slip."""
+
+MOST_SAMPLES = 2**32
+"""Samples that Mitsuba cannot render at once."""
+
+PIXEL_BYTES, VIEW_BYTES, IMAGE_BYTES = 4, 2_000, 200
+"""Estimated bytes of a view's pixel on disk, and in memory of a view and of the pixel rendered."""
 
 SHEET_COLUMNS, SHEET_WIDTH, SHEET_FRAMES = 8, 160, 32
 """Contact sheet: pictures in a row, their width in pixels, and most pictures."""
@@ -70,12 +82,26 @@ class RenderPreset:
     spp: int
 
 
+MOST_NOISE = 1000.0
+"""Largest error of positions, metres: far beyond any orbit."""
+
+
 @dataclass(frozen=True)
 class PoseNoise:
-    """Standard deviations of the pose errors in transforms.json, per axis: metres and degrees."""
+    """Standard deviations of the pose errors in transforms.json, per axis: metres and degrees.
+
+    Raises InputError if one is negative, NaN or absurdly large.
+    """
 
     position: float = 0.0
     rotation: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.position <= MOST_NOISE and 0 <= self.rotation <= 180):
+            raise InputError(
+                f"synth-orbit: --pose-noise {self.position:g} must be 0 to {MOST_NOISE:g} metres, "
+                f"and --rotation-noise {self.rotation:g} 0 to 180 degrees"
+            )
 
 
 PRESETS = {"quick": RenderPreset(320, 240, 32, 8), "paper": RenderPreset(640, 480, 100, 16)}
@@ -105,7 +131,8 @@ def synthesise(
     frames it takes (`mgs.synth.capture`). progress: called (views done, all views). say: called
     with lines for the user.
 
-    An interrupted run of the same settings is completed, with the same files as after one run.
+    An interrupted run of the same settings is completed, with the same files as after one run; a
+    finished one is loaded as it is.
     Raises InputError if the scene or preset is unknown, `out` is not empty, not writable or locked
     by another process, the mesh is bad, or the rock is not wholly in every view or is hidden.
     """
@@ -113,40 +140,45 @@ def synthesise(
     started, out = time.perf_counter(), Path(out)
     settings = scene if isinstance(scene, SceneFile) else load_scene_file(scene)
     preset = row_named(PRESETS, preset, "preset") if isinstance(preset, str) else preset
-    check_writable(out)
-    if (out / "transforms.json").exists() or not (out / "config.json").exists():
-        check_new_folder(out)  # before the rock is made, which takes seconds
-    rock, scale = rock_of(settings, seed, mesh, mesh_up, say)
-    size = preset.width, preset.height
-    cameras = rock_cameras(settings, size, preset.frames, rock)
-    frames = orbit_frames(out, cameras)
-    tests = _frames(out / TEST_FOLDER, evaluation_cameras(settings, size, test_views, rock), "tv")
     denoise = importlib.util.find_spec("pyoidn") is not None
+    spp = preset.spp * (1 if denoise else NOISY_FACTOR)
+    made_of = None
+    if mesh is not None:
+        with reading(Path(mesh), "mesh; give a GLB, OBJ or PLY file"):
+            made_of = fingerprint(mesh) | {"up": mesh_up or up_axis(mesh)}
     # All that decides what the dataset holds; an interrupted run continues only if it is the same.
     resolved: dict[str, Any] = {
         "scene": settings.model_dump(mode="json"),
         "preset": asdict(preset),
         "seed": seed,
-        "mesh": None if mesh is None else fingerprint(mesh) | {"up": mesh_up or up_axis(mesh)},
+        "mesh": made_of,
         "denoise": denoise,
         "pose_noise": None if pose_noise is None else asdict(pose_noise),
         "test_views": test_views,
         "on_demand": {"mesh": mesh and str(Path(mesh).resolve())} if on_demand else None,
     }
-    continues = resumes(out, "config.json", resolved)
-    glb = to_glb(rock)  # before the scene adds its attributes to the mesh
-    world = MitsubaScene(settings, rock, cameras[0], seed)
-    spp = preset.spp * (1 if denoise else NOISY_FACTOR)
-    if not denoise:
-        say(
-            f"pyoidn is not installed: {spp} samples per pixel in place of denoising; "
-            "`pip install pyoidn` is faster"
+    with folder_locked(out):
+        if resumes(out, "config.json", resolved) and (out / "transforms.json").is_file():
+            say(f"{out}: is finished already; nothing is rendered")
+            return load_dataset(out)
+        _check_cost(out, preset, test_views, spp, say)
+        rock, scale = rock_of(settings, seed, mesh, mesh_up, say)
+        size = preset.width, preset.height
+        cameras = rock_cameras(settings, size, preset.frames, rock)
+        frames = orbit_frames(out, cameras)
+        tests = _frames(
+            out / TEST_FOLDER, evaluation_cameras(settings, size, test_views, rock), "tv"
         )
-    exposure = _meter(world, cameras, seed, spp, denoise, say)
-    if not continues:
-        new_folder(out)
-        write_json(out / "config.json", resolved)
-    with locked(out):
+        glb = to_glb(rock)  # before the scene adds its attributes to the mesh
+        world = MitsubaScene(settings, rock, cameras[0], seed)
+        if not denoise:
+            say(
+                f"pyoidn is not installed: {spp} samples per pixel in place of denoising; "
+                "`pip install pyoidn` is faster"
+            )
+        exposure = _meter(world, cameras, seed, spp, denoise, say)
+        if not (out / "config.json").is_file():
+            write_json(out / "config.json", resolved)
         with atomic_path(out / "rock.glb") as temporary:
             temporary.write_bytes(glb)
         prepared = time.perf_counter()
@@ -160,13 +192,14 @@ def synthesise(
             "exposure": exposure,
             "samples_per_pixel": spp,
             "versions": versions(),
-            "timings": {
-                "prepare_s": round(prepared - started, 2),
-                "frame_s": round(float(np.median(seconds)), 3) if seconds else None,
-                "total_s": round(time.perf_counter() - started, 2),
-            },
         }
         write_json(out / "config.json", resolved | record)
+        timings = {
+            "prepare_s": round(prepared - started, 2),
+            "frame_s": round(float(np.median(seconds)), 3) if seconds else None,
+            "total_s": round(time.perf_counter() - started, 2),
+        }
+        write_json(out / "timings.json", timings)  # apart from what repeats bit for bit
         if tests:
             write_transforms(out / TEST_FOLDER, tests)
         published = frames if pose_noise is None else _with_noise(out, frames, pose_noise, seed)
@@ -176,6 +209,36 @@ def synthesise(
             _write_survey(out / SURVEY_FOLDER, world, cameras, published)
         write_transforms(out, published)
         return load_dataset(out)
+
+
+def _check_cost(
+    out: Path, preset: RenderPreset, test_views: int, spp: int, say: Callable[[str], None]
+) -> None:
+    """Estimate time and disk space of a dataset, and say them if it takes more than an hour.
+
+    Raises InputError if a frame has more samples than Mitsuba renders at once, or if time, memory
+    or disk do not suffice.
+    """
+    views, pixels = preset.frames + test_views, preset.width * preset.height
+    samples = pixels * spp
+    what = f"{views:,} views of {preset.width}x{preset.height} with {spp:,} samples per pixel"
+    instead = "lower --frames, --test-views, --size or --spp"
+    hours = views * (VIEW_SECONDS + SAMPLE_SECONDS * samples) / 3600
+    needed, there = (
+        views * pixels * PIXEL_BYTES,
+        next(p for p in out.resolve().parents if p.exists()),
+    )
+    free = shutil.disk_usage(there).free
+    cost = f"take about {hours:,.0f} hours and {needed / 2**30:,.1f} GiB on disk"
+    if GUIDES_PER_SAMPLE * samples >= MOST_SAMPLES or hours > MOST_HOURS or needed > free:
+        raise InputError(
+            f"synth-orbit: {what} {cost}; at most {MOST_HOURS:,} hours, {free / 2**30:,.1f} GiB and "
+            f"{MOST_SAMPLES // GUIDES_PER_SAMPLE:,} samples per view are possible; {instead}"
+        )
+    memory = views * VIEW_BYTES + pixels * IMAGE_BYTES
+    check_room(memory, f"synth-orbit: {what}", instead)
+    if hours > 1:
+        say(f"{what} {cost}")
 
 
 def rock_of(

@@ -58,7 +58,8 @@ def load_rock(
 
     up: "y" or "z", by default `up_axis`. Returns the mesh, +Z up, and the scale. Faces without area
     and repeated faces are removed: normals of opposite faces cancel, and a vertex without normal
-    has no shading. Raises InputError as `load_mesh`, and if all vertices are one point.
+    has no shading. Raises InputError as `load_mesh`, and if all vertices are one point or at one
+    height.
     """
     mesh = load_mesh(path)
     _leave_out_bad_faces(mesh)
@@ -67,7 +68,10 @@ def load_rock(
     if (up or up_axis(path)) == "y":
         mesh.apply_transform(WORLD_FROM_GLTF)
     scale = settings.size / float(mesh.extents.max())
-    return _stand(mesh, settings), scale
+    mesh = _stand(mesh, settings)
+    if mesh.bounds[1, 2] <= 0:
+        raise InputError(f"{path}: is flat on the ground; give a rock with a height, or --mesh-up")
+    return mesh, scale
 
 
 def _leave_out_bad_faces(mesh: trimesh.Trimesh) -> None:

@@ -118,12 +118,16 @@ class Orbit(_Strict):
     """
 
 
+MOST_ERROR = 100.0
+"""Largest factor on the errors of sensors: odometry then errs by as much as it moves."""
+
+
 class Sensor(_Strict):
     """Errors of the sensors of `mgs survey`; `mgs synth-orbit` has none."""
 
-    noise: Annotated[float, Field(ge=0)] = 1.0
+    noise: Annotated[float, Field(ge=0, le=MOST_ERROR)] = 1.0
     """Factor on the depth camera's noise (`mgs.survey.depth_sensor`)."""
-    drift: Annotated[float, Field(ge=0)] = 1.0
+    drift: Annotated[float, Field(ge=0, le=MOST_ERROR)] = 1.0
     """Factor on the odometry's drift (`mgs.survey.odometry`)."""
 
 
