@@ -13,12 +13,12 @@ import pytest
 import synthetic
 from program import command, steps, timeless
 
-from mgs.cli import app
+from mgs.cli import app, demo
 from mgs.cli.app import COMMANDS, main
-from mgs.cli.demo import POLICIES
 from mgs.data.dataset import load_dataset
 from mgs.images import read_exr
 from mgs.policy import criteria
+from mgs.policy.registry import policy_names
 from mgs.prior.build import load_prior
 from mgs.prior.initial import initial_gaussians
 from mgs.report import predicted_error
@@ -200,15 +200,18 @@ def test_demo_shows_the_table_and_the_pictures_and_can_be_repeated(tmp_path, cap
     dataset = synthetic.write_dataset(out / "dataset", synthetic.orbit_cameras(13, 32, 24))
     write_contact_sheet(out / "dataset/contact_sheet.png", dataset.frames)
     synthetic.write_dataset(out / "dataset/test", synthetic.orbit_cameras(2, 32, 24))
+    assert set(demo.POLICIES) < set(policy_names())
+    policies = ("d-optimal", "random")
+    monkeypatch.setattr("mgs.cli.demo.POLICIES", policies)
     monkeypatch.setattr("mgs.cli.demo.GAUSSIANS", 150)
     monkeypatch.setattr("mgs.cli.demo.BUDGET", 1)
     monkeypatch.setattr("mgs.report.diagnostics.VIEWS", 1)
     command("demo", out)
     shown = capsys.readouterr().out
     lines = shown.splitlines()
-    assert shown.count("test views (2): PSNR") == len(POLICIES)
+    assert shown.count("test views (2): PSNR") == len(policies)
     table = json.loads((out / "report/table.json").read_text())
-    assert {row["policy"] for row in table} == set(POLICIES)
+    assert {row["policy"] for row in table} == set(policies)
     for row in table:
         line = next(line for line in lines if line.split()[:1] == [row["policy"]])
         assert line.split()[2:4] == [f"{row['test.psnr']:.2f}", f"{row['test.ssim']:.4f}"]
@@ -218,6 +221,6 @@ def test_demo_shows_the_table_and_the_pictures_and_can_be_repeated(tmp_path, cap
     assert len(pictures) >= 7
     assert all(Path(picture).is_file() for picture in pictures)
     kept = {path: path.read_bytes() for path in out.glob("*/steps.jsonl")}
-    assert len(kept) == len(POLICIES)
+    assert len(kept) == len(policies)
     command("demo", out)
     assert {path: path.read_bytes() for path in out.glob("*/steps.jsonl")} == kept
