@@ -156,7 +156,7 @@ def runs(rock: Path, varied: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     kinds = {"constant": (rock, False), "without": (varied, False), "with": (varied, True)}
     for name, (root, exposure) in kinds.items():
         state = run_nbv(root, folder / name, exposure=exposure, evaluate_every=4, **RUN)
-        evaluate_run(folder / name, pictures=False)
+        evaluate_run(folder / name, pictures=False, convergence=True)
         made[name] = state, folder / name
     return made
 
