@@ -1,6 +1,7 @@
 """Shared set-up: sets the variant before any test module imports kernels, and common fixtures."""
 
 import importlib
+import os
 import shutil
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from hypothesis import settings
 
 from mgs import runtime
 
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # two workers share the processors
 runtime.start()
 # No deadline: the machine may be busy, and a first call loads libraries.
 settings.register_profile("mgs", deadline=None)

@@ -10,11 +10,22 @@ import pytest
 from mgs.cli.app import main
 
 
-def command(*arguments) -> None:
-    """Run `mgs ARGUMENTS`; fails unless it exits with 0."""
+def exit_code(*arguments) -> int:
+    """Run `mgs ARGUMENTS` and return its exit code."""
     with pytest.raises(SystemExit) as stop:
         main([str(argument) for argument in arguments])
-    assert stop.value.code == 0
+    return int(stop.value.code or 0)
+
+
+def command(*arguments) -> None:
+    """Run `mgs ARGUMENTS`; fails unless it exits with 0."""
+    assert exit_code(*arguments) == 0
+
+
+def said(capsys) -> tuple[str, str]:
+    """Output and errors since the last call, in one line each: rich breaks long ones."""
+    captured = capsys.readouterr()
+    return " ".join(captured.out.split()), " ".join(captured.err.split())
 
 
 def steps(run: Path) -> list[dict]:

@@ -83,7 +83,7 @@ def test_converged_is_said_at_the_minimum_alone(case):
 def test_what_is_printed_says_which(case):
     early = {"phi": 1.0, "predicted_decrease": 0.31, "converged": False}
     line = fit_line(early, "pass-limit")
-    assert "stopped early (pass-limit)" in line
+    assert "ended as designed (pass-limit)" in line
     assert "31 %" in line
     assert "converged" not in line
     assert "converged" in fit_line(early | {"converged": True}, "settled")

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic
-from commands import run, said
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import ExifTags, Image
+from program import command, said
 
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.files import read_json
@@ -156,7 +156,7 @@ def runs(rock: Path, varied: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     kinds = {"constant": (rock, False), "without": (varied, False), "with": (varied, True)}
     for name, (root, exposure) in kinds.items():
         state = run_nbv(root, folder / name, exposure=exposure, evaluate_every=4, **RUN)
-        evaluate_run(folder / name, pictures=False)
+        evaluate_run(folder / name, pictures=False, convergence=True)
         made[name] = state, folder / name
     return made
 
@@ -261,6 +261,6 @@ def test_an_import_tells_of_exposure_that_differs(rock, tmp_path, capsys, differ
         image = photograph(tmp_path / f"src/images/{frame.name}.jpg", time)
         frames.append(replace(frame, image_path=image, depth_path=None, mask_path=None))
     write_transforms(tmp_path / "src", frames)
-    assert run("import", tmp_path / "src", "--out", tmp_path / "out") == 0
+    command("import", tmp_path / "src", "--out", tmp_path / "out")
     message = "exposure differs by up to 0.5 stops between photographs"
     assert (message in said(capsys)[1]) == differs

@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 import pytest
 import synthetic
-from commands import one_line, run, said
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from program import command, exit_code, said
+from refusals import one_line
 
 from mgs.camera import Camera, look_at, opengl_from_opencv
 from mgs.colour import linear_from_srgb, srgb_from_linear
@@ -288,7 +289,7 @@ def test_what_is_missing_is_skipped_and_said(dataset, tmp_path, capsys):
     for frame in dataset.frames[:3]:
         frame.image_path.unlink()
     edit(dataset.root, lambda data: data.update(ply_file_path="sparse_pc.ply"))
-    assert run("import", dataset.root, "--out", tmp_path / "copy") == 0
+    command("import", dataset.root, "--out", tmp_path / "copy")
     out, err = said(capsys)
     assert len(load_dataset(tmp_path / "copy")) == 5
     assert "3 of 8 listed images do not exist" in err
@@ -302,9 +303,9 @@ def test_what_is_missing_is_skipped_and_said(dataset, tmp_path, capsys):
 def test_images_are_set_apart_as_test_views(dataset, tmp_path, capsys):
     arguments = ["import", dataset.root, "--test-every", "3", "--out"]
     out = tmp_path / "out"
-    assert run(*arguments, out) == 0
+    command(*arguments, out)
     (out / "transforms.json").unlink()  # as if it had been interrupted before its end
-    assert run(*arguments, out) == 0
+    command(*arguments, out)
     assert said(capsys)[0].count("images, which are no candidates; wrote") == 2
     made = load_dataset(out)
     tests = made.test_views()
@@ -318,7 +319,7 @@ def test_images_are_set_apart_as_test_views(dataset, tmp_path, capsys):
         assert np.allclose(frame.camera.world_to_camera, whole[frame.name].camera.world_to_camera)
     for frame in dataset.frames[1:]:
         frame.image_path.unlink()
-    assert run(*arguments, tmp_path / "none") == 2
+    assert exit_code(*arguments, tmp_path / "none") == 2
     assert "--test-every 3 of 1 images leaves none to choose from" in said(capsys)[1]
 
 
@@ -330,9 +331,9 @@ def test_masks_by_projecting_a_mesh_or_from_files(dataset, tmp_path):
         synthetic.cast(f.camera, [(synthetic.CENTRE, synthetic.AXES)])[1] for f in dataset.frames
     ]
     mesh = ["--mesh", dataset.root / "rock.glb"]
-    assert run("import", dataset.root, "--out", tmp_path / "mesh", *mesh) == 0
+    command("import", dataset.root, "--out", tmp_path / "mesh", *mesh)
     masks = ["--masks", dataset.root / "masks"]
-    assert run("import", dataset.root, "--out", tmp_path / "files", *masks) == 0
+    command("import", dataset.root, "--out", tmp_path / "files", *masks)
     projected, given = (load_dataset(tmp_path / name).frames for name in ("mesh", "files"))
     for a, b, mask in zip(projected, given, true, strict=True):
         assert np.array_equal(b.mask(), mask)
@@ -347,7 +348,7 @@ def test_a_mesh_is_said_to_be_turned_only_where_it_could_be_read(
 ):
     (tmp_path / "broken.glb").write_text("this is no mesh")
     for mesh, read in ((tmp_path / "broken.glb", False), (dataset.root / "rock.glb", True)):
-        run(*command, dataset.root, "--out", tmp_path / "out", "--mesh", mesh)
+        exit_code(*command, dataset.root, "--out", tmp_path / "out", "--mesh", mesh)
         assert ("turned from +Y up" in said(capsys)[0]) == read
 
 
@@ -470,5 +471,5 @@ def test_bad_input_is_one_line_and_leaves_nothing(case, tmp_path, capfd):
     (root / "rock").mkdir()
     source = spoil(root) or root
     given = [option.format(source=source) for option in options]
-    assert run("import", source, "--out", tmp_path / "out", *given) == 2
+    assert exit_code("import", source, "--out", tmp_path / "out", *given) == 2
     one_line(capfd.readouterr().err, message, tmp_path / "out")

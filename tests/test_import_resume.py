@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import synthetic
 import trimesh
-from commands import run, said
+from program import command, exit_code, said
 from refusals import listing, refused
 
 from mgs.data import importers
@@ -58,8 +58,8 @@ def many(source: Path) -> list:
 def ends_as_one_go(arguments: list, out: Path) -> None:
     """Finish the import in `out`, and compare it with one that was not interrupted."""
     whole = out.with_name("whole")
-    assert run(*arguments, out) == 0
-    assert run(*arguments, whole) == 0
+    command(*arguments, out)
+    command(*arguments, whole)
     assert listing(out) == listing(whole)
 
 
@@ -84,10 +84,10 @@ def test_struck_in_the_middle_and_given_again(many, tmp_path, blow, code, monkey
     read, load = [], importers.read_rgba
     with monkeypatch.context() as patch:
         patch.setattr(importers, "read_rgba", lambda path: (read.append(path.stem), load(path))[1])
-        assert run(*many, out) == 0
+        command(*many, out)
     assert read == [f"kf_{k:04d}" for k in range(3, 8)]
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
-    assert run(*many, tmp_path / "whole") == 0
+    command(*many, tmp_path / "whole")
     assert listing(out) == listing(tmp_path / "whole")
 
 
@@ -103,7 +103,7 @@ def stopped(arguments: list, out: Path, monkeypatch) -> Path:
 
     with monkeypatch.context() as patch:
         patch.setattr(importers, "write_png", stop)
-        assert run(*arguments, out) == 130
+        assert exit_code(*arguments, out) == 130
     return out
 
 
@@ -132,7 +132,7 @@ def test_a_damaged_image_in_the_middle_keeps_the_frames_before(source, many, tmp
     out, image = tmp_path / "out", source / "images/kf_0004.png"
     whole = image.read_bytes()
     image.write_bytes(whole[:100])
-    assert run(*many, out) == 2
+    assert exit_code(*many, out) == 2
     assert "kf_0004.png: not a readable image" in said(capsys)[1]
     assert len(list((out / "images").iterdir())) == 4
     image.write_bytes(whole)
@@ -142,5 +142,5 @@ def test_a_damaged_image_in_the_middle_keeps_the_frames_before(source, many, tmp
 def test_killed_before_the_first_frame(many, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out/.import.1.part.json").touch()
-    assert run(*many, tmp_path / "out") == 0
+    command(*many, tmp_path / "out")
     assert not list((tmp_path / "out").glob(".*"))

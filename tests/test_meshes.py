@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import synthetic
 import trimesh
-from commands import run, said
+from program import command, said
 from refusals import refused
 
 from mgs.data.dataset import Dataset
@@ -115,7 +115,7 @@ def test_a_mesh_that_is_small_and_far_away_is_one_line(tmp_path):
 
 def test_the_record_of_a_given_mesh_says_what_was_done(dataset, tmp_path, capsys):
     options = ["--mesh", dataset.root / "rock.glb", "--gaussians", 100, "--seed", 3]
-    assert run("prior", dataset.root, *options, "--out", tmp_path / "p") == 0
+    command("prior", dataset.root, *options, "--out", tmp_path / "p")
     used = {"gaussians": 100, "spacing": None, "seed": 3, "backing": 0.5}
     prior = load_prior(tmp_path / "p")
     assert prior.numbers["settings"] == used
@@ -186,7 +186,7 @@ def test_a_mesh_that_can_be_mended_gives_the_same_prior(tmp_path, how):
 def test_a_single_triangle_and_a_fold_are_sampled(dataset, tmp_path):
     (tmp_path / "one.obj").write_text(f"{TRIANGLE}f 1 3 2\n")
     options = ["--mesh", tmp_path / "one.obj", "--gaussians", 40, "--out", tmp_path / "p"]
-    assert run("prior", dataset.root, *options) == 0
+    command("prior", dataset.root, *options)
     # As it is wound, and drawn though no face is towards the viewer.
     assert np.allclose(load_prior(tmp_path / "p").normals, [0, 0, -1])
     # Two triangles folded flat onto each other: the normals of their vertices cancel.

@@ -98,7 +98,10 @@ def test_the_page_says_what_the_files_say(page, runs):
     assert "Unfinished: 4 of 6 views are taken" in parsed.text
     assert "Not measured: `mgs eval" in parsed.text
     steps = read_steps(runs[0])
-    assert "Last fit: converged; its objective could fall by 0.4 % yet" in parsed.text
+    assert (
+        "Last fit: converged; at its minimum the objective is predicted to be 0.4 % lower"
+        in parsed.text
+    )
     assert "stopped early" not in parsed.text
     plots = {plot["title"]: plot["data"] for plot in data["plots"]}
     gain, both = plots["Information gain of each chosen view (the paper's Fig. 2)"]

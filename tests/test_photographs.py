@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import synthetic
 import trimesh
-from commands import one_line, run, said
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from program import command, exit_code, said
+from refusals import one_line
 from scipy.ndimage import binary_dilation
 
 from mgs.camera import Camera, look_at
@@ -184,7 +185,7 @@ def test_points_of_any_ply_can_be_given(data, tmp_path):
     sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
     points = synthetic.CENTRE + synthetic.AXES * sphere
     trimesh.PointCloud(scale * points[points[:, 2] > 0]).export(tmp_path / "cloud.ply")
-    assert run("prior", dataset.root, "--points", tmp_path / "cloud.ply", "--gaussians", "300") == 0
+    command("prior", dataset.root, "--points", tmp_path / "cloud.ply", "--gaussians", "300")
     prior = load_prior(dataset.root / "prior")
     assert prior.numbers["from"] == "points"
     assert np.abs(synthetic.level(prior.points / scale)).mean() < 0.03
@@ -245,7 +246,7 @@ def test_a_refused_cloud_leaves_a_picture(data, tmp_path, capsys):
     source = data("colmap-binary")
     root = import_source(read_source(source), tmp_path / "d", masks=source / "masks").root
     write_cloud(tmp_path / "far.ply", SparseCloud(np.random.default_rng(0).uniform(5, 6, (300, 3))))
-    assert run("prior", root, "--points", tmp_path / "far.ply", "--gaussians", "300") == 2
+    assert exit_code("prior", root, "--points", tmp_path / "far.ply", "--gaussians", "300") == 2
     assert "only 0 of 300 points lie inside the masks" in said(capsys)[1]
     assert (root / "prior-refused.png").is_file()
     assert not (root / "prior").exists()
@@ -287,8 +288,8 @@ def test_up_is_found_in_a_turned_world_of_cameras_held_nearly_level(seed, altitu
 
 def test_the_unit_scales_cameras_and_points_to_metres(data, tmp_path):
     source = data("colmap-binary")
-    assert run("import", source, "--out", tmp_path / "raw") == 0
-    assert run("import", source, "--out", tmp_path / "metres", "--unit", str(1 / 0.37)) == 0
+    command("import", source, "--out", tmp_path / "raw")
+    command("import", source, "--out", tmp_path / "metres", "--unit", str(1 / 0.37))
     raw, metres = load_dataset(tmp_path / "raw"), load_dataset(tmp_path / "metres")
     assert (raw.unit, metres.unit) == ("unit", "m")
     for one, other in zip(raw.frames, metres.frames, strict=True):
@@ -298,9 +299,9 @@ def test_the_unit_scales_cameras_and_points_to_metres(data, tmp_path):
 
 
 def test_lengths_of_unknown_unit_are_not_called_metres(data, tmp_path, capsys):
-    assert run("import", data("nerf-synthetic"), "--out", tmp_path / "d", "--up", "0,0,2") == 0
+    command("import", data("nerf-synthetic"), "--out", tmp_path / "d", "--up", "0,0,2")
     assert "up is (0, 0, 1): as --up says; lengths are in units" in said(capsys)[0]
-    assert run("prior", tmp_path / "d", "--gaussians", "300", "--up", "0,1,0") == 0
+    command("prior", tmp_path / "d", "--gaussians", "300", "--up", "0,1,0")
     out = said(capsys)[0]
     assert "prior from hull: the dataset has masks" in out
     assert "unit²" in out
@@ -328,11 +329,11 @@ def test_a_smaller_image_is_the_mean_of_its_blocks_and_rays_stay():
 
 def test_downscaled_import(data, tmp_path):
     source = ["import", data("rgbd"), "--masks", data("rgbd") / "masks", "--out"]
-    assert run(*source, tmp_path / "d", "--downscale", "2") == 0
+    command(*source, tmp_path / "d", "--downscale", "2")
     frame = load_dataset(tmp_path / "d").frames[0]
     assert frame.rgb().shape == (36, 48, 3)
     assert frame.depth().shape == frame.mask().shape == (36, 48)
-    assert run(*source, tmp_path / "none", "--downscale", "100") == 2
+    assert exit_code(*source, tmp_path / "none", "--downscale", "100") == 2
 
 
 @pytest.mark.parametrize("orientation", [5, 6, 7, 8])
@@ -363,15 +364,15 @@ def test_a_phone_held_upright(exact, tmp_path, orientation):
 def test_masks_are_made_of_the_prior(data, tmp_path):
     source = data("colmap-binary")
     true = import_source(read_source(source), tmp_path / "true", masks=source / "masks")
-    assert run("import", source, "--out", tmp_path / "d") == 0
-    assert run("prior", tmp_path / "d", "--gaussians", "300") == 0
-    assert run("dataset", "masks", tmp_path / "d") == 0
+    command("import", source, "--out", tmp_path / "d")
+    command("prior", tmp_path / "d", "--gaussians", "300")
+    command("dataset", "masks", tmp_path / "d")
     made = load_dataset(tmp_path / "d")
     pairs = [(a.mask(), b.mask()) for a, b in zip(made.frames, true.frames, strict=True)]
     assert np.mean([(a & b).sum() / (a | b).sum() for a, b in pairs]) > 0.85
     with Image.open(tmp_path / "d/masks.png") as sheet:
         assert sheet.size == (6 * 240, 4 * 180)
-    assert run("dataset", "masks", tmp_path / "d") == 2
+    assert exit_code("dataset", "masks", tmp_path / "d") == 2
 
 
 def test_outlines_move_to_where_the_colour_changes():
@@ -479,16 +480,16 @@ def test_what_cannot_be_used_is_one_line(case, data, tmp_path, capfd):
     make, options, message = REFUSED[case]
     make(tmp_path / "d", data)
     capfd.readouterr()
-    assert run("prior", tmp_path / "d", "--gaussians", "300", *options) == 2
+    assert exit_code("prior", tmp_path / "d", "--gaussians", "300", *options) == 2
     one_line(capfd.readouterr().err, message, tmp_path / "d/prior")
 
 
 def test_a_world_in_which_nothing_would_be_drawn_is_one_line(data, tmp_path, capfd):
     """A prior has no unit, but the kernels draw nothing that is nearer than 0.01."""
-    assert run("import", data("nerf-synthetic"), "--out", tmp_path / "d", "--unit", "0.005") == 0
-    assert run("prior", tmp_path / "d", "--gaussians", "300") == 0
+    command("import", data("nerf-synthetic"), "--out", tmp_path / "d", "--unit", "0.005")
+    command("prior", tmp_path / "d", "--gaussians", "300")
     capfd.readouterr()
-    assert run("nbv", tmp_path / "d", "--out", tmp_path / "run", "--budget", "1") == 2
+    assert exit_code("nbv", tmp_path / "d", "--out", tmp_path / "run", "--budget", "1") == 2
     message = "m from it, and nothing nearer than 0.01 is drawn; import the data with --unit M"
     one_line(capfd.readouterr().err, message, tmp_path / "run")
 

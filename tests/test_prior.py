@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import synthetic
 import trimesh
-from commands import run, said
+from program import command, said
 from refusals import listing, refused
 from scipy.spatial import cKDTree
 
@@ -262,7 +262,7 @@ def test_prior_round_trip_and_determinism(built, dataset, tmp_path):
 
 
 def test_command_writes_everything(dataset, tmp_path, capsys):
-    assert run("prior", dataset.root, "--out", tmp_path / "p", "--gaussians", "500") == 0
+    command("prior", dataset.root, "--out", tmp_path / "p", "--gaussians", "500")
     files = {"mesh.ply", "points.ply", "prior.json", "prior.png"}
     assert {path.name for path in (tmp_path / "p").iterdir()} == files
     numbers = read_json(tmp_path / "p/prior.json")

@@ -383,6 +383,12 @@ def test_an_unfinished_run(runs, tmp_path):
     assert not (tmp_path / "report").exists()
 
 
+def test_a_run_whose_budget_was_raised_is_unfinished(runs, tmp_path):
+    run = changed(runs[0], tmp_path / "run", config=set_setting("budget", 7))
+    with pytest.raises(InputError, match="is unfinished, with 8 of 10 views"):
+        writing.write_report(tmp_path / "report", [run])
+
+
 def test_comparison_is_cropped_to_the_rock():
     mask = np.zeros((100, 200), bool)
     mask[40:60, 50:80] = True

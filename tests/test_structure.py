@@ -1,9 +1,7 @@
-"""The package's own imports, read from its sources: no cycle between modules, and rooms that import
-only from those below.
+"""Imports of the package, read from its sources: no cycle, and rooms import from those below.
 
-A room is a module or a sub-package directly in mgs/. Every import counts, those inside functions
-and under TYPE_CHECKING too: the first are there to start quickly and the second for annotations,
-neither to close a circle.
+A room is a module or sub-package directly in mgs/. Imports inside functions and under TYPE_CHECKING
+count, too.
 """
 
 from __future__ import annotations
@@ -15,30 +13,17 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PACKAGE = "mgs"
-ROOMS = (
-    "errors", "seeds", "runtime", "resources", "provenance", "colour", "rotation", "memory", "camera", "gaussians", "files",
-    "images", "splat_ply", "metrics", "plotting",
-    "data", "synth", "survey", "prior", "splat", "policy", "fit", "run", "report", "view", "bench", "study", "cli", "__main__",
-)  # fmt: skip
-"""All rooms, lowest first: each may import from those before it, and from none after it."""
-
-
-def sources(root: Path, package: str) -> dict[str, Path]:
-    """{dotted name: file} of every module of a package that lies in root."""
-    names = {
-        path: path.relative_to(root).with_suffix("").parts
-        for path in (root / package).rglob("*.py")
-    }
-    return {
-        ".".join(parts[:-1] if parts[-1] == "__init__" else parts): path
-        for path, parts in names.items()
-    }
+ROOMS = [
+    "errors", "seeds", "runtime", "resources", "provenance", "colour", "rotation", "memory",
+    "camera", "gaussians", "files", "images", "splat_ply", "metrics", "plotting",
+    "data", "synth", "survey", "prior", "splat", "policy", "fit", "run", "report", "view",
+    "bench", "study", "cli", "__main__",
+]  # fmt: skip
+"""All rooms; each may import from those before it."""
 
 
 def imported(node: ast.AST, module: str, is_package: bool) -> list[str]:
-    """Dotted names that one statement may load: of `from a import b` both a and a.b, since b may be
-    a module."""
+    """Dotted names that a statement may load: a and a.b of `from a import b`."""
     if isinstance(node, ast.Import):
         return [alias.name for alias in node.names]
     if not isinstance(node, ast.ImportFrom):
@@ -52,43 +37,37 @@ def imported(node: ast.AST, module: str, is_package: bool) -> list[str]:
 
 
 def import_graph(root: Path, package: str) -> dict[str, set[str]]:
-    """{module: modules of the same package that it imports}; of names that hold one another, only
-    the innermost module.
+    """{module: modules of the same package that it imports}; a.b counts, and a beside it does not.
 
-    The root of the package is left out as an import: Python loads it before any of its modules,
-    whatever they import.
+    The package itself is left out, since Python loads it before any of its modules.
     """
-    files, graph = sources(root, package), {}
+    files, graph = {}, {}
+    for path in (root / package).rglob("*.py"):
+        parts = path.relative_to(root).with_suffix("").parts
+        files[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
     for module, path in files.items():
         graph[module] = set()
         for node in ast.walk(ast.parse(path.read_text())):
-            found = [
-                name for name in imported(node, module, path.name == "__init__.py") if name in files
-            ]
-            inner = {
-                name for name in found if not any(other.startswith(f"{name}.") for other in found)
-            }
+            names = imported(node, module, path.name == "__init__.py")
+            found = [name for name in names if name in files]
+            inner = {a for a in found if not any(b.startswith(f"{a}.") for b in found)}
             graph[module] |= inner - {package, module}
     return graph
 
 
 def room(module: str) -> str:
-    """What lies directly in the package: `splat` of `mgs.splat.blocks`; empty for the root of the
-    package."""
+    """Room of a module: `splat` of `mgs.splat.blocks`; empty for the package itself."""
     return module.partition(".")[2].partition(".")[0]
 
 
-def misplaced(graph: dict[str, set[str]], rooms: tuple[str, ...]) -> list[str]:
-    """Imports from a room that does not lie below the importing one."""
+def misplaced(graph: dict[str, set[str]], rooms: list[str]) -> list[str]:
+    """Imports from a room that is not below the importing one."""
     height = {name: i for i, name in enumerate(rooms)}
-    pairs = [
-        (module, other)
-        for module, others in graph.items()
-        for other in others
-        if room(module) != room(other)
-    ]
     return sorted(
-        f"{a} imports {b}" for a, b in pairs if height.get(room(a), len(rooms)) < height[room(b)]
+        f"{a} imports {b}"
+        for a, others in graph.items()
+        for b in others
+        if room(a) != room(b) and height.get(room(a), len(rooms)) < height[room(b)]
     )
 
 
@@ -101,7 +80,7 @@ def cycle(graph: dict[str, set[str]]) -> list[str]:
     return []
 
 
-GRAPH = import_graph(ROOT, PACKAGE)
+GRAPH = import_graph(ROOT, "mgs")
 
 
 def test_modules_import_one_another_in_no_circle():
@@ -109,14 +88,9 @@ def test_modules_import_one_another_in_no_circle():
     assert not found, " < ".join(found)
 
 
-def test_every_room_has_its_place_in_the_order():
+def test_every_room_has_its_place_and_imports_only_from_rooms_below_it():
     assert sorted(ROOMS) == sorted({room(module) for module in GRAPH} - {""})
-
-
-@pytest.mark.parametrize("name", ROOMS)
-def test_a_room_imports_only_from_rooms_below_it(name):
-    of_it = {module: others for module, others in GRAPH.items() if room(module) == name}
-    found = misplaced(of_it, ROOMS)
+    found = misplaced(GRAPH, ROOMS)
     assert not found, "; ".join(found)
 
 
@@ -126,10 +100,8 @@ def test_nothing_but_tests_imports_tests(folder):
     for path in (ROOT / folder).rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if not getattr(node, "level", 0):
-                roots = {name.partition(".")[0] for name in imported(node, "", False)}
-                assert not roots & tests, (
-                    f"{path} line {node.lineno} imports {sorted(roots & tests)}"
-                )
+                names = {name.partition(".")[0] for name in imported(node, "", False)} & tests
+                assert not names, f"{path} line {node.lineno} imports {sorted(names)}"
 
 
 @pytest.mark.parametrize(
@@ -146,20 +118,13 @@ def test_nothing_but_tests_imports_tests(folder):
     ],
 )
 def test_every_kind_of_import_is_seen(tmp_path, statement):
-    """A package of two rooms in which the lower one imports from the upper one, which imports it in
-    turn."""
-    files = {
-        "__init__": "",
-        "low/__init__": "",
-        "low/b": "from p.high.a import name",
-        "high/__init__": "",
-        "high/a": statement,
-    }
-    for name, text in files.items():
+    """In a package of two modules that import one another."""
+    imports = {"low/b": "from p.high.a import name", "high/a": statement}
+    for name in ("__init__", "low/__init__", "low/b", "high/__init__", "high/a"):
         (tmp_path / f"p/{name}.py").parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / f"p/{name}.py").write_text(text)
+        (tmp_path / f"p/{name}.py").write_text(imports.get(name, ""))
     graph = import_graph(tmp_path, "p")
     assert graph["p.high.a"] == {"p.low.b"}
-    assert misplaced(graph, ("low", "high")) == ["p.low.b imports p.high.a"]
-    assert misplaced(graph, ("high", "low")) == ["p.high.a imports p.low.b"]
+    assert misplaced(graph, ["low", "high"]) == ["p.low.b imports p.high.a"]
+    assert misplaced(graph, ["high", "low"]) == ["p.high.a imports p.low.b"]
     assert set(cycle(graph)) == {"p.low.b", "p.high.a"}

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic
-from commands import run, said
+from program import command, said
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
@@ -278,7 +278,7 @@ def test_command_writes_a_dataset_with_its_figure(tmp_path, capsys):
     cameras = synthetic.orbit_cameras(12, 64, 48)
     root = synthetic.write_dataset(tmp_path / "data", cameras, ROCKS).root
     write_json(root / "config.json", {"scene": {"sensor": {"noise": 5.0, "drift": 0.5}}})
-    assert run("survey", root, "--sensor-noise", "0.2") == 0
+    command("survey", root, "--sensor-noise", "0.2")
     out = root / "survey"
     settings = read_json(out / "survey.json")["settings"]
     # An option goes before the scene, the scene before 1.

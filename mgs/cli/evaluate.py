@@ -16,6 +16,13 @@ def evaluate(
             help="Write truth, render and difference of every view, side by side, to RUN/renders."
         ),
     ] = True,
+    convergence: Annotated[
+        bool,
+        typer.Option(
+            "--convergence",
+            help="Measure how much lower the objective of the last fit could get (Newton decrease).",
+        ),
+    ] = False,
 ) -> None:
     """Measure the model on the test views, on all views, and on the views never trained on; write
     RUN/metrics.json, and renders beside truth.
@@ -34,6 +41,7 @@ def evaluate(
     from mgs.report.evaluation import evaluate_run
     from mgs.report.runs import Comparison, read_run
     from mgs.report.tables import comparison_rows
+    from mgs.run.ending import fit_line
     from mgs.run.folder import open_run
 
     runtime.start()
@@ -41,7 +49,11 @@ def evaluate(
     opened = open_run(run)
     with progress_bar() as bar:
         progress = partial(bar, "rendering and comparing")
-        evaluate_run(opened, pictures=pictures, progress=progress, say=said.append)
+        metrics = evaluate_run(
+            opened, pictures=pictures, convergence=convergence, progress=progress, say=said.append
+        )
     rows = comparison_rows(Comparison({opened.label: read_run(run)}, opened.dataset))
     print_quality(Console(), rows)
+    if "fit" in metrics:
+        said.insert(0, fit_line(metrics["fit"], opened.state.steps[-1]["stop_reason"]))
     typer.echo("\n".join(said))

@@ -23,11 +23,10 @@ from mgs.errors import InputError
 from mgs.survey.fusion import nearest_point
 
 COARSE, REFINEMENTS = 48, 2
-"""Cells along an edge of the first grid, which is refined near the surface REFINEMENTS times by
-two."""
+"""Cells along an edge of the first grid, and its refinements by two near the surface."""
 
 NEAR_SURFACE = 3.0
-"""Nodes of a refined grid are evaluated anew if their interpolated value is below this many cells.
+"""Nodes of a refined grid are evaluated anew if their interpolated value is under this many cells.
 """
 
 ROW = 4096
@@ -48,15 +47,17 @@ AGREEMENT = 0.8
 
 @dataclass(frozen=True)
 class Hull:
-    """mesh: closed surface, world; cell: finest grid cell, units of the world; agreement: share of
-    each frame's mask that the hull fills."""
+    """A visual hull. mesh: closed surface, world; cell: finest grid cell, units of the world;
+    agreement: share of each frame's mask that the hull fills."""
 
     mesh: Mesh
     cell: float
     agreement: np.ndarray
 
 
-def visual_hull(frames: Sequence[Frame], tell: Callable[[str], None] = lambda stage: None) -> Hull:
+def visual_hull(
+    frames: Sequence[Frame], on_stage: Callable[[str], None] = lambda stage: None
+) -> Hull:
     """Visual hull of the masks of frames, smoothed by at most half a cell.
 
     Raises InputError if all masks are empty or full, if they share no point of space, or if the
@@ -64,7 +65,7 @@ def visual_hull(frames: Sequence[Frame], tell: Callable[[str], None] = lambda st
     """
     from skimage.measure import marching_cubes
 
-    tell("visual hull")
+    on_stage("visual hull")
     views = [_view(frame) for frame in frames]
     lo, edge = _bounds(frames)
     cells = COARSE

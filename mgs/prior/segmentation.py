@@ -44,9 +44,8 @@ NORMAL_NEIGHBOURS = (16, 128)
 """Neighbours for a normal: without noise, and at most."""
 
 FLOOR_UPRIGHT = 0.9
-"""Points of the rock's cluster within two plane tolerances of the ground, and with a larger cosine
-of the angle between their normal and the ground's, are ground that rises at the foot of the rock.
-"""
+"""Least cosine between the normals of ground and of points that rise at the foot of the rock:
+points of its cluster within two plane tolerances of the ground, which are left out."""
 
 
 @dataclass(frozen=True)

@@ -213,13 +213,15 @@ def evaluate_run(
     run: str | Path | Run,
     *,
     pictures: bool = True,
+    convergence: bool = False,
     progress: Progress = no_progress,
     say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
     """Evaluate a run of `mgs nbv` on its dataset and its test views; write RUN/metrics.json and,
     with `pictures`, RUN/renders. Returns the contents of metrics.json.
 
-    run: folder or opened run. Of an on-demand dataset only frames that the run has taken have an
+    run: folder or opened run. convergence: measure how far the last fit is from its minimum, too
+    (entry "fit": `mgs.report.convergence.remaining_decrease`). Of an on-demand dataset only frames that the run has taken have an
     image, so none is held out. Metrics and pictures of this very model, dataset and version of mgs
     are kept. say: called with the metrics that are left out because there is no truth for them, and
     with what was written and kept. Raises InputError as `open_run`, if the test views cannot be
@@ -248,11 +250,15 @@ def evaluate_run(
                 progress=progress,
             )
             about = {"policy": run.label, "of": subject, "pictures": pictures}
-            metrics = about | _fit(run, progress, say) | {"informed": _informed(run)} | found
+            fit = _fit(run, progress) if convergence else {}
+            metrics = about | fit | {"informed": _informed(run)} | found
             write_json(file, metrics)
             say(f"wrote {file}" + (f" and {folder}" if pictures else ""))
             return metrics
         kept = f"kept {file}, measured before on this very model and dataset"
+        if convergence and "fit" not in metrics:
+            metrics |= _fit(run, progress)
+            write_json(file, metrics)
         paths = {folder / f"{frame.name}.png": frame for frame in frames}
         paths |= {folder / TEST_FOLDER / f"{frame.name}.png": frame for frame in test_frames}
         if not pictures:
@@ -271,17 +277,12 @@ def evaluate_run(
         return metrics
 
 
-def _fit(run: Run, progress: Progress, say: Callable[[str], None]) -> dict[str, Any]:
-    """Entry "fit": distance of the last fit from its minimum (`remaining_decrease`). Left out, with
-    the reason as a line, if the prior is gone or does not fit the run."""
+def _fit(run: Run, progress: Progress) -> dict[str, Any]:
+    """Entry "fit" of metrics.json. Raises InputError if the prior is gone or is not the run's."""
     from mgs.report.convergence import remaining_decrease
 
-    try:
-        model, settings = run.state.gaussians, run.settings
-        return {"fit": remaining_decrease(model, settings, run.prior, run.taken, progress)}
-    except InputError as error:
-        say(f"{error}; so it is not measured whether the last fit converged")
-        return {}
+    model, settings = run.state.gaussians, run.settings
+    return {"fit": remaining_decrease(model, settings, run.prior, run.taken, progress)}
 
 
 def _informed(run: Run) -> dict[str, dict[str, int]]:

@@ -40,7 +40,6 @@ from mgs.report.page_pictures import (
 from mgs.report.page_plots import line_plot, metric_name, orbit_plot, timing_plot, views_plot
 from mgs.report.runs import RunFiles, compare_runs
 from mgs.report.tables import table_cell
-from mgs.run.folder import read_settings
 
 COMPARED = 6
 """Most views of the dataset, and most test views, on which truth and renders are compared."""
@@ -117,8 +116,7 @@ def draw_pictures(
 
     progress(0, total)
     for one, model in modelled:
-        settings = read_settings(one.run.folder)
-        noise = settings.pixel_noise, settings.prior_std
+        noise = one.run.settings["pixel_noise"], one.run.settings["prior_std"]
         draw_taken(album, one.label, model, one.frames, noise, drawn)
         for frame in views:
             name = f"{frame.name}/{one.label}"

@@ -16,7 +16,7 @@ from mgs.report.page_plots import metric_name
 from mgs.report.runs import RunFiles, up_of
 from mgs.report.tables import path_of, table_cell
 from mgs.run.ending import fit_line, why_ended
-from mgs.run.folder import read_checkpoint, read_config
+from mgs.run.folder import read_checkpoint
 from mgs.splat_ply import read_ply
 
 GROUP_NAMES = {"all": "all views", "held_out": "held out", "test": "test views"}
@@ -174,10 +174,9 @@ def setting_rows(shown: Sequence[Shown]) -> list[tuple[str, list[str], bool]]:
     differ)."""
     columns = []
     for one in shown:
-        config = read_config(one.run.folder)
-        versions = config.get("versions", {}).items()
+        versions = one.run.versions.items()
         named = {f"version of {name}": str(version) for name, version in versions}
-        columns.append(_texts(config["settings"]) | named)
+        columns.append(_texts(one.run.settings) | named)
     rows = []
     for key in dict.fromkeys(key for column in columns for key in column):
         values = [column.get(key, "–") for column in columns]

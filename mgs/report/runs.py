@@ -10,13 +10,13 @@ from typing import Any
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from mgs.data.dataset import Dataset, load_dataset
+from mgs.data.dataset import Dataset
 from mgs.data.up import Up, unit_up
 from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.policy.from_file import label
 from mgs.run.ending import RunEnd
-from mgs.run.folder import check_same_frames, read_config, read_settings
+from mgs.run.folder import check_same_frames, open_run, read_config
 from mgs.run.settings import validated
 
 
@@ -80,8 +80,8 @@ class RunFiles:
     """Contents of the files of a run folder.
 
     policy: its name. steps: the lines of steps.jsonl (`mgs.run.folder` lists their keys). metrics:
-    metrics.json (`mgs.report.evaluation.evaluate`), None if the run was not evaluated. settings:
-    those in config.json.
+    metrics.json (`mgs.report.evaluation.evaluate`), None if the run was not evaluated. settings,
+    versions: those in config.json.
     """
 
     folder: Path
@@ -89,6 +89,7 @@ class RunFiles:
     steps: list[dict[str, Any]]
     metrics: dict[str, Any] | None
     settings: dict[str, Any]
+    versions: dict[str, str]
 
     @property
     def seeds(self) -> list[int]:
@@ -140,7 +141,8 @@ def read_run(folder: str | Path) -> RunFiles:
         raise InputError(
             f"{path}: is damaged; measure the run again with `mgs eval {folder}`"
         ) from None
-    return RunFiles(folder, label(settings.policy), steps, metrics, config["settings"])
+    name, versions = label(settings.policy), config.get("versions", {})
+    return RunFiles(folder, name, steps, metrics, config["settings"], versions)
 
 
 def _read_steps(folder: Path) -> list[dict[str, Any]]:
@@ -224,8 +226,8 @@ def compare_runs(folders: Sequence[str | Path]) -> Comparison:
                 f"{run.folder}: is a run on another dataset than {runs[0].folder}; "
                 "compare runs on one dataset"
             )
-    dataset = load_dataset(read_settings(runs[0].folder).dataset)
-    for run in runs:
+    dataset = open_run(runs[0].folder).dataset
+    for run in runs[1:]:
         check_same_frames(run.folder, dataset)
     return Comparison(labelled, dataset)
 

@@ -37,12 +37,10 @@ def diverged(out: Path, step: int, kept: int, losses: Sequence[float]) -> str:
 
 
 def fit_line(fit: dict[str, Any], stop_reason: str) -> str:
-    """Describe the last fit: whether it converged, and how far its objective could still fall."""
+    """Describe how the last fit ended, and how far it is from its minimum."""
     share = f"{100 * fit['predicted_decrease']:.2g} %"
-    how = "converged" if fit["converged"] else f"stopped early ({stop_reason})"
-    return (
-        f"last fit: {how}; its objective could fall by {share} yet, as predicted from its curvature"
-    )
+    how = "converged" if fit["converged"] else f"ended as designed ({stop_reason})"
+    return f"last fit: {how}; at its minimum the objective is predicted to be {share} lower"
 
 
 class RunEnd(StrEnum):

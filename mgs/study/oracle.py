@@ -1,6 +1,6 @@
 """An oracle that sees the truth: at every step it takes the view whose fit is best on the test
-views. It reads the images of all candidates, so it is no policy; it is greedy, so better choices may
-exist."""
+views. It reads the images of all candidates, so it is no policy. It is greedy, so better choices
+may exist."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from mgs.study.case import curves_of, test_views_of
 
 
 def oracle(tests: Dataset) -> Chooser:
-    """Chooser that fits to every candidate in reach; its score is the mean PSNR over the test views,
-    dB. Of equals it takes the first."""
+    """Chooser that fits to every candidate in reach; its score is the mean PSNR over the test
+    views, dB. Of equals it takes the first."""
     measure = psnr_measure(tests, ListCache())
 
     def choose(problem: Problem, state: Fitted, fisher: Any = None) -> tuple[int, float]:

@@ -20,7 +20,7 @@ from mgs.data.dataset import Frame, load_dataset
 from mgs.fit.fitting import Fit, fit
 from mgs.fit.settings import RATES, TrainSettings
 from mgs.gaussians import Gaussians
-from mgs.policy.criteria import DIRECTIONAL_STD, PIXEL_NOISE
+from mgs.policy.criteria import PIXEL_NOISE
 from mgs.policy.poses import seed_views
 from mgs.prior.build import load_prior
 from mgs.report.evidence import fit_lam, last_images, lean_fit, regularisation
@@ -133,7 +133,6 @@ def cells_of(size: ParsimonySize) -> list[Cell]:
     for scene in size.scenes:
         for _, n, learned, degree in fixed_choices(size):
             arguments: dict[str, Any] = {"learned": learned, "degree": degree}
-            arguments |= {"directional_std": DIRECTIONAL_STD} if degree else {}
             arguments |= (
                 {"noises": list(PRUNE_NOISE)} if (n, learned, degree) == (AUTO, ALL, 0) else {}
             )
@@ -160,15 +159,10 @@ def fit_and_judge(
     seeds: int,
     learned: str,
     degree: int,
-    directional_std: float = DIRECTIONAL_STD,
     noises: Sequence[float] = (),
 ) -> dict[str, Any]:
     """Task: fit views one after the other; returns quality and cost, and the same of the model
-    pruned at each of `noises`.
-
-    directional_std: the constant tau of colours of degrees above 0, so that a result with another
-    value is not reused.
-    """
+    pruned at each of `noises`."""
     rates = {kind: rate if kind in LEARNED[learned] else 0.0 for kind, rate in RATES.items()}
     train = TrainSettings(rates=rates)
     settings = NbvSettings(dataset=root / dataset, prior=root / prior, seeds=seeds, train=train)

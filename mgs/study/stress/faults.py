@@ -374,7 +374,7 @@ DATA_FAULTS = Experiment(
         _harm("exposure", 0.3, "Exposure that varies by 0.3 stops"),
         _harm("motion blur", 5.0, "Motion blur of 5 pixels"),
         _harm("defocus", 1.5, "Defocus of 1.5 pixels"),
-        _harm("missing depth", 0.6, "Depth missing in 60 % of the pixels (with the prior as it was)",
+        _harm("missing depth", 0.6, "Depth missing in 60 % of the pixels (the prior as it was)",
               0.5, harmless=True),
         _harm("shifted mask", 4.0, "A mask that is off by 4 pixels"),
         _harm("wrong mask", 3.0, "A mask that is 3 pixels too large or too small"),
