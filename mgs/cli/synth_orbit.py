@@ -73,7 +73,10 @@ def synth_orbit(
     ] = 0.0,
     seed: Annotated[
         int,
-        typer.Option(min=0, help="Root seed: the same seed gives the same dataset, bit for bit."),
+        typer.Option(
+            min=0,
+            help="Root seed: the same seed gives the same dataset, bit for bit; only timings.json differs.",
+        ),
     ] = 0,
 ) -> None:
     """Render a dataset with Mitsuba: an orbit around a rock, with photoreal images, depth, rock
