@@ -75,7 +75,7 @@ def synth_orbit(
         int,
         typer.Option(
             min=0,
-            help="Root seed: the same seed gives the same dataset, bit for bit; only timings.json differs.",
+            help="Root seed: equal seeds give equal datasets bit for bit, but for timings.json.",
         ),
     ] = 0,
 ) -> None:

@@ -83,7 +83,7 @@ def _distance(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def outline_margin(start: Gaussians, camera: Camera) -> int:
-    """Most distance of a good prior's outline from the mask, pixels: 1 standard deviation, and 1.
+    """Pixels that a good prior may stand out of the mask: a Gaussian's standard deviation and 1.
 
     start: the Gaussians before training.
     """
