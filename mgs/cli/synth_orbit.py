@@ -12,7 +12,7 @@ from rich.console import Console
 
 from mgs import runtime
 from mgs.camera import MAX_PIXELS
-from mgs.cli.options import Seed, argument, option
+from mgs.cli.options import argument, option
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError, row_named
 from mgs.synth.scene_file import ORBITS, load_scene_file
@@ -57,7 +57,10 @@ def synth_orbit(
     rotation_noise: Annotated[
         float, option("Noise on the rotations there, degrees per axis.", min=0)
     ] = 0.0,
-    seed: Seed = 0,
+    seed: Annotated[
+        int,
+        option("Root seed: the same gives the same dataset bit for bit, but timings.json.", min=0),
+    ] = 0,
 ) -> None:
     """Render a dataset with Mitsuba: an orbit around a rock, with photoreal images, depth, rock
     masks and exact poses.

@@ -232,8 +232,8 @@ def _check_cost(
     cost = f"take about {hours:,.0f} hours and {needed / 2**30:,.1f} GiB on disk"
     if GUIDES_PER_SAMPLE * samples >= MOST_SAMPLES or hours > MOST_HOURS or needed > free:
         raise InputError(
-            f"synth-orbit: {what} {cost}; at most {MOST_HOURS:,} hours, {free / 2**30:,.1f} GiB and "
-            f"{MOST_SAMPLES // GUIDES_PER_SAMPLE:,} samples per view are possible; {instead}"
+            f"synth-orbit: {what} {cost}; at most {MOST_HOURS:,} hours, {free / 2**30:,.1f} GiB "
+            f"and {MOST_SAMPLES // GUIDES_PER_SAMPLE:,} samples per view are possible; {instead}"
         )
     memory = views * VIEW_BYTES + pixels * IMAGE_BYTES
     check_room(memory, f"synth-orbit: {what}", instead)
