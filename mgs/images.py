@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
@@ -17,7 +16,7 @@ from mgs.camera import MAX_PIXELS, MAX_SIDE
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.errors import InputError
 from mgs.files import atomic_path, not_writable, reading
-from mgs.memory import check_room
+from mgs.memory import check_room, decoding
 
 PNG_BIT_DEPTH = 24
 """Index of the byte of a PNG file that holds the bits of a sample (PNG specification, 11.2.1)."""
@@ -75,8 +74,8 @@ def image_size(path: str | Path) -> tuple[int, int]:
     return _exr_size(path) if is_exr else _open_image(path, decode=False)[0].size
 
 
-def _check_pixels(path: Path, width: int, height: int, pixel_bytes: int) -> None:
-    """Raise InputError if an image has too many pixels to decode."""
+def check_pixels(path: Path, width: int, height: int, pixel_bytes: int = DECODED_BYTES) -> None:
+    """Raise InputError if an image has more than MAX_PIXELS or takes more than the free memory."""
     size = f"{path}: has {width}x{height} pixels"
     if width < 1 or height < 1 or width * height > MAX_PIXELS or max(width, height) > MAX_SIDE:
         raise InputError(f"{size}; images hold 1 to {MAX_PIXELS:,}, resize it")
@@ -84,14 +83,15 @@ def _check_pixels(path: Path, width: int, height: int, pixel_bytes: int) -> None
 
 
 @contextmanager
-def bounded_textures() -> Iterator[None]:
-    """Context manager in which Pillow refuses images of more than MAX_PIXELS by their header."""
+def unlimited_headers() -> Iterator[None]:
+    """Context manager in which Pillow opens images of any size, for `check_pixels` to judge."""
     from PIL import Image
 
-    Image.MAX_IMAGE_PIXELS = MAX_PIXELS
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", Image.DecompressionBombWarning)
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+    try:
         yield
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
 
 
 def _open_image(path: Path, decode: bool = True) -> tuple[Any, bytes]:
@@ -104,14 +104,12 @@ def _open_image(path: Path, decode: bool = True) -> tuple[Any, bytes]:
     with reading(path, "image"):
         data = path.read_bytes() if decode else b""
     try:
-        with bounded_textures(), Image.open(BytesIO(data) if decode else path) as image:
-            _check_pixels(path, *image.size, DECODED_BYTES)
+        with unlimited_headers(), Image.open(BytesIO(data) if decode else path) as image:
+            check_pixels(path, *image.size)
             if decode:
                 image.load()
     except InputError:
         raise
-    except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
-        raise InputError(f"{path}: too large to read ({error}); resize it") from None
     except UnidentifiedImageError:
         raise InputError(
             f"{path}: not a readable image; give a PNG or JPEG, or write it again if it is damaged"
@@ -239,7 +237,11 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
 
     path = Path(path)
     _exr_size(path)
-    with _reading_exr(path), OpenEXR.File(str(path), separate_channels=True) as file:
+    with (
+        decoding(path),
+        _reading_exr(path),
+        OpenEXR.File(str(path), separate_channels=True) as file,
+    ):
         channels = file.channels().items()
         return {name: np.asarray(one.pixels, np.float32) for name, one in channels}
 
@@ -258,7 +260,7 @@ def _exr_size(path: Path) -> tuple[int, int]:
         if any((one.xSampling, one.ySampling) != (1, 1) for one in channels):
             raise ValueError("subsampled channels")
     width, height = (int(side) for side in high - low + 1)
-    _check_pixels(path, width, height, 8 * len(channels))
+    check_pixels(path, width, height, 8 * len(channels))
     return width, height
 
 
@@ -271,7 +273,7 @@ def _reading_exr(path: Path) -> Iterator[None]:
         try:
             os.dup2(nowhere.fileno(), 2)
             yield
-        except (RuntimeError, OSError, ValueError, TypeError, KeyError, MemoryError) as error:
+        except (RuntimeError, OSError, ValueError, TypeError, KeyError) as error:
             raise InputError(
                 f"{path}: not a readable EXR ({error}); the file is damaged, write it again"
             ) from None

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+import resource
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
@@ -42,6 +44,33 @@ def check_room(needed: float, what: str, instead: str) -> None:
             f"{what} may take {needed / 2**30:,.1f} GiB, "
             f"and {spare / 2**30:,.1f} GiB are free; {instead}"
         )
+
+
+@contextmanager
+def decoding(path: Path) -> Iterator[None]:
+    """Context manager in which this process gets no more memory than is free, so that a small file
+    that claims to be huge cannot exhaust it.
+
+    Raises InputError, which names the file, if that does not suffice. Systems that do not report
+    free memory are trusted.
+    """
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    spare = _spare()
+    bounded = limits[0] == resource.RLIM_INFINITY and spare < float("inf")
+    if bounded:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+        most = pages * resource.getpagesize() + int(spare)
+        resource.setrlimit(resource.RLIMIT_AS, (most, limits[1]))
+    try:
+        yield
+    except MemoryError:
+        raise InputError(
+            f"{path}: decoding it takes more than the {spare / 2**30:,.1f} GiB that are free; "
+            "give a smaller file, or repair it"
+        ) from None
+    finally:
+        if bounded:
+            resource.setrlimit(resource.RLIMIT_AS, limits)
 
 
 def _spare() -> float:

@@ -21,6 +21,7 @@ from mgs.colour import SH_C0
 from mgs.errors import InputError
 from mgs.files import atomic_path, reading
 from mgs.gaussians import Gaussians
+from mgs.memory import decoding
 
 LINEAR_COMMENT = "mgs: colours are linear RGB"
 """Comment in the header of the files that mgs writes; the layout has no field for the colour space.
@@ -120,11 +121,11 @@ def read_ply(path: str | Path) -> Gaussians:
 def _parse(path: Path) -> PlyData:
     """Elements of a PLY file. Raises InputError if it cannot be read or is damaged."""
     try:
-        with reading(path, "file; give a 3DGS PLY"):
+        with reading(path, "file; give a 3DGS PLY"), decoding(path):
             return _parse_any_comment(path)
     except InputError:
         raise
-    except (PlyParseError, ValueError, OverflowError, MemoryError) as error:
+    except (PlyParseError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: not a readable 3DGS PLY ({error}); export it again") from None
 
 

@@ -134,7 +134,8 @@ def test_only_test_views_are_rendered_in_advance(full, poses):
     for ours, theirs in zip(poses.test_views().frames, full.test_views().frames, strict=True):
         assert same_files(ours, theirs)
     paths = [path.relative_to(poses.root) for path in poses.root.rglob("*") if path.is_file()]
-    written = {"transforms.json", "config.json", "contact_sheet.png", "rock.glb", "survey", "test"}
+    written = {"transforms.json", "config.json", "timings.json", "contact_sheet.png", "rock.glb"}
+    written |= {"survey", "test"}
     assert {path.parts[0] for path in paths} == written
 
 
@@ -149,7 +150,7 @@ def test_an_interrupted_dataset_goes_on_only_as_on_demand(poses, tmp_path):
         synthesise(out, *given, seed=3, test_views=2)
     synthesise(out, *given, seed=3, test_views=2, on_demand=True)
     ours, theirs = listing(out), listing(poses.root)
-    del ours["config.json"], theirs["config.json"]  # with timings
+    del ours["timings.json"], theirs["timings.json"]
     assert ours == theirs
 
 

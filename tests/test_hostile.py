@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import struct
 import subprocess
 import sys
@@ -11,20 +13,34 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tiny
+import trimesh
 from PIL import Image, ImageFile
-from refusals import refused
+from refusals import listing, refused
 
+from mgs.cli.app import main
+from mgs.data.check import check_dataset
+from mgs.data.clouds import read_cloud
 from mgs.data.dataset import load_dataset
+from mgs.data.meshes import load_mesh
 from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.images import image_size, read_exr, read_rgba, write_exr
+from mgs.splat_ply import read_ply, write_ply
+from mgs.synth.rendering import RenderPreset, synthesise
+from mgs.synth.scene_file import Arena, Rock, SceneFile
+
+
+def change(dataset: Path, frame: dict | None = None, **header: object) -> None:
+    data = read_json(dataset / "transforms.json") | header
+    data["frames"][2] |= frame or {}
+    (dataset / "transforms.json").write_text(json.dumps(data))
 
 
 def bomb(path: Path, side: int, kind: str = "PNG") -> Path:
     """A black image of few bytes. Beyond 20,000 pixels only the header says so."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     if side <= 20_000:
-        Image.new("1" if kind == "PNG" else "L", (side, side)).save(path, kind)
+        Image.new("L", (side, side)).save(path, kind)
         return path
     header = b"IHDR" + struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)
     chunk = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
@@ -38,7 +54,6 @@ def exr_bomb(path: Path) -> Path:
     window = b"dataWindow\0box2i\0" + struct.pack("<i", 16)
     said = window + struct.pack("<iiii", 0, 0, 2**21 - 1, 3)
     small = window + struct.pack("<iiii", 0, 0, 3, 3)
-    assert small in path.read_bytes()
     path.write_bytes(path.read_bytes().replace(small, said))
     return path
 
@@ -46,24 +61,22 @@ def exr_bomb(path: Path) -> Path:
 @pytest.mark.parametrize("side", [4_000, 13_300, 200_000])
 @pytest.mark.parametrize("command", ["check", "import"])
 def test_an_image_is_measured_by_its_header(capsys, dataset, tmp_path, monkeypatch, side, command):
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", None)
     bomb(dataset / "images/kf_0000.png", side)
-    for name in ("load", "verify"):
-        monkeypatch.setattr(ImageFile.ImageFile, name, None)  # decoding would fail
+    monkeypatch.setattr(ImageFile.ImageFile, "load", None)  # decoding would fail
     if command == "import":
         line = refused(capsys, ["import", dataset, "--out", tmp_path / "out"], tmp_path / "out")
     else:
         with pytest.raises(InputError) as error:
             load_dataset(dataset).frames[0].rgb()
         line = str(error.value)
-    assert f"{side}x{side}" in line or "too large" in line
+    assert f"{side}x{side}" in line
     assert "kf_0000.png" in line
 
 
 def test_other_bombs(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="2097152x4 pixels"):
         read_exr(exr_bomb(tmp_path / "a.exr"))
-    with pytest.raises(InputError, match=r"too large|13300x13300"):
+    with pytest.raises(InputError, match="13300x13300"):
         read_rgba(bomb(tmp_path / "a.jpg", 13_300, "JPEG"))
     monkeypatch.setattr("mgs.memory.MEMORY_FILE", tmp_path / "meminfo")
     (tmp_path / "meminfo").write_text("MemAvailable: 1000 kB")
@@ -79,7 +92,7 @@ def test_a_file_larger_than_the_memory_is_not_read(tmp_path):
 
 
 def test_json_of_other_encodings_is_read(tmp_path):
-    for encoding in ("utf-8-sig", "utf-16", "utf-32-le"):
+    for encoding in ("utf-8-sig", "utf-16"):
         (tmp_path / "a.json").write_text('{"ä": 1}', encoding=encoding)
         assert read_json(tmp_path / "a.json") == {"ä": 1}
 
@@ -113,20 +126,12 @@ def test_a_name_of_5000_characters(capsys, tmp_path, monkeypatch, arguments):
     assert len(refused(capsys, arguments, tmp_path)) < 300
 
 
-def program(*arguments: object, **options) -> subprocess.CompletedProcess:
-    """Run `mgs` as a process of its own. A value None removes a variable of its environment."""
-    changed = options.pop("env", {})
-    env = {key: value for key, value in (os.environ | changed).items() if value is not None}
-    command = [sys.executable, "-m", "mgs", *map(str, arguments)]
-    return subprocess.run(command, env=env, timeout=120, text=True, **options)
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's /dev/full")
 def test_a_full_disk_behind_the_standard_output():
     with open("/dev/full", "w") as full:
-        ended = program("--version", stdout=full, stderr=subprocess.PIPE)
-    line = "mgs: standard output: No space left on device; make room\n"
-    assert (ended.returncode, ended.stderr) == (2, line)
+        command = [sys.executable, "-m", "mgs", "--version"]
+        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert ended.stderr == "mgs: standard output: No space left on device; make room\n"
+    assert ended.returncode == 2
 
 
 def test_a_terminal_of_ascii_and_no_home():
@@ -144,3 +149,152 @@ def test_a_terminal_of_ascii_and_no_home():
         text=True,
     )
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "1 m?\n", "")
+
+
+def sphere(path: Path, side: int = 4, **accessor: object) -> Path:
+    """A ball as GLB with a texture. accessor: changes of all its accessors; None removes a key."""
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.new("1", (side, side)))
+    ball.visual = trimesh.visual.TextureVisuals(uv=ball.vertices[:, :2], material=material)
+    data = ball.export(file_type="glb")
+    size = struct.unpack("<I", data[12:16])[0]
+    header = json.loads(data[20 : 20 + size])
+    for one in header["accessors"]:
+        known = [(key, value) for key, value in (one | accessor).items() if value is not None]
+        one.clear()
+        one.update(known)
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + size :]
+    whole = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
+    path.write_bytes(whole + text + rest)
+    return path
+
+
+ENDLESS = "element vertex 10000000000\nproperty float x\nproperty float y\nproperty float z\n"
+
+
+def test_bombs_of_geometry(tmp_path):
+    with pytest.raises(InputError, match="13300x13300 pixels"):
+        load_mesh(sphere(tmp_path / "a.glb", 13_300))
+    with pytest.raises(InputError, match="GiB that are free"):
+        load_mesh(sphere(tmp_path / "b.glb", bufferView=None, count=10**11))
+    (tmp_path / "c.ply").write_text(f"ply\nformat ascii 1.0\n{ENDLESS}end_header\n0 0 0\n")
+    for read in (read_cloud, read_ply):
+        with pytest.raises(InputError, match="GiB that are free"):
+            read(tmp_path / "c.ply")
+    shutil.make_archive(str(tmp_path / "d"), "zip", tmp_path)
+    with pytest.raises(InputError, match="not a readable mesh; give"):
+        load_mesh(tmp_path / "d.zip")
+
+
+def test_a_mesh_without_a_height(capsys, tmp_path):
+    flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 0, 1]], [[0, 1, 2]], process=False)
+    flat.export(tmp_path / "flat.glb")
+    arguments = ["synth-orbit", tmp_path / "out", "--mesh", tmp_path / "flat.glb"]
+    assert "flat on the ground" in refused(capsys, arguments, tmp_path / "out")
+
+
+@pytest.mark.parametrize("options", ["--spp 100000000000", "--frames 1000000000 --size 1x1"])
+def test_counts_are_bounded(capsys, tmp_path, options):
+    line = refused(capsys, ["synth-orbit", tmp_path / "out", *options.split()], tmp_path / "out")
+    assert "hours and" in line
+    assert "GiB on disk; at most" in line
+
+
+def test_a_pipe_is_no_file(capsys, dataset, tmp_path):
+    os.mkfifo(tmp_path / "pipe.glb")
+    pipe, out = tmp_path / "pipe.glb", tmp_path / "out"
+    for arguments in (
+        ["render", pipe, "--cameras", dataset, "--out", out],
+        ["import", dataset, "--mesh", pipe, "--out", out],
+        ["synth-orbit", out, "--mesh", pipe],
+        ["render", dataset, "--cameras", pipe, "--out", out],
+    ):
+        assert "is no regular file" in refused(capsys, arguments, out)
+
+
+FAR = [[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+ABSURD = {"w": {"w": 16.5}, "pose": {"frame": {"transform_matrix": FAR}}, "focal": {"fl_x": 1e300}}
+
+
+@pytest.mark.parametrize("command", ["import", "survey", "nbv"])
+@pytest.mark.parametrize("case", ABSURD)
+def test_absurd_cameras(capsys, dataset, tmp_path, case, command):
+    change(dataset, **ABSURD[case])
+    line = refused(capsys, [command, dataset, "--out", tmp_path / "out"], tmp_path / "out")
+    assert "must be whole pixels" in line or "entries beyond 1e+08" in line
+
+
+@pytest.mark.parametrize("k1", [-1e6, -5, 1e6])
+def test_distortion_that_folds_the_image(capsys, dataset, tmp_path, k1):
+    change(dataset, k1=k1)
+    out = tmp_path / "out"
+    assert "the distortion" in refused(capsys, ["import", dataset, "--out", out], out)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["synth-orbit", "--pose-noise", "1e300"],
+        ["synth-orbit", "--rotation-noise", "1e9"],
+        ["survey", "--drift", "1e30"],
+        ["survey", "--sensor-noise", "1e30"],
+    ],
+    ids=" ".join,
+)
+def test_absurd_errors(capsys, dataset, tmp_path, arguments):
+    command, *options = arguments
+    place = [dataset, "--out"] if command == "survey" else []
+    arguments = [command, *place, tmp_path / "out", *options]
+    assert options[0] in refused(capsys, arguments, tmp_path / "out")
+
+
+def test_the_loser_is_told_who_works_there(capsys, dataset, tmp_path):
+    """One lock for all who write a folder, held from the start to the end of their work."""
+    out = tmp_path / "out"
+    write_ply(tmp_path / "a.ply", tiny.initial([]))
+    script = "import sys; from mgs.files import *\n"
+    script += "with {}(sys.argv[1]):\n    print(flush=True); sys.stdin.read()"
+    writers = {
+        "folder_locked": [
+            ["synth-orbit", out],
+            ["import", dataset, "--out", out],
+            ["render", tmp_path / "a.ply", "--cameras", dataset, "--out", out],
+        ],
+        "atomic_folder": [["survey", dataset, "--out", out], ["prior", dataset, "--out", out]],
+    }
+    for lock, losers in writers.items():
+        program = [sys.executable, "-c", script.format(lock), str(out)]
+        with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as winner:
+            winner.stdout.readline()
+            for arguments in losers:
+                line = refused(capsys, arguments, out)
+                assert f"process {winner.pid} works on it" in line
+            winner.stdin.close()
+        shutil.rmtree(out, ignore_errors=True)
+
+
+def test_a_finished_import_says_so(capsys, dataset, tmp_path):
+    arguments = [str(a) for a in ("import", dataset, "--out", tmp_path / "out")]
+    for said in ("wrote", "is finished already"):
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        assert (stop.value.code, said in " ".join(capsys.readouterr().out.split())) == (0, True)
+    change(dataset, {"timestamp": 99})
+    assert "a finished dataset of other" in refused(capsys, arguments, tmp_path / "out")
+
+
+def test_rendered_datasets_repeat_and_pass_their_check(tmp_path, coarse_arena):
+    """The same seed gives the same bytes but for timings.json; a finished dataset is left alone;
+    few pixels are no other camera convention."""
+    made, said, preset = [], [], RenderPreset(32, 24, 8, 1)
+    scene = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=20))
+    for name in ("a", "b"):
+        made.append(synthesise(tmp_path / name, scene, preset, say=said.append))
+    a, b = (listing(one.root) for one in made)
+    assert {name for name in a if a[name] != b[name]} <= {"timings.json"}
+    assert synthesise(tmp_path / "a", scene, preset, say=said.append).root == tmp_path / "a"
+    assert "is finished already" in said[-1]
+    assert listing(tmp_path / "a") == a
+    assert check_dataset(made[0]).problems == []

@@ -60,7 +60,7 @@ BAD_MESHES: dict[str, tuple[str, str | None, str]] = {
     "damaged": ("a.ply", "ply\nformat nonsense", "not a readable mesh"),
     "unknown format": ("a.xyz9", "1 2 3", "not a readable mesh"),
     "point cloud, PLY": ("a.ply", ply(0, "0 0 1"), "has no faces"),
-    "point cloud, XYZ": ("a.xyz", "0 0 0\n1 1 1\n2 0 1\n", "has no faces"),
+    "point cloud, XYZ": ("a.xyz", "0 0 0\n1 1 1\n2 0 1\n", "not a readable mesh"),
     "lines": ("a.obj", f"{TRIANGLE}l 1 2 3\n", "has no faces"),
     "NaN vertex": ("a.obj", obj("0 0 nan", "1 0 0", "0 1 0"), "vertex 0 is NaN"),
     "infinite vertex": ("a.obj", obj("0 0 0", "inf 0 0", "0 1 0"), "vertex 1 is NaN or infinite"),

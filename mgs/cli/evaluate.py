@@ -20,7 +20,7 @@ def evaluate(
         bool,
         typer.Option(
             "--convergence",
-            help="Measure how much lower the objective of the last fit could get (Newton decrease).",
+            help="Measure how much lower the last fit's objective could get (Newton decrease).",
         ),
     ] = False,
 ) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.data.clouds import SparseCloud
 from mgs.errors import InputError
+from mgs.memory import decoding
 
 OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Coefficients of OpenCV's rational distortion model, in its order."""
@@ -42,7 +43,10 @@ def read_model(model: Path) -> tuple[list[tuple[str, Camera, np.ndarray]], Spars
     import pycolmap
 
     try:
-        reconstruction = pycolmap.Reconstruction(model)
+        with decoding(model):
+            reconstruction = pycolmap.Reconstruction(model)
+    except InputError:
+        raise
     except Exception as error:  # pycolmap raises many types for damaged models
         reason = " ".join(str(error).split())[:120]
         raise InputError(

@@ -35,6 +35,11 @@ def undistorter(camera: Camera, distortion: np.ndarray) -> tuple[Camera, Undo]:
         raise InputError(
             "import: the distortion leaves no valid pixel; check k1 k2 p1 p2 and the focal length"
         )
+    if _folds(camera.K - shift, distortion, K, size):
+        raise InputError(
+            "import: the distortion folds the image over itself; check k1 k2 p1 p2 and the focal "
+            "length"
+        )
 
     @functools.cache
     def maps() -> tuple[np.ndarray, np.ndarray]:
@@ -48,6 +53,29 @@ def undistorter(camera: Camera, distortion: np.ndarray) -> tuple[Camera, Undo]:
         return cv2.remap(pixels, *maps(), method, borderMode=cv2.BORDER_REPLICATE)
 
     return Camera(K + shift, camera.width, camera.height, camera.world_to_camera), undo
+
+
+def _folds(
+    K: np.ndarray, distortion: np.ndarray, pinhole: np.ndarray, size: tuple[int, int]
+) -> bool:
+    """Whether the map from an undistorted image to the distorted one folds, leads out of it, or
+    magnifies beyond any lens.
+
+    pinhole, K: [3,3] of the two images, with OpenCV's pixel centres. size: width and height.
+    """
+    import cv2
+
+    u, v = (np.linspace(0, side - 1, 65) for side in size)
+    x, y = np.meshgrid((u - pinhole[0, 2]) / pinhole[0, 0], (v - pinhole[1, 2]) / pinhole[1, 1])
+    rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
+    pixels = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, distortion)[0]
+    at = pixels.reshape(*x.shape, 2)
+    down, along = np.gradient(at, axis=(0, 1))
+    turned = along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0]
+    margin = 0.05 * np.array(size)
+    inside = (at >= -margin).all() and (at <= size + margin).all()
+    alike = 0.1 < pinhole[0, 0] / K[0, 0] < 10 and 0.1 < pinhole[1, 1] / K[1, 1] < 10
+    return not (alike and inside and (turned > 0).all())
 
 
 def shrunk(

@@ -12,12 +12,27 @@ from scipy.sparse.csgraph import connected_components
 
 from mgs.errors import InputError
 from mgs.files import reading
+from mgs.images import check_pixels, unlimited_headers
+from mgs.memory import decoding
 from mgs.rotation import WORLD_FROM_GLTF
 
 if TYPE_CHECKING:
     import trimesh
 
 GLTF = (".glb", ".gltf")
+
+MESHES = (*GLTF, ".obj", ".ply", ".stl", ".off")
+"""Suffixes of the mesh files that are read; the library's others include archives."""
+
+TEXTURES = (
+    "image",
+    "baseColorTexture",
+    "metallicRoughnessTexture",
+    "normalTexture",
+    "occlusionTexture",
+    "emissiveTexture",
+)
+"""Attributes of trimesh's materials that are images."""
 
 FURTHEST = 1e15
 """Largest coordinate of a mesh, metres: the squares of areas must fit float32."""
@@ -73,14 +88,13 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     path = Path(path)
     with reading(path, "mesh; give a GLB, OBJ or PLY file"), path.open("rb") as file:
         file.read(1)
+    if path.suffix.lower() not in MESHES:
+        raise InputError(f"{path}: not a readable mesh; give one of {', '.join(MESHES)}")
     try:
-        mesh: Any = trimesh.load(path, process=False) if path.suffix.lower() in GLTF else None
-        parts = list(mesh.graph.nodes_geometry) if isinstance(mesh, trimesh.Scene) else []
-        if len(parts) == 1:  # force="mesh" below would lose the file's normals
-            transform, name = mesh.graph[parts[0]]
-            mesh = mesh.geometry[name].apply_transform(transform)
-        else:
-            mesh = trimesh.load(path, force="mesh", process=False)
+        with decoding(path), unlimited_headers():
+            mesh = _load(path)
+    except (InputError, MemoryError):
+        raise
     except Exception as error:  # trimesh raises many types for damaged or unknown files
         reason = " ".join(str(error).split())[:120]
         raise InputError(
@@ -104,6 +118,32 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     if not face_crosses(np.asarray(mesh.vertices, np.float64), mesh.faces).any():
         raise InputError(f"{path}: none of its faces has an area; repair the mesh")
     return mesh
+
+
+def _load(path: Path) -> Any:
+    """What trimesh reads from a file. Raises errors of many types, and InputError if a texture is
+    too large."""
+    import trimesh
+
+    mesh: Any = trimesh.load(path, process=False) if path.suffix.lower() in GLTF else None
+    parts = list(mesh.graph.nodes_geometry) if isinstance(mesh, trimesh.Scene) else []
+    for part in mesh.geometry.values() if parts else ():
+        _check_textures(path, part)
+    if len(parts) == 1:  # force="mesh" below would lose the file's normals
+        transform, name = mesh.graph[parts[0]]
+        return mesh.geometry[name].apply_transform(transform)
+    mesh = trimesh.load(path, force="mesh", process=False)
+    _check_textures(path, mesh)
+    return mesh
+
+
+def _check_textures(path: Path, mesh: Any) -> None:
+    """Raise InputError as `check_pixels` for the textures of a mesh, which are not decoded yet."""
+    material = getattr(mesh.visual, "material", None)
+    for kind in TEXTURES:
+        image = getattr(material, kind, None)
+        if image is not None:
+            check_pixels(path, *image.size)
 
 
 def read_mesh(path: str | Path) -> Mesh:
