@@ -1,7 +1,8 @@
 """Interactive plots of the report page, as Plotly takes them: dictionaries of plain data.
 
 Every plot has `title`, `alt` (for readers who do not see it), `data` (traces), `layout` and, but
-for the orbit, `numbers` (its table). The page's script adds colours of light and dark, and the size.
+for the orbit, `numbers` (its table). The script of the page adds colours of light and dark, and the
+size.
 """
 
 from __future__ import annotations
@@ -142,8 +143,8 @@ def orbit_plot(one: Shown, dataset: Dataset) -> dict[str, Any]:
     """The orbit in 3D: the model as points, all poses, seeds, and the chosen views, numbered and
     joined in their order.
 
-    The world is drawn turned so that +Z is up. The last trace, "shown above", marks the view of the page's slider; the page
-    moves it.
+    The world is drawn turned so that +Z is up. The last trace, "shown above", marks the view of the
+    page's slider; the page moves it.
     """
     seeds, chosen, taken, model = one.run.seeds, one.run.chosen, one.run.taken, one.model
     turn, order = upright(one.up), list(range(1, len(chosen) + 1))
