@@ -146,7 +146,7 @@ def _section(one: Shown, dataset: Dataset) -> dict[str, Any]:
     return {
         "label": one.label,
         "views": [_view(one, k) for k in range(len(one.frames))],
-        "orbit": orbit_plot(one, dataset),
+        "orbit": orbit_plot(one.label, one.run, dataset, one.model, one.up),
         "time": timing_plot(one.label, one.run.steps),
     }
 

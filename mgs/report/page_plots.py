@@ -8,19 +8,17 @@ size.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import Dataset
-from mgs.data.up import upright
+from mgs.data.up import Up, upright
 from mgs.gaussians import Gaussians
 from mgs.report.figures import Curves, axis_names, line_styles
-
-if TYPE_CHECKING:
-    from mgs.report.page_facts import Shown
+from mgs.report.runs import RunFiles
 
 SYMBOLS: dict[str | tuple[int, int, int], str] = {
     "o": "circle", "s": "square", "^": "triangle-up", "D": "diamond", "v": "triangle-down",
@@ -139,15 +137,17 @@ def views_plot(metric: str, runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> 
     return _plot(title, alt, traces, {"xaxis": axis, "yaxis": _axis(name)})
 
 
-def orbit_plot(one: Shown, dataset: Dataset) -> dict[str, Any]:
+def orbit_plot(
+    label: str, run: RunFiles, dataset: Dataset, model: Gaussians | None, up: Up
+) -> dict[str, Any]:
     """The orbit in 3D: the model as points, all poses, seeds, and the chosen views, numbered and
     joined in their order.
 
     The world is drawn turned so that +Z is up. The last trace, "shown above", marks the view of the
     page's slider; the page moves it.
     """
-    seeds, chosen, taken, model = one.run.seeds, one.run.chosen, one.run.taken, one.model
-    turn, order = upright(one.up), list(range(1, len(chosen) + 1))
+    seeds, chosen, taken = run.seeds, run.chosen, run.taken
+    turn, order = upright(up), list(range(1, len(chosen) + 1))
     names = [frame.name for frame in dataset.frames]
     cameras = [frame.camera for frame in dataset.frames]
     eyes = np.array([camera.position for camera in cameras])
@@ -177,16 +177,16 @@ def orbit_plot(one: Shown, dataset: Dataset) -> dict[str, Any]:
         path,
         _points("shown above", eyes[taken[:1]], here) | {"hoverinfo": "skip"},
     ]
-    titles = axis_names(one.up, dataset.unit)
+    titles = axis_names(up, dataset.unit)
     axes = {f"{a}axis": _axis(title) for a, title in zip("xyz", titles, strict=True)}
     view = {"eye": {"x": 0.9, "y": 0.9, "z": 0.7}}
     alt = (
-        f"Camera positions of {one.label} in 3D around the model. "
+        f"Camera positions of {label} in 3D around the model. "
         f"Seeds: {', '.join(names[i] for i in seeds)}. "
         f"Chosen, in this order: {', '.join(names[i] for i in chosen) or 'none yet'}."
     )
     layout = {"scene": {"aspectmode": "data", "camera": view, **axes}}
-    return {"title": f"Orbit, {one.label}", "alt": alt, "data": traces, "layout": layout}
+    return {"title": f"Orbit, {label}", "alt": alt, "data": traces, "layout": layout}
 
 
 def _model_points(model: Gaussians, turn: np.ndarray) -> dict[str, Any]:
