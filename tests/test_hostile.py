@@ -23,6 +23,7 @@ from mgs.data.check import check_dataset
 from mgs.data.clouds import read_cloud
 from mgs.data.dataset import load_dataset
 from mgs.data.meshes import load_mesh
+from mgs.data.sources import read_source
 from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.images import image_size, read_exr, read_rgba, write_exr
@@ -84,17 +85,13 @@ def test_other_bombs(tmp_path, monkeypatch):
         image_size(bomb(tmp_path / "b.png", 11_000))
 
 
-def test_a_file_larger_than_the_memory_is_not_read(tmp_path):
-    with (tmp_path / "a.json").open("wb") as file:
-        file.truncate(1 << 40)
+def test_json(tmp_path):
+    """Of other encodings it is read; larger than the memory, not."""
+    (tmp_path / "a.json").write_text('{"ä": 1}', encoding="utf-16")
+    assert read_json(tmp_path / "a.json") == {"ä": 1}
+    os.truncate(tmp_path / "a.json", 1 << 40)
     with pytest.raises(InputError, match="GiB are free"):
         read_json(tmp_path / "a.json")
-
-
-def test_json_of_other_encodings_is_read(tmp_path):
-    for encoding in ("utf-8-sig", "utf-16"):
-        (tmp_path / "a.json").write_text('{"ä": 1}', encoding=encoding)
-        assert read_json(tmp_path / "a.json") == {"ä": 1}
 
 
 def test_a_damaged_exr_is_one_line(tmp_path, capfd):
@@ -224,6 +221,13 @@ def test_absurd_cameras(capsys, dataset, tmp_path, case, command):
     change(dataset, **ABSURD[case])
     line = refused(capsys, [command, dataset, "--out", tmp_path / "out"], tmp_path / "out")
     assert "must be whole pixels" in line or "entries beyond 1e+08" in line
+
+
+def test_a_colmap_model_cut_off(tmp_path):
+    for name in ("cameras", "images", "points3D"):
+        (tmp_path / f"{name}.bin").write_bytes(b"\xff")
+    with pytest.raises(InputError, match="is damaged or cut off"):
+        read_source(tmp_path)
 
 
 @pytest.mark.parametrize("k1", [-1e6, -5, 1e6])
