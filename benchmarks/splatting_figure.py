@@ -118,7 +118,7 @@ def lanes_panel(axis, lengths) -> None:
     )
     axis.set(xlabel="lane (colours: packets of 16)", ylabel="list length")
     axis.set_title(
-        "3  walk: one lane a block, tile by tile, in it\nlongest first: packets end together",
+        "3  walk: one lane a block,\nlongest lists of a tile first",
         fontsize=9,
     )
 
