@@ -15,16 +15,8 @@ from mgs.run import problem, recording
 from mgs.study import case
 
 OF_A_FIT = {"uncertainty", "iterations", "loss", "stop_reason"}
-AT_THE_MODEL = {
-    "d-optimal",
-    "t-optimal",
-    "a-optimal",
-    "e-optimal",
-    "fisherrf",
-    "i-optimal",
-    "block-d",
-    "paper",
-}
+AT_THE_MODEL = {"d-optimal", "t-optimal", "a-optimal", "e-optimal", "fisherrf"}
+AT_THE_MODEL |= {"i-optimal", "block-d", "paper"}
 """Policies that use information at the fitted model."""
 
 

@@ -154,14 +154,6 @@ def test_displaced_means_move_back_to_the_surface(cameras, targets, means):
     assert moved.loss < 0.5 * frozen.loss
 
 
-@pytest.mark.parametrize("means", MOVING)
-def test_a_fit_repeats_bitwise(cameras, targets, means):
-    start = ball(0.05)
-    first, again = (fitted(start, cameras, targets, settings(means, passes=3)) for _ in range(2))
-    assert first.gaussians == again.gaussians
-    assert first.losses == again.losses
-
-
 def test_a_rate_that_is_missing_is_named(cameras, targets):
     with pytest.raises(InputError, match=r"train.rates: has no rate of mean"):
         fit(ball(), cameras, targets, TrainSettings(means="free"))

@@ -204,9 +204,7 @@ def test_evaluation_is_logged_and_changes_nothing(dataset, tmp_path):
 @pytest.mark.parametrize(
     ("moment", "count"),
     [
-        ("initial", 1),
         ("fit", 4),
-        ("fisher", 2),
         ("fisher", 40),
         ("before the lines are written", 1),
         ("before the lines are written", 3),

@@ -1,7 +1,7 @@
 """The program `mgs`: its commands, and how they end.
 
-Each command has a file beside this one. A command imports what it needs when it is called, so that
-`mgs --help` does not wait for Mitsuba.
+The files beside this one have the commands. A command imports what is slow to import when it is
+called, so that `mgs --help` does not wait for Mitsuba.
 """
 
 from __future__ import annotations
@@ -22,20 +22,16 @@ from mgs import __version__
 from mgs.cli.bench import bench
 from mgs.cli.dataset import dataset
 from mgs.cli.demo import demo
-from mgs.cli.diagnose import diagnose
 from mgs.cli.doctor import doctor
-from mgs.cli.evaluate import evaluate
 from mgs.cli.import_data import import_data
+from mgs.cli.models import diagnose, evaluate, prune, refit
 from mgs.cli.nbv import nbv
+from mgs.cli.pictures import render, view
 from mgs.cli.prior import prior
-from mgs.cli.prune import prune
-from mgs.cli.refit import refit
-from mgs.cli.render import render
 from mgs.cli.report import report
 from mgs.cli.studies import chart, parsimony, reproduce, stress
 from mgs.cli.survey import survey
 from mgs.cli.synth_orbit import synth_orbit
-from mgs.cli.view import view
 from mgs.errors import InputError, Notice
 
 INTERRUPTED = 130

@@ -2,69 +2,55 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-import typer
+from rich.console import Console
+from rich.table import Table
 
+from mgs import runtime
+from mgs.cli.options import argument, option
+from mgs.errors import InputError
+from mgs.files import check_writable, write_json
 from mgs.fit.settings import ALPHA_WEIGHT, TrainSettings
+from mgs.provenance import command_line, versions
 from mgs.run.settings import validated
 
-
-class Kind(StrEnum):
-    """What to measure."""
-
-    splat = "splat"
-    scaling = "scaling"
-    fit = "fit"
-
-
-OPTIONS = {
-    "--chart": (Kind.scaling,),
-    "--gaussians": (Kind.splat, Kind.scaling),
-    "--repeats": (Kind.splat, Kind.scaling),
-    "--dataset": (Kind.fit,),
-    "--alpha-weight": (Kind.fit,),
+KINDS = {
+    "chart": ("scaling",),
+    "gaussians": ("splat", "scaling"),
+    "repeats": ("splat", "scaling"),
+    "dataset": ("fit",),
+    "alpha_weight": ("fit",),
 }
 """Kinds that accept each option."""
 
 
 def bench(
     kind: Annotated[
-        Kind,
-        typer.Argument(
-            help="splat: compared with Mitsuba's own integrator, volprim_rf_basic. "
+        Literal["splat", "scaling", "fit"],
+        argument(
+            "splat: compared with Mitsuba's own integrator, volprim_rf_basic. "
             "scaling: as the numbers of Gaussians, pixels and threads grow. "
             "fit: accuracy and convergence of the fit of a dataset."
         ),
     ],
-    json: Annotated[Path | None, typer.Option(help="Write all measurements to this file.")] = None,
-    chart: Annotated[
-        Path | None, typer.Option(help="scaling only: draw the chart to this PNG.")
-    ] = None,
+    json: Annotated[Path | None, option("Write all measurements to this file.")] = None,
+    chart: Annotated[Path | None, option("scaling only: draw the chart to this PNG.")] = None,
     gaussians: Annotated[
         int | None,
-        typer.Option(
-            min=1000,
-            help="splat: number of Gaussians [100000]; scaling: the largest number [1000000].",
-        ),
+        option("splat: number of Gaussians [100000]; scaling: the largest [1000000].", min=1000),
     ] = None,
     repeats: Annotated[
         int | None,
-        typer.Option(
-            min=3,
-            help="splat, scaling: calls of each operation; the median counts. Default: 9.",
-        ),
+        option("splat, scaling: calls of each operation; the median counts. Default: 9.", min=3),
     ] = None,
     dataset: Annotated[
-        Path | None, typer.Option(help="fit only: the dataset, with depth. Default: demo/dataset.")
+        Path | None, option("fit only: the dataset, with depth. Default: demo/dataset.")
     ] = None,
     alpha_weight: Annotated[
         float | None,
-        typer.Option(
-            help=f"fit only: as of `mgs nbv`. Default: {ALPHA_WEIGHT}; 0 fits colours alone."
-        ),
+        option(f"fit only: as of `mgs nbv`. Default: {ALPHA_WEIGHT}; 0 fits colours alone."),
     ] = None,
 ) -> None:
     """Time rendering, gradients and Fisher information, or measure the fit of a dataset.
@@ -73,30 +59,22 @@ def bench(
     run on the machine meanwhile. The JSON file also holds the command line, the machine and the
     versions.
     """
-    from rich.console import Console
-
-    from mgs import runtime
-    from mgs.errors import InputError
-    from mgs.files import check_writable, write_json
-    from mgs.provenance import command_line, versions
-
-    values = (chart, gaussians, repeats, dataset, alpha_weight)
-    for (option, kinds), value in zip(OPTIONS.items(), values, strict=True):
-        if value is not None and kind not in kinds:
+    given = locals()
+    for name, kinds in KINDS.items():
+        if given[name] is not None and kind not in kinds:
             raise InputError(
-                f"{option}: is for {' and '.join(kinds)}, not for {kind.value}; leave it out"
+                f"--{name.replace('_', '-')}: is for {' and '.join(kinds)}, not for {kind}; "
+                "leave it out"
             )
     repeats = repeats or 9
-    if kind is Kind.scaling and gaussians is not None and gaussians < 3000:
+    if kind == "scaling" and gaussians is not None and gaussians < 3000:
         raise InputError(
             f"--gaussians {gaussians}: scaling fits the growth with N, from 1000 up; "
             "give at least 3000"
         )
     for target in (json, chart):
-        if target is not None:  # before minutes of measuring
-            check_writable(target)
-            if target.is_dir():
-                raise InputError(f"{target}: is a folder; name a file to write")
+        if target is not None and check_writable(target).is_dir():  # before minutes of measuring
+            raise InputError(f"{target}: is a folder; name a file to write")
     runtime.start()
     console = Console()
 
@@ -104,13 +82,13 @@ def bench(
         console.print(f"timing {what}", style="dim")
 
     result: dict[str, Any]
-    if kind is Kind.splat:
+    if kind == "splat":
         from mgs.bench import core
 
         result = core.bench_splat(gaussians or 100_000, 640, 480, repeats, report)
         _print_splat(console, result)
         _print_figures(console, result["figures"], core.TARGETS)
-    elif kind is Kind.fit:
+    elif kind == "fit":
         from mgs.bench import fit
 
         asked = {"alpha_weight": ALPHA_WEIGHT if alpha_weight is None else alpha_weight}
@@ -133,10 +111,8 @@ def bench(
         console.print(f"wrote {json}")
 
 
-def _print_scaling(console: Any, result: dict[str, Any]) -> None:
+def _print_scaling(console: Console, result: dict[str, Any]) -> None:
     """Print the exponents and the linear fits of time, a row for each quantity."""
-    from rich.table import Table
-
     rows, linear = result["exponents"], result["linear_growth"]
     title = f"fits against N start at {result['exponents_from_n']:,}"
     table = Table("exponent of", *next(iter(rows.values())), title=title)
@@ -149,10 +125,8 @@ def _print_scaling(console: Any, result: dict[str, Any]) -> None:
     console.print(table, costs)
 
 
-def _print_splat(console: Any, result: dict[str, Any]) -> None:
+def _print_splat(console: Console, result: dict[str, Any]) -> None:
     """Print the time of each operation, the share of peak arithmetic and the memory."""
-    from rich.table import Table
-
     scene = result["scene"]
     size = f"{scene['gaussians']:,} Gaussians, {scene['width']}x{scene['height']}"
     title = f"{size}, {result['pairs']:,} (splat, block) pairs"
@@ -168,11 +142,9 @@ def _print_splat(console: Any, result: dict[str, Any]) -> None:
 
 
 def _print_figures(
-    console: Any, figures: dict[str, float | None], targets: dict[str, tuple[str, float]]
+    console: Console, figures: dict[str, float | None], targets: dict[str, tuple[str, float]]
 ) -> None:
     """Print each figure beside its target; None if it was not measured."""
-    from rich.table import Table
-
     table = Table("figure", "measured", "asked for")
     for name, (bound, target) in targets.items():
         value = figures[name]

@@ -2,37 +2,31 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-import typer
+from rich.console import Console
+
+from mgs.cli.options import argument, option
+from mgs.cli.progress import progress_bar
+from mgs.errors import InputError
 
 UNCERTAINTY = 2.0
 """Error of a prior whose projections are masks, over its depth tolerance."""
 
 
-class Action(StrEnum):
-    """What to do with a dataset."""
-
-    check = "check"
-    masks = "masks"
-
-
 def dataset(
     action: Annotated[
-        Action,
-        typer.Argument(
-            help="check: read every file, and compare depth, masks and poses. masks: see below."
-        ),
+        Literal["check", "masks"],
+        argument("check: read every file, compare depth, masks and poses. masks: see below."),
     ],
-    path: Annotated[Path, typer.Argument(help="Folder of the dataset.")],
+    path: Annotated[Path, argument("Folder of the dataset.")],
     prior: Annotated[
-        Path | None, typer.Option(help="masks: the prior to project. Default: DATASET/prior.")
+        Path | None, option("masks: the prior to project. Default: DATASET/prior.")
     ] = None,
     refine: Annotated[
-        bool, typer.Option(help="masks: move outlines to where colours change, near the prior's.")
+        bool, option("masks: move outlines to where colours change, near the prior's.")
     ] = False,
 ) -> None:
     """Check that every file of a dataset can be read and has the right size, and that colour,
@@ -45,16 +39,13 @@ def dataset(
     every image, moves the outlines to where colours change with --refine, and writes masks/, and
     masks.png to look at.
     """
-    if action == Action.masks:
+    if action == "masks":
         _make_masks(path, path / "prior" if prior is None else prior, refine)
     else:
         _check(path)
 
 
 def _make_masks(path: Path, prior: Path, refine: bool) -> None:
-    from rich.console import Console
-
-    from mgs.cli.progress import progress_bar
     from mgs.data.dataset import load_dataset
     from mgs.data.masks import SHEET, make_masks
     from mgs.prior.build import load_prior
@@ -71,12 +62,8 @@ def _make_masks(path: Path, prior: Path, refine: bool) -> None:
 
 
 def _check(path: Path) -> None:
-    from rich.console import Console
-
-    from mgs.cli.progress import progress_bar
     from mgs.data.check import check_dataset, taken_frames
     from mgs.data.dataset import load_dataset
-    from mgs.errors import InputError
 
     loaded = load_dataset(path)
     console = Console()

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from rich.console import Console
+
+from mgs import runtime
+from mgs.cli.models import diagnose
+from mgs.cli.nbv import resume_and_print, start_and_print
+from mgs.cli.options import Seed, argument
+from mgs.cli.printing import print_quality
+from mgs.cli.prior import prior
+from mgs.cli.synth_orbit import synth_orbit
+from mgs.errors import InputError
+from mgs.files import check_new_folder, check_writable, read_json
 
 POLICIES = ("d-optimal", "paper", "directional-i", "uniform", "random")
 
@@ -22,24 +33,12 @@ BUDGET = 8
 
 def demo(
     out: Annotated[
-        Path,
-        typer.Argument(help="Folder for everything; the same command again continues or shows it."),
+        Path, argument("Folder for everything; the same command again continues or shows it.")
     ] = Path("demo"),
-    seed: Annotated[int, typer.Option(min=0, help="Root seed.")] = 0,
+    seed: Seed = 0,
 ) -> None:
     """Run all steps in minutes: render a rock orbit, build the prior, choose views by five
     policies, compare, draw."""
-    import time
-
-    from rich.console import Console
-
-    from mgs import runtime
-    from mgs.cli.diagnose import diagnose
-    from mgs.cli.nbv import resume_and_print, start_and_print
-    from mgs.cli.printing import print_quality
-    from mgs.cli.prior import prior
-    from mgs.cli.synth_orbit import synth_orbit
-    from mgs.files import check_new_folder, check_writable
     from mgs.report.runs import compare_runs
     from mgs.report.tables import comparison_rows
     from mgs.report.writing import write_report
@@ -81,8 +80,6 @@ def demo(
 
 def check_seed(dataset: Path, runs: list[Path], seed: int) -> None:
     """Raises InputError if the dataset or a run exists with another seed."""
-    from mgs.errors import InputError
-    from mgs.files import read_json
     from mgs.run.folder import read_settings
 
     recorded = {run: read_settings(run).seed for run in runs if (run / "config.json").is_file()}

@@ -7,8 +7,12 @@ import os
 import platform
 
 import typer
+from rich.console import Console
+from rich.table import Table
 
+from mgs import runtime
 from mgs.errors import InputError
+from mgs.resources import resource_folder
 
 PACKAGES = ("mgs", "mitsuba", "drjit", "numpy", "pyoidn", "pymeshlab")
 """Packages whose versions are printed. Only pyoidn is optional."""
@@ -23,9 +27,6 @@ def doctor() -> None:
 
     The exit code is 0 if all is well, and 2 if something prevents mgs from working.
     """
-    from rich.console import Console
-    from rich.table import Table
-
     rows = _software() + _machine() + _resources()
     table = Table(show_header=False, box=None, pad_edge=False)
     for name, value, problem in rows:
@@ -65,8 +66,6 @@ def _software() -> list[Row]:
 
 def _machine() -> list[Row]:
     """Processor, memory and libLLVM."""
-    from mgs import runtime
-
     gib = 1024**3 / os.sysconf("SC_PAGE_SIZE")
     total, free = os.sysconf("SC_PHYS_PAGES") / gib, os.sysconf("SC_AVPHYS_PAGES") / gib
     memory = f"{total:.1f} GiB, {free:.1f} GiB free"
@@ -88,8 +87,6 @@ def _machine() -> list[Row]:
 
 def _resources() -> list[Row]:
     """Folders of data files that come with mgs."""
-    from mgs.resources import resource_folder
-
     rows = []
     for name, pattern in (("scenes", "*.toml"), ("plugins", "*.py")):
         try:

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import os
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from rich.console import Console
+
+from mgs.cli.options import argument, option, parse_up
+from mgs.cli.progress import progress_bar
+from mgs.errors import InputError
 
 MANY_PIXELS = 2_000_000
 """Pixels of an image beyond which --downscale is recommended."""
@@ -16,57 +22,43 @@ EXPOSURE_DIFFERS = 0.1
 
 def import_data(
     source: Annotated[
-        Path,
-        typer.Argument(
-            help="A transforms.json, or a folder with one or with a COLMAP model (sparse/0)."
-        ),
+        Path, argument("A transforms.json, or a folder with one or with a COLMAP model (sparse/0).")
     ],
-    out: Annotated[
-        Path, typer.Option(help="Folder to write: new, empty, or left by an interrupted import.")
-    ],
+    out: Annotated[Path, option("Folder to write: new, empty, or left by an interrupted import.")],
     images: Annotated[
-        Path | None, typer.Option(help="Folder of COLMAP's images. Default: SOURCE/images.")
+        Path | None, option("Folder of COLMAP's images. Default: SOURCE/images.")
     ] = None,
     masks: Annotated[
-        Path | None,
-        typer.Option(help="Folder of rock masks, named like the images; white is rock."),
+        Path | None, option("Folder of rock masks, named like the images; white is rock.")
     ] = None,
     mesh: Annotated[
         Path | None,
-        typer.Option(
-            help="Mesh of the rock whose projections give the masks. World coordinates; "
+        option(
+            "Mesh of the rock whose projections give the masks. World coordinates; "
             "a GLB is turned from +Y up."
         ),
     ] = None,
     downscale: Annotated[
         int,
-        typer.Option(
-            min=1,
-            help="Side of the pixel blocks that become one, as 4 for photographs of 12 megapixels.",
-        ),
+        option("Side of the pixel blocks that become one, as 4 for 12 megapixels.", min=1),
     ] = 1,
     up: Annotated[
-        str,
-        typer.Option(
-            help="Upward direction: X,Y,Z in the source's world, or auto: as cameras were held."
-        ),
+        str, option("Upward: X,Y,Z in the source's world, or auto: as cameras were held.")
     ] = "auto",
     unit: Annotated[
         float | None,
-        typer.Option(
-            help="Metres in the source's unit of length. Default: unknown, unless there is depth."
-        ),
+        option("Metres in the source's unit of length. Default: unknown, unless there is depth."),
     ] = None,
     test_every: Annotated[
         int | None,
-        typer.Option(
+        option(
+            "Make every Nth image a test view, by name, from the first on; 8 is usual.",
             min=2,
             metavar="N",
-            help="Make every Nth image a test view, by name, from the first on; 8 is usual.",
         ),
     ] = None,
     split: Annotated[
-        str, typer.Option(help="Split of NeRF-synthetic data to import: train, val or test.")
+        str, option("Split of NeRF-synthetic data to import: train, val or test.")
     ] = "train",
 ) -> None:
     """Make a dataset of your own data: cameras and images, and depth and masks if there are any.
@@ -77,18 +69,10 @@ def import_data(
     alone (rock/). Points that came with the cameras are kept for `mgs prior`, in sparse.ply. The
     same command continues an interrupted import.
     """
-    import os
-    from functools import partial
-
-    from rich.console import Console
-
-    from mgs.cli.options import parse_up
-    from mgs.cli.progress import progress_bar
     from mgs.data.dataset import TEST_FOLDER
     from mgs.data.importers import import_source
     from mgs.data.meshes import GLTF
     from mgs.data.sources import read_source
-    from mgs.errors import InputError
     from mgs.images import exif_exposure
 
     console, notes = Console(), Console(stderr=True)

@@ -1,10 +1,28 @@
-"""Values of options that several commands share."""
+"""Options, and values of options, that several commands share."""
 
 from __future__ import annotations
 
-from typing import Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
 
 from mgs.errors import InputError
+
+
+def option(text: str, *flags: str, **more: Any) -> Any:
+    """A `typer.Option` with this help."""
+    return typer.Option(*flags, help=text, **more)
+
+
+def argument(text: str, **more: Any) -> Any:
+    """A `typer.Argument` with this help."""
+    return typer.Argument(help=text, **more)
+
+
+Run = Annotated[Path, argument("Folder that `mgs nbv` wrote.")]
+DatasetFolder = Annotated[Path, argument("Dataset folder (transforms.json).")]
+Seed = Annotated[int, option("Root seed: the same seed gives the same result.", min=0)]
 
 
 def parse_up(text: str) -> tuple[float, float, float] | None:

@@ -6,10 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
+from rich import box
+from rich.console import Console
+from rich.table import Column, Table
+from rich.text import Text
 
+if TYPE_CHECKING:
     from mgs.run.state import State
 
 GROUPS = {"test": "test", "all": "all", "held_out": "new"}
@@ -47,8 +49,6 @@ def print_quality(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
 
     Names that do not fit beside the numbers are printed below, by the number of their row.
     """
-    from rich.text import Text
-
     names = [row["policy"] for row in rows]
     whole = _quality("policy", names, rows)
     if fits(console, whole):
@@ -62,10 +62,6 @@ def print_quality(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
 
 def _quality(heading: str, first: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> Table:
     """The table of `print_quality`. heading, first: its first column."""
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
     from mgs.report.tables import has_held_out, table_cell
 
     tested, new = any("test.psnr" in row for row in rows), has_held_out(rows)
@@ -98,9 +94,6 @@ def _heading(key: str, new: bool) -> str:
 def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console) -> None:
     """Print the steps of a run as a table, then the quality of its model. Names that are too wide
     for the console have a table of their own."""
-    from rich.table import Column, Table
-    from rich.text import Text
-
     from mgs.run.ending import fit_line, why_ended
 
     columns = ("step", "image", "score", "coverage", "iterations", "loss", "stopped", "seconds")

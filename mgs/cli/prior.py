@@ -6,7 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from mgs.cli.options import DatasetFolder, Seed, option, parse_gaussians, parse_up
+from mgs.cli.progress import progress_bar
+from mgs.errors import InputError
+from mgs.files import atomic_folder
 
 if TYPE_CHECKING:
     from mgs.data.dataset import Dataset, Frame
@@ -26,71 +33,55 @@ WHY = {
 
 
 def prior(
-    dataset: Annotated[Path, typer.Argument(help="Dataset folder (transforms.json).")],
+    dataset: DatasetFolder,
     out: Annotated[
-        Path | None, typer.Option(help="Folder to write, new or empty. Default: DATASET/prior.")
+        Path | None, option("Folder to write, new or empty. Default: DATASET/prior.")
     ] = None,
     gaussians: Annotated[
         str | None,
-        typer.Option(
-            metavar="N|auto",
-            help="Number of Gaussians, on the surface and behind it. "
+        option(
+            "Number of Gaussians, on the surface and behind it. "
             "Default: auto, what the closest pixel resolves.",
+            metavar="N|auto",
         ),
     ] = None,
     spacing: Annotated[
-        float | None, typer.Option(help="Distance between samples, metres, instead of N.")
+        float | None, option("Distance between samples, metres, instead of N.")
     ] = None,
     source: Annotated[
         str | None,
-        typer.Option(
-            "--from",
-            help="depth, mesh, points or hull (of the masks). "
+        option(
+            "depth, mesh, points or hull (of the masks). "
             "Default: the first of depth, points, hull that there is.",
+            "--from",
         ),
     ] = None,
     points: Annotated[
-        Path | None,
-        typer.Option(help="PLY file of points to build it from, world coordinates."),
+        Path | None, option("PLY file of points to build it from, world coordinates.")
     ] = None,
     up: Annotated[
         str | None,
-        typer.Option(
-            help="Upward direction: X,Y,Z, or auto: the ground plane's normal. "
-            "Default: as the dataset says."
-        ),
+        option("Upward: X,Y,Z, or auto: the ground's normal. Default: as the dataset says."),
     ] = None,
     mesh: Annotated[
         Path | None,
-        typer.Option(
-            help="Mesh to sample instead of building one. World coordinates, metres; "
-            "a GLB is turned from +Y up."
-        ),
+        option("Mesh to sample. World coordinates, metres; a GLB is turned from +Y up."),
     ] = None,
     backing: Annotated[
         float,
-        typer.Option(
-            help="Gaussians behind the surface for each one on it, to keep it opaque. "
-            "0: none, as in the paper."
-        ),
+        option("Gaussians behind the surface per one on it, for opacity; in the paper 0."),
     ] = 0.5,
     poisson_depth: Annotated[
         int | None,
-        typer.Option(
-            help="Octree depth of the Poisson surface, 3 to 12. Default: by the cloud's density."
-        ),
+        option("Octree depth of the Poisson surface, 3 to 12. Default: by the cloud's density."),
     ] = None,
     prior_noise: Annotated[
-        float,
-        typer.Option(help="Degrade the rock's points: standard deviation of noise, metres."),
+        float, option("Degrade the rock's points: standard deviation of noise, metres.")
     ] = 0.0,
     holes: Annotated[
-        float,
-        typer.Option(help="Degrade the rock's points: share to remove, in round holes."),
+        float, option("Degrade the rock's points: share to remove, in round holes.")
     ] = 0.0,
-    seed: Annotated[
-        int, typer.Option(min=0, help="Root seed: the same seed gives the same prior.")
-    ] = 0,
+    seed: Seed = 0,
 ) -> None:
     """Build a mesh of the rock, and sample N points on it.
 
@@ -99,14 +90,8 @@ def prior(
     or above the ground. From a hull: the largest body inside all masks. Then spread samples evenly
     over what some frame saw. Writes mesh.ply, points.ply, prior.json and prior.png.
     """
-    from rich.console import Console
-
-    from mgs.cli.options import parse_gaussians, parse_up
-    from mgs.cli.progress import progress_bar
     from mgs.data.dataset import load_dataset
     from mgs.data.meshes import GLTF
-    from mgs.errors import InputError
-    from mgs.files import atomic_folder
     from mgs.prior.build import prior_from_mesh, save_prior
     from mgs.prior.figure import draw_prior
     from mgs.prior.initial import with_share_seen
@@ -156,9 +141,6 @@ def _built(
     **options: Any,
 ) -> tuple[Prior, SegmentedCloud | None]:
     """`build_prior`. A refused cloud is drawn beside `folder`, and the error names the picture."""
-    import numpy as np
-
-    from mgs.errors import InputError
     from mgs.prior.build import build_prior
     from mgs.prior.figure import draw_refused
     from mgs.prior.segmentation import NoSurface
@@ -173,8 +155,6 @@ def _built(
 
 def _seed_frames(dataset: Dataset, prior: Prior) -> list[Frame]:
     """The frames that `mgs nbv` would take as its SEEDS seeds, or all if there are fewer."""
-    import numpy as np
-
     from mgs.data.up import upright
     from mgs.policy.poses import seed_views
 
@@ -184,10 +164,8 @@ def _seed_frames(dataset: Dataset, prior: Prior) -> list[Frame]:
     return [dataset.frames[k] for k in seed_views(positions, middle, min(SEEDS, len(dataset)))]
 
 
-def _table(numbers: dict[str, Any]) -> Any:
+def _table(numbers: dict[str, Any]) -> Table:
     """Table of the numbers of prior.json."""
-    from rich.table import Table
-
     metres = numbers["unit"] == "m"
     unit = "m" if metres else "unit"
     n, spacing, area = numbers["n"], numbers["spacing"], numbers["sampled_area"]
@@ -253,7 +231,7 @@ def _up(numbers: dict[str, Any]) -> str:
     return f"{text}; the ground plane's normal is {angle:.1f}° from it"
 
 
-def _add_cloud_rows(table: Any, numbers: dict[str, Any], length: Callable[[float], str]) -> None:
+def _add_cloud_rows(table: Table, numbers: dict[str, Any], length: Callable[[float], str]) -> None:
     """Add the rows of a mesh that was built from a cloud."""
     points, size = f"{numbers['points']:,}", f"{numbers['cluster_size']:,}"
     if "pixels" in numbers:

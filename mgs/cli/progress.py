@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.progress import Progress, TaskID
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+)
 
 
 class ProgressBar:
@@ -46,14 +51,13 @@ def progress_bar(stage: str = "reading", console: Console | None = None) -> Iter
     The object it yields is called as progress(stage, done, total). For a function that reports
     (done, total) alone, pass `functools.partial(progress, "rendering")`.
     """
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
     )
-    with Progress(*columns, console=console or Console(), transient=True) as bar:
+    console = console or Console()
+    off = not console.is_terminal  # it would leave an empty line
+    with Progress(*columns, console=console, transient=True, disable=off) as bar:
         yield ProgressBar(bar, stage)

@@ -2,31 +2,36 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
+
+from mgs import runtime
+from mgs.cli.options import argument, option
+from mgs.cli.printing import print_quality
+from mgs.cli.progress import progress_bar
+from mgs.errors import InputError
+from mgs.files import check_writable
 
 
 def report(
-    runs: Annotated[list[Path], typer.Argument(help="Run folders, all of one dataset.")],
+    runs: Annotated[list[Path], argument("Run folders, all of one dataset.")],
     out: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder for the figures and the table. Files of an earlier report are replaced.",
+        option(
+            "Folder for the figures and the table. Files of an earlier report are replaced.",
             show_default="report; with --html none",
         ),
     ] = None,
     figures: Annotated[
-        str | None,
-        typer.Option(metavar="png|pdf|svg", help="Format of the figures.", show_default="png"),
+        str | None, option("Format of the figures.", metavar="png|pdf|svg", show_default="png")
     ] = None,
     html: Annotated[
         Path | None,
-        typer.Option(
-            "--html",
-            help="One page with everything, interactive; it opens from the disk and loads nothing.",
-        ),
+        option("One page with everything, interactive; it opens from the disk and loads nothing."),
     ] = None,
 ) -> None:
     """Compare runs: draw the orbit, information gain, coverage, PSNR against images and one test
@@ -39,8 +44,6 @@ def report(
     The page of --html takes unfinished runs too. Its pictures are drawn from the model that the run
     folder holds.
     """
-    from mgs.errors import InputError
-    from mgs.files import check_writable
     from mgs.plotting import FORMATS
 
     if figures not in (None, *FORMATS):
@@ -57,10 +60,6 @@ def report(
 
 def _write_figures(runs: list[Path], out: Path, kind: str) -> None:
     """Write the figures and the table, and print the table."""
-    from rich.console import Console
-
-    from mgs.cli.printing import print_quality
-    from mgs.files import check_writable
     from mgs.report.runs import compare_runs
     from mgs.report.tables import comparison_rows
     from mgs.report.writing import write_report
@@ -85,10 +84,6 @@ def _write_figures(runs: list[Path], out: Path, kind: str) -> None:
 
 def _write_page(runs: list[Path], html: Path) -> None:
     """Write the page, and print its size."""
-    from functools import partial
-
-    from mgs import runtime
-    from mgs.cli.progress import progress_bar
     from mgs.report.page import write_page
 
     runtime.start()

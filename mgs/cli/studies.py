@@ -7,19 +7,22 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-import typer
+from rich.console import Console
+from rich.table import Table
+
+from mgs import runtime
+from mgs.cli.options import argument, option
+from mgs.errors import InputError, row_named
+from mgs.files import check_new_folder, check_writable, locked, read_json, write_json
+from mgs.provenance import command_line
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from mgs.study.sweep import Report
 
 Size = TypeVar("Size")
 
-Out = Annotated[
-    Path, typer.Argument(help="Folder for everything; the same command again continues.")
-]
-Workers = Annotated[int, typer.Option(min=1, help="Worker processes, which share the cores.")]
+Out = Annotated[Path, argument("Folder for everything; the same command again continues.")]
+Workers = Annotated[int, option("Worker processes, which share the cores.", min=1)]
 
 
 @contextmanager
@@ -32,12 +35,6 @@ def _study(
     Raises InputError for an unknown preset, and if the folder is of another preset, holds something
     else, cannot be written or is in use.
     """
-    from rich.console import Console
-
-    from mgs import runtime
-    from mgs.errors import InputError, row_named
-    from mgs.files import check_new_folder, check_writable, locked, read_json, write_json
-
     size, console = row_named(sizes, preset, "--preset"), Console(highlight=False)
     record = check_writable(out) / "study.json"
     if not record.is_file():
@@ -61,47 +58,33 @@ def reproduce(
     out: Out = Path("reproduced"),
     preset: Annotated[
         str,
-        typer.Option(
-            help="quick: Table I of 12 of 32 views, 320x240. paper: of 54 of 100 views, 640x480."
-        ),
+        option("quick: Table I of 12 of 32 views, 320x240. paper: of 54 of 100 views, 640x480."),
     ] = "quick",
     only: Annotated[
         str | None,
-        typer.Option(
-            help="Which results, as table1,curves: table1, figures, curves, seeds, pools, oracle. "
+        option(
+            "Which results, as table1,curves: table1, figures, curves, seeds, pools, oracle. "
             "Default: all but oracle."
         ),
     ] = None,
     rocks: Annotated[
         int | None,
-        typer.Option(
-            min=1, help="Number of rocks of curves, seeds, pools and oracle. Default: the preset's."
-        ),
+        option("Rocks of curves, seeds, pools and oracle. Default: the preset's.", min=1),
     ] = None,
     policy: Annotated[
         list[str] | None,
-        typer.Option(
-            help="A further policy for curves and pools: a name, or FILE.py:FUNCTION. "
-            "May be given several times."
-        ),
+        option("A further policy for curves and pools: a name or FILE.py:FUNCTION; repeatable."),
     ] = None,
     mesh: Annotated[
         list[Path] | None,
-        typer.Option(
-            help="A rock of your own for results over many rocks, in place of the procedural ones. "
-            "May be given several times."
-        ),
+        option("A rock of your own in place of the procedural ones (not Table I); repeatable."),
     ] = None,
     batch: Annotated[
-        int,
-        typer.Option(
-            min=1, help="Of Table I and the figures: views chosen before the model is fitted again."
-        ),
+        int, option("Of Table I and the figures: views chosen before the next fit.", min=1)
     ] = 1,
     workers: Workers = 1,
     scheduler: Annotated[
-        str | None,
-        typer.Option(help="Use the workers of this Dask scheduler instead, as tcp://HOST:8786."),
+        str | None, option("Use the workers of this Dask scheduler instead, as tcp://HOST:8786.")
     ] = None,
 ) -> None:
     """Make the results of docs/results.md: Table I at equal numbers of images, PSNR against images
@@ -111,7 +94,6 @@ def reproduce(
     Every dataset, prior and run is a cell, done once and kept in OUT/cells; the results are written
     to OUT/results. Runs whose seconds are reported run alone: let nothing else run meanwhile.
     """
-    from mgs.errors import InputError, row_named
     from mgs.study import reproduce as study
     from mgs.study.reproduce_results import make
 
@@ -138,15 +120,11 @@ def reproduce(
 def stress(
     out: Out = Path("out/stress"),
     preset: Annotated[
-        str,
-        typer.Option(
-            help="quick: minutes on two cores with --workers 2. "
-            "full: more rocks, larger images, more runs; hours."
-        ),
+        str, option("quick: minutes with --workers 2. full: more rocks, larger images; hours.")
     ] = "quick",
     workers: Workers = 1,
     only: Annotated[
-        str | None, typer.Option(help="Names of experiments, separated by commas. Default: all.")
+        str | None, option("Names of experiments, separated by commas. Default: all.")
     ] = None,
 ) -> None:
     """Try to make the methods fail: experiments with a hypothesis each, and a verdict that follows
@@ -155,7 +133,6 @@ def stress(
     Writes stability.csv (all numbers), verdicts.json, stability.md (the verdicts as tables) and a
     plot of each experiment.
     """
-    from mgs.provenance import command_line
     from mgs.study.stress.lab import SIZES
     from mgs.study.stress.run import EXPERIMENTS, run_stress
     from mgs.study.sweep import names_of
@@ -171,11 +148,7 @@ def stress(
 def parsimony(
     out: Out = Path("parsimony"),
     preset: Annotated[
-        str,
-        typer.Option(
-            help="quick: six scenes of small images, ten minutes. "
-            "full: the same of 320x240, half an hour."
-        ),
+        str, option("quick: six scenes of small images, ten minutes. full: 320x240, half an hour.")
     ] = "quick",
 ) -> None:
     """Chart quality and cost against the number of Gaussians, the kinds of parameters learned, and
@@ -184,9 +157,6 @@ def parsimony(
     Renders the scenes, fits each model view by view, and judges it on test views that no model
     sees. Writes parsimony.json, parsimony.csv, parsimony.md and parsimony.png.
     """
-    from rich.table import Table
-
-    from mgs.provenance import command_line
     from mgs.study import parsimony as study
     from mgs.study.output import text_of
 
@@ -203,18 +173,15 @@ def parsimony(
 def chart(
     out: Out = Path("chart"),
     dataset: Annotated[
-        Path | None,
-        typer.Option(help="A dataset with test views, in place of the one that is rendered."),
+        Path | None, option("A dataset with test views, in place of the one that is rendered.")
     ] = None,
     preset: Annotated[
-        str, typer.Option(help="quick: about ten minutes on two quiet cores. full: hours.")
+        str, option("quick: about ten minutes on two quiet cores. full: hours.")
     ] = "quick",
-    only: Annotated[str | None, typer.Option(help="fit or run. Default: both.")] = None,
+    only: Annotated[str | None, option("fit or run. Default: both.")] = None,
     repeats: Annotated[
         int | None,
-        typer.Option(
-            min=1, help="Timings of each point; the median counts. Default: quick 2, full 3."
-        ),
+        option("Timings of each point; the median counts. Default: quick 2, full 3.", min=1),
     ] = None,
 ) -> None:
     """Chart speed against accuracy: of single fits and of whole runs.

@@ -2,60 +2,45 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-import typer
+from rich.console import Console
+from rich.table import Table
 
-
-class Poses(StrEnum):
-    """Source of the survey's poses."""
-
-    estimated = "estimated"
-    exact = "exact"
+from mgs.cli.options import Seed, argument, option
+from mgs.cli.progress import progress_bar
+from mgs.files import atomic_folder
 
 
 def survey(
-    dataset: Annotated[
-        Path, typer.Argument(help="Dataset folder (transforms.json) with exact depth images.")
-    ],
+    dataset: Annotated[Path, argument("Dataset folder (transforms.json) with exact depth images.")],
     out: Annotated[
-        Path | None, typer.Option(help="Folder to write, new or empty. Default: DATASET/survey.")
+        Path | None, option("Folder to write, new or empty. Default: DATASET/survey.")
     ] = None,
     poses: Annotated[
-        Poses,
-        typer.Option(
-            help="estimated: from odometry, registration and loop closure. exact: as flown."
-        ),
-    ] = Poses.estimated,
+        Literal["estimated", "exact"],
+        option("estimated: from odometry, registration and loop closure. exact: as flown."),
+    ] = "estimated",
     sensor_noise: Annotated[
         float | None,
-        typer.Option(
-            help="Factor on the depth camera's noise; 0: exact depth. "
+        option(
+            "Factor on the depth camera's noise; 0: exact depth. "
             "Default: as the dataset's scene says, else 1."
         ),
     ] = None,
     drift: Annotated[
         float | None,
-        typer.Option(
-            help="Factor on the errors of odometry. Default: as the dataset's scene says, else 1."
-        ),
+        option("Factor on the errors of odometry. Default: as the scene says, else 1."),
     ] = None,
-    seed: Annotated[
-        int, typer.Option(min=0, help="Root seed: the same seed gives the same survey.")
-    ] = 0,
+    seed: Seed = 0,
 ) -> None:
     """Survey a dataset's orbit: noisy depth, drifting odometry, registration, loop closure, fusion.
 
     The result is a dataset again, with estimated poses and measured depth, so `mgs prior OUT`
     builds the prior of such a flight. The folder also holds cloud.ply, survey.json and survey.png.
     """
-    from rich.console import Console
-
-    from mgs.cli.progress import progress_bar
     from mgs.data.dataset import load_dataset
-    from mgs.files import atomic_folder
     from mgs.survey.flight import SurveySettings, fly
     from mgs.survey.folder import save_survey
     from mgs.synth.scene_file import sensor_of
@@ -66,7 +51,7 @@ def survey(
     sensor = sensor_of(dataset)
     noise = sensor.noise if sensor_noise is None else sensor_noise
     drift = sensor.drift if drift is None else drift
-    settings = SurveySettings(noise, drift, poses is Poses.exact, seed)
+    settings = SurveySettings(noise, drift, poses == "exact", seed)
     # The folder is checked and locked before the work.
     with atomic_folder(folder) as unfinished, progress_bar("survey", console) as progress:
         flown = fly(frames, settings, progress)
@@ -79,10 +64,8 @@ def survey(
     )
 
 
-def _table(numbers: dict[str, Any]) -> Any:
+def _table(numbers: dict[str, Any]) -> Table:
     """Table of the numbers of survey.json."""
-    from rich.table import Table
-
     from mgs.survey.flight import STAGES
 
     table = Table("survey", "number", title="Survey")

@@ -2,81 +2,64 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-import typer
+from rich.console import Console
 
-
-class Axis(StrEnum):
-    """Up axis of a mesh."""
-
-    y = "y"
-    z = "z"
+from mgs import runtime
+from mgs.camera import MAX_PIXELS
+from mgs.cli.options import argument, option
+from mgs.cli.progress import progress_bar
+from mgs.errors import InputError, row_named
+from mgs.synth.scene_file import ORBITS, load_scene_file
 
 
 def synth_orbit(
-    out: Annotated[
-        Path, typer.Argument(help="Folder to write: new, empty, or left by an interrupted run.")
-    ],
+    out: Annotated[Path, argument("Folder to write: new, empty, or left by an interrupted run.")],
     scene: Annotated[
-        str, typer.Option(help="Name of a scene that comes with mgs, or path of a .toml file.")
+        str, option("Name of a scene that comes with mgs, or path of a .toml file.")
     ] = "boulder",
     orbit: Annotated[
-        str | None, typer.Option(help="circle, rings, spiral or hemisphere. Default: the scene's.")
+        str | None, option("circle, rings, spiral or hemisphere. Default: the scene's.")
     ] = None,
     mesh: Annotated[
-        Path | None,
-        typer.Option(help="A real rock: textured GLB, OBJ or PLY, scaled to the scene."),
+        Path | None, option("A real rock: textured GLB, OBJ or PLY, scaled to the scene.")
     ] = None,
     mesh_up: Annotated[
-        Axis | None,
-        typer.Option(
-            help="Up axis of --mesh. Default: y for GLB (its rule) and OBJ, z for others."
-        ),
+        Literal["y", "z"] | None,
+        option("Up axis of --mesh. Default: y for GLB (its rule) and OBJ, z for others."),
     ] = None,
     preset: Annotated[
-        str, typer.Option(help="quick: 32 frames of 320x240. paper: 100 frames of 640x480.")
+        str, option("quick: 32 frames of 320x240. paper: 100 frames of 640x480.")
     ] = "quick",
-    spp: Annotated[
-        int | None, typer.Option(min=1, help="Samples per pixel. Default: the preset's.")
-    ] = None,
-    frames: Annotated[
-        int | None, typer.Option(min=1, help="Number of frames. Default: the preset's.")
-    ] = None,
+    spp: Annotated[int | None, option("Samples per pixel. Default: the preset's.", min=1)] = None,
+    frames: Annotated[int | None, option("Number of frames. Default: the preset's.", min=1)] = None,
     size: Annotated[
-        str | None, typer.Option(help="Image size WIDTHxHEIGHT, pixels. Default: the preset's.")
+        str | None, option("Image size WIDTHxHEIGHT, pixels. Default: the preset's.")
     ] = None,
     test_views: Annotated[
-        int,
-        typer.Option(
-            min=0, help="Number of views on a dome, to judge models by; written to OUT/test."
-        ),
+        int, option("Number of views on a dome, to judge models by; written to OUT/test.", min=0)
     ] = 0,
     on_demand: Annotated[
         bool,
-        typer.Option(
+        option(
+            "Render test views and a survey, but no frame: `mgs nbv OUT` renders those it takes.",
             "--on-demand",
-            help="Render test views and a survey, but no frame: `mgs nbv OUT` renders those it "
-            "takes.",
         ),
     ] = False,
     pose_noise: Annotated[
-        float,
-        typer.Option(min=0, help="Noise on the positions in transforms.json, metres per axis."),
+        float, option("Noise on the positions in transforms.json, metres per axis.", min=0)
     ] = 0.0,
     rotation_noise: Annotated[
-        float, typer.Option(min=0, help="Noise on the rotations there, degrees per axis.")
+        float, option("Noise on the rotations there, degrees per axis.", min=0)
     ] = 0.0,
     seed: Annotated[
         int,
-        typer.Option(
-            min=0,
-            help="Root seed: the same seed gives the same dataset, bit for bit; only timings.json differs.",
-        ),
+        option("Root seed: the same gives the same dataset bit for bit, but timings.json.", min=0),
     ] = 0,
 ) -> None:
     """Render a dataset with Mitsuba: an orbit around a rock, with photoreal images, depth, rock
@@ -89,13 +72,6 @@ def synth_orbit(
     With --on-demand it writes poses, test views and a survey (depth and masks, OUT/survey), and an
     image of a frame exists only after a run of `mgs nbv` has taken it.
     """
-    from rich.console import Console
-
-    from mgs import runtime
-    from mgs.cli.progress import progress_bar
-    from mgs.errors import InputError, row_named
-    from mgs.synth.scene_file import ORBITS, load_scene_file
-
     runtime.start()
     from mgs.synth.rendering import PRESETS, PoseNoise, synthesise
 
@@ -125,7 +101,7 @@ def synth_orbit(
             noise,
             progress=partial(progress, stage),
             say=console.print,
-            mesh_up=mesh_up and mesh_up.value,
+            mesh_up=mesh_up,
             test_views=test_views,
             on_demand=on_demand,
         )
@@ -135,11 +111,6 @@ def synth_orbit(
 
 def _parse_size(size: str | None) -> dict[str, int]:
     """Width and height of an option like 320x240; {} for None. Raises InputError if malformed."""
-    import re
-
-    from mgs.camera import MAX_PIXELS
-    from mgs.errors import InputError
-
     if size is None:
         return {}
     found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", size.lower(), re.ASCII)

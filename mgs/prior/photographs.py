@@ -135,7 +135,7 @@ def surface_of(
     if source == "hull":
         settings.refuse_shaping("a hull is carved from masks")
         carved = visual_hull(dataset.frames, on_stage)
-        return Surface(carved.mesh, carved.cell, None, _hull_numbers(carved))
+        return Surface(carved.mesh, carved.cell, None, dict(carved.numbers))
     cloud = read_cloud(points or dataset.root / CLOUD)
     segmented = segment_points(cloud, dataset, settings, on_stage)
     hull = visual_hull(dataset.frames, on_stage) if has_masks(dataset.frames) else None
@@ -146,8 +146,9 @@ def surface_of(
     except NoSurface:
         raise
     except InputError as error:
-        kept = _same_rows(segmented.cloud.points, segmented.rock_points)
-        raise NoSurface(str(error), segmented.cloud.points, kept) from None
+        points_kept = segmented.cloud.points
+        kept = cKDTree(segmented.rock_points).query(points_kept)[0] == 0
+        raise NoSurface(str(error), points_kept, kept) from None
     numbers = {
         "points": len(cloud.points),
         "points_kept": len(segmented.cloud.points),
@@ -156,7 +157,7 @@ def surface_of(
         "cloud_spacing": spacing,
         "poisson_depth": depth,
     }
-    numbers |= {} if hull is None else _hull_numbers(hull)
+    numbers |= {} if hull is None else hull.numbers
     return Surface(mesh, spacing, segmented, numbers)
 
 
@@ -207,16 +208,3 @@ def _thinned(mesh: Mesh, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     kept = length[:, 0] > 1e-6
     return points[kept], (normals / np.maximum(length, 1e-12))[kept]
-
-
-def _hull_numbers(hull: Hull) -> dict[str, Any]:
-    return {
-        "hull_cell": hull.cell,
-        "hull_fills_masks": float(np.nanmean(hull.agreement)),
-        "hull_fills_least": float(np.nanmin(hull.agreement)),
-    }
-
-
-def _same_rows(points: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """Which of points [N,3] are rows of `part`, bool [N]."""
-    return cKDTree(part).query(points)[0] == 0

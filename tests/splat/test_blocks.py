@@ -27,13 +27,9 @@ from mgs.splat import (
 from mgs.splat.blocks import (
     BLOCK_X,
     BLOCK_Y,
-    REORDERED,
-    RESHAPED,
     TILE,
     build,
-    changes,
     depth_order,
-    footprints,
 )
 from mgs.splat.projection import camera_array, project
 from mgs.splat.walking import PIXELS, packet_count
@@ -167,25 +163,6 @@ def test_depth_order_is_a_stable_sort():
     depth = rng.choice(rng.uniform(0.01, 50, 300), 1000).astype(np.float32)
     found = np.asarray(depth_order(mi.Float(depth)))
     np.testing.assert_array_equal(found, np.argsort(depth, kind="stable"))
-
-
-def test_changes_are_found_where_they_matter():
-    """One splat is reshaped, one moved in depth, one reshaped but never drawn; colours count
-    not."""
-    camera = make_camera()
-    g = make_gaussians(40, 1, logits=(1, 3))
-    g = changed(g, logit_opacities=np.where(np.arange(40) == 7, -9.0, g.logit_opacities))
-    turned, moved = g.log_scales.copy(), g.means.copy()
-    turned[[3, 7]] += 0.1
-    moved[5] += 0.01 * np.asarray(camera.world_to_camera[2, :3])
-    built = footprints(projected(g, camera))
-    drawn = np.asarray(built.level) > 0
-    assert drawn[[3, 5]].all()
-    assert not drawn[7]
-    after = projected(changed(g, log_scales=turned, means=moved, sh=g.sh + 1), camera)
-    expected = np.zeros(40, int)
-    expected[3], expected[5] = RESHAPED, REORDERED
-    np.testing.assert_array_equal(np.asarray(changes(built, after)), expected)
 
 
 def images(gaussians, camera, cache=None) -> list[np.ndarray]:
@@ -437,3 +414,20 @@ def test_the_size_of_tiles_changes_no_bit(tile, monkeypatch):
     monkeypatch.setattr(blocks, "TILE", tile)
     for a, b in zip(everything(), expected, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("count", [0, 1, 1023, 1024, 1025])
+def test_pairs_of_any_number_are_sorted_and_padded(count):
+    rng = np.random.default_rng(count)
+    owner, number = rng.integers(0, 50, count), rng.integers(0, 256, count)
+    pairs = (mi.UInt32(owner), mi.UInt32(number)) if count else (mi.UInt32(), mi.UInt32())
+    arrays = blocks._by_block(*pairs, 256)
+    splat, pair, start, end = (np.asarray(a).astype(int) for a in arrays)
+    order = np.argsort(number, kind="stable")
+    assert len(splat) == len(pair) == blocks._room(count)
+    np.testing.assert_array_equal(splat, [*owner[order], *[0] * (len(splat) - count)])
+    np.testing.assert_array_equal(pair[:count][order], np.arange(count))
+    for k in range(256):
+        expected = np.full((number == k).sum(), k)
+        np.testing.assert_array_equal(np.sort(number)[start[k] : end[k]], expected)
+    assert dr.width(arrays[0]) % 1024 == 0

@@ -1,4 +1,5 @@
-"""Bitwise equal images, gradients and Fisher information: reruns, threads, processes."""
+"""Bitwise equal images, gradients and Fisher information: reruns, threads, processes,
+registers."""
 
 import hashlib
 import json
@@ -8,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mgs import runtime
 from mgs.splat import ListCache, fisher, render
 
 from .scenes import (
@@ -53,17 +55,13 @@ def first():
     return results()
 
 
-def test_reruns_are_bitwise_equal(first):
-    assert differing(first, results()) == []
-
-
 @pytest.mark.parametrize("threads", [1, 2])
 def test_threads_change_nothing(first, threads):
     with thread_count(threads):
         assert differing(first, results()) == []
 
 
-@pytest.mark.parametrize("scale", [1e-12, 1e-20, 1e-28, 1e-36])
+@pytest.mark.parametrize("scale", [1e-20, 1e-36])
 def test_faint_gradients_are_deterministic_too(scale):
     """Some threads flush denormal numbers, so these must not reach a result."""
     camera = make_camera((200, 150), focal=200.0)
@@ -92,12 +90,6 @@ def test_faint_information_is_deterministic_too():
         values = found["block"]
         assert not ((values != 0) & (np.abs(values) < np.finfo(np.float32).tiny)).any()
     assert differing(*information) == []
-
-
-def test_hutchinson_draws_the_same_probes():
-    camera, gaussians = make_camera(), make_gaussians(16, 2)
-    a, b = (fisher(gaussians, camera, "hutchinson") for _ in range(2))
-    np.testing.assert_array_equal(a, b)
 
 
 def test_garbage_is_not_collected_while_a_kernel_is_recorded():
@@ -171,3 +163,32 @@ with thread_count(1):
 """
     other = json.loads(in_own_process(code).splitlines()[-1])
     assert differing({k: hashlib.sha256(v).hexdigest() for k, v in first.items()}, other) == []
+
+
+EIGHT_LANES = """
+import ctypes, sys
+from pathlib import Path
+import drjit as dr
+import numpy as np
+runtime.start()
+core = ctypes.CDLL(str(Path(dr.__file__).parent / "libdrjit-core.so"))
+set_target = core._Z19jit_llvm_set_targetPKcS0_j  # jit_llvm_set_target, a C++ function
+set_target.argtypes, set_target.restype = [ctypes.c_char_p, ctypes.c_char_p, ctypes.c_uint], None
+set_target(b"haswell", b"", 8)
+assert runtime.processor()["simd_width"] == 8
+from splat.scenes import make_camera, make_gaussians
+from mgs.splat import fisher, render
+camera, gaussians = make_camera(), make_gaussians(60, 4)
+rgb = np.asarray(render(gaussians, camera).rgb)
+np.savez(sys.argv[1], rgb=rgb, fisher=fisher(gaussians, camera))
+"""
+
+
+def test_eight_lanes_draw_the_same_image_and_information_as_sixteen(tmp_path):
+    if runtime.processor()["simd_width"] != 16:
+        pytest.skip("this processor has no registers of sixteen lanes")
+    in_own_process(EIGHT_LANES, str(tmp_path / "x.npz"))
+    camera, gaussians = make_camera(), make_gaussians(60, 4)
+    narrow = np.load(tmp_path / "x.npz")
+    np.testing.assert_array_equal(narrow["rgb"], np.asarray(render(gaussians, camera).rgb))
+    np.testing.assert_array_equal(narrow["fisher"], fisher(gaussians, camera))

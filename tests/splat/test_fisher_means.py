@@ -5,13 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mgs.colour import SH_C0
 from mgs.errors import InputError
 from mgs.gaussians import LEARNED
 from mgs.splat import MEANS, fisher, groups, information, jvp, kernels, reference
 
 from .scenes import calm, changed, make_camera, make_gaussians
-from .test_fisher import BACKGROUND, TOLERANCE, assert_close, diagonal, make
+from .test_fisher import BACKGROUND, assert_close, diagonal, make
 from .test_robustness import CASES
 
 MOVING = ("normal", "free")
@@ -64,11 +63,9 @@ def test_means_against_brute_force(degree, means):
     ("n", "style", "size", "eye"),
     [
         (1, {"spread": 0.1, "log_scales": (-2, -1), "logits": (1, 2)}, (45, 27), (2.0, 0.4, 1.1)),
-        (3, {"log_scales": (-3, -1)}, (9, 5), (-1.5, 1.0, 0.3)),
         (60, {"log_scales": (-5, -2)}, (150, 70), (0.2, -2.0, 1.0)),
-        (16, {"log_scales": (-9, -1)}, (45, 27), (0.1, 0.2, 2.5)),
     ],
-    ids=["one", "three", "many", "needles"],
+    ids=["one", "many"],
 )
 def test_means_of_other_scenes_and_cameras(n, style, size, eye, means):
     camera = make_camera(size, focal=1.1 * size[0], eye=eye)
@@ -133,42 +130,10 @@ def test_information_is_the_size_of_tangents(degree):
         np.testing.assert_allclose(v @ blocks[j] @ v, squared(j, **tangents), rtol=1e-4)
 
 
-@pytest.mark.parametrize("estimator", ["exact", "block"])
-@pytest.mark.parametrize("means", MEANS)
-def test_alpha_is_a_colour_that_all_share_over_black(means, estimator):
-    """Alpha adds the information of a red image about the footprints."""
-    camera, weight = make_camera(), 0.7
-    g = make_gaussians(30, 8, log_scales=(-4.0, -1.0))
-    options = {"means": means, "normals": normals_of(g)}
-    red = changed(g, sh=np.broadcast_to(np.array([0.5, -0.5, -0.5]) / SH_C0, g.sh.shape))
-    without = fisher(g, camera, estimator, BACKGROUND, **options)
-    with_alpha = fisher(g, camera, estimator, BACKGROUND, alpha_weight=weight, **options)
-    alone = fisher(red, camera, estimator, **options)
-    atol = 1e-5 * np.abs(without[:, :3]).max()
-    np.testing.assert_allclose(with_alpha[:, :3], without[:, :3], rtol=1e-5, atol=atol)
-    footprint = (slice(None), *[slice(3, None)] * (without.ndim - 1))
-    found, expected = with_alpha[footprint], (without + weight * alone)[footprint]
-    assert (np.abs(weight * alone[footprint]) > 0.1 * np.abs(expected)).mean() > 0.2
-    block = estimator == "block"
-    bound = 2 * CORRELATION * scale_of(expected) if block else TOLERANCE * expected
-    assert (np.abs(found - expected) <= bound).all()
-
-
 def test_nothing_is_summed_that_is_not_asked_for():
     cases = {(False, False): 7, (True, False): 22, (False, True): 16, (True, True): 34}
     for (cross, means), sums in cases.items():
         assert kernels.fisher_sums(cross, means) == sums
-
-
-@pytest.mark.parametrize("estimator", ["exact", "block"])
-def test_other_columns_are_those_of_frozen_means(estimator):
-    camera, g = make_camera(), make_gaussians(60, 3, log_scales=(-4.0, -1.0))
-    frozen = fisher(g, camera, estimator, BACKGROUND, means="frozen", alpha_weight=0)
-    np.testing.assert_array_equal(frozen, fisher(g, camera, estimator, BACKGROUND))
-    cut = (slice(None), *[slice(11)] * (frozen.ndim - 1))
-    for means in MOVING:
-        found = fisher(g, camera, estimator, BACKGROUND, means=means, normals=normals_of(g))[cut]
-        np.testing.assert_allclose(found, frozen, rtol=1e-5, atol=1e-7 * frozen.max())
 
 
 def test_blocks_with_means_are_positive_semidefinite():

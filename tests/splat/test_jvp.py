@@ -19,7 +19,6 @@ from .scenes import (
     changed,
     compare,
     double,
-    gradients_of,
     make_camera,
     make_gaussians,
     thread_count,
@@ -116,15 +115,6 @@ def test_tangents_and_gradients_are_of_one_jacobian(seed, degree, scale, stretch
     assert_one_jacobian(gaussians, tangents, camera, image_weights(camera, seed))
 
 
-@pytest.mark.parametrize("eye", [(2.0, 0.4, 1.1), (-1.5, 1.0, 0.3), (0.1, 0.2, 2.5)])
-@pytest.mark.parametrize("degree", [0, 2])
-def test_means_have_one_jacobian_too(degree, eye):
-    camera, gaussians = make_camera(eye=eye), make_gaussians(30, 5, degree, log_scales=(-4.0, -1.5))
-    tangents = random_tangents(gaussians, degree, ["means"])
-    assert np.linalg.norm(jvp(gaussians, tangents, camera, BACKGROUND).rgb) > 1
-    assert_one_jacobian(gaussians, tangents, camera, image_weights(camera, degree))
-
-
 def test_forward_mode_of_drjit_through_render():
     """`dr.forward` from a number t that moves parameters and background."""
     gaussians, camera, _ = case(1)
@@ -142,25 +132,6 @@ def test_forward_mode_of_drjit_through_render():
     for output in OUTPUTS:
         np.testing.assert_allclose(found[output], expected[output], rtol=1e-5, atol=1e-5)
         assert np.abs(found[output]).max() > 1
-
-
-def test_a_loss_has_the_derivative_of_its_gradient():
-    """Forward mode of a loss: its gradient times the tangents."""
-    gaussians, camera, _ = case(0)
-    tangents = random_tangents(gaussians, 1, LEARNED)
-    model = with_gradients(gaussians, LEARNED)
-
-    def loss():
-        image = render(model, camera, BACKGROUND)
-        of_depth = dr.mean(image.alpha * image.depth, axis=None)
-        return dr.mean(dr.square(image.rgb), axis=None) + of_depth
-
-    dr.backward(loss())
-    expected = sum((g * tangents[n]).sum() for n, g in gradients_of(model, LEARNED).items())
-    for name in LEARNED:
-        dr.set_grad(getattr(model, name), mi.TensorXf(tangents[name]))
-    found = float(dr.forward_to(loss()).array[0])
-    assert found == pytest.approx(expected, rel=1e-4)
 
 
 def test_enabled_gradients_and_suspended_ones_play_no_part():
@@ -248,7 +219,7 @@ def test_a_cache_changes_nothing():
     assert kept.builds == 3
 
 
-@pytest.mark.parametrize("scale", [1, 1e-12, 1e-28, 1e-36])
+@pytest.mark.parametrize("scale", [1, 1e-36])
 def test_reruns_are_bitwise_equal(scale):
     """Also for changes so small that some threads would flush them to 0."""
     camera = make_camera((200, 150), focal=200.0)

@@ -152,9 +152,7 @@ def test_splats_behind_the_camera_change_nothing():
     np.testing.assert_array_equal(render(g, CAMERA).rgb, render(g[4:], CAMERA).rgb)
 
 
-@pytest.mark.parametrize(
-    "size", [(1, 1), (1, 30), (30, 1), (7, 3), (8, 4), (9, 5), (16, 8), (33, 17)]
-)
+@pytest.mark.parametrize("size", [(1, 1), (1, 30), (30, 1), (8, 4), (33, 17)])
 def test_any_image_size(size):
     camera = make_camera(size, focal=0.8 * max(size))
     assert_right(scene(2), camera)
@@ -222,12 +220,10 @@ def test_gradient_of_extreme_scenes_is_right_too():
         assert compare(found[name], part)[0] < 1e-4, name
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("name", PARAMETERS)
-def test_not_a_number_names_the_parameter_and_the_first_gaussian(name, value):
+def test_not_a_number_names_the_parameter_and_the_first_gaussian(name):
     g = scene()
-    getattr(g, name)[5] = value
-    getattr(g, name)[9] = value
+    getattr(g, name)[5], getattr(g, name)[9] = -np.inf, np.nan
     cache = ListCache()
     render(scene(), CAMERA, cache=cache)
     for call in (

@@ -1,0 +1,195 @@
+"""`mgs eval`, `diagnose`, `prune`, `refit`: measure the model of a run, or make a smaller one."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+from mgs import runtime
+from mgs.cli.options import Run, option
+from mgs.cli.printing import print_quality
+from mgs.cli.progress import progress_bar
+from mgs.errors import InputError
+from mgs.policy.criteria import LEARN_LOSS, PRUNE_NOISE
+
+if TYPE_CHECKING:
+    from mgs.report.refitting import RefittedRun
+
+
+def evaluate(
+    run: Run,
+    pictures: Annotated[
+        bool, option("Write truth, render and difference of each view to RUN/renders.")
+    ] = True,
+    convergence: Annotated[
+        bool,
+        option("Measure how much lower the last fit could get (Newton decrease).", "--convergence"),
+    ] = False,
+) -> None:
+    """Measure the model on the test views, on all views, and on the views never trained on; write
+    RUN/metrics.json, and renders beside truth.
+
+    Metrics and pictures of this very model and dataset are kept, and not made again. The truth is
+    the rock on black. PSNR and SSIM are over the full frame, and over the pixels of the rock only.
+    metrics.json also has the errors of alpha and depth, where the dataset has their truth.
+    """
+    from mgs.report.evaluation import evaluate_run
+    from mgs.report.runs import Comparison, read_run
+    from mgs.report.tables import comparison_rows
+    from mgs.run.ending import fit_line
+    from mgs.run.folder import open_run
+
+    runtime.start()
+    said: list[str] = []
+    opened = open_run(run)
+    with progress_bar() as bar:
+        progress = partial(bar, "rendering and comparing")
+        metrics = evaluate_run(
+            opened, pictures=pictures, convergence=convergence, progress=progress, say=said.append
+        )
+    rows = comparison_rows(Comparison({opened.label: read_run(run)}, opened.dataset))
+    print_quality(Console(), rows)
+    if "fit" in metrics:
+        said.insert(0, fit_line(metrics["fit"], opened.state.steps[-1]["stop_reason"]))
+    typer.echo("\n".join(said))
+
+
+def diagnose(
+    run: Run,
+    views: Annotated[
+        str | None,
+        option("Frames to draw, as kf_0003,kf_0010. Default: a few that were not trained on."),
+    ] = None,
+    calibrate: Annotated[
+        bool,
+        option("Instead, predict the errors of views not seen, and compare.", "--calibrate"),
+    ] = False,
+) -> None:
+    """Draw maps of the Fisher information and the uncertainty that a run has about its model, for
+    views and for Gaussians.
+
+    Writes into RUN/diagnostics: for each view an EXR with the channels R G B A Z, fisher.colour,
+    fisher.scale, fisher.rotation, fisher.opacity, information, uncertainty and unobserved, and a
+    PNG that shows them; and information.ply, a point for each Gaussian, coloured by its
+    information.
+
+    With --calibrate it writes uncertainty.json and uncertainty.png: how well errors are predicted
+    for the test views and for frames never trained on, after a calibration on the run's own views,
+    each left out of a fit once; and NAME.errors.exr, true error and predicted standard deviation of
+    some views.
+    """
+    from mgs.report.diagnostics import diagnose_run
+
+    if calibrate and views is not None:
+        raise InputError("--calibrate takes all views that were not seen; leave out --views")
+    wanted = None if views is None else [name.strip() for name in views.split(",") if name.strip()]
+    if wanted == []:
+        raise InputError(
+            f"--views {views!r}: names no frame; give some, as in kf_0003,kf_0010, or leave it out"
+        )
+    runtime.start()
+    with progress_bar() as bar:
+        if calibrate:
+            from mgs.report.predicted_error import calibrate_run
+
+            written = calibrate_run(run, partial(bar, "calibrating"))
+        else:
+            written = diagnose_run(run, wanted, partial(bar, "mapping"))
+    for path in written:
+        typer.echo(f"wrote {path}")
+
+
+def prune(
+    run: Run,
+    noise: Annotated[
+        float, option("Allowed change of the training images: rms of a pixel, linear RGB.")
+    ] = PRUNE_NOISE,
+) -> None:
+    """Leave out the Gaussians of a run without which its images hardly change; write
+    RUN/gaussians_pruned.ply.
+
+    The change by the removal of each Gaussian is known exactly; the change by the removal of all of
+    them together is measured, and stays within --noise. Nothing is fitted again, and the run itself
+    stays as it is.
+    """
+    from mgs.report.pruning import PRUNED, prune_run
+
+    runtime.start()
+    with progress_bar() as bar:
+        found = prune_run(run, noise, bar)
+    share = 1 - found.after / found.before
+    lines = [
+        f"{found.before:,} Gaussians, {found.after:,} stay: {share:.0%} are left out",
+        f"rms change of a pixel value: predicted {found.predicted:.2g}, "
+        f"measured {found.actual:.2g}, allowed {noise:.2g}",
+    ]
+    if found.psnr:
+        before, after = found.psnr
+        lines.append(
+            f"PSNR on the {found.views} views: {before:.2f} dB before, {after:.2f} dB after"
+        )
+    _print([*lines, f"wrote {run / PRUNED}"])
+
+
+def refit(
+    run: Run,
+    learn: Annotated[
+        str, option("auto: each Gaussian learns the kinds that the evidence pays for; all: all.")
+    ] = "auto",
+    sh: Annotated[
+        str, option("SH degree: 0, or auto: 1 if that predicts views left out better.")
+    ] = "auto",
+    loss: Annotated[
+        float, option("Allowed rise of the objective by parameters that are left out, dB.")
+    ] = LEARN_LOSS,
+) -> None:
+    """Fit the views of a run once more, with no more parameters than they pay for; write
+    RUN/gaussians_refitted.ply.
+
+    No test view is used for it: the kinds of parameters that a Gaussian learns are chosen by the
+    evidence, the marginal likelihood of the images, and by --loss; the SH degree by views that are
+    left out. Parameters that are not learned keep the prior's values, and are marked in the file.
+    The run itself stays as it is.
+    """
+    from mgs.report.refitting import REFITTED, refit_run
+
+    runtime.start()
+    options: Any = {"learn": learn, "sh": sh, "loss": loss}
+    with progress_bar() as bar:
+        found = refit_run(run, say=bar, **options)
+    _print([*_refitted(found), f"wrote {run / REFITTED}"])
+
+
+def _refitted(found: RefittedRun) -> list[str]:
+    """Describe a refitted run."""
+    share = found.after / found.before
+    shares = ", ".join(f"{kind} {share:.0%}" for kind, share in found.shares.items())
+    lines = [
+        f"{found.after:,} parameters are learned, {share:.0%} of the run's {found.before:,}",
+        f"learned by: {shares} of the Gaussians",
+    ]
+    if found.left_out:
+        more = "more" if found.left_out.pays else "not more"
+        lines.append(
+            f"SH degree {found.sh_degree}: on views left out, neighbours together, degree 1 gains "
+            f"{found.left_out.gain:+.3f} dB, {more} than its standard error of "
+            f"{found.left_out.error:.3f}"
+        )
+    else:
+        lines.append("SH degree 0: no other was tried")
+    if not found.psnr:
+        return [*lines, "PSNR: there are no views on which to compare the models"]
+    own, whole, lean = found.psnr
+    lines.append(
+        f"PSNR on the {found.views} views: {lean:.2f} dB, {whole:.2f} dB where all parameters are "
+        f"fitted in the same way; of the run's own model {own:.2f} dB"
+    )
+    return lines
+
+
+def _print(lines: list[str]) -> None:
+    for line in lines:
+        Console(highlight=False).print(line, soft_wrap=True)

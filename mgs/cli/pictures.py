@@ -1,0 +1,119 @@
+"""`mgs render` and `mgs view`: pictures of a model, through given cameras or in the browser."""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from mgs import runtime
+from mgs.cli.options import argument, option
+from mgs.cli.progress import progress_bar
+from mgs.errors import InputError
+from mgs.files import check_new_folder, folder_locked
+
+
+def render(
+    splats: Annotated[
+        Path,
+        argument("3DGS PLY of SH degree 0 to 3, binary, ascii or compressed, of mgs or others."),
+    ],
+    cameras: Annotated[
+        Path, option("transforms.json (nerfstudio), or the dataset folder that holds it.")
+    ],
+    out: Annotated[Path, option("Folder to write, new or empty.")],
+    width: Annotated[
+        int | None,
+        option("Width in pixels; the height follows. Default: the cameras' own.", min=1),
+    ] = None,
+    colour_space: Annotated[
+        Literal["auto", "linear", "srgb"],
+        option(
+            "Space in which the PLY's colours are blended: mgs trains in linear RGB, most other "
+            "tools in sRGB. auto: linear for files that mgs wrote (by their header), else srgb."
+        ),
+    ] = "auto",
+    background: Annotated[
+        tuple[float, float, float],
+        option(
+            "Colour behind the Gaussians, sRGB, each from 0 to 1.",
+            metavar="R G B",
+            show_default="black",
+        ),
+    ] = (0.0, 0.0, 0.0),
+    exr: Annotated[
+        bool,
+        option(
+            "Write an EXR too: linear R G B, opacity A, z-depth Z in metres (0: none).", "--exr"
+        ),
+    ] = False,
+) -> None:
+    """Draw a model of Gaussians through every camera of a transforms.json. The images it lists need
+    not exist.
+
+    Writes one PNG for each camera, with the name of the camera's image.
+    """
+    from mgs.data.dataset import load_cameras
+    from mgs.report.pictures import draw_views
+    from mgs.splat_ply import ply_colour_space, read_ply
+
+    if not all(0 <= value <= 1 for value in background):
+        given = " ".join(map(str, background))
+        raise InputError(f"--background {given}: must be three numbers from 0 to 1")
+    views = [
+        (name, camera.resized(width) if width else camera) for name, camera in load_cameras(cameras)
+    ]
+    gaussians = read_ply(splats)
+    space = ply_colour_space(splats) if colour_space == "auto" else colour_space
+    runtime.start()
+    with folder_locked(out), progress_bar() as bar:
+        check_new_folder(out)
+        progress = partial(bar, "rendering")
+        draw_views(out, gaussians, views, space, background, exr, progress)
+    colours = "linear RGB" if space == "linear" else "sRGB"
+    model = f"{len(gaussians):,} Gaussians (SH degree {gaussians.sh_degree}, colours in {colours})"
+    typer.echo(f"wrote {len(views)} views of {model} to {out}")
+
+
+def view(
+    subject: Annotated[
+        Path,
+        argument("Folder that `mgs nbv` wrote, or a 3DGS PLY.", metavar="RUN|SPLATS.ply"),
+    ],
+    port: Annotated[int, option("Port to serve on; 0: any free one.", min=0, max=65535)] = 8080,
+    host: Annotated[
+        str, option("Address to serve on. Any but 127.0.0.1 can be reached by others.")
+    ] = "127.0.0.1",
+    follow: Annotated[
+        bool, option("Show every new step of a run that goes on.", "--follow")
+    ] = False,
+) -> None:
+    """Show a run or a model in the browser, to be turned by mouse, keyboard or touch: Gaussians,
+    mesh and cameras.
+
+    While the camera moves, the browser draws the Gaussians, without view-dependent colour. While it
+    rests, the kernel's image is shown. Layers: colour, alpha, depth, and of a run information,
+    uncertainty, and what is unobserved. A click on a camera shows its image and its numbers. Ctrl-C
+    ends it.
+    """
+    from mgs.view.server import Viewer
+
+    runtime.start()
+    viewer = Viewer(subject, host, port, follow)
+    try:
+        token = viewer.access.token
+        if token:
+            typer.echo(f"--host {host}: whoever has the address below, with its token, can look")
+        shown = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+        query = f"/?token={token}" if token else ""
+        typer.echo(f"open http://{shown}:{viewer.port}{query} in a browser; Ctrl-C ends it")
+        while True:
+            viewer.tick()
+            time.sleep(0.05)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        viewer.close()
