@@ -18,6 +18,7 @@ from mgs.report.runs import (
     check_finished,
     check_measured,
     compare_runs,
+    least_trained,
     up_of,
 )
 from mgs.report.tables import comparison_rows, markdown_table
@@ -100,30 +101,22 @@ def shown_view(runs: Sequence[RunFiles], dataset: Dataset) -> tuple[Frame, str]:
     """The view that the comparison shows, and the key of metrics.json that lists it, "test_views"
     or "views".
 
-    It is the middle test view if all runs were measured on test views, else a view that the fewest
-    runs were trained on (`unseen_view`). Of frames on demand, only those that all runs have taken
+    It is the middle test view if all runs were measured on test views, else the middle one of those
+    that the fewest runs were trained on. Of frames on demand, only those that all runs have taken
     have an image. Raises InputError as `Dataset.test_views`, and if there is no such frame.
     """
     tests = dataset.test_views()
     if tests is not None and all((run.metrics or {}).get("test_views") for run in runs):
         return tests.frames[len(tests) // 2], "test_views"
     shared = set.intersection(*({dataset.frames[i].name for i in run.taken} for run in runs))
-    shown = {frame.name for frame in dataset.with_images(shared)}
+    shown = dataset.with_images(shared)
     if not shown:
         raise InputError(
             f"{dataset.root}: has no test views, and no frame that all runs have taken; "
             "report them one by one"
         )
-    indices = [index for index, frame in enumerate(dataset.frames) if frame.name in shown]
-    return dataset.frames[unseen_view(runs, indices)], "views"
-
-
-def unseen_view(runs: Sequence[RunFiles], frames: Sequence[int]) -> int:
-    """Index of a frame that the fewest runs were trained on; of several, the middle one. frames:
-    indices to choose from."""
-    counts = {index: sum(index in run.taken for run in runs) for index in frames}
-    fewest = [index for index in frames if counts[index] == min(counts.values())]
-    return fewest[len(fewest) // 2]
+    fewest = least_trained(runs, dataset, shown)
+    return fewest[len(fewest) // 2], "views"
 
 
 def _caption(run: RunFiles, views: str, name: str) -> str:

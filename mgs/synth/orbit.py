@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import trimesh
-from scipy.spatial.transform import Rotation
 
 from mgs.camera import Camera, look_at
 from mgs.errors import InputError
 from mgs.synth.scene_file import Orbit, SceneFile
+
+if TYPE_CHECKING:
+    import trimesh
 
 EVALUATION_ELEVATIONS = (5.0, 75.0)
 """Elevations of the test views above the rock's middle, degrees: from just over the stones on the
@@ -116,6 +119,8 @@ def perturb(
 ) -> list[Camera]:
     """Cameras with independent Gaussian pose errors. position, rotation: standard deviations per
     axis, metres and degrees."""
+    from scipy.spatial.transform import Rotation  # here, so that `mgs --help` does not load it
+
     noisy = []
     for camera in cameras:
         pose = camera.camera_to_world
