@@ -169,7 +169,7 @@ def _table(numbers: dict[str, Any]) -> Table:
     metres = numbers["unit"] == "m"
     unit = "m" if metres else "unit"
     n, spacing, area = numbers["n"], numbers["spacing"], numbers["sampled_area"]
-    table = Table("station", "number", title="Mesh prior")
+    table = Table("step", "number", title="Mesh prior")
 
     def length(value: float) -> str:
         return f"{1e3 * value:.2f} mm" if metres else f"{value:.4g} unit"
