@@ -71,15 +71,16 @@ def initial_gaussians(
     gains: np.ndarray | None = None,
     colours: Callable[[Frame], Colours] | None = None,
 ) -> tuple[Gaussians, np.ndarray]:
-    """One flat Gaussian per sample of a prior, in its mean colour, then one behind each backed
-    sample.
+    """Place one flat Gaussian per sample of a prior, in its mean colour, then one behind each
+    backed sample.
 
-    A frame sees a sample that lies in its rock mask, faces the camera and agrees with the depth
-    image (or the depth of the mesh, without one) up to `prior.depth_tolerance` and the slope. A
-    sample that no frame sees is grey. inset: depth below the sample, over `pixel_on`. gains: [V,3]
-    exposures that divide the colours (`mgs.prior.exposure`). colours: `colours_of` the prior, if
-    kept between calls. Returns (N + backed Gaussians of degree 0, seen [N] bool). Raises InputError
-    if a file of a frame cannot be read, and as `mesh_depth`.
+    inset: depth below the sample, over `pixel_on`. gains: [V,3] exposures that divide the colours
+    (`mgs.prior.exposure`). colours: `colours_of` the prior, if kept between calls.
+
+    Returns (N + backed Gaussians of degree 0, seen [N] bool). A frame sees a sample that lies in
+    its rock mask, faces the camera and agrees with the depth image (or else the mesh's depth) up to
+    `prior.depth_tolerance` and the slope. A sample that no frame sees is grey. Raises InputError if
+    a file of a frame cannot be read, and as `mesh_depth`.
     """
     n = len(prior.points)
     total, count = np.zeros((n, 3)), np.zeros(n)

@@ -86,7 +86,7 @@ class Problem:
     """A selection problem: which of the frames to take, and how the model is fitted to them.
 
     Positions, centre and points are in coordinates in which +Z is up, metres. lam [P]: lambda of
-    the run; prior_lam: the same without columns of means and without `--lambda`, for the surface.
+    the run; prior_lam: the same without columns of means and without `--lam`, for the surface.
     What depends on images (`start`) is computed when first asked for.
     """
 
