@@ -47,10 +47,10 @@ DATASET = "dataset"
 
 
 class Run:
-    """A run folder; what it was made of is read when first asked for, and once.
+    """A run folder, its settings, and its dataset, prior and state, each read once at first use.
 
-    folder: the run. settings: from its config.json. Properties raise InputError where a file is
-    missing or damaged; `state` where no step is finished yet; `dataset` where its frames changed.
+    settings: from the folder's config.json. Properties raise InputError if a file is missing or
+    damaged; `state` also if no step is finished yet; `dataset` also if its frames changed.
     """
 
     def __init__(
