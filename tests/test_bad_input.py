@@ -175,7 +175,6 @@ def test_survey_without_a_rock(capsys, dataset, tmp_path, given, named):
         "no seeds": (["--seeds", 0], "--seeds"),
         "budget larger than the candidates": (["--budget", 9], "8 candidates"),
         "negative budget": (["--budget", -1], "--budget"),
-        "negative seed": (["--seed", -1], "--seed"),
         "no pixel noise": (["--pixel-noise", 0], "--pixel-noise"),
         "NaN pixel noise": (["--pixel-noise", "nan"], "--pixel-noise"),
         "no passes": (["--passes", 0], "--passes"),
