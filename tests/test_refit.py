@@ -267,7 +267,7 @@ def test_a_run_is_refitted_beside_its_model(run, capsys):
     assert "PSNR on the test views" in said
     found = refit_run(run)
     assert (run / REFITTED).read_bytes() == refitted
-    assert found.after == parameters
+    assert found.lean.parameters == parameters
     assert found.before == 4400
     own, whole, lean = found.psnr
     assert lean > whole - 0.3
@@ -295,7 +295,7 @@ def test_a_run_that_learns_means_is_refitted_too(run, tmp_path, means):
     vertices = PlyData.read(str(tmp_path / "run" / REFITTED))["vertex"].data
     held = vertices["learned_mean"] == 0
     assert 0 < held.mean() < 1
-    assert held.mean() == pytest.approx(1 - found.shares["mean"])
+    assert held.mean() == pytest.approx(1 - found.lean.learned["mean"].mean())
 
 
 @pytest.mark.parametrize(
