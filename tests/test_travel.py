@@ -83,16 +83,6 @@ def test_the_choice_is_the_best_gain_for_its_cost(loaded, tmp_path, travel, batc
         assert step["score"] == step["information_gain"] == pytest.approx(gains[chosen])
 
 
-def test_dear_travel_makes_the_path_shorter_and_cheap_travel_changes_nothing(loaded, tmp_path):
-    positions = np.array([frame.camera.position for frame in loaded.frames])
-    paths, taken = {}, {}
-    for travel in (None, 1e6, 0.1):
-        taken[travel] = run(tmp_path / str(travel), loaded, travel=travel).taken
-        paths[travel] = pose_policies.path_length(positions[taken[travel]])
-    assert taken[None] == taken[1e6]
-    assert paths[0.1] < paths[None]
-
-
 def test_what_cannot_be_divided_by_a_cost_is_refused(loaded, tmp_path, monkeypatch):
     negative = lambda candidates, *rest: -np.ones(len(candidates))  # noqa: E731
     monkeypatch.setitem(pose_policies.POSE_POLICIES, "mine", negative)
