@@ -24,6 +24,7 @@ from mgs.study import case, free_fit, reproduce
 from mgs.study import reproduce_results as results
 from mgs.study.case import Case, Scene, Size
 from mgs.study.reproduce import FREE_FIT, ReproduceSize, Rock, Run, RunSize
+from mgs.study.reproduce_results import Work
 from mgs.study.sweep import cell_folder, run_cells
 
 ONE = RunSize(Size(48, 36, 8, 3, spp=1), 200, 2)
@@ -349,8 +350,8 @@ def test_differences_are_paired_by_rock(tmp_path):
     runs = reproduce.curve_runs(TINY, 3)
     ahead = {"d-optimal": 0.0, "uniform": 0.3, "directional-i": 0.5}
     found = fake(runs, lambda run: 25 + 10 * run.rock.index + ahead.get(run.policy, 0.1))
-    results.write_curves(tmp_path, tmp_path, found, TINY, 3, "c")
-    rows = json.loads((tmp_path / "curves.json").read_text())["rows"]
+    results.write_curves(Work(tmp_path, found, TINY, 3, "c"))
+    rows = json.loads((tmp_path / "results/curves.json").read_text())["rows"]
     row = next(r for r in rows if (r["policy"], r["images"]) == ("d-optimal", 6))
     assert row["test_psnr"] == pytest.approx(35)
     ends = [row[f"test_psnr_over_uniform{end}"] for end in ("", "_low", "_high")]
@@ -366,12 +367,12 @@ def test_differences_are_paired_by_rock(tmp_path):
     images = [reach[policy]["images"] for policy in ("uniform", "directional-i")]
     assert images == pytest.approx([5.6, 5.2])
     assert reach["d-optimal"] == {"images": None, "rocks": 0}
-    text = (tmp_path / "curves.md").read_text()
+    text = (tmp_path / "results/curves.md").read_text()
     assert "| d-optimal | 34.50 | 31.50 | – | – |" in text
     assert "| uniform | 34.80 | 31.80 | 5.6 | 5.6 |" in text
     pair = "| d-optimal − uniform | full frame | -0.30 [-0.30, -0.30], 0 of 3 | fails | 0.25 | 1 |"
     assert pair + " -0.30, 0 of 1 |" in text
-    assert (tmp_path / "curves.png").stat().st_size > 10_000
+    assert (tmp_path / "results/curves.png").stat().st_size > 10_000
 
 
 def test_scenes_that_chose_no_setting_are_judged_alone():
@@ -415,7 +416,7 @@ def test_shares_are_of_what_the_oracle_gains_over_random(tmp_path):
     assert text.count(f"| d-optimal |{f' {half} |' * pools}\n") == 3  # frame, rock, whole curve
     assert f"| directional-i |{' – |' * pools}\n" in text
     assert f"| d-optimal |{' 25% |' * pools}\n" in text
-    written = results.write_pools(tmp_path, tmp_path, fake(runs, lambda r: 25.0), TINY, 2, "c")
+    written = results.write_pools(Work(tmp_path, fake(runs, lambda r: 25.0), TINY, 2, "c"))
     assert {row["test_psnr_share"] for row in rows_of(written[0])} == {""}, "without the oracle"
     assert all(path.is_file() for path in written)
 
@@ -427,10 +428,10 @@ def test_numbers_of_seeds_are_compared_at_equal_images(tmp_path):
     rows, _ = results.seed_rows(found, runs)
     over = [row["test_psnr_over_four"] for row in rows[:6]]
     assert over == pytest.approx([-0.3, -0.2, -0.1, 0, 0.2, 0.4])
-    results.write_seeds(tmp_path, tmp_path, found, TINY, 2, "c")
+    results.write_seeds(Work(tmp_path, found, TINY, 2, "c"))
     line = "| d-optimal | 1 | 90.0 | 180 (180) | 25.10 | -0.30 [-0.30, -0.30] |"
-    assert line in (tmp_path / "seeds.md").read_text()
-    assert (tmp_path / "seeds.png").stat().st_size > 10_000
+    assert line in (tmp_path / "results/seeds.md").read_text()
+    assert (tmp_path / "results/seeds.png").stat().st_size > 10_000
     assert results.largest_gap([0, 27, 23, 19], 32) == pytest.approx(19 * 360 / 32)
     assert results.largest_gap([5], 8) == 360
     assert results.largest_gap([6, 0, 2, 4], 8) == 90
@@ -468,7 +469,7 @@ def test_pools_and_the_oracle_that_sees_the_truth(quick, tmp_path, monkeypatch):
     step = read_checkpoint(cell_folder(tmp_path, oracle.name) / "run").steps[1]
     assert step["score"] == step["test_psnr"], "what it foresaw is what the loop then fits"
     without = {name: found[name] for name in found if name != oracle.name}
-    written = results.write_pools(tmp_path, tmp_path / "results", without, TINY, 1, "c")
+    written = results.write_pools(Work(tmp_path, without, TINY, 1, "c"))
     assert [row["policy"] for row in rows_of(written[0])] == ["uniform", "random", "oracle"]
 
 

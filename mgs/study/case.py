@@ -91,12 +91,8 @@ class Case:
     @property
     def prior_name(self) -> str:
         """Name of the prior's cell."""
-        return "-".join(
-            [
-                f"prior/{self.name}",
-                *(f"{v:g}" if isinstance(v, float) else str(v) for v in self.settings.values()),
-            ]
-        )
+        values = (f"{v:g}" if isinstance(v, float) else str(v) for v in self.settings.values())
+        return "-".join([f"prior/{self.name}", *values])
 
     @property
     def folders(self) -> dict[str, str]:
@@ -114,6 +110,13 @@ class Case:
         arguments = {"dataset": self.dataset, **self.settings}
         needs = tuple(cell.name for cell in cells)
         return [*cells, Cell(self.prior_name, f"{__name__}:make_prior", arguments, needs)]
+
+    def with_task(self, name: str, task: str, alone: bool = False, **arguments: Any) -> list[Cell]:
+        """The cells above, and last a cell of a task that gets their folders and these
+        arguments."""
+        cells = self.cells()
+        needs = tuple(cell.name for cell in cells)
+        return [*cells, Cell(name, task, {**self.folders, **arguments}, needs, alone)]
 
 
 def make_dataset(
@@ -149,10 +152,9 @@ def make_prior(root: Path, out: Path, dataset: str, **settings: Any) -> dict[str
         with atomic_folder(folder) as unfinished:
             save_prior(unfinished, built)
     prior = load_prior(folder)
-    numbers = {
-        key: prior.numbers[key] for key in ("sampled_area", "resolution") if key in prior.numbers
-    }
-    return {"gaussians": len(prior.points) + prior.backed, "spacing": prior.spacing} | numbers
+    found = {"gaussians": len(prior.points) + prior.backed, "spacing": prior.spacing}
+    kept = ("sampled_area", "resolution")
+    return found | {key: prior.numbers[key] for key in kept if key in prior.numbers}
 
 
 def test_views_of(dataset: Dataset) -> Dataset:
@@ -168,10 +170,7 @@ def test_views_of(dataset: Dataset) -> Dataset:
 
 def judge(model: Gaussians, dataset: Dataset) -> dict[str, float]:
     """Mean metrics of a model over the test views of a dataset (`mgs.report.evaluation`)."""
-    metrics: dict[str, float] = evaluate(model, (), (), test_frames=test_views_of(dataset).frames)[
-        "test"
-    ]
-    return metrics
+    return dict(evaluate(model, (), (), test_frames=test_views_of(dataset).frames)["test"])
 
 
 def run_or_resume(
@@ -219,12 +218,10 @@ def _timed(
     steps = run_or_resume(root, out, dataset, prior, settings).steps
     peak = peak_megabytes()
     metrics = evaluate_run(out / "run", pictures=False)
-    choices = [step["seconds"]["score"] for step in steps[1:]]
-    spent = [
-        step["seconds"][stage] for step in steps for stage in step["seconds"] if stage != "evaluate"
-    ]
+    seconds = [step["seconds"] for step in steps]
+    choices = [one["score"] for one in seconds[1:]]
     return {key: metrics[key] for key in ("images", "test", "all", "held_out")} | {
-        "seconds": sum(spent),
+        "seconds": sum(one[stage] for one in seconds for stage in one if stage != "evaluate"),
         "choice_seconds": sum(choices) / len(choices) if choices else None,
         "peak_megabytes": peak,
     }
