@@ -22,29 +22,29 @@ from mgs.run import folder as run_folder
 from mgs.run.detectors import (
     DETECTORS,
     Before,
-    ViewSigns,
+    ViewIndicators,
     alarms,
     before_fit,
     means_drift,
     outline_margin,
     residual,
-    step_signs,
-    view_signs,
+    step_indicators,
+    view_indicators,
 )
 from mgs.run.nbv import run_nbv, start_run
 from mgs.splat import render
 
 FITS = Before(outline=0.001, offset=0.01, exposure=0.01)
-GOOD = ViewSigns(FITS, unexplained=0.05, error=0.02)
+GOOD = ViewIndicators(FITS, unexplained=0.05, error=0.02)
 FALLING = (1.0, 0.5, 0.3, 0.25, 0.249, 0.248)
 
 
-def signs(views=(GOOD,) * 4, losses=FALLING, coverage=0.95, gains=(0.5, 0.4), drift=0.0):
-    return step_signs(list(views), list(losses), coverage, list(gains), drift)
+def indicators(views=(GOOD,) * 4, losses=FALLING, coverage=0.95, gains=(0.5, 0.4), drift=0.0):
+    return step_indicators(list(views), list(losses), coverage, list(gains), drift)
 
 
-def one_bad(**changes) -> tuple[ViewSigns, ...]:
-    """Three good views, and one with these signs before the fit."""
+def one_bad(**changes) -> tuple[ViewIndicators, ...]:
+    """Three good views, and one with these indicators before the fit."""
     return GOOD, GOOD, GOOD, replace(GOOD, before=replace(FITS, **changes))
 
 
@@ -63,35 +63,35 @@ BAD = {
 
 
 def test_a_good_step_has_no_warning():
-    assert set(signs()) == set(DETECTORS)
-    assert alarms(signs()) == []
+    assert set(indicators()) == set(DETECTORS)
+    assert alarms(indicators()) == []
 
 
 @pytest.mark.parametrize("name", DETECTORS)
 def test_each_fault_has_one_warning_with_its_number(name):
     changes, words = BAD[name]
-    (said,) = alarms(signs(**changes))
+    (said,) = alarms(indicators(**changes))
     assert words in said
 
 
 def test_a_warning_comes_once_and_again_after_it_was_over():
-    bad, good = signs(coverage=0.2), signs()
+    bad, good = indicators(coverage=0.2), indicators()
     assert len(alarms(bad, good)) == 1
     assert alarms(bad, bad) == []
     assert alarms(good, bad) == []
 
 
 def test_signs_that_a_step_cannot_have_are_left_out():
-    assert set(step_signs([], [1.0], 1.0, [], 0.0)) == {"means"}
+    assert set(step_indicators([], [1.0], 1.0, [], 0.0)) == {"means"}
     # A warm fit may end lower than it was in between, and not lower than at its start.
-    assert step_signs([], [1.0, 1.2, 1.1, 1.0], 1.0, [], 0.0)["unconverged"] == 0
-    unknown = step_signs([], [1.0, float("nan"), 1.0, 1.0], 1.0, [], 0.0)
+    assert step_indicators([], [1.0, 1.2, 1.1, 1.0], 1.0, [], 0.0)["unconverged"] == 0
+    unknown = step_indicators([], [1.0, float("nan"), 1.0, 1.0], 1.0, [], 0.0)
     assert {"unconverged", "worse"}.isdisjoint(unknown)
 
 
 @pytest.mark.parametrize("views", [1, 3, 4])
 def test_coverage_is_expected_of_four_views_and_more(views):
-    assert bool(alarms(signs(views=(GOOD,) * views, coverage=0.7))) == (views == 4)
+    assert bool(alarms(indicators(views=(GOOD,) * views, coverage=0.7))) == (views == 4)
 
 
 def seen(mask, alpha, margin=1, rendered=0.5, truth=0.5):
@@ -136,11 +136,11 @@ def test_the_margin_is_a_pixel_and_the_size_of_a_gaussian():
 def test_a_perfect_render_explains_all_and_a_single_colour_nothing():
     truth = np.random.default_rng(0).uniform(0.2, 0.8, (6, 8, 3)).astype(np.float32)
     target, mask = np.dstack([truth, np.ones((6, 8), np.float32)]), np.ones((6, 8), bool)
-    flat = view_signs(target, mask, np.broadcast_to(truth.mean((0, 1)), truth.shape), FITS)
+    flat = view_indicators(target, mask, np.broadcast_to(truth.mean((0, 1)), truth.shape), FITS)
     assert flat.unexplained == pytest.approx(1, abs=1e-6)
     assert flat.error == pytest.approx(truth.std(axis=(0, 1)).mean(), rel=0.05)
-    assert view_signs(target, mask, truth, FITS) == ViewSigns(FITS, 0.0, 0.0)
-    assert view_signs(target, ~mask, truth, FITS) == ViewSigns(FITS, 0.0, 0.0)
+    assert view_indicators(target, mask, truth, FITS) == ViewIndicators(FITS, 0.0, 0.0)
+    assert view_indicators(target, ~mask, truth, FITS) == ViewIndicators(FITS, 0.0, 0.0)
 
 
 def test_drift_is_in_standard_deviations_of_a_gaussian():
@@ -174,7 +174,7 @@ def test_a_good_run_has_no_warning_and_the_residual_of_new_images(rock, tmp_path
         run_nbv(rock, tmp_path / f"{budget}", budget=budget, seeds=5) for budget in (1, 2)
     )
     assert [line.get("warnings") for line in after.steps] == [None] * 3
-    assert all("prior" in line["signs"] for line in after.steps)
+    assert all("prior" in line["indicators"] for line in after.steps)
     assert ["residual" in line for line in after.steps] == [False, True, True]
     frame = load_dataset(rock).frames[after.taken[-1]]
     target = target_of(frame)
@@ -199,7 +199,7 @@ def test_a_warning_is_printed_recorded_and_on_the_page(rock, tmp_path):
     (said,) = [warning for warning in first["warnings"] if "still fell" in warning]
     assert f"step 0: {said}" in console.export_text()
     assert f"step 0: {said}" in read_shown("d-optimal", read_run(run), load_dataset(rock)).notes
-    assert not any("signs" in key for key in measured(first))
+    assert not any("indicators" in key for key in measured(first))
 
 
 def test_a_prior_in_the_wrong_place_is_noticed_at_the_seeds(rock, tmp_path):
@@ -211,7 +211,7 @@ def test_a_prior_in_the_wrong_place_is_noticed_at_the_seeds(rock, tmp_path):
 
 def test_a_loop_without_renders_has_no_signs(dataset, tmp_path):
     state = tiny.run(tmp_path / "run", load_dataset(dataset))
-    assert not any("signs" in line or "warnings" in line for line in state.steps)
+    assert not any("indicators" in line or "warnings" in line for line in state.steps)
 
 
 def wrong_pose(frames):

@@ -23,6 +23,7 @@ from mgs.data.check import check_dataset
 from mgs.data.clouds import read_cloud
 from mgs.data.dataset import load_dataset
 from mgs.data.meshes import load_mesh
+from mgs.data.sources import read_source
 from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.images import image_size, read_exr, read_rgba, write_exr
@@ -32,7 +33,6 @@ from mgs.synth.scene_file import Arena, Rock, SceneFile
 
 
 def change(dataset: Path, frame: dict | None = None, **header: object) -> None:
-    """Change values of a transforms.json, and of its third frame."""
     data = read_json(dataset / "transforms.json") | header
     data["frames"][2] |= frame or {}
     (dataset / "transforms.json").write_text(json.dumps(data))
@@ -40,9 +40,8 @@ def change(dataset: Path, frame: dict | None = None, **header: object) -> None:
 
 def bomb(path: Path, side: int, kind: str = "PNG") -> Path:
     """A black image of few bytes. Beyond 20,000 pixels only the header says so."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     if side <= 20_000:
-        Image.new("1" if kind == "PNG" else "L", (side, side)).save(path, kind)
+        Image.new("L", (side, side)).save(path, kind)
         return path
     header = b"IHDR" + struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)
     chunk = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
@@ -56,7 +55,6 @@ def exr_bomb(path: Path) -> Path:
     window = b"dataWindow\0box2i\0" + struct.pack("<i", 16)
     said = window + struct.pack("<iiii", 0, 0, 2**21 - 1, 3)
     small = window + struct.pack("<iiii", 0, 0, 3, 3)
-    assert small in path.read_bytes()
     path.write_bytes(path.read_bytes().replace(small, said))
     return path
 
@@ -65,8 +63,7 @@ def exr_bomb(path: Path) -> Path:
 @pytest.mark.parametrize("command", ["check", "import"])
 def test_an_image_is_measured_by_its_header(capsys, dataset, tmp_path, monkeypatch, side, command):
     bomb(dataset / "images/kf_0000.png", side)
-    for name in ("load", "verify"):
-        monkeypatch.setattr(ImageFile.ImageFile, name, None)  # decoding would fail
+    monkeypatch.setattr(ImageFile.ImageFile, "load", None)  # decoding would fail
     if command == "import":
         line = refused(capsys, ["import", dataset, "--out", tmp_path / "out"], tmp_path / "out")
     else:
@@ -88,17 +85,13 @@ def test_other_bombs(tmp_path, monkeypatch):
         image_size(bomb(tmp_path / "b.png", 11_000))
 
 
-def test_a_file_larger_than_the_memory_is_not_read(tmp_path):
-    with (tmp_path / "a.json").open("wb") as file:
-        file.truncate(1 << 40)
+def test_json(tmp_path):
+    """Of other encodings it is read; larger than the memory, not."""
+    (tmp_path / "a.json").write_text('{"ä": 1}', encoding="utf-16")
+    assert read_json(tmp_path / "a.json") == {"ä": 1}
+    os.truncate(tmp_path / "a.json", 1 << 40)
     with pytest.raises(InputError, match="GiB are free"):
         read_json(tmp_path / "a.json")
-
-
-def test_json_of_other_encodings_is_read(tmp_path):
-    for encoding in ("utf-8-sig", "utf-16", "utf-32-le"):
-        (tmp_path / "a.json").write_text('{"ä": 1}', encoding=encoding)
-        assert read_json(tmp_path / "a.json") == {"ä": 1}
 
 
 def test_a_damaged_exr_is_one_line(tmp_path, capfd):
@@ -130,20 +123,12 @@ def test_a_name_of_5000_characters(capsys, tmp_path, monkeypatch, arguments):
     assert len(refused(capsys, arguments, tmp_path)) < 300
 
 
-def program(*arguments: object, **options) -> subprocess.CompletedProcess:
-    """Run `mgs` as a process of its own. A value None removes a variable of its environment."""
-    changed = options.pop("env", {})
-    env = {key: value for key, value in (os.environ | changed).items() if value is not None}
-    command = [sys.executable, "-m", "mgs", *map(str, arguments)]
-    return subprocess.run(command, env=env, timeout=120, text=True, **options)
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's /dev/full")
 def test_a_full_disk_behind_the_standard_output():
     with open("/dev/full", "w") as full:
-        ended = program("--version", stdout=full, stderr=subprocess.PIPE)
-    line = "mgs: standard output: No space left on device; make room\n"
-    assert (ended.returncode, ended.stderr) == (2, line)
+        command = [sys.executable, "-m", "mgs", "--version"]
+        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert ended.stderr == "mgs: standard output: No space left on device; make room\n"
+    assert ended.returncode == 2
 
 
 def test_a_terminal_of_ascii_and_no_home():
@@ -172,9 +157,9 @@ def sphere(path: Path, side: int = 4, **accessor: object) -> Path:
     size = struct.unpack("<I", data[12:16])[0]
     header = json.loads(data[20 : 20 + size])
     for one in header["accessors"]:
-        one.update(accessor)
-        for key in [key for key, value in one.items() if value is None]:
-            one.pop(key)
+        known = [(key, value) for key, value in (one | accessor).items() if value is not None]
+        one.clear()
+        one.update(known)
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 4)
     rest = data[20 + size :]
@@ -207,33 +192,23 @@ def test_a_mesh_without_a_height(capsys, tmp_path):
     assert "flat on the ground" in refused(capsys, arguments, tmp_path / "out")
 
 
-COUNTS = {
-    "--spp 100000000000": "samples per view",
-    "--frames 1000000000": "GiB on disk",
-    "--test-views 1000000000": "hours",
-    "--frames 1000000000 --size 1x1": "hours",
-}
-
-
-@pytest.mark.parametrize("options", COUNTS)
+@pytest.mark.parametrize("options", ["--spp 100000000000", "--frames 1000000000 --size 1x1"])
 def test_counts_are_bounded(capsys, tmp_path, options):
     line = refused(capsys, ["synth-orbit", tmp_path / "out", *options.split()], tmp_path / "out")
-    assert COUNTS[options] in line
-    assert "lower --frames" in line
+    assert "hours and" in line
+    assert "GiB on disk; at most" in line
 
 
-@pytest.mark.parametrize("what", ["render", "import", "--mesh", "--cameras"])
-def test_a_pipe_is_no_file(capsys, dataset, tmp_path, what):
+def test_a_pipe_is_no_file(capsys, dataset, tmp_path):
     os.mkfifo(tmp_path / "pipe.glb")
     pipe, out = tmp_path / "pipe.glb", tmp_path / "out"
-    write_ply(tmp_path / "a.ply", tiny.initial([]))
-    arguments = {
-        "render": ["render", pipe, "--cameras", dataset, "--out", out],
-        "import": ["import", dataset, "--mesh", pipe, "--out", out],
-        "--mesh": ["synth-orbit", out, "--mesh", pipe],
-        "--cameras": ["render", tmp_path / "a.ply", "--cameras", pipe, "--out", out],
-    }[what]
-    assert "is no regular file" in refused(capsys, arguments, out)
+    for arguments in (
+        ["render", pipe, "--cameras", dataset, "--out", out],
+        ["import", dataset, "--mesh", pipe, "--out", out],
+        ["synth-orbit", out, "--mesh", pipe],
+        ["render", dataset, "--cameras", pipe, "--out", out],
+    ):
+        assert "is no regular file" in refused(capsys, arguments, out)
 
 
 FAR = [[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
@@ -248,18 +223,24 @@ def test_absurd_cameras(capsys, dataset, tmp_path, case, command):
     assert "must be whole pixels" in line or "entries beyond 1e+08" in line
 
 
+def test_a_colmap_model_cut_off(tmp_path):
+    for name in ("cameras", "images", "points3D"):
+        (tmp_path / f"{name}.bin").write_bytes(b"\xff")
+    with pytest.raises(InputError, match="is damaged or cut off"):
+        read_source(tmp_path)
+
+
 @pytest.mark.parametrize("k1", [-1e6, -5, 1e6])
 def test_distortion_that_folds_the_image(capsys, dataset, tmp_path, k1):
     change(dataset, k1=k1)
-    line = refused(capsys, ["import", dataset, "--out", tmp_path / "out"], tmp_path / "out")
-    assert "the distortion" in line
+    out = tmp_path / "out"
+    assert "the distortion" in refused(capsys, ["import", dataset, "--out", out], out)
 
 
 @pytest.mark.parametrize(
     "arguments",
     [
         ["synth-orbit", "--pose-noise", "1e300"],
-        ["synth-orbit", "--pose-noise", "nan"],
         ["synth-orbit", "--rotation-noise", "1e9"],
         ["survey", "--drift", "1e30"],
         ["survey", "--sensor-noise", "1e30"],
@@ -269,8 +250,8 @@ def test_distortion_that_folds_the_image(capsys, dataset, tmp_path, k1):
 def test_absurd_errors(capsys, dataset, tmp_path, arguments):
     command, *options = arguments
     place = [dataset, "--out"] if command == "survey" else []
-    line = refused(capsys, [command, *place, tmp_path / "out", *options], tmp_path / "out")
-    assert options[0] in line
+    arguments = [command, *place, tmp_path / "out", *options]
+    assert options[0] in refused(capsys, arguments, tmp_path / "out")
 
 
 def test_the_loser_is_told_who_works_there(capsys, dataset, tmp_path):
@@ -294,12 +275,8 @@ def test_the_loser_is_told_who_works_there(capsys, dataset, tmp_path):
             for arguments in losers:
                 line = refused(capsys, arguments, out)
                 assert f"process {winner.pid} works on it" in line
-                assert "delete" not in line
-            (out if out.exists() else tmp_path / ".out.part").joinpath("a").touch()
-            line = refused(capsys, losers[0], out)
-            assert "works on it" in line
             winner.stdin.close()
-        shutil.rmtree(out)
+        shutil.rmtree(out, ignore_errors=True)
 
 
 def test_a_finished_import_says_so(capsys, dataset, tmp_path):

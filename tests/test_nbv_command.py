@@ -27,7 +27,7 @@ from mgs.prior.build import load_prior, save_prior
 from mgs.report.convergence import remaining_decrease
 from mgs.run import folder as run_folder
 from mgs.run import nbv
-from mgs.run.folder import load_run
+from mgs.run.folder import open_run
 from mgs.run.operations import psnr_measure
 from mgs.run.state import State
 from mgs.splat import ListCache, fisher
@@ -368,7 +368,7 @@ def test_the_documented_policy_of_ones_own(dataset, prior, tmp_path, monkeypatch
     assert state.steps[-1]["score"] == max(scores) > 0
 
     monkeypatch.undo()
-    assert load_run(run)[3] == name
+    assert open_run(run).label == name
     with pytest.raises(InputError, match=f"--policy {name}: unknown; choose one of d-optimal"):
         tiny.resume(run, loaded)
 

@@ -35,7 +35,7 @@ from mgs.report.evidence import (
     worth,
 )  # fmt: skip
 from mgs.report.refitting import REFITTED, refit_run
-from mgs.run.folder import load_run, open_run
+from mgs.run.folder import open_run
 from mgs.run.nbv import run_nbv
 from mgs.run.settings import NbvSettings
 from mgs.splat import render
@@ -260,7 +260,7 @@ def test_a_run_is_refitted_beside_its_model(run, capsys):
     parameters = sum(int(mask.sum()) * columns[kind] for kind, mask in marks.items())
     assert f"{parameters:,} parameters are learned" in said
     assert 1200 <= parameters < 4400
-    model, whole = read_ply(run / REFITTED), load_run(run)[0]
+    model, whole = read_ply(run / REFITTED), open_run(run).state.gaussians
     assert np.array_equal(model.means, whole.means)
     priors = np.unique(model.logit_opacities[~marks["opacity"]])
     assert len(priors) <= 2  # on the surface, and behind it

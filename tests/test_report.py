@@ -33,7 +33,7 @@ from mgs.report.figures import POLICY_STYLE
 from mgs.report.page_plots import SYMBOLS
 from mgs.report.runs import compare_runs, read_run
 from mgs.run import recording
-from mgs.run.folder import load_run
+from mgs.run.folder import open_run
 
 FIGURES = ("orbit", "gain", "coverage", "comparison", "psnr")
 
@@ -65,7 +65,8 @@ def write_runs(root):
         settings = tiny.start(root / policy, dataset, policy=policy, evaluate_every=1)
         parts = tiny.operations(measure=measure)
         recording.run(root / policy, settings, dataset, parts, tiny.silent)
-        gaussians, _, trained, _ = load_run(root / policy)
+        made = open_run(root / policy)
+        gaussians, trained = made.state.gaussians, [frame.name for frame in made.taken]
 
         def wall(_, camera, grey=grey):
             one = np.ones((camera.height, camera.width))

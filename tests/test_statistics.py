@@ -42,8 +42,8 @@ def test_the_interval_is_that_of_students_t():
 def test_permutation_p_is_the_share_of_sign_flips(differences):
     observed = abs(sum(differences))
     flips = [
-        abs(sum(s * d for s, d in zip(signs, differences, strict=True)))
-        for signs in product((1, -1), repeat=len(differences))
+        abs(sum(s * d for s, d in zip(indicators, differences, strict=True)))
+        for indicators in product((1, -1), repeat=len(differences))
     ]
     expected = np.mean([flip >= observed - 1e-9 for flip in flips])
     assert permutation_p(differences) == pytest.approx(expected)

@@ -130,9 +130,9 @@ def test_a_fault_of_the_prior_leaves_the_prior_as_it_was(lab, name):
 
 
 def test_signs_of_a_good_fit_and_of_a_shifted_prior(lab):
-    _, good = faults.signs_of(lab, lab.even(5))
+    _, good = faults.indicators_of(lab, lab.even(5))
     shifted = faults.shifted(lab.prior, 0.4, np.random.default_rng(0))
-    _, bad = faults.signs_of(lab.changed(prior=shifted), lab.even(5))
+    _, bad = faults.indicators_of(lab.changed(prior=shifted), lab.even(5))
     assert bad["prior"] > 2 * good["prior"]
 
 

@@ -24,7 +24,7 @@ from mgs.report.page import write_page
 from mgs.report.runs import up_of
 from mgs.report.writing import write_report
 from mgs.run import recording
-from mgs.run.folder import load_run, read_settings
+from mgs.run.folder import open_run, read_settings
 from mgs.view import layers
 from mgs.view.subject import read_subject
 
@@ -49,7 +49,8 @@ def make_run(root: Path, tilted: bool) -> Path:
     stations = tiny.operations(initial=lambda frames: turned(tiny.initial(frames)), up=dataset.up)
     settings = tiny.start(root / "run", dataset, policy="uniform")
     recording.run(root / "run", settings, dataset, stations, tiny.silent)
-    gaussians, _, trained, _ = load_run(root / "run")
+    made = open_run(root / "run")
+    gaussians, trained = made.state.gaussians, [frame.name for frame in made.taken]
 
     def black(g: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         shape = camera.height, camera.width

@@ -1,4 +1,4 @@
-"""`mgs eval`, `diagnose`, `prune` and `refit`: measure the model of a run, or make a smaller one."""
+"""`mgs eval`, `diagnose`, `prune`, `refit`: measure the model of a run, or make a smaller one."""
 
 from __future__ import annotations
 

@@ -57,5 +57,7 @@ def progress_bar(stage: str = "reading", console: Console | None = None) -> Iter
         MofNCompleteColumn(),
         TimeElapsedColumn(),
     )
-    with Progress(*columns, console=console or Console(), transient=True) as bar:
+    console = console or Console()
+    off = not console.is_terminal  # it would leave an empty line
+    with Progress(*columns, console=console, transient=True, disable=off) as bar:
         yield ProgressBar(bar, stage)

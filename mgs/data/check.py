@@ -129,8 +129,8 @@ def seen_through(
 
     Occluders can hide a point but never make it transparent, so the share is near 0 for right
     poses and depths, however far apart the frames are and however few pixels they have: depth is
-    the least of 3x3 pixels, and pixels at the outline do not count. depth, other_depth: [H,W] z-depth, metres;
-    mask: [H,W] bool, the rock in `frame`.
+    the least of 3x3 pixels, and pixels at the outline do not count. depth, other_depth: [H,W]
+    z-depth, metres; mask: [H,W] bool, the rock in `frame`.
     """
     inner = binary_erosion(mask, np.ones((3, 3)), border_value=1)  # outlines mix two depths
     points = frame.camera.unproject(depth)[(inner if inner.any() else mask) & (depth > 0)]

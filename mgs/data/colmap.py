@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.data.clouds import SparseCloud
 from mgs.errors import InputError
+from mgs.files import reading
 from mgs.memory import decoding
 
 OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -24,6 +26,33 @@ MODELS: dict[str, tuple[str, ...]] = {
     "FULL_OPENCV": OPENCV_ORDER,
 }
 """COLMAP camera model -> its distortion coefficients, the last entries of its parameters."""
+
+
+RECORDS = {
+    "cameras.bin": (24, False, 0),
+    "images.bin": (64, True, 24),
+    "points3D.bin": (43, False, 8),
+}
+"""Binary file -> bytes of a record, whether a name follows, and bytes of each item of the list that
+follows (COLMAP's output formats); no list: 0."""
+
+
+def _is_whole(path: Path, fixed: int, named: bool, item: int) -> bool:
+    """Whether a binary file is as long as its counts say. pycolmap does not end if it is not."""
+    with reading(path):
+        data = path.read_bytes()
+    try:
+        (count,), place = struct.unpack_from("<Q", data), 8
+        for _ in range(count):
+            place += fixed
+            place = data.index(b"\0", place) + 1 if named else place
+            if item:
+                place += 8 + item * struct.unpack_from("<Q", data, place)[0]
+            if place > len(data):
+                return False
+    except (struct.error, ValueError, OverflowError):
+        return False
+    return True
 
 
 def is_model(folder: Path) -> bool:
@@ -42,6 +71,9 @@ def read_model(model: Path) -> tuple[list[tuple[str, Camera, np.ndarray]], Spars
     """
     import pycolmap
 
+    for file, layout in RECORDS.items():
+        if (model / file).is_file() and not _is_whole(model / file, *layout):
+            raise InputError(f"{model / file}: is damaged or cut off; export the model again")
     try:
         with decoding(model):
             reconstruction = pycolmap.Reconstruction(model)

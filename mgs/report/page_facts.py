@@ -24,7 +24,7 @@ GROUP_NAMES = {"all": "all views", "held_out": "held out", "test": "test views"}
 
 STEP_KEYS = {
     "step", "frame", "images", "iterations", "score", "information_gain", "coverage",
-    "uncertainty", "loss", "seconds", "signs", "residual", "exposure", "ended",
+    "uncertainty", "loss", "seconds", "indicators", "residual", "exposure", "ended",
 }  # fmt: skip
 """Keys of steps.jsonl that hold numbers, but no metrics of images."""
 

@@ -1,4 +1,4 @@
-"""Entries of steps.jsonl that tell whether a run goes wrong: `residual`, `signs` and `warnings`."""
+"""Entries of steps.jsonl that show whether a run goes wrong: residual, indicators, warnings."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class Checks:
         )
         return {} if found is None else {"residual": found}
 
-    def signs(self, learned: Learned, steps: list[dict[str, Any]]) -> dict[str, Any]:
-        """`signs` of the last step and `warnings` where one exceeds its limit for the first time."""
+    def indicators(self, learned: Learned, steps: list[dict[str, Any]]) -> dict[str, Any]:
+        """`indicators` of the last step, and `warnings` where one now exceeds its limit."""
         problem, gains, fit = self.problem, learned.gains, learned.fit
         views = []
         shown = problem.targets(learned.taken, gains)
@@ -57,21 +57,21 @@ class Checks:
                 exposure = before.exposure - float(np.log(gains[k].mean()))
                 before = replace(before, exposure=exposure)
             rendered = self.render(fit.gaussians, problem.cameras[i])[0]
-            views.append(detectors.view_signs(target, mask, rendered, before))
+            views.append(detectors.view_indicators(target, mask, rendered, before))
         scores = [
             step["information_gain"] for step in steps if step["information_gain"] is not None
         ]
         start, coverage = problem.start, steps[-1]["coverage"]
         drift = detectors.means_drift(fit.gaussians.means, start.means, start.log_scales)
-        signs = detectors.step_signs(views, fit.losses, coverage, scores, drift)
+        indicators = detectors.step_indicators(views, fit.losses, coverage, scores, drift)
         before_this = next(
-            (step["signs"] for step in reversed(steps[:-1]) if "signs" in step), None
+            (step["indicators"] for step in reversed(steps[:-1]) if "indicators" in step), None
         )
-        said = detectors.alarms(signs, before_this)
-        return {"signs": signs, "warnings": said} if said else {"signs": signs}
+        said = detectors.alarms(indicators, before_this)
+        return {"indicators": indicators, "warnings": said} if said else {"indicators": indicators}
 
     def _before_fit(self, frame: int) -> tuple[np.ndarray, detectors.Before]:
-        """Mask of a frame taken, one bit a pixel, and its signs before any training.
+        """Mask of a frame taken, one bit a pixel, and its indicators before any training.
 
         Gaussians that no seed saw get the frame's own colours: grey would look like a change of
         exposure.
@@ -83,5 +83,5 @@ class Checks:
         own = problem.coloured((frame,)).sh
         start = replace(problem.start, sh=np.where(grey, own, problem.start.sh))
         rendered, alpha = self.render(start, camera)
-        signs = detectors.before_fit(problem.image(frame), mask, rendered, alpha, margin)
-        return np.packbits(mask), signs
+        indicators = detectors.before_fit(problem.image(frame), mask, rendered, alpha, margin)
+        return np.packbits(mask), indicators

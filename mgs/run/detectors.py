@@ -40,7 +40,7 @@ class Before:
 
 
 @dataclass(frozen=True)
-class ViewSigns:
+class ViewIndicators:
     """A captured image compared with the Gaussians before training, and with the fitted model.
 
     unexplained: mean squared error in the mask over the variance of the image there: 0 is a perfect
@@ -83,7 +83,7 @@ def _distance(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def outline_margin(start: Gaussians, camera: Camera) -> int:
-    """How far a good prior's outline may be from the mask, pixels: a standard deviation and a pixel.
+    """Pixels that a good prior may stand out of the mask: a Gaussian's standard deviation and 1.
 
     start: the Gaussians before training.
     """
@@ -95,16 +95,16 @@ def outline_margin(start: Gaussians, camera: Camera) -> int:
     return 1 + math.ceil(size * camera.K[0, 0] / float(np.median(in_front)))
 
 
-def view_signs(
+def view_indicators(
     target: np.ndarray, mask: np.ndarray, rendered: np.ndarray, before: Before
-) -> ViewSigns:
+) -> ViewIndicators:
     """Compare a fitted view with a render of the model; arguments as `before_fit`."""
     counted = mask & (target[..., 3] > 0)
     if not counted.any():
-        return ViewSigns(before, 0.0, 0.0)
+        return ViewIndicators(before, 0.0, 0.0)
     truth, drawn = target[counted][:, :3].astype(np.float64), rendered[counted].astype(np.float64)
     squared, variance = float(np.mean((truth - drawn) ** 2)), float(truth.var(axis=0).mean())
-    return ViewSigns(before, squared / max(variance, 1e-12), squared**0.5)
+    return ViewIndicators(before, squared / max(variance, 1e-12), squared**0.5)
 
 
 def residual(views: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> float | None:
@@ -116,8 +116,8 @@ def residual(views: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> floa
     return float(np.sqrt(squares.mean())) if len(squares) else None
 
 
-def step_signs(
-    views: Sequence[ViewSigns],
+def step_indicators(
+    views: Sequence[ViewIndicators],
     losses: Sequence[float],
     coverage: float,
     gains: Sequence[float],
@@ -128,26 +128,26 @@ def step_signs(
     views: all taken. losses: of the start of the fit, then of each pass. coverage: Eq. 9, 0 to 1.
     gains: information gain of every view chosen so far, in order. drift: of `means_drift`.
     """
-    signs = {"means": drift}
+    indicators = {"means": drift}
     if len(losses) >= 2 and min(losses) > 0 and np.isfinite(losses).all():
         # Lowest losses: a fit that starts from a fitted model rises first, then falls.
         window, lowest = min(2, len(losses) - 1), np.minimum.accumulate(losses)
-        signs["unconverged"] = float(1 - (lowest[-1] / lowest[-1 - window]) ** (1 / window))
-        signs["worse"] = min(losses[1:]) / losses[0] - 1
+        indicators["unconverged"] = float(1 - (lowest[-1] / lowest[-1 - window]) ** (1 / window))
+        indicators["worse"] = min(losses[1:]) / losses[0] - 1
     if views:
         errors = np.array([view.error for view in views])
         exposures = np.array([view.before.exposure for view in views])
-        signs["residual"] = float(np.median([view.unexplained for view in views]))
-        signs["prior"] = float(np.median([view.before.outline for view in views]))
-        signs["exposure"] = float(np.abs(exposures - np.median(exposures)).max())
-        signs["pose"] = max(view.before.offset for view in views)
+        indicators["residual"] = float(np.median([view.unexplained for view in views]))
+        indicators["prior"] = float(np.median([view.before.outline for view in views]))
+        indicators["exposure"] = float(np.abs(exposures - np.median(exposures)).max())
+        indicators["pose"] = max(view.before.offset for view in views)
         if len(views) >= COVERING_VIEWS:
-            signs["coverage"] = 1 - coverage
+            indicators["coverage"] = 1 - coverage
         if len(views) >= 3:
-            signs["outlier"] = float(errors.max() / max(np.median(errors), 1e-12))
+            indicators["outlier"] = float(errors.max() / max(np.median(errors), 1e-12))
     if len(gains) >= 2 and max(gains) > 0:
-        signs["saturated"] = 1 - gains[-1] / max(gains)
-    return signs
+        indicators["saturated"] = 1 - gains[-1] / max(gains)
+    return indicators
 
 
 def means_drift(means: np.ndarray, start: np.ndarray, log_scales: np.ndarray) -> float:
@@ -247,11 +247,11 @@ DETECTORS: dict[str, Detector] = {
 """By the name of the number."""
 
 
-def alarms(signs: Mapping[str, float], before: Mapping[str, float] | None = None) -> list[str]:
+def alarms(indicators: Mapping[str, float], before: Mapping[str, float] | None = None) -> list[str]:
     """Warnings of a step: for each number that exceeds its limit and did not in the step before."""
     before = before or {}
     return [
-        row.words(signs[name], row.limit)
+        row.words(indicators[name], row.limit)
         for name, row in DETECTORS.items()
-        if signs.get(name, -np.inf) > row.limit >= before.get(name, -np.inf)
+        if indicators.get(name, -np.inf) > row.limit >= before.get(name, -np.inf)
     ]

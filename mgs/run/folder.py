@@ -14,7 +14,7 @@ A step is one chosen view; of a batch only the last step has a fit. A line of `s
 - `iterations`, `loss`, `stop_reason`: of the fit.
 - `residual`: rms difference of the new images to the model before, linear RGB.
 - `exposure`: gains (red, green, blue) by frame name, with the setting `exposure`.
-- `signs`, `warnings`: of `mgs.run.detectors`. `seconds`: by stage.
+- `indicators`, `warnings`: of `mgs.run.detectors`. `seconds`: by stage.
 - `psnr`, `psnr_mask` over all views, `held_out_...`, `test_...`, dB: where it was evaluated.
 - `ended`: in the last line of a run that has ended (`mgs.run.ending.run_end`).
 """
@@ -214,14 +214,5 @@ def read_checkpoint(out: Path) -> State | None:
             return State(gaussians, data["H"], data["surface"], **record)
     except (zipfile.BadZipFile, KeyError, ValueError, OSError, EOFError) as error:
         raise InputError(
-            f"{path}: not a readable checkpoint ({error}); delete it to start the run from its seeds"
+            f"{path}: not a readable checkpoint ({error}); delete it to begin with the seeds"
         ) from None
-
-
-def load_run(folder: Path) -> tuple[Gaussians, Dataset, list[str], str]:
-    """(model, dataset, names of the views trained on in order, policy) of a run folder.
-
-    Raises InputError as `open_run` and `Run`.
-    """
-    run = open_run(folder)
-    return run.state.gaussians, run.dataset, [frame.name for frame in run.taken], run.label

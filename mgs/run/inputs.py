@@ -73,12 +73,8 @@ def frame_digests(frame: Frame, kinds: Iterable[str]) -> dict[str, str | None]:
 
 
 def _path(frame: Frame, kind: str) -> Path | None:
-    return {
-        "image": frame.image_path,
-        "mask": frame.mask_path,
-        "rock": frame.rock_path,
-        "depth": frame.depth_path,
-    }[kind]
+    path: Path | None = getattr(frame, f"{kind}_path")
+    return path
 
 
 def check_unchanged(

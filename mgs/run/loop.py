@@ -107,7 +107,7 @@ def fit_views(
     before: Fitted | None = None,
     gains: np.ndarray | None = None,
 ) -> Fit:
-    """Fit to the views taken, starting from the model before (`warm_start`), else from the prior."""
+    """Fit to the views taken, from the model before (`warm_start`), else from the prior."""
     problem.progress("fitting", 0, 1)
     start = problem.start_of(taken)
     step, model = 0, start
@@ -183,8 +183,8 @@ def choose(
     where = f"policy {problem.settings.policy}: returned"
     if scores.shape != (len(context.candidate_frames),):
         raise InputError(
-            f"{where} scores of shape {scores.shape} for {len(context.candidate_frames)} candidates; "
-            "return one number for each"
+            f"{where} scores of shape {scores.shape} for {len(context.candidate_frames)} "
+            "candidates; return one number for each"
         )
     weighed = scores / problem.travel_cost(context)
     best = max(range(len(scores)), key=lambda k: (weighed[k], farthest[k]))

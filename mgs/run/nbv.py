@@ -181,9 +181,10 @@ def resume_nbv(
     """Run the loop in a run folder from where it stands to its end.
 
     policy: FILE.py:FUNCTION, required where the run has a policy of the user's own: the file is
-    code, and a folder is not trusted to name it. on_step(state): called after every step, or batch of steps, that is finished and on disk.
-    progress(stage, done, total): called during a step. Returns the last state: gaussians, H, taken
-    (frame indices in the order of their choice), steps (lines of steps.jsonl; the last has `ended`).
+    code, and a folder is not trusted to name it. on_step(state): called after every step, or batch
+    of steps, that is finished and on disk. progress(stage, done, total): called during a step.
+    Returns the last state: gaussians, H, taken (frame indices in the order of their choice), steps
+    (lines of steps.jsonl; the last has `ended`).
     A finished run gives the same again. Raises InputError where the folder holds no run, its
     inputs are missing or changed, another process works on it, a fit diverged, or `policy` is not
     the run's.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -93,14 +93,12 @@ def kept_colours(dataset: Dataset, prior: Prior) -> Callable[[Frame], Colours]:
 def psnr_measure(
     dataset: Dataset, cache: ListCache, exposure: bool = False
 ) -> Callable[[Gaussians, list[int]], dict[str, float]]:
-    """measure(gaussians, frames taken) -> mean PSNR, dB: `psnr` and `psnr_mask` (inside the rock
-    mask) over all views, `held_out_psnr` and `held_out_psnr_mask` over those never trained on,
-    `test_psnr` and `test_psnr_mask` over the test views where the dataset has some; frames on
-    demand that were not taken have no image, and no part in any of them. With `exposure` the same
-    once more with `_corrected` at the end, of renders that are brought to the exposure of the view
-    (`mgs.metrics.colour_corrected`). As `mgs.report.evaluation`, without its other metrics, which
-    cost more. A mean over no view (all masks empty, none held out) is left out. Raises InputError
-    as `Dataset.test_views`.
+    """Returns measure(gaussians, frames taken) -> mean PSNR, dB.
+
+    `psnr`, `psnr_mask` (in the rock mask) over all views that have an image; `held_out_...` over
+    those not taken; `test_...` over the test views. With `exposure` also `..._corrected`, of
+    renders at the exposure of the view (`mgs.metrics.colour_corrected`). A mean over no view is
+    left out. Raises InputError as `Dataset.test_views`.
     """
     tests = dataset.test_views()
     frames = [*dataset.frames, *(tests.frames if tests else ())]
@@ -112,41 +110,32 @@ def psnr_measure(
 
     truth = kept_within(IMAGE_BYTES, read, lambda parts: sum(part.nbytes for part in parts))
 
-    def values(
-        image: np.ndarray, known: np.ndarray, rock: np.ndarray, rendered: np.ndarray
-    ) -> list[float]:
-        shown = (
-            [rendered, colour_corrected(linear_from_srgb(image), rendered, rock)]
-            if exposure
-            else [rendered]
-        )
-        return [psnr(srgb_from_linear(one), image, mask) for one in shown for mask in (known, rock)]
+    def values(gaussians: Gaussians, index: int) -> list[float]:
+        image, known, rock = truth(index)
+        rendered = np.asarray(render(gaussians, frames[index].camera, cache=cache).rgb)
+        shown = [rendered]
+        if exposure:
+            shown.append(colour_corrected(linear_from_srgb(image), rendered, rock))
+        srgb = [srgb_from_linear(one) for one in shown]
+        return [psnr(one, image, mask) for one in srgb for mask in (known, rock)]
 
     def measured(gaussians: Gaussians, chosen: Iterable[int]) -> np.ndarray:
-        found = [
-            values(*truth(i), np.asarray(render(gaussians, frames[i].camera, cache=cache).rgb))
-            for i in chosen
-        ]
-        return np.array(found).reshape(-1, len(names))
+        return np.array([values(gaussians, i) for i in chosen]).reshape(-1, len(names))
 
     def measure(gaussians: Gaussians, taken: list[int]) -> dict[str, float]:
         shown = [i for i, frame in enumerate(dataset.frames) if i in taken or not frame.on_demand]
-        views, test_views = (
-            measured(gaussians, shown),
-            measured(gaussians, range(len(dataset), len(frames))),
-        )
+        views = measured(gaussians, shown)
         held_out = views[[i not in taken for i in shown]]
-        return (
-            _means(views, "", names)
-            | _means(held_out, "held_out_", names)
-            | _means(test_views, "test_", names)
-        )
+        of_tests = measured(gaussians, range(len(dataset), len(frames)))
+        found = {"": views, "held_out_": held_out, "test_": of_tests}
+        return {key: mean for prefix, v in found.items() for key, mean in _means(v, prefix, names)}
 
     return measure
 
 
-def _means(values: np.ndarray, prefix: str, names: Sequence[str]) -> dict[str, float]:
-    """Mean of each column of [V,names] over the views that have it, by name."""
-    known = ~np.isnan(values).all(axis=0)
-    means = np.nanmean(np.where(known, values, 0), axis=0) if known.any() else values
-    return {prefix + name: float(means[i]) for i, name in enumerate(names) if known[i]}
+def _means(values: np.ndarray, prefix: str, names: Sequence[str]) -> Iterator[tuple[str, float]]:
+    """Name and mean of each column of [V,names] over the views that have it, if there are some."""
+    for name, column in zip(names, values.T, strict=True):
+        known = column[~np.isnan(column)]
+        if len(known):
+            yield prefix + name, float(known.mean())

@@ -38,7 +38,7 @@ def no_progress(stage: str, done: int, total: int) -> None:
 
 @dataclass(frozen=True)
 class Operations:
-    """What the loop computes with: deterministic functions, NumPy in and out (`mgs.run.operations`).
+    """Deterministic functions that the loop computes with, NumPy in and out (`operations_of`).
 
     centre: [3] middle of the rock, metres. groups: columns of the Fisher information by kind of
     parameter (`mgs.splat.groups`). up: unit vector that points upwards in the world.

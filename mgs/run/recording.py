@@ -51,7 +51,7 @@ def run(
     on_step: Callable[[State], None] = lambda state: None,
     chooser: Chooser | None = None,
 ) -> State:
-    """Run or resume the loop in `out` (which has its config.json) to its end; return the last state.
+    """Run or resume the loop in `out`, which has its config.json, to its end; give the last state.
 
     on_step(state): called after every step, or batch of steps, that is on disk. chooser: as
     `select_views`. Killed at any moment and called again, it takes the same views as
@@ -208,7 +208,7 @@ class Recorder:
             self.stopwatch("checking", 0, 1)
             if learned.before is not None:
                 line |= self.checks.residual(learned, learned.before, new)
-            line |= self.checks.signs(learned, [*known, *lines])
+            line |= self.checks.indicators(learned, [*known, *lines])
         every, first, step = settings.evaluate_every, len(known), line["step"]
         if every and any(k % every == 0 for k in range(first, step + 1)):
             self.stopwatch("evaluating", 0, 1)

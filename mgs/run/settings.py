@@ -59,7 +59,7 @@ class NbvSettings(BaseModel):
     prior: Path
     """Folder of the prior."""
     policy: str = "d-optimal"
-    """Policy that scores the candidates (`mgs.policy.registry`), or FILE.py:FUNCTION of your own."""
+    """Policy that scores the candidates, or FILE.py:FUNCTION of your own."""
     nearest: Annotated[int, Field(ge=1)] | None = None
     """Choose among this many views nearest to the last one. Default: all."""
     travel: Scale | None = None
@@ -67,7 +67,7 @@ class NbvSettings(BaseModel):
     estimator: str = "exact"
     """Estimator of the Fisher information: exact, hutchinson, or loss-gradient (the paper's)."""
     budget: Annotated[int, Field(ge=0)] = 50
-    """Most views to choose beyond the seeds. Default: 50, or all candidates where they are fewer."""
+    """Most views to choose beyond the seeds. Default: 50, or all candidates if fewer."""
     batch: Annotated[int, Field(ge=1)] = 1
     """Views to choose before their images are read and fitted; the last batch may be smaller."""
     stop_gain: Positive | None = None
@@ -83,7 +83,7 @@ class NbvSettings(BaseModel):
     pixel_noise: Scale = PIXEL_NOISE
     """Standard deviation of a pixel's residual, linear RGB; sets lambda of every criterion."""
     prior_std: dict[str, Scale] = PRIOR_STD
-    """Prior standard deviation of a kind of parameter; of `mean` in metres, where means are learned."""
+    """Prior standard deviation of a kind of parameter; of `mean` in metres, where it moves."""
     evaluate_every: Annotated[int, Field(ge=0)] = 0
     """Measure PSNR after every so many views; 0: at the end only. Never affects the choice."""
     warm_passes: Annotated[int, Field(ge=1)] = WARM_PASSES
@@ -133,7 +133,7 @@ class NbvSettings(BaseModel):
 def with_defaults(
     values: Mapping[str, Any], preset: RunPreset | None = None, alpha_weight: float = ALPHA_WEIGHT
 ) -> dict[str, Any]:
-    """Add this alpha_weight and a preset's values to fields of NbvSettings that do not have them."""
+    """Add this alpha_weight and a preset's values to fields of NbvSettings that lack them."""
     train = values.get("train", {})
     given = train.model_dump(exclude_unset=True) if isinstance(train, TrainSettings) else train
     if not isinstance(given, Mapping):

@@ -243,10 +243,10 @@ ONE_POSE = (1.0, 4.0)
 """Sizes of `pose_noise` in a single view."""
 
 
-def signs_of(
+def indicators_of(
     lab: Lab, taken: Sequence[int], passes: int = PASSES, means: str = "frozen"
 ) -> tuple[Gaussians, dict[str, float]]:
-    """A fit, and the signs that the loop would compute after its first step."""
+    """A fit, and the indicators that the loop would compute after its first step."""
     start = lab.start(taken)
     fit = lab.fit(taken, passes, means, with_prior=means == "frozen", start=start)
     surface = np.sum(lab.information(start, taken), axis=0)[: len(lab.prior.points)]
@@ -258,20 +258,20 @@ def signs_of(
         margin = detectors.outline_margin(start, frame.camera)
         shown, alpha = np.asarray(old.rgb), np.asarray(old.alpha)
         before = detectors.before_fit(target, mask, shown, alpha, margin)
-        views.append(detectors.view_signs(target, mask, np.asarray(new.rgb), before))
+        views.append(detectors.view_indicators(target, mask, np.asarray(new.rgb), before))
     drift = detectors.means_drift(fit.gaussians.means, start.means, start.log_scales)
     seen = coverage(surface, lab.lam())
-    return fit.gaussians, detectors.step_signs(views, fit.losses, seen, [], drift)
+    return fit.gaussians, detectors.step_indicators(views, fit.losses, seen, [], drift)
 
 
 def _row(lab: Lab, run: str, fault: str, size: float, clean: Row | None, *how: Any) -> Row:
-    """Row of one fit. clean: that of the clean run; how: arguments of `signs_of`."""
-    model, signs = signs_of(lab, *how)
+    """Row of one fit. clean: that of the clean run; how: arguments of `indicators_of`."""
+    model, indicators = indicators_of(lab, *how)
     row: Row = {"run": run, "scene": run.split(",")[0], "fault": fault, "size": size}
     row |= {"label": f"{fault} {size:g}", **lab.quality(model)}
     lost = (row if clean is None else clean)["psnr"] - row["psnr"]
     row |= {"lost": lost, "failed": bool(lost > FAILURE)}
-    return row | {f"sign {name}": value for name, value in signs.items()}
+    return row | {f"sign {name}": value for name, value in indicators.items()}
 
 
 def faults(
