@@ -347,11 +347,8 @@ def test_a_survey_with_noise_of_an_on_demand_dataset(poses, tmp_path):
 
 def test_bad_scenes_and_options_are_refused(small, poses, tmp_path, capsys):
     """With one line, before anything is made."""
-    bad, full, capture = (
-        tmp_path / "bad.toml",
-        occupied(tmp_path / "full"),
-        ["--capture", "boulder"],
-    )
+    bad, full = tmp_path / "bad.toml", occupied(tmp_path / "full")
+    capture = ["--capture", "boulder"]
     bad.write_text("[rock]\nsiez = 1\n")
     out = ["--out", tmp_path / "out"]
     for arguments, message in (

@@ -27,7 +27,8 @@ from mgs.gaussians import Gaussians
 from mgs.prior.build import build_prior, load_prior, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.report.evaluation import evaluate, evaluate_run
-from mgs.run.nbv import resume_nbv, run_nbv
+from mgs.run.folder import Run, open_run
+from mgs.run.nbv import resume_nbv, start_run
 from mgs.run.state import State
 from mgs.study.sweep import CELLS, Cell
 
@@ -173,17 +174,15 @@ def judge(model: Gaussians, dataset: Dataset) -> dict[str, float]:
     return dict(evaluate(model, (), (), test_frames=test_views_of(dataset).frames)["test"])
 
 
-def run_or_resume(
-    root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]
-) -> State:
-    """Last state of the run in OUT/run, which is started or continued. settings: of `mgs nbv`."""
+def begun_run(root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]) -> Run:
+    """The run in OUT/run, which is started if it is not there. settings: of `mgs nbv`."""
     for leftover in out.glob(".run.*.part"):  # of a process killed before the run began
         shutil.rmtree(leftover)
     run = out / "run"
     if (run / "config.json").is_file():
-        return resume_nbv(run, policy=settings["policy"])
-    given = {**settings, "train": {**COLOURS_ALONE, **settings.get("train", {})}}
-    return run_nbv(root / dataset, run, prior=root / prior, **given)
+        return open_run(run)
+    train = {**COLOURS_ALONE, **settings.get("train", {})}
+    return start_run(root / dataset, run, prior=root / prior, **settings | {"train": train})
 
 
 def run_policy(
@@ -191,7 +190,8 @@ def run_policy(
 ) -> dict[str, Any]:
     """Run a policy. Returns a list for each of CURVES, one number for each fit, and "taken", the
     indices of the frames in the order taken."""
-    return curves_of(run_or_resume(root, out, dataset, prior, {"evaluate_every": 1, **settings}))
+    run = begun_run(root, out, dataset, prior, {"evaluate_every": 1, **settings})
+    return curves_of(resume_nbv(run, policy=settings.get("policy")))
 
 
 def curves_of(state: State) -> dict[str, Any]:
@@ -215,9 +215,10 @@ def time_policy(
 def _timed(
     root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]
 ) -> dict[str, Any]:
-    steps = run_or_resume(root, out, dataset, prior, settings).steps
+    run = begun_run(root, out, dataset, prior, settings)
+    steps = resume_nbv(run, policy=settings.get("policy")).steps
     peak = peak_megabytes()
-    metrics = evaluate_run(out / "run", pictures=False)
+    metrics = evaluate_run(run.folder, pictures=False)
     seconds = [step["seconds"] for step in steps]
     choices = [one["score"] for one in seconds[1:]]
     return {key: metrics[key] for key in ("images", "test", "all", "held_out")} | {
