@@ -236,7 +236,7 @@ if __name__ == "__main__":
 
 
 def test_a_study_that_is_killed_leaves_no_process_behind(tmp_path):
-    program, said = tmp_path / "program.py", tmp_path / "pid"
+    program, said = tmp_path / "study.py", tmp_path / "pid"
     program.write_text(LINGERING)
     paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     environment = os.environ | {"PYTHONPATH": paths}
