@@ -7,7 +7,6 @@ import tiny
 from program import command, steps
 from tiny import run
 
-from mgs.data.dataset import load_dataset
 from mgs.policy import criteria
 from mgs.policy.registry import policy_names
 from mgs.run import problem, recording
@@ -17,11 +16,6 @@ OF_A_FIT = {"uncertainty", "iterations", "loss", "stop_reason"}
 AT_THE_MODEL = {"d-optimal", "t-optimal", "a-optimal", "e-optimal", "fisherrf"}
 AT_THE_MODEL |= {"i-optimal", "block-d", "paper"}
 """Policies that use information at the fitted model."""
-
-
-@pytest.fixture(scope="module")
-def loaded(tmp_path_factory):
-    return load_dataset(tiny.write_dataset(tmp_path_factory.mktemp("tiny") / "dataset"))
 
 
 def test_a_study_has_a_number_for_each_fit_of_a_run(loaded, tmp_path, monkeypatch):

@@ -30,8 +30,8 @@ from mgs.synth.scene_file import Arena, Rock, SceneFile
 from mgs.view.subject import read_subject
 
 TINY = RenderPreset(width=64, height=48, frames=8, spp=2)
-SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=20))
-TOML = "[rock]\ndetail = 0.06\n[arena]\nstones = 20\n"
+SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=4))
+TOML = "[rock]\ndetail = 0.06\n[arena]\nstones = 4\n"
 RUN = ["--seeds", "3", "--budget", "3", "--passes", "3", "--evaluate-every", "1", "--seed", "1"]
 KILLED = """
 import os, signal
