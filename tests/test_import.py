@@ -25,7 +25,6 @@ from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
 from mgs.data.importers import import_source
 from mgs.data.lens import undistorter
 from mgs.data.sources import read_source
-from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.images import write_png
 from mgs.prior.build import build_prior
@@ -350,14 +349,6 @@ def test_a_mesh_is_said_to_be_turned_only_where_it_could_be_read(
     for mesh, read in ((tmp_path / "broken.glb", False), (dataset.root / "rock.glb", True)):
         exit_code(*command, dataset.root, "--out", tmp_path / "out", "--mesh", mesh)
         assert ("turned from +Y up" in said(capsys)[0]) == read
-
-
-def test_an_empty_mask_in_every_frame_is_one_line(dataset):
-    empty = dataset.root / "masks/empty.png"
-    write_png(empty, np.zeros((48, 64), bool))
-    frames = tuple(replace(frame, mask_path=empty) for frame in dataset.frames)
-    with pytest.raises(InputError, match="masks are black in every frame"):
-        build_prior(Dataset(dataset.root, frames), PriorSettings(gaussians=100, backing=0))
 
 
 # What cannot be imported: how to spoil a dataset, options, what the error says.

@@ -241,7 +241,7 @@ def test_policies_choose_with_learned_means(files, tmp_path, policy):
             "--estimator hutchinson has no information",
         ),
         (["--means", "free", "--policy", "paper"], "--policy paper has no information about means"),
-        (["--means", "normal", "--prior-std", "mean=0"], "--prior-std mean=0.0: Input should be"),
+        (["--means", "normal", "--prior-std", "mean=0"], "--prior-std mean=0.0: must be at least"),
     ],
 )
 def test_bad_options_are_one_line(files, tmp_path, capsys, given, message):

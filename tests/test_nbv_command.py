@@ -209,7 +209,7 @@ def test_a_run_folder_appears_when_it_is_complete(dataset, prior, tmp_path, monk
 @pytest.mark.parametrize(
     ("values", "named"),
     [
-        ({"budget": -1}, "budget: Input should be greater than or equal to 0"),
+        ({"budget": -1}, "budget: must be at least 0"),
         ({"speed": 1}, "speed: Extra inputs are not permitted"),
         ({"prior_std": {"color": 1.0}}, f"prior_std: {KINDS}"),
         ({"train": {"speed": 1}}, "train.speed"),
@@ -233,15 +233,15 @@ def test_a_damaged_setting_is_named_with_its_file(dataset, prior, tmp_path, caps
     [
         ("--estimator block", "--estimator block: unknown; choose one of exact, hutchinson"),
         ("--optimiser hope", "--optimiser 'hope': unknown; choose one of natural, adam"),
-        ("--lam 0", "--lam 0.0: Input should be greater than or equal to"),
+        ("--lam 0", "--lam 0.0: must be at least"),
         ("--rate colour", "--rate colour: expected KIND=NUMBER, as in --rate colour=0.01"),
         ("--rate hue=1", f"--rate {{'hue': 1.0}}: {KINDS}"),
         ("--prior-std scale=inf", "--prior-std scale=inf: Input should be a finite number"),
-        ("--pixel-noise 1e-200", "1e-200: Input should be greater than or equal to 0.000001"),
-        ("--batch 0", "--batch 0: Input should be greater than or equal to 1"),
-        ("--alpha-weight -1", "--alpha-weight -1.0: Input should be greater than or equal to 0"),
-        ("--stop-gain 0", "--stop-gain 0.0: Input should be greater than 0"),
-        ("--stop-uncertainty 1", "--stop-uncertainty 1.0: Input should be less than 1"),
+        ("--pixel-noise 1e-200", "1e-200: must be at least 1e-06"),
+        ("--batch 0", "--batch 0: must be at least 1"),
+        ("--alpha-weight -1", "--alpha-weight -1.0: must be at least 0"),
+        ("--stop-gain 0", "--stop-gain 0.0: must be more than 0"),
+        ("--stop-uncertainty 1", "--stop-uncertainty 1.0: must be less than 1"),
     ],
 )
 def test_bad_options_are_one_line(dataset, prior, tmp_path, capsys, options, message):
@@ -254,7 +254,7 @@ def test_bad_options_are_one_line(dataset, prior, tmp_path, capsys, options, mes
     ("values", "message"),
     [
         ({"optimizer": "adam"}, "setting optimizer = 'adam': Extra inputs are not permitted"),
-        ({"train": {"tolerance": -1}}, "setting train.tolerance = -1: Input should be greater"),
+        ({"train": {"tolerance": -1}}, "setting train.tolerance = -1: must be at least 0"),
     ],
 )
 def test_settings_without_an_option_are_named_by_their_key(

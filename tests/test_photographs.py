@@ -451,7 +451,10 @@ def no_object(root: Path, data: Make) -> None:
     write_cloud(root / "sparse.ply", SparseCloud(ground))
 
 
-NO_SOURCE = "--masks DIR for --from hull, or give --points CLOUD.ply, or give --mesh MESH"
+NO_SOURCE = (
+    "has no depth images and no points (sparse.ply) and no masks; import data with depth, or "
+    "import with --masks DIR for --from hull, or give --points CLOUD.ply, or give --mesh MESH"
+)
 HULL = ["--from", "hull"]
 DEPTH = "has no depth images; take --from hull, or import data with depth"
 UP = "expected auto, or three numbers"

@@ -65,9 +65,9 @@ def import_source(
         "frames": len(shots),
         "sha256_of_frames": _digest(shots),
         "mesh": fingerprint(mesh) if mesh is not None and masks is None else None,
+        "downscale": downscale,
+        "test_views": None if tests is None else len(tests.shots),
     }
-    asked |= {"downscale": downscale} if downscale != 1 else {}
-    asked |= {"test_views": len(tests.shots)} if tests is not None else {}
     with folder_locked(out):
         if resumes(out, RECORD, asked) and (out / "transforms.json").is_file():
             return load_dataset(out)

@@ -89,7 +89,9 @@ def build_prior(
     tolerance = max(3 * residual, cell, 2 * noise)
     mesh = _seen_by(mesh, dataset.frames, tolerance)
     cameras = [frame.camera for frame in dataset.frames]
-    pixel = cell if chosen == "depth" else _pixel(cameras, mesh.vertices.mean(0))
+    middle = mesh.vertices.mean(0)
+    pixels = [np.linalg.norm(camera.position - middle) / camera.K[0, 0] for camera in cameras]
+    pixel = cell if chosen == "depth" else float(np.median(pixels))
     samples, normals, spacing, sampled = _samples(mesh, settings, cameras, pixel)
     upward = up if up is not None and up != "auto" else dataset.up
     numbers = {"from": chosen, "frames": len(dataset.frames), **surface.numbers}
@@ -136,11 +138,6 @@ def _depth_surface(
         "poisson_depth": depth,
     }
     return Surface(mesh, cloud.voxel, segmented, numbers)
-
-
-def _pixel(cameras: Sequence[Camera], point: np.ndarray) -> float:
-    """Median size of a pixel at a point [3], units of the world."""
-    return float(np.median([np.linalg.norm(c.position - point) / c.K[0, 0] for c in cameras]))
 
 
 def _samples(

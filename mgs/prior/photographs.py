@@ -74,14 +74,14 @@ def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = 
         "points": points is not None or (dataset.root / CLOUD).is_file(),
         "hull": has_masks(dataset.frames),
     }
-    if asked is None:
-        available = (name for name, there in has.items() if there)
-        asked = "points" if points is not None else next(available, None)
-    if asked is not None and has.get(asked):
+    there = [name for name, is_there in has.items() if is_there]
+    if asked is None and there:
+        asked = "points" if points is not None else there[0]
+    if asked in there:
         return asked
-    lacks = {"depth": "no depth images", "points": f"no points ({CLOUD})", "hull": "no masks"}
     if asked not in (None, *SOURCES):
         raise InputError(f"--from {asked!r}: is unknown; choose one of {', '.join(SOURCES)}")
+    lacks = {"depth": "no depth images", "points": f"no points ({CLOUD})", "hull": "no masks"}
     missing = lacks.get(asked, "no mesh of its own") if asked else " and ".join(lacks.values())
     ways = {
         "depth": "import data with depth",
@@ -89,9 +89,9 @@ def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = 
         "points": "give --points CLOUD.ply",
         "mesh": "give --mesh MESH",
     }
-    there = [f"take --from {name}" for name, is_there in has.items() if is_there]
-    open_ways = there + [way for name, way in ways.items() if not has.get(name)]
-    raise InputError(f"{dataset.root}: has {missing}; {', or '.join(open_ways)}")
+    cures = [f"take --from {name}" for name in there]
+    cures += [way for name, way in ways.items() if name not in there]
+    raise InputError(f"{dataset.root}: has {missing}; {', or '.join(cures)}")
 
 
 def check_photographs(frames: Sequence[Frame]) -> None:

@@ -1,4 +1,4 @@
-"""A run's views fitted once more, with no more parameters than they pay for: `mgs refit`."""
+"""Fit a run's views again, with no more parameters than they need: `mgs refit`."""
 
 from __future__ import annotations
 
