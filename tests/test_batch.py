@@ -7,10 +7,8 @@ import tiny
 from program import command, steps
 from tiny import run
 
-from mgs.data.dataset import load_dataset
 from mgs.policy import criteria
 from mgs.policy.registry import policy_names
-from mgs.report.writing import write_report
 from mgs.run import problem, recording
 from mgs.study import case
 
@@ -18,11 +16,6 @@ OF_A_FIT = {"uncertainty", "iterations", "loss", "stop_reason"}
 AT_THE_MODEL = {"d-optimal", "t-optimal", "a-optimal", "e-optimal", "fisherrf"}
 AT_THE_MODEL |= {"i-optimal", "block-d", "paper"}
 """Policies that use information at the fitted model."""
-
-
-@pytest.fixture(scope="module")
-def loaded(tmp_path_factory):
-    return load_dataset(tiny.write_dataset(tmp_path_factory.mktemp("tiny") / "dataset"))
 
 
 def test_a_study_has_a_number_for_each_fit_of_a_run(loaded, tmp_path):
@@ -85,18 +78,6 @@ def test_a_batch_measures_each_candidate_once_if_there_is_room(loaded, tmp_path,
     assert len(set(measured)) == candidates + taken
 
 
-def test_what_a_pose_sees_of_the_surface_is_measured_once_for_all_choices(loaded, tmp_path):
-    measured = []
-
-    def exact(gaussians, camera):
-        measured.append(camera.key)
-        return tiny.fisher(gaussians, camera)
-
-    run(tmp_path / "run", loaded, tiny.operations(exact=exact), policy="coverage", budget=4)
-    taken, candidates = 3 + 4, 12 - 3
-    assert len(measured) == taken + candidates
-
-
 def test_the_policies_that_use_the_model_exist():
     assert set(policy_names()) >= AT_THE_MODEL
 
@@ -143,4 +124,4 @@ def test_table_report_and_page_of_a_run_in_batches(dataset, prior, tmp_path, cap
     assert ["pass-limit" in row for row in rows] == [True, False, True, True]
     command("eval", out)
     command("report", out, "--out", tmp_path / "report", "--html", tmp_path / "page.html")
-    assert len(write_report(tmp_path / "again", [out])) == 7
+    assert len(list((tmp_path / "report").iterdir())) == 7

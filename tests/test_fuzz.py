@@ -141,7 +141,7 @@ LOADERS: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], object]]]
     **{
         f"COLMAP {name}": (name, colmap(kind), of_folder)
         for kind, end in (("text", "txt"), ("binary", "bin"))
-        for name in (f"cameras.{end}", f"images.{end}", f"points3D.{end}", f"frames.{end}")
+        for name in (f"{n}.{end}" for n in ("cameras", "images", "points3D", "frames", "rigs"))
     },
 }
 """Loader -> name of its file, function that writes a sound one, function that reads it."""

@@ -17,6 +17,7 @@ import tiny
 import trimesh
 from PIL import Image, ImageFile
 from refusals import listing, refused
+from test_fuzz import colmap
 
 from mgs.cli.app import main
 from mgs.data.check import check_dataset
@@ -223,11 +224,40 @@ def test_absurd_cameras(capsys, dataset, tmp_path, case, command):
     assert "must be whole pixels" in line or "entries beyond 1e+08" in line
 
 
-def test_a_colmap_model_cut_off(tmp_path):
-    for name in ("cameras", "images", "points3D"):
-        (tmp_path / f"{name}.bin").write_bytes(b"\xff")
-    with pytest.raises(InputError, match="is damaged or cut off"):
+COLMAP = {"endless": lambda data: b"\xff" * 8 + data[8:], "cut off": lambda data: data[:-9]}
+
+
+@pytest.mark.parametrize("damage", COLMAP)
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "frames", "rigs"])
+def test_a_colmap_file_of_another_length_than_it_says(tmp_path, name, damage):
+    colmap("binary")(tmp_path / "cameras.bin")
+    file = tmp_path / f"{name}.bin"
+    file.write_bytes(COLMAP[damage](file.read_bytes()))
+    with pytest.raises(InputError, match=rf"{name}\.bin: is damaged or cut off"):
         read_source(tmp_path)
+
+
+IMAGES = {
+    "id": (8, b"\xff" * 4),
+    "position": (44, b"\0" * 6 + b"\xf0\x7f"),
+    "camera": (68, b"\xff" * 4),
+    "name of no text": (72, b"\xff"),
+    "name of two lines": (72, b"\n"),
+}
+"""Damage of images.bin: place and bytes."""
+
+
+@pytest.mark.parametrize("damage", IMAGES)
+def test_damaged_images_of_a_colmap_model(tmp_path, damage):
+    colmap("binary")(tmp_path / "cameras.bin")
+    for name in ("frames", "rigs"):  # else the poses are theirs
+        (tmp_path / f"{name}.bin").unlink()
+    file = tmp_path / "images.bin"
+    data, (place, value) = file.read_bytes(), IMAGES[damage]
+    file.write_bytes(data[:place] + value + data[place + len(value) :])
+    with pytest.raises(InputError) as error:
+        read_source(tmp_path)
+    assert len(str(error.value).splitlines()) == 1
 
 
 @pytest.mark.parametrize("k1", [-1e6, -5, 1e6])

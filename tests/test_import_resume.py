@@ -122,6 +122,12 @@ def test_an_unfinished_import_of_something_else_is_refused(
     assert "unfinished dataset" in refused(capsys, [*many, out], out)
 
 
+def test_a_smaller_import_is_not_gone_on_with_in_full_size(many, tmp_path, monkeypatch, capsys):
+    out = stopped([*many[:-1], "--downscale", "2", "--out"], tmp_path / "out", monkeypatch)
+    said(capsys)
+    assert "unfinished dataset" in refused(capsys, [*many, out], out)
+
+
 def test_a_frame_whose_files_changed_is_made_again(source, many, tmp_path, monkeypatch):
     out = stopped(many, tmp_path / "out", monkeypatch)
     write_png(source / "images/kf_0000.png", np.full((48, 64, 3), 0.5))

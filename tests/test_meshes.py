@@ -124,50 +124,37 @@ def test_the_record_of_a_given_mesh_says_what_was_done(dataset, tmp_path, capsys
     assert "some frame saw" not in said(capsys)[0]
 
 
-def _spoilt(how: str) -> trimesh.Trimesh:
-    """The rock as a mesh with a defect that can be mended."""
+def _spoilt() -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Vertices and faces of the rock with defects that can be mended."""
     mesh = synthetic.rock_mesh()
-    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    some = np.random.default_rng(0).random(len(faces)) < 0.3
-    if how == "faces twice":
-        faces = np.concatenate([faces, faces[some]])
-    elif how == "faces twice, the second time inside out":
-        faces = np.concatenate([faces, faces[:, ::-1]])
-    elif how == "all of it twice, with vertices of its own":
-        faces = np.concatenate([faces, faces[:, ::-1] + len(vertices)])
-        vertices = np.concatenate([vertices, vertices])
-    elif how == "faces of one point, faces without area":
-        line = [[0, 1, len(vertices)]]
-        vertices = np.concatenate([vertices, (vertices[:1] + vertices[1:2]) / 2])
-        faces = np.concatenate([[[0, 0, 0], [3, 3, 5]], line, faces])
-    elif how == "vertices of no face":
-        vertices, faces = np.concatenate([[[900.0, 0, 0]], vertices]), faces + 1
-    elif how == "inside out":
-        faces = faces[:, ::-1]
-    elif how == "some faces inside out":
-        faces = np.where(some[:, None], faces[:, ::-1], faces)
-    elif how == "some faces inside out, no vertex shared":
-        vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
-        faces = np.where(some[:, None], faces[:, ::-1], faces)
-    return trimesh.Trimesh(vertices, faces, process=False)
+    v, f = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    some = np.random.default_rng(0).random(len(f))[:, None] < 0.3
+    turned, n = f[:, ::-1], len(v)
+    own = np.arange(f.size).reshape(-1, 3)
+    no_area = [[0, 0, 0], [3, 3, 5], [0, 1, n]]
+    both = np.concatenate
+    return {
+        "faces twice": (v, both([f, f[some[:, 0]]])),
+        "faces twice, the second time inside out": (v, both([f, turned])),
+        "all of it twice, with vertices of its own": (both([v, v]), both([f, turned + n])),
+        "faces without area": (both([v, (v[:1] + v[1:2]) / 2]), both([no_area, f])),
+        "vertices of no face": (both([[[900.0, 0, 0]], v]), f + 1),
+        "inside out": (v, turned),
+        "some faces inside out": (v, np.where(some, turned, f)),
+        "some faces inside out, no vertex shared": (
+            v[f].reshape(-1, 3),
+            np.where(some, own[:, ::-1], own),
+        ),
+    }
 
 
-@pytest.mark.parametrize(
-    "how",
-    [
-        "faces twice",
-        "faces twice, the second time inside out",
-        "all of it twice, with vertices of its own",
-        "faces of one point, faces without area",
-        "vertices of no face",
-        "inside out",
-        "some faces inside out",
-        "some faces inside out, no vertex shared",
-    ],
-)
+SPOILT = _spoilt()
+
+
+@pytest.mark.parametrize("how", SPOILT)
 def test_a_mesh_that_can_be_mended_gives_the_same_prior(tmp_path, how):
     synthetic.rock_mesh().export(tmp_path / "rock.ply")
-    _spoilt(how).export(tmp_path / "spoilt.ply")
+    trimesh.Trimesh(*SPOILT[how], process=False).export(tmp_path / "spoilt.ply")
     right, found = (
         prior_from_mesh(tmp_path / f"{name}.ply", PriorSettings(gaussians=200, backing=0))
         for name in ("rock", "spoilt")

@@ -22,12 +22,10 @@ from mgs.files import locked, write_json
 from mgs.fit.settings import ALPHA_WEIGHT, TrainSettings
 from mgs.images import write_png
 from mgs.policy import criteria
-from mgs.policy import poses as pose_policies
 from mgs.prior.build import load_prior, save_prior
-from mgs.report.convergence import remaining_decrease
+from mgs.report.runs import read_run
 from mgs.run import folder as run_folder
 from mgs.run import nbv
-from mgs.run.folder import open_run
 from mgs.run.operations import psnr_measure
 from mgs.run.state import State
 from mgs.splat import ListCache, fisher
@@ -162,18 +160,6 @@ def test_demo_refuses_results_of_another_seed(tmp_path, capsys, made):
     assert not (tmp_path / "demo/prior").exists()
 
 
-def test_learning_rates_that_are_too_high_are_one_line(dataset, prior, tmp_path, capsys):
-    """The loss settles on that of a black image, above its start."""
-    run, rates = tmp_path / "run", {"colour": 20, "scale": 20, "rotation": 10, "opacity": 50}
-    train = {"optimiser": "adam", "rates": rates}
-    tiny.start(run, load_dataset(dataset), prior=prior, budget=1, train=train)
-    said = refused(capsys, ["nbv", "--resume", run])
-    assert "the fit to the seeds diverged: its loss was" in said
-    assert "lower the learning rates (`train.rates` in" in said
-    change_settings(run, train={})
-    command("nbv", "--resume", run)
-
-
 def test_a_replaced_prior_is_one_line_on_resume(dataset, prior, tmp_path, capsys):
     """Whatever changed in it; with the old one back the run goes on."""
     run, known = tiny.write_run(tmp_path / "run", dataset, prior), load_prior(prior)
@@ -223,12 +209,10 @@ def test_a_run_folder_appears_when_it_is_complete(dataset, prior, tmp_path, monk
 @pytest.mark.parametrize(
     ("values", "named"),
     [
-        ({"budget": -1}, "budget: Input should be greater than or equal to 0"),
-        ({"seeds": "four"}, "seeds: Input should be a valid integer"),
+        ({"budget": -1}, "budget: must be at least 0"),
         ({"speed": 1}, "speed: Extra inputs are not permitted"),
         ({"prior_std": {"color": 1.0}}, f"prior_std: {KINDS}"),
         ({"train": {"speed": 1}}, "train.speed"),
-        ({"train": {"passes": "many"}}, "train.passes"),
         ({"train": {"rates": [0.1, 0.2]}}, "train.rates"),
         ({"train": {"decay": float("nan")}}, "train.decay"),
     ],
@@ -248,22 +232,16 @@ def test_a_damaged_setting_is_named_with_its_file(dataset, prior, tmp_path, caps
     ("options", "message"),
     [
         ("--estimator block", "--estimator block: unknown; choose one of exact, hutchinson"),
-        ("--estimator guess", "--estimator guess: unknown"),
         ("--optimiser hope", "--optimiser 'hope': unknown; choose one of natural, adam"),
-        ("--lam 0", "--lam 0.0: Input should be greater than or equal to"),
+        ("--lam 0", "--lam 0.0: must be at least"),
         ("--rate colour", "--rate colour: expected KIND=NUMBER, as in --rate colour=0.01"),
-        ("--rate colour=-1", "--rate colour=-1.0: Input should be greater than or equal to 0"),
         ("--rate hue=1", f"--rate {{'hue': 1.0}}: {KINDS}"),
         ("--prior-std scale=inf", "--prior-std scale=inf: Input should be a finite number"),
-        ("--pixel-noise inf", "--pixel-noise inf: Input should be a finite number"),
-        ("--pixel-noise 1e-200", "1e-200: Input should be greater than or equal to 0.000001"),
-        ("--passes 0", "--passes 0: Input should be greater than or equal to 1"),
-        ("--batch 0", "--batch 0: Input should be greater than or equal to 1"),
-        ("--alpha-weight -1", "--alpha-weight -1.0: Input should be greater than or equal to 0"),
-        ("--stop-gain 0", "--stop-gain 0.0: Input should be greater than 0"),
-        ("--stop-gain nan", "--stop-gain nan: Input should be"),
-        ("--stop-uncertainty 1", "--stop-uncertainty 1.0: Input should be less than 1"),
-        ("--stop-uncertainty -0.5", "--stop-uncertainty -0.5: Input should be greater than 0"),
+        ("--pixel-noise 1e-200", "1e-200: must be at least 1e-06"),
+        ("--batch 0", "--batch 0: must be at least 1"),
+        ("--alpha-weight -1", "--alpha-weight -1.0: must be at least 0"),
+        ("--stop-gain 0", "--stop-gain 0.0: must be more than 0"),
+        ("--stop-uncertainty 1", "--stop-uncertainty 1.0: must be less than 1"),
     ],
 )
 def test_bad_options_are_one_line(dataset, prior, tmp_path, capsys, options, message):
@@ -276,7 +254,7 @@ def test_bad_options_are_one_line(dataset, prior, tmp_path, capsys, options, mes
     ("values", "message"),
     [
         ({"optimizer": "adam"}, "setting optimizer = 'adam': Extra inputs are not permitted"),
-        ({"train": {"tolerance": -1}}, "setting train.tolerance = -1: Input should be greater"),
+        ({"train": {"tolerance": -1}}, "setting train.tolerance = -1: must be at least 0"),
     ],
 )
 def test_settings_without_an_option_are_named_by_their_key(
@@ -326,50 +304,24 @@ def test_without_masks_alpha_has_no_weight_by_default(dataset, prior, tmp_path):
     assert weight("given", train={"alpha_weight": 0.3}) == 0.3
 
 
-def test_alpha_as_a_channel_reaches_every_fit_and_the_resumed_run(dataset, prior, tmp_path):
-    def run(name, *options):
-        out = tmp_path / name
-        start = ["nbv", dataset, "--prior", prior, "--passes", 2, "--policy", "uniform"]
-        command(*start, *options, "--out", out)
-        return run_folder.read_settings(out), run_folder.read_checkpoint(out)
-
-    settings, plain = run("plain", "--budget", 1, "--alpha-weight", 0)
-    with_alpha, whole = run("whole", "--budget", 1, "--alpha-weight", 0.5)
-    assert [s.train.alpha_weight for s in (settings, with_alpha)] == [0, 0.5]
-    assert (whole.gaussians.logit_opacities != plain.gaussians.logit_opacities).any()
-    run("begun", "--budget", 0, "--alpha-weight", 0.5)
-    change_settings(tmp_path / "begun", budget=1)
-    command("nbv", "--resume", tmp_path / "begun")
-    assert run_folder.read_checkpoint(tmp_path / "begun").taken == whole.taken
-    begun, ply = ((tmp_path / name / "gaussians.ply").read_bytes() for name in ("begun", "whole"))
-    assert begun == ply
-    frames, known = [load_dataset(dataset).frames[i] for i in whole.taken], load_prior(prior)
-    phi, phi_alpha = (
-        remaining_decrease(whole.gaussians, s, known, frames)["phi"] for s in (settings, with_alpha)
-    )
-    assert phi_alpha > phi > 0
+def test_alpha_as_a_channel_reaches_the_fit(dataset, prior, tmp_path):
+    start, opacities = ["nbv", dataset, "--prior", prior, "--passes", 2, "--budget", 0], []
+    for weight in (0, 0.5):
+        out = tmp_path / str(weight)
+        command(*start, "--alpha-weight", weight, "--out", out)
+        assert run_folder.read_settings(out).train.alpha_weight == weight
+        opacities.append(run_folder.read_checkpoint(out).gaussians.logit_opacities)
+    assert (opacities[0] != opacities[1]).any()
 
 
-def test_the_documented_policy_of_ones_own(dataset, prior, tmp_path, monkeypatch):
-    """The criterion in docs/howto/policy.md runs; the run can be read without it."""
-    name, run = "least-known", tmp_path / "run"
-    monkeypatch.setitem(criteria.CRITERIA, name, None)  # removed again by `undo`
-    monkeypatch.setitem(pose_policies.POSE_POLICIES, "highest", None)
-    page = (Path(__file__).parent.parent / "docs/howto/policy.md").read_text()
-    exec(page.split('```python title="my_mgs.py"\n')[1].split("```")[0], {})
-    started(dataset, run, prior, policy=name, budget=1)
-
-    loaded, scores = load_dataset(dataset), []
-    own = criteria.CRITERIA[name]
-    counted = criteria.Criterion(lambda *given: scores.append(own.score(*given)) or scores[-1])
-    monkeypatch.setitem(criteria.CRITERIA, name, counted)
-    state = tiny.resume(run, loaded)
-    assert len(scores) == len(loaded) - 4
-    assert state.steps[-1]["score"] == max(scores) > 0
-
+def test_a_run_of_a_policy_of_ones_own_can_be_read_without_it(loaded, tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    mine = criteria.Criterion(lambda F, H, lam: float(F.sum()))
+    monkeypatch.setitem(criteria.CRITERIA, "mine", mine)
+    tiny.run(run, loaded, policy="mine", budget=1)
     monkeypatch.undo()
-    assert open_run(run).label == name
-    with pytest.raises(InputError, match=f"--policy {name}: unknown; choose one of d-optimal"):
+    assert read_run(run).policy == "mine"
+    with pytest.raises(InputError, match="--policy mine: unknown; choose one of d-optimal"):
         tiny.resume(run, loaded)
 
 

@@ -14,7 +14,6 @@ import mgs
 from mgs.policy import criteria
 from mgs.policy import poses as pose_policies
 from mgs.splat import ESTIMATORS
-from mgs.synth import arena
 
 ROOT = Path(__file__).parent.parent
 HOWTO = sorted((ROOT / "docs/howto").glob("*.md"))
@@ -74,8 +73,8 @@ def test_the_notebook_is_the_tutorial(pages):
 
 
 @pytest.mark.parametrize("page", HOWTO, ids=lambda page: page.stem)
-def test_a_how_to_page_can_be_followed(pages, data, tables_restored, monkeypatch, page):
-    monkeypatch.setattr(arena, "TEXELS", 64)  # a small ground texture renders faster
+@pytest.mark.usefixtures("coarse_arena", "tables_restored")
+def test_a_how_to_page_can_be_followed(pages, data, page):
     assert pages.run_page(page, data)[1] == []
 
 

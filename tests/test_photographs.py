@@ -105,7 +105,7 @@ def test_the_hull_of_a_convex_body_seen_from_all_sides_is_that_body(tmp_path):
     assert body.is_watertight
     assert 0.95 < body.volume / volume < 1.05  # outlines of whole pixels lie slightly inside
     assert np.abs(synthetic.level(found.mesh.vertices)).max() < 0.2
-    assert np.nanmin(found.agreement) > 0.97
+    assert found.numbers["hull_fills_least"] > 0.97
     for frame in dataset.frames:
         column, row = np.floor(frame.camera.project(found.mesh.vertices)[0]).astype(int).T
         assert binary_dilation(frame.mask(), iterations=1)[row, column].all()
@@ -451,7 +451,10 @@ def no_object(root: Path, data: Make) -> None:
     write_cloud(root / "sparse.ply", SparseCloud(ground))
 
 
-NO_SOURCE = "--masks DIR for --from hull, or give --points CLOUD.ply, or give --mesh MESH"
+NO_SOURCE = (
+    "has no depth images and no points (sparse.ply) and no masks; import data with depth, or "
+    "import with --masks DIR for --from hull, or give --points CLOUD.ply, or give --mesh MESH"
+)
 HULL = ["--from", "hull"]
 DEPTH = "has no depth images; take --from hull, or import data with depth"
 UP = "expected auto, or three numbers"

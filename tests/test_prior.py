@@ -14,13 +14,13 @@ from refusals import listing, refused
 from scipy.spatial import cKDTree
 
 from mgs.camera import Camera, look_at
-from mgs.data.dataset import Dataset, write_transforms
+from mgs.data.dataset import Dataset
 from mgs.data.meshes import Mesh, distances_to_mesh
 from mgs.data.raycast import mesh_depth
 from mgs.data.visibility import visible
 from mgs.errors import InputError
 from mgs.files import read_json
-from mgs.images import write_exr
+from mgs.images import write_exr, write_png
 from mgs.prior.build import build_prior, load_prior, save_prior
 from mgs.prior.segmentation import Plane, degrade, estimate_normals, ground_plane, rock_cluster
 from mgs.prior.settings import PriorSettings
@@ -284,9 +284,9 @@ def twins(root: Path) -> None:
     synthetic.write_dataset(root, synthetic.orbit_cameras(12, 96, 72), rocks)
 
 
-def no_depth(root: Path) -> None:
-    frames = synthetic.write_dataset(root, depth=False).frames
-    write_transforms(root, [replace(frame, mask_path=None) for frame in frames])
+def black_masks(root: Path) -> None:
+    for frame in synthetic.write_dataset(root).frames:
+        write_png(frame.mask_path, np.zeros((48, 64), bool))
 
 
 def no_return(root: Path) -> None:
@@ -314,15 +314,12 @@ def faceless_truth(root: Path) -> None:
     trimesh.PointCloud(np.random.default_rng(0).random((10, 3))).export(root / "rock.glb")
 
 
-NOTHING = "has no depth images and no points (sparse.ply) and no masks; import data with depth, or"
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (flat, "no rock in the cloud"),
         (twins, "equally large and equally near"),
-        (no_depth, NOTHING),
+        (black_masks, "masks are black in every frame"),
         (no_return, "no depth image has a return"),
         (truncated_depth, "kf_0003.exr: not a readable EXR"),
         (small_depth, "is 10x10"),

@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import tiny
+from program import command
 
 from mgs.run.folder import read_checkpoint
 from mgs.splat_ply import read_ply
@@ -32,19 +33,18 @@ def test_ctrl_c_while_modules_are_imported_is_one_line():
         assert (ended.returncode, ended.stderr) == (130, "mgs: interrupted\n")
 
 
-def test_a_damaged_model_is_restored_from_the_checkpoint(tmp_path):
+def test_a_damaged_model_is_restored_from_the_checkpoint(tmp_path, capsys):
     dataset, prior = tiny.write_dataset(tmp_path / "dataset"), tiny.write_prior(tmp_path / "prior")
     run = tiny.write_run(tmp_path / "run", dataset, prior)
     model, intact = run / "gaussians.ply", (run / "gaussians.ply").read_bytes()
     flipped = bytearray(intact)
     flipped[-40] ^= 0xFF
-    command = [sys.executable, "-m", "mgs", "eval", str(run), "--no-pictures"]
     for damaged in (bytes(flipped), intact[:-100], b""):
         model.write_bytes(damaged)
-        ended = subprocess.run(command, capture_output=True, text=True)
-        assert ended.returncode == 0, ended.stderr
+        command("eval", run, "--no-pictures")
         said = f"mgs: {model}: was damaged; restored from checkpoint.npz"
-        assert said in ended.stderr.splitlines()
+        assert said in capsys.readouterr().err.splitlines()
         assert model.read_bytes() == intact
     assert read_ply(model) == read_checkpoint(run).gaussians
-    assert "restored" not in subprocess.run(command, capture_output=True, text=True).stderr
+    command("eval", run, "--no-pictures")
+    assert "restored" not in capsys.readouterr().err

@@ -229,9 +229,7 @@ def test_no_stones_where_the_rock_keeps_them_out():
     assert make_stones(Arena(spread=2, stones=9), rock, ground, rng) is not None
 
 
-def test_scenes_are_known_by_name_and_the_boulder_is_the_default():
-    with pytest.raises(InputError, match="boulder"):
-        load_scene_file("boulders")
+def test_the_boulder_is_the_default():
     assert load_scene_file("boulder").model_copy(update={"description": ""}) == SceneFile()
 
 

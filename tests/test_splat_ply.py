@@ -9,11 +9,9 @@ import struct
 import numpy as np
 import pytest
 from refusals import refused
-from test_render_command import CAMERAS, foreign_ply, gaussians, pixels, run, write_cameras
+from test_render_command import foreign_ply, gaussians, write_cameras
 
-from mgs.errors import InputError
 from mgs.gaussians import Gaussians
-from mgs.splat import render
 from mgs.splat_ply import ply_colour_space, read_ply
 
 C0 = 0.28209479177387814
@@ -148,16 +146,6 @@ def test_opacities_of_0_and_1_are_drawn(tmp_path):
     assert (read.opacities > 1 / 255).tolist() == [False, True]  # below, nothing is drawn
 
 
-def test_render_of_a_compressed_model(tmp_path):
-    model = gaussians(1)
-    (tmp_path / "x.ply").write_bytes(pack(model))
-    write_cameras(tmp_path / "transforms.json")
-    run(tmp_path)
-    for name, camera in zip("ab", CAMERAS, strict=True):
-        truth = np.clip(np.asarray(render(model, camera).rgb), 0, 1)
-        np.testing.assert_allclose(pixels(tmp_path / f"out/{name}.png"), truth, atol=0.03)
-
-
 def replaced(old: bytes, new: bytes):
     return lambda data: data.replace(old, new, 1)
 
@@ -201,8 +189,3 @@ def test_a_comment_in_any_script(tmp_path, encoding):
         data = (tmp_path / "x.ply").read_bytes()
         (tmp_path / "y.ply").write_bytes(data.replace(b"from another tool", comment, 1))
         assert read_ply(tmp_path / "y.ply") == model
-
-
-def test_a_folder_in_place_of_a_ply(tmp_path):
-    with pytest.raises(InputError, match="cannot be read"):
-        read_ply(tmp_path)

@@ -254,15 +254,11 @@ def test_the_survey_is_a_dataset_and_gives_a_prior(dataset, survey, tmp_path):
 
 def test_files_of_one_name_in_different_folders_stay_apart(tmp_path):
     dataset = synthetic.write_dataset(tmp_path / "data")
-    for frame in dataset.frames:
-        (tmp_path / "data/frames" / frame.name).mkdir(parents=True)
-        rock = np.dstack([frame.masked_rgb(), frame.mask()]) / 2
-        write_rock_image(tmp_path / "data/frames" / frame.name / "rock.png", rock)
-        frame.mask_path.rename(tmp_path / "data/frames" / frame.name / "mask.png")
-    folders = {frame.name: tmp_path / "data/frames" / frame.name for frame in dataset.frames}
     frames = []
     for frame in dataset.frames:
-        mask, rock = (folders[frame.name] / f"{kind}.png" for kind in ("mask", "rock"))
+        mask, rock = (dataset.root / f"{frame.name}/{kind}.png" for kind in ("mask", "rock"))
+        write_rock_image(rock, np.dstack([frame.masked_rgb(), frame.mask()]) / 2)
+        frame.mask_path.rename(mask)
         frames.append(replace(frame, mask_path=mask, rock_path=rock))
     write_transforms(dataset.root, frames)
     dataset = load_dataset(dataset.root)

@@ -9,26 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from refusals import refused
+from tiny import run
 
-from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.policy import criteria
 from mgs.policy import poses as pose_policies
-from mgs.run import folder as run_folder
-from mgs.run import recording
 
 METRES = st.floats(-100, 100)
-
-
-@pytest.fixture(scope="module")
-def loaded(tmp_path_factory):
-    return load_dataset(tiny.write_dataset(tmp_path_factory.mktemp("tiny") / "dataset"))
-
-
-def run(out, dataset, **values) -> run_folder.State:
-    return recording.run(
-        out, tiny.start(out, dataset, **values), dataset, tiny.operations(), tiny.silent
-    )
 
 
 @given(
@@ -81,16 +68,6 @@ def test_the_choice_is_the_best_gain_for_its_cost(loaded, tmp_path, travel, batc
         chosen = left.index(step["frame"])
         assert worth[chosen] == pytest.approx(worth.max(), rel=0.01)
         assert step["score"] == step["information_gain"] == pytest.approx(gains[chosen])
-
-
-def test_dear_travel_makes_the_path_shorter_and_cheap_travel_changes_nothing(loaded, tmp_path):
-    positions = np.array([frame.camera.position for frame in loaded.frames])
-    paths, taken = {}, {}
-    for travel in (None, 1e6, 0.1):
-        taken[travel] = run(tmp_path / str(travel), loaded, travel=travel).taken
-        paths[travel] = pose_policies.path_length(positions[taken[travel]])
-    assert taken[None] == taken[1e6]
-    assert paths[0.1] < paths[None]
 
 
 def test_what_cannot_be_divided_by_a_cost_is_refused(loaded, tmp_path, monkeypatch):

@@ -111,7 +111,7 @@ def test_the_page_draws_it_upright_too_and_names_the_unit(runs, tmp_path):
     titles = [[scene[f"{axis}axis"]["title"]["text"] for axis in "xyz"] for scene in scenes]
     upright_names = ["horizontal (unit)", "horizontal, across (unit)", "up (unit)"]
     assert titles == [["x (m)", "y (m)", "z (m)"], upright_names]
-    assert "depth error (unit)" in text
+    assert "path (unit)" in text
     assert "(m)" not in text.split("<script")[0]
 
 

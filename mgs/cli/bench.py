@@ -30,8 +30,8 @@ def bench(
     kind: Annotated[
         Literal["splat", "scaling", "fit"],
         argument(
-            "splat: compared with Mitsuba's own integrator, volprim_rf_basic. "
-            "scaling: as the numbers of Gaussians, pixels and threads grow. "
+            "splat: time, compared with Mitsuba's own integrator, volprim_rf_basic. "
+            "scaling: time, as the numbers of Gaussians, pixels and threads grow. "
             "fit: accuracy and convergence of the fit of a dataset."
         ),
     ],

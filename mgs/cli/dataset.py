@@ -19,7 +19,7 @@ UNCERTAINTY = 2.0
 def dataset(
     action: Annotated[
         Literal["check", "masks"],
-        argument("check: read every file, compare depth, masks and poses. masks: see below."),
+        argument("check: read every file, compare depth, masks and poses. masks: see above."),
     ],
     path: Annotated[Path, argument("Folder of the dataset.")],
     prior: Annotated[
@@ -36,8 +36,7 @@ def dataset(
     dataset of their own: give DATASET/test.
 
     `mgs dataset masks DATASET` makes masks for a dataset that has none: it projects the prior into
-    every image, moves the outlines to where colours change with --refine, and writes masks/, and
-    masks.png to look at.
+    every image, and writes masks/, and masks.png to look at.
     """
     if action == "masks":
         _make_masks(path, path / "prior" if prior is None else prior, refine)

@@ -61,13 +61,13 @@ def import_data(
         str, option("Split of NeRF-synthetic data to import: train, val or test.")
     ] = "train",
 ) -> None:
-    """Make a dataset of your own data: cameras and images, and depth and masks if there are any.
+    """Make a dataset from your own data: cameras and images, with depth and masks if there are any.
     Lens distortion is undone.
 
-    Masks come from --masks, --mesh, the source's own mask files or the images' alpha: the first of
-    these that there is. Alpha with values between empty and full is kept, in images of the rock
-    alone (rock/). Points that came with the cameras are kept for `mgs prior`, in sparse.ply. The
-    same command continues an interrupted import.
+    Masks come from --masks, else --mesh, the source's own mask files, or the images' alpha. Alpha
+    with values between empty and full is kept, in images of the rock alone (rock/). Points that
+    came with the cameras are kept for `mgs prior`, in sparse.ply. The same command continues an
+    interrupted import.
     """
     from mgs.data.dataset import TEST_FOLDER
     from mgs.data.importers import import_source

@@ -26,14 +26,14 @@ def evaluate(
     ] = True,
     convergence: Annotated[
         bool,
-        option("Measure how much lower the last fit could get (Newton decrease).", "--convergence"),
+        option("Predict how much lower the last fit could get (Newton decrease).", "--convergence"),
     ] = False,
 ) -> None:
     """Measure the model on the test views, on all views, and on the views never trained on; write
     RUN/metrics.json, and renders beside truth.
 
-    Metrics and pictures of this very model and dataset are kept, and not made again. The truth is
-    the rock on black. PSNR and SSIM are over the full frame, and over the pixels of the rock only.
+    Metrics and pictures of the same model and dataset are kept, not made again. The truth is the
+    rock on black. PSNR and SSIM are over the full frame, and over the pixels of the rock only.
     metrics.json also has the errors of alpha and depth, where the dataset has their truth.
     """
     from mgs.report.evaluation import evaluate_run
@@ -68,18 +68,18 @@ def diagnose(
         option("Instead, predict the errors of views not seen, and compare.", "--calibrate"),
     ] = False,
 ) -> None:
-    """Draw maps of the Fisher information and the uncertainty that a run has about its model, for
-    views and for Gaussians.
+    """Draw maps of the Fisher information and the uncertainty of a run's model, for views and for
+    Gaussians.
 
     Writes into RUN/diagnostics: for each view an EXR with the channels R G B A Z, fisher.colour,
     fisher.scale, fisher.rotation, fisher.opacity, information, uncertainty and unobserved, and a
     PNG that shows them; and information.ply, a point for each Gaussian, coloured by its
     information.
 
-    With --calibrate it writes uncertainty.json and uncertainty.png: how well errors are predicted
-    for the test views and for frames never trained on, after a calibration on the run's own views,
-    each left out of a fit once; and NAME.errors.exr, true error and predicted standard deviation of
-    some views.
+    With --calibrate it writes uncertainty.json and uncertainty.png instead: how well errors are
+    predicted in test views and in frames never trained on. The prediction is calibrated on the
+    run's own views, each left out of a fit once. NAME.errors.exr has the true error and the
+    predicted standard deviation of some views.
     """
     from mgs.report.diagnostics import diagnose_run
 
@@ -108,12 +108,10 @@ def prune(
         float, option("Allowed change of the training images: rms of a pixel, linear RGB.")
     ] = PRUNE_NOISE,
 ) -> None:
-    """Leave out the Gaussians of a run without which its images hardly change; write
-    RUN/gaussians_pruned.ply.
+    """Remove Gaussians of a run that its images hardly need; write RUN/gaussians_pruned.ply.
 
-    The change by the removal of each Gaussian is known exactly; the change by the removal of all of
-    them together is measured, and stays within --noise. Nothing is fitted again, and the run itself
-    stays as it is.
+    The change of the training images is measured, and stays within --noise. Nothing is fitted
+    again, and the run itself stays as it is.
     """
     from mgs.report.pruning import PRUNED, prune_run
 
@@ -137,22 +135,22 @@ def prune(
 def refit(
     run: Run,
     learn: Annotated[
-        str, option("auto: each Gaussian learns the kinds that the evidence pays for; all: all.")
+        str, option("auto: each Gaussian learns the kinds that the evidence supports; all: all.")
     ] = "auto",
     sh: Annotated[
-        str, option("SH degree: 0, or auto: 1 if that predicts views left out better.")
+        str, option("SH degree: 0, or auto: 1 if it predicts left-out views better, else 0.")
     ] = "auto",
     loss: Annotated[
-        float, option("Allowed rise of the objective by parameters that are left out, dB.")
+        float, option("Allowed rise of the objective from parameters not learned, dB.")
     ] = LEARN_LOSS,
 ) -> None:
-    """Fit the views of a run once more, with no more parameters than they pay for; write
+    """Fit the views of a run again, with no more parameters than they need; write
     RUN/gaussians_refitted.ply.
 
-    No test view is used for it: the kinds of parameters that a Gaussian learns are chosen by the
-    evidence, the marginal likelihood of the images, and by --loss; the SH degree by views that are
-    left out. Parameters that are not learned keep the prior's values, and are marked in the file.
-    The run itself stays as it is.
+    The evidence (marginal likelihood of the images) and --loss choose the kinds of parameters that
+    each Gaussian learns; views left out choose the SH degree. No test view is used. Parameters that
+    are not learned keep the prior's values, and are marked in the file. The run itself stays as it
+    is.
     """
     from mgs.report.refitting import REFITTED, refit_run
 
@@ -165,18 +163,19 @@ def refit(
 
 def _refitted(found: RefittedRun) -> list[str]:
     """Describe a refitted run."""
-    share = found.after / found.before
-    shares = ", ".join(f"{kind} {share:.0%}" for kind, share in found.shares.items())
+    model, left_out = found.lean, found.lean.left_out
+    share = model.parameters / found.before
+    shares = ", ".join(f"{kind} {mask.mean():.0%}" for kind, mask in model.learned.items())
     lines = [
-        f"{found.after:,} parameters are learned, {share:.0%} of the run's {found.before:,}",
+        f"{model.parameters:,} parameters are learned, {share:.0%} of the run's {found.before:,}",
         f"learned by: {shares} of the Gaussians",
     ]
-    if found.left_out:
-        more = "more" if found.left_out.pays else "not more"
+    if left_out:
+        more = "more" if left_out.pays else "not more"
         lines.append(
-            f"SH degree {found.sh_degree}: on views left out, neighbours together, degree 1 gains "
-            f"{found.left_out.gain:+.3f} dB, {more} than its standard error of "
-            f"{found.left_out.error:.3f}"
+            f"SH degree {model.gaussians.sh_degree}: on views left out, neighbours together, "
+            f"degree 1 gains {left_out.gain:+.3f} dB, {more} than its standard error of "
+            f"{left_out.error:.3f}"
         )
     else:
         lines.append("SH degree 0: no other was tried")

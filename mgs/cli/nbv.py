@@ -63,7 +63,7 @@ def nbv(
         Path | None,
         typer.Option(
             metavar="RUN",
-            help="Continue this run, with the settings in its config.json.",
+            help="Continue this run by its config.json; repeat --policy if it is a file.",
             rich_help_panel="Main options",
         ),
     ] = None,

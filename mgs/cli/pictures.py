@@ -88,16 +88,16 @@ def view(
         str, option("Address to serve on. Any but 127.0.0.1 can be reached by others.")
     ] = "127.0.0.1",
     follow: Annotated[
-        bool, option("Show every new step of a run that goes on.", "--follow")
+        bool, option("Show every new step of a run in progress.", "--follow")
     ] = False,
 ) -> None:
-    """Show a run or a model in the browser, to be turned by mouse, keyboard or touch: Gaussians,
-    mesh and cameras.
+    """Show a run or a model in the browser: Gaussians, mesh and cameras, turned by mouse, keyboard
+    or touch.
 
     While the camera moves, the browser draws the Gaussians, without view-dependent colour. While it
-    rests, the kernel's image is shown. Layers: colour, alpha, depth, and of a run information,
-    uncertainty, and what is unobserved. A click on a camera shows its image and its numbers. Ctrl-C
-    ends it.
+    rests, the kernel's exact image is shown. Layers: colour, alpha, depth; for a run also
+    information, uncertainty, and what is unobserved. A click on a camera shows its image and its
+    numbers. Ctrl-C ends it.
     """
     from mgs.view.server import Viewer
 

@@ -86,9 +86,10 @@ def prior(
     """Build a mesh of the rock, and sample N points on it.
 
     From depth images: fuse a cloud, find the ground plane and the rock above it, reconstruct its
-    surface (Poisson). From points that came with the cameras: the same, of those inside the masks
-    or above the ground. From a hull: the largest body inside all masks. Then spread samples evenly
-    over what some frame saw. Writes mesh.ply, points.ply, prior.json and prior.png.
+    surface (Poisson). From points that came with the cameras: reconstruct the surface of those
+    inside the masks or above the ground. From a hull: take the largest body inside all masks. Then
+    spread samples evenly over the faces that some frame sees. Writes mesh.ply, points.ply,
+    prior.json and prior.png.
     """
     from mgs.data.dataset import load_dataset
     from mgs.data.meshes import GLTF
@@ -169,7 +170,7 @@ def _table(numbers: dict[str, Any]) -> Table:
     metres = numbers["unit"] == "m"
     unit = "m" if metres else "unit"
     n, spacing, area = numbers["n"], numbers["spacing"], numbers["sampled_area"]
-    table = Table("station", "number", title="Mesh prior")
+    table = Table("step", "number", title="Mesh prior")
 
     def length(value: float) -> str:
         return f"{1e3 * value:.2f} mm" if metres else f"{value:.4g} unit"

@@ -63,7 +63,7 @@ def reproduce(
     only: Annotated[
         str | None,
         option(
-            "Which results, as table1,curves: table1, figures, curves, seeds, pools, oracle. "
+            "Results to make, separated by commas: table1, figures, curves, seeds, pools, oracle. "
             "Default: all but oracle."
         ),
     ] = None,
@@ -80,7 +80,7 @@ def reproduce(
         option("A rock of your own in place of the procedural ones (not Table I); repeatable."),
     ] = None,
     batch: Annotated[
-        int, option("Of Table I and the figures: views chosen before the next fit.", min=1)
+        int, option("For Table I and the figures: views chosen before the next fit.", min=1)
     ] = 1,
     workers: Workers = 1,
     scheduler: Annotated[
@@ -88,11 +88,11 @@ def reproduce(
     ] = None,
 ) -> None:
     """Make the results of docs/results.md: Table I at equal numbers of images, PSNR against images
-    over many rocks with statistics, numbers of seeds, pools of candidates, and an oracle that sees
-    the truth.
+    over many rocks with statistics, numbers of seeds, pools of candidates, and an oracle that knows
+    the test views.
 
-    Every dataset, prior and run is a cell, done once and kept in OUT/cells; the results are written
-    to OUT/results. Runs whose seconds are reported run alone: let nothing else run meanwhile.
+    Every dataset, prior and run is made once and kept in OUT/cells; the results are written to
+    OUT/results. Runs whose seconds are reported run one at a time: let nothing else run meanwhile.
     """
     from mgs.study import reproduce as study
     from mgs.study.reproduce_results import make
@@ -123,8 +123,8 @@ def stress(
         str | None, option("Names of experiments, separated by commas. Default: all.")
     ] = None,
 ) -> None:
-    """Try to make the methods fail: experiments with a hypothesis each, and a verdict that follows
-    from the numbers by a rule.
+    """Try to make the methods fail: experiments test hypotheses, and a rule turns the numbers into
+    verdicts.
 
     Writes stability.csv (all numbers), verdicts.json, stability.md (the verdicts as tables) and a
     plot of each experiment.
@@ -180,10 +180,10 @@ def chart(
         option("Timings of each point; the median counts. Default: quick 2, full 3.", min=1),
     ] = None,
 ) -> None:
-    """Chart speed against accuracy: of single fits and of whole runs.
+    """Chart speed against accuracy of single fits and of whole runs.
 
-    Writes KIND.csv, KIND.json, KIND.md and KIND.png of each; each row names the command that
-    makes it again. Points are timed one after another: let nothing else run meanwhile.
+    Writes a CSV, JSON, Markdown and PNG file for fits (fit.*) and for runs (run.*); each row names
+    the command that makes it again. Points are timed one by one: let nothing else run meanwhile.
     """
     from mgs.study.chart import KINDS, SIZES, check_dataset, run_chart
     from mgs.study.sweep import names_of

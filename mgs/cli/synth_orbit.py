@@ -42,7 +42,7 @@ def synth_orbit(
         str | None, option("Image size WIDTHxHEIGHT, pixels. Default: the preset's.")
     ] = None,
     test_views: Annotated[
-        int, option("Number of views on a dome, to judge models by; written to OUT/test.", min=0)
+        int, option("Number of test views on a dome, to evaluate models; in OUT/test.", min=0)
     ] = 0,
     on_demand: Annotated[
         bool,
@@ -65,12 +65,12 @@ def synth_orbit(
     """Render a dataset with Mitsuba: an orbit around a rock, with photoreal images, depth, rock
     masks and exact poses.
 
-    Writes transforms.json (as nerfstudio has it), images/, depth/, masks/, rock/ (images of the
-    rock alone, with alpha), the true rock as rock.glb, config.json and contact_sheet.png. The same
+    Writes transforms.json (nerfstudio's format), images/, depth/, masks/, rock/ (images of the rock
+    alone, with alpha), the true rock as rock.glb, config.json and contact_sheet.png. The same
     command continues an interrupted run.
 
-    With --on-demand it writes poses, test views and a survey (depth and masks, OUT/survey), and an
-    image of a frame exists only after a run of `mgs nbv` has taken it.
+    With --on-demand it writes poses, test views and a survey (depth and masks, in OUT/survey). The
+    image of a frame is rendered when a run of `mgs nbv` takes it.
     """
     runtime.start()
     from mgs.synth.rendering import PRESETS, PoseNoise, synthesise

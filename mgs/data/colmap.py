@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,30 +30,59 @@ MODELS: dict[str, tuple[str, ...]] = {
 
 
 RECORDS = {
-    "cameras.bin": (24, False, 0),
-    "images.bin": (64, True, 24),
-    "points3D.bin": (43, False, 8),
+    "cameras.bin": (24, False, "", 0),
+    "images.bin": (64, True, "<Q", 24),
+    "points3D.bin": (43, False, "<Q", 8),
+    "frames.bin": (64, False, "<I", 16),
+    "rigs.bin": (4, False, "", 0),
 }
-"""Binary file -> bytes of a record, whether a name follows, and bytes of each item of the list that
-follows (COLMAP's output formats); no list: 0."""
+"""Binary file -> bytes of a record, whether a name follows, format of the count of the list that
+follows ("": none of this kind), and bytes of each of its items (COLMAP's output formats)."""
 
 
-def _is_whole(path: Path, fixed: int, named: bool, item: int) -> bool:
+def _is_whole(path: Path) -> bool:
     """Whether a binary file is as long as its counts say. pycolmap does not end if it is not."""
     with reading(path):
         data = path.read_bytes()
+    fixed, named, items, size = RECORDS[path.name]
     try:
         (count,), place = struct.unpack_from("<Q", data), 8
         for _ in range(count):
-            place += fixed
+            start, place = place, place + fixed
             place = data.index(b"\0", place) + 1 if named else place
-            if item:
-                place += 8 + item * struct.unpack_from("<Q", data, place)[0]
+            if items:
+                (number,) = struct.unpack_from(items, data, place)
+                place += struct.calcsize(items) + size * number
+            elif path.name == "cameras.bin":
+                place += 8 * _parameters(*struct.unpack_from("<i", data, start + 4))
+            else:
+                place += _bytes_of_sensors(data, place)
             if place > len(data):
                 return False
-    except (struct.error, ValueError, OverflowError):
+    except (struct.error, ValueError, OverflowError, IndexError):
         return False
     return True
+
+
+@cache
+def _parameters(model: int) -> int:
+    """Number of parameters of a camera model. Raises ValueError if there is no such model."""
+    from pycolmap import Camera, CameraModelId
+
+    known = {int(each): each for each in CameraModelId.__members__.values() if int(each) >= 0}
+    if model not in known:
+        raise ValueError(model)
+    return len(Camera.create_from_model_id(1, known[model], 1.0, 1, 1).params)
+
+
+def _bytes_of_sensors(data: bytes, place: int) -> int:
+    """Bytes of the sensors of a rig: their number, the reference, and the others, each with a pose
+    if its flag says so. Raises IndexError beyond the data."""
+    (sensors,) = struct.unpack_from("<I", data, place)
+    end = place + (12 if sensors else 4)
+    for _ in range(1, sensors):
+        end += 65 if data[end + 8] else 9
+    return end - place
 
 
 def is_model(folder: Path) -> bool:
@@ -71,12 +101,13 @@ def read_model(model: Path) -> tuple[list[tuple[str, Camera, np.ndarray]], Spars
     """
     import pycolmap
 
-    for file, layout in RECORDS.items():
-        if (model / file).is_file() and not _is_whole(model / file, *layout):
+    for file in RECORDS:
+        if (model / file).is_file() and not _is_whole(model / file):
             raise InputError(f"{model / file}: is damaged or cut off; export the model again")
     try:
         with decoding(model):
             reconstruction = pycolmap.Reconstruction(model)
+            return _images(model, reconstruction), _cloud(reconstruction)
     except InputError:
         raise
     except Exception as error:  # pycolmap raises many types for damaged models
@@ -84,6 +115,10 @@ def read_model(model: Path) -> tuple[list[tuple[str, Camera, np.ndarray]], Spars
         raise InputError(
             f"{model}: not a readable COLMAP model ({reason}); export it again"
         ) from None
+
+
+def _images(model: Path, reconstruction: Any) -> list[tuple[str, Camera, np.ndarray]]:
+    """Images of a model as in `read_model`."""
     images = []
     for image in sorted(reconstruction.images.values(), key=lambda image: image.name):
         lens = image.camera
@@ -95,11 +130,14 @@ def read_model(model: Path) -> tuple[list[tuple[str, Camera, np.ndarray]], Spars
             )
         pose = np.eye(4)
         pose[:3] = image.cam_from_world().matrix()
-        camera = Camera(lens.calibration_matrix(), lens.width, lens.height, pose)
+        try:
+            camera = Camera(lens.calibration_matrix(), lens.width, lens.height, pose)
+        except InputError as error:
+            raise InputError(f"{model}: image {image.name!r}: {error}") from None
         values = dict(zip(keys, lens.params[len(lens.params) - len(keys) :], strict=True))
         distortion = np.array([values.get(key, 0.0) for key in OPENCV_ORDER])
         images.append((image.name, camera, distortion))
-    return images, _cloud(reconstruction)
+    return images
 
 
 def _cloud(reconstruction: Any) -> SparseCloud | None:

@@ -185,7 +185,7 @@ def load_dataset(root: str | Path) -> Dataset:
     if not root.is_dir():
         raise InputError(f"{root}: no such dataset folder; make one with `mgs synth-orbit {root}`")
     data, records = read_records(path)
-    frames = [_frame(root, path, data, i, record) for i, record in enumerate(records)]
+    frames = [_frame(path, data, i, record) for i, record in enumerate(records)]
     for name, count in Counter(frame.name for frame in frames).items():
         if count > 1:  # runs and pictures refer to a frame by its name
             raise InputError(
@@ -258,6 +258,14 @@ def _camera(path: Path, data: dict[str, Any], index: int, record: dict[str, Any]
             f"{where} has no usable intrinsics or pose; fl_x fl_y cx cy w h and a 4x4 matrix "
             "are needed"
         ) from None
+    return posed_camera(where, K, width, height, pose)
+
+
+def posed_camera(
+    where: str, K: np.ndarray, width: float, height: float, pose: np.ndarray
+) -> Camera:
+    """Camera of a transform_matrix: OpenGL camera-to-world [4,4]. Raises InputError, which begins
+    with `where`, if the pose or the intrinsics are bad."""
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise InputError(
             f"{where} has a transform_matrix that is not a finite 4x4 matrix; correct the pose"
@@ -270,17 +278,27 @@ def _camera(path: Path, data: dict[str, Any], index: int, record: dict[str, Any]
         raise InputError(f"{where}: {error}") from None
 
 
-def _frame(
-    root: Path, path: Path, data: dict[str, Any], index: int, record: dict[str, Any]
-) -> Frame:
-    where = f"{path}: frame {index}"
-    camera, on_demand = _camera(path, data, index, record), data.get("on_demand") is True
+def finite_number(where: str, what: str, value: Any) -> float:
+    """A number as float. Raises InputError, which names `what`, for anything else, NaN and
+    infinity."""
     try:
-        timestamp = float(record.get("timestamp", FRAME_INTERVAL * index))
+        number = float(value)
     except (TypeError, ValueError, OverflowError):
-        timestamp = math.nan
-    if not math.isfinite(timestamp):
-        raise InputError(f"{where} has a timestamp that is no finite number; give seconds")
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError(f"{where}: {what} is {value!r}, no finite number; correct it")
+    return number
+
+
+def timestamp_of(where: str, index: int, record: dict[str, Any]) -> float:
+    """Time of a frame, seconds. Raises InputError unless it is finite."""
+    return finite_number(where, "timestamp", record.get("timestamp", FRAME_INTERVAL * index))
+
+
+def _frame(path: Path, data: dict[str, Any], index: int, record: dict[str, Any]) -> Frame:
+    root, where = path.parent, f"{path}: frame {index}"
+    camera, on_demand = _camera(path, data, index, record), data.get("on_demand") is True
+    timestamp = timestamp_of(where, index, record)
     paths: dict[str, Any] = {}
     for field, key in FILES.items():
         paths[field] = root / record[key] if record.get(key) else None

@@ -65,9 +65,9 @@ def import_source(
         "frames": len(shots),
         "sha256_of_frames": _digest(shots),
         "mesh": fingerprint(mesh) if mesh is not None and masks is None else None,
+        "downscale": downscale,
+        "test_views": None if tests is None else len(tests.shots),
     }
-    asked |= {"downscale": downscale} if downscale != 1 else {}
-    asked |= {"test_views": len(tests.shots)} if tests is not None else {}
     with folder_locked(out):
         if resumes(out, RECORD, asked) and (out / "transforms.json").is_file():
             return load_dataset(out)
@@ -152,14 +152,11 @@ def _import_shot(
     newest = max(path.stat().st_mtime_ns for path in files if path.is_file())
     if not image.is_file() or image.stat().st_mtime_ns < newest:
         rgba = read_fitting(read_rgba, shot.image, shot.camera)
-        mask, rock = _mask_and_rock(shot, rgba, undo) if silhouette is None else (None, None)
-        if silhouette is not None:
-            mask = silhouette(camera)
-        depth = None
-        if shot.depth is not None:
-            depth = read_fitting(
-                partial(_read_depth, unit=shot.depth_unit), shot.depth, shot.camera
-            )
+        mask, rock = silhouette(camera) if silhouette else None, None
+        if silhouette is None:
+            mask, rock = _mask_and_rock(shot, rgba, undo)
+        read = partial(_read_depth, unit=shot.depth_unit)
+        depth = None if shot.depth is None else read_fitting(read, shot.depth, shot.camera)
         begin()
         if depth_path is not None and depth is not None:
             write_exr(depth_path, {"Z": undo(depth, False)})
@@ -187,9 +184,7 @@ def _mask_and_rock(
     rgba [H,W,4]: pixels of the shot's image. Premultiplied light is resampled, since straight
     colours would mix with those of empty pixels and leave a rim.
     """
-    given = None
-    if shot.rock is not None:
-        given = read_fitting(read_rgba, shot.rock, shot.camera)
+    given = None if shot.rock is None else read_fitting(read_rgba, shot.rock, shot.camera)
     layer = rgba if given is None else given
     full = np.iinfo(layer.dtype).max
     alpha = layer[..., 3]

@@ -106,7 +106,7 @@ def make_masks(
             f"{dataset.root}: the mesh is in no image; mesh and poses do not fit, "
             "make masks with another"
         )
-    _write_sheet(dataset.root / SHEET, thumbnails)
+    write_sheet(dataset.root / SHEET, thumbnails, ACROSS)
     write_transforms(dataset.root, frames, dataset.up, dataset.unit)
     return replace(dataset, frames=tuple(frames))
 
@@ -125,10 +125,10 @@ def _outlined(rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return np.round(np.clip(small, 0, 1) * 255).astype(np.uint8)
 
 
-def _write_sheet(path: Path, pictures: list[np.ndarray]) -> None:
-    """Write pictures uint8 [H,W,3] of the same width in rows, as a PNG."""
+def write_sheet(path: Path, pictures: list[np.ndarray], across: int) -> None:
+    """Write pictures uint8 [H,W,3] of the same width as a PNG, `across` in a row."""
     height = max(len(picture) for picture in pictures)
     padded = [np.pad(picture, ((0, height - len(picture)), (0, 0), (0, 0))) for picture in pictures]
-    padded += [np.zeros_like(padded[0])] * (-len(padded) % ACROSS)
-    rows = [np.hstack(padded[k : k + ACROSS]) for k in range(0, len(padded), ACROSS)]
+    padded += [np.zeros_like(padded[0])] * (-len(padded) % across)
+    rows = [np.hstack(padded[k : k + across]) for k in range(0, len(padded), across)]
     write_png(path, np.vstack(rows))

@@ -10,10 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from mgs.camera import Camera, opencv_from_opengl
+from mgs.camera import Camera
 from mgs.data.clouds import SparseCloud, read_cloud
 from mgs.data.colmap import is_model, read_model
-from mgs.data.dataset import FRAME_INTERVAL, PINHOLES, read_records
+from mgs.data.dataset import (
+    FRAME_INTERVAL,
+    PINHOLES,
+    finite_number,
+    posed_camera,
+    read_records,
+    timestamp_of,
+)
 from mgs.data.up import PLUS_Z, Up, degrees_between, unit_up, up_of_cameras
 from mgs.errors import InputError
 from mgs.images import image_size
@@ -161,7 +168,8 @@ def _read_transforms(path: Path) -> Source:
             f"{path}: camera model {model} is not supported; "
             "undistort the images to OPENCV or PINHOLE first"
         )
-    scale = _number(path, "depth_unit_scale_factor", data.get("depth_unit_scale_factor", 1e-3))
+    key = "depth_unit_scale_factor"
+    scale = finite_number(str(path), key, data.get(key, 1e-3))
     shots, missing = [], 0
     for index, record in enumerate(records):
         image = find_image(path.parent, record["file_path"])
@@ -170,9 +178,9 @@ def _read_transforms(path: Path) -> Source:
             continue
         keys = ("depth_file_path", "mask_path", "rock_file_path")
         depth, mask, rock = (path.parent / record[key] if record.get(key) else None for key in keys)
-        camera, distortion = _transforms_camera(path, index, {**data, **record}, image)
-        time = record.get("timestamp", FRAME_INTERVAL * index)
-        time = _number(path, f"timestamp of frame {index}", time)
+        where = f"{path}: frame {index}"
+        camera, distortion = _transforms_camera(where, {**data, **record}, image)
+        time = timestamp_of(where, index, record)
         unit = 1.0 if depth is None or depth.suffix.lower() == ".exr" else scale
         name = _frame_name(record["file_path"])
         shots.append(Shot(name, camera, distortion, time, image, depth, unit, mask, rock))
@@ -185,22 +193,11 @@ def _read_transforms(path: Path) -> Source:
     return Source(kind, shots, missing, sparse, up, length, no_cloud)
 
 
-def _number(path: Path, what: str, value: Any) -> float:
-    """A finite number. Raises InputError, which names `what`, for anything else."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = np.nan
-    if not np.isfinite(number):
-        raise InputError(f"{path}: {what} is {value!r}, no finite number; correct it")
-    return number
-
-
 def _transforms_camera(
-    path: Path, index: int, record: dict[str, Any], image: Path
+    where: str, record: dict[str, Any], image: Path
 ) -> tuple[Camera, np.ndarray]:
-    """Camera and distortion of a frame; intrinsics that are not given follow from the image."""
-    where = f"{path}: frame {index}"
+    """Camera and distortion of a frame; intrinsics that are not given follow from the image.
+    Errors begin with `where`."""
     try:
         if "w" in record and "h" in record:
             width, height = float(record["w"]), float(record["h"])
@@ -225,15 +222,9 @@ def _transforms_camera(
         )
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0, 0, 0, 1]])
-    if pose.shape != (4, 4) or not np.isfinite(pose).all() or not np.isfinite(distortion).all():
-        raise InputError(
-            f"{where} has a pose or distortion that is not finite, or no 4x4 matrix; correct it"
-        )
-    try:
-        camera = Camera(K, width, height, opencv_from_opengl(pose))  # type: ignore[arg-type]
-        return camera, distortion
-    except (np.linalg.LinAlgError, InputError) as error:
-        raise InputError(f"{where}: {error}; correct the pose") from None
+    if not np.isfinite(distortion).all():
+        raise InputError(f"{where} has a distortion that is not finite; correct it")
+    return posed_camera(where, K, width, height, pose), distortion
 
 
 def _read_colmap(model: Path, images: Path) -> Source:

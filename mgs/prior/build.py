@@ -26,7 +26,7 @@ from mgs.errors import InputError
 from mgs.files import atomic_path, new_folder, read_json, write_json
 from mgs.prior.hull import MOST_PIXELS
 from mgs.prior.photographs import Surface, check_masks, source_of, surface_of
-from mgs.prior.resolution import Resolution, resolution
+from mgs.prior.resolution import resolution
 from mgs.prior.segmentation import SegmentedCloud, segment_dataset
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import poisson_mesh, sample_surface, spread_first
@@ -89,9 +89,10 @@ def build_prior(
     tolerance = max(3 * residual, cell, 2 * noise)
     mesh = _seen_by(mesh, dataset.frames, tolerance)
     cameras = [frame.camera for frame in dataset.frames]
-    resolved = resolution(mesh, cameras) if settings.resolved_by_cameras else None
-    pixel = cell if chosen == "depth" else _pixel(cameras, mesh.vertices.mean(0))
-    samples, normals, spacing, backed = _samples(mesh, settings, resolved, pixel)
+    middle = mesh.vertices.mean(0)
+    pixels = [np.linalg.norm(camera.position - middle) / camera.K[0, 0] for camera in cameras]
+    pixel = cell if chosen == "depth" else float(np.median(pixels))
+    samples, normals, spacing, sampled = _samples(mesh, settings, cameras, pixel)
     upward = up if up is not None and up != "auto" else dataset.up
     numbers = {"from": chosen, "frames": len(dataset.frames), **surface.numbers}
     if segmented is not None and plane is not None:
@@ -102,8 +103,7 @@ def build_prior(
             "plane_tolerance": plane.tolerance,
             "plane_normal": plane.normal.tolist(),
         }
-    numbers |= {"fit_rms": residual, "depth_tolerance": tolerance}
-    numbers |= _sample_numbers(mesh, samples, spacing, backed, resolved)
+    numbers |= {"fit_rms": residual, "depth_tolerance": tolerance, **sampled}
     numbers |= {"up": list(upward), "unit": dataset.unit, "settings": asdict(settings)}
     truth = dataset.root / "rock.glb"
     if truth.is_file() and chosen == "depth" and segmented is not None:
@@ -111,7 +111,8 @@ def build_prior(
         numbers["truth"] = error_to_truth(
             samples, spacing, mesh, truth, dataset.frames, segmented, settings.seed
         )
-    return Prior(mesh, samples, normals, spacing, tolerance, numbers, backed, upward), segmented
+    prior = Prior(mesh, samples, normals, spacing, tolerance, numbers, sampled["backed"], upward)
+    return prior, segmented
 
 
 def _depth_surface(
@@ -139,19 +140,16 @@ def _depth_surface(
     return Surface(mesh, cloud.voxel, segmented, numbers)
 
 
-def _pixel(cameras: Sequence[Camera], point: np.ndarray) -> float:
-    """Median size of a pixel at a point [3], units of the world."""
-    return float(np.median([np.linalg.norm(c.position - point) / c.K[0, 0] for c in cameras]))
-
-
 def _samples(
-    mesh: Mesh, settings: PriorSettings, resolved: Resolution | None, pixel: float
-) -> tuple[np.ndarray, np.ndarray, float, int]:
-    """Samples of a surface: points [N,3], unit normals [N,3], spacing in metres, number backed.
+    mesh: Mesh, settings: PriorSettings, cameras: Sequence[Camera], pixel: float
+) -> tuple[np.ndarray, np.ndarray, float, dict[str, Any]]:
+    """Samples of a surface: points [N,3], unit normals [N,3], spacing in metres, and items of
+    prior.json about mesh and samples; square metres, metres.
 
-    resolved: sets the spacing if given. pixel: unit of `settings.density`, metres. Raises
-    InputError as `sample_surface`.
+    cameras: set the spacing if the settings do not. pixel: unit of `settings.density`, metres.
+    Raises InputError as `resolution` and `sample_surface`.
     """
+    resolved = resolution(mesh, cameras) if settings.resolved_by_cameras else None
     asked, share = settings.gaussians, settings.backing
     total = asked if isinstance(asked, int) else None
     count = None if total is None else total - round(total * share / (1 + share))
@@ -163,15 +161,9 @@ def _samples(
     points, normals, spacing = sample_surface(mesh, seed, count=count, spacing=spacing)
     backed = round(share * len(points)) if total is None else total - len(points)
     order = spread_first(points, backed, spacing)
-    return points[order], normals[order], spacing, backed
-
-
-def _sample_numbers(
-    mesh: Mesh, points: np.ndarray, spacing: float, backed: int, resolved: Resolution | None
-) -> dict[str, Any]:
-    """Items of prior.json about the mesh and its samples [N,3]; square metres, metres."""
+    points = points[order]
     nearest = cKDTree(points).query(points, 2)[0][:, 1]
-    return {
+    numbers = {
         "mesh_faces": len(mesh.faces),
         "mesh_area": float(mesh.areas.sum()),
         "sampled_area": float(mesh.areas[mesh.seen].sum()),
@@ -182,6 +174,7 @@ def _sample_numbers(
         "nearest_neighbour_min": float(nearest.min()),
         **({} if resolved is None else {"resolution": asdict(resolved)}),
     }
+    return points, normals[order], spacing, numbers
 
 
 def prior_from_mesh(
@@ -204,19 +197,18 @@ def prior_from_mesh(
             f"{path}: a density counts by the voxels of a cloud, which a mesh has not; "
             "give a number or a spacing"
         )
-    resolved = resolution(mesh, cameras) if settings.resolved_by_cameras else None
-    points, normals, spacing, backed = _samples(mesh, settings, resolved, 0.0)
+    points, normals, spacing, sampled = _samples(mesh, settings, cameras, 0.0)
     used = {key: getattr(settings, key) for key in ("gaussians", "spacing", "seed", "backing")}
     numbers = {
         "from": "mesh",
         "mesh": str(path),
         "depth_tolerance": spacing,
-        **_sample_numbers(mesh, points, spacing, backed, resolved),
+        **sampled,
         "up": list(up),
         "unit": unit,
         "settings": used,
     }
-    return Prior(mesh, points, normals, spacing, spacing, numbers, backed, up)
+    return Prior(mesh, points, normals, spacing, spacing, numbers, sampled["backed"], up)
 
 
 def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,40 @@ LIGHT = np.array([-0.5, 0.4, 0.77])
 """Direction to the light in picture coordinates, about unit."""
 
 
+@dataclass(frozen=True)
+class _View:
+    """A view for panels. axes: [3,3], rows are the axes of picture coordinates; centre: [3] world,
+    in the middle of a panel; reach: half the width of a panel, metres."""
+
+    axes: np.ndarray
+    centre: np.ndarray
+    reach: float
+
+    def picture(self, points: np.ndarray) -> np.ndarray:
+        """Points [N,3] in picture coordinates."""
+        return (points - self.centre) @ self.axes.T
+
+    def frame(self, axis, zoom: float = 1) -> None:
+        """Set the limits of a panel, `zoom` times as wide as usual."""
+        limits = (-zoom * self.reach, zoom * self.reach)
+        axis.set(xlim=limits, ylim=limits, aspect="equal", xticks=[], yticks=[])
+
+    def dots(self, axis, points: np.ndarray, colour: np.ndarray, zoom: float, size: float) -> None:
+        """Draw world points [N,3], nearest last, as dots of `size` square points.
+
+        colour: RGB [N,3], or values [N] for a colour map.
+        """
+        points = self.picture(points)
+        if len(points) > MAX_DOTS:
+            chosen = np.random.default_rng(0).choice(len(points), MAX_DOTS, replace=False)
+            points, colour = points[chosen], colour[chosen]
+        order = np.argsort(points[:, 2])
+        x, y = points[order, :2].T
+        cmap = "viridis" if colour.ndim == 1 else None
+        axis.scatter(x, y, c=colour[order], cmap=cmap, s=size, linewidths=0, rasterized=True)
+        self.frame(axis, zoom)
+
+
 def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None) -> None:
     """Write the figure of a prior as a PNG, atomically.
 
@@ -35,30 +70,30 @@ def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None)
     import matplotlib
 
     plane = None if segmented is None else segmented.plane
-    frame = _oblique(np.array(prior.up) if plane is None else plane.normal)
-    body = prior.mesh.vertices
-    centre = (body.min(0) + body.max(0)) / 2
+    up, body = np.array(prior.up), prior.mesh.vertices
     reach = 0.5 * float(np.linalg.norm(np.ptp(body, axis=0)))
+    axes_of_view = _oblique(up if plane is None else plane.normal)
+    view = _View(axes_of_view, (body.min(0) + body.max(0)) / 2, reach)
     truth = prior.numbers.get("truth")
     error = f", accuracy {1e3 * truth['accuracy']:.2f} mm" if truth else ""
     unseen = "" if prior.mesh.seen.all() else "\nblue: seen by no frame, not sampled"
-    normals = prior.normals @ frame.T
+    normals = prior.normals @ view.axes.T
     towards = normals[:, 2] > 0
     shade = _lambert(normals[towards]) * [0.95, 0.85, 0.7]
-    dots = ((prior.points - centre) @ frame.T)[towards]
+    dot = float(np.clip(60_000 / max(len(shade), 1), 1, 12))
     metres = prior.numbers.get("unit", "m") == "m"
     spacing = f"{1e3 * prior.spacing:.2f} mm" if metres else f"{prior.spacing:.3g} units"
-    samples = f"samples: N = {len(prior.points):,} = area / spacing²\nspacing {spacing}"
+    area = f"{prior.numbers['mesh_area']:.2f} {'m' if metres else 'unit'}²"
     with matplotlib.rc_context(STYLE | FRAMED):
         figure = new_figure(17 if segmented is not None else 7, 4.2, dpi=100)
         axes = figure.subplots(1, 5 if segmented is not None else 2)
         if segmented is not None:
-            _cloud_panels(axes[:3], segmented, np.array(prior.up), frame, centre, reach)
-        _shaded_mesh(axes[-2], prior.mesh, frame, centre, reach)
-        area = f"{prior.numbers['mesh_area']:.2f} {'m' if metres else 'unit'}²"
+            _cloud_panels(axes[:3], view, segmented, up)
+        _shaded_mesh(axes[-2], view, prior.mesh)
         axes[-2].set_title(f"mesh, {area}{error}{unseen}")
-        _dots(axes[-1], dots, shade, None, reach, None)
-        axes[-1].set_title(samples)
+        view.dots(axes[-1], prior.points[towards], shade, 1, dot)
+        samples = f"samples: N = {len(prior.points):,} = area / spacing²"
+        axes[-1].set_title(f"{samples}\nspacing {spacing}")
         save_figure(figure, path)
 
 
@@ -80,26 +115,15 @@ def draw_refused(path: str | Path, points: np.ndarray, kept: np.ndarray, up: np.
         figure = new_figure(7, 4.2, dpi=100)
         views = {"from the side": oblique, "from above": above}
         taken = f"{int(kept.sum()):,} taken for the object (blue)"
-        for axis, (name, frame) in zip(figure.subplots(1, 2), views.items(), strict=True):
-            _dots(axis, (points - middle) @ frame.T, tint, None, 2 * reach, 1.5)
+        for axis, (name, axes) in zip(figure.subplots(1, 2), views.items(), strict=True):
+            _View(axes, middle, reach).dots(axis, points, tint, 2, 1.5)
             axis.set_title(f"{name}: {len(points):,} points,\n{taken}")
         save_figure(figure, path)
 
 
-def _cloud_panels(
-    axes,
-    segmented: SegmentedCloud,
-    up: np.ndarray,
-    frame: np.ndarray,
-    centre: np.ndarray,
-    reach: float,
-) -> None:
+def _cloud_panels(axes, view: _View, segmented: SegmentedCloud, up: np.ndarray) -> None:
     """Draw three panels: the cloud, its points on the ground plane (or, without one, not the
-    rock's), and the rock's.
-
-    up: [3] unit, for heights without a plane. frame: as `_oblique`; centre: [3] world; reach: half
-    the width of the rock in the picture; metres.
-    """
+    rock's), and the rock's. up: [3] unit, for heights without a plane."""
     cloud, rock, ground = segmented.cloud.points, segmented.rock_points, segmented.ground
     if segmented.plane is None:
         height = cloud @ up - np.min(rock @ up)
@@ -107,16 +131,15 @@ def _cloud_panels(
     else:
         height = segmented.plane.height(cloud)
         other, named = ground, f"ground plane: {int(ground.sum()):,} inliers"
-    near = np.linalg.norm(cloud - centre, axis=1) < 4 * reach
-    title = f"cloud: {len(cloud):,} points\ncoloured by height"
-    colour = np.where(other[near][:, None], TAN, BLUE)
+    near = np.linalg.norm(cloud - view.centre, axis=1) < 4 * view.reach
+    tint = np.where(other[near][:, None], TAN, BLUE)
     panels = [
-        (title, cloud[near], height[near], "viridis", 2.2),
-        (f"{named} (tan)\nthe rest in blue", cloud[near], colour, None, 2.2),
-        (f"rock cluster: {len(rock):,} points", rock, rock @ up, "viridis", 1.0),
+        (f"cloud: {len(cloud):,} points\ncoloured by height", cloud[near], height[near], 2.2),
+        (f"{named} (tan)\nthe rest in blue", cloud[near], tint, 2.2),
+        (f"rock cluster: {len(rock):,} points", rock, rock @ up, 1.0),
     ]
-    for axis, (title, points, value, colours, zoom) in zip(axes, panels, strict=True):
-        _dots(axis, (points - centre) @ frame.T, value, colours, zoom * reach, 0.8)
+    for axis, (title, points, colour, zoom) in zip(axes, panels, strict=True):
+        view.dots(axis, points, colour, zoom, 0.8)
         axis.set_title(title)
 
 
@@ -133,34 +156,11 @@ def _oblique(up: np.ndarray) -> np.ndarray:
     return np.stack([right, np.cross(towards, right), towards])
 
 
-def _dots(
-    axis,
-    points: np.ndarray,
-    colour: np.ndarray,
-    colours: str | None,
-    reach: float,
-    size: float | None,
-) -> None:
-    """Draw points [N,3] in picture coordinates, nearest last.
-
-    colour: values [N] for the colour map `colours`, or RGB [N,3]; reach: half the width of the
-    panel, metres; size: of a dot, square points, None to choose it by their number.
-    """
-    if len(points) > MAX_DOTS:
-        chosen = np.random.default_rng(0).choice(len(points), MAX_DOTS, replace=False)
-        points, colour = points[chosen], colour[chosen]
-    order = np.argsort(points[:, 2])
-    size = float(np.clip(60_000 / max(len(points), 1), 0.3, 12)) if size is None else size
-    x, y = points[order, :2].T
-    axis.scatter(x, y, c=colour[order], cmap=colours, s=size, linewidths=0, rasterized=True)
-    axis.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xticks=[], yticks=[])
-
-
-def _shaded_mesh(axis, mesh: Mesh, frame: np.ndarray, centre: np.ndarray, reach: float) -> None:
+def _shaded_mesh(axis, view: _View, mesh: Mesh) -> None:
     """Draw the front faces of a mesh, Lambert shaded, nearest last; unseen ones in blue."""
     from matplotlib.collections import PolyCollection
 
-    vertices = (mesh.vertices - centre) @ frame.T
+    vertices = view.picture(mesh.vertices)
     corners, normal = vertices[mesh.faces], face_crosses(vertices, mesh.faces)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
     front = np.flatnonzero(normal[:, 2] > 0)
@@ -171,7 +171,7 @@ def _shaded_mesh(axis, mesh: Mesh, frame: np.ndarray, centre: np.ndarray, reach:
         corners[front, :, :2], facecolors=shade, edgecolors=shade, linewidths=0.2, rasterized=True
     )
     axis.add_collection(faces)
-    axis.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xticks=[], yticks=[])
+    view.frame(axis)
 
 
 def _lambert(normals: np.ndarray) -> np.ndarray:

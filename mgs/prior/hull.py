@@ -48,11 +48,11 @@ AGREEMENT = 0.8
 @dataclass(frozen=True)
 class Hull:
     """A visual hull. mesh: closed surface, world; cell: finest grid cell, units of the world;
-    agreement: share of each frame's mask that the hull fills."""
+    numbers: items of prior.json, with mean and least share of a mask that the hull fills."""
 
     mesh: Mesh
     cell: float
-    agreement: np.ndarray
+    numbers: dict[str, float]
 
 
 def visual_hull(
@@ -68,13 +68,12 @@ def visual_hull(
     on_stage("visual hull")
     views = [_view(frame) for frame in frames]
     lo, edge = _bounds(frames)
-    cells = COARSE
-    field, carved = _first_grid(views, lo, edge)
+    cells, side = COARSE, np.arange(COARSE + 1)
+    nodes = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1)
+    points = lo + edge / cells * nodes.reshape(-1, 3)
+    field = _inside(views, points, 2 * NEAR_SURFACE * edge / cells).reshape(nodes.shape[:3])
     if field.max() <= 0:
-        kept = np.unravel_index(np.argmin(carved), carved.shape)
-        point = (lo + edge / cells * np.array(kept))[None]
-        values = zip(frames, (view(point)[0] for view in views), strict=True)
-        against = [frame.name for frame, value in values if not 0 < value < np.inf]
+        against = _against(frames, views, points)
         raise InputError(
             f"prior: the masks share no point of space (at best {len(against)} of {len(frames)} "
             f"frames, such as {against[0]}, are against it); poses and masks do not fit, "
@@ -90,7 +89,9 @@ def visual_hull(
     vertices, faces, _, _ = marching_cubes(solid, 0.0, gradient_direction="ascent")
     vertices = lo + cell * (vertices.astype(np.float64) - 1)
     mesh = Mesh(vertices, faces.astype(np.int64), np.ones(len(faces), bool))
-    return Hull(mesh, cell, _checked_agreement(frames, views, mesh))
+    filled = _checked_agreement(frames, views, mesh)
+    share = {"hull_fills_masks": np.nanmean(filled), "hull_fills_least": np.nanmin(filled)}
+    return Hull(mesh, cell, {"hull_cell": cell} | {key: float(share[key]) for key in share})
 
 
 @dataclass(frozen=True)
@@ -178,22 +179,18 @@ def _inside(views: Sequence[_View], points: np.ndarray, reach: float) -> np.ndar
     return np.where(outside, -reach, np.minimum(least, reach)).astype(np.float32)
 
 
-def _first_grid(
-    views: Sequence[_View], lo: np.ndarray, edge: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Values of the nodes of the coarse grid, and how many views carve each, [n,n,n] with n =
-    COARSE + 1; all views if fewer than LEAST_VIEWS have the node in their image."""
-    nodes = np.stack(np.meshgrid(*[np.arange(COARSE + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    points = lo + edge / COARSE * nodes
+def _against(frames: Sequence[Frame], views: Sequence[_View], points: np.ndarray) -> list[str]:
+    """Names of the frames whose mask does not contain the one of points [N,3] that the fewest
+    frames carve."""
     carved, count = np.zeros(len(points), int), np.zeros(len(points), int)
     for view in views:
         value = view(points)
         carved += value <= 0
         count += np.isfinite(value)
     carved[count < min(LEAST_VIEWS, len(views))] = len(views)
-    shape = (COARSE + 1,) * 3
-    field = _inside(views, points, 2 * NEAR_SURFACE * edge / COARSE)
-    return field.reshape(shape), carved.reshape(shape)
+    best = points[[np.argmin(carved)]]
+    values = [view(best)[0] for view in views]
+    return [f.name for f, value in zip(frames, values, strict=True) if not 0 < value < np.inf]
 
 
 def _refined(field: np.ndarray) -> np.ndarray:

@@ -1,10 +1,9 @@
 """Initial Gaussians from the prior and some frames (paper, section III-A), with an opaque backing.
 
-No image asks for an opaque surface. With one layer of Gaussians, as in the paper, bright patches
-become transparent, and the far side of the rock shines through, a different part in every camera.
-The mesh prior knows that the rock is solid. So every second Gaussian on the surface has a larger,
-opaque one a spacing behind it; all are fitted alike, and what shines through is the rock's own
-colour. docs/fit.md has the measurements.
+Images do not require an opaque surface. With one layer of Gaussians, as in the paper, bright
+patches become transparent, and the far side of the rock shows through, a different part in every
+camera. So every second Gaussian on the surface has a larger, opaque one a spacing behind it, which
+shows the rock's own colour there. All are fitted alike. docs/fit.md has the measurements.
 """
 
 from __future__ import annotations
@@ -71,15 +70,16 @@ def initial_gaussians(
     gains: np.ndarray | None = None,
     colours: Callable[[Frame], Colours] | None = None,
 ) -> tuple[Gaussians, np.ndarray]:
-    """One flat Gaussian per sample of a prior, in its mean colour, then one behind each backed
-    sample.
+    """Place one flat Gaussian per sample of a prior, in its mean colour, then one behind each
+    backed sample.
 
-    A frame sees a sample that lies in its rock mask, faces the camera and agrees with the depth
-    image (or the depth of the mesh, without one) up to `prior.depth_tolerance` and the slope. A
-    sample that no frame sees is grey. inset: depth below the sample, over `pixel_on`. gains: [V,3]
-    exposures that divide the colours (`mgs.prior.exposure`). colours: `colours_of` the prior, if
-    kept between calls. Returns (N + backed Gaussians of degree 0, seen [N] bool). Raises InputError
-    if a file of a frame cannot be read, and as `mesh_depth`.
+    inset: depth below the sample, over `pixel_on`. gains: [V,3] exposures that divide the colours
+    (`mgs.prior.exposure`). colours: `colours_of` the prior, if kept between calls.
+
+    Returns (N + backed Gaussians of degree 0, seen [N] bool). A frame sees a sample that lies in
+    its rock mask, faces the camera and agrees with the depth image (or else the mesh's depth) up to
+    `prior.depth_tolerance` and the slope. A sample that no frame sees is grey. Raises InputError if
+    a file of a frame cannot be read, and as `mesh_depth`.
     """
     n = len(prior.points)
     total, count = np.zeros((n, 3)), np.zeros(n)
@@ -170,8 +170,10 @@ def sees(
 def seen_colours(
     points: np.ndarray, normals: np.ndarray, frame: Frame, depth: np.ndarray, tolerance: float
 ) -> Colours:
-    """Which surface points [N] a frame `sees`, and the colours of these, [seen,3] linear RGB.
-    Raises InputError if a file cannot be read."""
+    """Mask [N] of the surface points that a frame `sees`, and their colours, [seen,3] linear RGB.
+
+    Raises InputError if a file cannot be read.
+    """
     seen = sees(points, normals, frame, depth, tolerance)
     pixels, _ = frame.camera.project(points[seen])
     at, rgb = [pixels[:, 1] - 0.5, pixels[:, 0] - 0.5], frame.rgb()

@@ -74,14 +74,14 @@ def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = 
         "points": points is not None or (dataset.root / CLOUD).is_file(),
         "hull": has_masks(dataset.frames),
     }
-    if asked is None:
-        available = (name for name, there in has.items() if there)
-        asked = "points" if points is not None else next(available, None)
-    if asked is not None and has.get(asked):
+    there = [name for name, is_there in has.items() if is_there]
+    if asked is None and there:
+        asked = "points" if points is not None else there[0]
+    if asked in there:
         return asked
-    lacks = {"depth": "no depth images", "points": f"no points ({CLOUD})", "hull": "no masks"}
     if asked not in (None, *SOURCES):
         raise InputError(f"--from {asked!r}: is unknown; choose one of {', '.join(SOURCES)}")
+    lacks = {"depth": "no depth images", "points": f"no points ({CLOUD})", "hull": "no masks"}
     missing = lacks.get(asked, "no mesh of its own") if asked else " and ".join(lacks.values())
     ways = {
         "depth": "import data with depth",
@@ -89,9 +89,9 @@ def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = 
         "points": "give --points CLOUD.ply",
         "mesh": "give --mesh MESH",
     }
-    there = [f"take --from {name}" for name, is_there in has.items() if is_there]
-    open_ways = there + [way for name, way in ways.items() if not has.get(name)]
-    raise InputError(f"{dataset.root}: has {missing}; {', or '.join(open_ways)}")
+    cures = [f"take --from {name}" for name in there]
+    cures += [way for name, way in ways.items() if name not in there]
+    raise InputError(f"{dataset.root}: has {missing}; {', or '.join(cures)}")
 
 
 def check_photographs(frames: Sequence[Frame]) -> None:
@@ -135,7 +135,7 @@ def surface_of(
     if source == "hull":
         settings.refuse_shaping("a hull is carved from masks")
         carved = visual_hull(dataset.frames, on_stage)
-        return Surface(carved.mesh, carved.cell, None, _hull_numbers(carved))
+        return Surface(carved.mesh, carved.cell, None, dict(carved.numbers))
     cloud = read_cloud(points or dataset.root / CLOUD)
     segmented = segment_points(cloud, dataset, settings, on_stage)
     hull = visual_hull(dataset.frames, on_stage) if has_masks(dataset.frames) else None
@@ -146,8 +146,9 @@ def surface_of(
     except NoSurface:
         raise
     except InputError as error:
-        kept = _same_rows(segmented.cloud.points, segmented.rock_points)
-        raise NoSurface(str(error), segmented.cloud.points, kept) from None
+        points_kept = segmented.cloud.points
+        kept = cKDTree(segmented.rock_points).query(points_kept)[0] == 0
+        raise NoSurface(str(error), points_kept, kept) from None
     numbers = {
         "points": len(cloud.points),
         "points_kept": len(segmented.cloud.points),
@@ -156,7 +157,7 @@ def surface_of(
         "cloud_spacing": spacing,
         "poisson_depth": depth,
     }
-    numbers |= {} if hull is None else _hull_numbers(hull)
+    numbers |= {} if hull is None else hull.numbers
     return Surface(mesh, spacing, segmented, numbers)
 
 
@@ -207,16 +208,3 @@ def _thinned(mesh: Mesh, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     kept = length[:, 0] > 1e-6
     return points[kept], (normals / np.maximum(length, 1e-12))[kept]
-
-
-def _hull_numbers(hull: Hull) -> dict[str, Any]:
-    return {
-        "hull_cell": hull.cell,
-        "hull_fills_masks": float(np.nanmean(hull.agreement)),
-        "hull_fills_least": float(np.nanmin(hull.agreement)),
-    }
-
-
-def _same_rows(points: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """Which of points [N,3] are rows of `part`, bool [N]."""
-    return cKDTree(part).query(points)[0] == 0

@@ -61,9 +61,18 @@ class Plane:
     sigma: float
     tolerance: float
 
+    @classmethod
+    def from_estimate(cls, points: np.ndarray) -> Plane:
+        """Least-squares plane of points [N,3], for skimage.measure.ransac; sigma, tolerance 0."""
+        centre = points.mean(0)
+        normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
+        return cls(normal, float(normal @ centre), 0.0, 0.0)
+
     def height(self, points: np.ndarray) -> np.ndarray:
         """Signed distance of points [N,3] from the plane [N], metres."""
         return points @ self.normal - self.offset
+
+    residuals = height
 
 
 class NoSurface(InputError):
@@ -72,24 +81,6 @@ class NoSurface(InputError):
     def __init__(self, message: str, points: np.ndarray, kept: np.ndarray) -> None:
         super().__init__(message)
         self.points, self.kept = points, kept
-
-
-class _PlaneModel:
-    """A plane, as a model for skimage.measure.ransac."""
-
-    def __init__(self, normal: np.ndarray, offset: float) -> None:
-        self.normal, self.offset = normal, offset
-
-    @classmethod
-    def from_estimate(cls, points: np.ndarray) -> _PlaneModel:
-        """Least-squares plane of points [N,3]."""
-        centre = points.mean(0)
-        normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
-        return cls(normal, float(normal @ centre))
-
-    def residuals(self, points: np.ndarray) -> np.ndarray:
-        """Signed distances [N] of points [N,3]."""
-        return points @ self.normal - self.offset
 
 
 def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
@@ -112,7 +103,7 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
         raise InputError(
             f"cloud: only {len(sample)} points; too few for a plane, give more depth frames"
         )
-    model, inliers = ransac(sample, _PlaneModel, 3, tolerance, max_trials=300, rng=rng)
+    model, inliers = ransac(sample, Plane, 3, tolerance, max_trials=300, rng=rng)
     share = 0.0 if inliers is None else float(np.mean(inliers))
     if share < PLANE_MIN_SHARE:
         raise InputError(
@@ -131,7 +122,7 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
         spread = np.abs(residual[core] - np.median(residual[core]))
         sigma = SIGMA_FROM_MAD * float(np.median(spread))
         tolerance = min(tolerance, max(3 * sigma, 2 * cloud.voxel))
-        model = _PlaneModel.from_estimate(around[core & (np.abs(residual) < tolerance)])
+        model = Plane.from_estimate(around[core & (np.abs(residual) < tolerance)])
     cameras = np.stack([frame.camera.position for frame in frames])
     sign = 1.0 if np.median(cameras @ model.normal) > model.offset else -1.0
     return Plane(sign * model.normal, sign * model.offset, sigma, tolerance)
@@ -144,14 +135,14 @@ def rock_cluster(
     name: str = "cloud",
     weight: Callable[[np.ndarray], np.ndarray] = lambda points: np.ones(len(points)),
 ) -> tuple[np.ndarray, float, int]:
-    """Which points above the ground [N,3] are the rock, by DBSCAN (Ester et al. 1996,
+    """Find the rock among points above the ground [N,3], by DBSCAN (Ester et al. 1996,
     scikit-learn).
 
-    voxel: distance between neighbours; target: [3] what the cameras look at; metres. name: of the
-    cloud, for messages. weight: points [N,3] -> [N], what each counts. The rock is the cluster that
-    counts most, or of several nearly as large ones (EQUAL_SIZE) the nearest to the target. Returns
-    (inside [N] bool, eps in metres, number of clusters). Raises InputError if there is no cluster,
-    or two are equally large and about equally near.
+    voxel: distance between neighbours, metres. target: [3] point that the cameras look at, metres.
+    name: of the cloud, for messages. weight: points [N,3] -> weights [N]. The rock is the cluster
+    of largest weight, or of several nearly as large ones (EQUAL_SIZE) the nearest to the target.
+    Returns (inside [N] bool, eps in metres, number of clusters). Raises InputError if there is no
+    cluster, or two are equally large and about equally near.
     """
     from sklearn.cluster import DBSCAN
 

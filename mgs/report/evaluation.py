@@ -220,12 +220,14 @@ def evaluate_run(
     """Evaluate a run of `mgs nbv` on its dataset and its test views; write RUN/metrics.json and,
     with `pictures`, RUN/renders. Returns the contents of metrics.json.
 
-    run: folder or opened run. convergence: measure how far the last fit is from its minimum, too
-    (entry "fit": `mgs.report.convergence.remaining_decrease`). Of an on-demand dataset only frames
-    that the run has taken have an image, so none is held out. Metrics and pictures of this very
-    model, dataset and version of mgs are kept. say: called with the metrics that are left out
-    because there is no truth for them, and with what was written and kept. Raises InputError as
-    `open_run`, if the test views cannot be read, and if another process works on the run.
+    run: folder or opened run. convergence: also predict how far the last fit is from its minimum
+    (entry "fit": `mgs.report.convergence.remaining_decrease`). say: called with lines for the user:
+    metrics left out for want of a truth, files written and kept.
+
+    Metrics and pictures of the same model, dataset and version of mgs are kept, not made again. In
+    an on-demand dataset only frames that the run has taken have an image, so none is held out.
+    Raises InputError as `open_run`, if the test views cannot be read, and if another process works
+    on the run.
     """
     run = run if isinstance(run, Run) else open_run(run)
     file, folder = run.folder / "metrics.json", run.folder / "renders"

@@ -18,7 +18,6 @@ import numpy as np
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.up import upright
 from mgs.files import atomic_path
-from mgs.report.figures import Curves
 from mgs.report.page_facts import (
     Shown,
     links,
@@ -26,6 +25,7 @@ from mgs.report.page_facts import (
     measured_views,
     read_shown,
     setting_rows,
+    step_facts,
     summary_rows,
 )
 from mgs.report.page_pictures import (
@@ -37,9 +37,8 @@ from mgs.report.page_pictures import (
     draw_taken,
     new_album,
 )
-from mgs.report.page_plots import line_plot, metric_name, orbit_plot, timing_plot, views_plot
-from mgs.report.runs import RunFiles, compare_runs
-from mgs.report.tables import table_cell
+from mgs.report.page_plots import METRIC_NAMES, line_plot, orbit_plot, timing_plot, views_plot
+from mgs.report.runs import RunFiles, compare_runs, least_trained, step_curves
 
 COMPARED = 6
 """Most views of the dataset, and most test views, on which truth and renders are compared."""
@@ -66,7 +65,7 @@ def write_page(
         title=", ".join(compared.runs),
         dataset=dataset.root.resolve().name,
         shown=shown,
-        summary=summary_rows(shown),
+        summary=summary_rows(shown, dataset),
         settings=setting_rows(shown),
         files=[(one.label, links(one.run, path)) for one in shown],
         data={
@@ -129,11 +128,8 @@ def draw_pictures(
 def compared_frames(runs: Sequence[RunFiles], dataset: Dataset) -> list[Frame]:
     """Frames on which the page compares truth and renders: up to COMPARED that the fewest runs were
     trained on, spread evenly, and as many test views, named `test/NAME`."""
-    taken = [{dataset.frames[i].name for i in run.taken} for run in runs]
-    there = dataset.with_images(set.union(*taken))
-    counts = [sum(frame.name in names for names in taken) for frame in there]
-    pool = [frame for frame, count in zip(there, counts, strict=True) if count == min(counts)]
-    tests = dataset.test_views()
+    there = dataset.with_images({dataset.frames[i].name for run in runs for i in run.taken})
+    pool, tests = least_trained(runs, dataset, there), dataset.test_views()
     frames = () if tests is None else tests.frames
     return [*_spread(pool), *_spread([replace(f, name=f"test/{f.name}") for f in frames])]
 
@@ -146,16 +142,11 @@ def _spread(frames: Sequence[Frame]) -> list[Frame]:
 
 def _section(one: Shown, dataset: Dataset) -> dict[str, Any]:
     """Section of one run: its views in the order they were taken, orbit, and times."""
-    run, cameras = one.run, [frame.camera for frame in dataset.frames]
-    names = [frame.name for frame in dataset.frames]
-    orbit = orbit_plot(
-        one.label, cameras, names, run.seeds, run.chosen, one.model, one.up, one.unit
-    )
     return {
         "label": one.label,
         "views": [_view(one, k) for k in range(len(one.frames))],
-        "orbit": orbit,
-        "time": timing_plot(one.label, run.steps),
+        "orbit": orbit_plot(one.label, one.run, dataset, one.model, one.up),
+        "time": timing_plot(one.label, one.run.steps),
     }
 
 
@@ -165,12 +156,9 @@ def _view(one: Shown, k: int) -> dict[str, Any]:
     frame, seeds = one.frames[k], len(one.run.seeds)
     step = one.run.steps[max(0, k - seeds + 1)]
     role = f"seed {k + 1} of {seeds}" if k < seeds else f"step {step['step']}"
-    facts = [("view", frame.name), ("taken as", role), ("images so far", str(k + 1))]
-    if k >= seeds:
-        facts.append(("information gain", f"{step['information_gain']:.4g}"))
-    if k >= seeds - 1:  # of the seeds, the coverage is known after the last
-        facts.append(("surface coverage", f"{100 * step['coverage']:.2f} %"))
-        facts += [(metric_name(key), table_cell(key, v)) for key, v in measured(step).items()]
+    facts = [("view", frame.name), ("taken as", role)]
+    # The numbers are known after the last of the seeds.
+    facts += step_facts(step) if k >= seeds - 1 else [("images", str(k + 1))]
     pictures = [] if one.model is None else _pictures(one, frame.name, k + 1)
     eye = (upright(one.up) @ frame.camera.position).tolist()
     return {"name": frame.name, "facts": facts, "pictures": pictures, "eye": eye}
@@ -226,13 +214,14 @@ def _compared(shown: Sequence[Shown], frame: Frame) -> dict[str, Any]:
 def _plots(shown: Sequence[Shown]) -> list[dict[str, Any]]:
     """Plots that compare runs: the paper's figures, and every metric that was measured after steps
     or of views."""
-    covered = _curves(shown, "coverage", 100)
+    runs = {one.label: one.run for one in shown}
+    covered = step_curves(runs, "coverage", 100)
     added = {
         label: (x[1:], [b - a for a, b in pairwise(y)])
         for label, (x, y) in covered.items()
         if len(y) > 1
     }
-    gain, left = _curves(shown, "information_gain"), _curves(shown, "uncertainty")
+    gain, left = step_curves(runs, "information_gain"), step_curves(runs, "uncertainty")
     wanted = [
         ("Information gain of each chosen view (the paper's Fig. 2)", gain, "gain, Eq. 7", True),
         ("Surface coverage (Fig. 3)", covered, "coverage (%)", False),
@@ -240,32 +229,18 @@ def _plots(shown: Sequence[Shown]) -> list[dict[str, Any]]:
         ("Variance left, over that of the prior", left, "mean over all parameters", True),
     ]
     for key in dict.fromkeys(key for one in shown for s in one.run.steps for key in measured(s)):
-        name = metric_name(key)
-        wanted.append((f"{name} after each step", _curves(shown, key), name, False))
-    loss = _curves(shown, "loss")
+        name = METRIC_NAMES[key]
+        wanted.append((f"{name} after each step", step_curves(runs, key), name, False))
+    loss = step_curves(runs, "loss")
     wanted.append(("Loss at the end of each fit", loss, "mean squared error", True))
-    plots = [
-        line_plot(title, found, "images", y, zero) for title, found, y, zero in wanted if found
-    ]
-    views = {one.label: measured_views(one) for one in shown if one.metrics is not None}
+    plots = [line_plot(title, found, y, zero) for title, found, y, zero in wanted if found]
+    views = {one.label: measured_views(one.run) for one in shown if one.run.measured}
     if views:
         masked = all(
             any(view.get("psnr_mask") is not None for view in of_run) for of_run in views.values()
         )
         plots.append(views_plot("psnr_mask" if masked else "psnr", views))
     return plots
-
-
-def _curves(shown: Sequence[Shown], key: str, factor: float = 1.0) -> Curves:
-    """A number or metric of the steps of each run, times a factor, against the number of images;
-    without runs that have none."""
-    curves = {}
-    for one in shown:
-        values = [(s["images"], (s | measured(s)).get(key)) for s in one.run.steps]
-        points = [(x, factor * y) for x, y in values if y is not None]
-        if points:
-            curves[one.label] = ([x for x, _ in points], [y for _, y in points])
-    return curves
 
 
 def _fill_in(**values: Any) -> str:

@@ -1,7 +1,8 @@
 """Interactive plots of the report page, as Plotly takes them: dictionaries of plain data.
 
-Every plot has `title`, `alt` (for readers who do not see it), `data` (traces), `layout` and
-`numbers` (its table). The page's script adds colours of light and dark, and the size.
+Every plot has `title`, `alt` (for readers who do not see it), `data` (traces), `layout` and, but
+for the orbit, `numbers` (its table). The script of the page adds colours of light and dark, and the
+size.
 """
 
 from __future__ import annotations
@@ -13,9 +14,11 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
-from mgs.data.up import PLUS_Z, Up, upright
+from mgs.data.dataset import Dataset
+from mgs.data.up import Up, upright
 from mgs.gaussians import Gaussians
 from mgs.report.figures import Curves, axis_names, line_styles
+from mgs.report.runs import RunFiles
 
 SYMBOLS: dict[str | tuple[int, int, int], str] = {
     "o": "circle", "s": "square", "^": "triangle-up", "D": "diamond", "v": "triangle-down",
@@ -35,47 +38,43 @@ GREY = "#7a7a7a"
 
 METRIC_NAMES = {
     "psnr": "PSNR (dB)",
-    "ssim": "SSIM",
     "psnr_mask": "PSNR, rock only (dB)",
-    "ssim_mask": "SSIM, rock only",
-    "psnr_inside": "PSNR, without the outline (dB)",
     "psnr_corrected": "PSNR, exposure fitted to each view (dB)",
     "psnr_mask_corrected": "PSNR, rock only, exposure fitted to each view (dB)",
-    "held_out_psnr": "PSNR, held out (dB)",
-    "held_out_psnr_mask": "PSNR, held out, rock only (dB)",
-    "test_psnr": "PSNR, test views (dB)",
-    "test_psnr_mask": "PSNR, test views, rock only (dB)",
-    "depth_error": "depth error ({unit})",
 }
-"""Headings of metrics whose key says too little; any other metric is called by its key."""
-
-
-def metric_name(key: str, unit: str = "m") -> str:
-    """Heading of a metric, by its key in metrics.json or steps.jsonl. unit: name of a length of
-    1."""
-    return METRIC_NAMES.get(key, key.replace("_", " ")).replace("{unit}", unit)
+METRIC_NAMES |= {
+    f"{key}_{metric}": name.replace("PSNR", f"PSNR, {views}")
+    for key, views in (("held_out", "held out"), ("test", "test views"))
+    for metric, name in METRIC_NAMES.items()
+}
+"""Metrics of steps.jsonl -> headings."""
 
 
 def _plot(
-    title: str,
-    alt: str,
-    data: list[dict[str, Any]],
-    layout: dict[str, Any],
-    heading: Sequence[str],
-    rows: list[list[str]],
+    title: str, alt: str, data: list[dict[str, Any]], layout: dict[str, Any]
 ) -> dict[str, Any]:
-    numbers = {"heading": list(heading), "rows": rows}
+    """A plot with axes x and y. Its table has a row for each x, and a column for each trace."""
+    columns = [dict(zip(trace["x"], trace["y"], strict=True)) for trace in data]
+    rows = [
+        [_number(x), *(_number(column[x]) if x in column else "–" for column in columns)]
+        for x in sorted(set().union(*columns))
+    ]
+    heading = [layout["xaxis"]["title"]["text"], *(trace["name"] for trace in data)]
+    numbers = {"heading": heading, "rows": rows}
     return {"title": title, "alt": alt, "data": data, "layout": layout, "numbers": numbers}
+
+
+def _number(value: Any) -> str:
+    return value if isinstance(value, str) else f"{value:.6g}"
 
 
 def _axis(title: str, **settings: Any) -> dict[str, Any]:
     return {"title": {"text": title}, **settings}
 
 
-def line_plot(
-    title: str, curves: Curves, x: str, y: str, from_zero: bool = False
-) -> dict[str, Any]:
-    """A plot with one line for each run, in the styles of the PNG figures. x, y: axis titles."""
+def line_plot(title: str, curves: Curves, y: str, from_zero: bool = False) -> dict[str, Any]:
+    """A plot over the number of images, a line for each run, in the styles of the PNG figures. y:
+    title of the axis."""
     traces = []
     for (label, (xs, ys)), style in zip(curves.items(), line_styles(curves), strict=True):
         colour = style["color"]
@@ -85,7 +84,7 @@ def line_plot(
         trace["marker"] = {"symbol": SYMBOLS[style["marker"]], "color": colour, "size": 7}
         trace["line"] = {"color": colour, "dash": dash, "width": 2}
         traces.append(trace)
-    layout = {"xaxis": _axis(x), "yaxis": _axis(y)}
+    layout = {"xaxis": _axis("images"), "yaxis": _axis(y)}
     if from_zero:
         layout["yaxis"]["rangemode"] = "tozero"
     ends = [
@@ -93,14 +92,7 @@ def line_plot(
         for label, (xs, ys) in curves.items()
         if len(ys) > 0
     ]
-    columns = [dict(zip(*curve, strict=True)) for curve in curves.values()]
-    rows = [
-        [f"{value:g}", *(f"{c[value]:.6g}" if value in c else "–" for c in columns)]
-        for value in sorted({value for xs, _ in curves.values() for value in xs})
-    ]
-    return _plot(
-        title, f"{title}, against {x}. {'; '.join(ends)}.", traces, layout, [x, *curves], rows
-    )
+    return _plot(title, f"{title}, against images. {'; '.join(ends)}.", traces, layout)
 
 
 def timing_plot(label: str, steps: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -115,17 +107,10 @@ def timing_plot(label: str, steps: Sequence[Mapping[str, Any]]) -> dict[str, Any
         {"type": "bar", "name": stage, "x": numbers, "y": values}
         for stage, values in stages.items()
     ]
-    axes = {"xaxis": _axis("step (0: the seeds)"), "yaxis": _axis("seconds")}
-    total = {stage: sum(values) for stage, values in stages.items()}
-    in_all = ", ".join(f"{stage} {value:.1f} s" for stage, value in total.items())
-    rows = [
-        [str(number), *(f"{values[i]:.2f}" for values in stages.values())]
-        for i, number in enumerate(numbers)
-    ]
-    rows.append(["all", *(f"{value:.2f}" for value in total.values())])
+    in_all = ", ".join(f"{stage} {sum(values):.1f} s" for stage, values in stages.items())
     alt = f"Seconds of each stage, step by step, of {label}. In all: {in_all}."
-    layout = {"barmode": "stack", **axes}
-    return _plot(f"Time, {label}", alt, traces, layout, ["step", *stages], rows)
+    axes = {"xaxis": _axis("step (0: the seeds)"), "yaxis": _axis("seconds")}
+    return _plot(f"Time, {label}", alt, traces, {"barmode": "stack", **axes})
 
 
 def views_plot(metric: str, runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
@@ -134,7 +119,7 @@ def views_plot(metric: str, runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> 
 
     runs: label -> views of metrics.json; views without this metric are left out.
     """
-    traces, rows = [], []
+    traces = []
     for (label, views), style in zip(runs.items(), line_styles(runs), strict=True):
         measured = [view for view in views if view.get(metric) is not None]
         for trained, which in ((True, "trained on"), (False, "held out")):
@@ -144,36 +129,27 @@ def views_plot(metric: str, runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> 
             xs, ys = [view["name"] for view in shown], [view[metric] for view in shown]
             trace = {"name": f"{label}, {which}", "x": xs, "y": ys}
             traces.append(trace | {"mode": "markers", "marker": marker})
-            rows += [[label, view["name"], which, f"{view[metric]:.4f}"] for view in shown]
-    name = metric_name(metric)
+    name = METRIC_NAMES[metric]
     names = sorted({view["name"] for views in runs.values() for view in views})
     axis = _axis("view", categoryorder="array", categoryarray=names, type="category")
     title = f"{name} of each view"
-    alt, layout = (
-        f"{title}; the numbers are in the table below.",
-        {"xaxis": axis, "yaxis": _axis(name)},
-    )
-    return _plot(title, alt, traces, layout, ["run", "view", "", name], rows)
+    alt = f"{title}; the numbers are in the table below."
+    return _plot(title, alt, traces, {"xaxis": axis, "yaxis": _axis(name)})
 
 
 def orbit_plot(
-    label: str,
-    cameras: Sequence[Camera],
-    names: Sequence[str],
-    seeds: list[int],
-    chosen: list[int],
-    model: Gaussians | None,
-    up: Up = PLUS_Z,
-    unit: str = "m",
+    label: str, run: RunFiles, dataset: Dataset, model: Gaussians | None, up: Up
 ) -> dict[str, Any]:
     """The orbit in 3D: the model as points, all poses, seeds, and the chosen views, numbered and
     joined in their order.
 
-    names: of the frames; seeds, chosen: their indices. up, unit: of the world; it is drawn turned
-    so that +Z is up. The last trace, "shown above", marks the view of the page's slider; the page
-    moves it.
+    The world is drawn turned so that +Z is up. The last trace, "shown above", marks the view of the
+    page's slider; the page moves it.
     """
-    turn, order, taken = upright(up), list(range(1, len(chosen) + 1)), seeds + chosen
+    seeds, chosen, taken = run.seeds, run.chosen, run.taken
+    turn, order = upright(up), list(range(1, len(chosen) + 1))
+    names = [frame.name for frame in dataset.frames]
+    cameras = [frame.camera for frame in dataset.frames]
     eyes = np.array([camera.position for camera in cameras])
     middle = np.mean(eyes if model is None else model.means, axis=0)
     length = FRUSTUM * float(np.linalg.norm(eyes - middle, axis=1).mean())
@@ -201,7 +177,7 @@ def orbit_plot(
         path,
         _points("shown above", eyes[taken[:1]], here) | {"hoverinfo": "skip"},
     ]
-    titles = axis_names(up, unit)
+    titles = axis_names(up, dataset.unit)
     axes = {f"{a}axis": _axis(title) for a, title in zip("xyz", titles, strict=True)}
     view = {"eye": {"x": 0.9, "y": 0.9, "z": 0.7}}
     alt = (
@@ -209,13 +185,8 @@ def orbit_plot(
         f"Seeds: {', '.join(names[i] for i in seeds)}. "
         f"Chosen, in this order: {', '.join(names[i] for i in chosen) or 'none yet'}."
     )
-    roles = ["seed"] * len(seeds) + [f"step {k}" for k in order]
-    rows = [
-        [role, names[i], *(f"{value:.3f}" for value in eyes[i])]
-        for role, i in zip(roles, taken, strict=True)
-    ]
     layout = {"scene": {"aspectmode": "data", "camera": view, **axes}}
-    return _plot(f"Orbit, {label}", alt, traces, layout, ["taken as", "view", *titles], rows)
+    return {"title": f"Orbit, {label}", "alt": alt, "data": traces, "layout": layout}
 
 
 def _model_points(model: Gaussians, turn: np.ndarray) -> dict[str, Any]:

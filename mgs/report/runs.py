@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from mgs.data.dataset import Dataset
+from mgs.data.dataset import Dataset, Frame
 from mgs.data.up import Up, unit_up
 from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.policy.from_file import label
+from mgs.report.figures import Curves
 from mgs.run.ending import RunEnd
 from mgs.run.folder import check_same_frames, open_run, read_config
 from mgs.run.settings import validated
@@ -107,6 +108,12 @@ class RunFiles:
         return self.seeds + self.chosen
 
     @property
+    def measured(self) -> dict[str, Any] | None:
+        """metrics.json, if it is of the model after the last step."""
+        fresh = self.metrics is not None and self.metrics["images"] == len(self.taken)
+        return self.metrics if fresh else None
+
+    @property
     def ended(self) -> dict[str, Any] | None:
         """Why the run ended, as in steps.jsonl; None for an unfinished run, also where the budget
         was raised after it was spent."""
@@ -193,7 +200,7 @@ def check_finished(run: RunFiles) -> None:
 
 def check_measured(run: RunFiles) -> None:
     """Raises InputError if a run was not evaluated since its last step."""
-    if run.metrics is None or run.metrics["images"] != len(run.taken):
+    if run.measured is None:
         raise InputError(
             f"{run.folder}: was not evaluated since its last step; "
             f"measure it with `mgs eval {run.folder}`"
@@ -230,6 +237,26 @@ def compare_runs(folders: Sequence[str | Path]) -> Comparison:
     for run in runs[1:]:
         check_same_frames(run.folder, dataset)
     return Comparison(labelled, dataset)
+
+
+def step_curves(runs: Mapping[str, RunFiles], key: str, factor: float = 1.0) -> Curves:
+    """A number of the steps of each run, times a factor, against the number of images; without runs
+    that have none."""
+    curves = {}
+    for name, run in runs.items():
+        points = [(s["images"], factor * s[key]) for s in run.steps if s.get(key) is not None]
+        if points:
+            curves[name] = ([x for x, _ in points], [y for _, y in points])
+    return curves
+
+
+def least_trained(
+    runs: Iterable[RunFiles], dataset: Dataset, frames: Sequence[Frame]
+) -> list[Frame]:
+    """The frames among these that the fewest runs were trained on, in their order."""
+    taken = [{dataset.frames[i].name for i in run.taken} for run in runs]
+    counts = [sum(frame.name in names for names in taken) for frame in frames]
+    return [frame for frame, count in zip(frames, counts, strict=True) if count == min(counts)]
 
 
 def up_of(prior: str | Path, dataset: Dataset) -> Up:

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from mgs.data.dataset import Frame
+from mgs.data.dataset import Dataset
 from mgs.policy.poses import path_length
-from mgs.report.runs import Comparison, check_measured, compare_runs
+from mgs.report.runs import Comparison, RunFiles, check_measured, compare_runs
 from mgs.run.ending import RunEnd
 
 COLUMNS = {
@@ -56,49 +56,35 @@ def comparison_rows(compared: Comparison) -> list[dict[str, Any]]:
 
     Raises InputError if a run was not evaluated since its last step.
     """
-    rows = []
-    for label, run in compared.runs.items():
+    for run in compared.runs.values():
         check_measured(run)
-        metrics = run.metrics or {}
-        row: dict[str, Any] = {"policy": label, "images": metrics["images"]}
-        for views in ("test", "all", "held_out"):
-            row |= {f"{views}.{name}": value for name, value in metrics.get(views, {}).items()}
-        if run.settings.get("exposure"):
-            row["exposure"] = True
-        if run.ended and run.ended["reason"] != RunEnd.BUDGET:
-            row["ended"] = run.ended["reason"]
-        row["coverage"] = 100 * run.steps[-1]["coverage"]
-        row["path"] = path_of([compared.dataset.frames[i] for i in run.taken])
-        row["unit"] = compared.dataset.unit
-        rows.append(row)
-    return rows
+    return [table_row(label, run, compared.dataset) for label, run in compared.runs.items()]
 
 
-def path_of(frames: Sequence[Frame]) -> float:
-    """Length of the straight lines from camera to camera."""
-    return path_length(np.array([frame.camera.position for frame in frames]))
+def table_row(label: str, run: RunFiles, dataset: Dataset) -> dict[str, Any]:
+    """Row of `comparison_rows`; without metrics if they are not of the run's last step."""
+    metrics = run.measured or {}
+    row: dict[str, Any] = {"policy": label, "images": len(run.taken)}
+    for views in ("test", "all", "held_out"):
+        row |= {f"{views}.{name}": value for name, value in metrics.get(views, {}).items()}
+    if run.settings.get("exposure"):
+        row["exposure"] = True
+    if run.ended and run.ended["reason"] != RunEnd.BUDGET:
+        row["ended"] = run.ended["reason"]
+    positions = np.array([dataset.frames[i].camera.position for i in run.taken])
+    row |= {"coverage": 100 * run.steps[-1]["coverage"], "path": path_length(positions)}
+    return row | {"unit": dataset.unit}
 
 
 def table_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Keys of COLUMNS that say something of these rows, in order.
-
-    Left out are test views if no run was measured on some, held-out views if no run has some, a
-    fitted exposure if no run estimated exposure, and the reason of the end if all runs spent their
-    budget.
-    """
+    """Keys of COLUMNS of which some row has a value, in order. A fitted exposure is left out if no
+    run estimated exposure."""
     exposure = any(row.get("exposure") for row in rows)
-    tests, new = any("test.psnr" in row for row in rows), has_held_out(rows)
-    ended = any("ended" in row for row in rows)
-
-    def shown(key: str) -> bool:
-        if key == "ended":
-            return ended
-        views = key.partition(".")[0]
-        return {"test": tests, "held_out": new}.get(views, True) and (
-            exposure or "corrected" not in key
-        )
-
-    return [key for key in COLUMNS if shown(key)]
+    return [
+        key
+        for key in COLUMNS
+        if any(row.get(key) is not None for row in rows) and (exposure or "corrected" not in key)
+    ]
 
 
 def has_held_out(rows: Sequence[Mapping[str, Any]]) -> bool:
@@ -122,12 +108,14 @@ def table_cell(key: str, value: Any) -> str:
 def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Format the rows of `table_numbers` as a Markdown table."""
     columns = table_columns(rows)
-    every = ", all" if has_held_out(rows) else ", views trained on"
-    headings = [
-        COLUMNS[key].replace("{unit}", rows[0].get("unit", "m")).replace(", all", every)
-        for key in columns
-    ]
+    headings = [table_heading(key, rows) for key in columns]
     return markdown(headings, [[table_cell(key, row.get(key)) for key in columns] for row in rows])
+
+
+def table_heading(key: str, rows: Sequence[Mapping[str, Any]]) -> str:
+    """Heading of a column of these rows."""
+    every = ", all" if has_held_out(rows) else ", views trained on"
+    return COLUMNS[key].replace("{unit}", rows[0]["unit"]).replace(", all", every)
 
 
 def markdown(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

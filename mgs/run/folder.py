@@ -47,10 +47,10 @@ DATASET = "dataset"
 
 
 class Run:
-    """A run folder; what it was made of is read when first asked for, and once.
+    """A run folder, its settings, and its dataset, prior and state, each read once at first use.
 
-    folder: the run. settings: from its config.json. Properties raise InputError where a file is
-    missing or damaged; `state` where no step is finished yet; `dataset` where its frames changed.
+    settings: from the folder's config.json. Properties raise InputError if a file is missing or
+    damaged; `state` also if no step is finished yet; `dataset` also if its frames changed.
     """
 
     def __init__(
@@ -147,6 +147,8 @@ def start(out: Path, settings: NbvSettings, dataset: Dataset) -> None:
 def read_config(out: Path) -> dict[str, Any]:
     """Read config.json of a run. Raises InputError where there is none, or it is damaged."""
     path = out / "config.json"
+    if (out / "transforms.json").is_file():
+        raise InputError(f"{out}: is a dataset; make a run of it: `mgs nbv {out} --out RUN`")
     if not path.is_file():
         raise InputError(
             f"{out}: holds no run (no config.json); start one with `mgs nbv DATASET --out {out}`"

@@ -34,8 +34,8 @@ def select_views(
 ) -> Iterator[Learned | Choice]:
     """Run the loop from the seeds, or from a state; yield the state after every fit.
 
-    Ends when the budget is spent, or as `stop_uncertainty` or `stop_gain` say; the last item is
-    then the view that was refused for its gain. chooser: in place of `choose`. Raises InputError as
+    Ends when the budget is spent, or by `stop_uncertainty` or `stop_gain`. After `stop_gain` the
+    last item is the choice that was refused. chooser: in place of `choose`. Raises InputError as
     `choose` and `learn`.
     """
     if state is None:
@@ -171,10 +171,10 @@ def choose_batch(
 def choose(
     problem: Problem, state: Fitted, fisher: Callable[[int], np.ndarray] | None = None
 ) -> tuple[int, float]:
-    """Choose the next view: (frame, score) of the largest score over its travel cost in reach.
+    """Choose the next view: (frame, score) of the view in reach of largest score / travel cost.
 
     A tie goes to the pose farthest from those taken. fisher(frame) -> [N,P]: information of a view
-    at the model, computed by default. Raises InputError where the policy returns no valid score.
+    at the model, computed by default. Raises InputError if the policy returns no valid score.
     """
     fisher = fisher or problem.view_information(state.gaussians)
     context = problem.context(state, problem.reachable(state.taken), fisher)

@@ -178,16 +178,15 @@ def resume_nbv(
     progress: Progress = no_progress,
     policy: str | None = None,
 ) -> State:
-    """Run the loop in a run folder from where it stands to its end.
+    """Continue a run from its last finished step to its end; return the last state.
 
-    policy: FILE.py:FUNCTION, required where the run has a policy of the user's own: the file is
-    code, and a folder is not trusted to name it. on_step(state): called after every step, or batch
-    of steps, that is finished and on disk. progress(stage, done, total): called during a step.
-    Returns the last state: gaussians, H, taken (frame indices in the order of their choice), steps
-    (lines of steps.jsonl; the last has `ended`).
-    A finished run gives the same again. Raises InputError where the folder holds no run, its
-    inputs are missing or changed, another process works on it, a fit diverged, or `policy` is not
-    the run's.
+    policy: FILE.py:FUNCTION, required if the run has a policy from a file. The file is code, so
+    the user names it, not the folder. on_step(state): called after every step, or batch of steps,
+    that is finished and on disk. progress(stage, done, total): called during a step.
+
+    A finished run returns its state again. Raises InputError if the folder holds no run, its inputs
+    are missing or changed, another process works on it, a fit diverged, or `policy` is not the
+    run's.
     """
     run = run if isinstance(run, Run) else open_run(run)
     check_named(run, policy)
@@ -208,8 +207,10 @@ def check_named(run: Run, policy: str | None) -> None:
 def problem_of(
     run: str | Path | Run, progress: Progress = no_progress, policy: str | None = None
 ) -> Problem:
-    """The selection problem of a run, for the functions of `mgs.run.loop`. Arguments and errors as
-    `resume_nbv`."""
+    """Selection problem of a run, for the functions of `mgs.run.loop`.
+
+    Arguments and errors as `resume_nbv`.
+    """
     run = run if isinstance(run, Run) else open_run(run)
     check_named(run, policy)
     operations = operations_of(run.dataset, run.prior, run.settings)

@@ -157,12 +157,18 @@ def validated(model: type[Model], values: dict[str, Any], file: Path | None = No
         first = error.errors(include_url=False)[0]
         parts = [str(part) for part in first["loc"]]
         message = first["msg"].removeprefix("Value error, ")
+        for bound, words in BOUNDS.items():
+            if bound in first.get("ctx", {}):
+                message = f"must be {words} {first['ctx'][bound]:g}"
         if file is not None:
             key = ".".join(["settings", *parts])
             message = f"{file}: {key}: {message}; correct it, or start the run anew"
             raise InputError(message) from None
         raise InputError(f"{option_of(parts, first['input'])}: {message}") from None
 
+
+BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
+"""Words for the limits of pydantic's numbers."""
 
 NO_OPTION = ("warm_rate", "tolerance", "decay", "dataset", "prior")
 """Settings without an option of their own."""

@@ -170,7 +170,7 @@ def points_of(size: ChartSize, kind: str) -> list[Point]:
 
 @dataclass(frozen=True)
 class Data:
-    """What is measured: the points of a size, on the rendered scene or on a given dataset."""
+    """Points of a size, to be measured on the rendered scene or on a given dataset."""
 
     size: ChartSize
     given: Path | None = None

@@ -404,8 +404,9 @@ def with_options(
 ) -> ReproduceSize:
     """Size with the options --policy, --mesh and --batch. names: the results to make.
 
-    Raises InputError where an option is for none of these results, a policy is unknown or compared
-    anyway, two policies or meshes have the same name, a mesh cannot be read, or they are too many.
+    Raises InputError if an option is for none of these results, a policy is unknown or already
+    compared, two policies or meshes have the same name, or a mesh cannot be read or is one too
+    many.
     """
     labels = list(POLICIES)
     for policy in policies:

@@ -41,21 +41,20 @@ class Noise:
         return map_coordinates(self.volume, at, order=1, mode="grid-wrap", prefilter=False)
 
     def fractal(
-        self, points: np.ndarray, wavelength: float, octaves: int, gain: float = 0.5
+        self,
+        points: np.ndarray,
+        wavelength: float,
+        octaves: int,
+        gain: float = 0.5,
+        ridged: bool = False,
     ) -> np.ndarray:
         """Sum of octaves, each of half the wavelength and `gain` times the amplitude of the one
-        before."""
-        octave = (gain**i * self.octave(points, wavelength / 2**i) for i in range(octaves))
-        return sum(octave, np.zeros(points.shape[:-1]))
-
-    def ridged(
-        self, points: np.ndarray, wavelength: float, octaves: int, gain: float = 0.5
-    ) -> np.ndarray:
-        """`fractal` of 0.8 - |noise| in place of noise: sharp crests, mean about zero."""
-        octave = (
-            gain**i * (0.8 - np.abs(self.octave(points, wavelength / 2**i))) for i in range(octaves)
-        )
-        return sum(octave, np.zeros(points.shape[:-1]))
+        before. ridged: of 0.8 - |noise| in place of noise: sharp crests, mean about zero."""
+        total = np.zeros(points.shape[:-1])
+        for i in range(octaves):
+            octave = self.octave(points, wavelength / 2**i)
+            total = total + gain**i * (0.8 - np.abs(octave) if ridged else octave)
+        return total
 
     def fracture(self, points: np.ndarray, wavelength: float) -> np.ndarray:
         """Field [N], about -1 to 1, linear within each of many cells: flat faces and narrow edges,

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import trimesh
-from scipy.spatial.transform import Rotation
 
 from mgs.camera import Camera, look_at
 from mgs.errors import InputError
 from mgs.synth.scene_file import Orbit, SceneFile
+
+if TYPE_CHECKING:
+    import trimesh
 
 EVALUATION_ELEVATIONS = (5.0, 75.0)
 """Elevations of the test views above the rock's middle, degrees: from just over the stones on the
@@ -29,21 +32,12 @@ def orbit_positions(settings: Orbit, frames: int, target: np.ndarray) -> np.ndar
     elevations (Fibonacci lattice), sorted by azimuth. Frame k is then moved away from the target
     [3] to settings.distances[k % len] times its distance.
     """
-    positions = _at_one_distance(settings, frames, target)
-    return positions + (np.resize(settings.distances, frames)[:, None] - 1) * (positions - target)
-
-
-def _at_one_distance(settings: Orbit, frames: int, target: np.ndarray) -> np.ndarray:
-    """`orbit_positions` without the factors on distances."""
     step = np.arange(frames)
-    if settings.kind == "circle":
-        azimuth = 2 * np.pi * step / frames
-        x = target[0] + settings.radius * np.cos(azimuth)
-        y = target[1] + settings.radius * np.sin(azimuth)
-        return np.stack([x, y, np.full(frames, settings.altitude)], 1)
     low, high = np.radians(settings.elevations)
     along = step / max(frames - 1, 1)
-    if settings.kind == "rings":
+    if settings.kind == "circle":
+        azimuth, elevation = 2 * np.pi * step / frames, np.zeros(frames)
+    elif settings.kind == "rings":
         rings = max(1, round(settings.turns))
         ring = step * rings // frames
         azimuth = 2 * np.pi * (step * rings / frames - ring)
@@ -57,7 +51,10 @@ def _at_one_distance(settings: Orbit, frames: int, target: np.ndarray) -> np.nda
         azimuth, elevation = azimuth[order], elevation[order]
     flat = settings.radius * np.cos(elevation)
     x, y, z = flat * np.cos(azimuth), flat * np.sin(azimuth), settings.radius * np.sin(elevation)
-    return np.stack([x, y, z], 1) + target
+    positions = np.stack([x, y, z], 1) + target
+    if settings.kind == "circle":
+        positions[:, 2] = settings.altitude
+    return positions + (np.resize(settings.distances, frames)[:, None] - 1) * (positions - target)
 
 
 def orbit_cameras(
@@ -116,6 +113,8 @@ def perturb(
 ) -> list[Camera]:
     """Cameras with independent Gaussian pose errors. position, rotation: standard deviations per
     axis, metres and degrees."""
+    from scipy.spatial.transform import Rotation  # here, so that `mgs --help` does not load it
+
     noisy = []
     for camera in cameras:
         pose = camera.camera_to_world

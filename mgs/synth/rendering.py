@@ -26,6 +26,7 @@ from mgs.data.dataset import (
     resumes,
     write_transforms,
 )
+from mgs.data.masks import write_sheet
 from mgs.data.meshes import GLTF, to_glb
 from mgs.data.rock_image import write_rock_image
 from mgs.errors import InputError, row_named
@@ -166,9 +167,8 @@ def synthesise(
         size = preset.width, preset.height
         cameras = rock_cameras(settings, size, preset.frames, rock)
         frames = orbit_frames(out, cameras)
-        tests = _frames(
-            out / TEST_FOLDER, evaluation_cameras(settings, size, test_views, rock), "tv"
-        )
+        dome = evaluation_cameras(settings, size, test_views, rock)
+        tests = orbit_frames(out / TEST_FOLDER, dome, "tv")
         glb = to_glb(rock)  # before the scene adds its attributes to the mesh
         world = MitsubaScene(settings, rock, cameras[0], seed)
         if not denoise:
@@ -340,25 +340,18 @@ def _render_frames(
 
 def write_contact_sheet(path: str | Path, frames: list[Frame]) -> None:
     """Write up to SHEET_FRAMES of the frames, evenly chosen, as small pictures in one PNG."""
-    columns, width = SHEET_COLUMNS, SHEET_WIDTH
     count = min(SHEET_FRAMES, len(frames))
-    chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
-    height = round(width * frames[0].camera.height / frames[0].camera.width)
-    sheet = Image.new("RGB", (columns * width, -(-len(chosen) // columns) * height))
-    for i, frame in enumerate(chosen):
-        with Image.open(frame.image_path) as image:
-            small = image.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)
-        sheet.paste(small, (i % columns * width, i // columns * height))
-    with atomic_path(path) as temporary:
-        sheet.save(temporary)
+    height = round(SHEET_WIDTH * frames[0].camera.height / frames[0].camera.width)
+    pictures = []
+    for i in np.unique(np.linspace(0, len(frames) - 1, count).astype(int)):
+        with Image.open(frames[i].image_path) as image:
+            small = image.convert("RGB").resize((SHEET_WIDTH, height), Image.Resampling.LANCZOS)
+        pictures.append(np.asarray(small))
+    write_sheet(Path(path), pictures, SHEET_COLUMNS)
 
 
-def orbit_frames(out: Path, cameras: list[Camera]) -> list[Frame]:
+def orbit_frames(out: Path, cameras: list[Camera], prefix: str = "kf") -> list[Frame]:
     """Frames of an orbit, kf_0000 and so on, with their files in the folder `out`."""
-    return _frames(out, cameras, "kf")
-
-
-def _frames(out: Path, cameras: list[Camera], prefix: str) -> list[Frame]:
     frames = []
     for i, camera in enumerate(cameras):
         name = f"{prefix}_{i:04d}"

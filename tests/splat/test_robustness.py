@@ -12,7 +12,7 @@ import mgs.splat
 from mgs.camera import Camera
 from mgs.errors import InputError
 from mgs.gaussians import SH_MAX, Gaussians
-from mgs.splat import ESTIMATORS, ListCache, as_drjit, fisher, reference, render
+from mgs.splat import ESTIMATORS, ListCache, as_drjit, fisher, jvp, reference, render
 from mgs.splat.constants import NEAR
 
 from .scenes import (
@@ -100,8 +100,8 @@ def gradients(gaussians, camera) -> dict[str, np.ndarray]:
 
 
 def assert_right(gaussians, camera, quats: bool = True) -> None:
-    """Image and Fisher information as the reference has them, gradients finite. quats=False:
-    without the columns of quaternions."""
+    """Image and Fisher information as the reference has them; gradients, tangents, and information
+    of means finite. quats=False: without the columns of quaternions."""
     image = render(gaussians, camera, BACKGROUND)
     with np.errstate(all="ignore"):
         truth = reference.render(gaussians, camera, BACKGROUND)
@@ -116,6 +116,12 @@ def assert_right(gaussians, camera, quats: bool = True) -> None:
     assert error.max() < 2e-5
     for name, gradient in gradients(gaussians, camera).items():
         assert np.isfinite(gradient).all(), f"gradient of {name}"
+    tangents = {name: np.ones_like(getattr(gaussians, name)) for name in PARAMETERS}
+    for name, change in vars(jvp(gaussians, tangents, camera, BACKGROUND)).items():
+        assert np.isfinite(np.asarray(change)).all(), f"tangent of {name}"
+    for estimator in ("exact", "block"):
+        found = fisher(gaussians, camera, estimator, means="free", alpha_weight=1.0)
+        assert np.isfinite(found).all()
     with np.errstate(all="ignore"):
         expected = reference.fisher_block(gaussians, camera, BACKGROUND)
     found, blocks = (fisher(gaussians, camera, e, BACKGROUND) for e in ("exact", "block"))

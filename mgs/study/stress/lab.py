@@ -1,5 +1,4 @@
-"""What the experiments work on: small rocks, each made once, and what most experiments do with
-them."""
+"""Small rocks for the experiments, each made once, and the operations that experiments share."""
 
 from __future__ import annotations
 
