@@ -10,10 +10,13 @@ import contextlib
 import errno
 import io
 import os
+import shlex
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from inspect import cleandoc
+from itertools import pairwise
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -137,7 +140,7 @@ def main(arguments: list[str] | None = None) -> None:
             raise
         code = INTERRUPTED
     if code == INTERRUPTED:  # typer turns Ctrl-C into this exit code and prints nothing
-        raise _stop(f"interrupted{_hint(arguments[0] if arguments else '')}", INTERRUPTED)
+        raise _stop(f"interrupted{_hint(arguments)}", INTERRUPTED)
     raise SystemExit(code or 0)
 
 
@@ -147,12 +150,15 @@ def _print_warning(message: Any, category: type, filename: str, line: int, *_: A
     sys.stderr.write(text or warnings.formatwarning(message, category, filename, line))
 
 
-def _hint(command: str) -> str:
+def _hint(arguments: Sequence[str]) -> str:
     """End of the line of an interrupted command: the way to continue, if there is one."""
+    command, *options = arguments or [""]
     if command in RESUMABLE:
         return "; run the same command again to continue"
-    resume = "; `mgs nbv --resume RUN` continues a run whose folder is there"
-    return resume if command == "nbv" else ""
+    runs = [after for option, after in pairwise(options) if option in ("--out", "--resume")]
+    if command != "nbv" or not runs or not (Path(runs[-1]) / "config.json").is_file():
+        return ""
+    return f"; continue with: mgs nbv --resume {shlex.quote(runs[-1])}"
 
 
 def _from_interrupt(error: BaseException | None) -> bool:

@@ -121,8 +121,8 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
 
 
 def _load(path: Path) -> Any:
-    """What trimesh reads from a file. Raises errors of many types, and InputError if a texture is
-    too large."""
+    """Read a file with trimesh. Raises errors of many types, and InputError if a texture is too
+    large."""
     import trimesh
 
     mesh: Any = trimesh.load(path, process=False) if path.suffix.lower() in GLTF else None
@@ -188,8 +188,8 @@ def _places(vertices: np.ndarray) -> np.ndarray:
 
 
 def _wound_against(faces: np.ndarray) -> np.ndarray:
-    """Which faces [F,3] to flip so that neighbours are wound alike, bool [F]: of each connected
-    piece, the fewer.
+    """Mask [F] of the faces [F,3] to flip so that neighbours are wound alike, as few as possible in
+    each connected piece.
 
     Neighbours share an edge with no third face, and are wound alike if they traverse it in opposite
     directions. Method: a graph with nodes f ("keep") and F + f ("flip"), and an edge between nodes

@@ -1,10 +1,9 @@
 """Initial Gaussians from the prior and some frames (paper, section III-A), with an opaque backing.
 
-No image asks for an opaque surface. With one layer of Gaussians, as in the paper, bright patches
-become transparent, and the far side of the rock shines through, a different part in every camera.
-The mesh prior knows that the rock is solid. So every second Gaussian on the surface has a larger,
-opaque one a spacing behind it; all are fitted alike, and what shines through is the rock's own
-colour. docs/fit.md has the measurements.
+Images do not require an opaque surface. With one layer of Gaussians, as in the paper, bright
+patches become transparent, and the far side of the rock shows through, a different part in every
+camera. So every second Gaussian on the surface has a larger, opaque one a spacing behind it, which
+shows the rock's own colour there. All are fitted alike. docs/fit.md has the measurements.
 """
 
 from __future__ import annotations
@@ -171,8 +170,10 @@ def sees(
 def seen_colours(
     points: np.ndarray, normals: np.ndarray, frame: Frame, depth: np.ndarray, tolerance: float
 ) -> Colours:
-    """Which surface points [N] a frame `sees`, and the colours of these, [seen,3] linear RGB.
-    Raises InputError if a file cannot be read."""
+    """Mask [N] of the surface points that a frame `sees`, and their colours, [seen,3] linear RGB.
+
+    Raises InputError if a file cannot be read.
+    """
     seen = sees(points, normals, frame, depth, tolerance)
     pixels, _ = frame.camera.project(points[seen])
     at, rgb = [pixels[:, 1] - 0.5, pixels[:, 0] - 0.5], frame.rgb()

@@ -85,8 +85,8 @@ def spacing_of(points: np.ndarray) -> float:
 
 
 def reliable(cloud: SparseCloud) -> np.ndarray:
-    """Which points are well triangulated by track and reprojection error, as far as known, bool
-    [N]."""
+    """Mask [N] of the points that are well triangulated, by track and reprojection error, where
+    known."""
     kept = np.ones(len(cloud.points), bool)
     if cloud.track is not None:
         kept &= cloud.track >= LEAST_TRACK
@@ -98,7 +98,7 @@ def reliable(cloud: SparseCloud) -> np.ndarray:
 
 
 def on_surface(points: np.ndarray) -> np.ndarray:
-    """Which points [N,3] have neighbours and lie near the plane through them, bool [N]."""
+    """Mask [N] of the points [N,3] that have neighbours and lie near the plane through them."""
     count = min(NEIGHBOURS + 1, len(points))
     distance, index = cKDTree(points).query(points, count)
     around = points[index[:, 1:]]

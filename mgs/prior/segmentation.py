@@ -135,14 +135,14 @@ def rock_cluster(
     name: str = "cloud",
     weight: Callable[[np.ndarray], np.ndarray] = lambda points: np.ones(len(points)),
 ) -> tuple[np.ndarray, float, int]:
-    """Which points above the ground [N,3] are the rock, by DBSCAN (Ester et al. 1996,
+    """Find the rock among points above the ground [N,3], by DBSCAN (Ester et al. 1996,
     scikit-learn).
 
-    voxel: distance between neighbours; target: [3] what the cameras look at; metres. name: of the
-    cloud, for messages. weight: points [N,3] -> [N], what each counts. The rock is the cluster that
-    counts most, or of several nearly as large ones (EQUAL_SIZE) the nearest to the target. Returns
-    (inside [N] bool, eps in metres, number of clusters). Raises InputError if there is no cluster,
-    or two are equally large and about equally near.
+    voxel: distance between neighbours, metres. target: [3] point that the cameras look at, metres.
+    name: of the cloud, for messages. weight: points [N,3] -> weights [N]. The rock is the cluster
+    of largest weight, or of several nearly as large ones (EQUAL_SIZE) the nearest to the target.
+    Returns (inside [N] bool, eps in metres, number of clusters). Raises InputError if there is no
+    cluster, or two are equally large and about equally near.
     """
     from sklearn.cluster import DBSCAN
 

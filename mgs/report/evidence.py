@@ -1,5 +1,5 @@
-"""A model with no more parameters than its images pay for: which kinds each Gaussian learns, and
-the SH degree of the colours.
+"""Choose by evidence which kinds of parameters each Gaussian learns, and the SH degree of the
+colours.
 
 Kinds of parameters are chosen by the evidence: the likelihood of the images, averaged over the
 prior of the parameters. In Laplace's approximation at a fit, with the exact diagonal H, learning
@@ -215,10 +215,10 @@ def lean_fit(
     cache: ListCache | None = None,
     say: Callable[[str], None] = lambda stage: None,
 ) -> LeanModel:
-    """Fit a model that has no more parameters than the images pay for.
+    """Fit a model that has no more parameters than the images need.
 
-    1. With sh "auto", choose degree 1 if it pays on views left out, else 0. Fewer views than BLOCKS
-       always get degree 0.
+    1. With sh "auto", choose degree 1 if it predicts left-out views better, else 0. Fewer views
+       than BLOCKS always get degree 0.
     2. Fit everything, and find the worth of each kind of each Gaussian.
     3. Fit once more from the start. DIRECTIONAL and, with learn "auto", all kinds but colour are
        learned only where they are `paying` (loss: dB, as there). Colour of degree 0 is learned by

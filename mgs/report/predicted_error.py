@@ -292,13 +292,9 @@ def _views(run: Run) -> tuple[list[Frame], dict[str, tuple[Frame, ...]]]:
     """The training frames, and the sets of other views, by name; none of these is empty."""
     where, settings, frames = run.folder, run.settings, run.taken
     if settings.train.means != "frozen":
-        raise InputError(
-            f"{where}: learns means; --calibrate knows the errors of frozen means only"
-        )
+        raise InputError(f"{where}: learns means; --calibrate needs frozen means")
     if settings.exposure:
-        raise InputError(
-            f"{where}: estimates exposure; --calibrate knows the errors of images as they are only"
-        )
+        raise InputError(f"{where}: estimates exposure; --calibrate needs a run without --exposure")
     if len(frames) < 2 * FOLDS:
         raise InputError(
             f"{where}: has {len(frames)} images; --calibrate leaves out a third of them, "

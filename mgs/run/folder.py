@@ -149,6 +149,8 @@ def start(out: Path, settings: NbvSettings, dataset: Dataset) -> None:
 def read_config(out: Path) -> dict[str, Any]:
     """Read config.json of a run. Raises InputError where there is none, or it is damaged."""
     path = out / "config.json"
+    if (out / "transforms.json").is_file():
+        raise InputError(f"{out}: is a dataset; make a run of it: `mgs nbv {out} --out RUN`")
     if not path.is_file():
         raise InputError(
             f"{out}: holds no run (no config.json); start one with `mgs nbv DATASET --out {out}`"

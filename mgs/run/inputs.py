@@ -1,4 +1,4 @@
-"""What a run was made from, as hashes: a resumed run goes on from the same inputs, or not at all.
+"""Hashes of a run's inputs. A run is resumed only if its inputs are unchanged.
 
 A record holds the hash of the `prior`; `cameras`, of pose and intrinsics of every frame by name;
 `files`, of the files of each frame taken, by name and kind; `policy`, of the user's policy file.

@@ -1,4 +1,4 @@
-"""What stays fixed during a run: frames, surface, settings, policy, and the operations on them."""
+"""Selection problem: all that stays fixed in a run (frames, surface, settings, policy)."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ class Problem:
 
     @cached_property
     def visibility(self) -> Visibility:
-        """What each pose sees of the surface."""
+        """Visibility of the surface from each pose."""
 
         def progress(done: int, total: int) -> None:
             self.progress("scoring candidates", done, total)
@@ -206,7 +206,7 @@ class Problem:
         left: list[int],
         fisher: Callable[[int], np.ndarray] | None = None,
     ) -> PolicyContext:
-        """What the policy may use to choose among the frames in `left`.
+        """Context of the policy's choice among the frames in `left`.
 
         fisher(frame): information of its view at the model, computed by default.
         """

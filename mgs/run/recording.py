@@ -225,7 +225,7 @@ class Recorder:
         )
 
     def lines(self, learned: Learned) -> list[dict[str, Any]]:
-        """What is known of each new step before its images are read."""
+        """Lines of the new steps, with all that is known before their images are read."""
         problem, seeds = self.problem, self.problem.settings.seeds
         if not learned.choices:
             names = [problem.frames[i].name for i in learned.taken]

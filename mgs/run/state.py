@@ -58,9 +58,9 @@ class Learned(Fitted):
 
 @dataclass
 class State(Fitted):
-    """What a run folder holds after a step.
+    """State of a run after a step, as the run folder holds it.
 
-    steps: lines of steps.jsonl. inputs: hashes of what the run was made from (`mgs.run.inputs`).
+    steps: lines of steps.jsonl. inputs: hashes of the inputs (`mgs.run.inputs`).
     """
 
     steps: list[dict[str, Any]] = field(default_factory=list)

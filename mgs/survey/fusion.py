@@ -46,7 +46,7 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Focus:
-    """What the cameras look at. point: [3] world, metres; distance: median distance of the cameras,
+    """Point that the cameras look at, [3] world, metres, and their median distance from it,
     metres."""
 
     point: np.ndarray
