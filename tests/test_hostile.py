@@ -288,7 +288,7 @@ def test_absurd_errors(capsys, dataset, tmp_path, arguments):
     assert options[0] in refused(capsys, arguments, tmp_path / "out")
 
 
-def test_the_loser_is_told_who_works_there(capsys, dataset, tmp_path):
+def test_the_loser_is_told_who_works_there(capsys, dataset, prior, tmp_path):
     """One lock for all who write a folder, held from the start to the end of their work."""
     out = tmp_path / "out"
     write_ply(tmp_path / "a.ply", tiny.initial([]))
@@ -299,6 +299,7 @@ def test_the_loser_is_told_who_works_there(capsys, dataset, tmp_path):
             ["synth-orbit", out],
             ["import", dataset, "--out", out],
             ["render", tmp_path / "a.ply", "--cameras", dataset, "--out", out],
+            ["stress", out],
         ],
         "atomic_folder": [["survey", dataset, "--out", out], ["prior", dataset, "--out", out]],
     }
@@ -413,6 +414,21 @@ CHECKPOINTS = {
         ],
     ),
 }
+
+
+@pytest.mark.parametrize("command", ["report", "diagnose"])
+def test_two_reports_on_one_folder(capsys, stranger, command, monkeypatch):
+    monkeypatch.setattr("mgs.report.runs.compare_runs", lambda runs: runs)
+    out = stranger / {"report": "report", "diagnose": "diagnostics"}[command]
+    script = f"from mgs.files import *\nwith folder_locked({str(out)!r}):\n    print(flush=True)\n"
+    script += "    input()"
+    program = [sys.executable, "-c", script]
+    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as winner:
+        winner.stdout.readline()
+        given = ["--out", out] if command == "report" else []
+        line = refused(capsys, [command, stranger, *given], stranger)
+        assert f"process {winner.pid} works on it" in line
+        winner.communicate(b"\n")
 
 
 @pytest.mark.parametrize("damage", CHECKPOINTS)
