@@ -121,7 +121,6 @@ def read_run(folder: str | Path) -> RunFiles:
     config = read_config(folder)
     settings = validated(_Settings, config["settings"], folder / "config.json")
     steps = _read_steps(folder)
-    check_frames(folder / "steps.jsonl", frames_of(steps), config)
     metrics = read_metrics(folder)
     name, versions = label(settings.policy), config.get("versions")
     versions = versions if isinstance(versions, dict) else {}
@@ -224,8 +223,9 @@ def compare_runs(folders: Sequence[str | Path]) -> Comparison:
                 "compare runs on one dataset"
             )
     dataset = open_run(runs[0].folder).dataset
-    for run in runs[1:]:
+    for run in runs:
         check_same_frames(run.folder, dataset)
+        check_frames(run.folder / "steps.jsonl", run.taken, len(dataset.frames))
     return Comparison(labelled, dataset)
 
 

@@ -25,6 +25,7 @@ import json
 import math
 import warnings
 import zipfile
+from collections.abc import Sequence
 from dataclasses import asdict, fields
 from functools import cached_property
 from pathlib import Path
@@ -240,7 +241,8 @@ def read_checkpoint(out: Path) -> State | None:
         raise InputError(
             f"{path}: not a readable checkpoint ({reason}); delete it to begin with the seeds"
         ) from None
-    check_frames(path, state.taken, read_config(out))
+    frames = read_config(out).get("frames")
+    check_frames(path, state.taken, len(frames) if isinstance(frames, list) else 0)
     return state
 
 
@@ -265,9 +267,7 @@ def _member(file: zipfile.ZipFile, name: str, kind: str) -> np.ndarray:
     return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C").copy("K")
 
 
-def check_frames(path: Path, taken: list[int], config: dict[str, Any]) -> None:
-    """Raises InputError where frames taken are not among those of the run's config.json."""
-    frames = config.get("frames")
-    count = len(frames) if isinstance(frames, list) else 0
+def check_frames(path: Path, taken: Sequence[int], count: int) -> None:
+    """Raises InputError where frames taken, as a file says, are not among this number."""
     if not all(0 <= frame < count for frame in taken):
         raise InputError(f"{path}: takes frames beyond the {count} of the run; start the run anew")
