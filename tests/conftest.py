@@ -18,10 +18,18 @@ settings.load_profile("mgs")
 
 import tiny  # noqa: E402
 
+from mgs.data.dataset import load_dataset  # noqa: E402
+
 
 @pytest.fixture(scope="module")
 def pristine(tmp_path_factory):
     return tiny.write_dataset(tmp_path_factory.mktemp("pristine") / "dataset")
+
+
+@pytest.fixture(scope="module")
+def loaded(pristine):
+    """A tiny dataset that no test changes."""
+    return load_dataset(pristine)
 
 
 @pytest.fixture

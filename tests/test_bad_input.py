@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import synthetic
 import tiny
 from refusals import occupied, refused
 
@@ -66,17 +65,9 @@ def remove(name: str) -> Change:
     return lambda root: (root / name).unlink()
 
 
-def every_depth(value: float) -> Change:
-    def apply(root: Path) -> None:
-        for path in (root / "depth").glob("*.exr"):
-            write_exr(path, {"Z": np.full((tiny.HEIGHT, tiny.WIDTH), value)})
-
-    return apply
-
-
-def no_intrinsics(data: dict) -> None:
-    for key in ("fl_x", "fl_y", "cx", "cy"):
-        data.pop(key)
+def no_number(root: Path) -> None:
+    for path in (root / "depth").glob("*.exr"):
+        write_exr(path, {"Z": np.full((tiny.HEIGHT, tiny.WIDTH), np.nan)})
 
 
 def no_surface(data: dict) -> None:
@@ -96,28 +87,14 @@ def same_name(root: Path) -> None:
     frame(file_path="images/left/kf_0000.png")(root)
 
 
-def pose(scale: tuple, x: float = 0.0) -> Change:
-    """A pose of these diagonal entries and this x."""
-    matrix = np.diag([*scale, 1.0])
-    matrix[0, 3] = x
-    return frame(transform_matrix=matrix.tolist())
-
-
 DATASETS: dict[str, tuple[Change, str]] = {
     "no transforms.json": (remove("transforms.json"), "transforms.json"),
     "folder in place of transforms.json": (a_folder, "transforms.json"),
-    "truncated transforms.json": (truncate("transforms.json"), "transforms.json"),
     "transforms.json of another shape": (
         lambda root: (root / "transforms.json").write_text("[1, 2]"),
         "no frames",
     ),
     "no frames": (header(frames=[]), "no frames"),
-    "no intrinsics": (edit(no_intrinsics), "intrinsics"),
-    "focal length 0": (header(fl_x=0), "focal"),
-    "NaN pose": (pose((1, 1, 1), float("nan")), "frame 2"),
-    "singular pose": (pose((0, 0, 0)), "frame 2"),
-    "pose that flattens": (pose((1, 1, 0)), "frame 2"),
-    "pose that is no matrix": (frame(transform_matrix=[1, 2, 3]), "frame 2"),
     "pose of words": (frame(transform_matrix=[["a"] * 4] * 4), "frame 2"),
     "width of a slip": (header(w=10**9), "1000000000x"),
     "width without end": (header(w=float("inf")), "frame 0"),
@@ -137,7 +114,6 @@ DATASETS: dict[str, tuple[Change, str]] = {
     "mask_path that is a list": (frame(mask_path=["a"]), "mask_path"),
     "timestamp NaN": (frame(timestamp=float("nan")), "timestamp"),
     "timestamp of words": (frame(timestamp="noon"), "timestamp"),
-    "missing image": (remove("images/kf_0003.png"), "kf_0003.png"),
     "missing depth": (remove("depth/kf_0003.exr"), "kf_0003.exr"),
     "missing mask": (remove("masks/kf_0003.png"), "kf_0003.png"),
 }
@@ -158,7 +134,6 @@ def test_broken_dataset_of_a_prior(capsys, dataset, tmp_path):
 
 @cases(
     {
-        "truncated image": (truncate("images/kf_0000.png"), "kf_0000.png"),
         "image that is text": (
             lambda root: (root / "images/kf_0000.png").write_text("no pixels"),
             "kf_0000.png",
@@ -167,11 +142,6 @@ def test_broken_dataset_of_a_prior(capsys, dataset, tmp_path):
             lambda root: write_png(root / "images/kf_0000.png", np.zeros((5, 7, 3), np.float32)),
             "7x5",
         ),
-        "mask of the wrong size": (
-            lambda root: write_png(root / "masks/kf_0000.png", np.ones((5, 7), bool)),
-            "7x5",
-        ),
-        "truncated depth": (truncate("depth/kf_0000.exr"), "kf_0000.exr"),
     }
 )
 def test_broken_pixels(capsys, dataset, prior, tmp_path, given, named):
@@ -184,26 +154,17 @@ def test_broken_pixels(capsys, dataset, prior, tmp_path, given, named):
 
 @cases(
     {
-        "truncated depth": (truncate("depth/kf_0005.exr"), "kf_0005.exr"),
         "neither depth nor masks": (
             edit(no_surface),
             "has no depth images and no points (sparse.ply) and no masks",
         ),
-        "no return in any pixel": (every_depth(0.0), "return"),
-        "NaN in every pixel": (every_depth(np.nan), "return"),
-        "ground without a rock": (
-            lambda root: (
-                shutil.rmtree(root),
-                synthetic.write_dataset(root, rocks=[]),
-            ),
-            "no rock",
-        ),
+        "NaN in every pixel": (no_number, "return"),
     }
 )
-@pytest.mark.parametrize("command", [["nbv", "--budget", 1], ["prior"]], ids=["nbv", "prior"])
-def test_survey_without_a_rock(capsys, dataset, tmp_path, command, given, named):
+def test_survey_without_a_rock(capsys, dataset, tmp_path, given, named):
+    """Other faults are tried with `mgs prior`, which shares this step."""
     given(dataset)
-    arguments = [*command, dataset, "--out", tmp_path / "out"]
+    arguments = ["nbv", "--budget", 1, dataset, "--out", tmp_path / "out"]
     assert named in refused(capsys, arguments, tmp_path / "out")
 
 
@@ -214,7 +175,6 @@ def test_survey_without_a_rock(capsys, dataset, tmp_path, command, given, named)
         "no seeds": (["--seeds", 0], "--seeds"),
         "budget larger than the candidates": (["--budget", 9], "8 candidates"),
         "negative budget": (["--budget", -1], "--budget"),
-        "negative seed": (["--seed", -1], "--seed"),
         "no pixel noise": (["--pixel-noise", 0], "--pixel-noise"),
         "NaN pixel noise": (["--pixel-noise", "nan"], "--pixel-noise"),
         "no passes": (["--passes", 0], "--passes"),
@@ -227,40 +187,23 @@ def test_nbv_settings(capsys, dataset, prior, tmp_path, given, named):
     assert named in refused(capsys, arguments, tmp_path / "out")
 
 
-@pytest.mark.parametrize(("command", "count"), [("nbv", 0), ("prior", 1), ("prior", -5)])
-def test_too_few_gaussians(capsys, dataset, tmp_path, command, count):
-    arguments = [command, dataset, "--out", tmp_path / "out", "--gaussians", count]
-    budget = ["--budget", 1] if command == "nbv" else []
-    assert "Gaussians" in refused(capsys, arguments + budget, tmp_path / "out")
+def test_too_few_gaussians(capsys, dataset, tmp_path):
+    arguments = ["nbv", dataset, "--out", tmp_path / "out", "--gaussians", 0, "--budget", 1]
+    assert "Gaussians" in refused(capsys, arguments, tmp_path / "out")
 
 
-CUBE = "v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n"
-
-
-@cases(
-    {
-        "no faces": ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "faces"),
-        "NaN vertices": (CUBE, "NaN"),
-        "not a mesh": ("this is no mesh", "mesh.obj"),
-    }
-)
-def test_broken_mesh(capsys, tmp_path, given, named):
-    (tmp_path / "mesh.obj").write_text(given)
+def test_broken_mesh(capsys, tmp_path):
+    """Other faults are tried with `mgs prior`, which reads meshes in the same way."""
+    (tmp_path / "mesh.obj").write_text("this is no mesh")
     arguments = ["synth-orbit", tmp_path / "out", "--mesh", tmp_path / "mesh.obj"]
-    line = refused(capsys, arguments, tmp_path / "out")
-    assert named in line
-    assert "mesh.obj" in line
+    assert "mesh.obj" in refused(capsys, arguments, tmp_path / "out")
 
 
 @cases(
     {
-        "missing mesh": (["--mesh", "nowhere.glb"], "nowhere.glb"),
         "up axis of no mesh": (["--mesh-up", "y"], "--mesh-up"),
         "unknown up axis": (["--mesh-up", "x"], "--mesh-up"),
-        "unknown scene": (["--scene", "moonbase"], "moonbase"),
         "missing scene file": (["--scene", "nowhere/x.toml"], "x.toml"),
-        "unknown preset": (["--preset", "huge"], "huge"),
-        "size of words": (["--size", "big"], "--size"),
         "size 0": (["--size", "0x12"], "--size"),
         "size of a slip": (["--size", "99999999x99999999"], "--size"),
         "size in other digits": (["--size", "3²x24"], "--size"),
@@ -277,7 +220,6 @@ DUST = "[rock]\ndetail = 0.1\nburied = 0.999\n[orbit]\naltitude = 0\n[arena]\nst
 @cases(
     {
         "unknown section": ("[rok]", "description, rock, arena"),
-        "unknown key": ("[orbit]\nradiu = 4", "kind, radius, altitude"),
         "unknown key of a lobe": ("[[rock.lobes]]\nradius = 1", "centre, radii"),
         "no lobes": ("[rock]\nlobes = []", "rock.lobes"),
         "rock wholly buried": ("[rock]\nburied = 1", "rock.buried"),
@@ -297,8 +239,6 @@ def test_scene_files(capsys, tmp_path, given, named):
 @cases(
     {
         "missing": (shutil.rmtree, "mgs prior"),
-        "without points": (remove("points.ply"), "points.ply"),
-        "truncated points": (truncate("points.ply"), "prior"),
         "truncated numbers": (truncate("prior.json"), "prior.json"),
         "negative spacing": (numbers(spacing=-1), "prior.json"),
         "NaN tolerance": (numbers(depth_tolerance=float("nan")), "prior.json"),

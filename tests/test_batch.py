@@ -7,7 +7,6 @@ import tiny
 from program import command, steps
 from tiny import run
 
-from mgs.data.dataset import load_dataset
 from mgs.policy import criteria
 from mgs.policy.registry import policy_names
 from mgs.run import problem, recording
@@ -19,19 +18,13 @@ AT_THE_MODEL |= {"i-optimal", "block-d", "paper"}
 """Policies that use information at the fitted model."""
 
 
-@pytest.fixture(scope="module")
-def loaded(tmp_path_factory):
-    return load_dataset(tiny.write_dataset(tmp_path_factory.mktemp("tiny") / "dataset"))
-
-
-def test_a_study_has_a_number_for_each_fit_of_a_run(loaded, tmp_path, monkeypatch):
+def test_a_study_has_a_number_for_each_fit_of_a_run(loaded, tmp_path):
     def measure(gaussians, taken):
         return {"test_psnr": 10 + len(taken), "test_psnr_mask": len(taken)}
 
     parts = tiny.operations(measure=measure)
     state = run(tmp_path / "run", loaded, parts, batch=2, evaluate_every=1)
-    monkeypatch.setattr(case, "run_or_resume", lambda *arguments: state)
-    curves = case.run_policy(tmp_path, tmp_path, "dataset", "prior", {"batch": 2})
+    curves = case.curves_of(state)
     assert curves["taken"] == state.taken
     assert curves["images"] == curves["test_psnr_mask"] == [3, 5, 7, 8]
     assert curves["test_psnr"] == [13, 15, 17, 18]

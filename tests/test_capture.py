@@ -30,8 +30,8 @@ from mgs.synth.scene_file import Arena, Rock, SceneFile
 from mgs.view.subject import read_subject
 
 TINY = RenderPreset(width=64, height=48, frames=8, spp=2)
-SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=20))
-TOML = "[rock]\ndetail = 0.06\n[arena]\nstones = 20\n"
+SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=4))
+TOML = "[rock]\ndetail = 0.06\n[arena]\nstones = 4\n"
 RUN = ["--seeds", "3", "--budget", "3", "--passes", "3", "--evaluate-every", "1", "--seed", "1"]
 KILLED = """
 import os, signal
@@ -344,11 +344,8 @@ def test_a_survey_with_noise_of_an_on_demand_dataset(poses, tmp_path):
 
 def test_bad_scenes_and_options_are_refused(small, poses, tmp_path, capsys):
     """With one line, before anything is made."""
-    bad, full, capture = (
-        tmp_path / "bad.toml",
-        occupied(tmp_path / "full"),
-        ["--capture", "boulder"],
-    )
+    bad, full = tmp_path / "bad.toml", occupied(tmp_path / "full")
+    capture = ["--capture", "boulder"]
     bad.write_text("[rock]\nsiez = 1\n")
     out = ["--out", tmp_path / "out"]
     for arguments, message in (

@@ -16,6 +16,9 @@ from mgs.policy import criteria
 from mgs.report import diagnostics
 from mgs.run import folder as run_folder
 from mgs.run import recording
+from mgs.run.folder import Run
+from mgs.run.settings import NbvSettings
+from mgs.run.state import State
 from mgs.splat import groups
 
 CHANNELS = {
@@ -24,13 +27,16 @@ CHANNELS = {
 }  # fmt: skip
 
 
-def test_scalars_follow_their_formulas():
+def test_scalars_follow_their_formulas(tmp_path):
     rng = np.random.default_rng(0)
     H, lam = rng.random((5, 11)) * 10, criteria.regularisation(groups(0))
     H[2] = 0
     surface = np.ones((5, 11))
     surface[4] = 1e-5
-    scalars = diagnostics.gaussian_scalars(H, surface, lam, lam, groups(0))
+    gaussians = Gaussians(*(np.zeros(shape) for shape in ((5, 3), (5, 3), (5, 4), 5, (5, 1, 3))))
+    run = Run(tmp_path, NbvSettings(dataset=tmp_path, prior=tmp_path))
+    run.state = State(gaussians, H, surface, [], [], {})
+    scalars = diagnostics.run_scalars(run)
     np.testing.assert_allclose(scalars["fisher.scale"], H[:, 3] + H[:, 4] + H[:, 5])
     np.testing.assert_allclose(scalars["fisher.opacity"], H[:, 10])
     assert scalars["information"][2] == 0

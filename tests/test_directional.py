@@ -12,7 +12,7 @@ from mgs.colour import SH_C0
 from mgs.data.dataset import load_dataset
 from mgs.policy import criteria, directional
 from mgs.policy.directional import Views, gains
-from mgs.run import loop, recording
+from mgs.run import loop
 from mgs.run.problem import Problem
 from mgs.splat import reference
 
@@ -131,9 +131,8 @@ def test_a_flight_is_planned_without_looking_at_any_fit(dataset, tmp_path, polic
 
     loaded, states = load_dataset(dataset), []
     for name, fit in (("run", tiny.fit), ("forgetful", forgetful)):
-        out, stations = tmp_path / name, tiny.operations(fit=fit)
-        settings = tiny.start(out, loaded, policy=policy, budget=3)
-        states.append(recording.run(out, settings, loaded, stations, tiny.silent))
+        parts = tiny.operations(fit=fit)
+        states.append(tiny.run(tmp_path / name, loaded, parts, policy=policy, budget=3))
     scores = [[step["score"] for step in state.steps] for state in states]
     assert (states[0].taken, scores[0]) == (states[1].taken, scores[1])
     start, cameras = tiny.initial([]), tiny.orbit()

@@ -63,6 +63,9 @@ def test_psnr_inside_a_mask(images):
     outside = np.where(mask[..., None], b, 0)
     assert psnr(a, outside, mask) == psnr(a, b, mask)
     assert psnr(a, outside) < psnr(a, b)
+    nothing = np.zeros(a.shape[:2], bool)
+    assert math.isnan(psnr(a, b, nothing))
+    assert math.isnan(ssim(a, b, nothing))
 
 
 def test_ssim_follows_its_definition(images):
@@ -88,13 +91,6 @@ def test_ssim_follows_its_definition(images):
     assert ssim(a, b) < 1
 
 
-def test_empty_masks_have_no_metric(images):
-    a, b = images
-    nothing = np.zeros(a.shape[:2], bool)
-    assert math.isnan(psnr(a, b, nothing))
-    assert math.isnan(ssim(a, b, nothing))
-
-
 def test_bad_images_are_named():
     with pytest.raises(InputError, match="cannot be compared"):
         psnr(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)))
@@ -111,8 +107,16 @@ def grey() -> Gaussians:
 def test_views_are_measured_beside_each_other_but_large_ones_alone(
     tmp_path, monkeypatch, pixels, most
 ):
+    """What a renderer returns is freed by the thread that draws. Memory of Dr.Jit that another
+    thread frees while the next view is drawn stops both for ever, now and then."""
     dataset, lock = write_dataset(tmp_path / "data", orbit_cameras(8)), threading.Lock()
-    active, seen = [0], []
+    active, seen, freed = [0], [], []
+
+    def renderer(gaussians, camera):
+        drawn = tuple(np.zeros((2, 2)) for _ in range(3))
+        for part in drawn:
+            weakref.finalize(part, lambda: freed.append(threading.current_thread()))
+        return drawn
 
     def measured(frame, rendered, spacing, folder):
         with lock:
@@ -125,29 +129,10 @@ def test_views_are_measured_beside_each_other_but_large_ones_alone(
 
     monkeypatch.setattr(evaluation, "_measured", measured)
     monkeypatch.setattr(evaluation, "PIXELS_AT_ONCE", pixels)
-    result = evaluate(grey(), dataset.frames, (), renderer=lambda *_: (np.zeros(1),) * 3)
+    result = evaluate(grey(), dataset.frames, (), renderer=renderer)
     assert [view["psnr"] for view in result["views"]] == list(range(8)), "in their order"
     assert len(seen) == 8
     assert (max(seen) == 1) if most == 1 else (1 < max(seen) <= most)
-
-
-def test_what_a_renderer_returns_is_freed_by_the_thread_that_draws(tmp_path, monkeypatch):
-    """Memory of Dr.Jit that another thread frees while the next view is drawn stops both for ever,
-    now and then."""
-    dataset, freed = write_dataset(tmp_path / "data", orbit_cameras(8)), []
-
-    def renderer(gaussians, camera):
-        drawn = tuple(np.zeros((2, 2)) for _ in range(3))
-        for part in drawn:
-            weakref.finalize(part, lambda: freed.append(threading.current_thread()))
-        return drawn
-
-    def measured(frame, rendered, spacing, folder):
-        time.sleep(0.02)
-        return {"psnr": 1.0}
-
-    monkeypatch.setattr(evaluation, "_measured", measured)
-    evaluate(grey(), dataset.frames, (), renderer=renderer)
     assert freed == [threading.main_thread()] * 24
 
 
@@ -367,20 +352,6 @@ def test_what_is_known_of_a_model_is_not_measured_again(dataset, prior, tmp_path
     assert listing(run / "renders") == pictures
 
 
-@pytest.mark.parametrize(
-    ("other", "measured"), [({"commit": "1234567"}, 0), ({"mitsuba": "0.1"}, 12)]
-)
-def test_another_commit_keeps_the_metrics_and_another_version_does_not(
-    dataset, prior, tmp_path, work, monkeypatch, other, measured
-):
-    run, versions = tiny.write_run(tmp_path / "run", dataset, prior), evaluation.versions()
-    evaluate_run(run)
-    work()
-    monkeypatch.setattr(evaluation, "versions", lambda: versions | other)
-    evaluate_run(run)
-    assert work()[0] == measured
-
-
 def brighten(run):
     """Make the model of a run brighter, in both of its files."""
     with np.load(run / "checkpoint.npz") as data:
@@ -399,6 +370,17 @@ CHANGES = {
     "spacing": lambda run, data: write_json(run.parent / "prior/prior.json", {"spacing": 0.01}),
     "damaged": lambda run, data: (run / "metrics.json").write_text("{"),
 }
+
+
+def test_another_commit_keeps_the_metrics_and_another_version_does_not(
+    dataset, prior, tmp_path, work, monkeypatch
+):
+    run, versions = tiny.write_run(tmp_path / "run", dataset, prior), evaluation.versions()
+    monkeypatch.setattr(evaluation, "versions", lambda: versions)
+    for name, measured in (("mgs", 12), ("commit", 0), ("mitsuba", 12)):
+        versions[name] = "1234567"
+        evaluate_run(run)
+        assert work()[0] == measured
 
 
 @pytest.mark.filterwarnings("ignore::mgs.errors.Notice")  # a model of another step is restored

@@ -125,19 +125,6 @@ def test_one_step_is_natural_on_the_gradient_of_the_objective(cameras, targets, 
 
 
 @pytest.mark.parametrize("means", MOVING)
-def test_what_no_image_sees_goes_back_to_its_start(cameras, means):
-    start, begun = ball(), ball(0.05)
-    cameras = cameras[:2]
-    black = [np.zeros((40, 48, 4), np.float32) for _ in cameras]  # of weight 0
-    lam = dict.fromkeys(LAM, 100.0)
-    train = settings(means, 0.004, optimiser="adam", passes=40, decay=1e-2)
-    found = fit(begun, cameras, black, train, start=start, lam=lam, normals=normals())
-    pixels = sum(image[..., :3].size for image in black)
-    assert found.losses[0] == pytest.approx(100 * N * 0.05**2 / pixels, rel=1e-3)
-    assert np.allclose(found.gaussians.means, start.means, atol=2e-3)
-
-
-@pytest.mark.parametrize("means", MOVING)
 def test_displaced_means_move_back_to_the_surface(cameras, targets, means):
     offsets = 0.4 * SPACING * np.random.default_rng(3).standard_normal(N)
     start = ball(offsets)

@@ -30,8 +30,8 @@ from mgs.splat_ply import read_ply
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return load_dataset(tiny.write_dataset(tmp_path_factory.mktemp("tiny") / "dataset"))
+def dataset(pristine):
+    return load_dataset(pristine)
 
 
 @pytest.fixture(scope="module")

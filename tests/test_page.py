@@ -275,6 +275,8 @@ def test_the_page_in_a_browser(browser, page, width, height, scheme):
             tab.locator(f"#{name}").scroll_into_view_if_needed()
             tab.wait_for_selector(f"#{name} .main-svg", state="attached")
         tab.wait_for_selector("#orbit-0 canvas")
+        assert tab.locator("img:not([alt]), img[alt='']").count() == 0
+        assert tab.locator(".plot:not([aria-label])").count() == 0
 
         def shown():
             return tab.locator("#pictures img").evaluate_all(
@@ -314,9 +316,3 @@ def test_the_page_in_a_browser(browser, page, width, height, scheme):
         tab.locator("#theme").click()
         assert tab.evaluate("getComputedStyle(document.body).backgroundColor") != background
         assert wrong == []
-
-
-def test_no_picture_or_plot_is_without_words(browser, page):
-    with opened(browser, page.as_uri(), 800, 600) as (tab, _):
-        assert tab.locator("img:not([alt]), img[alt='']").count() == 0
-        assert tab.locator(".plot:not([aria-label])").count() == 0

@@ -74,8 +74,7 @@ def file(tmp_path):
 
 
 def run(out, dataset, **values):
-    settings = tiny.start(out, dataset, **({"budget": 3} | values))
-    return recording.run(out, settings, dataset, tiny.operations(), tiny.silent)
+    return tiny.run(out, dataset, **({"budget": 3} | values))
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ from mgs import plotting
 from mgs.cli import printing
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data.dataset import load_dataset
+from mgs.data.up import PLUS_Z
 from mgs.errors import InputError
 from mgs.files import read_json, write_json
 from mgs.policy.registry import policy_names
@@ -291,16 +292,9 @@ UNFIT = {
         {"metrics": {"pictures": False}},
         "no picture of this model; draw it with `mgs eval",
     ),
-    "metrics of nothing": ({"metrics": {"images": None}}, r"metrics\.json: is damaged; measure"),
-    "metrics without numbers": ({"metrics": {"all": 1}}, r"metrics\.json: is damaged; measure"),
     "metrics of views without numbers": (
         {"metrics": {"views": [{}]}},
         r"metrics\.json: is damaged; measure",
-    ),
-    "no settings": ({"config": lambda config: config.pop("settings")}, "has no settings"),
-    "no policy": (
-        {"config": lambda config: config["settings"].pop("policy")},
-        r"config\.json: settings.policy: Field required.*start the run anew",
     ),
     "budget of words": (
         {"config": set_setting("budget", "many")},
@@ -411,6 +405,12 @@ def laid_out(figure):
     return figure
 
 
+def within(figure, box):
+    page = figure.bbox
+    across = page.x0 <= box.x0 < box.x1 <= page.x1
+    return across and page.y0 <= box.y0 < box.y1 <= page.y1
+
+
 LONG = "DJI_20231105103211_0004_W_some_flight_over_some_rock_with_a_long_name"
 
 
@@ -428,15 +428,13 @@ def test_no_word_of_a_comparison_is_cut_off_or_written_over(tmp_path, monkeypatc
     truth[10:50, 20:60] = 0.5
     captions = dict.fromkeys(labels, "100 images, trained on; 30.09 dB, SSIM 0.9301")
     renders = dict.fromkeys(labels, truth + 0.1)
-    figures.comparison_figure(tmp_path / "a.png", truth, renders, title=title, captions=captions)
+    figures.comparison_figure(tmp_path / "a.png", truth, renders, title, captions)
     figure = laid_out(found[0])
     texts = [text for axis in figure.axes for text in (axis.title, *axis.texts)]
     texts.append(figure.axes[-1].xaxis.label)
     boxes = [text.get_window_extent() for text in texts if text.get_text()]
     assert len(boxes) == 3 + len(labels)
-    for box in boxes:
-        assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
-        assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1
+    assert all(within(figure, box) for box in boxes)
     titles = [axis.title.get_window_extent() for axis in figure.axes if axis.title.get_text()]
     assert len(titles) == 1 + len(labels)
     assert all(a.x1 < b.x0 for a, b in pairwise(titles))
@@ -448,15 +446,13 @@ def test_no_word_of_a_comparison_is_cut_off_or_written_over(tmp_path, monkeypatc
 def test_no_word_of_an_orbit_is_cut_off_or_written_over(tmp_path, monkeypatch, runs, name):
     found = drawn_only(monkeypatch)
     choices = {f"{name} {i}": ([0], [1]) for i in range(runs)}
-    figures.orbit_figure(tmp_path / "a.png", np.eye(3), None, choices)
+    figures.orbit_figure(tmp_path / "a.png", np.eye(3), np.zeros((1, 3)), choices, PLUS_Z, "m")
     figure = laid_out(found[0])
     axes = figure.axes[:runs]
     titles = [axis.title.get_window_extent() for axis in axes]
-    assert all(a.x1 < b.x0 for a, b in pairwise(titles))
-    assert 0 <= titles[0].x0 < titles[-1].x1 <= figure.bbox.x1
-    assert all(box.y1 <= figure.bbox.y1 for box in titles)
     legend = figure.legends[0].get_window_extent()
-    assert legend.y0 >= 0
+    assert all(a.x1 < b.x0 for a, b in pairwise(titles))
+    assert all(within(figure, box) for box in (*titles, legend))
     assert all(legend.y1 <= axis.xaxis.label.get_window_extent().y0 for axis in axes)
 
 
@@ -473,8 +469,7 @@ def test_a_legend_covers_no_line(tmp_path, monkeypatch, runs):
     for figure in map(laid_out, found):
         legend = figure.legends[0].get_window_extent()
         assert [text.get_text() for text in figure.legends[0].get_texts()] == labels
-        assert figure.bbox.x0 <= legend.x0 < legend.x1 <= figure.bbox.x1
-        assert figure.bbox.y0 <= legend.y0 < legend.y1 <= figure.bbox.y1
+        assert within(figure, legend)
         for axis in figure.axes:
             assert axis.get_legend() is None
             assert axis.get_tightbbox().x1 <= legend.x0
@@ -495,6 +490,10 @@ def test_every_line_of_a_figure_looks_different(labels):
     assert [style["label"] for style in styles] == labels
     looks = {(style["color"], style["marker"], style["linestyle"]) for style in styles}
     assert len(looks) == len(labels)
+    for style in styles:  # of two runs of a policy, the first has its style
+        if style["label"] in (*POLICY_STYLE, "random (a)"):
+            own = POLICY_STYLE[style["label"].split(" ")[0]]
+            assert (style["color"], style["marker"]) == own
 
 
 SEEN = {
@@ -524,11 +523,6 @@ def test_every_policy_has_a_colour_and_a_marker_of_its_own(eyes):
     apart = np.linalg.norm(seen[:, None] - seen[None], axis=2) + 100 * np.eye(len(seen))
     assert apart.min() > 9  # a difference of 2 is just seen where patches touch
     assert seen[:, 0].max() < 80  # and all are seen on white
-
-
-def test_a_policy_keeps_its_style_whatever_it_is_compared_with():
-    ours = figures.line_styles(["mine", "random (a)", "random (b)"])[1]
-    assert (ours["color"], ours["marker"]) == POLICY_STYLE["random"]
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic
+from program import command, exit_code
 from refusals import occupied, refused
 
-from mgs.cli.app import main
 from mgs.data.dataset import TEST_FOLDER, load_dataset
 from mgs.errors import InputError
 from mgs.files import write_json
@@ -24,6 +24,7 @@ from mgs.study import case, free_fit, reproduce
 from mgs.study import reproduce_results as results
 from mgs.study.case import Case, Scene, Size
 from mgs.study.reproduce import FREE_FIT, ReproduceSize, Rock, Run, RunSize
+from mgs.study.reproduce_results import Work
 from mgs.study.sweep import cell_folder, run_cells
 
 ONE = RunSize(Size(48, 36, 8, 3, spp=1), 200, 2)
@@ -62,11 +63,8 @@ def quick(monkeypatch):
 
 
 def done(capsys, *arguments):
-    with pytest.raises(SystemExit) as stop:
-        main(["reproduce", *(str(argument) for argument in arguments)])
-    said = capsys.readouterr()
-    assert stop.value.code == 0, said.err
-    return said.out
+    command("reproduce", *arguments)
+    return capsys.readouterr().out
 
 
 def rows_of(path):
@@ -84,8 +82,8 @@ def test_curves_are_made_once_and_hold_what_the_runs_found(quick, tmp_path, caps
     assert set(before) == {*names, "statistics.json"}
     rows, each = rows_of(folder / "curves.csv"), rows_of(folder / "curves_by_rock.csv")
     assert [(row["policy"], row["images"]) for row in rows[:3]] == [("farthest", n) for n in "456"]
-    command = "mgs reproduce --preset quick --only curves --rocks 2"
-    assert {row["command"] for row in rows} == {command}
+    line = "mgs reproduce --preset quick --only curves --rocks 2"
+    assert {row["command"] for row in rows} == {line}
     (mean,), last = (
         [float(r["test_psnr"]) for r in of if (r["policy"], r["images"]) == ("uniform", "6")]
         for of in (rows, each)
@@ -108,8 +106,8 @@ def test_a_policy_of_ones_own_is_compared_over_rocks(quick, tmp_path, capsys):
     assert "4/5 curves run/boulder-1" in said, "the other policies are not run again"
     rows = rows_of(out / "results/curves.csv")
     assert {row["policy"] for row in rows} == {"farthest", "uniform", "mine.py:first"}
-    command = "mgs reproduce --preset quick --only curves --rocks 1 --policy mine.py:first"
-    assert {row["command"] for row in rows} == {command}
+    line = "mgs reproduce --preset quick --only curves --rocks 1 --policy mine.py:first"
+    assert {row["command"] for row in rows} == {line}
     pairs = json.loads((out / "results/statistics.json").read_text())["test_psnr"]["pairs"]
     own = [("mine.py:first", "uniform"), ("mine.py:first", "farthest")]
     assert [(pair["policy"], pair["other"]) for pair in pairs] == [("farthest", "uniform"), *own]
@@ -136,8 +134,8 @@ def test_rocks_of_ones_own_take_the_place_of_the_others(quick, tmp_path, capsys,
     assert rendered == [("boulder", "one.ply"), ("boulder", "two.glb")]
     assert "0/8 curves dataset/one-" in said
     assert {row["scene"] for row in rows_of(out / "results/curves_by_rock.csv")} == {"one", "two"}
-    command = "mgs reproduce --preset quick --only curves --rocks 2 --mesh one.ply --mesh two.glb"
-    assert {row["command"] for row in rows_of(out / "results/curves.csv")} == {command}
+    line = "mgs reproduce --preset quick --only curves --rocks 2 --mesh one.ply --mesh two.glb"
+    assert {row["command"] for row in rows_of(out / "results/curves.csv")} == {line}
     twice = ["--mesh", meshes[0], "--mesh", tmp_path / "out/../one.ply"]
     for options, line in (
         (["--rocks", 3, *given], "--rocks 3: curves can have 1 to 2"),
@@ -238,7 +236,7 @@ if __name__ == "__main__":
 
 
 def test_a_study_that_is_killed_leaves_no_process_behind(tmp_path):
-    program, said = tmp_path / "program.py", tmp_path / "pid"
+    program, said = tmp_path / "study.py", tmp_path / "pid"
     program.write_text(LINGERING)
     paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     environment = os.environ | {"PYTHONPATH": paths}
@@ -302,9 +300,9 @@ def test_table_1_has_equal_counts_and_the_papers_rows(quick, tmp_path, capsys, m
     assert "| random, mean of 2 | 6 | 20.70 | " + ours.format("20.70") in text
     assert "`mgs reproduce --preset quick --only table1`" in text
     assert "Not done yet" not in text
-    command = rows["random, draw 2"]["command"]
-    assert command.startswith("mgs nbv cells/dataset/boulder-0/circle-1/8x48x36/dataset --prior ")
-    assert command.endswith("--policy random --seeds 4 --budget 2 --seed 1000")
+    line = rows["random, draw 2"]["command"]
+    assert line.startswith("mgs nbv cells/dataset/boulder-0/circle-1/8x48x36/dataset --prior ")
+    assert line.endswith("--policy random --seeds 4 --budget 2 --seed 1000")
     done(capsys, out, "--only", "table1", "--batch", 2)
     rows = {row["row"]: row for row in rows_of(out / "results/table1.csv")}
     ending = "--policy d-optimal --batch 2 --seeds 4 --budget 2 --seed 0"
@@ -322,9 +320,7 @@ def test_table_1_is_there_for_the_rows_that_are_done(quick, tmp_path, capsys, mo
 
     monkeypatch.setattr(case, "time_policy", killed)
     out = tmp_path / "out"
-    with pytest.raises(SystemExit) as stop:
-        main(["reproduce", str(out), "--only", "table1"])
-    assert stop.value.code == 130
+    assert exit_code("reproduce", out, "--only", "table1") == 130
     assert "run the same command again to continue" in capsys.readouterr().err
     done_rows = [row["row"] for row in rows_of(out / "results/table1.csv")]
     assert done_rows == ["d-optimal", "random, draw 1"]
@@ -349,8 +345,8 @@ def test_differences_are_paired_by_rock(tmp_path):
     runs = reproduce.curve_runs(TINY, 3)
     ahead = {"d-optimal": 0.0, "uniform": 0.3, "directional-i": 0.5}
     found = fake(runs, lambda run: 25 + 10 * run.rock.index + ahead.get(run.policy, 0.1))
-    results.write_curves(tmp_path, tmp_path, found, TINY, 3, "c")
-    rows = json.loads((tmp_path / "curves.json").read_text())["rows"]
+    results.write_curves(Work(tmp_path, found, TINY, 3, "c"))
+    rows = json.loads((tmp_path / "results/curves.json").read_text())["rows"]
     row = next(r for r in rows if (r["policy"], r["images"]) == ("d-optimal", 6))
     assert row["test_psnr"] == pytest.approx(35)
     ends = [row[f"test_psnr_over_uniform{end}"] for end in ("", "_low", "_high")]
@@ -366,12 +362,12 @@ def test_differences_are_paired_by_rock(tmp_path):
     images = [reach[policy]["images"] for policy in ("uniform", "directional-i")]
     assert images == pytest.approx([5.6, 5.2])
     assert reach["d-optimal"] == {"images": None, "rocks": 0}
-    text = (tmp_path / "curves.md").read_text()
+    text = (tmp_path / "results/curves.md").read_text()
     assert "| d-optimal | 34.50 | 31.50 | – | – |" in text
     assert "| uniform | 34.80 | 31.80 | 5.6 | 5.6 |" in text
     pair = "| d-optimal − uniform | full frame | -0.30 [-0.30, -0.30], 0 of 3 | fails | 0.25 | 1 |"
     assert pair + " -0.30, 0 of 1 |" in text
-    assert (tmp_path / "curves.png").stat().st_size > 10_000
+    assert (tmp_path / "results/curves.png").stat().st_size > 10_000
 
 
 def test_scenes_that_chose_no_setting_are_judged_alone():
@@ -389,10 +385,8 @@ def test_of_one_rock_nothing_is_claimed():
     runs = reproduce.curve_runs(TINY, 1)
     statistics = results.statistics_of(fake(runs, lambda run: 25), runs)
     for pair in statistics["test_psnr"]["pairs"]:
-        assert [pair[key] for key in ("interval", "p", "p_holm", "verdict")] == [
-            *[None] * 3,
-            "depends",
-        ]
+        assert pair["interval"] is pair["p"] is pair["p_holm"] is None
+        assert pair["verdict"] == "depends"
     line = "| d-optimal − uniform | full frame | +0.00, 0 of 1 | depends | – | – | – |"
     assert line in results.statistics_text(statistics)
 
@@ -415,7 +409,7 @@ def test_shares_are_of_what_the_oracle_gains_over_random(tmp_path):
     assert text.count(f"| d-optimal |{f' {half} |' * pools}\n") == 3  # frame, rock, whole curve
     assert f"| directional-i |{' – |' * pools}\n" in text
     assert f"| d-optimal |{' 25% |' * pools}\n" in text
-    written = results.write_pools(tmp_path, tmp_path, fake(runs, lambda r: 25.0), TINY, 2, "c")
+    written = results.write_pools(Work(tmp_path, fake(runs, lambda r: 25.0), TINY, 2, "c"))
     assert {row["test_psnr_share"] for row in rows_of(written[0])} == {""}, "without the oracle"
     assert all(path.is_file() for path in written)
 
@@ -427,10 +421,10 @@ def test_numbers_of_seeds_are_compared_at_equal_images(tmp_path):
     rows, _ = results.seed_rows(found, runs)
     over = [row["test_psnr_over_four"] for row in rows[:6]]
     assert over == pytest.approx([-0.3, -0.2, -0.1, 0, 0.2, 0.4])
-    results.write_seeds(tmp_path, tmp_path, found, TINY, 2, "c")
+    results.write_seeds(Work(tmp_path, found, TINY, 2, "c"))
     line = "| d-optimal | 1 | 90.0 | 180 (180) | 25.10 | -0.30 [-0.30, -0.30] |"
-    assert line in (tmp_path / "seeds.md").read_text()
-    assert (tmp_path / "seeds.png").stat().st_size > 10_000
+    assert line in (tmp_path / "results/seeds.md").read_text()
+    assert (tmp_path / "results/seeds.png").stat().st_size > 10_000
     assert results.largest_gap([0, 27, 23, 19], 32) == pytest.approx(19 * 360 / 32)
     assert results.largest_gap([5], 8) == 360
     assert results.largest_gap([6, 0, 2, 4], 8) == 90
@@ -468,7 +462,7 @@ def test_pools_and_the_oracle_that_sees_the_truth(quick, tmp_path, monkeypatch):
     step = read_checkpoint(cell_folder(tmp_path, oracle.name) / "run").steps[1]
     assert step["score"] == step["test_psnr"], "what it foresaw is what the loop then fits"
     without = {name: found[name] for name in found if name != oracle.name}
-    written = results.write_pools(tmp_path, tmp_path / "results", without, TINY, 1, "c")
+    written = results.write_pools(Work(tmp_path, without, TINY, 1, "c"))
     assert [row["policy"] for row in rows_of(written[0])] == ["uniform", "random", "oracle"]
 
 
@@ -496,9 +490,8 @@ def test_every_run_of_every_result_has_its_own_cell():
         for name, result in reproduce.RESULTS.items():
             runs = result.runs(size, result.count(size))
             assert len({run.name for run in runs}) == len(runs), name
-            cells = result.cells(size, result.count(size))
-            names = {cell.name for cell in cells}
-            assert all(need in names for cell in cells for need in cell.needs)
+            cells = {cell.name: cell for cell in result.cells(size, result.count(size))}
+            assert all(need in cells for cell in cells.values() for need in cell.needs)
 
 
 @pytest.mark.parametrize(
@@ -507,11 +500,9 @@ def test_every_run_of_every_result_has_its_own_cell():
         ("--preset huge", "--preset 'huge': unknown; choose one of quick, paper"),
         ("--only table2", "unknown; choose some of table1,figures,curves,seeds,pools,oracle"),
         ("--only ,", "--only '': unknown"),
-        ("--rocks 0", "should be greater than or equal to 1"),
         ("--rocks 21", "--rocks 21: curves can have 1 to 20"),
         ("--rocks 11 --only pools", "--rocks 11: pools can have 1 to 10"),
         ("--workers 2 --scheduler tcp://x:1", "give one of them"),
-        ("--workers 0", "should be greater than or equal to 1"),
         ("--policy best", "--policy best: unknown; choose one of"),
         ("--policy uniform", "--policy uniform: is compared anyway"),
         ("--policy angle --policy angle", "angle: there is one of this name already"),

@@ -21,11 +21,6 @@ from mgs.run.settings import NbvSettings
 
 
 @pytest.fixture(scope="module")
-def loaded(tmp_path_factory):
-    return load_dataset(tiny.write_dataset(tmp_path_factory.mktemp("tiny") / "dataset"))
-
-
-@pytest.fixture(scope="module")
 def whole(loaded, tmp_path_factory):
     """A run that spent its budget of 5 views."""
     return run(tmp_path_factory.mktemp("whole") / "run", loaded)

@@ -11,7 +11,6 @@ import pytest
 from refusals import refused
 from test_render_command import foreign_ply, gaussians, write_cameras
 
-from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.splat_ply import ply_colour_space, read_ply
 
@@ -190,8 +189,3 @@ def test_a_comment_in_any_script(tmp_path, encoding):
         data = (tmp_path / "x.ply").read_bytes()
         (tmp_path / "y.ply").write_bytes(data.replace(b"from another tool", comment, 1))
         assert read_ply(tmp_path / "y.ply") == model
-
-
-def test_a_folder_in_place_of_a_ply(tmp_path):
-    with pytest.raises(InputError, match="cannot be read"):
-        read_ply(tmp_path)

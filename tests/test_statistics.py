@@ -19,7 +19,7 @@ from mgs.study.statistics import (
     pareto_front,
     permutation_p,
 )
-from mgs.study.verdict import Claim, Outcome, judged, outcome, paired, single, verdict_table
+from mgs.study.verdict import Claim, judged, paired, single, verdict_table
 
 numbers = st.floats(-10, 10, allow_nan=False).map(lambda x: round(x, 3))
 
@@ -38,21 +38,6 @@ def test_the_interval_is_that_of_students_t():
     assert interval([1.0]) is None
 
 
-@pytest.mark.parametrize(
-    ("differences", "p"),
-    [
-        ([1.0, 2.0, 3.0], 2 / 8),  # only all as they are, or all flipped, are as far from 0
-        ([0.1] * 12, 2 / 4096),
-        ([1.0, -1.0], 1.0),
-        ([0.0, 0.0, 0.0], 1.0),
-        ([3.0, -1.0], 1.0),
-        ([-5.0, -4.0, 1.0], 4 / 8),
-    ],
-)
-def test_permutation_p_of_known_cases(differences, p):
-    assert permutation_p(differences) == pytest.approx(p)
-
-
 @given(st.lists(numbers, min_size=2, max_size=7))
 def test_permutation_p_is_the_share_of_sign_flips(differences):
     observed = abs(sum(differences))
@@ -66,14 +51,9 @@ def test_permutation_p_is_the_share_of_sign_flips(differences):
 
 def test_without_replication_there_is_no_claim_and_too_many_rocks_are_refused():
     assert permutation_p([3.0]) is None
+    assert permutation_p([0.1] * 12) == pytest.approx(2 / 4096)
     with pytest.raises(ValueError, match="at most"):
         permutation_p([1.0] * (MOST_ROCKS + 1))
-
-
-def test_holm_of_a_known_case():
-    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
-    assert holm([0.4, 0.9]) == pytest.approx([0.8, 0.9])
-    assert holm([]) == []
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=8), st.floats(0.001, 0.5))
@@ -126,17 +106,6 @@ def test_a_verdict_follows_from_the_interval_alone(values, above, below):
     assert judged(claim("below"), rows)["verdict"] == below
     assert judged(claim("above"), rows)["runs"] == len(values)
     assert f"| it is so | **{above}** |" in verdict_table([judged(claim("above"), rows)])
-
-
-EFFECTS = st.lists(st.floats(-100, 100), min_size=2, max_size=9)
-
-
-@given(EFFECTS, st.floats(-100, 100))
-def test_mirrored_claims_agree_and_opposite_claims_never_both_fail(values, bound):
-    mirrored = interval([-value for value in values])
-    above = outcome("above", bound, interval(values))
-    assert above == outcome("below", -bound, mirrored)
-    assert {above, outcome("below", bound, interval(values))} != {Outcome.FAILS}
 
 
 def test_runs_are_paired_by_their_name():

@@ -6,9 +6,8 @@ import json
 import numpy as np
 import pytest
 import synthetic
-from refusals import refused
+from program import command
 
-from mgs.cli.app import main
 from mgs.data.dataset import load_dataset, write_transforms
 from mgs.prior.build import build_prior, save_prior
 from mgs.prior.settings import PriorSettings
@@ -194,9 +193,7 @@ def test_a_run_writes_its_files_continues_and_keeps_earlier_experiments(
     CALLS.clear()
 
     def verdicts(*arguments):
-        with pytest.raises(SystemExit) as ended:
-            main(["stress", str(tmp_path / "out"), *arguments])
-        assert ended.value.code == 0
+        command("stress", tmp_path / "out", *arguments)
         found = json.loads((tmp_path / "out/verdicts.json").read_text())["experiments"]
         return [(one["name"], one["claims"][0]["verdict"]) for one in found]
 
@@ -211,15 +208,3 @@ def test_a_run_writes_its_files_continues_and_keeps_earlier_experiments(
         assert len(list(csv.DictReader(file))) == 8
     assert "| It is so. | **holds** | 2.05 (" in (tmp_path / "out/stability.md").read_text()
     assert (tmp_path / "out/one.png").is_file()
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["--only", "nothing"], "--only 'nothing': unknown"),
-        (["--preset", "huge"], "--preset 'huge': unknown; choose one of"),
-    ],
-)
-def test_what_is_unknown_is_one_line(options, words, tmp_path, capsys):
-    assert words in refused(capsys, ["stress", str(tmp_path / "out"), *options])
-    assert not (tmp_path / "out").exists()

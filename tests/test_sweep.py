@@ -47,10 +47,8 @@ def test_cells_come_after_those_they_need_and_are_done_once(tmp_path):
     assert run_cells(tmp_path, cells, silent) == {"a/1": {"sum": 1}, "b": {"sum": 3}}
     assert CALLS == ["1", "b"]
     told = []
-    assert run_cells(tmp_path, cells, lambda *what: told.append(what)) == {
-        "a/1": {"sum": 1},
-        "b": {"sum": 3},
-    }
+    again = run_cells(tmp_path, cells, lambda *what: told.append(what))
+    assert again == {"a/1": {"sum": 1}, "b": {"sum": 3}}
     assert CALLS == ["1", "b"]
     assert told == []
 
@@ -91,12 +89,9 @@ def add_slowly(root, out, x, killed=False):
 def write_process(root, out, **arguments):
     """A task that finds its process, and whether another cell of the study had begun and not
     ended."""
-    others = [
-        folder
-        for folder in out.parent.iterdir()
-        if folder != out and not (folder / "result.json").exists()
-    ]
-    return {"pid": os.getpid(), "beside": [folder.name for folder in others]}
+    others = [folder for folder in out.parent.iterdir() if folder != out]
+    beside = [folder.name for folder in others if not (folder / "result.json").exists()]
+    return {"pid": os.getpid(), "beside": beside}
 
 
 def die(root, out):
@@ -165,14 +160,8 @@ def test_two_workers_that_are_killed_find_silently_what_a_serial_run_finds(tmp_p
     program.write_text(PROGRAM)
     paths = os.pathsep.join([os.path.dirname(__file__), os.getcwd()])
     command = [sys.executable, program, tmp_path / "parallel", told, data]
-    done = subprocess.run(
-        command,
-        env=os.environ | {"PYTHONPATH": paths},
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
+    options = {"env": os.environ | {"PYTHONPATH": paths}, "capture_output": True, "text": True}
+    done = subprocess.run(command, timeout=240, **options)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     names = told.read_text().split()
     assert len(names) == len(set(names)) == 9
@@ -198,11 +187,8 @@ def scheduler():
 
 def test_a_cell_that_must_be_alone_runs_here_and_beside_nothing(tmp_path, scheduler):
     alone = Cell("alone", "test_sweep:write_process", alone=True)
-    cells = [
-        alone,
-        Cell("a", "test_sweep:add_slowly", {"x": 1}),
-        Cell("b", "test_sweep:write_process"),
-    ]
+    cells = [alone, Cell("a", "test_sweep:add_slowly", {"x": 1})]
+    cells.append(Cell("b", "test_sweep:write_process"))
     results = run_cells(tmp_path, cells, silent, scheduler=scheduler)
     assert results["alone"] == {"pid": os.getpid(), "beside": []}
     assert results["b"]["pid"] != os.getpid()

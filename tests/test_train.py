@@ -144,14 +144,6 @@ def test_fit_repeats_bitwise_and_owes_nothing_to_a_used_cache(truth, cameras, ta
     assert not np.array_equal(first.gaussians.sh, other.gaussians.sh)
 
 
-def test_stops_when_passes_no_longer_help(truth, cameras, targets):
-    found = fit(
-        grey(truth), cameras, targets, TrainSettings(passes=50, rates=rates_of(*[1e-4] * 4))
-    )
-    assert found.stop_reason == "settled"
-    assert found.passes < 50
-
-
 def faster(factor: float, **values) -> TrainSettings:
     """Settings with multiplied learning rates."""
     rates = {kind: factor * rate for kind, rate in TrainSettings().rates.items()}

@@ -9,26 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from refusals import refused
+from tiny import run
 
-from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.policy import criteria
 from mgs.policy import poses as pose_policies
-from mgs.run import folder as run_folder
-from mgs.run import recording
 
 METRES = st.floats(-100, 100)
-
-
-@pytest.fixture(scope="module")
-def loaded(tmp_path_factory):
-    return load_dataset(tiny.write_dataset(tmp_path_factory.mktemp("tiny") / "dataset"))
-
-
-def run(out, dataset, **values) -> run_folder.State:
-    return recording.run(
-        out, tiny.start(out, dataset, **values), dataset, tiny.operations(), tiny.silent
-    )
 
 
 @given(

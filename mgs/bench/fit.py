@@ -29,9 +29,6 @@ from mgs.report.evaluation import evaluate
 from mgs.seeds import generator
 from mgs.splat import ListCache, as_drjit, fisher, groups
 
-Criterion = Callable[[np.ndarray, np.ndarray, np.ndarray], float]
-"""Score from the information F and H [N,P] and lambda [P]."""
-
 VIEWS = 12
 SIZES = (10_000, 20_000)
 STATES = (("even", 4), ("random", 4), ("random", 6), ("random", 8))
@@ -78,23 +75,21 @@ class Case:
     def measure(self, model: Gaussians, test: bool = False) -> dict[str, Any]:
         """Mean metrics over the views that were not taken; test: over the test views, {} if there
         are none."""
+        spacing, tests = self.prior.spacing, self.dataset.test_views()
         if not test:
             names = [self.dataset.frames[i].name for i in self.taken]
-            found = evaluate(model, self.dataset.frames, names, spacing=self.prior.spacing)
-            return dict(found["held_out"])
-        tests = self.dataset.test_views()
+            return dict(evaluate(model, self.dataset.frames, names, spacing=spacing)["held_out"])
         if tests is None:
             return {}
-        found = evaluate(model, [], [], test_frames=tests.frames, spacing=self.prior.spacing)
-        return dict(found["test"])
+        return dict(evaluate(model, [], [], test_frames=tests.frames, spacing=spacing)["test"])
 
-    def scores(self, model: Gaussians, criterion: Criterion = d_optimal) -> np.ndarray:
-        """Score each view that is not taken, by a criterion of the diagonal information [C]."""
+    def scores(self, model: Gaussians) -> np.ndarray:
+        """D-optimal score of each view that is not taken [C]."""
         cameras, lam = [frame.camera for frame in self.dataset.frames], regularisation(groups(0))
         found = [fisher(model, camera, cache=self.cache) for camera in cameras]
         H = np.stack([found[i] for i in self.taken]).sum(0, dtype=np.float64)
         left = [F for i, F in enumerate(found) if i not in self.taken]
-        return np.array([criterion(F, H, lam) for F in left])
+        return np.array([d_optimal(F, H, lam) for F in left])
 
     def _images(self) -> tuple[list[Any], list[np.ndarray]]:
         frames = [self.dataset.frames[i] for i in self.taken]

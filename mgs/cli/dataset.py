@@ -19,7 +19,7 @@ UNCERTAINTY = 2.0
 def dataset(
     action: Annotated[
         Literal["check", "masks"],
-        argument("check: read every file, compare depth, masks and poses. masks: see above."),
+        argument("check or masks: see above."),
     ],
     path: Annotated[Path, argument("Folder of the dataset.")],
     prior: Annotated[
@@ -29,14 +29,14 @@ def dataset(
         bool, option("masks: move outlines to where colours change, near the prior's.")
     ] = False,
 ) -> None:
-    """Check that every file of a dataset can be read and has the right size, and that colour,
-    depth, masks and poses agree.
+    """Check a dataset, or make masks for one that has none.
 
-    Prints every problem and its cure, and exits with code 2 if there is one. Test views are a
-    dataset of their own: give DATASET/test.
+    `mgs dataset check DATASET` checks that every file can be read and has the right size, and that
+    colour, depth, masks and poses agree. It prints every problem and its cure, and exits with code
+    2 if there is one. Test views are a dataset of their own: give DATASET/test.
 
-    `mgs dataset masks DATASET` makes masks for a dataset that has none: it projects the prior into
-    every image, and writes masks/, and masks.png to look at.
+    `mgs dataset masks DATASET` projects the prior into every image, and writes masks/, and
+    masks.png to look at.
     """
     if action == "masks":
         _make_masks(path, path / "prior" if prior is None else prior, refine)

@@ -163,18 +163,19 @@ def refit(
 
 def _refitted(found: RefittedRun) -> list[str]:
     """Describe a refitted run."""
-    share = found.after / found.before
-    shares = ", ".join(f"{kind} {share:.0%}" for kind, share in found.shares.items())
+    model, left_out = found.lean, found.lean.left_out
+    share = model.parameters / found.before
+    shares = ", ".join(f"{kind} {mask.mean():.0%}" for kind, mask in model.learned.items())
     lines = [
-        f"{found.after:,} parameters are learned, {share:.0%} of the run's {found.before:,}",
+        f"{model.parameters:,} parameters are learned, {share:.0%} of the run's {found.before:,}",
         f"learned by: {shares} of the Gaussians",
     ]
-    if found.left_out:
-        more = "more" if found.left_out.pays else "not more"
+    if left_out:
+        more = "more" if left_out.pays else "not more"
         lines.append(
-            f"SH degree {found.sh_degree}: on views left out, neighbours together, degree 1 gains "
-            f"{found.left_out.gain:+.3f} dB, {more} than its standard error of "
-            f"{found.left_out.error:.3f}"
+            f"SH degree {model.gaussians.sh_degree}: on views left out, neighbours together, "
+            f"degree 1 gains {left_out.gain:+.3f} dB, {more} than its standard error of "
+            f"{left_out.error:.3f}"
         )
     else:
         lines.append("SH degree 0: no other was tried")

@@ -108,11 +108,7 @@ def reproduce(
         )
     with _study(out, study.SIZES, preset) as (_, console, report):
         for name, count in counts.items():
-
-            def tell(cell: str, done: int, total: int, name: str = name) -> None:
-                report(f"{name} {cell}", done, total)
-
-            written = make(out, name, preset, size, count, tell, workers, scheduler)
+            written = make(out, name, preset, size, count, report, workers, scheduler)
             files = ", ".join(str(path) for path in written)
             console.print(f"{name}: wrote {files}", soft_wrap=True)
 

@@ -127,10 +127,10 @@ def seen_through(
     """Share of the rock points of `frame` where `other` measures a larger depth; NaN if it has none
     of them in view.
 
-    Occluders can hide a point but never make it transparent, so the share is near 0 for right
-    poses and depths, however far apart the frames are and however few pixels they have: depth is
-    the least of 3x3 pixels, and pixels at the outline do not count. depth, other_depth: [H,W]
-    z-depth, metres; mask: [H,W] bool, the rock in `frame`.
+    depth, other_depth: [H,W] z-depth, metres. mask: [H,W] bool, the rock in `frame`. Other things
+    can hide a point of the rock, but nothing can be measured behind it. So the share is near 0 for
+    right poses and depths. To allow for large pixels, depth is the least of 3x3 pixels, and pixels
+    at the outline do not count.
     """
     inner = binary_erosion(mask, np.ones((3, 3)), border_value=1)  # outlines mix two depths
     points = frame.camera.unproject(depth)[(inner if inner.any() else mask) & (depth > 0)]

@@ -47,41 +47,27 @@ DECADES = 4
 """Largest range of the logarithmic colour scales, in powers of ten."""
 
 
-def gaussian_scalars(
-    H: np.ndarray,
-    surface: np.ndarray,
-    lam: np.ndarray,
-    prior_lam: np.ndarray,
-    groups: dict[str, slice],
-) -> dict[str, np.ndarray]:
-    """The scalars of the module's docstring, name -> [N].
+def run_scalars(run: Run) -> dict[str, np.ndarray]:
+    """The scalars of the module's docstring of the model of a run, name -> [N].
 
-    H: [N,P] information of the training views about the fitted model, by the run's estimator.
-    surface: [S,P] their exact information about the Gaussians on the surface before training (both
-    as in a run's state). lam: [P] lambda of the run's criteria. prior_lam: [P] information of the
-    prior, which coverage is judged by. groups: columns of each kind (`mgs.splat.groups`).
+    H is about the fitted model, by the run's estimator. What is observed is judged by the exact
+    information about the Gaussians before training, [S,P], which are on the surface.
     """
+    from mgs.splat import groups
+
+    H, settings, degree = run.state.H, run.settings, run.state.gaussians.sh_degree
+    columns = groups(degree, settings.train.means)
+    lam = settings.regularisation(columns)
     scalars = {
-        f"fisher.{name}": H[:, columns].sum(axis=1, dtype=np.float64)
-        for name, columns in groups.items()
+        f"fisher.{name}": H[:, of].sum(axis=1, dtype=np.float64) for name, of in columns.items()
     }
     scalars["information"] = 0.5 * np.log1p(H / lam).sum(axis=1)
     scalars["uncertainty"] = criteria.uncertainty(H, lam)
-    unseen = ~criteria.observed(surface, prior_lam)
+    prior_lam = criteria.regularisation(groups(degree), settings.pixel_noise, settings.prior_std)
+    unseen = ~criteria.observed(run.state.surface, prior_lam)
     scalars["unobserved"] = np.zeros(len(H))
     scalars["unobserved"][: len(unseen)] = unseen
     return scalars
-
-
-def run_scalars(run: Run) -> dict[str, np.ndarray]:
-    """`gaussian_scalars` of the model of a run."""
-    from mgs.splat import groups
-
-    state, settings, degree = run.state, run.settings, run.state.gaussians.sh_degree
-    columns = groups(degree, settings.train.means)
-    prior_lam = criteria.regularisation(groups(degree), settings.pixel_noise, settings.prior_std)
-    lam = settings.regularisation(columns)
-    return gaussian_scalars(state.H, state.surface, lam, prior_lam, columns)
 
 
 def view_maps(

@@ -18,7 +18,6 @@ import numpy as np
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.up import upright
 from mgs.files import atomic_path
-from mgs.report.figures import Curves
 from mgs.report.page_facts import (
     Shown,
     links,
@@ -39,7 +38,7 @@ from mgs.report.page_pictures import (
     new_album,
 )
 from mgs.report.page_plots import METRIC_NAMES, line_plot, orbit_plot, timing_plot, views_plot
-from mgs.report.runs import RunFiles, compare_runs, least_trained
+from mgs.report.runs import RunFiles, compare_runs, least_trained, step_curves
 
 COMPARED = 6
 """Most views of the dataset, and most test views, on which truth and renders are compared."""
@@ -215,13 +214,14 @@ def _compared(shown: Sequence[Shown], frame: Frame) -> dict[str, Any]:
 def _plots(shown: Sequence[Shown]) -> list[dict[str, Any]]:
     """Plots that compare runs: the paper's figures, and every metric that was measured after steps
     or of views."""
-    covered = _curves(shown, "coverage", 100)
+    runs = {one.label: one.run for one in shown}
+    covered = step_curves(runs, "coverage", 100)
     added = {
         label: (x[1:], [b - a for a, b in pairwise(y)])
         for label, (x, y) in covered.items()
         if len(y) > 1
     }
-    gain, left = _curves(shown, "information_gain"), _curves(shown, "uncertainty")
+    gain, left = step_curves(runs, "information_gain"), step_curves(runs, "uncertainty")
     wanted = [
         ("Information gain of each chosen view (the paper's Fig. 2)", gain, "gain, Eq. 7", True),
         ("Surface coverage (Fig. 3)", covered, "coverage (%)", False),
@@ -230,8 +230,8 @@ def _plots(shown: Sequence[Shown]) -> list[dict[str, Any]]:
     ]
     for key in dict.fromkeys(key for one in shown for s in one.run.steps for key in measured(s)):
         name = METRIC_NAMES[key]
-        wanted.append((f"{name} after each step", _curves(shown, key), name, False))
-    loss = _curves(shown, "loss")
+        wanted.append((f"{name} after each step", step_curves(runs, key), name, False))
+    loss = step_curves(runs, "loss")
     wanted.append(("Loss at the end of each fit", loss, "mean squared error", True))
     plots = [line_plot(title, found, y, zero) for title, found, y, zero in wanted if found]
     views = {one.label: measured_views(one.run) for one in shown if one.run.measured}
@@ -241,18 +241,6 @@ def _plots(shown: Sequence[Shown]) -> list[dict[str, Any]]:
         )
         plots.append(views_plot("psnr_mask" if masked else "psnr", views))
     return plots
-
-
-def _curves(shown: Sequence[Shown], key: str, factor: float = 1.0) -> Curves:
-    """A number of the steps of each run, times a factor, against the number of images;
-    without runs that have none."""
-    curves = {}
-    for one in shown:
-        values = [(s["images"], s.get(key)) for s in one.run.steps]
-        points = [(x, factor * y) for x, y in values if y is not None]
-        if points:
-            curves[one.label] = ([x for x, _ in points], [y for _, y in points])
-    return curves
 
 
 def _fill_in(**values: Any) -> str:

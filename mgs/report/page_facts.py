@@ -98,12 +98,11 @@ def summary_rows(shown: Sequence[Shown], dataset: Dataset) -> list[tuple[str, li
     """Rows of the table of results, (heading, a cell for each run): the report's table, without
     what no run has, then the size of the model and the time."""
     rows = [table_row(one.label, one.run, dataset) for one in shown]
-    keys = [key for key in table_columns(rows)[1:] if any(key in row for row in rows)]
     seconds = [sum(sum(s.get("seconds", {}).values()) for s in one.run.steps) for one in shown]
     return [
         *(
             (table_heading(key, rows), [table_cell(key, row.get(key)) for row in rows])
-            for key in keys
+            for key in table_columns(rows)[1:]
         ),
         ("Gaussians", ["–" if one.model is None else f"{len(one.model):,}" for one in shown]),
         ("time of all steps (s)", [f"{value:.1f}" for value in seconds]),

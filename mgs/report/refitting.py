@@ -17,7 +17,7 @@ from mgs.run.folder import open_run
 from mgs.splat_ply import write_ply
 
 if TYPE_CHECKING:
-    from mgs.report.evidence import LeftOut
+    from mgs.report.evidence import LeanModel
 
 REFITTED = "gaussians_refitted.ply"
 
@@ -32,17 +32,13 @@ LARGEST_LOSS = 10.0
 class RefittedRun:
     """Result of `refit_run`.
 
-    before, after: number of learned parameters. shares: {kind: share of the Gaussians that learned
-    it}. left_out: as in `mgs.report.evidence.LeanModel`. sh_degree: of the model. views: "test" or
+    before: number of learned parameters of the run. lean: the refitted model. views: "test" or
     "held out". psnr: on these, dB, of the run's own model, of one that was refitted with all
     parameters, and of the refitted one; None if there are none.
     """
 
     before: int
-    after: int
-    shares: dict[str, float]
-    left_out: LeftOut | None
-    sh_degree: int
+    lean: LeanModel
     views: str
     psnr: list[float] | None
 
@@ -86,10 +82,7 @@ def refit_run(
     views, psnr = compare_models(models, opened.dataset, taken)
     marks = {f"learned_{kind}": mask for kind, mask in found.learned.items()}
     write_ply(path, found.gaussians, marks)
-    before = len(own) * parameters_of_each(settings.train)
-    shares = {kind: float(mask.mean()) for kind, mask in found.learned.items()}
-    degree = found.gaussians.sh_degree
-    return RefittedRun(before, found.parameters, shares, found.left_out, degree, views, psnr)
+    return RefittedRun(len(own) * parameters_of_each(settings.train), found, views, psnr)
 
 
 def parameters_of_each(train: TrainSettings) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from mgs.data.up import Up, unit_up
 from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.policy.from_file import label
+from mgs.report.figures import Curves
 from mgs.run.ending import RunEnd
 from mgs.run.folder import check_same_frames, open_run, read_config
 from mgs.run.settings import validated
@@ -236,6 +237,17 @@ def compare_runs(folders: Sequence[str | Path]) -> Comparison:
     for run in runs[1:]:
         check_same_frames(run.folder, dataset)
     return Comparison(labelled, dataset)
+
+
+def step_curves(runs: Mapping[str, RunFiles], key: str, factor: float = 1.0) -> Curves:
+    """A number of the steps of each run, times a factor, against the number of images; without runs
+    that have none."""
+    curves = {}
+    for name, run in runs.items():
+        points = [(s["images"], factor * s[key]) for s in run.steps if s.get(key) is not None]
+        if points:
+            curves[name] = ([x for x, _ in points], [y for _, y in points])
+    return curves
 
 
 def least_trained(

@@ -77,25 +77,14 @@ def table_row(label: str, run: RunFiles, dataset: Dataset) -> dict[str, Any]:
 
 
 def table_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Keys of COLUMNS that say something of these rows, in order.
-
-    Left out are test views if no run was measured on some, held-out views if no run has some, a
-    fitted exposure if no run estimated exposure, and the reason of the end if all runs spent their
-    budget.
-    """
+    """Keys of COLUMNS of which some row has a value, in order. A fitted exposure is left out if no
+    run estimated exposure."""
     exposure = any(row.get("exposure") for row in rows)
-    tests, new = any("test.psnr" in row for row in rows), has_held_out(rows)
-    ended = any("ended" in row for row in rows)
-
-    def shown(key: str) -> bool:
-        if key == "ended":
-            return ended
-        views = key.partition(".")[0]
-        return {"test": tests, "held_out": new}.get(views, True) and (
-            exposure or "corrected" not in key
-        )
-
-    return [key for key in COLUMNS if shown(key)]
+    return [
+        key
+        for key in COLUMNS
+        if any(row.get(key) is not None for row in rows) and (exposure or "corrected" not in key)
+    ]
 
 
 def has_held_out(rows: Sequence[Mapping[str, Any]]) -> bool:

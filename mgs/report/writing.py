@@ -19,6 +19,7 @@ from mgs.report.runs import (
     check_measured,
     compare_runs,
     least_trained,
+    step_curves,
     up_of,
 )
 from mgs.report.tables import comparison_rows, markdown_table
@@ -57,15 +58,15 @@ def write_report(
     choices = {label: (run.seeds, run.chosen) for label, run in compared.runs.items()}
     up = up_of(first.settings.get("prior", ""), dataset)
     figures.orbit_figure(paths["orbit"], positions, means, choices, up, dataset.unit)
-    steps = {label: run.steps for label, run in compared.runs.items()}
-    gains = {label: [s["information_gain"] for s in lines[1:]] for label, lines in steps.items()}
+    gains = {
+        label: [step["information_gain"] for step in run.steps[1:]]
+        for label, run in compared.runs.items()
+    }
     figures.gain_figure(paths["gain"], gains)
-    figures.coverage_figure(paths["coverage"], _curves(steps, "coverage"))
-    figures.comparison_figure(
-        paths["comparison"], truth, renders, title=frame.name, captions=captions
-    )
+    figures.coverage_figure(paths["coverage"], step_curves(compared.runs, "coverage"))
+    figures.comparison_figure(paths["comparison"], truth, renders, frame.name, captions)
     every = "views taken so far" if dataset.on_demand else "all views"
-    if panels := _psnr_panels(steps, every):
+    if panels := _psnr_panels(compared.runs, every):
         paths["psnr"] = out / f"psnr.{kind}"
         figures.psnr_figure(paths["psnr"], panels)
 
@@ -132,25 +133,14 @@ def _caption(run: RunFiles, views: str, name: str) -> str:
     return f"{len(run.taken)} images{seen}; {quality}"
 
 
-def _curves(steps: Mapping[str, Sequence[Mapping[str, float]]], key: str) -> figures.Curves:
-    """A number of the steps of each run against the number of images."""
-    return {
-        label: ([s["images"] for s in lines], [s[key] for s in lines])
-        for label, lines in steps.items()
-    }
-
-
-def _psnr_panels(
-    steps: Mapping[str, Sequence[Mapping[str, float]]], every: str
-) -> dict[str, figures.Curves]:
+def _psnr_panels(runs: Mapping[str, RunFiles], every: str) -> dict[str, figures.Curves]:
     """Panels of `psnr_figure`: over the test views, or else over all views, which are called
     `every`. Empty if a run was measured on neither."""
     for prefix, views in (("test_", "test views"), ("", every)):
-        keys = {views: f"{prefix}psnr", f"{views}, rock only": f"{prefix}psnr_mask"}
-        measured = {
-            label: [s for s in lines if set(keys.values()) <= s.keys()]
-            for label, lines in steps.items()
+        panels = {
+            views: step_curves(runs, f"{prefix}psnr"),
+            f"{views}, rock only": step_curves(runs, f"{prefix}psnr_mask"),
         }
-        if all(measured.values()):
-            return {what: _curves(measured, key) for what, key in keys.items()}
+        if all(len(curves) == len(runs) for curves in panels.values()):
+            return panels
     return {}

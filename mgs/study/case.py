@@ -27,7 +27,8 @@ from mgs.gaussians import Gaussians
 from mgs.prior.build import build_prior, load_prior, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.report.evaluation import evaluate, evaluate_run
-from mgs.run.nbv import resume_nbv, run_nbv
+from mgs.run.folder import Run, open_run
+from mgs.run.nbv import resume_nbv, start_run
 from mgs.run.state import State
 from mgs.study.sweep import CELLS, Cell
 
@@ -91,12 +92,8 @@ class Case:
     @property
     def prior_name(self) -> str:
         """Name of the prior's cell."""
-        return "-".join(
-            [
-                f"prior/{self.name}",
-                *(f"{v:g}" if isinstance(v, float) else str(v) for v in self.settings.values()),
-            ]
-        )
+        values = (f"{v:g}" if isinstance(v, float) else str(v) for v in self.settings.values())
+        return "-".join([f"prior/{self.name}", *values])
 
     @property
     def folders(self) -> dict[str, str]:
@@ -114,6 +111,13 @@ class Case:
         arguments = {"dataset": self.dataset, **self.settings}
         needs = tuple(cell.name for cell in cells)
         return [*cells, Cell(self.prior_name, f"{__name__}:make_prior", arguments, needs)]
+
+    def with_task(self, name: str, task: str, alone: bool = False, **arguments: Any) -> list[Cell]:
+        """The cells above, and last a cell of a task that gets their folders and these
+        arguments."""
+        cells = self.cells()
+        needs = tuple(cell.name for cell in cells)
+        return [*cells, Cell(name, task, {**self.folders, **arguments}, needs, alone)]
 
 
 def make_dataset(
@@ -149,10 +153,9 @@ def make_prior(root: Path, out: Path, dataset: str, **settings: Any) -> dict[str
         with atomic_folder(folder) as unfinished:
             save_prior(unfinished, built)
     prior = load_prior(folder)
-    numbers = {
-        key: prior.numbers[key] for key in ("sampled_area", "resolution") if key in prior.numbers
-    }
-    return {"gaussians": len(prior.points) + prior.backed, "spacing": prior.spacing} | numbers
+    found = {"gaussians": len(prior.points) + prior.backed, "spacing": prior.spacing}
+    kept = ("sampled_area", "resolution")
+    return found | {key: prior.numbers[key] for key in kept if key in prior.numbers}
 
 
 def test_views_of(dataset: Dataset) -> Dataset:
@@ -168,23 +171,18 @@ def test_views_of(dataset: Dataset) -> Dataset:
 
 def judge(model: Gaussians, dataset: Dataset) -> dict[str, float]:
     """Mean metrics of a model over the test views of a dataset (`mgs.report.evaluation`)."""
-    metrics: dict[str, float] = evaluate(model, (), (), test_frames=test_views_of(dataset).frames)[
-        "test"
-    ]
-    return metrics
+    return dict(evaluate(model, (), (), test_frames=test_views_of(dataset).frames)["test"])
 
 
-def run_or_resume(
-    root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]
-) -> State:
-    """Last state of the run in OUT/run, which is started or continued. settings: of `mgs nbv`."""
+def begun_run(root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]) -> Run:
+    """The run in OUT/run, which is started if it is not there. settings: of `mgs nbv`."""
     for leftover in out.glob(".run.*.part"):  # of a process killed before the run began
         shutil.rmtree(leftover)
     run = out / "run"
     if (run / "config.json").is_file():
-        return resume_nbv(run, policy=settings["policy"])
-    given = {**settings, "train": {**COLOURS_ALONE, **settings.get("train", {})}}
-    return run_nbv(root / dataset, run, prior=root / prior, **given)
+        return open_run(run)
+    train = {**COLOURS_ALONE, **settings.get("train", {})}
+    return start_run(root / dataset, run, prior=root / prior, **settings | {"train": train})
 
 
 def run_policy(
@@ -192,7 +190,8 @@ def run_policy(
 ) -> dict[str, Any]:
     """Run a policy. Returns a list for each of CURVES, one number for each fit, and "taken", the
     indices of the frames in the order taken."""
-    return curves_of(run_or_resume(root, out, dataset, prior, {"evaluate_every": 1, **settings}))
+    run = begun_run(root, out, dataset, prior, {"evaluate_every": 1, **settings})
+    return curves_of(resume_nbv(run, policy=settings.get("policy")))
 
 
 def curves_of(state: State) -> dict[str, Any]:
@@ -216,15 +215,14 @@ def time_policy(
 def _timed(
     root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]
 ) -> dict[str, Any]:
-    steps = run_or_resume(root, out, dataset, prior, settings).steps
+    run = begun_run(root, out, dataset, prior, settings)
+    steps = resume_nbv(run, policy=settings.get("policy")).steps
     peak = peak_megabytes()
-    metrics = evaluate_run(out / "run", pictures=False)
-    choices = [step["seconds"]["score"] for step in steps[1:]]
-    spent = [
-        step["seconds"][stage] for step in steps for stage in step["seconds"] if stage != "evaluate"
-    ]
+    metrics = evaluate_run(run.folder, pictures=False)
+    seconds = [step["seconds"] for step in steps]
+    choices = [one["score"] for one in seconds[1:]]
     return {key: metrics[key] for key in ("images", "test", "all", "held_out")} | {
-        "seconds": sum(spent),
+        "seconds": sum(one[stage] for one in seconds for stage in one if stage != "evaluate"),
         "choice_seconds": sum(choices) / len(choices) if choices else None,
         "peak_megabytes": peak,
     }

@@ -183,15 +183,12 @@ class Data:
 
     def cells(self, kind: str, repeats: int) -> list[Cell]:
         """Cells of all points of a kind, and those they need."""
-        cells: dict[str, Cell] = {}
+        cells: list[Cell] = []
         for point in points_of(self.size, kind):
+            given = {"repeats": repeats, "settings": point.settings(self.size.seeds)}
             case = self.case(point.density)
-            made, arguments = case.cells(), {**case.folders, "repeats": repeats}
-            arguments["settings"] = point.settings(self.size.seeds)
-            needs = tuple(cell.name for cell in made)
-            cell = Cell(point.name, f"{__name__}:measure", arguments, needs, alone=True)
-            cells |= {one.name: one for one in (*made, cell)}
-        return list(cells.values())
+            cells += case.with_task(point.name, f"{__name__}:measure", alone=True, **given)
+        return cells
 
     def rows(self, kind: str, root: Path, found: Results, unit: float) -> list[Row]:
         """A row for each point of a kind: factors, settings, results, command, and whether it is on
@@ -202,12 +199,8 @@ class Data:
         for point in points_of(self.size, kind):
             case = self.case(point.density)
             names = [name for name in by_factor if point in by_factor[name]]
-            row: Row = {
-                "factors": "; ".join(names),
-                "preset": presets.get(point, ""),
-                **asdict(point),
-                **found[point.name],
-            }
+            row: Row = {"factors": "; ".join(names), "preset": presets.get(point, "")}
+            row |= asdict(point) | found[point.name]
             row |= {"gaussians": found[case.prior_name]["gaussians"]}
             where = root / case.dataset, root / case.prior
             rows.append(row | {"command": point.command(*where, self.size.seeds)})
@@ -304,8 +297,8 @@ def run_chart(
     size = SIZES[preset]
     repeats = repeats or size.repeats
     data, measured = Data(size, dataset.resolve() if dataset else None), {}
-    cells = {cell.name: cell for kind in kinds for cell in data.cells(kind, repeats)}
-    found = run_cells(out, cells.values(), report)
+    cells = [cell for kind in kinds for cell in data.cells(kind, repeats)]
+    found = run_cells(out, cells, report)
     unit = float(np.median([one["reference"] for one in found.values() if "reference" in one]))
     for kind in kinds:
         words = ["mgs", "chart", str(out), "--only", kind, "--preset", preset]

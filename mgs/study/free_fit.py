@@ -1,10 +1,10 @@
 """A fit as in 3D Gaussian splatting (Kerbl et al. 2023): the row of Table I for a model that is not
 held to a surface.
 
-As theirs: free means, SH degree 3, Adam with their learning rates, no prior, and 15,000 steps at
-the paper's size. Not as theirs: it starts on the prior's surface in the colours of all images, adds
-and removes no Gaussians, lowers the squared error instead of L1 and SSIM, and all rates fall to a
-tenth.
+The same: free means, SH degree 3, Adam with their learning rates, no prior, and 15,000 steps at the
+paper's size. Different: the fit starts on the prior's surface in the colours of all images. It adds
+and removes no Gaussians, and minimises the squared error instead of L1 and SSIM. All rates fall to
+a tenth.
 """
 
 from __future__ import annotations

@@ -8,16 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from mgs.data.dataset import Dataset
-from mgs.fit.settings import COLOURS_ALONE
 from mgs.run import recording
-from mgs.run.folder import open_run
 from mgs.run.loop import Chooser, fit_views
-from mgs.run.nbv import start_run
 from mgs.run.operations import operations_of, psnr_measure
 from mgs.run.problem import Problem, no_progress
-from mgs.run.state import Fitted, State
+from mgs.run.state import Fitted
 from mgs.splat import ListCache
-from mgs.study.case import curves_of, test_views_of
+from mgs.study.case import begun_run, curves_of, test_views_of
 
 
 def oracle(tests: Dataset) -> Chooser:
@@ -40,18 +37,11 @@ def run_oracle(
 ) -> dict[str, Any]:
     """Task: start or resume a run of the oracle; returns what `mgs.study.case.run_policy` does.
     settings: without a policy. Raises InputError if there are no test views."""
-    run = out / "run"
-    if not (run / "config.json").is_file():
-        train = {**COLOURS_ALONE, **settings.get("train", {})}
-        given = {"policy": "random", "evaluate_every": 1, **settings, "train": train}
-        start_run(root / dataset, run, prior=root / prior, **given)
-    return curves_of(_choose_all(run))
-
-
-def _choose_all(folder: Path) -> State:
-    run = open_run(folder)
+    given = {"policy": "random", "evaluate_every": 1, **settings}
+    run = begun_run(root, out, dataset, prior, given)
     chooser = oracle(test_views_of(run.dataset))
     operations = operations_of(run.dataset, run.prior, run.settings)
-    return recording.run(
-        folder, run.settings, run.dataset, operations, no_progress, chooser=chooser
+    state = recording.run(
+        run.folder, run.settings, run.dataset, operations, no_progress, chooser=chooser
     )
+    return curves_of(state)

@@ -51,13 +51,8 @@ ALL = "+ rotation"
 
 DEGREES = (0, 1, 2)
 
-NUMBER, KINDS, DEGREE, AUTOMATIC, PRUNED = (
-    "number of Gaussians",
-    "kinds learned",
-    "SH degree",
-    "automatic",
-    "pruned",
-)
+NUMBER, KINDS, DEGREE = "number of Gaussians", "kinds learned", "SH degree"
+AUTOMATIC, PRUNED = "automatic", "pruned"
 """Values of the column `choice`: what differs among fixed choices; number, kinds and degree chosen
 automatically; and the fit with the automatic number, pruned."""
 
@@ -120,26 +115,20 @@ def _fit_name(scene: str, gaussians: int | str, learned: str, degree: int) -> st
 
 
 def cells_of(size: ParsimonySize) -> list[Cell]:
-    """Cells of each scene: dataset, priors, fits, and the fit of `mgs refit`."""
-    cells: dict[str, Cell] = {}
-
-    def add(name: str, task: str, case: Case, arguments: dict[str, Any]) -> None:
-        made = case.cells()
-        arguments = {**case.folders, "views": size.views, "seeds": size.seeds, **arguments}
-        needs = tuple(cell.name for cell in made)
-        cell = Cell(name, f"{__name__}:{task}", arguments, needs, alone=True)  # reports seconds
-        cells.update({one.name: one for one in (*made, cell)})
-
+    """Cells of each scene: dataset, priors, fits, and the fit of `mgs refit`. All fits report
+    seconds."""
+    cells: list[Cell] = []
+    shared: dict[str, Any] = {"alone": True, "views": size.views, "seeds": size.seeds}
     for scene in size.scenes:
         for _, n, learned, degree in fixed_choices(size):
-            arguments: dict[str, Any] = {"learned": learned, "degree": degree}
-            arguments |= (
-                {"noises": list(PRUNE_NOISE)} if (n, learned, degree) == (AUTO, ALL, 0) else {}
-            )
-            name = _fit_name(scene, n, learned, degree)
-            add(name, "fit_and_judge", size.case(scene, n), arguments)
-        add(f"lean/{scene}", "fit_lean_and_judge", size.case(scene, AUTO), {})
-    return list(cells.values())
+            arguments: dict[str, Any] = shared | {"learned": learned, "degree": degree}
+            if (n, learned, degree) == (AUTO, ALL, 0):
+                arguments["noises"] = list(PRUNE_NOISE)
+            name, task = _fit_name(scene, n, learned, degree), f"{__name__}:fit_and_judge"
+            cells += size.case(scene, n).with_task(name, task, **arguments)
+        task = f"{__name__}:fit_lean_and_judge"
+        cells += size.case(scene, AUTO).with_task(f"lean/{scene}", task, **shared)
+    return cells
 
 
 def views_in_order(positions: np.ndarray, centre: np.ndarray, views: int, seeds: int) -> list[int]:

@@ -346,9 +346,8 @@ class Result:
         return getattr(size, self.rocks) if self.rocks else 1
 
     def cells(self, size: ReproduceSize, count: int) -> list[Cell]:
-        """Cells over so many rocks, each once."""
-        cells = (cell for run in self.runs(size, count) for cell in run.cells())
-        return list({cell.name: cell for cell in cells}.values())
+        """Cells over so many rocks."""
+        return [cell for run in self.runs(size, count) for cell in run.cells()]
 
 
 RESULTS = {
@@ -393,6 +392,9 @@ def rocks_of(name: str, size: ReproduceSize, asked: int | None) -> int:
     return asked
 
 
+NAMESAKE = "there is one of this name already; leave it out, or rename its file"
+
+
 def with_options(
     size: ReproduceSize,
     names: Sequence[str],
@@ -402,32 +404,30 @@ def with_options(
 ) -> ReproduceSize:
     """Size with the options --policy, --mesh and --batch. names: the results to make.
 
-    Raises InputError where an option is for none of these results, a policy is unknown or compared
-    anyway, two policies or meshes have the same name, a mesh cannot be read, or they are too many.
+    Raises InputError if an option is for none of these results, a policy is unknown or already
+    compared, two policies or meshes have the same name, or a mesh cannot be read or is one too
+    many.
     """
     labels = list(POLICIES)
     for policy in policies:
-        if not {"curves", "pools"} & set(names):
-            raise InputError(
-                f"--policy {policy}: is for curves and pools, and --only leaves both out"
-            )
+        _check_used(f"--policy {policy}", names, "curves", "pools")
         if policy in POLICIES:
             raise InputError(f"--policy {policy}: is compared anyway")
         if policy_file.label(policy) in labels:
-            raise InputError(
-                f"--policy {policy}: there is one of this name already; "
-                "leave it out, or rename its file"
-            )
+            raise InputError(f"--policy {policy}: {NAMESAKE}")
         labels.append(policy_file.label(policy))
         policy_named(policy)
     size = replace(size, own_policies=tuple(policy_file.absolute(policy) for policy in policies))
     if batch > 1:
-        if not {"table1", "figures"} & set(names):
-            raise InputError(
-                f"--batch {batch}: is for table1 and figures, and --only leaves both out"
-            )
+        _check_used(f"--batch {batch}", names, "table1", "figures")
         size = replace(size, table=replace(size.table, batch=batch))
     return _with_meshes(size, names, meshes) if meshes else size
+
+
+def _check_used(option: str, names: Sequence[str], *results: str) -> None:
+    """Raise InputError if an option is for none of the results to make."""
+    if not set(results) & set(names):
+        raise InputError(f"{option}: is for {' and '.join(results)}, and --only leaves both out")
 
 
 def _with_meshes(
@@ -445,10 +445,7 @@ def _with_meshes(
     rocks: list[Rock] = []
     for k, mesh in enumerate(meshes):
         if mesh.stem in [rock.scene for rock in rocks]:
-            raise InputError(
-                f"--mesh {mesh}: there is one of this name already; "
-                "leave it out, or rename its file"
-            )
+            raise InputError(f"--mesh {mesh}: {NAMESAKE}")
         rocks.append(Rock(mesh.stem, 0, k, mesh.resolve(), file_digest(mesh)))
     count = len(rocks)
     return replace(size, meshes=tuple(rocks), curve_rocks=count, seed_rocks=count, pool_rocks=count)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -225,9 +227,9 @@ def statistics_text(statistics: Mapping[str, Any]) -> str:
         | {f"{key}_reach": _reach_text(statistics[key], policy) for key in MEASURES}
         for policy in statistics[MEASURES[0]]["area"]
     ]
-    columns = {"policy": "policy"}
-    columns |= {f"area, {what} (dB)": f"{key}:.2f" for key, what in measures}
-    columns |= {
+    columns = {
+        "policy": "policy",
+        **{f"area, {what} (dB)": f"{key}:.2f" for key, what in measures},
         "images for what random ends with": "test_psnr_reach",
         "the same, rock": "test_psnr_mask_reach",
     }
@@ -320,16 +322,13 @@ def pool_rows(results: Found, runs: Sequence[Run]) -> tuple[Rows, Rows]:
 
 def pools_text(rows: Rows) -> str:
     """Tables with a line for each policy and a column for each pool."""
-    tables = [
-        matrix(rows, "test views (dB)", lambda row: f"{row['test_psnr']:.2f}"),
-        matrix(rows, f"{LEADER} over it (dB)", lambda row: with_interval(row, "test_psnr_led")),
-        matrix(rows, "inside the rock (dB)", lambda row: with_interval(row, "test_psnr_mask_led")),
-        matrix(
-            rows,
-            "over the whole curve (dB)",
-            lambda row: with_interval(row, "test_psnr_area_led"),
-        ),
-    ]
+    tables = [matrix(rows, "test views (dB)", lambda row: f"{row['test_psnr']:.2f}")]
+    for title, key in (
+        (f"{LEADER} over it (dB)", "test_psnr_led"),
+        ("inside the rock (dB)", "test_psnr_mask_led"),
+        ("over the whole curve (dB)", "test_psnr_area_led"),
+    ):
+        tables.append(matrix(rows, title, partial(with_interval, key=key)))
     if any(row["test_psnr_share"] is not None for row in rows):
         tables.append(matrix(rows, "share of the oracle's", _share))
     return "\n".join(tables)
@@ -347,91 +346,91 @@ def matrix(rows: Rows, title: str, cell: Callable[[Row], str]) -> str:
     return markdown([title, *pools], lines)
 
 
-def write_table1(
-    root: Path, out: Path, results: Found, size: ReproduceSize, count: int, command: str
-) -> list[Path]:
+@dataclass(frozen=True)
+class Work:
+    """What a result is written from: the study's folder `root`, the results of cells, the size, the
+    number of rocks, and the command."""
+
+    root: Path
+    results: Found
+    size: ReproduceSize
+    count: int
+    command: str
+
+    @property
+    def out(self) -> Path:
+        """Folder for the files."""
+        return self.root / "results"
+
+    def write(
+        self, name: str, rows: Rows, text: str, each: Rows, panels: Sequence[Panel], drawn: Rows
+    ) -> list[Path]:
+        """Write NAME.csv, .json and .md of rows, NAME_by_rock.csv of the rows `each`, and NAME.png
+        of the rows `drawn`."""
+        draw_panels(self.out / f"{name}.png", panels, drawn)
+        by_rock = write_csv(self.out / f"{name}_by_rock.csv", each)
+        written = write_table(self.out, name, rows, text, self.command, rocks=self.count)
+        return [*written, by_rock, self.out / f"{name}.png"]
+
+
+def write_table1(work: Work) -> list[Path]:
     """table1.csv, .json and .md of the runs that are done."""
-    rows = table_rows(results, size)
+    rows = table_rows(work.results, work.size)
     done = {row["row"] for row in rows}
-    left = [label for label in reproduce.table_runs(size) if label not in done]
-    return write_table(out, "table1", rows, table_text(rows, left), command, left=left)
+    left = [label for label in reproduce.table_runs(work.size) if label not in done]
+    return write_table(work.out, "table1", rows, table_text(rows, left), work.command, left=left)
 
 
-def write_figures(
-    root: Path, out: Path, results: Found, size: ReproduceSize, count: int, command: str
-) -> list[Path]:
+def write_figures(work: Work) -> list[Path]:
     """Report on some runs of Table I, as `mgs report` draws it."""
-    needed = reproduce.RESULTS["figures"].runs(size, count)
-    runs = [cell_folder(root, run.name) / "run" for run in needed]
+    needed = reproduce.RESULTS["figures"].runs(work.size, work.count)
+    runs = [cell_folder(work.root, run.name) / "run" for run in needed]
     for run in runs:
         evaluate_run(run)  # draws; the metrics are there already
-    return write_report(out / "figures", runs)
+    return write_report(work.out / "figures", runs)
 
 
-def write_curves(
-    root: Path, out: Path, results: Found, size: ReproduceSize, count: int, command: str
-) -> list[Path]:
+def write_curves(work: Work) -> list[Path]:
     """curves.csv, .json, .md and .png; curves_by_rock.csv; statistics.json."""
-    runs = reproduce.curve_runs(size, count)
-    rows, statistics = by_rock(results, runs), statistics_of(results, runs)
+    runs = reproduce.curve_runs(work.size, work.count)
+    rows, statistics = by_rock(work.results, runs), statistics_of(work.results, runs)
     over = with_differences(rows, "over_uniform", {"policy": "uniform"}, ("rock", "images"))
-    about = {"command": command, "versions": versions(), "rocks": count}
-    write_json(out / "statistics.json", about | statistics)
-    label = "PSNR on the test views (dB)"
+    about = {"command": work.command, "versions": versions(), "rocks": work.count}
+    write_json(work.out / "statistics.json", about | statistics)
+    label, key = "PSNR on the test views (dB)", "test_psnr_over_uniform"
     panels = (
         Panel("images", "test_psnr", "images", label, "policy"),
-        Panel(
-            "images", "test_psnr_over_uniform", "images", "difference from uniform (dB)", "policy"
-        ),
+        Panel("images", key, "images", "difference from uniform (dB)", "policy"),
     )
-    draw_panels(out / "curves.png", panels, over)
-    each = write_csv(out / "curves_by_rock.csv", rows)
     means = summary(over, ("policy", "images"), _keys("over_uniform"))
-    text = statistics_text(statistics)
-    written = write_table(out, "curves", means, text, command, rocks=count)
-    return [*written, each, out / "statistics.json", out / "curves.png"]
+    written = work.write("curves", means, statistics_text(statistics), rows, panels, over)
+    return [*written, work.out / "statistics.json"]
 
 
-def write_seeds(
-    root: Path, out: Path, results: Found, size: ReproduceSize, count: int, command: str
-) -> list[Path]:
+def write_seeds(work: Work) -> list[Path]:
     """seeds.csv, .json, .md and .png; seeds_by_rock.csv."""
-    runs = reproduce.seed_runs(size, count)
-    means, rows = seed_rows(results, runs)
+    runs = reproduce.seed_runs(work.size, work.count)
+    means, rows = seed_rows(work.results, runs)
     label = "PSNR over four seeds (dB)"
-    draw_panels(
-        out / "seeds.png",
-        (Panel("seeds", "test_psnr_over_four", "seed views", label, "policy"),),
-        rows,
-    )
-    each = write_csv(out / "seeds_by_rock.csv", by_rock(results, runs))
-    written = write_table(out, "seeds", means, table(SEED_COLUMNS, means), command, rocks=count)
-    return [*written, each, out / "seeds.png"]
+    panels = (Panel("seeds", "test_psnr_over_four", "seed views", label, "policy"),)
+    each = by_rock(work.results, runs)
+    return work.write("seeds", means, table(SEED_COLUMNS, means), each, panels, rows)
 
 
-def write_pools(
-    root: Path, out: Path, results: Found, size: ReproduceSize, count: int, command: str
-) -> list[Path]:
+def write_pools(work: Work) -> list[Path]:
     """pools.csv, .json, .md and .png; pools_by_rock.csv; with the oracle where it is done."""
-    oracle = reproduce.oracle_runs(size, count)
-    known = dict(results) | known_runs(root, oracle)
-    runs = reproduce.pool_runs(size, count)
+    oracle = reproduce.oracle_runs(work.size, work.count)
+    known = dict(work.results) | known_runs(work.root, oracle)
+    runs = reproduce.pool_runs(work.size, work.count)
     runs += oracle if all(run.name in known for run in oracle) else []
     means, rows = pool_rows(known, runs)
     label = "PSNR on the test views, over random (dB)"
-    draw_panels(
-        out / "pools.png",
-        (Panel("pool", "test_psnr_over_random", "pool", label, "policy"),),
-        [row for row in rows if row["policy"] != "random"],
-    )
-    each = write_csv(out / "pools_by_rock.csv", by_rock(known, runs))
-    written = write_table(out, "pools", means, pools_text(means), command, rocks=count)
-    return [*written, each, out / "pools.png"]
+    panels = (Panel("pool", "test_psnr_over_random", "pool", label, "policy"),)
+    others = [row for row in rows if row["policy"] != "random"]
+    return work.write("pools", means, pools_text(means), by_rock(known, runs), panels, others)
 
 
-Writer = Callable[[Path, Path, Found, ReproduceSize, int, str], list[Path]]
-
-WRITERS: dict[str, Writer] = {
+WRITERS: dict[str, Callable[[Work], list[Path]]] = {
     "table1": write_table1,
     "figures": write_figures,
     "curves": write_curves,
@@ -439,8 +438,7 @@ WRITERS: dict[str, Writer] = {
     "pools": write_pools,
     "oracle": write_pools,
 }
-"""Writers of results: f(study's folder, folder for the results, results of cells, size, number of
-rocks, command) returns the files written."""
+"""Writers of results, which return the files written."""
 
 
 def make(
@@ -467,12 +465,12 @@ def make(
 
     def tell(cell: str, done: int, total: int) -> None:
         if name == "table1" and (so_far := known_runs(out, result.runs(size, count))):
-            WRITERS[name](out, out / "results", so_far, size, count, command)
-        report(cell, done, total)
+            write_table1(Work(out, so_far, size, count, command))
+        report(f"{name} {cell}", done, total)
 
     cells = result.cells(size, count)
     results = run_cells(out, cells, tell, workers=workers, scheduler=scheduler)
-    return WRITERS[name](out, out / "results", results, size, count, command)
+    return WRITERS[name](Work(out, results, size, count, command))
 
 
 def _from_here(policy: str) -> str:

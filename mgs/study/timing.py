@@ -91,13 +91,8 @@ def with_seconds(rows: Iterable[Row], unit: float) -> list[Row]:
     return [row | {f"seconds{end}": row[f"ratio{end}"] * unit for end in ends} for row in rows]
 
 
-def span(row: Row, scale: float = 1.0) -> str:
-    """Seconds of a row, times a scale, with their extremes, as text."""
-    low, value, high = (
-        _three_digits(scale * row[key]) for key in ("seconds_low", "seconds", "seconds_high")
-    )
+def span(row: Row) -> str:
+    """Seconds of a row with their extremes, as text of three digits."""
+    seconds = (row[key] for key in ("seconds_low", "seconds", "seconds_high"))
+    low, value, high = (f"{s:,.0f}" if s >= 100 else f"{s:.3g}" for s in seconds)
     return value if low == high else f"{value} ({low} to {high})"
-
-
-def _three_digits(value: float) -> str:
-    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"

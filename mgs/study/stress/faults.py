@@ -7,7 +7,7 @@ that of the clean run on the same rock and views.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,15 +37,15 @@ FAILURE = 1.0
 VIEWS = 6
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Captured(Frame):
     """A frame with its pixels in memory. pixels: linear RGB [H,W,3]; rgba: the rock alone,
     premultiplied [H,W,4]; z: depth [H,W], metres; rock: mask [H,W]."""
 
-    pixels: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
-    rgba: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 4)))
-    z: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    rock: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), bool))
+    pixels: np.ndarray
+    rgba: np.ndarray
+    z: np.ndarray
+    rock: np.ndarray
 
     def rgb(self) -> np.ndarray:
         """Linear RGB [H,W,3]."""
@@ -66,9 +66,9 @@ class Captured(Frame):
 
 def captured(frame: Frame) -> Captured:
     """A frame of a dataset with its pixels read."""
-    own = {name: getattr(frame, name) for name in Frame.__dataclass_fields__}
+    rgba, _ = frame.target()
     return Captured(
-        **own, pixels=frame.rgb(), rgba=frame.target()[0], z=frame.depth(), rock=frame.mask()
+        **vars(frame), pixels=frame.rgb(), rgba=rgba, z=frame.depth(), rock=frame.mask()
     )
 
 
@@ -252,9 +252,8 @@ def indicators_of(
     surface = np.sum(lab.information(start, taken), axis=0)[: len(lab.prior.points)]
     views = []
     for frame in (lab.frames[i] for i in taken):
-        old, new = (
-            render(model, frame.camera, cache=lab.cache) for model in (start, fit.gaussians)
-        )
+        models = (start, fit.gaussians)
+        old, new = (render(model, frame.camera, cache=lab.cache) for model in models)
         target, mask = target_of(frame), frame.mask()
         margin = detectors.outline_margin(start, frame.camera)
         shown, alpha = np.asarray(old.rgb), np.asarray(old.alpha)
@@ -341,15 +340,9 @@ def fault_cells(size: StressSize, kinds: str) -> list[Cell]:
     rocks, cells = (*size.rocks, *size.others), []
     for k, rock in enumerate(rocks):
         others = [size.case(*rocks[(k + step) % len(rocks)]) for step in (1, 2)]
-        *made, cell = rock_cell(
-            f"faults-{kinds}",
-            f"{__name__}:faults",
-            size,
-            rock,
-            kinds=kinds,
-            others=[case.folders for case in others],
-            repeats=size.repeats,
-        )
+        more = {"kinds": kinds, "others": [c.folders for c in others], "repeats": size.repeats}
+        task = f"{__name__}:faults"
+        *made, cell = rock_cell(f"faults-{kinds}", task, size, rock, **more)
         made += [one for case in others for one in case.cells()]
         cells += [*made, replace(cell, needs=tuple(dict.fromkeys(one.name for one in made)))]
     return cells

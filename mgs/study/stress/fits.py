@@ -11,13 +11,7 @@ import numpy as np
 from mgs.metrics import agreement
 from mgs.policy.criteria import Score, d_optimal, fisherrf, t_optimal
 from mgs.study.output import Panel
-from mgs.study.stress.lab import (
-    Array,
-    Experiment,
-    cells_per_rock,
-    open_lab,
-    turns,
-)
+from mgs.study.stress.lab import Array, Experiment, cells_per_rock, open_lab, turns
 from mgs.study.verdict import Claim, Effects, Row, paired, runs_of, single
 
 FREE_PASSES = 40

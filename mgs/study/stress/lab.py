@@ -100,10 +100,8 @@ def rock_cell(
 ) -> list[Cell]:
     """Cells of a task on one rock: those of its case, and NAME/SCENE-SEED. The task is called with
     scene="SCENE-SEED", dataset and prior."""
-    case, label = size.case(*rock), f"{rock[0]}-{rock[1]}"
-    cells = case.cells()
-    arguments = {"scene": label, **case.folders, **more}
-    return [*cells, Cell(f"{name}/{label}", task, arguments, tuple(cell.name for cell in cells))]
+    label = f"{rock[0]}-{rock[1]}"
+    return size.case(*rock).with_task(f"{name}/{label}", task, scene=label, **more)
 
 
 def cells_per_rock(

@@ -39,8 +39,8 @@ def run_stress(
     Returns the experiments of verdicts.json, including those done in this folder before. Raises
     InputError if the folder holds results of another size.
     """
-    cells = {cell.name: cell for name in names for cell in EXPERIMENTS[name].cells(size)}
-    run_cells(out, cells.values(), report, workers=workers)
+    cells = [cell for name in names for cell in EXPERIMENTS[name].cells(size)]
+    run_cells(out, cells, report, workers=workers)
     experiments, rows, sections = [], list[Row](), []
     for name, experiment in EXPERIMENTS.items():
         results = [found(out, cell) for cell in experiment.cells(size)]
