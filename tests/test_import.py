@@ -439,7 +439,7 @@ BAD: dict[str, tuple[Spoil, list[str], str]] = {
     "no points": (cloud(""), [], NO_POINTS),
     "points in one place": (cloud("1 2 3\n" * 500), [], NO_POINTS),
     "no model": (colmap(lambda root: shutil.rmtree(root / "sparse")), [], "COLMAP model (cameras,"),
-    "truncated model": (colmap(cut("sparse/0/images.bin", 2000)), [], "not a readable COLMAP"),
+    "truncated model": (colmap(cut("sparse/0/images.bin", 2000)), [], "is damaged or cut off"),
     "no mask": (nothing, ["--masks", "."], "no mask for image"),
     "one mask missing": (
         lambda root: (root / "masks/kf_0000.png").unlink(), MASKS, "no mask for image kf_0000.png",

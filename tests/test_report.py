@@ -24,6 +24,7 @@ from mgs import plotting
 from mgs.cli import printing
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data.dataset import load_dataset
+from mgs.data.up import PLUS_Z
 from mgs.errors import InputError
 from mgs.files import read_json, write_json
 from mgs.policy.registry import policy_names
@@ -427,7 +428,7 @@ def test_no_word_of_a_comparison_is_cut_off_or_written_over(tmp_path, monkeypatc
     truth[10:50, 20:60] = 0.5
     captions = dict.fromkeys(labels, "100 images, trained on; 30.09 dB, SSIM 0.9301")
     renders = dict.fromkeys(labels, truth + 0.1)
-    figures.comparison_figure(tmp_path / "a.png", truth, renders, title=title, captions=captions)
+    figures.comparison_figure(tmp_path / "a.png", truth, renders, title, captions)
     figure = laid_out(found[0])
     texts = [text for axis in figure.axes for text in (axis.title, *axis.texts)]
     texts.append(figure.axes[-1].xaxis.label)
@@ -445,7 +446,7 @@ def test_no_word_of_a_comparison_is_cut_off_or_written_over(tmp_path, monkeypatc
 def test_no_word_of_an_orbit_is_cut_off_or_written_over(tmp_path, monkeypatch, runs, name):
     found = drawn_only(monkeypatch)
     choices = {f"{name} {i}": ([0], [1]) for i in range(runs)}
-    figures.orbit_figure(tmp_path / "a.png", np.eye(3), None, choices)
+    figures.orbit_figure(tmp_path / "a.png", np.eye(3), np.zeros((1, 3)), choices, PLUS_Z, "m")
     figure = laid_out(found[0])
     axes = figure.axes[:runs]
     titles = [axis.title.get_window_extent() for axis in axes]

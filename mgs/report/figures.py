@@ -84,15 +84,15 @@ def axis_names(up: Up, unit: str) -> tuple[str, str, str]:
 def orbit_figure(
     path: str | Path,
     positions: np.ndarray,
-    surface: np.ndarray | None,
+    surface: np.ndarray,
     choices: Mapping[str, tuple[Sequence[int], Sequence[int]]],
-    up: Up = PLUS_Z,
-    unit: str = "m",
+    up: Up,
+    unit: str,
 ) -> None:
     """Draw the orbit from above, a panel for each run: poses, seeds, and the chosen views,
     numbered.
 
-    positions: [C,3] camera centres, world. surface: [N,3] points of the rock, or None. choices:
+    positions: [C,3] camera centres, world. surface: [N,3] points of the rock. choices:
     label -> indices into positions: (seeds, chosen views in their order). up, unit: of the world
     (`mgs.data.dataset.Dataset`); it is drawn turned so that +Z is up.
     """
@@ -103,7 +103,7 @@ def orbit_figure(
 
     turn, (x, y, _) = upright(up), axis_names(up, unit)
     positions = np.asarray(positions) @ turn.T
-    surface = None if surface is None else np.asarray(surface) @ turn.T
+    surface = np.asarray(surface) @ turn.T
     last = max((len(chosen) for _, chosen in choices.values()), default=1)
     norm = Normalize(1, max(last, 2))
     with matplotlib.rc_context(STYLE):
@@ -127,17 +127,16 @@ def orbit_figure(
 def _orbit_panel(
     axis: Axes,
     positions: np.ndarray,
-    surface: np.ndarray | None,
+    surface: np.ndarray,
     seeds: list[int],
     chosen: list[int],
     norm: Any,
 ) -> None:
     """Draw one run in `orbit_figure`. norm: colour scale of the order of the choices."""
     xy = positions[:, :2]
-    centre = xy.mean(axis=0) if surface is None else surface[:, :2].mean(axis=0)
-    if surface is not None:
-        rock = surface[:: max(1, len(surface) // 6000)]
-        axis.scatter(rock[:, 0], rock[:, 1], s=0.6, color="#b9b4ab", linewidths=0, zorder=1)
+    centre = surface[:, :2].mean(axis=0)
+    rock = surface[:: max(1, len(surface) // 6000)]
+    axis.scatter(rock[:, 0], rock[:, 1], s=0.6, color="#b9b4ab", linewidths=0, zorder=1)
     order = np.arange(1, len(chosen) + 1)
     hollow = {"facecolors": "white", "edgecolors": "#9a9a9a", "linewidths": 0.6}
     star = {"marker": "*", "color": "#D55E00", "linewidths": 0}
@@ -238,9 +237,8 @@ def comparison_figure(
     path: str | Path,
     truth: np.ndarray,
     renders: Mapping[str, np.ndarray],
-    *,
-    title: str = "",
-    captions: Mapping[str, str] | None = None,
+    title: str,
+    captions: Mapping[str, str],
 ) -> None:
     """Draw truth and renders of one view, and their absolute differences below (the paper's Fig.
     4), cropped to the rock.
@@ -263,8 +261,7 @@ def comparison_figure(
         scale = {"cmap": "magma", "vmin": 0, "vmax": limit, "interpolation": "nearest"}
         for (above, below), (label, image) in zip(axes.T[1:], images.items(), strict=True):
             above.imshow(image, interpolation="nearest")
-            caption = f"\n{_in_lines(captions[label])}" if captions and label in captions else ""
-            above.set_title(_in_lines(label) + caption)
+            above.set_title(f"{_in_lines(label)}\n{_in_lines(captions[label])}")
             map_ = below.imshow(differences[label], **scale)
         for axis in axes.flat:
             axis.set_axis_off()

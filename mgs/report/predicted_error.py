@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,28 +130,25 @@ class Predictor:
     variance: Array
     residual: Array
 
-    def terms(self, camera: Camera, rng: np.random.Generator) -> dict[str, Array]:
-        """Each of TERMS for one view, [H,W,3], squared linear RGB."""
+    def look(self, frame: Frame, seed: int) -> tuple[dict[str, Array], Array, NDArray[np.bool_]]:
+        """What one view shows: each of TERMS, [H,W,3], squared linear RGB; the true error, [H,W,3]
+        linear RGB; and the pixels that are wholly on the rock, [H,W]."""
         # Drawn as colours of about 1, for which float32 is precise.
         largest = max(float(self.residual.max(initial=0)), 1e-30)
-        image = render(_coloured(self.gaussians, self.residual / largest), camera)
+        image = render(_coloured(self.gaussians, self.residual / largest), frame.camera)
         alpha = np.maximum(np.asarray(image.alpha), 1e-6)[..., None]
         residual = np.asarray(image.rgb) * (largest / alpha)
-        rgb = np.asarray(render(self.gaussians, camera).rgb, np.float64)
+        rgb = np.asarray(render(self.gaussians, frame.camera).rgb, np.float64)
         down, right = np.gradient(rgb, axis=(0, 1))
-        return {
-            "parameters": parameter_variance(self.gaussians, camera, self.variance, rng),
+        rng = generator(seed, f"calibration/{frame.name}")
+        terms = {
+            "parameters": parameter_variance(self.gaussians, frame.camera, self.variance, rng),
             "residual": residual.astype(np.float64),
             "gradient": down**2 + right**2,
         }
-
-    def errors(self, frame: Frame) -> tuple[Array, NDArray[np.bool_]]:
-        """True error of a view, [H,W,3] linear RGB, and its pixels that are wholly on the rock,
-        [H,W]."""
         truth, weight = frame.target()
         inside = frame.mask() & (truth[..., 3] > 0.999) & (weight > 0)
-        rendered = np.asarray(render(self.gaussians, frame.camera).rgb, np.float64)
-        return rendered - truth[..., :3], inside
+        return terms, rgb - truth[..., :3], inside
 
 
 def predictor(
@@ -197,14 +193,6 @@ class Pixels:
         return Pixels(terms, np.concatenate([part.errors for part in parts]))
 
 
-def _pixels(found: Predictor, frame: Frame, seed: int) -> Pixels:
-    """Pixels of one view."""
-    error, inside = found.errors(frame)
-    terms = found.terms(frame.camera, generator(seed, f"calibration/{frame.name}"))
-    kept = {name: term[inside].ravel() for name, term in terms.items()}
-    return Pixels(kept, error[inside].ravel())
-
-
 def calibrate_run(
     run: str | Path, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> list[Path]:
@@ -229,7 +217,9 @@ def calibrate_run(
         nonlocal done
         parts = []
         for frame in views:
-            parts.append(_pixels(found, frame, seed))
+            terms, error, inside = found.look(frame, seed)
+            kept = {name: term[inside].ravel() for name, term in terms.items()}
+            parts.append(Pixels(kept, error[inside].ravel()))
             done += 1
             progress(done, total)
         return Pixels.joined(parts)
@@ -245,11 +235,15 @@ def calibrate_run(
     calibrations = {UNCALIBRATED: Calibration(assumed, NORMAL)}
     for name, used in ROWS.items():
         calibrations[name] = fit_calibration({term: own.terms[term] for term in used}, own.errors)
-    rows = [
-        _judged(name, views, calibration, pixels, seed)
-        for name, calibration in calibrations.items()
-        for views, pixels in sets.items()
-    ]
+    rows = []
+    for name, calibration in calibrations.items():
+        for views, pixels in sets.items():
+            sigma, rng = (
+                calibration.sigma(pixels.terms),
+                generator(seed, f"calibration/{name}/{views}"),
+            )
+            row = {"prediction": name, "views": views, "weights": dict(calibration.weights)}
+            rows.append(row | judged(pixels.errors, sigma, calibration.widths, rng))
     record = {
         "run": str(run),
         "policy": settings.policy,
@@ -261,21 +255,11 @@ def calibrate_run(
     write_json(out / "uncertainty.json", record)
     maps = []
     for frame in shown[:: -(-len(shown) // MAPPED)]:
-        error, inside = final.errors(frame)
-        terms = final.terms(frame.camera, generator(seed, f"calibration/{frame.name}"))
+        terms, error, inside = final.look(frame, seed)
         maps.append((frame.name, error, calibrations["all"].sigma(terms), inside))
     uncertainty_figure(out / "uncertainty.png", rows, maps)
     files = [_write_maps(out, name, error, sigma) for name, error, sigma, _ in maps]
     return [out / "uncertainty.json", out / "uncertainty.png", *files]
-
-
-def _judged(
-    name: str, views: str, calibration: Calibration, pixels: Pixels, seed: int
-) -> dict[str, Any]:
-    """Row of uncertainty.json: a prediction, judged on a set of views."""
-    rng, sigma = generator(seed, f"calibration/{name}/{views}"), calibration.sigma(pixels.terms)
-    row = {"prediction": name, "views": views, "weights": dict(calibration.weights)}
-    return row | judged(pixels.errors, sigma, calibration.widths, rng)
 
 
 def _write_maps(folder: Path, name: str, error: Array, sigma: Array) -> Path:

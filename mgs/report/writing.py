@@ -64,9 +64,7 @@ def write_report(
     }
     figures.gain_figure(paths["gain"], gains)
     figures.coverage_figure(paths["coverage"], step_curves(compared.runs, "coverage"))
-    figures.comparison_figure(
-        paths["comparison"], truth, renders, title=frame.name, captions=captions
-    )
+    figures.comparison_figure(paths["comparison"], truth, renders, frame.name, captions)
     every = "views taken so far" if dataset.on_demand else "all views"
     if panels := _psnr_panels(compared.runs, every):
         paths["psnr"] = out / f"psnr.{kind}"

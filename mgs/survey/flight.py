@@ -155,12 +155,12 @@ def survey_numbers(dataset: Dataset, survey: Survey, settings: SurveySettings) -
     steps_by_odometry: number of failed registrations; registration_overlap: of every step; loops:
     [i, j, overlap] each; error: `trajectory_error` of each of the STAGES.
     """
-    error = [
-        (measured - frame.depth())[(measured > 0) & frame.mask()]
-        for frame, measured in zip(dataset.frames, survey.depths, strict=True)
-    ]
-    returns = sum(int((depth > 0).sum()) for depth in survey.depths)
-    possible = sum(int((frame.depth() > 0).sum()) for frame in dataset.frames)
+    error, returns, possible = [], 0, 0
+    for frame, measured in zip(dataset.frames, survey.depths, strict=True):
+        true = frame.depth()
+        error.append((measured - true)[(measured > 0) & frame.mask()])
+        returns += int((measured > 0).sum())
+        possible += int((true > 0).sum())
     return {
         "frames": len(dataset.frames),
         "settings": asdict(settings),

@@ -44,11 +44,8 @@ def write_survey(out: Path, dataset: Dataset, survey: Survey) -> Dataset:
     for frame, pose, depth in zip(dataset.frames, survey.optimised, survey.depths, strict=True):
         # Files are named after their frame, since only frames are sure to have different names.
         paths: dict[str, Any] = {}
-        for kind, field in (
-            ("images", "image_path"),
-            ("masks", "mask_path"),
-            ("rock", "rock_path"),
-        ):
+        fields = {"images": "image_path", "masks": "mask_path", "rock": "rock_path"}
+        for kind, field in fields.items():
             path = getattr(frame, field)
             paths[field] = path and out / kind / f"{frame.name}{path.suffix}"
             if path and not (frame.on_demand and kind == "images"):

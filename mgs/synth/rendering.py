@@ -30,14 +30,7 @@ from mgs.data.masks import write_sheet
 from mgs.data.meshes import GLTF, to_glb
 from mgs.data.rock_image import write_rock_image
 from mgs.errors import InputError, row_named
-from mgs.files import (
-    atomic_path,
-    copy_file,
-    fingerprint,
-    folder_locked,
-    reading,
-    write_json,
-)
+from mgs.files import atomic_path, copy_file, fingerprint, folder_locked, reading, write_json
 from mgs.images import write_exr, write_png
 from mgs.memory import check_room
 from mgs.provenance import versions
@@ -224,11 +217,8 @@ def _check_cost(
     what = f"{views:,} views of {preset.width}x{preset.height} with {spp:,} samples per pixel"
     instead = "lower --frames, --test-views, --size or --spp"
     hours = views * (VIEW_SECONDS + SAMPLE_SECONDS * samples) / 3600
-    needed, there = (
-        views * pixels * PIXEL_BYTES,
-        next(p for p in out.resolve().parents if p.exists()),
-    )
-    free = shutil.disk_usage(there).free
+    needed = views * pixels * PIXEL_BYTES
+    free = shutil.disk_usage(next(p for p in out.resolve().parents if p.exists())).free
     cost = f"take about {hours:,.0f} hours and {needed / 2**30:,.1f} GiB on disk"
     if GUIDES_PER_SAMPLE * samples >= MOST_SAMPLES or hours > MOST_HOURS or needed > free:
         raise InputError(

@@ -180,13 +180,7 @@ def sensor_dict(camera: Camera) -> dict[str, Any]:
     """Mitsuba perspective sensor of a camera. Its box filter makes a pixel the mean over its own
     area."""
     K, w, h = camera.K, camera.width, camera.height
-    film = {
-        "type": "hdrfilm",
-        "width": w,
-        "height": h,
-        "pixel_format": "rgb",
-        "rfilter": {"type": "box"},
-    }
+    film = {"type": "hdrfilm", "width": w, "height": h, "pixel_format": "rgb"}
     return {
         "type": "perspective",
         "fov": float(np.degrees(2 * np.arctan(w / 2 / K[0, 0]))),
@@ -195,7 +189,7 @@ def sensor_dict(camera: Camera) -> dict[str, Any]:
         "principal_point_offset_y": float(0.5 - K[1, 2] / h),
         "near_clip": 0.01,
         "to_world": mi.ScalarTransform4f(_to_world(camera)),
-        "film": film,
+        "film": film | {"rfilter": {"type": "box"}},
         "sampler": {"type": "independent"},
     }
 
