@@ -8,6 +8,8 @@ import shutil
 import struct
 import subprocess
 import sys
+import tracemalloc
+import zipfile
 import zlib
 from pathlib import Path
 
@@ -28,9 +30,11 @@ from mgs.data.sources import read_source
 from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.images import image_size, read_exr, read_rgba, write_exr
+from mgs.run.folder import open_run
 from mgs.splat_ply import read_ply, write_ply
 from mgs.synth.rendering import RenderPreset, synthesise
 from mgs.synth.scene_file import Arena, Rock, SceneFile
+from mgs.view.subject import read_subject
 
 
 def change(dataset: Path, frame: dict | None = None, **header: object) -> None:
@@ -284,7 +288,7 @@ def test_absurd_errors(capsys, dataset, tmp_path, arguments):
     assert options[0] in refused(capsys, arguments, tmp_path / "out")
 
 
-def test_the_loser_is_told_who_works_there(capsys, dataset, tmp_path):
+def test_the_loser_is_told_who_works_there(capsys, dataset, prior, tmp_path):
     """One lock for all who write a folder, held from the start to the end of their work."""
     out = tmp_path / "out"
     write_ply(tmp_path / "a.ply", tiny.initial([]))
@@ -295,6 +299,7 @@ def test_the_loser_is_told_who_works_there(capsys, dataset, tmp_path):
             ["synth-orbit", out],
             ["import", dataset, "--out", out],
             ["render", tmp_path / "a.ply", "--cameras", dataset, "--out", out],
+            ["stress", out],
         ],
         "atomic_folder": [["survey", dataset, "--out", out], ["prior", dataset, "--out", out]],
     }
@@ -332,3 +337,128 @@ def test_rendered_datasets_repeat_and_pass_their_check(tmp_path, coarse_arena):
     assert "is finished already" in said[-1]
     assert listing(tmp_path / "a") == a
     assert check_dataset(made[0]).problems == []
+
+
+@pytest.fixture
+def stranger(dataset, prior, tmp_path):
+    """A run that anyone may have made."""
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    assert open_run(run).state.taken
+    return run
+
+
+def members(**changed: object):
+    """Damage of a checkpoint: with other arrays, None to leave one out."""
+
+    def damage(path: Path) -> None:
+        with np.load(path) as data:
+            arrays = {name: data[name] for name in data.files} | changed
+        np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
+
+    return damage
+
+
+def record(**changed: object):
+    """Damage of a checkpoint: with other entries of its JSON."""
+
+    def damage(path: Path) -> None:
+        with np.load(path) as data:
+            known = json.loads(str(data["json"]))
+        members(json=np.array(json.dumps(known | changed)))(path)
+
+    return damage
+
+
+def zip_bomb(path: Path) -> None:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file, file.open("json.npy", "w") as a:
+        for _ in range(64):
+            a.write(bytes(1 << 20))
+
+
+def endless_shape(path: Path) -> None:
+    """H of a petabyte in its header."""
+    with np.load(path) as data:
+        arrays = {name: data[name] for name in data.files}
+    with zipfile.ZipFile(path, "w") as file:
+        for name, values in arrays.items():
+            with file.open(f"{name}.npy", "w") as member:
+                shape = (10**12, 128) if name == "H" else values.shape
+                head = {"descr": values.dtype.str, "fortran_order": False, "shape": shape}
+                np.lib.format.write_array_header_1_0(member, head)
+                member.write(values.tobytes())
+
+
+CHECKPOINTS = {
+    "zip bomb": zip_bomb,
+    "endless shape": endless_shape,
+    "no archive": lambda path: path.write_bytes(b"no archive"),
+    "objects": members(H=np.array([{}], object)),
+    "integers": members(means=np.zeros((40, 3), int)),
+    "text": members(H=np.array("text")),
+    "no H": members(H=None),
+    "H of another shape": members(H=np.zeros((3, 11))),
+    "flat H": members(H=np.zeros(40)),
+    "other Gaussians": members(quats=np.zeros((3, 4), np.float32)),
+    "no number": members(means=np.full((40, 3), np.nan, np.float32)),
+    "no JSON": members(json=np.array("{")),
+    "deep JSON": members(json=np.array("[" * 100_000)),
+    "other keys": record(evil=1),
+    "no steps": record(steps=[]),
+    "steps of words": record(steps=["a", "b"]),
+    "a frame beyond": record(taken=[0, 10**9]),
+    "a frame beyond, twice": record(
+        taken=[0, 10**9],
+        steps=[
+            {"seeds": [0], "images": 1, "coverage": 0.1},
+            {"frame": 10**9, "images": 2, "coverage": 0.1, "information_gain": 1},
+        ],
+    ),
+}
+
+
+@pytest.mark.parametrize("command", ["report", "diagnose"])
+def test_two_reports_on_one_folder(capsys, stranger, command, monkeypatch):
+    monkeypatch.setattr("mgs.report.runs.compare_runs", lambda runs: runs)
+    out = stranger / {"report": "report", "diagnose": "diagnostics"}[command]
+    script = f"from mgs.files import *\nwith folder_locked({str(out)!r}):\n    print(flush=True)\n"
+    script += "    input()"
+    program = [sys.executable, "-c", script]
+    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as winner:
+        winner.stdout.readline()
+        given = ["--out", out] if command == "report" else []
+        line = refused(capsys, [command, stranger, *given], stranger)
+        assert f"process {winner.pid} works on it" in line
+        winner.communicate(b"\n")
+
+
+@pytest.mark.parametrize("damage", CHECKPOINTS)
+def test_the_checkpoint_of_a_stranger(capsys, stranger, damage):
+    CHECKPOINTS[damage](stranger / "checkpoint.npz")
+    tracemalloc.start()
+    with pytest.raises(InputError):
+        open_run(stranger).state  # noqa: B018
+    assert tracemalloc.get_traced_memory()[1] < 32 << 20
+    tracemalloc.stop()
+    for arguments in (["eval"], ["nbv", "--resume"]):
+        assert "checkpoint.npz: " in refused(capsys, [*arguments, stranger], stranger)
+
+
+SEEDS = {"seeds": [0], "images": 1, "coverage": 1}
+BAD_SEEDS = ({"seeds": [99]}, {"seeds": [-1]}, {"coverage": float("nan")}, {"seconds": [1]})
+LINES = {
+    "config.json": ['{"settings": 1}', '{"settings": {}, "frames": 7}', "[]"],
+    "steps.jsonl": ["", "[]", "[" * 100_000, *(json.dumps(SEEDS | bad) for bad in BAD_SEEDS)],
+    "metrics.json": ["[]", '{"images": {}}', "[" * 100_000],
+}
+"""File of a run -> damaged contents."""
+
+
+@pytest.mark.parametrize("file", LINES)
+def test_the_text_files_of_a_stranger(capsys, stranger, file):
+    for text in LINES[file]:
+        (stranger / file).write_text(text)
+        line = refused(capsys, ["report", stranger, "--html", stranger / "a.html"], stranger)
+        assert str(stranger / file) in line
+    if file == "metrics.json":
+        with pytest.raises(InputError, match=r"metrics\.json"):
+            read_subject(stranger)

@@ -13,6 +13,7 @@ from mgs.cli.options import Run, option
 from mgs.cli.printing import print_quality
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError
+from mgs.files import folder_locked
 from mgs.policy.criteria import LEARN_LOSS, PRUNE_NOISE
 
 if TYPE_CHECKING:
@@ -82,6 +83,7 @@ def diagnose(
     predicted standard deviation of some views.
     """
     from mgs.report.diagnostics import diagnose_run
+    from mgs.run.folder import open_run
 
     if calibrate and views is not None:
         raise InputError("--calibrate takes all views that were not seen; leave out --views")
@@ -91,7 +93,7 @@ def diagnose(
             f"--views {views!r}: names no frame; give some, as in kf_0003,kf_0010, or leave it out"
         )
     runtime.start()
-    with progress_bar() as bar:
+    with folder_locked(open_run(run).folder / "diagnostics"), progress_bar() as bar:
         if calibrate:
             from mgs.report.predicted_error import calibrate_run
 

@@ -14,7 +14,7 @@ from mgs.cli.options import argument, option
 from mgs.cli.printing import print_quality
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError
-from mgs.files import check_writable
+from mgs.files import check_writable, folder_locked
 
 
 def report(
@@ -67,7 +67,8 @@ def _write_figures(runs: list[Path], out: Path, kind: str) -> None:
 
     check_writable(out / "table.md")  # before the work
     compared = compare_runs(runs)
-    written = write_report(out, compared, kind)
+    with folder_locked(out):
+        written = write_report(out, compared, kind)
     rows = comparison_rows(compared)
     print_quality(Console(), rows)
     for row, run in zip(rows, compared.runs.values(), strict=True):

@@ -13,7 +13,7 @@ from rich.table import Table
 from mgs import runtime
 from mgs.cli.options import argument, option
 from mgs.errors import InputError, row_named
-from mgs.files import check_new_folder, check_writable, locked, read_json, write_json
+from mgs.files import check_new_folder, check_writable, folder_locked, read_json, write_json
 from mgs.provenance import command_line
 
 if TYPE_CHECKING:
@@ -37,20 +37,20 @@ def _study(
     """
     size, console = row_named(sizes, preset, "--preset"), Console(highlight=False)
     record = check_writable(out) / "study.json"
-    if not record.is_file():
-        check_new_folder(out)
-        write_json(record, {"preset": preset})
-    elif (there := read_json(record)) != {"preset": preset}:
-        was = there.get("preset") if isinstance(there, dict) else None
-        raise InputError(
-            f"{out}: was begun with --preset {was}, not {preset}; give that, or another folder"
-        )
-    runtime.start()
 
     def report(cell: str, done: int, total: int) -> None:
         console.print(f"{done}/{total} {cell}", style="dim", soft_wrap=True)
 
-    with locked(out):
+    with folder_locked(out):
+        if not record.is_file():
+            check_new_folder(out)
+            write_json(record, {"preset": preset})
+        elif (there := read_json(record)) != {"preset": preset}:
+            was = there.get("preset") if isinstance(there, dict) else None
+            raise InputError(
+                f"{out}: was begun with --preset {was}, not {preset}; give that, or another folder"
+            )
+        runtime.start()
         yield size, console, report
 
 

@@ -31,6 +31,7 @@ from mgs.gaussians import Gaussians
 from mgs.images import read_png
 from mgs.metrics import METRICS, SURFACE_METRICS, compare, compare_surface
 from mgs.provenance import versions
+from mgs.report.runs import read_metrics
 from mgs.run.folder import Run, open_run
 from mgs.run.inputs import array_digest, camera_digest, frame_digests
 
@@ -265,7 +266,7 @@ def evaluate_run(
         paths |= {folder / TEST_FOLDER / f"{frame.name}.png": frame for frame in test_frames}
         if not pictures:
             say(kept)
-        elif metrics["pictures"] and all(path.is_file() for path in paths):
+        elif metrics.get("pictures") and all(path.is_file() for path in paths):
             say(f"{kept}, and {folder}")
         else:
             views = [*metrics["views"], *metrics.get("test_views", [])]
@@ -349,10 +350,10 @@ def _subject(
 def _measured_before(file: Path, subject: str) -> dict[str, Any] | None:
     """Contents of metrics.json if it exists and is of this subject."""
     try:
-        metrics = read_json(file)
+        metrics = read_metrics(file.parent)
     except InputError:
         return None
-    return metrics if isinstance(metrics, dict) and metrics.get("of") == subject else None
+    return metrics if metrics is not None and metrics.get("of") == subject else None
 
 
 def compare_models(

@@ -13,11 +13,12 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.up import Up, unit_up
 from mgs.errors import InputError
-from mgs.files import read_json
+from mgs.files import read_json, reading
 from mgs.policy.from_file import label
 from mgs.report.figures import Curves
 from mgs.run.ending import RunEnd
-from mgs.run.folder import check_same_frames, open_run, read_config
+from mgs.run.folder import check_frames, check_same_frames, open_run, read_config
+from mgs.run.lines import check_line, frames_of
 from mgs.run.settings import validated
 
 
@@ -30,32 +31,6 @@ class _Settings(BaseModel):
     budget: int
 
 
-class _Ended(BaseModel):
-    reason: RunEnd
-    views: int
-
-
-class _Line(BaseModel):
-    """Numbers that a report needs of every line of steps.jsonl."""
-
-    images: int
-    coverage: float
-    ended: _Ended | None = None
-
-
-class _SeedLine(_Line):
-    """The first line, which is about the seeds."""
-
-    seeds: list[int]
-
-
-class _ChoiceLine(_Line):
-    """Any other line, which is about one chosen view."""
-
-    frame: int
-    information_gain: float
-
-
 class _View(BaseModel):
     """A view in metrics.json."""
 
@@ -63,6 +38,11 @@ class _View(BaseModel):
     trained: bool
     psnr: float
     ssim: float
+
+
+class _Fit(BaseModel):
+    predicted_decrease: float
+    converged: bool
 
 
 class _Metrics(BaseModel):
@@ -74,6 +54,7 @@ class _Metrics(BaseModel):
     views: list[_View]
     test: dict[str, float | None] = {}
     test_views: list[_View] = []
+    fit: _Fit | None = None
 
 
 @dataclass(frozen=True)
@@ -105,7 +86,7 @@ class RunFiles:
     @property
     def taken(self) -> list[int]:
         """Indices of all frames trained on: seeds, then chosen ones."""
-        return self.seeds + self.chosen
+        return frames_of(self.steps)
 
     @property
     def measured(self) -> dict[str, Any] | None:
@@ -140,16 +121,23 @@ def read_run(folder: str | Path) -> RunFiles:
     config = read_config(folder)
     settings = validated(_Settings, config["settings"], folder / "config.json")
     steps = _read_steps(folder)
+    metrics = read_metrics(folder)
+    name, versions = label(settings.policy), config.get("versions")
+    versions = versions if isinstance(versions, dict) else {}
+    return RunFiles(folder, name, steps, metrics, config["settings"], versions)
+
+
+def read_metrics(folder: Path) -> dict[str, Any] | None:
+    """Read metrics.json of a run; None if there is none. Raises InputError if it is damaged."""
     path = folder / "metrics.json"
-    metrics = read_json(path) if path.exists() else None
+    metrics: dict[str, Any] | None = read_json(path) if path.exists() else None
     try:
         TypeAdapter(_Metrics | None).validate_python(metrics)
     except ValidationError:
         raise InputError(
             f"{path}: is damaged; measure the run again with `mgs eval {folder}`"
         ) from None
-    name, versions = label(settings.policy), config.get("versions", {})
-    return RunFiles(folder, name, steps, metrics, config["settings"], versions)
+    return metrics
 
 
 def _read_steps(folder: Path) -> list[dict[str, Any]]:
@@ -161,12 +149,13 @@ def _read_steps(folder: Path) -> list[dict[str, Any]]:
             f"{path}: no such file; the run has no finished step, continue it with {resume}"
         )
     steps: list[dict[str, Any]] = []
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines() or [""]
+    with reading(path):
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines() or [""]
     for number, text in enumerate(lines, 1):
         try:
             steps.append(json.loads(text))
-            (_SeedLine if number == 1 else _ChoiceLine).model_validate(steps[-1])
-        except ValueError as error:
+            check_line(number, steps[-1])
+        except (ValueError, RecursionError) as error:  # RecursionError: nested too deeply
             raise InputError(
                 f"{path}: line {number} is damaged ({_cause(error)}); "
                 f"write the file anew with {resume}"
@@ -174,7 +163,7 @@ def _read_steps(folder: Path) -> list[dict[str, Any]]:
     return steps
 
 
-def _cause(error: ValueError) -> str:
+def _cause(error: Exception) -> str:
     """Error of a damaged line: its key and what it lacks, or "no JSON"."""
     if not isinstance(error, ValidationError):
         return "no JSON"
@@ -234,8 +223,9 @@ def compare_runs(folders: Sequence[str | Path]) -> Comparison:
                 "compare runs on one dataset"
             )
     dataset = open_run(runs[0].folder).dataset
-    for run in runs[1:]:
+    for run in runs:
         check_same_frames(run.folder, dataset)
+        check_frames(run.folder / "steps.jsonl", run.taken, len(dataset.frames))
     return Comparison(labelled, dataset)
 
 

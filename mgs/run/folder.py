@@ -22,8 +22,10 @@ A step is one chosen view; of a batch only the last step has a fit. A line of `s
 from __future__ import annotations
 
 import json
+import math
 import warnings
 import zipfile
+from collections.abc import Sequence
 from dataclasses import asdict, fields
 from functools import cached_property
 from pathlib import Path
@@ -33,11 +35,12 @@ import numpy as np
 
 from mgs.data.dataset import Dataset, Frame, load_dataset
 from mgs.errors import InputError, Notice
-from mgs.files import atomic_path, read_json, write_json
+from mgs.files import atomic_path, read_json, reading, write_json
 from mgs.gaussians import Gaussians
 from mgs.policy.from_file import label
 from mgs.prior.build import Prior, load_prior
 from mgs.provenance import versions
+from mgs.run.lines import check_line, frames_of
 from mgs.run.settings import NbvSettings, check_settings, validated
 from mgs.run.state import State
 from mgs.splat_ply import read_ply, write_ply
@@ -204,17 +207,67 @@ def write_steps(out: Path, state: State) -> None:
 def read_checkpoint(out: Path) -> State | None:
     """Read the state after the last finished step; None before the first.
 
-    Raises InputError where the file is damaged.
+    Raises InputError where the file is damaged, or claims more than it holds.
     """
     path = out / "checkpoint.npz"
     if not path.is_file():
         return None
+    kinds = {"json": "U", "H": "f", "surface": "f"} | {f.name: "f" for f in fields(Gaussians)}
     try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as data:
-            record = json.loads(str(data["json"]))
-            gaussians = Gaussians(*(data[field.name] for field in fields(Gaussians)))
-            return State(gaussians, data["H"], data["surface"], **record)
-    except (zipfile.BadZipFile, KeyError, ValueError, OSError, EOFError) as error:
+        with reading(path), zipfile.ZipFile(path) as file:
+            arrays = {name: _member(file, name, kind) for name, kind in kinds.items()}
+        record = json.loads(str(arrays.pop("json")[()]))
+        H, surface = arrays.pop("H"), arrays.pop("surface")
+        state = State(Gaussians(**arrays).check(), H, surface, **record)
+        for number, line in enumerate(state.steps, 1):
+            check_line(number, line)
+        if not isinstance(state.inputs, dict) or frames_of(state.steps) != state.taken:
+            raise ValueError("its frames are not those of its steps")
+        if H.ndim != 2 or surface.ndim != 2 or len(H) != len(state.gaussians):
+            raise ValueError(f"H has shape {H.shape} of {len(state.gaussians)} Gaussians")
+    except (
+        zipfile.BadZipFile,
+        LookupError,
+        ValueError,
+        TypeError,
+        OSError,
+        EOFError,
+        InputError,
+        RuntimeError,
+        RecursionError,
+        SyntaxError,
+    ) as error:
+        reason = " ".join(str(error).split())[:120]
         raise InputError(
-            f"{path}: not a readable checkpoint ({error}); delete it to begin with the seeds"
+            f"{path}: not a readable checkpoint ({reason}); delete it to begin with the seeds"
         ) from None
+    frames = read_config(out).get("frames")
+    check_frames(path, state.taken, len(frames) if isinstance(frames, list) else 0)
+    return state
+
+
+def _member(file: zipfile.ZipFile, name: str, kind: str) -> np.ndarray:
+    """An array of a checkpoint. Raises ValueError unless it is stored as it is, its dtype is of
+    this kind, and it is as long as its header says, so that it takes no more memory than disk."""
+    known = file.getinfo(f"{name}.npy")
+    if known.compress_type != zipfile.ZIP_STORED or known.flag_bits & 1:
+        raise ValueError(f"{name} is compressed")
+    with file.open(known) as member:
+        version = np.lib.format.read_magic(member)
+        if version not in ((1, 0), (2, 0)):
+            raise ValueError(f"{name} has a header of another version")
+        read = np.lib.format.read_array_header_1_0
+        read = read if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, fortran, dtype = read(member)
+        if dtype.kind != kind or dtype.hasobject:
+            raise ValueError(f"{name} has dtype {dtype}")
+        data = member.read()
+    if math.prod(shape) * dtype.itemsize != len(data):
+        raise ValueError(f"{name} has shape {shape} in {len(data)} bytes")
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C").copy("K")
+
+
+def check_frames(path: Path, taken: Sequence[int], count: int) -> None:
+    """Raises InputError where frames taken, as a file says, are not among this number."""
+    if not all(0 <= frame < count for frame in taken):
+        raise InputError(f"{path}: takes frames beyond the {count} of the run; start the run anew")

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,11 +12,10 @@ from mgs.data.dataset import Frame
 from mgs.data.meshes import Mesh, read_mesh
 from mgs.data.up import PLUS_Z, Up
 from mgs.errors import InputError
-from mgs.files import read_json
 from mgs.gaussians import Gaussians
 from mgs.report.diagnostics import run_scalars
 from mgs.report.page_facts import step_facts
-from mgs.report.runs import up_of
+from mgs.report.runs import read_metrics, up_of
 from mgs.run.ending import RunEnd
 from mgs.run.folder import Run, open_run
 from mgs.splat_ply import ply_colour_space, read_ply
@@ -141,12 +139,10 @@ def _read_run(run: Run, follow: bool) -> Subject:
 
 def _psnr(run: Path, images: int) -> dict[str, float]:
     """PSNR of each view by its name, if the run was measured since its last step."""
-    file = run / "metrics.json"
-    metrics: Any = read_json(file) if file.is_file() else None
-    if not isinstance(metrics, dict) or metrics.get("images") != images:
+    metrics = read_metrics(run)
+    if metrics is None or metrics["images"] != images:
         return {}
-    views = metrics.get("views", [])
-    return {view["name"]: view["psnr"] for view in views if view.get("psnr") is not None}
+    return {view["name"]: view["psnr"] for view in metrics["views"]}
 
 
 def _views(run: Run, psnr: dict[str, float]) -> list[View]:
