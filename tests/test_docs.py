@@ -150,7 +150,7 @@ def command_lines(page):
 
 
 def wrong_command(words, whole):
-    """What is wrong with a command line, else None. Options may stand in brackets."""
+    """Error of a command line, else None. Options may stand in brackets."""
     command = COMMANDS.get(words[1])
     if command is None:
         return f"no command {words[1]}"

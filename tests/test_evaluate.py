@@ -107,8 +107,8 @@ def grey() -> Gaussians:
 def test_views_are_measured_beside_each_other_but_large_ones_alone(
     tmp_path, monkeypatch, pixels, most
 ):
-    """What a renderer returns is freed by the thread that draws. Memory of Dr.Jit that another
-    thread frees while the next view is drawn stops both for ever, now and then."""
+    """The drawing thread frees a renderer's result: if another thread frees memory of Dr.Jit while
+    the next view is drawn, both can stop for ever."""
     dataset, lock = write_dataset(tmp_path / "data", orbit_cameras(8)), threading.Lock()
     active, seen, freed = [0], [], []
 

@@ -91,7 +91,7 @@ def test_other_bombs(tmp_path, monkeypatch):
 
 
 def test_json(tmp_path):
-    """Of other encodings it is read; larger than the memory, not."""
+    """JSON in other encodings is read; a file larger than the memory is refused."""
     (tmp_path / "a.json").write_text('{"ä": 1}', encoding="utf-16")
     assert read_json(tmp_path / "a.json") == {"ä": 1}
     os.truncate(tmp_path / "a.json", 1 << 40)

@@ -80,7 +80,7 @@ def test_the_default_budget_is_50_or_all_candidates(prior, tmp_path, frames, bud
 def test_a_frame_without_rock_is_refused_before_it_is_fitted_to(
     dataset, tmp_path, frames, images, named
 ):
-    """Of 12 frames on a circle 0, 4 and 8 are seeds; `farthest` takes 2 first, then 6."""
+    """Frames 0, 4 and 8 of 12 on a circle are seeds; `farthest` takes 2 first, then 6."""
     blacken(dataset, *frames)
     fits = []
 

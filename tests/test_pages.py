@@ -30,7 +30,7 @@ def pages():
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """What the how-to pages start from: demo, photos with depth, a COLMAP model, masks, a mesh."""
+    """Inputs of the how-to pages: demo, photos with depth, a COLMAP model, masks, a mesh."""
     folder = tmp_path_factory.mktemp("readers")
     dataset = synthetic.write_dataset(folder / "demo/dataset", synthetic.orbit_cameras(14, 48, 36))
     prior, _ = mgs.build_prior(dataset, mgs.PriorSettings(gaussians=300))

@@ -176,8 +176,8 @@ def test_context_policies_use_their_own_estimator():
 
 
 def test_cover_and_completeness_look_at_what_was_not_observed():
-    """Of two points, the first was observed from +X, and the view taken says less about the second
-    than the prior does."""
+    """The first of two points was observed from +X; the view taken says less about the second than
+    the prior does."""
     points = np.array([[0.0, 0, 0], [0, 0, 1e-9]])
     positions = np.array([[4.0, 0, 0], [0, 4, 0], [0, -4, 0], [4, 0, 0]])
     enough = LAM[0] / SH_C0**2

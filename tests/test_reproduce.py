@@ -371,7 +371,7 @@ def test_differences_are_paired_by_rock(tmp_path):
 
 
 def test_scenes_that_chose_no_setting_are_judged_alone():
-    """Of five rocks, one a scene, policies were developed on the first two."""
+    """Policies were developed on the first two of five rocks, one rock a scene."""
     runs, ahead = reproduce.curve_runs(TINY, 5), (5.0, 5.0, 0.1, 0.2, -0.6)
     found = fake(runs, lambda r: 25 + ahead[r.rock.index] * (r.policy == "directional-i"))
     pairs = results.statistics_of(found, runs)["test_psnr"]["pairs"]

@@ -29,7 +29,7 @@ LOADED = re.compile(
     r"""|<link\b[^>]*href="?(https?:)?//[^>]*rel="?(stylesheet|icon|preload)"""
     r"""|(url\(|@import)\s*["']?(https?:)?//"""
 )
-"""What loads from a network, in HTML or CSS."""
+"""Pattern of HTML or CSS that loads from a network."""
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

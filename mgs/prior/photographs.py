@@ -35,7 +35,7 @@ LEAST_OVERLAP = 0.5
 """Least share of cameras that have in their image the point that all look at."""
 
 GAP = 4.0
-"""Where the hull is farther than this many point spacings from every point, it replaces the points.
+"""Distance from every point, in point spacings, beyond which the hull replaces the points.
 """
 
 CELL_OF_SPACING = 0.5

@@ -131,7 +131,7 @@ class Predictor:
     residual: Array
 
     def look(self, frame: Frame, seed: int) -> tuple[dict[str, Array], Array, NDArray[np.bool_]]:
-        """What one view shows: each of TERMS, [H,W,3], squared linear RGB; the true error, [H,W,3]
+        """Errors of one view: each of TERMS, [H,W,3], squared linear RGB; the true error, [H,W,3]
         linear RGB; and the pixels that are wholly on the rock, [H,W]."""
         # Drawn as colours of about 1, for which float32 is precise.
         largest = max(float(self.residual.max(initial=0)), 1e-30)

@@ -244,7 +244,7 @@ DETECTORS: dict[str, Detector] = {
         ),
     ),
 }
-"""By the name of the number."""
+"""Detector of each indicator, by its name."""
 
 
 def alarms(indicators: Mapping[str, float], before: Mapping[str, float] | None = None) -> list[str]:

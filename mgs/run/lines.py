@@ -24,7 +24,7 @@ class _Ended(_Checked):
 
 
 class _Line(_Checked):
-    """What every line has, and the kinds of what some have."""
+    """Keys of every line, and the types of optional ones."""
 
     images: int
     coverage: float

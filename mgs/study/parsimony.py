@@ -99,7 +99,7 @@ SIZES = {
 }
 
 Fixed = tuple[str, int | str, str, int]
-"""What differs, number of Gaussians, kinds learned, and SH degree of a fit."""
+"""Factor that varies, number of Gaussians, kinds learned, and SH degree of a fit."""
 
 
 def fixed_choices(size: ParsimonySize) -> list[Fixed]:

@@ -167,7 +167,7 @@ def _keys(*names: str) -> list[str]:
 
 
 def statistics_of(results: Found, runs: Sequence[Run]) -> dict[str, Any]:
-    """For each of MEASURES the area under the curve by policy and the tests of pairs of policies.
+    """Area under the curve by policy, and tests of pairs of policies, for each of MEASURES.
 
     "area": mean over rocks; "area_by_rock"; "reach": mean number of images to what `random` ends
     with, and on how many rocks it is reached; "pairs": judged claims (`mgs.study.verdict`) that the
@@ -348,8 +348,8 @@ def matrix(rows: Rows, title: str, cell: Callable[[Row], str]) -> str:
 
 @dataclass(frozen=True)
 class Work:
-    """What a result is written from: the study's folder `root`, the results of cells, the size, the
-    number of rocks, and the command."""
+    """Inputs of a result: the study's folder `root`, the results of cells, the size, the number of
+    rocks, and the command."""
 
     root: Path
     results: Found
