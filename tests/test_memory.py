@@ -110,7 +110,7 @@ def test_a_run_holds_few_images_at_once_and_finds_the_same(
 TARGET_OF = problem.target_of
 
 
-def test_stations_before_a_run_hold_few_images_at_once(
+def test_commands_before_a_run_hold_few_images_at_once(
     rock: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from mgs.data import importers

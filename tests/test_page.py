@@ -28,7 +28,7 @@ from mgs.run.folder import open_run
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """Two runs on stand-in stations: one finished and measured, one stopped two steps before its
+    """Two runs on stand-in operations: one finished and measured, one stopped two steps before its
     end."""
     root = tmp_path_factory.mktemp("a <b> & c")  # to be escaped, in an address and in text
     dataset = load_dataset(tiny.write_dataset(root / "data"))

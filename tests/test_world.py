@@ -46,9 +46,9 @@ def make_run(root: Path, tilted: bool) -> Path:
     def turned(g: Gaussians) -> Gaussians:
         return replace(g, means=(g.means @ turn.T).astype(np.float32))
 
-    stations = tiny.operations(initial=lambda frames: turned(tiny.initial(frames)), up=dataset.up)
+    operations = tiny.operations(initial=lambda frames: turned(tiny.initial(frames)), up=dataset.up)
     settings = tiny.start(root / "run", dataset, policy="uniform")
-    recording.run(root / "run", settings, dataset, stations, tiny.silent)
+    recording.run(root / "run", settings, dataset, operations, tiny.silent)
     made = open_run(root / "run")
     gaussians, trained = made.state.gaussians, [frame.name for frame in made.taken]
 
