@@ -28,10 +28,11 @@ from mgs.policy.criteria import (
 from mgs.policy.criteria import i_optimal as i_optimality
 from mgs.policy.poses import POSE_POLICIES
 
+
 def directional_d(context: PolicyContext) -> Array:
-    """Directional D-optimality, nats, with colours of SH degree 2 and tau 0.3
-    (`mgs.policy.directional`)."""
-    return context.gains(context.taken_frames, context.candidate_frames, 2, 0.3, False)
+    """Directional D-optimality, nats, with colours of SH degree 1 and tau 0.3: degree and tau were
+    chosen on five rocks that judge nothing (`mgs.policy.directional`)."""
+    return context.gains(context.taken_frames, context.candidate_frames, 1, 0.3, False)
 
 
 def directional_i(context: PolicyContext) -> Array:
@@ -136,6 +137,17 @@ CONTEXT_POLICIES: dict[str, Policy] = {
 def policy_names() -> list[str]:
     """Names of the three tables, which `mgs nbv --policy` accepts."""
     return [*CRITERIA, *CONTEXT_POLICIES, *POSE_POLICIES]
+
+
+MODEL_POLICIES = ("i-optimal", "block-d", "paper")
+"""Rows of CONTEXT_POLICIES that use the fitted model; the others need poses and prior alone."""
+
+
+def needs_model(name: str) -> bool:
+    """Whether a policy may use the fitted model, so that a choice needs a fit before it."""
+    if name in CRITERIA:
+        return CRITERIA[name].at == "fitted"
+    return name in MODEL_POLICIES or from_file.in_file(name)
 
 
 def check_policy(name: str) -> None:
