@@ -171,8 +171,8 @@ def test_survey_without_a_rock(capsys, dataset, tmp_path, given, named):
 @cases(
     {
         "unknown policy": (["--policy", "best"], "best"),
-        "more seeds than frames": (["--seeds", 13], "13 seeds"),
-        "no seeds": (["--seeds", 0], "--seeds"),
+        "more seeds than frames": (["--seed-views", 13], "13 seeds"),
+        "no seeds": (["--seed-views", 0], "--seed-views"),
         "budget larger than the candidates": (["--budget", 9], "8 candidates"),
         "negative budget": (["--budget", -1], "--budget"),
         "no pixel noise": (["--pixel-noise", 0], "--pixel-noise"),

@@ -24,7 +24,7 @@ from mgs.splat import ListCache
 from mgs.splat_ply import read_ply
 from mgs.synth.rendering import write_contact_sheet
 
-VIEWS = ["--seeds", "3", "--budget", "4", "--passes", "6", "--seed", "1"]
+VIEWS = ["--seed-views", "3", "--budget", "4", "--passes", "6", "--random-seed", "1"]
 STRUCK = """
 import os, signal
 from mgs.run import operations

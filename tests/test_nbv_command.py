@@ -155,8 +155,8 @@ def test_demo_refuses_results_of_another_seed(tmp_path, capsys, made):
         write_json(root / "config.json", {"seed": 3})
     else:
         tiny.start(tmp_path / "demo/random", load_dataset(root), seed=3)
-    said = refused(capsys, ["demo", tmp_path / "demo", "--seed", "1"])
-    assert f"demo/{made}: was made with --seed 3, not 1" in said
+    said = refused(capsys, ["demo", tmp_path / "demo", "--random-seed", "1"])
+    assert f"demo/{made}: was made with --random-seed 3, not 1" in said
     assert not (tmp_path / "demo/prior").exists()
 
 
@@ -266,7 +266,7 @@ def test_settings_without_an_option_are_named_by_their_key(
 
 def test_options_reach_the_run(dataset, prior, tmp_path):
     """Here the paper's Eq. 7: squared gradients of one scalar loss per image, one lambda."""
-    options = "--estimator loss-gradient --lam 1e-6 --budget 1 --seeds 3 --passes 2"
+    options = "--estimator loss-gradient --lam 1e-6 --budget 1 --seed-views 3 --passes 2"
     options += " --rate colour=0.1 --rate opacity=0 --prior-std scale=2"
     options += " --nearest 5 --travel 2.5 --batch 3 --stop-gain 1e-9 --stop-uncertainty 1e-9"
     run = tmp_path / "run"

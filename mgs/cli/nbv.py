@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
 
+from mgs.errors import FLAGS, flag
 from mgs.fit.settings import TrainSettings
 from mgs.policy.registry import policy_names
 from mgs.run.settings import PRESETS, NbvSettings
@@ -151,7 +152,7 @@ def _option(name: str, panel: str) -> inspect.Parameter:
         kind, default = list[str], ", ".join(f"{k}={v:g}" for k, v in default.items())
     if default is not None and not isinstance(default, bool) and "Default:" not in text:
         text += f" Default: {default}."
-    flags = ["--exposure"] if kind is bool else ["--rate"] if name == "rates" else []
+    flags = ["--exposure"] if kind is bool else [FLAGS[name]] if name in FLAGS else []
     option = typer.Option(
         *flags, metavar=METAVARS.get(name), help=text, rich_help_panel=panel, show_default=False
     )
@@ -172,18 +173,16 @@ def refuse_others(context: typer.Context, resume: Path) -> None:
         source = context.get_parameter_source(name)
         if name in ("resume", "policy") or source is None or source.name != "COMMANDLINE":
             continue
-        option = (
-            name if name == "dataset" else f"--{name.replace('_', '-')}".replace("rates", "rate")
-        )
+        option = flag(name)
         where = f"--resume takes its settings from {resume / 'config.json'}; change it there"
-        raise InputError(f"nbv: {option.upper() if name == 'dataset' else option}: {where}")
+        raise InputError(f"nbv: {'DATASET' if name == 'dataset' else option}: {where}")
 
 
 def pairs(name: str, given: list[str]) -> dict[str, float]:
     """Parse `KIND=NUMBER` options. Raises InputError for one that is not of this form."""
     from mgs.errors import InputError
 
-    option, table = {"rates": "--rate", "prior_std": "--prior-std"}[name], {}
+    option, table = flag(name), {}
     for text in given:
         kind, _, number = text.partition("=")
         try:
