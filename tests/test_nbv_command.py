@@ -122,11 +122,11 @@ def test_a_quality_that_could_not_be_measured_is_a_dash(tmp_path):
     views = {"count": 2, "psnr": 30.123, "ssim": 0.95, "psnr_mask": None, "ssim_mask": None}
     console = Console(record=True, width=500)
     print_run(tmp_path, state_of([]), NOT_SHOWN | {"all": views}, console)
-    text = "(2): PSNR 30.12 dB, SSIM 0.9500; inside the rock mask PSNR – dB, SSIM –"
-    assert f"views trained on {text}" in console.export_text(clear=False)
+    text = "(2): PSNR 30.12 dB, SSIM 0.9500; masked PSNR – dB, SSIM –"
+    assert f"training views {text}" in console.export_text(clear=False)
     assert "test views" not in console.export_text()
     print_run(tmp_path, state_of([]), NOT_SHOWN | {"all": views, "test": views}, console)
-    assert f"test views {text}\nviews trained on {text}" in console.export_text()
+    assert f"test views {text}\ntraining views {text}" in console.export_text()
 
 
 @pytest.mark.parametrize(
@@ -136,15 +136,15 @@ def test_a_quality_that_could_not_be_measured_is_a_dash(tmp_path):
 def test_names_and_numbers_are_readable_at_80_columns(tmp_path, name, width):
     line = {"step": 0, "name": None, "seed_names": [name.format(i) for i in range(4)]}
     line |= {"score": None, "coverage": 1.0, "seconds": {"fit": 123.4}}
-    line |= {"iterations": 1120, "loss": 2.34e-4, "stop_reason": "pass-limit"}
+    line |= {"images": 4, "iterations": 1120, "loss": 2.34e-4, "stop_reason": "pass-limit"}
     lines = [line, line | {"step": 1, "name": name.format(5), "score": 1.234e-05}]
-    console = Console(record=True, width=width)
+    console = Console(record=True, width=width, force_terminal=True)
     print_run(tmp_path, state_of(lines), NOT_SHOWN, console)
     shown = console.export_text().splitlines()[:-1]
     assert max(len(text) for text in shown) <= width
     for i in (0, 1, 2, 3, 5):
         assert sum(name.format(i) in text for text in shown) == 1
-    for number in ("1.234e-05", "100.00 %", "1120", "0.000234", "pass-limit", "123.4"):
+    for number in ("1.234e-05", "100.00 %", "280", "0.000234", "pass-limit", "123.4"):
         assert any(number in text for text in shown)
 
 

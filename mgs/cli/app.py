@@ -71,6 +71,7 @@ RESUMABLE = ("synth-orbit", "import", "demo", "reproduce", "chart", "stress", "p
 OLD_NAMES = {"--seeds": "--seed-views", "--seed": "--random-seed", "--preset": "--scale"}
 """Former names of options, which still work; `nbv` has a --preset of its own."""
 
+
 def _help(docstring: str | None) -> str:
     """Join the lines of each paragraph, so that the help breaks lines only at the terminal's
     width."""

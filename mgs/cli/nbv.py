@@ -209,27 +209,32 @@ def start_and_print(dataset: Path | None, out: Path, console: Console, **setting
 def resume_and_print(
     run: Path | Run, console: Console, policy: str | None = None, pictures: bool = False
 ) -> None:
-    """Run or resume the loop of a run, evaluate (with pictures where asked), print the table.
+    """Run or resume the loop of a run, evaluate (with pictures where asked), print the table of
+    steps; where the output is no terminal, a line after each step instead.
 
     policy: FILE.py:FUNCTION where the run has a policy of the user's own.
     """
     from functools import partial
 
-    from mgs.cli.printing import print_run
+    from mgs.cli.printing import print_run, step_line
     from mgs.cli.progress import progress_bar
     from mgs.report.evaluation import evaluate_run
     from mgs.run.folder import Run, open_run
     from mgs.run.nbv import resume_nbv
 
     run = run if isinstance(run, Run) else open_run(run)
-    total = run.settings.seeds + run.settings.budget
+    total, known = run.settings.seeds + run.settings.budget, list[dict[str, Any]]()
     with progress_bar("reading", console) as progress:
 
         def on_step(state: State) -> None:
             progress.whole(f"{run.folder.name}: images", len(state.taken), total)
-            line = state.steps[-1]
-            for warning in line.get("warnings", []):
-                progress.print(f"step {line['step']}: {warning}")
+            new = state.steps[len(known) :]
+            known.extend(new)
+            for line in new:
+                if not console.is_terminal:
+                    progress.print(step_line(line))
+                for warning in line.get("warnings", []):
+                    progress.print(f"step {line['step']}: {warning}")
 
         state = resume_nbv(run, on_step, progress, policy)
         metrics = evaluate_run(
