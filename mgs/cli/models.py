@@ -129,7 +129,7 @@ def prune(
     if found.psnr:
         before, after = found.psnr
         lines.append(
-            f"PSNR on the {found.views.replace(' ', '-')} views: {before:.2f} dB before, {after:.2f} dB after"
+            f"PSNR on the {found.views} views: {before:.2f} dB before, {after:.2f} dB after"
         )
     _print([*lines, f"wrote {run / PRUNED}"])
 
@@ -185,7 +185,7 @@ def _refitted(found: RefittedRun) -> list[str]:
         return [*lines, "PSNR: there are no views on which to compare the models"]
     own, whole, lean = found.psnr
     lines.append(
-        f"PSNR on the {found.views.replace(' ', '-')} views: {lean:.2f} dB, {whole:.2f} dB where all parameters are "
+        f"PSNR on the {found.views} views: {lean:.2f} dB, {whole:.2f} dB where all parameters are "
         f"fitted in the same way; of the run's own model {own:.2f} dB"
     )
     return lines

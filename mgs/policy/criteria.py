@@ -51,7 +51,7 @@ BLOCKS_AT_ONCE = 2048
 
 
 GAIN_UNIT = "½ nat per parameter"
-"""Unit of `d_optimal` with the lambda of `regularisation`: 2/l times a mutual information in nats."""
+"""Unit of `d_optimal` with the lambda of `regularisation`: 2/l times mutual information in nats."""
 
 
 def regularisation(
