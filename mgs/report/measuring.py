@@ -44,7 +44,8 @@ def evaluate(
     """
     if isinstance(subject, Run) or (not isinstance(subject, Gaussians) and Path(subject).is_dir()):
         return evaluate_run(subject, progress=progress, **options)
-    renderer, path = render_view, None
+    renderer: Renderer = render_view
+    path = None
     if not isinstance(subject, Gaussians):
         path = Path(subject)
         subject, renderer = read_ply(path), _renderer(ply_colour_space(path))

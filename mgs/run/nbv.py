@@ -212,7 +212,7 @@ def check_named(run: Run, policy: str | Callable[..., Any] | None) -> None:
         raise InputError(f"--policy {name_of(policy)}: is not the policy of {run.folder}, {own}")
     if is_function(own):
         call = f"mgs.resume_nbv({str(run.folder)!r}, policy={label(own)})"
-        if policy is None:
+        if policy is None or isinstance(policy, str):
             raise InputError(f"{run.folder}: its policy is a Python function; in Python: {call}")
         kept = run.folder / POLICY_SOURCE
         with reading(kept):
