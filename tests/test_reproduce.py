@@ -60,8 +60,9 @@ def quick(monkeypatch):
     """The preset `quick` is tiny, nothing is rendered, and few policies are compared."""
     monkeypatch.setitem(reproduce.SIZES, "quick", TINY)
     monkeypatch.setattr(case, "make_dataset", ellipsoids)
-    monkeypatch.setattr(reproduce, "POLICIES", ("directional-d", "d-optimal", "random"))
+    monkeypatch.setattr(reproduce, "POLICIES", ("directional-d", "random"))
     monkeypatch.setattr(setups, "JUDGE_PASSES", 2)
+    monkeypatch.setattr(setups, "DRAWS", 2)
     for name in list(setups.SETUPS):
         if name not in ("ring", "one seed"):
             monkeypatch.delitem(setups.SETUPS, name)
@@ -85,14 +86,14 @@ def rows_of(path):
 
 
 def test_setups_are_made_once_and_hold_what_the_policies_found(quick, tmp_path, capsys):
-    out, line = tmp_path / "out", "mgs reproduce --preset quick --only setups --rocks 2"
+    out, line = tmp_path / "out", "mgs reproduce --scale quick --only setups --rocks 2"
     assert "setups dataset/boulder-11" in done(capsys, out, "--only", "setups", "--rocks", 2)
     folder = out / "results"
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert set(before) == {"setups.csv", "setups.json", "setups.md", "setups.png", "leads.csv"}
     rows = rows_of(folder / "setups.csv")
     assert {row["command"] for row in rows} == {line}
-    assert len(rows) == 2 * 2 * 3
+    assert len(rows) == 2 * 2 * 2
     assert [float(row["test_gain"]) for row in rows if row["policy"] == "random"] == [0] * 4
     again = done(capsys, out, "--only", "setups", "--rocks", 2)
     assert "setup/" not in again, "a cell was done twice"
@@ -109,7 +110,7 @@ def test_a_policy_of_ones_own_is_compared(quick, tmp_path, capsys):
     assert "directional-d" not in said, "the other policies are not run again"
     rows = rows_of(out / "results/setups.csv")
     assert {row["policy"] for row in rows} == {*reproduce.POLICIES, "mine.py:first"}
-    line = "mgs reproduce --preset quick --only setups --rocks 1 --policy mine.py:first"
+    line = "mgs reproduce --scale quick --only setups --rocks 1 --policy mine.py:first"
     assert {row["command"] for row in rows} == {line}
     mine.write_text("def first(candidates):\n    return candidates[:, 0]\n")
     more = done(capsys, *one, "--policy", f"{mine}:first")
@@ -124,16 +125,17 @@ def test_rocks_of_ones_own_take_the_place_of_the_others(quick, tmp_path, capsys,
         return ellipsoids(root, out, scene, seed, size)
 
     monkeypatch.setattr(case, "make_dataset", seen)
+    monkeypatch.setattr(reproduce, "POLICIES", ("uniform", "random"))
     out, meshes = tmp_path / "out", [tmp_path / "one.ply", tmp_path / "two.glb"]
     for mesh in meshes:
         mesh.write_text(mesh.name)
     given = [part for mesh in meshes for part in ("--mesh", mesh)]
-    said = done(capsys, out, "--only", "seeds", *given)
-    assert rendered == [("boulder", "one.ply"), ("boulder", "two.glb")]
-    assert "seeds dataset/one-" in said
-    assert {row["scene"] for row in rows_of(out / "results/seeds_by_rock.csv")} == {"one", "two"}
-    line = "mgs reproduce --preset quick --only seeds --rocks 2 --mesh one.ply --mesh two.glb"
-    assert {row["command"] for row in rows_of(out / "results/seeds.csv")} == {line}
+    said = done(capsys, out, "--only", "setups", *given)
+    assert set(rendered) == {("boulder", "one.ply"), ("boulder", "two.glb")}
+    assert "setups dataset/one-" in said
+    assert {row["scene"] for row in rows_of(out / "results/setups.csv")} == {"one", "two"}
+    line = "mgs reproduce --scale quick --only setups --rocks 2 --mesh one.ply --mesh two.glb"
+    assert {row["command"] for row in rows_of(out / "results/setups.csv")} == {line}
     twice = ["--mesh", meshes[0], "--mesh", tmp_path / "out/../one.ply"]
     for options, line in (
         (["--rocks", 3, *given], "--rocks 3: setups can have 1 to 2"),
@@ -142,7 +144,7 @@ def test_rocks_of_ones_own_take_the_place_of_the_others(quick, tmp_path, capsys,
     ):
         assert line in refused(capsys, ["reproduce", out, *options], out)
     meshes[0].write_text("another rock")
-    again = done(capsys, out, "--only", "seeds", *given)
+    again = done(capsys, out, "--only", "setups", *given)
     assert "dataset/one-" in again, "another file is another rock"
     assert "/two-" not in again
 
@@ -199,7 +201,7 @@ def test_a_timed_run_has_a_process_of_its_own(quick, tmp_path):
     assert found["choice_seconds"] == pytest.approx(sum(choices) / 4)
     assert 100 < found["peak_megabytes"] < 4000
     wrong = Run(Rock("boulder", 1), ONE, "nonsense", budget=1, timed=True)
-    with pytest.raises(InputError, match="--policy nonsense: unknown"):
+    with pytest.raises(InputError, match=r"^policy nonsense: unknown"):
         run_cells(tmp_path, wrong.cells(), silent)
 
 
@@ -296,14 +298,14 @@ def test_table_1_has_equal_counts_and_the_papers_rows(quick, tmp_path, capsys, m
     assert theirs in text
     assert "| d-optimal | 6 | 20.20 | " + ours.format("20.20") in text
     assert "| random, mean of 2 | 6 | 20.70 | " + ours.format("20.70") in text
-    assert "`mgs reproduce --preset quick --only table1`" in text
+    assert "`mgs reproduce --scale quick --only table1`" in text
     assert "Not done yet" not in text
     line = rows["random, draw 2"]["command"]
     assert line.startswith("mgs nbv cells/dataset/boulder-0/circle-1/8x48x36/dataset --prior ")
-    assert line.endswith("--policy random --seeds 4 --budget 2 --seed 1000")
+    assert line.endswith("--policy random --seed-views 4 --budget 2 --random-seed 1000")
     done(capsys, out, "--only", "table1", "--batch", 2)
     rows = {row["row"]: row for row in rows_of(out / "results/table1.csv")}
-    ending = "--policy d-optimal --batch 2 --seeds 4 --budget 2 --seed 0"
+    ending = "--policy d-optimal --batch 2 --seed-views 4 --budget 2 --random-seed 0"
     assert rows["d-optimal"]["command"].endswith(ending)
     batches = [settings.get("batch") for settings in asked]
     assert batches == [None] * 6 + [2] * 5  # the fit to all views is no run
@@ -444,7 +446,7 @@ def test_every_run_of_every_result_has_its_own_cell():
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ("--preset huge", "--preset 'huge': unknown; choose one of quick, paper"),
+        ("--scale huge", "--scale 'huge': unknown; choose one of quick, paper"),
         ("--only table2", "unknown; choose some of table1,figures,setups,seeds,oracle"),
         ("--only ,", "--only '': unknown"),
         ("--rocks 13", "--rocks 13: setups can have 1 to 12"),
@@ -472,4 +474,4 @@ def test_a_folder_of_another_preset_or_of_something_else_is_refused(capsys, tmp_
     (tmp_path / "paper").mkdir()
     write_json(tmp_path / "paper/study.json", {"preset": "paper"})
     line = refused(capsys, ["reproduce", tmp_path / "paper"], tmp_path)
-    assert "was begun with --preset paper" in line
+    assert "was begun with --scale paper" in line

@@ -115,9 +115,7 @@ def case_of(rock: Rock, setup: Setup, size: SetupSize) -> Case:
     return Case(rock.at(dict(setup.orbit)), images, number | {"seed": 0})
 
 
-def cells_of(
-    size: SetupSize, rocks: Iterable[Rock], policies: Sequence[str], draws: int = DRAWS
-) -> list[Cell]:
+def cells_of(size: SetupSize, rocks: Iterable[Rock], policies: Sequence[str]) -> list[Cell]:
     """Cells of every policy in every set-up on every rock, with datasets and priors."""
     cells: dict[str, Cell] = {}
     for rock in rocks:
@@ -126,7 +124,7 @@ def cells_of(
             case = case_of(rock, setup, size)
             common = {"seeds": setup.seeds, "budget": size.images - setup.seeds, **setup.settings}
             for policy in policies:
-                for draw in range(draws if policy == RANDOM else 1):
+                for draw in range(DRAWS if policy == RANDOM else 1):
                     settings = common | {"policy": policy, "seed": rock.index + 1000 * draw}
                     version = "".join(f"-{d[:8]}" for d in policy_record(policy).values())
                     label = f"{policy_file.label(policy)}{version}-{draw}"
@@ -256,14 +254,16 @@ def by_scene(rows: Sequence[Row], setup: str, policy: str, key: str) -> dict[str
 
 
 def leads_of(rows: Sequence[Row], leader: str, measure: str) -> list[Row]:
-    """Lead of a policy over each other in each set-up: mean over scenes, 95 % interval, exact
-    permutation p, and p by Holm's correction over all of them."""
+    """Lead of a policy over each other in each set-up, where both were run: mean over scenes, 95 %
+    interval, exact permutation p, and p by Holm's correction over all of them."""
     leads = []
     for setup, other in dict.fromkeys((row["setup"], row["policy"]) for row in rows):
         if other in (leader, ORACLE):
             continue
         own, theirs = (by_scene(rows, setup, policy, measure) for policy in (leader, other))
-        apart = [own[scene] - theirs[scene] for scene in theirs]
+        apart = [own[scene] - theirs[scene] for scene in theirs if scene in own]
+        if not apart:
+            continue
         low, high = interval(apart) or (None, None)
         lead = {"lead": float(np.mean(apart)), "lead_low": low, "lead_high": high}
         about = {"measure": measure, "setup": setup, "policy": other, "scenes": len(apart)}
