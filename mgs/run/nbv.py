@@ -106,6 +106,8 @@ def start_run(
         built = found or _built_prior(unfinished, frames, gaussians, row, complete.seed, progress)
         _check_near(built, frames, where)
         complete = complete.with_spacing(built.spacing)
+        if complete.flies or complete.no_fly or complete.clearance is not None:
+            Problem(frames, complete, operations_of(frames, built, complete)).check_seeds()
         start(unfinished, complete, frames)
     return Run(out, complete, loaded, found)
 
