@@ -8,6 +8,8 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mgs.policy.criteria import GAIN_UNIT
+
 if TYPE_CHECKING:
     from mgs.run.settings import NbvSettings
 
@@ -92,5 +94,8 @@ def why_ended(ended: Mapping[str, Any]) -> str:
             f"no pose is left that the flight's limits allow, {views}; "
             f"the flight is {ended['metres']:.1f} m long with the way home"
         )
-    gain, limit = f"{ended['information_gain']:.4g}", f"less than --stop-gain {ended['limit']:g}"
+    gain, limit = (
+        f"{ended['information_gain']:.4g} {GAIN_UNIT}",
+        f"less than --stop-gain {ended['limit']:g}",
+    )
     return f"the next view, {ended['name']}, would gain {gain} after {views}, {limit}"

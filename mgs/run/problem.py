@@ -144,7 +144,7 @@ class Problem:
             seconds = metres / settings.speed + settings.hover * len(self.seeds)
             raise InputError(
                 f"nbv: the flight over {len(self.seeds)} seeds and home takes {metres:.1f} m and "
-                f"{seconds:.0f} s; raise --flight-length or --flight-time, or lower --seeds"
+                f"{seconds:.0f} s; raise --flight-length or --flight-time, or lower --seed-views"
             )
 
     @cached_property
