@@ -116,7 +116,7 @@ def test_a_dataset_is_one_command_and_its_flight_plan_is_read_by_pymavlink(run, 
             ahead[:2] / np.linalg.norm(ahead[:2]),
             atol=1e-6,
         )
-        assert (stop.param1, mount.param7) == (2, mavutil.mavlink.MAV_MOUNT_MODE_MAVLINK_TARGETING)
+        assert (stop.param1, mount.z) == (2, mavutil.mavlink.MAV_MOUNT_MODE_MAVLINK_TARGETING)
     mission = json.loads(plans[0].read_text())["mission"]
     packed = [
         mavutil.mavlink.MAVLink_mission_item_message(

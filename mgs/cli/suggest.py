@@ -264,6 +264,8 @@ def _write_plan(path: Path, run: Run, found: Suggestion, place: Any, settings: A
 
 def _print(console: Console, found: Suggestion, views: int, run: Run, crossed: str) -> None:
     """Print what was dropped, the views as a table, and the flight."""
+    from mgs.policy.criteria import GAIN_UNIT
+
     for reason, count in found.dropped.items():
         console.print(f"dropped: {count} {reason}")
     rows = found.plan if views > 1 else found.ranking[:SHOWN]
@@ -277,7 +279,7 @@ def _print(console: Console, found: Suggestion, views: int, run: Run, crossed: s
     unit = run.dataset.unit
     plan = f"{len(found.plan)} view{'s' if len(found.plan) > 1 else ''}"
     console.print(
-        f"gain: Eq. 7, nats per parameter; unseen, unknown: of what the picture shows\n"
+        f"gain: Eq. 7, {GAIN_UNIT}; unseen, unknown: of what the picture shows\n"
         f"flight: {found.metres:.1f} {unit} and {found.seconds:.0f} s from the first image through "
         f"{plan} and back"
     )

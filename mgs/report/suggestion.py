@@ -13,6 +13,7 @@ from mgs.colour import srgb_from_linear
 from mgs.data.dataset import Frame, write_transforms
 from mgs.data.up import upright
 from mgs.files import write_json
+from mgs.policy.criteria import GAIN_UNIT
 from mgs.report.diagnostics import VISIBLE, run_scalars, view_maps
 from mgs.run.folder import Run
 from mgs.run.suggest import Suggestion, View, taken_in_order
@@ -45,7 +46,7 @@ def write_suggestion(out: Path, run: Run, found: Suggestion) -> None:
 def numbers(run: Run, found: Suggestion) -> dict[str, Any]:
     """Contents of suggestions.json."""
     units = {
-        "information_gain": "mean of log(1 + F/(H + lambda)) over the parameters, nats (Eq. 7)",
+        "information_gain": f"Eq. 7, {GAIN_UNIT}",
         "unseen": "share of what the picture shows that no image shows",
         "unknown": "mean share of the prior's variance left in what the picture shows",
         "distance": f"from the last image, {run.dataset.unit}",

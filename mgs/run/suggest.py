@@ -53,11 +53,11 @@ FINE = 320
 class View:
     """A candidate and what its picture would give.
 
-    score: the policy's. information_gain: Eq. 7, the mean over the parameters of log(1 + F / (H +
-    lambda)), nats. unseen, unknown: share of what it shows, by squared blending weight, that no
-    image shows, and mean share of the prior's variance that is left there. distance: from the last
-    image taken. azimuth, elevation: from the middle of the object, degrees; azimuth 0 is +X.
-    planned: place in the order of choice, from 1; 0 if not planned.
+    score: the policy's. information_gain: Eq. 7 (`mgs.policy.criteria.d_optimal`). unseen, unknown:
+    share of what it shows, by squared blending weight, that no image shows, and mean share of the
+    prior's variance that is left there. distance: from the last image taken. azimuth, elevation:
+    from the middle of the object, degrees; azimuth 0 is +X. planned: place in the order of choice,
+    from 1; 0 if not planned.
     """
 
     name: str
