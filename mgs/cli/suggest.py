@@ -178,8 +178,7 @@ def _run(source: Path, scratch: Path, settings: dict[str, Any], progress: Any) -
     given = {key: value for key, value in settings.items() if value is not None}
     count = len(load_dataset(source))
     run = start_run(source, scratch, seeds=count, budget=0, progress=progress, **given)
-    resume_nbv(run, progress=progress, policy=run.settings.policy)
-    return run
+    return resume_nbv(run, progress=progress)
 
 
 def _candidates(

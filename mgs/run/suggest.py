@@ -21,8 +21,10 @@ from mgs.data.dataset import Dataset, Frame
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.policy import criteria, tour
+from mgs.policy.context import Policy
 from mgs.policy.directional import squared_weights
-from mgs.policy.from_file import absolute, in_file
+from mgs.policy.from_file import in_file, is_function, name_of
+from mgs.policy.registry import policy_of
 from mgs.prior.build import Prior
 from mgs.prior.initial import initial_gaussians
 from mgs.run.candidates import Named, Site, refusals
@@ -107,10 +109,10 @@ def suggest(
     settings: fields of `NbvSettings` in place of the run's. Raises InputError if no
     pose can be flown, fewer can than `views`, a setting is invalid, or the policy fails.
     """
-    if "policy" not in settings and in_file(run.settings.policy):
-        raise InputError(
-            f"{run.folder}: its policy is a program, {run.settings.policy}; name it with --policy"
-        )
+    policy, own = settings.pop("policy", None) or run.policy, run.settings.policy
+    if policy is None and (in_file(own) or is_function(own)):
+        raise InputError(f"{run.folder}: its policy is a program, {own}; name it with --policy")
+    settings |= {} if policy is None else {"policy": name_of(policy)}
     images = taken_in_order(run)
     site, taken = Site(run.prior, images[-1].camera), [frame.camera for frame in images]
     why = refusals(poses, taken, site, safe_distance, elevations)
@@ -118,7 +120,8 @@ def suggest(
     dropped = {reason: why.count(reason) for reason in dict.fromkeys(why) if reason}
     known = _settings(run, len(taken), min(views, len(flyable)), settings)
     _check_left(len(poses), len(flyable), dropped, views, known.flies)
-    problem, state = _problem(run, images, flyable, known, progress)
+    scores = None if policy is None else policy_of(policy)
+    problem, state = _problem(run, images, flyable, known, progress, scores)
     fisher = problem.view_information(state.gaussians)
     weights = _weights(problem, fisher, len(taken))
     blind = [i for i, seen in weights.items() if not seen.any()]
@@ -158,8 +161,7 @@ def _settings(run: Run, taken: int, views: int, given: dict[str, Any]) -> NbvSet
     """Settings of the run for a batch of `views` after all views taken."""
     fixed = {"seeds": taken, "budget": views, "batch": max(views, 2)}
     free = {"travel": None, "nearest": None, "stop_gain": None, "stop_uncertainty": None}
-    known = run.settings.model_dump() | free | given | fixed
-    settings = validated(NbvSettings, known | {"policy": absolute(known["policy"])})
+    settings = validated(NbvSettings, run.settings.model_dump() | free | given | fixed)
     check_settings(settings, taken + views)
     return settings
 
@@ -262,6 +264,7 @@ def _problem(
     poses: Sequence[Named],
     settings: NbvSettings,
     progress: Progress,
+    policy: Policy | None,
 ) -> tuple[Problem, Fitted]:
     """Selection problem of the images taken, then the poses, with a coarse model; and its state.
 
@@ -281,7 +284,7 @@ def _problem(
     count, ratio = len(images), images[0].camera.width / frames[0].camera.width
     usual = operations_of(dataset, prior, settings)
     operations = _scaled(replace(usual, initial=lambda frames: start), ratio**2 * thinning)
-    problem = Problem(dataset, settings, operations, progress, seeds=range(count))
+    problem = Problem(dataset, settings, operations, progress, policy, seeds=range(count))
     problem.skipped = count
     taken = [*range(1, count), 0]
     H = information(problem, model, taken)
