@@ -45,27 +45,6 @@ def test_exponents_of_growth():
     assert "threads" not in scaling_exponents(one_core)["forward, cold"]
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_the_chart_shows_the_records(tmp_path, monkeypatch, threads):
-    drawn = []
-    monkeypatch.setattr(scaling, "save_figure", lambda figure, path: drawn.append((figure, path)))
-    records = [p for p in points() if p["sweep"] != "threads" or p["threads"] <= threads]
-    scaling.scaling_figure(tmp_path / "chart.png", records)
-    ((figure, path),) = drawn
-    assert path == tmp_path / "chart.png"
-    axes = figure.axes[:4]
-    sweeps = {"gaussians": "n", "pixels": "pixels", "threads": "threads", "both": "pairs"}
-    for axis, (sweep, key) in zip(axes, sweeps.items(), strict=True):
-        expected = [(p[key], 1e3 * p["forward_warm"]) for p in records if p["sweep"] == sweep]
-        np.testing.assert_allclose(axis.lines[0].get_xydata(), expected)
-    assert [axis.get_legend().get_texts()[0].get_text() for axis in axes] == [
-        "forward, warm: 0.70",
-        "forward, warm: 0.50",
-        "forward, warm: -1.00" if threads > 1 else "forward, warm: ",
-        "forward, warm: 0.90, 1.40",
-    ]
-
-
 def test_linear_growth_finds_its_costs_and_the_worst_deviation():
     records = points()
     for p in records:

@@ -118,13 +118,6 @@ def test_what_cannot_be_read_is_named_with_its_cause(tmp_path, case, name):
     assert not (tmp_path / "copy.png").exists()
 
 
-def test_a_picture_that_is_none_is_named_alone(tmp_path):
-    (tmp_path / "a.png").write_text("no pixels")
-    path = tmp_path / "a.png"
-    with pytest.raises(InputError, match=f"^{path}: not a readable image; give a PNG or JPEG"):
-        read_png(path)
-
-
 def test_depth_of_three_channels_is_refused(tmp_path):
     write_png(tmp_path / "a.png", np.zeros((3, 4, 3)))
     with pytest.raises(InputError, match="not a depth image, its pixels are of kind RGB"):
