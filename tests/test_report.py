@@ -13,7 +13,7 @@ import tiny
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
-from program import command
+from program import command, table_numbers
 from program import steps as read_steps
 from refusals import refused
 from rich.console import Console
@@ -138,7 +138,7 @@ def test_report_writes_every_figure(runs, tmp_path, drawn):
             picture.load()
             assert picture.size == tuple(drawn[path.name].canvas.get_width_height())
         assert path.stat().st_size < 400_000
-    assert read_json(out / "table.json") == tables.table_numbers(runs)
+    assert read_json(out / "table.json") == table_numbers(runs)
 
     read = {run.policy: run for run in map(read_run, runs)}
     assert len(read["d-optimal"].seeds) == 3
@@ -196,7 +196,7 @@ def test_a_figure_that_is_left_out_is_named(runs, tmp_path, capsys):
 @pytest.mark.parametrize("sets", [["all", "held_out"], ["test", "all", "held_out"]])
 def test_table(request, sets):
     runs = request.getfixturevalue("tested" if "test" in sets else "runs")
-    rows, run = tables.table_numbers(runs), read_run(runs[1])
+    rows, run = table_numbers(runs), read_run(runs[1])
     means = {
         f"{views}.{name}": value for views in sets for name, value in run.metrics[views].items()
     }
@@ -228,7 +228,7 @@ def test_table(request, sets):
 
 
 def test_the_views_that_were_not_measured_have_a_dash(runs, tested):
-    rows = [*tables.table_numbers(runs), *tables.table_numbers(tested)]
+    rows = [*table_numbers(runs), *table_numbers(tested)]
     lines = tables.markdown_table(rows).splitlines()
     assert len({line.count("|") for line in lines}) == 1
     assert (lines[2].count("–"), lines[4].count("–")) == (4, 0)
@@ -321,7 +321,7 @@ def test_missing_files(runs, tmp_path):
         writing.write_report(tmp_path / "report", [run])
     (run / "metrics.json").unlink()
     with pytest.raises(InputError, match="mgs eval"):
-        tables.table_numbers([run])
+        table_numbers([run])
     (run / "steps.jsonl").unlink()
     with pytest.raises(InputError, match=r"steps\.jsonl: no such file; .*--resume"):
         read_run(run)
