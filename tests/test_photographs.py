@@ -33,7 +33,7 @@ from mgs.images import write_png
 from mgs.prior import hull
 from mgs.prior.build import build_prior, load_prior
 from mgs.prior.hull import visual_hull
-from mgs.prior.points import main_cluster, on_surface, reliable
+from mgs.prior.points import _grown, main_cluster, on_surface, reliable
 from mgs.prior.settings import PriorSettings
 
 Make = Callable[[str], Path]
@@ -488,3 +488,17 @@ def test_a_world_in_which_nothing_would_be_drawn_is_one_line(data, tmp_path, cap
 def test_mask_files_must_not_be_there_yet(exact, tmp_path):
     with pytest.raises(InputError, match="has a mask already"):
         make_masks(load_dataset(exact), read_mesh(exact / "rock.glb"), 0.1)
+
+
+def test_a_part_with_few_points_belongs_to_the_object_above_the_ground():
+    """Few points in shade are no cluster of their own; other things, farther off, stay out."""
+    rng = np.random.default_rng(0)
+    lit = rng.uniform([0, 0, 0], [1, 1, 1], (800, 3))
+    shade = rng.uniform([1, 0, 0], [1.3, 1, 0.02], (40, 3))
+    elsewhere = rng.uniform([2, 0, 0], [2.2, 0.2, 0.2], (60, 3))
+    lonely = np.array([[0.5, 0.5, 1.4]])
+    points = np.concatenate([lit, shade, elsewhere, lonely])
+    grown = _grown(points, np.arange(len(points)) < 800)
+    assert grown[:800].all()
+    assert grown[800:840].mean() > 0.95
+    assert not grown[840:].any()
