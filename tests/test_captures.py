@@ -97,7 +97,7 @@ def test_the_front_of_a_building(photographs, tmp_path):
     up = found.up_or_estimate()[0]
     assert degrees_between(up, unit_up(truth["up"])) < 2
     dataset = import_source(found, tmp_path / "d", up=up)
-    prior, _ = build_prior(dataset, PriorSettings(gaussians=1500, backing=0))
+    prior = build_prior(dataset, PriorSettings(gaussians=1500, backing=0))
     assert trimesh.Trimesh(prior.mesh.vertices, prior.mesh.faces).is_watertight
     assert "plane_normal" not in prior.numbers
     true, scale = read_mesh(source / "truth.ply"), truth["scale"]

@@ -26,7 +26,7 @@ from mgs.errors import InputError
 from mgs.files import read_json, write_json
 from mgs.policy.registry import policy_names
 from mgs.report import figures, tables, writing
-from mgs.report.evaluation import evaluate
+from mgs.report.evaluation import evaluate_model
 from mgs.report.figures import POLICY_STYLE
 from mgs.report.page_plots import SYMBOLS
 from mgs.report.runs import compare_runs, read_run
@@ -70,7 +70,7 @@ def write_runs(root):
             one = np.ones((camera.height, camera.width))
             return np.full((*one.shape, 3), grey, np.float32), one, one
 
-        metrics = evaluate(
+        metrics = evaluate_model(
             gaussians,
             dataset.frames,
             trained,
@@ -211,8 +211,8 @@ def test_table(request, sets):
     assert len(lines) == 4
     row = dict(zip(lines[0], lines[3], strict=True))
     assert (row["policy"], row["images"]) == ("random", "8")
-    assert row["PSNR, all (dB)"] == f"{run.metrics['all']['psnr']:.2f}"
-    assert row["SSIM, held out, rock only"] == f"{run.metrics['held_out']['ssim_mask']:.4f}"
+    assert row["PSNR, all views (dB)"] == f"{run.metrics['all']['psnr']:.2f}"
+    assert row["masked SSIM, held-out views"] == f"{run.metrics['held_out']['ssim_mask']:.4f}"
     assert row["path (m)"] == f"{path:.2f}"
     assert len(row) == 10 + 4 * ("test" in sets)
     assert "| path (unit) |" in tables.markdown_table([row | {"unit": "unit"} for row in rows])
@@ -240,7 +240,7 @@ def test_a_report_shows_test_views_where_there_are_some(tested, tmp_path, drawn)
     axes = drawn["psnr.png"].axes
     panels = {
         "PSNR, test views (dB)": "test_psnr",
-        "PSNR, test views, rock only (dB)": "test_psnr_mask",
+        "masked PSNR, test views (dB)": "test_psnr_mask",
     }
     assert [axis.get_ylabel() for axis in axes] == list(panels)
     for axis, key in zip(axes, panels.values(), strict=True):
@@ -280,14 +280,14 @@ def set_setting(name, value):
 UNFIT = {
     "measured before": (
         {"metrics": {"images": 7}},
-        "not evaluated since its last step; measure it with `mgs eval",
+        r"not evaluated since its last step; measure it with `mgs\.evaluate",
     ),
     "another dataset": ({"config": set_setting("dataset", "/elsewhere")}, "another dataset"),
     "frames changed": ({"config": lambda config: config["frames"].pop()}, "its frames differ"),
     "view not measured": ({"metrics": {"views": []}}, "was not evaluated on kf_"),
     "pictures of another model": (
         {"metrics": {"pictures": False}},
-        "no picture of this model; draw it with `mgs eval",
+        r"no picture of this model; draw it with `mgs\.evaluate",
     ),
     "metrics of views without numbers": (
         {"metrics": {"views": [{}]}},
@@ -295,7 +295,7 @@ UNFIT = {
     ),
     "budget raised": (
         {"config": set_setting("budget", 7)},
-        "is unfinished, with 8 of 10 views; go on with `mgs nbv --resume",
+        r"is unfinished, with 8 of 10 views; go on with `mgs\.resume_nbv",
     ),
     "budget of words": (
         {"config": set_setting("budget", "many")},
@@ -317,13 +317,13 @@ def test_missing_files(runs, tmp_path):
         read_run(tmp_path)
     run = changed(runs[0], tmp_path / "run")
     shutil.rmtree(run / "renders")
-    with pytest.raises(InputError, match="draw it with `mgs eval"):
+    with pytest.raises(InputError, match=r"draw it with `mgs\.evaluate"):
         writing.write_report(tmp_path / "report", [run])
     (run / "metrics.json").unlink()
-    with pytest.raises(InputError, match="mgs eval"):
+    with pytest.raises(InputError, match=r"mgs\.evaluate"):
         table_numbers([run])
     (run / "steps.jsonl").unlink()
-    with pytest.raises(InputError, match=r"steps\.jsonl: no such file; .*--resume"):
+    with pytest.raises(InputError, match=r"steps\.jsonl: no such file; .*resume_nbv"):
         read_run(run)
     config = read_json(run / "config.json")
     set_setting("dataset", str(tmp_path / "moved"))(config)
@@ -344,7 +344,7 @@ def test_a_damaged_line(runs, tmp_path, key, value):
         return {k: v for k, v in new.items() if v is not ...}
 
     run = changed(runs[0], tmp_path / "run", steps=damage)
-    line = rf"steps\.jsonl: line 3 is damaged \({key}\b.*: .*anew with `mgs nbv --resume"
+    line = rf"steps\.jsonl: line 3 is damaged \({key}\b.*: .*anew with `mgs\.resume_nbv"
     with pytest.raises(InputError, match=line):
         writing.write_report(tmp_path / "report", [run])
 
@@ -355,7 +355,7 @@ def test_an_unfinished_run(runs, tmp_path):
     lines = (run / "steps.jsonl").read_text().splitlines(keepends=True)
     (run / "steps.jsonl").write_text("".join(lines[:3]))
     (run / "gaussians.ply").unlink()
-    expected = f"{run}: is unfinished, with 5 of 8 views; go on with `mgs nbv --resume {run}`"
+    expected = f"{run}: is unfinished, with 5 of 8 views; go on with `mgs.resume_nbv('{run}')`"
     for metrics in ({}, {"images": 5}, None):
         if metrics is None:
             (run / "metrics.json").unlink()
@@ -364,7 +364,7 @@ def test_an_unfinished_run(runs, tmp_path):
         with pytest.raises(InputError, match=re.escape(expected)):
             writing.write_report(tmp_path / "report", [runs[1], run])
     (run / "steps.jsonl").write_text("".join(lines))
-    expected = r"run: has all 8 views, but no gaussians\.ply; write it with `mgs nbv --resume"
+    expected = r"run: has all 8 views, but no gaussians\.ply; write it with `mgs\.resume_nbv"
     with pytest.raises(InputError, match=expected):
         writing.write_report(tmp_path / "report", [run])
     assert not (tmp_path / "report").exists()
@@ -435,7 +435,7 @@ def test_a_legend_covers_no_line(tmp_path, monkeypatch, runs):
     lines = dict.fromkeys(labels, ((4, 5, 6), (0.1, 0.2, 0.3)))
     figures.gain_figure(tmp_path / "a.png", dict.fromkeys(labels, (0.1, 0.2, 0.3)))
     figures.coverage_figure(tmp_path / "a.png", lines)
-    figures.psnr_figure(tmp_path / "a.png", {"test views": lines, "rock only": lines})
+    figures.psnr_figure(tmp_path / "a.png", {"test views": lines, "masked PSNR": lines})
     assert len(found) == 3
     for figure in map(laid_out, found):
         legend = figure.legends[0].get_window_extent()
