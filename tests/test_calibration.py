@@ -14,7 +14,6 @@ from mgs.errors import InputError
 from mgs.images import write_png
 from mgs.report import calibration, predicted_error
 from mgs.report.calibration import (
-    Calibration,
     ause,
     ause_of_constant,
     crps,
@@ -152,12 +151,6 @@ def test_crps_against_the_integral_that_defines_it():
     for error, sigma in ((0.3, 1.0), (-2.0, 0.5), (0.0, 2.0)):
         integral = np.square(norm.cdf(x / sigma) - (x >= error)).sum() * (x[1] - x[0])
         assert crps(np.array([error]), np.array([sigma])) == pytest.approx(integral, rel=1e-3)
-
-
-def test_sigma_of_maps_has_their_shape():
-    found = Calibration({"parameters": 2.0, "noise": 5.0}, {})
-    sigma = found.sigma({"parameters": np.full((4, 5, 3), 2.0)})
-    np.testing.assert_allclose(sigma, np.full((4, 5, 3), 3.0))
 
 
 @pytest.mark.parametrize(
