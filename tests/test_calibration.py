@@ -98,6 +98,7 @@ def test_a_sigma_half_as_large_and_one_that_knows_nothing_are_found_out():
     shuffled = judge(errors, np.random.default_rng(2).permutation(sigma))
     area = shuffled["ause"]
     assert abs(area["ause"] - area["constant"]) < 0.05
+    assert area["perfect"] < 0.5 * area["constant"]  # errors drawn from it follow it
     assert abs(shuffled["spearman"]) < 0.05
     assert judge(errors, np.full(N, 0.1))["spearman"] == 0
 
