@@ -102,6 +102,8 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
         ) from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError(f"{path}: has no faces; give a triangle mesh, not a point cloud")
+    if mesh.vertices.shape[1:] != (3,) or mesh.faces.shape[1:] != (3,):
+        raise InputError(f"{path}: its vertices or faces have no three numbers; export it again")
     if not np.isfinite(mesh.vertices).all():
         first = int(np.argwhere(~np.isfinite(mesh.vertices))[0][0])
         raise InputError(f"{path}: vertex {first} is NaN or infinite; repair the mesh")
