@@ -243,6 +243,7 @@ def test_a_colmap_file_of_another_length_than_it_says(tmp_path, name, damage):
 
 IMAGES = {
     "id": (8, b"\xff" * 4),
+    "no rotation": (12, b"\0" * 32),
     "position": (44, b"\0" * 6 + b"\xf0\x7f"),
     "camera": (68, b"\xff" * 4),
     "name of no text": (72, b"\xff"),
