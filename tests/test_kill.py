@@ -1,5 +1,9 @@
 """Commands killed (SIGKILL) at random moments and run again: their files equal those of an
-uninterrupted run bit for bit. `pytest -m kill` runs it; KILLS: number of kills, by default 100."""
+uninterrupted run bit for bit.
+
+`pytest -m kill` runs it; KILLS: number of kills, by default 100. The same command continues an
+interrupted pass; --cache-clear begins a new one.
+"""
 
 from __future__ import annotations
 
@@ -103,11 +107,16 @@ def contents(work: Path) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_killed_at_any_moment(name, places):
+def test_killed_at_any_moment(name, places, request):
+    """pytest's cache holds the number of kills so far."""
+    cache, count = request.config.cache, -(-KILLS // len(COMMANDS))
+    done = cache.get(f"kill/{name}", 0)
+    if done >= count:
+        pytest.skip(f"had its {count} kills; begin a new pass with --cache-clear")
     work, begun = cleared(name, places), time.monotonic()
     assert started(name, places).wait() == 0
     took, whole = time.monotonic() - begun, contents(work)
-    for moment in np.random.default_rng(KILLS).uniform(0, took, max(1, KILLS // len(COMMANDS))):
+    for moment in np.random.default_rng(0).uniform(0, took, count)[done:]:
         cleared(name, places)
         process = started(name, places)
         time.sleep(moment)
@@ -117,3 +126,5 @@ def test_killed_at_any_moment(name, places):
         after = contents(work)
         differ = [key for key in whole | after if whole.get(key) != after.get(key)]
         assert not differ, f"killed after {moment:.2f} s of {took:.2f}"
+        done += 1
+        cache.set(f"kill/{name}", done)
