@@ -417,10 +417,14 @@ CHECKPOINTS = {
 }
 
 
-@pytest.mark.parametrize("command", ["report", "diagnose"])
-def test_two_reports_on_one_folder(capsys, stranger, command, monkeypatch):
+PLACES = {"report": "report", "diagnose": "diagnostics", "eval": "", "prune": "", "refit": ""}
+"""Command on a run -> folder in the run that it locks."""
+
+
+@pytest.mark.parametrize("command", PLACES)
+def test_two_commands_on_one_run(capsys, stranger, command, monkeypatch):
     monkeypatch.setattr("mgs.report.runs.compare_runs", lambda runs: runs)
-    out = stranger / {"report": "report", "diagnose": "diagnostics"}[command]
+    out = stranger / PLACES[command]
     script = f"from mgs.files import *\nwith folder_locked({str(out)!r}):\n    print(flush=True)\n"
     script += "    input()"
     program = [sys.executable, "-c", script]
