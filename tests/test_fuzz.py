@@ -1,7 +1,7 @@
 """Damaged files in every loader: it succeeds or raises an InputError of one line, prints nothing,
 and takes little memory and time.
 
-`pytest -m fuzz` makes them at random. FUZZ_SECONDS: time for each loader, by default 20. The same
+`pytest -m fuzz` makes them at random. FUZZ_SECONDS: CPU time for each loader, by default 20. The same
 command continues an interrupted pass; --cache-clear begins a new one. An input that fails is copied
 to the folder `corpus`, which the quick suite reads.
 """
@@ -286,13 +286,13 @@ def test_damaged_files(name, request, capfd):
     )
     while spent < SECONDS:
         cache.set(running, True)
-        begun = time.monotonic()
+        begun = time.process_time()
         try:
             seed(batches)(options(given(damages(sound) | tree(sound))(damaged)))()
         except BaseException:
             keep(name, folder / file)
             raise
         finally:
-            batches, spent = batches + 1, spent + time.monotonic() - begun
+            batches, spent = batches + 1, spent + time.process_time() - begun
             cache.set(f"fuzz/{name}", [batches, spent])
             cache.set(running, False)
