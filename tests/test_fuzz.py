@@ -1,9 +1,9 @@
 """Damaged files in every loader: it succeeds or raises an InputError of one line, prints nothing,
 and takes little memory and time.
 
-`pytest -m fuzz` makes them at random. FUZZ_SECONDS: CPU time for each loader, by default 20. The same
-command continues an interrupted pass; --cache-clear begins a new one. An input that fails is copied
-to the folder `corpus`, which the quick suite reads.
+`pytest -m fuzz` makes them at random. FUZZ_SECONDS: CPU time for each loader, by default 20. The
+same command continues an interrupted pass; --cache-clear begins a new one. An input that fails is
+copied to the folder `corpus`, which the quick suite reads.
 """
 
 from __future__ import annotations
