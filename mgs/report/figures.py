@@ -16,12 +16,8 @@ import numpy as np
 
 from mgs.colour import srgb_from_linear
 from mgs.data.up import PLUS_Z, Up, upright
-<<<<<<< HEAD
 from mgs.plotting import STYLE, crop, literal, new_figure, save_figure
-=======
-from mgs.plotting import STYLE, crop, new_figure, save_figure
 from mgs.policy.criteria import GAIN_UNIT
->>>>>>> main
 from mgs.report.calibration import BINS
 
 if TYPE_CHECKING:
