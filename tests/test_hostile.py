@@ -213,6 +213,19 @@ def test_a_pipe_is_no_file(capsys, dataset, tmp_path):
         assert "is no regular file" in refused(capsys, arguments, out)
 
 
+def test_a_mesh_that_names_a_pipe(tmp_path):
+    """It is not opened, which would never end; the library takes a texture as missing."""
+    os.mkfifo(tmp_path / "pipe.bin")
+    buffers = [{"uri": "pipe.bin", "byteLength": 36}]
+    (tmp_path / "a.gltf").write_text(json.dumps({"asset": {"version": "2.0"}, "buffers": buffers}))
+    with pytest.raises(InputError, match=r"pipe\.bin is no regular file"):
+        load_mesh(tmp_path / "a.gltf")
+    (tmp_path / "a.mtl").write_text("newmtl a\nmap_Kd pipe.bin\n")
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\nusemtl a\n" + TRIANGLE)
+    assert len(load_mesh(tmp_path / "a.obj").faces) == 1
+
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
 FAR = [[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 ABSURD = {"w": {"w": 16.5}, "pose": {"frame": {"transform_matrix": FAR}}, "focal": {"fl_x": 1e300}}
 
