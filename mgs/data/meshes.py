@@ -192,12 +192,25 @@ def distinct_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     way round, the first."""
     kept = np.flatnonzero(np.linalg.norm(face_crosses(vertices, faces), axis=1) > 0)
     corners = np.sort(_places(vertices)[faces[kept]], axis=1)
-    return kept[np.sort(np.unique(corners, axis=0, return_index=True)[1])]
+    order, number = _numbered(corners)
+    return kept[
+        np.sort(order[np.searchsorted(number[order], np.arange(number.max(initial=-1) + 1))])
+    ]
 
 
 def _places(vertices: np.ndarray) -> np.ndarray:
     """[V] number of each vertex's place. 0.0 and -0.0 are the same coordinate."""
-    return np.unique(vertices + 0.0, axis=0, return_inverse=True)[1].ravel()
+    return _numbered(vertices)[1]
+
+
+def _numbered(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Stable lexicographic order of rows [N,K], and the number [N] of each row among the different
+    ones in that order: as `np.unique(axis=0)`, but many times faster."""
+    order = np.lexsort(rows.T[::-1])
+    new = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
+    number = np.zeros(len(rows), np.int64)
+    number[order[1:]] = np.cumsum(new)
+    return order, number
 
 
 def _wound_against(faces: np.ndarray) -> np.ndarray:
@@ -211,12 +224,8 @@ def _wound_against(faces: np.ndarray) -> np.ndarray:
     """
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     forward = edges[:, 0] < edges[:, 1]
-    _, edge, count = np.unique(
-        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    edge = edge.ravel()
-    order = np.argsort(edge, kind="stable")
-    first, second = order[count[edge[order]] == 2].reshape(-1, 2).T
+    order, edge = _numbered(np.sort(edges, axis=1))
+    first, second = order[np.bincount(edge)[edge[order]] == 2].reshape(-1, 2).T
     against = forward[first] == forward[second]
     n, first, second = len(faces), first // 3, second // 3
     if not against.any():
