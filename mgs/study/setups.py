@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from mgs.data.dataset import load_dataset
+from mgs.data.dataset import Frame, load_dataset
 from mgs.policy import from_file as policy_file
 from mgs.policy.registry import needs_model
 from mgs.prior.build import load_prior
 from mgs.run.inputs import policy_record
 from mgs.run.loop import choose, finished, fit_views, learn, select_views, surface_information
-from mgs.run.operations import operations_of, psnr_measure
+from mgs.run.operations import operations_of, psnr_over
 from mgs.run.problem import Problem
 from mgs.run.settings import NbvSettings, with_defaults
 from mgs.run.state import Fitted
@@ -158,7 +158,7 @@ def choose_and_judge(
     the views taken).
     """
     policy = settings["policy"]
-    shared, measure, on_ring = _shared(
+    shared, tests, pool, on_ring = _shared(
         root / dataset, root / prior, root / ring, every, settings["seeds"], settings["budget"]
     )
     chosen_by = RANDOM if policy == ORACLE else policy
@@ -171,15 +171,15 @@ def choose_and_judge(
         taken = _from_poses(problem)
     train = problem.settings.train.model_copy(update={"passes": JUDGE_PASSES})
     model = fit_views(problem.with_settings(train=train), taken).gaussians
-    found = measure(model, taken)
-    same = every is None and dataset == ring
-    views = found["held_out_psnr"] if same or every else on_ring(model, [])["psnr"]
+    left = [i for i in range(len(shared.frames)) if i not in taken]
+    on_tests, on_pool = tests(model), pool(model, left)
+    mine = dataset == ring  # the poses of the ring, of which some may be taken
     positions = problem.positions[taken]
     return {
-        "test": found["test_psnr"],
-        "test_mask": found["test_psnr_mask"],
-        "pool": found["held_out_psnr"],
-        "ring": views,
+        "test": float(on_tests["psnr"].mean()),
+        "test_mask": float(on_tests["psnr_mask"].mean()),
+        "pool": float(on_pool["psnr"].mean()),
+        "ring": float((on_pool if mine else on_ring(model))["psnr"].mean()),
         "path": float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()),
         "taken": taken,
     }
@@ -196,12 +196,16 @@ def _from_poses(problem: Problem) -> list[int]:
     return state.taken
 
 
+Measure = Callable[..., dict[str, np.ndarray]]
+"""(model, indices of frames; default: all) -> as `mgs.run.operations.psnr_over`."""
+
+
 @lru_cache(maxsize=1)
 def _shared(
     dataset: Path, prior: Path, ring: Path, every: int | None, seeds: int, budget: int
-) -> tuple[Problem, Callable[..., dict[str, float]], Callable[..., dict[str, float]]]:
+) -> tuple[Problem, Measure, Measure, Measure]:
     """What the policies of one set-up on one rock share: the problem, with the surface's
-    visibility, and functions that measure PSNR on its views and on the ring's."""
+    visibility, and PSNR on the test views, on the candidates and on the ring's."""
     data, cache = load_dataset(dataset), ListCache()
     if every is not None:
         half = len(data) // 2
@@ -212,7 +216,14 @@ def _shared(
     problem = Problem(data, settings, operations_of(data, load_prior(prior), settings))
     _ = problem.start, problem.visibility  # once, for all copies `with_settings`
     _after_seeds.cache_clear()
-    return problem, psnr_measure(data, cache), psnr_measure(load_dataset(ring), cache)
+
+    def over(frames: Sequence[Frame]) -> Measure:
+        of = psnr_over(frames, cache)
+        return lambda model, some=range(len(frames)): of(model, some)
+
+    views = test_views_of(data).frames, data.frames, load_dataset(ring).frames
+    tests, pool, on_ring = map(over, views)
+    return problem, tests, pool, on_ring
 
 
 @lru_cache(maxsize=1)
