@@ -13,7 +13,7 @@ from mgs.camera import Camera
 from mgs.data.dataset import Dataset, Frame, target_of
 from mgs.data.up import PLUS_Z, Up, upright
 from mgs.gaussians import Gaussians
-from mgs.memory import IMAGE_BYTES, Deferred, kept_within
+from mgs.memory import IMAGE_BYTES, VIEW_BYTES, Deferred, kept_within
 from mgs.policy import criteria, poses
 from mgs.policy.context import Policy, PolicyContext
 from mgs.policy.from_file import label
@@ -193,12 +193,16 @@ class Problem:
     def view_information(self, model: Gaussians) -> Callable[[int], np.ndarray]:
         """A function frame -> information [N,P] of its view at a model.
 
-        Results are kept while there is room where views are chosen in batches: all choices of a
+        Where views are chosen in batches, results are kept within VIEW_BYTES: all choices of a
         batch are about one model.
         """
-        room = IMAGE_BYTES if self.settings.batch > 1 else 0
         fisher, cameras = self.operations.fisher, self.cameras
-        return kept_within(room, lambda i: fisher(model, cameras[i]), lambda F: F.nbytes)
+        if self.settings.batch == 1:
+            return lambda i: fisher(model, cameras[i])
+        # Copies: the kernel returns part of a larger array, of up to twice the memory.
+        return kept_within(
+            VIEW_BYTES, lambda i: np.array(fisher(model, cameras[i])), lambda F: F.nbytes
+        )
 
     def context(
         self,
