@@ -104,7 +104,8 @@ def check_seed(dataset: Path, runs: list[Path], seed: int) -> None:
 
     recorded = {run: read_settings(run).seed for run in runs if (run / "config.json").is_file()}
     if (dataset / "config.json").is_file():
-        recorded[dataset] = read_json(dataset / "config.json").get("seed", seed)
+        config = read_json(dataset / "config.json")
+        recorded[dataset] = config.get("seed", seed) if isinstance(config, dict) else seed
     for folder, found in recorded.items():
         if found != seed:
             raise InputError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -102,6 +103,8 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
         ) from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError(f"{path}: has no faces; give a triangle mesh, not a point cloud")
+    if mesh.vertices.shape[1:] != (3,) or mesh.faces.shape[1:] != (3,):
+        raise InputError(f"{path}: its vertices or faces have no three numbers; export it again")
     if not np.isfinite(mesh.vertices).all():
         first = int(np.argwhere(~np.isfinite(mesh.vertices))[0][0])
         raise InputError(f"{path}: vertex {first} is NaN or infinite; repair the mesh")
@@ -125,14 +128,24 @@ def _load(path: Path) -> Any:
     large."""
     import trimesh
 
-    mesh: Any = trimesh.load(path, process=False) if path.suffix.lower() in GLTF else None
+    class Files(trimesh.resolvers.FilePathResolver):
+        """Reads the files that a mesh names, but no pipe and no device, which may never end."""
+
+        def get(self, name: str) -> bytes:
+            for one in (Path(self.parent, name.strip()), Path(self.parent, Path(name).name)):
+                if one.exists() and not (one.is_file() or one.is_dir()):
+                    raise InputError(f"{path}: {one} is no regular file; correct the name")
+            return super().get(name)
+
+    load = partial(trimesh.load, path, process=False, resolver=Files(str(path)))
+    mesh: Any = load() if path.suffix.lower() in GLTF else None
     parts = list(mesh.graph.nodes_geometry) if isinstance(mesh, trimesh.Scene) else []
     for part in mesh.geometry.values() if parts else ():
         _check_textures(path, part)
     if len(parts) == 1:  # force="mesh" below would lose the file's normals
         transform, name = mesh.graph[parts[0]]
         return mesh.geometry[name].apply_transform(transform)
-    mesh = trimesh.load(path, force="mesh", process=False)
+    mesh = load(force="mesh")
     _check_textures(path, mesh)
     return mesh
 

@@ -26,7 +26,7 @@ from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import TEST_FOLDER, Dataset, Frame
 from mgs.errors import InputError
-from mgs.files import atomic_path, locked, read_json, write_json
+from mgs.files import atomic_path, read_json, working_in, write_json
 from mgs.gaussians import Gaussians
 from mgs.images import PNG_LEVEL, read_png
 from mgs.metrics import METRICS, SURFACE_METRICS, compare, compare_surface
@@ -232,7 +232,7 @@ def evaluate_run(
     """
     run = run if isinstance(run, Run) else open_run(run)
     file, folder = run.folder / "metrics.json", run.folder / "renders"
-    with locked(run.folder):
+    with working_in(run.folder):
         gaussians, dataset = run.state.gaussians, run.dataset
         trained = [frame.name for frame in run.taken]
         frames, tests = dataset.with_images(trained), dataset.test_views()
