@@ -68,7 +68,7 @@ def demo(
             start_and_print(dataset, run, console, prior=folder, **settings)
         resume_and_print(run, console, pictures=True)
     heading("4/5 what the views say about each Gaussian")
-    diagnose(runs[0])
+    diagnose(runs[:1])
     heading("5/5 the report")
     compared = compare_runs(runs)
     written = write_report(report, compared)
