@@ -104,7 +104,7 @@ def diagnose(
         option("Instead, predict the errors of views not seen, and compare.", "--calibrate"),
     ] = False,
 ) -> None:
-    """Draw maps of the Fisher information and the uncertainty of the models of runs, for views and for
+    """Draw maps of the Fisher information and the uncertainty of a run's model, for views and for
     Gaussians.
 
     Writes into RUN/diagnostics: for each view an EXR with the channels R G B A Z, fisher.colour,
