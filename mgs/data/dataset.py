@@ -17,6 +17,7 @@ from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.errors import InputError
 from mgs.files import check_new_folder, read_json, write_json
 from mgs.images import image_size, read_exr, read_mask, read_png
+from mgs.notebook import html, thumbnails
 
 PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 """Camera models of transforms.json that are pinholes if their distortion is zero."""
@@ -126,7 +127,7 @@ class Frame:
         return path
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Dataset:
     """A folder of keyframes in order of time.
 
@@ -141,6 +142,13 @@ class Dataset:
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    def __repr__(self) -> str:
+        camera = self.frames[0].camera
+        return f"Dataset({self.root}: {len(self)} frames, {camera.width}x{camera.height})"
+
+    def _repr_html_(self) -> str:
+        return html(repr(self), thumbnails([frame.image_path for frame in self.frames]))
 
     @property
     def on_demand(self) -> bool:
