@@ -27,6 +27,7 @@ from mgs.files import (
     copy_file,
     locked,
     read_json,
+    working_in,
     write_csv,
     write_json,
 )
@@ -184,6 +185,17 @@ def test_an_atomic_folder_appears_whole(tmp_path, there):
         assert not (out / "file").exists()
     assert [path.name for path in out.parent.iterdir()] == ["out"]
     assert (out / "file").exists()
+
+
+def test_what_ended_processes_left_in_a_folder_is_removed(tmp_path):
+    """But nothing of a process that runs, and nothing of the user."""
+    (tmp_path / "renders").mkdir()
+    ended = [f".a.{process}.part.ply" for process in (os.getpid(), 2**30)]
+    kept = {".a.1.part.ply", ".a.part", "a.1.part"}
+    for name in [*ended, *kept]:
+        (tmp_path / "renders" / name).touch()
+    with working_in(tmp_path):
+        assert {path.name for path in (tmp_path / "renders").iterdir()} == kept
 
 
 def test_what_a_killed_process_left_of_an_atomic_folder_is_removed(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
@@ -220,12 +221,17 @@ def start_and_print(dataset: Path | None, out: Path, console: Console, **setting
 
 
 def resume_and_print(
-    run: Path | Run, console: Console, policy: str | None = None, pictures: bool = False
+    run: Path | Run,
+    console: Console,
+    policy: str | None = None,
+    pictures: bool = False,
+    on_state: Callable[[State], None] = lambda state: None,
 ) -> None:
     """Run or resume the loop of a run, evaluate (with pictures where asked), print the table of
     steps; where the output is no terminal, a line after each step instead.
 
-    policy: FILE.py:FUNCTION where the run has a policy of the user's own.
+    policy: FILE.py:FUNCTION where the run has a policy of the user's own. on_state: called with
+    every state that is on disk.
     """
     from functools import partial
 
@@ -240,6 +246,7 @@ def resume_and_print(
     with progress_bar("reading", console) as progress:
 
         def on_step(state: State) -> None:
+            on_state(state)
             progress.whole(f"{run.folder.name}: images", len(state.taken), total)
             new = state.steps[len(known) :]
             known.extend(new)

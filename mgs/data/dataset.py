@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from mgs.camera import Camera, opencv_from_opengl, opengl_from_opencv
 from mgs.data.rock_image import boundary, read_rock_image
 from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.errors import InputError
-from mgs.files import check_new_folder, read_json, write_json
+from mgs.files import check_new_folder, read_json, remove_leftovers, write_json
 from mgs.images import image_size, read_exr, read_mask, read_png
 from mgs.notebook import html, thumbnails
 
@@ -201,7 +202,7 @@ def load_dataset(root: str | Path) -> Dataset:
             )
     ordered = tuple(sorted(frames, key=lambda frame: (frame.timestamp, frame.name)))
     up = unit_up(data["up"]) if data.get("up") else PLUS_Z
-    return Dataset(root, ordered, up, str(data.get("unit") or "m"))
+    return Dataset(root, ordered, up, unit_of(path, data) or "m")
 
 
 def load_cameras(path: str | Path) -> list[tuple[str, Camera]]:
@@ -303,6 +304,15 @@ def timestamp_of(where: str, index: int, record: dict[str, Any]) -> float:
     return finite_number(where, "timestamp", record.get("timestamp", FRAME_INTERVAL * index))
 
 
+def unit_of(path: Path, data: dict[str, Any]) -> str | None:
+    """Name of the unit of length in a transforms.json, None if it has none. Raises InputError
+    unless it is a short word."""
+    unit = data.get("unit")
+    if unit and not (isinstance(unit, str) and re.fullmatch(r"\w{1,16}", unit)):
+        raise InputError(f"{path}: its unit is no word of at most 16 letters; correct it")
+    return unit or None
+
+
 def _frame(path: Path, data: dict[str, Any], index: int, record: dict[str, Any]) -> Frame:
     root, where = path.parent, f"{path}: frame {index}"
     camera, on_demand = _camera(path, data, index, record), data.get("on_demand") is True
@@ -370,8 +380,7 @@ def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:
             f"{out}: is not empty, but holds {state} dataset of other settings or sources; "
             "choose a new folder or delete it"
         )
-    for left in out.rglob(".*.part*"):
-        left.unlink()
+    remove_leftovers(out)
     return True
 
 
