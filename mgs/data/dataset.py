@@ -205,14 +205,16 @@ def load_dataset(root: str | Path) -> Dataset:
     return Dataset(root, ordered, up, unit_of(path, data) or "m")
 
 
-def load_cameras(path: str | Path) -> list[tuple[str, Camera]]:
+def load_cameras(path: str | Path, like: Camera | None = None) -> list[tuple[str, Camera]]:
     """(file_path, camera) of every frame of a transforms.json, in its order.
 
-    path: the file, or its folder. The image files need not exist. Otherwise raises InputError as
-    `load_dataset`.
+    path: the file, or its folder. like: camera of the intrinsics where the file has none. The image
+    files need not exist. Otherwise raises InputError as `load_dataset`.
     """
     path = Path(path) / "transforms.json" if Path(path).is_dir() else Path(path)
     data, records = read_records(path)
+    if like is not None and not any(key in data | records[0] for key in INTRINSICS):
+        data = _intrinsics(like) | data
     return [
         (record["file_path"], _camera(path, data, i, record)) for i, record in enumerate(records)
     ]
@@ -335,12 +337,17 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
 
 
 def write_transforms(
-    root: str | Path, frames: list[Frame] | tuple[Frame, ...], up: Up = PLUS_Z, unit: str = "m"
+    root: str | Path,
+    frames: list[Frame] | tuple[Frame, ...],
+    up: Up = PLUS_Z,
+    unit: str = "m",
+    notes: dict[str, str] | None = None,
 ) -> None:
     """Write transforms.json into the folder `root`, with paths relative to it.
 
-    up, unit: as `Dataset`. Frames are either all on demand or none. Intrinsics equal to those of
-    the first frame are written once. Write this file last: its presence marks a complete dataset.
+    up, unit: as `Dataset`. notes: more entries, for people. Frames are either all on demand
+    or none. Intrinsics equal to those of the first frame are written once. Write this file last:
+    its presence marks a complete dataset.
     """
     root = Path(root)
     header: dict[str, Any] = {"camera_model": "OPENCV", **_intrinsics(frames[0].camera)}
@@ -358,7 +365,8 @@ def write_transforms(
         own = _intrinsics(frame.camera)
         record |= {key: value for key, value in own.items() if value != header[key]}
         records.append(record)
-    write_json(root / "transforms.json", header | world | demand | {"frames": records})
+    known = header | world | demand | (notes or {})
+    write_json(root / "transforms.json", known | {"frames": records})
 
 
 def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:

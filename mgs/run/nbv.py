@@ -103,7 +103,7 @@ def start_run(
     known = validated(NbvSettings, {"dataset": root.resolve(), "prior": where.resolve(), **wanted})
     count = len(loaded) if loaded else _candidates(capture)
     complete = _resolved(known, count, "budget" in settings)
-    policy_of(policy)  # a user's policy fails here, before there is a folder
+    scores = policy_of(policy)  # a user's policy fails here, before there is a folder
     check_settings(complete, count)
     found = load_prior(prior) if isinstance(prior, str | Path) else prior
     with atomic_folder(out) as unfinished:
@@ -113,6 +113,10 @@ def start_run(
             save_prior(unfinished / "prior", built)
         _check_near(built, frames, where)
         complete = complete.with_spacing(built.spacing)
+        if complete.flies or complete.no_fly or complete.clearance is not None:
+            Problem(
+                frames, complete, operations_of(frames, built, complete), policy=scores
+            ).check_seeds()
         start(unfinished, complete, frames)
         if not isinstance(policy, str):
             (unfinished / POLICY_SOURCE).write_text(source_of(policy), encoding="utf-8")

@@ -67,6 +67,7 @@ def operations_of(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Oper
         exposure=exposure,
         on_surface=len(prior.points),
         up=prior.up,
+        ground=float((prior.mesh.vertices @ np.array(prior.up)).min()),
         prior=prior_digest(prior),
         capture=_capture(dataset) if dataset.on_demand else lambda frame: None,
     )

@@ -131,7 +131,9 @@ def mark_end(problem: Problem, state: State, refused: Choice | None = None) -> S
         name = problem.frames[refused.frame].name
         next_view = {"name": name, "information_gain": refused.information_gain}
     views = len(state.taken) - problem.settings.seeds
-    ended = run_end(problem.settings, views, uncertainty(problem, state), next_view)
+    stuck = not problem.reachable(state.taken)
+    metres = problem.flight.metres(state.taken) if stuck else None
+    ended = run_end(problem.settings, views, uncertainty(problem, state), next_view, metres)
     return replace(state, steps=[*state.steps[:-1], last | ({"ended": ended} if ended else {})])
 
 
