@@ -49,15 +49,21 @@ class RunEnd(StrEnum):
     BUDGET = "budget"
     UNCERTAINTY = "uncertainty"
     GAIN = "gain"
+    CANDIDATES = "candidates"
 
 
 def run_end(
-    settings: NbvSettings, views: int, uncertainty: float, refused: Mapping[str, Any] | None
+    settings: NbvSettings,
+    views: int,
+    uncertainty: float,
+    refused: Mapping[str, Any] | None,
+    left: bool = True,
 ) -> dict[str, Any] | None:
     """`ended` of steps.jsonl where the run ends here: the `reason` and its numbers; else None.
 
     views: chosen so far. uncertainty: mean variance that is left, over that of the prior.
-    refused: `name` and `information_gain` of the next view, where it is known.
+    refused: `name` and `information_gain` of the next view, where it is known. left: whether a
+    candidate is left.
     """
     if views >= settings.budget:
         return {"reason": str(RunEnd.BUDGET), "views": views}
@@ -68,7 +74,7 @@ def run_end(
     if refused and settings.stop_gain is not None and gain < settings.stop_gain:
         view = {"name": refused["name"], "information_gain": gain}
         return {"reason": str(RunEnd.GAIN), "views": views, **view, "limit": settings.stop_gain}
-    return None
+    return None if left else {"reason": str(RunEnd.CANDIDATES), "views": views}
 
 
 def why_ended(ended: Mapping[str, Any]) -> str:
@@ -76,6 +82,8 @@ def why_ended(ended: Mapping[str, Any]) -> str:
     views = f"{ended['views']} chosen view{'' if ended['views'] == 1 else 's'}"
     if ended["reason"] == RunEnd.BUDGET:
         return f"its budget is spent, {views}"
+    if ended["reason"] == RunEnd.CANDIDATES:
+        return f"no candidate is left after {views}"
     if ended["reason"] == RunEnd.UNCERTAINTY:
         limit = f"no more than --stop-uncertainty {ended['limit']:g}"
         return f"{ended['uncertainty']:.4g} of the prior's variance is left after {views}, {limit}"

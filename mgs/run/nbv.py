@@ -19,6 +19,7 @@ from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.run import recording
 from mgs.run.folder import DATASET, Run, holds_run, open_run, start
+from mgs.run.live import Live, begin
 from mgs.run.operations import operations_of
 from mgs.run.problem import Problem, Progress, no_progress
 from mgs.run.settings import (
@@ -30,6 +31,7 @@ from mgs.run.settings import (
     with_defaults,
 )
 from mgs.run.state import State
+from mgs.run.transports import Transport
 from mgs.splat.constants import NEAR
 from mgs.synth.scene_file import load_scene_file
 
@@ -53,7 +55,7 @@ def run_nbv(
     dataset, out, settings: as `start_run`. Callbacks, result and errors: as `resume_nbv`.
     """
     run = start_run(dataset, out, progress=progress, **settings)
-    return resume_nbv(run, on_step, progress, run.settings.policy)
+    return resume_nbv(run, on_step, progress, run.settings.policy, settings.get("live"))
 
 
 def start_run(
@@ -61,6 +63,7 @@ def start_run(
     out: str | Path,
     *,
     capture: str | Path | None = None,
+    live: Live | Transport | None = None,
     prior: str | Path | None = None,
     gaussians: int | Literal["auto"] | None = None,
     preset: str | None = None,
@@ -71,6 +74,8 @@ def start_run(
 
     capture: a scene (`mgs.synth.scene_file.load_scene_file`) in place of a dataset: the run renders
     an image only when its view is chosen, and has its own OUT/dataset with CAPTURE_TEST_VIEWS.
+    live: how pictures of the dataset's poses without an image are captured: `Live`, or a function
+    (pose file, picture file) (docs/howto/on-site.md). They are kept in OUT/dataset.
     prior: a folder; default DATASET/prior where there is one, else a prior of `gaussians` is built
     in the run (default: as many as the images resolve). preset: a row of `PRESETS`, defaults of
     what is not given. settings: fields of `NbvSettings`; by default the budget is 50 views or all
@@ -92,10 +97,13 @@ def start_run(
     if prior is None and gaussians is None and (root / "prior/prior.json").is_file():
         prior = root / "prior"
     row = None if preset is None else row_named(PRESETS, preset, "--preset")
-    loaded = load_dataset(root) if capture is None else None
+    loaded = load_dataset(root, to_capture=live is not None) if capture is None else None
+    if live is not None and not (loaded and loaded.on_demand):
+        raise InputError(f"{root}: all its images exist; leave out --capture-command or -folder")
     where = out / "prior" if prior is None else Path(prior)
     given = _with_defaults(settings, row, loaded)
-    known = validated(NbvSettings, {"dataset": root.resolve(), "prior": where.resolve(), **given})
+    images = root if live is None else out / DATASET
+    known = validated(NbvSettings, {"dataset": images.resolve(), "prior": where.resolve(), **given})
     count = len(loaded) if loaded else _candidates(capture)
     complete = _resolved(known, count, "budget" in settings)
     policy_named(complete.policy)  # a user's file fails here, before there is a folder
@@ -106,8 +114,10 @@ def start_run(
         built = found or _built_prior(unfinished, frames, gaussians, row, complete.seed, progress)
         _check_near(built, frames, where)
         complete = complete.with_spacing(built.spacing)
+        if live is not None:
+            begin(unfinished / DATASET, frames, built)
         start(unfinished, complete, frames)
-    return Run(out, complete, loaded, found)
+    return Run(out, complete, loaded if live is None else None, found)
 
 
 def _with_defaults(settings: dict[str, Any], row: Any, loaded: Dataset | None) -> dict[str, Any]:
@@ -177,11 +187,13 @@ def resume_nbv(
     on_step: Callable[[State], None] = lambda state: None,
     progress: Progress = no_progress,
     policy: str | None = None,
+    live: Live | Transport | None = None,
 ) -> State:
     """Continue a run from its last finished step to its end; return the last state.
 
-    policy: FILE.py:FUNCTION, required if the run has a policy from a file. The file is code, so
-    the user names it, not the folder. on_step(state): called after every step, or batch of steps,
+    live: as `start_run`, given again where pictures are still to be captured. policy:
+    FILE.py:FUNCTION, required if the run has a policy from a file. The file is code, so the user
+    names it, not the folder. on_step(state): called after every step, or batch of steps,
     that is finished and on disk. progress(stage, done, total): called during a step.
 
     A finished run returns its state again. Raises InputError if the folder holds no run, its inputs
@@ -190,7 +202,8 @@ def resume_nbv(
     """
     run = run if isinstance(run, Run) else open_run(run)
     check_named(run, policy)
-    operations = operations_of(run.dataset, run.prior, run.settings)
+    live = live if live is None or isinstance(live, Live) else Live(live)
+    operations = operations_of(run.dataset, run.prior, run.settings, live)
     return recording.run(run.folder, run.settings, run.dataset, operations, progress, on_step)
 
 
