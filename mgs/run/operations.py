@@ -93,9 +93,18 @@ def _capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[[Fra
 
 def kept_colours(prior: Prior) -> Callable[[Frame], Colours]:
     """`mgs.prior.initial.colours_of` the prior, with results kept within IMAGE_BYTES."""
-    return kept_within(
-        IMAGE_BYTES, colours_of(prior), lambda found: sum(part.nbytes for part in found)
+    of, frames = colours_of(prior), dict[str, Frame]()
+    kept = kept_within(
+        IMAGE_BYTES,
+        lambda name: of(frames[name]),
+        lambda found: sum(part.nbytes for part in found),
     )
+
+    def colours(frame: Frame) -> Colours:
+        frames[frame.name] = frame
+        return kept(frame.name)
+
+    return colours
 
 
 def psnr_measure(
