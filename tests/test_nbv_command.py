@@ -303,7 +303,7 @@ def test_a_run_of_a_policy_of_ones_own_can_be_read_without_it(loaded, tmp_path, 
     tiny.run(run, loaded, policy="mine", budget=1)
     monkeypatch.undo()
     assert read_run(run).policy == "mine"
-    with pytest.raises(InputError, match="--policy mine: unknown; choose one of d-optimal"):
+    with pytest.raises(InputError, match=r"^policy mine: unknown; choose one of d-optimal"):
         tiny.resume(run, loaded)
 
 

@@ -26,7 +26,7 @@ from mgs.errors import InputError
 from mgs.files import read_json, write_json
 from mgs.policy.registry import policy_names
 from mgs.report import figures, tables, writing
-from mgs.report.evaluation import evaluate
+from mgs.report.evaluation import evaluate_model
 from mgs.report.figures import POLICY_STYLE
 from mgs.report.page_plots import SYMBOLS
 from mgs.report.runs import compare_runs, read_run
@@ -70,7 +70,7 @@ def write_runs(root):
             one = np.ones((camera.height, camera.width))
             return np.full((*one.shape, 3), grey, np.float32), one, one
 
-        metrics = evaluate(
+        metrics = evaluate_model(
             gaussians,
             dataset.frames,
             trained,
@@ -317,13 +317,13 @@ def test_missing_files(runs, tmp_path):
         read_run(tmp_path)
     run = changed(runs[0], tmp_path / "run")
     shutil.rmtree(run / "renders")
-    with pytest.raises(InputError, match="draw it with `mgs eval"):
+    with pytest.raises(InputError, match=r"draw it with `mgs\.evaluate"):
         writing.write_report(tmp_path / "report", [run])
     (run / "metrics.json").unlink()
-    with pytest.raises(InputError, match="mgs eval"):
+    with pytest.raises(InputError, match=r"mgs\.evaluate"):
         tables.table_numbers([run])
     (run / "steps.jsonl").unlink()
-    with pytest.raises(InputError, match=r"steps\.jsonl: no such file; .*--resume"):
+    with pytest.raises(InputError, match=r"steps\.jsonl: no such file; .*resume_nbv"):
         read_run(run)
     config = read_json(run / "config.json")
     set_setting("dataset", str(tmp_path / "moved"))(config)

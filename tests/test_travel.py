@@ -72,7 +72,7 @@ def test_the_choice_is_the_best_gain_for_its_cost(loaded, tmp_path, travel, batc
 def test_what_cannot_be_divided_by_a_cost_is_refused(loaded, tmp_path, monkeypatch):
     negative = lambda candidates, *rest: -np.ones(len(candidates))  # noqa: E731
     monkeypatch.setitem(pose_policies.POSE_POLICIES, "mine", negative)
-    with pytest.raises(InputError, match="policy mine: returned negative scores, which --travel"):
+    with pytest.raises(InputError, match="policy mine: returned negative scores, which travel"):
         run(tmp_path / "run", loaded, policy="mine", travel=1.0)
     assert len(run(tmp_path / "free", loaded, policy="mine").taken) == 8
 

@@ -157,7 +157,7 @@ def main(arguments: list[str] | None = None) -> None:
             raise
         raise _stop(_system_error(error), 2) from None
     except InputError as error:
-        raise _stop(str(error), 2) from None
+        raise _stop(error.line, 2) from None
     except typer.TyperException as error:
         message = error.format_message().replace("Value error, ", "")
         raise _stop(" ".join(message.split()), 2) from None

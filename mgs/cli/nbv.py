@@ -315,7 +315,7 @@ def resume_and_print(
                 for warning in line.get("warnings", []):
                     progress.print(f"step {line['step']}: {warning}")
 
-        state = resume_nbv(run, on_step, progress, policy, live)
+        state = resume_nbv(run, on_step, progress, policy, live).state
         metrics = evaluate_run(
             run.folder, pictures=pictures, progress=partial(progress, "evaluating")
         )

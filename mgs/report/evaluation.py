@@ -63,7 +63,7 @@ def render_view(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.nd
     return np.asarray(image.rgb), np.asarray(image.alpha), np.asarray(image.depth)
 
 
-def evaluate(
+def evaluate_model(
     gaussians: Gaussians,
     frames: Sequence[Frame],
     trained: Iterable[str],
@@ -243,7 +243,7 @@ def evaluate_run(
             say(reason)
         metrics = _measured_before(file, subject)
         if metrics is None:
-            found = evaluate(
+            found = evaluate_model(
                 gaussians,
                 frames,
                 trained,
@@ -371,4 +371,4 @@ def compare_models(
         frames = tuple(f for f in dataset.with_images(taken) if f.name not in taken)
     if not frames:
         return name, None
-    return name, [float(evaluate(model, frames, ())["all"]["psnr"]) for model in models]
+    return name, [float(evaluate_model(model, frames, ())["all"]["psnr"]) for model in models]

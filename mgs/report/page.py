@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,7 @@ COMPARED = 6
 
 def write_page(
     path: str | Path,
-    folders: Sequence[str | Path],
+    folders: Sequence[str | PathLike[str]],
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> int:
     """Write the page of these runs as one HTML file; return its size in bytes.

@@ -225,7 +225,7 @@ def measure(
 
     def run() -> State:
         shutil.rmtree(out / "run", ignore_errors=True)
-        return run_nbv(root / dataset, out / "run", prior=root / prior, **given)
+        return run_nbv(root / dataset, out / "run", prior=root / prior, **given).state
 
     state, times = timed(run, repeats)
     shutil.rmtree(out / "run")
