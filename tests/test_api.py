@@ -47,17 +47,6 @@ def test_no_module_hides_behind_a_function_of_its_name():
                 )
 
 
-def test_type_checkers_see_the_names(tmp_path):
-    (tmp_path / "program.py").write_text(
-        "import mgs\n\nreveal_type(mgs.render)\nreveal_type(mgs.Camera.position)\nmgs.rendr\n"
-    )
-    command = [sys.executable, "-m", "mypy", str(tmp_path / "program.py")]
-    said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300).stdout
-    assert "gaussians: mgs.gaussians.Gaussians, camera: mgs.camera.Camera" in said
-    assert 'Module has no attribute "rendr"' in said
-    assert (ROOT / "mgs/py.typed").is_file()
-
-
 def test_the_whole_way_from_python(dataset, prior, tmp_path, capsys):
     """Nothing is printed, callbacks are called, and the state is what the folder holds."""
     steps, stages = [], set()

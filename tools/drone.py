@@ -37,15 +37,15 @@ def flown(asked: Camera, noise: float, rng: np.random.Generator) -> Camera:
 
 def photograph(world: Path, asked: dict, out: Path, noise: float, failure: str, seed: int) -> None:
     """Fly to a pose and write the answer, spoiled by a failure."""
-    runtime.start()
-    from mgs.synth.capture import photographer_of  # needs a variant
-
     if failure == "crash":
         sys.exit("the drone lost its radio link")
     if failure == "hang":
         time.sleep(3600)
     if failure == "nothing":
         return
+    runtime.start()
+    from mgs.synth.capture import photographer_of  # needs a variant
+
     K = np.array([[asked["fl_x"], 0, asked["cx"]], [0, asked["fl_y"], asked["cy"]], [0, 0, 1]])
     pose = opencv_from_opengl(asked["transform_matrix"])
     camera = Camera(K, asked["w"], asked["h"], pose)

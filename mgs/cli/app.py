@@ -49,6 +49,7 @@ COMMANDS = {
     "survey": "survey.survey",
     "prior": "prior.prior",
     "nbv": "nbv.nbv",
+    "suggest": "suggest.suggest",
     "eval": "models.evaluate",
     "diagnose": "models.diagnose",
     "report": "report.report",

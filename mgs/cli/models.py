@@ -14,7 +14,7 @@ from mgs.cli.options import Run, argument, option
 from mgs.cli.printing import print_quality
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError
-from mgs.files import folder_locked
+from mgs.files import folder_locked, working_in
 from mgs.policy.criteria import LEARN_LOSS, PRUNE_NOISE
 
 if TYPE_CHECKING:
@@ -147,9 +147,10 @@ def prune(
     again, and the run itself stays as it is.
     """
     from mgs.report.pruning import PRUNED, prune_run
+    from mgs.run.folder import open_run
 
     runtime.start()
-    with progress_bar() as bar:
+    with working_in(open_run(run).folder), progress_bar() as bar:
         found = prune_run(run, noise, bar)
     share = 1 - found.after / found.before
     lines = [
@@ -186,10 +187,11 @@ def refit(
     is.
     """
     from mgs.report.refitting import REFITTED, refit_run
+    from mgs.run.folder import open_run
 
     runtime.start()
     options: Any = {"learn": learn, "sh": sh, "loss": loss}
-    with progress_bar() as bar:
+    with working_in(open_run(run).folder), progress_bar() as bar:
         found = refit_run(run, say=bar, **options)
     _print([*_refitted(found), f"wrote {run / REFITTED}"])
 

@@ -24,6 +24,7 @@ from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.data.visibility import in_mask, visible
 from mgs.errors import InputError
 from mgs.files import atomic_path, new_folder, read_json, write_json
+from mgs.memory import decoding
 from mgs.prior.hull import MOST_PIXELS
 from mgs.prior.photographs import Surface, check_masks, source_of, surface_of
 from mgs.prior.resolution import resolution
@@ -287,12 +288,13 @@ def load_prior(folder: str | Path) -> Prior:
     if not path.is_file():
         raise InputError(f"{path}: no such file; make the prior again with `mgs prior`")
     try:
-        data = PlyData.read(str(path))["vertex"].data
+        with decoding(path):
+            data = PlyData.read(str(path))["vertex"].data
         names = ("x", "y", "z", "nx", "ny", "nz")
         columns = np.stack([np.asarray(data[name], np.float64) for name in names], 1)
         spacing, tolerance = float(numbers["spacing"]), float(numbers["depth_tolerance"])
         backed, up = int(numbers["backed"]), unit_up(numbers["up"])
-    except (PlyParseError, KeyError, ValueError, TypeError, UnicodeDecodeError) as error:
+    except (PlyParseError, KeyError, ValueError, TypeError, OverflowError) as error:
         raise InputError(
             f"{folder}: not a readable prior ({error}); make it again with `mgs prior`"
         ) from None

@@ -16,7 +16,8 @@ A step is one chosen view; of a batch only the last step has a fit. A line of `s
 - `residual`: rms difference of the new images to the model before, linear RGB.
 - `exposure`: gains (red, green, blue) by frame name, with the setting `exposure`.
 - `indicators`, `warnings`: of `mgs.run.detectors`. `seconds`: by stage.
-- `psnr`, `psnr_mask` over all views, `held_out_...`, `test_...`, dB: where it was evaluated.
+- `test_psnr`, `test_psnr_mask`, dB, where it was evaluated; without test views `psnr`, `psnr_mask`
+  over all views, and `held_out_...`.
 - `ended`: in the last line of a run that has ended (`mgs.run.ending.run_end`).
 """
 

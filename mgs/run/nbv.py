@@ -75,7 +75,7 @@ def start_run(
     capture: a scene (`mgs.synth.scene_file.load_scene_file`) in place of a dataset: the run renders
     an image only when its view is chosen, and has its own OUT/dataset with CAPTURE_TEST_VIEWS.
     live: how pictures of the dataset's poses without an image are captured: `Live`, or a function
-    (pose file, picture file) (docs/nbv.md). They are kept in OUT/dataset.
+    (pose file, picture file) (docs/howto/on-site.md). They are kept in OUT/dataset.
     prior: a folder, or a Prior, which is copied into the run; default DATASET/prior where there is
     one, else a prior of `gaussians` is built in the run (default: as many as the images resolve).
     preset: a row of `PRESETS`, defaults of what is not given. settings: fields of `NbvSettings`;
@@ -115,7 +115,7 @@ def start_run(
     )
     count = len(loaded) if loaded else _candidates(capture)
     complete = _resolved(known, count, "budget" in settings)
-    policy_of(policy)  # a user's policy fails here, before there is a folder
+    scores = policy_of(policy)  # a user's policy fails here, before there is a folder
     check_settings(complete, count)
     found = load_prior(prior) if isinstance(prior, str | Path) else prior
     with atomic_folder(out) as unfinished:
@@ -125,6 +125,10 @@ def start_run(
             save_prior(unfinished / "prior", built)
         _check_near(built, frames, where)
         complete = complete.with_spacing(built.spacing)
+        if complete.flies or complete.no_fly or complete.clearance is not None:
+            Problem(
+                frames, complete, operations_of(frames, built, complete), policy=scores
+            ).check_seeds()
         if live is not None:
             begin(unfinished / DATASET, frames, built)
         start(unfinished, complete, frames)
