@@ -32,6 +32,7 @@ from mgs.cli.nbv import nbv
 from mgs.cli.pictures import render, view
 from mgs.cli.prior import prior
 from mgs.cli.report import report
+from mgs.cli.share import export
 from mgs.cli.studies import chart, parsimony, reproduce, stress
 from mgs.cli.survey import survey
 from mgs.cli.synth_orbit import synth_orbit
@@ -65,6 +66,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "report": report,
     "view": view,
     "render": render,
+    "export": export,
     "prune": prune,
     "refit": refit,
     "demo": demo,
