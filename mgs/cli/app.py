@@ -55,6 +55,7 @@ COMMANDS = {
     "view": "pictures.view",
     "render": "pictures.render",
     "export": "share.export",
+    "video": "share.video",
     "prune": "models.prune",
     "refit": "models.refit",
     "demo": "demo.demo",

@@ -16,7 +16,7 @@ from mgs.report.evaluation import evaluate_run
 from mgs.report.tables import markdown
 from mgs.report.writing import write_report
 from mgs.study import reproduce
-from mgs.study.output import Panel, draw_panels, table, with_interval, write_table
+from mgs.study.output import Panel, draw_matrix, draw_panels, table, with_interval, write_table
 from mgs.study.reproduce import LEADER, ORACLE, ReproduceSize, Run
 from mgs.study.statistics import area, holm, images_to_reach, interval, permutation_p
 from mgs.study.sweep import Report, cell_folder, found, run_cells
@@ -363,11 +363,18 @@ class Work:
         return self.root / "results"
 
     def write(
-        self, name: str, rows: Rows, text: str, each: Rows, panels: Sequence[Panel], drawn: Rows
+        self,
+        name: str,
+        rows: Rows,
+        text: str,
+        each: Rows,
+        panels: Sequence[Panel],
+        drawn: Sequence[Row],
     ) -> list[Path]:
         """Write NAME.csv, .json and .md of rows, NAME_by_rock.csv of the rows `each`, and NAME.png
-        of the rows `drawn`."""
-        draw_panels(self.out / f"{name}.png", panels, drawn)
+        of the rows `drawn`, if there are panels."""
+        if panels:
+            draw_panels(self.out / f"{name}.png", panels, drawn)
         by_rock = write_csv(self.out / f"{name}_by_rock.csv", each)
         written = write_table(self.out, name, rows, text, self.command, rocks=self.count)
         return [*written, by_rock, self.out / f"{name}.png"]
@@ -417,17 +424,23 @@ def write_seeds(work: Work) -> list[Path]:
     return work.write("seeds", means, table(SEED_COLUMNS, means), each, panels, rows)
 
 
+POOLS = Panel(
+    "pool", "test_psnr_over_random", "pool", "", "policy",
+    title="PSNR over random views (dB). Bold: the 95 % interval excludes 0",
+)  # fmt: skip
+"""Figure of `write_pools`."""
+
+
 def write_pools(work: Work) -> list[Path]:
     """pools.csv, .json, .md and .png; pools_by_rock.csv; with the oracle where it is done."""
     oracle = reproduce.oracle_runs(work.size, work.count)
     known = dict(work.results) | known_runs(work.root, oracle)
     runs = reproduce.pool_runs(work.size, work.count)
     runs += oracle if all(run.name in known for run in oracle) else []
-    means, rows = pool_rows(known, runs)
-    label = "PSNR on the test views, over random (dB)"
-    panels = (Panel("pool", "test_psnr_over_random", "pool", label, "policy"),)
-    others = [row for row in rows if row["policy"] != "random"]
-    return work.write("pools", means, pools_text(means), by_rock(known, runs), panels, others)
+    means, _ = pool_rows(known, runs)
+    written = work.write("pools", means, pools_text(means), by_rock(known, runs), (), ())
+    draw_matrix(work.out / "pools.png", POOLS, [r for r in means if r["policy"] != "random"])
+    return written
 
 
 WRITERS: dict[str, Callable[[Work], list[Path]]] = {
