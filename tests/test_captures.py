@@ -163,7 +163,7 @@ def prior_of(source: Path, out: Path, masks: bool) -> tuple[Dataset, Prior, np.n
     up = found.up_or_estimate()[0]
     assert degrees_between(up, unit_up(truth["up"])) < 2
     dataset = import_source(found, out, masks=source / "masks" if masks else None, up=up)
-    prior, _ = build_prior(dataset, PriorSettings(gaussians=1500, backing=0))
+    prior = build_prior(dataset, PriorSettings(gaussians=1500, backing=0))
     assert trimesh.Trimesh(prior.mesh.vertices, prior.mesh.faces).is_watertight
     true = read_mesh(source / "truth.ply")
     distance = distances_to_mesh(prior.points, true.vertices, true.faces)

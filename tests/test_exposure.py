@@ -111,7 +111,7 @@ def rock(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(synthetic, "albedo", albedo)
         dataset = synthetic.write_dataset(root, synthetic.orbit_cameras(16, 64, 48))
-    save_prior(root / "prior", build_prior(dataset, PriorSettings(gaussians=600))[0])
+    save_prior(root / "prior", build_prior(dataset, PriorSettings(gaussians=600)))
     return root
 
 
@@ -146,7 +146,7 @@ def runs(rock: Path, varied: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     made = {}
     kinds = {"constant": (rock, False), "without": (varied, False), "with": (varied, True)}
     for name, (root, exposure) in kinds.items():
-        state = run_nbv(root, folder / name, exposure=exposure, evaluate_every=4, **RUN)
+        state = run_nbv(root, folder / name, exposure=exposure, evaluate_every=4, **RUN).state
         evaluate_run(folder / name, pictures=False, convergence=True)
         made[name] = state, folder / name
     return made

@@ -75,7 +75,7 @@ class Live:
 def rock(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     root = tmp_path_factory.mktemp("rock") / "dataset"
     dataset = synthetic.write_dataset(root, synthetic.orbit_cameras(9, 48, 36))
-    save_prior(root / "prior", build_prior(dataset, PriorSettings(gaussians=300))[0])
+    save_prior(root / "prior", build_prior(dataset, PriorSettings(gaussians=300)))
     return dataset
 
 
@@ -98,7 +98,7 @@ def test_a_run_holds_few_images_at_once_and_finds_the_same(
         live.now = live.most = 0
         settings = {"policy": "uniform", "seeds": 6, "budget": 3, "evaluate_every": 1}
         settings |= {"exposure": True, "train": {"passes": 2}, "warm_passes": 1}
-        found.append(run_nbv(rock.root, tmp_path / name, **settings))
+        found.append(run_nbv(rock.root, tmp_path / name, **settings).state)
         most.append(live.most)
     assert most[0] >= 9  # all images that were taken are counted
     assert most[1] <= 4

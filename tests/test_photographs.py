@@ -31,7 +31,7 @@ from mgs.errors import InputError
 from mgs.files import read_json, write_json
 from mgs.images import write_png
 from mgs.prior import hull
-from mgs.prior.build import build_prior, load_prior
+from mgs.prior.build import build_prior, load_prior, prior_and_cloud
 from mgs.prior.hull import visual_hull
 from mgs.prior.points import _grown, main_cluster, on_surface, reliable
 from mgs.prior.settings import PriorSettings
@@ -153,7 +153,7 @@ def test_real_clouds_give_the_rock(data, tmp_path, kind, masks):
     up, _ = source.up_or_estimate()
     folder = data(kind) / "masks" if masks else None
     dataset = import_source(source, tmp_path / "d", masks=folder, up=up)
-    prior, cloud = build_prior(dataset, PriorSettings(gaussians=600, backing=0))
+    prior, cloud = prior_and_cloud(dataset, PriorSettings(gaussians=600, backing=0))
     rock = read_mesh(data(kind) / "truth.ply")
     distance = distances_to_mesh(prior.points, rock.vertices, rock.faces) / truth["scale"]
     assert prior.numbers["from"] == "points"
@@ -164,7 +164,7 @@ def test_real_clouds_give_the_rock(data, tmp_path, kind, masks):
     assert len(cloud.rock_points) > 150
     assert degrees_between(prior.up, unit_up(truth["up"])) < 3
     if kind == "nerfstudio":
-        again, _ = build_prior(dataset, PriorSettings(gaussians=600, backing=0))
+        again = build_prior(dataset, PriorSettings(gaussians=600, backing=0))
         assert np.array_equal(prior.points, again.points)
 
 

@@ -21,7 +21,7 @@ from mgs.data.visibility import visible
 from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.images import write_exr, write_png
-from mgs.prior.build import build_prior, load_prior, save_prior
+from mgs.prior.build import build_prior, load_prior, prior_and_cloud, save_prior
 from mgs.prior.segmentation import Plane, degrade, estimate_normals, ground_plane, rock_cluster
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import poisson_mesh, sample_surface
@@ -39,7 +39,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 @pytest.fixture(scope="module")
 def built(dataset: Dataset):
-    return build_prior(dataset, PriorSettings(gaussians=1500, backing=0))
+    return prior_and_cloud(dataset, PriorSettings(gaussians=1500, backing=0))
 
 
 def _ball(centre=(0.0, 0.0, 0.5), radius=0.5) -> Mesh:
@@ -250,7 +250,7 @@ def test_error_to_truth_sees_a_wrong_prior(built, dataset):
 
 def test_prior_round_trip_and_determinism(built, dataset, tmp_path):
     prior = built[0]
-    again, _ = build_prior(dataset, PriorSettings(gaussians=1500, backing=0))
+    again = build_prior(dataset, PriorSettings(gaussians=1500, backing=0))
     assert np.array_equal(prior.points, again.points)
     assert prior.numbers == again.numbers
     loaded = load_prior(save_prior(tmp_path / "prior", prior))
@@ -360,7 +360,7 @@ def test_one_frame_with_depth_gives_what_it_saw(tmp_path):
     dataset = synthetic.write_dataset(tmp_path)
     dataset = replace(dataset, frames=dataset.frames[:1])
     (tmp_path / "rock.glb").unlink()
-    prior, _ = build_prior(dataset, PriorSettings(gaussians=200, backing=0))
+    prior = build_prior(dataset, PriorSettings(gaussians=200, backing=0))
     assert trimesh.Trimesh(prior.mesh.vertices, prior.mesh.faces).is_watertight
     away = dataset.frames[0].camera.position - prior.points
     facing = np.einsum("nk,nk->n", prior.normals, away) / np.linalg.norm(away, axis=1)
@@ -404,7 +404,7 @@ def test_no_prior_and_no_dataset_are_one_line(tmp_path, capsys):
 def test_error_grows_with_noise_holes_and_a_coarse_poisson(built, dataset):
     def error(**options) -> dict[str, float]:
         settings = PriorSettings(gaussians=1500, backing=0, **options)
-        return build_prior(dataset, settings)[0].numbers["truth"]
+        return build_prior(dataset, settings).numbers["truth"]
 
     exact = built[0].numbers["truth"]
     assert exact["chamfer"] < error(noise=0.01)["chamfer"] < error(noise=0.04)["chamfer"]

@@ -275,7 +275,7 @@ def posed_camera(
     except np.linalg.LinAlgError:
         raise InputError(f"{where} has a singular transform_matrix; correct the pose") from None
     except InputError as error:
-        raise InputError(f"{where}: {error}") from None
+        raise InputError(f"{where}: {error.line}") from None
 
 
 def finite_number(where: str, what: str, value: Any) -> float:

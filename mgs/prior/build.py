@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from mgs.camera import Camera
 from mgs.data.clouds import SparseCloud, write_cloud
-from mgs.data.dataset import Dataset, Frame
+from mgs.data.dataset import Dataset, Frame, load_dataset
 from mgs.data.lens import shrunk_to
 from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh
 from mgs.data.up import PLUS_Z, Up, unit_up
@@ -57,6 +57,25 @@ class Prior:
 
 
 def build_prior(
+    dataset: str | Path | Dataset,
+    settings: PriorSettings | None = None,
+    on_stage: Callable[[str], None] = lambda stage: None,
+    *,
+    source: str | None = None,
+    points: Path | None = None,
+    up: Up | Literal["auto"] | None = None,
+    **given: Any,
+) -> Prior:
+    """Build the prior of a dataset, as `build_prior(dataset, gaussians=2000)`.
+
+    settings, or given: fields of `PriorSettings`. Other arguments and errors as `prior_and_cloud`.
+    """
+    dataset = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
+    asked = replace(settings or PriorSettings(), **given)
+    return prior_and_cloud(dataset, asked, on_stage, source=source, points=points, up=up)[0]
+
+
+def prior_and_cloud(
     dataset: Dataset,
     settings: PriorSettings,
     on_stage: Callable[[str], None] = lambda stage: None,

@@ -63,7 +63,7 @@ def render_view(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.nd
     return np.asarray(image.rgb), np.asarray(image.alpha), np.asarray(image.depth)
 
 
-def evaluate(
+def evaluate_model(
     gaussians: Gaussians,
     frames: Sequence[Frame],
     trained: Iterable[str],
@@ -243,7 +243,7 @@ def evaluate_run(
             say(reason)
         metrics = _measured_before(file, subject)
         if metrics is None:
-            found = evaluate(
+            found = evaluate_model(
                 gaussians,
                 frames,
                 trained,
@@ -362,13 +362,13 @@ def compare_models(
     """Mean PSNR of each model, dB, full frame, on views that a run did not train on.
 
     taken: names of the run's frames. Returns the name of the set, "test" if the dataset has test
-    views, else "held out", and the means, None if there is no such view.
+    views, else "held-out", and the means, None if there is no such view.
     """
     tests = dataset.test_views()
     name, frames = "test", tests.frames if tests else ()
     if not tests:
-        name = "held out"
+        name = "held-out"
         frames = tuple(f for f in dataset.with_images(taken) if f.name not in taken)
     if not frames:
         return name, None
-    return name, [float(evaluate(model, frames, ())["all"]["psnr"]) for model in models]
+    return name, [float(evaluate_model(model, frames, ())["all"]["psnr"]) for model in models]

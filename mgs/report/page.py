@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import numpy as np
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.up import upright
 from mgs.files import atomic_path
+from mgs.policy.criteria import GAIN_UNIT
 from mgs.report.page_facts import (
     Shown,
     links,
@@ -46,7 +48,7 @@ COMPARED = 6
 
 def write_page(
     path: str | Path,
-    folders: Sequence[str | Path],
+    folders: Sequence[str | PathLike[str]],
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> int:
     """Write the page of these runs as one HTML file; return its size in bytes.
@@ -207,7 +209,7 @@ def _compared(shown: Sequence[Shown], frame: Frame) -> dict[str, Any]:
             alt = f"Render of {one.label} at {view}{quality}."
             sides.append({"label": one.label + quality, "name": name, "alt": alt})
     trained = [one.label for one in shown if view in {f.name for f in one.frames}]
-    note = f"trained on by {', '.join(trained)}" if trained else "never trained on"
+    note = f"trained on by {', '.join(trained)}" if trained else "held out"
     return {"view": view, "note": note, "sides": sides}
 
 
@@ -223,7 +225,12 @@ def _plots(shown: Sequence[Shown]) -> list[dict[str, Any]]:
     }
     gain, left = step_curves(runs, "information_gain"), step_curves(runs, "uncertainty")
     wanted = [
-        ("Information gain of each chosen view (the paper's Fig. 2)", gain, "gain, Eq. 7", True),
+        (
+            "Information gain of each chosen view (the paper's Fig. 2)",
+            gain,
+            f"information gain ({GAIN_UNIT})",
+            True,
+        ),
         ("Surface coverage (Fig. 3)", covered, "coverage (%)", False),
         ("Coverage that each view added (Fig. 3)", added, "percentage points", True),
         ("Variance left, over that of the prior", left, "mean over all parameters", True),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -18,16 +18,16 @@ COLUMNS = {
     "images": "images",
     "test.psnr": "PSNR, test views (dB)",
     "test.ssim": "SSIM, test views",
-    "test.psnr_mask": "PSNR, test views, rock only (dB)",
-    "test.ssim_mask": "SSIM, test views, rock only",
-    "test.psnr_mask_corrected": "PSNR, test views, rock only, exposure fitted to each view (dB)",
-    "all.psnr": "PSNR, all (dB)",
-    "all.ssim": "SSIM, all",
-    "held_out.psnr": "PSNR, held out (dB)",
-    "held_out.ssim": "SSIM, held out",
-    "held_out.psnr_mask": "PSNR, held out, rock only (dB)",
-    "held_out.ssim_mask": "SSIM, held out, rock only",
-    "held_out.psnr_mask_corrected": "PSNR, held out, rock only, exposure fitted to each view (dB)",
+    "test.psnr_mask": "masked PSNR, test views (dB)",
+    "test.ssim_mask": "masked SSIM, test views",
+    "test.psnr_mask_corrected": "masked PSNR, test views, exposure fitted (dB)",
+    "all.psnr": "PSNR, all views (dB)",
+    "all.ssim": "SSIM, all views",
+    "held_out.psnr": "PSNR, held-out views (dB)",
+    "held_out.ssim": "SSIM, held-out views",
+    "held_out.psnr_mask": "masked PSNR, held-out views (dB)",
+    "held_out.ssim_mask": "masked SSIM, held-out views",
+    "held_out.psnr_mask_corrected": "masked PSNR, held-out views, exposure fitted (dB)",
     "coverage": "coverage (%)",
     "path": "path ({unit})",
     "ended": "ended by",
@@ -36,7 +36,7 @@ COLUMNS = {
 those that no row needs."""
 
 
-def table_numbers(folders: Sequence[str | Path]) -> list[dict[str, Any]]:
+def table_numbers(folders: Sequence[str | PathLike[str]]) -> list[dict[str, Any]]:
     """`comparison_rows` of run folders. Raises InputError as `compare_runs` and that."""
     return comparison_rows(compare_runs(folders))
 
@@ -63,10 +63,7 @@ def comparison_rows(compared: Comparison) -> list[dict[str, Any]]:
 
 def table_row(label: str, run: RunFiles, dataset: Dataset) -> dict[str, Any]:
     """Row of `comparison_rows`; without metrics if they are not of the run's last step."""
-    metrics = run.measured or {}
-    row: dict[str, Any] = {"policy": label, "images": len(run.taken)}
-    for views in ("test", "all", "held_out"):
-        row |= {f"{views}.{name}": value for name, value in metrics.get(views, {}).items()}
+    row = metrics_row(label, (run.measured or {}) | {"images": len(run.taken)})
     if run.settings.get("exposure"):
         row["exposure"] = True
     if run.ended and run.ended["reason"] != RunEnd.BUDGET:
@@ -74,6 +71,14 @@ def table_row(label: str, run: RunFiles, dataset: Dataset) -> dict[str, Any]:
     positions = np.array([dataset.frames[i].camera.position for i in run.taken])
     row |= {"coverage": 100 * run.steps[-1]["coverage"], "path": path_length(positions)}
     return row | {"unit": dataset.unit}
+
+
+def metrics_row(label: str, metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """The part of a row that metrics.json has."""
+    row = {"policy": label, "images": metrics["images"]}
+    for views in ("test", "all", "held_out"):
+        row |= {f"{views}.{name}": value for name, value in metrics.get(views, {}).items()}
+    return row
 
 
 def table_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -114,8 +119,8 @@ def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def table_heading(key: str, rows: Sequence[Mapping[str, Any]]) -> str:
     """Heading of a column of these rows."""
-    every = ", all" if has_held_out(rows) else ", views trained on"
-    return COLUMNS[key].replace("{unit}", rows[0]["unit"]).replace(", all", every)
+    every = "all views" if has_held_out(rows) else "training views"
+    return COLUMNS[key].replace("{unit}", rows[0]["unit"]).replace("all views", every)
 
 
 def markdown(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ from mgs.splat_ply import read_ply
 
 
 def write_report(
-    out: str | Path, runs: Sequence[str | Path] | Comparison, kind: str = "png"
+    out: str | Path, runs: Sequence[str | PathLike[str]] | Comparison, kind: str = "png"
 ) -> list[Path]:
     """Write all figures and the table of runs into the folder `out`; return the paths of the files.
 
@@ -149,8 +150,8 @@ def _psnr_panels(runs: Mapping[str, RunFiles], every: str) -> dict[str, figures.
     `every`. Empty if a run was measured on neither."""
     for prefix, views in (("test_", "test views"), ("", every)):
         panels = {
-            views: step_curves(runs, f"{prefix}psnr"),
-            f"{views}, rock only": step_curves(runs, f"{prefix}psnr_mask"),
+            f"PSNR, {views}": step_curves(runs, f"{prefix}psnr"),
+            f"masked PSNR, {views}": step_curves(runs, f"{prefix}psnr_mask"),
         }
         if all(len(curves) == len(runs) for curves in panels.values()):
             return panels

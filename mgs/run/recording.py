@@ -14,6 +14,7 @@ from mgs.data.dataset import Dataset
 from mgs.errors import InputError
 from mgs.files import locked
 from mgs.policy import criteria
+from mgs.policy.context import Policy
 from mgs.run import inputs
 from mgs.run.checks import Checks
 from mgs.run.ending import FitDivergedError, diverged, run_end
@@ -50,12 +51,13 @@ def run(
     progress: Progress,
     on_step: Callable[[State], None] = lambda state: None,
     chooser: Chooser | None = None,
+    policy: Policy | None = None,
 ) -> State:
     """Run or resume the loop in `out`, which has its config.json, to its end; give the last state.
 
     on_step(state): called after every step, or batch of steps, that is on disk. chooser: as
-    `select_views`. Killed at any moment and called again, it takes the same views as
-    an uninterrupted run.
+    `select_views`. policy: in place of that of the settings. Killed at any moment and called again,
+    it takes the same views as an uninterrupted run.
 
     Raises InputError as `check_settings`; where another process works on the folder; where the
     prior, a pose or a file of a frame taken has changed; where a frame it takes cannot be read or
@@ -69,7 +71,7 @@ def run(
         if state is not None:
             inputs.check_unchanged(out, state.inputs, operations.prior, settings, dataset)
         stopwatch = Stopwatch(progress)
-        problem = Problem(dataset, settings, operations, stopwatch)
+        problem = Problem(dataset, settings, operations, stopwatch, policy)
         recorder = Recorder(problem, stopwatch)
         if state is not None:
             check_model(out, problem, state)
