@@ -13,7 +13,7 @@ from mgs.view import server
 from mgs.view.access import COOKIE, Access, plain
 from mgs.view.server import Viewer, window_camera
 
-pytest.importorskip("viser", reason="viser is not installed (pip install viser)")
+pytest.importorskip("viser", reason="viser is not installed")
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +96,20 @@ def test_a_camera_that_is_none_is_not_drawn(viewer, name, value):
     good |= {"wxyz": np.array([1.0, 0, 0, 0]), "position": np.zeros(3)}
     assert window_camera(SimpleNamespace(**good)) is not None
     assert window_camera(SimpleNamespace(**good | {name: value})) is None
+
+
+@pytest.mark.parametrize("message", [b"", b"\xff", "text", b"\x81\xa4type\xa4Nope"])
+def test_a_message_of_no_kind_ends_its_connection_alone(viewer, message, capfd):
+    from websockets.exceptions import ConnectionClosed
+
+    own = f"http://127.0.0.1:{viewer.port}"
+    with connect(viewer, origin=own) as socket:
+        socket.send(message)
+        with pytest.raises(ConnectionClosed):
+            list(socket)
+    with connect(viewer, origin=own) as socket:
+        assert socket.recv()
+    assert capfd.readouterr().err == ""
 
 
 def test_no_message_of_a_window_ends_the_server(viewer):

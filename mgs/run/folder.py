@@ -16,7 +16,8 @@ A step is one chosen view; of a batch only the last step has a fit. A line of `s
 - `residual`: rms difference of the new images to the model before, linear RGB.
 - `exposure`: gains (red, green, blue) by frame name, with the setting `exposure`.
 - `indicators`, `warnings`: of `mgs.run.detectors`. `seconds`: by stage.
-- `psnr`, `psnr_mask` over all views, `held_out_...`, `test_...`, dB: where it was evaluated.
+- `test_psnr`, `test_psnr_mask`, dB, where it was evaluated; without test views `psnr`, `psnr_mask`
+  over all views, and `held_out_...`.
 - `ended`: in the last line of a run that has ended (`mgs.run.ending.run_end`).
 """
 
@@ -35,9 +36,11 @@ from typing import Any
 import numpy as np
 
 from mgs.data.dataset import Dataset, Frame, load_dataset
+from mgs.data.up import upright
 from mgs.errors import InputError, Notice
 from mgs.files import atomic_path, read_json, reading, write_json
 from mgs.gaussians import Gaussians
+from mgs.notebook import cloud, html, thumbnails
 from mgs.policy.from_file import label
 from mgs.prior.build import Prior, load_prior
 from mgs.provenance import versions
@@ -74,6 +77,19 @@ class Run:
 
     def __fspath__(self) -> str:
         return str(self.folder)
+
+    def __repr__(self) -> str:
+        planned = self.settings.seeds + self.settings.budget
+        path = self.folder / "checkpoint.npz"
+        views = len(self.state.taken) if self._state or path.is_file() else 0
+        return f"Run({self.folder}: {self.label}, {views} of {planned} views)"
+
+    def _repr_html_(self) -> str:
+        if not (self._state or (self.folder / "checkpoint.npz").is_file()):
+            return html(repr(self), [])
+        taken, g = thumbnails([frame.image_path for frame in self.taken]), self.gaussians
+        turn = upright(self.prior.up)
+        return html(repr(self), [*taken, cloud(g.means @ turn.T, g.rgb)])
 
     @cached_property
     def dataset(self) -> Dataset:
