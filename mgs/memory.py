@@ -19,6 +19,9 @@ IMAGE_BYTES = 1 << 30
 """Most memory of arrays of one kind that are kept for reuse, bytes: 218 target images of 640x480,
 or five of 12 megapixels. Others are read or computed again at each use."""
 
+VIEW_BYTES = 1 << 29
+"""Most memory of the information of views about one model that are kept for several choices, bytes:
+122 views of 100,000 Gaussians. That of others is computed again for each choice."""
 
 LITTLE = 1 << 30
 """Bytes up to which `check_room` checks nothing: the check takes part of the time of a small image.
@@ -110,17 +113,17 @@ def padded(values: Any, dtype: Any = np.float32) -> np.ndarray:
 
 
 def kept_within(
-    budget: int, make: Callable[[int], Value], size: Callable[[Value], int]
-) -> Callable[[int], Value]:
+    budget: int, make: Callable[[Any], Value], size: Callable[[Value], int]
+) -> Callable[[Any], Value]:
     """Cache the results of `make` until their sizes sum to `budget` bytes.
 
     Later keys are made again at each call. A fit uses its images again and again in changing
     orders, for which an LRU cache would mostly drop what is needed next.
     """
-    kept: dict[int, Value] = {}
+    kept: dict[Any, Value] = {}
     held = 0
 
-    def get(key: int) -> Value:
+    def get(key: Any) -> Value:
         nonlocal held
         if key in kept:
             return kept[key]

@@ -224,14 +224,6 @@ def test_a_surface_is_measured_as_far_as_the_truth_is_known():
     assert names(fractional=True, true_depth=true_depth, spacing=0.1) == set(SURFACE_METRICS)
 
 
-def test_where_nothing_is_drawn_the_model_is_infinitely_deep():
-    truth, one = np.ones((2, 2, 4)), np.ones((2, 2))
-    surface = {"fractional": True, "true_depth": 3 * one, "spacing": 0.1}
-    found = compare_surface(truth, 0 * one, 0 * one, one > 0, one, **surface)
-    assert math.isnan(found.pop("depth_error"))
-    assert set(found.values()) == {1.0}
-
-
 def test_test_views_are_measured_and_drawn_apart(tmp_path):
     """They may have the names of frames that the model was trained on."""
     dataset = write_dataset(tmp_path / "data", orbit_cameras(4))

@@ -12,7 +12,7 @@ import synthetic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import ExifTags, Image
-from program import command, said
+from program import command, said, table_numbers
 
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.files import read_json
@@ -22,7 +22,7 @@ from mgs.prior.build import build_prior, save_prior
 from mgs.prior.exposure import DARK, GAIN_STD, RATIO_STD, SATURATED, solve_gains
 from mgs.prior.settings import PriorSettings
 from mgs.report.evaluation import evaluate_run
-from mgs.report.tables import markdown_table, table_numbers
+from mgs.report.tables import markdown_table
 from mgs.run.folder import State, read_checkpoint
 from mgs.run.nbv import resume_nbv, run_nbv
 

@@ -327,8 +327,8 @@ def test_a_smaller_image_is_the_mean_of_its_blocks_and_rays_stay():
     )
 
 
-def test_downscaled_import(data, tmp_path):
-    source = ["import", data("rgbd"), "--masks", data("rgbd") / "masks", "--out"]
+def test_downscaled_import(exact, tmp_path):
+    source = ["import", exact, "--out"]
     command(*source, tmp_path / "d", "--downscale", "2")
     frame = load_dataset(tmp_path / "d").frames[0]
     assert frame.rgb().shape == (36, 48, 3)
@@ -419,17 +419,6 @@ def apart(root: Path, data: Make) -> None:
     moved(root, data, pose_of)
 
 
-def unfit(root: Path, data: Make) -> None:
-    """Each camera has the masks of another one, far from it, and lies on its side."""
-
-    def pose_of(k: int, pose: np.ndarray) -> np.ndarray:
-        pose[:3] = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]) @ pose[:3] if k % 2 else pose[:3]
-        pose[:3, 3] += [0.25 * (-1) ** k, 0.2 * (-1) ** (k // 2), 0]
-        return pose
-
-    moved(root, data, pose_of)
-
-
 def black(root: Path, data: Make) -> None:
     source = data("colmap-binary")
     for frame in import_source(read_source(source), root, masks=source / "masks").frames:
@@ -463,7 +452,6 @@ REFUSED: dict[str, tuple[Callable[[Path, Make], object], list[str], str]] = {
     "no overlap": (apart, [], "the photographs do not overlap"),
     "black masks": (black, [], "the masks are black in every frame"),
     "black masks, hull": (black, HULL, "the masks are black in every frame"),
-    "poses that do not fit": (unfit, [], "poses and masks do not fit"),
     "no object": (no_object, [], "points lie in one cluster above the ground; give masks"),
     "nothing": (bare, [], NO_SOURCE),
     "hull without masks": (bare, HULL, "has no masks; "),
@@ -500,16 +488,6 @@ def test_a_world_in_which_nothing_would_be_drawn_is_one_line(data, tmp_path, cap
 def test_mask_files_must_not_be_there_yet(exact, tmp_path):
     with pytest.raises(InputError, match="has a mask already"):
         make_masks(load_dataset(exact), read_mesh(exact / "rock.glb"), 0.1)
-
-
-def test_photographs_repeat_by_seed(exact, data, photographs, tmp_path):
-    folders = [data("nerfstudio"), tmp_path / "same", tmp_path / "other"]
-    photographs.make(exact, folders[1], "nerfstudio", 0)
-    photographs.make(exact, folders[2], "nerfstudio", 1)
-    for name in ("transforms.json", "sparse_pc.ply"):
-        files = [(folder / name).read_bytes() for folder in folders]
-        assert files[0] == files[1] != files[2]
-    assert read_json(folders[0] / "transforms.json")["k1"] == photographs.DISTORTION[0]
 
 
 def test_a_part_with_few_points_belongs_to_the_object_above_the_ground():

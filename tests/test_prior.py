@@ -22,7 +22,7 @@ from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.images import write_exr, write_png
 from mgs.prior.build import build_prior, load_prior, prior_and_cloud, save_prior
-from mgs.prior.segmentation import Plane, degrade, estimate_normals, ground_plane, rock_cluster
+from mgs.prior.segmentation import Plane, degrade, ground_plane, rock_cluster
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import poisson_mesh, sample_surface
 from mgs.prior.truth import error_to_truth
@@ -125,15 +125,6 @@ def test_of_two_equal_clusters_the_one_looked_at_wins_and_a_tie_is_an_error():
     assert not inside[:2000].any()
     with pytest.raises(InputError, match="equally large and equally near"):
         rock_cluster(both, 0.05, np.zeros(3))
-
-
-def test_normals_of_a_sphere_point_at_the_cameras():
-    points = np.random.default_rng(5).standard_normal((4000, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    normals = estimate_normals(points, points)
-    cosine = np.einsum("nk,nk->n", normals, points)
-    assert np.degrees(np.arccos(cosine.min())) < 15
-    assert cosine.mean() > 0.998
 
 
 @pytest.mark.parametrize("count", [2, 3, 137, 5000])
@@ -392,13 +383,6 @@ def test_damaged_prior_is_one_line(built, tmp_path, damage, message):
     with pytest.raises(InputError, match=message) as error:
         load_prior(folder)
     assert "\n" not in str(error.value)
-
-
-def test_no_prior_and_no_dataset_are_one_line(tmp_path, capsys):
-    with pytest.raises(InputError, match="no such prior"):
-        load_prior(tmp_path / "elsewhere")
-    assert "no such dataset folder" in refused(capsys, ["prior", tmp_path / "nowhere"])
-    assert not (tmp_path / "nowhere").exists()
 
 
 def test_error_grows_with_noise_holes_and_a_coarse_poisson(built, dataset):

@@ -24,7 +24,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from mgs import __version__
-from mgs.errors import InputError, Notice
+from mgs.errors import InputError, Notice, missing
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C: by convention 128 plus the number of the signal, SIGINT."""
@@ -49,6 +49,7 @@ COMMANDS = {
     "survey": "survey.survey",
     "prior": "prior.prior",
     "nbv": "nbv.nbv",
+    "suggest": "suggest.suggest",
     "eval": "models.evaluate",
     "diagnose": "models.diagnose",
     "report": "report.report",
@@ -164,6 +165,9 @@ def main(arguments: list[str] | None = None) -> None:
     except typer.Abort:
         raise _stop("stopped", 1) from None
     except Exception as error:
+        lacks = missing(error.name) if isinstance(error, ModuleNotFoundError) else ""
+        if lacks:
+            raise _stop(lacks, 2) from None
         if not _from_interrupt(error):
             raise
         code = INTERRUPTED
@@ -196,7 +200,9 @@ def _hint(arguments: Sequence[str]) -> str:
     runs = [after for option, after in pairwise(options) if option in ("--out", "--resume")]
     if command != "nbv" or not runs or not (Path(runs[-1]) / "config.json").is_file():
         return ""
-    return f"; continue with: mgs nbv --resume {shlex.quote(runs[-1])}"
+    live = [pair for pair in pairwise([*options, ""]) if pair[0].startswith("--capture-")]
+    again = [x for pair in live for x in (pair[:1] if "=" in pair[0] else pair)]
+    return f"; continue with: mgs nbv {shlex.join(['--resume', runs[-1], *again])}"
 
 
 def _from_interrupt(error: BaseException | None) -> bool:

@@ -12,17 +12,19 @@ import typer
 from mgs.errors import FLAGS, flag
 from mgs.fit.settings import TrainSettings
 from mgs.policy.registry import policy_names
-from mgs.run.settings import PRESETS, NbvSettings
+from mgs.run.settings import PRESETS, NbvSettings, settings_in
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from mgs.run.folder import Run
+    from mgs.run.live import Live
     from mgs.run.state import State
 
 PANELS = {
     "Main options": ("policy", "budget", "seeds"),
     "Choosing": ("batch", "nearest", "travel", "stop_gain", "stop_uncertainty"),
+    "Flight": ("flight_length", "flight_time", "speed", "hover", "no_fly", "clearance"),
     "Fitting": ("passes", "warm_passes", "means", "exposure", "alpha_weight", "optimiser", "rates"),
     "Advanced": ("estimator", "lam", "pixel_noise", "prior_std", "evaluate_every", "seed"),
 }
@@ -31,6 +33,12 @@ PANELS = {
 METAVARS = {
     "batch": "K",
     "travel": "METRES",
+    "flight_length": "METRES",
+    "flight_time": "SECONDS",
+    "speed": "M/S",
+    "hover": "SECONDS",
+    "no_fly": "METRES",
+    "clearance": "METRES",
     "stop_gain": "GAIN",
     "stop_uncertainty": "SHARE",
     "alpha_weight": "WEIGHT",
@@ -65,7 +73,7 @@ def nbv(
         Path | None,
         typer.Option(
             metavar="RUN",
-            help="Continue this run by its config.json; repeat --policy if it is a file.",
+            help="Continue this run by its config.json; repeat programs: --policy, --capture-...",
             rich_help_panel="Main options",
         ),
     ] = None,
@@ -75,6 +83,57 @@ def nbv(
             metavar="SCENE",
             help="In place of DATASET: a scene (name or .toml), rendered when a view is chosen.",
             rich_help_panel="Data",
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.toml",
+            help="Settings with the keys of config.json (that of a run works, too); options win.",
+            rich_help_panel="Main options",
+        ),
+    ] = None,
+    capture_command: Annotated[
+        str | None,
+        typer.Option(
+            metavar="COMMAND",
+            help="Program that takes a picture of a pose: 'CMD {pose} {out}' (JSON in, PNG out).",
+            rich_help_panel="Live capture",
+        ),
+    ] = None,
+    capture_folder: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder in which poses are written and pictures of them are awaited.",
+            rich_help_panel="Live capture",
+        ),
+    ] = None,
+    capture_timeout: Annotated[
+        float,
+        typer.Option(
+            min=0.01, help="Longest wait for a picture, seconds.", rich_help_panel="Live capture"
+        ),
+    ] = 600.0,
+    capture_tries: Annotated[
+        int,
+        typer.Option(
+            min=1, help="Most pictures asked for at a pose.", rich_help_panel="Live capture"
+        ),
+    ] = 3,
+    capture_failure: Annotated[
+        str,
+        typer.Option(
+            metavar="skip|stop",
+            help="After the last try: take the next best pose in its place, or stop the run.",
+            rich_help_panel="Live capture",
+        ),
+    ] = "skip",
+    capture_distance: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="Largest distance from the pose asked for. Default: a quarter of the object's.",
+            rich_help_panel="Live capture",
         ),
     ] = None,
     gaussians: Annotated[
@@ -107,13 +166,26 @@ def nbv(
 
     console = Console(highlight=False)
     given = {name: options[name] for name in options if options[name] not in (None, [])}
+    live = live_capture(
+        capture_command,
+        capture_folder,
+        capture_timeout,
+        tries=capture_tries,
+        failure=capture_failure,
+        distance=capture_distance,
+    )
     if resume is not None:
         refuse_others(context, resume)
-        resume_and_print(resume, console, given.get("policy"))
+        resume_and_print(resume, console, given.get("policy"), live=live)
         return
+    settings: dict[str, Any] = settings_in(config) if config else {}
+    dataset = dataset or (None if capture else settings.get("dataset"))
+    if gaussians is None:
+        prior = prior or settings.get("prior")
+    train = dict(settings.get("train", {}))
     if (dataset is None) == (capture is None) or out is None:
         raise InputError("nbv: give a DATASET or --capture SCENE, and --out RUN; or --resume RUN")
-    settings, train = dict[str, Any](), dict[str, Any]()
+    settings = {k: v for k, v in settings.items() if k not in ("dataset", "prior", "train")}
     for name, value in given.items():
         where = train if name in TrainSettings.model_fields and name != "seed" else settings
         where[name] = pairs(name, value) if isinstance(value, list) else value
@@ -122,13 +194,35 @@ def nbv(
         out,
         console,
         capture=capture,
+        live=live,
         prior=prior,
         gaussians=parse_gaussians(gaussians),
         preset=preset,
         **settings,
         train=train,
     )
-    resume_and_print(run, console, run.settings.policy)
+    resume_and_print(run, console, run.settings.policy, live=live)
+
+
+def live_capture(
+    command: str | None, folder: Path | None, timeout: float, **rest: Any
+) -> Live | None:
+    """`Live` of the options of a live capture, None without one. Raises InputError as `command`,
+    and where options do not go together."""
+    from mgs.errors import InputError
+    from mgs.files import check_writable
+    from mgs.run import transports
+    from mgs.run.live import Live
+
+    if rest["failure"] not in ("skip", "stop"):
+        raise InputError(f"--capture-failure {rest['failure']}: choose skip or stop")
+    if command is not None and folder is not None:
+        raise InputError("nbv: give either --capture-command or --capture-folder")
+    if command is not None:
+        return Live(transports.command(command, timeout), **rest)
+    if folder is not None:
+        return Live(transports.watched(timeout), check_writable(folder), **rest)
+    return None
 
 
 def with_settings_as_options(function: Any) -> Any:
@@ -172,7 +266,8 @@ def refuse_others(context: typer.Context, resume: Path) -> None:
 
     for name in context.params:
         source = context.get_parameter_source(name)
-        if name in ("resume", "policy") or source is None or source.name != "COMMANDLINE":
+        again = name in ("resume", "policy") or name.startswith("capture_")
+        if again or source is None or source.name != "COMMANDLINE":
             continue
         option = flag(name)
         where = f"--resume takes its settings from {resume / 'config.json'}; change it there"
@@ -197,13 +292,17 @@ def pairs(name: str, given: list[str]) -> dict[str, float]:
 def start_and_print(dataset: Path | None, out: Path, console: Console, **settings: Any) -> Run:
     """`mgs.run.nbv.start_run` with its progress; print which prior was found in the dataset."""
     from mgs.cli.progress import progress_bar
-    from mgs.run.nbv import start_run
+    from mgs.run.nbv import problem_of, start_run
 
     with progress_bar("starting", console) as progress:
         run = start_run(dataset, out, progress=progress, **settings)
     found = run.settings.prior
     if settings.get("prior") is None and dataset and found.parent == dataset.resolve():
         console.print(f"prior: {found}", soft_wrap=True)
+    if run.settings.no_fly or run.settings.clearance is not None:
+        allowed = problem_of(run, policy=run.settings.policy).allowed
+        where = f"of {len(allowed)} poses are ruled out by --no-fly and --clearance"
+        console.print(f"{len(allowed) - allowed.sum()} {where}")
     return run
 
 
@@ -212,13 +311,14 @@ def resume_and_print(
     console: Console,
     policy: str | None = None,
     pictures: bool = False,
+    live: Live | None = None,
     on_state: Callable[[State], None] = lambda state: None,
 ) -> None:
     """Run or resume the loop of a run, evaluate (with pictures where asked), print the table of
     steps; where the output is no terminal, a line after each step instead.
 
-    policy: FILE.py:FUNCTION where the run has a policy of the user's own. on_state: called with
-    every state that is on disk.
+    policy: FILE.py:FUNCTION where the run has a policy of the user's own. live: of its pictures.
+    on_state: called with every state that is on disk.
     """
     from functools import partial
 
@@ -243,7 +343,7 @@ def resume_and_print(
                 for warning in line.get("warnings", []):
                     progress.print(f"step {line['step']}: {warning}")
 
-        state = resume_nbv(run, on_step, progress, policy).state
+        state = resume_nbv(run, on_step, progress, policy, live).state
         metrics = evaluate_run(
             run.folder, pictures=pictures, progress=partial(progress, "evaluating")
         )

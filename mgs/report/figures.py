@@ -336,13 +336,13 @@ def _draw_ause(axis: Any, rows: Sequence[tuple[dict[str, Any], str]]) -> None:
     """Draw AUSE of absolute errors as bars, with ticks for a perfect sigma and a line for a
     constant one."""
     for i, (row, colour) in enumerate(rows):
-        area = row["ause"]["mae"]
+        area = row["ause"]
         ends, perfect = [i - 0.4, i + 0.4], [area["perfect"]] * 2
         axis.bar(i, area["ause"], color=colour)
         axis.plot(ends, perfect, color="white", linewidth=2.5)
         label = "if it were perfect" if i == 0 else None
         axis.plot(ends, perfect, color="black", linewidth=1, label=label)
-    constant = rows[0][0]["ause"]["mae"]["constant"]
+    constant = rows[0][0]["ause"]["constant"]
     axis.axhline(constant, color="black", linewidth=1, linestyle="--", label="a constant")
     axis.set_xticks([])
     axis.set_ylabel("AUSE of |error|")

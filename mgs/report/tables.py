@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from os import PathLike
 from typing import Any
 
 import numpy as np
 
 from mgs.data.dataset import Dataset
 from mgs.policy.poses import path_length
-from mgs.report.runs import Comparison, RunFiles, check_measured, compare_runs
+from mgs.report.runs import Comparison, RunFiles, check_measured
 from mgs.run.ending import RunEnd
 
 COLUMNS = {
@@ -32,13 +31,8 @@ COLUMNS = {
     "path": "path ({unit})",
     "ended": "ended by",
 }
-"""Columns of the table: key in a row of `table_numbers` -> heading. `table_columns` leaves out
+"""Columns of the table: key in a row of `comparison_rows` -> heading. `table_columns` leaves out
 those that no row needs."""
-
-
-def table_numbers(folders: Sequence[str | PathLike[str]]) -> list[dict[str, Any]]:
-    """`comparison_rows` of run folders. Raises InputError as `compare_runs` and that."""
-    return comparison_rows(compare_runs(folders))
 
 
 def comparison_rows(compared: Comparison) -> list[dict[str, Any]]:
@@ -111,7 +105,7 @@ def table_cell(key: str, value: Any) -> str:
 
 
 def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Format the rows of `table_numbers` as a Markdown table."""
+    """Format the rows of `comparison_rows` as a Markdown table."""
     columns = table_columns(rows)
     headings = [table_heading(key, rows) for key in columns]
     return markdown(headings, [[table_cell(key, row.get(key)) for key in columns] for row in rows])

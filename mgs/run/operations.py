@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from mgs import runtime
 from mgs.camera import Camera
 from mgs.colour import linear_from_srgb, srgb_from_linear
-from mgs.data.dataset import Dataset, Frame
+from mgs.data.dataset import Dataset
+from mgs.data.frames import Frame, as_captured
 from mgs.fit.fitting import Fit, fit
 from mgs.fit.settings import TrainSettings
 from mgs.gaussians import Gaussians
@@ -20,18 +21,24 @@ from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of
 from mgs.prior.initial import Colours, colours_of, initial_gaussians, initial_normals
 from mgs.run.inputs import prior_digest
+from mgs.run.live import Live, live_capture
 from mgs.run.problem import Operations
 from mgs.run.settings import NbvSettings
 from mgs.splat import ListCache, fisher, groups, render
 
 
-def operations_of(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Operations:
-    """Operations on the splat core; the centre is the prior's centre of mass."""
+def operations_of(
+    dataset: Dataset, prior: Prior, settings: NbvSettings, live: Live | None = None
+) -> Operations:
+    """Operations on the splat core; the centre is the prior's centre of mass.
+
+    live: how images of an on-demand dataset are captured that is not rendered.
+    """
     cache, means = ListCache(), settings.train.means
     columns, normals = groups(0, means), initial_normals(prior)
     lam = lam_by_kind(settings.regularisation(columns), columns)
     exposure = exposure_of(prior) if settings.exposure else None
-    colours = kept_colours(dataset, prior)
+    colours = kept_colours(prior)
 
     def initial(frames: Sequence[Frame]) -> Gaussians:
         gains = exposure(frames) if exposure else None
@@ -67,76 +74,97 @@ def operations_of(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Oper
         exposure=exposure,
         on_surface=len(prior.points),
         up=prior.up,
+        ground=float((prior.mesh.vertices @ np.array(prior.up)).min()),
         prior=prior_digest(prior),
-        capture=_capture(dataset) if dataset.on_demand else lambda frame: None,
+        capture=_capture(dataset, prior, live),
     )
 
 
-def _capture(dataset: Dataset) -> Callable[[Frame], None]:
+def _capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[[Frame], Frame]:
+    """`Operations.capture` of a dataset: complete, rendered, or captured live."""
+    if not dataset.on_demand:
+        return lambda frame: frame
+    if not (dataset.root / "config.json").is_file():
+        return live_capture(dataset, prior, live)
     runtime.start()
-    from mgs.synth.capture import capture_of  # needs a variant, and only on-demand datasets need it
+    from mgs.synth.capture import capture_of  # needs a variant, and only rendered datasets need it
 
     return capture_of(dataset)
 
 
-def kept_colours(dataset: Dataset, prior: Prior) -> Callable[[Frame], Colours]:
+def kept_colours(prior: Prior) -> Callable[[Frame], Colours]:
     """`mgs.prior.initial.colours_of` the prior, with results kept within IMAGE_BYTES."""
-    of, index = colours_of(prior), {frame.name: i for i, frame in enumerate(dataset.frames)}
+    of, frames = colours_of(prior), dict[str, Frame]()
     kept = kept_within(
         IMAGE_BYTES,
-        lambda i: of(dataset.frames[i]),
+        lambda name: of(frames[name]),
         lambda found: sum(part.nbytes for part in found),
     )
-    return lambda frame: kept(index[frame.name])
+
+    def colours(frame: Frame) -> Colours:
+        frames[frame.name] = frame
+        return kept(frame.name)
+
+    return colours
 
 
 def psnr_measure(
     dataset: Dataset, cache: ListCache, exposure: bool = False
 ) -> Callable[[Gaussians, list[int]], dict[str, float]]:
-    """Returns measure(gaussians, frames taken) -> mean PSNR, dB.
+    """Returns measure(gaussians, frames taken) -> mean PSNR, dB, by the names of `psnr_over`.
 
-    `test_psnr`, `test_psnr_mask` (in the rock mask) over the test views. A dataset without test
-    views: `psnr`, `psnr_mask` over all views that have an image, `held_out_...` over those not
-    taken. With `exposure` also `..._corrected`, of renders at the exposure of the view
-    (`mgs.metrics.colour_corrected`). A mean over no view is left out. Raises InputError as
-    `Dataset.test_views`.
+    `test_psnr...` over the test views. A dataset without test views: `psnr...` over all views that
+    have an image, `held_out_psnr...` over those not taken. A mean over no view is left out. Raises
+    InputError as `Dataset.test_views`.
     """
     tests = dataset.test_views()
     frames = dataset.frames if tests is None else tests.frames
+    of = psnr_over(frames, cache, exposure)
+
+    def measure(gaussians: Gaussians, taken: list[int]) -> dict[str, float]:
+        if tests is not None:
+            return _means(of(gaussians, range(len(frames))), "test_")
+        shown = [i for i, frame in enumerate(frames) if i in taken or not frame.on_demand]
+        views = of(gaussians, shown)
+        held_out = {key: v[[i not in taken for i in shown]] for key, v in views.items()}
+        return _means(views) | _means(held_out, "held_out_")
+
+    return measure
+
+
+def psnr_over(
+    frames: Sequence[Frame], cache: ListCache, exposure: bool = False
+) -> Callable[[Gaussians, Sequence[int]], dict[str, np.ndarray]]:
+    """Returns a function (gaussians, indices of frames) -> PSNR of each of these views, dB.
+
+    `psnr`; `psnr_mask`, in the rock mask. With `exposure` also `..._corrected`, of renders at the
+    exposure of the view (`mgs.metrics.colour_corrected`).
+    """
     names = ("psnr", "psnr_mask", *(("psnr_corrected", "psnr_mask_corrected") if exposure else ()))
 
     def read(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        rgba, weight = frames[index].target()
+        rgba, weight = as_captured(frames[index]).target()
         return srgb_from_linear(rgba[..., :3]), weight > 0, frames[index].mask() & (weight > 0)
 
     truth = kept_within(IMAGE_BYTES, read, lambda parts: sum(part.nbytes for part in parts))
 
     def values(gaussians: Gaussians, index: int) -> list[float]:
         image, known, rock = truth(index)
-        rendered = np.asarray(render(gaussians, frames[index].camera, cache=cache).rgb)
+        rendered = np.asarray(render(gaussians, as_captured(frames[index]).camera, cache=cache).rgb)
         shown = [rendered]
         if exposure:
             shown.append(colour_corrected(linear_from_srgb(image), rendered, rock))
         srgb = [srgb_from_linear(one) for one in shown]
         return [psnr(one, image, mask) for one in srgb for mask in (known, rock)]
 
-    def measured(gaussians: Gaussians, chosen: Iterable[int]) -> np.ndarray:
-        return np.array([values(gaussians, i) for i in chosen]).reshape(-1, len(names))
+    def measured(gaussians: Gaussians, chosen: Sequence[int]) -> dict[str, np.ndarray]:
+        table = np.array([values(gaussians, i) for i in chosen]).reshape(-1, len(names))
+        return dict(zip(names, table.T, strict=True))
 
-    def measure(gaussians: Gaussians, taken: list[int]) -> dict[str, float]:
-        if tests is not None:
-            return dict(_means(measured(gaussians, range(len(frames))), "test_", names))
-        shown = [i for i, frame in enumerate(frames) if i in taken or not frame.on_demand]
-        views = measured(gaussians, shown)
-        found = {"": views, "held_out_": views[[i not in taken for i in shown]]}
-        return {key: mean for prefix, v in found.items() for key, mean in _means(v, prefix, names)}
-
-    return measure
+    return measured
 
 
-def _means(values: np.ndarray, prefix: str, names: Sequence[str]) -> Iterator[tuple[str, float]]:
-    """Name and mean of each column of [V,names] over the views that have it, if there are some."""
-    for name, column in zip(names, values.T, strict=True):
-        known = column[~np.isnan(column)]
-        if len(known):
-            yield prefix + name, float(known.mean())
+def _means(values: Mapping[str, np.ndarray], prefix: str = "") -> dict[str, float]:
+    """Mean of each array over the views that have it, if there are some; names with a prefix."""
+    known = {key: column[~np.isnan(column)] for key, column in values.items()}
+    return {prefix + key: float(column.mean()) for key, column in known.items() if len(column)}

@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mgs.camera import Camera
-from mgs.data.dataset import Dataset, Frame, target_of
+from mgs.data.dataset import Dataset, target_of
+from mgs.data.frames import Frame, as_asked
 from mgs.data.up import PLUS_Z, Up, upright
+from mgs.errors import InputError
 from mgs.gaussians import Gaussians
-from mgs.memory import IMAGE_BYTES, Deferred, kept_within
-from mgs.policy import criteria, poses
+from mgs.memory import IMAGE_BYTES, VIEW_BYTES, Deferred, kept_within
+from mgs.policy import criteria, poses, tour
 from mgs.policy.context import Policy, PolicyContext
 from mgs.policy.from_file import label
 from mgs.policy.registry import policy_named
 from mgs.policy.visibility import Visibility
 from mgs.prior.exposure import without_gain
+from mgs.run.flight import Flight, allowed_poses
 from mgs.run.settings import NbvSettings
 from mgs.seeds import generator
 
@@ -41,7 +45,8 @@ class Operations:
     """Deterministic functions that the loop computes with, NumPy in and out (`operations_of`).
 
     centre: [3] middle of the rock, metres. groups: columns of the Fisher information by kind of
-    parameter (`mgs.splat.groups`). up: unit vector that points upwards in the world.
+    parameter (`mgs.splat.groups`). up: unit vector that points upwards in the world. ground: height
+    of the object's lowest point, metres.
     on_surface: number of Gaussians on the surface, the first ones; None: all.
     prior: hash of what `initial` starts from (`mgs.run.inputs.prior_digest`).
 
@@ -53,7 +58,8 @@ class Operations:
     exact(gaussians, camera) -> exact information [N,P]; None: as `fisher`.
     render(gaussians, camera) -> linear RGB [H,W,3] and alpha [H,W]; None: no detectors.
     measure(gaussians, taken) -> entries of steps.jsonl (`mgs.run.operations.psnr_measure`).
-    capture(frame): makes the frame's images where they do not exist yet.
+    capture(frame) -> the frame once its images exist, which this makes where they do not; its
+    camera is that of the picture. `given_up` where there is none to be had.
     """
 
     centre: np.ndarray
@@ -78,8 +84,9 @@ class Operations:
     render: Callable[[Gaussians, Camera], tuple[np.ndarray, np.ndarray]] | None = None
     on_surface: int | None = None
     up: Up = PLUS_Z
+    ground: float = -np.inf
     prior: str = ""
-    capture: Callable[[Frame], None] = lambda frame: None
+    capture: Callable[[Frame], Frame] = lambda frame: frame
 
 
 class Problem:
@@ -87,7 +94,11 @@ class Problem:
 
     Positions, centre and points are in coordinates in which +Z is up, metres. lam [P]: lambda of
     the run; prior_lam: the same without columns of means and without `--lam`, for the surface.
-    What depends on images (`start`) is computed when first asked for.
+    allowed [V]: poses that `no_fly` and `clearance` allow. skipped: number of views taken before
+    the flight. What depends on images (`start`) is computed when first asked for.
+
+    seeds: frames that start the model; by default spread evenly in azimuth among those allowed.
+    Raises InputError where these are too few, or their flight exceeds the limits.
     """
 
     def __init__(
@@ -97,11 +108,12 @@ class Problem:
         operations: Operations,
         progress: Progress = no_progress,
         policy: Policy | None = None,
+        seeds: Sequence[int] | None = None,
     ) -> None:
         self.dataset, self.settings = dataset, settings
         self.operations, self.progress = operations, progress
-        self.frames = dataset.frames
-        self.cameras = [frame.camera for frame in dataset.frames]
+        self.frames = [as_asked(frame) for frame in dataset.frames]
+        self.cameras = [frame.camera for frame in self.frames]
         self.policy = policy or policy_named(settings.policy)
         self.turn = upright(operations.up)
         self.positions = np.array([camera.position for camera in self.cameras]) @ self.turn.T
@@ -109,17 +121,54 @@ class Problem:
         kinds = {kind: at for kind, at in operations.groups.items() if kind != "mean"}
         self.prior_lam = criteria.regularisation(kinds, settings.pixel_noise, settings.prior_std)
         self.lam = settings.regularisation(operations.groups)
-        self.seeds = poses.seed_views(self.positions, self.centre, settings.seeds)
+        self.allowed = allowed_poses(self.positions, self.centre, operations.ground, settings)
+        self.skipped = 0
+        self.seeds = self._spread_seeds() if seeds is None else list(seeds)
         with_alpha = settings.train.alpha_weight > 0
         self.image = kept_within(
             IMAGE_BYTES, lambda i: target_of(self.frames[i], with_alpha), lambda image: image.nbytes
         )
         self._start_of = lru_cache(maxsize=2)(self.coloured)
 
+    def with_settings(self, **changes: Any) -> Problem:
+        """The same problem with other settings that neither change `lam` nor the seeds, such as
+        the policy, `seed` or `train`. What was measured of dataset and prior is kept."""
+        other = copy(self)
+        other.settings = self.settings.model_copy(update=changes)
+        other.policy = policy_named(other.settings.policy)
+        other.__dict__.pop("flight", None)
+        return other
+
+    def _spread_seeds(self) -> list[int]:
+        free, count = np.flatnonzero(self.allowed), self.settings.seeds
+        if len(free) < count:
+            raise InputError(
+                f"{self.dataset.root}: --no-fly and --clearance allow {len(free)} of its "
+                f"{len(self.frames)} poses, fewer than {count} seeds; lower one of them"
+            )
+        return [int(free[k]) for k in poses.seed_views(self.positions[free], self.centre, count)]
+
+    def check_seeds(self) -> None:
+        """Raises InputError where the flight over the seeds and home exceeds the limits."""
+        flight, settings = self.flight, self.settings
+        metres = flight.metres(self.seeds)
+        if flight.share(metres, len(self.seeds)) > 1:
+            seconds = metres / settings.speed + settings.hover * len(self.seeds)
+            raise InputError(
+                f"nbv: the flight over {len(self.seeds)} seeds and home takes {metres:.1f} m and "
+                f"{seconds:.0f} s; raise --flight-length or --flight-time, or lower --seed-views"
+            )
+
+    @cached_property
+    def flight(self) -> Flight:
+        """Legs between all poses, and the limits of the flight; its home is the first seed."""
+        matrix = tour.legs(self.positions, self.centre[:2], self.settings.no_fly or 0.0)
+        return Flight(self.settings, matrix, self.seeds[0], self.skipped)
+
     @cached_property
     def start(self) -> Gaussians:
         """The Gaussians before training, in the colours of the seeds, whose images this reads."""
-        self.make_images(self.seeds)
+        self.make_seeds()
         return self.operations.initial([self.frames[i] for i in self.seeds])
 
     @cached_property
@@ -162,8 +211,12 @@ class Problem:
         return Deferred(range(len(taken)), lambda k: without_gain(self.image(taken[k]), gains[k]))
 
     def reachable(self, taken: Sequence[int]) -> list[int]:
-        """Frames not taken; with the setting `nearest`, that many nearest to the last view."""
-        left = [i for i in range(len(self.frames)) if i not in taken]
+        """Frames not taken or given up, allowed, and within the flight's limits; with the setting
+        `nearest`, that many nearest to the last view."""
+        free = [self.allowed[i] and not frame.given_up for i, frame in enumerate(self.frames)]
+        left = [i for i in range(len(self.frames)) if free[i] and i not in taken]
+        if self.settings.flies:
+            left = self.flight.in_reach(taken, left)
         if self.settings.nearest is None:
             return left
         here = self.positions[taken[-1]]
@@ -176,11 +229,46 @@ class Problem:
             return np.ones(len(context.candidate_frames))
         return poses.travel_cost(context.candidates, context.taken[-1], self.settings.travel)
 
-    def make_images(self, views: Sequence[int]) -> None:
-        """Make the images of these frames where they do not exist yet."""
+    def make_images(self, views: Sequence[int]) -> bool:
+        """Make the images of these frames where they do not exist yet; whether all could be made.
+
+        Stops at the first that was given up. Where a picture was taken from another pose, the
+        problem has that pose from now on.
+        """
         for done, i in enumerate(views):
             self.progress("capturing", done, len(views))
-            self.operations.capture(self.frames[i])
+            frame = self.operations.capture(self.frames[i])
+            if frame.camera != self.cameras[i]:
+                self.cameras[i] = frame.camera
+                self.positions[i] = self.turn @ frame.camera.position
+                for known in ("visibility", "flight"):
+                    self.__dict__.pop(known, None)
+            self.frames[i] = frame
+            if frame.given_up:
+                return False
+        return True
+
+    def make_seeds(self) -> None:
+        """Make the images of the seeds; the nearest other pose replaces one that was given up.
+
+        Raises InputError where no other is left.
+        """
+        while not self.make_images(self.seeds):
+            failed = next(i for i in self.seeds if self.frames[i].given_up)
+            others = self.reachable(self.seeds)
+            if not others:
+                raise InputError(f"{self.dataset.root}: too few poses are left for the seeds")
+            nearest = poses.nearest_poses(self.positions[others], self.positions[failed], 1)[0]
+            self.seeds = [others[nearest] if i == failed else i for i in self.seeds]
+
+    def resume(self, taken: Sequence[int]) -> None:
+        """Continue with views that were taken before."""
+        self.seeds = list(taken[: self.settings.seeds])
+        self.make_images(taken)
+
+    def moved(self, views: Sequence[int]) -> bool:
+        """Whether some of these pictures were taken from another pose than was asked for."""
+        return any(self.frames[i].asked is not None for i in views)
 
     def surface_information(self, frame: int) -> np.ndarray:
         """Exact information [S,P] of a view about the surface before training."""
@@ -193,12 +281,16 @@ class Problem:
     def view_information(self, model: Gaussians) -> Callable[[int], np.ndarray]:
         """A function frame -> information [N,P] of its view at a model.
 
-        Results are kept while there is room where views are chosen in batches: all choices of a
-        batch are about one model.
+        Where several choices are about one model, in batches and plans of a flight, results are
+        kept within VIEW_BYTES.
         """
-        room = IMAGE_BYTES if self.settings.batch > 1 else 0
         fisher, cameras = self.operations.fisher, self.cameras
-        return kept_within(room, lambda i: fisher(model, cameras[i]), lambda F: F.nbytes)
+        if self.settings.batch == 1 and not self.settings.flies:
+            return lambda i: fisher(model, cameras[i])
+        # Copies: the kernel's array has padded rows, and Dr.Jit keeps its memory when it is freed.
+        return kept_within(
+            VIEW_BYTES, lambda i: np.array(fisher(model, cameras[i])), lambda F: F.nbytes
+        )
 
     def context(
         self,

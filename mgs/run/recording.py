@@ -66,6 +66,7 @@ def run(
         problem = Problem(dataset, settings, operations, stopwatch, policy)
         recorder = Recorder(problem, stopwatch)
         if state is not None:
+            problem.resume(state.taken)
             check_model(out, problem, state)
             known, state = state, mark_end(problem, state)
             if known.steps != state.steps:
@@ -101,6 +102,9 @@ def _go_on(
         kept = len(state.steps) if state else 0
         raise InputError(diverged(out, error.step, kept, error.losses)) from None
     assert state is not None
+    known, state = state, mark_end(problem, state)
+    if state.steps != known.steps:  # the last candidates were given up
+        write_checkpoint(out, state)
     return state
 
 
@@ -131,7 +135,9 @@ def mark_end(problem: Problem, state: State, refused: Choice | None = None) -> S
         name = problem.frames[refused.frame].name
         next_view = {"name": name, "information_gain": refused.information_gain}
     views = len(state.taken) - problem.settings.seeds
-    ended = run_end(problem.settings, views, uncertainty(problem, state), next_view)
+    stuck = not problem.reachable(state.taken)
+    metres = problem.flight.metres(state.taken) if stuck else None
+    ended = run_end(problem.settings, views, uncertainty(problem, state), next_view, metres)
     return replace(state, steps=[*state.steps[:-1], last | ({"ended": ended} if ended else {})])
 
 
@@ -208,7 +214,7 @@ class Recorder:
             self.stopwatch("evaluating", 0, 1)
             line |= problem.operations.measure(fit.gaussians, learned.taken)
         line["seconds"] |= self.stopwatch.take()
-        kinds = ["image", "mask", "rock", "depth"]
+        kinds = ["image", "mask", "rock", "depth", "capture"]
         files = dict(state.inputs["files"]) if state else {}
         for frame in (problem.frames[i] for i in new):
             files[frame.name] = inputs.frame_digests(frame, kinds)
@@ -229,7 +235,8 @@ class Recorder:
             line |= {"score": None, "information_gain": None}
             return [line | {"images": seeds, "coverage": coverage, "seconds": {}}]
         first = len(learned.taken) - seeds - len(learned.choices) + 1
-        laps, self.stopwatch.laps = self.stopwatch.laps, []
+        laps = self.stopwatch.laps[-len(learned.choices) :]  # without choices that were given up
+        self.stopwatch.laps = []
         return [
             {
                 "step": first + k,

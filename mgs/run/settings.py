@@ -5,6 +5,7 @@ The docstring of a field is the help of its option of `mgs nbv`. Needs neither M
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from mgs.errors import InputError, flag, row_named
+from mgs.files import read_json, reading
 from mgs.fit.settings import (
     ALPHA_WEIGHT,
     MEAN_RATE,
@@ -58,12 +60,24 @@ class NbvSettings(BaseModel):
     """Folder of the dataset."""
     prior: Path
     """Folder of the prior."""
-    policy: str = "d-optimal"
+    policy: str = "directional-d"
     """Policy that scores the candidates, or FILE.py:FUNCTION of your own."""
     nearest: Annotated[int, Field(ge=1)] | None = None
     """Choose among this many views nearest to the last one. Default: all."""
     travel: Scale | None = None
     """Distance in metres that costs as much as an image: scores are over 1 + distance / METRES."""
+    flight_length: Scale | None = None
+    """Most metres of the flight, with the seeds and the way home. Default: no limit."""
+    flight_time: Scale | None = None
+    """Most seconds of the flight at --speed, and --hover for each picture. Default: no limit."""
+    speed: Scale = 2.0
+    """Speed between pictures, metres per second."""
+    hover: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 3.0
+    """Seconds that a picture takes."""
+    no_fly: Scale | None = None
+    """Radius in metres of an upright cylinder around the object that no pose and no leg enters."""
+    clearance: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    """Least height in metres of a pose above the object's lowest point."""
     estimator: str = "exact"
     """Estimator of the Fisher information: exact, hutchinson, or loss-gradient (the paper's)."""
     budget: Annotated[int, Field(ge=0)] = 50
@@ -98,6 +112,11 @@ class NbvSettings(BaseModel):
     _every_kind = field_validator("prior_std", mode="before")(
         lambda given: complete(given, PRIOR_STD)
     )
+
+    @property
+    def flies(self) -> bool:
+        """Whether the flight has a limit, so that views are planned as a tour."""
+        return self.flight_length is not None or self.flight_time is not None
 
     def train_at(self, step: int) -> TrainSettings:
         """Settings of the fit of a step: `train` for step 0, with the warm values afterwards."""
@@ -161,10 +180,34 @@ def validated(model: type[Model], values: dict[str, Any], file: Path | None = No
             if bound in first.get("ctx", {}):
                 message = f"must be {words} {first['ctx'][bound]:g}"
         if file is not None:
+            if file.suffix != ".json":
+                raise InputError(f"{file}: {'.'.join(parts)}: {message}; correct it") from None
             key = ".".join(["settings", *parts])
             message = f"{file}: {key}: {message}; correct it, or start the run anew"
             raise InputError(message) from None
         raise InputError(f"{option_of(parts, first['input'])}: {message}") from None
+
+
+def settings_in(file: Path) -> dict[str, Any]:
+    """Settings that a TOML file, or the config.json of a run, has; paths are from its folder.
+
+    Raises InputError where the file cannot be read, or a key or a value is wrong.
+    """
+    if file.suffix == ".json":
+        config = read_json(file)
+        found = config.get("settings") if isinstance(config, dict) else None
+    else:
+        with reading(file):
+            data = file.read_bytes()
+        try:
+            found = tomllib.loads(data.decode())
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise InputError(f"{file}: not valid TOML ({error}); correct it") from None
+    if not isinstance(found, dict):
+        raise InputError(f"{file}: has no settings; give a TOML file or the config.json of a run")
+    validated(NbvSettings, {"dataset": "", "prior": "", **found}, file)
+    paths = {key: file.parent / found[key] for key in ("dataset", "prior") if key in found}
+    return {**found, **paths}
 
 
 BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
@@ -204,6 +247,11 @@ def check_settings(settings: NbvSettings, frames: int) -> None:
         message = f"{fixed[0]} has no information about means; leave out either"
         raise InputError(f"--means {settings.train.means}: {message}")
     row_named(OPTIMISERS, settings.train.optimiser, "--optimiser")
+    if settings.flies and settings.travel is not None:
+        raise InputError(
+            f"--travel {settings.travel:g}: a flight with a limit has its own travel cost; "
+            "leave out --travel"
+        )
     left, where = frames - settings.seeds, settings.dataset
     if left < 0:
         few = f"has {frames} frames, fewer than {settings.seeds} seeds; lower --seed-views"

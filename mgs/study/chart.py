@@ -234,7 +234,6 @@ def measure(
         **times,
         **{name: metrics[name] for name in QUALITIES},
         "total_passes": sum(step["iterations"] // step["images"] for step in state.steps),
-        "image_passes": sum(step["iterations"] for step in state.steps),
     }
 
 
