@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from mgs.data.frames import Frame, as_asked
 from mgs.data.up import PLUS_Z, Up, upright
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
-from mgs.memory import IMAGE_BYTES, Deferred, kept_within
+from mgs.memory import IMAGE_BYTES, VIEW_BYTES, Deferred, kept_within
 from mgs.policy import criteria, poses, tour
 from mgs.policy.context import Policy, PolicyContext
 from mgs.policy.from_file import label
@@ -128,6 +129,15 @@ class Problem:
             IMAGE_BYTES, lambda i: target_of(self.frames[i], with_alpha), lambda image: image.nbytes
         )
         self._start_of = lru_cache(maxsize=2)(self.coloured)
+
+    def with_settings(self, **changes: Any) -> Problem:
+        """The same problem with other settings that neither change `lam` nor the seeds, such as
+        the policy, `seed` or `train`. What was measured of dataset and prior is kept."""
+        other = copy(self)
+        other.settings = self.settings.model_copy(update=changes)
+        other.policy = policy_named(other.settings.policy)
+        other.__dict__.pop("flight", None)
+        return other
 
     def _spread_seeds(self) -> list[int]:
         free, count = np.flatnonzero(self.allowed), self.settings.seeds
@@ -271,12 +281,16 @@ class Problem:
     def view_information(self, model: Gaussians) -> Callable[[int], np.ndarray]:
         """A function frame -> information [N,P] of its view at a model.
 
-        Results are kept while there is room where several choices are about one model: in batches
-        and plans of a flight.
+        Where several choices are about one model, in batches and plans of a flight, results are
+        kept within VIEW_BYTES.
         """
-        room = IMAGE_BYTES if self.settings.batch > 1 or self.settings.flies else 0
         fisher, cameras = self.operations.fisher, self.cameras
-        return kept_within(room, lambda i: fisher(model, cameras[i]), lambda F: F.nbytes)
+        if self.settings.batch == 1 and not self.settings.flies:
+            return lambda i: fisher(model, cameras[i])
+        # Copies: the kernel's array has padded rows, and Dr.Jit keeps its memory when it is freed.
+        return kept_within(
+            VIEW_BYTES, lambda i: np.array(fisher(model, cameras[i])), lambda F: F.nbytes
+        )
 
     def context(
         self,
