@@ -62,7 +62,9 @@ def write_glb(path: str | Path, gaussians: Gaussians, space: str, to_y_up: np.nd
         f"{EXTENSION}:OPACITY": g.opacities[:, None],
     }
     attributes |= dict(zip(_sh_names(g.sh.shape[1]), np.moveaxis(g.sh, 1, 0), strict=True))
-    views, accessors, body = [], [], b""
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    body = b""
     for name, values in attributes.items():
         data = np.ascontiguousarray(values, "<f4")
         kind = next(kind for kind, size in SIZES.items() if size == data.shape[1])
@@ -120,7 +122,8 @@ def read_glb(path: str | Path) -> tuple[Gaussians, str]:
 
 def _chunks(data: bytes) -> tuple[Any, bytes]:
     """JSON and binary chunk of a GLB. Raises ValueError or struct.error if it is damaged."""
-    start, chunks = 12, {}
+    start = 12
+    chunks: dict[int, bytes] = {}
     while start + 8 <= len(data):
         size, kind = struct.unpack_from("<II", data, start)
         if start + 8 + size > len(data):

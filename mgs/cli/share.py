@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from mgs.cli.options import Run, argument, option
+from mgs.cli.options import argument, option
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError
 
@@ -54,7 +54,7 @@ def export(
 
 
 def video(
-    run: Run,
+    run: Annotated[Path, argument("Folder that `mgs nbv` wrote.")],
     out: Annotated[
         Path | None,
         option("File to write: .mp4 (needs imageio-ffmpeg), .gif or .png. Default: RUN/video.mp4."),

@@ -63,8 +63,8 @@ def _shown_view(run: Run, model: Fitted, unknown: dict[str, np.ndarray]) -> Fram
     """The view of `story_frames`, by the model after the first image."""
     tests, frames = run.dataset.test_views(), run.dataset.frames
     new = [frame for i, frame in enumerate(frames) if i not in run.state.taken]
-    choice = tests.frames if tests is not None else run.dataset.with_images({f.name for f in new})
-    choice = list(choice or run.taken)
+    others = tests.frames if tests is not None else run.dataset.with_images({f.name for f in new})
+    choice = list(others or run.taken)
     left = [_left(view_maps(model.gaussians, frame.camera, unknown)) for frame in choice]
     least_known = [f for f, mean in zip(choice, left, strict=True) if mean >= np.median(left)]
     return max(least_known, key=lambda frame: srgb_from_linear(frame.masked_rgb()).mean())
