@@ -294,6 +294,4 @@ def _with_meshes(
             raise InputError(f"--mesh {mesh}: {NAMESAKE}")
         rocks.append(Rock(mesh.stem, 0, k, mesh.resolve(), file_digest(mesh)))
     count = len(rocks)
-    return replace(
-        size, meshes=tuple(rocks), setup_rocks=count, seed_rocks=count, oracle_rocks=count
-    )
+    return replace(size, meshes=tuple(rocks), setup_rocks=count, oracle_rocks=count)
