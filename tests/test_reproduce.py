@@ -26,11 +26,8 @@ from mgs.study.setups import SetupSize
 from mgs.study.sweep import cell_folder, run_cells
 
 ONE = RunSize(Size(48, 36, 8, 3, spp=1), 200, 2)
-TINY = ReproduceSize(ONE, FEW, setup_rocks=2, oracle_rocks=1),
-    seed_rocks=1,
-    setup_rocks=2,
-    oracle_rocks=1,
-)
+FEW = SetupSize(48, 36, 3, 1, 6, fewer=4, gaussians=200)
+TINY = ReproduceSize(ONE, FEW, setup_rocks=2, oracle_rocks=1)
 
 
 def silent(name, done, total):
