@@ -28,6 +28,7 @@ WHY = {
     "depth": ": the dataset has depth images",
     "points": ": the dataset has points (sparse.ply) and no depth",
     "hull": ": the dataset has masks, and neither depth nor points",
+    "random": ": the dataset has neither depth, points nor masks; fit it with `mgs fit`",
 }
 """Reason for a source that was not asked for."""
 
@@ -51,8 +52,8 @@ def prior(
     source: Annotated[
         str | None,
         option(
-            "depth, mesh, points or hull (of the masks). "
-            "Default: the first of depth, points, hull that there is.",
+            "depth, mesh, points, hull (of the masks) or random. "
+            "Default: the first of depth, points, hull that there is, else random.",
             "--from",
         ),
     ] = None,
@@ -128,7 +129,7 @@ def prior(
         progress("figure")
         save_prior(unfinished, result)
         draw_prior(unfinished / "prior.png", result, segmented)
-    console.print(_table(result.numbers))
+    console.print(_random(result.numbers) if "radius" in result.numbers else _table(result.numbers))
     if "resolution" in result.numbers:
         console.print(_reason(result.numbers), soft_wrap=True)
     console.print(f"wrote {folder}: mesh.ply, points.ply, prior.json, prior.png")
@@ -163,6 +164,12 @@ def _seed_frames(dataset: Dataset, prior: Prior) -> list[Frame]:
     positions = np.stack([frame.camera.position for frame in dataset.frames]) @ turn.T
     middle = turn @ prior.points.mean(0)
     return [dataset.frames[k] for k in seed_views(positions, middle, min(SEEDS, len(dataset)))]
+
+
+def _random(numbers: dict[str, Any]) -> str:
+    """Line about a random start."""
+    unit = "m" if numbers["unit"] == "m" else "units"
+    return f"{numbers['n']:,} random points in a ball of radius {numbers['radius']:.3g} {unit}"
 
 
 def _table(numbers: dict[str, Any]) -> Table:

@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
 from scipy.special import logit
 
 from mgs.camera import Camera
 from mgs.data.dataset import Frame
-from mgs.data.visibility import in_mask, visible
+from mgs.data.visibility import in_image, in_mask, visible
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.rotation import quat_from_normals
 
@@ -55,6 +56,9 @@ spacing: more overlap than on the surface, to leave no gaps."""
 
 BACKING_OPACITY = 0.99
 
+RANDOM_OPACITY = 0.1
+"""Opacity of a Gaussian of a random start, as in 3DGS (Kerbl et al. 2023)."""
+
 GREY = 0.5
 """Linear RGB of a Gaussian that no frame sees: all its spherical harmonics are zero."""
 
@@ -81,6 +85,8 @@ def initial_gaussians(
     `prior.depth_tolerance` and the slope. A sample that no frame sees is grey. Raises InputError if
     a file of a frame cannot be read, and as `mesh_depth`.
     """
+    if prior.numbers.get("from") == "random":
+        return _scattered(prior, frames, gains)
     n = len(prior.points)
     total, count = np.zeros((n, 3)), np.zeros(n)
     colours = colours or colours_of(prior)
@@ -100,6 +106,32 @@ def initial_gaussians(
         sh=sh_from_rgb(rgb),
     )
     return _with_backing(surface, prior), seen
+
+
+def _scattered(
+    prior: Prior, frames: Sequence[Frame], gains: np.ndarray | None
+) -> tuple[Gaussians, np.ndarray]:
+    """Round, nearly transparent Gaussians at random points, in the mean colour of all pixels that
+    show them; and whether some do."""
+    points = prior.points
+    total, count = np.zeros((len(points), 3)), np.zeros(len(points))
+    for k, frame in enumerate(frames):
+        pixels, z = frame.camera.project(points)
+        here = in_image(frame.camera, pixels, z) & in_mask(points, frame)
+        column, row = pixels[here].astype(int).T
+        total[here] += frame.rgb()[row, column] / (1 if gains is None else gains[k])
+        count[here] += 1
+    seen = count > 0
+    rgb = np.where(seen[:, None], total / np.maximum(count, 1)[:, None], GREY)
+    size = np.log(cKDTree(points).query(points, 4)[0][:, 1:].mean(1))
+    start = Gaussians(
+        means=points.astype(np.float32),
+        log_scales=np.tile(size[:, None], 3).astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (len(points), 1)),
+        logit_opacities=np.full(len(points), logit(RANDOM_OPACITY), np.float32),
+        sh=sh_from_rgb(rgb),
+    )
+    return start, seen
 
 
 def warm_start(model: Gaussians, before: Gaussians, start: Gaussians) -> Gaussians:
