@@ -96,6 +96,16 @@ DATASETS: dict[str, tuple[Change, str]] = {
     ),
     "no frames": (header(frames=[]), "no frames"),
     "pose of words": (frame(transform_matrix=[["a"] * 4] * 4), "frame 2"),
+    "pose of NaN": (frame(transform_matrix=[[float("nan")] * 4] * 4), "not a finite 4x4"),
+    "pose of 2 rows": (frame(transform_matrix=[[1, 0], [0, 1]]), "not a finite 4x4"),
+    "singular pose": (frame(transform_matrix=np.diag([1, 1, 0, 1]).tolist()), "singular"),
+    "no pose": (edit(lambda data: data["frames"][2].pop("transform_matrix")), "frame 2 lacks"),
+    "no intrinsics": (edit(lambda data: data.pop("fl_x")), "intrinsics"),
+    "width 0": (header(w=0), "image size"),
+    "negative focal length": (header(fl_x=-1), "focal lengths"),
+    "no image file": (frame(file_path="images/none.png"), "does not exist"),
+    "no rock file": (frame(rock_file_path="rock/none.png"), "rock/none.png does not exist"),
+    "rock_file_path a list": (frame(rock_file_path=["a"]), "rock_file_path that is no text"),
     "width of a slip": (header(w=10**9), "1000000000x"),
     "width without end": (header(w=float("inf")), "frame 0"),
     "focal length without end": (header(fl_x=float("inf")), "frame 0"),
@@ -124,12 +134,6 @@ DATASETS: dict[str, tuple[Change, str]] = {
 def test_broken_dataset(capsys, dataset, tmp_path, given, named):
     given(dataset)
     assert named in refused(capsys, ["nbv", dataset, "--out", tmp_path / "out"], tmp_path / "out")
-
-
-def test_broken_dataset_of_a_prior(capsys, dataset, tmp_path):
-    header(frames=[])(dataset)
-    arguments = ["prior", dataset, "--out", tmp_path / "out"]
-    assert "no frames" in refused(capsys, arguments, tmp_path / "out")
 
 
 @cases(
@@ -166,37 +170,6 @@ def test_survey_without_a_rock(capsys, dataset, tmp_path, given, named):
     given(dataset)
     arguments = ["nbv", "--budget", 1, dataset, "--out", tmp_path / "out"]
     assert named in refused(capsys, arguments, tmp_path / "out")
-
-
-@cases(
-    {
-        "unknown policy": (["--policy", "best"], "best"),
-        "more seeds than frames": (["--seeds", 13], "13 seeds"),
-        "no seeds": (["--seeds", 0], "--seeds"),
-        "budget larger than the candidates": (["--budget", 9], "8 candidates"),
-        "negative budget": (["--budget", -1], "--budget"),
-        "no pixel noise": (["--pixel-noise", 0], "--pixel-noise"),
-        "NaN pixel noise": (["--pixel-noise", "nan"], "--pixel-noise"),
-        "no passes": (["--passes", 0], "--passes"),
-        "negative evaluation interval": (["--evaluate-every", -2], "--evaluate-every"),
-    }
-)
-def test_nbv_settings(capsys, dataset, prior, tmp_path, given, named):
-    budget = [] if "--budget" in given else ["--budget", 1]
-    arguments = ["nbv", dataset, "--out", tmp_path / "out", "--prior", prior, *budget, *given]
-    assert named in refused(capsys, arguments, tmp_path / "out")
-
-
-def test_too_few_gaussians(capsys, dataset, tmp_path):
-    arguments = ["nbv", dataset, "--out", tmp_path / "out", "--gaussians", 0, "--budget", 1]
-    assert "Gaussians" in refused(capsys, arguments, tmp_path / "out")
-
-
-def test_broken_mesh(capsys, tmp_path):
-    """Other faults are tried with `mgs prior`, which reads meshes in the same way."""
-    (tmp_path / "mesh.obj").write_text("this is no mesh")
-    arguments = ["synth-orbit", tmp_path / "out", "--mesh", tmp_path / "mesh.obj"]
-    assert "mesh.obj" in refused(capsys, arguments, tmp_path / "out")
 
 
 @cases(

@@ -115,16 +115,11 @@ def test_an_unfinished_import_of_something_else_is_refused(
     other = synthetic.write_dataset(tmp_path / "other").root
     trimesh.creation.icosphere(subdivisions=2).export(tmp_path / "ball.ply")
     masks, ball = ["--masks", source / "masks"], ["--mesh", tmp_path / "ball.ply"]
-    for arguments in ([source], [other], [source, *masks], [source, *ball]):
+    smaller = [source, "--mesh", source / "rock.glb", "--downscale", "2"]
+    for arguments in ([source], [other], [source, *masks], [source, *ball], smaller):
         line = refused(capsys, ["import", *arguments, "--out", out], out)
         assert "unfinished dataset of other settings or sources" in line
     write_json(source / "transforms.json", read_json(source / "transforms.json") | {"cx": 30.0})
-    assert "unfinished dataset" in refused(capsys, [*many, out], out)
-
-
-def test_a_smaller_import_is_not_gone_on_with_in_full_size(many, tmp_path, monkeypatch, capsys):
-    out = stopped([*many[:-1], "--downscale", "2", "--out"], tmp_path / "out", monkeypatch)
-    said(capsys)
     assert "unfinished dataset" in refused(capsys, [*many, out], out)
 
 

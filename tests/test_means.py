@@ -232,25 +232,6 @@ def test_policies_choose_with_learned_means(files, tmp_path, policy):
     assert np.isfinite(state.steps[1]["score"])
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        (["--means", "loose"], "--means loose: Input should be 'frozen', 'normal' or 'free'"),
-        (
-            ["--means", "free", "--estimator", "hutchinson"],
-            "--estimator hutchinson has no information",
-        ),
-        (["--means", "free", "--policy", "paper"], "--policy paper has no information about means"),
-        (["--means", "normal", "--prior-std", "mean=0"], "--prior-std mean=0.0: must be at least"),
-    ],
-)
-def test_bad_options_are_one_line(files, tmp_path, capsys, given, message):
-    out = tmp_path / "run"
-    arguments = ["nbv", files[0], "--prior", files[1], "--budget", "1", "--out", out, *given]
-    assert message in refused(capsys, arguments)
-    assert not out.exists()
-
-
 def test_means_that_changed_since_the_start_are_one_line(files, whole, capsys):
     means, out, _ = whole
     text = (out / "config.json").read_text()

@@ -291,13 +291,3 @@ def test_a_run_of_other_frames_or_without_settings_is_named(dataset, tmp_path):
     (out / "config.json").write_text("{}")
     with pytest.raises(InputError, match="no settings"):
         run_folder.read_settings(out)
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [({"seeds": 13}, "fewer than 13 seeds"), ({"budget": 10}, "9 candidates")],
-)
-def test_counts_are_checked_before_anything_is_written(dataset, tmp_path, values, message):
-    with pytest.raises(InputError, match=message):
-        tiny.start(tmp_path / "run", dataset, **values)
-    assert not (tmp_path / "run").exists()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mgs.synth.orbit import intrinsics, orbit_cameras, orbit_positions, perturb
+from mgs.synth.orbit import orbit_cameras, orbit_positions, perturb
 from mgs.synth.scene_file import Orbit
 
 TARGET = np.array([0.3, -0.2, 0.6])
@@ -54,11 +54,6 @@ def test_hemisphere_is_even():
     distance = np.linalg.norm(p[:, None] - p[None], axis=-1) + 9 * np.eye(100)
     nearest = distance.min(1)
     assert nearest.max() < 2.5 * nearest.min()
-
-
-def test_intrinsics_match_the_field_of_view():
-    K = intrinsics(90, 640, 480)
-    np.testing.assert_allclose(K, [[320, 0, 320], [0, 320, 240], [0, 0, 1]])
 
 
 def test_pose_noise_has_the_stated_size():

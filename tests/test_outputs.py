@@ -144,12 +144,8 @@ def test_a_result_appears_whole(tmp_path, monkeypatch, name):
 OPTIONS: dict[str, tuple[list, str]] = {
     "unknown command": (["fly"], "fly"),
     "unknown option": (["nbv", "--fast"], "--fast"),
-    "missing argument": (["prior"], "dataset"),
-    "missing option": (["import", "somewhere"], "--out"),
     "number of words": (["bench", "splat", "--repeats", "many"], "--repeats"),
-    "number out of range": (["bench", "splat", "--repeats", 1], "--repeats"),
     "unknown choice": (["bench", "speed"], "speed"),
-    "unknown option of the program": (["--fast"], "--fast"),
 }
 
 
@@ -181,11 +177,3 @@ def test_every_word_of_a_help_text_is_printed(capsys, monkeypatch, name):
     for words in filter(None, [made.help, *(parameter.help for parameter in made.params)]):
         for paragraph in words.split("\n\n"):
             assert " ".join(paragraph.split()) in text
-
-
-def test_a_paragraph_of_a_help_text_is_one_line_in_a_wide_terminal(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "400")
-    command("diagnose", "--help")
-    lines = capsys.readouterr().out.splitlines()
-    (line,) = (line for line in lines if "Writes into RUN/diagnostics" in line)
-    assert "coloured by its information." in line

@@ -8,7 +8,6 @@ import tiny
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from refusals import refused
 from tiny import run
 
 from mgs.errors import InputError
@@ -76,18 +75,6 @@ def test_what_cannot_be_divided_by_a_cost_is_refused(loaded, tmp_path, monkeypat
     with pytest.raises(InputError, match="policy mine: returned negative scores, which --travel"):
         run(tmp_path / "run", loaded, policy="mine", travel=1.0)
     assert len(run(tmp_path / "free", loaded, policy="mine").taken) == 8
-
-
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [("--travel", "0"), ("--travel", "-1"), ("--travel", "nan"), ("--nearest", "0")],
-)
-def test_a_distance_that_is_none_is_one_line(dataset, prior, tmp_path, capsys, option, value):
-    out = tmp_path / "run"
-    assert option in refused(
-        capsys, ["nbv", dataset, "--prior", prior, "--out", out, option, value]
-    )
-    assert not out.exists()
 
 
 def test_moves_can_be_limited_to_the_nearest_poses(loaded, tmp_path):

@@ -1,7 +1,7 @@
 """The program `mgs`: its commands, and how they end.
 
-The files beside this one have the commands. A command imports what is slow to import when it is
-called, so that `mgs --help` does not wait for Mitsuba.
+The files beside this one have the commands. A file is imported when its command is used, and a
+command imports what is slow to import when it is called.
 """
 
 from __future__ import annotations
@@ -13,28 +13,17 @@ import os
 import shlex
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module
 from inspect import cleandoc
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 from mgs import __version__
-from mgs.cli.bench import bench
-from mgs.cli.dataset import dataset
-from mgs.cli.demo import demo
-from mgs.cli.doctor import doctor
-from mgs.cli.import_data import import_data
-from mgs.cli.models import diagnose, evaluate, prune, refit
-from mgs.cli.nbv import nbv
-from mgs.cli.pictures import render, view
-from mgs.cli.prior import prior
-from mgs.cli.report import report
-from mgs.cli.studies import chart, parsimony, reproduce, stress
-from mgs.cli.survey import survey
-from mgs.cli.synth_orbit import synth_orbit
 from mgs.errors import InputError, Notice
 
 INTERRUPTED = 130
@@ -52,34 +41,32 @@ CURES = {
 }
 """Errors of the system that the user can correct, and how. All others are errors of the program."""
 
-COMMANDS: dict[str, Callable[..., None]] = {
-    "doctor": doctor,
-    "synth-orbit": synth_orbit,
-    "dataset": dataset,
-    "import": import_data,
-    "survey": survey,
-    "prior": prior,
-    "nbv": nbv,
-    "eval": evaluate,
-    "diagnose": diagnose,
-    "report": report,
-    "view": view,
-    "render": render,
-    "prune": prune,
-    "refit": refit,
-    "demo": demo,
-    "bench": bench,
-    "reproduce": reproduce,
-    "chart": chart,
-    "stress": stress,
-    "parsimony": parsimony,
+COMMANDS = {
+    "doctor": "doctor.doctor",
+    "synth-orbit": "synth_orbit.synth_orbit",
+    "dataset": "dataset.dataset",
+    "import": "import_data.import_data",
+    "survey": "survey.survey",
+    "prior": "prior.prior",
+    "nbv": "nbv.nbv",
+    "eval": "models.evaluate",
+    "diagnose": "models.diagnose",
+    "report": "report.report",
+    "view": "pictures.view",
+    "render": "pictures.render",
+    "prune": "models.prune",
+    "refit": "models.refit",
+    "demo": "demo.demo",
+    "bench": "bench.bench",
+    "reproduce": "studies.reproduce",
+    "chart": "studies.chart",
+    "stress": "studies.stress",
+    "parsimony": "studies.parsimony",
 }
-"""All commands, in about the order in which they are used."""
+"""File and function of all commands, in about the order in which they are used."""
 
 RESUMABLE = ("synth-orbit", "import", "demo", "reproduce", "chart", "stress", "parsimony")
 """Commands that continue where they stopped when they are given again."""
-
-app = typer.Typer(name="mgs", add_completion=False, pretty_exceptions_enable=False)
 
 
 def _help(docstring: str | None) -> str:
@@ -89,8 +76,46 @@ def _help(docstring: str | None) -> str:
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
 
 
-for name, command in COMMANDS.items():
-    app.command(name, help=_help(command.__doc__))(command)
+class _Commands(Mapping[str, Any]):
+    """All commands by name; a command is imported when it is looked up."""
+
+    def __len__(self) -> int:
+        return len(COMMANDS)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(COMMANDS)
+
+    def __getitem__(self, name: str) -> Any:
+        file, function = COMMANDS[name].split(".")
+        found = getattr(import_module(f"mgs.cli.{file}"), function)
+        alone = typer.Typer(add_completion=False)
+        alone.command(name, help=_help(found.__doc__))(found)
+        return typer.main.get_command(alone)
+
+
+class _Program(TyperGroup):
+    """The program: its own help reads the commands' docstrings without importing them."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands: Any = _Commands()
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print the help of the program."""
+        self.commands = {name: TyperCommand(name, help=_docstring(name)) for name in COMMANDS}
+        super().format_help(ctx, formatter)
+
+
+def _docstring(command: str) -> str:
+    """First paragraph of a command's help, read from the source."""
+    file, function = COMMANDS[command].split(".")
+    source = Path(__file__).with_name(f"{file}.py").read_text(encoding="utf-8")
+    start = source.index(f"def {function}(")
+    quoted = source[source.index('    """', start) :].split('"""')[1]
+    return _help(quoted).split("\n\n")[0]
+
+
+app = typer.Typer(name="mgs", cls=_Program, add_completion=False, pretty_exceptions_enable=False)
 
 
 def _print_version(wanted: bool) -> None:
