@@ -33,6 +33,7 @@ from mgs.images import write_png
 from mgs.prior import hull
 from mgs.prior.build import build_prior, load_prior
 from mgs.prior.hull import visual_hull
+from mgs.prior.initial import initial_gaussians
 from mgs.prior.points import _grown, main_cluster, on_surface, reliable
 from mgs.prior.settings import PriorSettings
 
@@ -451,10 +452,6 @@ def no_object(root: Path, data: Make) -> None:
     write_cloud(root / "sparse.ply", SparseCloud(ground))
 
 
-NO_SOURCE = (
-    "has no depth images and no points (sparse.ply) and no masks; import data with depth, or "
-    "import with --masks DIR for --from hull, or give --points CLOUD.ply, or give --mesh MESH"
-)
 HULL = ["--from", "hull"]
 DEPTH = "has no depth images; take --from hull, or import data with depth"
 UP = "expected auto, or three numbers"
@@ -465,10 +462,14 @@ REFUSED: dict[str, tuple[Callable[[Path, Make], object], list[str], str]] = {
     "black masks, hull": (black, HULL, "the masks are black in every frame"),
     "poses that do not fit": (unfit, [], "poses and masks do not fit"),
     "no object": (no_object, [], "points lie in one cluster above the ground; give masks"),
-    "nothing": (bare, [], NO_SOURCE),
+    "a surface at random": (bare, ["--from", "random", "--holes", "0.1"], "has no surface"),
     "hull without masks": (bare, HULL, "has no masks; "),
     "depth without depth": (few, ["--from", "depth"], DEPTH),
-    "no such source": (bare, ["--from", "dreams"], "choose one of depth, mesh, points, hull"),
+    "no such source": (
+        bare,
+        ["--from", "dreams"],
+        "choose one of depth, mesh, points, hull, random",
+    ),
     "mesh without mesh": (bare, ["--from", "mesh"], "give --mesh MESH"),
     "mesh and hull": (bare, ["--mesh", "rock.glb", *HULL], "give one of them"),
     "noise on a hull": (photos, ["--prior-noise", "0.1"], "of a cloud, but a hull is carved"),
@@ -495,6 +496,36 @@ def test_a_world_in_which_nothing_would_be_drawn_is_one_line(data, tmp_path, cap
     assert exit_code("nbv", tmp_path / "d", "--out", tmp_path / "run", "--budget", "1") == 2
     message = "m from it, and nothing nearer than 0.01 is drawn; import the data with --unit M"
     one_line(capfd.readouterr().err, message, tmp_path / "run")
+
+
+def test_poses_alone_are_fitted_from_random_points(data, tmp_path, capfd):
+    bare(tmp_path / "d", data)
+    command("prior", tmp_path / "d", "--gaussians", "300")
+    assert "300 random points" in capfd.readouterr().out
+    fitted = ["fit", tmp_path / "d", "--passes", "2", "--out", tmp_path / "run"]
+    assert exit_code(*fitted, "--means", "frozen") == 2
+    one_line(capfd.readouterr().err, "pass --means free", tmp_path / "run")
+    command(*fitted)
+    settings = read_json(tmp_path / "run/config.json")["settings"]
+    assert (settings["seeds"], settings["budget"], settings["train"]["means"]) == (10, 0, "free")
+    frames = load_dataset(tmp_path / "d").frames
+    start, seen = initial_gaussians(load_prior(tmp_path / "d/prior"), frames)
+    assert seen.mean() > 0.9
+    assert np.allclose(start.opacities, 0.1)
+
+
+def test_test_views_get_masks_too(data, tmp_path, capfd):
+    command("import", data("colmap-binary"), "--test-every", "4", "--out", tmp_path / "d")
+    command("prior", tmp_path / "d", "--gaussians", "300")
+    command("dataset", "masks", tmp_path / "d")
+    tests = tmp_path / "d/test"
+    assert all(0 < frame.mask().mean() < 0.9 for frame in load_dataset(tests).frames)
+    command("dataset", "check", tmp_path / "d")
+    frames = [replace(frame, mask_path=None) for frame in load_dataset(tests).frames]
+    write_transforms(tests, frames)
+    capfd.readouterr()
+    assert exit_code("dataset", "check", tmp_path / "d") == 2
+    assert "the test views have no masks as the frames have" in capfd.readouterr().out
 
 
 def test_mask_files_must_not_be_there_yet(exact, tmp_path):

@@ -49,6 +49,7 @@ COMMANDS = {
     "survey": "survey.survey",
     "prior": "prior.prior",
     "nbv": "nbv.nbv",
+    "fit": "fit.fit",
     "eval": "models.evaluate",
     "diagnose": "models.diagnose",
     "report": "report.report",
@@ -181,7 +182,7 @@ def _hint(arguments: Sequence[str]) -> str:
     if command in RESUMABLE:
         return "; run the same command again to continue"
     runs = [after for option, after in pairwise(options) if option in ("--out", "--resume")]
-    if command != "nbv" or not runs or not (Path(runs[-1]) / "config.json").is_file():
+    if command not in ("nbv", "fit") or not runs or not (Path(runs[-1]) / "config.json").is_file():
         return ""
     return f"; continue with: mgs nbv --resume {shlex.quote(runs[-1])}"
 

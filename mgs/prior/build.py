@@ -33,8 +33,8 @@ from mgs.prior.photographs import (
     surface_of,
 )
 from mgs.prior.resolution import resolution
-from mgs.prior.segmentation import SegmentedCloud, segment_dataset
 from mgs.prior.scattered import scattered
+from mgs.prior.segmentation import SegmentedCloud, segment_dataset
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import poisson_mesh, sample_surface, spread_first
 from mgs.prior.truth import error_to_truth
@@ -75,11 +75,11 @@ def build_prior(
     """Build the prior of a dataset. Returns it, and the cloud of its mesh (None for a hull).
 
     on_stage: called with the name of each stage. source: "depth", "points", "hull" or "random"; by
-    default the first that the dataset has. points: PLY file in place of the dataset's points. up: unit
-    vector; "auto" is the normal of the ground plane, if there is one; None the dataset's. Raises
-    InputError as `source_of`, `check_masks`, `surface_of`, `segment_dataset`, `poisson_mesh` and
-    `sample_surface`, and if no frame sees the mesh; NoSurface, which holds the cloud, if points
-    give no surface.
+    default the first that the dataset has. points: PLY file in place of the dataset's points. up:
+    unit vector; "auto" is the normal of the ground plane, if there is one; None the dataset's.
+    Raises InputError as `source_of`, `check_masks`, `surface_of`, `scattered`, `segment_dataset`,
+    `poisson_mesh` and `sample_surface`, and if no frame sees the mesh; NoSurface, which holds the
+    cloud, if points give no surface.
     """
     chosen = source_of(dataset, source, points)
     if chosen == "random":
@@ -125,7 +125,7 @@ def build_prior(
 
 
 def _random_prior(dataset: Dataset, settings: PriorSettings, up: Up) -> Prior:
-    """The prior of the source "random". Raises InputError as `check_photographs` and `scattered`."""
+    """The prior of the source "random". Raises InputError as `check_photographs`, `scattered`."""
     check_photographs(dataset.frames)
     check_masks(dataset.frames)
     mesh, points, normals, spacing, numbers = scattered(dataset, settings)

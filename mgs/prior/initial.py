@@ -56,6 +56,13 @@ spacing: more overlap than on the surface, to leave no gaps."""
 
 BACKING_OPACITY = 0.99
 
+AGREEMENT_FRAMES = 24
+"""Most frames whose colours are compared on the surface (`colour_agreement`)."""
+
+AGREEMENT = 0.85
+"""Least `colour_agreement` of a right surface. Measured: 0.93 for a rendered rock, 0.83 with its
+surface 10 % too large and 0.74 with it 10 % too small, 0.79 for the hull of hollow bricks."""
+
 RANDOM_OPACITY = 0.1
 """Opacity of a Gaussian of a random start, as in 3DGS (Kerbl et al. 2023)."""
 
@@ -123,7 +130,7 @@ def _scattered(
         count[here] += 1
     seen = count > 0
     rgb = np.where(seen[:, None], total / np.maximum(count, 1)[:, None], GREY)
-    size = np.log(cKDTree(points).query(points, 4)[0][:, 1:].mean(1))
+    size = np.log(cKDTree(points).query(points, min(4, len(points)))[0][:, 1:].mean(1))
     start = Gaussians(
         means=points.astype(np.float32),
         log_scales=np.tile(size[:, None], 3).astype(np.float32),
@@ -226,6 +233,33 @@ def depth_of(prior: Prior) -> Callable[[Frame], np.ndarray]:
         return mesh_depth(prior.mesh)
 
     return lambda frame: of_mesh()(frame.camera) if frame.depth_path is None else frame.depth()
+
+
+def colour_agreement(prior: Prior, frames: Sequence[Frame]) -> float:
+    """Share of the variance of the colours seen that is between samples, not between frames at one
+    sample; NaN if no sample is seen twice.
+
+    A point of a real surface has about one colour in all frames that see it; a wrong surface shows
+    another thing in each. Up to AGREEMENT_FRAMES frames, evenly spread, are read. Raises InputError
+    if a file cannot be read.
+    """
+    step = max(1, -(-len(frames) // AGREEMENT_FRAMES))
+    colours = colours_of(prior)
+    n = len(prior.points)
+    count, total, squares = np.zeros(n), np.zeros((n, 3)), np.zeros(n)
+    for frame in frames[::step]:
+        seen, rgb = colours(frame)
+        count[seen] += 1
+        total[seen] += rgb
+        squares[seen] += np.square(rgb).sum(1)
+    twice = count > 1
+    count, total, squares = count[twice], total[twice], squares[twice]
+    if not twice.any():
+        return float("nan")
+    within = (squares - np.square(total).sum(1) / count).sum() / (count - 1).sum()
+    mean = total.sum(0) / count.sum()
+    whole = squares.sum() / count.sum() - np.square(mean).sum()
+    return float(1 - within / max(whole, 1e-12))
 
 
 def with_share_seen(prior: Prior, seed_frames: Sequence[Frame]) -> Prior:

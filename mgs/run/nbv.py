@@ -16,6 +16,7 @@ from mgs.files import atomic_folder
 from mgs.policy.from_file import absolute, in_file
 from mgs.policy.registry import policy_named
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
+from mgs.prior.photographs import PHOTOGRAPHIC, source_of
 from mgs.prior.settings import PriorSettings
 from mgs.run import recording
 from mgs.run.folder import DATASET, Run, holds_run, open_run, start
@@ -105,9 +106,38 @@ def start_run(
         frames = loaded or _poses(unfinished / DATASET, str(capture), complete.seed, progress)
         built = found or _built_prior(unfinished, frames, gaussians, row, complete.seed, progress)
         _check_near(built, frames, where)
+        if built.numbers.get("from") == "random" and complete.train.means != "free":
+            free = "pass --means free, or give depth, points or masks"
+            raise InputError(f"{where}: starts at random points, not on a surface; {free}")
         complete = complete.with_spacing(built.spacing)
         start(unfinished, complete, frames)
     return Run(out, complete, loaded, found)
+
+
+def start_fit(
+    dataset: str | Path,
+    out: str | Path,
+    *,
+    prior: str | Path | None = None,
+    gaussians: int | Literal["auto"] | None = None,
+    progress: Progress = no_progress,
+    **settings: Any,
+) -> Run:
+    """`start_run` of a run that takes all images at once and chooses none.
+
+    By default means are free where the prior comes from photographs (`PHOTOGRAPHIC`), else frozen.
+    Arguments and errors as `start_run`.
+    """
+    root = Path(dataset)
+    loaded, train = load_dataset(root), dict(settings.pop("train", {}))
+    found = Path(prior) if prior is not None else root / "prior"
+    known = gaussians is None and (prior is not None or (found / "prior.json").is_file())
+    source = load_prior(found).numbers.get("from") if known else source_of(loaded.survey())
+    train.setdefault("means", "free" if source in PHOTOGRAPHIC else "frozen")
+    every = {"seeds": len(loaded), "budget": 0, "train": train}
+    return start_run(
+        root, out, prior=prior, gaussians=gaussians, progress=progress, **settings | every
+    )
 
 
 def _with_defaults(settings: dict[str, Any], row: Any, loaded: Dataset | None) -> dict[str, Any]:
