@@ -7,6 +7,14 @@ from typing import TypeVar
 
 Row = TypeVar("Row")
 
+FLAGS = {"rates": "--rate", "seeds": "--seed-views", "seed": "--random-seed"}
+"""Settings whose option has another name."""
+
+
+def flag(setting: str) -> str:
+    """Option of a setting on the command line."""
+    return FLAGS.get(setting) or f"--{setting.replace('_', '-')}"
+
 
 class InputError(ValueError):
     """Bad input. The message is one line: what is wrong, where, and how to correct it.

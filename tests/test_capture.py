@@ -32,7 +32,18 @@ from mgs.view.subject import read_subject
 TINY = RenderPreset(width=64, height=48, frames=8, spp=2)
 SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=4))
 TOML = "[rock]\ndetail = 0.06\n[arena]\nstones = 4\n"
-RUN = ["--seeds", "3", "--budget", "3", "--passes", "3", "--evaluate-every", "1", "--seed", "1"]
+RUN = [
+    "--seed-views",
+    "3",
+    "--budget",
+    "3",
+    "--passes",
+    "3",
+    "--evaluate-every",
+    "1",
+    "--random-seed",
+    "1",
+]
 KILLED = """
 import os, signal
 from mgs import runtime
@@ -266,7 +277,7 @@ def test_every_command_that_reads_a_run_reads_this_one(captured, tmp_path, capsy
     capsys.readouterr()
     command("eval", captured)
     said = capsys.readouterr().out
-    assert "own: trained on" in said
+    assert "training" in said
     assert "new: views" not in said
     assert {path.stem for path in (captured / "renders").glob("*.png")} == set(taken(captured))
     command("diagnose", captured)
@@ -326,7 +337,7 @@ def test_one_command_does_all_of_it(small, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "test views (1)" in said
     assert "views trained on (4)" in said
-    assert "never trained on" not in said
+    assert "held" not in said
     leftover = run / "dataset/images/.kf_0009.1.part.png"
     leftover.write_bytes(b"left by a kill")
     command("nbv", "--resume", run)
@@ -353,7 +364,7 @@ def test_bad_scenes_and_options_are_refused(small, poses, tmp_path, capsys):
         (["--capture", bad, *out], "rock.siez"),
         ([poses.root, *capture, *out], "give a DATASET or --capture"),
         (["--resume", tmp_path, *capture], "--capture: --resume takes its settings"),
-        ([*capture, "--seeds", 3, "--budget", 6, *out], "--budget 6 exceeds its 5"),
+        ([*capture, "--seed-views", 3, "--budget", 6, *out], "--budget 6 exceeds its 5"),
         ([*capture, "--out", full], "not empty"),
         ([*capture, "--prior", tmp_path / "no", *out], "no such prior"),
     ):

@@ -200,7 +200,7 @@ def test_a_chart_is_measured_once_and_written(small, tmp_path, capsys):
         assert len(rows) == len(record["rows"])
         assert all(parsed(row["command"]) for row in rows)
         assert any(row["front"] for row in record["rows"])
-        line = f"mgs chart {out} --only {kind} --preset quick --repeats 1 --dataset {small}"
+        line = f"mgs chart {out} --only {kind} --scale quick --repeats 1 --dataset {small}"
         assert record["command"] == line
         assert line in (out / f"{kind}.md").read_text()
         assert (out / f"{kind}.png").stat().st_size > 10_000

@@ -24,7 +24,7 @@ from mgs.splat import ListCache
 from mgs.splat_ply import read_ply
 from mgs.synth.rendering import write_contact_sheet
 
-VIEWS = ["--seeds", "3", "--budget", "4", "--passes", "6", "--seed", "1"]
+VIEWS = ["--seed-views", "3", "--budget", "4", "--passes", "6", "--random-seed", "1"]
 STRUCK = """
 import os, signal
 from mgs.run import operations
@@ -136,7 +136,7 @@ def test_resuming_a_finished_run_shows_it_again(run, capsys):
     before = (run / "checkpoint.npz").read_bytes()
     command("nbv", "--resume", run)
     assert (run / "checkpoint.npz").read_bytes() == before
-    assert "views never trained on" in capsys.readouterr().out
+    assert "held-out views" in capsys.readouterr().out
 
 
 def test_errors_are_predicted_and_calibrated(run):

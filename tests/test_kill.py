@@ -40,7 +40,7 @@ run_cells(Path(sys.argv[1]), [Cell("run", "test_sweep:real_run", given)], lambda
 
 TOML = "[rock]\ndetail = 0.06\n[arena]\nstones = 20\n"
 UNEQUAL = rb'"(commit|\w*seconds\w*)":\s*(\{[^}]*\}|"[^"]*"|[-+.\de]+)'
-LOOP = "--seeds 2 --budget 2 --passes 3 --seed 1"
+LOOP = "--seed-views 2 --budget 2 --passes 3 --random-seed 1"
 COMMANDS = {
     "nbv": f"nbv {{data}} --prior {{prior}} --out {{out}} {LOOP} --evaluate-every 1",
     "capture": f"nbv --capture {{scene}} --gaussians 150 --out {{out}} {LOOP}",

@@ -114,7 +114,7 @@ def test_a_mesh_that_is_small_and_far_away_is_one_line(tmp_path):
 
 
 def test_the_record_of_a_given_mesh_says_what_was_done(dataset, tmp_path, capsys):
-    options = ["--mesh", dataset.root / "rock.glb", "--gaussians", 100, "--seed", 3]
+    options = ["--mesh", dataset.root / "rock.glb", "--gaussians", 100, "--random-seed", 3]
     command("prior", dataset.root, *options, "--out", tmp_path / "p")
     used = {"gaussians": 100, "spacing": None, "seed": 3, "backing": 0.5}
     prior = load_prior(tmp_path / "p")

@@ -122,11 +122,11 @@ def test_a_quality_that_could_not_be_measured_is_a_dash(tmp_path):
     views = {"count": 2, "psnr": 30.123, "ssim": 0.95, "psnr_mask": None, "ssim_mask": None}
     console = Console(record=True, width=500)
     print_run(tmp_path, state_of([]), NOT_SHOWN | {"all": views}, console)
-    text = "(2): PSNR 30.12 dB, SSIM 0.9500; inside the rock mask PSNR – dB, SSIM –"
-    assert f"views trained on {text}" in console.export_text(clear=False)
+    text = "(2): PSNR 30.12 dB, SSIM 0.9500; masked PSNR – dB, SSIM –"
+    assert f"training views {text}" in console.export_text(clear=False)
     assert "test views" not in console.export_text()
     print_run(tmp_path, state_of([]), NOT_SHOWN | {"all": views, "test": views}, console)
-    assert f"test views {text}\nviews trained on {text}" in console.export_text()
+    assert f"test views {text}\ntraining views {text}" in console.export_text()
 
 
 @pytest.mark.parametrize("made", ["dataset", "random"])
@@ -136,8 +136,8 @@ def test_demo_refuses_results_of_another_seed(tmp_path, capsys, made):
         write_json(root / "config.json", {"seed": 3})
     else:
         tiny.start(tmp_path / "demo/random", load_dataset(root), seed=3)
-    said = refused(capsys, ["demo", tmp_path / "demo", "--seed", "1"])
-    assert f"demo/{made}: was made with --seed 3, not 1" in said
+    said = refused(capsys, ["demo", tmp_path / "demo", "--random-seed", "1"])
+    assert f"demo/{made}: was made with --random-seed 3, not 1" in said
     assert not (tmp_path / "demo/prior").exists()
 
 
@@ -224,8 +224,8 @@ def test_a_damaged_setting_is_named_with_its_file(dataset, prior, tmp_path, caps
         ("--stop-gain 0", "--stop-gain 0.0: must be more than 0"),
         ("--stop-uncertainty 1", "--stop-uncertainty 1.0: must be less than 1"),
         ("--policy best", "--policy best: unknown; choose one of"),
-        ("--seeds 13", "fewer than 13 seeds"),
-        ("--seeds 0", "--seeds"),
+        ("--seed-views 13", "fewer than 13 seeds"),
+        ("--seed-views 0", "--seed-views"),
         ("--budget -1", "--budget -1: must be at least 0"),
         ("--travel nan", "--travel"),
         ("--nearest 0", "--nearest 0: must be at least 1"),
@@ -257,7 +257,7 @@ def test_settings_without_an_option_are_named_by_their_key(
 
 def test_options_reach_the_run(dataset, prior, tmp_path):
     """Here the paper's Eq. 7: squared gradients of one scalar loss per image, one lambda."""
-    options = "--estimator loss-gradient --lam 1e-6 --budget 1 --seeds 3 --passes 2"
+    options = "--estimator loss-gradient --lam 1e-6 --budget 1 --seed-views 3 --passes 2"
     options += " --rate colour=0.1 --rate opacity=0 --prior-std scale=2 --alpha-weight 0.3"
     options += " --nearest 5 --travel 2.5 --batch 3 --stop-gain 1e-9 --stop-uncertainty 1e-9"
     run = tmp_path / "run"

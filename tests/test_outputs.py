@@ -93,7 +93,7 @@ def test_bench_knows_before_it_measures_that_it_cannot_write(capsys, tmp_path, o
 @pytest.mark.parametrize("command", ["nbv", "prior", "synth-orbit", "survey", "demo"])
 def test_negative_seed(capsys, dataset, prior, tmp_path, command):
     arguments = writers(dataset, prior, tmp_path, tmp_path / "out")[command]
-    assert "--seed" in refused(capsys, [*arguments, "--seed", -1], tmp_path)
+    assert "--random-seed" in refused(capsys, [*arguments, "--random-seed", -1], tmp_path)
 
 
 def test_a_picture_too_large(capsys, dataset, tmp_path):

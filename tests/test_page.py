@@ -213,7 +213,7 @@ def test_what_is_not_there_is_left_out(runs, tmp_path):
     assert "metrics.json is of 5 images, the model of 6" in parsed.text
     assert "holds no model" in parsed.text
     assert f"{metrics['held_out']['psnr']:.4f}" not in parsed.text
-    assert "PSNR, held out" not in parsed.text
+    assert "PSNR, held-out views" not in parsed.text
 
 
 def test_test_views_are_compared_and_their_metrics_shown(runs, tmp_path):

@@ -211,8 +211,8 @@ def test_table(request, sets):
     assert len(lines) == 4
     row = dict(zip(lines[0], lines[3], strict=True))
     assert (row["policy"], row["images"]) == ("random", "8")
-    assert row["PSNR, all (dB)"] == f"{run.metrics['all']['psnr']:.2f}"
-    assert row["SSIM, held out, rock only"] == f"{run.metrics['held_out']['ssim_mask']:.4f}"
+    assert row["PSNR, all views (dB)"] == f"{run.metrics['all']['psnr']:.2f}"
+    assert row["masked SSIM, held-out views"] == f"{run.metrics['held_out']['ssim_mask']:.4f}"
     assert row["path (m)"] == f"{path:.2f}"
     assert len(row) == 10 + 4 * ("test" in sets)
     assert "| path (unit) |" in tables.markdown_table([row | {"unit": "unit"} for row in rows])
@@ -240,7 +240,7 @@ def test_a_report_shows_test_views_where_there_are_some(tested, tmp_path, drawn)
     axes = drawn["psnr.png"].axes
     panels = {
         "PSNR, test views (dB)": "test_psnr",
-        "PSNR, test views, rock only (dB)": "test_psnr_mask",
+        "masked PSNR, test views (dB)": "test_psnr_mask",
     }
     assert [axis.get_ylabel() for axis in axes] == list(panels)
     for axis, key in zip(axes, panels.values(), strict=True):
@@ -435,7 +435,7 @@ def test_a_legend_covers_no_line(tmp_path, monkeypatch, runs):
     lines = dict.fromkeys(labels, ((4, 5, 6), (0.1, 0.2, 0.3)))
     figures.gain_figure(tmp_path / "a.png", dict.fromkeys(labels, (0.1, 0.2, 0.3)))
     figures.coverage_figure(tmp_path / "a.png", lines)
-    figures.psnr_figure(tmp_path / "a.png", {"test views": lines, "rock only": lines})
+    figures.psnr_figure(tmp_path / "a.png", {"test views": lines, "masked PSNR": lines})
     assert len(found) == 3
     for figure in map(laid_out, found):
         legend = figure.legends[0].get_window_extent()

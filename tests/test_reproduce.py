@@ -82,7 +82,7 @@ def test_curves_are_made_once_and_hold_what_the_runs_found(quick, tmp_path, caps
     assert set(before) == {*names, "statistics.json"}
     rows, each = rows_of(folder / "curves.csv"), rows_of(folder / "curves_by_rock.csv")
     assert [(row["policy"], row["images"]) for row in rows[:3]] == [("farthest", n) for n in "456"]
-    line = "mgs reproduce --preset quick --only curves --rocks 2"
+    line = "mgs reproduce --scale quick --only curves --rocks 2"
     assert {row["command"] for row in rows} == {line}
     (mean,), last = (
         [float(r["test_psnr"]) for r in of if (r["policy"], r["images"]) == ("uniform", "6")]
@@ -106,7 +106,7 @@ def test_a_policy_of_ones_own_is_compared_over_rocks(quick, tmp_path, capsys):
     assert "4/5 curves run/boulder-1" in said, "the other policies are not run again"
     rows = rows_of(out / "results/curves.csv")
     assert {row["policy"] for row in rows} == {"farthest", "uniform", "mine.py:first"}
-    line = "mgs reproduce --preset quick --only curves --rocks 1 --policy mine.py:first"
+    line = "mgs reproduce --scale quick --only curves --rocks 1 --policy mine.py:first"
     assert {row["command"] for row in rows} == {line}
     pairs = json.loads((out / "results/statistics.json").read_text())["test_psnr"]["pairs"]
     own = [("mine.py:first", "uniform"), ("mine.py:first", "farthest")]
@@ -134,7 +134,7 @@ def test_rocks_of_ones_own_take_the_place_of_the_others(quick, tmp_path, capsys,
     assert rendered == [("boulder", "one.ply"), ("boulder", "two.glb")]
     assert "0/8 curves dataset/one-" in said
     assert {row["scene"] for row in rows_of(out / "results/curves_by_rock.csv")} == {"one", "two"}
-    line = "mgs reproduce --preset quick --only curves --rocks 2 --mesh one.ply --mesh two.glb"
+    line = "mgs reproduce --scale quick --only curves --rocks 2 --mesh one.ply --mesh two.glb"
     assert {row["command"] for row in rows_of(out / "results/curves.csv")} == {line}
     twice = ["--mesh", meshes[0], "--mesh", tmp_path / "out/../one.ply"]
     for options, line in (
@@ -298,14 +298,14 @@ def test_table_1_has_equal_counts_and_the_papers_rows(quick, tmp_path, capsys, m
     assert theirs in text
     assert "| d-optimal | 6 | 20.20 | " + ours.format("20.20") in text
     assert "| random, mean of 2 | 6 | 20.70 | " + ours.format("20.70") in text
-    assert "`mgs reproduce --preset quick --only table1`" in text
+    assert "`mgs reproduce --scale quick --only table1`" in text
     assert "Not done yet" not in text
     line = rows["random, draw 2"]["command"]
     assert line.startswith("mgs nbv cells/dataset/boulder-0/circle-1/8x48x36/dataset --prior ")
-    assert line.endswith("--policy random --seeds 4 --budget 2 --seed 1000")
+    assert line.endswith("--policy random --seed-views 4 --budget 2 --random-seed 1000")
     done(capsys, out, "--only", "table1", "--batch", 2)
     rows = {row["row"]: row for row in rows_of(out / "results/table1.csv")}
-    ending = "--policy d-optimal --batch 2 --seeds 4 --budget 2 --seed 0"
+    ending = "--policy d-optimal --batch 2 --seed-views 4 --budget 2 --random-seed 0"
     assert rows["d-optimal"]["command"].endswith(ending)
     batches = [settings.get("batch") for settings in asked]
     assert batches == [None] * 6 + [2] * 5  # the fit to all views is no run
@@ -497,7 +497,7 @@ def test_every_run_of_every_result_has_its_own_cell():
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ("--preset huge", "--preset 'huge': unknown; choose one of quick, paper"),
+        ("--scale huge", "--scale 'huge': unknown; choose one of quick, paper"),
         ("--only table2", "unknown; choose some of table1,figures,curves,seeds,pools,oracle"),
         ("--only ,", "--only '': unknown"),
         ("--rocks 21", "--rocks 21: curves can have 1 to 20"),
@@ -525,4 +525,4 @@ def test_a_folder_of_another_preset_or_of_something_else_is_refused(capsys, tmp_
     (tmp_path / "paper").mkdir()
     write_json(tmp_path / "paper/study.json", {"preset": "paper"})
     line = refused(capsys, ["reproduce", tmp_path / "paper"], tmp_path)
-    assert "was begun with --preset paper" in line
+    assert "was begun with --scale paper" in line

@@ -252,7 +252,7 @@ def test_without_the_denoiser_more_samples_and_a_note(tmp_path, monkeypatch):
     ("options", "message"),
     [
         (["--scene", "moon"], "scene 'moon': unknown; choose one of boulder"),
-        (["--preset", "huge"], "preset 'huge': unknown; choose one of quick, paper"),
+        (["--scale", "huge"], "scale 'huge': unknown; choose one of quick, paper"),
         (["--orbit", "figure-eight"], "--orbit 'figure-eight': unknown"),
         (["--size", "320"], "expected WIDTHxHEIGHT"),
         (["--mesh", "nowhere.glb"], "no such mesh"),

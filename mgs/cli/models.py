@@ -30,11 +30,11 @@ def evaluate(
         option("Predict how much lower the last fit could get (Newton decrease).", "--convergence"),
     ] = False,
 ) -> None:
-    """Measure the model on the test views, on all views, and on the views never trained on; write
+    """Measure the model on the test views, on all views, and on the held-out views; write
     RUN/metrics.json, and renders beside truth.
 
     Metrics and pictures of the same model and dataset are kept, not made again. The truth is the
-    rock on black. PSNR and SSIM are over the full frame, and over the pixels of the rock only.
+    rock on black. PSNR and SSIM are over the full frame, and masked to the pixels of the rock.
     metrics.json also has the errors of alpha and depth, where the dataset has their truth.
     """
     from mgs.report.evaluation import evaluate_run
@@ -78,7 +78,7 @@ def diagnose(
     information.
 
     With --calibrate it writes uncertainty.json and uncertainty.png instead: how well errors are
-    predicted in test views and in frames never trained on. The prediction is calibrated on the
+    predicted in test views and in held-out frames. The prediction is calibrated on the
     run's own views, each left out of a fit once. NAME.errors.exr has the true error and the
     predicted standard deviation of some views.
     """

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
 
+from mgs.errors import FLAGS, flag
 from mgs.fit.settings import TrainSettings
 from mgs.policy.registry import policy_names
 from mgs.run.settings import PRESETS, NbvSettings
@@ -158,7 +159,7 @@ def _option(name: str, panel: str) -> inspect.Parameter:
         kind, default = list[str], ", ".join(f"{k}={v:g}" for k, v in default.items())
     if default is not None and not isinstance(default, bool) and "Default:" not in text:
         text += f" Default: {default}."
-    flags = ["--exposure"] if kind is bool else ["--rate"] if name == "rates" else []
+    flags = ["--exposure"] if kind is bool else [FLAGS[name]] if name in FLAGS else []
     option = typer.Option(
         *flags, metavar=METAVARS.get(name), help=text, rich_help_panel=panel, show_default=False
     )
@@ -179,18 +180,16 @@ def refuse_others(context: typer.Context, resume: Path) -> None:
         source = context.get_parameter_source(name)
         if name in ("resume", "policy") or source is None or source.name != "COMMANDLINE":
             continue
-        option = (
-            name if name == "dataset" else f"--{name.replace('_', '-')}".replace("rates", "rate")
-        )
+        option = flag(name)
         where = f"--resume takes its settings from {resume / 'config.json'}; change it there"
-        raise InputError(f"nbv: {option.upper() if name == 'dataset' else option}: {where}")
+        raise InputError(f"nbv: {'DATASET' if name == 'dataset' else option}: {where}")
 
 
 def pairs(name: str, given: list[str]) -> dict[str, float]:
     """Parse `KIND=NUMBER` options. Raises InputError for one that is not of this form."""
     from mgs.errors import InputError
 
-    option, table = {"rates": "--rate", "prior_std": "--prior-std"}[name], {}
+    option, table = flag(name), {}
     for text in given:
         kind, _, number = text.partition("=")
         try:
@@ -224,27 +223,32 @@ def start_and_print(
 def resume_and_print(
     run: Path | Run, console: Console, policy: str | None = None, pictures: bool = False
 ) -> None:
-    """Run or resume the loop of a run, evaluate (with pictures where asked), print the table.
+    """Run or resume the loop of a run, evaluate (with pictures where asked), print the table of
+    steps; where the output is no terminal, a line after each step instead.
 
     policy: FILE.py:FUNCTION where the run has a policy of the user's own.
     """
     from functools import partial
 
-    from mgs.cli.printing import print_run
+    from mgs.cli.printing import print_run, step_line
     from mgs.cli.progress import progress_bar
     from mgs.report.evaluation import evaluate_run
     from mgs.run.folder import Run, open_run
     from mgs.run.nbv import resume_nbv
 
     run = run if isinstance(run, Run) else open_run(run)
-    total = run.settings.seeds + run.settings.budget
+    total, known = run.settings.seeds + run.settings.budget, list[dict[str, Any]]()
     with progress_bar("reading", console) as progress:
 
         def on_step(state: State) -> None:
             progress.whole(f"{run.folder.name}: images", len(state.taken), total)
-            line = state.steps[-1]
-            for warning in line.get("warnings", []):
-                progress.print(f"step {line['step']}: {warning}")
+            new = state.steps[len(known) :]
+            known.extend(new)
+            for line in new:
+                if not console.is_terminal:
+                    progress.print(step_line(line))
+                for warning in line.get("warnings", []):
+                    progress.print(f"step {line['step']}: {warning}")
 
         state = resume_nbv(run, on_step, progress, policy)
         metrics = evaluate_run(

@@ -22,7 +22,9 @@ def argument(text: str, **more: Any) -> Any:
 
 Run = Annotated[Path, argument("Folder that `mgs nbv` wrote.")]
 DatasetFolder = Annotated[Path, argument("Dataset folder (transforms.json).")]
-Seed = Annotated[int, option("Root seed: the same seed gives the same result.", min=0)]
+Seed = Annotated[
+    int, option("Root seed: the same seed gives the same result.", "--random-seed", min=0)
+]
 
 
 def parse_up(text: str) -> tuple[float, float, float] | None:

@@ -14,18 +14,11 @@ from rich.text import Text
 if TYPE_CHECKING:
     from mgs.run.state import State
 
-GROUPS = {"test": "test", "all": "all", "held_out": "new"}
+GROUPS = {"test": "test", "all": "all", "held_out": "held out"}
 """Sets of views -> their names in the headings of `print_quality`."""
 
 SHOWN = {
-    True: (
-        "test.psnr",
-        "test.ssim",
-        "test.psnr_mask",
-        "all.psnr",
-        "held_out.psnr",
-        "held_out.psnr_mask",
-    ),
+    True: ("test.psnr", "test.ssim", "test.psnr_mask", "held_out.psnr", "held_out.psnr_mask"),
     False: (
         "all.psnr",
         "all.ssim",
@@ -36,6 +29,14 @@ SHOWN = {
     ),
 }
 """Columns of `print_quality` with and without test views: as many as fit into 80 characters."""
+
+
+MEASURED = {
+    f"{prefix}{key}": f"{name}\n{views}"
+    for prefix, views in (("test_", "test"), ("held_out_", "held out"), ("", "all"))
+    for key, name in (("psnr", "PSNR"), ("psnr_mask", "masked PSNR"))
+}
+"""Metrics of steps.jsonl -> headings; a table of steps shows the first two that there are."""
 
 
 def fits(console: Console, table: Table) -> bool:
@@ -67,10 +68,7 @@ def _quality(heading: str, first: Sequence[str], rows: Sequence[Mapping[str, Any
     tested, new = any("test.psnr" in row for row in rows), has_held_out(rows)
     metrics = [key for key in SHOWN[tested] if new or not key.startswith("held_out.")]
     keys = ["images", *metrics, "coverage"]
-    if new:
-        caption = "n: images; dB and %; new: views never trained on; rock: inside its mask"
-    else:
-        caption = "n: images; dB, %; own: trained on; rock: in its mask"
+    caption = "n: images; PSNR in dB, coverage in %"
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption=caption)
     table.add_column(heading, no_wrap=True)
     for key in keys:
@@ -81,29 +79,46 @@ def _quality(heading: str, first: Sequence[str], rows: Sequence[Mapping[str, Any
 
 
 def _heading(key: str, new: bool) -> str:
-    """Heading of a column: the metric, and below it the set of views and `rock` for a metric inside
-    the mask. new: whether some views were not trained on."""
+    """Heading of a column: the metric, and below it the set of views. new: whether some views were
+    held out."""
     views, _, metric = key.partition(".")
     if not metric:
         return {"coverage": "cover", "images": "n"}[key]
     name, _, mask = metric.partition("_")
-    group = GROUPS[views] if new or views != "all" else "own"
-    return f"{name.upper()}\n{group}" + ("\nrock" if mask else "")
+    group = GROUPS[views] if new or views != "all" else "training"
+    return ("masked\n" if mask else "") + f"{name.upper()}\n{group}"
 
 
 def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console) -> None:
-    """Print the steps of a run as a table, then the quality of its model. Names that are too wide
-    for the console have a table of their own."""
+    """Print the steps of a run as a table, on a terminal only, then the quality of its model."""
     from mgs.run.ending import fit_line, why_ended
 
-    columns = ("step", "image", "score", "coverage", "iterations", "loss", "stopped", "seconds")
+    if console.is_terminal:  # a log has a line a step
+        _print_steps(state.steps, console)
+    for text in _quality_lines(metrics, any("exposure" in step for step in state.steps)):
+        console.print(text)
+    last = state.steps[-1] if state.steps else {}
+    if "fit" in metrics:
+        console.print(fit_line(metrics["fit"], last["stop_reason"]))
+    if "ended" in last:
+        console.print(f"the run has ended: {why_ended(last['ended'])}", soft_wrap=True)
+    console.print(f"wrote {out}", soft_wrap=True)
+
+
+def _print_steps(steps: Sequence[Mapping[str, Any]], console: Console) -> None:
+    """Print the steps of a run as a table. Names that are too wide have a table of their own."""
+    measured = _measured(steps)
+    fitted = [MEASURED[key] for key in measured] or ["loss", "stopped"]
+    columns = ("step", "image", "score", "coverage", "passes", *fitted, "seconds")
     rows = []
-    for line in state.steps:
+    for line in steps:
         names = [line["name"]] if line["name"] else line["seed_names"]
         score = "" if line["score"] is None else f"{line['score']:.4g}"
-        fit = ("", "", "")
+        fit = ["", "", ""]
         if "loss" in line:
-            fit = (str(line["iterations"]), f"{line['loss']:.3g}", line["stop_reason"])
+            fit = [passes(line), f"{line['loss']:.3g}", line["stop_reason"]]
+        if measured:
+            fit[1:] = [f"{line[key]:.2f}" if key in line else "" for key in measured]
         coverage, seconds = f"{100 * line['coverage']:.2f} %", sum(line["seconds"].values())
         row = (str(line["step"]), "\n".join(names), score, coverage, *fit, f"{seconds:.1f}")
         rows.append(row)
@@ -121,14 +136,27 @@ def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console
     else:
         console.print(table(0, *range(2, len(columns))))
         console.print(table(0, 1))
-    for text in _quality_lines(metrics, any("exposure" in step for step in state.steps)):
-        console.print(text)
-    last = state.steps[-1] if state.steps else {}
-    if "fit" in metrics:
-        console.print(fit_line(metrics["fit"], last["stop_reason"]))
-    if "ended" in last:
-        console.print(f"the run has ended: {why_ended(last['ended'])}", soft_wrap=True)
-    console.print(f"wrote {out}", soft_wrap=True)
+
+
+def _measured(steps: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The two keys of MEASURED to show: PSNR and masked PSNR over the first set that steps have."""
+    return [key for key in MEASURED if any(key in line for line in steps)][:2]
+
+
+def passes(line: Mapping[str, Any]) -> str:
+    """Number of passes of the fit in a line of steps.jsonl."""
+    return str(line["iterations"] // line["images"])
+
+
+def step_line(line: Mapping[str, Any]) -> str:
+    """A step in one line, for a log."""
+    parts = [f"step {line['step']}: {line['name'] or ', '.join(line['seed_names'])}"]
+    parts.append(f"coverage {100 * line['coverage']:.2f} %")
+    if "loss" in line:
+        parts.append(f"{passes(line)} passes")
+    for key in _measured([line]):
+        parts.append(f"{' '.join(MEASURED[key].split())} views {line[key]:.2f} dB")
+    return ", ".join([*parts, f"{sum(line['seconds'].values()):.1f} s"])
 
 
 def _quality_lines(metrics: dict[str, Any], exposure: bool) -> list[str]:
@@ -136,8 +164,8 @@ def _quality_lines(metrics: dict[str, Any], exposure: bool) -> list[str]:
     it."""
     from mgs.report.tables import table_cell
 
-    every = "all views" if metrics.get("held_out", {}).get("count") else "views trained on"
-    sets = {"test": "test views", "all": every, "held_out": "views never trained on"}
+    every = "all views" if metrics.get("held_out", {}).get("count") else "training views"
+    sets = {"test": "test views", "all": every, "held_out": "held-out views"}
     lines = []
     for key, label in sets.items():
         mean = metrics.get(key, {"count": 0})
@@ -146,12 +174,12 @@ def _quality_lines(metrics: dict[str, Any], exposure: bool) -> list[str]:
         cells = {name: table_cell(name, value) for name, value in mean.items()}
         lines.append(
             f"{label} ({mean['count']}): PSNR {cells['psnr']} dB, SSIM {cells['ssim']}; "
-            f"inside the rock mask PSNR {cells['psnr_mask']} dB, SSIM {cells['ssim_mask']}"
+            f"masked PSNR {cells['psnr_mask']} dB, SSIM {cells['ssim_mask']}"
         )
         if exposure:
             lines.append(
                 f"{label}, with a gain per channel fitted to each view itself: "
                 f"PSNR {cells['psnr_corrected']} dB; "
-                f"inside the rock mask {cells['psnr_mask_corrected']} dB"
+                f"masked PSNR {cells['psnr_mask_corrected']} dB"
             )
     return lines

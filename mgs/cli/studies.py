@@ -29,13 +29,13 @@ Workers = Annotated[int, option("Worker processes, which share the cores.", min=
 def _study(
     out: Path, sizes: Mapping[str, Size], preset: str
 ) -> Iterator[tuple[Size, Console, Report]]:
-    """Context of every study: locks its folder and records its preset; gives the size, a console,
+    """Context of every study: locks its folder and records its scale; gives the size, a console,
     and the callback that prints each cell that begins.
 
-    Raises InputError for an unknown preset, and if the folder is of another preset, holds something
+    Raises InputError for an unknown scale, and if the folder is of another scale, holds something
     else, cannot be written or is in use.
     """
-    size, console = row_named(sizes, preset, "--preset"), Console(highlight=False)
+    size, console = row_named(sizes, preset, "--scale"), Console(highlight=False)
     record = check_writable(out) / "study.json"
 
     def report(cell: str, done: int, total: int) -> None:
@@ -48,7 +48,7 @@ def _study(
         elif (there := read_json(record)) != {"preset": preset}:
             was = there.get("preset") if isinstance(there, dict) else None
             raise InputError(
-                f"{out}: was begun with --preset {was}, not {preset}; give that, or another folder"
+                f"{out}: was begun with --scale {was}, not {preset}; give that, or another folder"
             )
         runtime.start()
         yield size, console, report
@@ -58,7 +58,10 @@ def reproduce(
     out: Out = Path("reproduced"),
     preset: Annotated[
         str,
-        option("quick: Table I of 12 of 32 views, 320x240. paper: of 54 of 100 views, 640x480."),
+        option(
+            "quick: Table I of 12 of 32 views, 320x240. paper: of 54 of 100 views, 640x480.",
+            "--scale",
+        ),
     ] = "quick",
     only: Annotated[
         str | None,
@@ -69,7 +72,7 @@ def reproduce(
     ] = None,
     rocks: Annotated[
         int | None,
-        option("Rocks of curves, seeds, pools and oracle. Default: the preset's.", min=1),
+        option("Rocks of curves, seeds, pools and oracle. Default: as --scale says.", min=1),
     ] = None,
     policy: Annotated[
         list[str] | None,
@@ -98,7 +101,7 @@ def reproduce(
     from mgs.study.reproduce_results import make
 
     names = study.results_of(only)
-    size = row_named(study.SIZES, preset, "--preset")
+    size = row_named(study.SIZES, preset, "--scale")
     size = study.with_options(size, names, policy or [], mesh or [], batch)
     counts = {name: study.rocks_of(name, size, rocks) for name in names}
     if scheduler is not None and workers != 1:
@@ -116,7 +119,10 @@ def reproduce(
 def stress(
     out: Out = Path("out/stress"),
     preset: Annotated[
-        str, option("quick: minutes with --workers 2. full: more rocks, larger images; hours.")
+        str,
+        option(
+            "quick: minutes with --workers 2. full: more rocks, larger images; hours.", "--scale"
+        ),
     ] = "quick",
     workers: Workers = 1,
     only: Annotated[
@@ -144,7 +150,11 @@ def stress(
 def parsimony(
     out: Out = Path("parsimony"),
     preset: Annotated[
-        str, option("quick: six scenes of small images, ten minutes. full: 320x240, half an hour.")
+        str,
+        option(
+            "quick: six scenes of small images, ten minutes. full: 320x240, half an hour.",
+            "--scale",
+        ),
     ] = "quick",
 ) -> None:
     """Chart quality and cost against the number of Gaussians, the kinds of parameters learned, and
@@ -172,7 +182,7 @@ def chart(
         Path | None, option("A dataset with test views, in place of the one that is rendered.")
     ] = None,
     preset: Annotated[
-        str, option("quick: about ten minutes on two quiet cores. full: hours.")
+        str, option("quick: about ten minutes on two quiet cores. full: hours.", "--scale")
     ] = "quick",
     only: Annotated[str | None, option("fit or run. Default: both.")] = None,
     repeats: Annotated[

@@ -34,12 +34,16 @@ def synth_orbit(
         option("Up axis of --mesh. Default: y for GLB (its rule) and OBJ, z for others."),
     ] = None,
     preset: Annotated[
-        str, option("quick: 32 frames of 320x240. paper: 100 frames of 640x480.")
+        str, option("quick: 32 frames of 320x240. paper: 100 frames of 640x480.", "--scale")
     ] = "quick",
-    spp: Annotated[int | None, option("Samples per pixel. Default: the preset's.", min=1)] = None,
-    frames: Annotated[int | None, option("Number of frames. Default: the preset's.", min=1)] = None,
+    spp: Annotated[
+        int | None, option("Samples per pixel. Default: as --scale says.", min=1)
+    ] = None,
+    frames: Annotated[
+        int | None, option("Number of frames. Default: as --scale says.", min=1)
+    ] = None,
     size: Annotated[
-        str | None, option("Image size WIDTHxHEIGHT, pixels. Default: the preset's.")
+        str | None, option("Image size WIDTHxHEIGHT, pixels. Default: as --scale says.")
     ] = None,
     test_views: Annotated[
         int, option("Number of test views on a dome, to evaluate models; in OUT/test.", min=0)
@@ -59,7 +63,11 @@ def synth_orbit(
     ] = 0.0,
     seed: Annotated[
         int,
-        option("Root seed: the same gives the same dataset bit for bit, but timings.json.", min=0),
+        option(
+            "Root seed: the same gives the same dataset bit for bit, but timings.json.",
+            "--random-seed",
+            min=0,
+        ),
     ] = 0,
 ) -> None:
     """Render a dataset with Mitsuba: an orbit around a rock, with photoreal images, depth, rock
@@ -84,7 +92,7 @@ def synth_orbit(
     if mesh_up is not None and mesh is None:
         raise InputError("--mesh-up: says how a mesh stands, but there is none; give --mesh too")
     given = {"spp": spp, "frames": frames, **_parse_size(size)}
-    images = row_named(PRESETS, preset, "--preset")
+    images = row_named(PRESETS, preset, "--scale")
     images = replace(images, **{key: value for key, value in given.items() if value is not None})
     noise = PoseNoise(pose_noise, rotation_noise) if pose_noise or rotation_noise else None
     views = f"{images.frames} frames" + (", none rendered" if on_demand else "")

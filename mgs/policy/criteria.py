@@ -50,6 +50,10 @@ BLOCKS_AT_ONCE = 2048
 """Blocks whose determinants are computed together: 2 MB, which fit into a core's cache."""
 
 
+GAIN_UNIT = "½ nat per parameter"
+"""Unit of `d_optimal` with the lambda of `regularisation`: 2/l times mutual information in nats."""
+
+
 def regularisation(
     groups: dict[str, slice],
     pixel_noise: float = PIXEL_NOISE,

@@ -362,12 +362,12 @@ def compare_models(
     """Mean PSNR of each model, dB, full frame, on views that a run did not train on.
 
     taken: names of the run's frames. Returns the name of the set, "test" if the dataset has test
-    views, else "held out", and the means, None if there is no such view.
+    views, else "held-out", and the means, None if there is no such view.
     """
     tests = dataset.test_views()
     name, frames = "test", tests.frames if tests else ()
     if not tests:
-        name = "held out"
+        name = "held-out"
         frames = tuple(f for f in dataset.with_images(taken) if f.name not in taken)
     if not frames:
         return name, None

@@ -17,6 +17,7 @@ import numpy as np
 from mgs.colour import srgb_from_linear
 from mgs.data.up import PLUS_Z, Up, upright
 from mgs.plotting import STYLE, crop, new_figure, save_figure
+from mgs.policy.criteria import GAIN_UNIT
 from mgs.report.calibration import BINS
 
 if TYPE_CHECKING:
@@ -167,7 +168,7 @@ def gain_figure(path: str | Path, gains: Mapping[str, Sequence[float]]) -> None:
     gains: label -> gain of each step after the seeds.
     """
     curves = {label: (range(1, len(values) + 1), values) for label, values in gains.items()}
-    panel = (curves, "active step", r"$\mathrm{IG}_D$ of the selected view")
+    panel = (curves, "active step", f"information gain ({GAIN_UNIT})")
     _curves_figure(path, [panel], 4.8, lambda axes: axes[0].set_ylim(bottom=0))
 
 
@@ -188,12 +189,12 @@ def coverage_figure(path: str | Path, coverage: Curves) -> None:
 
 
 def psnr_figure(path: str | Path, panels: Mapping[str, Curves]) -> None:
-    """Draw PSNR against the number of images, a panel for each set of views.
+    """Draw PSNR against the number of images, a panel for each metric.
 
-    panels: set of views -> label -> (numbers of images, PSNR in dB).
+    panels: metric and set of views -> label -> (numbers of images, PSNR in dB).
     """
     x = "images in the training set"
-    drawn = [(curves, x, f"PSNR, {what} (dB)") for what, curves in panels.items()]
+    drawn = [(curves, x, f"{what} (dB)") for what, curves in panels.items()]
     _curves_figure(path, drawn, 3.6 * len(panels))
 
 

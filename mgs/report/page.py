@@ -18,6 +18,7 @@ import numpy as np
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.up import upright
 from mgs.files import atomic_path
+from mgs.policy.criteria import GAIN_UNIT
 from mgs.report.page_facts import (
     Shown,
     links,
@@ -207,7 +208,7 @@ def _compared(shown: Sequence[Shown], frame: Frame) -> dict[str, Any]:
             alt = f"Render of {one.label} at {view}{quality}."
             sides.append({"label": one.label + quality, "name": name, "alt": alt})
     trained = [one.label for one in shown if view in {f.name for f in one.frames}]
-    note = f"trained on by {', '.join(trained)}" if trained else "never trained on"
+    note = f"trained on by {', '.join(trained)}" if trained else "held out"
     return {"view": view, "note": note, "sides": sides}
 
 
@@ -223,7 +224,12 @@ def _plots(shown: Sequence[Shown]) -> list[dict[str, Any]]:
     }
     gain, left = step_curves(runs, "information_gain"), step_curves(runs, "uncertainty")
     wanted = [
-        ("Information gain of each chosen view (the paper's Fig. 2)", gain, "gain, Eq. 7", True),
+        (
+            "Information gain of each chosen view (the paper's Fig. 2)",
+            gain,
+            f"information gain ({GAIN_UNIT})",
+            True,
+        ),
         ("Surface coverage (Fig. 3)", covered, "coverage (%)", False),
         ("Coverage that each view added (Fig. 3)", added, "percentage points", True),
         ("Variance left, over that of the prior", left, "mean over all parameters", True),

@@ -12,6 +12,7 @@ from urllib.parse import quote
 from mgs.data.dataset import Dataset, Frame
 from mgs.data.up import Up
 from mgs.gaussians import Gaussians
+from mgs.policy.criteria import GAIN_UNIT
 from mgs.report.page_plots import METRIC_NAMES
 from mgs.report.runs import RunFiles, up_of
 from mgs.report.tables import table_cell, table_columns, table_heading, table_row
@@ -118,7 +119,7 @@ def step_facts(step: Mapping[str, Any]) -> list[tuple[str, str]]:
     """(name, value) of a line of steps.jsonl: images, information gain, coverage, and metrics."""
     facts = [("images", str(step["images"]))]
     if step.get("information_gain") is not None:
-        facts.append(("information gain", f"{step['information_gain']:.4g}"))
+        facts.append(("information gain", f"{step['information_gain']:.4g} {GAIN_UNIT}"))
     facts.append(("surface coverage", f"{100 * step['coverage']:.2f} %"))
     return facts + [(METRIC_NAMES[key], table_cell(key, v)) for key, v in measured(step).items()]
 

@@ -38,13 +38,13 @@ GREY = "#7a7a7a"
 
 METRIC_NAMES = {
     "psnr": "PSNR (dB)",
-    "psnr_mask": "PSNR, rock only (dB)",
-    "psnr_corrected": "PSNR, exposure fitted to each view (dB)",
-    "psnr_mask_corrected": "PSNR, rock only, exposure fitted to each view (dB)",
+    "psnr_mask": "masked PSNR (dB)",
+    "psnr_corrected": "PSNR, exposure fitted (dB)",
+    "psnr_mask_corrected": "masked PSNR, exposure fitted (dB)",
 }
 METRIC_NAMES |= {
     f"{key}_{metric}": name.replace("PSNR", f"PSNR, {views}")
-    for key, views in (("held_out", "held out"), ("test", "test views"))
+    for key, views in (("held_out", "held-out views"), ("test", "test views"))
     for metric, name in METRIC_NAMES.items()
 }
 """Metrics of steps.jsonl -> headings."""
@@ -122,7 +122,7 @@ def views_plot(metric: str, runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> 
     traces = []
     for (label, views), style in zip(runs.items(), line_styles(runs), strict=True):
         measured = [view for view in views if view.get(metric) is not None]
-        for trained, which in ((True, "trained on"), (False, "held out")):
+        for trained, which in ((True, "training view"), (False, "held-out view")):
             shown = [view for view in measured if view["trained"] == trained]
             symbol = SYMBOLS[style["marker"]] + ("" if trained else "-open")
             marker = {"symbol": symbol, "color": style["color"], "size": 8}

@@ -19,7 +19,7 @@ class PrunedRun:
     """Result of `prune_run`.
 
     before, after: number of Gaussians. predicted, actual: rms change of the training images
-    (`mgs.splat.pruning.Pruned`). views: "test" or "held out". psnr: on these, before and after, dB;
+    (`mgs.splat.pruning.Pruned`). views: "test" or "held-out". psnr: on these, before and after, dB;
     None if there are none.
     """
 

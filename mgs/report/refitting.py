@@ -33,7 +33,7 @@ class RefittedRun:
     """Result of `refit_run`.
 
     before: number of learned parameters of the run. lean: the refitted model. views: "test" or
-    "held out". psnr: on these, dB, of the run's own model, of one that was refitted with all
+    "held-out". psnr: on these, dB, of the run's own model, of one that was refitted with all
     parameters, and of the refitted one; None if there are none.
     """
 

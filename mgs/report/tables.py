@@ -18,16 +18,16 @@ COLUMNS = {
     "images": "images",
     "test.psnr": "PSNR, test views (dB)",
     "test.ssim": "SSIM, test views",
-    "test.psnr_mask": "PSNR, test views, rock only (dB)",
-    "test.ssim_mask": "SSIM, test views, rock only",
-    "test.psnr_mask_corrected": "PSNR, test views, rock only, exposure fitted to each view (dB)",
-    "all.psnr": "PSNR, all (dB)",
-    "all.ssim": "SSIM, all",
-    "held_out.psnr": "PSNR, held out (dB)",
-    "held_out.ssim": "SSIM, held out",
-    "held_out.psnr_mask": "PSNR, held out, rock only (dB)",
-    "held_out.ssim_mask": "SSIM, held out, rock only",
-    "held_out.psnr_mask_corrected": "PSNR, held out, rock only, exposure fitted to each view (dB)",
+    "test.psnr_mask": "masked PSNR, test views (dB)",
+    "test.ssim_mask": "masked SSIM, test views",
+    "test.psnr_mask_corrected": "masked PSNR, test views, exposure fitted (dB)",
+    "all.psnr": "PSNR, all views (dB)",
+    "all.ssim": "SSIM, all views",
+    "held_out.psnr": "PSNR, held-out views (dB)",
+    "held_out.ssim": "SSIM, held-out views",
+    "held_out.psnr_mask": "masked PSNR, held-out views (dB)",
+    "held_out.ssim_mask": "masked SSIM, held-out views",
+    "held_out.psnr_mask_corrected": "masked PSNR, held-out views, exposure fitted (dB)",
     "coverage": "coverage (%)",
     "path": "path ({unit})",
     "ended": "ended by",
@@ -114,8 +114,8 @@ def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def table_heading(key: str, rows: Sequence[Mapping[str, Any]]) -> str:
     """Heading of a column of these rows."""
-    every = ", all" if has_held_out(rows) else ", views trained on"
-    return COLUMNS[key].replace("{unit}", rows[0]["unit"]).replace(", all", every)
+    every = "all views" if has_held_out(rows) else "training views"
+    return COLUMNS[key].replace("{unit}", rows[0]["unit"]).replace("all views", every)
 
 
 def markdown(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -138,8 +138,8 @@ def _psnr_panels(runs: Mapping[str, RunFiles], every: str) -> dict[str, figures.
     `every`. Empty if a run was measured on neither."""
     for prefix, views in (("test_", "test views"), ("", every)):
         panels = {
-            views: step_curves(runs, f"{prefix}psnr"),
-            f"{views}, rock only": step_curves(runs, f"{prefix}psnr_mask"),
+            f"PSNR, {views}": step_curves(runs, f"{prefix}psnr"),
+            f"masked PSNR, {views}": step_curves(runs, f"{prefix}psnr_mask"),
         }
         if all(len(curves) == len(runs) for curves in panels.values()):
             return panels

@@ -8,6 +8,8 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mgs.policy.criteria import GAIN_UNIT
+
 if TYPE_CHECKING:
     from mgs.run.settings import NbvSettings
 
@@ -79,5 +81,8 @@ def why_ended(ended: Mapping[str, Any]) -> str:
     if ended["reason"] == RunEnd.UNCERTAINTY:
         limit = f"no more than --stop-uncertainty {ended['limit']:g}"
         return f"{ended['uncertainty']:.4g} of the prior's variance is left after {views}, {limit}"
-    gain, limit = f"{ended['information_gain']:.4g}", f"less than --stop-gain {ended['limit']:g}"
+    gain, limit = (
+        f"{ended['information_gain']:.4g} {GAIN_UNIT}",
+        f"less than --stop-gain {ended['limit']:g}",
+    )
     return f"the next view, {ended['name']}, would gain {gain} after {views}, {limit}"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from mgs.errors import InputError, row_named
+from mgs.errors import InputError, flag, row_named
 from mgs.fit.settings import (
     ALPHA_WEIGHT,
     MEAN_RATE,
@@ -180,7 +180,7 @@ def option_of(parts: list[str], value: Any) -> str:
     known = NbvSettings.model_fields.keys() | TrainSettings.model_fields.keys()
     if key in NO_OPTION or key not in known:
         return f"setting {'.'.join(parts)} = {value!r}"
-    option = f"--{key.replace('_', '-').replace('rates', 'rate')}"
+    option = flag(key)
     return f"{option} {kind[0]}={value}" if kind else f"{option} {value}"
 
 
@@ -206,7 +206,7 @@ def check_settings(settings: NbvSettings, frames: int) -> None:
     row_named(OPTIMISERS, settings.train.optimiser, "--optimiser")
     left, where = frames - settings.seeds, settings.dataset
     if left < 0:
-        few = f"has {frames} frames, fewer than {settings.seeds} seeds; lower --seeds"
+        few = f"has {frames} frames, fewer than {settings.seeds} seeds; lower --seed-views"
         raise InputError(f"{where}: {few}")
     if settings.budget > left:
         many = f"--budget {settings.budget} exceeds its {left} candidates; lower --budget"

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from mgs.data.dataset import load_dataset
+from mgs.errors import flag
 from mgs.fit.settings import COLOURS_ALONE, PASSES, WARM_PASSES
 from mgs.plotting import STYLE, new_figure, save_figure
 from mgs.run.nbv import run_nbv
@@ -133,7 +134,7 @@ class Point:
         options = given | given.pop("train") | {"alpha_weight": 0}
         words = ["mgs", "nbv", str(dataset), "--prior", str(prior), "--out", "RUN"]
         for name, value in options.items():
-            words += [f"--{name.replace('_', '-')}", str(value)]
+            words += [flag(name), str(value)]
         return shlex.join(words)
 
 
@@ -301,7 +302,7 @@ def run_chart(
     found = run_cells(out, cells, report)
     unit = float(np.median([one["reference"] for one in found.values() if "reference" in one]))
     for kind in kinds:
-        words = ["mgs", "chart", str(out), "--only", kind, "--preset", preset]
+        words = ["mgs", "chart", str(out), "--only", kind, "--scale", preset]
         words += ["--repeats", str(repeats), *(["--dataset", str(dataset)] if dataset else [])]
         rows = data.rows(kind, out, found, unit)
         claims = [judged(PRESET_CLAIM, rows)] if kind == "run" else []

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from mgs.data.dataset import TEST_FOLDER, load_dataset, write_transforms
-from mgs.errors import InputError
+from mgs.errors import InputError, flag
 from mgs.files import atomic_folder
 from mgs.policy import from_file as policy_file
 from mgs.policy.registry import policy_named
@@ -252,7 +252,7 @@ class Run:
         if self.policy in OTHER_TASKS:
             return ""
         folders = self.cells()[-1].arguments
-        options = " ".join(f"--{key} {value}" for key, value in self.settings().items())
+        options = " ".join(f"{flag(key)} {value}" for key, value in self.settings().items())
         where = f"{folders['dataset']} --prior {folders['prior']} --out RUN"
         return f"mgs nbv {where} --alpha-weight 0 {options}"
 

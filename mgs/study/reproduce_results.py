@@ -454,7 +454,7 @@ def make(
     """Do the cells of a result over so many rocks and write it into OUT/results; returns the files.
     Table I is written anew before each cell, from the runs that are done."""
     result = reproduce.RESULTS[name]
-    command = f"mgs reproduce --preset {preset} --only {name}"
+    command = f"mgs reproduce --scale {preset} --only {name}"
     command += f" --rocks {count}" if result.count(size) > 1 else ""
     if name in ("curves", "pools"):
         command += "".join(f" --policy {_from_here(policy)}" for policy in size.own_policies)
