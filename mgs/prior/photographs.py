@@ -25,9 +25,6 @@ from mgs.survey.fusion import focus, voxel_means
 SOURCES = ("depth", "mesh", "points", "hull", "random")
 """Sources of a prior."""
 
-PHOTOGRAPHIC = ("points", "hull", "random")
-"""Sources whose surface is less sure than the images, so that means are learned by default."""
-
 CLOUD = "sparse.ply"
 """File of a dataset with the points that came with its cameras."""
 

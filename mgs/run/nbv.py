@@ -16,7 +16,7 @@ from mgs.files import atomic_folder
 from mgs.policy.from_file import absolute, in_file
 from mgs.policy.registry import policy_named
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
-from mgs.prior.photographs import PHOTOGRAPHIC, source_of
+from mgs.prior.photographs import source_of
 from mgs.prior.settings import PriorSettings
 from mgs.run import recording
 from mgs.run.folder import DATASET, Run, holds_run, open_run, start
@@ -39,6 +39,14 @@ CAPTURE_PRESET = "quick"
 
 CAPTURE_TEST_VIEWS = 12
 """Test views of a run that captures its images, which has no held-out views."""
+
+
+FREE_PASSES = 30
+"""Passes of a fit of free means to all images. A chosen constant."""
+
+LOOSE = {"points": 4.0, "hull": 4.0, "random": 40.0}
+"""Sources of a prior less sure than the images -> factor on its standard deviations in a fit
+of free means to all images. Chosen constants."""
 
 
 def run_nbv(
@@ -65,6 +73,7 @@ def start_run(
     prior: str | Path | None = None,
     gaussians: int | Literal["auto"] | None = None,
     preset: str | None = None,
+    loose: float = 1.0,
     progress: Progress = no_progress,
     **settings: Any,
 ) -> Run:
@@ -109,7 +118,7 @@ def start_run(
         if built.numbers.get("from") == "random" and complete.train.means != "free":
             free = "pass --means free, or give depth, points or masks"
             raise InputError(f"{where}: starts at random points, not on a surface; {free}")
-        complete = complete.with_spacing(built.spacing)
+        complete = complete.with_spacing(built.spacing, loose)
         start(unfinished, complete, frames)
     return Run(out, complete, loaded, found)
 
@@ -125,16 +134,20 @@ def start_fit(
 ) -> Run:
     """`start_run` of a run that takes all images at once and chooses none.
 
-    By default means are free where the prior comes from photographs (`PHOTOGRAPHIC`), else frozen.
-    Arguments and errors as `start_run`.
+    By default means are free where the prior comes from photographs (`LOOSE`), with FREE_PASSES
+    passes and a looser prior, else frozen. Arguments and errors as `start_run`.
     """
     root = Path(dataset)
     loaded, train = load_dataset(root), dict(settings.pop("train", {}))
     found = Path(prior) if prior is not None else root / "prior"
     known = gaussians is None and (prior is not None or (found / "prior.json").is_file())
     source = load_prior(found).numbers.get("from") if known else source_of(loaded.survey())
-    train.setdefault("means", "free" if source in PHOTOGRAPHIC else "frozen")
-    every = {"seeds": len(loaded), "budget": 0, "train": train}
+    train.setdefault("means", "free" if source in LOOSE else "frozen")
+    loose = 1.0
+    if train["means"] == "free" and source in LOOSE:
+        loose = LOOSE[source]
+        train.setdefault("passes", FREE_PASSES)
+    every = {"seeds": len(loaded), "budget": 0, "train": train, "loose": loose}
     return start_run(
         root, out, prior=prior, gaussians=gaussians, progress=progress, **settings | every
     )

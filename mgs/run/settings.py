@@ -117,16 +117,21 @@ class NbvSettings(BaseModel):
         by_kind = regularisation(groups, self.pixel_noise, self.prior_std)
         return by_kind if self.lam is None else np.full_like(by_kind, self.lam)
 
-    def with_spacing(self, spacing: float) -> NbvSettings:
+    def with_spacing(self, spacing: float, loose: float = 1.0) -> NbvSettings:
         """The settings with a rate and a prior std of learned means, from the samples' spacing, m.
 
-        What is given stays; nothing changes where means are frozen.
+        loose: factor on the default prior std of every kind. What is given stays; nothing changes
+        where means are frozen.
         """
         if self.train.means == "frozen":
             return self
         rates = {"mean": MEAN_RATE * spacing} | self.train.rates
         train = self.train.model_copy(update={"rates": rates})
-        prior_std = {"mean": MEAN_STD * spacing} | self.prior_std
+        prior_std = {
+            kind: loose * std if std == PRIOR_STD.get(kind) else std
+            for kind, std in self.prior_std.items()
+        }
+        prior_std = {"mean": loose * MEAN_STD * spacing} | prior_std
         return self.model_copy(update={"train": train, "prior_std": prior_std})
 
 
