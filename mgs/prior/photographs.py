@@ -91,7 +91,7 @@ def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = 
         "points": "give --points CLOUD.ply",
         "mesh": "give --mesh MESH",
     }
-    cures = [f"take --from {name}" for name in there]
+    cures = [f"take --from {name}" for name in there if name != "random"]
     cures += [way for name, way in ways.items() if name not in there]
     raise InputError(f"{dataset.root}: has {missing}; {', or '.join(cures)}")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -30,7 +31,7 @@ DRAWS = 64
 
 def scattered(
     dataset: Dataset, settings: PriorSettings
-) -> tuple[Mesh, np.ndarray, np.ndarray, float, dict[str, object]]:
+) -> tuple[Mesh, np.ndarray, np.ndarray, float, dict[str, Any]]:
     """Mesh, points [N,3], unit normals [N,3], spacing and items of prior.json of a random start.
 
     Points fill the ball that all cameras see, about the point they look at, inside the masks if all
