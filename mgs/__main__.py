@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import sys
+import warnings
 
 
 def main() -> None:
-    """Run `mgs.cli.app.main`. Raises SystemExit."""
+    """Run `mgs.cli.app.main`. Raises SystemExit. Warnings of libraries are printed with python -W
+    only."""
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
     try:
         from mgs.cli.app import main as run
 

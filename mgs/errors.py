@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import TypeVar
 
@@ -19,8 +20,47 @@ def flag(setting: str) -> str:
 class InputError(ValueError):
     """Bad input. The message is one line: what is wrong, where, and how to correct it.
 
-    The command line prints the message without a traceback and exits with code 2.
+    The command line prints `line`, without a traceback, and exits with code 2. In Python the same
+    message names arguments and functions in place of options and commands.
     """
+
+    @property
+    def line(self) -> str:
+        """The message for the command line."""
+        return str(self.args[0])
+
+    def __str__(self) -> str:
+        return in_python(self.line)
+
+
+ARGUMENTS = {option: setting for setting, option in FLAGS.items()} | {
+    "--from": "source",
+    "--prior-noise": "noise",
+}
+"""Options whose argument in Python has another name."""
+
+FUNCTIONS = {
+    r"`mgs nbv --resume (\S+) --policy (\S+)`": r"`mgs.resume_nbv('\1', policy='\2')`",
+    r"`mgs nbv --resume (\S+)`": r"`mgs.resume_nbv('\1')`",
+    r"`mgs nbv (\S+) --out (\S+)`": r"`mgs.run_nbv('\1', '\2')`",
+    r"`mgs eval (\S+)`": r"`mgs.evaluate('\1')`",
+    r"`mgs prior DATASET --out (\S+)`": r"`mgs.save_prior('\1', mgs.build_prior(dataset))`",
+}
+"""Commands in messages -> calls that do the same."""
+
+
+def in_python(line: str) -> str:
+    """A message with Python's arguments and functions in place of options and commands."""
+    for command, call in FUNCTIONS.items():
+        line = re.sub(command, call, line)
+
+    def argument(found: re.Match[str]) -> str:
+        option = found[0]
+        if option.startswith("`"):
+            return option  # another command
+        return ARGUMENTS.get(option) or option.removeprefix("--").replace("-", "_")
+
+    return re.sub(r"`[^`]*`|(?<![^\s(/])--[a-z][a-z-]+", argument, line)
 
 
 class Notice(UserWarning):

@@ -44,6 +44,14 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+def remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files that ended processes left in a folder and below it."""
+    for left in folder.rglob(".*.[0-9]*.part*"):
+        process = left.name.partition(".part")[0].rpartition(".")[2]
+        if process == str(os.getpid()) or not Path("/proc", process).exists():
+            left.unlink(missing_ok=True)
+
+
 def not_writable(path: Path, error: Exception) -> InputError:
     """InputError for a path that cannot be written, with the reason of the system."""
     return InputError(
@@ -255,6 +263,15 @@ def locked(folder: str | Path) -> Iterator[None]:
             _held.discard(path.resolve())
             with suppress(OSError):
                 path.unlink()
+
+
+@contextmanager
+def working_in(folder: str | Path) -> Iterator[None]:
+    """Context manager: holds the lock of a folder of mgs, without what ended processes left in it.
+    Raises InputError as `locked`."""
+    with locked(folder):
+        remove_leftovers(Path(folder))
+        yield
 
 
 def _lock(path: Path) -> TextIO:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -192,7 +193,8 @@ def read_rgba(path: str | Path) -> np.ndarray:
     if bits < 16:
         return np.asarray(image.convert("RGBA"))
     # Pillow keeps only the upper 8 bits of 16-bit colour.
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    with _silent():
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.uint16:
         raise InputError(f"{path}: not a readable 16-bit PNG; the file is damaged, write it again")
     conversions = {1: cv2.COLOR_GRAY2RGBA, 3: cv2.COLOR_BGR2RGBA, 4: cv2.COLOR_BGRA2RGBA}
@@ -266,17 +268,29 @@ def _exr_size(path: Path) -> tuple[int, int]:
 
 @contextmanager
 def _reading_exr(path: Path) -> Iterator[None]:
-    """Context manager: turns errors of OpenEXR into an InputError, and drops the lines that it
-    prints to the standard error itself."""
-    with open(os.devnull, "wb") as nowhere:
+    """Context manager: turns errors of OpenEXR into an InputError, without the lines that it prints
+    itself."""
+    try:
+        with _silent():
+            yield
+    except (RuntimeError, OSError, ValueError, TypeError, KeyError) as error:
+        raise InputError(
+            f"{path}: not a readable EXR ({error}); the file is damaged, write it again"
+        ) from None
+
+
+_redirecting = Lock()
+"""Held while the standard error is redirected: two threads would not restore it."""
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Context manager: drops what libraries print to the standard error."""
+    with _redirecting, open(os.devnull, "wb") as nowhere:
         kept = os.dup(2)
         try:
             os.dup2(nowhere.fileno(), 2)
             yield
-        except (RuntimeError, OSError, ValueError, TypeError, KeyError) as error:
-            raise InputError(
-                f"{path}: not a readable EXR ({error}); the file is damaged, write it again"
-            ) from None
         finally:
             os.dup2(kept, 2)
             os.close(kept)

@@ -46,6 +46,11 @@ def new_figure(width: float, height: float, dpi: int = DPI) -> Figure:
     return Figure(figsize=(width, height), dpi=dpi, layout="constrained")
 
 
+def literal(text: str) -> str:
+    """Text for a figure in which matplotlib takes no $ as the start of a formula."""
+    return text.replace("$", r"\$")
+
+
 def save_figure(figure: Figure, path: str | Path) -> None:
     """Write a figure in the format of its suffix: .png, .pdf or .svg; the file appears complete.
 

@@ -40,14 +40,19 @@ def opened(
     height: int,
     scheme: str = "light",
     known: Callable[[Any], bool] = lambda message: False,
+    scripts: bool = True,
 ) -> Iterator[tuple[Any, list[str]]]:
     """Open an address in a window of this size; yields the page and a list of what went wrong on
     it: console errors, exceptions, and requests to other hosts.
 
-    known: whether a ConsoleMessage of playwright is an error to pass over.
+    known: whether a ConsoleMessage of playwright is an error to pass over. scripts: whether the
+    browser runs them.
     """
     context = browser.new_context(
-        viewport={"width": width, "height": height}, color_scheme=scheme, has_touch=width < 600
+        viewport={"width": width, "height": height},
+        color_scheme=scheme,
+        has_touch=width < 600,
+        java_script_enabled=scripts,
     )
     page, wrong = context.new_page(), []
     own = ("data:", "blob:", "file:", "about:", address, address.replace("http", "ws"))
@@ -63,6 +68,7 @@ def opened(
     page.on("console", on_console)
     page.on("pageerror", lambda error: wrong.append(str(error)))
     page.on("request", on_request)
+    page.set_default_timeout(200_000)  # the machine may be busy
     page.goto(address)
     try:
         yield page, wrong

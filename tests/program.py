@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from mgs.cli.app import main
+from mgs.report.runs import compare_runs
+from mgs.report.tables import comparison_rows
 
 
 def exit_code(*arguments) -> int:
@@ -26,6 +28,11 @@ def said(capsys) -> tuple[str, str]:
     """Output and errors since the last call, in one line each: rich breaks long ones."""
     captured = capsys.readouterr()
     return " ".join(captured.out.split()), " ".join(captured.err.split())
+
+
+def table_numbers(runs: list[Path]) -> list[dict]:
+    """Rows of the table of these runs."""
+    return comparison_rows(compare_runs(runs))
 
 
 def steps(run: Path) -> list[dict]:

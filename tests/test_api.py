@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny
+from refusals import refused
 
 import mgs
 
@@ -46,24 +47,14 @@ def test_no_module_hides_behind_a_function_of_its_name():
                 )
 
 
-def test_type_checkers_see_the_names(tmp_path):
-    (tmp_path / "program.py").write_text(
-        "import mgs\n\nreveal_type(mgs.render)\nreveal_type(mgs.Camera.position)\nmgs.rendr\n"
-    )
-    command = [sys.executable, "-m", "mypy", str(tmp_path / "program.py")]
-    said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300).stdout
-    assert "gaussians: mgs.gaussians.Gaussians, camera: mgs.camera.Camera" in said
-    assert 'Module has no attribute "rendr"' in said
-    assert (ROOT / "mgs/py.typed").is_file()
-
-
 def test_the_whole_way_from_python(dataset, prior, tmp_path, capsys):
     """Nothing is printed, callbacks are called, and the state is what the folder holds."""
     steps, stages = [], set()
-    state = mgs.run_nbv(
-        dataset,
+    loaded, known = mgs.load_dataset(dataset), mgs.load_prior(prior)
+    run = mgs.run_nbv(
+        loaded,
         tmp_path / "run",
-        prior=prior,
+        prior=known,
         budget=2,
         seeds=3,
         policy="farthest",
@@ -74,15 +65,53 @@ def test_the_whole_way_from_python(dataset, prior, tmp_path, capsys):
     assert capsys.readouterr() == ("", "")
     assert steps == [3, 4, 5]
     assert {"fitting", "information of the training set"} <= stages
-    assert mgs.read_ply(tmp_path / "run/gaussians.ply") == state.gaussians
+    assert mgs.read_ply(tmp_path / "run/gaussians.ply") == run.gaussians
     again = mgs.resume_nbv(tmp_path / "run")
-    assert again.gaussians == state.gaussians
-    assert again.taken == state.taken
-    frames = mgs.load_dataset(dataset).frames
-    metrics = mgs.evaluate(state.gaussians, frames, [frames[i].name for i in state.taken])
+    assert again.gaussians == run.gaussians
+    assert again.state.taken == run.state.taken
+    assert np.array_equal(again.prior.points, known.points)
+    metrics = mgs.evaluate(run)
     assert metrics["images"] == 5
-    information = mgs.fisher(state.gaussians, frames[0].camera)
+    taken = [frame.name for frame in run.taken]
+    same = mgs.evaluate(run.gaussians, loaded, trained=taken)
+    of_file = mgs.evaluate(tmp_path / "run/gaussians.ply")
+    for found in (same, of_file):
+        assert found["held_out"].items() <= metrics["held_out"].items()
+    information = mgs.fisher(run.gaussians, loaded.frames[0].camera)
     assert information.shape == (tiny.POINTS, 11)
     assert isinstance(information, np.ndarray)
-    with pytest.raises(mgs.InputError, match="holds a run"):
+    with pytest.raises(mgs.InputError, match=r"holds a run; `mgs\.resume_nbv\('.*run'\)`"):
         mgs.run_nbv(dataset, tmp_path / "run", prior=prior)
+    with pytest.raises(mgs.InputError, match=r"^seeds 0: must be at least 1"):
+        mgs.run_nbv(dataset, tmp_path / "other", prior=prior, seeds=0)
+
+
+def highest(candidates):
+    """Score of each candidate: its height."""
+    return candidates[:, 2] + 0.1 * candidates[:, 0]
+
+
+def test_a_function_is_a_policy_that_a_resumed_run_asks_for(dataset, prior, tmp_path, capsys):
+    out, given = tmp_path / "run", {"prior": prior, "seeds": 3, "train": {"passes": 1}}
+
+    def stop(state):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        mgs.run_nbv(dataset, out, policy=highest, budget=1, on_step=stop, **given)
+    assert (out / "policy.py").read_text().startswith("def highest(candidates):")
+    with pytest.raises(mgs.InputError, match=r"in Python: mgs\.resume_nbv\(.*policy=highest\)"):
+        mgs.resume_nbv(out)
+    with pytest.raises(mgs.InputError, match="is not the policy of"):
+        mgs.resume_nbv(out, policy=lambda candidates: candidates[:, 0])
+    assert "its policy is a Python function" in refused(capsys, ["nbv", "--resume", out], out)
+    run = mgs.resume_nbv(out, policy=highest)
+    places = np.array([frame.camera.position for frame in run.dataset.frames])
+    left = [i for i in range(len(places)) if i not in run.state.taken[:3]]
+    assert run.state.taken[3] == max(left, key=lambda i: highest(places)[i])
+    assert run.label == "highest"
+    with pytest.raises(mgs.InputError, match="unknown parameter view"):
+        mgs.start_run(dataset, tmp_path / "wrong", policy=lambda view: 0, **given)
+    (out / "policy.py").write_text("def highest(candidates): ...")
+    with pytest.raises(mgs.InputError, match="policy highest: is not as"):
+        mgs.resume_nbv(out, policy=highest)

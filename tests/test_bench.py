@@ -11,7 +11,7 @@ from PIL import Image
 from refusals import refused
 
 from mgs.bench import core, scaling
-from mgs.bench.scaling import OPERATIONS, fitted, growth, linear_growth, scaling_exponents
+from mgs.bench.scaling import OPERATIONS, exponents, fitted, scaling_exponents
 from mgs.cli.app import main
 from mgs.files import read_json
 
@@ -43,39 +43,6 @@ def test_exponents_of_growth():
     assert fitted(points(3000))[0]["n"] == 1000
     one_core = [p for p in records if p["sweep"] != "threads" or p["threads"] == 1]
     assert "threads" not in scaling_exponents(one_core)["forward, cold"]
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_the_chart_shows_the_records(tmp_path, monkeypatch, threads):
-    drawn = []
-    monkeypatch.setattr(scaling, "save_figure", lambda figure, path: drawn.append((figure, path)))
-    records = [p for p in points() if p["sweep"] != "threads" or p["threads"] <= threads]
-    scaling.scaling_figure(tmp_path / "chart.png", records)
-    ((figure, path),) = drawn
-    assert path == tmp_path / "chart.png"
-    axes = figure.axes[:4]
-    sweeps = {"gaussians": "n", "pixels": "pixels", "threads": "threads", "both": "pairs"}
-    for axis, (sweep, key) in zip(axes, sweeps.items(), strict=True):
-        expected = [(p[key], 1e3 * p["forward_warm"]) for p in records if p["sweep"] == sweep]
-        np.testing.assert_allclose(axis.lines[0].get_xydata(), expected)
-    assert [axis.get_legend().get_texts()[0].get_text() for axis in axes] == [
-        "forward, warm: 0.70",
-        "forward, warm: 0.50",
-        "forward, warm: -1.00" if threads > 1 else "forward, warm: ",
-        "forward, warm: 0.90, 1.40",
-    ]
-
-
-def test_linear_growth_finds_its_costs_and_the_worst_deviation():
-    records = points()
-    for p in records:
-        p.update(dict.fromkeys(OPERATIONS, 2e-3 + 3e-9 * p["pairs"] + 5e-9 * p["n"]))
-        p["forward_cold"] = 1e-9 * p["n"] ** 1.5
-        p["fisher_exact"] = 1.0 if p["threads"] == 1 else 4e-9 * p["n"]
-    found = linear_growth(records)
-    assert list(found["forward, warm"].values()) == pytest.approx([2, 3, 5, 0], abs=1e-6)
-    assert list(found["exact Fisher"].values()) == pytest.approx([0, 0, 4, 0], abs=1e-6)
-    assert found["forward, cold"]["worst deviation"] > 0.3
 
 
 def test_cold_renders_a_new_view_in_each_call(monkeypatch):
@@ -136,7 +103,7 @@ def test_peak_memory_is_that_of_the_point_alone():
 
 
 def test_the_json_holds_the_command_as_typed(monkeypatch, capsys, tmp_path):
-    result = {"repeats": 5, "points": points()} | growth(points())
+    result = {"repeats": 5, "points": points()} | exponents(points())
     monkeypatch.setattr(scaling, "bench_scaling", lambda *_: dict(result))
     chart, json = tmp_path / "chart.png", tmp_path / "a b.json"
     arguments = ["bench", "scaling", "--repeats", "5", "--json", str(json), "--chart", str(chart)]

@@ -8,7 +8,7 @@ import synthetic
 from mgs.bench import fit as bench
 from mgs.fit.settings import TrainSettings
 from mgs.metrics import agreement
-from mgs.report.evaluation import evaluate
+from mgs.report.evaluation import evaluate_model
 from mgs.splat import as_drjit
 
 
@@ -24,7 +24,7 @@ def root(tmp_path_factory):
 def make(root):
     """Function of the kind and number of views and the weight of alpha that makes a case."""
     dataset = bench.load_dataset(root)
-    prior, _ = bench.build_prior(dataset, bench.PriorSettings(gaussians=200))
+    prior = bench.build_prior(dataset, gaussians=200)
     return lambda *state: bench.make_case(dataset, prior, *state)
 
 
@@ -42,13 +42,13 @@ def test_the_figures_are_those_of_the_fits(root, make, monkeypatch):
     fitted = case.fit()
     frames, spacing = case.dataset.frames, case.prior.spacing
     names = [frames[i].name for i in case.taken]
-    means = evaluate(fitted.gaussians, frames, names, spacing=spacing)["held_out"]
+    means = evaluate_model(fitted.gaussians, frames, names, spacing=spacing)["held_out"]
     assert figures["psnr_held_out"] == means["psnr"]
     assert figures["psnr_inside_10k"] == means["psnr_inside"]
     assert figures["psnr_inside_20k"] == found["held_out"][400]["psnr_inside"]
     assert figures["psnr_inside_20k"] != means["psnr_inside"]
     tests = case.dataset.test_views().frames
-    on_test = evaluate(fitted.gaussians, [], [], test_frames=tests, spacing=spacing)["test"]
+    on_test = evaluate_model(fitted.gaussians, [], [], test_frames=tests, spacing=spacing)["test"]
     assert found["test"][200] == on_test
     phi = case.objective().phi
     longer = case.fit(passes=3 * fitted.passes, tolerance=0.0)

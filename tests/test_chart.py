@@ -136,7 +136,7 @@ def test_a_run_with_a_preset_writes_what_it_came_to(dataset, prior, tmp_path, mo
     settings = json.loads((tmp_path / "run/config.json").read_text())["settings"]
     assert settings["train"]["passes"] == PRESETS["fast"].passes
     assert settings["warm_passes"] == 4
-    with pytest.raises(InputError, match="--preset 'best': unknown; choose one of fast, balanced"):
+    with pytest.raises(InputError, match=r"^preset 'best': unknown; choose one of fast, balanced"):
         start_run(dataset, tmp_path / "other", prior=prior, preset="best")
     asked = []
 

@@ -161,7 +161,7 @@ def rock(tmp_path_factory):
     """A dataset of an ellipsoid that can be fitted well, with its prior."""
     root = tmp_path_factory.mktemp("rock") / "dataset"
     dataset = synthetic.write_dataset(root, synthetic.orbit_cameras(10, 64, 48))
-    save_prior(root / "prior", build_prior(dataset, PriorSettings(gaussians=600))[0])
+    save_prior(root / "prior", build_prior(dataset, PriorSettings(gaussians=600)))
     return root
 
 
@@ -171,7 +171,7 @@ def warnings(state) -> list[str]:
 
 def test_a_good_run_has_no_warning_and_the_residual_of_new_images(rock, tmp_path):
     before, after = (
-        run_nbv(rock, tmp_path / f"{budget}", budget=budget, seeds=5) for budget in (1, 2)
+        run_nbv(rock, tmp_path / f"{budget}", budget=budget, seeds=5).state for budget in (1, 2)
     )
     assert [line.get("warnings") for line in after.steps] == [None] * 3
     assert all("prior" in line["indicators"] for line in after.steps)
@@ -186,7 +186,7 @@ def test_a_good_run_has_no_warning_and_the_residual_of_new_images(rock, tmp_path
 
 def test_a_side_that_no_seed_saw_is_no_drift_of_the_exposure(rock, tmp_path):
     """Gaussians that no seed saw are grey, and the rock is not."""
-    state = run_nbv(rock, tmp_path / "run", policy="farthest", budget=3, seeds=1)
+    state = run_nbv(rock, tmp_path / "run", policy="farthest", budget=3, seeds=1).state
     assert not any("exposure" in warning for warning in warnings(state))
 
 
@@ -205,7 +205,7 @@ def test_a_warning_is_printed_recorded_and_on_the_page(rock, tmp_path):
 def test_a_prior_in_the_wrong_place_is_noticed_at_the_seeds(rock, tmp_path):
     prior = load_prior(rock / "prior")
     save_prior(tmp_path / "prior", replace(prior, points=prior.points + np.array([0.4, 0, 0])))
-    state = run_nbv(rock, tmp_path / "run", prior=tmp_path / "prior", budget=0, seeds=5)
+    state = run_nbv(rock, tmp_path / "run", prior=tmp_path / "prior", budget=0, seeds=5).state
     assert any("the prior's outline and the masks disagree" in said for said in warnings(state))
 
 
@@ -257,7 +257,7 @@ def test_a_spoiled_dataset_has_the_warning_for_its_fault(rock, tmp_path, spoil):
     frames = list(load_dataset(root).frames)
     spoil(frames)
     write_transforms(root, frames)
-    said = warnings(run_nbv(root, run, prior=rock / "prior", budget=1, seeds=9))
+    said = warnings(run_nbv(root, run, prior=rock / "prior", budget=1, seeds=9).state)
     assert any(words in warning for warning in said), said
     others = set(SPOILED.values()) - {words}
     assert not any(word in warning for warning in said for word in others), said

@@ -127,15 +127,6 @@ def test_every_link_and_picture_leads_somewhere(page):
     assert broken_links(page) == set()
 
 
-def test_a_broken_link_is_found(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text(
-        "# At the paper's `size`\n[a](#at-the-papers-size) [b](page.md#size) [c](x.md)\n\n"
-        "| ![d](y.png) |\n| --- |\n"
-    )
-    assert broken_links(page) == {"page.md#size", "x.md", "y.png"}
-
-
 def command_lines(page):
     """Yield (words, whether the line stands in a block) of every `mgs ...` of a page."""
     for token in MARKDOWN.parse(page.read_text(encoding="utf-8")):
@@ -170,12 +161,3 @@ def wrong_command(words, whole):
 def test_every_command_line_is_one(page):
     wrong = {" ".join(words): wrong_command(words, whole) for words, whole in command_lines(page)}
     assert {line: problem for line, problem in wrong.items() if problem} == {}
-
-
-def test_command_lines_are_found_and_read(tmp_path):
-    block = "mgs prior D --spacing many   # no\nmgs nbv D [--lamb 1]\nmgs eval R # yes\n"
-    (tmp_path / "page.md").write_text(f"`mgs nbv D --polcy P` `mgs fly`\n```\n{block}```\n")
-    found = [wrong_command(words, whole) for words, whole in command_lines(tmp_path / "page.md")]
-    assert found[:2] == ["nbv has no {'--polcy'}", "no command fly"]
-    assert found[2].startswith("Invalid value for '--spacing'")
-    assert found[3:] == ["nbv has no {'--lamb'}", None]

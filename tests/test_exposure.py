@@ -12,7 +12,7 @@ import synthetic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import ExifTags, Image
-from program import command, said
+from program import command, said, table_numbers
 
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.files import read_json
@@ -22,7 +22,7 @@ from mgs.prior.build import build_prior, save_prior
 from mgs.prior.exposure import DARK, GAIN_STD, RATIO_STD, SATURATED, solve_gains
 from mgs.prior.settings import PriorSettings
 from mgs.report.evaluation import evaluate_run
-from mgs.report.tables import markdown_table, table_numbers
+from mgs.report.tables import markdown_table
 from mgs.run.folder import State, read_checkpoint
 from mgs.run.nbv import resume_nbv, run_nbv
 
@@ -111,7 +111,7 @@ def rock(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(synthetic, "albedo", albedo)
         dataset = synthetic.write_dataset(root, synthetic.orbit_cameras(16, 64, 48))
-    save_prior(root / "prior", build_prior(dataset, PriorSettings(gaussians=600))[0])
+    save_prior(root / "prior", build_prior(dataset, PriorSettings(gaussians=600)))
     return root
 
 
@@ -146,7 +146,7 @@ def runs(rock: Path, varied: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     made = {}
     kinds = {"constant": (rock, False), "without": (varied, False), "with": (varied, True)}
     for name, (root, exposure) in kinds.items():
-        state = run_nbv(root, folder / name, exposure=exposure, evaluate_every=4, **RUN)
+        state = run_nbv(root, folder / name, exposure=exposure, evaluate_every=4, **RUN).state
         evaluate_run(folder / name, pictures=False, convergence=True)
         made[name] = state, folder / name
     return made

@@ -19,7 +19,7 @@ from PIL import Image
 
 from mgs.colour import linear_from_srgb
 from mgs.data.meshes import load_mesh
-from mgs.errors import InputError, row_named
+from mgs.errors import InputError
 from mgs.files import (
     atomic_folder,
     atomic_path,
@@ -27,6 +27,7 @@ from mgs.files import (
     copy_file,
     locked,
     read_json,
+    working_in,
     write_csv,
     write_json,
 )
@@ -56,12 +57,6 @@ def test_records_with_other_keys_share_one_csv(tmp_path):
     records = [{"a": 1, "b": None}, {"c": "x, y", "a": 0.5}]
     assert write_csv(tmp_path / "a.csv", records) == tmp_path / "a.csv"
     assert (tmp_path / "a.csv").read_bytes() == b'a,b,c\n1,,\n0.5,,"x, y"\n'
-
-
-def test_an_unknown_row_is_named_with_those_there_are():
-    assert row_named({"a": 1, "b": 2}, "b", "--it") == 2
-    with pytest.raises(InputError, match="--it 'c': unknown; choose one of a, b"):
-        row_named({"a": 1, "b": 2}, "c", "--it")
 
 
 NOISE = np.random.default_rng(0).random((90, 90, 3))
@@ -116,13 +111,6 @@ def test_what_cannot_be_read_is_named_with_its_cause(tmp_path, case, name):
         READERS[name](tmp_path / name)
     assert "damaged" not in str(error.value)
     assert not (tmp_path / "copy.png").exists()
-
-
-def test_a_picture_that_is_none_is_named_alone(tmp_path):
-    (tmp_path / "a.png").write_text("no pixels")
-    path = tmp_path / "a.png"
-    with pytest.raises(InputError, match=f"^{path}: not a readable image; give a PNG or JPEG"):
-        read_png(path)
 
 
 def test_depth_of_three_channels_is_refused(tmp_path):
@@ -184,6 +172,17 @@ def test_an_atomic_folder_appears_whole(tmp_path, there):
         assert not (out / "file").exists()
     assert [path.name for path in out.parent.iterdir()] == ["out"]
     assert (out / "file").exists()
+
+
+def test_what_ended_processes_left_in_a_folder_is_removed(tmp_path):
+    """But nothing of a process that runs, and nothing of the user."""
+    (tmp_path / "renders").mkdir()
+    ended = [f".a.{process}.part.ply" for process in (os.getpid(), 2**30)]
+    kept = {".a.1.part.ply", ".a.part", "a.1.part"}
+    for name in [*ended, *kept]:
+        (tmp_path / "renders" / name).touch()
+    with working_in(tmp_path):
+        assert {path.name for path in (tmp_path / "renders").iterdir()} == kept
 
 
 def test_what_a_killed_process_left_of_an_atomic_folder_is_removed(tmp_path):

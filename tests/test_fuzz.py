@@ -1,24 +1,30 @@
-"""Damaged files in every loader: it succeeds or raises InputError, within bounded memory.
+"""Damaged files in every loader: it succeeds or raises an InputError of one line, prints nothing,
+and takes little memory and time.
 
-`pytest -m fuzz` runs it; FUZZ_SECONDS is the time for each loader, by default 20.
+`pytest -m fuzz` makes them at random. FUZZ_SECONDS: CPU time for each loader, by default 20. The
+same command continues an interrupted pass; --cache-clear begins a new one. An input that fails is
+copied to the folder `corpus`, which the quick suite reads.
 """
 
 from __future__ import annotations
 
+import faulthandler
+import hashlib
 import os
 import resource
-import struct
+import shutil
 import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import tiny
 import trimesh
-from hypothesis import HealthCheck, Phase, given, settings
-from hypothesis import strategies as st
+from grammars import GRAMMARS, damages
+from hypothesis import HealthCheck, Phase, given, seed, settings
 from PIL import Image
 
 from mgs.data.clouds import SparseCloud, read_cloud, write_cloud
@@ -26,29 +32,33 @@ from mgs.data.dataset import load_dataset
 from mgs.data.meshes import load_mesh
 from mgs.data.sources import read_source
 from mgs.errors import InputError
-from mgs.files import read_json
-from mgs.images import exif_exposure, image_size, read_exr, read_rgba, read_values, write_exr
-from mgs.splat_ply import read_ply, write_ply
-from mgs.synth.scene_file import load_scene_file
-
-pytestmark = pytest.mark.fuzz
-SECONDS = float(os.environ.get("FUZZ_SECONDS", "20"))
-MOST_GROWTH = 2 << 30  # bytes, of peak memory by damaged small files
-
-HUGE = (0, 1, 0x7F, 0xFF, 0x7FFFFFFF, 0xFFFFFFFF, 1 << 30)
-WORDS = (
-    b"NaN",
-    b"1e999",
-    b"-1",
-    b"1" * 30,
-    b"null",
-    b"[]",
-    b"{}",
-    b'"\\ud800"',
-    b"",
-    b"\0",
-    b"inf",
+from mgs.files import read_json, write_json
+from mgs.images import (
+    exif_exposure,
+    image_size,
+    read_exr,
+    read_mask,
+    read_rgba,
+    read_values,
+    write_exr,
+    write_png,
 )
+from mgs.report.evaluation import evaluate_run
+from mgs.report.page import write_page
+from mgs.report.runs import read_run
+from mgs.run.folder import open_run
+from mgs.splat_ply import read_ply, write_ply
+from mgs.study.sweep import Cell, found
+from mgs.synth.scene_file import load_scene_file
+from mgs.view.subject import read_subject
+
+CORPUS = Path(__file__).parent / "corpus"
+SECONDS = float(os.environ.get("FUZZ_SECONDS", "20"))
+BATCH = 100
+LONGEST = 60
+"""Seconds after which reading a small file counts as endless, and ends the process."""
+MOST_GROWTH = 2 << 30
+"""Most growth of the peak memory by a damaged small file, bytes."""
 
 
 def read_image(path: Path) -> None:
@@ -60,6 +70,11 @@ def read_image(path: Path) -> None:
 def png(path: Path) -> None:
     pixels = np.random.default_rng(0).integers(0, 255, (24, 32, 4), np.uint8)
     Image.fromarray(pixels).save(path)
+
+
+def png16(path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 65535, (24, 32, 3), np.uint16)
+    cv2.imwrite(str(path), pixels)
 
 
 def exr(path: Path) -> None:
@@ -123,6 +138,38 @@ def of_folder(path: Path) -> None:
     read_source(path.parent)
 
 
+def run(path: Path) -> None:
+    """A finished run of the seeds alone, with its dataset and prior beside it."""
+    root = path.parent.parent
+    data, prior = tiny.write_dataset(root / "data"), tiny.write_prior(root / "prior")
+    tiny.write_run(root / "run", data, prior)
+    evaluate_run(root / "run", pictures=False)
+
+
+def read_all(path: Path) -> None:
+    """Everything that commands read of the run around a file."""
+    root = path.parent.parent
+    found = open_run(root / "run")
+    read_run(root / "run")
+    found.state, found.dataset, found.prior  # noqa: B018
+    read_subject(root / "run")
+
+
+def page(path: Path) -> None:
+    write_page(path.parent.parent / "page.html", [path.parent])
+
+
+def study(path: Path) -> None:
+    write_json(path, {"task": "a:b", "arguments": {"a": 1}, "found": {"psnr": 1.5}})
+
+
+def result(path: Path) -> None:
+    """Read the record of a study's cell."""
+    found(path.parents[2], Cell(path.parent.name, "a:b", {"a": 1}))
+
+
+RUN = ("config.json", "steps.jsonl", "metrics.json")
+
 LOADERS: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], object]]] = {
     "PNG": ("a.png", png, read_image),
     "JPEG": ("a.jpg", lambda path: Image.effect_noise((32, 24), 50).save(path), read_image),
@@ -134,6 +181,14 @@ LOADERS: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], object]]]
     "GLB": ("a.glb", mesh, load_mesh),
     "OBJ": ("a.obj", trimesh.creation.icosphere(subdivisions=0).export, load_mesh),
     "mesh PLY": ("m.ply", trimesh.creation.icosphere(subdivisions=0).export, load_mesh),
+    "16 bits": ("a.png", png16, read_image),
+    "mask": ("a.png", lambda path: write_png(path, np.eye(24, 32, dtype=bool)), read_mask),
+    "checkpoint": ("run/checkpoint.npz", run, read_all),
+    **{f"run {name}": (f"run/{name}", run, read_all) for name in RUN},
+    "page": ("run/metrics.json", run, page),
+    "prior.json": ("prior/prior.json", run, read_all),
+    "prior points": ("prior/points.ply", run, read_all),
+    "study": ("cells/a/result.json", study, result),
     "JSON": ("a.json", lambda path: path.write_text('{"a": [1, 2.5, "b"]}'), read_json),
     "transforms.json": ("transforms.json", transforms, lambda path: load_dataset(path.parent)),
     "import": ("transforms.json", transforms, of_folder),
@@ -147,54 +202,97 @@ LOADERS: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], object]]]
 """Loader -> name of its file, function that writes a sound one, function that reads it."""
 
 
-@st.composite
-def damages(draw: st.DrawFn, data: bytes) -> bytes:
-    """Bytes of a file: truncated, with bytes flipped, with 32-bit numbers or words of a grammar in
-    the place of others, and with a part repeated."""
-    found = bytearray(data)
-    for _ in range(draw(st.integers(1, 4))):
-        place = draw(st.integers(0, max(len(found) - 1, 0)))
-        kind = draw(st.sampled_from(["cut", "flip", "number", "word", "repeat"]))
-        if kind == "cut":
-            del found[place:]
-        elif kind == "flip" and found:
-            found[place] ^= 1 << draw(st.integers(0, 7))
-        elif kind == "number":
-            value = struct.pack(draw(st.sampled_from("<>")) + "I", draw(st.sampled_from(HUGE)))
-            found[place : place + 4] = value
-        elif kind == "word":
-            found[place : place + draw(st.integers(0, 6))] = draw(st.sampled_from(WORDS))
-        else:
-            found[place:place] = found[place : place + draw(st.integers(0, 64))]
-    return bytes(found)
+def harmless(name: str, path: Path) -> None:
+    """Read a file as in the program `mgs`, where warnings of libraries are not printed."""
+    faulthandler.dump_traceback_later(LONGEST, exit=True)
+    read, lines = LOADERS[name][2], []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            read(path)
+        except InputError as error:
+            lines = str(error).splitlines()
+    assert len(lines) < 2
+
+
+def peak() -> int:
+    """Largest memory of this process since `begin_peak`, bytes."""
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def begin_peak() -> int:
+    """Begin to measure the largest memory, bytes; as it is now."""
+    Path("/proc/self/clear_refs").write_text("5")
+    return peak()
+
+
+def keep(name: str, path: Path) -> Path:
+    """Copy an input that failed to the corpus."""
+    data = path.read_bytes()
+    kept = CORPUS / name / hashlib.sha256(data).hexdigest()[:12]
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    kept.write_bytes(data)
+    return kept
 
 
 @pytest.mark.parametrize("name", LOADERS)
-def test_damaged_files(name, tmp_path):
+def test_inputs_that_once_failed(name, tmp_path, capfd):
     file, write, read = LOADERS[name]
-    write(tmp_path / file)
-    sound, until = (tmp_path / file).read_bytes(), time.monotonic() + SECONDS
-    read(tmp_path / file)
-    before = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    kept = sorted((CORPUS / name).glob("*"))
+    if kept:
+        write(tmp_path / file)
+        read(tmp_path / file)
+    for path in kept:
+        (tmp_path / file).write_bytes(path.read_bytes())
+        before = begin_peak()
+        harmless(name, tmp_path / file)
+        assert peak() < before + MOST_GROWTH, path
+    assert capfd.readouterr().err == ""
 
-    @settings(
-        max_examples=100,
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize("name", LOADERS)
+def test_damaged_files(name, request, capfd):
+    """pytest's cache holds the batches and seconds of the loader so far, and whether it is running.
+    After the death of a process, the file that it read last is kept and read again."""
+    cache = request.config.cache
+    batches, spent = cache.get(f"fuzz/{name}", [0, 0.0])
+    folder, running = cache.mkdir("fuzz") / name, f"fuzz/running {name}"
+    file, write, read = LOADERS[name]
+    if cache.get(running, False):
+        kept = keep(name, folder / file)
+        harmless(name, folder / file)
+        kept.unlink()
+    shutil.rmtree(folder, ignore_errors=True)
+    if spent >= SECONDS:
+        pytest.skip(f"had its {SECONDS:g} s; begin a new pass with --cache-clear")
+    folder.mkdir()
+    write(folder / file)
+    sound, tree = (folder / file).read_bytes(), GRAMMARS.get(Path(file).suffix, damages)
+    read(folder / file)
+    before = begin_peak()
+
+    def damaged(data: bytes) -> None:
+        (folder / file).write_bytes(data)
+        harmless(name, folder / file)
+        assert peak() < before + MOST_GROWTH
+        assert capfd.readouterr().err == ""
+
+    options = settings(
+        max_examples=BATCH,
         phases=[Phase.generate, Phase.shrink],
         database=None,
         suppress_health_check=list(HealthCheck),
     )
-    @given(damages(sound))
-    def damaged(data: bytes) -> None:
-        (tmp_path / file).write_bytes(data)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of libraries; the command line prints none
-            lines = []
-            try:
-                read(tmp_path / file)
-            except InputError as error:
-                lines = str(error).splitlines()
-            assert len(lines) < 2
-
-    while time.monotonic() < until:
-        damaged()
-    assert 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < before + MOST_GROWTH
+    while spent < SECONDS:
+        cache.set(running, True)
+        begun = time.process_time()
+        try:
+            seed(batches)(options(given(damages(sound) | tree(sound))(damaged)))()
+        except BaseException:
+            keep(name, folder / file)
+            raise
+        finally:
+            batches, spent = batches + 1, spent + time.process_time() - begun
+            cache.set(f"fuzz/{name}", [batches, spent])
+            cache.set(running, False)

@@ -213,6 +213,19 @@ def test_a_pipe_is_no_file(capsys, dataset, tmp_path):
         assert "is no regular file" in refused(capsys, arguments, out)
 
 
+def test_a_mesh_that_names_a_pipe(tmp_path):
+    """It is not opened, which would never end; the library takes a texture as missing."""
+    os.mkfifo(tmp_path / "pipe.bin")
+    buffers = [{"uri": "pipe.bin", "byteLength": 36}]
+    (tmp_path / "a.gltf").write_text(json.dumps({"asset": {"version": "2.0"}, "buffers": buffers}))
+    with pytest.raises(InputError, match=r"pipe\.bin is no regular file"):
+        load_mesh(tmp_path / "a.gltf")
+    (tmp_path / "a.mtl").write_text("newmtl a\nmap_Kd pipe.bin\n")
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\nusemtl a\n" + TRIANGLE)
+    assert len(load_mesh(tmp_path / "a.obj").faces) == 1
+
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
 FAR = [[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 ABSURD = {"w": {"w": 16.5}, "pose": {"frame": {"transform_matrix": FAR}}, "focal": {"fl_x": 1e300}}
 
@@ -240,6 +253,7 @@ def test_a_colmap_file_of_another_length_than_it_says(tmp_path, name, damage):
 
 IMAGES = {
     "id": (8, b"\xff" * 4),
+    "no rotation": (12, b"\0" * 32),
     "position": (44, b"\0" * 6 + b"\xf0\x7f"),
     "camera": (68, b"\xff" * 4),
     "name of no text": (72, b"\xff"),
@@ -398,10 +412,14 @@ CHECKPOINTS = {
 }
 
 
-@pytest.mark.parametrize("command", ["report", "diagnose"])
-def test_two_reports_on_one_folder(capsys, stranger, command, monkeypatch):
+PLACES = {"report": "report", "diagnose": "diagnostics", "eval": "", "prune": "", "refit": ""}
+"""Command on a run -> folder in the run that it locks."""
+
+
+@pytest.mark.parametrize("command", PLACES)
+def test_two_commands_on_one_run(capsys, stranger, command, monkeypatch):
     monkeypatch.setattr("mgs.report.runs.compare_runs", lambda runs: runs)
-    out = stranger / {"report": "report", "diagnose": "diagnostics"}[command]
+    out = stranger / PLACES[command]
     script = f"from mgs.files import *\nwith folder_locked({str(out)!r}):\n    print(flush=True)\n"
     script += "    input()"
     program = [sys.executable, "-c", script]

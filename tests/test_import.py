@@ -27,7 +27,7 @@ from mgs.data.lens import undistorter
 from mgs.data.sources import read_source
 from mgs.files import read_json
 from mgs.images import write_png
-from mgs.prior.build import build_prior
+from mgs.prior.build import prior_and_cloud
 from mgs.prior.settings import PriorSettings
 
 DISTORTION = np.array([-0.15, 0.04, 0.002, -0.003, 0.0])
@@ -105,7 +105,7 @@ def test_colmap_gives_cameras_and_points_for_a_prior(dataset, tmp_path, binary):
     copy = _import(tmp_path / "colmap", tmp_path / "copy")
     same_cameras(dataset, copy)
     if binary:
-        prior, rock = build_prior(copy, PriorSettings(gaussians=800, backing=0))
+        prior, rock = prior_and_cloud(copy, PriorSettings(gaussians=800, backing=0))
         assert np.median(np.abs(synthetic.level(prior.points))) < 0.02
         assert len(rock.rock_points) > 2000
 

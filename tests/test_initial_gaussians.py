@@ -42,7 +42,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 @pytest.fixture(scope="module")
 def prior(dataset: Dataset) -> Prior:
-    return build_prior(dataset, PriorSettings(gaussians=2000, backing=0))[0]
+    return build_prior(dataset, PriorSettings(gaussians=2000, backing=0))
 
 
 def test_shapes_scales_and_rotations(prior, dataset):
@@ -168,7 +168,7 @@ def test_colours_are_averaged_and_the_mask_counts(prior, dataset, tmp_path):
 
 def test_behind_the_surface_lies_an_opaque_backing(dataset):
     """A third of the Gaussians, evenly spread, a spacing inside, opaque, coloured as above them."""
-    prior = build_prior(dataset, PriorSettings(gaussians=1200))[0]
+    prior = build_prior(dataset, PriorSettings(gaussians=1200))
     gaussians, seen = initial_gaussians(prior, dataset.frames)
     assert (len(gaussians), len(prior.points), len(seen), prior.backed) == (1200, 800, 800, 400)
     surface, backing, over = gaussians[:800], gaussians[800:], slice(0, 400)
@@ -193,7 +193,7 @@ def joined(a: Gaussians, b: Gaussians) -> Gaussians:
 
 
 def test_the_backing_survives_the_file_and_is_part_of_what_a_run_goes_on_from(dataset, tmp_path):
-    prior = build_prior(dataset, PriorSettings(gaussians=300))[0]
+    prior = build_prior(dataset, PriorSettings(gaussians=300))
     loaded = load_prior(save_prior(tmp_path / "prior", prior))
     assert loaded.backed == prior.backed == 100
     assert len(initial_gaussians(loaded, dataset.frames[:2])[0]) == 300
@@ -202,5 +202,5 @@ def test_the_backing_survives_the_file_and_is_part_of_what_a_run_goes_on_from(da
     (tmp_path / "prior/prior.json").write_text(json.dumps(numbers | {"backed": 1000}))
     with pytest.raises(InputError, match="backed must be a number of the points"):
         load_prior(tmp_path / "prior")
-    with pytest.raises(InputError, match="0 to 1; correct --backing"):
+    with pytest.raises(InputError, match="0 to 1; correct backing"):
         PriorSettings(gaussians=300, backing=1.5)

@@ -1,22 +1,34 @@
 """Commands killed (SIGKILL) at random moments and run again: their files equal those of an
-uninterrupted run bit for bit. `pytest -m kill` runs it; KILLS: number of kills, by default 100."""
+uninterrupted run bit for bit. Two processes of every writing command. The memory of 1,000 steps.
+
+`pytest -m kill` runs them; KILLS: number of kills, by default 100. The same command continues an
+interrupted pass; --cache-clear begins a new one.
+"""
 
 from __future__ import annotations
 
 import os
 import re
+import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import synthetic
+import tiny
+
+from mgs.data.dataset import load_dataset, write_transforms
+from mgs.run.nbv import resume_nbv, start_run
 
 pytestmark = pytest.mark.kill
+MOST_GROWTH = 30 << 20
+"""Bytes of memory that the steps from 200 to 1,000 may add: their images and sorted lists."""
 KILLS = int(os.environ.get("KILLS", "100"))
 
 PROGRAM = """
@@ -49,7 +61,24 @@ COMMANDS = {
     "refit": "refit {out}",
     "study": "{out} {data}",
 }
-"""Name -> arguments; `refit` gets a copy of {run}."""
+"""Name -> arguments; those of ON_RUNS get a copy of {run}."""
+
+WRITERS = {name: COMMANDS[name] for name in COMMANDS if name != "study"} | {
+    "prior": "prior {data} --mesh {data}/rock.glb --gaussians 150 --out {out}",
+    "survey": "survey {data} --out {out}",
+    "masks": "dataset masks {out} --prior {prior}",
+    "eval": "eval {out}",
+    "diagnose": "diagnose {out}",
+    "prune": "prune {out}",
+    "report": "report {out} --out {out}/report",
+    "page": "report {out} --html {out}/page.html",
+    "render": "render {run}/gaussians.ply --cameras {data} --out {out}",
+}
+LONG = {name: f"{name} {{out}}" for name in ("demo", "chart", "stress", "parsimony", "reproduce")}
+"""Commands whose winner is stopped when the loser has ended."""
+ON_RUNS = ("refit", "eval", "diagnose", "prune", "report", "page")
+LOST = "works on it|is finished already|holds a run|is not empty|has a mask already"
+"""What the loser may say."""
 
 
 @pytest.fixture(scope="module")
@@ -62,19 +91,19 @@ def places(tmp_path_factory) -> dict[str, Path]:
     paths["scene"].write_text(TOML)
     made = f"prior {data} --mesh {data}/rock.glb --gaussians 150 --out {paths['prior']}"
     nbv = COMMANDS["nbv"].format(**paths | {"out": paths["run"]})
-    for arguments in (made, nbv):
+    for arguments in (made, nbv, f"eval {paths['run']}"):
         subprocess.run([sys.executable, "-c", PROGRAM, *arguments.split()], check=True)
     return paths
 
 
-def started(name: str, places: dict[str, Path]) -> subprocess.Popen:
+def started(name: str, places: dict[str, Path], **pipes: int) -> subprocess.Popen:
     """The process of a command; of a run that has begun, the one that resumes it."""
-    arguments = COMMANDS[name].format(**places).split()
+    arguments = (COMMANDS | WRITERS | LONG)[name].format(**places).split()
     if arguments[0] == "nbv" and (places["out"] / "config.json").is_file():
         arguments = ["nbv", "--resume", str(places["out"])]
     program = [sys.executable, "-c", CELL if name == "study" else PROGRAM, *arguments]
     env = os.environ | {"PYTHONPATH": os.pathsep.join([os.path.dirname(__file__), *sys.path])}
-    return subprocess.Popen(program, env=env, stdout=subprocess.DEVNULL)
+    return subprocess.Popen(program, env=env, stdout=subprocess.DEVNULL, text=True, **pipes)
 
 
 def cleared(name: str, places: dict[str, Path]) -> Path:
@@ -82,8 +111,16 @@ def cleared(name: str, places: dict[str, Path]) -> Path:
     work = places["out"].parent
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir()
-    if name == "refit":
+    if name in ON_RUNS:
         shutil.copytree(places["run"], places["out"])
+    if name == "eval":
+        (places["out"] / "metrics.json").unlink()
+        shutil.rmtree(places["out"] / "renders")
+    if name == "masks":
+        shutil.copytree(places["data"], places["out"])
+        frames = [replace(frame, mask_path=None) for frame in load_dataset(places["out"]).frames]
+        write_transforms(places["out"], frames)
+        shutil.rmtree(places["out"] / "masks")
     return work
 
 
@@ -103,11 +140,16 @@ def contents(work: Path) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_killed_at_any_moment(name, places):
+def test_killed_at_any_moment(name, places, request):
+    """pytest's cache holds the number of kills so far."""
+    cache, count = request.config.cache, -(-KILLS // len(COMMANDS))
+    done = cache.get(f"kill/{name}", 0)
+    if done >= count:
+        pytest.skip(f"had its {count} kills; begin a new pass with --cache-clear")
     work, begun = cleared(name, places), time.monotonic()
     assert started(name, places).wait() == 0
     took, whole = time.monotonic() - begun, contents(work)
-    for moment in np.random.default_rng(KILLS).uniform(0, took, max(1, KILLS // len(COMMANDS))):
+    for moment in np.random.default_rng(0).uniform(0, took, count)[done:]:
         cleared(name, places)
         process = started(name, places)
         time.sleep(moment)
@@ -117,3 +159,46 @@ def test_killed_at_any_moment(name, places):
         after = contents(work)
         differ = [key for key in whole | after if whole.get(key) != after.get(key)]
         assert not differ, f"killed after {moment:.2f} s of {took:.2f}"
+        done += 1
+        cache.set(f"kill/{name}", done)
+
+
+@pytest.mark.parametrize("name", WRITERS | LONG)
+def test_two_processes_of_a_command(name, places):
+    """Both leave what one leaves alone, or one ends with code 2 and a line that says why."""
+    work, whole = cleared(name, places), None
+    if name not in LONG:
+        assert started(name, places).wait() == 0
+        whole = contents(work)
+        cleared(name, places)
+    both = [started(name, places, stderr=subprocess.PIPE) for _ in range(2)]
+    if name in LONG:
+        while all(one.poll() is None for one in both):
+            time.sleep(0.1)
+        for one in both:
+            one.terminate()
+    ends = [(one.communicate()[1], one.returncode) for one in both]
+    lost = [(said, code) for said, code in ends if code not in (0, -signal.SIGTERM)]
+    assert len(lost) < 2, ends
+    for said, code in lost:
+        assert (code, said.count("\n")) == (2, 1), said
+        assert re.search(LOST, said), said
+    if name in LONG:
+        assert len(lost) == 1
+    else:
+        assert contents(work) == whole
+
+
+def test_memory_of_1000_steps_is_flat(tmp_path):
+    """A run of 1,000 views on a minute problem, with the kernels of the program."""
+    data, prior = tiny.write_dataset(tmp_path / "data", 1003), tiny.write_prior(tmp_path / "prior")
+    fit = {"train": {"passes": 1}, "warm_passes": 1}
+    run = start_run(data, tmp_path / "run", prior=prior, seeds=3, budget=1000, batch=100, **fit)
+    resident = {}
+
+    def measure(state) -> None:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        resident[len(state.taken) - 3] = pages * resource.getpagesize()
+
+    resume_nbv(run, on_step=measure)
+    assert resident[1000] < resident[200] + MOST_GROWTH, resident

@@ -37,14 +37,14 @@ def rock(tmp_path_factory) -> Path:
     """A dataset of a rock with its prior."""
     root = tmp_path_factory.mktemp("rock")
     dataset = synthetic.write_dataset(root, synthetic.orbit_cameras(8, 48, 36))
-    mgs.save_prior(root / "prior", mgs.build_prior(dataset, mgs.PriorSettings(gaussians=200))[0])
+    mgs.save_prior(root / "prior", mgs.build_prior(dataset, mgs.PriorSettings(gaussians=200)))
     return root
 
 
 @pytest.mark.parametrize("policy", ["d-optimal", "directional-i"])
 def test_a_loop_by_hand_gives_the_same_views_and_gaussians(rock, tmp_path, policy):
     settings = {"policy": policy, "seeds": 3, "budget": 2, "train": {"passes": 3}}
-    whole = mgs.run_nbv(rock, tmp_path / "run", **settings)
+    whole = mgs.run_nbv(rock, tmp_path / "run", **settings).state
     ours = loop_by_hand(mgs.start_run(rock, tmp_path / "hand", **settings))
     assert ours.taken == whole.taken
     np.testing.assert_array_equal(ours.H, whole.H)

@@ -165,7 +165,7 @@ def options(files, means: str, **values):
 def whole(request, files, tmp_path_factory):
     """(means, run folder, last state) of a complete run."""
     out = tmp_path_factory.mktemp(request.param) / "run"
-    return request.param, out, run_nbv(files[0], out, **options(files, request.param))
+    return request.param, out, run_nbv(files[0], out, **options(files, request.param)).state
 
 
 def test_units_are_spacings_of_the_prior_unless_given(files, tmp_path):
@@ -196,7 +196,7 @@ def test_criteria_see_the_means_and_coverage_does_not(files, whole):
         (0.02 / (MEAN_STD * prior.spacing)) ** 2
     )
     assert state.surface.shape == (len(prior.points), 11)
-    frozen = run_nbv(files[0], out.parent / "frozen", **options(files, "frozen", budget=0))
+    frozen = run_nbv(files[0], out.parent / "frozen", **options(files, "frozen", budget=0)).state
     assert frozen.steps[0]["coverage"] == state.steps[0]["coverage"]
     moved = state.gaussians.means - prior.points
     assert np.abs(moved).max() > 1e-3
@@ -219,7 +219,7 @@ def test_interrupted_and_resumed_the_run_is_the_same(files, whole, tmp_path, mon
     monkeypatch.setattr(operations, "fit", struck)
     with pytest.raises(KeyboardInterrupt):
         run_nbv(files[0], tmp_path / "run", **options(files, means))
-    resumed = resume_nbv(tmp_path / "run")
+    resumed = resume_nbv(tmp_path / "run").state
     assert resumed.taken == state.taken
     assert resumed.gaussians == state.gaussians
     assert (tmp_path / "run/gaussians.ply").read_bytes() == (out / "gaussians.ply").read_bytes()
@@ -227,7 +227,9 @@ def test_interrupted_and_resumed_the_run_is_the_same(files, whole, tmp_path, mon
 
 @pytest.mark.parametrize("policy", ["block-d", "i-optimal", "coverage", "directional-d"])
 def test_policies_choose_with_learned_means(files, tmp_path, policy):
-    state = run_nbv(files[0], tmp_path / "run", **options(files, "normal", budget=1, policy=policy))
+    state = run_nbv(
+        files[0], tmp_path / "run", **options(files, "normal", budget=1, policy=policy)
+    ).state
     assert len(state.taken) == 4
     assert np.isfinite(state.steps[1]["score"])
 

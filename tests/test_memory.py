@@ -23,7 +23,7 @@ from mgs.data.dataset import Dataset, Frame, load_dataset
 from mgs.data.importers import import_source
 from mgs.data.sources import read_source
 from mgs.fit import objective
-from mgs.memory import PADDING, Deferred, kept_within, padded
+from mgs.memory import PADDING, kept_within, padded
 from mgs.prior.build import build_prior, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.run import operations, problem
@@ -41,18 +41,6 @@ def test_results_are_kept_within_the_budget() -> None:
     for _ in range(3):
         assert [int(get(key)[0]) for key in range(4)] == [0, 1, 2, 3]
     assert made == {0: 1, 1: 1, 2: 3, 3: 3}
-
-
-def test_a_deferred_sequence_gets_an_item_at_each_access() -> None:
-    asked = []
-    items = Deferred([5, 6, 7], lambda key: asked.append(key) or 10 * key)  # type: ignore[func-returns-value]
-    assert len(items) == 3
-    assert asked == []
-    assert items[1] == 60
-    assert list(items[1:]) == list(items)[1:] == [60, 70]
-    assert asked == [6, 6, 7, 5, 6, 7]
-    with pytest.raises(IndexError):
-        items[3]
 
 
 class Live:
@@ -75,7 +63,7 @@ class Live:
 def rock(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     root = tmp_path_factory.mktemp("rock") / "dataset"
     dataset = synthetic.write_dataset(root, synthetic.orbit_cameras(9, 48, 36))
-    save_prior(root / "prior", build_prior(dataset, PriorSettings(gaussians=300))[0])
+    save_prior(root / "prior", build_prior(dataset, PriorSettings(gaussians=300)))
     return dataset
 
 
@@ -98,7 +86,7 @@ def test_a_run_holds_few_images_at_once_and_finds_the_same(
         live.now = live.most = 0
         settings = {"policy": "uniform", "seeds": 6, "budget": 3, "evaluate_every": 1}
         settings |= {"exposure": True, "train": {"passes": 2}, "warm_passes": 1}
-        found.append(run_nbv(rock.root, tmp_path / name, **settings))
+        found.append(run_nbv(rock.root, tmp_path / name, **settings).state)
         most.append(live.most)
     assert most[0] >= 9  # all images that were taken are counted
     assert most[1] <= 4

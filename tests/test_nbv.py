@@ -265,7 +265,7 @@ def test_a_fit_that_diverges_ends_the_run_which_can_go_on(
     said = str(stop.value)
     assert "diverged: its loss was 0.0123 at the start, and 0.5, nan in the last passes" in said
     assert f"`train.rates` in {out / 'config.json'}" in said
-    assert f"mgs nbv --resume {out}" in said
+    assert f"mgs.resume_nbv('{out}')" in said
     assert "\n" not in said
     assert ((out / "steps.jsonl").exists() and len(steps(out))) == kept
     whole = run(tmp_path / "whole", dataset, batch=batch)

@@ -257,6 +257,62 @@ def test_the_command(runs, tmp_path, capsys):
     assert "holds no run" in line
 
 
+EVIL = "<img src=x onerror=owned=1>$\\x{1+1}<script>owned=1<a href='https:evil.example'>"
+"""A name that is markup for a browser, for Plotly and for matplotlib."""
+
+
+@pytest.fixture(scope="module")
+def hostile(tmp_path_factory):
+    """The page of a run by a stranger, whose names and texts are markup."""
+    root = tmp_path_factory.mktemp("hostile") / EVIL
+    dataset = tiny.write_dataset(root / "data", 6)
+    text = (dataset / "transforms.json").read_text().replace("kf_0001", EVIL.replace('"', ""))
+    for path in [*dataset.rglob("kf_0001.*")]:
+        path.rename(path.with_stem(EVIL))
+    (dataset / "transforms.json").write_text(text.replace("\\", "\\\\"))
+    loaded = load_dataset(dataset)
+    run = root / EVIL
+    tiny.run(run, loaded, tiny.operations(), budget=2, evaluate_every=1)
+    evaluate_run(run)
+    config = read_json(run / "config.json")
+    config["settings"]["policy"] = f"/a/{EVIL}.py:{EVIL}"
+    config["versions"] = {EVIL: EVIL}
+    write_json(run / "config.json", config)
+    steps = [line | {"warnings": [EVIL]} for line in read_steps(run)]
+    (run / "steps.jsonl").write_text("".join(json.dumps(line) + "\n" for line in steps))
+    write_page(root / "page.html", [run])
+    return root / "page.html"
+
+
+def test_figures_and_pages_take_names_literally(hostile):
+    """A name is no formula to matplotlib and no markup to the page."""
+    command("diagnose", hostile.parent / EVIL, "--views", EVIL)
+    assert EVIL not in hostile.read_text()
+
+
+@pytest.mark.parametrize("scripts", [True, False])
+def test_a_page_about_a_strangers_run_is_safe(browser, hostile, tmp_path, scripts):
+    """Nothing of the run is executed or loaded, with scripts and without; and if markup got in, the
+    policy of the page would stop it."""
+    with opened(browser, hostile.as_uri(), 1280, 900, scripts=scripts) as (tab, wrong):
+        assert tab.locator(f"text={EVIL}").first.is_visible()
+        if scripts:
+            views = tab.locator(".figures .plot").last  # names its views
+            views.scroll_into_view_if_needed()
+            views.locator(".main-svg").first.wait_for(state="attached")
+            assert tab.evaluate("typeof owned") == "undefined"
+        assert tab.locator("svg a, a[href^='https:']").count() == 0
+        assert tab.locator("img[src=x]").count() == 0
+        assert wrong == []
+    text = hostile.read_text().replace("<h1>", "<h1><script>owned=1</script>" + EVIL)
+    (tmp_path / "injected.html").write_text(text)
+    address = (tmp_path / "injected.html").as_uri()
+    with opened(browser, address, 1280, 900, scripts=scripts) as (tab, wrong):
+        assert tab.locator("h1 img").count() == 1
+        if scripts:
+            assert tab.evaluate("typeof owned") == "undefined"
+
+
 @pytest.fixture(scope="module")
 def browser():
     with chromium() as found:

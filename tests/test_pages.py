@@ -33,7 +33,7 @@ def data(tmp_path_factory):
     """Inputs of the how-to pages: demo, photos with depth, a COLMAP model, masks, a mesh."""
     folder = tmp_path_factory.mktemp("readers")
     dataset = synthetic.write_dataset(folder / "demo/dataset", synthetic.orbit_cameras(14, 48, 36))
-    prior, _ = mgs.build_prior(dataset, mgs.PriorSettings(gaussians=300))
+    prior = mgs.build_prior(dataset, mgs.PriorSettings(gaussians=300))
     mgs.save_prior(folder / "demo/prior", prior)
     photos = synthetic.write_dataset(folder / "photos", synthetic.orbit_cameras(10, 48, 36))
     synthetic.write_colmap(photos, folder / "colmap", True)

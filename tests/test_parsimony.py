@@ -65,7 +65,7 @@ def test_only_cameras_count_that_see_the_face():
     middle = resolution(mesh, [first, camera_above(0.2, focal=400)])
     whole = resolution(mesh, [camera_above(0.2, focal=400, size=4000)])
     assert alone.samples < middle.samples < whole.samples
-    with pytest.raises(InputError, match="give --gaussians N"):
+    with pytest.raises(InputError, match="give gaussians N"):
         resolution(mesh, [camera_above(-2.0)])
 
 
@@ -88,9 +88,7 @@ def test_a_prior_takes_its_number_from_the_pixels(data, tmp_path, capsys, asked)
     assert 1.4 / 52.8 < pixel < 2.6 / 52.8  # between the nearest and the farthest point of the rock
     said = capsys.readouterr().out
     assert f"{numbers['n'] + numbers['backed']:,} Gaussians, since the closest pixel covers" in said
-    double, _ = build_prior(
-        write_data(tmp_path / "double", (96, 72)), PriorSettings(gaussians="auto")
-    )
+    double = build_prior(write_data(tmp_path / "double", (96, 72)), PriorSettings(gaussians="auto"))
     assert len(double.points) / numbers["n"] == pytest.approx(4, rel=0.15)
 
 

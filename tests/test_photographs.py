@@ -32,7 +32,7 @@ from mgs.errors import InputError
 from mgs.files import read_json, write_json
 from mgs.images import write_png
 from mgs.prior import hull
-from mgs.prior.build import build_prior, load_prior
+from mgs.prior.build import build_prior, load_prior, prior_and_cloud
 from mgs.prior.hull import visual_hull
 from mgs.prior.initial import initial_gaussians
 from mgs.prior.points import _grown, main_cluster, on_surface, reliable
@@ -155,7 +155,7 @@ def test_real_clouds_give_the_rock(data, tmp_path, kind, masks):
     up, _ = source.up_or_estimate()
     folder = data(kind) / "masks" if masks else None
     dataset = import_source(source, tmp_path / "d", masks=folder, up=up)
-    prior, cloud = build_prior(dataset, PriorSettings(gaussians=600, backing=0))
+    prior, cloud = prior_and_cloud(dataset, PriorSettings(gaussians=600, backing=0))
     rock = read_mesh(data(kind) / "truth.ply")
     distance = distances_to_mesh(prior.points, rock.vertices, rock.faces) / truth["scale"]
     assert prior.numbers["from"] == "points"
@@ -166,7 +166,7 @@ def test_real_clouds_give_the_rock(data, tmp_path, kind, masks):
     assert len(cloud.rock_points) > 150
     assert degrees_between(prior.up, unit_up(truth["up"])) < 3
     if kind == "nerfstudio":
-        again, _ = build_prior(dataset, PriorSettings(gaussians=600, backing=0))
+        again = build_prior(dataset, PriorSettings(gaussians=600, backing=0))
         assert np.array_equal(prior.points, again.points)
 
 
@@ -329,8 +329,8 @@ def test_a_smaller_image_is_the_mean_of_its_blocks_and_rays_stay():
     )
 
 
-def test_downscaled_import(data, tmp_path):
-    source = ["import", data("rgbd"), "--masks", data("rgbd") / "masks", "--out"]
+def test_downscaled_import(exact, tmp_path):
+    source = ["import", exact, "--out"]
     command(*source, tmp_path / "d", "--downscale", "2")
     frame = load_dataset(tmp_path / "d").frames[0]
     assert frame.rgb().shape == (36, 48, 3)
@@ -421,17 +421,6 @@ def apart(root: Path, data: Make) -> None:
     moved(root, data, pose_of)
 
 
-def unfit(root: Path, data: Make) -> None:
-    """Each camera has the masks of another one, far from it, and lies on its side."""
-
-    def pose_of(k: int, pose: np.ndarray) -> np.ndarray:
-        pose[:3] = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]) @ pose[:3] if k % 2 else pose[:3]
-        pose[:3, 3] += [0.25 * (-1) ** k, 0.2 * (-1) ** (k // 2), 0]
-        return pose
-
-    moved(root, data, pose_of)
-
-
 def black(root: Path, data: Make) -> None:
     source = data("colmap-binary")
     for frame in import_source(read_source(source), root, masks=source / "masks").frames:
@@ -461,7 +450,6 @@ REFUSED: dict[str, tuple[Callable[[Path, Make], object], list[str], str]] = {
     "no overlap": (apart, [], "the photographs do not overlap"),
     "black masks": (black, [], "the masks are black in every frame"),
     "black masks, hull": (black, HULL, "the masks are black in every frame"),
-    "poses that do not fit": (unfit, [], "poses and masks do not fit"),
     "no object": (no_object, [], "points lie in one cluster above the ground; give masks"),
     "a surface at random": (bare, ["--from", "random", "--holes", "0.1"], "has no surface"),
     "hull without masks": (bare, HULL, "has no masks; "),
@@ -532,16 +520,6 @@ def test_test_views_get_masks_too(data, tmp_path):
 def test_mask_files_must_not_be_there_yet(exact, tmp_path):
     with pytest.raises(InputError, match="has a mask already"):
         make_masks(load_dataset(exact), read_mesh(exact / "rock.glb"), 0.1)
-
-
-def test_photographs_repeat_by_seed(exact, data, photographs, tmp_path):
-    folders = [data("nerfstudio"), tmp_path / "same", tmp_path / "other"]
-    photographs.make(exact, folders[1], "nerfstudio", 0)
-    photographs.make(exact, folders[2], "nerfstudio", 1)
-    for name in ("transforms.json", "sparse_pc.ply"):
-        files = [(folder / name).read_bytes() for folder in folders]
-        assert files[0] == files[1] != files[2]
-    assert read_json(folders[0] / "transforms.json")["k1"] == photographs.DISTORTION[0]
 
 
 def test_a_part_with_few_points_belongs_to_the_object_above_the_ground():

@@ -195,15 +195,6 @@ def test_gradients_are_those_of_the_api(ply, pixel_format, depth, film):
         assert_near(dr.grad(params[f"integrator.{name}"]), dr.grad(getattr(model, name)))
 
 
-def test_frozen_parameters_get_no_gradient(ply):
-    scene = load(ply)
-    params = mi.traverse(scene)
-    dr.enable_grad(params["integrator.sh"])
-    dr.backward(dr.sum(mi.render(scene, params), axis=None))
-    assert np.abs(np.asarray(dr.grad(params["integrator.sh"]))).max() > 0
-    assert not dr.grad_enabled(params["integrator.means"])
-
-
 def test_samples_and_seeds_change_nothing(ply):
     scene = load(ply)
     cases = ((1, 0), (1, 7), (16, 0))

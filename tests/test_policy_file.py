@@ -166,7 +166,7 @@ def test_a_run_goes_on_with_the_same_file_only(dataset, file, tmp_path, monkeypa
 def test_names_in_files_and_in_tables():
     assert from_file.absolute("d-optimal") == from_file.label("d-optimal") == "d-optimal"
     assert from_file.label("/a/b/mine.py:best") == "mine.py:best"
-    with pytest.raises(InputError, match=r"--policy mine\.py: unknown; choose one of d-optimal"):
+    with pytest.raises(InputError, match=r"^policy mine\.py: unknown; choose one of d-optimal"):
         policy_named("mine.py")
 
 
@@ -204,4 +204,4 @@ def test_a_run_folder_runs_no_program_that_was_not_named(dataset, file, tmp_path
     assert not proof.exists()
     config["settings"]["policy"] = f"{file}:poses"
     (out / "config.json").write_text(json.dumps(config))
-    assert len(mgs.resume_nbv(out, policy=f"{file}:poses").taken) == 5
+    assert len(mgs.resume_nbv(out, policy=f"{file}:poses").state.taken) == 5

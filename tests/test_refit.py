@@ -25,7 +25,6 @@ from mgs.report.evidence import (
     BLOCKS,
     DIRECTIONAL,
     Images,
-    LeftOut,
     Worth,
     kinds,
     last_images,
@@ -195,12 +194,6 @@ def test_few_views_leave_no_choice_of_a_degree(tmp_path):
     start = model()
     found = lean_fit(images_of(start, start, views=BLOCKS - 1), settings(tmp_path))
     assert (found.gaussians.sh_degree, found.left_out) == (0, None)
-
-
-def test_a_gain_within_its_own_error_does_not_pay():
-    assert LeftOut(0.2, 0.1).pays
-    assert not LeftOut(0.1, 0.2).pays
-    assert not LeftOut(-0.2, 0.1).pays
 
 
 def test_each_view_is_left_out_once_with_its_neighbours(tmp_path, monkeypatch):

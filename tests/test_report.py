@@ -13,7 +13,7 @@ import tiny
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
-from program import command
+from program import command, table_numbers
 from program import steps as read_steps
 from refusals import refused
 from rich.console import Console
@@ -26,7 +26,7 @@ from mgs.errors import InputError
 from mgs.files import read_json, write_json
 from mgs.policy.registry import policy_names
 from mgs.report import figures, tables, writing
-from mgs.report.evaluation import evaluate
+from mgs.report.evaluation import evaluate_model
 from mgs.report.figures import POLICY_STYLE
 from mgs.report.page_plots import SYMBOLS
 from mgs.report.runs import compare_runs, read_run
@@ -70,7 +70,7 @@ def write_runs(root):
             one = np.ones((camera.height, camera.width))
             return np.full((*one.shape, 3), grey, np.float32), one, one
 
-        metrics = evaluate(
+        metrics = evaluate_model(
             gaussians,
             dataset.frames,
             trained,
@@ -138,7 +138,7 @@ def test_report_writes_every_figure(runs, tmp_path, drawn):
             picture.load()
             assert picture.size == tuple(drawn[path.name].canvas.get_width_height())
         assert path.stat().st_size < 400_000
-    assert read_json(out / "table.json") == tables.table_numbers(runs)
+    assert read_json(out / "table.json") == table_numbers(runs)
 
     read = {run.policy: run for run in map(read_run, runs)}
     assert len(read["d-optimal"].seeds) == 3
@@ -196,7 +196,7 @@ def test_a_figure_that_is_left_out_is_named(runs, tmp_path, capsys):
 @pytest.mark.parametrize("sets", [["all", "held_out"], ["test", "all", "held_out"]])
 def test_table(request, sets):
     runs = request.getfixturevalue("tested" if "test" in sets else "runs")
-    rows, run = tables.table_numbers(runs), read_run(runs[1])
+    rows, run = table_numbers(runs), read_run(runs[1])
     means = {
         f"{views}.{name}": value for views in sets for name, value in run.metrics[views].items()
     }
@@ -228,7 +228,7 @@ def test_table(request, sets):
 
 
 def test_the_views_that_were_not_measured_have_a_dash(runs, tested):
-    rows = [*tables.table_numbers(runs), *tables.table_numbers(tested)]
+    rows = [*table_numbers(runs), *table_numbers(tested)]
     lines = tables.markdown_table(rows).splitlines()
     assert len({line.count("|") for line in lines}) == 1
     assert (lines[2].count("–"), lines[4].count("–")) == (4, 0)
@@ -280,14 +280,14 @@ def set_setting(name, value):
 UNFIT = {
     "measured before": (
         {"metrics": {"images": 7}},
-        "not evaluated since its last step; measure it with `mgs eval",
+        r"not evaluated since its last step; measure it with `mgs\.evaluate",
     ),
     "another dataset": ({"config": set_setting("dataset", "/elsewhere")}, "another dataset"),
     "frames changed": ({"config": lambda config: config["frames"].pop()}, "its frames differ"),
     "view not measured": ({"metrics": {"views": []}}, "was not evaluated on kf_"),
     "pictures of another model": (
         {"metrics": {"pictures": False}},
-        "no picture of this model; draw it with `mgs eval",
+        r"no picture of this model; draw it with `mgs\.evaluate",
     ),
     "metrics of views without numbers": (
         {"metrics": {"views": [{}]}},
@@ -295,7 +295,7 @@ UNFIT = {
     ),
     "budget raised": (
         {"config": set_setting("budget", 7)},
-        "is unfinished, with 8 of 10 views; go on with `mgs nbv --resume",
+        r"is unfinished, with 8 of 10 views; go on with `mgs\.resume_nbv",
     ),
     "budget of words": (
         {"config": set_setting("budget", "many")},
@@ -317,13 +317,13 @@ def test_missing_files(runs, tmp_path):
         read_run(tmp_path)
     run = changed(runs[0], tmp_path / "run")
     shutil.rmtree(run / "renders")
-    with pytest.raises(InputError, match="draw it with `mgs eval"):
+    with pytest.raises(InputError, match=r"draw it with `mgs\.evaluate"):
         writing.write_report(tmp_path / "report", [run])
     (run / "metrics.json").unlink()
-    with pytest.raises(InputError, match="mgs eval"):
-        tables.table_numbers([run])
+    with pytest.raises(InputError, match=r"mgs\.evaluate"):
+        table_numbers([run])
     (run / "steps.jsonl").unlink()
-    with pytest.raises(InputError, match=r"steps\.jsonl: no such file; .*--resume"):
+    with pytest.raises(InputError, match=r"steps\.jsonl: no such file; .*resume_nbv"):
         read_run(run)
     config = read_json(run / "config.json")
     set_setting("dataset", str(tmp_path / "moved"))(config)
@@ -344,7 +344,7 @@ def test_a_damaged_line(runs, tmp_path, key, value):
         return {k: v for k, v in new.items() if v is not ...}
 
     run = changed(runs[0], tmp_path / "run", steps=damage)
-    line = rf"steps\.jsonl: line 3 is damaged \({key}\b.*: .*anew with `mgs nbv --resume"
+    line = rf"steps\.jsonl: line 3 is damaged \({key}\b.*: .*anew with `mgs\.resume_nbv"
     with pytest.raises(InputError, match=line):
         writing.write_report(tmp_path / "report", [run])
 
@@ -355,7 +355,7 @@ def test_an_unfinished_run(runs, tmp_path):
     lines = (run / "steps.jsonl").read_text().splitlines(keepends=True)
     (run / "steps.jsonl").write_text("".join(lines[:3]))
     (run / "gaussians.ply").unlink()
-    expected = f"{run}: is unfinished, with 5 of 8 views; go on with `mgs nbv --resume {run}`"
+    expected = f"{run}: is unfinished, with 5 of 8 views; go on with `mgs.resume_nbv('{run}')`"
     for metrics in ({}, {"images": 5}, None):
         if metrics is None:
             (run / "metrics.json").unlink()
@@ -364,7 +364,7 @@ def test_an_unfinished_run(runs, tmp_path):
         with pytest.raises(InputError, match=re.escape(expected)):
             writing.write_report(tmp_path / "report", [runs[1], run])
     (run / "steps.jsonl").write_text("".join(lines))
-    expected = r"run: has all 8 views, but no gaussians\.ply; write it with `mgs nbv --resume"
+    expected = r"run: has all 8 views, but no gaussians\.ply; write it with `mgs\.resume_nbv"
     with pytest.raises(InputError, match=expected):
         writing.write_report(tmp_path / "report", [run])
     assert not (tmp_path / "report").exists()

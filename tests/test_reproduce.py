@@ -201,7 +201,7 @@ def test_a_timed_run_has_a_process_of_its_own(quick, tmp_path):
     assert found["choice_seconds"] == pytest.approx(sum(choices) / 4)
     assert 100 < found["peak_megabytes"] < 4000
     wrong = Run(Rock("boulder", 1), ONE, "nonsense", budget=1, timed=True)
-    with pytest.raises(InputError, match="--policy nonsense: unknown"):
+    with pytest.raises(InputError, match=r"^policy nonsense: unknown"):
         run_cells(tmp_path, wrong.cells(), silent)
 
 

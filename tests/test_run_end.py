@@ -7,14 +7,14 @@ import pytest
 import tiny
 from hypothesis import given
 from hypothesis import strategies as st
-from program import change_settings, command, steps
+from program import change_settings, command, steps, table_numbers
 from tiny import resume, run
 
 from mgs.data.dataset import load_dataset
 from mgs.policy import criteria
 from mgs.report.page_facts import read_shown
 from mgs.report.runs import read_run
-from mgs.report.tables import markdown_table, table_numbers
+from mgs.report.tables import markdown_table
 from mgs.run import folder as run_folder
 from mgs.run.ending import run_end, why_ended
 from mgs.run.settings import NbvSettings

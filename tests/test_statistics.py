@@ -7,9 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mgs.plotting import STYLE, save_figure
-from mgs.study import output
-from mgs.study.output import Panel, draw_panels, table, with_interval
+from mgs.study.output import table, with_interval
 from mgs.study.statistics import (
     MOST_ROCKS,
     area,
@@ -126,30 +124,3 @@ def test_columns_are_formats_or_functions_and_missing_values_are_dashes():
     assert with_interval({"d": 1.0, "d_low": 0.5, "d_high": 1.5}, "d") == "+1.00 [+0.50, +1.50]"
     assert with_interval({"d": 1.0, "d_low": None}, "d") == "+1.00"
     assert with_interval({}, "d") == "–"
-
-
-def test_panels_cut_no_point_off(tmp_path, monkeypatch):
-    rng, figures = np.random.default_rng(0), []
-    rows = [
-        {"run": run, "policy": policy, "views": k + 2, "size": 2.0**k, "name": f"long name {k}",
-         "tau": 1.0 if policy == "d-optimal" else rng.random()}
-        for run in "ab" for policy in ("d-optimal", "uniform") for k in range(13)
-    ]  # fmt: skip
-    panels = (
-        Panel("views", "tau", "views", "Kendall's tau", "policy"),
-        Panel("size", "tau", "size", "Kendall's tau", None, True),
-        Panel("name", "tau", "a name for each", "Kendall's tau", "policy"),
-        Panel("missing", "tau", "no rows", "Kendall's tau"),
-    )
-    monkeypatch.setattr(
-        output, "save_figure", lambda *how: (save_figure(*how), figures.append(how[0]))
-    )
-    draw_panels(tmp_path / "it.png", panels, rows)
-    (figure,) = figures
-    assert len(figure.axes) == 3
-    for axis in figure.axes:
-        box, radius = axis.get_window_extent(), STYLE["lines.markersize"] / 72 * figure.dpi / 2
-        for line in axis.lines:
-            x, y = axis.transData.transform(line.get_xydata()).T
-            assert box.x0 + radius < x.min() <= x.max() < box.x1 - radius
-            assert box.y0 + radius < y.min() <= y.max() < box.y1 - radius

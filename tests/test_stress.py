@@ -83,7 +83,7 @@ def root(tmp_path_factory):
     cameras = synthetic.orbit_cameras(3, 48, 36, altitude=2.0)
     tests = synthetic.write_dataset(folder / "dataset/test", cameras)
     write_transforms(folder / "dataset/test", tests.frames)
-    save_prior(folder / "prior", build_prior(dataset, PriorSettings(gaussians=300))[0])
+    save_prior(folder / "prior", build_prior(dataset, PriorSettings(gaussians=300)))
     return folder
 
 

@@ -102,29 +102,3 @@ def test_nothing_but_tests_imports_tests(folder):
             if not getattr(node, "level", 0):
                 names = {name.partition(".")[0] for name in imported(node, "", False)} & tests
                 assert not names, f"{path} line {node.lineno} imports {sorted(names)}"
-
-
-@pytest.mark.parametrize(
-    "statement",
-    [
-        "import p.low.b",
-        "import p.low.b as other",
-        "from p.low import b",
-        "from p.low.b import name",
-        "from ..low import b",
-        "from ..low.b import name",
-        "def f():\n    from p.low import b",
-        "if TYPE_CHECKING:\n    from p.low.b import name",
-    ],
-)
-def test_every_kind_of_import_is_seen(tmp_path, statement):
-    """In a package of two modules that import one another."""
-    imports = {"low/b": "from p.high.a import name", "high/a": statement}
-    for name in ("__init__", "low/__init__", "low/b", "high/__init__", "high/a"):
-        (tmp_path / f"p/{name}.py").parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / f"p/{name}.py").write_text(imports.get(name, ""))
-    graph = import_graph(tmp_path, "p")
-    assert graph["p.high.a"] == {"p.low.b"}
-    assert misplaced(graph, ["low", "high"]) == ["p.low.b imports p.high.a"]
-    assert misplaced(graph, ["high", "low"]) == ["p.high.a imports p.low.b"]
-    assert set(cycle(graph)) == {"p.low.b", "p.high.a"}

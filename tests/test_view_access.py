@@ -98,6 +98,20 @@ def test_a_camera_that_is_none_is_not_drawn(viewer, name, value):
     assert window_camera(SimpleNamespace(**good | {name: value})) is None
 
 
+@pytest.mark.parametrize("message", [b"", b"\xff", "text", b"\x81\xa4type\xa4Nope"])
+def test_a_message_of_no_kind_ends_its_connection_alone(viewer, message, capfd):
+    from websockets.exceptions import ConnectionClosed
+
+    own = f"http://127.0.0.1:{viewer.port}"
+    with connect(viewer, origin=own) as socket:
+        socket.send(message)
+        with pytest.raises(ConnectionClosed):
+            list(socket)
+    with connect(viewer, origin=own) as socket:
+        assert socket.recv()
+    assert capfd.readouterr().err == ""
+
+
 def test_no_message_of_a_window_ends_the_server(viewer):
     class Broken:
         @property

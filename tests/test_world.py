@@ -19,7 +19,7 @@ from mgs.data.up import PLUS_Z, unit_up, upright
 from mgs.files import write_json
 from mgs.gaussians import Gaussians
 from mgs.report import diagnostics, figures
-from mgs.report.evaluation import evaluate
+from mgs.report.evaluation import evaluate_model
 from mgs.report.page import write_page
 from mgs.report.runs import up_of
 from mgs.report.writing import write_report
@@ -56,7 +56,7 @@ def make_run(root: Path, tilted: bool) -> Path:
         shape = camera.height, camera.width
         return np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
 
-    metrics = evaluate(
+    metrics = evaluate_model(
         gaussians, dataset.frames, trained, renderer=black, pictures=root / "run/renders"
     )
     write_json(root / "run/metrics.json", {"policy": "uniform"} | metrics)

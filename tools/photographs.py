@@ -1,10 +1,8 @@
 """Make a photographer's data of an exact dataset: images, and the files of the tools that find
-cameras.
+cameras. Test data of importers and priors.
 
-python tools/photographs.py DATASET OUT --kind colmap-binary [--exposure STOPS] [--seed N]
-
-DATASET is a folder of `mgs synth-orbit`, with exact cameras and depth. OUT holds the same rock with
-the errors of real data, in the format of the kind:
+The folder `out` of `make` holds the same rock with the errors of real data, in the format of the
+kind:
 
 - colmap-text, colmap-binary: JPEG files of a camera that was not held level, with lens distortion;
   a sparse model (sparse/0) in a world that is rotated, scaled and moved. Poses and points have the
@@ -12,19 +10,13 @@ the errors of real data, in the format of the kind:
 - nerfstudio: the same photographs and world, as transforms.json with distortion, and the points as
   a PLY file without tracks.
 - nerf-synthetic: PNG files with alpha, exact poses in a world of another scale, no points.
-- rgbd: PNG files, noisy depth of 16 bits, exact poses in metres.
 
-With --exposure, the JPEG files differ in exposure and white balance, and their EXIF has the
-exposure times.
-
-OUT also has what no importer reads: the true masks (masks), the true rock in the world of these
-data (truth.ply), and the similarity to that world and the gains of the images (truth.json). The
-same seed gives the same files.
+It also has what no importer reads: the true masks (masks), the true rock in the world of these data
+(truth.ply), and the similarity to that world (truth.json). The same seed gives the same files.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,7 +25,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from PIL import ExifTags, Image
+from PIL import Image
 
 from mgs.camera import Camera, opengl_from_opencv
 from mgs.colour import srgb_from_linear
@@ -41,7 +33,6 @@ from mgs.data.dataset import Dataset, Frame, load_dataset
 from mgs.data.meshes import read_mesh
 from mgs.images import LUMA, write_png
 from mgs.seeds import generator
-from mgs.survey.depth_sensor import noisy_depth
 
 # Errors of the data, fixed before the importers were written and not tuned to them.
 
@@ -74,16 +65,10 @@ CROP = 1.2
 stay within its images."""
 QUALITY = 92
 """Quality of the JPEG files."""
-WHITE_BALANCE = 1 / 3
-"""Largest gain of red and blue over that of green, in stops over the largest exposure."""
-SHUTTER = 0.005
-"""Exposure time of a gain of 1, seconds."""
 SCALE = 0.37
 """Units of the new world in a metre, which no importer knows."""
 SHIFT = np.array([2.0, -1.0, 0.5])
 """Origin of the dataset's world in the new one, units."""
-
-KINDS = ("colmap-text", "colmap-binary", "nerfstudio", "nerf-synthetic", "rgbd")
 
 HALF = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 """Offset of intrinsics: OpenCV has pixel centres at whole numbers, mgs at +0.5."""
@@ -244,28 +229,12 @@ def _shows(photo: Photograph, depth: np.ndarray, place: np.ndarray) -> bool:
     return bool(abs(depth[row, column] / z - 1) < 0.01)
 
 
-def exposures(count: int, stops: float, seed: int) -> np.ndarray:
-    """Gains [count,3] of images: exposure of up to so many stops more or less, and white balance,
-    uniform."""
-    rng = generator(seed, "photographs/exposure")
-    exposure = rng.uniform(-stops, stops, (count, 1))
-    balance = WHITE_BALANCE * rng.uniform(-stops, stops, (count, 3))
-    return 2.0 ** (exposure + balance * [1, 0, 1])
-
-
-def write_photographs(photos: Sequence[Photograph], out: Path, gains: np.ndarray | None) -> None:
-    """Write the JPEG files and the true masks. gains: [V,3] of the images, linear RGB; None: all 1,
-    and no EXIF."""
+def write_photographs(photos: Sequence[Photograph], out: Path) -> None:
+    """Write the JPEG files and the true masks."""
     (out / "images").mkdir(parents=True)
-    for k, photo in enumerate(photos):
-        rgb, exif = photo.frame.rgb(), Image.Exif()
-        if gains is not None:
-            rgb = rgb * gains[k].astype(np.float32)
-            tags, base = exif.get_ifd(ExifTags.IFD.Exif), ExifTags.Base
-            tags[base.ExposureTime] = SHUTTER * float(gains[k, 1])
-            tags[base.FNumber], tags[base.ISOSpeedRatings] = 2.8, 100
-        pixels, name = photo.resample(_display(rgb)), photo.frame.name
-        Image.fromarray(pixels).save(out / f"images/{name}.jpg", quality=QUALITY, exif=exif)
+    for photo in photos:
+        pixels, name = photo.resample(_display(photo.frame.rgb())), photo.frame.name
+        Image.fromarray(pixels).save(out / f"images/{name}.jpg", quality=QUALITY)
         mask = photo.resample(photo.frame.mask().astype(np.float32)) >= 0.5
         write_png(out / f"masks/{name}.png", mask)
 
@@ -362,21 +331,6 @@ def write_nerf_synthetic(dataset: Dataset, world: World, out: Path) -> None:
     _write_json(out / "transforms_train.json", {"camera_angle_x": float(angle), "frames": frames})
 
 
-def write_rgbd(dataset: Dataset, out: Path, seed: int) -> None:
-    """Write transforms.json, PNG files, and noisy depth in millimetres (16-bit PNG); the masks are
-    not named in it."""
-    rng, frames = generator(seed, "photographs/depth"), []
-    (out / "depth").mkdir()
-    for frame in dataset.frames:
-        write_png(out / f"images/{frame.name}.png", frame.rgb())
-        write_png(out / f"masks/{frame.name}.png", frame.mask())
-        depth = f"depth/{frame.name}.png"
-        millimetres = np.round(1000 * noisy_depth(frame.depth(), frame.camera, rng))
-        cv2.imwrite(str(out / depth), np.clip(millimetres, 0, 65535).astype(np.uint16))
-        frames.append(_frame(f"images/{frame.name}.png", frame.camera, depth_file_path=depth))
-    _write_json(out / "transforms.json", _lens(dataset.frames[0].camera) | {"frames": frames})
-
-
 def _lens(camera: Camera) -> dict[str, Any]:
     """Size and intrinsics of a camera in transforms.json."""
     K = camera.K
@@ -395,58 +349,34 @@ def _display(linear: np.ndarray) -> np.ndarray:
     return np.round(srgb_from_linear(linear) * 255).astype(np.uint8)
 
 
-def make(root: Path, out: Path, kind: str, seed: int = 0, stops: float = 0.0) -> None:
-    """Write the data of a kind into a new folder. stops: largest exposure difference of COLMAP and
-    nerfstudio images."""
+def make(root: Path, out: Path, kind: str, seed: int = 0) -> None:
+    """Write the data of a kind into a new folder."""
     dataset, rng = load_dataset(root), generator(seed, "photographs")
     out.mkdir(parents=True)
-    gains: dict[str, list[float]] = {}
     if kind == "nerf-synthetic":
         world = World(SCALE, np.eye(3), np.zeros(3))
         write_nerf_synthetic(dataset, world, out)
-    elif kind == "rgbd":
-        world = World(1.0, np.eye(3), np.zeros(3))
-        write_rgbd(dataset, out, seed)
     else:
         world = World(SCALE, random_rotation(rng), SHIFT)
         photos = [photograph(frame, rng) for frame in dataset.frames]
-        drawn = exposures(len(photos), stops, seed) if stops else None
-        if drawn is not None:
-            gains = {f.name: g.tolist() for f, g in zip(dataset.frames, drawn, strict=True)}
-        write_photographs(photos, out, drawn)
+        write_photographs(photos, out)
         points, cameras = triangulated(photos, rng), estimated_cameras(photos, world, seed)
         if kind == "nerfstudio":
             write_nerfstudio(photos, points, cameras, world, out)
         else:
             write_colmap(photos, points, cameras, world, out, kind == "colmap-binary")
-    _write_truth(root, world, out, gains)
+    _write_truth(root, world, out)
 
 
-def _write_truth(root: Path, world: World, out: Path, gains: dict[str, list[float]]) -> None:
+def _write_truth(root: Path, world: World, out: Path) -> None:
     import trimesh
 
     if (root / "rock.glb").is_file():
         rock = read_mesh(root / "rock.glb")
         mesh = trimesh.Trimesh(world.points(rock.vertices), rock.faces, process=False)
         mesh.export(out / "truth.ply")
-    rotation, shift = world.rotation.tolist(), world.shift.tolist()
-    similarity = {"scale": world.scale, "rotation": rotation, "shift": shift}
-    up = {"up": world.rotation[:, 2].tolist()}
-    _write_json(out / "truth.json", similarity | up | {"gains": gains})
+    _write_json(out / "truth.json", {"scale": world.scale, "up": world.rotation[:, 2].tolist()})
 
 
 def _write_json(path: Path, data: dict) -> None:
     path.write_text(json.dumps(data, indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Make a photographer's data of an exact dataset.")
-    parser.add_argument("dataset", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--kind", choices=KINDS, required=True)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--exposure", type=float, default=0.0, metavar="STOPS")
-    given = parser.parse_args()
-    if given.exposure and given.kind in ("nerf-synthetic", "rgbd"):
-        parser.error(f"--exposure is for photographs of colmap and nerfstudio, not {given.kind}")
-    make(given.dataset, given.out, given.kind, given.seed, given.exposure)

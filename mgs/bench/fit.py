@@ -23,9 +23,8 @@ from mgs.policy.criteria import d_optimal, lam_by_kind, regularisation
 from mgs.policy.poses import seed_views
 from mgs.prior.build import Prior, build_prior
 from mgs.prior.initial import initial_gaussians
-from mgs.prior.settings import PriorSettings
 from mgs.report.convergence import CG_ITERATIONS
-from mgs.report.evaluation import evaluate
+from mgs.report.evaluation import evaluate_model
 from mgs.seeds import generator
 from mgs.splat import ListCache, as_drjit, fisher, groups
 
@@ -78,10 +77,14 @@ class Case:
         spacing, tests = self.prior.spacing, self.dataset.test_views()
         if not test:
             names = [self.dataset.frames[i].name for i in self.taken]
-            return dict(evaluate(model, self.dataset.frames, names, spacing=spacing)["held_out"])
+            return dict(
+                evaluate_model(model, self.dataset.frames, names, spacing=spacing)["held_out"]
+            )
         if tests is None:
             return {}
-        return dict(evaluate(model, [], [], test_frames=tests.frames, spacing=spacing)["test"])
+        return dict(
+            evaluate_model(model, [], [], test_frames=tests.frames, spacing=spacing)["test"]
+        )
 
     def scores(self, model: Gaussians) -> np.ndarray:
         """D-optimal score of each view that is not taken [C]."""
@@ -109,7 +112,7 @@ def bench_fit(
     """
     dataset = load_dataset(root)
     report(f"accuracy of {' and '.join(f'{n:,}' for n in SIZES)} Gaussians on {VIEWS} views")
-    priors = {n: build_prior(dataset, PriorSettings(gaussians=n))[0] for n in SIZES}
+    priors = {n: build_prior(dataset, gaussians=n) for n in SIZES}
     cases = {n: make_case(dataset, priors[n], "even", VIEWS, alpha_weight) for n in SIZES}
     fits = {n: case.fit() for n, case in cases.items()}
     means = {n: case.measure(fits[n].gaussians) for n, case in cases.items()}

@@ -10,7 +10,6 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
-from scipy.optimize import nnls
 
 from mgs import runtime
 from mgs.bench.core import surface_camera, surface_gaussians, time_core
@@ -57,7 +56,7 @@ def bench_scaling(
 
     report(what) is called before each point. Returns "repeats"; "points", a record for each point
     with "sweep", "n", "pixels", "threads" and the results of `scaling_point`; and the fits of
-    `growth`.
+    `exponents`.
     """
     threads, base = dr.thread_count(), min(100_000, most)
     numbers = [n for n in NUMBERS if n <= most]
@@ -72,7 +71,7 @@ def bench_scaling(
         report(f"{n:,} Gaussians, {width}x{height}, {count} thread{'' if count == 1 else 's'}")
         where = {"sweep": sweep, "n": n, "pixels": width * height, "threads": count}
         points.append(where | in_new_process(scaling_point, n, width, height, count, repeats))
-    return {"repeats": repeats, "points": points} | growth(points)
+    return {"repeats": repeats, "points": points} | exponents(points)
 
 
 def scaling_point(n: int, width: int, height: int, threads: int, repeats: int) -> dict[str, float]:
@@ -94,14 +93,10 @@ def in_new_process(call: Callable[..., Any], *arguments: Any) -> Any:
         return pool.submit(call, *arguments).result()
 
 
-def growth(points: Records) -> dict[str, Any]:
-    """Fit the records: "exponents" of `scaling_exponents`, "exponents_from_n" (the least N that is
-    fitted) and "linear_growth"."""
-    return {
-        "exponents": scaling_exponents(points),
-        "linear_growth": linear_growth(points),
-        "exponents_from_n": fitted(points)[0]["n"],
-    }
+def exponents(points: Records) -> dict[str, Any]:
+    """Fit the records: "exponents" of `scaling_exponents`, and "exponents_from_n", the least N that
+    is fitted."""
+    return {"exponents": scaling_exponents(points), "exponents_from_n": fitted(points)[0]["n"]}
 
 
 def sweep_points(points: Records, sweep: str) -> Records:
@@ -152,30 +147,6 @@ def exponent(x: list[float], y: list[float]) -> float:
     return float(np.polyfit(np.log(x), np.log(y), 1)[0])
 
 
-def linear_growth(points: Records) -> dict[str, dict[str, float]]:
-    """Fit time = constant + a pairs + b N for each operation; label -> the three numbers and the
-    largest relative deviation of a measured time.
-
-    The costs are not negative. They are fitted by least squares of the relative deviations to all
-    records with most threads. A Gaussian in view has at least one pair, so time is at most
-    constant + (a + b) pairs.
-    """
-    most = max(p["threads"] for p in points)
-    chosen = [p for p in points if p["threads"] == most]
-    terms = np.array([[1.0, p["pairs"], p["n"]] for p in chosen])
-    found = {}
-    for name, label in OPERATIONS.items():
-        seconds = np.array([p[name] for p in chosen])
-        costs, _ = nnls(terms / seconds[:, None], np.ones(len(seconds)))
-        found[label] = {
-            "constant, ms": costs[0] * 1e3,
-            "ns per pair": costs[1] * 1e9,
-            "ns per Gaussian": costs[2] * 1e9,
-            "worst deviation": np.abs(terms @ costs / seconds - 1).max(),
-        }
-    return found
-
-
 def scaling_figure(path: str | Path, points: Records) -> None:
     """Draw time (first row) and memory (second row) against N, pixels, threads and pairs as a PNG.
 
@@ -184,7 +155,7 @@ def scaling_figure(path: str | Path, points: Records) -> None:
     """
     import matplotlib
 
-    exponents, start = scaling_exponents(points), f"{fitted(points)[0]['n']:,}"
+    found, start = scaling_exponents(points), f"{fitted(points)[0]['n']:,}"
     columns = (
         ("n", "Gaussians N", {"gaussians": "N"}, f"exponent, fitted from {start}"),
         ("pixels", "pixels", {"pixels": "pixels"}, "exponent"),
@@ -206,7 +177,7 @@ def scaling_figure(path: str | Path, points: Records) -> None:
         ):
             for axis, (key, name, sweeps, title) in zip(axes, columns, strict=True):
                 for quantity, label in quantities.items():
-                    known = [exponents[label][x] for x in sweeps.values() if x in exponents[label]]
+                    known = [found[label][x] for x in sweeps.values() if x in found[label]]
                     text = f"{label}: {', '.join(f'{value:z.2f}' for value in known)}"
                     _draw_lines(axis, points, (key, quantity, scale), list(sweeps), text)
                 axis.set(xlabel=name)

@@ -50,6 +50,7 @@ COMMANDS = {
     "prior": "prior.prior",
     "nbv": "nbv.nbv",
     "fit": "fit.fit",
+    "suggest": "suggest.suggest",
     "eval": "models.evaluate",
     "diagnose": "models.diagnose",
     "report": "report.report",
@@ -158,7 +159,7 @@ def main(arguments: list[str] | None = None) -> None:
             raise
         raise _stop(_system_error(error), 2) from None
     except InputError as error:
-        raise _stop(str(error), 2) from None
+        raise _stop(error.line, 2) from None
     except typer.TyperException as error:
         message = error.format_message().replace("Value error, ", "")
         raise _stop(" ".join(message.split()), 2) from None

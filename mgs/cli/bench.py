@@ -112,17 +112,13 @@ def bench(
 
 
 def _print_scaling(console: Console, result: dict[str, Any]) -> None:
-    """Print the exponents and the linear fits of time, a row for each quantity."""
-    rows, linear = result["exponents"], result["linear_growth"]
+    """Print the exponents, a row for each quantity."""
+    rows = result["exponents"]
     title = f"fits against N start at {result['exponents_from_n']:,}"
     table = Table("exponent of", *next(iter(rows.values())), title=title)
     for name, row in rows.items():
         table.add_row(name, *(f"{value:z.2f}" for value in row.values()))
-    costs = Table("time of", *next(iter(linear.values())), title="linear fit to all points")
-    for name, row in linear.items():
-        *values, deviation = row.values()
-        costs.add_row(name, *(f"{value:.1f}" for value in values), f"{deviation:.0%}")
-    console.print(table, costs)
+    console.print(table)
 
 
 def _print_splat(console: Console, result: dict[str, Any]) -> None:

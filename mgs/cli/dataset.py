@@ -11,6 +11,7 @@ from rich.console import Console
 from mgs.cli.options import argument, option
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError
+from mgs.files import working_in
 
 UNCERTAINTY = 2.0
 """Error of a prior whose projections are masks, over its depth tolerance."""
@@ -52,7 +53,7 @@ def _make_masks(path: Path, prior: Path, refine: bool) -> None:
     loaded, known = load_dataset(path), load_prior(prior)
     band = UNCERTAINTY * known.depth_tolerance
     console = Console()
-    with progress_bar("masks", console) as progress:
+    with working_in(path), progress_bar("masks", console) as progress:
         shown = partial(progress, "masks")
         made = make_masks(loaded, known.mesh, band, refine=refine, progress=shown)
     console.print(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from rich.console import Console
 
@@ -17,6 +18,10 @@ from mgs.cli.prior import prior
 from mgs.cli.synth_orbit import synth_orbit
 from mgs.errors import InputError
 from mgs.files import check_new_folder, check_writable, read_json
+
+if TYPE_CHECKING:
+    from mgs.run.folder import Run
+    from mgs.run.state import State
 
 POLICIES = ("d-optimal", "paper", "directional-i", "uniform", "random")
 
@@ -42,6 +47,7 @@ def demo(
     from mgs.report.runs import compare_runs
     from mgs.report.tables import comparison_rows
     from mgs.report.writing import write_report
+    from mgs.run.folder import open_run
 
     runtime.start()
     console, started = Console(highlight=False), time.monotonic()
@@ -61,12 +67,17 @@ def demo(
     heading(f"2/5 the prior: {GAUSSIANS:,} Gaussians on the rock's mesh")
     if not (folder / "prior.json").is_file():
         prior(dataset, out=folder, gaussians=str(GAUSSIANS), seed=seed)
+    opened: list[Run] = []
+    share = partial(share_seeds, runs)
     for policy, run in zip(POLICIES, runs, strict=True):
+        if (run / "config.json").is_file():
+            opened.append(open_run(run))
+            continue
+        settings = {"policy": policy, "budget": BUDGET, "seed": seed, "evaluate_every": 1}
+        opened.append(start_and_print(dataset, run, console, prior=folder, **settings))
+    for policy, started_run in zip(POLICIES, opened, strict=True):
         heading(f"3/5 next best views: {policy}, 4 seeds and {BUDGET} views")
-        if not (run / "config.json").is_file():
-            settings = {"policy": policy, "budget": BUDGET, "seed": seed, "evaluate_every": 1}
-            start_and_print(dataset, run, console, prior=folder, **settings)
-        resume_and_print(run, console, pictures=True)
+        resume_and_print(started_run, console, pictures=True, on_state=share)
     heading("4/5 what the views say about each Gaussian")
     diagnose(runs[0])
     heading("5/5 the report")
@@ -78,13 +89,23 @@ def demo(
         console.print(f"  {picture}", soft_wrap=True)
 
 
+def share_seeds(runs: list[Path], state: State) -> None:
+    """Give the fit to the seeds, the same for every policy, to the runs that have none yet."""
+    from mgs.run.folder import write_checkpoint
+
+    for run in runs:
+        if len(state.steps) == 1 and not (run / "checkpoint.npz").is_file():
+            write_checkpoint(run, state)
+
+
 def check_seed(dataset: Path, runs: list[Path], seed: int) -> None:
     """Raises InputError if the dataset or a run exists with another seed."""
     from mgs.run.folder import read_settings
 
     recorded = {run: read_settings(run).seed for run in runs if (run / "config.json").is_file()}
     if (dataset / "config.json").is_file():
-        recorded[dataset] = read_json(dataset / "config.json").get("seed", seed)
+        config = read_json(dataset / "config.json")
+        recorded[dataset] = config.get("seed", seed) if isinstance(config, dict) else seed
     for folder, found in recorded.items():
         if found != seed:
             raise InputError(

@@ -9,7 +9,7 @@ from mgs.cli.nbv import resume_and_print, settings_of, start_and_print, with_set
 from mgs.cli.options import DatasetFolder, option, parse_gaussians
 
 PANELS = {
-    "Fitting": ("passes", "means", "exposure", "alpha_weight", "optimiser", "rates"),
+    "Fitting": ("passes", "means", "density", "exposure", "alpha_weight", "optimiser", "rates"),
     "Advanced": ("pixel_noise", "prior_std", "seed"),
 }
 """Settings with an option of the same name, as `mgs.cli.nbv.PANELS`."""

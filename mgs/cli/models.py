@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 
 from mgs import runtime
-from mgs.cli.options import Run, option
+from mgs.cli.options import Run, argument, option
 from mgs.cli.printing import print_quality
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError
-from mgs.files import folder_locked
+from mgs.files import folder_locked, working_in
 from mgs.policy.criteria import LEARN_LOSS, PRUNE_NOISE
 
 if TYPE_CHECKING:
@@ -21,7 +22,12 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    run: Run,
+    subjects: Annotated[
+        list[Path], argument("Folders that `mgs nbv` wrote, or PLYs.", metavar="RUN|SPLATS.ply...")
+    ],
+    dataset: Annotated[
+        Path | None, option("Dataset of a PLY. Default: that of the run in whose folder it is.")
+    ] = None,
     pictures: Annotated[
         bool, option("Write truth, render and difference of each view to RUN/renders.")
     ] = True,
@@ -30,32 +36,57 @@ def evaluate(
         option("Predict how much lower the last fit could get (Newton decrease).", "--convergence"),
     ] = False,
 ) -> None:
-    """Measure the model on the test views, on all views, and on the held-out views; write
+    """Measure models on the test views, on all views, and on the held-out views; write
     RUN/metrics.json, and renders beside truth.
 
-    Metrics and pictures of the same model and dataset are kept, not made again. The truth is the
-    rock on black. PSNR and SSIM are over the full frame, and masked to the pixels of the rock.
-    metrics.json also has the errors of alpha and depth, where the dataset has their truth.
+    Of a run its refitted and pruned models are measured, too, where they are there; the numbers of
+    a PLY are written beside it. Metrics and pictures of the same model and dataset are kept, not
+    made again. The truth is the rock on black. PSNR and SSIM are over the full frame, and masked to
+    the pixels of the rock. metrics.json also has the errors of alpha and depth, where the dataset
+    has their truth.
     """
+    from mgs.report.measuring import evaluate as measured
+    from mgs.report.pruning import PRUNED
+    from mgs.report.refitting import REFITTED
+    from mgs.report.tables import metrics_row
+
+    runtime.start()
+    rows, said = list[dict[str, Any]](), list[str]()
+    with progress_bar() as bar:
+        progress = partial(bar, "rendering and comparing")
+        for subject in subjects:
+            others = (
+                [subject / name for name in (REFITTED, PRUNED)] if subject.is_dir() else [subject]
+            )
+            if subject.is_dir():
+                if dataset is not None:
+                    raise InputError(f"--dataset: is for a PLY; {subject} has a dataset of its own")
+                options = {"pictures": pictures, "convergence": convergence, "progress": progress}
+                rows += _measured_run(subject, said, options)
+            for path in others:
+                if path.is_file() or path == subject:
+                    name = path.name if path == subject else f"  {path.stem.partition('_')[2]}"
+                    metrics = measured(path, dataset, progress=progress)
+                    rows.append(metrics_row(name, metrics))
+                    said.append(f"wrote {path.with_suffix('.metrics.json')}")
+    print_quality(Console(), rows)
+    _print(said)
+
+
+def _measured_run(run: Path, said: list[str], options: dict[str, Any]) -> list[dict[str, Any]]:
+    """Evaluate a run; return its row of the table. said: gets the lines for the user."""
     from mgs.report.evaluation import evaluate_run
     from mgs.report.runs import Comparison, read_run
     from mgs.report.tables import comparison_rows
     from mgs.run.ending import fit_line
     from mgs.run.folder import open_run
 
-    runtime.start()
-    said: list[str] = []
     opened = open_run(run)
-    with progress_bar() as bar:
-        progress = partial(bar, "rendering and comparing")
-        metrics = evaluate_run(
-            opened, pictures=pictures, convergence=convergence, progress=progress, say=said.append
-        )
-    rows = comparison_rows(Comparison({opened.label: read_run(run)}, opened.dataset))
-    print_quality(Console(), rows)
+    first = len(said)
+    metrics = evaluate_run(opened, say=said.append, **options)
     if "fit" in metrics:
-        said.insert(0, fit_line(metrics["fit"], opened.state.steps[-1]["stop_reason"]))
-    typer.echo("\n".join(said))
+        said.insert(first, fit_line(metrics["fit"], opened.state.steps[-1]["stop_reason"]))
+    return comparison_rows(Comparison({opened.label: read_run(run)}, opened.dataset))
 
 
 def diagnose(
@@ -116,9 +147,10 @@ def prune(
     again, and the run itself stays as it is.
     """
     from mgs.report.pruning import PRUNED, prune_run
+    from mgs.run.folder import open_run
 
     runtime.start()
-    with progress_bar() as bar:
+    with working_in(open_run(run).folder), progress_bar() as bar:
         found = prune_run(run, noise, bar)
     share = 1 - found.after / found.before
     lines = [
@@ -155,10 +187,11 @@ def refit(
     is.
     """
     from mgs.report.refitting import REFITTED, refit_run
+    from mgs.run.folder import open_run
 
     runtime.start()
     options: Any = {"learn": learn, "sh": sh, "loss": loss}
-    with progress_bar() as bar:
+    with working_in(open_run(run).folder), progress_bar() as bar:
         found = refit_run(run, say=bar, **options)
     _print([*_refitted(found), f"wrote {run / REFITTED}"])
 

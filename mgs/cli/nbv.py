@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 PANELS = {
     "Main options": ("policy", "budget", "seeds"),
     "Choosing": ("batch", "nearest", "travel", "stop_gain", "stop_uncertainty"),
+    "Flight": ("flight_length", "flight_time", "speed", "hover", "no_fly", "clearance"),
     "Fitting": ("passes", "warm_passes", "means", "exposure", "alpha_weight", "optimiser", "rates"),
     "Advanced": ("estimator", "lam", "pixel_noise", "prior_std", "evaluate_every", "seed"),
 }
@@ -31,6 +32,12 @@ PANELS = {
 METAVARS = {
     "batch": "K",
     "travel": "METRES",
+    "flight_length": "METRES",
+    "flight_time": "SECONDS",
+    "speed": "M/S",
+    "hover": "SECONDS",
+    "no_fly": "METRES",
+    "clearance": "METRES",
     "stop_gain": "GAIN",
     "stop_uncertainty": "SHARE",
     "alpha_weight": "WEIGHT",
@@ -210,23 +217,32 @@ def start_and_print(
     """`mgs.run.nbv.start_run`, or another start, with its progress; print which prior was found in
     the dataset."""
     from mgs.cli.progress import progress_bar
-    from mgs.run.nbv import start_run
+    from mgs.run.nbv import problem_of, start_run
 
     with progress_bar("starting", console) as progress:
         run = (start or start_run)(dataset, out, progress=progress, **settings)
     found = run.settings.prior
     if settings.get("prior") is None and dataset and found.parent == dataset.resolve():
         console.print(f"prior: {found}", soft_wrap=True)
+    if run.settings.no_fly or run.settings.clearance is not None:
+        allowed = problem_of(run, policy=run.settings.policy).allowed
+        where = f"of {len(allowed)} poses are ruled out by --no-fly and --clearance"
+        console.print(f"{len(allowed) - allowed.sum()} {where}")
     return run
 
 
 def resume_and_print(
-    run: Path | Run, console: Console, policy: str | None = None, pictures: bool = False
+    run: Path | Run,
+    console: Console,
+    policy: str | None = None,
+    pictures: bool = False,
+    on_state: Callable[[State], None] = lambda state: None,
 ) -> None:
     """Run or resume the loop of a run, evaluate (with pictures where asked), print the table of
     steps; where the output is no terminal, a line after each step instead.
 
-    policy: FILE.py:FUNCTION where the run has a policy of the user's own.
+    policy: FILE.py:FUNCTION where the run has a policy of the user's own. on_state: called with
+    every state that is on disk.
     """
     from functools import partial
 
@@ -241,6 +257,7 @@ def resume_and_print(
     with progress_bar("reading", console) as progress:
 
         def on_step(state: State) -> None:
+            on_state(state)
             progress.whole(f"{run.folder.name}: images", len(state.taken), total)
             new = state.steps[len(known) :]
             known.extend(new)
@@ -250,7 +267,7 @@ def resume_and_print(
                 for warning in line.get("warnings", []):
                     progress.print(f"step {line['step']}: {warning}")
 
-        state = resume_nbv(run, on_step, progress, policy)
+        state = resume_nbv(run, on_step, progress, policy).state
         metrics = evaluate_run(
             run.folder, pictures=pictures, progress=partial(progress, "evaluating")
         )

@@ -46,7 +46,7 @@ def fits(console: Console, table: Table) -> bool:
 
 
 def print_quality(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Print the rows of `mgs.report.tables.table_numbers` as a table, for 80 columns.
+    """Print the rows of `mgs.report.tables.comparison_rows` as a table, for 80 columns.
 
     Names that do not fit beside the numbers are printed below, by the number of their row.
     """

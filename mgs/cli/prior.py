@@ -154,17 +154,17 @@ def _built(
     on_stage: Callable[[str], None],
     **options: Any,
 ) -> tuple[Prior, SegmentedCloud | None]:
-    """`build_prior`. A refused cloud is drawn beside `folder`, and the error names the picture."""
-    from mgs.prior.build import build_prior
+    """`prior_and_cloud`. A refused cloud is drawn beside `folder`; the error names the picture."""
+    from mgs.prior.build import prior_and_cloud
     from mgs.prior.figure import draw_refused
     from mgs.prior.segmentation import NoSurface
 
     try:
-        return build_prior(dataset, settings, on_stage, **options)
+        return prior_and_cloud(dataset, settings, on_stage, **options)
     except NoSurface as refused:
         picture = folder.with_name(f"{folder.name}-refused.png")
         draw_refused(picture, refused.points, refused.kept, np.array(dataset.up))
-        raise InputError(f"{refused} (the points: {picture})") from None
+        raise InputError(f"{refused.line} (the points: {picture})") from None
 
 
 def _seed_frames(dataset: Dataset, prior: Prior) -> list[Frame]:

@@ -128,8 +128,10 @@ def _images(model: Path, reconstruction: Any) -> list[tuple[str, Camera, np.ndar
                 f"{model}: camera model {lens.model_name} is not supported; "
                 "run COLMAP's image_undistorter first"
             )
-        pose = np.eye(4)
-        pose[:3] = image.cam_from_world().matrix()
+        pose, world = np.eye(4), image.cam_from_world()
+        if not np.linalg.norm(world.rotation.quat) > 0.5:  # pycolmap normalises all but 0
+            raise InputError(f"{model}: image {image.name!r}: its quaternion is 0; export it again")
+        pose[:3] = world.matrix()
         try:
             camera = Camera(lens.calibration_matrix(), lens.width, lens.height, pose)
         except InputError as error:

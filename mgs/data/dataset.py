@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from mgs.camera import Camera, opencv_from_opengl, opengl_from_opencv
 from mgs.data.rock_image import boundary, read_rock_image
 from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.errors import InputError
-from mgs.files import check_new_folder, read_json, write_json
+from mgs.files import check_new_folder, read_json, remove_leftovers, write_json
 from mgs.images import image_size, read_exr, read_mask, read_png
 
 PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
@@ -193,17 +194,19 @@ def load_dataset(root: str | Path) -> Dataset:
             )
     ordered = tuple(sorted(frames, key=lambda frame: (frame.timestamp, frame.name)))
     up = unit_up(data["up"]) if data.get("up") else PLUS_Z
-    return Dataset(root, ordered, up, str(data.get("unit") or "m"))
+    return Dataset(root, ordered, up, unit_of(path, data) or "m")
 
 
-def load_cameras(path: str | Path) -> list[tuple[str, Camera]]:
+def load_cameras(path: str | Path, like: Camera | None = None) -> list[tuple[str, Camera]]:
     """(file_path, camera) of every frame of a transforms.json, in its order.
 
-    path: the file, or its folder. The image files need not exist. Otherwise raises InputError as
-    `load_dataset`.
+    path: the file, or its folder. like: camera of the intrinsics where the file has none. The image
+    files need not exist. Otherwise raises InputError as `load_dataset`.
     """
     path = Path(path) / "transforms.json" if Path(path).is_dir() else Path(path)
     data, records = read_records(path)
+    if like is not None and not any(key in data | records[0] for key in INTRINSICS):
+        data = _intrinsics(like) | data
     return [
         (record["file_path"], _camera(path, data, i, record)) for i, record in enumerate(records)
     ]
@@ -275,7 +278,7 @@ def posed_camera(
     except np.linalg.LinAlgError:
         raise InputError(f"{where} has a singular transform_matrix; correct the pose") from None
     except InputError as error:
-        raise InputError(f"{where}: {error}") from None
+        raise InputError(f"{where}: {error.line}") from None
 
 
 def finite_number(where: str, what: str, value: Any) -> float:
@@ -293,6 +296,15 @@ def finite_number(where: str, what: str, value: Any) -> float:
 def timestamp_of(where: str, index: int, record: dict[str, Any]) -> float:
     """Time of a frame, seconds. Raises InputError unless it is finite."""
     return finite_number(where, "timestamp", record.get("timestamp", FRAME_INTERVAL * index))
+
+
+def unit_of(path: Path, data: dict[str, Any]) -> str | None:
+    """Name of the unit of length in a transforms.json, None if it has none. Raises InputError
+    unless it is a short word."""
+    unit = data.get("unit")
+    if unit and not (isinstance(unit, str) and re.fullmatch(r"\w{1,16}", unit)):
+        raise InputError(f"{path}: its unit is no word of at most 16 letters; correct it")
+    return unit or None
 
 
 def _frame(path: Path, data: dict[str, Any], index: int, record: dict[str, Any]) -> Frame:
@@ -317,12 +329,17 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
 
 
 def write_transforms(
-    root: str | Path, frames: list[Frame] | tuple[Frame, ...], up: Up = PLUS_Z, unit: str = "m"
+    root: str | Path,
+    frames: list[Frame] | tuple[Frame, ...],
+    up: Up = PLUS_Z,
+    unit: str = "m",
+    notes: dict[str, str] | None = None,
 ) -> None:
     """Write transforms.json into the folder `root`, with paths relative to it.
 
-    up, unit: as `Dataset`. Frames are either all on demand or none. Intrinsics equal to those of
-    the first frame are written once. Write this file last: its presence marks a complete dataset.
+    up, unit: as `Dataset`. notes: more entries, for people. Frames are either all on demand
+    or none. Intrinsics equal to those of the first frame are written once. Write this file last:
+    its presence marks a complete dataset.
     """
     root = Path(root)
     header: dict[str, Any] = {"camera_model": "OPENCV", **_intrinsics(frames[0].camera)}
@@ -340,7 +357,8 @@ def write_transforms(
         own = _intrinsics(frame.camera)
         record |= {key: value for key, value in own.items() if value != header[key]}
         records.append(record)
-    write_json(root / "transforms.json", header | world | demand | {"frames": records})
+    known = header | world | demand | (notes or {})
+    write_json(root / "transforms.json", known | {"frames": records})
 
 
 def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:
@@ -362,8 +380,7 @@ def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:
             f"{out}: is not empty, but holds {state} dataset of other settings or sources; "
             "choose a new folder or delete it"
         )
-    for left in out.rglob(".*.part*"):
-        left.unlink()
+    remove_leftovers(out)
     return True
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -102,6 +103,8 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
         ) from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError(f"{path}: has no faces; give a triangle mesh, not a point cloud")
+    if mesh.vertices.shape[1:] != (3,) or mesh.faces.shape[1:] != (3,):
+        raise InputError(f"{path}: its vertices or faces have no three numbers; export it again")
     if not np.isfinite(mesh.vertices).all():
         first = int(np.argwhere(~np.isfinite(mesh.vertices))[0][0])
         raise InputError(f"{path}: vertex {first} is NaN or infinite; repair the mesh")
@@ -125,14 +128,24 @@ def _load(path: Path) -> Any:
     large."""
     import trimesh
 
-    mesh: Any = trimesh.load(path, process=False) if path.suffix.lower() in GLTF else None
+    class Files(trimesh.resolvers.FilePathResolver):
+        """Reads the files that a mesh names, but no pipe and no device, which may never end."""
+
+        def get(self, name: str) -> bytes:
+            for one in (Path(self.parent, name.strip()), Path(self.parent, Path(name).name)):
+                if one.exists() and not (one.is_file() or one.is_dir()):
+                    raise InputError(f"{path}: {one} is no regular file; correct the name")
+            return super().get(name)
+
+    load = partial(trimesh.load, path, process=False, resolver=Files(str(path)))
+    mesh: Any = load() if path.suffix.lower() in GLTF else None
     parts = list(mesh.graph.nodes_geometry) if isinstance(mesh, trimesh.Scene) else []
     for part in mesh.geometry.values() if parts else ():
         _check_textures(path, part)
     if len(parts) == 1:  # force="mesh" below would lose the file's normals
         transform, name = mesh.graph[parts[0]]
         return mesh.geometry[name].apply_transform(transform)
-    mesh = trimesh.load(path, force="mesh", process=False)
+    mesh = load(force="mesh")
     _check_textures(path, mesh)
     return mesh
 
@@ -179,12 +192,25 @@ def distinct_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     way round, the first."""
     kept = np.flatnonzero(np.linalg.norm(face_crosses(vertices, faces), axis=1) > 0)
     corners = np.sort(_places(vertices)[faces[kept]], axis=1)
-    return kept[np.sort(np.unique(corners, axis=0, return_index=True)[1])]
+    order, number = _numbered(corners)
+    return kept[
+        np.sort(order[np.searchsorted(number[order], np.arange(number.max(initial=-1) + 1))])
+    ]
 
 
 def _places(vertices: np.ndarray) -> np.ndarray:
     """[V] number of each vertex's place. 0.0 and -0.0 are the same coordinate."""
-    return np.unique(vertices + 0.0, axis=0, return_inverse=True)[1].ravel()
+    return _numbered(vertices)[1]
+
+
+def _numbered(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Stable lexicographic order of rows [N,K], and the number [N] of each row among the different
+    ones in that order: as `np.unique(axis=0)`, but many times faster."""
+    order = np.lexsort(rows.T[::-1])
+    new = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
+    number = np.zeros(len(rows), np.int64)
+    number[order[1:]] = np.cumsum(new)
+    return order, number
 
 
 def _wound_against(faces: np.ndarray) -> np.ndarray:
@@ -198,12 +224,8 @@ def _wound_against(faces: np.ndarray) -> np.ndarray:
     """
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     forward = edges[:, 0] < edges[:, 1]
-    _, edge, count = np.unique(
-        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    edge = edge.ravel()
-    order = np.argsort(edge, kind="stable")
-    first, second = order[count[edge[order]] == 2].reshape(-1, 2).T
+    order, edge = _numbered(np.sort(edges, axis=1))
+    first, second = order[np.bincount(edge)[edge[order]] == 2].reshape(-1, 2).T
     against = forward[first] == forward[second]
     n, first, second = len(faces), first // 3, second // 3
     if not against.any():

@@ -20,6 +20,7 @@ from mgs.data.dataset import (
     posed_camera,
     read_records,
     timestamp_of,
+    unit_of,
 )
 from mgs.data.up import PLUS_Z, Up, degrees_between, unit_up, up_of_cameras
 from mgs.errors import InputError
@@ -189,7 +190,7 @@ def _read_transforms(path: Path) -> Source:
     no_cloud = cloud if cloud is not None and not cloud.is_file() else None
     sparse = read_cloud(cloud) if cloud is not None and no_cloud is None else None
     up = unit_up(data["up"]) if data.get("up") else None
-    length = str(data.get("unit") or "") or ("m" if any(shot.depth for shot in shots) else None)
+    length = unit_of(path, data) or ("m" if any(shot.depth for shot in shots) else None)
     return Source(kind, shots, missing, sparse, up, length, no_cloud)
 
 

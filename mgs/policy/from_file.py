@@ -1,4 +1,4 @@
-"""Load a policy from a user's file, named FILE.py:FUNCTION."""
+"""Policies of a user's own: from a file, named FILE.py:FUNCTION, or a Python function."""
 
 from __future__ import annotations
 
@@ -42,6 +42,31 @@ CANDIDATE_ARGUMENTS: dict[str, Callable[[PolicyContext, int], Any]] = {
 surface, and its camera centre [3]."""
 
 
+FUNCTION = "python:"
+"""Start of the name of a policy that is a Python function: python:MODULE.NAME."""
+
+
+def name_of(policy: str | Callable[..., Any]) -> str:
+    """Name of a policy: itself, or the import path of a function."""
+    if isinstance(policy, str):
+        return absolute(policy)
+    name = getattr(policy, "__qualname__", type(policy).__qualname__)
+    return f"{FUNCTION}{policy.__module__}.{name}"
+
+
+def is_function(name: str) -> bool:
+    """Whether the name of a policy is that of a Python function."""
+    return name.startswith(FUNCTION)
+
+
+def source_of(function: Callable[..., Any]) -> str:
+    """Source text of a function; empty where Python does not know it."""
+    try:
+        return inspect.getsource(function)
+    except (OSError, TypeError):
+        return ""
+
+
 def in_file(name: str) -> bool:
     """Whether the name of a policy has the form FILE.py:FUNCTION."""
     return ".py:" in name
@@ -53,7 +78,9 @@ def absolute(name: str) -> str:
 
 
 def label(name: str) -> str:
-    """The name of a policy without the folder of its file."""
+    """The name of a policy without the folder of its file, or its module."""
+    if is_function(name):
+        return name.rpartition(".")[2]
     return Path(name).name if in_file(name) else name
 
 
@@ -93,7 +120,7 @@ def load(name: str) -> Policy:
     function = getattr(module, name.rpartition(":")[2], None)
     if not callable(function):
         raise _no_function(name)
-    return _by_parameter_name(name, path, function)
+    return by_parameter_name(name, function, path)
 
 
 def _source(name: str) -> bytes:
@@ -134,8 +161,12 @@ def _no_function(name: str) -> InputError:
     )
 
 
-def _by_parameter_name(name: str, path: Path, function: Callable[..., Any]) -> Policy:
-    """Wrap a function as a policy; its arguments are passed by parameter name."""
+def by_parameter_name(name: str, function: Callable[..., Any], path: Path | None = None) -> Policy:
+    """Wrap a function as a policy; its arguments are passed by parameter name.
+
+    path: its file, where the user named one: then its errors are InputError, with their line.
+    Raises InputError for an unknown parameter.
+    """
     known = [*CANDIDATE_ARGUMENTS, *CONTEXT_ARGUMENTS]
     parameters = list(inspect.signature(function).parameters)
     if unknown := [parameter for parameter in parameters if parameter not in known]:
@@ -157,6 +188,8 @@ def _by_parameter_name(name: str, path: Path, function: Callable[..., Any]) -> P
         except InputError:
             raise
         except Exception as error:
+            if path is None:
+                raise
             raise InputError(f"--policy {name}: {_failed(path, error)}") from error
 
     return policy

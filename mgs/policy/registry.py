@@ -9,6 +9,7 @@ Three tables hold them, by what their functions use: information
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,11 +146,19 @@ def check_policy(name: str) -> None:
     (`mgs.policy.from_file.check`)."""
     if from_file.in_file(name):
         from_file.check(name)
-    elif name not in policy_names():
+    elif not from_file.is_function(name) and name not in policy_names():
         raise InputError(
             f"--policy {name}: unknown; choose one of {', '.join(policy_names())}, "
             "or add your own (docs/howto/policy.md)"
         )
+
+
+def policy_of(policy: str | Callable[..., Any]) -> Policy:
+    """The policy of a name, or of a function. Raises InputError as `policy_named` and
+    `mgs.policy.from_file.by_parameter_name`."""
+    if isinstance(policy, str):
+        return policy_named(policy)
+    return from_file.by_parameter_name(from_file.name_of(policy), policy)
 
 
 def policy_named(name: str) -> Policy:
@@ -157,6 +166,8 @@ def policy_named(name: str) -> Policy:
     `mgs.policy.from_file.load`."""
     if from_file.in_file(name):
         return from_file.load(name)
+    if from_file.is_function(name):
+        raise InputError(f"--policy {name}: is a Python function; give it again in Python")
     check_policy(name)
     if name in CRITERIA:
         return _of_criterion(CRITERIA[name])

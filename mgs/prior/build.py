@@ -17,13 +17,14 @@ from scipy.spatial import cKDTree
 
 from mgs.camera import Camera
 from mgs.data.clouds import SparseCloud, write_cloud
-from mgs.data.dataset import Dataset, Frame
+from mgs.data.dataset import Dataset, Frame, load_dataset
 from mgs.data.lens import shrunk_to
 from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh
 from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.data.visibility import in_mask, visible
 from mgs.errors import InputError
 from mgs.files import atomic_path, new_folder, read_json, write_json
+from mgs.memory import decoding
 from mgs.prior.hull import MOST_PIXELS
 from mgs.prior.photographs import (
     Surface,
@@ -64,6 +65,25 @@ class Prior:
 
 
 def build_prior(
+    dataset: str | Path | Dataset,
+    settings: PriorSettings | None = None,
+    on_stage: Callable[[str], None] = lambda stage: None,
+    *,
+    source: str | None = None,
+    points: Path | None = None,
+    up: Up | Literal["auto"] | None = None,
+    **given: Any,
+) -> Prior:
+    """Build the prior of a dataset, as `build_prior(dataset, gaussians=2000)`.
+
+    settings, or given: fields of `PriorSettings`. Other arguments and errors as `prior_and_cloud`.
+    """
+    dataset = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
+    asked = replace(settings or PriorSettings(), **given)
+    return prior_and_cloud(dataset, asked, on_stage, source=source, points=points, up=up)[0]
+
+
+def prior_and_cloud(
     dataset: Dataset,
     settings: PriorSettings,
     on_stage: Callable[[str], None] = lambda stage: None,
@@ -287,12 +307,13 @@ def load_prior(folder: str | Path) -> Prior:
     if not path.is_file():
         raise InputError(f"{path}: no such file; make the prior again with `mgs prior`")
     try:
-        data = PlyData.read(str(path))["vertex"].data
+        with decoding(path):
+            data = PlyData.read(str(path))["vertex"].data
         names = ("x", "y", "z", "nx", "ny", "nz")
         columns = np.stack([np.asarray(data[name], np.float64) for name in names], 1)
         spacing, tolerance = float(numbers["spacing"]), float(numbers["depth_tolerance"])
         backed, up = int(numbers["backed"]), unit_up(numbers["up"])
-    except (PlyParseError, KeyError, ValueError, TypeError, UnicodeDecodeError) as error:
+    except (PlyParseError, KeyError, ValueError, TypeError, OverflowError) as error:
         raise InputError(
             f"{folder}: not a readable prior ({error}); make it again with `mgs prior`"
         ) from None

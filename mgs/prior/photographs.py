@@ -150,7 +150,7 @@ def surface_of(
     except InputError as error:
         points_kept = segmented.cloud.points
         kept = cKDTree(segmented.rock_points).query(points_kept)[0] == 0
-        raise NoSurface(str(error), points_kept, kept) from None
+        raise NoSurface(error.line, points_kept, kept) from None
     numbers = {
         "points": len(cloud.points),
         "points_kept": len(segmented.cloud.points),

@@ -153,7 +153,7 @@ def write_preview(
     """
     import matplotlib
 
-    from mgs.plotting import STYLE, crop, new_figure, save_figure
+    from mgs.plotting import STYLE, crop, literal, new_figure, save_figure
 
     rgb = np.stack([maps[channel] for channel in "RGB"], axis=-1)
     visible = maps["A"] >= VISIBLE
@@ -163,7 +163,7 @@ def write_preview(
         figure = new_figure(8.4, 3 * (2.3 * height / width + 0.35), dpi=130)
         axes = figure.subplots(3, 3).flat
         axes[0].imshow(srgb_from_linear(rgb)[window], interpolation="nearest")
-        axes[0].set_title(title)
+        axes[0].set_title(literal(title))
         for axis, (channel, (label, name)) in zip(axes[1:], PANELS.items(), strict=True):
             values = np.ma.masked_where(~visible, maps[channel])[window]
             colours = matplotlib.colormaps[name].with_extremes(bad="#e8e8e8")

@@ -26,9 +26,9 @@ from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import TEST_FOLDER, Dataset, Frame
 from mgs.errors import InputError
-from mgs.files import atomic_path, locked, read_json, write_json
+from mgs.files import atomic_path, read_json, working_in, write_json
 from mgs.gaussians import Gaussians
-from mgs.images import read_png
+from mgs.images import PNG_LEVEL, read_png
 from mgs.metrics import METRICS, SURFACE_METRICS, compare, compare_surface
 from mgs.provenance import versions
 from mgs.report.runs import read_metrics
@@ -63,7 +63,7 @@ def render_view(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.nd
     return np.asarray(image.rgb), np.asarray(image.alpha), np.asarray(image.depth)
 
 
-def evaluate(
+def evaluate_model(
     gaussians: Gaussians,
     frames: Sequence[Frame],
     trained: Iterable[str],
@@ -192,7 +192,7 @@ def write_comparison(
     for i, caption in enumerate(captions):
         draw.text(((i + 0.5) * width, size), caption, fill=(0, 0, 0), font=font, anchor="mm")
     with atomic_path(path) as temporary:
-        picture.save(temporary, format="PNG")
+        picture.save(temporary, format="PNG", compress_level=PNG_LEVEL)
 
 
 def read_comparison(path: str | Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -232,7 +232,7 @@ def evaluate_run(
     """
     run = run if isinstance(run, Run) else open_run(run)
     file, folder = run.folder / "metrics.json", run.folder / "renders"
-    with locked(run.folder):
+    with working_in(run.folder):
         gaussians, dataset = run.state.gaussians, run.dataset
         trained = [frame.name for frame in run.taken]
         frames, tests = dataset.with_images(trained), dataset.test_views()
@@ -243,7 +243,7 @@ def evaluate_run(
             say(reason)
         metrics = _measured_before(file, subject)
         if metrics is None:
-            found = evaluate(
+            found = evaluate_model(
                 gaussians,
                 frames,
                 trained,
@@ -371,4 +371,4 @@ def compare_models(
         frames = tuple(f for f in dataset.with_images(taken) if f.name not in taken)
     if not frames:
         return name, None
-    return name, [float(evaluate(model, frames, ())["all"]["psnr"]) for model in models]
+    return name, [float(evaluate_model(model, frames, ())["all"]["psnr"]) for model in models]

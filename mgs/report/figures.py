@@ -16,7 +16,7 @@ import numpy as np
 
 from mgs.colour import srgb_from_linear
 from mgs.data.up import PLUS_Z, Up, upright
-from mgs.plotting import STYLE, crop, new_figure, save_figure
+from mgs.plotting import STYLE, crop, literal, new_figure, save_figure
 from mgs.policy.criteria import GAIN_UNIT
 from mgs.report.calibration import BINS
 
@@ -72,7 +72,8 @@ def line_styles(labels: Iterable[str]) -> list[dict[str, Any]]:
     styles = []
     for label in labels:
         (colour, marker), dashes = (taken[label], "-") if label in taken else next(spare)
-        styles.append({"color": colour, "marker": marker, "linestyle": dashes, "label": label})
+        styles.append({"color": colour, "marker": marker, "linestyle": dashes})
+        styles[-1]["label"] = literal(label)
     return styles
 
 
@@ -278,7 +279,7 @@ def comparison_figure(
 
 def _in_lines(text: str, width: int = 34) -> str:
     """Wrap text to lines of at most `width` characters, which fit above one column."""
-    return "\n".join(textwrap.wrap(text, width))
+    return "\n".join(textwrap.wrap(literal(text), width))
 
 
 def uncertainty_figure(
@@ -326,7 +327,7 @@ def _draw_maps(figure: Any, maps: Sequence[tuple[str, Any, Any, Any]]) -> None:
         panels = (("true error", error), ("predicted", sigma))
         for axis, (label, values) in zip(column, panels, strict=True):
             image = axis.imshow(np.ma.masked_where(~inside, rms(values))[crop(inside)], **scale)
-            axis.set_title(f"{name}, {label}")
+            axis.set_title(literal(f"{name}, {label}"))
             axis.set_axis_off()
     figure.colorbar(image, ax=axes, label="rms of the channels, linear RGB", shrink=0.8)
 
@@ -335,13 +336,13 @@ def _draw_ause(axis: Any, rows: Sequence[tuple[dict[str, Any], str]]) -> None:
     """Draw AUSE of absolute errors as bars, with ticks for a perfect sigma and a line for a
     constant one."""
     for i, (row, colour) in enumerate(rows):
-        area = row["ause"]["mae"]
+        area = row["ause"]
         ends, perfect = [i - 0.4, i + 0.4], [area["perfect"]] * 2
         axis.bar(i, area["ause"], color=colour)
         axis.plot(ends, perfect, color="white", linewidth=2.5)
         label = "if it were perfect" if i == 0 else None
         axis.plot(ends, perfect, color="black", linewidth=1, label=label)
-    constant = rows[0][0]["ause"]["mae"]["constant"]
+    constant = rows[0][0]["ause"]["constant"]
     axis.axhline(constant, color="black", linewidth=1, linestyle="--", label="a constant")
     axis.set_xticks([])
     axis.set_ylabel("AUSE of |error|")

@@ -7,9 +7,12 @@ missing.
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from hashlib import sha256
 from itertools import pairwise
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +50,7 @@ COMPARED = 6
 
 def write_page(
     path: str | Path,
-    folders: Sequence[str | Path],
+    folders: Sequence[str | PathLike[str]],
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> int:
     """Write the page of these runs as one HTML file; return its size in bytes.
@@ -266,4 +269,6 @@ def _fill_in(**values: Any) -> str:
     for name in ("css", "js"):
         values[name] = Markup((folder / f"page.{name}").read_text(encoding="utf-8"))
     values["plotly"] = Markup(get_plotlyjs())
+    hashes = (sha256(values[name].encode()).digest() for name in ("plotly", "js"))
+    values["scripts"] = Markup(" ".join(f"'sha256-{b64encode(h).decode()}'" for h in hashes))
     return environment.get_template("page.html").render(**values)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -62,8 +63,8 @@ class RunFiles:
     """Contents of the files of a run folder.
 
     policy: its name. steps: the lines of steps.jsonl (`mgs.run.folder` lists their keys). metrics:
-    metrics.json (`mgs.report.evaluation.evaluate`), None if the run was not evaluated. settings,
-    versions: those in config.json.
+    metrics.json (`mgs.report.evaluation.evaluate_model`), None if the run was not evaluated.
+    settings, versions: those in config.json.
     """
 
     folder: Path
@@ -111,7 +112,7 @@ class Comparison:
     dataset: Dataset
 
 
-def read_run(folder: str | Path) -> RunFiles:
+def read_run(folder: str | PathLike[str]) -> RunFiles:
     """Read config.json, steps.jsonl and, if it exists, metrics.json of a run folder.
 
     Raises InputError if the folder holds no run, or a file is damaged, empty, or lacks a number
@@ -196,7 +197,7 @@ def check_measured(run: RunFiles) -> None:
         )
 
 
-def compare_runs(folders: Sequence[str | Path]) -> Comparison:
+def compare_runs(folders: Sequence[str | PathLike[str]]) -> Comparison:
     """Read runs that are to be compared, and load their dataset.
 
     Raises InputError as `read_run`; if two runs have the same policy and folder name; if the runs

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mgs.data.dataset import Dataset
 from mgs.policy.poses import path_length
-from mgs.report.runs import Comparison, RunFiles, check_measured, compare_runs
+from mgs.report.runs import Comparison, RunFiles, check_measured
 from mgs.run.ending import RunEnd
 
 COLUMNS = {
@@ -32,13 +31,8 @@ COLUMNS = {
     "path": "path ({unit})",
     "ended": "ended by",
 }
-"""Columns of the table: key in a row of `table_numbers` -> heading. `table_columns` leaves out
+"""Columns of the table: key in a row of `comparison_rows` -> heading. `table_columns` leaves out
 those that no row needs."""
-
-
-def table_numbers(folders: Sequence[str | Path]) -> list[dict[str, Any]]:
-    """`comparison_rows` of run folders. Raises InputError as `compare_runs` and that."""
-    return comparison_rows(compare_runs(folders))
 
 
 def comparison_rows(compared: Comparison) -> list[dict[str, Any]]:
@@ -63,10 +57,7 @@ def comparison_rows(compared: Comparison) -> list[dict[str, Any]]:
 
 def table_row(label: str, run: RunFiles, dataset: Dataset) -> dict[str, Any]:
     """Row of `comparison_rows`; without metrics if they are not of the run's last step."""
-    metrics = run.measured or {}
-    row: dict[str, Any] = {"policy": label, "images": len(run.taken)}
-    for views in ("test", "all", "held_out"):
-        row |= {f"{views}.{name}": value for name, value in metrics.get(views, {}).items()}
+    row = metrics_row(label, (run.measured or {}) | {"images": len(run.taken)})
     if run.settings.get("exposure"):
         row["exposure"] = True
     if run.ended and run.ended["reason"] != RunEnd.BUDGET:
@@ -74,6 +65,14 @@ def table_row(label: str, run: RunFiles, dataset: Dataset) -> dict[str, Any]:
     positions = np.array([dataset.frames[i].camera.position for i in run.taken])
     row |= {"coverage": 100 * run.steps[-1]["coverage"], "path": path_length(positions)}
     return row | {"unit": dataset.unit}
+
+
+def metrics_row(label: str, metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """The part of a row that metrics.json has."""
+    row = {"policy": label, "images": metrics["images"]}
+    for views in ("test", "all", "held_out"):
+        row |= {f"{views}.{name}": value for name, value in metrics.get(views, {}).items()}
+    return row
 
 
 def table_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -106,7 +105,7 @@ def table_cell(key: str, value: Any) -> str:
 
 
 def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Format the rows of `table_numbers` as a Markdown table."""
+    """Format the rows of `comparison_rows` as a Markdown table."""
     columns = table_columns(rows)
     headings = [table_heading(key, rows) for key in columns]
     return markdown(headings, [[table_cell(key, row.get(key)) for key in columns] for row in rows])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ from mgs.splat_ply import read_ply
 
 
 def write_report(
-    out: str | Path, runs: Sequence[str | Path] | Comparison, kind: str = "png"
+    out: str | Path, runs: Sequence[str | PathLike[str]] | Comparison, kind: str = "png"
 ) -> list[Path]:
     """Write all figures and the table of runs into the folder `out`; return the paths of the files.
 

@@ -51,21 +51,29 @@ class RunEnd(StrEnum):
     BUDGET = "budget"
     UNCERTAINTY = "uncertainty"
     GAIN = "gain"
+    FLIGHT = "flight"
 
 
 def run_end(
-    settings: NbvSettings, views: int, uncertainty: float, refused: Mapping[str, Any] | None
+    settings: NbvSettings,
+    views: int,
+    uncertainty: float,
+    refused: Mapping[str, Any] | None,
+    metres: float | None = None,
 ) -> dict[str, Any] | None:
     """`ended` of steps.jsonl where the run ends here: the `reason` and its numbers; else None.
 
     views: chosen so far. uncertainty: mean variance that is left, over that of the prior.
-    refused: `name` and `information_gain` of the next view, where it is known.
+    refused: `name` and `information_gain` of the next view, where it is known. metres: length of
+    the flight, where no pose is left in its reach.
     """
     if views >= settings.budget:
         return {"reason": str(RunEnd.BUDGET), "views": views}
     if settings.stop_uncertainty is not None and uncertainty <= settings.stop_uncertainty:
         numbers = {"uncertainty": uncertainty, "limit": settings.stop_uncertainty}
         return {"reason": str(RunEnd.UNCERTAINTY), "views": views, **numbers}
+    if metres is not None:
+        return {"reason": str(RunEnd.FLIGHT), "views": views, "metres": metres}
     gain = refused.get("information_gain", math.inf) if refused else math.inf
     if refused and settings.stop_gain is not None and gain < settings.stop_gain:
         view = {"name": refused["name"], "information_gain": gain}
@@ -81,6 +89,11 @@ def why_ended(ended: Mapping[str, Any]) -> str:
     if ended["reason"] == RunEnd.UNCERTAINTY:
         limit = f"no more than --stop-uncertainty {ended['limit']:g}"
         return f"{ended['uncertainty']:.4g} of the prior's variance is left after {views}, {limit}"
+    if ended["reason"] == RunEnd.FLIGHT:
+        return (
+            f"no pose is left that the flight's limits allow, {views}; "
+            f"the flight is {ended['metres']:.1f} m long with the way home"
+        )
     gain, limit = (
         f"{ended['information_gain']:.4g} {GAIN_UNIT}",
         f"less than --stop-gain {ended['limit']:g}",

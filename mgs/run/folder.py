@@ -4,6 +4,7 @@
 - `checkpoint.npz`: the state after the last finished step, replaced atomically: the commit.
 - `steps.jsonl`: one line a step, written after the checkpoint.
 - `gaussians.ply`: the model, once the run has ended.
+- `policy.py`: source of a policy that is a Python function; read, never run.
 
 A step is one chosen view; of a batch only the last step has a fit. A line of `steps.jsonl` holds:
 
@@ -15,7 +16,8 @@ A step is one chosen view; of a batch only the last step has a fit. A line of `s
 - `residual`: rms difference of the new images to the model before, linear RGB.
 - `exposure`: gains (red, green, blue) by frame name, with the setting `exposure`.
 - `indicators`, `warnings`: of `mgs.run.detectors`. `seconds`: by stage.
-- `psnr`, `psnr_mask` over all views, `held_out_...`, `test_...`, dB: where it was evaluated.
+- `test_psnr`, `test_psnr_mask`, dB, where it was evaluated; without test views `psnr`, `psnr_mask`
+  over all views, and `held_out_...`.
 - `ended`: in the last line of a run that has ended (`mgs.run.ending.run_end`).
 """
 
@@ -25,7 +27,7 @@ import json
 import math
 import warnings
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields
 from functools import cached_property
 from pathlib import Path
@@ -45,6 +47,8 @@ from mgs.run.settings import NbvSettings, check_settings, validated
 from mgs.run.state import State
 from mgs.splat_ply import read_ply, write_ply
 
+POLICY_SOURCE = "policy.py"
+
 DATASET = "dataset"
 """Folder of a run that holds its dataset, where the run captures images (`mgs nbv --capture`)."""
 
@@ -52,8 +56,9 @@ DATASET = "dataset"
 class Run:
     """A run folder, its settings, and its dataset, prior and state, each read once at first use.
 
-    settings: from the folder's config.json. Properties raise InputError if a file is missing or
-    damaged; `state` also if no step is finished yet; `dataset` also if its frames changed.
+    settings: from the folder's config.json. policy: as it was given in this process, if it was. A
+    Run can be given wherever a folder is wanted. Properties raise InputError if a file is missing
+    or damaged; `state` also if no step is finished yet; `dataset` also if its frames changed.
     """
 
     def __init__(
@@ -62,9 +67,14 @@ class Run:
         settings: NbvSettings,
         dataset: Dataset | None = None,
         prior: Prior | None = None,
+        policy: str | Callable[..., Any] | None = None,
+        state: State | None = None,
     ) -> None:
-        self.folder, self.settings = folder, settings
-        self._dataset, self._prior = dataset, prior
+        self.folder, self.settings, self.policy = folder, settings, policy
+        self._dataset, self._prior, self._state = dataset, prior, state
+
+    def __fspath__(self) -> str:
+        return str(self.folder)
 
     @cached_property
     def dataset(self) -> Dataset:
@@ -90,6 +100,8 @@ class Run:
     @cached_property
     def state(self) -> State:
         """The state after the last finished step."""
+        if self._state is not None:
+            return self._state
         state = read_checkpoint(self.folder)
         if state is None:
             resume = f"`mgs nbv --resume {self.folder}`"
@@ -110,6 +122,11 @@ class Run:
             warnings.warn(
                 Notice(f"{path}: was damaged; restored from checkpoint.npz"), stacklevel=3
             )
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The model after the last finished step."""
+        return self.state.gaussians
 
     @property
     def taken(self) -> list[Frame]:

@@ -21,6 +21,7 @@ class _Ended(_Checked):
     limit: float = 0.0
     uncertainty: float = 0.0
     information_gain: float = 0.0
+    metres: float = 0.0
 
 
 class _Line(_Checked):

@@ -15,7 +15,7 @@ import numpy as np
 from mgs.errors import InputError
 from mgs.fit.stopping import StopReason
 from mgs.gaussians import Gaussians
-from mgs.policy import criteria, poses
+from mgs.policy import criteria, poses, tour
 from mgs.prior.initial import warm_start
 from mgs.run.ending import FitDivergedError
 from mgs.run.problem import Problem
@@ -23,6 +23,7 @@ from mgs.run.state import Choice, Fitted, Learned
 
 if TYPE_CHECKING:
     from mgs.fit.fitting import Fit
+    from mgs.policy.context import PolicyContext
 
 
 Chooser = Callable[[Problem, Fitted, Callable[[int], np.ndarray]], tuple[int, float]]
@@ -51,9 +52,12 @@ def select_views(
 
 
 def finished(problem: Problem, state: Fitted) -> bool:
-    """Whether the budget is spent, or no more than `stop_uncertainty` of the variance is left."""
+    """Whether the budget is spent, no view is in reach, or no more than `stop_uncertainty` of the
+    variance is left."""
     settings = problem.settings
     if len(state.taken) - settings.seeds >= settings.budget:
+        return True
+    if not problem.reachable(state.taken):
         return True
     limit = settings.stop_uncertainty
     return limit is not None and uncertainty(problem, state) <= limit
@@ -155,17 +159,27 @@ def choose_batch(
     left = settings.budget - (len(state.taken) - settings.seeds)
     planned = state
     for _ in range(min(settings.batch, left)):
+        if not problem.reachable(planned.taken):
+            break
         frame, score = chooser(problem, planned, fisher)
-        F = fisher(frame)
-        gain = criteria.d_optimal(F, planned.H, problem.lam)
-        surface = surface_information(problem, [frame], planned)
-        choice = Choice(frame, score, gain, criteria.coverage(surface, problem.prior_lam))
+        gain = criteria.d_optimal(fisher(frame), planned.H, problem.lam)
+        after = with_view(problem, planned, frame, fisher)
+        covered = criteria.coverage(after.surface, problem.prior_lam)
+        choice = Choice(frame, score, gain, covered)
         if settings.stop_gain is not None and gain < settings.stop_gain:
             return planned, choices, choice
         choices.append(choice)
         problem.progress("chosen", len(choices), settings.batch)
-        planned = Fitted(state.gaussians, planned.H + F, surface, [*planned.taken, frame])
+        planned = after
     return planned, choices, None
+
+
+def with_view(
+    problem: Problem, state: Fitted, frame: int, fisher: Callable[[int], np.ndarray]
+) -> Fitted:
+    """The state as if a view were taken, its model unchanged."""
+    surface = surface_information(problem, [frame], state)
+    return Fitted(state.gaussians, state.H + fisher(frame), surface, [*state.taken, frame])
 
 
 def choose(
@@ -173,11 +187,22 @@ def choose(
 ) -> tuple[int, float]:
     """Choose the next view: (frame, score) of the view in reach of largest score / travel cost.
 
-    A tie goes to the pose farthest from those taken. fisher(frame) -> [N,P]: information of a view
-    at the model, computed by default. Raises InputError if the policy returns no valid score.
+    A tie goes to the pose farthest from those taken. Where the flight has a limit, it is the first
+    stop of `plan_flight`. fisher(frame) -> [N,P]: information of a view at the model, computed by
+    default. Raises InputError if the policy returns no valid score.
     """
     fisher = fisher or problem.view_information(state.gaussians)
+    if problem.settings.flies:
+        return plan_flight(problem, state, fisher)[0]
     context = problem.context(state, problem.reachable(state.taken), fisher)
+    return rated(problem, context, problem.travel_cost(context))[0]
+
+
+def rated(
+    problem: Problem, context: PolicyContext, cost: np.ndarray | float = 1.0
+) -> list[tuple[int, float]]:
+    """(frame, score) of the candidates by falling score / cost [C]; of equals, the farthest from
+    the views taken comes first. Raises InputError as `choose`."""
     scores = np.asarray(problem.policy(context), np.float64)
     farthest = poses.farthest_pose(context.candidates, context.taken, context.centre, context.rng)
     where = f"policy {problem.settings.policy}: returned"
@@ -186,10 +211,45 @@ def choose(
             f"{where} scores of shape {scores.shape} for {len(context.candidate_frames)} "
             "candidates; return one number for each"
         )
-    weighed = scores / problem.travel_cost(context)
-    best = max(range(len(scores)), key=lambda k: (weighed[k], farthest[k]))
+    weighed = scores / cost
+    order = sorted(range(len(scores)), key=lambda k: (weighed[k], farthest[k]), reverse=True)
+    best = order[0]
     if np.isnan(scores).any() or np.isinf(scores[best]):
         raise InputError(f"{where} a score that is NaN or infinite (docs/howto/policy.md)")
-    if problem.settings.travel is not None and scores[best] < 0:
-        raise InputError(f"{where} negative scores, which --travel cannot divide; leave it out")
-    return context.candidate_frames[best], float(scores[best])
+    if (problem.settings.travel is not None or problem.settings.flies) and scores[best] < 0:
+        option = "--travel" if problem.settings.travel is not None else "--flight-length"
+        raise InputError(f"{where} negative scores, which {option} cannot divide; leave it out")
+    return [(context.candidate_frames[k], float(scores[k])) for k in order]
+
+
+def plan_flight(
+    problem: Problem, state: Fitted, fisher: Callable[[int], np.ndarray]
+) -> list[tuple[int, float]]:
+    """Views of the rest of the flight in flying order, each with its score when it was planned.
+
+    Cost-benefit greedy: the view of largest score / cost joins the tour at its cheapest place, and
+    2-opt shortens the tour. Then the next one, as if it were taken, until none fits. The cost is
+    the share of the limits that a view adds, and its share of the views that the budget has left.
+    """
+    flight, settings = problem.flight, problem.settings
+    pool, way = problem.reachable(state.taken), [state.taken[-1], flight.home]
+    most = settings.budget - (len(state.taken) - settings.seeds)
+    before, pictures = flight.flown(state.taken), len(state.taken) - flight.skipped
+    planned, scores = state, dict[int, float]()
+    while pool and len(scores) < most:
+        metres, count = before + tour.tour_length(flight.legs, way), pictures + len(scores)
+        added, places = tour.insertions(flight.legs, way, pool)
+        shares = flight.share(metres + added, count + 1)
+        fits = [k for k in range(len(pool)) if shares[k] <= 1]
+        if not fits:
+            break
+        context = problem.context(planned, [pool[k] for k in fits], fisher)
+        cost = shares[fits] - flight.share(metres, count) + 1 / most
+        frame, score = rated(problem, context, cost)[0]
+        scores[frame] = score
+        way.insert(int(places[pool.index(frame)]), frame)
+        way = tour.two_opt(flight.legs, way)
+        pool.remove(frame)
+        if pool and len(scores) < most:
+            planned = with_view(problem, planned, frame, fisher)
+    return [(frame, scores[frame]) for frame in way[1:-1]]

@@ -12,14 +12,14 @@ from scipy.spatial import cKDTree
 from mgs import runtime
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.errors import InputError, row_named
-from mgs.files import atomic_folder
-from mgs.policy.from_file import absolute, in_file
-from mgs.policy.registry import policy_named
+from mgs.files import atomic_folder, reading
+from mgs.policy.from_file import in_file, is_function, label, name_of, source_of
+from mgs.policy.registry import policy_of
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
-from mgs.prior.photographs import source_of
+from mgs.prior.photographs import source_of as source_of_prior
 from mgs.prior.settings import PriorSettings
 from mgs.run import recording
-from mgs.run.folder import DATASET, Run, holds_run, open_run, start
+from mgs.run.folder import DATASET, POLICY_SOURCE, Run, holds_run, open_run, start
 from mgs.run.operations import operations_of
 from mgs.run.problem import Problem, Progress, no_progress
 from mgs.run.settings import (
@@ -50,27 +50,27 @@ of free means to all images. Chosen constants."""
 
 
 def run_nbv(
-    dataset: str | Path | None,
+    dataset: str | Path | Dataset | None,
     out: str | Path,
     *,
     on_step: Callable[[State], None] = lambda state: None,
     progress: Progress = no_progress,
     **settings: Any,
-) -> State:
+) -> Run:
     """Choose views one by one, as the paper does: `start_run`, then `resume_nbv`.
 
     dataset, out, settings: as `start_run`. Callbacks, result and errors: as `resume_nbv`.
     """
     run = start_run(dataset, out, progress=progress, **settings)
-    return resume_nbv(run, on_step, progress, run.settings.policy)
+    return resume_nbv(run, on_step, progress, run.policy)
 
 
 def start_run(
-    dataset: str | Path | None,
+    dataset: str | Path | Dataset | None,
     out: str | Path,
     *,
     capture: str | Path | None = None,
-    prior: str | Path | None = None,
+    prior: str | Path | Prior | None = None,
     gaussians: int | Literal["auto"] | None = None,
     preset: str | None = None,
     loose: float = 1.0,
@@ -81,10 +81,12 @@ def start_run(
 
     capture: a scene (`mgs.synth.scene_file.load_scene_file`) in place of a dataset: the run renders
     an image only when its view is chosen, and has its own OUT/dataset with CAPTURE_TEST_VIEWS.
-    prior: a folder; default DATASET/prior where there is one, else a prior of `gaussians` is built
-    in the run (default: as many as the images resolve). preset: a row of `PRESETS`, defaults of
-    what is not given. settings: fields of `NbvSettings`; by default the budget is 50 views or all
-    candidates, and alpha_weight is ALPHA_WEIGHT, or 0 where frames have neither mask nor alpha.
+    prior: a folder, or a Prior, which is copied into the run; default DATASET/prior where there is
+    one, else a prior of `gaussians` is built in the run (default: as many as the images resolve).
+    preset: a row of `PRESETS`, defaults of what is not given. settings: fields of `NbvSettings`;
+    `policy` may be a function with arguments as in docs/howto/policy.md, whose source is kept in
+    the run. By default the budget is 50 views or all candidates, and alpha_weight is ALPHA_WEIGHT,
+    or 0 where frames have neither mask nor alpha.
 
     Leaves no folder behind where it fails. Raises InputError where the folder is not empty, a
     setting is invalid, the dataset is too small, an input is missing or damaged, or the cameras are
@@ -96,31 +98,42 @@ def start_run(
     if holds_run(out):
         resume = f"`mgs nbv --resume {out}` continues it"
         raise InputError(f"{out}: holds a run; {resume}; for another, choose a new folder")
-    root = out / DATASET if dataset is None else Path(dataset)
+    given = dataset if isinstance(dataset, Dataset) else None
+    root = given.root if given else out / DATASET if dataset is None else Path(str(dataset))
     if prior is not None and gaussians is not None:
         raise InputError("nbv: --gaussians builds a prior; leave it out, or leave out --prior")
     if prior is None and gaussians is None and (root / "prior/prior.json").is_file():
         prior = root / "prior"
     row = None if preset is None else row_named(PRESETS, preset, "--preset")
-    loaded = load_dataset(root) if capture is None else None
-    where = out / "prior" if prior is None else Path(prior)
-    given = _with_defaults(settings, row, loaded)
-    known = validated(NbvSettings, {"dataset": root.resolve(), "prior": where.resolve(), **given})
+    loaded = given or (load_dataset(root) if capture is None else None)
+    where = Path(prior) if isinstance(prior, str | Path) else out / "prior"
+    policy = settings.get("policy", NbvSettings.model_fields["policy"].default)
+    named = name_of(policy) if isinstance(policy, str) or callable(policy) else policy
+    wanted = _with_defaults(settings | {"policy": named}, row, loaded)
+    known = validated(NbvSettings, {"dataset": root.resolve(), "prior": where.resolve(), **wanted})
     count = len(loaded) if loaded else _candidates(capture)
     complete = _resolved(known, count, "budget" in settings)
-    policy_named(complete.policy)  # a user's file fails here, before there is a folder
+    scores = policy_of(policy)  # a user's policy fails here, before there is a folder
     check_settings(complete, count)
-    found = None if prior is None else load_prior(prior)
+    found = load_prior(prior) if isinstance(prior, str | Path) else prior
     with atomic_folder(out) as unfinished:
         frames = loaded or _poses(unfinished / DATASET, str(capture), complete.seed, progress)
-        built = found or _built_prior(unfinished, frames, gaussians, row, complete.seed, progress)
+        built = found or _built_prior(frames, gaussians, row, complete.seed, progress)
+        if not isinstance(prior, str | Path):
+            save_prior(unfinished / "prior", built)
         _check_near(built, frames, where)
         if built.numbers.get("from") == "random" and complete.train.means != "free":
             free = "pass --means free, or give depth, points or masks"
             raise InputError(f"{where}: starts at random points, not on a surface; {free}")
         complete = complete.with_spacing(built.spacing, loose)
+        if complete.flies or complete.no_fly or complete.clearance is not None:
+            Problem(
+                frames, complete, operations_of(frames, built, complete), policy=scores
+            ).check_seeds()
         start(unfinished, complete, frames)
-    return Run(out, complete, loaded, found)
+        if not isinstance(policy, str):
+            (unfinished / POLICY_SOURCE).write_text(source_of(policy), encoding="utf-8")
+    return Run(out, complete, loaded, found, policy)
 
 
 def start_fit(
@@ -141,7 +154,7 @@ def start_fit(
     loaded, train = load_dataset(root), dict(settings.pop("train", {}))
     found = Path(prior) if prior is not None else root / "prior"
     known = gaussians is None and (prior is not None or (found / "prior.json").is_file())
-    source = load_prior(found).numbers.get("from") if known else source_of(loaded.survey())
+    source = load_prior(found).numbers.get("from") if known else source_of_prior(loaded.survey())
     train.setdefault("means", "free" if source in LOOSE else "frozen")
     loose = 1.0
     if train["means"] == "free" and source in LOOSE:
@@ -160,8 +173,8 @@ def _with_defaults(settings: dict[str, Any], row: Any, loaded: Dataset | None) -
 
 
 def _resolved(given: NbvSettings, count: int, budget_given: bool) -> NbvSettings:
-    """Settings that hold in any folder: the policy's whole path, the fit's seed, the budget."""
-    resolved: dict[str, Any] = {"policy": absolute(given.policy)}
+    """Settings that hold in any folder: the fit's seed, the budget."""
+    resolved: dict[str, Any] = {}
     if "seed" not in given.train.model_fields_set:
         resolved["train"] = given.train.model_copy(update={"seed": given.seed})
     if not budget_given:
@@ -169,16 +182,12 @@ def _resolved(given: NbvSettings, count: int, budget_given: bool) -> NbvSettings
     return given.model_copy(update=resolved)
 
 
-def _built_prior(
-    unfinished: Path, frames: Dataset, gaussians: Any, row: Any, seed: int, progress: Progress
-) -> Prior:
-    """Build a prior of a dataset, or of its survey, into the run's folder."""
+def _built_prior(frames: Dataset, gaussians: Any, row: Any, seed: int, progress: Progress) -> Prior:
+    """Build a prior of a dataset, or of its survey."""
     asked = PriorSettings(gaussians=gaussians, seed=seed, density=row.density if row else None)
-    built, _ = build_prior(
+    return build_prior(
         frames.survey(), asked, on_stage=lambda stage: progress(f"prior: {stage}", 0, 1)
     )
-    save_prior(unfinished / "prior", built)
-    return built
 
 
 def _check_near(prior: Prior, dataset: Dataset, where: Path) -> None:
@@ -219,42 +228,63 @@ def resume_nbv(
     run: str | Path | Run,
     on_step: Callable[[State], None] = lambda state: None,
     progress: Progress = no_progress,
-    policy: str | None = None,
-) -> State:
-    """Continue a run from its last finished step to its end; return the last state.
+    policy: str | Callable[..., Any] | None = None,
+) -> Run:
+    """Continue a run from its last finished step to its end; return it, with its state.
 
-    policy: FILE.py:FUNCTION, required if the run has a policy from a file. The file is code, so
-    the user names it, not the folder. on_step(state): called after every step, or batch of steps,
-    that is finished and on disk. progress(stage, done, total): called during a step.
+    policy: required if it is the user's own: FILE.py:FUNCTION, or the Python function. That is
+    code, so the user names it, not the folder; a Run of this process knows it. on_step(state):
+    called after every step, or batch of steps, that is finished and on disk. progress(stage, done,
+    total): called during a step.
 
-    A finished run returns its state again. Raises InputError if the folder holds no run, its inputs
+    A finished run is returned as it is. Raises InputError if the folder holds no run, its inputs
     are missing or changed, another process works on it, a fit diverged, or `policy` is not the
     run's.
     """
     run = run if isinstance(run, Run) else open_run(run)
+    policy = policy or run.policy
     check_named(run, policy)
     operations = operations_of(run.dataset, run.prior, run.settings)
-    return recording.run(run.folder, run.settings, run.dataset, operations, progress, on_step)
+    scores = None if policy is None else policy_of(policy)
+    state = recording.run(
+        run.folder, run.settings, run.dataset, operations, progress, on_step, policy=scores
+    )
+    return Run(run.folder, run.settings, run.dataset, run.prior, policy, state)
 
 
-def check_named(run: Run, policy: str | None) -> None:
-    """Raises InputError where a run's policy is a user's file and `policy` does not name it."""
+def check_named(run: Run, policy: str | Callable[..., Any] | None) -> None:
+    """Raises InputError where a run's policy is a user's own and `policy` is not the same."""
     own = run.settings.policy
-    if policy is not None and absolute(policy) != own:
-        raise InputError(f"--policy {policy}: is not the policy of {run.folder}, {own}")
+    if policy is not None and name_of(policy) != own:
+        raise InputError(f"--policy {name_of(policy)}: is not the policy of {run.folder}, {own}")
+    if is_function(own):
+        call = f"mgs.resume_nbv({str(run.folder)!r}, policy={label(own)})"
+        if policy is None or isinstance(policy, str):
+            raise InputError(f"{run.folder}: its policy is a Python function; in Python: {call}")
+        kept = run.folder / POLICY_SOURCE
+        with reading(kept):
+            same = kept.read_text(encoding="utf-8") == source_of(policy)
+        if not same:
+            raise InputError(
+                f"policy {label(own)}: is not as {kept} has it; restore it, or start a new run"
+            )
     if in_file(own) and policy is None:
         resume = f"`mgs nbv --resume {run.folder} --policy {own}`"
         raise InputError(f"{run.folder}: its policy is a program, {own}; to run it: {resume}")
 
 
 def problem_of(
-    run: str | Path | Run, progress: Progress = no_progress, policy: str | None = None
+    run: str | Path | Run,
+    progress: Progress = no_progress,
+    policy: str | Callable[..., Any] | None = None,
 ) -> Problem:
     """Selection problem of a run, for the functions of `mgs.run.loop`.
 
     Arguments and errors as `resume_nbv`.
     """
     run = run if isinstance(run, Run) else open_run(run)
+    policy = policy or run.policy
     check_named(run, policy)
     operations = operations_of(run.dataset, run.prior, run.settings)
-    return Problem(run.dataset, run.settings, operations, progress)
+    scores = None if policy is None else policy_of(policy)
+    return Problem(run.dataset, run.settings, operations, progress, scores)

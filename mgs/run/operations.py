@@ -67,6 +67,7 @@ def operations_of(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Oper
         exposure=exposure,
         on_surface=len(prior.points),
         up=prior.up,
+        ground=float((prior.mesh.vertices @ np.array(prior.up)).min()),
         prior=prior_digest(prior),
         capture=_capture(dataset) if dataset.on_demand else lambda frame: None,
     )
@@ -95,13 +96,14 @@ def psnr_measure(
 ) -> Callable[[Gaussians, list[int]], dict[str, float]]:
     """Returns measure(gaussians, frames taken) -> mean PSNR, dB.
 
-    `psnr`, `psnr_mask` (in the rock mask) over all views that have an image; `held_out_...` over
-    those not taken; `test_...` over the test views. With `exposure` also `..._corrected`, of
-    renders at the exposure of the view (`mgs.metrics.colour_corrected`). A mean over no view is
-    left out. Raises InputError as `Dataset.test_views`.
+    `test_psnr`, `test_psnr_mask` (in the rock mask) over the test views. A dataset without test
+    views: `psnr`, `psnr_mask` over all views that have an image, `held_out_...` over those not
+    taken. With `exposure` also `..._corrected`, of renders at the exposure of the view
+    (`mgs.metrics.colour_corrected`). A mean over no view is left out. Raises InputError as
+    `Dataset.test_views`.
     """
     tests = dataset.test_views()
-    frames = [*dataset.frames, *(tests.frames if tests else ())]
+    frames = dataset.frames if tests is None else tests.frames
     names = ("psnr", "psnr_mask", *(("psnr_corrected", "psnr_mask_corrected") if exposure else ()))
 
     def read(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -123,11 +125,11 @@ def psnr_measure(
         return np.array([values(gaussians, i) for i in chosen]).reshape(-1, len(names))
 
     def measure(gaussians: Gaussians, taken: list[int]) -> dict[str, float]:
-        shown = [i for i, frame in enumerate(dataset.frames) if i in taken or not frame.on_demand]
+        if tests is not None:
+            return dict(_means(measured(gaussians, range(len(frames))), "test_", names))
+        shown = [i for i, frame in enumerate(frames) if i in taken or not frame.on_demand]
         views = measured(gaussians, shown)
-        held_out = views[[i not in taken for i in shown]]
-        of_tests = measured(gaussians, range(len(dataset), len(frames)))
-        found = {"": views, "held_out_": held_out, "test_": of_tests}
+        found = {"": views, "held_out_": views[[i not in taken for i in shown]]}
         return {key: mean for prefix, v in found.items() for key, mean in _means(v, prefix, names)}
 
     return measure

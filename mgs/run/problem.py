@@ -12,14 +12,16 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.data.dataset import Dataset, Frame, target_of
 from mgs.data.up import PLUS_Z, Up, upright
+from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.memory import IMAGE_BYTES, Deferred, kept_within
-from mgs.policy import criteria, poses
+from mgs.policy import criteria, poses, tour
 from mgs.policy.context import Policy, PolicyContext
 from mgs.policy.from_file import label
 from mgs.policy.registry import policy_named
 from mgs.policy.visibility import Visibility
 from mgs.prior.exposure import without_gain
+from mgs.run.flight import Flight, allowed_poses
 from mgs.run.settings import NbvSettings
 from mgs.seeds import generator
 
@@ -41,7 +43,8 @@ class Operations:
     """Deterministic functions that the loop computes with, NumPy in and out (`operations_of`).
 
     centre: [3] middle of the rock, metres. groups: columns of the Fisher information by kind of
-    parameter (`mgs.splat.groups`). up: unit vector that points upwards in the world.
+    parameter (`mgs.splat.groups`). up: unit vector that points upwards in the world. ground: height
+    of the object's lowest point, metres.
     on_surface: number of Gaussians on the surface, the first ones; None: all.
     prior: hash of what `initial` starts from (`mgs.run.inputs.prior_digest`).
 
@@ -78,6 +81,7 @@ class Operations:
     render: Callable[[Gaussians, Camera], tuple[np.ndarray, np.ndarray]] | None = None
     on_surface: int | None = None
     up: Up = PLUS_Z
+    ground: float = -np.inf
     prior: str = ""
     capture: Callable[[Frame], None] = lambda frame: None
 
@@ -87,7 +91,11 @@ class Problem:
 
     Positions, centre and points are in coordinates in which +Z is up, metres. lam [P]: lambda of
     the run; prior_lam: the same without columns of means and without `--lam`, for the surface.
-    What depends on images (`start`) is computed when first asked for.
+    allowed [V]: poses that `no_fly` and `clearance` allow. skipped: number of views taken before
+    the flight. What depends on images (`start`) is computed when first asked for.
+
+    seeds: frames that start the model; by default spread evenly in azimuth among those allowed.
+    Raises InputError where these are too few, or their flight exceeds the limits.
     """
 
     def __init__(
@@ -97,6 +105,7 @@ class Problem:
         operations: Operations,
         progress: Progress = no_progress,
         policy: Policy | None = None,
+        seeds: Sequence[int] | None = None,
     ) -> None:
         self.dataset, self.settings = dataset, settings
         self.operations, self.progress = operations, progress
@@ -109,12 +118,40 @@ class Problem:
         kinds = {kind: at for kind, at in operations.groups.items() if kind != "mean"}
         self.prior_lam = criteria.regularisation(kinds, settings.pixel_noise, settings.prior_std)
         self.lam = settings.regularisation(operations.groups)
-        self.seeds = poses.seed_views(self.positions, self.centre, settings.seeds)
+        self.allowed = allowed_poses(self.positions, self.centre, operations.ground, settings)
+        self.skipped = 0
+        self.seeds = self._spread_seeds() if seeds is None else list(seeds)
         with_alpha = settings.train.alpha_weight > 0
         self.image = kept_within(
             IMAGE_BYTES, lambda i: target_of(self.frames[i], with_alpha), lambda image: image.nbytes
         )
         self._start_of = lru_cache(maxsize=2)(self.coloured)
+
+    def _spread_seeds(self) -> list[int]:
+        free, count = np.flatnonzero(self.allowed), self.settings.seeds
+        if len(free) < count:
+            raise InputError(
+                f"{self.dataset.root}: --no-fly and --clearance allow {len(free)} of its "
+                f"{len(self.frames)} poses, fewer than {count} seeds; lower one of them"
+            )
+        return [int(free[k]) for k in poses.seed_views(self.positions[free], self.centre, count)]
+
+    def check_seeds(self) -> None:
+        """Raises InputError where the flight over the seeds and home exceeds the limits."""
+        flight, settings = self.flight, self.settings
+        metres = flight.metres(self.seeds)
+        if flight.share(metres, len(self.seeds)) > 1:
+            seconds = metres / settings.speed + settings.hover * len(self.seeds)
+            raise InputError(
+                f"nbv: the flight over {len(self.seeds)} seeds and home takes {metres:.1f} m and "
+                f"{seconds:.0f} s; raise --flight-length or --flight-time, or lower --seed-views"
+            )
+
+    @cached_property
+    def flight(self) -> Flight:
+        """Legs between all poses, and the limits of the flight; its home is the first seed."""
+        matrix = tour.legs(self.positions, self.centre[:2], self.settings.no_fly or 0.0)
+        return Flight(self.settings, matrix, self.seeds[0], self.skipped)
 
     @cached_property
     def start(self) -> Gaussians:
@@ -162,8 +199,11 @@ class Problem:
         return Deferred(range(len(taken)), lambda k: without_gain(self.image(taken[k]), gains[k]))
 
     def reachable(self, taken: Sequence[int]) -> list[int]:
-        """Frames not taken; with the setting `nearest`, that many nearest to the last view."""
-        left = [i for i in range(len(self.frames)) if i not in taken]
+        """Frames not taken, allowed, and within the flight's limits; with the setting `nearest`,
+        that many nearest to the last view."""
+        left = [i for i in range(len(self.frames)) if i not in taken and self.allowed[i]]
+        if self.settings.flies:
+            left = self.flight.in_reach(taken, left)
         if self.settings.nearest is None:
             return left
         here = self.positions[taken[-1]]
@@ -193,10 +233,10 @@ class Problem:
     def view_information(self, model: Gaussians) -> Callable[[int], np.ndarray]:
         """A function frame -> information [N,P] of its view at a model.
 
-        Results are kept while there is room where views are chosen in batches: all choices of a
-        batch are about one model.
+        Results are kept while there is room where several choices are about one model: in batches
+        and plans of a flight.
         """
-        room = IMAGE_BYTES if self.settings.batch > 1 else 0
+        room = IMAGE_BYTES if self.settings.batch > 1 or self.settings.flies else 0
         fisher, cameras = self.operations.fisher, self.cameras
         return kept_within(room, lambda i: fisher(model, cameras[i]), lambda F: F.nbytes)
 

@@ -12,18 +12,13 @@ import numpy as np
 
 from mgs.data.dataset import Dataset
 from mgs.errors import InputError
-from mgs.files import locked
+from mgs.files import working_in
 from mgs.policy import criteria
+from mgs.policy.context import Policy
 from mgs.run import inputs
 from mgs.run.checks import Checks
 from mgs.run.ending import FitDivergedError, diverged, run_end
-from mgs.run.folder import (
-    DATASET,
-    check_settings,
-    read_checkpoint,
-    write_checkpoint,
-    write_steps,
-)
+from mgs.run.folder import check_settings, read_checkpoint, write_checkpoint, write_steps
 from mgs.run.loop import Chooser, select_views, uncertainty
 from mgs.run.problem import Operations, Problem, Progress
 from mgs.run.settings import NbvSettings
@@ -50,26 +45,25 @@ def run(
     progress: Progress,
     on_step: Callable[[State], None] = lambda state: None,
     chooser: Chooser | None = None,
+    policy: Policy | None = None,
 ) -> State:
     """Run or resume the loop in `out`, which has its config.json, to its end; give the last state.
 
     on_step(state): called after every step, or batch of steps, that is on disk. chooser: as
-    `select_views`. Killed at any moment and called again, it takes the same views as
-    an uninterrupted run.
+    `select_views`. policy: in place of that of the settings. Killed at any moment and called again,
+    it takes the same views as an uninterrupted run.
 
     Raises InputError as `check_settings`; where another process works on the folder; where the
     prior, a pose or a file of a frame taken has changed; where a frame it takes cannot be read or
     has an empty mask; and where a fit diverged. The steps before are kept.
     """
     check_settings(settings, len(dataset))
-    with locked(out):
-        for leftover in [*out.glob(".*.part*"), *(out / DATASET).rglob(".*.part*")]:
-            leftover.unlink()
+    with working_in(out):
         state = read_checkpoint(out)
         if state is not None:
             inputs.check_unchanged(out, state.inputs, operations.prior, settings, dataset)
         stopwatch = Stopwatch(progress)
-        problem = Problem(dataset, settings, operations, stopwatch)
+        problem = Problem(dataset, settings, operations, stopwatch, policy)
         recorder = Recorder(problem, stopwatch)
         if state is not None:
             check_model(out, problem, state)
@@ -137,7 +131,9 @@ def mark_end(problem: Problem, state: State, refused: Choice | None = None) -> S
         name = problem.frames[refused.frame].name
         next_view = {"name": name, "information_gain": refused.information_gain}
     views = len(state.taken) - problem.settings.seeds
-    ended = run_end(problem.settings, views, uncertainty(problem, state), next_view)
+    stuck = not problem.reachable(state.taken)
+    metres = problem.flight.metres(state.taken) if stuck else None
+    ended = run_end(problem.settings, views, uncertainty(problem, state), next_view, metres)
     return replace(state, steps=[*state.steps[:-1], last | ({"ended": ended} if ended else {})])
 
 

@@ -64,6 +64,18 @@ class NbvSettings(BaseModel):
     """Choose among this many views nearest to the last one. Default: all."""
     travel: Scale | None = None
     """Distance in metres that costs as much as an image: scores are over 1 + distance / METRES."""
+    flight_length: Scale | None = None
+    """Most metres of the flight, with the seeds and the way home. Default: no limit."""
+    flight_time: Scale | None = None
+    """Most seconds of the flight at --speed, and --hover for each picture. Default: no limit."""
+    speed: Scale = 2.0
+    """Speed between pictures, metres per second."""
+    hover: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 3.0
+    """Seconds that a picture takes."""
+    no_fly: Scale | None = None
+    """Radius in metres of an upright cylinder around the object that no pose and no leg enters."""
+    clearance: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    """Least height in metres of a pose above the object's lowest point."""
     estimator: str = "exact"
     """Estimator of the Fisher information: exact, hutchinson, or loss-gradient (the paper's)."""
     budget: Annotated[int, Field(ge=0)] = 50
@@ -98,6 +110,11 @@ class NbvSettings(BaseModel):
     _every_kind = field_validator("prior_std", mode="before")(
         lambda given: complete(given, PRIOR_STD)
     )
+
+    @property
+    def flies(self) -> bool:
+        """Whether the flight has a limit, so that views are planned as a tour."""
+        return self.flight_length is not None or self.flight_time is not None
 
     def train_at(self, step: int) -> TrainSettings:
         """Settings of the fit of a step: `train` for step 0, with the warm values afterwards."""
@@ -195,7 +212,8 @@ def check_settings(settings: NbvSettings, frames: int) -> None:
     Unknown are: a policy, an estimator without a diagonal, an optimiser; an estimator or a policy
     that has no columns of learned means; seeds and budget beyond the number of frames.
     """
-    from mgs.fit.optimisers import OPTIMISERS  # loads Dr.Jit, as the next
+    from mgs.fit.density import DENSITIES  # loads Dr.Jit, as the next two
+    from mgs.fit.optimisers import OPTIMISERS
     from mgs.splat import ESTIMATORS
 
     diagonal = [name for name in ESTIMATORS if name != "block"]
@@ -209,6 +227,15 @@ def check_settings(settings: NbvSettings, frames: int) -> None:
         message = f"{fixed[0]} has no information about means; leave out either"
         raise InputError(f"--means {settings.train.means}: {message}")
     row_named(OPTIMISERS, settings.train.optimiser, "--optimiser")
+    control = row_named(DENSITIES, settings.train.density, "--density")
+    if control and (settings.train.means != "free" or settings.budget > 0):
+        needs = "needs free means and all images at once; give `mgs fit --means free`"
+        raise InputError(f"--density {settings.train.density}: {needs}")
+    if settings.flies and settings.travel is not None:
+        raise InputError(
+            f"--travel {settings.travel:g}: a flight with a limit has its own travel cost; "
+            "leave out --travel"
+        )
     left, where = frames - settings.seeds, settings.dataset
     if left < 0:
         few = f"has {frames} frames, fewer than {settings.seeds} seeds; lower --seed-views"

@@ -26,7 +26,7 @@ from mgs.fit.settings import COLOURS_ALONE
 from mgs.gaussians import Gaussians
 from mgs.prior.build import build_prior, load_prior, save_prior
 from mgs.prior.settings import PriorSettings
-from mgs.report.evaluation import evaluate, evaluate_run
+from mgs.report.evaluation import evaluate_model, evaluate_run
 from mgs.run.folder import Run, open_run
 from mgs.run.nbv import resume_nbv, start_run
 from mgs.run.state import State
@@ -149,7 +149,7 @@ def make_prior(root: Path, out: Path, dataset: str, **settings: Any) -> dict[str
     folder = out / "prior"
     if not (folder / "prior.json").is_file():  # written last
         shutil.rmtree(folder, ignore_errors=True)
-        built, _ = build_prior(load_dataset(root / dataset), PriorSettings(**settings))
+        built = build_prior(load_dataset(root / dataset), PriorSettings(**settings))
         with atomic_folder(folder) as unfinished:
             save_prior(unfinished, built)
     prior = load_prior(folder)
@@ -171,7 +171,7 @@ def test_views_of(dataset: Dataset) -> Dataset:
 
 def judge(model: Gaussians, dataset: Dataset) -> dict[str, float]:
     """Mean metrics of a model over the test views of a dataset (`mgs.report.evaluation`)."""
-    return dict(evaluate(model, (), (), test_frames=test_views_of(dataset).frames)["test"])
+    return dict(evaluate_model(model, (), (), test_frames=test_views_of(dataset).frames)["test"])
 
 
 def begun_run(root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]) -> Run:
@@ -191,7 +191,7 @@ def run_policy(
     """Run a policy. Returns a list for each of CURVES, one number for each fit, and "taken", the
     indices of the frames in the order taken."""
     run = begun_run(root, out, dataset, prior, {"evaluate_every": 1, **settings})
-    return curves_of(resume_nbv(run, policy=settings.get("policy")))
+    return curves_of(resume_nbv(run, policy=settings.get("policy")).state)
 
 
 def curves_of(state: State) -> dict[str, Any]:
@@ -216,7 +216,7 @@ def _timed(
     root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]
 ) -> dict[str, Any]:
     run = begun_run(root, out, dataset, prior, settings)
-    steps = resume_nbv(run, policy=settings.get("policy")).steps
+    steps = resume_nbv(run, policy=settings.get("policy")).state.steps
     peak = peak_megabytes()
     metrics = evaluate_run(run.folder, pictures=False)
     seconds = [step["seconds"] for step in steps]

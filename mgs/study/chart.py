@@ -225,7 +225,7 @@ def measure(
 
     def run() -> State:
         shutil.rmtree(out / "run", ignore_errors=True)
-        return run_nbv(root / dataset, out / "run", prior=root / prior, **given)
+        return run_nbv(root / dataset, out / "run", prior=root / prior, **given).state
 
     state, times = timed(run, repeats)
     shutil.rmtree(out / "run")
@@ -234,7 +234,6 @@ def measure(
         **times,
         **{name: metrics[name] for name in QUALITIES},
         "total_passes": sum(step["iterations"] // step["images"] for step in state.steps),
-        "image_passes": sum(step["iterations"] for step in state.steps),
     }
 
 

@@ -21,7 +21,7 @@ from mgs.fit.settings import TrainSettings
 from mgs.memory import IMAGE_BYTES, Deferred, kept_within
 from mgs.prior.build import load_prior
 from mgs.prior.initial import initial_gaussians
-from mgs.report.evaluation import evaluate
+from mgs.report.evaluation import evaluate_model
 from mgs.study.case import in_new_process, peak_megabytes, test_views_of
 
 PASSES = 150
@@ -61,6 +61,6 @@ def _free_fit(dataset: Path, prior: Path, seed: int) -> dict[str, Any]:
     model = fit(start, [frame.camera for frame in frames], targets, train).gaussians
     seconds, peak = time.perf_counter() - began, peak_megabytes()
     tests = test_views_of(data).frames
-    metrics = evaluate(model, frames, [frame.name for frame in frames], test_frames=tests)
+    metrics = evaluate_model(model, frames, [frame.name for frame in frames], test_frames=tests)
     found = {key: metrics[key] for key in ("images", "test", "all", "held_out")}
     return found | {"seconds": seconds, "choice_seconds": None, "peak_megabytes": peak}

@@ -29,7 +29,7 @@ from mgs.run.operations import operations_of
 from mgs.run.problem import Problem
 from mgs.run.settings import NbvSettings
 from mgs.run.state import Fitted
-from mgs.splat import ListCache, fisher, groups
+from mgs.splat import ListCache, groups
 from mgs.splat.pruning import prune
 from mgs.study.case import Case, Scene, Size, judge
 from mgs.study.output import Content, Panel, draw_panels, table, write_table
@@ -155,8 +155,7 @@ def fit_and_judge(
     rates = {kind: rate if kind in LEARNED[learned] else 0.0 for kind, rate in RATES.items()}
     train = TrainSettings(rates=rates)
     settings = NbvSettings(dataset=root / dataset, prior=root / prior, seeds=seeds, train=train)
-    lam, cache = regularisation(settings, degree), ListCache()
-    problem, spent = _problem(settings, degree, cache), list[float]()
+    problem, spent = _problem(settings, degree, ListCache()), list[float]()
     order = views_in_order(problem.positions, problem.centre, views, seeds)
     problem.seeds = order[:seeds]
     for i in order:
@@ -171,19 +170,16 @@ def fit_and_judge(
         before = Fitted(model, nothing, nothing, order[:count])
     cameras = [problem.cameras[i] for i in order]
     kinds = groups(degree)
-    columns = np.concatenate([np.r_[kinds[kind]] for kind in LEARNED[learned]])
-    information = [fisher(model, camera, cache=cache).astype(np.float64) for camera in cameras]
-    H = np.sum(information, axis=0)[:, columns]
+    each = sum(kinds[kind].stop - kinds[kind].start for kind in LEARNED[learned])
     pruned = []
     for noise in noises:
         left = prune(model, cameras, noise * PIXEL_NOISE)
         row = {"noise": noise, "gaussians": len(left.kept), "actual": left.actual}
-        row |= {"predicted": left.predicted, "parameters": len(left.kept) * H.shape[1]}
+        row |= {"predicted": left.predicted, "parameters": len(left.kept) * each}
         pruned.append(row | _quality(model[left.kept], root / dataset))
     return _quality(model, root / dataset) | {
         "gaussians": len(model),
-        "parameters": int(H.size),
-        "informed": float((lam[columns] < H).mean()),
+        "parameters": len(model) * each,
         "seconds": sum(spent),
         "passes": passes,
         "pruned": pruned,

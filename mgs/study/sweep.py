@@ -81,12 +81,13 @@ def found(root: Path, cell: Cell) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     record = read_json(path)
-    if record["task"] != cell.task or record["arguments"] != cell.arguments:
+    result = record.get("found") if isinstance(record, dict) else None
+    asked = {"task": cell.task, "arguments": cell.arguments}
+    if not isinstance(result, dict) or record != asked | {"found": result}:
         raise InputError(
             f"{path}: was made with other settings or by another version; "
             "delete that folder, or give a new one"
         )
-    result: dict[str, Any] = record["found"]
     return result
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mgs.errors import InputError
-from mgs.files import read_json
+from mgs.files import read_json, reading
 from mgs.resources import scene_path
 
 Positive = Annotated[float, Field(gt=0)]
@@ -150,10 +150,10 @@ def load_scene_file(scene: str | Path) -> SceneFile:
     range.
     """
     path = scene_path(scene)
+    with reading(path):
+        data = path.read_bytes()
     try:
-        return SceneFile.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML ({error}); correct it") from None
+        return SceneFile.model_validate(tomllib.loads(data.decode()))
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
@@ -161,8 +161,10 @@ def load_scene_file(scene: str | Path) -> SceneFile:
             known = ", ".join(_keys_beside(first["loc"]))
             raise InputError(f"{path}: unknown key {key!r}; choose one of {known}") from None
         raise InputError(
-            f"{path}: {key}: {first['msg']} (is {first['input']!r}); correct it"
+            f"{path}: {key}: {first['msg']} (is {repr(first['input'])[:80]}); correct it"
         ) from None
+    except (ValueError, RecursionError) as error:  # RecursionError: nested too deeply
+        raise InputError(f"{path}: not valid TOML ({error}); correct it") from None
 
 
 def _keys_beside(where: tuple[int | str, ...]) -> list[str]:

@@ -8,6 +8,7 @@ others reach, the first request must have the token of the printed URL; a cookie
 from __future__ import annotations
 
 import hmac
+import logging
 import secrets
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -73,14 +74,16 @@ class Access:
 
     @contextmanager
     def guarding(self) -> Iterator[None]:
-        """A server of websockets that is started in this context answers as `answered`."""
+        """A server of websockets that is started in this context answers as `answered`, and prints
+        nothing about messages that it cannot read."""
         from websockets.asyncio import server
 
-        serve = server.serve
+        serve, logger = server.serve, logging.getLogger("mgs.view")
+        logger.disabled = True
 
         def guarded(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
             answer = lambda connection, request: self.answered(connection, request, process_request)  # noqa: E731
-            return serve(*arguments, process_request=answer, **options)
+            return serve(*arguments, process_request=answer, **options | {"logger": logger})
 
         server.serve = guarded  # type: ignore[assignment,misc]
         try:

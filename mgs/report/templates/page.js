@@ -16,7 +16,7 @@ function isDark() {
 
 function layoutOf(spec) {
   const axis = {gridcolor: style("--line"), zerolinecolor: style("--line"), linecolor: style("--line"), automargin: true, exponentformat: "power"};
-  const layout = structuredClone(spec.layout);
+  const layout = plain(spec.layout);
   for (const name of ["xaxis", "yaxis"]) layout[name] = {...axis, ...(layout[name] || {})};
   if (layout.scene) {
     const inSpace = {gridcolor: style("--line"), zerolinecolor: style("--line"), color: style("--soft"), showbackground: false};
@@ -31,9 +31,12 @@ function layoutOf(spec) {
   };
 }
 
+// A copy in which Plotly takes no name for markup.
+function plain(value) { return JSON.parse(JSON.stringify(value).replaceAll("<", "&lt;")); }
+
 function tracesOf(spec) {
   // Black, one of the colours that colour-blind people tell apart, is white on a dark page.
-  return isDark() ? JSON.parse(JSON.stringify(spec.data).replaceAll("#000000", "#ffffff")) : spec.data;
+  return isDark() ? JSON.parse(JSON.stringify(plain(spec.data)).replaceAll("#000000", "#ffffff")) : plain(spec.data);
 }
 
 function draw(id) {

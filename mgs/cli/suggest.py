@@ -1,0 +1,298 @@
+"""`mgs suggest`: the next pictures to take, from the images so far and candidate poses."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Any
+
+from rich.console import Console
+from rich.table import Table
+
+from mgs import runtime
+from mgs.cli.options import argument, option, parse_gaussians
+from mgs.cli.progress import progress_bar
+from mgs.errors import InputError
+from mgs.files import atomic_folder
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from mgs.run.candidates import Named
+    from mgs.run.folder import Run
+    from mgs.run.suggest import Suggestion, View
+
+DOME = 100
+"""Candidates where none are given."""
+
+SHOWN = 10
+"""Rows of the table of one view to take; suggestions.json has all."""
+
+
+def suggest(
+    source: Annotated[Path, argument("Dataset folder, or folder of a run.", metavar="DATASET|RUN")],
+    poses: Annotated[
+        Path | None,
+        option("Candidates: a transforms.json without images, or a CSV with columns x,y,z."),
+    ] = None,
+    dome: Annotated[int | None, option("Candidates: N poses on a dome.", min=1)] = None,
+    ring: Annotated[int | None, option("Candidates: N poses on a ring.", min=1)] = None,
+    grid: Annotated[int | None, option("Candidates: about N poses of a lattice.", min=1)] = None,
+    views: Annotated[int, option("Views to plan together, in flying order.", min=1)] = 1,
+    out: Annotated[
+        Path | None,
+        option("New folder for suggestions.json, transforms.json and suggestions.png."),
+    ] = None,
+    plan: Annotated[
+        list[Path] | None,
+        option("Flight plan to write: .plan, .waypoints or .kml. Needs --origin."),
+    ] = None,
+    origin: Annotated[
+        str | None,
+        option("Place of the world's origin: LAT,LON,ALT, and the bearing of +Y if not north."),
+    ] = None,
+    radius: Annotated[
+        float | None, option("Distance of placed poses. Default: median of the images'.")
+    ] = None,
+    elevations: Annotated[
+        str | None, option("Lowest and highest elevation, degrees. Default if placed: 10,80.")
+    ] = None,
+    safe_distance: Annotated[
+        float | None,
+        option("Least distance from the prior's mesh. Default if placed: half that of the images."),
+    ] = None,
+    no_fly: Annotated[
+        float | None,
+        option("Radius in metres of an upright cylinder around the object to fly around."),
+    ] = None,
+    clearance: Annotated[
+        float | None, option("Least height in metres above the object's lowest point.")
+    ] = None,
+    flight_length: Annotated[
+        float | None, option("Most metres of the flight; --views is then the most.")
+    ] = None,
+    flight_time: Annotated[float | None, option("Most seconds of the flight.")] = None,
+    speed: Annotated[float | None, option("Metres per second. Default: 2.")] = None,
+    hover: Annotated[float | None, option("Seconds at each picture. Default: 3.")] = None,
+    policy: Annotated[
+        str | None, option("Policy that scores. Default: that of `mgs nbv`, or of the run.")
+    ] = None,
+    prior: Annotated[
+        Path | None, option("Folder of `mgs prior`. Default: DATASET/prior, or one built now.")
+    ] = None,
+    gaussians: Annotated[
+        str | None, option("Build a prior of this many Gaussians.", metavar="N|auto")
+    ] = None,
+    preset: Annotated[str | None, option("As of `mgs nbv`.")] = None,
+) -> None:
+    """Rank candidate poses by what a picture from each would add; plan the next flight.
+
+    Takes all images of a dataset, fits a model to them, and rates candidates, of which no image is
+    needed; by default 100 poses on a dome. Of a run it takes the model as it is; by default its own
+    frames that are left are the candidates. With --views K it plans K views together and puts them
+    into flying order, from the first image and back to it. Lengths are in the dataset's unit.
+    """
+    from mgs.data.flight_plan import check_plan_path, parse_origin
+
+    console = Console(highlight=False)
+    place = parse_origin(origin) if origin else None
+    for path in plan or ():
+        check_plan_path(path)
+    if plan and place is None:
+        raise InputError("suggest: --plan needs --origin LAT,LON,ALT, the place of the world's 0")
+    settings = {
+        "no_fly": no_fly,
+        "clearance": clearance,
+        "flight_length": flight_length,
+        "flight_time": flight_time,
+        "speed": speed,
+        "hover": hover,
+        "policy": policy,
+    }
+    settings = {key: value for key, value in settings.items() if value is not None}
+    band = _elevations(elevations)
+    runtime.start()
+    with TemporaryDirectory() as scratch, progress_bar("reading", console) as progress:
+        fit = {"prior": prior, "gaussians": parse_gaussians(gaussians), "preset": preset}
+        run = _run(source, Path(scratch) / "run", fit | {"policy": policy}, progress)
+        if plan and run.dataset.unit != "m":
+            raise InputError(
+                f"{source}: its lengths have no unit, and a flight plan has metres; import the "
+                "data with --unit"
+            )
+        shapes = {"dome": dome, "ring": ring, "grid": grid}
+        candidates, safe, band = _candidates(run, poses, shapes, radius, band, safe_distance)
+        from mgs.run.suggest import suggest as suggested
+
+        found = suggested(
+            run,
+            candidates,
+            views,
+            safe_distance=safe,
+            elevations=band,
+            progress=progress,
+            **settings,
+        )
+        crossed = _crossed(run, found)
+        if crossed and plan:
+            raise InputError(f"suggest: {crossed}, so no flight plan is written; give --no-fly")
+        if out is not None:
+            from mgs.report.suggestion import write_suggestion
+
+            with atomic_folder(out) as unfinished:
+                write_suggestion(unfinished, run, found)
+        for path in plan or ():
+            _write_plan(path, run, found, place, settings)
+    _print(console, found, views, run, crossed)
+    for written in [*([out] if out else []), *(plan or ())]:
+        console.print(f"wrote {written}", soft_wrap=True)
+
+
+def _elevations(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    try:
+        low, high = (float(part) for part in text.split(","))
+        if not -90 <= low <= high <= 90:
+            raise ValueError
+    except ValueError:
+        raise InputError(
+            f"--elevations {text!r}: expected LOWEST,HIGHEST, degrees from -90 to 90, as in 10,80"
+        ) from None
+    return low, high
+
+
+def _run(source: Path, scratch: Path, settings: dict[str, Any], progress: Any) -> Run:
+    """The run itself, or a new one in `scratch`, fitted to all images of a dataset."""
+    from mgs.data.dataset import load_dataset
+    from mgs.run.folder import holds_run, open_run
+    from mgs.run.nbv import resume_nbv, start_run
+
+    if holds_run(source):
+        for name in ("prior", "gaussians", "preset"):
+            if settings[name] is not None:
+                raise InputError(f"suggest: {source} is a run with its model; leave out --{name}")
+        return open_run(source)
+    given = {key: value for key, value in settings.items() if value is not None}
+    count = len(load_dataset(source))
+    run = start_run(source, scratch, seeds=count, budget=0, progress=progress, **given)
+    return resume_nbv(run, progress=progress)
+
+
+def _candidates(
+    run: Run,
+    poses: Path | None,
+    shapes: dict[str, int | None],
+    radius: float | None,
+    band: tuple[float, float] | None,
+    safe: float | None,
+) -> tuple[Sequence[Named], float, tuple[float, float] | None]:
+    """Candidates, their least distance from the mesh, and their elevations."""
+    import numpy as np
+
+    from mgs.data.meshes import distances_to_mesh
+    from mgs.run.candidates import Site, place_poses, read_poses
+
+    shape = {name: count for name, count in shapes.items() if count is not None}
+    if len(shape) + (poses is not None) > 1:
+        raise InputError("suggest: --poses, --dome, --ring, --grid: give one of them")
+    for name, value in {"--safe-distance": safe, "--radius": radius}.items():
+        if value is not None and not 0 < value < math.inf:
+            raise InputError(f"{name} {value}: must be a positive length")
+    site = Site(run.prior, run.taken[-1].camera)
+    left = [frame for frame in run.dataset.frames if frame not in run.taken]
+    if poses is not None:
+        return read_poses(poses, site), safe or 0.0, band
+    if not shape and left:
+        return [(frame.name, frame.camera) for frame in left], safe or 0.0, band
+    ((kind, count),) = shape.items() or {"dome": DOME}.items()
+    eyes = np.stack([frame.camera.position for frame in run.taken])
+    band = band or (10.0, 80.0)
+    if safe is None:
+        mesh = run.prior.mesh
+        safe = float(distances_to_mesh(eyes, mesh.vertices, mesh.faces).min()) / 2
+    far = float(np.median(np.linalg.norm(eyes - site.centre, axis=1)))
+    return place_poses(kind, count, radius or far, band, site), safe, band
+
+
+def _crossed(run: Run, found: Suggestion) -> str:
+    """Say which leg crosses the object, if one does."""
+    import numpy as np
+
+    from mgs.run.candidates import inside
+    from mgs.run.suggest import taken_in_order
+
+    home = taken_in_order(run)[0].camera.position
+    ends = [*(view.camera.position for view in found.plan), home]
+    names = [*(view.name for view in found.plan), "the first image"]
+    for here, corners, end, name in zip([home, *ends], found.corners, ends, names, strict=False):
+        way = np.array([here, *corners, end])
+        steps = np.linspace(0, 1, 50)[:, None, None]
+        points = (way[:-1] + steps * np.diff(way, axis=0)).reshape(-1, 3)
+        if inside(run.prior.mesh, points).any():
+            return f"the leg to {name} crosses the object"
+    return ""
+
+
+def _write_plan(path: Path, run: Run, found: Suggestion, place: Any, settings: Any) -> None:
+    """Write a flight plan; home is on the ground under the first image."""
+    import numpy as np
+
+    from mgs.data.flight_plan import Stop, write_flight_plan
+    from mgs.data.up import upright
+    from mgs.run.settings import NbvSettings
+    from mgs.run.suggest import taken_in_order
+
+    turn = upright(run.prior.up)
+    pose = np.eye(4)
+    pose[:3, :3] = turn.T
+    home = turn @ taken_in_order(run)[0].camera.position
+    ground = float((run.prior.mesh.vertices @ turn.T)[:, 2].min())
+    stops = [Stop(np.array([*home[:2], ground]))]
+    for corners, view in zip(found.corners, [*found.plan, None], strict=True):
+        stops += [Stop(turn @ corner) for corner in corners]
+        if view is not None:
+            turned = replace(view.camera, world_to_camera=view.camera.world_to_camera @ pose)
+            stops.append(Stop(turn @ view.camera.position, view.name, turned))
+    defaults = NbvSettings.model_fields
+    hover, speed = (settings.get(key, defaults[key].default) for key in ("hover", "speed"))
+    write_flight_plan(path, stops, place, hover, speed)
+
+
+def _print(console: Console, found: Suggestion, views: int, run: Run, crossed: str) -> None:
+    """Print what was dropped, the views as a table, and the flight."""
+    from mgs.policy.criteria import GAIN_UNIT
+
+    for reason, count in found.dropped.items():
+        console.print(f"dropped: {count} {reason}")
+    rows = found.plan if views > 1 else found.ranking[:SHOWN]
+    table = Table(box=None)
+    numbers = ("score", "gain", "distance", "azimuth", "elevation", "unseen", "unknown")
+    for heading in ("", "pose", *numbers):
+        table.add_column(heading, justify="left" if heading == "pose" else "right", overflow="fold")
+    for number, view in enumerate(rows, 1):
+        table.add_row(str(number), view.name, *_cells(view, run.dataset.unit))
+    console.print(table)
+    unit = run.dataset.unit
+    plan = f"{len(found.plan)} view{'s' if len(found.plan) > 1 else ''}"
+    console.print(
+        f"gain: Eq. 7, {GAIN_UNIT}; unseen, unknown: of what the picture shows\n"
+        f"flight: {found.metres:.1f} {unit} and {found.seconds:.0f} s from the first image through "
+        f"{plan} and back"
+    )
+    if crossed:
+        console.print(f"{crossed}; --no-fly METRES plans around it")
+
+
+def _cells(view: View, unit: str) -> tuple[str, ...]:
+    return (
+        f"{view.score:.4g}",
+        f"{view.information_gain:.4f}",
+        f"{view.distance:.2f} {unit}",
+        f"{view.azimuth:.0f}°",
+        f"{view.elevation:.0f}°",
+        f"{100 * view.unseen:.1f} %",
+        f"{100 * view.unknown:.0f} %",
+    )

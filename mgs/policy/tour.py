@@ -1,0 +1,116 @@
+"""Tours of a flight: lengths of legs, cheapest insertion, 2-opt. Pure NumPy.
+
+A tour is a list of poses, the indices of rows of a matrix of legs. Its two ends stay where they
+are: where the camera is, and its home. Positions are in metres, with +Z up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mgs.policy.criteria import Array
+
+ARC_STEP = np.radians(15)
+"""Largest angle between two corners of a leg around a cylinder. A chosen constant."""
+
+
+def legs(positions: Array, axis: Array, radius: float = 0.0) -> NDArray[np.float64]:
+    """Lengths of the legs between all pairs of positions [V,3], metres [V,V].
+
+    A leg is straight. If it would cross the upright cylinder of this radius around `axis` [2], it
+    leads around it through the corners of `leg_corners`. For a pose inside the cylinder, the
+    cylinder shrinks to it.
+    """
+    offset = positions[:, None] - positions[None]
+    level = np.linalg.norm(offset[..., :2], axis=2)
+    if radius > 0:
+        out = np.linalg.norm(positions[:, :2] - axis, axis=1)
+        clear = np.minimum(radius, np.minimum(out[:, None], out[None]))
+        tangents, arc = _around(positions[:, :2] - axis, out, clear)
+        half, count = _steps(arc)
+        level = np.where(arc > 0, tangents + 2 * count * clear * np.tan(half), level)
+    return np.hypot(level, offset[..., 2])
+
+
+def _around(level: Array, out: Array, clear: Array) -> tuple[Array, Array]:
+    """Sum of both tangents to the circle, metres, and the arc between them, radians [V,V]; the arc
+    is 0 where the straight leg is free. level: [V,2] from the axis. out: its length [V]."""
+    radii = np.stack(np.broadcast_arrays(out[:, None], out[None]))
+    safe = np.maximum(radii, 1e-12)
+    cosine = np.clip((level @ level.T) / (safe[0] * safe[1]), -1, 1)
+    behind = np.arccos(np.clip(clear / safe, 0, 1))
+    arc = np.arccos(cosine) - behind.sum(0)
+    tangents = np.sqrt(np.maximum(radii**2 - clear**2, 0)).sum(0)
+    return tangents, np.where(arc > 1e-9, arc, 0.0)
+
+
+def _steps(arc: Array) -> tuple[Array, Array]:
+    """Half the angle between the corners of an arc, and their number."""
+    count = np.maximum(np.ceil(arc / ARC_STEP), 1)
+    return arc / (2 * count), count
+
+
+def leg_corners(start: Array, end: Array, axis: Array, radius: float) -> NDArray[np.float64]:
+    """Corners [M,3] of the leg from `start` to `end` [3] (`legs`); none if it is straight.
+
+    They lie just outside the cylinder, and their heights change evenly along the leg.
+    """
+    ends = np.stack([start, end])
+    level, out = ends[:, :2] - axis, np.linalg.norm(ends[:, :2] - axis, axis=1)
+    clear = min(radius, float(out.min()))
+    tangents, arcs = _around(level, out, np.full((2, 2), clear))
+    arc = float(arcs[0, 1])
+    if radius <= 0 or arc == 0:
+        return np.zeros((0, 3))
+    half, count = (float(value) for value in _steps(np.array(arc)))
+    turn = 1.0 if level[0, 0] * level[1, 1] - level[0, 1] * level[1, 0] >= 0 else -1.0
+    first = np.arctan2(level[0, 1], level[0, 0]) + turn * np.arccos(min(clear / out[0], 1))
+    step = np.arange(int(count))
+    angles = first + turn * (2 * step + 1) * half
+    flat = axis + clear / np.cos(half) * np.stack([np.cos(angles), np.sin(angles)], 1)
+    whole = tangents[0, 1] + 2 * count * clear * np.tan(half)
+    tangent = np.sqrt(max(out[0] ** 2 - clear**2, 0))
+    along = (tangent + (2 * step + 1) * clear * np.tan(half)) / whole
+    return np.column_stack([flat, start[2] + along * (end[2] - start[2])])
+
+
+def tour_length(matrix: Array, tour: Sequence[int]) -> float:
+    """Length of a tour, metres. matrix: `legs` [V,V]."""
+    return float(matrix[list(tour[:-1]), list(tour[1:])].sum())
+
+
+def insertions(
+    matrix: Array, tour: Sequence[int], stops: Sequence[int]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Least metres that each stop adds to a tour [C], and the index in the tour that it takes."""
+    before, after, new = list(tour[:-1]), list(tour[1:]), list(stops)
+    added = matrix[np.ix_(new, before)] + matrix[np.ix_(new, after)] - matrix[before, after]
+    place = added.argmin(axis=1)
+    return np.maximum(added[np.arange(len(new)), place], 0.0), place + 1
+
+
+def two_opt(matrix: Array, tour: Sequence[int]) -> list[int]:
+    """Reverse parts of a tour while that shortens it; both ends stay."""
+    best, improved = list(tour), True
+    while improved:
+        improved = False
+        for i in range(1, len(best) - 2):
+            for j in range(i + 1, len(best) - 1):
+                a, b, c, d = best[i - 1], best[i], best[j], best[j + 1]
+                if matrix[a, c] + matrix[b, d] < matrix[a, b] + matrix[c, d] - 1e-9:
+                    best[i : j + 1] = best[i : j + 1][::-1]
+                    improved = True
+    return best
+
+
+def flying_order(matrix: Array, start: int, stops: Sequence[int], home: int) -> list[int]:
+    """Stops in the order of a short tour from `start` to `home`: nearest next, then 2-opt."""
+    tour, left = [start], list(stops)
+    while left:
+        nearest = min(left, key=lambda stop: (matrix[tour[-1], stop], stop))
+        left.remove(nearest)
+        tour.append(nearest)
+    return two_opt(matrix, [*tour, home])[1:-1]

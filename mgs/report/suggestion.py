@@ -1,0 +1,128 @@
+"""Files of a suggestion: a figure, numbers, and the poses to fly."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.camera import opengl_from_opencv
+from mgs.colour import srgb_from_linear
+from mgs.data.dataset import Frame, write_transforms
+from mgs.data.up import upright
+from mgs.files import write_json
+from mgs.policy.criteria import GAIN_UNIT
+from mgs.report.diagnostics import VISIBLE, run_scalars, view_maps
+from mgs.run.folder import Run
+from mgs.run.suggest import Suggestion, View, taken_in_order
+
+CONVENTION = (
+    "transform_matrix: camera to world, metres, OpenGL axes (x right, y up, z backwards), as in "
+    "nerfstudio"
+)
+
+MOST_PICTURES, PICTURE_WIDTH = 6, 200
+"""Views in the figure, and pixels of the width of their pictures."""
+
+
+def write_suggestion(out: Path, run: Run, found: Suggestion) -> None:
+    """Write suggestions.json, transforms.json and suggestions.png into the folder `out`.
+
+    transforms.json is a dataset of the planned poses in flying order; their pictures belong in
+    images/. Raises InputError if a file cannot be written.
+    """
+    write_json(out / "suggestions.json", numbers(run, found))
+    frames = [
+        Frame(view.name, view.camera, float(k), out / f"images/{view.name}.png", on_demand=True)
+        for k, view in enumerate(found.plan)
+    ]
+    up, unit = run.dataset.up, run.dataset.unit
+    write_transforms(out, frames, up, unit, {"convention": CONVENTION})
+    draw_suggestion(out / "suggestions.png", run, found)
+
+
+def numbers(run: Run, found: Suggestion) -> dict[str, Any]:
+    """Contents of suggestions.json."""
+    units = {
+        "information_gain": f"Eq. 7, {GAIN_UNIT}",
+        "unseen": "share of what the picture shows that no image shows",
+        "unknown": "mean share of the prior's variance left in what the picture shows",
+        "distance": f"from the last image, {run.dataset.unit}",
+    }
+    return {
+        "policy": run.label,
+        "images": len(run.taken),
+        "convention": CONVENTION,
+        "units": units,
+        "flight": {"metres": found.metres, "seconds": found.seconds},
+        "dropped": found.dropped,
+        "plan": [_record(view) for view in found.plan],
+        "ranking": [_record(view) for view in found.ranking],
+    }
+
+
+def _record(view: View) -> dict[str, Any]:
+    values = {key: value for key, value in asdict(view).items() if key != "camera"}
+    pose = opengl_from_opencv(view.camera.world_to_camera)
+    return values | {"transform_matrix": pose.tolist()}
+
+
+def draw_suggestion(path: str | Path, run: Run, found: Suggestion) -> None:
+    """Draw the site from above, and for the first planned views what the model shows from there and
+    how uncertain it is. Raises InputError if the figure cannot be written."""
+    import matplotlib
+
+    from mgs.plotting import STYLE, crop, new_figure, save_figure
+
+    views = found.plan[:MOST_PICTURES]
+    scalars = {"uncertainty": run_scalars(run)["uncertainty"]}
+    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
+        figure = new_figure(4.0 + 1.7 * len(views), 4.2, dpi=120)
+        grid = figure.add_gridspec(2, 1 + len(views), width_ratios=[3.6, *[1.7] * len(views)])
+        _from_above(figure.add_subplot(grid[:, 0]), run, found)
+        for k, view in enumerate(views, 1):
+            small = view.camera.resized(min(view.camera.width, PICTURE_WIDTH))
+            maps = view_maps(run.state.gaussians, small, scalars)
+            visible = maps["A"] >= VISIBLE
+            window = crop(visible)
+            rgb = srgb_from_linear(np.stack([maps[channel] for channel in "RGB"], -1))
+            unknown = np.ma.masked_where(~visible, maps["uncertainty"])
+            colours = matplotlib.colormaps["cividis"].with_extremes(bad="#e8e8e8")
+            top, below = (figure.add_subplot(grid[row, k]) for row in (0, 1))
+            top.imshow(rgb[window])
+            top.set_title(f"{k}: {view.name}\ngain {view.information_gain:.3f}")
+            shown = below.imshow(unknown[window], cmap=colours, vmin=0, vmax=1)
+            below.set_title(f"unknown {100 * view.unknown:.0f} %")
+            for axis in (top, below):
+                axis.set_axis_off()
+        figure.colorbar(shown, ax=below, shrink=0.8, aspect=16, label="variance left")
+        save_figure(figure, path)
+
+
+def _from_above(axis: Any, run: Run, found: Suggestion) -> None:
+    """Draw images, candidates by gain, and the planned way, from above."""
+    turn = upright(run.prior.up)
+
+    def level(points: Any) -> np.ndarray:
+        return np.asarray(np.atleast_2d(points) @ turn.T)[:, :2]
+
+    images = level([frame.camera.position for frame in taken_in_order(run)])
+    ranked = level([view.camera.position for view in found.ranking])
+    gains = [view.information_gain for view in found.ranking]
+    axis.scatter(*level(run.prior.points[::7]).T, s=0.5, color="#b0a898", rasterized=True)
+    axis.scatter(*images.T, marker="^", s=26, color="black", label="images")
+    dots = axis.scatter(*ranked.T, c=gains, s=18, cmap="viridis", label="candidates")
+    stops = [level(view.camera.position) for view in found.plan]
+    way = [images[:1]]
+    for corners, stop in zip(found.corners, [*stops, images[:1]], strict=True):
+        way += [level(corners)] * (len(corners) > 0) + [stop]
+    axis.plot(*np.concatenate(way).T, color="#d1495b", linewidth=1.2)
+    for k, stop in enumerate(stops, 1):
+        axis.annotate(str(k), stop[0], (3, 3), textcoords="offset points", color="#d1495b")
+    unit = run.dataset.unit
+    axis.set(aspect="equal", xlabel=f"x ({unit})", ylabel=f"y ({unit})")
+    axis.set_title(f"from above: a flight of {found.metres:.1f} {unit}")
+    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
+    axis.figure.colorbar(dots, ax=axis, shrink=0.6, aspect=20, label="gain")

@@ -1,0 +1,234 @@
+"""Candidate poses of the next pictures: read from a file, or placed around the object.
+
+A candidate needs no image. Positions are in the world of the dataset, metres.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from mgs.camera import Camera, look_at
+from mgs.data.dataset import load_cameras
+from mgs.data.meshes import Mesh, distances_to_mesh
+from mgs.data.up import upright
+from mgs.errors import InputError
+from mgs.files import reading
+from mgs.prior.build import Prior
+from mgs.rotation import rotmat_from_quat
+from mgs.synth.orbit import orbit_positions
+from mgs.synth.scene_file import Orbit
+
+POSITION, TARGET = ("x", "y", "z"), ("target_x", "target_y", "target_z")
+QUATERNION = ("qw", "qx", "qy", "qz")
+COLUMNS = ("name", *POSITION, *TARGET, *QUATERNION)
+"""Columns of a CSV of poses. The quaternion is that of camera to world, with OpenCV axes."""
+
+MOST_POSES = 5000
+"""Most candidates of one suggestion: each is drawn, and the legs between all are compared."""
+
+SAME_PLACE, SAME_VIEW = 1e-3, 1.0
+"""Distance over that from the object, and angle in degrees, below which a pose counts as taken."""
+
+Named = tuple[str, Camera]
+
+
+@dataclass(frozen=True)
+class Site:
+    """The object, and the camera that looks at it.
+
+    mesh, centre [3], up: of the prior. like: camera whose intrinsics candidates have by default.
+    """
+
+    prior: Prior
+    like: Camera
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """Middle of the object [3]."""
+        return np.asarray(self.prior.points.mean(axis=0), np.float64)
+
+    def camera(self, eye: Sequence[float] | np.ndarray, target: np.ndarray | None = None) -> Camera:
+        """A camera at `eye` [3] that looks at `target` [3], by default the middle of the object."""
+        pose = look_at(eye, self.centre if target is None else target, self.prior.up)
+        return Camera(self.like.K, self.like.width, self.like.height, pose)
+
+
+def read_poses(path: str | Path, site: Site) -> list[Named]:
+    """Poses of a transforms.json, or of a CSV with the columns x, y, z, and optionally name, a
+    target or a quaternion (COLUMNS). Intrinsics that a file lacks are those of `site.like`.
+
+    Raises InputError as `load_cameras`; for a CSV without rows, with unknown, missing or half of
+    the columns, or a number that is none; for more than MOST_POSES poses, or two of one name.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".csv":
+        poses = _read_csv(path, site)
+    else:
+        poses = [(Path(name).stem, camera) for name, camera in load_cameras(path, site.like)]
+    if len(poses) > MOST_POSES:
+        raise InputError(f"{path}: lists {len(poses):,} poses, more than {MOST_POSES:,}; thin them")
+    names = [name for name, _ in poses]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise InputError(f"{path}: lists the pose {twice} more than once; rename or remove it")
+    return poses
+
+
+def _read_csv(path: Path, site: Site) -> list[Named]:
+    with reading(path), open(path, newline="", encoding="utf-8", errors="replace") as file:
+        table = csv.reader(file)
+        columns = [name.strip().lower() for name in next(table, [])]
+        lines = [(table.line_num, row) for row in table if any(cell.strip() for cell in row)]
+    unknown = [name for name in columns if name not in COLUMNS]
+    known = ", ".join(COLUMNS)
+    if unknown or not columns:
+        what = f"has the column {unknown[0]!r}" if unknown else "is empty"
+        raise InputError(f"{path}: {what}; its first line must name columns of {known}")
+    for group in (POSITION, TARGET, QUATERNION):
+        lacking = [name for name in group if name not in columns]
+        if lacking and (group == POSITION or len(lacking) < len(group)):
+            raise InputError(f"{path}: lacks the column {lacking[0]}; add it, or correct its name")
+    if not lines:
+        raise InputError(f"{path}: lists no poses; add a line with x, y and z for each")
+    return [
+        _csv_pose(f"{path}: line {number}", k, columns, row, site)
+        for k, (number, row) in enumerate(lines)
+    ]
+
+
+def _csv_pose(where: str, index: int, columns: list[str], row: list[str], site: Site) -> Named:
+    if len(row) != len(columns):
+        raise InputError(f"{where} has {len(row)} cells, not {len(columns)}; correct it")
+    cells = dict(zip(columns, (cell.strip() for cell in row), strict=True))
+    name = cells.pop("name", "") or f"pose_{index:04d}"
+    numbers = dict[str, float]()
+    for key, text in cells.items():
+        try:
+            numbers[key] = float(text)
+        except ValueError:
+            numbers[key] = math.nan
+        if not math.isfinite(numbers[key]):
+            raise InputError(f"{where}: {key} is {text!r}, no finite number; correct it")
+    eye = np.array([numbers[key] for key in POSITION])
+    if "qw" not in numbers:
+        target = np.array([numbers[key] for key in TARGET]) if "target_x" in numbers else None
+        try:
+            return name, site.camera(eye, target)
+        except InputError:
+            raise InputError(f"{where}: looks at its own position; correct it") from None
+    quaternion = np.array([numbers[key] for key in QUATERNION])
+    if not quaternion.any():
+        raise InputError(f"{where}: its quaternion is zero; correct it")
+    pose = np.eye(4)
+    pose[:3, :3] = rotmat_from_quat(quaternion).T
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    return name, Camera(site.like.K, site.like.width, site.like.height, pose)
+
+
+def place_poses(
+    shape: str, count: int, radius: float, elevations: tuple[float, float], site: Site
+) -> list[Named]:
+    """About `count` poses around the object, which look at its middle.
+
+    shape: "dome", spread evenly over the elevations; "ring", a circle at their middle; "grid", a
+    cubic lattice of the dome's radius. radius: metres. elevations: lowest and highest above the
+    middle of the object, degrees. Raises InputError if the lattice has no place between them.
+    """
+    turn, low, high = upright(site.prior.up), *elevations
+    if shape == "grid":
+        offsets = _lattice(count, radius, elevations)
+        if not len(offsets):
+            raise InputError(f"--grid {count}: has no pose in the elevations; ask for more")
+    else:
+        band = elevations if shape == "dome" else ((low + high) / 2,) * 2
+        kind = "hemisphere" if shape == "dome" else "rings"
+        orbit = Orbit(kind=kind, radius=radius, elevations=band, turns=1)  # type: ignore[arg-type]
+        offsets = orbit_positions(orbit, count, np.zeros(3))
+    digits = len(str(len(offsets) - 1))
+    eyes = site.centre + offsets @ turn
+    return [(f"{shape}_{i:0{digits}d}", site.camera(eye)) for i, eye in enumerate(eyes)]
+
+
+def _lattice(count: int, radius: float, elevations: tuple[float, float]) -> NDArray[np.float64]:
+    """About `count` points of a cubic lattice between two elevations and within a radius [M,3]."""
+    low, high = np.sin(np.radians(elevations))
+    volume = 2 * np.pi / 3 * radius**3 * max(high - low, 1e-3)
+    step = (volume / count) ** (1 / 3)
+    line = step * np.arange(-math.ceil(radius / step), math.ceil(radius / step) + 1)
+    points = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)
+    far = np.linalg.norm(points, axis=1)
+    rise = points[:, 2] / np.maximum(far, 1e-12)
+    return points[(far > 0) & (far <= radius) & (rise >= low) & (rise <= high)]
+
+
+def inside(mesh: Mesh, points: np.ndarray) -> NDArray[np.bool_]:
+    """Whether points [M,3] are inside a mesh, bool [M]: its winding number is above 1/2.
+
+    The winding number sums the signed solid angles of the faces over 4 pi (Van Oosterom and
+    Strackee 1983), so a mesh with holes has an inside too.
+    """
+    found = np.zeros(len(points), bool)
+    try:
+        planes = ConvexHull(mesh.vertices).equations
+    except QhullError:  # flat
+        return found
+    corners = mesh.vertices[mesh.faces]
+    for k in np.flatnonzero((points @ planes[:, :3].T + planes[:, 3] <= 0).all(1)):
+        a, b, c = np.moveaxis(corners - points[k], 1, 0)
+        la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
+        volume = np.einsum("fk,fk->f", a, np.cross(b, c))
+        ab, bc, ca = (np.einsum("fk,fk->f", p, q) for p, q in ((a, b), (b, c), (c, a)))
+        angle = np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb)
+        found[k] = angle.sum() / (2 * np.pi) > 0.5
+    return found
+
+
+def refusals(
+    poses: Sequence[Named],
+    taken: Sequence[Camera],
+    site: Site,
+    safe_distance: float = 0.0,
+    elevations: tuple[float, float] | None = None,
+) -> list[str]:
+    """Why each candidate cannot be flown; empty if it can.
+
+    safe_distance: least distance from the prior's mesh, metres. elevations: lowest and highest
+    above the middle of the object, degrees.
+    """
+    eyes = np.stack([camera.position for _, camera in poses])
+    mesh, centre = site.prior.mesh, site.centre
+    offset = (eyes - centre) @ upright(site.prior.up).T
+    far = np.linalg.norm(offset, axis=1)
+    rise = np.degrees(np.arcsin(np.clip(offset[:, 2] / np.maximum(far, 1e-12), -1, 1)))
+    low, high = elevations or (-90.0, 90.0)
+    beyond = (rise < low - 1e-6) | (rise > high + 1e-6)
+    near = distances_to_mesh(eyes, mesh.vertices, mesh.faces) < safe_distance
+    within = inside(mesh, eyes)
+    reasons = {
+        "inside the object": within,
+        f"nearer to it than {safe_distance:.3g}": near,
+        f"not between {low:g} and {high:g} degrees": beyond,
+        "taken already": _are_taken(poses, taken, far),
+    }
+    return [next((why for why, hit in reasons.items() if hit[k]), "") for k in range(len(poses))]
+
+
+def _are_taken(
+    poses: Sequence[Named], taken: Sequence[Camera], far: np.ndarray
+) -> NDArray[np.bool_]:
+    """Whether an image was taken from about the same place in about the same direction."""
+    eyes = np.stack([camera.position for camera in taken])
+    ahead = np.stack([camera.world_to_camera[2, :3] for camera in taken])
+    found = np.zeros(len(poses), bool)
+    for k, (_, camera) in enumerate(poses):
+        close = np.linalg.norm(eyes - camera.position, axis=1) <= SAME_PLACE * far[k]
+        turned = ahead @ camera.world_to_camera[2, :3] >= np.cos(np.radians(SAME_VIEW))
+        found[k] = (close & turned).any()
+    return found

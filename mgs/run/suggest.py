@@ -1,0 +1,341 @@
+"""`mgs suggest` for programs: rank candidate poses by a run's model, and plan a flight over some.
+
+Choosing a view needs less model than rendering it. So it uses a coarse one: about COARSE of the
+model's Gaussians, larger by the ratio of their spacings, in smaller images in which they are as
+large as before. Ranks agree with those of the whole model (docs/howto/on-site.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mgs.camera import Camera
+from mgs.data.dataset import Dataset, Frame
+from mgs.errors import InputError
+from mgs.gaussians import Gaussians
+from mgs.policy import criteria, tour
+from mgs.policy.context import Policy
+from mgs.policy.directional import squared_weights
+from mgs.policy.from_file import in_file, is_function, name_of
+from mgs.policy.registry import policy_of
+from mgs.prior.build import Prior
+from mgs.prior.initial import initial_gaussians
+from mgs.run.candidates import Named, Site, refusals
+from mgs.run.folder import Run
+from mgs.run.loop import (
+    Chooser,
+    choose,
+    choose_batch,
+    information,
+    plan_flight,
+    rated,
+    surface_information,
+)
+from mgs.run.operations import operations_of
+from mgs.run.problem import Operations, Problem, Progress, no_progress
+from mgs.run.settings import NbvSettings, check_settings, validated
+from mgs.run.state import Fitted
+
+COARSE = 8000
+"""About the most Gaussians on the surface of the model that candidates are rated by. A chosen
+constant."""
+
+FINE = 320
+"""Most pixels of an image's width of a model that is not thinned. A chosen constant."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A candidate and what its picture would give.
+
+    score: the policy's. information_gain: Eq. 7 (`mgs.policy.criteria.d_optimal`). unseen, unknown:
+    share of what it shows, by squared blending weight, that no image shows, and mean share of the
+    prior's variance that is left there. distance: from the last image taken. azimuth, elevation:
+    from the middle of the object, degrees; azimuth 0 is +X. planned: place in the order of choice,
+    from 1; 0 if not planned.
+    """
+
+    name: str
+    camera: Camera
+    score: float
+    information_gain: float
+    unseen: float
+    unknown: float
+    distance: float
+    azimuth: float
+    elevation: float
+    planned: int = 0
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """Candidates in the order of their scores, and the planned ones in flying order.
+
+    A planned view's score and gain are those with the views chosen before it. metres: length of the
+    flight from the first image taken through the plan and back; seconds: its time. dropped:
+    reasons for which candidates cannot be flown, with their numbers. corners: points of the way
+    before each planned view and before home, where it leads around the no-fly cylinder.
+    """
+
+    ranking: list[View]
+    plan: list[View]
+    metres: float
+    seconds: float
+    dropped: dict[str, int]
+    corners: list[NDArray[np.float64]]
+
+
+def suggest(
+    run: Run,
+    poses: Sequence[Named],
+    views: int = 1,
+    *,
+    safe_distance: float = 0.0,
+    elevations: tuple[float, float] | None = None,
+    progress: Progress = no_progress,
+    **settings: Any,
+) -> Suggestion:
+    """Rank poses by what a picture from each would add to the model of a run, and plan `views`.
+
+    With a limit of the flight, `views` is the most, and the plan is that of `plan_flight`. The
+    flight starts and ends at the first image taken. safe_distance, elevations: as `refusals`.
+    settings: fields of `NbvSettings` in place of the run's. Raises InputError if no
+    pose can be flown, fewer can than `views`, a setting is invalid, or the policy fails.
+    """
+    policy, own = settings.pop("policy", None) or run.policy, run.settings.policy
+    if policy is None and (in_file(own) or is_function(own)):
+        raise InputError(f"{run.folder}: its policy is a program, {own}; name it with --policy")
+    settings |= {} if policy is None else {"policy": name_of(policy)}
+    images = taken_in_order(run)
+    site, taken = Site(run.prior, images[-1].camera), [frame.camera for frame in images]
+    why = refusals(poses, taken, site, safe_distance, elevations)
+    flyable = [pose for pose, reason in zip(poses, why, strict=True) if not reason]
+    dropped = {reason: why.count(reason) for reason in dict.fromkeys(why) if reason}
+    known = _settings(run, len(taken), min(views, len(flyable)), settings)
+    _check_left(len(poses), len(flyable), dropped, views, known.flies)
+    scores = None if policy is None else policy_of(policy)
+    problem, state = _problem(run, images, flyable, known, progress, scores)
+    fisher = problem.view_information(state.gaussians)
+    weights = _weights(problem, fisher, len(taken))
+    blind = [i for i, seen in weights.items() if not seen.any()]
+    _drop(dropped, "sees nothing of the object", blind, problem)
+    ruled_out = [i for i in weights if not problem.allowed[i] and i not in blind]
+    _drop(dropped, "ruled out by --no-fly or --clearance", ruled_out, problem)
+    free = [i for i in weights if problem.allowed[i]]
+    _check_left(len(poses), len(free), dropped, views, known.flies)
+    order = rated(problem, problem.context(state, free, fisher))
+    described = _described(problem, state, flyable, weights)
+    ranking = [
+        replace(
+            described(frame),
+            score=score,
+            information_gain=criteria.d_optimal(fisher(frame), state.H, problem.lam),
+        )
+        for frame, score in order
+    ]
+    plan, frames = _plan(problem, state, fisher, described)
+    way = [0, *frames, 0]
+    radius, axis = known.no_fly or 0.0, problem.centre[:2]
+    ends = [problem.positions[i] for i in way]
+    corners = [tour.leg_corners(a, b, axis, radius) @ problem.turn for a, b in pairwise(ends)]
+    metres = tour.tour_length(problem.flight.legs, way)
+    seconds = metres / known.speed + known.hover * len(plan)
+    return Suggestion(ranking, plan, metres, seconds, dropped, corners)
+
+
+def taken_in_order(run: Run) -> list[Frame]:
+    """The images of a run in the order in which they were taken; seeds alone by their time."""
+    if len(run.taken) > run.settings.seeds:
+        return run.taken
+    return sorted(run.taken, key=lambda frame: (frame.timestamp, frame.name))
+
+
+def _settings(run: Run, taken: int, views: int, given: dict[str, Any]) -> NbvSettings:
+    """Settings of the run for a batch of `views` after all views taken."""
+    fixed = {"seeds": taken, "budget": views, "batch": max(views, 2)}
+    free = {"travel": None, "nearest": None, "stop_gain": None, "stop_uncertainty": None}
+    settings = validated(NbvSettings, run.settings.model_dump() | free | given | fixed)
+    check_settings(settings, taken + views)
+    return settings
+
+
+def _check_left(count: int, left: int, dropped: dict[str, int], views: int, flies: bool) -> None:
+    """Raise InputError where too few of `count` candidates are left."""
+    reasons = "; ".join(f"{number} {why}" for why, number in dropped.items()) or "none was dropped"
+    if not left:
+        raise InputError(
+            f"suggest: none of the {count} candidates can be flown ({reasons}); give others"
+        )
+    if left < views and not flies:
+        raise InputError(
+            f"suggest: --views {views} of {left} candidates ({reasons}); lower it, or give more"
+        )
+
+
+def _drop(dropped: dict[str, int], reason: str, frames: list[int], problem: Problem) -> None:
+    problem.allowed[frames] = False
+    if frames:
+        dropped[reason] = len(frames)
+
+
+def _weights(problem: Problem, fisher: Any, taken: int) -> dict[int, NDArray[np.float32]]:
+    """Squared blending weights of the surface's Gaussians in each candidate, by its frame."""
+    found = {}
+    for i in range(taken, len(problem.frames)):
+        problem.progress("looking from the candidates", i - taken, len(problem.frames) - taken)
+        found[i] = squared_weights(fisher(i))[: problem.on_surface]
+    return found
+
+
+def _described(
+    problem: Problem, state: Fitted, poses: Sequence[Named], weights: dict[int, Any]
+) -> Any:
+    """A function frame -> `View` without score and gain."""
+    unseen = ~criteria.observed(state.surface, problem.prior_lam)
+    left = criteria.uncertainty(state.H, problem.lam)[: problem.on_surface]
+    taken = len(state.taken)
+    here = problem.positions[taken - 1]
+
+    def view(frame: int) -> View:
+        seen, (name, camera) = weights[frame], poses[frame - taken]
+        x, y, z = offset = problem.positions[frame] - problem.centre
+        return View(
+            name,
+            camera,
+            score=0.0,
+            information_gain=0.0,
+            unseen=float(seen[unseen].sum() / seen.sum()),
+            unknown=float((seen * left).sum() / seen.sum()),
+            distance=float(np.linalg.norm(problem.positions[frame] - here)),
+            azimuth=float(np.degrees(np.arctan2(y, x)) % 360),
+            elevation=float(np.degrees(np.arcsin(z / np.linalg.norm(offset)))),
+        )
+
+    return view
+
+
+def _plan(
+    problem: Problem, state: Fitted, fisher: Any, described: Any
+) -> tuple[list[View], list[int]]:
+    """Views of the plan in flying order, and their frames."""
+    chooser: Chooser = choose
+    if problem.settings.flies:
+        if not problem.reachable(state.taken):
+            raise InputError(
+                "suggest: no candidate is within the limits of the flight; raise --flight-length "
+                "or --flight-time"
+            )
+        stops = plan_flight(problem, state, fisher)
+        problem.settings = problem.settings.model_copy(update={"batch": len(stops)})
+        chooser = _following(stops)
+    _, choices, _ = choose_batch(problem, state, chooser)
+    frames = [choice.frame for choice in choices]
+    if not problem.settings.flies:
+        frames = tour.flying_order(problem.flight.legs, 0, frames, 0)
+    of = {choice.frame: (k, choice) for k, choice in enumerate(choices, 1)}
+    plan = []
+    for frame in frames:
+        number, choice = of[frame]
+        numbers = {"score": choice.score, "information_gain": choice.information_gain}
+        plan.append(replace(described(frame), planned=number, **numbers))  # type: ignore[arg-type]
+    return plan, frames
+
+
+def _following(stops: Sequence[tuple[int, float]]) -> Chooser:
+    """A chooser that takes these stops in turn."""
+    left = iter(stops)
+
+    def choose_next(problem: Problem, state: Fitted, fisher: Any = None) -> tuple[int, float]:
+        return next(left)
+
+    return choose_next
+
+
+def _problem(
+    run: Run,
+    images: Sequence[Frame],
+    poses: Sequence[Named],
+    settings: NbvSettings,
+    progress: Progress,
+    policy: Policy | None,
+) -> tuple[Problem, Fitted]:
+    """Selection problem of the images taken, then the poses, with a coarse model; and its state.
+
+    The first image counts as the last view taken, since the flight starts there.
+    """
+    prior, rows = coarse_prior(run.prior)
+    thinning = len(prior.points) / len(run.prior.points)
+    model, start = _coarse(run.state.gaussians, rows, thinning, run.prior), _start(prior)
+    width = max(round(images[0].camera.width * thinning**0.5), 1)
+
+    def small(camera: Camera) -> Camera:
+        return camera.resized(max(min(camera.width, width if thinning < 1 else FINE), 16))
+
+    frames = [replace(frame, camera=small(frame.camera)) for frame in images]
+    frames += [Frame(f"{name}/candidate", small(camera), 0.0, Path(name)) for name, camera in poses]
+    dataset = Dataset(run.dataset.root, tuple(frames), run.dataset.up, run.dataset.unit)
+    count, ratio = len(images), images[0].camera.width / frames[0].camera.width
+    usual = operations_of(dataset, prior, settings)
+    operations = _scaled(replace(usual, initial=lambda frames: start), ratio**2 * thinning)
+    problem = Problem(dataset, settings, operations, progress, policy, seeds=range(count))
+    problem.skipped = count
+    taken = [*range(1, count), 0]
+    H = information(problem, model, taken)
+    return problem, Fitted(model, H, surface_information(problem, taken), taken)
+
+
+def coarse_prior(prior: Prior, most: int = COARSE) -> tuple[Prior, NDArray[np.int64]]:
+    """About `most` samples of a prior, one in each cell of a grid, and their indices.
+
+    A prior with at most as many is returned as it is, with all indices.
+    """
+    count = len(prior.points)
+    if count <= most:
+        return prior, np.arange(count)
+    low, high = prior.spacing, prior.spacing * count
+    rows = np.arange(count)
+    while len(rows) > most or high / low > 1.05:
+        cell = np.sqrt(low * high)
+        cells = np.floor(prior.points / cell).astype(np.int64)
+        rows = np.sort(np.unique(cells, axis=0, return_index=True)[1])
+        low, high = (cell, high) if len(rows) > most else (low, cell)
+    thinned = replace(
+        prior,
+        points=prior.points[rows],
+        normals=prior.normals[rows],
+        spacing=prior.spacing * float(np.sqrt(count / len(rows))),
+        backed=0,
+    )
+    return thinned, rows
+
+
+def _coarse(model: Gaussians, rows: np.ndarray, thinning: float, prior: Prior) -> Gaussians:
+    """Gaussians of a fitted model for the samples of a coarse prior: fewer and larger."""
+    if thinning == 1:
+        return model
+    some = model[rows]
+    return replace(some, log_scales=some.log_scales - np.float32(0.5 * np.log(thinning)))
+
+
+def _start(prior: Prior) -> Gaussians:
+    """Gaussians before training, grey: no image is read."""
+    return initial_gaussians(prior, [])[0]
+
+
+def _scaled(operations: Operations, factor: float) -> Operations:
+    """Operations whose information is that of the images at their own size."""
+    fisher, estimate = operations.fisher, operations.estimate
+    exact = operations.exact or fisher
+    return replace(
+        operations,
+        fisher=lambda model, camera: fisher(model, camera) * np.float32(factor),
+        exact=lambda model, camera: exact(model, camera) * np.float32(factor),
+        estimate=lambda model, camera, name: estimate(model, camera, name) * np.float32(factor),
+    )

@@ -1,0 +1,127 @@
+"""Flights with a limit: tours, the budget of a run, poses that are not allowed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import tiny
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from program import command, said, steps
+from refusals import refused
+from tiny import run
+
+from mgs.policy import tour
+from mgs.run import folder as run_folder
+from mgs.run.problem import Problem
+
+POSITIONS = arrays(np.float64, (9, 3), elements=st.floats(-50, 50, width=32))
+RADII = st.sampled_from([0.0, 1.0, 20.0])
+AXIS = np.array([1.0, -2.0])
+
+
+@given(POSITIONS, RADII)
+def test_a_leg_is_as_long_as_its_corners_say_and_keeps_out(positions, radius):
+    matrix = tour.legs(positions, AXIS, radius)
+    np.testing.assert_allclose(matrix, matrix.T, atol=1e-6)
+    straight = np.linalg.norm(positions[0] - positions[1])
+    corners = tour.leg_corners(positions[0], positions[1], AXIS, radius)
+    way = np.array([positions[0], *corners, positions[1]])
+    length = np.linalg.norm(np.diff(way, axis=0), axis=1).sum()
+    assert matrix[0, 1] == pytest.approx(length, abs=1e-4)
+    assert length >= straight - 1e-6
+    assert len(corners) == 0 or radius > 0
+    out = np.linalg.norm(positions[:2, :2] - AXIS, axis=1)
+    if out.min() > radius:
+        between = way[:-1, None] + np.linspace(0, 1, 20)[:, None] * np.diff(way, axis=0)[:, None]
+        nearest = np.linalg.norm(between[..., :2] - AXIS, axis=2).min()
+        assert nearest > radius - 1e-3 * (1 + radius)
+
+
+@given(POSITIONS, RADII, st.permutations(range(8)))
+def test_insertion_and_2_opt_only_shorten(positions, radius, order):
+    """Against a stop put at the end of the tour, before home, and the tour as it was."""
+    matrix = tour.legs(positions, AXIS, radius)
+    added, places = tour.insertions(matrix, order, [8])
+    way = [*order[: places[0]], 8, *order[places[0] :]]
+    naive = [*order[:-1], 8, order[-1]]
+    assert tour.tour_length(matrix, way) <= tour.tour_length(matrix, naive) + 1e-9
+    grown = tour.tour_length(matrix, way) - tour.tour_length(matrix, order)
+    assert added[0] == pytest.approx(max(grown, 0), abs=1e-9)
+    short = tour.two_opt(matrix, way)
+    assert (short[0], short[-1], sorted(short)) == (way[0], way[-1], sorted(way))
+    assert tour.tour_length(matrix, short) <= tour.tour_length(matrix, way) + 1e-9
+    visited = tour.flying_order(matrix, order[0], order[1:-1], order[-1])
+    assert sorted(visited) == sorted(order[1:-1])
+
+
+def metres(dataset, taken):
+    positions = np.array([dataset.frames[i].camera.position for i in [*taken, taken[0]]])
+    return np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()
+
+
+LIMITS = [
+    {"flight_length": 24.0},
+    {"flight_length": 30.0, "batch": 2},
+    {"flight_time": 40.0, "speed": 1.0, "hover": 3.0},
+    {"flight_length": 19.0, "policy": "random"},
+]
+
+
+@pytest.mark.parametrize("limits", LIMITS, ids=str)
+def test_a_flight_never_exceeds_its_limits_and_resumes_the_same(loaded, tmp_path, limits):
+    given = {"budget": 9, "seeds": 3, **limits}
+    state = run(tmp_path / "run", loaded, **given)
+    flown, pictures = metres(loaded, state.taken), len(state.taken)
+    assert flown <= limits.get("flight_length", np.inf)
+    assert flown / limits.get("speed", 2) + 3 * pictures <= limits.get("flight_time", np.inf)
+    assert state.steps[-1]["ended"] == {
+        "reason": "flight", "views": pictures - 3, "metres": pytest.approx(flown)
+    }  # fmt: skip
+
+    def stop(state):
+        if len(state.taken) >= 4:
+            raise KeyboardInterrupt
+
+    settings, parts = tiny.start(tmp_path / "part", loaded, **given), tiny.operations()
+    with pytest.raises(KeyboardInterrupt):
+        tiny.recording.run(tmp_path / "part", settings, loaded, parts, tiny.silent, stop)
+    assert tiny.resume(tmp_path / "part", loaded).taken == state.taken
+
+
+def test_a_limit_that_binds_nothing_changes_no_view_of_one_step(loaded, tmp_path):
+    free = run(tmp_path / "free", loaded, budget=1)
+    wide = run(tmp_path / "wide", loaded, budget=1, flight_length=1e6)
+    assert wide.taken == free.taken
+
+
+def test_poses_that_are_not_allowed_are_never_taken(dataset, prior, tmp_path, capsys):
+    """Twelve poses on a circle of 3 m; the sphere's samples reach from -1 to 1 m."""
+    given = ["--seeds", 3, "--budget", 2, "--prior", prior]
+    command("nbv", dataset, *given, "--no-fly", 2.9, "--out", tmp_path / "run")
+    assert "0 of 12 poses are ruled out by --no-fly and --clearance" in said(capsys)[0]
+    assert len(steps(tmp_path / "run")) == 3
+    settings = run_folder.read_settings(tmp_path / "run").model_copy(update={"no_fly": 2.0})
+    problem = Problem(run_folder.open_run(tmp_path / "run").dataset, settings, tiny.operations())
+    opposite = problem.flight.legs[0, 6]
+    assert 6 < opposite == pytest.approx(2 * np.sqrt(5) + 2 * (np.pi - 2 * np.arccos(2 / 3)), 0.01)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (["--flight-length", "-1"], "--flight-length -1.0: must be at least 1e-06"),
+        (["--flight-time", "nan"], "--flight-time nan"),
+        (["--hover", "-1"], "--hover -1.0: must be at least 0"),
+        (["--speed", "0"], "--speed 0"),
+        (["--flight-length", "9"], "takes 15.6 m and 17 s; raise --flight-length"),
+        (["--no-fly", "4"], "allow 0 of its 12 poses, fewer than 3 seeds"),
+        (["--clearance", "30"], "allow 0 of its 12 poses, fewer than 3 seeds"),
+        (["--flight-length", "30", "--travel", "2"], "leave out --travel"),
+    ],
+)
+def test_limits_that_cannot_be_are_one_line(dataset, prior, tmp_path, capsys, given, words):
+    arguments = ["nbv", dataset, "--prior", prior, "--seeds", 3, "--out", tmp_path / "run"]
+    assert words in refused(capsys, [*arguments, *given], tmp_path)
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,237 @@
+"""`mgs suggest`: candidates, ranks, plans; flight plans read by a parser that is not ours."""
+
+from __future__ import annotations
+
+import json
+import math
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import synthetic
+from program import command, said
+from pymavlink import mavutil, mavwp
+from refusals import refused
+
+import mgs
+from mgs.camera import Camera, look_at
+from mgs.data import flight_plan
+from mgs.data.dataset import load_cameras, load_dataset
+from mgs.run.candidates import Site, inside, place_poses, read_poses
+from mgs.run.folder import open_run
+from mgs.run.suggest import coarse_prior, suggest
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of three seeds on one side of an ellipsoid, of 14 poses on a circle of 2.6 m."""
+    folder = tmp_path_factory.mktemp("suggest")
+    data = synthetic.write_dataset(folder / "data", synthetic.orbit_cameras(14, 48, 36)[:8])
+    prior = mgs.build_prior(data, mgs.PriorSettings(gaussians=300))
+    mgs.save_prior(data.root / "prior", prior)
+    mgs.run_nbv(data.root, folder / "run", seeds=8, budget=0)
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def site(run):
+    opened = open_run(run)
+    return Site(opened.prior, opened.taken[0].camera)
+
+
+def test_the_best_candidate_sees_what_no_image_shows(run, site):
+    """The images are on one half of the circle; the best of a ring is on the other."""
+    found = suggest(open_run(run), place_poses("ring", 12, 2.6, (25, 35), site))
+    best, worst = found.ranking[0], found.ranking[-1]
+    assert 180 < best.azimuth < 360
+    assert best.unknown > worst.unknown
+    assert [view.score for view in found.ranking] == sorted(
+        (view.score for view in found.ranking), reverse=True
+    )
+    assert [view.name for view in found.plan] == [best.name]
+    assert best.information_gain == pytest.approx(found.plan[0].information_gain)
+
+
+def test_views_are_planned_together_and_flown_in_a_short_order(run, site):
+    opened, ring = open_run(run), place_poses("ring", 12, 2.6, (25, 35), site)
+    found = suggest(opened, ring, 4)
+    assert sorted(view.planned for view in found.plan) == [1, 2, 3, 4]
+    chosen = sorted(found.plan, key=lambda view: view.planned)
+    alone = {view.name: view.information_gain for view in found.ranking}
+    assert all(view.information_gain <= alone[view.name] + 1e-6 for view in chosen)
+    assert (
+        chosen[1].name != found.ranking[1].name
+        or chosen[1].information_gain < alone[chosen[1].name]
+    )
+    azimuths = [view.azimuth for view in found.plan]
+    assert azimuths in (sorted(azimuths), sorted(azimuths, reverse=True))
+    short = suggest(opened, ring, 12, flight_length=0.8 * found.metres)
+    assert 0 < len(short.plan) < 12
+    assert short.metres <= 0.8 * found.metres
+
+
+def test_a_coarse_model_keeps_the_best(run, site, monkeypatch):
+    opened, dome = open_run(run), place_poses("dome", 20, 2.6, (10, 80), site)
+    thin, rows = coarse_prior(opened.prior, 100)
+    assert 60 <= len(thin.points) == len(rows) <= 100
+    whole = {view.name: view.score for view in suggest(opened, dome).ranking}
+    monkeypatch.setattr(coarse_prior, "__defaults__", (100,))
+    coarse = suggest(opened, dome).ranking
+    assert whole[coarse[0].name] > 0.9 * max(whole.values())
+
+
+def test_a_dataset_is_one_command_and_its_flight_plan_is_read_by_pymavlink(run, tmp_path, capsys):
+    out, data = tmp_path / "next", open_run(run).dataset.root
+    plans = [tmp_path / f"next.{kind}" for kind in ("plan", "waypoints", "kml")]
+    written = [word for path in plans for word in ("--plan", path)]
+    place = ["--origin", "47,8,400,90", "--no-fly", 1.5, "--hover", 2, "--speed", 1.5]
+    command("suggest", data, "--dome", 30, "--views", 3, "--out", out, *written, *place)
+    assert "ruled out by --no-fly or --clearance" in said(capsys)[0]
+    numbers = json.loads((out / "suggestions.json").read_text())
+    assert {"plan", "ranking", "convention", "units"} <= set(numbers)
+    poses = [camera for _, camera in load_cameras(out)]
+    assert len(load_dataset(out)) == len(poses) == 3
+    loader = mavwp.MAVWPLoader()
+    assert loader.load(str(plans[1])) > 10
+    items = [loader.wp(k) for k in range(loader.count())]
+    command_of = mavutil.mavlink.enums["MAV_CMD"]
+    names = [command_of[item.command].name for item in items]
+    assert names[:3] == ["MAV_CMD_NAV_WAYPOINT", "MAV_CMD_NAV_TAKEOFF", "MAV_CMD_DO_CHANGE_SPEED"]
+    assert names[-1] == "MAV_CMD_NAV_RETURN_TO_LAUNCH"
+    assert names.count("MAV_CMD_IMAGE_START_CAPTURE") == 3
+    stops = [k for k, name in enumerate(names) if name == "MAV_CMD_DO_MOUNT_CONTROL"]
+    home = items[0]
+    for k, camera in zip(stops, poses, strict=True):
+        stop, mount = items[k - 1], items[k]
+        # +Y is east, so +X is south.
+        south, east, _ = camera.position
+        level = (math.radians(stop.x - 47) * -6.367e6, math.radians(stop.y - 8) * 4.361e6)
+        np.testing.assert_allclose(level, (south, east), rtol=0.01, atol=0.01)
+        assert home.z + stop.z == pytest.approx(400 + camera.position[2], abs=1e-2)
+        ahead = camera.world_to_camera[2, :3]
+        assert math.sin(math.radians(mount.param1)) == pytest.approx(ahead[2], abs=1e-6)
+        heading = math.radians(stop.param4)
+        np.testing.assert_allclose(
+            [-math.cos(heading), math.sin(heading)],
+            ahead[:2] / np.linalg.norm(ahead[:2]),
+            atol=1e-6,
+        )
+        assert (stop.param1, mount.z) == (2, mavutil.mavlink.MAV_MOUNT_MODE_MAVLINK_TARGETING)
+    mission = json.loads(plans[0].read_text())["mission"]
+    packed = [
+        mavutil.mavlink.MAVLink_mission_item_message(
+            1, 1, k, item["frame"], item["command"], 0, 1, *item["params"]
+        )
+        for k, item in enumerate(mission["items"], 1)
+    ]
+    keys = ("command", "frame", "param1", "param2", "param3", "param4", "x", "y", "z")
+    for ours, theirs in zip(packed, items[1:], strict=True):
+        values = [[getattr(item, key) for key in keys] for item in (ours, theirs)]
+        assert values[0] == pytest.approx(values[1], abs=1e-6)
+    root = ElementTree.parse(plans[2]).getroot()
+    cameras = root.findall(".//{*}Camera")
+    assert [float(one.find("{*}heading").text) for one in cameras] == pytest.approx(
+        [items[k - 1].param4 for k in stops], abs=1e-6
+    )
+    assert len(root.find(".//{*}LineString/{*}coordinates").text.split()) >= 5
+
+
+def test_a_plan_around_a_cylinder_does_not_cross_the_object(run, tmp_path, capsys):
+    """Two poses on opposite sides."""
+    path = tmp_path / "poses.csv"
+    path.write_text("name,x,y,z\na,-2.6,0.1,0.3\nb,2.6,0.3,0.3\n")
+    plan = ["--plan", tmp_path / "a.plan", "--origin", "47,8,400"]
+    base = ["suggest", run, "--poses", path, "--views", 2, *plan]
+    assert "crosses the object, so no flight plan" in refused(capsys, base)
+    assert not (tmp_path / "a.plan").exists()
+    command(*base, "--no-fly", 1.2)
+    assert (tmp_path / "a.plan").is_file()
+
+
+def test_poses_of_a_csv(site, tmp_path):
+    path = tmp_path / "poses.csv"
+    path.write_text("X, y,z,target_x,target_y,target_z,name\n3,0,1,0,0,0,east\n0,3,1,0,1,1,\n")
+    (east, first), (number, second) = read_poses(path, site)
+    assert (east, number) == ("east", "pose_0001")
+    assert first == Camera(site.like.K, 48, 36, look_at([3, 0, 1], [0, 0, 0]))
+    np.testing.assert_allclose(second.world_to_camera[2, :3], [0, -1, 0], atol=1e-9)
+    path.write_text("x,y,z,qw,qx,qy,qz\n1,2,3,2,0,0,0\n")
+    ((_, third),) = read_poses(path, site)
+    np.testing.assert_allclose(
+        third.camera_to_world[:3], np.eye(4)[:3] + [[0, 0, 0, k] for k in (1, 2, 3)]
+    )
+
+
+def test_points_inside_a_mesh_with_a_hole(site):
+    mesh = site.prior.mesh
+    points = np.array([synthetic.CENTRE, synthetic.CENTRE + np.array([0, 0, 1]), [0.55, 0.4, 0.5]])
+    assert inside(mesh, points).tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize("shape", ["dome", "ring", "grid"])
+def test_placed_poses_keep_to_the_elevations(site, shape):
+    poses = place_poses(shape, 40, 3.0, (20, 50), site)
+    offset = np.array([camera.position for _, camera in poses]) - site.centre
+    rise = np.degrees(np.arcsin(offset[:, 2] / np.linalg.norm(offset, axis=1)))
+    assert 20 - 1e-6 <= rise.min() <= rise.max() <= 50 + 1e-6
+    assert 20 <= len(poses) <= 80
+    assert len({name for name, _ in poses}) == len(poses)
+
+
+BAD_CSV = {
+    "empty": ("", "is empty; its first line must name columns"),
+    "no rows": ("x,y,z\n", "lists no poses"),
+    "NaN": ("x,y,z\n1,nan,2\n", "line 2: y is 'nan', no finite number"),
+    "text": ("x,y,z\n1,2,up\n", "line 2: z is 'up'"),
+    "wrong column": ("x,y,height\n1,2,3\n", "has the column 'height'"),
+    "missing column": ("x,y\n1,2\n", "lacks the column z"),
+    "half a target": ("x,y,z,target_x\n1,2,3,0\n", "lacks the column target_y"),
+    "short row": ("x,y,z\n1,2\n", "line 2 has 2 cells, not 3"),
+    "zero quaternion": ("x,y,z,qw,qx,qy,qz\n1,2,3,0,0,0,0\n", "its quaternion is zero"),
+    "twice": ("x,y,z,name\n3,0,1,a\n0,3,1,a\n", "lists the pose a more than once"),
+    "looks at itself": ("x,y,z,target_x,target_y,target_z\n3,0,1,3,0,1\n", "at its own position"),
+    "inside": ("x,y,z\n0.1,-0.05,0.3\n", "can be flown (1 inside the object)"),
+    "blind": ("x,y,z,target_x,target_y,target_z\n3,0,1,9,0,1\n", "1 sees nothing of the object"),
+}
+
+
+@pytest.mark.parametrize(("text", "words"), BAD_CSV.values(), ids=BAD_CSV.keys())
+def test_a_csv_that_is_no_list_of_poses_is_one_line(run, tmp_path, capsys, text, words):
+    path = tmp_path / "poses.csv"
+    path.write_text(text)
+    assert words in refused(capsys, ["suggest", run, "--poses", path])
+
+
+BAD = {
+    "all taken": (["--poses", "DATA"], "can be flown (8 taken already)"),
+    "too many views": (["--ring", "3", "--views", "4"], "--views 4 of 3 candidates"),
+    "no candidate in reach": (["--dome", "5", "--flight-length", "0.1"], "within the limits"),
+    "negative budget": (["--dome", "5", "--flight-length", "-3"], "--flight-length -3.0: must be"),
+    "two kinds": (["--dome", "5", "--ring", "5"], "give one of them"),
+    "no origin": (["--plan", "a.plan"], "--plan needs --origin"),
+    "unknown plan": (
+        ["--plan", "a.txt", "--origin", "1,2,3"],
+        "written as .plan, .waypoints, .kml",
+    ),
+    "origin": (["--origin", "47,8"], "--origin '47,8': expected LATITUDE"),
+    "elevations": (["--elevations", "50,20"], "--elevations '50,20': expected"),
+    "radius": (["--dome", "5", "--radius", "nan"], "--radius nan: must be"),
+    "in the object": (["--dome", "5", "--radius", "0.1"], "none of the 5 candidates can be flown"),
+    "policy": (["--dome", "5", "--policy", "best"], "--policy best: unknown"),
+    "prior of a run": (["--gaussians", "9"], "is a run with its model; leave out --gaussians"),
+}
+
+
+@pytest.mark.parametrize(("given", "words"), BAD.values(), ids=BAD.keys())
+def test_a_suggestion_that_cannot_be_made_is_one_line(run, tmp_path, capsys, given, words):
+    data = open_run(run).dataset.root / "transforms.json"
+    given = [str(data) if word == "DATA" else word for word in given]
+    out = tmp_path / "out"
+    assert words in refused(capsys, ["suggest", run, *given, "--out", out])
+    assert not out.exists()
+
+
+def test_straight_down_the_top_of_the_image_is_ahead():
+    camera = Camera(np.diag([9.0, 9, 1]), 8, 8, look_at([0, 0, 5], [0, 0, 0], [1, 0, 0]))
+    heading, pitch = flight_plan.Stop(camera.position, camera=camera).heading_and_pitch(10)
+    assert (heading, pitch) == (pytest.approx(100), pytest.approx(-90))
