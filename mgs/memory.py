@@ -110,17 +110,17 @@ def padded(values: Any, dtype: Any = np.float32) -> np.ndarray:
 
 
 def kept_within(
-    budget: int, make: Callable[[int], Value], size: Callable[[Value], int]
-) -> Callable[[int], Value]:
+    budget: int, make: Callable[[Any], Value], size: Callable[[Value], int]
+) -> Callable[[Any], Value]:
     """Cache the results of `make` until their sizes sum to `budget` bytes.
 
     Later keys are made again at each call. A fit uses its images again and again in changing
     orders, for which an LRU cache would mostly drop what is needed next.
     """
-    kept: dict[int, Value] = {}
+    kept: dict[Any, Value] = {}
     held = 0
 
-    def get(key: int) -> Value:
+    def get(key: Any) -> Value:
         nonlocal held
         if key in kept:
             return kept[key]

@@ -28,7 +28,8 @@ def test_the_lock_pins_every_requirement_for_the_lowest_python():
     locked = {canonicalize_name(name): pin for name, pin in (line.split("==") for line in lines)}
 
     groups, package = project["dependency-groups"], project["project"]
-    wanted = package["dependencies"] + package["optional-dependencies"]["view"]
+    extras = package["optional-dependencies"]
+    wanted = package["dependencies"] + extras["view"] + extras["ros"]
     wanted += groups["dev"] + groups["docs"] + project["build-system"]["requires"]
     unmet = [
         text

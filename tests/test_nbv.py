@@ -17,7 +17,7 @@ import tiny
 from program import steps, timeless
 from tiny import resume, run
 
-import mgs.data.dataset
+import mgs.data.frames
 import mgs.run.inputs
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
@@ -140,9 +140,9 @@ def test_a_tie_goes_to_the_farthest_camera(dataset, tmp_path):
 def test_images_are_read_only_once_a_batch_is_chosen(dataset, tmp_path, monkeypatch, policy, batch):
     opened, at_choice, choose = set(), [], loop.choose
     for module, name in (
-        (mgs.data.dataset, "read_png"),
-        (mgs.data.dataset, "read_mask"),
-        (mgs.data.dataset, "read_exr"),
+        (mgs.data.frames, "read_png"),
+        (mgs.data.frames, "read_mask"),
+        (mgs.data.frames, "read_exr"),
         (mgs.run.inputs, "file_digest"),
     ):
         logged = lambda path, f=getattr(module, name): opened.add(Path(path).stem) or f(path)  # noqa: E731

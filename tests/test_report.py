@@ -453,7 +453,7 @@ def test_a_legend_covers_no_line(tmp_path, monkeypatch, runs):
         list(POLICY_STYLE),
         ["mine", "d-optimal", "yours"],
         ["random (a)", "random (b)"],
-        [f"mine-{i}" for i in range(15)],
+        [f"mine-{i}" for i in range(30)],
     ],
 )
 def test_every_line_of_a_figure_looks_different(labels):

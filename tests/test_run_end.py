@@ -16,7 +16,7 @@ from mgs.report.page_facts import read_shown
 from mgs.report.runs import read_run
 from mgs.report.tables import markdown_table
 from mgs.run import folder as run_folder
-from mgs.run.ending import run_end, why_ended
+from mgs.run.ending import GAIN_UNIT, run_end, why_ended
 from mgs.run.settings import NbvSettings
 
 
@@ -124,7 +124,7 @@ def test_one_line_says_why_a_run_ended(dataset, prior, tmp_path, capsys):
     early, whole, known = runs = [tmp_path / name for name in ("early", "whole", "known")]
     shown = mgs(*start, "--out", early, "--stop-gain", "1e3")
     ended = steps(early)[-1]["ended"]
-    gain = f"would gain {ended['information_gain']:.4g} after 0 chosen views"
+    gain = f"would gain {ended['information_gain']:.4g} {GAIN_UNIT} after 0 chosen views"
     next_view = f"the next view, {ended['name']}"
     line = f"the run has ended: {next_view}, {gain}, less than --stop-gain 1000"
     assert shown.count(line) == 1

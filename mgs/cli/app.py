@@ -198,7 +198,9 @@ def _hint(arguments: Sequence[str]) -> str:
     runs = [after for option, after in pairwise(options) if option in ("--out", "--resume")]
     if command not in ("nbv", "fit") or not runs or not (Path(runs[-1]) / "config.json").is_file():
         return ""
-    return f"; continue with: mgs nbv --resume {shlex.quote(runs[-1])}"
+    live = [pair for pair in pairwise([*options, ""]) if pair[0].startswith("--capture-")]
+    again = [x for pair in live for x in (pair[:1] if "=" in pair[0] else pair)]
+    return f"; continue with: mgs nbv {shlex.join(['--resume', runs[-1], *again])}"
 
 
 def _from_interrupt(error: BaseException | None) -> bool:

@@ -1,17 +1,22 @@
-"""`mgs import`: make a dataset of data in the formats of nerfstudio, NeRF-synthetic and COLMAP."""
+"""`mgs import`: make a dataset of cameras and images in other formats (docs/howto/data.md)."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from rich.console import Console
 
 from mgs.cli.options import argument, option, parse_up
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError
+
+if TYPE_CHECKING:
+    from mgs.data.sources import Shot
 
 MANY_PIXELS = 2_000_000
 """Pixels of an image beyond which --downscale is recommended."""
@@ -22,12 +27,20 @@ EXPOSURE_DIFFERS = 0.1
 
 def import_data(
     source: Annotated[
-        Path, argument("A transforms.json, or a folder with one or with a COLMAP model (sparse/0).")
+        Path,
+        argument(
+            "A transforms.json or a folder with one, a COLMAP model (sparse/0), ROS bag, Metashape "
+            "XML, or a folder of TUM RGB-D, Open3D or RTAB-Map."
+        ),
     ],
     out: Annotated[Path, option("Folder to write: new, empty, or left by an interrupted import.")],
     images: Annotated[
-        Path | None, option("Folder of COLMAP's images. Default: SOURCE/images.")
+        Path | None,
+        option("Folder of COLMAP's or Metashape's images (default: images), or topic of a bag."),
     ] = None,
+    keyframes: Annotated[
+        str, option("Keyframes of a recording: least seconds or metres apart, as 0.5s or 0.2m.")
+    ] = "0.5s",
     masks: Annotated[
         Path | None, option("Folder of rock masks, named like the images; white is rock.")
     ] = None,
@@ -80,7 +93,8 @@ def import_data(
         raise InputError(
             "import: --masks and --mesh both say where masks come from; give one of them"
         )
-    found = read_source(source, images, split)
+    unpacked = out.with_name(f"{out.name}.unpacked")
+    found = read_source(source, images, split, keyframes=keyframes, unpack=unpacked)
     found = found if unit is None else found.in_metres(unit)
     given = parse_up(up)
     upward, reason = found.up_or_estimate() if given is None else (given, "as --up says")
@@ -138,3 +152,13 @@ def import_data(
             f"test views: {len(tests.shots)} images, which are no candidates; "
             f"wrote {out / TEST_FOLDER}"
         )
+    _tidy([*found.shots, *(tests.shots if tests else ())], unpacked)
+
+
+def _tidy(shots: Sequence[Shot], unpacked: Path) -> None:
+    """Remove the files that were unpacked of a bag."""
+    for path in (path for shot in shots for path in (shot.image, shot.depth) if path):
+        if path.parent == unpacked:
+            path.unlink(missing_ok=True)
+    with suppress(OSError):
+        unpacked.rmdir()

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from mgs.run.folder import Run
+    from mgs.run.live import Live
     from mgs.run.state import State
 
 PANELS = {
@@ -72,7 +73,7 @@ def nbv(
         Path | None,
         typer.Option(
             metavar="RUN",
-            help="Continue this run by its config.json; repeat --policy if it is a file.",
+            help="Continue this run by its config.json; repeat programs: --policy, --capture-...",
             rich_help_panel="Main options",
         ),
     ] = None,
@@ -82,6 +83,49 @@ def nbv(
             metavar="SCENE",
             help="In place of DATASET: a scene (name or .toml), rendered when a view is chosen.",
             rich_help_panel="Data",
+        ),
+    ] = None,
+    capture_command: Annotated[
+        str | None,
+        typer.Option(
+            metavar="COMMAND",
+            help="Program that takes a picture of a pose: 'CMD {pose} {out}' (JSON in, PNG out).",
+            rich_help_panel="Live capture",
+        ),
+    ] = None,
+    capture_folder: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder in which poses are written and pictures of them are awaited.",
+            rich_help_panel="Live capture",
+        ),
+    ] = None,
+    capture_timeout: Annotated[
+        float,
+        typer.Option(
+            min=0.01, help="Longest wait for a picture, seconds.", rich_help_panel="Live capture"
+        ),
+    ] = 600.0,
+    capture_tries: Annotated[
+        int,
+        typer.Option(
+            min=1, help="Most pictures asked for at a pose.", rich_help_panel="Live capture"
+        ),
+    ] = 3,
+    capture_failure: Annotated[
+        str,
+        typer.Option(
+            metavar="skip|stop",
+            help="After the last try: take the next best pose in its place, or stop the run.",
+            rich_help_panel="Live capture",
+        ),
+    ] = "skip",
+    capture_distance: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="Largest distance from the pose asked for. Default: a quarter of the object's.",
+            rich_help_panel="Live capture",
         ),
     ] = None,
     gaussians: Annotated[
@@ -114,9 +158,17 @@ def nbv(
 
     console = Console(highlight=False)
     given = {name: options[name] for name in options if options[name] not in (None, [])}
+    live = live_capture(
+        capture_command,
+        capture_folder,
+        capture_timeout,
+        tries=capture_tries,
+        failure=capture_failure,
+        distance=capture_distance,
+    )
     if resume is not None:
         refuse_others(context, resume)
-        resume_and_print(resume, console, given.get("policy"))
+        resume_and_print(resume, console, given.get("policy"), live=live)
         return
     if (dataset is None) == (capture is None) or out is None:
         raise InputError("nbv: give a DATASET or --capture SCENE, and --out RUN; or --resume RUN")
@@ -126,12 +178,34 @@ def nbv(
         out,
         console,
         capture=capture,
+        live=live,
         prior=prior,
         gaussians=parse_gaussians(gaussians),
         preset=preset,
         **settings,
     )
-    resume_and_print(run, console, run.settings.policy)
+    resume_and_print(run, console, run.settings.policy, live=live)
+
+
+def live_capture(
+    command: str | None, folder: Path | None, timeout: float, **rest: Any
+) -> Live | None:
+    """`Live` of the options of a live capture, None without one. Raises InputError as `command`,
+    and where options do not go together."""
+    from mgs.errors import InputError
+    from mgs.files import check_writable
+    from mgs.run import transports
+    from mgs.run.live import Live
+
+    if rest["failure"] not in ("skip", "stop"):
+        raise InputError(f"--capture-failure {rest['failure']}: choose skip or stop")
+    if command is not None and folder is not None:
+        raise InputError("nbv: give either --capture-command or --capture-folder")
+    if command is not None:
+        return Live(transports.command(command, timeout), **rest)
+    if folder is not None:
+        return Live(transports.watched(timeout), check_writable(folder), **rest)
+    return None
 
 
 def settings_of(given: dict[str, Any]) -> dict[str, Any]:
@@ -185,7 +259,8 @@ def refuse_others(context: typer.Context, resume: Path) -> None:
 
     for name in context.params:
         source = context.get_parameter_source(name)
-        if name in ("resume", "policy") or source is None or source.name != "COMMANDLINE":
+        again = name in ("resume", "policy") or name.startswith("capture_")
+        if again or source is None or source.name != "COMMANDLINE":
             continue
         option = flag(name)
         where = f"--resume takes its settings from {resume / 'config.json'}; change it there"
@@ -236,13 +311,14 @@ def resume_and_print(
     console: Console,
     policy: str | None = None,
     pictures: bool = False,
+    live: Live | None = None,
     on_state: Callable[[State], None] = lambda state: None,
 ) -> None:
     """Run or resume the loop of a run, evaluate (with pictures where asked), print the table of
     steps; where the output is no terminal, a line after each step instead.
 
-    policy: FILE.py:FUNCTION where the run has a policy of the user's own. on_state: called with
-    every state that is on disk.
+    policy: FILE.py:FUNCTION where the run has a policy of the user's own. live: of its pictures.
+    on_state: called with every state that is on disk.
     """
     from functools import partial
 
@@ -267,7 +343,7 @@ def resume_and_print(
                 for warning in line.get("warnings", []):
                     progress.print(f"step {line['step']}: {warning}")
 
-        state = resume_nbv(run, on_step, progress, policy).state
+        state = resume_nbv(run, on_step, progress, policy, live).state
         metrics = evaluate_run(
             run.folder, pictures=pictures, progress=partial(progress, "evaluating")
         )

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 
 from mgs.camera import Camera, opencv_from_opengl, opengl_from_opencv
-from mgs.data.rock_image import boundary, read_rock_image
+from mgs.data.frames import SURVEY_FOLDER, Frame, as_captured
 from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.errors import InputError
 from mgs.files import check_new_folder, read_json, remove_leftovers, write_json
-from mgs.images import image_size, read_exr, read_mask, read_png
 
 PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 """Camera models of transforms.json that are pinholes if their distortion is zero."""
@@ -32,9 +31,6 @@ FRAME_INTERVAL = 0.5
 TEST_FOLDER = "test"
 """Subfolder with the test views, itself a dataset."""
 
-SURVEY_FOLDER = "survey"
-"""Subfolder of an on-demand dataset with its survey, itself a dataset: depth and masks only."""
-
 FILES = {
     "image_path": "file_path",
     "depth_path": "depth_file_path",
@@ -42,89 +38,6 @@ FILES = {
     "rock_path": "rock_file_path",
 }
 """Path fields of `Frame` -> their keys in transforms.json."""
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One keyframe: its camera, its time in seconds, and the files of its images.
-
-    on_demand: the files exist only after a run has taken the frame. Reading a file that does not
-    exist yet raises InputError.
-    """
-
-    name: str
-    camera: Camera
-    timestamp: float
-    image_path: Path
-    depth_path: Path | None = None
-    mask_path: Path | None = None
-    rock_path: Path | None = None
-    on_demand: bool = False
-
-    def rgb(self) -> np.ndarray:
-        """Linear RGB float32 [H,W,3]. Raises InputError if missing, damaged or of another size."""
-        return read_png(self._existing(self.image_path))
-
-    def depth(self) -> np.ndarray:
-        """z-depth float32 [H,W], metres, 0 = no return. Raises InputError as `rgb`, and if the
-        frame has no depth file."""
-        if self.depth_path is None:
-            raise InputError(
-                f"frame {self.name}: has no depth_file_path; this command needs RGB-D frames"
-            )
-        channels = read_exr(self._existing(self.depth_path))
-        depth = channels.get("Z", next(iter(channels.values())))
-        return np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0)
-
-    def mask(self) -> np.ndarray:
-        """Rock mask, bool [H,W]: the mask file; else alpha >= 0.5 of the rock image; else all true.
-
-        In rendered datasets a pixel is true if the ray through its centre meets the rock. Raises
-        InputError as `rgb`.
-        """
-        if self.mask_path is not None:
-            return read_mask(self._existing(self.mask_path))
-        if self.rock_path is not None:
-            return self.target()[0][..., 3] >= 0.5
-        return np.ones((self.camera.height, self.camera.width), bool)
-
-    def target(self) -> tuple[np.ndarray, np.ndarray]:
-        """Target of a fit to the rock alone: rgba float32 [H,W,4] and weight float32 [H,W].
-
-        rgba is linear RGB premultiplied by alpha, and alpha, the share of the pixel that the rock
-        covers. weight is 1 where rgba is known, else 0. With a rock image, weight is 1 everywhere.
-        With a mask only, alpha is 0 or 1, which is wrong along the outline, so the `boundary` of
-        the mask has weight 0. With neither, alpha and weight are 1. Raises InputError as `rgb`.
-        """
-        if self.rock_path is not None:
-            rgba = read_rock_image(self._existing(self.rock_path))
-            return rgba, np.ones(rgba.shape[:2], np.float32)
-        mask = self.mask()
-        rgba = np.dstack([self.rgb(), np.ones(mask.shape, np.float32)]) * mask[..., None]
-        return rgba, (~boundary(mask)).astype(np.float32)
-
-    def masked_rgb(self) -> np.ndarray:
-        """Colour of `target`: linear RGB float32 [H,W,3] of the rock in front of black."""
-        return self.target()[0][..., :3]
-
-    def _existing(self, path: Path) -> Path:
-        """Return `path`, a file of the camera's size by its header.
-
-        Raises InputError if no run has taken this on-demand frame yet, and as `image_size`.
-        """
-        if self.on_demand and not path.exists():
-            raise InputError(
-                f"{path}: does not exist, since no run has taken frame {self.name} of this "
-                "on-demand dataset; `mgs nbv` takes what it chooses, and what `mgs prior` reads "
-                f"is in the dataset's folder {SURVEY_FOLDER}"
-            )
-        (width, height), camera = image_size(path), self.camera
-        if (width, height) != (camera.width, camera.height):
-            raise InputError(
-                f"{path}: is {width}x{height}, but transforms.json says "
-                f"{camera.width}x{camera.height}; correct either"
-            )
-        return path
 
 
 @dataclass(frozen=True)
@@ -174,19 +87,20 @@ class Dataset:
         return load_dataset(folder)
 
 
-def load_dataset(root: str | Path) -> Dataset:
+def load_dataset(root: str | Path, *, to_capture: bool = False) -> Dataset:
     """Read transforms.json and check that the files it names exist (unless it is on demand).
 
-    Pixels are read later, by the methods of `Frame`. Raises InputError if the folder or a file is
-    missing, intrinsics are missing, images are distorted, a pose is not finite or singular, there
-    are no frames, or two frames have the same name.
+    to_capture: frames whose image does not exist are on demand. Pixels are read later, by the
+    methods of `Frame`. Raises InputError if the folder or a file is missing, intrinsics are
+    missing, images are distorted, a pose is not finite or singular, there are no frames, or two
+    frames have the same name.
     """
     root = Path(root)
     path = root / "transforms.json"
     if not root.is_dir():
         raise InputError(f"{root}: no such dataset folder; make one with `mgs synth-orbit {root}`")
     data, records = read_records(path)
-    frames = [_frame(path, data, i, record) for i, record in enumerate(records)]
+    frames = [_frame(path, data, i, record, to_capture) for i, record in enumerate(records)]
     for name, count in Counter(frame.name for frame in frames).items():
         if count > 1:  # runs and pictures refer to a frame by its name
             raise InputError(
@@ -206,7 +120,7 @@ def load_cameras(path: str | Path, like: Camera | None = None) -> list[tuple[str
     path = Path(path) / "transforms.json" if Path(path).is_dir() else Path(path)
     data, records = read_records(path)
     if like is not None and not any(key in data | records[0] for key in INTRINSICS):
-        data = _intrinsics(like) | data
+        data = intrinsics(like) | data
     return [
         (record["file_path"], _camera(path, data, i, record)) for i, record in enumerate(records)
     ]
@@ -307,9 +221,12 @@ def unit_of(path: Path, data: dict[str, Any]) -> str | None:
     return unit or None
 
 
-def _frame(path: Path, data: dict[str, Any], index: int, record: dict[str, Any]) -> Frame:
+def _frame(
+    path: Path, data: dict[str, Any], index: int, record: dict[str, Any], to_capture: bool
+) -> Frame:
     root, where = path.parent, f"{path}: frame {index}"
     camera, on_demand = _camera(path, data, index, record), data.get("on_demand") is True
+    on_demand |= to_capture and not (root / record["file_path"]).is_file()
     timestamp = timestamp_of(where, index, record)
     paths: dict[str, Any] = {}
     for field, key in FILES.items():
@@ -319,10 +236,11 @@ def _frame(path: Path, data: dict[str, Any], index: int, record: dict[str, Any])
                 f"{where}: {key} {record[key]} does not exist in {root}; "
                 "restore it or remove the frame"
             )
-    return Frame(Path(record["file_path"]).stem, camera, timestamp, **paths, on_demand=on_demand)
+    name = Path(record["file_path"]).stem
+    return as_captured(Frame(name, camera, timestamp, **paths, on_demand=on_demand))
 
 
-def _intrinsics(camera: Camera) -> dict[str, float]:
+def intrinsics(camera: Camera) -> dict[str, float]:
     K = camera.K
     values = (K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.width, camera.height)
     return dict(zip(INTRINSICS, values, strict=True))
@@ -342,7 +260,7 @@ def write_transforms(
     its presence marks a complete dataset.
     """
     root = Path(root)
-    header: dict[str, Any] = {"camera_model": "OPENCV", **_intrinsics(frames[0].camera)}
+    header: dict[str, Any] = {"camera_model": "OPENCV", **intrinsics(frames[0].camera)}
     # Default: +Z and metres.
     world = {"up": list(up), "unit": unit} if (up, unit) != (PLUS_Z, "m") else {}
     demand = {"on_demand": True} if frames[0].on_demand else {}
@@ -354,7 +272,7 @@ def write_transforms(
         }
         record["transform_matrix"] = opengl_from_opencv(frame.camera.world_to_camera).tolist()
         record["timestamp"] = frame.timestamp
-        own = _intrinsics(frame.camera)
+        own = intrinsics(frame.camera)
         record |= {key: value for key, value in own.items() if value != header[key]}
         records.append(record)
     known = header | world | demand | (notes or {})

@@ -15,7 +15,7 @@ from mgs.camera import Camera
 from mgs.data.clouds import write_cloud
 from mgs.data.dataset import TEST_FOLDER, Dataset, Frame, load_dataset, resumes, write_transforms
 from mgs.data.lens import Undo, read_fitting, shrunk, undistorter
-from mgs.data.meshes import read_mesh
+from mgs.data.meshes import Mesh, read_mesh
 from mgs.data.rock_image import premultiplied, write_rock_image
 from mgs.data.sources import Shot, Source, find_image
 from mgs.data.up import PLUS_Z, Up
@@ -59,7 +59,7 @@ def import_source(
         shots = [replace(shot, mask=_mask_file(masks, shot), rock=None) for shot in shots]
     elif mesh is not None:
         shots = [replace(shot, mask=None, rock=None) for shot in shots]
-        silhouette = _silhouette(mesh)
+        silhouette = silhouette_of(read_mesh(mesh))
     asked = {
         "kind": source.kind,
         "frames": len(shots),
@@ -80,7 +80,7 @@ def import_source(
         for k, shot in enumerate(shots):
             if on_frame:
                 on_frame(k, len(shots))
-            frames.append(_import_shot(shot, out, silhouette, downscale, begin))
+            frames.append(import_shot(shot, out, silhouette, downscale, begin))
         if source.sparse is not None:
             write_cloud(out / "sparse.ply", source.sparse)
         if tests is not None and not (out / TEST_FOLDER / "transforms.json").is_file():
@@ -129,7 +129,7 @@ def _digest(shots: list[Shot]) -> str:
     return hashlib.sha256(json.dumps(known).encode()).hexdigest()
 
 
-def _import_shot(
+def import_shot(
     shot: Shot,
     out: Path,
     silhouette: Callable[[Camera], np.ndarray] | None,
@@ -139,7 +139,7 @@ def _import_shot(
     """Write the files of a frame, the image last, unless the image exists and is no older than its
     sources.
 
-    silhouette: mask of a camera by `_silhouette`. begin: makes the output folder, called between
+    silhouette: mask of a camera by `silhouette_of`. begin: makes the output folder, called between
     reading and writing, so that a source that cannot be read leaves no folder behind.
     """
     camera, undo = undistorter(shot.camera, shot.distortion)
@@ -213,10 +213,10 @@ def _read_depth(path: Path, unit: float) -> np.ndarray:
     return read_values(path).astype(np.float32) * unit
 
 
-def _silhouette(path: Path) -> Callable[[Camera], np.ndarray]:
-    """Return mask(camera): bool [H,W], pixels whose centre shows the mesh of a file. Raises
-    InputError as `read_mesh` and `mesh_depth`."""
+def silhouette_of(mesh: Mesh) -> Callable[[Camera], np.ndarray]:
+    """Return mask(camera): bool [H,W], pixels whose centre shows the mesh. Raises InputError as
+    `mesh_depth`."""
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
-    depth = mesh_depth(read_mesh(path))
+    depth = mesh_depth(mesh)
     return lambda camera: depth(camera) > 0

@@ -1,9 +1,10 @@
-"""Data to import: cameras and files in the formats of nerfstudio, NeRF-synthetic and COLMAP."""
+"""Data to import: cameras and files of nerfstudio, NeRF-synthetic, COLMAP, and RECORDINGS."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mgs.camera import Camera
+from mgs.data.bags import is_bag, read_bag
 from mgs.data.clouds import SparseCloud, read_cloud
 from mgs.data.colmap import is_model, read_model
 from mgs.data.dataset import (
@@ -22,6 +24,16 @@ from mgs.data.dataset import (
     timestamp_of,
     unit_of,
 )
+from mgs.data.metashape import is_metashape, read_metashape
+from mgs.data.rgbd_folders import (
+    is_open3d,
+    is_rtabmap,
+    is_tum,
+    read_open3d,
+    read_rtabmap,
+    read_tum,
+)
+from mgs.data.tracks import Spacing
 from mgs.data.up import PLUS_Z, Up, degrees_between, unit_up, up_of_cameras
 from mgs.errors import InputError
 from mgs.images import image_size
@@ -30,8 +42,8 @@ DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 """Coefficients of the OPENCV camera model, in OpenCV's order."""
 
 LEVELLED = 10.0
-"""A transforms.json whose cameras' common up vector is within this angle of +Z, degrees, is taken
-as +Z up."""
+"""A transforms.json or recording whose cameras' common up vector is within this angle of +Z,
+degrees, is taken as +Z up."""
 
 SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 """NeRF-synthetic names images without a suffix."""
@@ -106,17 +118,69 @@ class Source:
         if self.kind == "NeRF-synthetic":
             return PLUS_Z, "the rule of NeRF-synthetic data"
         found = up_of_cameras([shot.camera for shot in self.shots])
-        if self.kind == "nerfstudio" and degrees_between(found, PLUS_Z) < LEVELLED:
+        levelled = ("nerfstudio", "ROS bag", "TUM RGB-D", "RTAB-Map")
+        if self.kind in levelled and degrees_between(found, PLUS_Z) < LEVELLED:
             return PLUS_Z, f"the cameras' common up vector is within {LEVELLED:.0f} degrees of it"
         return found, "the cameras' common up vector"
 
 
-def read_source(source: str | Path, images: Path | None = None, split: str = "train") -> Source:
+@dataclass(frozen=True)
+class Options:
+    """What the reader of a recording is told.
+
+    images: folder of the images, or of a bag their topic. spacing: of keyframes. unpack: folder in
+    which the keyframes of a bag are unpacked.
+    """
+
+    images: Path | None
+    spacing: Spacing
+    unpack: Path
+
+    @property
+    def topic(self) -> str | None:
+        """Topic of a bag's images."""
+        return None if self.images is None else str(self.images)
+
+
+Fields = list[dict[str, Any]]
+"""Fields of each `Shot`."""
+
+RECORDINGS: dict[
+    str, tuple[Callable[[Path], bool], Callable[[Path, Options], tuple[Fields, str | None]]]
+] = {
+    "ROS bag": (
+        is_bag,
+        lambda path, given: (
+            read_bag(path, given.unpack, given.topic, given.spacing),
+            "m",
+        ),
+    ),
+    "TUM RGB-D": (is_tum, lambda path, given: (read_tum(path, given.spacing), "m")),
+    "Open3D": (is_open3d, lambda path, given: (read_open3d(path, given.spacing), "m")),
+    "RTAB-Map": (is_rtabmap, lambda path, given: (read_rtabmap(path, given.spacing), "m")),
+    "Metashape": (
+        is_metashape,
+        lambda path, given: read_metashape(path, given.images or path.parent / "images"),
+    ),
+}
+"""Recordings of robots: kind -> (whether a path is one, reader of its shots and unit)."""
+
+
+def read_source(
+    source: str | Path,
+    images: Path | None = None,
+    split: str = "train",
+    *,
+    keyframes: str = "0.5s",
+    unpack: Path | None = None,
+) -> Source:
     """Recognise the format of a source, and read its cameras and file names.
 
     source: a transforms.json or its folder; a folder with NeRF-synthetic's transforms_SPLIT.json;
-    or a folder with a COLMAP model in itself, sparse/ or sparse/0/. images: COLMAP's image folder,
-    by default SOURCE/images. split: train, val or test. Raises InputError if no format is
+    a folder with a COLMAP model in itself, sparse/ or sparse/0/; or one of RECORDINGS. images: the
+    image folder of COLMAP or Metashape, by default SOURCE/images; of a bag the topic. split: train,
+    val or test. keyframes: `Spacing` of a recording. unpack: folder for the images of a bag, by
+    default SOURCE.unpacked. Raises InputError if no format is
     recognised, no image exists, a frame is listed twice, or a camera model is not supported.
     """
     source = Path(source)
@@ -128,14 +192,22 @@ def read_source(source: str | Path, images: Path | None = None, split: str = "tr
     path = source if source.is_file() else source / "transforms.json"
     split_path = source / f"transforms_{split}.json"
     folders = (source / "sparse/0", source / "sparse", source)
-    if path.is_file() or split_path.is_file():
+    recording = next((kind for kind, (fits, _) in RECORDINGS.items() if fits(source)), None)
+    if recording is not None:
+        folder = unpack or source.with_name(f"{source.name}.unpacked")
+        options = Options(images, Spacing.parse(keyframes), folder)
+        fields, unit = RECORDINGS[recording][1](source, options)
+        shots = [Shot(**each) for each in fields if each["image"].is_file()]
+        result = Source(recording, shots, len(fields) - len(shots), unit=unit)
+    elif path.is_file() or split_path.is_file():
         result = _read_transforms(path if path.is_file() else split_path)
     elif model := next((folder for folder in folders if is_model(folder)), None):
         result = _read_colmap(model, images if images is not None else source / "images")
     else:
         raise InputError(
             f"{source}: holds no transforms.json, transforms_{split}.json or COLMAP model "
-            "(cameras, images and points3D, .bin or .txt, in sparse/0, sparse or the folder itself)"
+            "(cameras, images and points3D, .bin or .txt, in sparse/0, sparse or the folder "
+            f"itself), and is no {', '.join(RECORDINGS)}"
         )
     if not result.shots:
         raise InputError(
@@ -180,7 +252,7 @@ def _read_transforms(path: Path) -> Source:
         keys = ("depth_file_path", "mask_path", "rock_file_path")
         depth, mask, rock = (path.parent / record[key] if record.get(key) else None for key in keys)
         where = f"{path}: frame {index}"
-        camera, distortion = _transforms_camera(where, {**data, **record}, image)
+        camera, distortion = record_camera(where, {**data, **record}, image)
         time = timestamp_of(where, index, record)
         unit = 1.0 if depth is None or depth.suffix.lower() == ".exr" else scale
         name = _frame_name(record["file_path"])
@@ -194,9 +266,7 @@ def _read_transforms(path: Path) -> Source:
     return Source(kind, shots, missing, sparse, up, length, no_cloud)
 
 
-def _transforms_camera(
-    where: str, record: dict[str, Any], image: Path
-) -> tuple[Camera, np.ndarray]:
+def record_camera(where: str, record: dict[str, Any], image: Path) -> tuple[Camera, np.ndarray]:
     """Camera and distortion of a frame; intrinsics that are not given follow from the image.
     Errors begin with `where`."""
     try:

@@ -1,7 +1,8 @@
 """Hashes of a run's inputs. A run is resumed only if its inputs are unchanged.
 
-A record holds the hash of the `prior`; `cameras`, of pose and intrinsics of every frame by name;
-`files`, of the files of each frame taken, by name and kind; `policy`, of the user's policy file.
+A record holds the hash of the `prior`; `cameras`, of pose and intrinsics of every frame by name,
+as asked for in a live capture; `files`, of the files of each frame taken, by name and kind;
+`policy`, of the user's policy file.
 Files of frames that were not taken are never opened.
 """
 
@@ -63,7 +64,8 @@ def camera_digest(camera: Camera) -> str:
 
 
 def frame_digests(frame: Frame, kinds: Iterable[str]) -> dict[str, str | None]:
-    """Hashes of the files of a frame by kind: `image`, `mask`, `rock`, `depth`; None of no file.
+    """Hashes of the files of a frame by kind: `image`, `mask`, `rock`, `depth`, `capture` (the
+    record of a live capture); None of no file.
 
     Raises InputError as `file_digest`.
     """
@@ -90,7 +92,7 @@ def check_unchanged(
     if record.get("policy") != policy_record(settings.policy).get("policy"):
         raise InputError(f"policy {settings.policy}: its file has {changed} it, or start a new run")
     for frame in dataset.frames:
-        if record["cameras"].get(frame.name) != camera_digest(frame.camera):
+        if record["cameras"].get(frame.name) != camera_digest(frame.asked or frame.camera):
             where = f"{dataset.root / 'transforms.json'}: the camera of frame {frame.name} has"
             raise InputError(f"{where} {changed} it, or start a new run")
         known = record["files"].get(frame.name, {})

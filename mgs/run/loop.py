@@ -40,6 +40,7 @@ def select_views(
     `choose` and `learn`.
     """
     if state is None:
+        problem.make_seeds()
         state = learn(problem, problem.seeds)
         yield state
     while not finished(problem, state):
@@ -47,6 +48,8 @@ def select_views(
         if refused and not choices:
             yield refused
             return
+        if not problem.make_images(planned.taken[len(state.taken) :]):
+            continue  # a pose was given up: choose again without it
         state = learn(problem, planned.taken, state, planned.surface, choices)
         yield state
 
@@ -77,13 +80,13 @@ def learn(
 ) -> Learned:
     """Capture the views that are new in `taken`, fit to all of them, sum their information.
 
-    surface: `Fitted.surface` of `taken`, where it is known. Raises FitDivergedError, and InputError
-    where a frame cannot be read.
+    surface: `Fitted.surface` of `taken` at the poses asked for, where it is known. Raises
+    FitDivergedError, and InputError where a frame cannot be read.
     """
     new = taken[len(before.taken) :] if before else taken
-    if surface is None:
-        surface = surface_information(problem, new, before)
     gains = capture(problem, new, taken)
+    if surface is None or problem.moved(new):
+        surface = surface_information(problem, new, before)
     fit = fit_views(problem, taken, before, gains)
     if fit.stop_reason == StopReason.DIVERGED:
         raise FitDivergedError(len(taken) - problem.settings.seeds, fit.losses)

@@ -20,6 +20,7 @@ from mgs.prior.photographs import source_of as source_of_prior
 from mgs.prior.settings import PriorSettings
 from mgs.run import recording
 from mgs.run.folder import DATASET, POLICY_SOURCE, Run, holds_run, open_run, start
+from mgs.run.live import Live, begin
 from mgs.run.operations import operations_of
 from mgs.run.problem import Problem, Progress, no_progress
 from mgs.run.settings import (
@@ -31,6 +32,7 @@ from mgs.run.settings import (
     with_defaults,
 )
 from mgs.run.state import State
+from mgs.run.transports import Transport
 from mgs.splat.constants import NEAR
 from mgs.synth.scene_file import load_scene_file
 
@@ -62,7 +64,7 @@ def run_nbv(
     dataset, out, settings: as `start_run`. Callbacks, result and errors: as `resume_nbv`.
     """
     run = start_run(dataset, out, progress=progress, **settings)
-    return resume_nbv(run, on_step, progress, run.policy)
+    return resume_nbv(run, on_step, progress, run.policy, settings.get("live"))
 
 
 def start_run(
@@ -70,6 +72,7 @@ def start_run(
     out: str | Path,
     *,
     capture: str | Path | None = None,
+    live: Live | Transport | None = None,
     prior: str | Path | Prior | None = None,
     gaussians: int | Literal["auto"] | None = None,
     preset: str | None = None,
@@ -81,6 +84,8 @@ def start_run(
 
     capture: a scene (`mgs.synth.scene_file.load_scene_file`) in place of a dataset: the run renders
     an image only when its view is chosen, and has its own OUT/dataset with CAPTURE_TEST_VIEWS.
+    live: how pictures of the dataset's poses without an image are captured: `Live`, or a function
+    (pose file, picture file) (docs/howto/on-site.md). They are kept in OUT/dataset.
     prior: a folder, or a Prior, which is copied into the run; default DATASET/prior where there is
     one, else a prior of `gaussians` is built in the run (default: as many as the images resolve).
     preset: a row of `PRESETS`, defaults of what is not given. settings: fields of `NbvSettings`;
@@ -105,12 +110,19 @@ def start_run(
     if prior is None and gaussians is None and (root / "prior/prior.json").is_file():
         prior = root / "prior"
     row = None if preset is None else row_named(PRESETS, preset, "--preset")
-    loaded = given or (load_dataset(root) if capture is None else None)
+    loaded = given
+    if given is None and capture is None:
+        loaded = load_dataset(root, to_capture=live is not None)
+    if live is not None and not (loaded and loaded.on_demand):
+        raise InputError(f"{root}: all its images exist; leave out --capture-command or -folder")
+    images = root if live is None else out / DATASET
     where = Path(prior) if isinstance(prior, str | Path) else out / "prior"
     policy = settings.get("policy", NbvSettings.model_fields["policy"].default)
     named = name_of(policy) if isinstance(policy, str) or callable(policy) else policy
     wanted = _with_defaults(settings | {"policy": named}, row, loaded)
-    known = validated(NbvSettings, {"dataset": root.resolve(), "prior": where.resolve(), **wanted})
+    known = validated(
+        NbvSettings, {"dataset": images.resolve(), "prior": where.resolve(), **wanted}
+    )
     count = len(loaded) if loaded else _candidates(capture)
     complete = _resolved(known, count, "budget" in settings)
     scores = policy_of(policy)  # a user's policy fails here, before there is a folder
@@ -130,10 +142,12 @@ def start_run(
             Problem(
                 frames, complete, operations_of(frames, built, complete), policy=scores
             ).check_seeds()
+        if live is not None:
+            begin(unfinished / DATASET, frames, built)
         start(unfinished, complete, frames)
         if not isinstance(policy, str):
             (unfinished / POLICY_SOURCE).write_text(source_of(policy), encoding="utf-8")
-    return Run(out, complete, loaded, found, policy)
+    return Run(out, complete, loaded if live is None else None, found, policy)
 
 
 def start_fit(
@@ -229,13 +243,15 @@ def resume_nbv(
     on_step: Callable[[State], None] = lambda state: None,
     progress: Progress = no_progress,
     policy: str | Callable[..., Any] | None = None,
+    live: Live | Transport | None = None,
 ) -> Run:
     """Continue a run from its last finished step to its end; return it, with its state.
 
     policy: required if it is the user's own: FILE.py:FUNCTION, or the Python function. That is
-    code, so the user names it, not the folder; a Run of this process knows it. on_step(state):
-    called after every step, or batch of steps, that is finished and on disk. progress(stage, done,
-    total): called during a step.
+    code, so the user names it, not the folder; a Run of this process knows it. live: as
+    `start_run`, given again where pictures are still to be captured. on_step(state): called after
+    every step, or batch of steps, that is finished and on disk. progress(stage, done, total):
+    called during a step.
 
     A finished run is returned as it is. Raises InputError if the folder holds no run, its inputs
     are missing or changed, another process works on it, a fit diverged, or `policy` is not the
@@ -244,12 +260,14 @@ def resume_nbv(
     run = run if isinstance(run, Run) else open_run(run)
     policy = policy or run.policy
     check_named(run, policy)
-    operations = operations_of(run.dataset, run.prior, run.settings)
+    live = live if live is None or isinstance(live, Live) else Live(live)
+    operations = operations_of(run.dataset, run.prior, run.settings, live)
     scores = None if policy is None else policy_of(policy)
     state = recording.run(
         run.folder, run.settings, run.dataset, operations, progress, on_step, policy=scores
     )
-    return Run(run.folder, run.settings, run.dataset, run.prior, policy, state)
+    dataset = None if run.dataset.on_demand else run.dataset  # captured poses are in its files
+    return Run(run.folder, run.settings, dataset, run.prior, policy, state)
 
 
 def check_named(run: Run, policy: str | Callable[..., Any] | None) -> None:

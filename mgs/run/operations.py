@@ -9,7 +9,8 @@ import numpy as np
 from mgs import runtime
 from mgs.camera import Camera
 from mgs.colour import linear_from_srgb, srgb_from_linear
-from mgs.data.dataset import Dataset, Frame
+from mgs.data.dataset import Dataset
+from mgs.data.frames import Frame, as_captured
 from mgs.fit.fitting import Fit, fit
 from mgs.fit.settings import TrainSettings
 from mgs.gaussians import Gaussians
@@ -20,18 +21,24 @@ from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of
 from mgs.prior.initial import Colours, colours_of, initial_gaussians, initial_normals
 from mgs.run.inputs import prior_digest
+from mgs.run.live import Live, live_capture
 from mgs.run.problem import Operations
 from mgs.run.settings import NbvSettings
 from mgs.splat import ListCache, fisher, groups, render
 
 
-def operations_of(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Operations:
-    """Operations on the splat core; the centre is the prior's centre of mass."""
+def operations_of(
+    dataset: Dataset, prior: Prior, settings: NbvSettings, live: Live | None = None
+) -> Operations:
+    """Operations on the splat core; the centre is the prior's centre of mass.
+
+    live: how images of an on-demand dataset are captured that is not rendered.
+    """
     cache, means = ListCache(), settings.train.means
     columns, normals = groups(0, means), initial_normals(prior)
     lam = lam_by_kind(settings.regularisation(columns), columns)
     exposure = exposure_of(prior) if settings.exposure else None
-    colours = kept_colours(dataset, prior)
+    colours = kept_colours(prior)
 
     def initial(frames: Sequence[Frame]) -> Gaussians:
         gains = exposure(frames) if exposure else None
@@ -69,26 +76,36 @@ def operations_of(dataset: Dataset, prior: Prior, settings: NbvSettings) -> Oper
         up=prior.up,
         ground=float((prior.mesh.vertices @ np.array(prior.up)).min()),
         prior=prior_digest(prior),
-        capture=_capture(dataset) if dataset.on_demand else lambda frame: None,
+        capture=_capture(dataset, prior, live),
     )
 
 
-def _capture(dataset: Dataset) -> Callable[[Frame], None]:
+def _capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[[Frame], Frame]:
+    """`Operations.capture` of a dataset: complete, rendered, or captured live."""
+    if not dataset.on_demand:
+        return lambda frame: frame
+    if not (dataset.root / "config.json").is_file():
+        return live_capture(dataset, prior, live)
     runtime.start()
-    from mgs.synth.capture import capture_of  # needs a variant, and only on-demand datasets need it
+    from mgs.synth.capture import capture_of  # needs a variant, and only rendered datasets need it
 
     return capture_of(dataset)
 
 
-def kept_colours(dataset: Dataset, prior: Prior) -> Callable[[Frame], Colours]:
+def kept_colours(prior: Prior) -> Callable[[Frame], Colours]:
     """`mgs.prior.initial.colours_of` the prior, with results kept within IMAGE_BYTES."""
-    of, index = colours_of(prior), {frame.name: i for i, frame in enumerate(dataset.frames)}
+    of, frames = colours_of(prior), dict[str, Frame]()
     kept = kept_within(
         IMAGE_BYTES,
-        lambda i: of(dataset.frames[i]),
+        lambda name: of(frames[name]),
         lambda found: sum(part.nbytes for part in found),
     )
-    return lambda frame: kept(index[frame.name])
+
+    def colours(frame: Frame) -> Colours:
+        frames[frame.name] = frame
+        return kept(frame.name)
+
+    return colours
 
 
 def psnr_measure(
@@ -107,14 +124,14 @@ def psnr_measure(
     names = ("psnr", "psnr_mask", *(("psnr_corrected", "psnr_mask_corrected") if exposure else ()))
 
     def read(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        rgba, weight = frames[index].target()
+        rgba, weight = as_captured(frames[index]).target()
         return srgb_from_linear(rgba[..., :3]), weight > 0, frames[index].mask() & (weight > 0)
 
     truth = kept_within(IMAGE_BYTES, read, lambda parts: sum(part.nbytes for part in parts))
 
     def values(gaussians: Gaussians, index: int) -> list[float]:
         image, known, rock = truth(index)
-        rendered = np.asarray(render(gaussians, frames[index].camera, cache=cache).rgb)
+        rendered = np.asarray(render(gaussians, as_captured(frames[index]).camera, cache=cache).rgb)
         shown = [rendered]
         if exposure:
             shown.append(colour_corrected(linear_from_srgb(image), rendered, rock))

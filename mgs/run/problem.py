@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mgs.camera import Camera
-from mgs.data.dataset import Dataset, Frame, target_of
+from mgs.data.dataset import Dataset, target_of
+from mgs.data.frames import Frame, as_asked
 from mgs.data.up import PLUS_Z, Up, upright
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
@@ -56,7 +57,8 @@ class Operations:
     exact(gaussians, camera) -> exact information [N,P]; None: as `fisher`.
     render(gaussians, camera) -> linear RGB [H,W,3] and alpha [H,W]; None: no detectors.
     measure(gaussians, taken) -> entries of steps.jsonl (`mgs.run.operations.psnr_measure`).
-    capture(frame): makes the frame's images where they do not exist yet.
+    capture(frame) -> the frame once its images exist, which this makes where they do not; its
+    camera is that of the picture. `given_up` where there is none to be had.
     """
 
     centre: np.ndarray
@@ -83,7 +85,7 @@ class Operations:
     up: Up = PLUS_Z
     ground: float = -np.inf
     prior: str = ""
-    capture: Callable[[Frame], None] = lambda frame: None
+    capture: Callable[[Frame], Frame] = lambda frame: frame
 
 
 class Problem:
@@ -109,8 +111,8 @@ class Problem:
     ) -> None:
         self.dataset, self.settings = dataset, settings
         self.operations, self.progress = operations, progress
-        self.frames = dataset.frames
-        self.cameras = [frame.camera for frame in dataset.frames]
+        self.frames = [as_asked(frame) for frame in dataset.frames]
+        self.cameras = [frame.camera for frame in self.frames]
         self.policy = policy or policy_named(settings.policy)
         self.turn = upright(operations.up)
         self.positions = np.array([camera.position for camera in self.cameras]) @ self.turn.T
@@ -156,7 +158,7 @@ class Problem:
     @cached_property
     def start(self) -> Gaussians:
         """The Gaussians before training, in the colours of the seeds, whose images this reads."""
-        self.make_images(self.seeds)
+        self.make_seeds()
         return self.operations.initial([self.frames[i] for i in self.seeds])
 
     @cached_property
@@ -199,9 +201,10 @@ class Problem:
         return Deferred(range(len(taken)), lambda k: without_gain(self.image(taken[k]), gains[k]))
 
     def reachable(self, taken: Sequence[int]) -> list[int]:
-        """Frames not taken, allowed, and within the flight's limits; with the setting `nearest`,
-        that many nearest to the last view."""
-        left = [i for i in range(len(self.frames)) if i not in taken and self.allowed[i]]
+        """Frames not taken or given up, allowed, and within the flight's limits; with the setting
+        `nearest`, that many nearest to the last view."""
+        free = [self.allowed[i] and not frame.given_up for i, frame in enumerate(self.frames)]
+        left = [i for i in range(len(self.frames)) if free[i] and i not in taken]
         if self.settings.flies:
             left = self.flight.in_reach(taken, left)
         if self.settings.nearest is None:
@@ -216,11 +219,46 @@ class Problem:
             return np.ones(len(context.candidate_frames))
         return poses.travel_cost(context.candidates, context.taken[-1], self.settings.travel)
 
-    def make_images(self, views: Sequence[int]) -> None:
-        """Make the images of these frames where they do not exist yet."""
+    def make_images(self, views: Sequence[int]) -> bool:
+        """Make the images of these frames where they do not exist yet; whether all could be made.
+
+        Stops at the first that was given up. Where a picture was taken from another pose, the
+        problem has that pose from now on.
+        """
         for done, i in enumerate(views):
             self.progress("capturing", done, len(views))
-            self.operations.capture(self.frames[i])
+            frame = self.operations.capture(self.frames[i])
+            if frame.camera != self.cameras[i]:
+                self.cameras[i] = frame.camera
+                self.positions[i] = self.turn @ frame.camera.position
+                for known in ("visibility", "flight"):
+                    self.__dict__.pop(known, None)
+            self.frames[i] = frame
+            if frame.given_up:
+                return False
+        return True
+
+    def make_seeds(self) -> None:
+        """Make the images of the seeds; the nearest other pose replaces one that was given up.
+
+        Raises InputError where no other is left.
+        """
+        while not self.make_images(self.seeds):
+            failed = next(i for i in self.seeds if self.frames[i].given_up)
+            others = self.reachable(self.seeds)
+            if not others:
+                raise InputError(f"{self.dataset.root}: too few poses are left for the seeds")
+            nearest = poses.nearest_poses(self.positions[others], self.positions[failed], 1)[0]
+            self.seeds = [others[nearest] if i == failed else i for i in self.seeds]
+
+    def resume(self, taken: Sequence[int]) -> None:
+        """Continue with views that were taken before."""
+        self.seeds = list(taken[: self.settings.seeds])
+        self.make_images(taken)
+
+    def moved(self, views: Sequence[int]) -> bool:
+        """Whether some of these pictures were taken from another pose than was asked for."""
+        return any(self.frames[i].asked is not None for i in views)
 
     def surface_information(self, frame: int) -> np.ndarray:
         """Exact information [S,P] of a view about the surface before training."""

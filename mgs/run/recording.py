@@ -66,6 +66,7 @@ def run(
         problem = Problem(dataset, settings, operations, stopwatch, policy)
         recorder = Recorder(problem, stopwatch)
         if state is not None:
+            problem.resume(state.taken)
             check_model(out, problem, state)
             known, state = state, mark_end(problem, state)
             if known.steps != state.steps:
@@ -101,6 +102,9 @@ def _go_on(
         kept = len(state.steps) if state else 0
         raise InputError(diverged(out, error.step, kept, error.losses)) from None
     assert state is not None
+    known, state = state, mark_end(problem, state)
+    if state.steps != known.steps:  # the last candidates were given up
+        write_checkpoint(out, state)
     return state
 
 
@@ -210,7 +214,7 @@ class Recorder:
             self.stopwatch("evaluating", 0, 1)
             line |= problem.operations.measure(fit.gaussians, learned.taken)
         line["seconds"] |= self.stopwatch.take()
-        kinds = ["image", "mask", "rock", "depth"]
+        kinds = ["image", "mask", "rock", "depth", "capture"]
         files = dict(state.inputs["files"]) if state else {}
         for frame in (problem.frames[i] for i in new):
             files[frame.name] = inputs.frame_digests(frame, kinds)
@@ -231,7 +235,8 @@ class Recorder:
             line |= {"score": None, "information_gain": None}
             return [line | {"images": seeds, "coverage": coverage, "seconds": {}}]
         first = len(learned.taken) - seeds - len(learned.choices) + 1
-        laps, self.stopwatch.laps = self.stopwatch.laps, []
+        laps = self.stopwatch.laps[-len(learned.choices) :]  # without choices that were given up
+        self.stopwatch.laps = []
         return [
             {
                 "step": first + k,

@@ -26,19 +26,19 @@ POSE_TOLERANCE = 1e-9
 """Largest change of a pose entry (metres, cosines) by writing it as text and reading it."""
 
 
-def capture_of(dataset: Dataset) -> Callable[[Frame], None]:
-    """Return capture(frame), which renders a frame of an on-demand dataset unless it is done.
+def capture_of(dataset: Dataset) -> Callable[[Frame], Frame]:
+    """Return capture(frame) -> frame, which renders a frame of an on-demand dataset unless done.
 
     The files are bit for bit those of `synthesise` without `on_demand`. The scene is built at the
     first call, in seconds. capture raises InputError if the dataset has no config.json of `mgs
     synth-orbit --on-demand`, its mesh has changed or is gone, its denoiser is not installed, or the
     frame is not one of the scene's orbit.
     """
-    prepared = cache(lambda: _prepared(dataset.root))
+    prepared = cache(lambda: photographer_of(dataset.root))
 
-    def capture(frame: Frame) -> None:
+    def capture(frame: Frame) -> Frame:
         if is_done(frame):
-            return
+            return frame
         photographer, orbit, exact = prepared()
         known = orbit.get(frame.name)
         if known is not None:
@@ -50,12 +50,16 @@ def capture_of(dataset: Dataset) -> Callable[[Frame], None]:
                 "restore or remove it"
             )
         photographer.take(known)
+        return frame
 
     return capture
 
 
-def _prepared(root: Path) -> tuple[Photographer, dict[str, Frame], bool]:
-    """Photographer of an on-demand dataset, its frames by name, and whether its poses are exact."""
+def photographer_of(root: Path) -> tuple[Photographer, dict[str, Frame], bool]:
+    """Photographer of an on-demand dataset, its frames by name, and whether its poses are exact.
+
+    Raises InputError as `capture_of`.
+    """
     path = root / "config.json"
     config: Any = read_json(path)
     try:

@@ -1,0 +1,140 @@
+"""Frames of a dataset: cameras and image files, and what a live capture recorded of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from mgs.camera import Camera
+from mgs.data.rock_image import boundary, read_rock_image
+from mgs.errors import InputError
+from mgs.files import read_json
+from mgs.images import image_size, read_exr, read_mask, read_png
+
+SURVEY_FOLDER = "survey"
+"""Subfolder of an on-demand dataset with its survey, itself a dataset: depth and masks only."""
+
+CAPTURED = "captured"
+"""Subfolder of an on-demand dataset with the records of its live capture, NAME.json."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One keyframe: its camera, its time in seconds, and the files of its images.
+
+    on_demand: the files exist only after a run has taken the frame. Reading a file that does not
+    exist yet raises InputError. Of a live capture (`mgs.run.live`), capture_path: its record, None
+    before; asked: the camera asked for, where the picture is from another; given_up: no picture.
+    """
+
+    name: str
+    camera: Camera
+    timestamp: float
+    image_path: Path
+    depth_path: Path | None = None
+    mask_path: Path | None = None
+    rock_path: Path | None = None
+    on_demand: bool = False
+    asked: Camera | None = None
+    capture_path: Path | None = None
+    given_up: bool = False
+
+    def rgb(self) -> np.ndarray:
+        """Linear RGB float32 [H,W,3]. Raises InputError if missing, damaged or of another size."""
+        return read_png(self._existing(self.image_path))
+
+    def depth(self) -> np.ndarray:
+        """z-depth float32 [H,W], metres, 0 = no return. Raises InputError as `rgb`, and if the
+        frame has no depth file."""
+        if self.depth_path is None:
+            raise InputError(
+                f"frame {self.name}: has no depth_file_path; this command needs RGB-D frames"
+            )
+        channels = read_exr(self._existing(self.depth_path))
+        depth = channels.get("Z", next(iter(channels.values())))
+        return np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0)
+
+    def mask(self) -> np.ndarray:
+        """Rock mask, bool [H,W]: the mask file; else alpha >= 0.5 of the rock image; else all true.
+
+        In rendered datasets a pixel is true if the ray through its centre meets the rock. Raises
+        InputError as `rgb`.
+        """
+        if self.mask_path is not None:
+            return read_mask(self._existing(self.mask_path))
+        if self.rock_path is not None:
+            return self.target()[0][..., 3] >= 0.5
+        return np.ones((self.camera.height, self.camera.width), bool)
+
+    def target(self) -> tuple[np.ndarray, np.ndarray]:
+        """Target of a fit to the rock alone: rgba float32 [H,W,4] and weight float32 [H,W].
+
+        rgba is linear RGB premultiplied by alpha, and alpha, the share of the pixel that the rock
+        covers. weight is 1 where rgba is known, else 0. With a rock image, weight is 1 everywhere.
+        With a mask only, alpha is 0 or 1, which is wrong along the outline, so the `boundary` of
+        the mask has weight 0. With neither, alpha and weight are 1. Raises InputError as `rgb`.
+        """
+        if self.rock_path is not None:
+            rgba = read_rock_image(self._existing(self.rock_path))
+            return rgba, np.ones(rgba.shape[:2], np.float32)
+        mask = self.mask()
+        rgba = np.dstack([self.rgb(), np.ones(mask.shape, np.float32)]) * mask[..., None]
+        return rgba, (~boundary(mask)).astype(np.float32)
+
+    def masked_rgb(self) -> np.ndarray:
+        """Colour of `target`: linear RGB float32 [H,W,3] of the rock in front of black."""
+        return self.target()[0][..., :3]
+
+    def _existing(self, path: Path) -> Path:
+        """Return `path`, a file of the camera's size by its header.
+
+        Raises InputError if no run has taken this on-demand frame yet, and as `image_size`.
+        """
+        if self.on_demand and not path.exists():
+            raise InputError(
+                f"{path}: does not exist, since no run has taken frame {self.name} of this "
+                "on-demand dataset; `mgs nbv` takes what it chooses, and what `mgs prior` reads "
+                f"is in the dataset's folder {SURVEY_FOLDER}"
+            )
+        (width, height), camera = image_size(path), self.camera
+        if (width, height) != (camera.width, camera.height):
+            raise InputError(
+                f"{path}: is {width}x{height}, but transforms.json says "
+                f"{camera.width}x{camera.height}; correct either"
+            )
+        return path
+
+
+def capture_record(frame: Frame) -> Path:
+    """Path of the record of a frame's live capture; its image lies in ROOT/images."""
+    return frame.image_path.parent.parent / CAPTURED / f"{frame.name}.json"
+
+
+def as_captured(frame: Frame) -> Frame:
+    """The frame as a live capture recorded it, with the pose and lens of its picture; itself where
+    there is no record. Raises InputError if the record is damaged."""
+    path = capture_record(frame)
+    if not frame.on_demand or frame.capture_path or not path.is_file():
+        return frame
+    record = read_json(path)
+    try:
+        if record.get("given_up"):
+            return replace(frame, given_up=True)
+        depth = frame.image_path.parent.parent / "depth" / f"{frame.name}.exr"
+        found = replace(
+            frame, capture_path=path, depth_path=depth if record["depth"] else frame.depth_path
+        )
+        if record["camera"] is None:
+            return found
+        camera = Camera(**record["camera"])
+    except (AttributeError, TypeError, KeyError, ValueError, InputError):
+        raise InputError(f"{path}: is damaged; delete it to capture the frame again") from None
+    return replace(found, asked=frame.camera, camera=camera)
+
+
+def as_asked(frame: Frame) -> Frame:
+    """The frame as it was before its live capture; a frame that was given up stays so."""
+    camera = frame.asked or frame.camera
+    return replace(frame, camera=camera, asked=None, capture_path=None)

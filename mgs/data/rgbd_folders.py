@@ -1,0 +1,211 @@
+"""Folders of robots and scanners with a pose for each image: TUM RGB-D, Open3D, RTAB-Map exports.
+
+Each reader returns keyframes as fields of `mgs.data.sources.Shot`, in metres.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.camera import Camera
+from mgs.data.tracks import Spacing, Track, rigid
+from mgs.errors import InputError
+from mgs.files import read_json, reading
+from mgs.images import image_size
+
+TUM_DEPTH_UNIT = 1 / 5000
+"""Metres in a step of a TUM RGB-D depth image."""
+
+SYNCHRONOUS = 0.02
+"""Largest difference of the times of a colour and its depth image, seconds (TUM's associate.py)."""
+
+OPEN3D_INTERVAL = 0.5
+"""Seconds between two images of an Open3D folder, which has no times: all become keyframes."""
+
+
+def rows(path: Path, least: int) -> list[list[str]]:
+    """Words of the lines of a text file, without comments. Raises InputError where a line has fewer
+    than `least`."""
+    with reading(path):
+        lines = path.read_text(errors="replace").splitlines()
+    found = [line.split() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    if short := [words for words in found if len(words) < least]:
+        raise InputError(f"{path}: {' '.join(short[0])[:60]!r} has fewer than {least} columns")
+    return found
+
+
+def numbers(path: Path, words: list[str]) -> list[float]:
+    """Words as finite numbers. Raises InputError."""
+    try:
+        found = [float(word) for word in words]
+    except ValueError:
+        found = [np.nan]
+    if not np.isfinite(found).all():
+        raise InputError(f"{path}: {' '.join(words)[:60]!r} are not all numbers; correct the line")
+    return found
+
+
+def poses(path: Path) -> list[list[float]]:
+    """Lines (time, x, y, z, qx, qy, qz, qw, ...) of a trajectory."""
+    return [numbers(path, words) for words in rows(path, 8)]
+
+
+def calibration(folder: Path, image: Path) -> tuple[np.ndarray, np.ndarray]:
+    """K [3,3] and distortion by camera_intrinsic.json (Open3D), else calibration.txt (fx fy cx cy
+    and k1 k2 p1 p2 k3). Both count pixel centres as whole numbers."""
+    path = folder / "camera_intrinsic.json"
+    if path.is_file():
+        record: Any = read_json(path)
+        try:
+            K = np.array(record["intrinsic_matrix"], np.float64).reshape(3, 3).T.copy()
+        except (TypeError, KeyError, ValueError):
+            raise InputError(f"{path}: has no intrinsic_matrix of 9 numbers; correct it") from None
+        K[:2, 2] += 0.5
+        return K, np.zeros(5)
+    path = folder / "calibration.txt"
+    if not path.is_file():
+        raise InputError(
+            f"{folder}: has no calibration; write fx fy cx cy into its calibration.txt "
+            "(525 525 319.5 239.5 is the default of a Kinect)"
+        )
+    values = numbers(path, [word for words in rows(path, 1) for word in words])
+    if len(values) not in (4, 8, 9):
+        raise InputError(
+            f"{path}: has {len(values)} numbers; expected fx fy cx cy (k1 k2 p1 p2 k3)"
+        )
+    fx, fy, cx, cy, *distortion = values
+    K = np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]])
+    return K, np.array([*distortion, *np.zeros(5 - len(distortion))])
+
+
+def is_tum(folder: Path) -> bool:
+    """Whether a folder is as those of the TUM RGB-D benchmark."""
+    return (folder / "rgb.txt").is_file() and (folder / "groundtruth.txt").is_file()
+
+
+def read_tum(folder: Path, spacing: Spacing) -> list[dict[str, Any]]:
+    """Keyframes of rgb.txt, depth.txt and groundtruth.txt, whose poses are interpolated."""
+    listed: dict[str, list[tuple[float, Path]]] = {}
+    for kind in ("rgb", "depth"):
+        path = folder / f"{kind}.txt"
+        lines = rows(path, 2) if kind == "rgb" or path.is_file() else []
+        listed[kind] = [(numbers(path, words[:1])[0], folder / words[1]) for words in lines]
+    path = folder / "groundtruth.txt"
+    track = Track.of([(row[0], _pose(path, row[1:8])) for row in poses(path)])
+    images = [(t, image) for t, image in sorted(listed["rgb"]) if image.is_file()]
+    posed = [(t, pose, image) for t, image in images if (pose := track.at(t)) is not None]
+    if not posed:
+        raise InputError(f"{folder}: no image has a pose at its time; check groundtruth.txt")
+    K, distortion = calibration(folder, posed[0][2])
+    times = np.array([time for time, _ in listed["depth"]])
+    shots: list[dict[str, Any]] = []
+    for k in spacing.choose([(time, pose) for time, pose, _ in posed]):
+        time, pose, image = posed[k]
+        near = int(np.argmin(np.abs(times - time))) if len(times) else -1
+        depth = listed["depth"][near][1] if near >= 0 else None
+        if depth is not None and abs(times[near] - time) > SYNCHRONOUS:
+            depth = None
+        shots.append(_shot(f"kf_{len(shots):04d}", K, distortion, pose, time - posed[0][0], image))
+        shots[-1] |= {"depth": depth, "depth_unit": TUM_DEPTH_UNIT}
+    return shots
+
+
+def is_open3d(folder: Path) -> bool:
+    """Whether a folder has the trajectory and images of an Open3D recording."""
+    return (folder / "trajectory.log").is_file() and (folder / "color").is_dir()
+
+
+def read_open3d(folder: Path, spacing: Spacing) -> list[dict[str, Any]]:
+    """Keyframes of color/, depth/ (mm) and trajectory.log (camera-to-world), in order of name."""
+    path = folder / "trajectory.log"
+    words = [word for line in rows(path, 3) for word in line]
+    values = numbers(path, words)
+    if len(values) % 19:
+        raise InputError(f"{path}: expected three numbers and a 4x4 matrix for each image")
+    matrices = np.array(values).reshape(-1, 19)[:, 3:].reshape(-1, 4, 4)
+    images = sorted(path for path in (folder / "color").iterdir() if path.is_file())
+    if len(images) != len(matrices):
+        raise InputError(f"{path}: has {len(matrices)} poses for {len(images)} images in color")
+    times = OPEN3D_INTERVAL * np.arange(len(images))
+    K, distortion = calibration(folder, images[0])
+    shots: list[dict[str, Any]] = []
+    for k in spacing.choose(list(zip(times.tolist(), matrices, strict=True))):
+        shots.append(_shot(images[k].stem, K, distortion, matrices[k], times[k], images[k]))
+        depth = folder / "depth" / f"{images[k].stem}.png"
+        shots[-1] |= {"depth": depth if depth.is_file() else None, "depth_unit": 1e-3}
+    return shots
+
+
+def is_rtabmap(folder: Path) -> bool:
+    """Whether a folder is one of `rtabmap-export --images_id --poses_camera --poses_format 11`."""
+    return bool([*folder.glob("*_camera_poses.txt")]) and bool([*folder.glob("*_calib")])
+
+
+def read_rtabmap(folder: Path, spacing: Spacing) -> list[dict[str, Any]]:
+    """Keyframes of NAME_rgb, NAME_depth (mm), NAME_calib and NAME_camera_poses.txt, by id."""
+    path = min(folder.glob("*_camera_poses.txt"))
+    name = path.name.removesuffix("_camera_poses.txt")
+    listed = poses(path)
+    if any(len(row) < 9 for row in listed):
+        raise InputError(f"{path}: has no ids; export with --poses_format 11")
+    posed = [(row[0], _pose(path, row[1:8]), int(row[8])) for row in sorted(listed)]
+    shots: list[dict[str, Any]] = []
+    for k in spacing.choose([(time, pose) for time, pose, _ in posed]):
+        time, pose, number = posed[k]
+        pictures = [folder / f"{name}_rgb" / f"{number}.{end}" for end in ("jpg", "png")]
+        image = next((path for path in pictures if path.is_file()), pictures[0])
+        lens = folder / f"{name}_calib" / f"{number}.yaml"
+        K, distortion = _opencv_yaml(lens)
+        shots.append(_shot(f"{number:06d}", K, distortion, pose, time - posed[0][0], image))
+        depth = folder / f"{name}_depth" / f"{number}.png"
+        shots[-1] |= {"depth": depth if depth.is_file() else None, "depth_unit": 1e-3}
+    return shots
+
+
+def _opencv_yaml(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """K and distortion of a camera as OpenCV's FileStorage writes them."""
+    import cv2
+
+    with reading(path):
+        path.stat()
+    try:
+        file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        K = np.array(file.getNode("camera_matrix").mat(), np.float64).reshape(3, 3)
+        D = np.array(file.getNode("distortion_coefficients").mat(), np.float64).ravel()
+    except (cv2.error, ValueError, TypeError, SystemError):
+        raise InputError(f"{path}: has no camera_matrix and distortion_coefficients") from None
+    K[:2, 2] += 0.5
+    return K, np.concatenate([D, np.zeros(max(0, 5 - len(D)))])
+
+
+def _pose(path: Path, row: list[float]) -> np.ndarray:
+    """Camera-to-world of x, y, z and a quaternion."""
+    try:
+        return rigid(row[:3], row[3:])
+    except ValueError:
+        raise InputError(f"{path}: has a quaternion of zeros; correct the line") from None
+
+
+def _shot(
+    name: str,
+    K: np.ndarray,
+    distortion: np.ndarray,
+    pose: np.ndarray,
+    time: float,
+    image: Path,
+) -> dict[str, Any]:
+    """Fields of a shot but its depth."""
+    try:
+        camera = Camera(K, *image_size(image), np.linalg.inv(pose))
+    except np.linalg.LinAlgError:
+        raise InputError(f"{image}: its pose is singular; correct it") from None
+    return {
+        "name": name,
+        "camera": camera,
+        "distortion": distortion,
+        "timestamp": float(time),
+        "image": image,
+    }

@@ -1,0 +1,84 @@
+"""Poses measured over time, and the choice of keyframes among the images of a recording."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from mgs.errors import InputError
+
+
+def rigid(translation: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:
+    """Matrix [4,4] of a translation and a quaternion (x, y, z, w). Raises ValueError if that is
+    zero."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    pose[:3, 3] = translation
+    return pose
+
+
+@dataclass(frozen=True)
+class Track:
+    """Rigid transforms [T,4,4] measured at times [T], seconds, in rising order."""
+
+    times: np.ndarray
+    transforms: np.ndarray
+
+    @classmethod
+    def of(cls, samples: Sequence[tuple[float, np.ndarray]]) -> Track:
+        """Track of (time, transform); of samples of the same time the last counts."""
+        known = dict(samples)
+        times = sorted(known)
+        return cls(np.array(times), np.stack([known[time] for time in times]))
+
+    @cached_property
+    def _turns(self) -> Slerp:
+        return Slerp(self.times, Rotation.from_matrix(self.transforms[:, :3, :3]))
+
+    def at(self, time: float) -> np.ndarray | None:
+        """Interpolated transform [4,4]; None before the first and after the last sample. A single
+        sample holds at all times."""
+        if len(self.times) == 1:
+            return self.transforms[0]
+        if not self.times[0] <= time <= self.times[-1]:
+            return None
+        pose = np.eye(4)
+        pose[:3, :3] = self._turns(time).as_matrix()
+        pose[:3, 3] = [
+            np.interp(time, self.times, self.transforms[:, axis, 3]) for axis in range(3)
+        ]
+        return pose
+
+
+@dataclass(frozen=True)
+class Spacing:
+    """Least distance between keyframes, in seconds or metres."""
+
+    least: float
+    metres: bool = False
+
+    @classmethod
+    def parse(cls, text: str) -> Spacing:
+        """Spacing of a text as 0.5s or 0.2m. Raises InputError for anything else."""
+        found = re.fullmatch(r"(\d+\.?\d*|\.\d+)(s|m)", text.strip())
+        if not found:
+            raise InputError(f"--keyframes {text!r}: expected seconds or metres, as 0.5s or 0.2m")
+        return cls(float(found[1]), found[2] == "m")
+
+    def choose(self, shots: Sequence[tuple[float, np.ndarray]]) -> list[int]:
+        """Indices of the keyframes among (time, camera-to-world) in order of time: the first, and
+        each that is far enough from the keyframe before."""
+        kept: list[int] = []
+        for k, (time, pose) in enumerate(shots):
+            if kept:
+                last_time, last = shots[kept[-1]]
+                moved = float(np.linalg.norm(pose[:3, 3] - last[:3, 3]))
+                if (moved if self.metres else time - last_time) < self.least - 1e-6:
+                    continue
+            kept.append(k)
+        return kept

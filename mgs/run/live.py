@@ -1,0 +1,228 @@
+"""Live capture: a pose goes out as a JSON file, and a picture of it comes back.
+
+Of a run, RUN/dataset has the poses (transforms.json), the pictures taken, undistorted, with masks
+(of the prior where none came), and captured/NAME.json, the record that is written last. What was
+received lies in RUN/dataset/flight, or in the watched folder; what was refused is renamed there.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from mgs.camera import Camera, opengl_from_opencv
+from mgs.data.dataset import FILES, Dataset, intrinsics, load_dataset, read_records
+from mgs.data.frames import Frame, as_captured, capture_record
+from mgs.data.importers import import_shot, silhouette_of
+from mgs.data.sources import Shot, record_camera
+from mgs.data.up import Up, upright
+from mgs.errors import InputError, Notice
+from mgs.files import read_json, write_json
+from mgs.prior.build import Prior
+from mgs.run.photograph import check_photograph
+from mgs.run.transports import Transport, answers, picture
+
+CONVENTION = (
+    "transform_matrix is camera-to-world, camera axes x right, y up, z backward (OpenGL, "
+    "nerfstudio); lengths in the unit; heading in degrees clockwise from +Y, pitch above the "
+    "horizon, seen with `up` upwards; pixels from the image's corner"
+)
+
+SAME = 1e-9
+"""Largest difference of an entry of a pose that came back unchanged through JSON."""
+
+REACH = 0.25
+"""Default of the largest distance from the pose asked for, as a share of that to the object."""
+
+DEPTH_UNIT = 1e-3
+"""Metres in a step of a PNG depth image."""
+
+
+@dataclass(frozen=True)
+class Live:
+    """How pictures are captured.
+
+    deliver: a transport (`mgs.run.transports`), or your own function(pose file, picture file).
+    folder: where the two files are; by default RUN/dataset/flight. tries: for each pose. failure:
+    after these, skip (take the next best pose in its place) or stop. distance: largest from the
+    pose asked for, in units of the world; by default REACH.
+    """
+
+    deliver: Transport
+    folder: Path | None = None
+    tries: int = 3
+    failure: Literal["skip", "stop"] = "skip"
+    distance: float | None = None
+
+
+def begin(folder: Path, poses: Dataset, prior: Prior) -> None:
+    """Write the dataset of a live run: all poses, and the images that exist already."""
+    data, records = read_records(poses.root / "transforms.json")
+    for record in records:
+        name = Path(record["file_path"]).stem
+        for key in FILES.values():
+            record.pop(key, None)
+        record |= {"file_path": f"images/{name}.png", "mask_path": f"masks/{name}.png"}
+    write_json(folder / "transforms.json", data | {"on_demand": True, "frames": records})
+    frames = load_dataset(folder).frames
+    silhouette = cache(lambda: silhouette_of(prior.mesh))
+    for given, frame in zip(poses.frames, frames, strict=True):
+        if not given.on_demand:
+            image, depth, mask = given.image_path, given.depth_path, given.mask_path
+            shot = Shot(frame.name, frame.camera, np.zeros(5), frame.timestamp, image, depth)
+            _commit(folder, frame, replace(shot, mask=mask), silhouette)
+
+
+def live_capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[[Frame], Frame]:
+    """Return capture(frame) -> the frame as it was captured.
+
+    A frame that was captured or given up before is returned at once. Refused pictures are asked for
+    again, `live.tries` times in all; each is one line. Raises InputError where the run then stops,
+    and where a picture is needed without `live`.
+    """
+    silhouette = cache(lambda: silhouette_of(prior.mesh))
+    centre = prior.points.mean(axis=0)
+
+    def capture(frame: Frame) -> Frame:
+        known = as_captured(frame)
+        if known.capture_path or known.given_up:
+            return known
+        if live is None:
+            raise InputError(
+                f"{dataset.root}: frame {frame.name} has no image; "
+                "give --capture-command or --capture-folder"
+            )
+        folder, reason = live.folder or dataset.root / "flight", ""
+        for attempt in range(1, live.tries + 1):
+            pose, out = ask(folder, frame, dataset, attempt)
+            try:
+                live.deliver(pose, out)
+                return _received(dataset.root, frame, out, live, centre, silhouette)
+            except (InputError, OSError) as error:
+                reason = str(error)
+                _set_aside(out)
+                said = f"{frame.name}, try {attempt} of {live.tries}: {reason}"
+                warnings.warn(Notice(said), stacklevel=2)
+        if live.failure == "skip":
+            write_json(capture_record(frame), {"given_up": reason})
+            return as_captured(frame)
+        raise InputError(
+            f"{frame.name}: no picture after {live.tries} tries ({reason}); "
+            "mend it and continue the run with --resume"
+        )
+
+    return capture
+
+
+def ask(folder: Path, frame: Frame, dataset: Dataset, attempt: int) -> tuple[Path, Path]:
+    """Write the pose file of a frame; return its path, and that of the picture to come.
+
+    Raises InputError where an answer lies there already though this pose was never asked for.
+    """
+    heading, pitch = heading_and_pitch(frame.camera, dataset.up)
+    asked = {
+        "name": frame.name,
+        "convention": CONVENTION,
+        "unit": dataset.unit,
+        "up": list(dataset.up),
+        "transform_matrix": opengl_from_opencv(frame.camera.world_to_camera).tolist(),
+        "position": frame.camera.position.tolist(),
+        "heading": heading,
+        "pitch": pitch,
+        "camera_model": "OPENCV",
+        **intrinsics(frame.camera),
+    }
+    pose, out = folder / f"{frame.name}.pose.json", folder / f"{frame.name}.png"
+    known: Any = read_json(pose) if pose.is_file() else {}
+    same = isinstance(known, dict) and known == asked | {"attempt": known.get("attempt")}
+    if not same and (there := [*answers(out).values()]):
+        raise InputError(f"{there[0]}: lay there before its pose was asked for; move it away")
+    write_json(pose, asked | {"attempt": attempt})
+    return pose, out
+
+
+def heading_and_pitch(camera: Camera, up: Up) -> tuple[float, float]:
+    """Direction of view, degrees: heading clockwise from +Y (0 to 360), pitch above the horizon."""
+    x, y, z = upright(up) @ camera.world_to_camera[2, :3]
+    return float(np.degrees(np.arctan2(x, y)) % 360), float(
+        np.degrees(np.arcsin(np.clip(z, -1, 1)))
+    )
+
+
+def _received(
+    root: Path,
+    frame: Frame,
+    out: Path,
+    live: Live,
+    centre: np.ndarray,
+    silhouette: Callable[[], Callable[[Camera], np.ndarray]],
+) -> Frame:
+    """Read, check and commit an answer. Raises InputError where it is refused."""
+    image, found = picture(out), answers(out)
+    camera, distortion = frame.camera, np.zeros(5)
+    if flown := found.get(".flown.json"):
+        camera, distortion = _flown(flown, frame, image)
+    away = float(np.linalg.norm(camera.position - frame.camera.position))
+    limit = live.distance or REACH * float(np.linalg.norm(frame.camera.position - centre))
+    if away > limit:
+        raise InputError(f"{flown}: is {away:.3g} from the pose asked for, more than {limit:.3g}")
+    depth = found.get(".depth.exr") or found.get(".depth.png")
+    unit = DEPTH_UNIT if depth and depth.suffix == ".png" else 1.0
+    mask = found.get(".mask.png")
+    shot = Shot(frame.name, camera, distortion, frame.timestamp, image, depth, unit, mask)
+    return _commit(root, frame, shot, silhouette)
+
+
+def _flown(path: Path, frame: Frame, image: Path) -> tuple[Camera, np.ndarray]:
+    """Camera and distortion by a flown pose; the lens is that asked for where it says nothing."""
+    record: Any = read_json(path)
+    if not isinstance(record, dict) or "transform_matrix" not in record:
+        raise InputError(f"{path}: has no transform_matrix")
+    camera, distortion = record_camera(str(path), intrinsics(frame.camera) | record, image)
+    asked = frame.camera
+    same = (camera.width, camera.height) == (asked.width, asked.height) and all(
+        np.allclose(one, other, rtol=0, atol=SAME)
+        for one, other in (
+            (camera.world_to_camera, asked.world_to_camera),
+            (camera.K, asked.K),
+        )
+    )
+    return asked if same else camera, distortion
+
+
+def _commit(
+    root: Path,
+    frame: Frame,
+    shot: Shot,
+    silhouette: Callable[[], Callable[[Camera], np.ndarray]],
+) -> Frame:
+    """Import a picture into the dataset, check it, and write its record."""
+    frame.image_path.unlink(missing_ok=True)  # of a picture that was refused or interrupted
+    made = import_shot(shot, root, None if shot.mask else silhouette(), 1, lambda: None)
+    if made.mask_path is None:
+        raise InputError(f"{shot.mask}: is no mask")
+    check_photograph(made)
+    camera = made.camera
+    moved = {
+        "K": camera.K.tolist(),
+        "width": camera.width,
+        "height": camera.height,
+        "world_to_camera": camera.world_to_camera.tolist(),
+    }
+    record = {"camera": None if camera == frame.camera else moved, "depth": shot.depth is not None}
+    write_json(capture_record(frame), record)
+    return as_captured(frame)
+
+
+def _set_aside(out: Path) -> None:
+    """Rename a refused answer, so that another can come in its place."""
+    names = {path.name.partition(f"{out.stem}.refused-")[2] for path in out.parent.iterdir()}
+    number = 1 + max((int(name.split(".")[0]) for name in names if name[:1].isdigit()), default=0)
+    for end, path in answers(out).items():
+        path.rename(out.with_name(f"{out.stem}.refused-{number}{end}"))

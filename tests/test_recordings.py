@@ -1,0 +1,335 @@
+"""Imports of recordings: ROS bags, TUM RGB-D, Open3D, RTAB-Map, Metashape."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import synthetic
+from PIL import Image
+from program import command, said
+from refusals import refused
+from scipy.spatial.transform import Rotation
+
+from mgs.data import tracks
+from mgs.data.dataset import load_dataset
+from mgs.errors import InputError
+
+MOUNT = tracks.rigid((0.1, -0.2, 0.3), (0.5, -0.5, 0.5, -0.5))
+"""Camera to body of the robot."""
+OPTICAL, DEPTH_UNIT = "camera_color_optical_frame", 1e-3
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return synthetic.write_dataset(tmp_path_factory.mktemp("recordings") / "data")
+
+
+def millimetres(frame) -> np.ndarray:
+    return np.round(frame.depth() / DEPTH_UNIT).astype(np.uint16)
+
+
+class Bag:
+    """A bag in which a robot records the frames of a dataset, two a second."""
+
+    def __init__(self, path: Path, version: int) -> None:
+        from rosbags.rosbag1 import Writer as Writer1
+        from rosbags.rosbag2 import Writer as Writer2
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        self.version, self.connections = version, {}
+        store = Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE
+        self.store = get_typestore(store)
+        if version == 1:
+            text = "geometry_msgs/TransformStamped[] transforms"
+            self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
+        self.writer = Writer1(path) if version == 1 else Writer2(path, version=9)
+
+    def make(self, kind: str, *values):
+        return self.store.types[kind](*values)
+
+    def header(self, time: float, frame: str):
+        stamp = self.make("builtin_interfaces/msg/Time", int(time), round(time % 1 * 1e9))
+        sequence = (0,) if self.version == 1 else ()
+        return self.make("std_msgs/msg/Header", *sequence, stamp, frame)
+
+    def write(self, topic: str, kind: str, time: float, *values) -> None:
+        if topic not in self.connections:
+            found = self.writer.add_connection(topic, kind, typestore=self.store)
+            self.connections[topic] = found
+        message = self.make(kind, *values)
+        dump = self.store.serialize_ros1 if self.version == 1 else self.store.serialize_cdr
+        self.writer.write(self.connections[topic], int(time * 1e9), dump(message, kind))
+
+    def image(self, topic: str, time: float, encoding: str, pixels: np.ndarray) -> None:
+        height, width = pixels.shape[:2]
+        data = np.frombuffer(pixels.tobytes(), np.uint8)
+        shape = height, width, encoding, 0, len(data) // height
+        self.write(topic, "sensor_msgs/msg/Image", time, self.header(time, OPTICAL), *shape, data)
+
+    def lens(self, topic: str, time: float, camera) -> None:
+        K = camera.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+        numbers = np.zeros(5), K.ravel(), np.eye(3).ravel(), np.eye(3, 4).ravel()
+        roi = self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+        size = camera.height, camera.width, "plumb_bob"
+        head = self.header(time, OPTICAL)
+        self.write(topic, "sensor_msgs/msg/CameraInfo", time, head, *size, *numbers, 0, 0, roi)
+
+    def pose(self, pose: np.ndarray):
+        """(translation, quaternion) as values of messages."""
+        turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        return pose[:3, 3].tolist(), self.make("geometry_msgs/msg/Quaternion", *turn)
+
+    def tf(self, topic: str, time: float, parent: str, child: str, pose: np.ndarray) -> None:
+        place, turn = self.pose(pose)
+        move = self.make("geometry_msgs/msg/Vector3", *place)
+        step = self.make("geometry_msgs/msg/Transform", move, turn)
+        head = self.header(time, parent)
+        stamped = self.make("geometry_msgs/msg/TransformStamped", head, child, step)
+        self.write(topic, "tf2_msgs/msg/TFMessage", time, [stamped])
+
+    def stamped(self, topic: str, time: float, pose: np.ndarray) -> None:
+        place, turn = self.pose(pose)
+        made = self.make(
+            "geometry_msgs/msg/Pose", self.make("geometry_msgs/msg/Point", *place), turn
+        )
+        head = self.header(time, "map")
+        self.write(topic, "geometry_msgs/msg/PoseStamped", time, head, made)
+
+
+def write_bag(
+    path: Path, dataset, version: int = 2, leave_out: str = "", poses: str = "tf"
+) -> Path:
+    """Write a bag without the topics whose names contain `leave_out`."""
+    bag = Bag(path, version)
+    with bag.writer:
+        for k, frame in enumerate(dataset.frames):
+            time, camera = 100 + 0.5 * k, frame.camera
+            if poses == "stamped":
+                bag.stamped("/slam/pose", time, camera.camera_to_world)
+            elif leave_out != "tf":
+                body = camera.camera_to_world @ np.linalg.inv(MOUNT)
+                bag.tf("/tf_static", time, "base_link", OPTICAL, MOUNT)
+                bag.tf("/tf", time, "map", "base_link", body)
+            rgb = np.asarray(Image.open(frame.image_path))
+            if leave_out != "colour":
+                bag.image("/camera/color/image_raw", time, "bgr8", rgb[..., ::-1])
+                bag.image("/camera/color/image_raw", time + 0.2, "bgr8", 0 * rgb)  # no keyframe
+            if leave_out != "camera_info":
+                bag.lens("/camera/color/camera_info", time, camera)
+            bag.image("/camera/aligned_depth/image_raw", time + 0.01, "16UC1", millimetres(frame))
+    return path
+
+
+def write_tum(root: Path, dataset) -> Path:
+    """Folder as of the benchmark, with poses between the images only."""
+    root.mkdir()
+    listed = {"rgb": [], "depth": [], "groundtruth": ["# timestamp tx ty tz qx qy qz qw"]}
+    for k, frame in enumerate(dataset.frames):
+        (root / "rgb").mkdir(exist_ok=True)
+        (root / "depth").mkdir(exist_ok=True)
+        shutil.copy(frame.image_path, root / f"rgb/{k}.png")
+        depth = np.round(frame.depth() * 5000).astype(np.uint16)
+        Image.fromarray(depth).save(root / f"depth/{k}.png")
+        listed["rgb"].append(f"{100 + k} rgb/{k}.png")
+        listed["depth"].append(f"{100.01 + k} depth/{k}.png")
+        pose = frame.camera.camera_to_world
+        turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        listed["groundtruth"].append(
+            " ".join(map(repr, [100.0 + k, *pose[:3, 3].tolist(), *turn.tolist()]))
+        )
+    for kind, lines in listed.items():
+        (root / f"{kind}.txt").write_text("\n".join(lines))
+    K = dataset.frames[0].camera.K
+    (root / "calibration.txt").write_text(f"{K[0, 0]} {K[1, 1]} {K[0, 2] - 0.5} {K[1, 2] - 0.5}")
+    return root
+
+
+def write_open3d(root: Path, dataset) -> Path:
+    """Folder with color/, depth/, trajectory.log and camera_intrinsic.json."""
+    for kind in ("color", "depth"):
+        (root / kind).mkdir(parents=True)
+    text, camera = "", dataset.frames[0].camera
+    for k, frame in enumerate(dataset.frames):
+        shutil.copy(frame.image_path, root / f"color/{k:06d}.png")
+        Image.fromarray(millimetres(frame)).save(root / f"depth/{k:06d}.png")
+        matrix = "\n".join(
+            " ".join(map(repr, row)) for row in frame.camera.camera_to_world.tolist()
+        )
+        text += f"{k} {k} {k + 1}\n{matrix}\n"
+    (root / "trajectory.log").write_text(text)
+    K = camera.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    record = {"width": camera.width, "height": camera.height}
+    record["intrinsic_matrix"] = K.T.ravel().tolist()
+    (root / "camera_intrinsic.json").write_text(json.dumps(record))
+    return root
+
+
+def write_rtabmap(root: Path, dataset) -> Path:
+    """Folder of `rtabmap-export`, with calibrations as OpenCV writes them."""
+    for kind in ("rgb", "depth", "calib"):
+        (root / f"rtabmap_{kind}").mkdir(parents=True)
+    lines = ["#timestamp x y z qx qy qz qw id"]
+    for k, frame in enumerate(dataset.frames, 1):
+        shutil.copy(frame.image_path, root / f"rtabmap_rgb/{k}.png")
+        Image.fromarray(millimetres(frame)).save(root / f"rtabmap_depth/{k}.png")
+        file = cv2.FileStorage(str(root / f"rtabmap_calib/{k}.yaml"), cv2.FILE_STORAGE_WRITE)
+        file.write("camera_matrix", frame.camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+        file.write("distortion_coefficients", np.zeros((1, 5)))
+        file.release()
+        pose = frame.camera.camera_to_world
+        turn = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+        lines.append(" ".join(map(repr, [100.0 + k, *pose[:3, 3].tolist(), *turn, k])))
+    (root / "rtabmap_camera_poses.txt").write_text("\n".join(lines))
+    return root
+
+
+def write_metashape(root: Path, dataset, more: str = "") -> Path:
+    """cameras.xml of half the scale, which its chunk states; images beside it."""
+    shutil.copytree(dataset.root / "images", root / "images")
+    camera, rows = dataset.frames[0].camera, ""
+    for k, frame in enumerate(dataset.frames):
+        pose = frame.camera.camera_to_world.copy()
+        pose[:3, 3] /= 2
+        words = " ".join(map(repr, pose.ravel().tolist()))
+        rows += f'<camera id="{k}" sensor_id="0" label="{frame.name}">'
+        rows += f"<transform>{words}</transform></camera>"
+    rows += '<camera id="99" sensor_id="0" label="not_aligned"/>'
+    size = f'<resolution width="{camera.width}" height="{camera.height}"/>'
+    inner = f"{size}<f>{camera.K[0, 0]}</f>{more}"
+    lens = f'<calibration type="frame" class="adjusted">{inner}</calibration>'
+    (root / "cameras.xml").write_text(
+        '<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk label="Chunk 1">'
+        f'<sensors><sensor id="0" type="frame">{size}{lens}</sensor></sensors>'
+        f"<cameras>{rows}</cameras><transform><scale>2</scale></transform></chunk></document>"
+    )
+    return root / "cameras.xml"
+
+
+WRITERS = {
+    "ROS bag 2": lambda root, data: write_bag(root / "bag", data),
+    "ROS bag 1": lambda root, data: write_bag(root / "one.bag", data, 1),
+    "ROS bag poses": lambda root, data: write_bag(root / "bag", data, poses="stamped"),
+    "TUM RGB-D": lambda root, data: write_tum(root / "tum", data),
+    "Open3D": lambda root, data: write_open3d(root / "open3d", data),
+    "RTAB-Map": lambda root, data: write_rtabmap(root / "rtabmap", data),
+    "Metashape": lambda root, data: write_metashape(root / "metashape", data),
+}
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_cameras_pixels_and_depth_are_those_recorded(dataset, tmp_path, capsys, kind):
+    if kind.startswith("ROS"):
+        pytest.importorskip("rosbags")
+    source, out = WRITERS[kind](tmp_path, dataset), tmp_path / "out"
+    command("import", source, "--out", out)
+    printed, _ = said(capsys)
+    assert "lengths are metres" in printed
+    assert not (tmp_path / "out.unpacked").exists()
+    made = load_dataset(out)
+    assert len(made) == len(dataset)
+    assert np.allclose(made.up, (0, 0, 1), atol=1e-9)
+    for one, other in zip(dataset.frames, made.frames, strict=True):
+        assert np.allclose(one.camera.world_to_camera, other.camera.world_to_camera, atol=1e-6)
+        assert np.allclose(one.camera.K, other.camera.K, atol=1e-9)
+        assert np.array_equal(one.rgb(), other.rgb())
+        if kind != "Metashape":
+            assert np.abs(one.depth() - other.depth()).max() < 6e-4
+
+
+def test_keyframes_by_distance(dataset, tmp_path):
+    source = write_tum(tmp_path / "tum", dataset)
+    steps = np.linalg.norm(
+        np.diff([frame.camera.position for frame in dataset.frames], axis=0), axis=1
+    )
+    out = tmp_path / "out"
+    command("import", source, "--out", out, "--keyframes", f"{1.5 * steps[0]}m")
+    names = [frame.camera.position.tolist() for frame in load_dataset(out).frames]
+    assert np.allclose(names, [frame.camera.position for frame in dataset.frames[::2]], atol=1e-6)
+
+
+def test_poses_are_interpolated():
+    start, end = np.eye(4), tracks.rigid((2, 0, 0), (0, 0, 1, 1))
+    track = tracks.Track.of([(3.0, end), (1.0, start)])
+    middle = track.at(2.0)
+    assert np.allclose(middle[:3, 3], [1, 0, 0])
+    assert np.allclose(Rotation.from_matrix(middle[:3, :3]).as_rotvec(degrees=True), [0, 0, 45])
+    assert track.at(0.9) is None
+    assert track.at(3.1) is None
+    assert tracks.Track.of([(1.0, end)]).at(9.0)[0, 3] == 2
+
+
+@pytest.mark.parametrize("text", ["", "0.5", "m", "-1s", "1 km", "nan s"])
+def test_bad_spacings(text):
+    with pytest.raises(InputError, match="expected seconds or metres"):
+        tracks.Spacing.parse(text)
+
+
+def damage(root: Path, name: str, old: str, new: str) -> None:
+    path = root / name
+    path.write_text(path.read_text().replace(old, new))
+
+
+BROKEN = {
+    "no tf": (lambda r, d: write_bag(r / "bag", d, leave_out="tf"), "record /tf and /tf_static"),
+    "no info": (
+        lambda r, d: write_bag(r / "bag", d, leave_out="camera_info"),
+        "has no camera_info",
+    ),
+    "no colour": (lambda r, d: write_bag(r / "bag", d, leave_out="colour"), "images are none"),
+    "no bag": (lambda r, d: _text(r / "x.bag", "no bag"), "not a readable ROS bag"),
+    "no calibration": (
+        lambda r, d: _without(write_tum(r / "t", d), "calibration.txt"),
+        "fx fy cx cy",
+    ),
+    "few columns": (lambda r, d: _line(write_tum(r / "t", d), "groundtruth.txt"), "fewer than 8"),
+    "no numbers": (lambda r, d: _line(write_tum(r / "t", d), "calibration.txt"), "not all numbers"),
+    "poses": (lambda r, d: _line(write_open3d(r / "o", d), "trajectory.log"), "fewer than 3"),
+    "not XML": (lambda r, d: _text(r / "x.xml", "<a"), "no XML of Metashape"),
+    "b2": (lambda r, d: write_metashape(r / "m", d, "<b2>1</b2>"), "b2 or k4"),
+    "yaml": (
+        lambda r, d: _text(write_rtabmap(r / "r", d) / "rtabmap_calib/3.yaml", "x").parent.parent,
+        "camera_matrix",
+    ),
+}
+
+
+def _text(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def _without(root: Path, name: str) -> Path:
+    (root / name).unlink()
+    return root
+
+
+def _line(root: Path, name: str) -> Path:
+    with open(root / name, "a") as file:
+        file.write("\nnonsense\n")
+    return root
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_refusals_are_one_line(dataset, tmp_path, capsys, case):
+    if "bag" in case or case in ("no tf", "no info", "no colour"):
+        pytest.importorskip("rosbags")
+    make, message = BROKEN[case]
+    source = make(tmp_path, dataset)
+    assert message in refused(capsys, ["import", source, "--out", tmp_path / "out"], tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["ROS bag 2", "TUM RGB-D"])
+def test_a_recording_becomes_a_model(dataset, tmp_path, kind):
+    """Bag, dataset, masks of the rock's mesh, prior of the depth, run, renders."""
+    source, out = WRITERS[kind](tmp_path, dataset), tmp_path / "out"
+    command("import", source, "--out", out, "--mesh", dataset.root / "rock.glb")
+    options = ["--seeds", 3, "--budget", 1, "--passes", 2, "--gaussians", 200]
+    command("nbv", out, *options, "--out", tmp_path / "run")
+    command("eval", tmp_path / "run")
+    assert len(list((tmp_path / "run/renders").glob("*.png"))) > 0
