@@ -2,6 +2,7 @@
 
 from .camera import Camera as Camera
 from .camera import look_at as look_at
+from .cli.progress import progress_bar as progress_bar
 from .data.dataset import Dataset as Dataset
 from .data.dataset import Frame as Frame
 from .data.dataset import load_cameras as load_cameras

@@ -8,6 +8,32 @@ from typing import TypeVar
 
 Row = TypeVar("Row")
 
+EXTRAS = {
+    "pymeshlab": "prior",
+    "manifold3d": "prior",
+    "sklearn": "prior",
+    "cv2": "prior",
+    "pycolmap": "import",
+    "gtsam": "survey",
+    "small_gicp": "survey",
+    "pyoidn": "denoise",
+    "plotly": "page",
+    "jinja2": "page",
+    "viser": "view",
+    "distributed": "study",
+    "dask": "study",
+}
+"""Modules that only some commands need -> extra of pyproject.toml that installs them."""
+
+
+def missing(module: str | None) -> str:
+    """Line for a module that is not installed; empty if mgs does not know it."""
+    name = (module or "").partition(".")[0]
+    if name not in EXTRAS:
+        return ""
+    return f'this needs {name}, which is not installed; `pip install "mgs[{EXTRAS[name]}]"`'
+
+
 FLAGS = {"rates": "--rate", "seeds": "--seed-views", "seed": "--random-seed"}
 """Settings whose option has another name."""
 

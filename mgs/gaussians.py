@@ -14,6 +14,7 @@ from scipy.special import expit
 
 from mgs.colour import SH_C0
 from mgs.errors import InputError
+from mgs.notebook import cloud, html
 
 MAX_SH_DEGREE = 3
 """Highest degree of spherical harmonics, as in 3DGS."""
@@ -45,7 +46,7 @@ def learned(means: str = "frozen") -> dict[str, str]:
     return dict(zip(LEARNED, KINDS, strict=True)) | ({} if means == "frozen" else {"means": "mean"})
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Gaussians:
     """N Gaussians; float32 NumPy arrays, or inside `mgs.splat` Dr.Jit tensors of the same shapes.
 
@@ -69,6 +70,13 @@ class Gaussians:
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
+
+    def __repr__(self) -> str:
+        return f"Gaussians({len(self):,}, SH degree {self.sh_degree})"
+
+    def _repr_html_(self) -> str:
+        g = Gaussians(*(np.asarray(getattr(self, field.name)) for field in fields(self)))
+        return html(repr(self), [cloud(g.means, g.rgb)])
 
     def __getitem__(self, index: Any) -> Gaussians:
         """Select Gaussians by a slice, a mask [N], indices [M] in their order, or one index."""

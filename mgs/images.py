@@ -174,8 +174,6 @@ def read_rgba(path: str | Path) -> np.ndarray:
     image without alpha is opaque. Raises InputError if the file is missing, unreadable, damaged, or
     neither grey nor RGB. CMYK is refused: its colours depend on the file's colour profile.
     """
-    import cv2
-
     path = Path(path)
     image, data = _open_image(path)
     bits = data[PNG_BIT_DEPTH] if image.format == "PNG" else 8
@@ -192,7 +190,8 @@ def read_rgba(path: str | Path) -> np.ndarray:
         )
     if bits < 16:
         return np.asarray(image.convert("RGBA"))
-    # Pillow keeps only the upper 8 bits of 16-bit colour.
+    import cv2  # Pillow keeps only the upper 8 bits of 16-bit colour
+
     with _silent():
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.uint16:

@@ -19,6 +19,9 @@ IMAGE_BYTES = 1 << 30
 """Most memory of arrays of one kind that are kept for reuse, bytes: 218 target images of 640x480,
 or five of 12 megapixels. Others are read or computed again at each use."""
 
+VIEW_BYTES = 1 << 29
+"""Most memory of the information of views about one model that are kept for several choices, bytes:
+122 views of 100,000 Gaussians. That of others is computed again for each choice."""
 
 LITTLE = 1 << 30
 """Bytes up to which `check_room` checks nothing: the check takes part of the time of a small image.

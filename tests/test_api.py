@@ -115,3 +115,20 @@ def test_a_function_is_a_policy_that_a_resumed_run_asks_for(dataset, prior, tmp_
     (out / "policy.py").write_text("def highest(candidates): ...")
     with pytest.raises(mgs.InputError, match="policy highest: is not as"):
         mgs.resume_nbv(out, policy=highest)
+
+
+def test_objects_are_short_in_text_and_have_pictures_in_notebooks(dataset, prior, tmp_path):
+    loaded, known = mgs.load_dataset(dataset), mgs.load_prior(prior)
+    begun = mgs.start_run(loaded, tmp_path / "begun", prior=known, seeds=3)
+    given = {"prior": known, "seeds": 3, "budget": 0, "train": {"passes": 1}}
+    run = mgs.run_nbv(loaded, tmp_path / "run", **given)
+    for one, text, pictures in (
+        (loaded, f"Dataset({dataset}: 12 frames, 16x12)", 6),
+        (known, "Prior(40 points, 40 Gaussians, spacing 0.5 m)", 1),
+        (begun, f"Run({tmp_path / 'begun'}: d-optimal, 0 of 12 views)", 0),
+        (run, f"Run({tmp_path / 'run'}: d-optimal, 3 of 3 views)", 4),
+        (run.gaussians, "Gaussians(40, SH degree 0)", 1),
+    ):
+        assert repr(one) == text
+        assert one._repr_html_().startswith(f"<div>{text}</div>")
+        assert one._repr_html_().count("<img") == pictures

@@ -67,7 +67,7 @@ def test_a_batch_measures_each_candidate_once_if_there_is_room(loaded, tmp_path,
         measured.append((gaussians.sh.tobytes(), camera.key))
         return tiny.fisher(gaussians, camera)
 
-    monkeypatch.setattr(problem, "IMAGE_BYTES", room)
+    monkeypatch.setattr(problem, "VIEW_BYTES", room)
     parts, views = tiny.operations(fisher=fisher, exact=tiny.fisher), {"budget": 6, "batch": 3}
     state = run(tmp_path / "run", loaded, parts, **views)
     assert state.taken == run(tmp_path / "as before", loaded, **views).taken

@@ -14,8 +14,9 @@ from program import change_settings, command
 from refusals import refused
 from rich.console import Console
 
+from mgs.cli import nbv as nbv_command
 from mgs.cli.nbv import start_and_print
-from mgs.cli.printing import print_run
+from mgs.cli.printing import print_run, step_line
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import locked, write_json
@@ -253,6 +254,41 @@ def test_settings_without_an_option_are_named_by_their_key(
 ):
     with pytest.raises(InputError, match=message):
         started(dataset, tmp_path / "run", prior, budget=1, **values)
+
+
+def test_options_win_over_a_file_of_settings(dataset, prior, tmp_path, capsys, monkeypatch):
+    """The config.json of a run is such a file, too."""
+    monkeypatch.setattr(nbv_command, "resume_and_print", lambda *given: None)
+    file, first, second = (tmp_path / name for name in ("mine.toml", "first", "second"))
+    text = f'dataset = "{dataset.name}"\nprior = "{prior}"\nseeds = 3\nbudget = 2\n'
+    file.write_text(text + "[train]\npasses = 2\n")
+    command("nbv", "--config", file, "--budget", 1, "--out", first)
+    made = run_folder.read_settings(first)
+    assert (made.seeds, made.budget, made.train.passes, made.prior) == (3, 1, 2, prior.resolve())
+    command("nbv", "--config", first / "config.json", "--policy", "random", "--out", second)
+    assert run_folder.read_settings(second) == made.model_copy(update={"policy": "random"})
+    for wrong, said in {
+        "budgett = 1": "mine.toml: budgett: Extra inputs are not permitted; correct it",
+        "budget = -1": "mine.toml: budget: must be at least 0; correct it",
+        "budget = ": "mine.toml: not valid TOML",
+    }.items():
+        file.write_text(wrong)
+        assert said in refused(capsys, ["nbv", dataset, "--config", file, "--out", tmp_path / "x"])
+
+
+def test_the_table_of_steps_has_the_psnr_that_was_measured(tmp_path):
+    line = {"step": 0, "name": None, "seed_names": ["a", "b"], "score": None, "coverage": 1.0}
+    line |= {"seconds": {"fit": 2.5}, "images": 2, "iterations": 14, "loss": 0.1}
+    line |= {"stop_reason": "pass-limit", "psnr": 20.0, "test_psnr": 30.12, "test_psnr_mask": 25.5}
+    console = Console(record=True, width=80, force_terminal=True)
+    print_run(tmp_path, state_of([line]), NOT_SHOWN, console)
+    shown = console.export_text()
+    assert all(text in shown for text in ("30.12", "25.50", "masked PSNR", "test", " 7 "))
+    assert "20.0" not in shown
+    assert step_line(line) == (
+        "step 0: a, b, coverage 100.00 %, 7 passes, PSNR test views 30.12 dB, "
+        "masked PSNR test views 25.50 dB, 2.5 s"
+    )
 
 
 def test_options_reach_the_run(dataset, prior, tmp_path):

@@ -54,6 +54,7 @@ def tables_restored():
         table.clear()
         table.update(rows)
     sys.modules.pop("my_mgs", None)
+    sys.modules.pop("mine", None)
 
 
 def test_the_tutorial_prints_what_it_shows(pages, tmp_path):

@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 ROOMS = [
     "errors", "seeds", "runtime", "resources", "provenance", "colour", "rotation", "memory",
-    "camera", "gaussians", "files", "images", "splat_ply", "metrics", "plotting",
+    "notebook", "camera", "gaussians", "files", "images", "splat_ply", "metrics", "plotting",
     "data", "synth", "survey", "prior", "splat", "policy", "fit", "run", "report", "view",
     "bench", "study", "cli", "__main__",
 ]  # fmt: skip

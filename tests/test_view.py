@@ -196,7 +196,7 @@ def test_refusals(capsys, run, dataset, prior, tmp_path, monkeypatch):
     assert "no finished step yet" in view(tmp_path / "begun")
     assert read_subject(tmp_path / "begun", follow=True).gaussians is None
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert "pip install viser" in view(run)
+    assert 'pip install "mgs[view]"' in view(run)
     check_address("127.0.0.1", 0)
 
 
@@ -224,7 +224,7 @@ def viewing(*arguments):
 
 
 def test_a_run_is_followed_from_its_beginning(dataset, prior, tmp_path):
-    pytest.importorskip("viser", reason="viser is not installed (pip install viser)")
+    pytest.importorskip("viser", reason="viser is not installed")
     tiny.start(tmp_path / "run", load_dataset(dataset), prior=prior, budget=2)
     viewer = Viewer(tmp_path / "run", port=0, follow=True)
     try:
@@ -299,7 +299,7 @@ def choose(tab, label, option):
 
 @pytest.fixture(scope="module")
 def browser():
-    pytest.importorskip("viser", reason="viser is not installed (pip install viser)")
+    pytest.importorskip("viser", reason="viser is not installed")
     with chromium() as found:
         yield found
 

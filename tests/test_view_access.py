@@ -13,7 +13,7 @@ from mgs.view import server
 from mgs.view.access import COOKIE, Access, plain
 from mgs.view.server import Viewer, window_camera
 
-pytest.importorskip("viser", reason="viser is not installed (pip install viser)")
+pytest.importorskip("viser", reason="viser is not installed")
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from mgs import __version__
-from mgs.errors import InputError, Notice
+from mgs.errors import InputError, Notice, missing
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C: by convention 128 plus the number of the signal, SIGINT."""
@@ -166,6 +166,9 @@ def main(arguments: list[str] | None = None) -> None:
     except typer.Abort:
         raise _stop("stopped", 1) from None
     except Exception as error:
+        lacks = missing(error.name) if isinstance(error, ModuleNotFoundError) else ""
+        if lacks:
+            raise _stop(lacks, 2) from None
         if not _from_interrupt(error):
             raise
         code = INTERRUPTED

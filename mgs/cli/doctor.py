@@ -5,17 +5,19 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
+from importlib.util import find_spec
 
 import typer
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from mgs import runtime
-from mgs.errors import InputError
+from mgs.errors import EXTRAS, InputError
 from mgs.resources import resource_folder
 
-PACKAGES = ("mgs", "mitsuba", "drjit", "numpy", "pyoidn", "pymeshlab")
-"""Packages whose versions are printed. Only pyoidn is optional."""
+PACKAGES = ("mgs", "mitsuba", "drjit", "numpy")
+"""Packages whose versions are printed."""
 
 Row = tuple[str, str, str]
 """Name, value, and what is wrong with it, or ""."""
@@ -30,7 +32,7 @@ def doctor() -> None:
     rows = _software() + _machine() + _resources()
     table = Table(show_header=False, box=None, pad_edge=False)
     for name, value, problem in rows:
-        table.add_row(name, value, style="red" if problem else None)
+        table.add_row(Text(name), Text(value), style="red" if problem else None)
     console = Console(highlight=False)
     console.print(table)
     problems = [problem for *_, problem in rows if problem]
@@ -48,16 +50,17 @@ def _software() -> list[Row]:
         try:
             rows.append((package, importlib.metadata.version(package), ""))
         except importlib.metadata.PackageNotFoundError:
-            if package == "pyoidn":
-                absent = "absent: images are rendered with more samples instead of being denoised"
-                rows.append((package, absent, ""))
-                continue
             mend = "install mgs again (`make setup`, or `pip install .`)"
             rows.append((package, "missing", f"the package {package} is missing; {mend}"))
+    for extra in dict.fromkeys(EXTRAS.values()):
+        names = [name for name, of in EXTRAS.items() if of == extra]
+        absent = [name for name in names if find_spec(name) is None]
+        lacks = f'no {", ".join(absent)}: `pip install "mgs[{extra}]"`' if absent else "installed"
+        rows.append((f"mgs[{extra}]", lacks, ""))
     try:  # pymeshlab needs the system's libGL to load, although mgs draws nothing with it
         import pymeshlab  # noqa: F401
     except ModuleNotFoundError:
-        pass  # reported above
+        pass  # an extra, reported above
     except ImportError as error:
         mend = "install libGL (`apt-get install libgl1 libopengl0`)"
         rows.append(("pymeshlab", "does not load", f"pymeshlab: {error}; {mend}"))

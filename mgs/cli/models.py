@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 from mgs import runtime
-from mgs.cli.options import Run, argument, option
+from mgs.cli.options import Runs, argument, option
 from mgs.cli.printing import print_quality
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError
@@ -62,7 +62,7 @@ def evaluate(
                 if dataset is not None:
                     raise InputError(f"--dataset: is for a PLY; {subject} has a dataset of its own")
                 options = {"pictures": pictures, "convergence": convergence, "progress": progress}
-                rows += _measured_run(subject, said, options)
+                rows += _measured_run(subject, len(subjects) == 1, said, options)
             for path in others:
                 if path.is_file() or path == subject:
                     name = path.name if path == subject else f"  {path.stem.partition('_')[2]}"
@@ -73,8 +73,11 @@ def evaluate(
     _print(said)
 
 
-def _measured_run(run: Path, said: list[str], options: dict[str, Any]) -> list[dict[str, Any]]:
-    """Evaluate a run; return its row of the table. said: gets the lines for the user."""
+def _measured_run(
+    run: Path, alone: bool, said: list[str], options: dict[str, Any]
+) -> list[dict[str, Any]]:
+    """Evaluate a run; return its row of the table. alone: whether no other one is shown. said: gets
+    the lines for the user."""
     from mgs.report.evaluation import evaluate_run
     from mgs.report.runs import Comparison, read_run
     from mgs.report.tables import comparison_rows
@@ -86,14 +89,15 @@ def _measured_run(run: Path, said: list[str], options: dict[str, Any]) -> list[d
     metrics = evaluate_run(opened, say=said.append, **options)
     if "fit" in metrics:
         said.insert(first, fit_line(metrics["fit"], opened.state.steps[-1]["stop_reason"]))
-    return comparison_rows(Comparison({opened.label: read_run(run)}, opened.dataset))
+    label = opened.label if alone else f"{opened.label} ({run.resolve().name})"
+    return comparison_rows(Comparison({label: read_run(run)}, opened.dataset))
 
 
 def diagnose(
-    run: Run,
+    runs: Runs,
     views: Annotated[
         str | None,
-        option("Frames to draw, as kf_0003,kf_0010. Default: a few that were not trained on."),
+        option("Frames to draw, as kf_0003,kf_0010. Default: a few held-out ones."),
     ] = None,
     calibrate: Annotated[
         bool,
@@ -124,19 +128,20 @@ def diagnose(
             f"--views {views!r}: names no frame; give some, as in kf_0003,kf_0010, or leave it out"
         )
     runtime.start()
-    with folder_locked(open_run(run).folder / "diagnostics"), progress_bar() as bar:
-        if calibrate:
-            from mgs.report.predicted_error import calibrate_run
+    for run in runs:
+        with folder_locked(open_run(run).folder / "diagnostics"), progress_bar() as bar:
+            if calibrate:
+                from mgs.report.predicted_error import calibrate_run
 
-            written = calibrate_run(run, partial(bar, "calibrating"))
-        else:
-            written = diagnose_run(run, wanted, partial(bar, "mapping"))
-    for path in written:
-        typer.echo(f"wrote {path}")
+                written = calibrate_run(run, partial(bar, "calibrating"))
+            else:
+                written = diagnose_run(run, wanted, partial(bar, "mapping"))
+        for path in written:
+            typer.echo(f"wrote {path}")
 
 
 def prune(
-    run: Run,
+    runs: Runs,
     noise: Annotated[
         float, option("Allowed change of the training images: rms of a pixel, linear RGB.")
     ] = PRUNE_NOISE,
@@ -150,24 +155,25 @@ def prune(
     from mgs.run.folder import open_run
 
     runtime.start()
-    with working_in(open_run(run).folder), progress_bar() as bar:
-        found = prune_run(run, noise, bar)
-    share = 1 - found.after / found.before
-    lines = [
-        f"{found.before:,} Gaussians, {found.after:,} stay: {share:.0%} are left out",
-        f"rms change of a pixel value: predicted {found.predicted:.2g}, "
-        f"measured {found.actual:.2g}, allowed {noise:.2g}",
-    ]
-    if found.psnr:
-        before, after = found.psnr
-        lines.append(
-            f"PSNR on the {found.views} views: {before:.2f} dB before, {after:.2f} dB after"
-        )
-    _print([*lines, f"wrote {run / PRUNED}"])
+    for run in runs:
+        with working_in(open_run(run).folder), progress_bar() as bar:
+            found = prune_run(run, noise, bar)
+        share = 1 - found.after / found.before
+        lines = [
+            f"{found.before:,} Gaussians, {found.after:,} stay: {share:.0%} are left out",
+            f"rms change of a pixel value: predicted {found.predicted:.2g}, "
+            f"measured {found.actual:.2g}, allowed {noise:.2g}",
+        ]
+        if found.psnr:
+            before, after = found.psnr
+            lines.append(
+                f"PSNR on the {found.views} views: {before:.2f} dB before, {after:.2f} dB after"
+            )
+        _print([*lines, f"wrote {run / PRUNED}"])
 
 
 def refit(
-    run: Run,
+    runs: Runs,
     learn: Annotated[
         str, option("auto: each Gaussian learns the kinds that the evidence supports; all: all.")
     ] = "auto",
@@ -191,9 +197,10 @@ def refit(
 
     runtime.start()
     options: Any = {"learn": learn, "sh": sh, "loss": loss}
-    with working_in(open_run(run).folder), progress_bar() as bar:
-        found = refit_run(run, say=bar, **options)
-    _print([*_refitted(found), f"wrote {run / REFITTED}"])
+    for run in runs:
+        with working_in(open_run(run).folder), progress_bar() as bar:
+            found = refit_run(run, say=bar, **options)
+        _print([*_refitted(found), f"wrote {run / REFITTED}"])
 
 
 def _refitted(found: RefittedRun) -> list[str]:

@@ -12,7 +12,7 @@ import typer
 from mgs.errors import FLAGS, flag
 from mgs.fit.settings import TrainSettings
 from mgs.policy.registry import policy_names
-from mgs.run.settings import PRESETS, NbvSettings
+from mgs.run.settings import PRESETS, NbvSettings, settings_in
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -83,6 +83,14 @@ def nbv(
             metavar="SCENE",
             help="In place of DATASET: a scene (name or .toml), rendered when a view is chosen.",
             rich_help_panel="Data",
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.toml",
+            help="Settings with the keys of config.json (that of a run works, too); options win.",
+            rich_help_panel="Main options",
         ),
     ] = None,
     capture_command: Annotated[
@@ -170,9 +178,15 @@ def nbv(
         refuse_others(context, resume)
         resume_and_print(resume, console, given.get("policy"), live=live)
         return
+    settings: dict[str, Any] = settings_in(config) if config else {}
+    dataset = dataset or (None if capture else settings.get("dataset"))
+    if gaussians is None:
+        prior = prior or settings.get("prior")
+    train = dict(settings.get("train", {}))
     if (dataset is None) == (capture is None) or out is None:
         raise InputError("nbv: give a DATASET or --capture SCENE, and --out RUN; or --resume RUN")
-    settings = settings_of(given)
+    settings = {k: v for k, v in settings.items() if k not in ("dataset", "prior", "train")}
+    settings |= settings_of(given, train)
     run = start_and_print(
         dataset,
         out,
@@ -208,9 +222,10 @@ def live_capture(
     return None
 
 
-def settings_of(given: dict[str, Any]) -> dict[str, Any]:
-    """Fields of `NbvSettings`, those of a fit under `train`, from the options given."""
-    settings, train = dict[str, Any](), dict[str, Any]()
+def settings_of(given: dict[str, Any], fit: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Fields of `NbvSettings` from the options given, those of a fit under `train`, added to
+    `fit`."""
+    settings, train = dict[str, Any](), dict(fit or {})
     for name, value in given.items():
         where = train if name in TrainSettings.model_fields and name != "seed" else settings
         where[name] = pairs(name, value) if isinstance(value, list) else value

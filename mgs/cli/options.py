@@ -20,7 +20,7 @@ def argument(text: str, **more: Any) -> Any:
     return typer.Argument(help=text, **more)
 
 
-Run = Annotated[Path, argument("Folder that `mgs nbv` wrote.")]
+Runs = Annotated[list[Path], argument("Folders that `mgs nbv` wrote.", metavar="RUN...")]
 DatasetFolder = Annotated[Path, argument("Dataset folder (transforms.json).")]
 Seed = Annotated[
     int, option("Root seed: the same seed gives the same result.", "--random-seed", min=0)

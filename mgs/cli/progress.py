@@ -46,7 +46,7 @@ class ProgressBar:
 
 @contextmanager
 def progress_bar(stage: str = "reading", console: Console | None = None) -> Iterator[ProgressBar]:
-    """Show progress while the context is open, on a terminal only; nothing of it stays.
+    """Show progress while the context is open, on a terminal or in a notebook; nothing of it stays.
 
     The object it yields is called as progress(stage, done, total). For a function that reports
     (done, total) alone, pass `functools.partial(progress, "rendering")`.
@@ -58,6 +58,6 @@ def progress_bar(stage: str = "reading", console: Console | None = None) -> Iter
         TimeElapsedColumn(),
     )
     console = console or Console()
-    off = not console.is_terminal  # it would leave an empty line
+    off = not (console.is_terminal or console.is_jupyter)  # it would leave an empty line
     with Progress(*columns, console=console, transient=True, disable=off) as bar:
         yield ProgressBar(bar, stage)

@@ -108,7 +108,7 @@ def synth_orbit(
             mesh,
             noise,
             progress=partial(progress, stage),
-            say=console.print,
+            say=partial(console.print, markup=False),
             mesh_up=mesh_up,
             test_views=test_views,
             on_demand=on_demand,

@@ -17,6 +17,7 @@ from mgs.data.frames import SURVEY_FOLDER, Frame, as_captured
 from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.errors import InputError
 from mgs.files import check_new_folder, read_json, remove_leftovers, write_json
+from mgs.notebook import html, thumbnails
 
 PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 """Camera models of transforms.json that are pinholes if their distortion is zero."""
@@ -40,7 +41,7 @@ FILES = {
 """Path fields of `Frame` -> their keys in transforms.json."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Dataset:
     """A folder of keyframes in order of time.
 
@@ -55,6 +56,13 @@ class Dataset:
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    def __repr__(self) -> str:
+        camera = self.frames[0].camera
+        return f"Dataset({self.root}: {len(self)} frames, {camera.width}x{camera.height})"
+
+    def _repr_html_(self) -> str:
+        return html(repr(self), thumbnails([frame.image_path for frame in self.frames]))
 
     @property
     def on_demand(self) -> bool:

@@ -20,11 +20,12 @@ from mgs.data.clouds import SparseCloud, write_cloud
 from mgs.data.dataset import Dataset, Frame, load_dataset
 from mgs.data.lens import shrunk_to
 from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh
-from mgs.data.up import PLUS_Z, Up, unit_up
+from mgs.data.up import PLUS_Z, Up, unit_up, upright
 from mgs.data.visibility import in_mask, visible
 from mgs.errors import InputError
 from mgs.files import atomic_path, new_folder, read_json, write_json
 from mgs.memory import decoding
+from mgs.notebook import cloud, html
 from mgs.prior.hull import MOST_PIXELS
 from mgs.prior.photographs import (
     Surface,
@@ -42,7 +43,7 @@ from mgs.prior.truth import error_to_truth
 from mgs.seeds import derive_seed
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Prior:
     """A mesh of the rock and N samples of its seen faces.
 
@@ -62,6 +63,15 @@ class Prior:
     numbers: dict[str, Any]
     backed: int = 0
     up: Up = PLUS_Z
+
+    def __repr__(self) -> str:
+        points, unit = len(self.points), self.numbers.get("unit", "m")
+        number = f"{points:,} points, {points + self.backed:,} Gaussians"
+        return f"Prior({number}, spacing {self.spacing:.4g} {unit})"
+
+    def _repr_html_(self) -> str:
+        turn = upright(self.up)
+        return html(repr(self), [cloud(self.points @ turn.T, 0.5 + self.normals @ turn.T / 2)])
 
 
 def build_prior(

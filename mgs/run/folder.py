@@ -36,9 +36,11 @@ from typing import Any
 import numpy as np
 
 from mgs.data.dataset import Dataset, Frame, load_dataset
+from mgs.data.up import upright
 from mgs.errors import InputError, Notice
 from mgs.files import atomic_path, read_json, reading, write_json
 from mgs.gaussians import Gaussians
+from mgs.notebook import cloud, html, thumbnails
 from mgs.policy.from_file import label
 from mgs.prior.build import Prior, load_prior
 from mgs.provenance import versions
@@ -75,6 +77,19 @@ class Run:
 
     def __fspath__(self) -> str:
         return str(self.folder)
+
+    def __repr__(self) -> str:
+        planned = self.settings.seeds + self.settings.budget
+        path = self.folder / "checkpoint.npz"
+        views = len(self.state.taken) if self._state or path.is_file() else 0
+        return f"Run({self.folder}: {self.label}, {views} of {planned} views)"
+
+    def _repr_html_(self) -> str:
+        if not (self._state or (self.folder / "checkpoint.npz").is_file()):
+            return html(repr(self), [])
+        taken, g = thumbnails([frame.image_path for frame in self.taken]), self.gaussians
+        turn = upright(self.prior.up)
+        return html(repr(self), [*taken, cloud(g.means @ turn.T, g.rgb)])
 
     @cached_property
     def dataset(self) -> Dataset:

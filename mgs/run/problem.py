@@ -15,7 +15,7 @@ from mgs.data.frames import Frame, as_asked
 from mgs.data.up import PLUS_Z, Up, upright
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
-from mgs.memory import IMAGE_BYTES, Deferred, kept_within
+from mgs.memory import IMAGE_BYTES, VIEW_BYTES, Deferred, kept_within
 from mgs.policy import criteria, poses, tour
 from mgs.policy.context import Policy, PolicyContext
 from mgs.policy.from_file import label
@@ -271,12 +271,16 @@ class Problem:
     def view_information(self, model: Gaussians) -> Callable[[int], np.ndarray]:
         """A function frame -> information [N,P] of its view at a model.
 
-        Results are kept while there is room where several choices are about one model: in batches
-        and plans of a flight.
+        Where several choices are about one model, in batches and plans of a flight, results are
+        kept within VIEW_BYTES.
         """
-        room = IMAGE_BYTES if self.settings.batch > 1 or self.settings.flies else 0
         fisher, cameras = self.operations.fisher, self.cameras
-        return kept_within(room, lambda i: fisher(model, cameras[i]), lambda F: F.nbytes)
+        if self.settings.batch == 1 and not self.settings.flies:
+            return lambda i: fisher(model, cameras[i])
+        # Copies: the kernel's array has padded rows, and Dr.Jit keeps its memory when it is freed.
+        return kept_within(
+            VIEW_BYTES, lambda i: np.array(fisher(model, cameras[i])), lambda F: F.nbytes
+        )
 
     def context(
         self,

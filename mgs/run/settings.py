@@ -5,6 +5,7 @@ The docstring of a field is the help of its option of `mgs nbv`. Needs neither M
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from mgs.errors import InputError, flag, row_named
+from mgs.files import read_json, reading
 from mgs.fit.settings import (
     ALPHA_WEIGHT,
     MEAN_RATE,
@@ -183,10 +185,34 @@ def validated(model: type[Model], values: dict[str, Any], file: Path | None = No
             if bound in first.get("ctx", {}):
                 message = f"must be {words} {first['ctx'][bound]:g}"
         if file is not None:
+            if file.suffix != ".json":
+                raise InputError(f"{file}: {'.'.join(parts)}: {message}; correct it") from None
             key = ".".join(["settings", *parts])
             message = f"{file}: {key}: {message}; correct it, or start the run anew"
             raise InputError(message) from None
         raise InputError(f"{option_of(parts, first['input'])}: {message}") from None
+
+
+def settings_in(file: Path) -> dict[str, Any]:
+    """Settings that a TOML file, or the config.json of a run, has; paths are from its folder.
+
+    Raises InputError where the file cannot be read, or a key or a value is wrong.
+    """
+    if file.suffix == ".json":
+        config = read_json(file)
+        found = config.get("settings") if isinstance(config, dict) else None
+    else:
+        with reading(file):
+            data = file.read_bytes()
+        try:
+            found = tomllib.loads(data.decode())
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise InputError(f"{file}: not valid TOML ({error}); correct it") from None
+    if not isinstance(found, dict):
+        raise InputError(f"{file}: has no settings; give a TOML file or the config.json of a run")
+    validated(NbvSettings, {"dataset": "", "prior": "", **found}, file)
+    paths = {key: file.parent / found[key] for key in ("dataset", "prior") if key in found}
+    return {**found, **paths}
 
 
 BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}

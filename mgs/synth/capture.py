@@ -76,7 +76,7 @@ def photographer_of(root: Path) -> tuple[Photographer, dict[str, Frame], bool]:
     if denoise and importlib.util.find_spec("pyoidn") is None:
         raise InputError(
             f"{path}: its images are denoised by pyoidn, which is not installed; "
-            "`pip install pyoidn`"
+            '`pip install "mgs[denoise]"`'
         )
     if mesh is not None:
         with reading(Path(mesh), f"mesh, of which {root} is made"):

@@ -167,7 +167,7 @@ def synthesise(
         if not denoise:
             say(
                 f"pyoidn is not installed: {spp} samples per pixel in place of denoising; "
-                "`pip install pyoidn` is faster"
+                '`pip install "mgs[denoise]"` makes it faster'
             )
         exposure = _meter(world, cameras, seed, spp, denoise, say)
         if not (out / "config.json").is_file():

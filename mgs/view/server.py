@@ -94,7 +94,7 @@ class Viewer:
     """Serve a run folder or a PLY until `close`. `tick` must be called repeatedly.
 
     follow: look for a new step of the run every FOLLOW seconds. Raises InputError as `read_subject`
-    and `check_address`, and if viser is not installed.
+    and `check_address`.
     """
 
     def __init__(
@@ -103,12 +103,8 @@ class Viewer:
         self.path, self.follow = Path(path), follow
         self.stamp = self._stamp()
         self.subject = read_subject(path, follow)
-        try:
-            import viser
-        except ImportError:
-            raise InputError(
-                "mgs view: needs viser, which is not installed; `pip install viser`"
-            ) from None
+        import viser
+
         check_address(host, port)
         # A window may be closed while its image is drawn; viser then warns.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
