@@ -15,6 +15,8 @@ from mgs.policy.context import PolicyContext
 from mgs.policy.registry import policy_named
 from mgs.seeds import generator
 from mgs.splat import groups
+from mgs.synth.orbit import orbit_positions
+from mgs.synth.scene_file import Orbit
 
 LAM = criteria.regularisation(groups(0))
 N = 5
@@ -170,7 +172,7 @@ def test_context_policies_use_their_own_estimator():
     whole = [criteria.block_log_determinant(blocks[0] + F, LAM) for F in blocks[1:]]
     d = np.array(whole) - criteria.block_log_determinant(blocks[0], LAM)
     assert policy_named("block-d")(context) == pytest.approx(d)
-    lam = np.full(11, 1e-6)
+    lam = np.full(11, gradients[0].mean())  # of the one view taken
     paper = [criteria.d_optimal(F, gradients[0], lam) for F in gradients[1:]]
     assert policy_named("paper")(context) == pytest.approx(paper)
 
@@ -224,6 +226,24 @@ def test_seeds_are_evenly_spaced_wherever_the_orbit_starts():
     assert pose_policies.seed_views(CIRCLE, CENTRE, 4) == [0, 3, 6, 9]
     assert pose_policies.seed_views(np.roll(CIRCLE, 5, axis=0) + rock, rock, 4) == [5, 8, 11, 2]
     assert sorted(pose_policies.seed_views(CIRCLE, CENTRE, 12)) == list(range(12))
+
+
+def test_seeds_are_spread_over_elevations_too():
+    """On a dome, no other frame in place of one seed brings the poses nearer to the seeds."""
+    dome = orbit_positions(Orbit(kind="hemisphere", radius=4), 30, CENTRE)
+    squared = pose_policies.angles(dome, dome, CENTRE) ** 2
+
+    def cost(seeds):
+        return squared[seeds].min(axis=0).sum()
+
+    for count in (1, 2, 5, 12):
+        seeds = pose_policies.seed_views(dome, CENTRE, count)
+        assert len(set(seeds)) == count
+        for k in range(count):
+            others = [[*seeds[:k], i, *seeds[k + 1 :]] for i in range(30)]
+            assert min(map(cost, others)) >= cost(seeds) - 1e-9
+    (top,) = pose_policies.seed_views(dome, CENTRE, 1)
+    assert dome[top, 2] > np.quantile(dome[:, 2], 0.8), "one seed looks from above"
 
 
 def test_azimuth_is_measured_about_the_rock():

@@ -6,29 +6,38 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import synthetic
 from program import command, exit_code
 from refusals import occupied, refused
 
-from mgs.data.dataset import TEST_FOLDER, load_dataset
+from mgs.data.dataset import TEST_FOLDER
 from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.fit.settings import COLOURS_ALONE
 from mgs.run.folder import read_checkpoint
 from mgs.run.nbv import run_nbv
-from mgs.study import case, free_fit, reproduce
+from mgs.study import case, free_fit, reproduce, setups
 from mgs.study import reproduce_results as results
 from mgs.study.case import Case, Scene, Size
-from mgs.study.reproduce import FREE_FIT, ReproduceSize, Rock, Run, RunSize
+from mgs.study.reproduce import FREE_FIT, ReproduceSize, Run, RunSize
 from mgs.study.reproduce_results import Work
+from mgs.study.rocks import Rock
+from mgs.study.setups import SetupSize
 from mgs.study.sweep import cell_folder, run_cells
 
 ONE = RunSize(Size(48, 36, 8, 3, spp=1), 200, 2)
-TINY = ReproduceSize(ONE, ONE, curve_rocks=2, seed_rocks=1, pool_rocks=1)
+TINY = ReproduceSize(
+    ONE,
+    ONE,
+    SetupSize(48, 36, 3, 1, 6, fewer=4, gaussians=200),
+    seed_rocks=1,
+    setup_rocks=2,
+    oracle_rocks=1,
+)
 
 
 def silent(name, done, total):
@@ -39,7 +48,7 @@ def ellipsoids(root, out, scene, seed, size, changes=None, mesh=None):
     """In place of the task that renders: another rock for each seed, at once."""
     folder, images = out / "dataset", (size["width"], size["height"])
     if not folder.exists():
-        rocks = [(synthetic.CENTRE, synthetic.AXES * (1 + 0.1 * seed))]
+        rocks = [(synthetic.CENTRE, synthetic.AXES * (1 + 0.1 * (seed % 5)))]
         synthetic.write_dataset(folder, synthetic.orbit_cameras(size["frames"], *images), rocks)
         tests = synthetic.orbit_cameras(size["tests"], *images)
         synthetic.write_dataset(folder / TEST_FOLDER, tests, rocks)
@@ -51,9 +60,13 @@ def quick(monkeypatch):
     """The preset `quick` is tiny, nothing is rendered, and few policies are compared."""
     monkeypatch.setitem(reproduce.SIZES, "quick", TINY)
     monkeypatch.setattr(case, "make_dataset", ellipsoids)
+    monkeypatch.setattr(reproduce, "POLICIES", ("directional-d", "random"))
+    monkeypatch.setattr(setups, "JUDGE_PASSES", 2)
+    monkeypatch.setattr(setups, "DRAWS", 2)
+    for name in list(setups.SETUPS):
+        if name not in ("ring", "one seed"):
+            monkeypatch.delitem(setups.SETUPS, name)
     for name, value in {
-        "POLICIES": ("farthest", "uniform"),
-        "PAIRS": (("farthest", "uniform"),),
         "TABLE_POLICIES": ("d-optimal", "random"),
         "SLOW_POLICIES": (),
         "DRAWS": 2,
@@ -72,50 +85,36 @@ def rows_of(path):
         return list(csv.DictReader(file))
 
 
-def test_curves_are_made_once_and_hold_what_the_runs_found(quick, tmp_path, capsys):
-    out = tmp_path / "out"
-    said = done(capsys, out, "--only", "curves")
-    assert "0/8 curves dataset/boulder-1" in said
+def test_setups_are_made_once_and_hold_what_the_policies_found(quick, tmp_path, capsys):
+    out, line = tmp_path / "out", "mgs reproduce --scale quick --only setups --rocks 2"
+    assert "setups dataset/boulder-11" in done(capsys, out, "--only", "setups", "--rocks", 2)
     folder = out / "results"
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    names = ("curves.csv", "curves.json", "curves.md", "curves.png", "curves_by_rock.csv")
-    assert set(before) == {*names, "statistics.json"}
-    rows, each = rows_of(folder / "curves.csv"), rows_of(folder / "curves_by_rock.csv")
-    assert [(row["policy"], row["images"]) for row in rows[:3]] == [("farthest", n) for n in "456"]
-    line = "mgs reproduce --scale quick --only curves --rocks 2"
+    assert set(before) == {"setups.csv", "setups.json", "setups.md", "setups.png", "leads.csv"}
+    rows = rows_of(folder / "setups.csv")
     assert {row["command"] for row in rows} == {line}
-    (mean,), last = (
-        [float(r["test_psnr"]) for r in of if (r["policy"], r["images"]) == ("uniform", "6")]
-        for of in (rows, each)
-    )
-    assert len(last) == 2
-    assert mean == pytest.approx(np.mean(last))
-    statistics = json.loads((folder / "statistics.json").read_text())
-    assert all(pair["p"] in (0.5, 1.0) for pair in statistics["test_psnr"]["pairs"])
-    again = done(capsys, out, "--only", "curves")
-    assert "/8" not in again, "a cell was done twice"
+    assert len(rows) == 2 * 2 * 2
+    assert [float(row["test_gain"]) for row in rows if row["policy"] == "random"] == [0] * 4
+    again = done(capsys, out, "--only", "setups", "--rocks", 2)
+    assert "setup/" not in again, "a cell was done twice"
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_a_policy_of_ones_own_is_compared_over_rocks(quick, tmp_path, capsys):
+def test_a_policy_of_ones_own_is_compared(quick, tmp_path, capsys):
     out, mine = tmp_path / "out", tmp_path / "mine.py"
     mine.write_text("def first(candidates):\n    return -1.0 * (candidates[:, 0] > -9)\n")
-    one = (out, "--only", "curves", "--rocks", 1)
+    one = (out, "--only", "setups", "--rocks", 1)
     done(capsys, *one)
     said = done(capsys, *one, "--policy", f"{mine}:first")
-    assert "4/5 curves run/boulder-1" in said, "the other policies are not run again"
-    rows = rows_of(out / "results/curves.csv")
-    assert {row["policy"] for row in rows} == {"farthest", "uniform", "mine.py:first"}
-    line = "mgs reproduce --scale quick --only curves --rocks 1 --policy mine.py:first"
+    assert "mine.py:first" in said
+    assert "directional-d" not in said, "the other policies are not run again"
+    rows = rows_of(out / "results/setups.csv")
+    assert {row["policy"] for row in rows} == {*reproduce.POLICIES, "mine.py:first"}
+    line = "mgs reproduce --scale quick --only setups --rocks 1 --policy mine.py:first"
     assert {row["command"] for row in rows} == {line}
-    pairs = json.loads((out / "results/statistics.json").read_text())["test_psnr"]["pairs"]
-    own = [("mine.py:first", "uniform"), ("mine.py:first", "farthest")]
-    assert [(pair["policy"], pair["other"]) for pair in pairs] == [("farthest", "uniform"), *own]
     mine.write_text("def first(candidates):\n    return candidates[:, 0]\n")
-    more = done(capsys, *one, "--policy", f"{mine}:first", "--policy", "coverage")
-    assert "4/6 curves run/boulder-1" in more, "another file is another policy"
-    rows = rows_of(out / "results/curves.csv")
-    assert {row["policy"] for row in rows} == {"farthest", "uniform", "mine.py:first", "coverage"}
+    more = done(capsys, *one, "--policy", f"{mine}:first")
+    assert "mine.py:first" in more, "another file is another policy"
 
 
 def test_rocks_of_ones_own_take_the_place_of_the_others(quick, tmp_path, capsys, monkeypatch):
@@ -126,25 +125,26 @@ def test_rocks_of_ones_own_take_the_place_of_the_others(quick, tmp_path, capsys,
         return ellipsoids(root, out, scene, seed, size)
 
     monkeypatch.setattr(case, "make_dataset", seen)
+    monkeypatch.setattr(reproduce, "POLICIES", ("uniform", "random"))
     out, meshes = tmp_path / "out", [tmp_path / "one.ply", tmp_path / "two.glb"]
     for mesh in meshes:
         mesh.write_text(mesh.name)
     given = [part for mesh in meshes for part in ("--mesh", mesh)]
-    said = done(capsys, out, "--only", "curves", *given)
-    assert rendered == [("boulder", "one.ply"), ("boulder", "two.glb")]
-    assert "0/8 curves dataset/one-" in said
-    assert {row["scene"] for row in rows_of(out / "results/curves_by_rock.csv")} == {"one", "two"}
-    line = "mgs reproduce --scale quick --only curves --rocks 2 --mesh one.ply --mesh two.glb"
-    assert {row["command"] for row in rows_of(out / "results/curves.csv")} == {line}
+    said = done(capsys, out, "--only", "setups", *given)
+    assert set(rendered) == {("boulder", "one.ply"), ("boulder", "two.glb")}
+    assert "setups dataset/one-" in said
+    assert {row["scene"] for row in rows_of(out / "results/setups.csv")} == {"one", "two"}
+    line = "mgs reproduce --scale quick --only setups --rocks 2 --mesh one.ply --mesh two.glb"
+    assert {row["command"] for row in rows_of(out / "results/setups.csv")} == {line}
     twice = ["--mesh", meshes[0], "--mesh", tmp_path / "out/../one.ply"]
     for options, line in (
-        (["--rocks", 3, *given], "--rocks 3: curves can have 1 to 2"),
+        (["--rocks", 3, *given], "--rocks 3: setups can have 1 to 2"),
         ([part for _ in range(21) for part in ("--mesh", meshes[0])], "--mesh: 21 files"),
         (twice, "one.ply: there is one of this name already"),
     ):
         assert line in refused(capsys, ["reproduce", out, *options], out)
     meshes[0].write_text("another rock")
-    again = done(capsys, out, "--only", "curves", *given)
+    again = done(capsys, out, "--only", "setups", *given)
     assert "dataset/one-" in again, "another file is another rock"
     assert "/two-" not in again
 
@@ -341,77 +341,53 @@ def fake(runs, value, steps=3):
     return found
 
 
-def test_differences_are_paired_by_rock(tmp_path):
-    runs = reproduce.curve_runs(TINY, 3)
-    ahead = {"d-optimal": 0.0, "uniform": 0.3, "directional-i": 0.5}
-    found = fake(runs, lambda run: 25 + 10 * run.rock.index + ahead.get(run.policy, 0.1))
-    results.write_curves(Work(tmp_path, found, TINY, 3, "c"))
-    rows = json.loads((tmp_path / "results/curves.json").read_text())["rows"]
-    row = next(r for r in rows if (r["policy"], r["images"]) == ("d-optimal", 6))
-    assert row["test_psnr"] == pytest.approx(35)
-    ends = [row[f"test_psnr_over_uniform{end}"] for end in ("", "_low", "_high")]
-    assert ends == pytest.approx([-0.3] * 3)
-    statistics = results.statistics_of(found, runs)["test_psnr"]
-    pairs, reach = statistics["pairs"], statistics["reach"]
-    assert [(p["policy"], p["other"]) for p in pairs] == list(reproduce.PAIRS)
-    assert [p["effect"] for p in pairs] == pytest.approx([-0.3, -0.1, 0.2, 0.4, 0, -0.1, 0])
-    assert [p["ahead"] for p in pairs] == [0, 0, 3, 3, 0, 0, 0]
-    assert [p["p"] for p in pairs] == pytest.approx([*[0.25] * 4, 1, 0.25, 1])
-    assert [p["p_holm"] for p in pairs] == pytest.approx([1.0] * 7)
-    assert [p["verdict"] for p in pairs[:4]] == ["fails", "fails", "holds", "holds"]
-    images = [reach[policy]["images"] for policy in ("uniform", "directional-i")]
-    assert images == pytest.approx([5.6, 5.2])
-    assert reach["d-optimal"] == {"images": None, "rocks": 0}
-    text = (tmp_path / "results/curves.md").read_text()
-    assert "| d-optimal | 34.50 | 31.50 | – | – |" in text
-    assert "| uniform | 34.80 | 31.80 | 5.6 | 5.6 |" in text
-    pair = "| d-optimal − uniform | full frame | -0.30 [-0.30, -0.30], 0 of 3 | fails | 0.25 | 1 |"
-    assert pair + " -0.30, 0 of 1 |" in text
-    assert (tmp_path / "results/curves.png").stat().st_size > 10_000
+def made_up(value, scenes):
+    """Rows of set-ups in which each policy finds value(policy) + the number of its rock."""
+    return [
+        {"rock": f"{scene}-{k}", "scene": scene, "setup": "ring", "policy": policy}
+        | dict.fromkeys(setups.MEASURES, value[policy] + k)
+        | {f"{key}_gain": value[policy] - value["random"] for key in setups.MEASURES}
+        for k, scene in enumerate(scenes)
+        for policy in value
+    ]
 
 
-def test_scenes_that_chose_no_setting_are_judged_alone():
-    """Policies were developed on the first two of five rocks, one rock a scene."""
-    runs, ahead = reproduce.curve_runs(TINY, 5), (5.0, 5.0, 0.1, 0.2, -0.6)
-    found = fake(runs, lambda r: 25 + ahead[r.rock.index] * (r.policy == "directional-i"))
-    pairs = results.statistics_of(found, runs)["test_psnr"]["pairs"]
-    pair = next(p for p in pairs if (p["policy"], p["other"]) == ("directional-i", "uniform"))
-    assert (pair["runs"], pair["ahead"], pair["effect"]) == (5, 4, pytest.approx(9.7 / 5))
-    there = pair["elsewhere"]
-    assert (there["runs"], there["ahead"], there["effect"]) == (3, 2, pytest.approx(-0.1))
+def test_leads_are_over_scenes_and_corrected_for_all_tests():
+    value = {"directional-d": 26.0, "cover": 25.8, "random": 25.0, "oracle": 26.25}
+    rows = made_up(value, ("a", "b", "c", "c"))
+    rows[8]["test"] += 0.3  # directional-d on one of two rocks of the third scene
+    leads = {lead["policy"]: lead for lead in setups.leads_of(rows, "directional-d", "test")}
+    assert set(leads) == {"cover", "random"}
+    assert [leads[p]["scenes"] for p in leads] == [3, 3]
+    assert leads["cover"]["lead"] == pytest.approx((0.2 + 0.2 + 0.35) / 3)
+    assert [leads[p]["p"] for p in leads] == [0.25, 0.25]
+    assert [leads[p]["p_holm"] for p in leads] == [0.5, 0.5]
+    text = setups.text_of(rows, list(leads.values()))
+    assert "| directional-d | +1.00 |" in text
+    assert "| cover | +0.25 [" in text
+    assert "| cover | 64% |" in text
+    one = setups.leads_of(made_up(value, ("a",)), "directional-d", "test")
+    assert {lead["p_holm"] for lead in one} == {lead["lead_low"] for lead in one} == {None}
 
 
-def test_of_one_rock_nothing_is_claimed():
-    runs = reproduce.curve_runs(TINY, 1)
-    statistics = results.statistics_of(fake(runs, lambda run: 25), runs)
-    for pair in statistics["test_psnr"]["pairs"]:
-        assert pair["interval"] is pair["p"] is pair["p_holm"] is None
-        assert pair["verdict"] == "depends"
-    line = "| d-optimal − uniform | full frame | +0.00, 0 of 1 | depends | – | – | – |"
-    assert line in results.statistics_text(statistics)
+def test_an_oracle_that_sees_the_truth_is_best_in_its_first_choice(quick, tmp_path, monkeypatch):
+    monkeypatch.setattr(setups, "JUDGE_PASSES", 10)
+    size, rocks = replace(TINY.setups, images=5), TINY.some_rocks(1)
+    found = run_cells(tmp_path, setups.cells_of(size, rocks, ("oracle", "random")), silent)
+    ring = {name: r["test"] for name, r in found.items() if "/ring-" in name and "/oracle-" in name}
+    others = [r["test"] for name, r in found.items() if "/ring-" in name and "/random-" in name]
+    assert len(others) == setups.DRAWS
+    assert next(iter(ring.values())) >= max(others) - 0.1, "its fit is warm, the judge's is not"
 
 
-def test_shares_are_of_what_the_oracle_gains_over_random(tmp_path):
-    runs, oracle = reproduce.pool_runs(TINY, 2), reproduce.oracle_runs(TINY, 2)
-    value = {"oracle": 27.0, "random": 24.0, "d-optimal": 25.5}
-    found = fake(runs + oracle, lambda r: value.get(r.policy, 26.0) + r.rock.index + r.draw)
-    means, _ = results.pool_rows(found, runs + oracle)
-    rows = {(row["pool"], row["policy"]): row for row in means}
-    expected = {"oracle": 1, "random": 0, "d-optimal": 0.25, "farthest": 0.5}
-    for pool in reproduce.POOLS:
-        shares = {policy: rows[pool, policy]["test_psnr_share"] for policy in expected}
-        assert shares == pytest.approx(expected)
-        assert rows[pool, "random"]["rocks"] == 2
-    half, pools = "+0.50 [+0.50, +0.50]", len(reproduce.POOLS)
-    text = results.pools_text(means)
-    assert f"| test views (dB) | {' | '.join(reproduce.POOLS)} |" in text
-    assert f"| d-optimal |{' 26.00 |' * pools}\n" in text
-    assert text.count(f"| d-optimal |{f' {half} |' * pools}\n") == 3  # frame, rock, whole curve
-    assert f"| directional-i |{' – |' * pools}\n" in text
-    assert f"| d-optimal |{' 25% |' * pools}\n" in text
-    written = results.write_pools(Work(tmp_path, fake(runs, lambda r: 25.0), TINY, 2, "c"))
-    assert {row["test_psnr_share"] for row in rows_of(written[0])} == {""}, "without the oracle"
-    assert all(path.is_file() for path in written)
+def test_views_are_chosen_without_a_fit_where_no_model_is_needed(quick, tmp_path, monkeypatch):
+    cells = setups.cells_of(TINY.setups, TINY.some_rocks(1), ("directional-d",))
+    fits = []
+    monkeypatch.setattr(setups, "learn", lambda *given: fits.append(given))
+    found = run_cells(tmp_path, cells, silent)
+    chosen = [one for name, one in found.items() if name.startswith("setup/")]
+    assert not fits
+    assert [len(set(one["taken"])) for one in chosen] == [6] * 2
 
 
 def test_numbers_of_seeds_are_compared_at_equal_images(tmp_path):
@@ -430,40 +406,13 @@ def test_numbers_of_seeds_are_compared_at_equal_images(tmp_path):
     assert results.largest_gap([6, 0, 2, 4], 8) == 90
 
 
-def test_a_pool_changes_the_orbit_of_the_scene():
-    dataset, _, cell = Run(Rock("boulder", 1), ONE, "uniform", pool="mixed distances").cells()
-    assert dataset.name == "dataset/boulder-1/hemisphere-1-2-3/8x48x36"
+def test_a_set_up_changes_the_orbit_of_the_scene():
+    rock = Rock("boulder", 11)
+    case = setups.case_of(rock, setups.SETUPS["mixed distances"], setups.SetupSize())
+    dataset, prior = case.cells()
+    assert dataset.name == "dataset/boulder-11/hemisphere-1-2-3/36x128x96"
     assert dataset.arguments["changes"]["orbit"] == {"kind": "hemisphere", "distances": [1, 2, 3]}
-    assert cell.arguments["dataset"] == f"cells/{dataset.name}/dataset"
-
-
-def test_the_pool_of_an_arc_is_half_dense_and_half_sparse(quick, tmp_path):
-    run = Run(Rock("boulder", 1), ONE, "uniform", pool="biased arc")
-    ring, _, arc, cell = run.cells()
-    for _ in range(2):
-        assert run_cells(tmp_path, [ring, arc], silent)[arc.name] == {"frames": 7}
-    whole = load_dataset(tmp_path / arc.arguments["ring"])
-    some = load_dataset(tmp_path / cell.arguments["dataset"])
-    kept = [whole.frames[i].name for i in (*range(6), 6)]
-    assert [frame.name for frame in some.frames] == kept
-    assert np.array_equal(some.frames[6].target()[0], whole.frames[6].target()[0])
-    assert len(some.test_views()) == 3
-
-
-def test_pools_and_the_oracle_that_sees_the_truth(quick, tmp_path, monkeypatch):
-    monkeypatch.setattr(reproduce, "POLICIES", ("uniform", "random"))
-    monkeypatch.setattr(reproduce, "DRAWS", 1)
-    monkeypatch.setattr(reproduce, "POOLS", {"five nearest": {"kind": "circle", "nearest": 5}})
-    found = run_cells(tmp_path, reproduce.RESULTS["oracle"].cells(TINY, 1), silent)
-    oracle = reproduce.oracle_runs(TINY, 1)[0]
-    best = found[oracle.name]["test_psnr"][1]
-    others = [found[run.name]["test_psnr"][1] for run in reproduce.pool_runs(TINY, 1)]
-    assert best >= max(others), "the first choice is the best there is"
-    step = read_checkpoint(cell_folder(tmp_path, oracle.name) / "run").steps[1]
-    assert step["score"] == step["test_psnr"], "what it foresaw is what the loop then fits"
-    without = {name: found[name] for name in found if name != oracle.name}
-    written = results.write_pools(Work(tmp_path, without, TINY, 1, "c"))
-    assert [row["policy"] for row in rows_of(written[0])] == ["uniform", "random", "oracle"]
+    assert "gaussians" not in prior.arguments, "their number is automatic"
 
 
 def test_a_run_that_was_killed_goes_on(quick, tmp_path):
@@ -488,9 +437,9 @@ def test_a_run_that_was_killed_goes_on(quick, tmp_path):
 def test_every_run_of_every_result_has_its_own_cell():
     for size in reproduce.SIZES.values():
         for name, result in reproduce.RESULTS.items():
-            runs = result.runs(size, result.count(size))
-            assert len({run.name for run in runs}) == len(runs), name
-            cells = {cell.name: cell for cell in result.cells(size, result.count(size))}
+            cells: dict = {}
+            for cell in result.cells(size, result.count(size)):
+                assert cells.setdefault(cell.name, cell) == cell, name
             assert all(need in cells for cell in cells.values() for need in cell.needs)
 
 
@@ -498,20 +447,20 @@ def test_every_run_of_every_result_has_its_own_cell():
     ("arguments", "line"),
     [
         ("--scale huge", "--scale 'huge': unknown; choose one of quick, paper"),
-        ("--only table2", "unknown; choose some of table1,figures,curves,seeds,pools,oracle"),
+        ("--only table2", "unknown; choose some of table1,figures,setups,seeds,oracle"),
         ("--only ,", "--only '': unknown"),
-        ("--rocks 21", "--rocks 21: curves can have 1 to 20"),
-        ("--rocks 11 --only pools", "--rocks 11: pools can have 1 to 10"),
+        ("--rocks 13", "--rocks 13: setups can have 1 to 12"),
+        ("--rocks 13 --only seeds", "--rocks 13: seeds can have 1 to 12"),
         ("--workers 2 --scheduler tcp://x:1", "give one of them"),
         ("--policy best", "--policy best: unknown; choose one of"),
         ("--policy uniform", "--policy uniform: is compared anyway"),
         ("--policy angle --policy angle", "angle: there is one of this name already"),
-        ("--policy block-d --only table1", "is for curves and pools, and --only leaves both out"),
+        ("--policy block-d --only table1", "is for setups and oracle, and --only leaves both out"),
         ("--policy none.py:f", "none.py"),
         ("--mesh none.glb", "none.glb: cannot be read (No such file or directory)"),
         ("--mesh none.glb --only table1", "is for results over many rocks, and --only leaves them"),
         ("--batch 0", "should be greater than or equal to 1"),
-        ("--batch 5 --only curves", "is for table1 and figures, and --only leaves both out"),
+        ("--batch 5 --only setups", "is for table1 and figures, and --only leaves both out"),
     ],
 )
 def test_bad_options_are_one_clear_line(capsys, tmp_path, arguments, line):

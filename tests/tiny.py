@@ -148,6 +148,7 @@ def operations(**replaced) -> problem.Operations:
 def start(out: Path, dataset: Dataset, **values) -> NbvSettings:
     """Begin a run folder with these settings over small defaults."""
     defaults = {"dataset": dataset.root, "prior": dataset.root, "budget": 5, "seeds": 3}
+    defaults |= {"policy": "d-optimal"}
     settings = NbvSettings(**(defaults | values))
     run_folder.start(out, settings, dataset)
     return settings

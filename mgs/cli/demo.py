@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mgs.run.folder import Run
     from mgs.run.state import State
 
-POLICIES = ("d-optimal", "paper", "directional-i", "uniform", "random")
+POLICIES = ("directional-d", "d-optimal", "paper", "uniform", "random")
 
 GAUSSIANS = 10_000
 """About one Gaussian per pixel of the rock at 320x240."""

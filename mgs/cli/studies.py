@@ -66,17 +66,17 @@ def reproduce(
     only: Annotated[
         str | None,
         option(
-            "Results to make, separated by commas: table1, figures, curves, seeds, pools, oracle. "
+            "Results to make, separated by commas: table1, figures, setups, seeds, oracle. "
             "Default: all but oracle."
         ),
     ] = None,
     rocks: Annotated[
         int | None,
-        option("Rocks of curves, seeds, pools and oracle. Default: as --scale says.", min=1),
+        option("Rocks of setups, seeds and oracle. Default: as --scale says.", min=1),
     ] = None,
     policy: Annotated[
         list[str] | None,
-        option("A further policy for curves and pools: a name or FILE.py:FUNCTION; repeatable."),
+        option("A further policy for the set-ups: a name or FILE.py:FUNCTION; repeatable."),
     ] = None,
     mesh: Annotated[
         list[Path] | None,
@@ -90,9 +90,9 @@ def reproduce(
         str | None, option("Use the workers of this Dask scheduler instead, as tcp://HOST:8786.")
     ] = None,
 ) -> None:
-    """Make the results of docs/results.md: Table I at equal numbers of images, PSNR against images
-    over many rocks with statistics, numbers of seeds, pools of candidates, and an oracle that knows
-    the test views.
+    """Make the results of docs/results.md: Table I at equal numbers of images, policies in six
+    set-ups over many rocks with statistics, numbers of seeds, and an oracle that knows the test
+    views.
 
     Every dataset, prior and run is made once and kept in OUT/cells; the results are written to
     OUT/results. Runs whose seconds are reported run one at a time: let nothing else run meanwhile.

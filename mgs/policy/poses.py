@@ -55,11 +55,16 @@ def smallest_angle(
     candidates: Array, taken: Array, centre: Array, rng: np.random.Generator
 ) -> Array:
     """Angle at `centre` to the nearest camera already taken, radians."""
-    ours, theirs = (
+    return _rounded(angles(candidates, taken, centre).min(axis=1))
+
+
+def angles(ours: Array, theirs: Array, centre: Array) -> NDArray[np.float64]:
+    """Angles [A,B] at `centre` between camera centres [A,3] and [B,3], radians."""
+    a, b = (
         offset / np.linalg.norm(offset, axis=1, keepdims=True)
-        for offset in (candidates - centre, taken - centre)
+        for offset in (ours - centre, theirs - centre)
     )
-    return _rounded(np.arccos(np.clip(ours @ theirs.T, -1, 1)).min(axis=1))
+    return np.asarray(np.arccos(np.clip(a @ b.T, -1, 1)))
 
 
 def _rounded(scores: Array) -> Array:
@@ -98,13 +103,28 @@ def path_length(positions: Array) -> float:
 
 
 def seed_views(positions: Array, centre: Array, count: int) -> list[int]:
-    """Distinct frames nearest to `count` evenly spaced azimuths (0, 360/count, ...), in that order.
+    """`count` distinct frames spread over the directions of a pool, in the order of their azimuths.
+
+    k-medoids: from the frames nearest to evenly spaced azimuths (0, 360/count, ...), which are best
+    on an even ring, one frame at a time is exchanged as long as that lowers the sum over the pool
+    of the squared angle to the nearest of them.
 
     positions: camera centres [C,3]; centre: the rock [3]; metres. Needs count <= C.
     """
-    angles, seeds = azimuths(positions, centre), list[int]()
+    azimuth, squared = azimuths(positions, centre), angles(positions, positions, centre) ** 2
+    seeds = list[int]()
     for target in 2 * np.pi * np.arange(count) / count:
-        distance = _rounded(azimuth_difference(angles, target))
+        distance = _rounded(azimuth_difference(azimuth, target))
         distance[seeds] = np.inf
         seeds.append(int(np.argmin(distance)))
-    return seeds
+    before = None
+    while seeds != before:
+        before = list(seeds)
+        for k in range(count):
+            others = seeds[:k] + seeds[k + 1 :]
+            nearest = squared[others].min(axis=0, initial=np.inf)
+            cost = _rounded(np.minimum(nearest, squared).sum(axis=1))
+            cost[others] = np.inf
+            if cost.min() < cost[seeds[k]]:
+                seeds[k] = int(np.argmin(cost))
+    return sorted(seeds, key=lambda i: (azimuth[i], i))

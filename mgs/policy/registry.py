@@ -29,14 +29,11 @@ from mgs.policy.criteria import (
 from mgs.policy.criteria import i_optimal as i_optimality
 from mgs.policy.poses import POSE_POLICIES
 
-PAPER_LAM = 1e-6
-"""Lambda of the policy `paper`, for all parameters: that of POp-GS, since the paper states none."""
-
 
 def directional_d(context: PolicyContext) -> Array:
-    """Directional D-optimality, nats, with colours of SH degree 2 and tau 0.3
-    (`mgs.policy.directional`)."""
-    return context.gains(context.taken_frames, context.candidate_frames, 2, 0.3, False)
+    """Directional D-optimality, nats, with colours of SH degree 1 and tau 0.3: degree and tau were
+    chosen on five rocks that judge nothing (`mgs.policy.directional`)."""
+    return context.gains(context.taken_frames, context.candidate_frames, 1, 0.3, False)
 
 
 def directional_i(context: PolicyContext) -> Array:
@@ -65,10 +62,12 @@ def block_d(context: PolicyContext) -> Array:
 def paper(context: PolicyContext) -> Array:
     """Eq. 7 as the paper has it: squared gradients of one scalar loss per image, one lambda.
 
-    The paper states neither the loss nor the lambda. The loss is that of the estimator
-    `loss-gradient`, lambda is PAPER_LAM.
+    The paper states neither. The loss is that of the estimator `loss-gradient`. Lambda is the mean
+    squared gradient of one view taken: the gain of the first choice is then near the paper's 0.091
+    (its Fig. 2; docs/nbv.md).
     """
-    H, lam = _summed(context, "loss-gradient"), np.full_like(context.lam, PAPER_LAM)
+    H = _summed(context, "loss-gradient")
+    lam = np.full_like(context.lam, H.mean(dtype=np.float64) / len(context.taken_frames))
     return _each(context, lambda i: d_optimal(context.estimate(i, "loss-gradient"), H, lam))
 
 
@@ -139,6 +138,17 @@ CONTEXT_POLICIES: dict[str, Policy] = {
 def policy_names() -> list[str]:
     """Names of the three tables, which `mgs nbv --policy` accepts."""
     return [*CRITERIA, *CONTEXT_POLICIES, *POSE_POLICIES]
+
+
+MODEL_POLICIES = ("i-optimal", "block-d", "paper")
+"""Rows of CONTEXT_POLICIES that use the fitted model; the others need poses and prior alone."""
+
+
+def needs_model(name: str) -> bool:
+    """Whether a policy may use the fitted model, so that a choice needs a fit before it."""
+    if name in CRITERIA:
+        return CRITERIA[name].at == "fitted"
+    return name in MODEL_POLICIES or from_file.in_file(name)
 
 
 def check_policy(name: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -111,16 +111,35 @@ def kept_colours(prior: Prior) -> Callable[[Frame], Colours]:
 def psnr_measure(
     dataset: Dataset, cache: ListCache, exposure: bool = False
 ) -> Callable[[Gaussians, list[int]], dict[str, float]]:
-    """Returns measure(gaussians, frames taken) -> mean PSNR, dB.
+    """Returns measure(gaussians, frames taken) -> mean PSNR, dB, by the names of `psnr_over`.
 
-    `test_psnr`, `test_psnr_mask` (in the rock mask) over the test views. A dataset without test
-    views: `psnr`, `psnr_mask` over all views that have an image, `held_out_...` over those not
-    taken. With `exposure` also `..._corrected`, of renders at the exposure of the view
-    (`mgs.metrics.colour_corrected`). A mean over no view is left out. Raises InputError as
-    `Dataset.test_views`.
+    `test_psnr...` over the test views. A dataset without test views: `psnr...` over all views that
+    have an image, `held_out_psnr...` over those not taken. A mean over no view is left out. Raises
+    InputError as `Dataset.test_views`.
     """
     tests = dataset.test_views()
     frames = dataset.frames if tests is None else tests.frames
+    of = psnr_over(frames, cache, exposure)
+
+    def measure(gaussians: Gaussians, taken: list[int]) -> dict[str, float]:
+        if tests is not None:
+            return _means(of(gaussians, range(len(frames))), "test_")
+        shown = [i for i, frame in enumerate(frames) if i in taken or not frame.on_demand]
+        views = of(gaussians, shown)
+        held_out = {key: v[[i not in taken for i in shown]] for key, v in views.items()}
+        return _means(views) | _means(held_out, "held_out_")
+
+    return measure
+
+
+def psnr_over(
+    frames: Sequence[Frame], cache: ListCache, exposure: bool = False
+) -> Callable[[Gaussians, Sequence[int]], dict[str, np.ndarray]]:
+    """Returns a function (gaussians, indices of frames) -> PSNR of each of these views, dB.
+
+    `psnr`; `psnr_mask`, in the rock mask. With `exposure` also `..._corrected`, of renders at the
+    exposure of the view (`mgs.metrics.colour_corrected`).
+    """
     names = ("psnr", "psnr_mask", *(("psnr_corrected", "psnr_mask_corrected") if exposure else ()))
 
     def read(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -138,23 +157,14 @@ def psnr_measure(
         srgb = [srgb_from_linear(one) for one in shown]
         return [psnr(one, image, mask) for one in srgb for mask in (known, rock)]
 
-    def measured(gaussians: Gaussians, chosen: Iterable[int]) -> np.ndarray:
-        return np.array([values(gaussians, i) for i in chosen]).reshape(-1, len(names))
+    def measured(gaussians: Gaussians, chosen: Sequence[int]) -> dict[str, np.ndarray]:
+        table = np.array([values(gaussians, i) for i in chosen]).reshape(-1, len(names))
+        return dict(zip(names, table.T, strict=True))
 
-    def measure(gaussians: Gaussians, taken: list[int]) -> dict[str, float]:
-        if tests is not None:
-            return dict(_means(measured(gaussians, range(len(frames))), "test_", names))
-        shown = [i for i, frame in enumerate(frames) if i in taken or not frame.on_demand]
-        views = measured(gaussians, shown)
-        found = {"": views, "held_out_": views[[i not in taken for i in shown]]}
-        return {key: mean for prefix, v in found.items() for key, mean in _means(v, prefix, names)}
-
-    return measure
+    return measured
 
 
-def _means(values: np.ndarray, prefix: str, names: Sequence[str]) -> Iterator[tuple[str, float]]:
-    """Name and mean of each column of [V,names] over the views that have it, if there are some."""
-    for name, column in zip(names, values.T, strict=True):
-        known = column[~np.isnan(column)]
-        if len(known):
-            yield prefix + name, float(known.mean())
+def _means(values: Mapping[str, np.ndarray], prefix: str = "") -> dict[str, float]:
+    """Mean of each array over the views that have it, if there are some; names with a prefix."""
+    known = {key: column[~np.isnan(column)] for key, column in values.items()}
+    return {prefix + key: float(column.mean()) for key, column in known.items() if len(column)}

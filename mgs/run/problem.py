@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -128,6 +129,15 @@ class Problem:
             IMAGE_BYTES, lambda i: target_of(self.frames[i], with_alpha), lambda image: image.nbytes
         )
         self._start_of = lru_cache(maxsize=2)(self.coloured)
+
+    def with_settings(self, **changes: Any) -> Problem:
+        """The same problem with other settings that neither change `lam` nor the seeds, such as
+        the policy, `seed` or `train`. What was measured of dataset and prior is kept."""
+        other = copy(self)
+        other.settings = self.settings.model_copy(update=changes)
+        other.policy = policy_named(other.settings.policy)
+        other.__dict__.pop("flight", None)
+        return other
 
     def _spread_seeds(self) -> list[int]:
         free, count = np.flatnonzero(self.allowed), self.settings.seeds

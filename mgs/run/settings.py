@@ -60,7 +60,7 @@ class NbvSettings(BaseModel):
     """Folder of the dataset."""
     prior: Path
     """Folder of the prior."""
-    policy: str = "d-optimal"
+    policy: str = "directional-d"
     """Policy that scores the candidates, or FILE.py:FUNCTION of your own."""
     nearest: Annotated[int, Field(ge=1)] | None = None
     """Choose among this many views nearest to the last one. Default: all."""

@@ -4,17 +4,14 @@ may exist."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from mgs.data.dataset import Dataset
-from mgs.run import recording
 from mgs.run.loop import Chooser, fit_views
-from mgs.run.operations import operations_of, psnr_measure
-from mgs.run.problem import Problem, no_progress
+from mgs.run.operations import psnr_measure
+from mgs.run.problem import Problem
 from mgs.run.state import Fitted
 from mgs.splat import ListCache
-from mgs.study.case import begun_run, curves_of, test_views_of
 
 
 def oracle(tests: Dataset) -> Chooser:
@@ -30,18 +27,3 @@ def oracle(tests: Dataset) -> Chooser:
         return left[best], scores[best]
 
     return choose
-
-
-def run_oracle(
-    root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]
-) -> dict[str, Any]:
-    """Task: start or resume a run of the oracle; returns what `mgs.study.case.run_policy` does.
-    settings: without a policy. Raises InputError if there are no test views."""
-    given = {"policy": "random", "evaluate_every": 1, **settings}
-    run = begun_run(root, out, dataset, prior, given)
-    chooser = oracle(test_views_of(run.dataset))
-    operations = operations_of(run.dataset, run.prior, run.settings)
-    state = recording.run(
-        run.folder, run.settings, run.dataset, operations, no_progress, chooser=chooser
-    )
-    return curves_of(state)

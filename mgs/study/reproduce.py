@@ -6,53 +6,23 @@ need are done once.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mgs.data.dataset import TEST_FOLDER, load_dataset, write_transforms
 from mgs.errors import InputError, flag
-from mgs.files import atomic_folder
 from mgs.policy import from_file as policy_file
 from mgs.policy.registry import policy_named
 from mgs.run.inputs import file_digest, policy_record
-from mgs.study.case import Case, Scene, Size
+from mgs.study.case import Case, Size
+from mgs.study.rocks import FRESH, Rock
+from mgs.study.setups import DRAWS, ORACLE, POLICIES, SetupSize, cells_of
 from mgs.study.statistics import MOST_ROCKS
-from mgs.study.sweep import CELLS, Cell, names_of
-
-SCENES = ("boulder", "contact-binary", "low-sun", "pebbles", "strata")
-
-DEVELOPED_ON = ("boulder", "contact-binary")
-"""Scenes whose rocks of seed 0 were used to choose settings of policies."""
+from mgs.study.sweep import Cell, names_of
 
 SEEDS = 4
 """Seed views of a run, as in the paper."""
-
-POLICIES = (
-    "paper", "d-optimal", "directional-i", "directional-d", "fisherrf", "cover", "coverage",
-    "completeness", "farthest", "uniform", "random",
-)  # fmt: skip
-"""Policies that are compared over rocks."""
-
-PAIRS = (
-    ("d-optimal", "uniform"),
-    ("d-optimal", "farthest"),
-    ("directional-i", "uniform"),
-    ("directional-i", "farthest"),
-    ("paper", "coverage"),
-    ("d-optimal", "coverage"),
-    ("cover", "fisherrf"),
-)
-"""Pairs of policies whose difference is tested, named before they were measured over rocks. The
-paper compares `paper`, `d-optimal` and `coverage`; COVER's authors compare it with FisherRF."""
-
-LEADER = "directional-i"
-"""Policy whose difference from every other is reported for each pool."""
-
-DRAWS = 3
-"""Runs of the policy `random` for one row of a table."""
 
 TABLE_POLICIES = (
     "paper", "d-optimal", "coverage", "uniform", "directional-i", "fisherrf", "farthest", "random",
@@ -69,30 +39,15 @@ FEWER_IMAGES fewer images, as the paper counts; and a fit that is not held to a 
 
 FEWER_IMAGES = 4
 
-POOLS: dict[str, dict[str, Any]] = {
-    "ring": {"kind": "circle"},
-    "hemisphere": {"kind": "hemisphere"},
-    "rings": {"kind": "rings"},
-    "biased arc": {"kind": "circle", "every": 6},
-    "five nearest": {"kind": "circle", "nearest": 5},
-    "mixed distances": {"kind": "hemisphere", "distances": [1, 2, 3]},
-}
-"""Pools of candidates. kind, distances: as in `mgs.synth.scene_file.Orbit`; every: all frames of
-half a ring and one in so many of its other half, from a ring of 3/2 as many frames; nearest: the
-setting of `mgs nbv`."""
-
 SEED_COUNTS = (1, 2, 3, 4, 6, 8)
 SEED_POLICIES = ("d-optimal", "paper")
 
-ORACLE, FREE_FIT = "oracle", "free-fit"
-OTHER_TASKS = {ORACLE: "mgs.study.oracle:run_oracle", FREE_FIT: "mgs.study.free_fit:time_free_fit"}
+FREE_FIT = "free-fit"
+OTHER_TASKS = {FREE_FIT: "mgs.study.free_fit:time_free_fit"}
 """Tasks of runs that have no policy of `mgs nbv`."""
 
-MESH_SCENE = "boulder"
-"""Scene whose ground, light and orbits a mesh gets."""
-
-MOST_POOL_ROCKS = 10
-"""Two rocks of each scene. The twelfth is larger than the images of its hemisphere."""
+RING = {"kind": "circle", "distances": [1]}
+"""Orbit of Table I and of the numbers of seeds: the paper's."""
 
 FIGURE_POLICIES = ("paper", "d-optimal", "coverage", "uniform")
 """Runs of Table I that the figures show."""
@@ -109,72 +64,47 @@ class RunSize:
     batch: int = 1
 
 
-@dataclass(frozen=True)
-class Rock:
-    """A scene and the seed of its rock, or a mesh file and its hash in MESH_SCENE. index: place
-    among the rocks, and seed of the runs."""
-
-    scene: str
-    seed: int
-    index: int = 0
-    mesh: Path | None = None
-    digest: str = ""
-
-    @property
-    def name(self) -> str:
-        """Folder name."""
-        return f"{self.scene}-{self.digest[:8] if self.mesh else self.seed}"
-
-    def at(self, orbit: dict[str, Any]) -> Scene:
-        """Scene of the rock with values of the orbit's section."""
-        scene = MESH_SCENE if self.mesh else self.scene
-        mesh = str(self.mesh) if self.mesh else None
-        kind = "-".join([orbit["kind"], *map(str, orbit.get("distances", ()))])
-        return Scene(scene, self.seed, {"orbit": orbit}, mesh, f"{self.name}/{kind}")
-
-
 TABLE_ROCK = Rock("boulder", 0)
 """Rock of Table I."""
 
 
 @dataclass(frozen=True)
 class ReproduceSize:
-    """Size of a reproduction: of the runs of Table I, of the runs over many rocks, and how many
-    rocks these results have.
+    """Size of a reproduction: of the runs of Table I, of those over numbers of seeds, of the
+    set-ups, and how many rocks these results have.
 
-    own_policies: policies that curves and pools compare, too. meshes: rocks in place of the
-    procedural ones.
+    own_policies: policies that the set-ups compare, too. meshes: rocks in place of FRESH.
     """
 
     table: RunSize
-    rocks: RunSize
-    curve_rocks: int = 12
+    seeds: RunSize
+    setups: SetupSize
     seed_rocks: int = 5
-    pool_rocks: int = 3
+    setup_rocks: int = len(FRESH)
+    oracle_rocks: int = 2
     own_policies: tuple[str, ...] = ()
     meshes: tuple[Rock, ...] = ()
 
     @property
     def policies(self) -> tuple[str, ...]:
-        """Policies that curves and pools compare."""
+        """Policies that the set-ups compare."""
         return (*POLICIES, *self.own_policies)
 
     def some_rocks(self, count: int) -> list[Rock]:
-        """The first rocks: meshes, or the scenes in turn with seeds from 1 on. On rocks of seed 0
-        the policies were developed."""
-        if self.meshes:
-            return list(self.meshes[:count])
-        return [Rock(SCENES[k % len(SCENES)], 1 + k // len(SCENES), k) for k in range(count)]
+        """The first of the meshes, or of FRESH."""
+        return list((self.meshes or FRESH)[:count])
 
 
 SIZES = {
     "quick": ReproduceSize(
-        RunSize(Size(320, 240, 32, 12), 10_000, 8), RunSize(Size(240, 180, 32, 12), 5_000, 8)
+        RunSize(Size(320, 240, 32, 12), 10_000, 8),
+        RunSize(Size(240, 180, 32, 12), 5_000, 8),
+        SetupSize(),
     ),
     "paper": ReproduceSize(
         RunSize(Size(640, 480, 100, 24, spp=16), 100_000, 50),
         RunSize(Size(320, 240, 48, 24), 10_000, 20),
-        pool_rocks=5,
+        SetupSize(320, 240, 24, 16),
     ),
 }
 
@@ -190,33 +120,19 @@ class Run:
     seeds: int = SEEDS
     budget: int | None = None
     draw: int = 0
-    pool: str = "ring"
     timed: bool = False
 
     @property
     def case(self) -> Case:
         """Case of the dataset and the prior; the prior is of the whole flight."""
-        pool, images = POOLS[self.pool], self.size.images
-        if "every" in pool:
-            images = replace(images, frames=images.frames * 3 // 2)
-        orbit = {"distances": [1]} | {k: pool[k] for k in ("kind", "distances") if k in pool}
         settings = {"gaussians": self.size.gaussians, "seed": 0}
-        return Case(self.rock.at(orbit), images, settings)
+        return Case(self.rock.at(RING), self.size.images, settings)
 
     def cells(self) -> list[Cell]:
         """Cells of the run; the last is the run itself."""
-        case, pool = self.case, POOLS[self.pool]
-        cells, folders = case.cells(), case.folders
-        if "every" in pool:
-            arguments = {"ring": case.dataset, "every": pool["every"]}
-            arc = Cell(f"arc/{case.name}", f"{__name__}:make_arc", arguments, (cells[0].name,))
-            cells.append(arc)
-            folders["dataset"] = f"{CELLS}/{arc.name}/dataset"
         usual = "time_policy" if self.timed else "run_policy"
         task = OTHER_TASKS.get(self.policy, f"mgs.study.case:{usual}")
-        needs = tuple(cell.name for cell in cells)
-        arguments = {**folders, "settings": self.settings()}
-        return [*cells, Cell(self.name, task, arguments, needs, alone=self.timed)]
+        return self.case.with_task(self.name, task, self.timed, settings=self.settings())
 
     @property
     def name(self) -> str:
@@ -227,7 +143,7 @@ class Run:
         views = f"{self.seeds}+{settings['budget']}-{settings['seed']}"
         views += f"-by{settings['batch']}" if "batch" in settings else ""
         version = "".join(f"-{digest[:8]}" for digest in policy_record(self.policy).values())
-        where = f"{kind}/{self.rock.name}/{self.pool.replace(' ', '-')}-{shape}"
+        where = f"{kind}/{self.rock.name}/ring-{shape}"
         return f"{where}/{self.label}{version}-{views}"
 
     @property
@@ -243,9 +159,7 @@ class Run:
             settings = {"policy": self.policy, **batch}
         budget = self.size.budget if self.budget is None else self.budget
         settings |= {"seeds": self.seeds, "budget": budget}
-        settings |= {"seed": self.rock.index + 1000 * self.draw}
-        nearest = POOLS[self.pool].get("nearest")
-        return settings | ({"nearest": nearest} if nearest else {})
+        return settings | {"seed": self.rock.index + 1000 * self.draw}
 
     def command(self) -> str:
         """The `mgs nbv` that does the same in the study's folder; empty for OTHER_TASKS."""
@@ -255,28 +169,6 @@ class Run:
         options = " ".join(f"{flag(key)} {value}" for key, value in self.settings().items())
         where = f"{folders['dataset']} --prior {folders['prior']} --out RUN"
         return f"mgs nbv {where} --alpha-weight 0 {options}"
-
-
-def make_arc(root: Path, out: Path, ring: str, every: int) -> dict[str, Any]:
-    """Task: a dataset of all frames of the first half of a ring, and one in so many of the second
-    half, into OUT/dataset."""
-    source, folder = load_dataset(root / ring), out / "dataset"
-    half = len(source) // 2
-    kept = [frame for i, frame in enumerate(source.frames) if i < half or (i - half) % every == 0]
-    if not folder.is_dir():
-        with atomic_folder(folder) as unfinished:
-            copies = []
-            for frame in kept:
-                paths: dict[str, Any] = {}
-                for key, path in asdict(frame).items():
-                    if isinstance(path, Path):
-                        paths[key] = unfinished / path.relative_to(source.root)
-                        paths[key].parent.mkdir(parents=True, exist_ok=True)
-                        shutil.copyfile(path, paths[key])
-                copies.append(replace(frame, **paths))
-            shutil.copytree(source.root / TEST_FOLDER, unfinished / TEST_FOLDER)
-            write_transforms(unfinished, copies, source.up, source.unit)
-    return {"frames": len(kept)}
 
 
 def table_runs(size: ReproduceSize) -> dict[str, Run]:
@@ -294,49 +186,41 @@ def table_runs(size: ReproduceSize) -> dict[str, Run]:
     return runs
 
 
-def curve_runs(size: ReproduceSize, count: int) -> list[Run]:
-    """Every policy on every rock."""
-    rocks = size.some_rocks(count)
-    return [Run(rock, size.rocks, policy) for rock in rocks for policy in size.policies]
-
-
 def seed_runs(size: ReproduceSize, count: int) -> list[Run]:
     """Numbers of seeds, at equal numbers of images."""
-    total = SEEDS + size.rocks.budget
+    total = SEEDS + size.seeds.budget
     return [
-        Run(rock, size.rocks, policy, seeds=seeds, budget=total - seeds)
+        Run(rock, size.seeds, policy, seeds=seeds, budget=total - seeds)
         for rock in size.some_rocks(count)
         for policy in SEED_POLICIES
         for seeds in SEED_COUNTS
     ]
 
 
-def pool_runs(size: ReproduceSize, count: int) -> list[Run]:
-    """Every policy on every pool; several draws of `random`."""
-    return [
-        Run(rock, size.rocks, policy, draw=draw, pool=pool)
-        for pool in POOLS
-        for rock in size.some_rocks(count)
-        for policy in size.policies
-        for draw in range(DRAWS if policy == "random" else 1)
-    ]
+def setup_cells(size: ReproduceSize, count: int) -> list[Cell]:
+    """Every policy in every set-up."""
+    return cells_of(size.setups, size.some_rocks(count), size.policies)
 
 
-def oracle_runs(size: ReproduceSize, count: int) -> list[Run]:
-    """The oracle on every pool."""
+def oracle_cells(size: ReproduceSize, count: int) -> list[Cell]:
+    """The set-ups, and the oracle in each on the first rocks."""
     rocks = size.some_rocks(count)
-    return [Run(rock, size.rocks, ORACLE, pool=pool) for pool in POOLS for rock in rocks]
+    return setup_cells(size, count) + cells_of(size.setups, rocks, (ORACLE,))
+
+
+def _runs_cells(runs: Iterable[Run]) -> list[Cell]:
+    return [cell for run in runs for cell in run.cells()]
 
 
 @dataclass(frozen=True)
 class Result:
     """A result that --only can name.
 
-    runs(size, rocks): the runs that it needs. rocks: attribute of the size with its default number
-    of rocks; None: it has one. optional: only done if asked for. most: most rocks.
+    cells(size, rocks): the cells that it needs. rocks: attribute of the size with its default
+    number of rocks; None: it has one. optional: only done if asked for. most: most rocks.
     """
 
-    runs: Callable[[ReproduceSize, int], list[Run]]
+    cells: Callable[[ReproduceSize, int], list[Cell]]
     rocks: str | None = None
     optional: bool = False
     most: int = MOST_ROCKS
@@ -345,32 +229,20 @@ class Result:
         """Default number of rocks."""
         return getattr(size, self.rocks) if self.rocks else 1
 
-    def cells(self, size: ReproduceSize, count: int) -> list[Cell]:
-        """Cells over so many rocks."""
-        return [cell for run in self.runs(size, count) for cell in run.cells()]
-
 
 RESULTS = {
-    "table1": Result(lambda size, _: list(table_runs(size).values())),
-    "figures": Result(lambda size, _: [table_runs(size)[policy] for policy in FIGURE_POLICIES]),
-    "curves": Result(curve_runs, "curve_rocks"),
-    "seeds": Result(seed_runs, "seed_rocks"),
-    "pools": Result(pool_runs, "pool_rocks", most=MOST_POOL_ROCKS),
-    "oracle": Result(
-        lambda size, count: pool_runs(size, count) + oracle_runs(size, count),
-        "pool_rocks",
-        optional=True,
-        most=MOST_POOL_ROCKS,
-    ),
+    "table1": Result(lambda size, _: _runs_cells(table_runs(size).values())),
+    "figures": Result(lambda size, _: _runs_cells(figure_runs(size))),
+    "setups": Result(setup_cells, "setup_rocks", most=len(FRESH)),
+    "seeds": Result(lambda size, n: _runs_cells(seed_runs(size, n)), "seed_rocks", most=len(FRESH)),
+    "oracle": Result(oracle_cells, "oracle_rocks", optional=True, most=len(FRESH)),
 }
 """Every result by name, in the order in which they are made."""
 
 
-def pairs_of(policies: Iterable[str]) -> tuple[tuple[str, str], ...]:
-    """Pairs of policies whose difference is tested: PAIRS, and the user's own policies with two
-    baselines."""
-    own = [policy for policy in policies if policy not in POLICIES]
-    return (*PAIRS, *((policy, other) for policy in own for other in ("uniform", "farthest")))
+def figure_runs(size: ReproduceSize) -> list[Run]:
+    """Runs of Table I that the figures show."""
+    return [table_runs(size)[policy] for policy in FIGURE_POLICIES]
 
 
 def results_of(only: str | None) -> list[str]:
@@ -410,7 +282,7 @@ def with_options(
     """
     labels = list(POLICIES)
     for policy in policies:
-        _check_used(f"--policy {policy}", names, "curves", "pools")
+        _check_used(f"--policy {policy}", names, "setups", "oracle")
         if policy in POLICIES:
             raise InputError(f"--policy {policy}: is compared anyway")
         if policy_file.label(policy) in labels:
@@ -448,4 +320,6 @@ def _with_meshes(
             raise InputError(f"--mesh {mesh}: {NAMESAKE}")
         rocks.append(Rock(mesh.stem, 0, k, mesh.resolve(), file_digest(mesh)))
     count = len(rocks)
-    return replace(size, meshes=tuple(rocks), curve_rocks=count, seed_rocks=count, pool_rocks=count)
+    return replace(
+        size, meshes=tuple(rocks), setup_rocks=count, seed_rocks=count, oracle_rocks=count
+    )

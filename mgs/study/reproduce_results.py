@@ -4,23 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mgs.files import write_csv, write_json
-from mgs.provenance import versions
+from mgs.files import write_csv
 from mgs.report.evaluation import evaluate_run
-from mgs.report.tables import markdown
 from mgs.report.writing import write_report
-from mgs.study import reproduce
+from mgs.study import reproduce, setups
 from mgs.study.output import Panel, draw_panels, table, with_interval, write_table
-from mgs.study.reproduce import LEADER, ORACLE, ReproduceSize, Run
-from mgs.study.statistics import area, holm, images_to_reach, interval, permutation_p
+from mgs.study.reproduce import ReproduceSize, Run
+from mgs.study.statistics import interval
 from mgs.study.sweep import Report, cell_folder, found, run_cells
-from mgs.study.verdict import Claim, Row, judged, paired
+from mgs.study.verdict import Row
 
 Found = Mapping[str, Mapping[str, Any]]
 """Results of cells by name."""
@@ -98,7 +95,6 @@ def by_rock(results: Found, runs: Sequence[Run]) -> Rows:
             "rock": run.rock.index,
             "scene": run.rock.scene,
             "rock_seed": run.rock.seed,
-            "pool": run.pool,
             "policy": run.label,
             "draw": run.draw,
             "seeds": run.seeds,
@@ -111,19 +107,8 @@ def by_rock(results: Found, runs: Sequence[Run]) -> Rows:
 
 
 def last_rows(results: Found, runs: Sequence[Run]) -> Rows:
-    """A row for each run: its last step, and KEY_area, the mean of each curve. Draws of a policy
-    are averaged."""
-    drawn: dict[tuple[Any, ...], Rows] = {}
-    for run in runs:
-        row = by_rock(results, [run])[-1] | {"run": run.rock.name}
-        for key in MEASURES:
-            row[f"{key}_area"] = area(results[run.name]["images"], results[run.name][key])
-        drawn.setdefault((run.pool, run.rock.index, run.label, run.seeds), []).append(row)
-    measured = [f"{key}{end}" for key in MEASURES for end in ("", "_area")]
-    return [
-        rows[0] | {key: float(np.mean([row[key] for row in rows])) for key in measured}
-        for rows in drawn.values()
-    ]
+    """A row for each run: its last step."""
+    return [by_rock(results, [run])[-1] | {"run": run.rock.name} for run in runs]
 
 
 def with_differences(
@@ -166,104 +151,6 @@ def _keys(*names: str) -> list[str]:
     return [f"{key}{end}" for end in ("", *(f"_{name}" for name in names)) for key in MEASURES]
 
 
-def statistics_of(results: Found, runs: Sequence[Run]) -> dict[str, Any]:
-    """Area under the curve by policy, and tests of pairs of policies, for each of MEASURES.
-
-    "area": mean over rocks; "area_by_rock"; "reach": mean number of images to what `random` ends
-    with, and on how many rocks it is reached; "pairs": judged claims (`mgs.study.verdict`) that the
-    first policy is ahead, with the differences by rock, the p-values, and the same "elsewhere", on
-    scenes not in DEVELOPED_ON.
-    """
-    rows = last_rows(results, runs)
-    elsewhere = [row for row in rows if row["scene"] not in reproduce.DEVELOPED_ON]
-    statistics: dict[str, Any] = {}
-    for key in MEASURES:
-        areas: dict[str, list[float]] = {}
-        for row in rows:
-            areas.setdefault(row["policy"], []).append(row[f"{key}_area"])
-        pairs: Rows = []
-        for policy, other in reproduce.pairs_of(areas):
-            effects = paired(f"{key}_area", {"policy": policy}, {"policy": other})
-            claim = Claim(f"{policy} is ahead of {other}.", effects, "dB", "above", 0.0, "rock")
-            there = _ahead(claim, elsewhere) if elsewhere else None
-            pair = {"policy": policy, "other": other, **_ahead(claim, rows), "elsewhere": there}
-            pairs.append(pair | {"p": permutation_p(pair["differences"])})
-        p_values = [pair["p"] for pair in pairs]
-        corrected = p_values if None in p_values else holm(p_values)  # None: one rock
-        pairs = [pair | {"p_holm": p} for pair, p in zip(pairs, corrected, strict=True)]
-        means = {policy: float(np.mean(values)) for policy, values in areas.items()}
-        reach = _reach(results, runs, key)
-        statistics[key] = {"area": means, "area_by_rock": areas, "reach": reach, "pairs": pairs}
-    return statistics
-
-
-def _ahead(claim: Claim, rows: Rows) -> Row:
-    """A judged claim with its differences by rock, and on how many of them the first is ahead."""
-    differences = claim.effects(rows)
-    ahead = sum(difference > 0 for difference in differences)
-    return judged(claim, rows) | {"ahead": ahead, "differences": differences}
-
-
-def _reach(results: Found, runs: Sequence[Run], key: str) -> dict[str, Row]:
-    levels = {run.rock.index: results[run.name][key][-1] for run in runs if run.label == "random"}
-    needed: dict[str, list[float]] = {}
-    for run in runs:
-        if run.rock.index in levels:
-            own, curve = needed.setdefault(run.label, []), results[run.name]
-            images = images_to_reach(curve["images"], curve[key], levels[run.rock.index])
-            own += [] if images is None else [images]
-    return {
-        policy: {"images": float(np.mean(own)) if own else None, "rocks": len(own)}
-        for policy, own in needed.items()
-    }
-
-
-def statistics_text(statistics: Mapping[str, Any]) -> str:
-    """Two tables: areas of each policy, and the tests of pairs."""
-    measures = list(zip(MEASURES, ("full frame", "rock"), strict=True))
-    areas = [
-        {"policy": policy}
-        | {key: statistics[key]["area"][policy] for key in MEASURES}
-        | {f"{key}_reach": _reach_text(statistics[key], policy) for key in MEASURES}
-        for policy in statistics[MEASURES[0]]["area"]
-    ]
-    columns = {
-        "policy": "policy",
-        **{f"area, {what} (dB)": f"{key}:.2f" for key, what in measures},
-        "images for what random ends with": "test_psnr_reach",
-        "the same, rock": "test_psnr_mask_reach",
-    }
-    pairs = [pair | {"of": what} for key, what in measures for pair in statistics[key]["pairs"]]
-    pair_columns: dict[str, str | Callable[[Row], str]] = {
-        "pair": lambda pair: f"{pair['policy']} − {pair['other']}",
-        "PSNR of": "of",
-        "difference of areas (dB)": _difference,
-        "is ahead": "verdict",
-        "p": "p:.2g",
-        "p, Holm": "p_holm:.2g",
-        "on scenes that chose no setting": lambda pair: (
-            _difference(pair["elsewhere"]) if pair["elsewhere"] else "–"
-        ),
-    }
-    return f"{table(columns, areas)}\n{table(pair_columns, pairs)}"
-
-
-def _difference(pair: Row) -> str:
-    """Difference, its interval, and on how many rocks the first policy is ahead."""
-    low, high = pair["interval"] or (None, None)
-    text = with_interval({"d": pair["effect"], "d_low": low, "d_high": high}, "d")
-    return f"{text}, {pair['ahead']} of {pair['runs']}"
-
-
-def _reach_text(of: Mapping[str, Any], policy: str) -> str:
-    reached = of["reach"].get(policy)
-    if reached is None or reached["images"] is None:
-        return "–"
-    rocks = len(of["area_by_rock"][policy])
-    some = f" ({reached['rocks']} of {rocks} rocks)" if reached["rocks"] < rocks else ""
-    return f"{reached['images']:.1f}{some}"
-
-
 def largest_gap(taken: Sequence[int], frames: int) -> float:
     """Largest angle between neighbours among the frames taken of an evenly spaced ring."""
     turned = np.sort(taken)
@@ -297,53 +184,6 @@ def seed_rows(results: Found, runs: Sequence[Run]) -> tuple[Rows, Rows]:
         alike = [r for r in rows if (r["policy"], r["seeds"]) == (mean["policy"], mean["seeds"])]
         mean["gap_max"] = max(row["gap"] for row in alike)
     return means, rows
-
-
-def pool_rows(results: Found, runs: Sequence[Run]) -> tuple[Rows, Rows]:
-    """A row for each pool and policy, and the rows by rock: the last model, its difference from
-    `random` and by how much LEADER is ahead of it, there and in the area under the curve; KEY_share
-    of what the oracle gains over `random`, None without an oracle or a gain."""
-    rows = last_rows(results, runs)
-    rows = with_differences(rows, "over_random", {"policy": "random"}, ("pool", "rock"))
-    every = _keys("area")
-    rows = with_differences(rows, "over_leader", {"policy": LEADER}, ("pool", "rock"), every)
-    for row in rows:
-        if row["policy"] != LEADER and f"{every[0]}_over_leader" in row:
-            row |= {f"{key}_led": -row[f"{key}_over_leader"] for key in every}
-    led = [f"{key}_led" for key in every]
-    means = summary(rows, ("pool", "policy"), [*_keys("over_random"), *led])
-    oracle = {mean["pool"]: mean for mean in means if mean["policy"] == ORACLE}
-    for mean in means:
-        for key in MEASURES:
-            won = oracle.get(mean["pool"], {}).get(f"{key}_over_random", 0)
-            mean[f"{key}_share"] = mean[f"{key}_over_random"] / won if won > 0 else None
-    return means, rows
-
-
-def pools_text(rows: Rows) -> str:
-    """Tables with a line for each policy and a column for each pool."""
-    tables = [matrix(rows, "test views (dB)", lambda row: f"{row['test_psnr']:.2f}")]
-    for title, key in (
-        (f"{LEADER} over it (dB)", "test_psnr_led"),
-        ("inside the rock (dB)", "test_psnr_mask_led"),
-        ("over the whole curve (dB)", "test_psnr_area_led"),
-    ):
-        tables.append(matrix(rows, title, partial(with_interval, key=key)))
-    if any(row["test_psnr_share"] is not None for row in rows):
-        tables.append(matrix(rows, "share of the oracle's", _share))
-    return "\n".join(tables)
-
-
-def _share(row: Row) -> str:
-    return "–" if row["test_psnr_share"] is None else f"{row['test_psnr_share']:.0%}"
-
-
-def matrix(rows: Rows, title: str, cell: Callable[[Row], str]) -> str:
-    """Table of the rows of pools, with a line for each policy and a column for each pool."""
-    pools, policies = (list(dict.fromkeys(row[key] for row in rows)) for key in ("pool", "policy"))
-    cells = {(row["policy"], row["pool"]): cell(row) for row in rows}
-    lines = [[policy, *(cells.get((policy, pool), "–") for pool in pools)] for policy in policies]
-    return markdown([title, *pools], lines)
 
 
 @dataclass(frozen=True)
@@ -383,28 +223,11 @@ def write_table1(work: Work) -> list[Path]:
 
 def write_figures(work: Work) -> list[Path]:
     """Report on some runs of Table I, as `mgs report` draws it."""
-    needed = reproduce.RESULTS["figures"].runs(work.size, work.count)
+    needed = reproduce.figure_runs(work.size)
     runs = [cell_folder(work.root, run.name) / "run" for run in needed]
     for run in runs:
         evaluate_run(run)  # draws; the metrics are there already
     return write_report(work.out / "figures", runs)
-
-
-def write_curves(work: Work) -> list[Path]:
-    """curves.csv, .json, .md and .png; curves_by_rock.csv; statistics.json."""
-    runs = reproduce.curve_runs(work.size, work.count)
-    rows, statistics = by_rock(work.results, runs), statistics_of(work.results, runs)
-    over = with_differences(rows, "over_uniform", {"policy": "uniform"}, ("rock", "images"))
-    about = {"command": work.command, "versions": versions(), "rocks": work.count}
-    write_json(work.out / "statistics.json", about | statistics)
-    label, key = "PSNR on the test views (dB)", "test_psnr_over_uniform"
-    panels = (
-        Panel("images", "test_psnr", "images", label, "policy"),
-        Panel("images", key, "images", "difference from uniform (dB)", "policy"),
-    )
-    means = summary(over, ("policy", "images"), _keys("over_uniform"))
-    written = work.write("curves", means, statistics_text(statistics), rows, panels, over)
-    return [*written, work.out / "statistics.json"]
 
 
 def write_seeds(work: Work) -> list[Path]:
@@ -417,26 +240,33 @@ def write_seeds(work: Work) -> list[Path]:
     return work.write("seeds", means, table(SEED_COLUMNS, means), each, panels, rows)
 
 
-def write_pools(work: Work) -> list[Path]:
-    """pools.csv, .json, .md and .png; pools_by_rock.csv; with the oracle where it is done."""
-    oracle = reproduce.oracle_runs(work.size, work.count)
-    known = dict(work.results) | known_runs(work.root, oracle)
-    runs = reproduce.pool_runs(work.size, work.count)
-    runs += oracle if all(run.name in known for run in oracle) else []
-    means, rows = pool_rows(known, runs)
-    label = "PSNR on the test views, over random (dB)"
-    panels = (Panel("pool", "test_psnr_over_random", "pool", label, "policy"),)
-    others = [row for row in rows if row["policy"] != "random"]
-    return work.write("pools", means, pools_text(means), by_rock(known, runs), panels, others)
+def write_setups(work: Work) -> list[Path]:
+    """setups.csv, .json, .md and .png; leads.csv; with the oracle where it is done."""
+    size, rocks = work.size, work.size.some_rocks(work.count)
+    cells = reproduce.oracle_cells(size, work.count)
+    known = dict(work.results)
+    for cell in cells:
+        if cell.name not in known and (result := found(work.root, cell)) is not None:
+            known[cell.name] = result
+    rows = setups.rows_of(known, [cell for cell in cells if cell.name in known], rocks)
+    leads = [lead for key in setups.MEASURES for lead in setups.leads_of(rows, setups.LEADER, key)]
+    write_csv(work.out / "leads.csv", leads)
+    panels = (
+        Panel("setup", "test_gain", "set-up", "PSNR on test views, over random (dB)", "policy"),
+    )
+    shown = [row for row in rows if row["policy"] not in (setups.RANDOM, setups.ORACLE)]
+    draw_panels(work.out / "setups.png", panels, shown)
+    text = setups.text_of(rows, leads)
+    written = write_table(work.out, "setups", rows, text, work.command, rocks=work.count)
+    return [*written, work.out / "leads.csv", work.out / "setups.png"]
 
 
 WRITERS: dict[str, Callable[[Work], list[Path]]] = {
     "table1": write_table1,
     "figures": write_figures,
-    "curves": write_curves,
     "seeds": write_seeds,
-    "pools": write_pools,
-    "oracle": write_pools,
+    "setups": write_setups,
+    "oracle": write_setups,
 }
 """Writers of results, which return the files written."""
 
@@ -456,15 +286,17 @@ def make(
     result = reproduce.RESULTS[name]
     command = f"mgs reproduce --scale {preset} --only {name}"
     command += f" --rocks {count}" if result.count(size) > 1 else ""
-    if name in ("curves", "pools"):
+    if name in ("setups", "oracle"):
         command += "".join(f" --policy {_from_here(policy)}" for policy in size.own_policies)
     if result.rocks:
         command += "".join(f" --mesh {rock.mesh.name}" for rock in size.meshes if rock.mesh)
     elif size.table.batch > 1:
         command += f" --batch {size.table.batch}"
 
+    runs = list(reproduce.table_runs(size).values())
+
     def tell(cell: str, done: int, total: int) -> None:
-        if name == "table1" and (so_far := known_runs(out, result.runs(size, count))):
+        if name == "table1" and (so_far := known_runs(out, runs)):
             write_table1(Work(out, so_far, size, count, command))
         report(f"{name} {cell}", done, total)
 

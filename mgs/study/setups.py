@@ -1,0 +1,344 @@
+"""Policies compared in set-ups where choosing matters: few seeds, limited reach, mixed distances.
+
+Every policy chooses until the same number of images is taken; one fit of these from the prior is
+then judged, so that two policies which take the same views get the same number. Policies that need
+no model choose without any fit. Rocks and scenes chose no setting of a policy. A scene is the unit
+of every test, because rocks of one scene are not independent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.data.dataset import Frame, load_dataset
+from mgs.policy import from_file as policy_file
+from mgs.policy.registry import needs_model
+from mgs.prior.build import load_prior
+from mgs.run.inputs import policy_record
+from mgs.run.loop import choose, finished, fit_views, learn, select_views, surface_information
+from mgs.run.operations import operations_of, psnr_over
+from mgs.run.problem import Problem
+from mgs.run.settings import NbvSettings, with_defaults
+from mgs.run.state import Fitted
+from mgs.splat import ListCache
+from mgs.study.case import Case, Size, test_views_of
+from mgs.study.oracle import oracle
+from mgs.study.output import table, with_interval
+from mgs.study.rocks import Rock
+from mgs.study.statistics import holm, interval, permutation_p
+from mgs.study.sweep import Cell
+from mgs.study.verdict import Row
+
+Found = Mapping[str, Mapping[str, Any]]
+"""Results of cells by name."""
+
+POLICIES = (
+    "directional-d", "directional-i", "cover", "coverage", "farthest", "uniform", "random",
+    "d-optimal", "paper",
+)  # fmt: skip
+
+LEADER = "directional-d"
+"""Policy whose lead over every other is tested: the default of `mgs nbv`."""
+
+RANDOM, ORACLE = "random", "oracle"
+
+DRAWS = 5
+"""Runs of `random`, averaged."""
+
+JUDGE_PASSES = 20
+"""Passes of the fit that is judged: twice the default."""
+
+MEASURES = {
+    "test": "test views",
+    "test_mask": "inside the rock",
+    "pool": "views of the pool not taken",
+    "ring": "views of the ring not taken",
+}
+"""Mean PSNR of each cell, dB, by what it is over."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Candidates and seeds of a run.
+
+    orbit: values of the scene's orbit. frames: number of poses. seeds: views to start with. every:
+    take only the first half of the frames, and one in so many of the others. settings: more of
+    `mgs nbv`.
+    """
+
+    orbit: Mapping[str, Any]
+    frames: int
+    seeds: int = 4
+    every: int | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+RING = {"kind": "circle", "distances": [1]}
+DOME = {"kind": "hemisphere", "distances": [1]}
+
+SETUPS = {
+    "ring": Setup(RING, 48),
+    "hemisphere": Setup(DOME, 36),
+    "one seed": Setup(DOME, 36, seeds=1),
+    "biased arc": Setup(RING, 48, seeds=2, every=6),
+    "five nearest": Setup(RING, 48, settings={"nearest": 5}),
+    "mixed distances": Setup({"kind": "hemisphere", "distances": [1, 2, 3]}, 36),
+}
+"""The ring is the paper's; in the others the choice matters more."""
+
+
+@dataclass(frozen=True)
+class SetupSize:
+    """Width, height, test views and samples per pixel of the images, and images that a run
+    takes, seeds among them. Numbers of frames are those of SETUPS, over `fewer`. gaussians: of the
+    prior; None: automatic."""
+
+    width: int = 128
+    height: int = 96
+    tests: int = 16
+    spp: int = 8
+    images: int = 12
+    fewer: int = 1
+    gaussians: int | None = None
+
+
+def case_of(rock: Rock, setup: Setup, size: SetupSize) -> Case:
+    """Dataset and prior."""
+    images = Size(size.width, size.height, setup.frames // size.fewer, size.tests, size.spp)
+    number = {} if size.gaussians is None else {"gaussians": size.gaussians}
+    return Case(rock.at(dict(setup.orbit)), images, number | {"seed": 0})
+
+
+def cells_of(size: SetupSize, rocks: Iterable[Rock], policies: Sequence[str]) -> list[Cell]:
+    """Cells of every policy in every set-up on every rock, with datasets and priors."""
+    cells: dict[str, Cell] = {}
+    for rock in rocks:
+        ring = case_of(rock, SETUPS["ring"], size)
+        for name, setup in SETUPS.items():
+            case = case_of(rock, setup, size)
+            common = {"seeds": setup.seeds, "budget": size.images - setup.seeds, **setup.settings}
+            for policy in policies:
+                for draw in range(DRAWS if policy == RANDOM else 1):
+                    settings = common | {"policy": policy, "seed": rock.index + 1000 * draw}
+                    version = "".join(f"-{d[:8]}" for d in policy_record(policy).values())
+                    label = f"{policy_file.label(policy)}{version}-{draw}"
+                    folder = name.replace(" ", "-")
+                    of = f"setup/{rock.name}/{folder}-{size.width}x{size.height}/{label}"
+                    made = case.with_task(
+                        of,
+                        f"{__name__}:choose_and_judge",
+                        ring=ring.dataset,
+                        every=setup.every,
+                        settings=settings,
+                    )
+                    last = replace(made[-1], needs=(*made[-1].needs, ring.cells()[0].name))
+                    for cell in (*ring.cells()[:1], *made[:-1], last):
+                        cells[cell.name] = cell
+    return list(cells.values())
+
+
+def choose_and_judge(
+    root: Path,
+    out: Path,
+    dataset: str,
+    prior: str,
+    ring: str,
+    every: int | None,
+    settings: dict[str, Any],
+) -> dict[str, Any]:
+    """Task: choose views by a policy, fit all of them from the prior, and judge the model.
+
+    Returns MEASURES, "taken" (indices of the frames in the order taken) and "path" (metres through
+    the views taken).
+    """
+    policy = settings["policy"]
+    shared, tests, pool, on_ring = _shared(
+        root / dataset, root / prior, root / ring, every, settings["seeds"], settings["budget"]
+    )
+    chosen_by = RANDOM if policy == ORACLE else policy
+    problem = shared.with_settings(**settings | {"policy": chosen_by})
+    if policy == ORACLE or needs_model(policy):
+        chooser = oracle(test_views_of(shared.dataset)) if policy == ORACLE else None
+        states = select_views(problem, _after_seeds(shared), chooser)
+        taken = [state for state in states if isinstance(state, Fitted)][-1].taken
+    else:
+        taken = _from_poses(problem)
+    train = problem.settings.train.model_copy(update={"passes": JUDGE_PASSES})
+    model = fit_views(problem.with_settings(train=train), taken).gaussians
+    left = [i for i in range(len(shared.frames)) if i not in taken]
+    on_tests, on_pool = tests(model), pool(model, left)
+    mine = dataset == ring  # the poses of the ring, of which some may be taken
+    positions = problem.positions[taken]
+    return {
+        "test": float(on_tests["psnr"].mean()),
+        "test_mask": float(on_tests["psnr_mask"].mean()),
+        "pool": float(on_pool["psnr"].mean()),
+        "ring": float((on_pool if mine else on_ring(model))["psnr"].mean()),
+        "path": float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()),
+        "taken": taken,
+    }
+
+
+def _from_poses(problem: Problem) -> list[int]:
+    """Views taken by a policy that needs no model."""
+    surface = surface_information(problem, problem.seeds)
+    state = Fitted(problem.start, np.zeros_like(surface), surface, problem.seeds)
+    while not finished(problem, state):
+        frame, _ = choose(problem, state)
+        surface = surface_information(problem, [frame], state)
+        state = replace(state, surface=surface, taken=[*state.taken, frame])
+    return state.taken
+
+
+Measure = Callable[..., dict[str, np.ndarray]]
+"""(model, indices of frames; default: all) -> as `mgs.run.operations.psnr_over`."""
+
+
+@lru_cache(maxsize=1)
+def _shared(
+    dataset: Path, prior: Path, ring: Path, every: int | None, seeds: int, budget: int
+) -> tuple[Problem, Measure, Measure, Measure]:
+    """What the policies of one set-up on one rock share: the problem, with the surface's
+    visibility, and PSNR on the test views, on the candidates and on the ring's."""
+    data, cache = load_dataset(dataset), ListCache()
+    if every is not None:
+        half = len(data) // 2
+        kept = (f for i, f in enumerate(data.frames) if i < half or (i - half) % every == 0)
+        data = replace(data, frames=tuple(kept))
+    given = {"dataset": dataset, "prior": prior, "policy": RANDOM, "seeds": seeds, "budget": budget}
+    settings = NbvSettings(**with_defaults(given))
+    problem = Problem(data, settings, operations_of(data, load_prior(prior), settings))
+    _ = problem.start, problem.visibility  # once, for all copies `with_settings`
+    _after_seeds.cache_clear()
+
+    def over(frames: Sequence[Frame]) -> Measure:
+        of = psnr_over(frames, cache)
+        return lambda model, some=range(len(frames)): of(model, some)
+
+    views = test_views_of(data).frames, data.frames, load_dataset(ring).frames
+    tests, pool, on_ring = map(over, views)
+    return problem, tests, pool, on_ring
+
+
+@lru_cache(maxsize=1)
+def _after_seeds(problem: Problem) -> Fitted:
+    """State after the fit to the seeds, the same for every policy."""
+    return learn(problem, problem.seeds)
+
+
+def rows_of(results: Found, cells: Sequence[Cell], rocks: Sequence[Rock]) -> list[Row]:
+    """A row for each rock, set-up and policy, draws averaged: MEASURES, "path", and KEY_gain, the
+    difference from `random`."""
+    scenes = {rock.name: rock.scene for rock in rocks}
+    groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
+    for cell in cells:
+        if cell.name.startswith("setup/"):
+            _, rock, where, _ = cell.name.split("/")
+            setup = next(s for s in SETUPS if where.startswith(s.replace(" ", "-") + "-"))
+            policy = policy_file.label(cell.arguments["settings"]["policy"])
+            groups.setdefault((rock, setup, policy), []).append(results[cell.name])
+    rows: list[Row] = [
+        {"rock": rock, "scene": scenes[rock], "setup": setup, "policy": policy}
+        | {key: float(np.mean([one[key] for one in found])) for key in (*MEASURES, "path")}
+        for (rock, setup, policy), found in groups.items()
+    ]
+    base = {(row["rock"], row["setup"]): row for row in rows if row["policy"] == RANDOM}
+    for row in rows:
+        against = base[row["rock"], row["setup"]]
+        row |= {f"{key}_gain": row[key] - against[key] for key in MEASURES}
+    return rows
+
+
+def by_scene(rows: Sequence[Row], setup: str, policy: str, key: str) -> dict[str, float]:
+    """Mean of a key over the rocks of each scene."""
+    values: dict[str, list[float]] = {}
+    for row in rows:
+        if (row["setup"], row["policy"]) == (setup, policy):
+            values.setdefault(row["scene"], []).append(row[key])
+    return {scene: float(np.mean(of)) for scene, of in values.items()}
+
+
+def leads_of(rows: Sequence[Row], leader: str, measure: str) -> list[Row]:
+    """Lead of a policy over each other in each set-up, where both were run: mean over scenes, 95 %
+    interval, exact permutation p, and p by Holm's correction over all of them."""
+    leads = []
+    for setup, other in dict.fromkeys((row["setup"], row["policy"]) for row in rows):
+        if other in (leader, ORACLE):
+            continue
+        own, theirs = (by_scene(rows, setup, policy, measure) for policy in (leader, other))
+        apart = [own[scene] - theirs[scene] for scene in theirs if scene in own]
+        if not apart:
+            continue
+        low, high = interval(apart) or (None, None)
+        lead = {"lead": float(np.mean(apart)), "lead_low": low, "lead_high": high}
+        about = {"measure": measure, "setup": setup, "policy": other, "scenes": len(apart)}
+        leads.append(about | lead | {"p": permutation_p(apart)})
+    p_values = [lead["p"] for lead in leads]
+    corrected = p_values if None in p_values else holm(p_values)  # None: one scene
+    return [lead | {"p_holm": p} for lead, p in zip(leads, corrected, strict=True)]
+
+
+def text_of(rows: Sequence[Row], leads: Sequence[Row]) -> str:
+    """Tables with a line for each policy and a column for each set-up: gains over `random` by each
+    of MEASURES, share of the oracle's gain, and the leader's lead."""
+    setups = list(dict.fromkeys(row["setup"] for row in rows))
+    policies = list(dict.fromkeys(row["policy"] for row in rows))
+
+    def gain(setup: str, policy: str, key: str) -> float | None:
+        found = by_scene(rows, setup, policy, f"{key}_gain")
+        return float(np.mean(list(found.values()))) if found else None
+
+    def matrix(title: str, cell: Callable[[str, str], str], over: Sequence[str]) -> str:
+        columns = {title: "policy"} | {setup: setup for setup in setups}
+        lines = [{"policy": p} | {setup: cell(setup, p) for setup in setups} for p in over]
+        return table(columns, lines)
+
+    def signed(value: float | None) -> str:
+        return "–" if value is None else f"{value:+.2f}"
+
+    def gains(key: str) -> Callable[[str, str], str]:
+        return lambda setup, policy: signed(gain(setup, policy, key))
+
+    tables = [
+        matrix(f"{title}, over random (dB)", gains(key), policies)
+        for key, title in MEASURES.items()
+    ]
+    known = {(lead["setup"], lead["policy"]): lead for lead in leads if lead["measure"] == "test"}
+    others = [p for p in policies if p not in (LEADER, ORACLE)]
+    tables.append(
+        matrix(
+            f"{LEADER} over it (dB)",
+            lambda s, p: (
+                with_interval(known.get((s, p), {}), "lead")
+                + (" *" if (known.get((s, p), {}).get("p_holm") or 1) < 0.05 else "")
+            ),
+            others,
+        )
+    )
+    if ORACLE in policies:
+        tables.append(_shares(rows, setups, policies, matrix))
+    return "\n".join(tables)
+
+
+def _shares(
+    rows: Sequence[Row],
+    setups: Sequence[str],
+    policies: Sequence[str],
+    matrix: Callable[..., str],
+) -> str:
+    """Share of the oracle's gain over `random`, over the rocks that the oracle was tried on."""
+    rocks = {row["rock"] for row in rows if row["policy"] == ORACLE}
+
+    def share(setup: str, policy: str) -> str:
+        of = [r["test_gain"] for r in rows if (r["setup"], r["policy"]) == (setup, policy)
+              and r["rock"] in rocks]  # fmt: skip
+        won = [r["test_gain"] for r in rows if (r["setup"], r["policy"]) == (setup, ORACLE)]
+        return f"{np.mean(of) / np.mean(won):.0%}" if of and np.mean(won) > 0 else "–"
+
+    return matrix("share of the oracle's gain", share, [p for p in policies if p != RANDOM])
