@@ -113,7 +113,9 @@ def prior_and_cloud(
     """
     chosen = source_of(dataset, source, points)
     if chosen == "random":
-        return _random_prior(dataset, settings, dataset.up if up in (None, "auto") else up), None
+        return _random_prior(
+            dataset, settings, dataset.up if up is None or up == "auto" else up
+        ), None
     if chosen == "depth":
         surface = _depth_surface(dataset, settings, on_stage)
     else:

@@ -134,7 +134,7 @@ def _scattered(
     start = Gaussians(
         means=points.astype(np.float32),
         log_scales=np.tile(size[:, None], 3).astype(np.float32),
-        quats=np.tile(np.float32([1, 0, 0, 0]), (len(points), 1)),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (len(points), 1)),
         logit_opacities=np.full(len(points), logit(RANDOM_OPACITY), np.float32),
         sh=sh_from_rgb(rgb),
     )
