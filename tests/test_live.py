@@ -40,7 +40,6 @@ FIRST = 'grep -q \'"attempt": 1\' "$2"'
 
 TROUBLES = {
     "exit code": ("echo no link >&2; exit 7", "exit code 7: no link"),
-    "hang": ("sleep 60", "did not end within 3 s"),
     "nothing": ("rm $3", "the picture is missing"),
     "half a file": ('head -c 90 "$1/images/$name.png" > "$3"', "the file is damaged"),
     "another size": ('cp "$1/other.png" "$3"', "is 8x6, but its camera is 16x12"),
@@ -121,7 +120,7 @@ def drone(data, folder, trouble=":", at="none", tries="true"):
     """Transport of SCRIPT."""
     script = folder / "drone.sh"
     script.write_text(SCRIPT.format(trouble=trouble, at=at, tries=tries))
-    return transports.command(f"sh '{script}' '{data}' {{pose}} {{out}}", 3)
+    return transports.command(f"sh '{script}' '{data}' {{pose}} {{out}}", 600)
 
 
 def copying(data, change=lambda pose, out: None):
@@ -153,6 +152,12 @@ def test_what_goes_wrong_is_one_line_and_is_tried_again(flight, data, whole, tmp
     assert flight.steps == timeless(steps(whole))
     refused = [path.name for path in (flight.dataset / "flight").glob("*refused-1*")]
     assert ("kf_0004.refused-1.png" in refused) == (case != "nothing")
+
+
+def test_a_command_that_hangs_is_ended_with_its_children(tmp_path):
+    deliver = transports.command("sh -c 'sleep 60 & wait' {pose} {out}", 0.3)
+    with pytest.raises(InputError, match=r"the command did not end within 0\.3 s"):
+        deliver(tmp_path / "a.pose.json", tmp_path / "a.png")
 
 
 @pytest.mark.parametrize("seed", [True, False])
@@ -344,8 +349,8 @@ def test_the_simulated_drone(tmp_path, capfd):
     command("synth-orbit", world, "--on-demand", *orbit)
     tool = Path(__file__).parent.parent / "tools/drone.py"
     program = f"{sys.executable} {tool} {world} {{pose}} {{out}} --fail 0.4 --noise 0.02"
-    flying = ["--capture-command", program, "--capture-tries", 4, "--capture-timeout", 60]
-    settings = ["--seeds", 3, "--budget", 2, "--passes", 2, "--gaussians", 200]
+    flying = ["--capture-command", program, "--capture-tries", 4, "--capture-timeout", 200]
+    settings = ["--seed-views", 3, "--budget", 2, "--passes", 2, "--gaussians", 200]
     command("nbv", world, *settings, *flying, "--out", run)
     assert "try 1 of 4" in capfd.readouterr().err
     assert len(steps(run)) == 3
