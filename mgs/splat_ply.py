@@ -1,5 +1,4 @@
-"""Gaussians as PLY files: writes and reads the layout of 3DGS, and reads the compressed one of
-SuperSplat and PlayCanvas.
+"""Gaussians as PLY files: the layout of 3DGS, and the compressed one of SuperSplat and PlayCanvas.
 
 The layout of 3DGS has one vertex per Gaussian: x y z; nx ny nz (zero); f_dc_0..2, the coefficients
 of degree 0; f_rest_*, those of higher degrees, all of red, then all of green, then all of blue;
@@ -15,6 +14,7 @@ from tempfile import NamedTemporaryFile
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
+from scipy.spatial import cKDTree
 from scipy.special import logit
 
 from mgs.colour import SH_C0
@@ -51,14 +51,18 @@ def _ply_names(coefficients: int) -> list[str]:
 
 
 def write_ply(
-    path: str | Path, gaussians: Gaussians, marks: Mapping[str, np.ndarray] | None = None
+    path: str | Path,
+    gaussians: Gaussians,
+    marks: Mapping[str, np.ndarray] | None = None,
+    linear: bool = True,
 ) -> None:
     """Write Gaussians (NumPy fields) as a binary PLY in the layout of 3DGS; the file appears
     complete.
 
-    It opens in any splat viewer. Colours stay linear RGB, which viewers that expect sRGB show too
-    dark. marks: {name: [N] bool}, extra properties of the vertices, bytes of 0 or 1, which
-    `read_ply` and viewers ignore. Raises InputError as `mgs.files.atomic_path`.
+    It opens in any splat viewer. Viewers that expect sRGB show linear RGB too dark. marks: {name:
+    [N] bool}, extra properties of the vertices, bytes of 0 or 1, which `read_ply` and viewers
+    ignore. linear: the colours are linear RGB, which a comment records. Raises InputError as
+    `mgs.files.atomic_path`.
     """
     g, n = gaussians, len(gaussians)
     names = _ply_names(g.sh.shape[1])
@@ -73,7 +77,7 @@ def write_ply(
         vertices[name] = columns[:, i]
     for name, mask in marks.items():
         vertices[name] = mask
-    ply = PlyData([PlyElement.describe(vertices, "vertex")], comments=[LINEAR_COMMENT])
+    ply = PlyData([PlyElement.describe(vertices, "vertex")], comments=[LINEAR_COMMENT] * linear)
     with atomic_path(path) as temporary:
         ply.write(str(temporary))
 
@@ -257,3 +261,74 @@ def _decompress_sh(path: Path, ply: PlyData, n: int) -> dict[str, np.ndarray]:
     values = (np.arange(256) + 0.5) / 32 - 4
     values[[0, 255]] = -4, 4
     return {name: values[table[name]] for name in table.dtype.names}
+
+
+def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
+    """Write Gaussians (NumPy fields) as a compressed PLY (`_decompress`); the file appears
+    complete.
+
+    Gaussians are sorted such that those of a chunk are neighbours, which keeps the steps of their
+    positions small. Raises InputError as `mgs.files.atomic_path`.
+    """
+    g = gaussians[cKDTree(gaussians.means, leafsize=CHUNK).indices]
+    n, rest = len(g), 3 * (g.sh.shape[1] - 1)
+    starts = np.arange(0, n, CHUNK)
+    chunk_types, chunk_columns, shares = [], [], []
+    groups = (
+        ("", "xyz", g.means),
+        ("scale_", "xyz", g.log_scales),
+        ("", "rgb", 0.5 + SH_C0 * g.sh[:, 0]),
+    )
+    for prefix, names, values in groups:
+        low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+        for end, bound in (("min", low), ("max", high)):
+            chunk_types += [(f"{end}_{prefix}{name}", "<f4") for name in names]
+            chunk_columns += list(bound.T)
+        first, span = (np.repeat(part, CHUNK, 0)[:n] for part in (low, high - low))
+        shares.append((values - first) / np.where(span > 0, span, 1))
+    colour = np.column_stack([shares[2], g.opacities])
+    words = [
+        _packed(shares[0], (11, 10, 11)),
+        _packed_quats(g.quats),
+        _packed(shares[1], (11, 10, 11)),
+        _packed(colour, (8, 8, 8, 8)),
+    ]
+    tables = {
+        "chunk": _table(chunk_types, chunk_columns),
+        "vertex": _table([(name, "<u4") for name in PACKED], words),
+    }
+    if rest:
+        higher = np.transpose(g.sh[:, 1:], (0, 2, 1)).reshape(n, rest)
+        steps = np.clip(np.floor((higher / 8 + 0.5) * 256), 0, 255)
+        tables["sh"] = _table([(f"f_rest_{i}", "u1") for i in range(rest)], list(steps.T))
+    elements = [PlyElement.describe(table, name) for name, table in tables.items()]
+    with atomic_path(path) as temporary:
+        PlyData(elements, byte_order="<").write(str(temporary))
+
+
+def _table(types: list[tuple[str, str]], columns: list[np.ndarray]) -> np.ndarray:
+    """Rows of a PLY element from its columns."""
+    rows = np.empty(len(columns[0]), types)
+    for (name, _), column in zip(types, columns, strict=True):
+        rows[name] = column
+    return rows
+
+
+def _packed(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+    """Words [N] of fractions [N,K] with these numbers of bits, the first in the highest."""
+    word = np.zeros(len(shares), np.uint32)
+    for share, width in zip(shares.T, bits, strict=True):
+        whole = np.floor(np.clip(share, 0, 1) * (2**width - 1) + 0.5)
+        word = word << np.uint32(width) | whole.astype(np.uint32)
+    return word
+
+
+def _packed_quats(quats: np.ndarray) -> np.ndarray:
+    """Words [N] of quaternions: the index of the largest component, and the other three."""
+    unit = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
+    largest = np.abs(unit).argmax(1)
+    sign = np.where(np.take_along_axis(unit, largest[:, None], 1) < 0, -1, 1)
+    others = np.array([[j for j in range(4) if j != i] for i in range(4)])[largest]
+    three = sign * np.take_along_axis(unit, others, 1)
+    packed = _packed(0.5 + three * np.sqrt(0.5), (10, 10, 10))
+    return packed | largest.astype(np.uint32) << np.uint32(30)

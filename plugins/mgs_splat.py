@@ -7,7 +7,7 @@
 
 Properties:
 
-- `filename`: a 3DGS PLY.
+- `filename`: a 3DGS PLY, GLB or SPZ.
 - `colour_space`: "linear" or "srgb", in which colours are blended. Default: linear for files of
   mgs, srgb for those of other tools.
 - `background`: RGB behind the Gaussians in that space. Default: black.
@@ -34,7 +34,7 @@ from mgs.gaussians import Gaussians
 from mgs.splat import ListCache, as_drjit, render
 from mgs.splat.mitsuba_sensor import camera_from_sensor
 from mgs.splat.rendering import as_colour
-from mgs.splat_ply import ply_colour_space, read_ply
+from mgs.splat_files import colour_space, load_gaussians
 
 
 class MgsSplat(mi.CppADIntegrator):
@@ -46,8 +46,8 @@ class MgsSplat(mi.CppADIntegrator):
         if not isinstance(props.get("filename"), str):
             raise InputError("mgs_splat: `filename` is missing or no string; name a 3DGS PLY")
         path = str(mi.file_resolver().resolve(props["filename"]))
-        self.gaussians = as_drjit(read_ply(path))
-        self.colour_space = props.get("colour_space", ply_colour_space(path))
+        self.gaussians = as_drjit(load_gaussians(path))
+        self.colour_space = props.get("colour_space", colour_space(path))
         if self.colour_space not in ("linear", "srgb"):
             raise InputError(
                 f"mgs_splat: colour_space {self.colour_space!r} is unknown; choose linear or srgb"

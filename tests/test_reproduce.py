@@ -17,27 +17,17 @@ from refusals import occupied, refused
 from mgs.data.dataset import TEST_FOLDER
 from mgs.errors import InputError
 from mgs.files import write_json
-from mgs.fit.settings import COLOURS_ALONE
 from mgs.run.folder import read_checkpoint
-from mgs.run.nbv import run_nbv
 from mgs.study import case, free_fit, reproduce, setups
-from mgs.study import reproduce_results as results
 from mgs.study.case import Case, Scene, Size
 from mgs.study.reproduce import FREE_FIT, ReproduceSize, Run, RunSize
-from mgs.study.reproduce_results import Work
 from mgs.study.rocks import Rock
 from mgs.study.setups import SetupSize
 from mgs.study.sweep import cell_folder, run_cells
 
 ONE = RunSize(Size(48, 36, 8, 3, spp=1), 200, 2)
-TINY = ReproduceSize(
-    ONE,
-    ONE,
-    SetupSize(48, 36, 3, 1, 6, fewer=4, gaussians=200),
-    seed_rocks=1,
-    setup_rocks=2,
-    oracle_rocks=1,
-)
+FEW = SetupSize(48, 36, 3, 1, 6, fewer=4, gaussians=200)
+TINY = ReproduceSize(ONE, FEW, setup_rocks=2, oracle_rocks=1)
 
 
 def silent(name, done, total):
@@ -188,7 +178,7 @@ def test_a_prior_is_built_once_and_whole(tmp_path, monkeypatch):
 
 
 def test_a_timed_run_has_a_process_of_its_own(quick, tmp_path):
-    run = Run(Rock("boulder", 1), ONE, "farthest", budget=4, timed=True)
+    run = Run(Rock("boulder", 1), ONE, "farthest", budget=4)
     *before, cell = run.cells()
     found = run_cells(tmp_path, [*before, cell], silent)[cell.name]
     assert cell.alone
@@ -200,7 +190,7 @@ def test_a_timed_run_has_a_process_of_its_own(quick, tmp_path):
     choices = [step["seconds"]["score"] for step in steps[1:]]
     assert found["choice_seconds"] == pytest.approx(sum(choices) / 4)
     assert 100 < found["peak_megabytes"] < 4000
-    wrong = Run(Rock("boulder", 1), ONE, "nonsense", budget=1, timed=True)
+    wrong = Run(Rock("boulder", 1), ONE, "nonsense", budget=1)
     with pytest.raises(InputError, match=r"^policy nonsense: unknown"):
         run_cells(tmp_path, wrong.cells(), silent)
 
@@ -208,7 +198,7 @@ def test_a_timed_run_has_a_process_of_its_own(quick, tmp_path):
 def test_a_free_fit_is_measured_on_all_views(quick, tmp_path, monkeypatch):
     monkeypatch.setattr(free_fit, "in_new_process", lambda task, out, *how: task(*how))
     monkeypatch.setattr(free_fit, "PASSES", 3)
-    run = Run(Rock("boulder", 1), ONE, FREE_FIT, seeds=8, budget=0, timed=True)
+    run = Run(Rock("boulder", 1), ONE, FREE_FIT, seeds=8, budget=0)
     *before, cell = run.cells()
     found = run_cells(tmp_path, [*before, cell], silent)[cell.name]
     assert cell.alone
@@ -330,17 +320,6 @@ def test_table_1_is_there_for_the_rows_that_are_done(quick, tmp_path, capsys, mo
     assert f"Not done yet: {left}.\n" in text
 
 
-def fake(runs, value, steps=3):
-    """What runs might have found: curves that rise by 0.5 dB an image and end in value(run)."""
-    found = {}
-    for run in runs:
-        psnr = [value(run) - 0.5 * (steps - 1 - k) for k in range(steps)]
-        images, taken = [run.seeds + k for k in range(steps)], [0, run.size.images.frames // 2]
-        measured = {"test_psnr": psnr, "test_psnr_mask": [v - 3 for v in psnr]}
-        found[run.name] = {"images": images, "taken": taken, "coverage": [0.9] * steps} | measured
-    return found
-
-
 def made_up(value, scenes):
     """Rows of set-ups in which each policy finds value(policy) + the number of its rock."""
     return [
@@ -390,22 +369,6 @@ def test_views_are_chosen_without_a_fit_where_no_model_is_needed(quick, tmp_path
     assert [len(set(one["taken"])) for one in chosen] == [6] * 2
 
 
-def test_numbers_of_seeds_are_compared_at_equal_images(tmp_path):
-    runs = reproduce.seed_runs(TINY, 2)
-    assert {run.seeds + run.settings()["budget"] for run in runs} == {6}
-    found = fake(runs, lambda run: 25 + run.seeds / 10)
-    rows, _ = results.seed_rows(found, runs)
-    over = [row["test_psnr_over_four"] for row in rows[:6]]
-    assert over == pytest.approx([-0.3, -0.2, -0.1, 0, 0.2, 0.4])
-    results.write_seeds(Work(tmp_path, found, TINY, 2, "c"))
-    line = "| d-optimal | 1 | 90.0 | 180 (180) | 25.10 | -0.30 [-0.30, -0.30] |"
-    assert line in (tmp_path / "results/seeds.md").read_text()
-    assert (tmp_path / "results/seeds.png").stat().st_size > 10_000
-    assert results.largest_gap([0, 27, 23, 19], 32) == pytest.approx(19 * 360 / 32)
-    assert results.largest_gap([5], 8) == 360
-    assert results.largest_gap([6, 0, 2, 4], 8) == 90
-
-
 def test_a_set_up_changes_the_orbit_of_the_scene():
     rock = Rock("boulder", 11)
     case = setups.case_of(rock, setups.SETUPS["mixed distances"], setups.SetupSize())
@@ -413,25 +376,6 @@ def test_a_set_up_changes_the_orbit_of_the_scene():
     assert dataset.name == "dataset/boulder-11/hemisphere-1-2-3/36x128x96"
     assert dataset.arguments["changes"]["orbit"] == {"kind": "hemisphere", "distances": [1, 2, 3]}
     assert "gaussians" not in prior.arguments, "their number is automatic"
-
-
-def test_a_run_that_was_killed_goes_on(quick, tmp_path):
-    run = Run(Rock("boulder", 1), ONE, "d-optimal")
-    *before, cell = run.cells()
-    run_cells(tmp_path, before, silent)
-    folder = cell_folder(tmp_path, cell.name)
-    (folder / ".run.1.part").mkdir(parents=True)
-    dataset, prior = (tmp_path / cell.arguments[name] for name in ("dataset", "prior"))
-    given = {**run.settings(), "budget": 2, "evaluate_every": 1, "train": COLOURS_ALONE}
-
-    def stop(state):
-        if len(state.steps) == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run_nbv(dataset, folder / "run", prior=prior, on_step=stop, **given)
-    whole = run_cells(tmp_path, [*before, cell], silent)[cell.name]
-    assert whole == run_cells(tmp_path / "other", [*before, cell], silent)[cell.name]
 
 
 def test_every_run_of_every_result_has_its_own_cell():
@@ -447,10 +391,9 @@ def test_every_run_of_every_result_has_its_own_cell():
     ("arguments", "line"),
     [
         ("--scale huge", "--scale 'huge': unknown; choose one of quick, paper"),
-        ("--only table2", "unknown; choose some of table1,figures,setups,seeds,oracle"),
+        ("--only table2", "unknown; choose some of table1,figures,setups,oracle"),
         ("--only ,", "--only '': unknown"),
         ("--rocks 13", "--rocks 13: setups can have 1 to 12"),
-        ("--rocks 13 --only seeds", "--rocks 13: seeds can have 1 to 12"),
         ("--workers 2 --scheduler tcp://x:1", "give one of them"),
         ("--policy best", "--policy best: unknown; choose one of"),
         ("--policy uniform", "--policy uniform: is compared anyway"),

@@ -10,9 +10,7 @@ from hypothesis import strategies as st
 from mgs.study.output import table, with_interval
 from mgs.study.statistics import (
     MOST_ROCKS,
-    area,
     holm,
-    images_to_reach,
     interval,
     pareto_front,
     permutation_p,
@@ -20,13 +18,6 @@ from mgs.study.statistics import (
 from mgs.study.verdict import Claim, judged, paired, single, verdict_table
 
 numbers = st.floats(-10, 10, allow_nan=False).map(lambda x: round(x, 3))
-
-
-def test_the_area_is_the_mean_of_a_straight_line_and_weighs_gaps():
-    assert area([4, 5, 6], [20, 21, 22]) == pytest.approx(21)
-    assert area([4, 12], [10, 30]) == pytest.approx(20)
-    assert area([4, 5, 12], [0, 8, 8]) == pytest.approx((4 + 56) / 8)
-    assert area([4], [7.5]) == 7.5
 
 
 def test_the_interval_is_that_of_students_t():
@@ -64,13 +55,6 @@ def test_holm_rejects_as_the_step_down_procedure_does(p_values, alpha):
     adjusted = holm(p_values)
     assert {k for k, p in enumerate(adjusted) if p <= alpha} == rejected
     assert all(a >= p for a, p in zip(adjusted, p_values, strict=True))
-
-
-def test_a_level_is_reached_between_two_points_or_never():
-    assert images_to_reach([4, 5, 7], [20, 21, 23], 22) == pytest.approx(6)
-    assert images_to_reach([4, 5, 7], [20, 21, 23], 20) == 4
-    assert images_to_reach([4, 5, 7], [20, 19, 23], 19.5) == 4
-    assert images_to_reach([4, 5, 7], [20, 21, 23], 23.1) is None
 
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=12))

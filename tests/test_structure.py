@@ -15,7 +15,8 @@ import pytest
 ROOT = Path(__file__).parent.parent
 ROOMS = [
     "errors", "seeds", "runtime", "resources", "provenance", "colour", "rotation", "memory",
-    "notebook", "camera", "gaussians", "files", "images", "splat_ply", "metrics", "plotting",
+    "notebook", "camera", "gaussians", "files", "images", "splat_ply", "splat_gltf", "splat_files",
+    "metrics", "plotting",
     "data", "synth", "survey", "prior", "splat", "policy", "fit", "run", "report", "view",
     "bench", "study", "cli", "__main__",
 ]  # fmt: skip

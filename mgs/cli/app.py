@@ -56,6 +56,8 @@ COMMANDS = {
     "report": "report.report",
     "view": "pictures.view",
     "render": "pictures.render",
+    "export": "share.export",
+    "video": "share.video",
     "prune": "models.prune",
     "refit": "models.refit",
     "demo": "demo.demo",

@@ -19,7 +19,7 @@ from mgs.files import check_new_folder, folder_locked
 def render(
     splats: Annotated[
         Path,
-        argument("3DGS PLY of SH degree 0 to 3, binary, ascii or compressed, of mgs or others."),
+        argument("Gaussians of mgs or others: 3DGS PLY (binary, ascii, compressed), GLB or SPZ."),
     ],
     cameras: Annotated[
         Path, option("transforms.json (nerfstudio), or the dataset folder that holds it.")
@@ -32,8 +32,8 @@ def render(
     colour_space: Annotated[
         Literal["auto", "linear", "srgb"],
         option(
-            "Space in which the PLY's colours are blended: mgs trains in linear RGB, most other "
-            "tools in sRGB. auto: linear for files that mgs wrote (by their header), else srgb."
+            "Space in which the colours are blended: mgs trains in linear RGB, most other tools in "
+            "sRGB. auto: what the file says, else srgb."
         ),
     ] = "auto",
     background: Annotated[
@@ -58,7 +58,8 @@ def render(
     """
     from mgs.data.dataset import load_cameras
     from mgs.report.pictures import draw_views
-    from mgs.splat_ply import ply_colour_space, read_ply
+    from mgs.splat_files import colour_space as space_of
+    from mgs.splat_files import load_gaussians
 
     if not all(0 <= value <= 1 for value in background):
         given = " ".join(map(str, background))
@@ -66,8 +67,8 @@ def render(
     views = [
         (name, camera.resized(width) if width else camera) for name, camera in load_cameras(cameras)
     ]
-    gaussians = read_ply(splats)
-    space = ply_colour_space(splats) if colour_space == "auto" else colour_space
+    gaussians = load_gaussians(splats)
+    space = space_of(splats) if colour_space == "auto" else colour_space
     runtime.start()
     with folder_locked(out), progress_bar() as bar:
         check_new_folder(out)
@@ -81,7 +82,7 @@ def render(
 def view(
     subject: Annotated[
         Path,
-        argument("Folder that `mgs nbv` wrote, or a 3DGS PLY.", metavar="RUN|SPLATS.ply"),
+        argument("Folder that `mgs nbv` wrote, or a PLY, GLB or SPZ.", metavar="RUN|SPLATS"),
     ],
     port: Annotated[int, option("Port to serve on; 0: any free one.", min=0, max=65535)] = 8080,
     host: Annotated[

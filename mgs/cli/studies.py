@@ -66,13 +66,13 @@ def reproduce(
     only: Annotated[
         str | None,
         option(
-            "Results to make, separated by commas: table1, figures, setups, seeds, oracle. "
+            "Results to make, separated by commas: table1, figures, setups, oracle. "
             "Default: all but oracle."
         ),
     ] = None,
     rocks: Annotated[
         int | None,
-        option("Rocks of setups, seeds and oracle. Default: as --scale says.", min=1),
+        option("Rocks of setups and oracle. Default: as --scale says.", min=1),
     ] = None,
     policy: Annotated[
         list[str] | None,
@@ -91,8 +91,7 @@ def reproduce(
     ] = None,
 ) -> None:
     """Make the results of docs/results.md: Table I at equal numbers of images, policies in six
-    set-ups over many rocks with statistics, numbers of seeds, and an oracle that knows the test
-    views.
+    set-ups over many rocks with statistics, and an oracle that knows the test views.
 
     Every dataset, prior and run is made once and kept in OUT/cells; the results are written to
     OUT/results. Runs whose seconds are reported run one at a time: let nothing else run meanwhile.

@@ -83,6 +83,13 @@ def axis_names(up: Up, unit: str) -> tuple[str, str, str]:
     return f"{x} ({unit})", f"{y} ({unit})", f"{z} ({unit})"
 
 
+ACROSS = 3
+"""Most panels side by side in `orbit_figure`."""
+
+SEED, CHOSEN, NEWEST = "#8a8a8a", "#0072B2", "#D55E00"
+"""Colours of seeds, of chosen views, and of the one that was chosen last."""
+
+
 def orbit_figure(
     path: str | Path,
     positions: np.ndarray,
@@ -91,76 +98,95 @@ def orbit_figure(
     up: Up,
     unit: str,
 ) -> None:
-    """Draw the orbit from above, a panel for each run: poses, seeds, and the chosen views,
-    numbered.
+    """Draw the views that each run chose, from above, a panel for each run.
 
     positions: [C,3] camera centres, world. surface: [N,3] points of the rock. choices:
     label -> indices into positions: (seeds, chosen views in their order). up, unit: of the world
     (`mgs.data.dataset.Dataset`); it is drawn turned so that +Z is up.
     """
     import matplotlib
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-    from matplotlib.ticker import MaxNLocator
 
-    turn, (x, y, _) = upright(up), axis_names(up, unit)
-    positions = np.asarray(positions) @ turn.T
-    surface = np.asarray(surface) @ turn.T
-    last = max((len(chosen) for _, chosen in choices.values()), default=1)
-    norm = Normalize(1, max(last, 2))
-    with matplotlib.rc_context(STYLE):
-        figure = new_figure(3.1 * len(choices) + 0.8, 3.9)
-        axes = figure.subplots(1, len(choices), sharex=True, sharey=True, squeeze=False)[0]
-        for axis, (label, (seeds, chosen)) in zip(axes, choices.items(), strict=True):
-            _orbit_panel(axis, positions, surface, list(seeds), list(chosen), norm)
-            title = f"{label}: {len(seeds)} seeds, {len(chosen)} chosen"
-            axis.set(title=_in_lines(title), xlabel=x)
-        axes[0].set_ylabel(y)
-        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-        bar = figure.colorbar(ScalarMappable(norm, "viridis"), ax=list(axes), shrink=0.8, pad=0.01)
-        bar.locator = MaxNLocator(integer=True)
-        bar.set_label("step at which the view was chosen")
-        # Panels of a fixed aspect: the layout needs some passes to find room for two-line titles.
-        for _ in range(3):
-            figure.draw_without_rendering()
+    columns = min(ACROSS, len(choices))
+    lines = -(-len(choices) // columns)
+    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
+        figure = new_figure(2.7 * columns, 2.75 * lines + (0.6 if columns > 1 else 1.1))
+        axes = figure.subplots(lines, columns, squeeze=False).ravel()
+        for axis, (label, (seeds, chosen)) in zip(axes, choices.items(), strict=False):
+            draw_cameras(axis, positions, surface, seeds, chosen, up)
+            axis.set_title(_in_lines(label))
+        for axis in axes[len(choices) :]:
+            axis.remove()
+        _draw_length(axes[0], unit)
+        looks = (("candidate", "white", "#9a9a9a"), ("seed", SEED, SEED))
+        handles = [_disc(name, face, edge) for name, face, edge in looks]
+        handles.append(_disc("chosen, in this order", CHOSEN, CHOSEN))
+        figure.legend(handles=handles, loc="outside lower center", ncols=3 if columns > 1 else 1)
+        several = "the views that each policy chose" if len(choices) > 1 else "the chosen views"
+        figure.suptitle(f"From above: {several}")
         save_figure(figure, path)
 
 
-def _orbit_panel(
+def draw_cameras(
     axis: Axes,
     positions: np.ndarray,
     surface: np.ndarray,
-    seeds: list[int],
-    chosen: list[int],
-    norm: Any,
+    seeds: Sequence[int],
+    chosen: Sequence[int],
+    up: Up,
+    newest: int | None = None,
 ) -> None:
-    """Draw one run in `orbit_figure`. norm: colour scale of the order of the choices."""
-    xy = positions[:, :2]
-    centre = surface[:, :2].mean(axis=0)
-    rock = surface[:: max(1, len(surface) // 6000)]
-    axis.scatter(rock[:, 0], rock[:, 1], s=0.6, color="#b9b4ab", linewidths=0, zorder=1)
-    order = np.arange(1, len(chosen) + 1)
+    """Draw cameras from above into axes: all as rings, seeds as discs, chosen ones as discs with
+    their order.
+
+    newest: index of a camera to draw in NEWEST, with its line to the rock. Others: as
+    `orbit_figure`.
+    """
+    turn = upright(up)
+    xy = (np.asarray(positions) @ turn.T)[:, :2]
+    rock = (np.asarray(surface) @ turn.T)[:: max(1, len(surface) // 6000), :2]
+    centre = rock.mean(axis=0)
+    axis.scatter(*rock.T, s=0.6, color="#b9b4ab", linewidths=0)
     hollow = {"facecolors": "white", "edgecolors": "#9a9a9a", "linewidths": 0.6}
-    star = {"marker": "*", "color": "#D55E00", "linewidths": 0}
-    by_order = {"c": order, "cmap": "viridis", "norm": norm, "linewidths": 0}
-    axis.scatter(*xy.T, s=12, label="candidate", zorder=2, **hollow)
-    axis.scatter(*xy[seeds].T, s=46, label="seed", zorder=4, **star)
-    axis.scatter(*xy[chosen].T, s=26, label="chosen", zorder=3, **by_order)
-    for number, index in zip(order, chosen, strict=True):
-        outward = xy[index] - centre
-        outward = outward / max(float(np.linalg.norm(outward)), 1e-9)
-        axis.annotate(
-            str(number),
-            xy[index],
-            xytext=tuple(outward * 9),
-            textcoords="offset points",
-            fontsize=6,
-            ha="center",
-            va="center",
-        )
-    span = np.abs(xy - centre).max() * 1.2
+    axis.scatter(*xy.T, s=14, label="candidate", **hollow)
+    disc = {"s": 95, "linewidths": 0, "zorder": 3}
+    axis.scatter(*xy[list(seeds)].T, color=SEED, label="seed", **disc)
+    axis.scatter(*xy[list(chosen)].T, color=CHOSEN, label="chosen", **disc)
+    if newest is not None:
+        axis.plot(*np.stack([xy[newest], centre]).T, color=NEWEST, linewidth=1)
+        axis.scatter(*xy[newest], color=NEWEST, **disc)
+    text = {"color": "white", "fontsize": 7.5, "ha": "center", "va": "center_baseline"}
+    for order, index in enumerate(chosen, 1):
+        axis.annotate(str(order), xy[index], zorder=4, **text)
+    span = np.abs(xy - centre).max() * 1.12
     low, high = centre - span, centre + span
-    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])
+    axis.spines[:].set_visible(False)
+
+
+def _draw_length(axis: Axes, unit: str) -> None:
+    """Draw a bar of a round length into the lower left corner of axes."""
+    (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
+    wanted = (right - left) / 4
+    power = 10.0 ** np.floor(np.log10(wanted))
+    length = max(step * power for step in (1, 2, 5) if step * power <= wanted)
+    y = bottom + 0.02 * (top - bottom)
+    axis.plot([left, left + length], [y, y], color="black", linewidth=1.5)
+    axis.annotate(
+        f"{length:g} {unit}",
+        (left + length / 2, y),
+        (0, 3),
+        textcoords="offset points",
+        ha="center",
+        fontsize=8,
+    )
+
+
+def _disc(name: str, face: str, edge: str) -> Any:
+    """Entry of a legend."""
+    from matplotlib.lines import Line2D
+
+    look: dict[str, Any] = {"marker": "o", "linestyle": "none", "markersize": 7}
+    return Line2D([], [], markerfacecolor=face, markeredgecolor=edge, label=name, **look)
 
 
 def gain_figure(path: str | Path, gains: Mapping[str, Sequence[float]]) -> None:
@@ -169,24 +195,21 @@ def gain_figure(path: str | Path, gains: Mapping[str, Sequence[float]]) -> None:
     gains: label -> gain of each step after the seeds.
     """
     curves = {label: (range(1, len(values) + 1), values) for label, values in gains.items()}
-    panel = (curves, "active step", f"information gain ({GAIN_UNIT})")
-    _curves_figure(path, [panel], 4.8, lambda axes: axes[0].set_ylim(bottom=0))
+    panel = (curves, "chosen view", f"information gain ({GAIN_UNIT})")
+    title = "Information that each chosen view promised"
+    _curves_figure(path, [panel], 4.8, title, lambda axes: axes[0].set_ylim(bottom=0))
 
 
 def coverage_figure(path: str | Path, coverage: Curves) -> None:
-    """Draw surface coverage after each step, and what each step added (the paper's Fig. 3).
+    """Draw surface coverage after each step (the paper's Fig. 3).
 
     coverage: label -> (number of training images, share of the surface observed, 0 to 1), after the
     seeds and after each step.
     """
     percent = {label: (x, 100 * np.asarray(y, float)) for label, (x, y) in coverage.items()}
-    added = {label: (x[1:], np.diff(y)) for label, (x, y) in percent.items()}
-    panels = [
-        (percent, "images", r"surface coverage $C$ (%)"),
-        (added, "images", "coverage gained (percentage points)"),
-    ]
-    zero = {"color": "#9a9a9a", "linewidth": 0.8, "zorder": 0}
-    _curves_figure(path, panels, 7.2, lambda axes: axes[1].axhline(0, **zero))
+    panel = (percent, "images", "surface seen (%)")
+    title = "Surface that at least one image sees"
+    _curves_figure(path, [panel], 4.8, title, lambda axes: axes[0].set_ylim(top=100))
 
 
 def psnr_figure(path: str | Path, panels: Mapping[str, Curves]) -> None:
@@ -194,15 +217,15 @@ def psnr_figure(path: str | Path, panels: Mapping[str, Curves]) -> None:
 
     panels: metric and set of views -> label -> (numbers of images, PSNR in dB).
     """
-    x = "images in the training set"
-    drawn = [(curves, x, f"{what} (dB)") for what, curves in panels.items()]
-    _curves_figure(path, drawn, 3.6 * len(panels))
+    drawn = [(curves, "images", f"{what} (dB)") for what, curves in panels.items()]
+    _curves_figure(path, drawn, 3.6 * len(panels), "Quality after each image")
 
 
 def _curves_figure(
     path: str | Path,
     panels: Sequence[tuple[Mapping[str, Any], str, str]],
     width: float,
+    title: str,
     finish: Any = lambda axes: None,
 ) -> None:
     """Write a figure of panels (curves, x label, y label), one line for each label.
@@ -220,6 +243,7 @@ def _curves_figure(
                 axis.plot(xs, ys, **style)
             axis.set(xlabel=x, ylabel=y)
             axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+        figure.suptitle(title)
         finish(axes)
         _legend_beside(figure)
         save_figure(figure, path)

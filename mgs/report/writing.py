@@ -103,13 +103,14 @@ def shown_view(runs: Sequence[RunFiles], dataset: Dataset) -> tuple[Frame, str]:
     """The view that the comparison shows, and the key of metrics.json that lists it, "test_views"
     or "views".
 
-    It is the middle test view if all runs were measured on test views, else the middle one of those
-    that the fewest runs were trained on. Of frames on demand, only those that all runs have taken
-    have an image. Raises InputError as `Dataset.test_views`, and if there is no such frame.
+    It is the view of median PSNR (mean over the runs) among the test views if all runs were
+    measured on them, else among those that the fewest runs were trained on. Of frames on demand,
+    only those that all runs have taken have an image. Raises InputError as
+    `Dataset.test_views`, and if there is no such frame.
     """
     tests = dataset.test_views()
     if tests is not None and all((run.metrics or {}).get("test_views") for run in runs):
-        return tests.frames[len(tests) // 2], "test_views"
+        return _median_view(runs, tests.frames, "test_views"), "test_views"
     shared = set.intersection(*({dataset.frames[i].name for i in run.taken} for run in runs))
     shown = dataset.with_images(shared)
     if not shown:
@@ -117,8 +118,18 @@ def shown_view(runs: Sequence[RunFiles], dataset: Dataset) -> tuple[Frame, str]:
             f"{dataset.root}: has no test views, and no frame that all runs have taken; "
             "report them one by one"
         )
-    fewest = least_trained(runs, dataset, shown)
-    return fewest[len(fewest) // 2], "views"
+    return _median_view(runs, least_trained(runs, dataset, shown), "views"), "views"
+
+
+def _median_view(runs: Sequence[RunFiles], frames: Sequence[Frame], views: str) -> Frame:
+    """The frame of median PSNR, mean over the runs; of an even number, the better of two. views:
+    key of metrics.json that lists them."""
+    measured = [{v["name"]: v["psnr"] for v in (run.metrics or {}).get(views, [])} for run in runs]
+
+    def mean_psnr(frame: Frame) -> float:
+        return sum(psnr.get(frame.name, 0.0) for psnr in measured)
+
+    return sorted(frames, key=mean_psnr)[len(frames) // 2]
 
 
 def _caption(run: RunFiles, views: str, name: str) -> str:

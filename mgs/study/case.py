@@ -29,11 +29,7 @@ from mgs.prior.settings import PriorSettings
 from mgs.report.evaluation import evaluate_model, evaluate_run
 from mgs.run.folder import Run, open_run
 from mgs.run.nbv import resume_nbv, start_run
-from mgs.run.state import State
 from mgs.study.sweep import CELLS, Cell
-
-CURVES = ("images", "coverage", "test_psnr", "test_psnr_mask")
-"""Entries of each step that `run_policy` returns."""
 
 
 @dataclass(frozen=True)
@@ -183,21 +179,6 @@ def begun_run(root: Path, out: Path, dataset: str, prior: str, settings: dict[st
         return open_run(run)
     train = {**COLOURS_ALONE, **settings.get("train", {})}
     return start_run(root / dataset, run, prior=root / prior, **settings | {"train": train})
-
-
-def run_policy(
-    root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]
-) -> dict[str, Any]:
-    """Run a policy. Returns a list for each of CURVES, one number for each fit, and "taken", the
-    indices of the frames in the order taken."""
-    run = begun_run(root, out, dataset, prior, {"evaluate_every": 1, **settings})
-    return curves_of(resume_nbv(run, policy=settings.get("policy")).state)
-
-
-def curves_of(state: State) -> dict[str, Any]:
-    """Result of `run_policy` from the last state of a run."""
-    fitted = [step for step in state.steps if "loss" in step]
-    return {key: [step[key] for step in fitted] for key in CURVES} | {"taken": state.taken}
 
 
 def time_policy(

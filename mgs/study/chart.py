@@ -10,10 +10,10 @@ from __future__ import annotations
 import shlex
 import shutil
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,6 +30,9 @@ from mgs.study.statistics import pareto_front
 from mgs.study.sweep import Cell, Report, Results, run_cells
 from mgs.study.timing import span, timed, with_seconds
 from mgs.study.verdict import Claim, Row, judged, verdict_table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 KINDS = ("fit", "run")
 
@@ -310,40 +313,56 @@ def run_chart(
         text += f"\n{verdict_table(claims)}" if claims else ""
         more = {"preset": preset, "repeats": repeats, "reference_seconds": unit, "claims": claims}
         write_table(out, kind, rows, text, shlex.join(words), **more)
-        draw(out / f"{kind}.png", rows)
+        draw(out / f"{kind}.png", {kind: rows})
         measured[kind] = rows, claims
     return measured
 
 
-def draw(path: Path, rows: Sequence[Row]) -> None:
-    """Draw seconds against PSNR and SSIM for points of the usual number of images: by the last of
-    their factors, with the front and the names of presets."""
+TITLES = {"fit": "What a second buys: single fits", "run": "What a second buys: whole runs"}
+"""Titles of the figures of the kinds."""
+
+
+def draw(path: Path, kinds: Mapping[str, Sequence[Row]]) -> None:
+    """Draw seconds against PSNR, a panel for each kind of KINDS, for points of the usual number of
+    images: by the last of their factors, with the best of each time and the names of presets.
+
+    Raises InputError if the file cannot be written.
+    """
     import matplotlib
 
-    most = Counter(row["images"] for row in rows).most_common(1)[0][0]
-    rows = [row | {"factor": row["factors"].split("; ")[-1]} for row in rows]
-    rows = [row for row in rows if row["images"] == most]
-    names = list(dict.fromkeys(row["factor"] for row in rows))
+    names = list(dict.fromkeys(_factor(row) for rows in kinds.values() for row in rows))
+    looks = dict(zip(names, group_styles(names), strict=True))
     with matplotlib.rc_context(STYLE):
-        figure = new_figure(10, 4)
-        panels = figure.subplots(1, 2)
-        metrics = (("psnr", "front", "PSNR on the test views, dB"), ("ssim", "front_ssim", "SSIM"))
-        for axes, (metric, flag, label) in zip(panels, metrics, strict=True):
-            front = sorted((row["seconds"], row[metric]) for row in rows if row[flag])
-            axes.step(*zip(*front, strict=True), where="post", color="black", lw=1, label="front")
-            for name, style in zip(names, group_styles(names), strict=True):
-                of = [row for row in rows if row["factor"] == name]
-                low, x, high = (
-                    np.array([row[f"seconds{end}"] for row in of]) for end in ("_low", "", "_high")
-                )
-                look = style | {"linestyle": "none"}
-                axes.errorbar(x, [row[metric] for row in of], xerr=[x - low, high - x], **look)
-            for row in rows:
-                at = row["seconds"], row[metric]
-                axes.annotate(row["preset"], at, (6, -9), textcoords="offset points", fontsize=8)
-            logarithmic(axes)
-            axes.margins(0.08)
-            axes.set(xlabel=f"seconds, {most} images", ylabel=label)
-        handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        figure = new_figure(0.6 + 4.2 * len(kinds), 4.6)
+        panels = figure.subplots(1, len(kinds), squeeze=False)[0]
+        for axes, (kind, rows) in zip(panels, kinds.items(), strict=True):
+            _draw_kind(axes, rows, looks)
+            axes.set_title(TITLES[kind])
         save_figure(figure, path)
+
+
+def _factor(row: Row) -> str:
+    return str(row["factors"].split("; ")[-1])
+
+
+def _draw_kind(axes: Axes, rows: Sequence[Row], looks: Mapping[str, dict[str, Any]]) -> None:
+    """Draw one panel. looks: keywords for matplotlib by factor."""
+    most = Counter(row["images"] for row in rows).most_common(1)[0][0]
+    rows = [row for row in rows if row["images"] == most]
+    front = sorted((row["seconds"], row["psnr"]) for row in rows if row["front"])
+    ahead = {"color": "black", "linewidth": 1, "zorder": 1, "label": "best of its time"}
+    axes.step(*zip(*front, strict=True), where="post", **ahead)
+    for name in dict.fromkeys(map(_factor, rows)):
+        of = [row for row in rows if _factor(row) == name]
+        low, x, high = (
+            np.array([row[f"seconds{end}"] for row in of]) for end in ("_low", "", "_high")
+        )
+        look = looks[name] | {"linestyle": "none", "elinewidth": 0.8, "markersize": 6}
+        axes.errorbar(x, [row["psnr"] for row in of], xerr=[x - low, high - x], **look)
+    for row in rows:
+        at = row["seconds"], row["psnr"]
+        axes.annotate(row["preset"], at, (6, -12), textcoords="offset points")
+    logarithmic(axes)
+    axes.margins(0.08)
+    axes.set(xlabel=f"seconds, {most} images", ylabel="PSNR on the test views (dB)")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, fontsize=9)

@@ -109,14 +109,54 @@ def draw_panels(path: Path, panels: Sequence[Panel], rows: Sequence[Row]) -> Non
         axes = figure.subplots(len(lines), columns, squeeze=False, gridspec_kw=ratios).ravel()
         for axis, (panel, chosen) in zip(axes, drawn, strict=False):
             (_draw_lines if _numeric(panel, chosen) else _draw_names)(axis, panel, chosen)
-            axis.set_title(panel.title)
             if panel.by and not shared:
-                axis.legend(loc="lower center", bbox_to_anchor=(0.5, 1.02), ncols=2)
+                axis.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
+                figure.suptitle(panel.title)
+            else:
+                axis.set_title(panel.title)
         for axis in axes[len(drawn) :]:
             axis.remove()
         if shared:
             handles, labels = axes[0].get_legend_handles_labels()
             figure.legend(handles, labels, loc="outside upper center", ncols=2 * columns)
+        save_figure(figure, path)
+
+
+def draw_matrix(path: Path, panel: Panel, rows: Sequence[Row]) -> None:
+    """Draw a column y of rows as numbers in a matrix: x across, `by` down, best mean first.
+
+    Blue is above 0, orange below. A number is bold where its interval (columns y_low, y_high) is on
+    one side of 0. Raises InputError if the file cannot be written.
+    """
+    import matplotlib
+
+    across = list(dict.fromkeys(row[panel.x] for row in rows))
+    cells = {(row[panel.by or ""], row[panel.x]): row for row in rows}
+    groups = list(dict.fromkeys(row[panel.by or ""] for row in rows))
+
+    def value(group: Any, x: Any, end: str = "") -> float:
+        found = cells.get((group, x), {}).get(f"{panel.y}{end}")
+        return float("nan") if found is None else float(found)
+
+    groups.sort(key=lambda group: -np.nanmean([value(group, x) for x in across]))
+    numbers = np.array([[value(group, x) for x in across] for group in groups])
+    limit = float(np.nanmax(np.abs(numbers))) or 1.0
+    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
+        figure = new_figure(1.6 + 0.95 * len(across), 0.9 + 0.3 * len(groups))
+        axes = figure.subplots()
+        scale = {"cmap": "PuOr", "vmin": -1.6 * limit, "vmax": 1.6 * limit, "aspect": "auto"}
+        axes.imshow(numbers, **scale)
+        for i, group in enumerate(groups):
+            for k, x in enumerate(across):
+                sure = value(group, x, "_low") > 0 or value(group, x, "_high") < 0
+                weight = "bold" if sure else "normal"
+                text = "–" if np.isnan(numbers[i, k]) else f"{numbers[i, k]:+.2f}"
+                axes.text(k, i, text, ha="center", va="center", fontweight=weight)
+        axes.set_xticks(range(len(across)), across)
+        axes.set_yticks(range(len(groups)), groups)
+        axes.tick_params(length=0)
+        axes.spines[:].set_visible(False)
+        axes.set_title(panel.title)
         save_figure(figure, path)
 
 
@@ -171,7 +211,9 @@ def _draw_lines(axis: Axes, panel: Panel, rows: Sequence[Row]) -> None:
         xs, points = _points(panel, rows, group)
         order = np.argsort(xs)
         x, (mean, low, high) = np.asarray(xs, float)[order], points[:, order]
-        axis.plot(x, mean, **(style | {"marker": ""} if crowded else style))
+        alone = {"marker": "*", "markersize": 13, "color": "black", "zorder": 3}
+        look = {"marker": ""} if crowded else alone if len(x) == 1 else {}
+        axis.plot(x, mean, **(style | look))
         axis.fill_between(x, low, high, color=style["color"], alpha=0.15, linewidth=0)
     if panel.log:
         logarithmic(axis)

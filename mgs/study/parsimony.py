@@ -315,10 +315,16 @@ def run_study(
     text = f"{table(COLUMNS, choices)}\n{verdict_table(claims)}"
     more = {"preset": preset, "priors": priors, "claims": claims}
     write_table(out, "parsimony", rows, text, command, **more)
+    draw(out / "parsimony.png", rows)
+    return choices, claims
+
+
+def draw(path: Path, rows: Sequence[Row]) -> None:
+    """Draw PSNR against the number of parameters, a panel for each scene. Raises InputError if the
+    file cannot be written."""
     label, axes = "PSNR inside the rock (dB)", ("parameters", "psnr_inside")
     panels = [
-        Panel(*axes, "parameters", label, "choice", True, (("run", scene),), scene)
-        for scene in size.scenes
+        Panel(*axes, "learned parameters", label, "choice", True, (("run", scene),), scene)
+        for scene in dict.fromkeys(row["run"] for row in rows)
     ]
-    draw_panels(out / "parsimony.png", panels, rows)
-    return choices, claims
+    draw_panels(path, panels, rows)

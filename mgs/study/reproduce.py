@@ -39,9 +39,6 @@ FEWER_IMAGES fewer images, as the paper counts; and a fit that is not held to a 
 
 FEWER_IMAGES = 4
 
-SEED_COUNTS = (1, 2, 3, 4, 6, 8)
-SEED_POLICIES = ("d-optimal", "paper")
-
 FREE_FIT = "free-fit"
 OTHER_TASKS = {FREE_FIT: "mgs.study.free_fit:time_free_fit"}
 """Tasks of runs that have no policy of `mgs nbv`."""
@@ -70,16 +67,13 @@ TABLE_ROCK = Rock("boulder", 0)
 
 @dataclass(frozen=True)
 class ReproduceSize:
-    """Size of a reproduction: of the runs of Table I, of those over numbers of seeds, of the
-    set-ups, and how many rocks these results have.
+    """Size of a reproduction: of the runs of Table I, of the set-ups, and numbers of rocks.
 
     own_policies: policies that the set-ups compare, too. meshes: rocks in place of FRESH.
     """
 
     table: RunSize
-    seeds: RunSize
     setups: SetupSize
-    seed_rocks: int = 5
     setup_rocks: int = len(FRESH)
     oracle_rocks: int = 2
     own_policies: tuple[str, ...] = ()
@@ -96,14 +90,9 @@ class ReproduceSize:
 
 
 SIZES = {
-    "quick": ReproduceSize(
-        RunSize(Size(320, 240, 32, 12), 10_000, 8),
-        RunSize(Size(240, 180, 32, 12), 5_000, 8),
-        SetupSize(),
-    ),
+    "quick": ReproduceSize(RunSize(Size(320, 240, 32, 12), 10_000, 8), SetupSize()),
     "paper": ReproduceSize(
         RunSize(Size(640, 480, 100, 24, spp=16), 100_000, 50),
-        RunSize(Size(320, 240, 48, 24), 10_000, 20),
         SetupSize(320, 240, 24, 16),
     ),
 }
@@ -111,8 +100,8 @@ SIZES = {
 
 @dataclass(frozen=True)
 class Run:
-    """A run of a policy on the views of a rock. budget: by default that of the size. timed: it runs
-    alone, for its seconds and memory, and is measured on all views."""
+    """A run of a policy on the views of a rock. It runs alone, for its seconds and memory, and is
+    measured on all views. budget: by default that of the size."""
 
     rock: Rock
     size: RunSize
@@ -120,7 +109,6 @@ class Run:
     seeds: int = SEEDS
     budget: int | None = None
     draw: int = 0
-    timed: bool = False
 
     @property
     def case(self) -> Case:
@@ -130,20 +118,18 @@ class Run:
 
     def cells(self) -> list[Cell]:
         """Cells of the run; the last is the run itself."""
-        usual = "time_policy" if self.timed else "run_policy"
-        task = OTHER_TASKS.get(self.policy, f"mgs.study.case:{usual}")
-        return self.case.with_task(self.name, task, self.timed, settings=self.settings())
+        task = OTHER_TASKS.get(self.policy, "mgs.study.case:time_policy")
+        return self.case.with_task(self.name, task, alone=True, settings=self.settings())
 
     @property
     def name(self) -> str:
         """Name of its cell."""
         images, settings = self.size.images, self.settings()
-        kind = "timed" if self.timed else "run"
         shape = f"{images.frames}x{images.width}x{images.height}-{self.size.gaussians}"
         views = f"{self.seeds}+{settings['budget']}-{settings['seed']}"
         views += f"-by{settings['batch']}" if "batch" in settings else ""
         version = "".join(f"-{digest[:8]}" for digest in policy_record(self.policy).values())
-        where = f"{kind}/{self.rock.name}/ring-{shape}"
+        where = f"timed/{self.rock.name}/ring-{shape}"
         return f"{where}/{self.label}{version}-{views}"
 
     @property
@@ -178,23 +164,12 @@ def table_runs(size: ReproduceSize) -> dict[str, Run]:
         draws = DRAWS if policy == "random" else 1
         for draw in range(draws):
             label = policy if draws == 1 else f"{policy}, draw {draw + 1}"
-            runs[label] = Run(TABLE_ROCK, one, policy, draw=draw, timed=True)
-    runs[FEWER] = Run(TABLE_ROCK, one, "coverage", budget=one.budget - FEWER_IMAGES, timed=True)
-    runs[ALL_VIEWS] = Run(TABLE_ROCK, one, "uniform", budget=one.images.frames - SEEDS, timed=True)
-    runs |= {policy: Run(TABLE_ROCK, one, policy, timed=True) for policy in SLOW_POLICIES}
-    runs[AS_3DGS] = Run(TABLE_ROCK, one, FREE_FIT, seeds=one.images.frames, budget=0, timed=True)
+            runs[label] = Run(TABLE_ROCK, one, policy, draw=draw)
+    runs[FEWER] = Run(TABLE_ROCK, one, "coverage", budget=one.budget - FEWER_IMAGES)
+    runs[ALL_VIEWS] = Run(TABLE_ROCK, one, "uniform", budget=one.images.frames - SEEDS)
+    runs |= {policy: Run(TABLE_ROCK, one, policy) for policy in SLOW_POLICIES}
+    runs[AS_3DGS] = Run(TABLE_ROCK, one, FREE_FIT, seeds=one.images.frames, budget=0)
     return runs
-
-
-def seed_runs(size: ReproduceSize, count: int) -> list[Run]:
-    """Numbers of seeds, at equal numbers of images."""
-    total = SEEDS + size.seeds.budget
-    return [
-        Run(rock, size.seeds, policy, seeds=seeds, budget=total - seeds)
-        for rock in size.some_rocks(count)
-        for policy in SEED_POLICIES
-        for seeds in SEED_COUNTS
-    ]
 
 
 def setup_cells(size: ReproduceSize, count: int) -> list[Cell]:
@@ -234,7 +209,6 @@ RESULTS = {
     "table1": Result(lambda size, _: _runs_cells(table_runs(size).values())),
     "figures": Result(lambda size, _: _runs_cells(figure_runs(size))),
     "setups": Result(setup_cells, "setup_rocks", most=len(FRESH)),
-    "seeds": Result(lambda size, n: _runs_cells(seed_runs(size, n)), "seed_rocks", most=len(FRESH)),
     "oracle": Result(oracle_cells, "oracle_rocks", optional=True, most=len(FRESH)),
 }
 """Every result by name, in the order in which they are made."""
@@ -320,6 +294,4 @@ def _with_meshes(
             raise InputError(f"--mesh {mesh}: {NAMESAKE}")
         rocks.append(Rock(mesh.stem, 0, k, mesh.resolve(), file_digest(mesh)))
     count = len(rocks)
-    return replace(
-        size, meshes=tuple(rocks), setup_rocks=count, seed_rocks=count, oracle_rocks=count
-    )
+    return replace(size, meshes=tuple(rocks), setup_rocks=count, oracle_rocks=count)

@@ -13,9 +13,8 @@ from mgs.files import write_csv
 from mgs.report.evaluation import evaluate_run
 from mgs.report.writing import write_report
 from mgs.study import reproduce, setups
-from mgs.study.output import Panel, draw_panels, table, with_interval, write_table
+from mgs.study.output import Panel, draw_panels, table, write_table
 from mgs.study.reproduce import ReproduceSize, Run
-from mgs.study.statistics import interval
 from mgs.study.sweep import Report, cell_folder, found, run_cells
 from mgs.study.verdict import Row
 
@@ -23,10 +22,6 @@ Found = Mapping[str, Mapping[str, Any]]
 """Results of cells by name."""
 
 Rows = list[Row]
-
-MEASURES = ("test_psnr", "test_psnr_mask")
-"""Mean PSNR over the test views, dB: of the full frame, by which policies are judged, and inside
-the rock's mask."""
 
 PAPER_TABLE = (("D-Optimal NBV", 54, 25.97, 0.9654), ("Coverage-Greedy", 50, 26.06, 0.9648))
 """Table I of the paper: method, images, PSNR in dB and SSIM over all 100 views of its own rock,
@@ -87,105 +82,6 @@ def table_text(rows: Rows, left: Sequence[str]) -> str:
     return table(TABLE_COLUMNS, shown) + to_come
 
 
-def by_rock(results: Found, runs: Sequence[Run]) -> Rows:
-    """A row for each step of each run, with the MEASURES and the coverage."""
-    rows = []
-    for run in runs:
-        about = {
-            "rock": run.rock.index,
-            "scene": run.rock.scene,
-            "rock_seed": run.rock.seed,
-            "policy": run.label,
-            "draw": run.draw,
-            "seeds": run.seeds,
-        }
-        curves = [results[run.name][key] for key in ("images", *MEASURES, "coverage")]
-        for images, psnr, psnr_mask, coverage in zip(*curves, strict=True):
-            measured = dict(zip(MEASURES, (psnr, psnr_mask), strict=True))
-            rows.append(about | {"images": images} | measured | {"coverage": coverage})
-    return rows
-
-
-def last_rows(results: Found, runs: Sequence[Run]) -> Rows:
-    """A row for each run: its last step."""
-    return [by_rock(results, [run])[-1] | {"run": run.rock.name} for run in runs]
-
-
-def with_differences(
-    rows: Rows, name: str, reference: Row, same: Sequence[str], keys: Sequence[str] = MEASURES
-) -> Rows:
-    """Rows with KEY_NAME, the difference of each key from the row that has the entries `reference`
-    and the same values of `same`; unchanged where there is none."""
-    known = {
-        tuple(row[key] for key in same): row for row in rows if reference.items() <= row.items()
-    }
-    made = []
-    for row in rows:
-        other = known.get(tuple(row[key] for key in same))
-        gains = {f"{key}_{name}": row[key] - other[key] for key in keys} if other else {}
-        made.append(row | gains)
-    return made
-
-
-def summary(rows: Rows, by: Sequence[str], keys: Sequence[str]) -> Rows:
-    """A row for each combination of `by`: number of rocks, and KEY, KEY_low, KEY_high, the mean of
-    each key over rocks and its 95 % interval (None for one rock)."""
-    groups: dict[tuple[Any, ...], Rows] = {}
-    for row in rows:
-        groups.setdefault(tuple(row[key] for key in by), []).append(row)
-    made = []
-    for values, group in groups.items():
-        one: Row = dict(zip(by, values, strict=True)) | {"rocks": len(group)}
-        for key in keys:
-            if key in group[0]:
-                numbers = [row[key] for row in group]
-                low, high = interval(numbers) or (None, None)
-                ends = {f"{key}_low": low, f"{key}_high": high}
-                one |= {key: float(np.mean(numbers)), **ends}
-        made.append(one)
-    return made
-
-
-def _keys(*names: str) -> list[str]:
-    """MEASURES, and each with the name of a difference."""
-    return [f"{key}{end}" for end in ("", *(f"_{name}" for name in names)) for key in MEASURES]
-
-
-def largest_gap(taken: Sequence[int], frames: int) -> float:
-    """Largest angle between neighbours among the frames taken of an evenly spaced ring."""
-    turned = np.sort(taken)
-    return float(np.diff(turned, append=turned[0] + frames).max() * 360 / frames)
-
-
-SEED_COLUMNS: dict[str, str | Callable[[Row], str]] = {
-    "policy": "policy",
-    "seeds": "seeds",
-    "they see (%)": lambda row: f"{100 * row['first_coverage']:.1f}",
-    "largest gap (most), degrees": lambda row: f"{row['gap']:.0f} ({row['gap_max']:.0f})",
-    "test views (dB)": "test_psnr:.2f",
-    "over four seeds (dB)": lambda row: with_interval(row, "test_psnr_over_four"),
-    "rock (dB)": lambda row: with_interval(row, "test_psnr_mask_over_four"),
-}
-
-
-def seed_rows(results: Found, runs: Sequence[Run]) -> tuple[Rows, Rows]:
-    """A row for each policy and number of seeds, and the rows by rock: the last model, its
-    difference from four seeds, coverage of the seeds, and `largest_gap` (mean, most)."""
-    rows = with_differences(
-        last_rows(results, runs), "over_four", {"seeds": reproduce.SEEDS}, ("policy", "rock")
-    )
-    for row, run in zip(rows, runs, strict=True):
-        numbers = results[run.name]
-        row |= {"first_coverage": numbers["coverage"][0]}
-        row |= {"gap": largest_gap(numbers["taken"], run.size.images.frames)}
-    keys = [*_keys("over_four"), "first_coverage", "gap"]
-    means = summary(rows, ("policy", "seeds", "images"), keys)
-    for mean in means:
-        alike = [r for r in rows if (r["policy"], r["seeds"]) == (mean["policy"], mean["seeds"])]
-        mean["gap_max"] = max(row["gap"] for row in alike)
-    return means, rows
-
-
 @dataclass(frozen=True)
 class Work:
     """Inputs of a result: the study's folder `root`, the results of cells, the size, the number of
@@ -201,16 +97,6 @@ class Work:
     def out(self) -> Path:
         """Folder for the files."""
         return self.root / "results"
-
-    def write(
-        self, name: str, rows: Rows, text: str, each: Rows, panels: Sequence[Panel], drawn: Rows
-    ) -> list[Path]:
-        """Write NAME.csv, .json and .md of rows, NAME_by_rock.csv of the rows `each`, and NAME.png
-        of the rows `drawn`."""
-        draw_panels(self.out / f"{name}.png", panels, drawn)
-        by_rock = write_csv(self.out / f"{name}_by_rock.csv", each)
-        written = write_table(self.out, name, rows, text, self.command, rocks=self.count)
-        return [*written, by_rock, self.out / f"{name}.png"]
 
 
 def write_table1(work: Work) -> list[Path]:
@@ -228,16 +114,6 @@ def write_figures(work: Work) -> list[Path]:
     for run in runs:
         evaluate_run(run)  # draws; the metrics are there already
     return write_report(work.out / "figures", runs)
-
-
-def write_seeds(work: Work) -> list[Path]:
-    """seeds.csv, .json, .md and .png; seeds_by_rock.csv."""
-    runs = reproduce.seed_runs(work.size, work.count)
-    means, rows = seed_rows(work.results, runs)
-    label = "PSNR over four seeds (dB)"
-    panels = (Panel("seeds", "test_psnr_over_four", "seed views", label, "policy"),)
-    each = by_rock(work.results, runs)
-    return work.write("seeds", means, table(SEED_COLUMNS, means), each, panels, rows)
 
 
 def write_setups(work: Work) -> list[Path]:
@@ -264,7 +140,6 @@ def write_setups(work: Work) -> list[Path]:
 WRITERS: dict[str, Callable[[Work], list[Path]]] = {
     "table1": write_table1,
     "figures": write_figures,
-    "seeds": write_seeds,
     "setups": write_setups,
     "oracle": write_setups,
 }

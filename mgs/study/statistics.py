@@ -11,26 +11,6 @@ MOST_ROCKS = 20
 """Most differences of a permutation test, which enumerates all 2^n sign flips."""
 
 
-def area(images: Sequence[float], values: Sequence[float]) -> float:
-    """Mean of the curve values(images), in the unit of the values: its area over the length of the
-    axis. images: rising. A curve of one point is its value."""
-    if len(images) == 1:
-        return float(values[0])
-    return float(np.trapezoid(values, images) / (images[-1] - images[0]))
-
-
-def images_to_reach(images: Sequence[float], values: Sequence[float], level: float) -> float | None:
-    """Number of images at which the curve values(images) first reaches a level, with linear
-    interpolation; None if it never does. images: rising."""
-    for k, value in enumerate(values):
-        if value >= level:
-            if k == 0:
-                return float(images[0])
-            share = (level - values[k - 1]) / (value - values[k - 1])
-            return float(images[k - 1] + share * (images[k] - images[k - 1]))
-    return None
-
-
 def interval(numbers: Sequence[float]) -> tuple[float, float] | None:
     """Student's t interval of 95 % of the mean of independent numbers, (low, high); None for fewer
     than two."""

@@ -18,7 +18,7 @@ from mgs.report.page_facts import step_facts
 from mgs.report.runs import read_metrics, up_of
 from mgs.run.ending import RunEnd
 from mgs.run.folder import Run, open_run
-from mgs.splat_ply import ply_colour_space, read_ply
+from mgs.splat_files import colour_space, load_gaussians
 
 SCALARS = ("information", "uncertainty", "unobserved")
 """Scalars of `mgs.report.diagnostics` that the viewer shows."""
@@ -67,7 +67,7 @@ class Subject:
 
 
 def read_subject(path: str | Path, follow: bool = False) -> Subject:
-    """Read a run folder or a PLY of Gaussians. follow: accept a run without a finished step.
+    """Read a run folder or a file of Gaussians. follow: accept a run without a finished step.
 
     Raises InputError if there is neither, if a file is damaged or the dataset has changed, and,
     unless `follow`, if the run has no finished step.
@@ -79,7 +79,7 @@ def read_subject(path: str | Path, follow: bool = False) -> Subject:
         raise InputError(f"{path}: --follow needs the folder of a run")
     if not path.is_file():
         raise InputError(f"{path}: no such run folder or PLY file")
-    return scaled(Subject(path.name, read_ply(path), ply_colour_space(path), unit="unit"))
+    return scaled(Subject(path.name, load_gaussians(path), colour_space(path), unit="unit"))
 
 
 def scaled(subject: Subject) -> Subject:

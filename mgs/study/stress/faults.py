@@ -264,11 +264,38 @@ def indicators_of(
     return fit.gaussians, detectors.step_indicators(views, fit.losses, seen, [], drift)
 
 
+SIZES_IN_WORDS = {
+    "none": "no fault",
+    "pose noise": "{:g}° and cm",
+    "image noise": "{:g} of the range",
+    "exposure": "{:g} stops",
+    "motion blur": "{:g} px",
+    "defocus": "{:g} px",
+    "missing depth": "{:.0%}",
+    "shifted mask": "{:g} px",
+    "wrong mask": "{:g} px",
+    "noisy prior": "{:g} spacings",
+    "smoothed prior": "{:g} times",
+    "holes": "{:.0%} of the surface",
+    "shifted prior": "{:g} m",
+    "scaled prior": "factor {:g}",
+    "turned prior": "{:g}°",
+}
+"""Sizes of faults with their units."""
+
+
+def label_of(fault: str, size: float) -> str:
+    """Name of a fault and its size, with the unit."""
+    if fault == "none":
+        return SIZES_IN_WORDS[fault]
+    return f"{fault}, {SIZES_IN_WORDS.get(fault, '{:g}').format(size)}"
+
+
 def _row(lab: Lab, run: str, fault: str, size: float, clean: Row | None, *how: Any) -> Row:
     """Row of one fit. clean: that of the clean run; how: arguments of `indicators_of`."""
     model, indicators = indicators_of(lab, *how)
     row: Row = {"run": run, "scene": run.split(",")[0], "fault": fault, "size": size}
-    row |= {"label": f"{fault} {size:g}", **lab.quality(model)}
+    row |= {"label": label_of(fault, size), **lab.quality(model)}
     lost = (row if clean is None else clean)["psnr"] - row["psnr"]
     row |= {"lost": lost, "failed": bool(lost > FAILURE)}
     return row | {f"sign {name}": value for name, value in indicators.items()}
@@ -356,7 +383,10 @@ def _harm(fault: str, size: float, words: str, bound: float = 1.0, harmless: boo
     return Claim(hypothesis, lost, "dB", "below" if harmless else "above", bound, "rock and draw")
 
 
-LOST = Panel("label", "lost", "fault and its size", "PSNR lost on test views (dB)")
+LOST = Panel(
+    "label", "lost", "fault and its size", "PSNR lost on test views (dB)",
+    title="PSNR that each fault costs",
+)  # fmt: skip
 
 DATA_FAULTS = Experiment(
     "Which faults of the images spoil a model?",

@@ -1,0 +1,71 @@
+"""Models for viewers of other programs: `mgs export`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from mgs.colour import srgb_from_linear
+from mgs.data.up import PLUS_Z, Up, upright
+from mgs.gaussians import Gaussians
+from mgs.report.runs import up_of
+from mgs.run.folder import open_run
+from mgs.splat.reference import sh_basis
+from mgs.splat_files import colour_space, load_gaussians
+
+DIRECTIONS = 64
+"""Directions from which a view-dependent colour is converted; 16 coefficients are fitted to them.
+"""
+
+PART = 1 << 16
+"""Gaussians whose colours are converted at a time."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """Gaussians (NumPy fields), the space of their colours ("linear" or "srgb"), and the upward
+    direction of their world."""
+
+    gaussians: Gaussians
+    space: str
+    up: Up = PLUS_Z
+
+
+def read_model(source: str | Path) -> Model:
+    """Read the model of a run folder, or of a file, whose world is taken as +Z up. Raises
+    InputError as `open_run`, `Run.state` and `load_gaussians`."""
+    source = Path(source)
+    if not source.is_dir():
+        return Model(load_gaussians(source), colour_space(source))
+    run = open_run(source)
+    return Model(run.state.gaussians, "linear", up_of(run.settings.prior, run.dataset))
+
+
+def in_srgb(model: Model) -> Model:
+    """Convert linear colours to sRGB, which most viewers blend as it is; the rest is unchanged.
+
+    The colour of each Gaussian is exact at SH degree 0. At higher degrees its coefficients are a
+    least-squares fit over DIRECTIONS. Blending differs in any case: mixtures are a little darker.
+    """
+    if model.space == "srgb":
+        return model
+    g = model.gaussians
+    k = np.arange(DIRECTIONS) + 0.5
+    z, turn = 1 - 2 * k / DIRECTIONS, np.pi * (1 + 5**0.5) * k
+    across = np.sqrt(1 - z * z)
+    directions = np.column_stack([across * np.cos(turn), across * np.sin(turn), z])
+    directions = directions if g.sh_degree else directions[:1]
+    basis = sh_basis(directions, g.sh_degree)
+    inverse, sh = np.linalg.pinv(basis), np.empty_like(g.sh)
+    for first in range(0, len(g), PART):
+        part = slice(first, first + PART)
+        colours = srgb_from_linear(0.5 + np.einsum("dk,nkc->ndc", basis, g.sh[part]))
+        sh[part] = np.einsum("kd,ndc->nkc", inverse, colours - 0.5)
+    return replace(model, gaussians=replace(g, sh=sh), space="srgb")
+
+
+def to_y_up(up: Up) -> np.ndarray:
+    """Rotation [3,3] of a world with this upward direction into glTF's, in which +Y is up."""
+    return np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]) @ upright(up)

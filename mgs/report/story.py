@@ -1,0 +1,112 @@
+"""The story of a run: the model after each view, with the camera that took it and what is unknown.
+
+A run keeps only its last model, so the fits are done again, view by view, from the prior on. From
+the seeds on they are those of a run that takes one view at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from mgs.colour import srgb_from_linear
+from mgs.data.dataset import Frame
+from mgs.metrics import psnr
+from mgs.plotting import STYLE, crop, new_figure
+from mgs.policy import criteria
+from mgs.report.diagnostics import VISIBLE, view_maps
+from mgs.report.figures import NEWEST, draw_cameras
+from mgs.report.runs import up_of
+from mgs.report.video import UNKNOWN, Film
+from mgs.run.folder import Run
+from mgs.run.loop import learn
+from mgs.run.nbv import problem_of
+from mgs.run.problem import Progress
+from mgs.run.state import Fitted
+
+SIZE = (8.4, 3.1)
+"""Width and height of a frame, inches."""
+
+DPI = 110
+
+
+def models(run: Run, progress: Progress) -> Iterator[Fitted]:
+    """Fit the run's views again, one more each time; yield every model. Raises InputError as
+    `problem_of` and `learn`."""
+    problem = problem_of(run, progress, run.settings.policy)
+    taken, seeds = run.state.taken, run.settings.seeds
+    before: Fitted | None = None
+    for count in range(1, len(taken) + 1):
+        before = learn(problem, taken[:count], before if count > seeds else None)
+        yield before
+
+
+def story_frames(run: Run, progress: Progress) -> Film:
+    """Frames of the story, one for each view taken: the cameras from above, the render of one view,
+    and the share of the variance that is left in it.
+
+    The view shown is the brightest of those that the first image leaves more unknown than most,
+    among the test views, or else the views never taken, or else all. Raises InputError as `models`,
+    and if an image cannot be read.
+    """
+    lam = problem_of(run, policy=run.settings.policy).lam
+    shown: Frame | None = None
+    for model in models(run, progress):
+        unknown = {"uncertainty": criteria.uncertainty(model.H, lam)}
+        shown = shown or _shown_view(run, model, unknown)
+        maps = view_maps(model.gaussians, shown.camera, unknown)
+        yield _drawn(run, model, maps, shown)
+
+
+def _shown_view(run: Run, model: Fitted, unknown: dict[str, np.ndarray]) -> Frame:
+    """The view of `story_frames`, by the model after the first image."""
+    tests, frames = run.dataset.test_views(), run.dataset.frames
+    new = [frame for i, frame in enumerate(frames) if i not in run.state.taken]
+    others = tests.frames if tests is not None else run.dataset.with_images({f.name for f in new})
+    choice = list(others or run.taken)
+    left = [_left(view_maps(model.gaussians, frame.camera, unknown)) for frame in choice]
+    least_known = [f for f, mean in zip(choice, left, strict=True) if mean >= np.median(left)]
+    return max(least_known, key=lambda frame: srgb_from_linear(frame.masked_rgb()).mean())
+
+
+def _left(maps: dict[str, np.ndarray]) -> float:
+    """Mean share of the variance that is left, over the pixels that show the model."""
+    return float(maps["uncertainty"][maps["A"] >= VISIBLE].mean())
+
+
+def _drawn(run: Run, model: Fitted, maps: dict[str, np.ndarray], shown: Frame) -> np.ndarray:
+    """One frame, sRGB uint8 [H,W,3]."""
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.cm import ScalarMappable
+
+    truth = srgb_from_linear(shown.masked_rgb())
+    rgb = srgb_from_linear(np.stack([maps[channel] for channel in "RGB"], -1))
+    window = crop(truth.max(axis=2) > 0)
+    count, seeds = len(model.taken), run.settings.seeds
+    why = f"one of {seeds} to begin with" if count <= seeds else f"chosen by {run.label}"
+    title = f"image {count} of {len(run.state.taken)}: {why}"
+    with matplotlib.rc_context(STYLE | {"axes.grid": False, "font.size": 11}):
+        figure = new_figure(*SIZE, dpi=DPI)
+        orbit, render, map_ = figure.subplots(1, 3, width_ratios=(1, 1, 1))
+        figure.suptitle(title, fontsize=14, color=NEWEST)
+        eyes = np.array([frame.camera.position for frame in run.dataset.frames])
+        views = model.taken[:seeds], model.taken[seeds:]
+        up = up_of(run.settings.prior, run.dataset)
+        draw_cameras(orbit, eyes, model.gaussians.means, *views, up, model.taken[-1])
+        orbit.set_xlabel("cameras, from above")
+        render.imshow(rgb[window], interpolation="nearest")
+        render.set_xlabel(f"render of a new view: {psnr(rgb, truth):.1f} dB")
+        inside = np.ma.masked_where(maps["A"] < VISIBLE, maps["uncertainty"])[window]
+        map_.imshow(inside, cmap=UNKNOWN, vmin=0, vmax=1, interpolation="nearest")
+        map_.set_xlabel(f"still unknown: {100 * _left(maps):.0f} %")
+        bar = figure.colorbar(ScalarMappable(cmap=UNKNOWN), ax=map_, shrink=0.7, aspect=14)
+        bar.set_ticks([0, 1], labels=["known", "unknown"])
+        for axis in (render, map_):
+            axis.set(xticks=[], yticks=[])
+            axis.spines[:].set_visible(False)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        pixels = np.asarray(canvas.buffer_rgba())[..., :3]
+    return np.ascontiguousarray(pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2])

@@ -1,0 +1,201 @@
+"""Films of a run: a path of cameras around its model, and how the model came to be, view by view.
+
+A path turns about the median of the Gaussians' means, at the median distance and height of the
+dataset's cameras. Films are MP4, or without any package beside Pillow GIF and animated PNG.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from mgs.camera import Camera, look_at
+from mgs.colour import srgb_from_linear
+from mgs.data.dataset import Dataset
+from mgs.data.up import upright
+from mgs.errors import InputError
+from mgs.files import atomic_path
+from mgs.report.diagnostics import VISIBLE, run_scalars, view_maps
+from mgs.report.runs import up_of
+from mgs.run.folder import Run
+
+Film = Iterator[np.ndarray]
+"""Frames, sRGB uint8 [H,W,3], all of one size."""
+
+PATHS = ("turntable", "spiral", "cameras")
+"""Paths: a circle; two turns from low to high and back; a spline through the dataset's cameras."""
+
+FORMATS = (".mp4", ".gif", ".png")
+"""Endings of films; .png is an animated PNG."""
+
+GAP = 4
+"""Pixels between two pictures of a frame."""
+
+STEEPEST = 75.0
+"""Largest elevation of a spiral, degrees."""
+
+UNKNOWN = "cividis"
+"""Colour map of what is unknown: blue is known, yellow unknown."""
+
+
+def camera_path(
+    dataset: Dataset, means: np.ndarray, up: Sequence[float], path: str, count: int, width: int
+) -> list[Camera]:
+    """Cameras of a closed path, at equal intervals of time.
+
+    means: [N,3] of the Gaussians. up: of the world. path: one of PATHS. count: of cameras. width:
+    of their images, pixels.
+    """
+    first = dataset.frames[0].camera
+    turn, centre = upright((up[0], up[1], up[2])), np.median(means, axis=0)
+    eyes = np.array([frame.camera.position for frame in dataset.frames])
+    t = np.arange(count) / count
+    if path == "cameras":
+        closed = np.concatenate([eyes, eyes[:1]])
+        places = CubicSpline(np.linspace(0, 1, len(closed)), closed, bc_type="periodic")(t)
+    else:
+        away = (eyes - centre) @ turn.T
+        distance = float(np.median(np.linalg.norm(away, axis=1)))
+        heights = np.arcsin(np.clip(away[:, 2] / np.linalg.norm(away, axis=1), -1, 1))
+        start = float(np.arctan2(away[0, 1], away[0, 0]))
+        turns, elevation = 1, np.full(count, float(np.median(heights)))
+        if path == "spiral":
+            low, steepest = float(heights.min()), np.radians(STEEPEST)
+            high = min(max(float(heights.max()), low + np.radians(45)), steepest)
+            turns, elevation = 2, low + (high - low) * (1 - np.cos(2 * np.pi * t)) / 2
+        angle, flat = start + 2 * np.pi * turns * t, distance * np.cos(elevation)
+        rise = distance * np.sin(elevation)
+        places = np.column_stack([flat * np.cos(angle), flat * np.sin(angle), rise]) @ turn + centre
+    shape = first.resized(width + width % 2)
+    shape = replace(shape, height=shape.height + shape.height % 2)  # encoders need even numbers
+    return [replace(shape, world_to_camera=look_at(eye, centre, up)) for eye in places]
+
+
+def path_frames(run: Run, path: str, beside: str | None, count: int, width: int) -> Film:
+    """Frames along a path; with beside="uncertainty", the map of what is unknown to the right.
+
+    With beside="truth", the frames are the dataset's views themselves, in their order, beside their
+    images.
+    """
+    model = run.state.gaussians
+    if beside == "truth":
+        for frame in run.dataset.frames:
+            camera = frame.camera.resized(width + width % 2)
+            truth = _resized(srgb_from_linear(frame.masked_rgb()), camera)
+            yield _side_by_side(truth, _picture(view_maps(model, camera, {})))
+        return
+    scalars = {"uncertainty": run_scalars(run)["uncertainty"]} if beside else {}
+    up = up_of(run.settings.prior, run.dataset)
+    for camera in camera_path(run.dataset, model.means, up, path, count, width):
+        maps = view_maps(model, camera, scalars)
+        right = [_unknown(maps)] if beside else []
+        yield _side_by_side(_picture(maps), *right)
+
+
+def _picture(maps: dict[str, np.ndarray]) -> np.ndarray:
+    """Render of `view_maps`, sRGB in [0,1] [H,W,3]."""
+    return srgb_from_linear(np.stack([maps[channel] for channel in "RGB"], -1))
+
+
+def _unknown(maps: dict[str, np.ndarray], behind: float = 0.0) -> np.ndarray:
+    """Map of the variance that is left, sRGB in [0,1] [H,W,3]. behind: grey around the model."""
+    import matplotlib
+
+    colours = matplotlib.colormaps[UNKNOWN](np.clip(maps["uncertainty"], 0, 1))[..., :3]
+    return np.where(maps["A"][..., None] >= VISIBLE, colours, behind).astype(np.float32)
+
+
+def _resized(image: np.ndarray, camera: Camera) -> np.ndarray:
+    """Image in the size of a camera."""
+    import cv2
+
+    return np.asarray(
+        cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    )
+
+
+def _side_by_side(*pictures: np.ndarray) -> np.ndarray:
+    """Pictures [H,W,3] in [0,1] beside each other, uint8, with even numbers of pixels."""
+    gap = np.ones((pictures[0].shape[0], GAP, 3), np.float32)
+    parts = [part for picture in pictures for part in (gap, picture)][1:]
+    frame = np.concatenate(parts, axis=1)
+    return np.round(frame[: frame.shape[0] // 2 * 2] * 255).astype(np.uint8)
+
+
+def write_film(
+    path: str | Path,
+    frames: Film,
+    seconds: Sequence[float],
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Write a film as MP4 (H.264), GIF or animated PNG, by its ending; the file appears complete.
+
+    seconds: of each frame; an MP4 shows all as long as the first. Raises InputError for another
+    ending, if imageio-ffmpeg is missing for an MP4, and as `mgs.files.atomic_path`.
+    """
+    check_film(path)
+    kind = Path(path).suffix.lower()
+    shown = _reported(frames, len(seconds), progress)
+    with atomic_path(path) as temporary:
+        if kind == ".mp4":
+            _write_mp4(temporary, shown, 1 / seconds[0])
+        else:
+            _write_animation(temporary, shown, seconds, kind == ".gif")
+
+
+def check_film(path: str | Path) -> None:
+    """Raise InputError as `write_film` would, before any frame is drawn."""
+    if Path(path).suffix.lower() not in FORMATS:
+        raise InputError(f"{path}: films are written as {', '.join(FORMATS)}; choose one of them")
+    if Path(path).suffix.lower() == ".mp4":
+        _ffmpeg()
+
+
+def _reported(frames: Film, count: int, progress: Callable[[int, int], None]) -> Film:
+    for done, frame in enumerate(frames):
+        progress(done, count)
+        yield frame
+    progress(count, count)
+
+
+def _ffmpeg() -> Any:
+    """The module imageio_ffmpeg. Raises InputError if it is not installed."""
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        raise InputError(
+            "mgs video: MP4 needs imageio-ffmpeg, which is not installed; "
+            "`pip install imageio-ffmpeg`, or write a .gif"
+        ) from None
+    return imageio_ffmpeg
+
+
+def _write_mp4(path: Path, frames: Film, rate: float) -> None:
+    """Write frames at a rate (1/s) as H.264."""
+    first = next(frames)
+    size = (first.shape[1], first.shape[0])
+    writer = _ffmpeg().write_frames(
+        str(path), size, fps=rate, codec="libx264", macro_block_size=2, quality=7
+    )
+    writer.send(None)
+    for frame in (first, *frames):
+        writer.send(np.ascontiguousarray(frame))
+    writer.close()
+
+
+def _write_animation(path: Path, frames: Film, seconds: Sequence[float], gif: bool) -> None:
+    """Write frames as GIF, each with 256 colours of its own, or as animated PNG."""
+    from PIL import Image
+
+    pictures = [Image.fromarray(frame) for frame in frames]
+    if gif:
+        pictures = [picture.quantize(256, Image.Quantize.MAXCOVERAGE) for picture in pictures]
+    options: dict[str, Any] = {"save_all": True, "append_images": pictures[1:], "loop": 0}
+    durations = [round(1000 * each) for each in seconds[: len(pictures)]]
+    kind = "GIF" if gif else "PNG"
+    pictures[0].save(path, format=kind, duration=durations, optimize=True, **options)

@@ -1,0 +1,103 @@
+"""Films of a run: paths of cameras, the story of its views, and the files."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import tiny
+from PIL import Image
+from refusals import refused
+
+from mgs.cli.app import main
+from mgs.data.dataset import load_dataset
+from mgs.report import story
+from mgs.report.video import PATHS, camera_path, write_film
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    root = tmp_path_factory.mktemp("film")
+    data, prior = tiny.write_dataset(root / "data"), tiny.write_prior(root / "prior")
+    return tiny.write_run(root / "run", data, prior)
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_a_path_goes_around_the_object_and_looks_at_it(tmp_path, path):
+    dataset = load_dataset(tiny.write_dataset(tmp_path / "data"))
+    cameras = camera_path(dataset, np.zeros((5, 3)), (0, 0, 1), path, 48, 30)
+    eyes = np.array([camera.position for camera in cameras])
+    distances = np.linalg.norm(eyes, axis=1)
+    np.testing.assert_allclose(distances, np.hypot(3, 1.5), rtol=0.05)
+    steps = np.linalg.norm(np.diff(eyes, axis=0, append=eyes[:1]), axis=1)
+    assert steps.max() < 0.35 * distances[0], "it jumps, or does not end where it began"
+    turned = np.unwrap(np.arctan2(eyes[:, 1], eyes[:, 0]))
+    assert abs(turned[-1] - turned[0]) > 2 * np.pi * 0.9
+    for camera in cameras[::7]:
+        pixel = camera.project(np.zeros((1, 3)))[0][0]
+        np.testing.assert_allclose(pixel, camera.K[:2, 2], atol=1e-6)
+        assert (camera.width % 2, camera.height % 2) == (0, 0)
+
+
+def grey(values):
+    return iter(np.full((8, 10, 3), value, np.uint8) for value in values)
+
+
+@pytest.mark.parametrize("ending", ["gif", "png", "mp4"])
+def test_a_film_has_its_frames_and_their_lengths(tmp_path, ending):
+    path = tmp_path / f"a.{ending}"
+    if ending == "mp4":
+        pytest.importorskip("imageio_ffmpeg")
+        write_film(path, grey([0, 120, 250]), [0.1, 0.1, 0.1])
+        read = cv2.VideoCapture(str(path))
+        about = [read.get(key) for key in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS)]
+        assert (about, read.read()[1].shape) == ([3, 10], (8, 10, 3))
+        return
+    write_film(path, grey([0, 120, 250]), [0.2, 0.2, 0.6])
+    with Image.open(path) as image:
+        found = []
+        for k in range(image.n_frames):
+            image.seek(k)
+            found.append((image.convert("RGB").getpixel((4, 4))[0], image.info["duration"]))
+    assert found == [(0, 200), (120, 200), (250, 600)]
+
+
+def film(*arguments) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main(["video", *map(str, arguments)])
+    return stop.value.code
+
+
+@pytest.mark.parametrize(("beside", "count"), [("uncertainty", 5), ("truth", tiny.FRAMES)])
+def test_the_command_draws_pictures_side_by_side(run, tmp_path, beside, count):
+    out = tmp_path / "a.png"
+    assert film(run, "--out", out, "--seconds", 1, "--fps", 5, "--beside", beside) == 0
+    with Image.open(out) as image:
+        assert image.n_frames == count
+        assert image.size == (2 * tiny.WIDTH + 4, tiny.HEIGHT)
+
+
+def test_the_story_has_a_frame_for_each_view(run, tmp_path, monkeypatch):
+    def models(run, progress):
+        for count in range(1, len(run.state.taken) + 1):
+            yield replace(run.state, taken=run.state.taken[:count])
+
+    monkeypatch.setattr(story, "models", models)
+    assert film(run, "--out", tmp_path / "a.gif", "--story") == 0
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.n_frames > 1
+        assert image.size[0] > 800
+
+
+def test_refusals(run, tmp_path, monkeypatch, capsys):
+    line = refused(capsys, ["video", run, "--out", tmp_path / "a.avi"], tmp_path)
+    assert "films are written as .mp4, .gif, .png" in line
+    (tmp_path / "a.gif").write_text("keep me")
+    line = refused(capsys, ["video", run, "--out", tmp_path / "a.gif"], tmp_path)
+    assert "is there already" in line
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    line = refused(capsys, ["video", run, "--out", tmp_path / "a.mp4"], tmp_path)
+    assert "`pip install imageio-ffmpeg`, or write a .gif" in line

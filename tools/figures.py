@@ -1,0 +1,75 @@
+"""Draw the figures of docs/results again from the rows beside them.
+
+python tools/figures.py [NAME ...]     # chart, parsimony, pools, prior-faults; default: all
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from mgs.study import chart, parsimony
+from mgs.study.output import Panel, draw_matrix, draw_panels
+from mgs.study.stress.faults import LOST, label_of
+
+RESULTS = Path(__file__).parent.parent / "docs/results"
+
+Rows = list[dict[str, Any]]
+
+
+POOLS = Panel(
+    "pool", "test_psnr_over_random", "pool", "", "policy",
+    title="PSNR over random views (dB). Bold: the 95 % interval excludes 0",
+)  # fmt: skip
+
+
+def read_rows(path: Path) -> Rows:
+    """Rows of a CSV file; numbers, true and false are converted, empty cells left out."""
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = csv.DictReader(file)
+        return [{key: _value(text) for key, text in row.items() if text} for row in rows]
+
+
+def _value(text: str) -> Any:
+    if text in ("True", "False"):
+        return text == "True"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def _chart(path: Path, rows: Rows) -> None:
+    runs = read_rows(path.with_name("run.csv"))
+    kinds = {"fit": rows, "run": runs}
+    chart.draw(path, {k: [{"preset": ""} | row for row in rows] for k, rows in kinds.items()})
+
+
+def _pools(path: Path, rows: Rows) -> None:
+    draw_matrix(path, POOLS, [row for row in rows if row["policy"] != "random"])
+
+
+def _faults(path: Path, rows: Rows) -> None:
+    labelled = [row | {"label": label_of(row["fault"], row["size"])} for row in rows]
+    draw_panels(path, [LOST], labelled)
+
+
+FIGURES: Mapping[str, tuple[str, Callable[[Path, Rows], None]]] = {
+    "chart": ("chart/fit", _chart),
+    "parsimony": ("parsimony/parsimony", parsimony.draw),
+    "pools": ("reproduce/pools", _pools),
+    "prior-faults": ("stress/prior-faults", _faults),
+}
+"""Figures by name: file below RESULTS without its ending, and the function that draws its rows."""
+
+
+if __name__ == "__main__":
+    for name in sys.argv[1:] or FIGURES:
+        where, draw = FIGURES[name]
+        draw(RESULTS / f"{where}.png", read_rows(RESULTS / f"{where}.csv"))
+        print(f"wrote docs/results/{where}.png")
