@@ -29,7 +29,7 @@ from mgs.run.state import Fitted
 from mgs.splat import ListCache
 from mgs.study.case import Case, Size, test_views_of
 from mgs.study.oracle import oracle
-from mgs.study.output import table, with_interval
+from mgs.study.output import Panel, draw_matrix, table, with_interval
 from mgs.study.rocks import Rock
 from mgs.study.statistics import holm, interval, permutation_p
 from mgs.study.sweep import Cell
@@ -282,6 +282,21 @@ def leads_of(rows: Sequence[Row], leader: str, measure: str) -> list[Row]:
     p_values = [lead["p"] for lead in leads]
     corrected = p_values if None in p_values else holm(p_values)  # None: one scene
     return [lead | {"p_holm": p} for lead, p in zip(leads, corrected, strict=True)]
+
+
+def draw(path: Path, rows: Sequence[Row]) -> None:
+    """Draw gains over `random` on the test views, means over scenes, as a matrix of policies and
+    set-ups. Raises InputError if the file cannot be written."""
+    means = []
+    for setup, policy in dict.fromkeys((row["setup"], row["policy"]) for row in rows):
+        if policy in (RANDOM, ORACLE):
+            continue
+        values = list(by_scene(rows, setup, policy, "test_gain").values())
+        low, high = interval(values) or (np.nan, np.nan)
+        gain = {"gain": float(np.mean(values)), "gain_low": low, "gain_high": high}
+        means.append({"setup": setup, "policy": policy} | gain)
+    title = "PSNR over random views (dB). Bold: the 95 % interval excludes 0"
+    draw_matrix(path, Panel("setup", "gain", "set-up", "", "policy", title=title), means)
 
 
 def text_of(rows: Sequence[Row], leads: Sequence[Row]) -> str:
