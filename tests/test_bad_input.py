@@ -158,10 +158,7 @@ def test_broken_pixels(capsys, dataset, prior, tmp_path, given, named):
 
 @cases(
     {
-        "neither depth nor masks": (
-            edit(no_surface),
-            "has no depth images and no points (sparse.ply) and no masks",
-        ),
+        "neither depth nor masks": (edit(no_surface), "starts at random points"),
         "NaN in every pixel": (no_number, "return"),
     }
 )

@@ -19,12 +19,13 @@ from refusals import one_line
 from scipy.ndimage import binary_dilation
 
 from mgs.camera import Camera, look_at
+from mgs.data.check import check_dataset
 from mgs.data.clouds import SparseCloud, read_cloud, views_of, write_cloud
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.data.importers import import_source
 from mgs.data.lens import shrunk
 from mgs.data.masks import make_masks, refined_mask
-from mgs.data.meshes import distances_to_mesh, read_mesh
+from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh
 from mgs.data.sources import read_source
 from mgs.data.up import degrees_between, unit_up, up_of_cameras, upright
 from mgs.errors import InputError
@@ -33,6 +34,7 @@ from mgs.images import write_png
 from mgs.prior import hull
 from mgs.prior.build import build_prior, load_prior, prior_and_cloud
 from mgs.prior.hull import visual_hull
+from mgs.prior.initial import initial_gaussians
 from mgs.prior.points import _grown, main_cluster, on_surface, reliable
 from mgs.prior.settings import PriorSettings
 
@@ -440,10 +442,6 @@ def no_object(root: Path, data: Make) -> None:
     write_cloud(root / "sparse.ply", SparseCloud(ground))
 
 
-NO_SOURCE = (
-    "has no depth images and no points (sparse.ply) and no masks; import data with depth, or "
-    "import with --masks DIR for --from hull, or give --points CLOUD.ply, or give --mesh MESH"
-)
 HULL = ["--from", "hull"]
 DEPTH = "has no depth images; take --from hull, or import data with depth"
 UP = "expected auto, or three numbers"
@@ -453,10 +451,14 @@ REFUSED: dict[str, tuple[Callable[[Path, Make], object], list[str], str]] = {
     "black masks": (black, [], "the masks are black in every frame"),
     "black masks, hull": (black, HULL, "the masks are black in every frame"),
     "no object": (no_object, [], "points lie in one cluster above the ground; give masks"),
-    "nothing": (bare, [], NO_SOURCE),
+    "a surface at random": (bare, ["--from", "random", "--holes", "0.1"], "has no surface"),
     "hull without masks": (bare, HULL, "has no masks; "),
     "depth without depth": (few, ["--from", "depth"], DEPTH),
-    "no such source": (bare, ["--from", "dreams"], "choose one of depth, mesh, points, hull"),
+    "no such source": (
+        bare,
+        ["--from", "dreams"],
+        "choose one of depth, mesh, points, hull, random",
+    ),
     "mesh without mesh": (bare, ["--from", "mesh"], "give --mesh MESH"),
     "mesh and hull": (bare, ["--mesh", "rock.glb", *HULL], "give one of them"),
     "noise on a hull": (photos, ["--prior-noise", "0.1"], "of a cloud, but a hull is carved"),
@@ -483,6 +485,36 @@ def test_a_world_in_which_nothing_would_be_drawn_is_one_line(data, tmp_path, cap
     assert exit_code("nbv", tmp_path / "d", "--out", tmp_path / "run", "--budget", "1") == 2
     message = "m from it, and nothing nearer than 0.01 is drawn; import the data with --unit M"
     one_line(capfd.readouterr().err, message, tmp_path / "run")
+
+
+def test_poses_alone_are_fitted_from_random_points(data, tmp_path, capfd):
+    bare(tmp_path / "d", data)
+    command("prior", tmp_path / "d", "--gaussians", "300")
+    assert "300 random points" in capfd.readouterr().out
+    fitted = ["fit", tmp_path / "d", "--passes", "2", "--out", tmp_path / "run"]
+    assert exit_code(*fitted, "--means", "frozen") == 2
+    one_line(capfd.readouterr().err, "pass --means free", tmp_path / "run")
+    command(*fitted)
+    settings = read_json(tmp_path / "run/config.json")["settings"]
+    assert (settings["seeds"], settings["budget"], settings["train"]["means"]) == (10, 0, "free")
+    frames = load_dataset(tmp_path / "d").frames
+    start, seen = initial_gaussians(load_prior(tmp_path / "d/prior"), frames)
+    assert seen.mean() > 0.9
+    assert np.allclose(start.opacities, 0.1)
+
+
+def test_test_views_get_masks_too(data, tmp_path):
+    bare(tmp_path / "d", data)
+    bare(tmp_path / "d/test", data)
+    ball = trimesh.creation.icosphere(2, 0.4)
+    mesh = Mesh(ball.vertices, ball.faces, np.ones(len(ball.faces), bool))
+    made = make_masks(load_dataset(tmp_path / "d"), mesh, 0.1)
+    tests = load_dataset(tmp_path / "d/test")
+    assert all(0 < frame.mask().mean() < 0.9 for frame in tests.frames)
+    assert not any("no masks" in line for line in check_dataset(made).problems)
+    frames = [replace(frame, mask_path=None) for frame in tests.frames]
+    write_transforms(tests.root, frames)
+    assert any("test views have no masks" in line for line in check_dataset(made).problems)
 
 
 def test_mask_files_must_not_be_there_yet(exact, tmp_path):

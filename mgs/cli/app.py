@@ -49,6 +49,7 @@ COMMANDS = {
     "survey": "survey.survey",
     "prior": "prior.prior",
     "nbv": "nbv.nbv",
+    "fit": "fit.fit",
     "suggest": "suggest.suggest",
     "eval": "models.evaluate",
     "diagnose": "models.diagnose",
@@ -200,7 +201,7 @@ def _hint(arguments: Sequence[str]) -> str:
     if command in RESUMABLE:
         return "; run the same command again to continue"
     runs = [after for option, after in pairwise(options) if option in ("--out", "--resume")]
-    if command != "nbv" or not runs or not (Path(runs[-1]) / "config.json").is_file():
+    if command not in ("nbv", "fit") or not runs or not (Path(runs[-1]) / "config.json").is_file():
         return ""
     live = [pair for pair in pairwise([*options, ""]) if pair[0].startswith("--capture-")]
     again = [x for pair in live for x in (pair[:1] if "=" in pair[0] else pair)]

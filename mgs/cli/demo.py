@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from rich.console import Console
 
@@ -73,7 +73,7 @@ def demo(
         if (run / "config.json").is_file():
             opened.append(open_run(run))
             continue
-        settings = {"policy": policy, "budget": BUDGET, "seed": seed, "evaluate_every": 1}
+        settings: Any = {"policy": policy, "budget": BUDGET, "seed": seed, "evaluate_every": 1}
         opened.append(start_and_print(dataset, run, console, prior=folder, **settings))
     for policy, started_run in zip(POLICIES, opened, strict=True):
         heading(f"3/5 next best views: {policy}, 4 seeds and {BUDGET} views")

@@ -186,9 +186,7 @@ def nbv(
     if (dataset is None) == (capture is None) or out is None:
         raise InputError("nbv: give a DATASET or --capture SCENE, and --out RUN; or --resume RUN")
     settings = {k: v for k, v in settings.items() if k not in ("dataset", "prior", "train")}
-    for name, value in given.items():
-        where = train if name in TrainSettings.model_fields and name != "seed" else settings
-        where[name] = pairs(name, value) if isinstance(value, list) else value
+    settings |= settings_of(given, train)
     run = start_and_print(
         dataset,
         out,
@@ -199,7 +197,6 @@ def nbv(
         gaussians=parse_gaussians(gaussians),
         preset=preset,
         **settings,
-        train=train,
     )
     resume_and_print(run, console, run.settings.policy, live=live)
 
@@ -225,11 +222,22 @@ def live_capture(
     return None
 
 
-def with_settings_as_options(function: Any) -> Any:
-    """Give a command an option for each setting in PANELS; only options given reach `**options`."""
+def settings_of(given: dict[str, Any], fit: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Fields of `NbvSettings` from the options given, those of a fit under `train`, added to
+    `fit`."""
+    settings, train = dict[str, Any](), dict(fit or {})
+    for name, value in given.items():
+        where = train if name in TrainSettings.model_fields and name != "seed" else settings
+        where[name] = pairs(name, value) if isinstance(value, list) else value
+    return settings | {"train": train}
+
+
+def with_settings_as_options(function: Any, panels: dict[str, tuple[str, ...]] = PANELS) -> Any:
+    """Give a command an option for each setting in `panels`; only options given reach
+    `**options`."""
     signature = inspect.signature(function, eval_str=True)
     parameters = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-    for panel, names in PANELS.items():
+    for panel, names in panels.items():
         parameters += [_option(name, panel) for name in names]
     function.__signature__ = signature.replace(parameters=parameters)
     function.__annotations__ = {p.name: p.annotation for p in parameters}
@@ -289,13 +297,20 @@ def pairs(name: str, given: list[str]) -> dict[str, float]:
     return table
 
 
-def start_and_print(dataset: Path | None, out: Path, console: Console, **settings: Any) -> Run:
-    """`mgs.run.nbv.start_run` with its progress; print which prior was found in the dataset."""
+def start_and_print(
+    dataset: Path | None,
+    out: Path,
+    console: Console,
+    start: Callable[..., Run] | None = None,
+    **settings: Any,
+) -> Run:
+    """`mgs.run.nbv.start_run`, or another start, with its progress; print which prior was found in
+    the dataset."""
     from mgs.cli.progress import progress_bar
     from mgs.run.nbv import problem_of, start_run
 
     with progress_bar("starting", console) as progress:
-        run = start_run(dataset, out, progress=progress, **settings)
+        run = (start or start_run)(dataset, out, progress=progress, **settings)
     found = run.settings.prior
     if settings.get("prior") is None and dataset and found.parent == dataset.resolve():
         console.print(f"prior: {found}", soft_wrap=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -28,6 +29,7 @@ WHY = {
     "depth": ": the dataset has depth images",
     "points": ": the dataset has points (sparse.ply) and no depth",
     "hull": ": the dataset has masks, and neither depth nor points",
+    "random": ": the dataset has neither depth, points nor masks; fit it with `mgs fit`",
 }
 """Reason for a source that was not asked for."""
 
@@ -51,8 +53,8 @@ def prior(
     source: Annotated[
         str | None,
         option(
-            "depth, mesh, points or hull (of the masks). "
-            "Default: the first of depth, points, hull that there is.",
+            "depth, mesh, points, hull (of the masks) or random. "
+            "Default: the first of depth, points, hull that there is, else random.",
             "--from",
         ),
     ] = None,
@@ -95,7 +97,7 @@ def prior(
     from mgs.data.meshes import GLTF
     from mgs.prior.build import prior_from_mesh, save_prior
     from mgs.prior.figure import draw_prior
-    from mgs.prior.initial import with_share_seen
+    from mgs.prior.initial import AGREEMENT, colour_agreement, with_share_seen
     from mgs.prior.photographs import source_of
     from mgs.prior.settings import PriorSettings
 
@@ -125,10 +127,21 @@ def prior(
             result, segmented = _built(loaded, settings, folder, progress, **options)
         progress("seed frames")
         result = with_share_seen(result, _seed_frames(loaded, result))
+        if result.numbers["from"] != "random" and not loaded.on_demand:
+            progress("colours of the surface")
+            agreement = {"colour_agreement": colour_agreement(result, loaded.frames)}
+            result = replace(result, numbers=result.numbers | agreement)
         progress("figure")
         save_prior(unfinished, result)
         draw_prior(unfinished / "prior.png", result, segmented)
-    console.print(_table(result.numbers))
+    console.print(_random(result.numbers) if "radius" in result.numbers else _table(result.numbers))
+    agreed = result.numbers.get("colour_agreement", 1.0)
+    if agreed < AGREEMENT:
+        console.print(
+            f"the photographs agree on {agreed:.0%} of the surface's colours, and on a right "
+            f"surface on {AGREEMENT:.0%} or more: it may be wrong; fit with `--means free`",
+            soft_wrap=True,
+        )
     if "resolution" in result.numbers:
         console.print(_reason(result.numbers), soft_wrap=True)
     console.print(f"wrote {folder}: mesh.ply, points.ply, prior.json, prior.png")
@@ -165,6 +178,12 @@ def _seed_frames(dataset: Dataset, prior: Prior) -> list[Frame]:
     return [dataset.frames[k] for k in seed_views(positions, middle, min(SEEDS, len(dataset)))]
 
 
+def _random(numbers: dict[str, Any]) -> str:
+    """Line about a random start."""
+    unit = "m" if numbers["unit"] == "m" else "units"
+    return f"{numbers['n']:,} random points in a ball of radius {numbers['radius']:.3g} {unit}"
+
+
 def _table(numbers: dict[str, Any]) -> Table:
     """Table of the numbers of prior.json."""
     metres = numbers["unit"] == "m"
@@ -193,6 +212,9 @@ def _table(numbers: dict[str, Any]) -> Table:
     table.add_row("nearest neighbour over spacing", f"mean {mean:.2f}, least {least:.2f}")
     seen = f"{numbers['seen_by_seeds']:.1%}; the rest starts grey"
     table.add_row(f"samples that {SEEDS} evenly spaced frames see", seen)
+    agreed = numbers.get("colour_agreement", float("nan"))
+    if agreed == agreed:
+        table.add_row("colour variance that all frames agree on", f"{agreed:.0%}")
     table.add_row("up", _up(numbers))
     truth = numbers.get("truth")
     if truth is None:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion, minimum_filter
 
 from mgs.data.dataset import Dataset, Frame
-from mgs.data.visibility import in_image
+from mgs.data.visibility import has_masks, in_image
 from mgs.errors import InputError
 
 TOLERANCE = 0.02
@@ -95,9 +95,21 @@ def check_dataset(
             "poses, intrinsics or depth follow another convention; "
             "poses must be OpenGL camera-to-world, depth z-depth in metres"
         )
+    problems.extend(_test_problems(dataset))
     low, high = (min(r[0] for r in ranges), max(r[1] for r in ranges)) if ranges else (0.0, 0.0)
     share = float(np.mean(shares)) if shares else 0.0
     return Check(problems, share, (float(low), float(high)), median)
+
+
+def _test_problems(dataset: Dataset) -> Iterator[str]:
+    """Problem of test views that have no masks where the frames have."""
+    tests = dataset.test_views()
+    if tests is not None and has_masks(dataset.frames) and not has_masks(tests.frames):
+        yield (
+            f"{tests.root}: the test views have no masks as the frames have, so their background "
+            f"would count as the object; make masks with `mgs dataset masks {tests.root} --prior "
+            f"{dataset.root / 'prior'}`, or import again with --masks"
+        )
 
 
 def _mask_problems(frame: Frame, mask: np.ndarray) -> Iterator[str]:

@@ -17,6 +17,7 @@ from scipy.ndimage import binary_dilation, binary_erosion, binary_fill_holes, la
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import Dataset, write_transforms
 from mgs.data.meshes import Mesh
+from mgs.data.visibility import has_masks
 from mgs.errors import InputError
 from mgs.images import write_png
 
@@ -72,7 +73,8 @@ def make_masks(
     refine: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Dataset:
-    """Write a mask of a mesh for each frame of a dataset, a contact sheet, and transforms.json.
+    """Write a mask of a mesh for each frame of a dataset, a contact sheet, and transforms.json; the
+    same first for its test views, if they have no masks.
 
     uncertainty: error of the mesh, units of the world; with `refine` the half width of the band in
     which outlines move (`refined_mask`). progress: called (done, total) before each frame. Raises
@@ -87,6 +89,9 @@ def make_masks(
                 f"frame {frame.name}: has a mask already; "
                 "import the data without masks to make others"
             )
+    tests = dataset.test_views()
+    if tests is not None and not has_masks(tests.frames):
+        make_masks(tests, mesh, uncertainty, refine=refine, progress=progress)
     depth, frames, middle, seen = mesh_depth(mesh), [], mesh.vertices.mean(0), False
     thumbnails = []
     for k, frame in enumerate(dataset.frames):

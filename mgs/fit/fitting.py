@@ -16,6 +16,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.colour import SH_C0
 from mgs.errors import InputError, row_named
+from mgs.fit.density import DENSITIES, DENSITY_PASSES, DENSITY_UNTIL, controlled
 from mgs.fit.objective import (
     Objective,
     ParameterPrior,
@@ -145,6 +146,9 @@ def fit(
     """
     settings = settings or TrainSettings()
     optimiser = row_named(OPTIMISERS, settings.optimiser, "optimiser")
+    control = row_named(DENSITIES, settings.density, "density")
+    if control and (settings.means != "free" or learns):
+        raise InputError("density: Gaussians can move only where all learn free means")
     kinds = learned(settings.means).values()
     if missing := [kind for kind in kinds if kind not in settings.rates]:
         raise InputError(
@@ -160,6 +164,7 @@ def fit(
     buffers = [[dr.zeros(mi.TensorXf, shape) for _ in range(optimiser.buffers)] for shape in shapes]
     information: list[Any] = [None] * len(shapes)
     rng = generator(settings.seed, "train/order")
+    draws, until = generator(settings.seed, "train/density"), DENSITY_UNTIL * settings.passes
     losses, best, stop = [goal.loss(model)], model, None
     while stop is None:
         done = len(losses) - 1
@@ -168,7 +173,10 @@ def fit(
             dr.opaque(mi.Float, settings.rates[kind] * fall) * mask
             for kind, mask in zip(kinds, masks, strict=True)
         ]
-        if optimiser.uses_information and done % INFORMATION_PASSES == 0:
+        changes = control is not None and done % DENSITY_PASSES == 0 and 0 < done < until
+        if control and changes:
+            goal, model, buffers = controlled(control, goal, model, buffers, draws)
+        if optimiser.uses_information and (changes or done % INFORMATION_PASSES == 0):
             information = goal.largest_diagonal(model)
         order = rng.permutation(len(goal.photos))
         model, buffers, loss = _pass(
@@ -179,7 +187,8 @@ def fit(
         losses.append(loss)
         if on_pass:
             on_pass(done + 1, settings.passes)
-        stop = stop_reason(losses, settings.tolerance, settings.passes)
+        tolerance = 0.0 if control and done < until else settings.tolerance
+        stop = stop_reason(losses, tolerance, settings.passes)
     passes = len(losses) - 1
     numpy = Gaussians(*(np.asarray(getattr(best, f.name)) for f in fields(best)))
     lowest = min((loss for loss in losses[1:] if np.isfinite(loss)), default=losses[0])

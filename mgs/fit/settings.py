@@ -54,6 +54,8 @@ class TrainSettings(BaseModel):
 
     means: Literal["frozen", "normal", "free"] = "frozen"
     """How means move: frozen, as in the paper; normal, along the prior's normals; or free."""
+    density: str = "fixed"
+    """Density control of free means: fixed, or relocate (the least seen Gaussians, by error)."""
     optimiser: str = "natural"
     """Optimiser of the fit: natural (gradient over Fisher information) or adam."""
     passes: Annotated[int, Field(ge=1)] = PASSES

@@ -27,8 +27,15 @@ from mgs.files import atomic_path, new_folder, read_json, write_json
 from mgs.memory import decoding
 from mgs.notebook import cloud, html
 from mgs.prior.hull import MOST_PIXELS
-from mgs.prior.photographs import Surface, check_masks, source_of, surface_of
+from mgs.prior.photographs import (
+    Surface,
+    check_masks,
+    check_photographs,
+    source_of,
+    surface_of,
+)
 from mgs.prior.resolution import resolution
+from mgs.prior.scattered import scattered
 from mgs.prior.segmentation import SegmentedCloud, segment_dataset
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import poisson_mesh, sample_surface, spread_first
@@ -97,14 +104,18 @@ def prior_and_cloud(
 ) -> tuple[Prior, SegmentedCloud | None]:
     """Build the prior of a dataset. Returns it, and the cloud of its mesh (None for a hull).
 
-    on_stage: called with the name of each stage. source: "depth", "points" or "hull"; by default
-    the first that the dataset has. points: PLY file in place of the dataset's points. up: unit
-    vector; "auto" is the normal of the ground plane, if there is one; None the dataset's. Raises
-    InputError as `source_of`, `check_masks`, `surface_of`, `segment_dataset`, `poisson_mesh` and
-    `sample_surface`, and if no frame sees the mesh; NoSurface, which holds the cloud, if points
-    give no surface.
+    on_stage: called with the name of each stage. source: "depth", "points", "hull" or "random"; by
+    default the first that the dataset has. points: PLY file in place of the dataset's points. up:
+    unit vector; "auto" is the normal of the ground plane, if there is one; None the dataset's.
+    Raises InputError as `source_of`, `check_masks`, `surface_of`, `scattered`, `segment_dataset`,
+    `poisson_mesh` and `sample_surface`, and if no frame sees the mesh; NoSurface, which holds the
+    cloud, if points give no surface.
     """
     chosen = source_of(dataset, source, points)
+    if chosen == "random":
+        return _random_prior(
+            dataset, settings, dataset.up if up is None or up == "auto" else up
+        ), None
     if chosen == "depth":
         surface = _depth_surface(dataset, settings, on_stage)
     else:
@@ -143,6 +154,16 @@ def prior_and_cloud(
         )
     prior = Prior(mesh, samples, normals, spacing, tolerance, numbers, sampled["backed"], upward)
     return prior, segmented
+
+
+def _random_prior(dataset: Dataset, settings: PriorSettings, up: Up) -> Prior:
+    """The prior of the source "random". Raises InputError as `check_photographs`, `scattered`."""
+    check_photographs(dataset.frames)
+    check_masks(dataset.frames)
+    mesh, points, normals, spacing, numbers = scattered(dataset, settings)
+    about = {"from": "random", "frames": len(dataset.frames), "up": list(up), "unit": dataset.unit}
+    tolerance = float(numbers["depth_tolerance"])
+    return Prior(mesh, points, normals, spacing, tolerance, about | numbers, 0, up)
 
 
 def _depth_surface(

@@ -83,7 +83,7 @@ def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None)
     dot = float(np.clip(60_000 / max(len(shade), 1), 1, 12))
     metres = prior.numbers.get("unit", "m") == "m"
     spacing = f"{1e3 * prior.spacing:.2f} mm" if metres else f"{prior.spacing:.3g} units"
-    area = f"{prior.numbers['mesh_area']:.2f} {'m' if metres else 'unit'}²"
+    area = f"{prior.mesh.areas.sum():.2f} {'m' if metres else 'unit'}²"
     with matplotlib.rc_context(STYLE | FRAMED):
         figure = new_figure(17 if segmented is not None else 7, 4.2, dpi=100)
         axes = figure.subplots(1, 5 if segmented is not None else 2)

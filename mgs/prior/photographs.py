@@ -22,7 +22,7 @@ from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import closed_poisson, intersection, poisson_mesh
 from mgs.survey.fusion import focus, voxel_means
 
-SOURCES = ("depth", "mesh", "points", "hull")
+SOURCES = ("depth", "mesh", "points", "hull", "random")
 """Sources of a prior."""
 
 CLOUD = "sparse.ply"
@@ -64,7 +64,8 @@ class Surface:
 
 
 def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = None) -> str:
-    """Source of a dataset's prior: the one asked for, else the first of depth, points and hull.
+    """Source of a dataset's prior: the one asked for, else the first of depth, points, hull and
+    random.
 
     points: file of a given cloud. Raises InputError if there is no source, or not the one asked
     for.
@@ -73,23 +74,24 @@ def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = 
         "depth": any(frame.depth_path for frame in dataset.frames),
         "points": points is not None or (dataset.root / CLOUD).is_file(),
         "hull": has_masks(dataset.frames),
+        "random": True,
     }
     there = [name for name, is_there in has.items() if is_there]
-    if asked is None and there:
+    if asked is None:
         asked = "points" if points is not None else there[0]
     if asked in there:
         return asked
     if asked not in (None, *SOURCES):
         raise InputError(f"--from {asked!r}: is unknown; choose one of {', '.join(SOURCES)}")
     lacks = {"depth": "no depth images", "points": f"no points ({CLOUD})", "hull": "no masks"}
-    missing = lacks.get(asked, "no mesh of its own") if asked else " and ".join(lacks.values())
+    missing = lacks.get(asked, "no mesh of its own")
     ways = {
         "depth": "import data with depth",
         "hull": "import with --masks DIR for --from hull",
         "points": "give --points CLOUD.ply",
         "mesh": "give --mesh MESH",
     }
-    cures = [f"take --from {name}" for name in there]
+    cures = [f"take --from {name}" for name in there if name != "random"]
     cures += [way for name, way in ways.items() if name not in there]
     raise InputError(f"{dataset.root}: has {missing}; {', or '.join(cures)}")
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from mgs.data.dataset import Frame
+from mgs.errors import InputError
 from mgs.fit.objective import newton_decrease, objective
 from mgs.gaussians import Gaussians
 from mgs.policy.criteria import lam_by_kind
@@ -41,8 +42,14 @@ def remaining_decrease(
 
     Returns "phi" (`mgs.fit.objective`, squared pixel values); "predicted_decrease", the Newton
     decrease after CG_ITERATIONS as a share of phi; and "converged", whether that is at most
-    CONVERGED_SHARE. Raises InputError if a frame cannot be read.
+    CONVERGED_SHARE. Raises InputError if a frame cannot be read, or the fit relocated Gaussians,
+    whose prior is not kept.
     """
+    if settings.train.density != "fixed":
+        raise InputError(
+            "--convergence: the fit relocated Gaussians, so its objective is not known; "
+            "leave it out, or fit with --density fixed"
+        )
     images, train = last_images(settings, prior, frames), settings.train
     kinds = groups(0, train.means)
     by_kind = lam_by_kind(settings.regularisation(kinds), kinds)

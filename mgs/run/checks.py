@@ -62,7 +62,9 @@ class Checks:
             step["information_gain"] for step in steps if step["information_gain"] is not None
         ]
         start, coverage = problem.start, steps[-1]["coverage"]
-        drift = detectors.means_drift(fit.gaussians.means, start.means, start.log_scales)
+        drift = 0.0  # relocated Gaussians are not those of the start
+        if problem.settings.train.density == "fixed":
+            drift = detectors.means_drift(fit.gaussians.means, start.means, start.log_scales)
         indicators = detectors.step_indicators(views, fit.losses, coverage, scores, drift)
         before_this = next(
             (step["indicators"] for step in reversed(steps[:-1]) if "indicators" in step), None

@@ -16,6 +16,7 @@ from mgs.files import atomic_folder, reading
 from mgs.policy.from_file import in_file, is_function, label, name_of, source_of
 from mgs.policy.registry import policy_of
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
+from mgs.prior.photographs import source_of as source_of_prior
 from mgs.prior.settings import PriorSettings
 from mgs.run import recording
 from mgs.run.folder import DATASET, POLICY_SOURCE, Run, holds_run, open_run, start
@@ -40,6 +41,14 @@ CAPTURE_PRESET = "quick"
 
 CAPTURE_TEST_VIEWS = 12
 """Test views of a run that captures its images, which has no held-out views."""
+
+
+FREE_PASSES = 30
+"""Passes of a fit of free means to all images. A chosen constant."""
+
+LOOSE = {"points": 4.0, "hull": 4.0, "random": 40.0}
+"""Sources of a prior less sure than the images -> factor on its standard deviations in a fit
+of free means to all images. Chosen constants."""
 
 
 def run_nbv(
@@ -67,6 +76,7 @@ def start_run(
     prior: str | Path | Prior | None = None,
     gaussians: int | Literal["auto"] | None = None,
     preset: str | None = None,
+    loose: float = 1.0,
     progress: Progress = no_progress,
     **settings: Any,
 ) -> Run:
@@ -124,7 +134,10 @@ def start_run(
         if not isinstance(prior, str | Path):
             save_prior(unfinished / "prior", built)
         _check_near(built, frames, where)
-        complete = complete.with_spacing(built.spacing)
+        if built.numbers.get("from") == "random" and complete.train.means != "free":
+            free = "pass --means free, or give depth, points or masks"
+            raise InputError(f"{where}: starts at random points, not on a surface; {free}")
+        complete = complete.with_spacing(built.spacing, loose)
         if complete.flies or complete.no_fly or complete.clearance is not None:
             Problem(
                 frames, complete, operations_of(frames, built, complete), policy=scores
@@ -135,6 +148,36 @@ def start_run(
         if not isinstance(policy, str):
             (unfinished / POLICY_SOURCE).write_text(source_of(policy), encoding="utf-8")
     return Run(out, complete, loaded if live is None else None, found, policy)
+
+
+def start_fit(
+    dataset: str | Path,
+    out: str | Path,
+    *,
+    prior: str | Path | None = None,
+    gaussians: int | Literal["auto"] | None = None,
+    progress: Progress = no_progress,
+    **settings: Any,
+) -> Run:
+    """`start_run` of a run that takes all images at once and chooses none.
+
+    By default means are free where the prior comes from photographs (`LOOSE`), with FREE_PASSES
+    passes and a looser prior, else frozen. Arguments and errors as `start_run`.
+    """
+    root = Path(dataset)
+    loaded, train = load_dataset(root), dict(settings.pop("train", {}))
+    found = Path(prior) if prior is not None else root / "prior"
+    known = gaussians is None and (prior is not None or (found / "prior.json").is_file())
+    source = load_prior(found).numbers.get("from") if known else source_of_prior(loaded.survey())
+    train.setdefault("means", "free" if source in LOOSE else "frozen")
+    loose = 1.0
+    if train["means"] == "free" and source in LOOSE:
+        loose = LOOSE[source]
+        train.setdefault("passes", FREE_PASSES)
+    every = {"seeds": len(loaded), "budget": 0, "train": train, "loose": loose}
+    return start_run(
+        root, out, prior=prior, gaussians=gaussians, progress=progress, **settings | every
+    )
 
 
 def _with_defaults(settings: dict[str, Any], row: Any, loaded: Dataset | None) -> dict[str, Any]:

@@ -136,16 +136,21 @@ class NbvSettings(BaseModel):
         by_kind = regularisation(groups, self.pixel_noise, self.prior_std)
         return by_kind if self.lam is None else np.full_like(by_kind, self.lam)
 
-    def with_spacing(self, spacing: float) -> NbvSettings:
+    def with_spacing(self, spacing: float, loose: float = 1.0) -> NbvSettings:
         """The settings with a rate and a prior std of learned means, from the samples' spacing, m.
 
-        What is given stays; nothing changes where means are frozen.
+        loose: factor on the default prior std of every kind. What is given stays; nothing changes
+        where means are frozen.
         """
         if self.train.means == "frozen":
             return self
         rates = {"mean": MEAN_RATE * spacing} | self.train.rates
         train = self.train.model_copy(update={"rates": rates})
-        prior_std = {"mean": MEAN_STD * spacing} | self.prior_std
+        prior_std = {
+            kind: loose * std if std == PRIOR_STD.get(kind) else std
+            for kind, std in self.prior_std.items()
+        }
+        prior_std = {"mean": loose * MEAN_STD * spacing} | prior_std
         return self.model_copy(update={"train": train, "prior_std": prior_std})
 
 
@@ -233,7 +238,8 @@ def check_settings(settings: NbvSettings, frames: int) -> None:
     Unknown are: a policy, an estimator without a diagonal, an optimiser; an estimator or a policy
     that has no columns of learned means; seeds and budget beyond the number of frames.
     """
-    from mgs.fit.optimisers import OPTIMISERS  # loads Dr.Jit, as the next
+    from mgs.fit.density import DENSITIES  # loads Dr.Jit, as the next two
+    from mgs.fit.optimisers import OPTIMISERS
     from mgs.splat import ESTIMATORS
 
     diagonal = [name for name in ESTIMATORS if name != "block"]
@@ -247,6 +253,10 @@ def check_settings(settings: NbvSettings, frames: int) -> None:
         message = f"{fixed[0]} has no information about means; leave out either"
         raise InputError(f"--means {settings.train.means}: {message}")
     row_named(OPTIMISERS, settings.train.optimiser, "--optimiser")
+    control = row_named(DENSITIES, settings.train.density, "--density")
+    if control and (settings.train.means != "free" or settings.budget > 0):
+        needs = "needs free means and all images at once; give `mgs fit --means free`"
+        raise InputError(f"--density {settings.train.density}: {needs}")
     if settings.flies and settings.travel is not None:
         raise InputError(
             f"--travel {settings.travel:g}: a flight with a limit has its own travel cost; "

@@ -1,0 +1,48 @@
+"""`mgs fit`: fit a model to all images of a dataset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from mgs.cli.nbv import resume_and_print, settings_of, start_and_print, with_settings_as_options
+from mgs.cli.options import DatasetFolder, option, parse_gaussians
+
+PANELS = {
+    "Fitting": ("passes", "means", "density", "exposure", "alpha_weight", "optimiser", "rates"),
+    "Advanced": ("pixel_noise", "prior_std", "seed"),
+}
+"""Settings with an option of the same name, as `mgs.cli.nbv.PANELS`."""
+
+
+def fit(
+    dataset: DatasetFolder,
+    out: Annotated[Path, option("New folder for the run.")],
+    prior: Annotated[
+        Path | None,
+        option("Folder of `mgs prior`. Default: DATASET/prior, or one built in the run."),
+    ] = None,
+    gaussians: Annotated[
+        str | None,
+        option("Build a prior of this many Gaussians in the run.", metavar="N|auto"),
+    ] = None,
+    **options: Any,
+) -> None:
+    """Fit a model to all images of a dataset, and measure it.
+
+    Means are free by default where the prior comes from photographs (points, masks or random), and
+    frozen where it comes from depth or a mesh. Test views are never fitted. The folder is a run of
+    `mgs nbv` that chooses no view, so every command for runs takes it.
+    """
+    from rich.console import Console
+
+    from mgs.run.nbv import start_fit
+
+    console = Console(highlight=False)
+    given = {name: options[name] for name in options if options[name] not in (None, [])}
+    asked = {"prior": prior, "gaussians": parse_gaussians(gaussians)}
+    run = start_and_print(dataset, out, console, start_fit, **asked, **settings_of(given))
+    resume_and_print(run, console, run.settings.policy)
+
+
+with_settings_as_options(fit, PANELS)

@@ -1,0 +1,74 @@
+"""Random start: a prior for photographs whose object has no known surface."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+
+from mgs.data.dataset import Dataset
+from mgs.data.meshes import Mesh
+from mgs.data.visibility import has_masks, mask_share
+from mgs.errors import InputError
+from mgs.prior.points import MASK_SHARE
+from mgs.prior.settings import PriorSettings
+from mgs.seeds import generator
+from mgs.survey.fusion import focus
+
+GAUSSIANS = 10_000
+"""Number of Gaussians where none is given."""
+
+FAR = 10.0
+"""Radius within which the background of photographs without masks starts, over that of the ball
+that the cameras look at."""
+
+DRAWS = 64
+"""Draws per Gaussian after which too few lie inside the masks."""
+
+
+def scattered(
+    dataset: Dataset, settings: PriorSettings
+) -> tuple[Mesh, np.ndarray, np.ndarray, float, dict[str, Any]]:
+    """Mesh, points [N,3], unit normals [N,3], spacing and items of prior.json of a random start.
+
+    Points fill the ball that all cameras see, about the point they look at, inside the masks if all
+    frames have them. Otherwise half of them lie outside, evenly in the logarithm of their distance,
+    as background. The mesh is the ball; normals point outwards. Raises InputError if the settings
+    shape a surface, or the masks share no point of the ball.
+    """
+    settings.refuse_shaping("a random start has no surface")
+    count = settings.gaussians if isinstance(settings.gaussians, int) else GAUSSIANS
+    middle, rng = focus(dataset.frames).point, generator(settings.seed, "prior/random")
+    reach = [
+        np.linalg.norm(frame.camera.position - middle)
+        * np.sin(np.arctan(min(frame.camera.width, frame.camera.height) / 2 / frame.camera.K[0, 0]))
+        for frame in dataset.frames
+    ]
+    radius, masked = float(np.median(reach)), has_masks(dataset.frames)
+    kept, drawn = [np.zeros((0, 3))], 0
+    while sum(map(len, kept)) < count and drawn < DRAWS * count:
+        directions = rng.normal(size=(count, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        distance = rng.random(count) ** (1 / 3)
+        if not masked:
+            distance = np.where(rng.random(count) < 0.5, distance, FAR ** rng.random(count))
+        points = middle + radius * distance[:, None] * directions
+        share, views = mask_share(points, dataset.frames)
+        kept.append(points[(views > 0) & (share >= MASK_SHARE)])
+        drawn += count
+    points = np.concatenate(kept)[:count]
+    if len(points) < count:
+        raise InputError(
+            f"{dataset.root}: only {len(points)} of {drawn} random points lie inside all masks; "
+            "poses and masks do not fit, correct or remove frames"
+        )
+    outwards = points - middle
+    normals = outwards / np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-9)
+    spacing = float(np.median(cKDTree(points).query(points, 2)[0][:, 1]))
+    ball = trimesh.creation.icosphere(3, radius)
+    mesh = Mesh(ball.vertices + middle, ball.faces, np.ones(len(ball.faces), bool))
+    numbers = {"n": count, "spacing": spacing, "radius": radius, "depth_tolerance": 2 * radius}
+    return mesh, points, normals, spacing, numbers | {"backed": 0, "settings": asdict(settings)}
