@@ -18,7 +18,7 @@ from mgs.fit.settings import ALPHA_WEIGHT, COLOURS_ALONE, TrainSettings
 from mgs.prior.settings import PriorSettings
 from mgs.run.nbv import start_run
 from mgs.run.settings import PRESETS, NbvSettings, with_defaults
-from mgs.study import case, chart, oracle, timing
+from mgs.study import case, chart, timing
 
 DEFAULTS = {**NbvSettings.model_fields, **TrainSettings.model_fields}
 
@@ -124,7 +124,6 @@ def test_studies_fit_colours_alone(dataset, prior, tmp_path, monkeypatch):
         lambda: chart.measure(*where, settings, 1),
         lambda: case.begun_run(*where, {}),
         lambda: case.begun_run(*where, settings),
-        lambda: oracle.run_oracle(*where, settings),
     ):
         with pytest.raises(Begun) as begun:
             call()

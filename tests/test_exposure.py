@@ -215,7 +215,7 @@ def test_the_distance_of_a_fit_from_its_end_is_that_of_the_corrected_images(runs
 def test_the_table_has_the_corrected_columns_only_where_a_run_estimated_exposure(runs):
     for name, there in (("with", True), ("without", False)):
         table = markdown_table(table_numbers([runs[name][1]]))
-        assert ("exposure fitted to each view" in table) == there
+        assert ("exposure fitted (dB)" in table) == there
 
 
 # What photographs say themselves
