@@ -82,11 +82,11 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, Figure]:
 
 
 def test_the_orbit_of_a_tilted_world_is_drawn_as_that_of_the_upright_one(runs, drawn, tmp_path):
-    shown, labels = [], [("x (m)", "y (m)"), ("horizontal (unit)", "horizontal, across (unit)")]
-    for run, names in zip(runs, labels, strict=True):
+    shown = []
+    for run, length in zip(runs, ("1 m", "1 unit"), strict=True):
         write_report(tmp_path / "report", [run])
         axis = drawn["orbit.png"].axes[0]
-        assert (axis.get_xlabel(), axis.get_ylabel()) == names
+        assert length in [text.get_text() for text in axis.texts]
         shown.append([np.asarray(points.get_offsets()) for points in axis.collections])
         assert len(shown[-1]) == 4
     for level, tilted in zip(*shown, strict=True):

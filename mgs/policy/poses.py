@@ -127,4 +127,5 @@ def seed_views(positions: Array, centre: Array, count: int) -> list[int]:
             cost[others] = np.inf
             if cost.min() < cost[seeds[k]]:
                 seeds[k] = int(np.argmin(cost))
-    return sorted(seeds, key=lambda i: (azimuth[i], i))
+    order = np.round(azimuth, 9) % round(2 * np.pi, 9)  # an azimuth just below 2 pi is 0
+    return sorted(seeds, key=lambda i: (order[i], i))

@@ -97,7 +97,7 @@ class Problem:
     allowed [V]: poses that `no_fly` and `clearance` allow. skipped: number of views taken before
     the flight. What depends on images (`start`) is computed when first asked for.
 
-    seeds: frames that start the model; by default spread evenly in azimuth among those allowed.
+    seeds: frames that start the model; by default spread over the directions of those allowed.
     Raises InputError where these are too few, or their flight exceeds the limits.
     """
 
