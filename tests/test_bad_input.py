@@ -227,7 +227,7 @@ def test_nbv_needs_to_know_what_to_do(capsys, dataset, tmp_path):
 
 @cases(
     {
-        "missing": (shutil.rmtree, "holds no run"),
+        "missing": (shutil.rmtree, "no such run folder or PLY file"),
         "without config": (remove("config.json"), "holds no run"),
         "truncated config": (truncate("config.json"), "config.json"),
         "truncated checkpoint": (truncate("checkpoint.npz"), "checkpoint.npz"),

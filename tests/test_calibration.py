@@ -157,7 +157,7 @@ def test_crps_against_the_integral_that_defines_it():
 @pytest.mark.parametrize(
     ("trained", "changes", "said"),
     [
-        (5, {}, "has 5 images; --calibrate leaves out a third of them, and needs 6 or more"),
+        (5, {}, "has 5 images; calibrate leaves out a third of them, and needs 6 or more"),
         (7, {"train": {"means": "free"}}, "learns means"),
         (7, {"exposure": True}, "estimates exposure"),
         (8, {}, "was trained on all views there are"),

@@ -115,7 +115,7 @@ def test_poses_that_are_not_allowed_are_never_taken(dataset, prior, tmp_path, ca
         (["--flight-time", "nan"], "--flight-time nan"),
         (["--hover", "-1"], "--hover -1.0: must be at least 0"),
         (["--speed", "0"], "--speed 0"),
-        (["--flight-length", "9"], "takes 15.6 m and 17 s; raise --flight-length"),
+        (["--flight-length", "9"], "takes 15.2 m and 17 s; raise --flight-length"),
         (["--no-fly", "4"], "allow 0 of its 12 poses, fewer than 3 seeds"),
         (["--clearance", "30"], "allow 0 of its 12 poses, fewer than 3 seeds"),
         (["--flight-length", "30", "--travel", "2"], "leave out --travel"),

@@ -192,7 +192,7 @@ def test_a_run_folder_appears_when_it_is_complete(dataset, prior, tmp_path, monk
     ("values", "named"),
     [
         ({"budget": -1}, "budget: must be at least 0"),
-        ({"speed": 1}, "speed: Extra inputs are not permitted"),
+        ({"haste": 1}, "haste: Extra inputs are not permitted"),
         ({"prior_std": {"color": 1.0}}, f"prior_std: {KINDS}"),
         ({"train": {"speed": 1}}, "train.speed"),
         ({"train": {"rates": [0.1, 0.2]}}, "train.rates"),
@@ -258,7 +258,7 @@ def test_settings_without_an_option_are_named_by_their_key(
 
 def test_options_win_over_a_file_of_settings(dataset, prior, tmp_path, capsys, monkeypatch):
     """The config.json of a run is such a file, too."""
-    monkeypatch.setattr(nbv_command, "resume_and_print", lambda *given: None)
+    monkeypatch.setattr(nbv_command, "resume_and_print", lambda *given, live: None)
     file, first, second = (tmp_path / name for name in ("mine.toml", "first", "second"))
     text = f'dataset = "{dataset.name}"\nprior = "{prior}"\nseeds = 3\nbudget = 2\n'
     file.write_text(text + "[train]\npasses = 2\n")

@@ -1,6 +1,6 @@
 """Draw the figures of docs/results again from the rows beside them.
 
-python tools/figures.py [NAME ...]     # chart, parsimony, pools, prior-faults; default: all
+python tools/figures.py [NAME ...]     # chart, parsimony, setups, prior-faults; default: all
 """
 
 from __future__ import annotations
@@ -11,19 +11,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from mgs.study import chart, parsimony
-from mgs.study.output import Panel, draw_matrix, draw_panels
+from mgs.study import chart, parsimony, setups
+from mgs.study.output import draw_panels
 from mgs.study.stress.faults import LOST, label_of
 
 RESULTS = Path(__file__).parent.parent / "docs/results"
 
 Rows = list[dict[str, Any]]
-
-
-POOLS = Panel(
-    "pool", "test_psnr_over_random", "pool", "", "policy",
-    title="PSNR over random views (dB). Bold: the 95 % interval excludes 0",
-)  # fmt: skip
 
 
 def read_rows(path: Path) -> Rows:
@@ -50,10 +44,6 @@ def _chart(path: Path, rows: Rows) -> None:
     chart.draw(path, {k: [{"preset": ""} | row for row in rows] for k, rows in kinds.items()})
 
 
-def _pools(path: Path, rows: Rows) -> None:
-    draw_matrix(path, POOLS, [row for row in rows if row["policy"] != "random"])
-
-
 def _faults(path: Path, rows: Rows) -> None:
     labelled = [row | {"label": label_of(row["fault"], row["size"])} for row in rows]
     draw_panels(path, [LOST], labelled)
@@ -62,7 +52,7 @@ def _faults(path: Path, rows: Rows) -> None:
 FIGURES: Mapping[str, tuple[str, Callable[[Path, Rows], None]]] = {
     "chart": ("chart/fit", _chart),
     "parsimony": ("parsimony/parsimony", parsimony.draw),
-    "pools": ("reproduce/pools", _pools),
+    "setups": ("setups/setups", setups.draw),
     "prior-faults": ("stress/prior-faults", _faults),
 }
 """Figures by name: file below RESULTS without its ending, and the function that draws its rows."""

@@ -48,6 +48,8 @@ def evaluate(
     path = None
     if not isinstance(subject, Gaussians):
         path = Path(subject)
+        if not path.exists():
+            raise InputError(f"{path}: no such run folder or PLY file")
         subject, renderer = read_ply(path), _renderer(ply_colour_space(path))
         if dataset is None and holds_run(path.parent):
             run = open_run(path.parent)

@@ -165,8 +165,9 @@ def choose_batch(
         if not problem.reachable(planned.taken):
             break
         frame, score = chooser(problem, planned, fisher)
-        gain = criteria.d_optimal(fisher(frame), planned.H, problem.lam)
-        after = with_view(problem, planned, frame, fisher)
+        F = fisher(frame)
+        gain = criteria.d_optimal(F, planned.H, problem.lam)
+        after = with_view(problem, planned, frame, F)
         covered = criteria.coverage(after.surface, problem.prior_lam)
         choice = Choice(frame, score, gain, covered)
         if settings.stop_gain is not None and gain < settings.stop_gain:
@@ -177,12 +178,10 @@ def choose_batch(
     return planned, choices, None
 
 
-def with_view(
-    problem: Problem, state: Fitted, frame: int, fisher: Callable[[int], np.ndarray]
-) -> Fitted:
-    """The state as if a view were taken, its model unchanged."""
+def with_view(problem: Problem, state: Fitted, frame: int, F: np.ndarray) -> Fitted:
+    """The state as if a view were taken, its model unchanged. F: its information [N,P]."""
     surface = surface_information(problem, [frame], state)
-    return Fitted(state.gaussians, state.H + fisher(frame), surface, [*state.taken, frame])
+    return Fitted(state.gaussians, state.H + F, surface, [*state.taken, frame])
 
 
 def choose(
@@ -254,5 +253,5 @@ def plan_flight(
         way = tour.two_opt(flight.legs, way)
         pool.remove(frame)
         if pool and len(scores) < most:
-            planned = with_view(problem, planned, frame, fisher)
+            planned = with_view(problem, planned, frame, fisher(frame))
     return [(frame, scores[frame]) for frame in way[1:-1]]

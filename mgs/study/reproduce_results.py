@@ -13,7 +13,7 @@ from mgs.files import write_csv
 from mgs.report.evaluation import evaluate_run
 from mgs.report.writing import write_report
 from mgs.study import reproduce, setups
-from mgs.study.output import Panel, draw_panels, table, write_table
+from mgs.study.output import table, write_table
 from mgs.study.reproduce import ReproduceSize, Run
 from mgs.study.sweep import Report, cell_folder, found, run_cells
 from mgs.study.verdict import Row
@@ -127,11 +127,7 @@ def write_setups(work: Work) -> list[Path]:
     rows = setups.rows_of(known, [cell for cell in cells if cell.name in known], rocks)
     leads = [lead for key in setups.MEASURES for lead in setups.leads_of(rows, setups.LEADER, key)]
     write_csv(work.out / "leads.csv", leads)
-    panels = (
-        Panel("setup", "test_gain", "set-up", "PSNR on test views, over random (dB)", "policy"),
-    )
-    shown = [row for row in rows if row["policy"] not in (setups.RANDOM, setups.ORACLE)]
-    draw_panels(work.out / "setups.png", panels, shown)
+    setups.draw(work.out / "setups.png", rows)
     text = setups.text_of(rows, leads)
     written = write_table(work.out, "setups", rows, text, work.command, rocks=work.count)
     return [*written, work.out / "leads.csv", work.out / "setups.png"]

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from mgs.run.state import Fitted
 from mgs.splat import ListCache
 from mgs.study.case import Case, Size, test_views_of
 from mgs.study.oracle import oracle
-from mgs.study.output import table, with_interval
+from mgs.study.output import Panel, draw_matrix, table, with_interval
 from mgs.study.rocks import Rock
 from mgs.study.statistics import holm, interval, permutation_p
 from mgs.study.sweep import Cell
@@ -47,6 +48,9 @@ LEADER = "directional-d"
 """Policy whose lead over every other is tested: the default of `mgs nbv`."""
 
 RANDOM, ORACLE = "random", "oracle"
+
+MEAN = "mean"
+"""Name of the mean over the set-ups, beside their names."""
 
 DRAWS = 5
 """Runs of `random`, averaged."""
@@ -256,19 +260,30 @@ def rows_of(results: Found, cells: Sequence[Cell], rocks: Sequence[Rock]) -> lis
 
 
 def by_scene(rows: Sequence[Row], setup: str, policy: str, key: str) -> dict[str, float]:
-    """Mean of a key over the rocks of each scene."""
+    """Mean of a key over the rocks of each scene; setup: a name of SETUPS, or MEAN."""
     values: dict[str, list[float]] = {}
     for row in rows:
-        if (row["setup"], row["policy"]) == (setup, policy):
+        if row["policy"] == policy and setup in (row["setup"], MEAN):
             values.setdefault(row["scene"], []).append(row[key])
     return {scene: float(np.mean(of)) for scene, of in values.items()}
 
 
+def _setups(rows: Sequence[Row]) -> list[str]:
+    """Set-ups of the rows, in their order, and MEAN."""
+    return [*dict.fromkeys(row["setup"] for row in rows), MEAN]
+
+
+def _policies(rows: Sequence[Row]) -> list[str]:
+    return list(dict.fromkeys(row["policy"] for row in rows))
+
+
 def leads_of(rows: Sequence[Row], leader: str, measure: str) -> list[Row]:
-    """Lead of a policy over each other in each set-up, where both were run: mean over scenes, 95 %
-    interval, exact permutation p, and p by Holm's correction over all of them."""
-    leads = []
-    for setup, other in dict.fromkeys((row["setup"], row["policy"]) for row in rows):
+    """Lead of a policy over each other in each set-up and in their mean, where both were run.
+
+    Each is a mean over scenes, with a 95 % interval, an exact permutation p, and p by Holm's
+    correction over all of them."""
+    leads: list[Row] = []
+    for setup, other in product(_setups(rows), _policies(rows)):
         if other in (leader, ORACLE):
             continue
         own, theirs = (by_scene(rows, setup, policy, measure) for policy in (leader, other))
@@ -284,11 +299,25 @@ def leads_of(rows: Sequence[Row], leader: str, measure: str) -> list[Row]:
     return [lead | {"p_holm": p} for lead, p in zip(leads, corrected, strict=True)]
 
 
+def draw(path: Path, rows: Sequence[Row]) -> None:
+    """Draw gains over `random` on the test views, means over scenes, as a matrix of policies and
+    set-ups. Raises InputError if the file cannot be written."""
+    means = []
+    for setup, policy in product(_setups(rows), _policies(rows)):
+        if policy in (RANDOM, ORACLE):
+            continue
+        values = list(by_scene(rows, setup, policy, "test_gain").values())
+        low, high = interval(values) or (np.nan, np.nan)
+        gain = {"gain": float(np.mean(values)), "gain_low": low, "gain_high": high}
+        means.append({"setup": setup, "policy": policy} | gain)
+    title = "PSNR over random views (dB). Bold: the 95 % interval excludes 0"
+    draw_matrix(path, Panel("setup", "gain", "set-up", "", "policy", title=title), means)
+
+
 def text_of(rows: Sequence[Row], leads: Sequence[Row]) -> str:
     """Tables with a line for each policy and a column for each set-up: gains over `random` by each
     of MEASURES, share of the oracle's gain, and the leader's lead."""
-    setups = list(dict.fromkeys(row["setup"] for row in rows))
-    policies = list(dict.fromkeys(row["policy"] for row in rows))
+    setups, policies = _setups(rows), _policies(rows)
 
     def gain(setup: str, policy: str, key: str) -> float | None:
         found = by_scene(rows, setup, policy, f"{key}_gain")
@@ -334,11 +363,11 @@ def _shares(
 ) -> str:
     """Share of the oracle's gain over `random`, over the rocks that the oracle was tried on."""
     rocks = {row["rock"] for row in rows if row["policy"] == ORACLE}
+    tried = [row for row in rows if row["rock"] in rocks]
 
     def share(setup: str, policy: str) -> str:
-        of = [r["test_gain"] for r in rows if (r["setup"], r["policy"]) == (setup, policy)
-              and r["rock"] in rocks]  # fmt: skip
-        won = [r["test_gain"] for r in rows if (r["setup"], r["policy"]) == (setup, ORACLE)]
-        return f"{np.mean(of) / np.mean(won):.0%}" if of and np.mean(won) > 0 else "–"
+        of, won = (by_scene(tried, setup, p, "test_gain") for p in (policy, ORACLE))
+        total = sum(won.values())
+        return f"{sum(of.values()) / total:.0%}" if of and total > 0 else "–"
 
     return matrix("share of the oracle's gain", share, [p for p in policies if p != RANDOM])
