@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,15 @@ SPZ_MAGIC = (b"\x1f\x8b", b"NGSP")
 
 SPZ_BITS = 23
 """Bits of the magnitude of an SPZ position, a fixed-point number."""
+
+Y_UP = np.array([1, -1, -1], np.float32)
+"""Signs of x, y, z between the axes of 3DGS files (y down, z forward) and of SPZ (y up)."""
+
+Y_UP_QUATS = np.array([1, 1, -1, -1], np.float32)
+"""Signs of w, x, y, z of a quaternion between these axes."""
+
+Y_UP_SH = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+"""Signs s_k of the colour coefficients between these axes: Y_k(x, -y, -z) = s_k Y_k(x, y, z)."""
 
 OTHERS = {
     ".splat": "a .splat",
@@ -116,8 +126,17 @@ def _spz_codec(path: Path) -> Any:
     return gsply_cpp
 
 
+def _flip_y_up(g: Gaussians) -> Gaussians:
+    """Turn Gaussians between the axes of 3DGS files and of SPZ; twice gives the same Gaussians."""
+    sh = g.sh * Y_UP_SH[: g.sh.shape[1], None]
+    return replace(g, means=g.means * Y_UP, quats=g.quats * Y_UP_QUATS, sh=sh)
+
+
 def _read_spz(path: Path) -> Gaussians:
-    """Read an SPZ of version 1 to 4. Raises InputError if it is damaged."""
+    """Read an SPZ of version 1 to 4 and turn it to the axes of 3DGS files.
+
+    Raises InputError if it is damaged.
+    """
     codec = _spz_codec(path)
     try:
         with reading(path), decoding(path):
@@ -125,13 +144,14 @@ def _read_spz(path: Path) -> Gaussians:
             parts = [found["sh0"][:, None, :]]
             if found["shN"] is not None and found["shN"].size:
                 parts.append(found["shN"])
-            return Gaussians(
+            y_up = Gaussians(
                 means=found["means"],
                 log_scales=found["scales"],
                 quats=found["quats"],
                 logit_opacities=found["opacities"],
                 sh=np.concatenate(parts, axis=1),
             ).check()
+            return _flip_y_up(y_up)
     except (RuntimeError, ValueError) as error:
         reason = str(error).removesuffix(f": {path}")
         raise InputError(f"{path}: not a readable SPZ ({reason}); export it again") from None
@@ -141,13 +161,13 @@ def _read_spz(path: Path) -> Gaussians:
 
 
 def _write_spz(path: Path, gaussians: Gaussians) -> None:
-    """Write an SPZ of version 3. Positions take as many fractional bits as their size allows.
+    """Write an SPZ of version 3, y up. Positions take as many fractional bits as their size allows.
 
     Values outside the format's range are clipped: log-scales to -10 to 5.9, coefficients of degree
     0 to +-3.3, and the others to +-1.
     """
     codec = _spz_codec(path)
-    g = gaussians
+    g = _flip_y_up(gaussians)
     largest = max(float(np.abs(g.means).max(initial=0)), 1e-6)
     bits = int(np.clip(np.floor(SPZ_BITS - np.log2(largest * (1 + 1e-6))), 1, 24))
     fields = (g.means, g.log_scales, g.quats, g.logit_opacities, g.sh[:, 0])

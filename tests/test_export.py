@@ -19,7 +19,8 @@ from mgs.colour import srgb_from_linear
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.report.exporting import Model, in_srgb, to_y_up
-from mgs.splat_files import FORMATS, colour_space, load_gaussians, write_gaussians
+from mgs.splat.reference import sh_basis
+from mgs.splat_files import FORMATS, Y_UP_SH, colour_space, load_gaussians, write_gaussians
 from mgs.splat_ply import write_ply
 
 TOLERANCES = {
@@ -55,6 +56,24 @@ def test_a_model_comes_back(tmp_path, kind, degree):
     assert np.abs(unit(read.quats) - unit(model.quats)).max() <= quat
     assert np.abs(read.opacities - model.opacities).max() <= opacity
     assert np.abs(read.sh - model.sh).max() <= colour
+
+
+def test_an_spz_is_y_up(tmp_path):
+    codec = pytest.importorskip("gsply_cpp")
+    model = gaussians(3, n=300)
+    model.sh = np.clip(model.sh, -0.99, 0.99)
+    raw = codec.read_spz(str(written(tmp_path, "spz", model)))
+    np.testing.assert_allclose(raw["means"], model.means * (1, -1, -1), atol=1e-6)
+    np.testing.assert_allclose(unit(raw["quats"]), unit(model.quats * (1, 1, -1, -1)), atol=3e-3)
+    higher = (model.sh * Y_UP_SH[:, None])[:, 1:]
+    np.testing.assert_allclose(raw["shN"], higher, atol=TOLERANCES["spz"][-1])
+
+
+def test_the_signs_of_coefficients_turn_the_basis():
+    directions = np.random.default_rng(0).normal(size=(100, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    turned = sh_basis(directions * (1, -1, -1), 3)
+    np.testing.assert_allclose(turned, Y_UP_SH * sh_basis(directions, 3), atol=1e-12)
 
 
 @pytest.mark.parametrize("degree", [0, 2])
