@@ -7,6 +7,7 @@ one after another in this process, or several at a time in Dask workers; the res
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -184,13 +185,15 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
 def _connected(scheduler: str) -> Client:
     from distributed import Client
 
-    try:
+    client = None
+    with suppress(OSError, ValueError, TimeoutError):
         client = Client(scheduler, timeout=CONNECT_SECONDS)
-    except (OSError, ValueError, TimeoutError):
+    if client is None:
+        gc.collect()  # the client that failed: collected while another starts, it blocks for ever
         raise InputError(
             f"--scheduler {scheduler}: no Dask scheduler answers; "
             "give its address, as tcp://HOST:8786"
-        ) from None
+        )
     with suppress(TimeoutError):
         client.wait_for_workers(1, timeout=CONNECT_SECONDS)
     threads = client.nthreads().values()
