@@ -2,7 +2,7 @@
 
 Choosing a view needs less model than rendering it. So it uses a coarse one: about COARSE of the
 model's Gaussians, larger by the ratio of their spacings, in smaller images in which they are as
-large as before. Ranks agree with those of the whole model (docs/howto/on-site.md).
+large as before.
 """
 
 from __future__ import annotations
