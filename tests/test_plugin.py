@@ -221,7 +221,7 @@ PLY = {"filename": "PLY"}
 BAD_FILES = [
     ({}, NO_NAME),
     ({"filename": 5}, NO_NAME),
-    ({"filename": "nowhere.ply"}, "nowhere.ply: no such file; give a 3DGS PLY"),
+    ({"filename": "nowhere.ply"}, "nowhere.ply: no such file; give a PLY, GLB or SPZ of Gaussians"),
     ({"filename": __file__}, "export it again"),
     (PLY | {"depth": "false"}, "mgs_splat: depth 'false' must be a boolean"),
     (PLY | {"background": "white"}, f"background white: {NO_COLOUR}"),

@@ -254,7 +254,10 @@ EMPTY = "ply\nformat ascii 1.0\nelement point 0\n"
 ONE_FLOAT = "property float x\nend_header\n"
 UNREADABLE = "not a readable 3DGS PLY"
 BAD = {
-    "no PLY": (lambda folder: (folder / "x.ply").unlink(), "x.ply: no such file; give a 3DGS PLY"),
+    "no PLY": (
+        lambda folder: (folder / "x.ply").unlink(),
+        "x.ply: no such file; give a PLY, GLB or SPZ of Gaussians",
+    ),
     "not a PLY": (replaced("ply\n", "solid ply\n"), UNREADABLE),
     "truncated": (
         lambda folder: (folder / "x.ply").write_text((folder / "x.ply").read_text()[:-60]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -129,8 +130,10 @@ def prior(
         result = with_share_seen(result, _seed_frames(loaded, result))
         if result.numbers["from"] != "random" and not loaded.on_demand:
             progress("colours of the surface")
-            agreement = {"colour_agreement": colour_agreement(result, loaded.frames)}
-            result = replace(result, numbers=result.numbers | agreement)
+            agreed = colour_agreement(result, loaded.frames)
+            if not math.isnan(agreed):
+                numbers = result.numbers | {"colour_agreement": agreed}
+                result = replace(result, numbers=numbers)
         progress("figure")
         save_prior(unfinished, result)
         draw_prior(unfinished / "prior.png", result, segmented)
@@ -212,9 +215,9 @@ def _table(numbers: dict[str, Any]) -> Table:
     table.add_row("nearest neighbour over spacing", f"mean {mean:.2f}, least {least:.2f}")
     seen = f"{numbers['seen_by_seeds']:.1%}; the rest starts grey"
     table.add_row(f"samples that {SEEDS} evenly spaced frames see", seen)
-    agreed = numbers.get("colour_agreement", float("nan"))
-    if agreed == agreed:
-        table.add_row("colour variance that all frames agree on", f"{agreed:.0%}")
+    if "colour_agreement" in numbers:
+        agreed = f"{numbers['colour_agreement']:.0%}"
+        table.add_row("colour variance that all frames agree on", agreed)
     table.add_row("up", _up(numbers))
     truth = numbers.get("truth")
     if truth is None:
