@@ -4,9 +4,9 @@ from .camera import Camera as Camera
 from .camera import look_at as look_at
 from .cli.progress import progress_bar as progress_bar
 from .data.dataset import Dataset as Dataset
-from .data.dataset import Frame as Frame
 from .data.dataset import load_cameras as load_cameras
 from .data.dataset import load_dataset as load_dataset
+from .data.frames import Frame as Frame
 from .errors import InputError as InputError
 from .gaussians import Gaussians as Gaussians
 from .prior.build import Prior as Prior

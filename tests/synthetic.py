@@ -9,7 +9,8 @@ import numpy as np
 import trimesh
 
 from mgs.camera import Camera, look_at
-from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
+from mgs.data.dataset import Dataset, load_dataset, write_transforms
+from mgs.data.frames import Frame
 from mgs.data.meshes import to_glb
 from mgs.images import write_exr, write_png
 

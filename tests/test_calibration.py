@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from splat.scenes import calm, make_camera, make_gaussians
 
-from mgs.data.dataset import Dataset, Frame
+from mgs.data.dataset import Dataset
+from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.images import write_png
 from mgs.report import calibration, predicted_error

@@ -10,7 +10,8 @@ import pytest
 import trimesh
 
 from mgs.camera import Camera, look_at
-from mgs.data.dataset import Frame, write_transforms
+from mgs.data.dataset import write_transforms
+from mgs.data.frames import Frame
 from mgs.data.importers import import_source
 from mgs.data.masks import make_masks
 from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh, to_glb

@@ -21,7 +21,8 @@ from refusals import one_line
 from mgs.camera import Camera, look_at, opengl_from_opencv
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data.check import check_dataset
-from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
+from mgs.data.dataset import Dataset, load_dataset, write_transforms
+from mgs.data.frames import Frame
 from mgs.data.importers import import_source
 from mgs.data.lens import undistorter
 from mgs.data.sources import read_source

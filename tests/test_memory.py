@@ -19,7 +19,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 import synthetic
 
 import mgs
-from mgs.data.dataset import Dataset, Frame, load_dataset
+from mgs.data.dataset import Dataset, load_dataset
+from mgs.data.frames import Frame
 from mgs.data.importers import import_source
 from mgs.data.sources import read_source
 from mgs.fit import objective

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from mgs.camera import Camera, look_at
-from mgs.data.dataset import Dataset, Frame, load_dataset, write_transforms
+from mgs.data.dataset import Dataset, load_dataset, write_transforms
+from mgs.data.frames import Frame
 from mgs.fit.settings import TrainSettings
 from mgs.fit.stopping import StopReason
 from mgs.gaussians import Gaussians, sh_from_rgb

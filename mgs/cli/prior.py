@@ -18,7 +18,8 @@ from mgs.errors import InputError
 from mgs.files import atomic_folder
 
 if TYPE_CHECKING:
-    from mgs.data.dataset import Dataset, Frame
+    from mgs.data.dataset import Dataset
+    from mgs.data.frames import Frame
     from mgs.prior.build import Prior
     from mgs.prior.segmentation import SegmentedCloud
     from mgs.prior.settings import PriorSettings

@@ -13,7 +13,8 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.data.clouds import write_cloud
-from mgs.data.dataset import TEST_FOLDER, Dataset, Frame, load_dataset, resumes, write_transforms
+from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, resumes, write_transforms
+from mgs.data.frames import Frame
 from mgs.data.lens import Undo, read_fitting, shrunk, undistorter
 from mgs.data.meshes import Mesh, read_mesh
 from mgs.data.rock_image import premultiplied, write_rock_image

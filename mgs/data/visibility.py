@@ -11,7 +11,7 @@ from scipy.ndimage import binary_dilation
 from mgs.camera import Camera
 
 if TYPE_CHECKING:
-    from mgs.data.dataset import Frame
+    from mgs.data.frames import Frame
 
 GRAZING = 0.2
 """Least cosine of the angle between normal and view that widens the tolerance."""

@@ -17,7 +17,8 @@ from scipy.spatial import cKDTree
 
 from mgs.camera import Camera
 from mgs.data.clouds import SparseCloud, write_cloud
-from mgs.data.dataset import Dataset, Frame, load_dataset
+from mgs.data.dataset import Dataset, load_dataset
+from mgs.data.frames import Frame
 from mgs.data.lens import shrunk_to
 from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh
 from mgs.data.up import PLUS_Z, Up, unit_up, upright

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mgs.data.dataset import Frame
+from mgs.data.frames import Frame
 from mgs.prior.initial import depth_of, seen_colours
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter, label
 
 from mgs.camera import Camera
-from mgs.data.dataset import Frame
+from mgs.data.frames import Frame
 from mgs.data.lens import shrunk_to
 from mgs.data.meshes import Mesh
 from mgs.data.visibility import in_image

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from scipy.special import logit
 
 from mgs.camera import Camera
-from mgs.data.dataset import Frame
+from mgs.data.frames import Frame
 from mgs.data.visibility import in_image, in_mask, visible
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.rotation import quat_from_normals

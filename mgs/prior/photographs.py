@@ -11,7 +11,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mgs.data.clouds import read_cloud
-from mgs.data.dataset import Dataset, Frame
+from mgs.data.dataset import Dataset
+from mgs.data.frames import Frame
 from mgs.data.meshes import Mesh
 from mgs.data.visibility import has_masks, in_image
 from mgs.errors import InputError

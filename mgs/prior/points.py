@@ -15,7 +15,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mgs.data.clouds import SparseCloud, views_of
-from mgs.data.dataset import Dataset, Frame
+from mgs.data.dataset import Dataset
+from mgs.data.frames import Frame
 from mgs.data.up import Up
 from mgs.data.visibility import has_masks, mask_share
 from mgs.errors import InputError

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mgs.data.dataset import Dataset, Frame
+from mgs.data.dataset import Dataset
+from mgs.data.frames import Frame
 from mgs.data.visibility import has_masks, mask_share
 from mgs.errors import InputError
 from mgs.prior.settings import PriorSettings

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mgs.data.dataset import Frame
+from mgs.data.frames import Frame
 from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh
 from mgs.data.visibility import visible
 from mgs.errors import InputError

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from mgs.data.dataset import Frame
+from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.fit.objective import newton_decrease, objective
 from mgs.gaussians import Gaussians

@@ -29,7 +29,7 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
-from mgs.data.dataset import Frame
+from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.files import atomic_path
 from mgs.gaussians import Gaussians, sh_from_rgb

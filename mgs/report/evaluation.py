@@ -24,7 +24,8 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
-from mgs.data.dataset import TEST_FOLDER, Dataset, Frame
+from mgs.data.dataset import TEST_FOLDER, Dataset
+from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.files import atomic_path, read_json, working_in, write_json
 from mgs.gaussians import Gaussians

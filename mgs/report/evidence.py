@@ -27,7 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mgs.camera import Camera
-from mgs.data.dataset import Frame, target_of
+from mgs.data.dataset import target_of
+from mgs.data.frames import Frame
 from mgs.data.up import upright
 from mgs.errors import InputError
 from mgs.fit.fitting import fit

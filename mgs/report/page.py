@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from mgs.data.dataset import Dataset, Frame
+from mgs.data.dataset import Dataset
+from mgs.data.frames import Frame
 from mgs.data.up import upright
 from mgs.files import atomic_path
 from mgs.policy.criteria import GAIN_UNIT

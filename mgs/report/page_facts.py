@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from mgs.data.dataset import Dataset, Frame
+from mgs.data.dataset import Dataset
+from mgs.data.frames import Frame
 from mgs.data.up import Up
 from mgs.gaussians import Gaussians
 from mgs.policy.criteria import GAIN_UNIT

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from mgs.colour import srgb_from_linear
-from mgs.data.dataset import Frame
+from mgs.data.frames import Frame
 from mgs.gaussians import Gaussians
 from mgs.plotting import crop
 from mgs.policy.criteria import regularisation, uncertainty

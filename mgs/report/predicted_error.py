@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 
 from mgs.camera import Camera
 from mgs.colour import SH_C0
-from mgs.data.dataset import Frame, target_of
+from mgs.data.dataset import target_of
+from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.fit.fitting import fit

@@ -11,7 +11,8 @@ from typing import Any
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from mgs.data.dataset import Dataset, Frame
+from mgs.data.dataset import Dataset
+from mgs.data.frames import Frame
 from mgs.data.up import Up, unit_up
 from mgs.errors import InputError
 from mgs.files import read_json, reading

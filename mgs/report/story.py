@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from mgs.colour import srgb_from_linear
-from mgs.data.dataset import Frame
+from mgs.data.frames import Frame
 from mgs.metrics import psnr
 from mgs.plotting import STYLE, crop, new_figure
 from mgs.policy import criteria

@@ -10,7 +10,8 @@ import numpy as np
 
 from mgs.camera import opengl_from_opencv
 from mgs.colour import srgb_from_linear
-from mgs.data.dataset import Frame, write_transforms
+from mgs.data.dataset import write_transforms
+from mgs.data.frames import Frame
 from mgs.data.up import upright
 from mgs.files import write_json
 from mgs.policy.criteria import GAIN_UNIT

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mgs.data.dataset import TEST_FOLDER, Dataset, Frame
+from mgs.data.dataset import TEST_FOLDER, Dataset
+from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.files import atomic_path, write_json
 from mgs.report import figures

@@ -35,7 +35,8 @@ from typing import Any
 
 import numpy as np
 
-from mgs.data.dataset import Dataset, Frame, load_dataset
+from mgs.data.dataset import Dataset, load_dataset
+from mgs.data.frames import Frame
 from mgs.data.up import upright
 from mgs.errors import InputError, Notice
 from mgs.files import atomic_path, read_json, reading, write_json

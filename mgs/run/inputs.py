@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mgs.camera import Camera
-from mgs.data.dataset import Dataset, Frame
+from mgs.data.dataset import Dataset
+from mgs.data.frames import Frame
 from mgs.data.up import PLUS_Z
 from mgs.errors import InputError
 from mgs.policy import from_file

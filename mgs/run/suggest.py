@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mgs.camera import Camera
-from mgs.data.dataset import Dataset, Frame
+from mgs.data.dataset import Dataset
+from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.policy import criteria, tour

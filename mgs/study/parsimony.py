@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from mgs.data.dataset import Frame, load_dataset
+from mgs.data.dataset import load_dataset
+from mgs.data.frames import Frame
 from mgs.fit.fitting import Fit, fit
 from mgs.fit.settings import RATES, TrainSettings
 from mgs.gaussians import Gaussians

@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from mgs.data.dataset import Frame, load_dataset
+from mgs.data.dataset import load_dataset
+from mgs.data.frames import Frame
 from mgs.policy import from_file as policy_file
 from mgs.policy.registry import needs_model
 from mgs.prior.build import load_prior

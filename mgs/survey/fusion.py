@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from mgs.data.dataset import Frame
+from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.survey.depth_sensor import depth_noise, filter_depth
 

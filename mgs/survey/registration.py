@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mgs.camera import Camera
-from mgs.data.dataset import Frame
+from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.survey.depth_sensor import depth_noise, filter_depth
 from mgs.survey.fusion import usable_depth

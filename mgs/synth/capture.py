@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from mgs.data.dataset import Dataset, Frame
+from mgs.data.dataset import Dataset
+from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.files import fingerprint, read_json, reading
 from mgs.synth.orbit import rock_cameras

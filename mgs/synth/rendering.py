@@ -21,11 +21,11 @@ from mgs.data.dataset import (
     SURVEY_FOLDER,
     TEST_FOLDER,
     Dataset,
-    Frame,
     load_dataset,
     resumes,
     write_transforms,
 )
+from mgs.data.frames import Frame
 from mgs.data.masks import write_sheet
 from mgs.data.meshes import GLTF, to_glb
 from mgs.data.rock_image import write_rock_image

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mgs.data.dataset import Frame
+from mgs.data.frames import Frame
 from mgs.data.meshes import Mesh, read_mesh
 from mgs.data.up import PLUS_Z, Up
 from mgs.errors import InputError

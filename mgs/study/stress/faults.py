@@ -17,7 +17,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mgs.colour import linear_from_srgb, srgb_from_linear
-from mgs.data.dataset import Frame, target_of
+from mgs.data.dataset import target_of
+from mgs.data.frames import Frame
 from mgs.fit.settings import PASSES
 from mgs.gaussians import Gaussians
 from mgs.policy.criteria import coverage

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mgs.camera import Camera
-from mgs.data.dataset import Dataset, Frame, load_dataset, target_of
+from mgs.data.dataset import Dataset, load_dataset, target_of
+from mgs.data.frames import Frame
 from mgs.fit.fitting import Fit, fit
 from mgs.fit.settings import MEAN_RATE, PASSES, RATES, TrainSettings
 from mgs.gaussians import Gaussians
