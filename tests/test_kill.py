@@ -79,7 +79,7 @@ LONG = {name: f"{name} {{out}}" for name in ("demo", "chart", "stress", "parsimo
 """Commands whose winner is stopped when the loser has ended."""
 ON_RUNS = ("refit", "eval", "diagnose", "prune", "report", "page")
 LOST = "works on it|is finished already|holds a run|is not empty|has a mask already"
-"""What the loser may say."""
+"""Pattern of the loser's line."""
 
 
 @pytest.fixture(autouse=True)

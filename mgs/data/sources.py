@@ -126,7 +126,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Options:
-    """What the reader of a recording is told.
+    """Options of the reader of a recording.
 
     images: folder of the images, or of a bag their topic. spacing: of keyframes. unpack: folder in
     which the keyframes of a bag are unpacked.

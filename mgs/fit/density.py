@@ -40,7 +40,7 @@ SPREAD = 0.5
 
 @dataclass(frozen=True)
 class Statistics:
-    """What the images say about each Gaussian at a model, summed over images and pixels, [N].
+    """Sums over images and pixels for each Gaussian at a model, [N].
 
     weight: blending weights. error: squared residuals times blending weights.
     """

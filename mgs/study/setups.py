@@ -209,8 +209,9 @@ Measure = Callable[..., dict[str, np.ndarray]]
 def _shared(
     dataset: Path, prior: Path, ring: Path, every: int | None, seeds: int, budget: int
 ) -> tuple[Problem, Measure, Measure, Measure]:
-    """What the policies of one set-up on one rock share: the problem, with the surface's
-    visibility, and PSNR on the test views, on the candidates and on the ring's."""
+    """Problem of a set-up on one rock, and PSNR over test views, candidates and the ring.
+
+    All policies share them, with the visibility of the surface."""
     data, cache = load_dataset(dataset), ListCache()
     if every is not None:
         half = len(data) // 2
