@@ -98,7 +98,9 @@ def draw_suggestion(path: str | Path, run: Run, found: Suggestion) -> None:
             below.set_title(f"unknown {100 * view.unknown:.0f} %")
             for axis in (top, below):
                 axis.set_axis_off()
+                axis.set_anchor("N")
         figure.colorbar(shown, ax=below, shrink=0.8, aspect=16, label="variance left")
+        figure.legend(loc="outside lower left", ncols=3)
         save_figure(figure, path)
 
 
@@ -113,17 +115,17 @@ def _from_above(axis: Any, run: Run, found: Suggestion) -> None:
     ranked = level([view.camera.position for view in found.ranking])
     gains = [view.information_gain for view in found.ranking]
     axis.scatter(*level(run.prior.points[::7]).T, s=0.5, color="#b0a898", rasterized=True)
-    axis.scatter(*images.T, marker="^", s=26, color="black", label="images")
+    axis.scatter(*images.T, marker="^", s=26, color="black", label="images so far")
     dots = axis.scatter(*ranked.T, c=gains, s=18, cmap="viridis", label="candidates")
     stops = [level(view.camera.position) for view in found.plan]
     way = [images[:1]]
     for corners, stop in zip(found.corners, [*stops, images[:1]], strict=True):
         way += [level(corners)] * (len(corners) > 0) + [stop]
     axis.plot(*np.concatenate(way).T, color="#d1495b", linewidth=1.2)
+    axis.scatter(*np.concatenate(stops).T, s=110, color="#d1495b", zorder=3, label="to take next")
     for k, stop in enumerate(stops, 1):
-        axis.annotate(str(k), stop[0], (3, 3), textcoords="offset points", color="#d1495b")
+        axis.text(*stop[0], str(k), color="white", fontsize=8, ha="center", va="center", zorder=4)
     unit = run.dataset.unit
     axis.set(aspect="equal", xlabel=f"x ({unit})", ylabel=f"y ({unit})")
     axis.set_title(f"from above: a flight of {found.metres:.1f} {unit}")
-    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
-    axis.figure.colorbar(dots, ax=axis, shrink=0.6, aspect=20, label="gain")
+    axis.figure.colorbar(dots, ax=axis, shrink=0.6, aspect=20, label=f"gain ({GAIN_UNIT})")
