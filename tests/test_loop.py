@@ -10,7 +10,7 @@ import pytest
 import synthetic
 
 import mgs
-from mgs.run.loop import surface_information
+from mgs.run.planning import surface_information
 
 
 def loop_by_hand(run: mgs.Run) -> mgs.Fitted:

@@ -30,16 +30,9 @@ from mgs.prior.build import Prior
 from mgs.prior.initial import initial_gaussians
 from mgs.run.candidates import Named, Site, refusals
 from mgs.run.folder import Run
-from mgs.run.loop import (
-    Chooser,
-    choose,
-    choose_batch,
-    information,
-    plan_flight,
-    rated,
-    surface_information,
-)
+from mgs.run.loop import Chooser, choose, choose_batch, information
 from mgs.run.operations import operations_of
+from mgs.run.planning import plan_flight, rated, surface_information
 from mgs.run.problem import Operations, Problem, Progress, no_progress
 from mgs.run.settings import NbvSettings, check_settings, validated
 from mgs.run.state import Fitted

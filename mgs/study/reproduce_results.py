@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,9 @@ from mgs.report.writing import write_report
 from mgs.study import reproduce, setups
 from mgs.study.output import table, write_table
 from mgs.study.reproduce import ReproduceSize, Run
+from mgs.study.setups import Found
 from mgs.study.sweep import Report, cell_folder, found, run_cells
 from mgs.study.verdict import Row
-
-Found = Mapping[str, Mapping[str, Any]]
-"""Results of cells by name."""
 
 Rows = list[Row]
 

@@ -23,8 +23,9 @@ from mgs.policy import from_file as policy_file
 from mgs.policy.registry import needs_model
 from mgs.prior.build import load_prior
 from mgs.run.inputs import policy_record
-from mgs.run.loop import choose, finished, fit_views, learn, select_views, surface_information
+from mgs.run.loop import choose, finished, fit_views, learn, select_views
 from mgs.run.operations import operations_of, psnr_over
+from mgs.run.planning import surface_information, with_view
 from mgs.run.problem import Problem
 from mgs.run.settings import NbvSettings, with_defaults
 from mgs.run.state import Fitted
@@ -193,11 +194,11 @@ def choose_and_judge(
 def _from_poses(problem: Problem) -> list[int]:
     """Views taken by a policy that needs no model."""
     surface = surface_information(problem, problem.seeds)
-    state = Fitted(problem.start, np.zeros_like(surface), surface, problem.seeds)
+    unused = np.zeros_like(surface)  # information about a model that there is not
+    state = Fitted(problem.start, unused, surface, problem.seeds)
     while not finished(problem, state):
         frame, _ = choose(problem, state)
-        surface = surface_information(problem, [frame], state)
-        state = replace(state, surface=surface, taken=[*state.taken, frame])
+        state = with_view(problem, state, frame, unused)
     return state.taken
 
 
