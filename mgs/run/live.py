@@ -46,7 +46,7 @@ DEPTH_UNIT = 1e-3
 
 @dataclass(frozen=True)
 class Live:
-    """How pictures are captured.
+    """Settings of live capture.
 
     deliver: a transport (`mgs.run.transports`), or your own function(pose file, picture file).
     folder: where the two files are; by default RUN/dataset/flight. tries: for each pose. failure:
