@@ -7,6 +7,7 @@ import math
 import signal
 import subprocess
 import sys
+import time
 import weakref
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +24,7 @@ from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.fit.stopping import StopReason
 from mgs.policy import criteria
+from mgs.policy.poses import POSE_POLICIES
 from mgs.policy.registry import policy_names
 from mgs.run import folder as run_folder
 from mgs.run import loop
@@ -271,6 +273,17 @@ def test_a_fit_that_diverges_ends_the_run_which_can_go_on(
     whole = run(tmp_path / "whole", dataset, batch=batch)
     assert resume(out, dataset).taken == whole.taken
     assert (out / "gaussians.ply").read_bytes() == (tmp_path / "whole/gaussians.ply").read_bytes()
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+def test_a_choice_takes_the_seconds_of_its_policy(dataset, tmp_path, monkeypatch, batch):
+    def slow(candidates, taken, centre, rng):
+        time.sleep(0.05)
+        return rng.random(len(candidates))
+
+    monkeypatch.setitem(POSE_POLICIES, "slow", slow)
+    state = run(tmp_path / "run", dataset, policy="slow", batch=batch, budget=2)
+    assert all(step["seconds"]["score"] >= 0.05 for step in state.steps[1:])
 
 
 @pytest.mark.parametrize("score", [math.nan, math.inf])

@@ -30,7 +30,6 @@ STAGES = {
     "fitting": "fit",
     "information of the training set": "information",
     "scoring candidates": "score",
-    "chosen": "score",
     "checking": "check",
     "evaluating": "evaluate",
 }
