@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import tiny
 from PIL import Image
-from refusals import refused
 
 from mgs.bench import core, scaling
 from mgs.bench.scaling import OPERATIONS, exponents, fitted, scaling_exponents
@@ -120,17 +119,3 @@ def test_the_json_holds_the_command_as_typed(monkeypatch, capsys, tmp_path):
     printed = capsys.readouterr().out
     assert "start at 10,000" in printed
     assert "1.40" in printed
-
-
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (["splat", "--chart", "x.png"], "--chart: is for scaling, not for splat; leave it out"),
-        (["fit", "--gaussians", 5000], "--gaussians: is for splat and scaling, not for fit"),
-        (["splat", "--alpha-weight", 0], "--alpha-weight: is for fit, not for splat"),
-        (["scaling", "--gaussians", 2999], "at least 3000"),
-        (["scaling", "--json", "."], "is a folder; name a file"),
-    ],
-)
-def test_refused(capsys, arguments, line):
-    assert line in refused(capsys, ["bench", *arguments])

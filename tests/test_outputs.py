@@ -90,18 +90,6 @@ def test_bench_knows_before_it_measures_that_it_cannot_write(capsys, tmp_path, o
         assert named in refused(capsys, ["bench", "scaling", option, path])
 
 
-@pytest.mark.parametrize("command", ["nbv", "prior", "synth-orbit", "survey", "demo"])
-def test_negative_seed(capsys, dataset, prior, tmp_path, command):
-    arguments = writers(dataset, prior, tmp_path, tmp_path / "out")[command]
-    assert "--random-seed" in refused(capsys, [*arguments, "--random-seed", -1], tmp_path)
-
-
-def test_a_picture_too_large(capsys, dataset, tmp_path):
-    write_ply(tmp_path / "splats.ply", tiny.initial([]))
-    arguments = ["render", tmp_path / "splats.ply", "--cameras", dataset, "--out", tmp_path / "out"]
-    assert "100000000x" in refused(capsys, [*arguments, "--width", 100_000_000], tmp_path)
-
-
 @pytest.mark.parametrize("existing", [False, True])
 def test_a_prior_that_fails_leaves_all_as_it_was(capsys, dataset, tmp_path, existing):
     out = tmp_path / "new/deeper/prior"
@@ -139,20 +127,6 @@ def test_a_result_appears_whole(tmp_path, monkeypatch, name):
     assert drawn == [True]
     assert sorted(path.name for path in out.iterdir() if path.is_file()) == files.split()
     assert not list(tmp_path.glob(".*"))
-
-
-OPTIONS: dict[str, tuple[list, str]] = {
-    "unknown command": (["fly"], "fly"),
-    "unknown option": (["nbv", "--fast"], "--fast"),
-    "number of words": (["bench", "splat", "--repeats", "many"], "--repeats"),
-    "unknown choice": (["bench", "speed"], "speed"),
-}
-
-
-@pytest.mark.parametrize("case", OPTIONS)
-def test_wrong_options(capsys, case):
-    arguments, named = OPTIONS[case]
-    assert named in refused(capsys, arguments)
 
 
 def printed(capsys, *arguments) -> str:

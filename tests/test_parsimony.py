@@ -100,13 +100,6 @@ def test_a_given_mesh_takes_its_number_from_the_pixels_too(data, tmp_path, capsy
         prior_from_mesh(tmp_path / "rock.ply", PriorSettings(density=0.5))
 
 
-@pytest.mark.parametrize("name", ["prior", "nbv"])
-def test_a_number_that_is_none_is_one_line(data, tmp_path, capsys, name):
-    arguments = [name, data.root, "--out", tmp_path / "x", "--gaussians", "many"]
-    line = "--gaussians 'many': expected a whole number, or auto"
-    assert line in refused(capsys, arguments, tmp_path)
-
-
 def test_views_are_spread_evenly_from_the_first_on():
     angles = 2 * np.pi * np.arange(24) / 24
     positions = np.stack([np.cos(angles), np.sin(angles), np.ones(24)], 1)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from refusals import listing, refused
+from refusals import listing
 from scipy.spatial import cKDTree
 
 from mgs.camera import opencv_from_opengl
@@ -246,21 +246,6 @@ def test_without_the_denoiser_more_samples_and_a_note(tmp_path, monkeypatch):
     assert '`pip install "mgs[denoise]"`' in notes[0]
     assert read_json(dataset.root / "config.json")["samples_per_pixel"] == 8
     assert dataset.frames[0].rgb()[dataset.frames[0].mask()].mean() == pytest.approx(0.2, rel=0.5)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--scene", "moon"], "scene 'moon': unknown; choose one of boulder"),
-        (["--scale", "huge"], "scale 'huge': unknown; choose one of quick, paper"),
-        (["--orbit", "figure-eight"], "--orbit 'figure-eight': unknown"),
-        (["--size", "320"], "expected WIDTHxHEIGHT"),
-        (["--mesh", "nowhere.glb"], "no such mesh"),
-    ],
-)
-def test_bad_options_leave_nothing_behind(tmp_path, capsys, options, message):
-    assert message in refused(capsys, ["synth-orbit", tmp_path / "out", *options])
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
