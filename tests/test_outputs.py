@@ -81,13 +81,12 @@ def test_a_report_under_a_file(capsys, dataset, prior, tmp_path):
         assert "cannot be written" in line
 
 
-@pytest.mark.parametrize("option", ["--json", "--chart"])
-def test_bench_knows_before_it_measures_that_it_cannot_write(capsys, tmp_path, option):
+def test_bench_knows_before_it_measures_that_it_cannot_write(capsys, tmp_path):
     for path, named in (
         (a_file(tmp_path / "file") / "x", "cannot be written"),
         (occupied(tmp_path / "folder"), "is a folder"),
     ):
-        assert named in refused(capsys, ["bench", "scaling", option, path])
+        assert named in refused(capsys, ["bench", "--json", path])
 
 
 @pytest.mark.parametrize("existing", [False, True])

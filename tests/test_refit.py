@@ -13,7 +13,7 @@ from plyfile import PlyData
 from program import change_settings, command
 from scipy.stats import multivariate_normal
 
-from mgs.bench.core import surface_camera, surface_gaussians
+from mgs.bench import surface_camera, surface_gaussians
 from mgs.camera import Camera, look_at
 from mgs.errors import InputError
 from mgs.fit.fitting import fit
