@@ -9,9 +9,9 @@ from rich.console import Console
 from rich.table import Table
 
 from mgs import runtime
-from mgs.cli.options import argument, option
+from mgs.cli.options import Force, argument, option
 from mgs.errors import InputError
-from mgs.files import check_writable, write_json
+from mgs.files import check_new_file, write_json
 from mgs.fit.settings import ALPHA_WEIGHT, TrainSettings
 from mgs.provenance import command_line, versions
 from mgs.run.settings import validated
@@ -52,6 +52,7 @@ def bench(
         float | None,
         option(f"fit only: as of `mgs nbv`. Default: {ALPHA_WEIGHT}; 0 fits colours alone."),
     ] = None,
+    force: Force = False,
 ) -> None:
     """Time rendering, gradients and Fisher information, or measure the fit of a dataset.
 
@@ -73,8 +74,8 @@ def bench(
             "give at least 3000"
         )
     for target in (json, chart):
-        if target is not None and check_writable(target).is_dir():  # before minutes of measuring
-            raise InputError(f"{target}: is a folder; name a file to write")
+        if target is not None:
+            check_new_file(target, force)  # before minutes of measuring
     runtime.start()
     console = Console()
 
