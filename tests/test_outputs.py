@@ -95,7 +95,7 @@ def test_force_replaces_what_the_command_made_and_nothing_else(capsys, dataset, 
 
 ONE_FILE = {
     "report": ["report", "RUN", "--html", "FILE.html"],
-    "bench": ["bench", "splat", "--json", "FILE.json"],
+    "bench": ["bench", "--json", "FILE.json"],
     "prune": ["prune", "RUN"],
 }
 
@@ -138,13 +138,12 @@ def test_a_report_under_a_file(capsys, dataset, prior, tmp_path):
         assert "cannot be written" in line
 
 
-@pytest.mark.parametrize("option", ["--json", "--chart"])
-def test_bench_knows_before_it_measures_that_it_cannot_write(capsys, tmp_path, option):
+def test_bench_knows_before_it_measures_that_it_cannot_write(capsys, tmp_path):
     for path, named in (
         (a_file(tmp_path / "file") / "x", "cannot be written"),
         (occupied(tmp_path / "folder"), "is a folder"),
     ):
-        assert named in refused(capsys, ["bench", "scaling", option, path])
+        assert named in refused(capsys, ["bench", "--json", path])
 
 
 @pytest.mark.parametrize("command", ["nbv", "prior", "synth-orbit", "survey", "demo"])
@@ -201,8 +200,8 @@ def test_a_result_appears_whole(tmp_path, monkeypatch, name):
 OPTIONS: dict[str, tuple[list, str]] = {
     "unknown command": (["fly"], "fly"),
     "unknown option": (["nbv", "--fast"], "--fast"),
-    "number of words": (["bench", "splat", "--repeats", "many"], "--repeats"),
-    "unknown choice": (["bench", "speed"], "speed"),
+    "number of words": (["bench", "--repeats", "many"], "--repeats"),
+    "unknown choice": (["survey", "DATASET", "--poses", "guessed"], "guessed"),
 }
 
 

@@ -14,7 +14,7 @@ from program import change_settings, command
 from refusals import refused
 from scipy.stats import multivariate_normal
 
-from mgs.bench.core import surface_camera, surface_gaussians
+from mgs.bench import surface_camera, surface_gaussians
 from mgs.camera import Camera, look_at
 from mgs.errors import InputError
 from mgs.fit.fitting import fit

@@ -22,8 +22,7 @@ from mgs.run.settings import NbvSettings
 from mgs.splat import as_drjit, groups
 
 CG_ITERATIONS = 20
-"""Iterations of conjugate gradients; `mgs bench fit` compares their prediction with a longer
-fit."""
+"""Iterations of conjugate gradients."""
 
 CONVERGED_SHARE = 0.02
 """A fit has converged if the objective is predicted to fall by at most this share of itself."""

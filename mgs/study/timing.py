@@ -33,7 +33,7 @@ def _reference() -> Callable[[], Any]:
     runtime.start()
     import mitsuba as mi
 
-    from mgs.bench.core import gradient, surface_camera, surface_gaussians
+    from mgs.bench import gradient, surface_camera, surface_gaussians
     from mgs.splat import ListCache, as_drjit
 
     gaussians, cache = surface_gaussians(REFERENCE_GAUSSIANS), ListCache()

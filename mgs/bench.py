@@ -6,7 +6,6 @@ times are about the same on other machines; times are not.
 
 from __future__ import annotations
 
-import re
 import resource
 import time
 from collections.abc import Callable
@@ -23,38 +22,13 @@ from mgs.memory import padded
 from mgs.rotation import quat_from_normals
 from mgs.seeds import derive_seed, generator
 from mgs.splat import ListCache, as_drjit, fisher, render
-from mgs.splat.blocks import BLOCK_X, BLOCK_Y
-from mgs.splat.projection import camera_array, project
-from mgs.splat.walking import PIXELS, TOGETHER
-
-TARGETS = {
-    "forward_warm_speedup": ("at least", 60.0),
-    "forward_cold_speedup": ("at least", 25.0),
-    "gradient_warm_speedup": ("at least", 60.0),
-    "fisher_over_gradient": ("at most", 1.2),
-    "block_fisher_over_gradient": ("at most", 2.0),
-    "tiny_forward_ms": ("at most", 5.0),
-}
-"""Goals for the "figures" of `bench_splat`, printed beside them by `mgs bench splat`.
-
-*_speedup: time of Mitsuba's integrator over ours. *_over_gradient: time of the Fisher information
-over that of image and gradient. tiny_forward_ms: milliseconds.
-"""
 
 WARM_UP = 2
 """Untimed calls before the timed ones: they compile kernels and allocate memory."""
 
-CALL = r"call <.*@llvm\."
-OPERATION = re.compile(rf" (?:fadd|fsub|fmul|fdiv) <|{CALL}(?:fma|sqrt|x86\.\w+\.(?:rcp|rsqrt))")
-SECOND_OPERATION = re.compile(rf"{CALL}fma")
-"""Floating-point instructions of LLVM's code; an FMA counts twice."""
-
-LOOP = re.compile(r"^l_(\d+)_cond:(.*?)^l_\1_end:", re.MULTILINE | re.DOTALL)
-"""A loop of a compiled kernel."""
-
 
 def surface_gaussians(n: int, seed: int = 0) -> Gaussians:
-    """Sample n flat Gaussians on the surface of the default rock, the scene of the TARGETS.
+    """Sample n flat Gaussians on the surface of the default rock, the scene of `mgs bench`.
 
     Their standard deviations are 0.8, 0.8 and 0.2 spacings (the square root of area / n). Their
     opacity is 0.73 (logit 1), their colours are random.
@@ -147,8 +121,7 @@ def time_core(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, f
 
     forward_cold renders a new view in each call, so its block lists must be built. The others use
     one camera and keep its lists: forward_warm renders, gradient_warm is `gradient`, fisher_exact
-    and fisher_block are `mgs.splat.fisher`. The result also has pairs, the number of (splat, block)
-    pairs of the camera, and list_bytes, the memory of its lists.
+    and fisher_block are `mgs.splat.fisher`.
     """
     device, cache = as_drjit(gaussians), ListCache()
     new_views = iter(turned_cameras(camera, gaussians, repeats + WARM_UP))
@@ -163,10 +136,7 @@ def time_core(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, f
         "fisher_exact": lambda: fisher(device, camera, "exact", cache=cache),
         "fisher_block": lambda: fisher(device, camera, "block", cache=cache),
     }
-    seconds = {name: median_seconds(call, repeats) for name, call in calls.items()}
-    lists, _ = cache.get(camera, project(device, camera_array(camera)))
-    pairs = float(np.sum(np.asarray(lists.end).astype(np.int64) - np.asarray(lists.start)))
-    return seconds | {"pairs": pairs, "list_bytes": float(cache.nbytes)}
+    return {name: median_seconds(call, repeats) for name, call in calls.items()}
 
 
 def volprim_scene(gaussians: Gaussians, camera: Camera) -> Any:
@@ -221,102 +191,33 @@ def time_volprim(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str
     return {"volprim_forward": primal, "volprim_gradient": median_seconds(backward, repeats)}
 
 
-def flops_per_pair(call: Callable[[], Any], lanes: int) -> float:
-    """Count the floating-point operations of a call per (splat, block) pair.
-
-    Counts those in the first loop of each kernel of `lanes` lanes (the blocks of the image), in the
-    code that Dr.Jit compiled. A kernel with a second loop, which clears sums, draws one pair in an
-    iteration; the others draw TOGETHER.
-    """
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        dr.eval(call())
-        history = dr.kernel_history([dr.KernelType.JIT])
-    total = 0.0
-    for entry in history:
-        loops = LOOP.findall(entry["ir"].getvalue()) if entry["size"] == lanes else []
-        if loops:
-            body = loops[0][1]
-            operations = len(OPERATION.findall(body)) + len(SECOND_OPERATION.findall(body))
-            total += operations / (TOGETHER if len(loops) == 1 else 1)
-    return total
-
-
-def peak_flops(lanes: int = 1 << 16, rounds: int = 64) -> float:
-    """Measure the machine's FMAs, each two operations, in floating-point operations per second.
-
-    Runs 8 independent chains of FMAs in each lane, on registers, with Dr.Jit's number of threads.
-    The fastest of 15 calls counts, by Dr.Jit's own clock.
-    """
-    scale = dr.opaque(mi.Float, 0.999)
-    x = dr.arange(mi.Float, lanes) * (1 / lanes) + 1
-    dr.eval(x)
-    start = [x + i for i in range(8)]
-
-    def body(i: Any, chains: list[Any]) -> Any:
-        for _ in range(16):
-            chains = [dr.fma(value, scale, scale) for value in chains]
-        return i + 1, chains
-
-    seconds = []
-    for _ in range(15):
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            dr.kernel_history_clear()
-            dr.eval(sum(dr.while_loop((mi.UInt32(0), start), lambda i, _: i < rounds, body)[1]))
-            dr.sync_thread()
-            seconds.append(1e-3 * dr.kernel_history([dr.KernelType.JIT])[-1]["execution_time"])
-    return 2 * 8 * 16 * lanes * rounds / min(seconds)
-
-
 def bench_splat(
     n: int, width: int, height: int, repeats: int, report: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Measure what `mgs bench splat` prints: n Gaussians in an image of width x height pixels.
+    """Measure what `mgs bench` prints: n Gaussians in an image of width x height pixels.
 
     report(what) is called before each measurement. Returns "scene"; "seconds" of each operation;
-    "figures", those of TARGETS; "pairs" (splat, block); "pixel_splat_pairs_per_second";
-    "peak_gflops_measured"; "share_of_peak" of the kernels; "list_megabytes" of a camera's block
-    lists; and "peak_memory_megabytes" of the process before Mitsuba's integrator is loaded.
+    "ratios", time of Mitsuba's integrator over ours (..._speedup) and of the Fisher information
+    over that of image and gradient; and "peak_memory_megabytes" of the process before Mitsuba's
+    integrator is loaded.
     """
     gaussians = surface_gaussians(n)
     camera = surface_camera(gaussians, width, height)
     report("splatting")
     own = time_core(gaussians, camera, repeats)
-    report("a tiny image")
-    tiny = surface_gaussians(1000)
-    tiny_device, tiny_camera, cache = as_drjit(tiny), surface_camera(tiny, 64, 48), ListCache()
-    tiny_seconds = median_seconds(lambda: render(tiny_device, tiny_camera, cache=cache).rgb, 20)
     memory = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) / 1e3
     report("Mitsuba's volprim_rf_basic")
     peer = time_volprim(gaussians, camera, max(repeats // 3, 3))
-    report("peak arithmetic")
-    peak = peak_flops()
-    device, lanes = as_drjit(gaussians), -(-width // BLOCK_X) * -(-height // BLOCK_Y)
-    forward = flops_per_pair(lambda: render(device, camera).rgb, lanes)
-    exact = flops_per_pair(lambda: fisher(device, camera), lanes)
-    pixels = own["pairs"] * PIXELS
     ratios = {
         "forward_warm_speedup": peer["volprim_forward"] / own["forward_warm"],
         "forward_cold_speedup": peer["volprim_forward"] / own["forward_cold"],
         "gradient_warm_speedup": peer["volprim_gradient"] / own["gradient_warm"],
         "fisher_over_gradient": own["fisher_exact"] / own["gradient_warm"],
         "block_fisher_over_gradient": own["fisher_block"] / own["gradient_warm"],
-        "tiny_forward_ms": 1e3 * tiny_seconds,
     }
     return {
         "scene": {"gaussians": n, "width": width, "height": height, "repeats": repeats},
-        "seconds": {k: v for k, v in (own | peer).items() if k not in ("pairs", "list_bytes")},
-        "figures": ratios,
-        "pairs": int(own["pairs"]),
-        "pixel_splat_pairs_per_second": {
-            "forward": pixels / own["forward_warm"],
-            "fisher_exact": 2 * pixels / own["fisher_exact"],
-        },
-        "peak_gflops_measured": peak / 1e9,
-        "share_of_peak": {
-            "forward": forward * own["pairs"] / own["forward_warm"] / peak,
-            "fisher_exact": exact * own["pairs"] / own["fisher_exact"] / peak,
-        },
-        "list_megabytes": own["list_bytes"] / 1e6,
+        "seconds": own | peer,
+        "ratios": ratios,
         "peak_memory_megabytes": memory,
     }

@@ -1,1 +1,0 @@
-"""Timings of the splatting kernels on this machine."""
