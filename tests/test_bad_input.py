@@ -234,7 +234,9 @@ def test_broken_run_of_other_commands(capsys, dataset, prior, tmp_path, command)
 
 
 def test_demo_keeps_out_of_a_folder_of_something_else(capsys, tmp_path):
-    assert "not empty" in refused(capsys, ["demo", occupied(tmp_path / "out")], tmp_path / "out")
+    assert "is there already" in refused(
+        capsys, ["demo", occupied(tmp_path / "out")], tmp_path / "out"
+    )
 
 
 def change_bytes(change: Callable[[bytes], bytes]) -> Change:

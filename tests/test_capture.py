@@ -349,7 +349,7 @@ def test_bad_scenes_and_options_are_refused(small, tmp_path, capsys):
     for arguments, message in (
         ([bad, *out], "rock.siez"),
         (["boulder", "--seed-views", 3, "--budget", 6, *out], "--budget 6 exceeds its 5"),
-        (["boulder", "--out", occupied(tmp_path / "full")], "not empty"),
+        (["boulder", "--out", occupied(tmp_path / "full")], "is there already"),
     ):
         assert message in refused(capsys, ["nbv", "--capture", *arguments], tmp_path)
 

@@ -66,13 +66,13 @@ OPTIONS: dict[str, list[tuple[str, str]]] = {
         ("--resume {run} --prior-std colour=1", f"nbv: --prior-std: {NO_MORE}"),
         ("--resume {run} --capture boulder", f"--capture: {NO_MORE}"),
         ("--resume {run} --policy random", "--policy random: is not the policy of"),
-        ("{data} --prior {prior} --out {run}", "holds a run; `mgs nbv --resume"),
+        ("{data} --prior {prior} --out {run}", "--force; `mgs nbv --resume"),
         ("{data} --capture boulder --out {out}", "give a DATASET or --capture"),
         ("--capture nosuch --out {out}", "nosuch"),
         ("--capture boulder --prior no --out {out}", "no such prior"),
         ("{rock} --out {out} --gaussians many", NO_GAUSSIANS),
     ],
-    "nbv {data} --prior {prior} --seeds 3 --budget 1 --out {out}": [
+    "nbv {data} --prior {prior} --seed-views 3 --budget 1 --out {out}": [
         ("--estimator block", "--estimator block: unknown; choose one of exact, hutchinson"),
         ("--optimiser hope", "--optimiser 'hope': unknown; choose one of natural, adam"),
         ("--lam 0", "--lam 0.0: must be at least"),

@@ -391,7 +391,7 @@ def test_every_run_of_every_result_has_its_own_cell():
 
 def test_a_folder_of_another_preset_or_of_something_else_is_refused(capsys, tmp_path):
     occupied(tmp_path / "full")
-    assert "not empty" in refused(capsys, ["reproduce", tmp_path / "full"], tmp_path)
+    assert "is there already" in refused(capsys, ["reproduce", tmp_path / "full"], tmp_path)
     (tmp_path / "paper").mkdir()
     write_json(tmp_path / "paper/study.json", {"preset": "paper"})
     line = refused(capsys, ["reproduce", tmp_path / "paper"], tmp_path)

@@ -309,7 +309,7 @@ def occupied(root: Path) -> None:
         (two_frames, "too few for a survey"),
         (no_depth, "depth_file_path"),
         (blind_frame, "cannot be registered"),
-        (occupied, "not empty"),
+        (occupied, "is there already"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(spoil, message, tmp_path, capsys):
