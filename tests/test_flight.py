@@ -98,11 +98,11 @@ def test_a_limit_that_binds_nothing_changes_no_view_of_one_step(loaded, tmp_path
 
 def test_poses_that_are_not_allowed_are_never_taken(dataset, prior, tmp_path, capsys):
     """Twelve poses on a circle of 3 m; the sphere's samples reach from -1 to 1 m."""
-    given = ["--seeds", 3, "--budget", 2, "--prior", prior]
+    given = ["--seed-views", 3, "--budget", 2, "--prior", prior]
     command("nbv", dataset, *given, "--no-fly", 2.9, "--out", tmp_path / "run")
     assert "0 of 12 poses are ruled out by --no-fly and --clearance" in said(capsys)[0]
     assert len(steps(tmp_path / "run")) == 3
-    settings = run_folder.read_settings(tmp_path / "run").model_copy(update={"no_fly": 2.0})
+    settings = run_folder.open_run(tmp_path / "run").settings.model_copy(update={"no_fly": 2.0})
     problem = Problem(run_folder.open_run(tmp_path / "run").dataset, settings, tiny.operations())
     opposite = problem.flight.legs[0, 6]
     assert 6 < opposite == pytest.approx(2 * np.sqrt(5) + 2 * (np.pi - 2 * np.arccos(2 / 3)), 0.01)
@@ -122,6 +122,6 @@ def test_poses_that_are_not_allowed_are_never_taken(dataset, prior, tmp_path, ca
     ],
 )
 def test_limits_that_cannot_be_are_one_line(dataset, prior, tmp_path, capsys, given, words):
-    arguments = ["nbv", dataset, "--prior", prior, "--seeds", 3, "--out", tmp_path / "run"]
+    arguments = ["nbv", dataset, "--prior", prior, "--seed-views", 3, "--out", tmp_path / "run"]
     assert words in refused(capsys, [*arguments, *given], tmp_path)
     assert not (tmp_path / "run").exists()

@@ -263,10 +263,10 @@ def test_options_win_over_a_file_of_settings(dataset, prior, tmp_path, capsys, m
     text = f'dataset = "{dataset.name}"\nprior = "{prior}"\nseeds = 3\nbudget = 2\n'
     file.write_text(text + "[train]\npasses = 2\n")
     command("nbv", "--config", file, "--budget", 1, "--out", first)
-    made = run_folder.read_settings(first)
+    made = run_folder.open_run(first).settings
     assert (made.seeds, made.budget, made.train.passes, made.prior) == (3, 1, 2, prior.resolve())
     command("nbv", "--config", first / "config.json", "--policy", "random", "--out", second)
-    assert run_folder.read_settings(second) == made.model_copy(update={"policy": "random"})
+    assert run_folder.open_run(second).settings == made.model_copy(update={"policy": "random"})
     for wrong, said in {
         "budgett = 1": "mine.toml: budgett: Extra inputs are not permitted; correct it",
         "budget = -1": "mine.toml: budget: must be at least 0; correct it",
@@ -298,7 +298,7 @@ def test_options_reach_the_run(dataset, prior, tmp_path):
     options += " --nearest 5 --travel 2.5 --batch 3 --stop-gain 1e-9 --stop-uncertainty 1e-9"
     run = tmp_path / "run"
     command("nbv", dataset, "--prior", prior, "--out", run, *options.split())
-    state, settings = run_folder.read_checkpoint(run), run_folder.read_settings(run)
+    state, settings = run_folder.read_checkpoint(run), run_folder.open_run(run).settings
     assert settings.train.rates == {"colour": 0.1, "scale": 0.04, "rotation": 0.02, "opacity": 0}
     assert settings.train.alpha_weight == 0.3
     assert settings.prior_std == criteria.PRIOR_STD | {"scale": 2.0}

@@ -100,9 +100,9 @@ def share_seeds(runs: list[Path], state: State) -> None:
 
 def check_seed(dataset: Path, runs: list[Path], seed: int) -> None:
     """Raises InputError if the dataset or a run exists with another seed."""
-    from mgs.run.folder import read_settings
+    from mgs.run.folder import open_run
 
-    recorded = {run: read_settings(run).seed for run in runs if (run / "config.json").is_file()}
+    recorded = {run: open_run(run).settings.seed for run in runs if (run / "config.json").is_file()}
     if (dataset / "config.json").is_file():
         config = read_json(dataset / "config.json")
         recorded[dataset] = config.get("seed", seed) if isinstance(config, dict) else seed

@@ -27,7 +27,7 @@ from mgs.colour import srgb_from_linear
 from mgs.data.dataset import TEST_FOLDER, Dataset
 from mgs.data.frames import Frame
 from mgs.errors import InputError
-from mgs.files import atomic_path, read_json, working_in, write_json
+from mgs.files import atomic_path, working_in, write_json
 from mgs.gaussians import Gaussians
 from mgs.images import PNG_LEVEL, read_png
 from mgs.metrics import METRICS, SURFACE_METRICS, compare, compare_surface
@@ -70,15 +70,13 @@ def evaluate_model(
     trained: Iterable[str],
     *,
     test_frames: Sequence[Frame] = (),
-    spacing: float | None = None,
     renderer: Renderer = render_view,
     pictures: Path | None = None,
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
     """Compare a model with every frame of a dataset, and with its test views if it has some.
 
-    trained: names of the training frames; the others are held out. spacing: of the prior's samples,
-    metres; without it the shares that are too deep are left out. pictures: folder for the
+    trained: names of the training frames; the others are held out. pictures: folder for the
     comparisons (`write_comparison`), NAME.png of every frame and test/NAME.png of every test view.
 
     Returns the contents of metrics.json, without the entries that are about a run:
@@ -116,7 +114,7 @@ def evaluate_model(
             # Copies: memory of Dr.Jit must not be freed by another thread. That thread would wait
             # for a lock of Dr.Jit while it holds Python's, and this one the other way round.
             drawn = tuple(map(np.array, renderer(gaussians, frame.camera)))
-            waiting.append((found, frame, pool.submit(_measured, frame, drawn, spacing, folder)))
+            waiting.append((found, frame, pool.submit(_measured, frame, drawn, folder)))
         while waiting:
             finish_first()
     result: dict[str, Any] = {"images": len(trained)}
@@ -131,21 +129,16 @@ def evaluate_model(
 
 
 def _measured(
-    frame: Frame, rendered: tuple[np.ndarray, ...], spacing: float | None, folder: Path | None
+    frame: Frame, rendered: tuple[np.ndarray, ...], folder: Path | None
 ) -> dict[str, float]:
     """METRICS of one view, and SURFACE_METRICS that it has a truth for. Its picture goes into the
     folder."""
     (truth, weight), mask, (rgb, alpha, depth) = frame.target(), frame.mask(), rendered
     true_depth = frame.depth() if frame.depth_path else None
-    found = compare(truth, rgb, mask, weight) | compare_surface(
-        truth,
-        alpha,
-        depth,
-        mask,
-        weight,
-        fractional=frame.rock_path is not None,
-        true_depth=true_depth,
-        spacing=spacing,
+    shares = frame.rock_path is not None
+    found = compare(truth, rgb, mask, weight)
+    found |= compare_surface(
+        truth, alpha, depth, mask, weight, fractional=shares, true_depth=true_depth
     )
     if folder is not None:
         write_comparison(folder / f"{frame.name}.png", truth[..., :3], rgb, found["psnr"])
@@ -238,9 +231,8 @@ def evaluate_run(
         trained = [frame.name for frame in run.taken]
         frames, tests = dataset.with_images(trained), dataset.test_views()
         test_frames = () if tests is None else tests.frames
-        spacing = _spacing(run.settings.prior)
-        subject = _subject(gaussians, [*frames, *test_frames], trained, spacing)
-        for reason in _left_out(dataset, run.settings.prior, spacing):
+        subject = _subject(gaussians, [*frames, *test_frames], trained)
+        for reason in _left_out(dataset):
             say(reason)
         metrics = _measured_before(file, subject)
         if metrics is None:
@@ -249,7 +241,6 @@ def evaluate_run(
                 frames,
                 trained,
                 test_frames=test_frames,
-                spacing=spacing,
                 pictures=folder if pictures else None,
                 progress=progress,
             )
@@ -303,22 +294,7 @@ def _informed(run: Run) -> dict[str, dict[str, int]]:
     }
 
 
-def _spacing(prior: Path) -> float | None:
-    """Spacing of the prior's samples, metres; None if its folder is gone. Raises InputError if its
-    file is damaged."""
-    file = prior / "prior.json"
-    if not file.is_file():
-        return None
-    numbers = read_json(file)
-    spacing = numbers.get("spacing") if isinstance(numbers, dict) else None
-    if not isinstance(spacing, float | int) or not 0 < spacing < math.inf:
-        raise InputError(
-            f"{file}: spacing must be positive metres; make the prior again with `mgs prior`"
-        )
-    return float(spacing)
-
-
-def _left_out(dataset: Dataset, prior: Path, spacing: float | None) -> list[str]:
+def _left_out(dataset: Dataset) -> list[str]:
     """Why some of SURFACE_METRICS are not measured, in a line each."""
     reasons = []
     if not any(frame.rock_path for frame in dataset.frames):
@@ -327,24 +303,18 @@ def _left_out(dataset: Dataset, prior: Path, spacing: float | None) -> list[str]
         )
     if not any(frame.depth_path for frame in dataset.frames):
         reasons.append(f"{dataset.root}: has no depth images, so the errors of depth are left out")
-    elif spacing is None:
-        reasons.append(
-            f"{prior}: is not there, so the shares that are too deep, in its spacings, are left out"
-        )
     return reasons
 
 
-def _subject(
-    gaussians: Gaussians, frames: Sequence[Frame], trained: list[str], spacing: float | None
-) -> str:
-    """Hash of all that the metrics of a run depend on: model, cameras and files of all views,
-    spacing of the prior, and versions without the commit."""
+def _subject(gaussians: Gaussians, frames: Sequence[Frame], trained: list[str]) -> str:
+    """Hash of all that the metrics of a run depend on: model, cameras and files of all views, and
+    versions without the commit."""
     kinds = ("image", "mask", "rock", "depth")
     views = [
         [frame.name, camera_digest(frame.camera), frame_digests(frame, kinds)] for frame in frames
     ]
     known = {name: version for name, version in versions().items() if name != "commit"}
-    text = json.dumps([array_digest(asdict(gaussians).values()), views, trained, spacing, known])
+    text = json.dumps([array_digest(asdict(gaussians).values()), views, trained, known])
     return array_digest([np.frombuffer(text.encode(), np.uint8)])
 
 

@@ -204,11 +204,6 @@ def holds_run(out: Path) -> bool:
     return True
 
 
-def read_settings(out: Path) -> NbvSettings:
-    """Settings of a run folder. Raises InputError as `open_run`."""
-    return open_run(out).settings
-
-
 def check_same_frames(out: Path, dataset: Dataset) -> None:
     """Raises InputError where the dataset has other frames than the run was started on."""
     if read_config(out).get("frames") != [frame.name for frame in dataset.frames]:
