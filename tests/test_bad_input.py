@@ -262,7 +262,9 @@ def test_diagnose_of_views_that_are_not_there(capsys, dataset, prior, tmp_path, 
 
 
 def test_demo_keeps_out_of_a_folder_of_something_else(capsys, tmp_path):
-    assert "not empty" in refused(capsys, ["demo", occupied(tmp_path / "out")], tmp_path / "out")
+    assert "is there already" in refused(
+        capsys, ["demo", occupied(tmp_path / "out")], tmp_path / "out"
+    )
 
 
 def change_bytes(change: Callable[[bytes], bytes]) -> Change:

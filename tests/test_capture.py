@@ -364,7 +364,7 @@ def test_bad_scenes_and_options_are_refused(small, poses, tmp_path, capsys):
         ([poses.root, *capture, *out], "give a DATASET or --capture"),
         (["--resume", tmp_path, *capture], "--capture: --resume takes its settings"),
         ([*capture, "--seed-views", 3, "--budget", 6, *out], "--budget 6 exceeds its 5"),
-        ([*capture, "--out", full], "not empty"),
+        ([*capture, "--out", full], "is there already"),
         ([*capture, "--prior", tmp_path / "no", *out], "no such prior"),
     ):
         assert message in refused(capsys, ["nbv", *arguments], tmp_path)

@@ -78,7 +78,7 @@ WRITERS = {name: COMMANDS[name] for name in COMMANDS if name != "study"} | {
 LONG = {name: f"{name} {{out}}" for name in ("demo", "chart", "stress", "parsimony", "reproduce")}
 """Commands whose winner is stopped when the loser has ended."""
 ON_RUNS = ("refit", "eval", "diagnose", "prune", "report", "page")
-LOST = "works on it|is finished already|holds a run|is not empty|has a mask already"
+LOST = "works on it|is finished already|is there already|has a mask already"
 """Pattern of the loser's line."""
 
 

@@ -355,8 +355,8 @@ def test_a_dataset_or_prior_that_moved_is_named(dataset, prior, tmp_path, capsys
 def test_a_run_that_exists_is_not_started_again(dataset, prior, tmp_path, capsys):
     run = tiny.write_run(tmp_path / "run", dataset, prior)
     said = refused(capsys, ["nbv", dataset, "--prior", prior, "--out", run], run)
-    assert f"{run}: holds a run; `mgs nbv --resume {run}` continues it" in said
-    assert "for another, choose a new folder" in said
+    assert f"{run}: a run is there already; choose" in said
+    assert f"--force; `mgs nbv --resume {run}` continues it" in said
 
 
 @pytest.mark.parametrize("option", ["--budget 9", "--exposure", "--prior-std colour=1"])

@@ -314,7 +314,7 @@ def faceless_truth(root: Path) -> None:
         (no_return, "no depth image has a return"),
         (truncated_depth, "kf_0003.exr: not a readable EXR"),
         (small_depth, "is 10x10"),
-        (occupied, "not empty"),
+        (occupied, "is there already"),
         (faceless_truth, "no faces"),
     ],
 )

@@ -276,7 +276,7 @@ BAD = {
     "no intrinsics": (framed("a.png"), "frame 0 lacks fl_x; correct the intrinsics"),
     "open brackets": (written("transforms.json", "[" * 100_000), "not valid JSON"),
     "5000 digits": (written("transforms.json", '{"w": ' + "9" * 5000 + "}"), "not valid JSON"),
-    "not empty": (lambda folder: (folder / "out/kept").mkdir(parents=True), "is not empty"),
+    "not empty": (lambda folder: (folder / "out/kept").mkdir(parents=True), "is there already"),
     "background": (lambda folder: None, "must be three numbers from 0 to 1"),
 }
 

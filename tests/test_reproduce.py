@@ -415,7 +415,7 @@ def test_bad_options_are_one_clear_line(capsys, tmp_path, arguments, line):
 
 def test_a_folder_of_another_preset_or_of_something_else_is_refused(capsys, tmp_path):
     occupied(tmp_path / "full")
-    assert "not empty" in refused(capsys, ["reproduce", tmp_path / "full"], tmp_path)
+    assert "is there already" in refused(capsys, ["reproduce", tmp_path / "full"], tmp_path)
     (tmp_path / "paper").mkdir()
     write_json(tmp_path / "paper/study.json", {"preset": "paper"})
     line = refused(capsys, ["reproduce", tmp_path / "paper"], tmp_path)

@@ -311,7 +311,7 @@ def occupied(root: Path) -> None:
         (blind_frame, [], "cannot be registered"),
         (None, ["--sensor-noise", "-1"], "factors of 0 or more"),
         (None, ["--drift", "nan"], "factors of 0 or more"),
-        (occupied, [], "not empty"),
+        (occupied, [], "is there already"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(spoil, options, message, tmp_path, capsys):

@@ -163,7 +163,7 @@ def test_same_seed_same_bytes_and_resume_and_pose_noise(dataset, tmp_path):
 def test_output_folder_that_is_not_empty(dataset, tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr("mgs.synth.rendering.make_rock", None)  # refused before the rock is made
-        with pytest.raises(InputError, match="not empty"):
+        with pytest.raises(InputError, match="is there already"):
             synthesise(dataset.root, SCENE, TINY, seed=4)
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(InputError, match="other settings"):

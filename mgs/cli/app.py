@@ -186,7 +186,8 @@ def _hint(arguments: Sequence[str]) -> str:
     """End of the line of an interrupted command: the way to continue, if there is one."""
     command, *options = arguments or [""]
     if command in RESUMABLE:
-        return "; run the same command again to continue"
+        but = " without --force" if "--force" in options else ""
+        return f"; run the same command again{but} to continue"
     runs = [after for option, after in pairwise(options) if option in ("--out", "--resume")]
     if command not in ("nbv", "fit") or not runs or not (Path(runs[-1]) / "config.json").is_file():
         return ""

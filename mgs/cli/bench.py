@@ -9,9 +9,8 @@ from rich.console import Console
 from rich.table import Table
 
 from mgs import runtime
-from mgs.cli.options import option
-from mgs.errors import InputError
-from mgs.files import check_writable, write_json
+from mgs.cli.options import Force, option
+from mgs.files import check_new_file, write_json
 from mgs.provenance import command_line, versions
 
 
@@ -19,6 +18,7 @@ def bench(
     json: Annotated[Path | None, option("Write all measurements to this file.")] = None,
     gaussians: Annotated[int, option("Number of Gaussians.", min=1000)] = 100_000,
     repeats: Annotated[int, option("Calls of each operation; the median counts.", min=3)] = 9,
+    force: Force = False,
 ) -> None:
     """Time rendering, gradients and Fisher information, and Mitsuba's own integrator,
     volprim_rf_basic.
@@ -27,8 +27,8 @@ def bench(
     run on the machine meanwhile. The JSON file also holds the command line, the machine and the
     versions.
     """
-    if json is not None and check_writable(json).is_dir():  # before minutes of measuring
-        raise InputError(f"{json}: is a folder; name a file to write")
+    if json is not None:
+        check_new_file(json, force)  # before minutes of measuring
     runtime.start()
     from mgs.bench import bench_splat
 

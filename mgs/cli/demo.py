@@ -79,7 +79,7 @@ def demo(
         heading(f"3/5 next best views: {policy}, 4 seeds and {BUDGET} views")
         resume_and_print(started_run, console, pictures=True, on_state=share)
     heading("4/5 what the views say about each Gaussian")
-    diagnose(runs[:1])
+    diagnose(runs[:1], force=True)
     heading("5/5 the report")
     compared = compare_runs(runs)
     written = write_report(report, compared)

@@ -151,6 +151,12 @@ def nbv(
             rich_help_panel="Fitting",
         ),
     ] = None,
+    force: Annotated[
+        bool,
+        typer.Option(
+            "--force", help="Replace a run that is there.", rich_help_panel="Main options"
+        ),
+    ] = False,
     **options: Any,
 ) -> None:
     """Choose the next best views: fit to the seeds, choose a view, read its image, fit again.
@@ -196,6 +202,7 @@ def nbv(
         prior=prior,
         gaussians=parse_gaussians(gaussians),
         preset=preset,
+        force=force,
         **settings,
     )
     resume_and_print(run, console, run.settings.policy, live=live)

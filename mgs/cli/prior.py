@@ -12,10 +12,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from mgs.cli.options import DatasetFolder, Seed, option, parse_gaussians, parse_up
+from mgs.cli.options import DatasetFolder, Force, Seed, option, parse_gaussians, parse_up
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError
-from mgs.files import atomic_folder
+from mgs.files import Ours, atomic_folder
 
 if TYPE_CHECKING:
     from mgs.data.dataset import Dataset
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 SEEDS = 4
 """Seed frames in the paper; the table says what share of the samples they see."""
+
+FILES = ("prior.json", "mesh.ply", "points.ply", "prior.png")
+"""Names in a folder of this command."""
 
 WHY = {
     "depth": ": the dataset has depth images",
@@ -86,6 +89,7 @@ def prior(
         float, option("Degrade the rock's points: share to remove, in round holes.")
     ] = 0.0,
     seed: Seed = 0,
+    force: Force = False,
 ) -> None:
     """Build a mesh of the rock, and sample N points on it.
 
@@ -114,7 +118,8 @@ def prior(
     number = parse_gaussians(gaussians)
     settings = PriorSettings(number, spacing, poisson_depth, prior_noise, holes, seed, backing)
     # The folder is checked and locked before the work.
-    with atomic_folder(folder) as unfinished, progress_bar(console=console) as progress:
+    ours = Ours(FILES, [path for path in (dataset, mesh, points) if path]) if force else None
+    with atomic_folder(folder, ours) as unfinished, progress_bar(console=console) as progress:
         segmented = None
         if mesh is not None:
             cameras = [frame.camera for frame in loaded.frames]
@@ -148,7 +153,7 @@ def prior(
         )
     if "resolution" in result.numbers:
         console.print(_reason(result.numbers), soft_wrap=True)
-    console.print(f"wrote {folder}: mesh.ply, points.ply, prior.json, prior.png")
+    console.print(f"wrote {folder}: {', '.join(sorted(FILES))}")
 
 
 def _built(

@@ -27,6 +27,13 @@ from mgs.report.runs import (
 from mgs.report.tables import comparison_rows, markdown_table
 from mgs.splat_ply import read_ply
 
+FIGURES = ("orbit", "gain", "coverage", "comparison", "psnr")
+
+
+def report_files(kind: str) -> list[str]:
+    """Names of the files of a report; the last figure is only in some."""
+    return [*(f"{name}.{kind}" for name in FIGURES), "table.md", "table.json"]
+
 
 def write_report(
     out: str | Path, runs: Sequence[str | PathLike[str]] | Comparison, kind: str = "png"
@@ -52,7 +59,7 @@ def write_report(
         check_measured(run)
     out, dataset = Path(out), compared.dataset
     frame, truth, renders, captions = _comparison(compared)
-    paths = {name: out / f"{name}.{kind}" for name in ("orbit", "gain", "coverage", "comparison")}
+    paths = {name: out / f"{name}.{kind}" for name in FIGURES[:-1]}
 
     first = next(iter(compared.runs.values()))
     positions = np.array([frame.camera.position for frame in dataset.frames])

@@ -52,6 +52,12 @@ from mgs.splat_ply import read_ply, write_ply
 
 POLICY_SOURCE = "policy.py"
 
+FILES = [
+    *("config.json", "checkpoint.npz", "steps.jsonl", "metrics.json", "gaussians*", POLICY_SOURCE),
+    *("prior", "dataset", "renders", "diagnostics", "tensorboard", "export.*", "video.*"),
+]
+"""Names in the folder of a run, with what commands add to it."""
+
 DATASET = "dataset"
 """Folder of a run that holds its dataset, where the run captures images (`mgs nbv --capture`)."""
 
