@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
 
+from mgs.cli.options import argument, option
 from mgs.errors import FLAGS, flag
 from mgs.fit.settings import TrainSettings
 from mgs.policy.registry import policy_names
@@ -51,112 +53,81 @@ MORE_HELP = {
     "alpha_weight": " Default: 0.1, or 0 where frames have neither mask nor alpha.",
 }
 
+main = partial(option, rich_help_panel="Main options")
+data = partial(option, rich_help_panel="Data")
+capturing = partial(option, rich_help_panel="Live capture")
+
 
 def nbv(
     context: typer.Context,
     dataset: Annotated[
-        Path | None,
-        typer.Argument(help="Dataset folder (transforms.json). Not needed with --resume."),
+        Path | None, argument("Dataset folder (transforms.json). Not needed with --resume.")
     ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(help="New folder for the run.", rich_help_panel="Main options"),
-    ] = None,
+    out: Annotated[Path | None, main("New folder for the run.")] = None,
     prior: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of `mgs prior`. Default: DATASET/prior, or one built in the run.",
-            rich_help_panel="Main options",
-        ),
+        Path | None, main("Folder of `mgs prior`. Default: DATASET/prior, or one built in the run.")
     ] = None,
     resume: Annotated[
         Path | None,
-        typer.Option(
+        main(
+            "Continue this run by its config.json; repeat programs: --policy, --capture-...",
             metavar="RUN",
-            help="Continue this run by its config.json; repeat programs: --policy, --capture-...",
-            rich_help_panel="Main options",
         ),
     ] = None,
     capture: Annotated[
         str | None,
-        typer.Option(
+        data(
+            "In place of DATASET: a scene (name or .toml), rendered when a view is chosen.",
             metavar="SCENE",
-            help="In place of DATASET: a scene (name or .toml), rendered when a view is chosen.",
-            rich_help_panel="Data",
         ),
     ] = None,
     config: Annotated[
         Path | None,
-        typer.Option(
+        main(
+            "Settings with the keys of config.json (that of a run works, too); options win.",
             metavar="FILE.toml",
-            help="Settings with the keys of config.json (that of a run works, too); options win.",
-            rich_help_panel="Main options",
         ),
     ] = None,
     capture_command: Annotated[
         str | None,
-        typer.Option(
+        capturing(
+            "Program that takes a picture of a pose: 'CMD {pose} {out}' (JSON in, PNG out).",
             metavar="COMMAND",
-            help="Program that takes a picture of a pose: 'CMD {pose} {out}' (JSON in, PNG out).",
-            rich_help_panel="Live capture",
         ),
     ] = None,
     capture_folder: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder in which poses are written and pictures of them are awaited.",
-            rich_help_panel="Live capture",
-        ),
+        capturing("Folder in which poses are written and pictures of them are awaited."),
     ] = None,
     capture_timeout: Annotated[
-        float,
-        typer.Option(
-            min=0.01, help="Longest wait for a picture, seconds.", rich_help_panel="Live capture"
-        ),
+        float, capturing("Longest wait for a picture, seconds.", min=0.01)
     ] = 600.0,
-    capture_tries: Annotated[
-        int,
-        typer.Option(
-            min=1, help="Most pictures asked for at a pose.", rich_help_panel="Live capture"
-        ),
-    ] = 3,
+    capture_tries: Annotated[int, capturing("Most pictures asked for at a pose.", min=1)] = 3,
     capture_failure: Annotated[
         str,
-        typer.Option(
+        capturing(
+            "After the last try: take the next best pose in its place, or stop the run.",
             metavar="skip|stop",
-            help="After the last try: take the next best pose in its place, or stop the run.",
-            rich_help_panel="Live capture",
         ),
     ] = "skip",
     capture_distance: Annotated[
         float | None,
-        typer.Option(
-            min=0.0,
-            help="Largest distance from the pose asked for. Default: a quarter of the object's.",
-            rich_help_panel="Live capture",
+        capturing(
+            "Largest distance from the pose asked for. Default: a quarter of the object's.", min=0.0
         ),
     ] = None,
     gaussians: Annotated[
         str | None,
-        typer.Option(
-            metavar="N|auto",
-            help="Build a prior of this many Gaussians in the run (`mgs prior`).",
-            rich_help_panel="Data",
-        ),
+        data("Build a prior of this many Gaussians in the run (`mgs prior`).", metavar="N|auto"),
     ] = None,
     preset: Annotated[
         str | None,
-        typer.Option(
-            help=f"Defaults of passes and of the number of Gaussians: {', '.join(PRESETS)}.",
+        option(
+            f"Defaults of passes and of the number of Gaussians: {', '.join(PRESETS)}.",
             rich_help_panel="Fitting",
         ),
     ] = None,
-    force: Annotated[
-        bool,
-        typer.Option(
-            "--force", help="Replace a run that is there.", rich_help_panel="Main options"
-        ),
-    ] = False,
+    force: Annotated[bool, main("Replace a run that is there.", "--force")] = False,
     **options: Any,
 ) -> None:
     """Choose the next best views: fit to the seeds, choose a view, read its image, fit again.

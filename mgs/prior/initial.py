@@ -260,13 +260,3 @@ def colour_agreement(prior: Prior, frames: Sequence[Frame]) -> float:
     mean = total.sum(0) / count.sum()
     whole = squares.sum() / count.sum() - np.square(mean).sum()
     return float(1 - within / max(whole, 1e-12))
-
-
-def with_share_seen(prior: Prior, seed_frames: Sequence[Frame]) -> Prior:
-    """The prior with `numbers` of seen_by_seeds: the share of samples that some seed frame sees;
-    the rest would start grey. Raises InputError if a depth image or mask cannot be read."""
-    depth = depth_of(prior)
-    seen = np.logical_or.reduce(
-        [sees(prior.points, prior.normals, f, depth(f), prior.depth_tolerance) for f in seed_frames]
-    )
-    return replace(prior, numbers=prior.numbers | {"seen_by_seeds": float(seen.mean())})

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 from mgs.camera import Camera
-from mgs.colour import srgb_from_linear
-from mgs.data.dataset import TEST_FOLDER, Dataset
+from mgs.colour import linear_from_srgb, srgb_from_linear
+from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset
 from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.files import atomic_path, working_in, write_json
@@ -33,8 +33,9 @@ from mgs.images import PNG_LEVEL, read_png
 from mgs.metrics import METRICS, SURFACE_METRICS, compare, compare_surface
 from mgs.provenance import versions
 from mgs.report.runs import read_metrics
-from mgs.run.folder import Run, open_run
+from mgs.run.folder import Run, holds_run, open_run
 from mgs.run.inputs import array_digest, camera_digest, frame_digests
+from mgs.splat_ply import ply_colour_space, read_ply
 
 Renderer = Callable[[Gaussians, Camera], tuple[np.ndarray, np.ndarray, np.ndarray]]
 """(gaussians, camera) -> linear RGB [H,W,3], alpha [H,W], expected z-depth [H,W] in metres."""
@@ -217,7 +218,7 @@ def evaluate_run(
 
     run: folder or opened run. convergence: also predict how far the last fit is from its minimum
     (entry "fit": `mgs.report.convergence.remaining_decrease`). say: called with lines for the user:
-    metrics left out for want of a truth, files written and kept.
+    files written and kept.
 
     Metrics and pictures of the same model, dataset and version of mgs are kept, not made again. In
     an on-demand dataset only frames that the run has taken have an image, so none is held out.
@@ -232,8 +233,6 @@ def evaluate_run(
         frames, tests = dataset.with_images(trained), dataset.test_views()
         test_frames = () if tests is None else tests.frames
         subject = _subject(gaussians, [*frames, *test_frames], trained)
-        for reason in _left_out(dataset):
-            say(reason)
         metrics = _measured_before(file, subject)
         if metrics is None:
             found = evaluate_model(
@@ -294,18 +293,6 @@ def _informed(run: Run) -> dict[str, dict[str, int]]:
     }
 
 
-def _left_out(dataset: Dataset) -> list[str]:
-    """Why some of SURFACE_METRICS are not measured, in a line each."""
-    reasons = []
-    if not any(frame.rock_path for frame in dataset.frames):
-        reasons.append(
-            f"{dataset.root}: has no images of the rock alone, so the error of alpha is left out"
-        )
-    if not any(frame.depth_path for frame in dataset.frames):
-        reasons.append(f"{dataset.root}: has no depth images, so the errors of depth are left out")
-    return reasons
-
-
 def _subject(gaussians: Gaussians, frames: Sequence[Frame], trained: list[str]) -> str:
     """Hash of all that the metrics of a run depend on: model, cameras and files of all views, and
     versions without the commit."""
@@ -343,3 +330,60 @@ def compare_models(
     if not frames:
         return name, None
     return name, [float(evaluate_model(model, frames, ())["all"]["psnr"]) for model in models]
+
+
+def evaluate(
+    subject: str | Path | Run | Gaussians,
+    dataset: str | Path | Dataset | None = None,
+    *,
+    trained: Iterable[str] = (),
+    progress: Progress = no_progress,
+    **options: Any,
+) -> dict[str, Any]:
+    """Measure a run, or a model on the views of a dataset; return the contents of metrics.json.
+
+    subject: a run or its folder, measured by `evaluate_run` with its options; or Gaussians, or a
+    PLY. dataset: of a model; default of a PLY in a run's folder: that of the run. trained: names of
+    the frames that the model was trained on; there those of the run. The numbers of a PLY are
+    written beside it, as NAME.metrics.json. Raises InputError as `evaluate_run`, `read_ply` and
+    `load_dataset`, and where a model comes without a dataset.
+    """
+    if isinstance(subject, Run) or (not isinstance(subject, Gaussians) and Path(subject).is_dir()):
+        return evaluate_run(subject, progress=progress, **options)
+    renderer: Renderer = render_view
+    path = None
+    if not isinstance(subject, Gaussians):
+        path = Path(subject)
+        if not path.exists():
+            raise InputError(f"{path}: no such run folder or PLY file")
+        subject, renderer = read_ply(path), _renderer(ply_colour_space(path))
+        if dataset is None and holds_run(path.parent):
+            run = open_run(path.parent)
+            dataset, trained = run.dataset, [frame.name for frame in run.taken]
+    if dataset is None:
+        raise InputError(f"{path or 'the model'}: is of no run here; give a dataset with --dataset")
+    views = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
+    names, tests = list(trained), views.test_views()
+    metrics = evaluate_model(
+        subject,
+        views.with_images(names),
+        names,
+        test_frames=tests.frames if tests else (),
+        renderer=renderer,
+        progress=progress,
+    )
+    if path is not None:
+        write_json(path.with_suffix(".metrics.json"), metrics)
+    return metrics
+
+
+def _renderer(space: str) -> Renderer:
+    """Renderer of a model whose colours are blended in this space."""
+    if space == "linear":
+        return render_view
+
+    def render(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        rgb, alpha, depth = render_view(gaussians, camera)
+        return linear_from_srgb(np.clip(rgb, 0, 1)), alpha, depth
+
+    return render
