@@ -258,7 +258,7 @@ def test_settings_without_an_option_are_named_by_their_key(
 
 def test_options_win_over_a_file_of_settings(dataset, prior, tmp_path, capsys, monkeypatch):
     """The config.json of a run is such a file, too."""
-    monkeypatch.setattr(nbv_command, "resume_and_print", lambda *given, live: None)
+    monkeypatch.setattr(nbv_command, "resume_and_print", lambda *given, **more: None)
     file, first, second = (tmp_path / name for name in ("mine.toml", "first", "second"))
     text = f'dataset = "{dataset.name}"\nprior = "{prior}"\nseeds = 3\nbudget = 2\n'
     file.write_text(text + "[train]\npasses = 2\n")
@@ -367,3 +367,13 @@ def test_resume_takes_no_other_setting(dataset, prior, tmp_path, capsys, option)
     assert f"nbv: {option.split()[0]}: {where}" in said
     said = refused(capsys, ["nbv", "--resume", run, "--policy", "random"], run)
     assert f"--policy random: is not the policy of {run}, d-optimal" in said
+
+
+def test_steps_are_logged_for_tensorboard(dataset, prior, tmp_path):
+    pytest.importorskip("tensorboardX")
+    short = ["--seed-views", 3, "--budget", 1, "--passes", 1, "--evaluate-every", 1]
+    run = tmp_path / "run"
+    command("nbv", dataset, "--prior", prior, "--out", run, *short, "--tensorboard")
+    (log,) = (run / "tensorboard").iterdir()
+    logged = log.read_bytes()
+    assert all(name in logged for name in (b"psnr", b"information_gain", b"newest_view/render"))

@@ -128,6 +128,12 @@ def nbv(
         ),
     ] = None,
     force: Annotated[bool, main("Replace a run that is there.", "--force")] = False,
+    tensorboard: Annotated[
+        bool,
+        typer.Option(
+            "--tensorboard", help="Log to RUN/tensorboard too.", rich_help_panel="Main options"
+        ),
+    ] = False,
     **options: Any,
 ) -> None:
     """Choose the next best views: fit to the seeds, choose a view, read its image, fit again.
@@ -140,7 +146,10 @@ def nbv(
 
     from mgs.cli.options import parse_gaussians
     from mgs.errors import InputError
+    from mgs.run.folder import open_run
 
+    if tensorboard:
+        import tensorboardX  # noqa: F401  # its absence is known before the work
     console = Console(highlight=False)
     given = {name: options[name] for name in options if options[name] not in (None, [])}
     live = live_capture(
@@ -153,7 +162,8 @@ def nbv(
     )
     if resume is not None:
         refuse_others(context, resume)
-        resume_and_print(resume, console, given.get("policy"), live=live)
+        logged = _logged(open_run(resume), tensorboard)
+        resume_and_print(resume, console, given.get("policy"), live=live, on_state=logged)
         return
     settings: dict[str, Any] = settings_in(config) if config else {}
     dataset = dataset or (None if capture else settings.get("dataset"))
@@ -176,7 +186,17 @@ def nbv(
         force=force,
         **settings,
     )
-    resume_and_print(run, console, run.settings.policy, live=live)
+    logged = _logged(run, tensorboard)
+    resume_and_print(run, console, run.settings.policy, live=live, on_state=logged)
+
+
+def _logged(run: Run, wanted: bool) -> Callable[[State], None]:
+    """Callback that logs steps to RUN/tensorboard, or does nothing."""
+    from mgs.run import tensorboard
+
+    if not wanted:
+        return lambda state: None
+    return tensorboard.tensorboard(run.folder / "tensorboard", run.dataset)
 
 
 def live_capture(
@@ -252,7 +272,7 @@ def refuse_others(context: typer.Context, resume: Path) -> None:
 
     for name in context.params:
         source = context.get_parameter_source(name)
-        again = name in ("resume", "policy") or name.startswith("capture_")
+        again = name in ("resume", "policy", "tensorboard") or name.startswith("capture_")
         if again or source is None or source.name != "COMMANDLINE":
             continue
         option = flag(name)

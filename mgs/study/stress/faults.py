@@ -281,6 +281,7 @@ SIZES_IN_WORDS = {
     "shifted prior": "{:g} m",
     "scaled prior": "factor {:g}",
     "turned prior": "{:g}°",
+    "another rock's prior": "draw {:g}",
 }
 """Sizes of faults with their units."""
 
