@@ -1,8 +1,7 @@
 """The visual hull: the largest body inside the masks of all frames (Laurentini 1994), by carving.
 
-A point has a value per frame: its projection's distance inside the mask's outline, pixels, times
-the size of a pixel there. The least value is positive inside the hull, negative outside, and about
-the distance to its surface nearby; marching cubes find the surface.
+A point has a value per frame: its projection's distance inside the mask's outline, times the size
+of a pixel there. The least value is positive inside the hull; marching cubes find its surface.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Points of the object, with normals, from a triangulated cloud.
 
-Clouds of real photographs are uneven: dense on texture, empty on plain parts, with wrong points
-anywhere, often without ground. Points are judged one by one (track, reprojection error), then by
-masks, else by ground plane and density clusters (HDBSCAN), and last by their neighbours.
+Points are judged one by one (track, reprojection error), then by masks, else by ground plane and
+density clusters (HDBSCAN), and last by their neighbours.
 """
 
 from __future__ import annotations

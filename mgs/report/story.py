@@ -1,7 +1,6 @@
 """The story of a run: the model after each view, with the camera that took it and what is unknown.
 
-A run keeps only its last model, so the fits are done again, view by view, from the prior on. From
-the seeds on they are those of a run that takes one view at a time.
+A run keeps only its last model, so the fits are done again, view by view, from the prior on.
 """
 
 from __future__ import annotations

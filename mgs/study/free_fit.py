@@ -2,9 +2,8 @@
 held to a surface.
 
 The same: free means, SH degree 3, Adam with their learning rates, no prior, and 15,000 steps at the
-paper's size. Different: the fit starts on the prior's surface in the colours of all images. It adds
-and removes no Gaussians, and minimises the squared error instead of L1 and SSIM. All rates fall to
-a tenth.
+paper's size. Different: the fit starts on the prior's surface, adds and removes no Gaussians, and
+minimises the squared error instead of L1 and SSIM. All rates fall to a tenth.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Registration: relative poses of a flight's cameras from their depth images.
 
-Point clouds of two frames are aligned (GICP), frames that see the same place again are found (loop
-closure), and all relative poses are reconciled (pose graph). Poses are [4,4] camera-to-world,
-metres.
+Clouds of two frames are aligned (GICP), loops are closed, and all relative poses are reconciled
+(pose graph). Poses are [4,4] camera-to-world, metres.
 """
 
 from __future__ import annotations
