@@ -48,8 +48,7 @@ def sparsification(errors: Array, sigma: Array) -> Array:
 
 
 def ause(errors: Array, sigma: Array) -> float:
-    """Area between the sparsification curves by sigma and by the errors themselves. errors: [n], 0
-    or more."""
+    """Area between the sparsification curves by sigma and by the errors [n] themselves."""
     return float((sparsification(errors, sigma) - sparsification(errors, errors)).mean())
 
 

@@ -19,8 +19,14 @@ from mgs.files import read_json, reading
 from mgs.policy.from_file import label
 from mgs.report.figures import Curves
 from mgs.run.ending import RunEnd
-from mgs.run.folder import check_frames, check_same_frames, open_run, read_config
-from mgs.run.lines import check_line, frames_of
+from mgs.run.folder import (
+    check_frames,
+    check_line,
+    check_same_frames,
+    frames_of,
+    open_run,
+    read_config,
+)
 from mgs.run.settings import validated
 
 

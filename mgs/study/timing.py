@@ -84,8 +84,7 @@ def timed(
 
 
 def with_seconds(rows: Iterable[Row], unit: float) -> list[Row]:
-    """Rows with seconds, seconds_low and seconds_high: their ratios times the seconds of the
-    reference."""
+    """Rows with seconds, seconds_low and seconds_high: ratio times `unit`."""
     ends = ("", "_low", "_high")
     return [row | {f"seconds{end}": row[f"ratio{end}"] * unit for end in ends} for row in rows]
 

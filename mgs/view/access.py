@@ -74,8 +74,7 @@ class Access:
 
     @contextmanager
     def guarding(self) -> Iterator[None]:
-        """A server of websockets that is started in this context answers as `answered`, and prints
-        nothing about messages that it cannot read."""
+        """Context manager in which a server of websockets answers as `answered`."""
         from websockets.asyncio import server
 
         serve, logger = server.serve, logging.getLogger("mgs.view")
