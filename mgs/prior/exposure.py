@@ -36,8 +36,7 @@ RATIO_STD = 0.1
 """Standard deviation of the log ratio from one sample. A chosen constant."""
 
 GAIN_STD = 0.5
-"""Prior standard deviation of a log gain, 0.7 stops. It matters only for images that share few
-samples."""
+"""Prior standard deviation of a log gain, 0.7 stops."""
 
 
 def solve_gains(colours: np.ndarray, weights: np.ndarray) -> np.ndarray:

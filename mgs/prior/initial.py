@@ -39,15 +39,13 @@ INSET = 0.6
 half a pixel, which would draw the rock too large. A chosen constant (docs/fit.md)."""
 
 THICKNESS = 0.1
-"""Standard deviation of a Gaussian across the surface, over the spacing: flat, but well
-conditioned."""
+"""Standard deviation of a Gaussian across the surface, over the spacing."""
 
 BACKING_DEPTH = 1.0
 """Distance of the backing behind the surface's Gaussians, over their spacing."""
 
 BACKING_SCALE = (0.8, 0.8, 0.2)
-"""Standard deviations of a backing Gaussian along the surface and the normal, over the backing's
-spacing: more overlap than on the surface, to leave no gaps."""
+"""Standard deviations of a backing Gaussian, over the backing's spacing."""
 
 BACKING_OPACITY = 0.99
 
@@ -113,8 +111,7 @@ def initial_gaussians(
 def _scattered(
     prior: Prior, frames: Sequence[Frame], gains: np.ndarray | None
 ) -> tuple[Gaussians, np.ndarray]:
-    """Round, nearly transparent Gaussians at random points, in the mean colour of all pixels that
-    show them; and whether some do."""
+    """Round, nearly transparent Gaussians at random points, and whether a pixel shows them."""
     points = prior.points
     total, count = np.zeros((len(points), 3)), np.zeros(len(points))
     for k, frame in enumerate(frames):

@@ -136,7 +136,6 @@ def judged(
 
 
 def crps(errors: Array, sigma: Array) -> float:
-    """Mean continuous ranked probability score of normal distributions around 0, in the unit of the
-    errors; smaller is better."""
+    """Mean continuous ranked probability score of normal distributions around 0."""
     z = errors / sigma
     return float((sigma * (z * (2 * ndtr(z) - 1) + 2 * norm.pdf(z) - 1 / np.sqrt(np.pi))).mean())

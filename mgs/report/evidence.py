@@ -128,8 +128,7 @@ def last_images(settings: NbvSettings, prior: Prior, frames: Sequence[Frame]) ->
 
 
 def kinds(sh_degree: int, means: str = "frozen") -> dict[str, slice]:
-    """Columns of the Fisher information by kind, as `mgs.splat.groups`, with colours of degrees
-    above 0 as a kind of their own."""
+    """Columns as `mgs.splat.groups`, with DIRECTIONAL as a kind of its own."""
     of = groups(sh_degree, means)
     if sh_degree == 0:
         return of
@@ -338,8 +337,7 @@ def fitted(
 
 
 def _masks(kept: Mapping[str, Mask], coefficients: int, means: str) -> dict[str, np.ndarray]:
-    """Masks of `LeanModel.learned` in shapes that broadcast to the learned arrays. coefficients: of
-    a colour channel."""
+    """Masks of `LeanModel.learned` that broadcast to the learned arrays."""
     flat = ("opacity", "mean") if means == "normal" else ("opacity",)  # arrays of shape [N]
     masks = {kind: mask if kind in flat else mask[:, None] for kind, mask in kept.items()}
     directional = masks.pop(DIRECTIONAL, None)

@@ -46,8 +46,7 @@ from mgs.splat import ListCache, as_drjit, fisher, groups, jvp, render
 Array = NDArray[np.floating]
 
 DRAWS = 32
-"""Draws from the posterior. The standard deviation of a variance estimated from 32 is a quarter of
-it."""
+"""Draws from the posterior, which give a variance within a quarter."""
 
 FOLDS = 3
 """Parts of a run's views; each is predicted by a model that was fitted to the others."""

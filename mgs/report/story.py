@@ -31,8 +31,7 @@ DPI = 110
 
 
 def models(run: Run, progress: Progress) -> Iterator[Fitted]:
-    """Fit the run's views again, one more each time; yield every model. Raises InputError as
-    `problem_of` and `learn`."""
+    """Fit the run's views again, one more each time; yield every model."""
     problem = problem_of(run, progress, run.settings.policy)
     taken, seeds = run.state.taken, run.settings.seeds
     before: Fitted | None = None

@@ -39,8 +39,7 @@ MEAN_RATE = 1.6e-4
 def time_free_fit(
     root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]
 ) -> dict[str, Any]:
-    """Fit to all images of a dataset in a new process; returns what `mgs.study.case.time_policy`
-    does, without a choice."""
+    """Fit to all images in a new process; returns as `time_policy`, without a choice."""
     return in_new_process(_free_fit, out, root / dataset, root / prior, settings["seed"])
 
 
