@@ -302,7 +302,7 @@ def test_a_run_that_learns_means_is_refitted_too(run, tmp_path, means):
     ],
 )
 def test_what_cannot_be_chosen_is_one_line(run, capsys, options, said):
-    assert said in refused(capsys, ["refit", run, *options])
+    assert said in refused(capsys, ["refit", run, "--force", *options])
 
 
 def test_a_prior_that_is_gone_is_one_line(run, tmp_path):

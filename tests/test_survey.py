@@ -32,8 +32,7 @@ from mgs.survey.depth_sensor import (
 )
 from mgs.survey.flight import SurveySettings, fly, survey_numbers, trajectory_error
 from mgs.survey.folder import write_survey
-from mgs.survey.odometry import chain, drifting_odometry
-from mgs.survey.registration import Edge, loop_candidates, optimise
+from mgs.survey.registration import Edge, chain, drifting_odometry, loop_candidates, optimise
 
 ROCKS = [
     (np.array(centre), np.array(axes))

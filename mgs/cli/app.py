@@ -74,8 +74,7 @@ RESUMABLE = ("synth-orbit", "import", "demo", "reproduce", "chart", "stress", "p
 
 
 def _help(docstring: str | None) -> str:
-    """Join the lines of each paragraph, so that the help breaks lines only at the terminal's
-    width."""
+    """Join the lines of each paragraph, so that the terminal breaks them."""
     paragraphs = cleandoc(docstring or "").split("\n\n")
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
 

@@ -29,8 +29,7 @@ GAUSSIANS = 10_000
 """About one Gaussian per pixel of the rock at 320x240."""
 
 TEST_VIEWS = 12
-"""Test views on a dome around the rock: enough to see it from all sides, and few beside the 32 of
-the orbit."""
+"""Test views on a dome around the rock."""
 
 BUDGET = 8
 """Views beyond the four seeds, the same for every policy."""

@@ -221,8 +221,7 @@ def live_capture(
 
 
 def settings_of(given: dict[str, Any], fit: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Fields of `NbvSettings` from the options given, those of a fit under `train`, added to
-    `fit`."""
+    """Fields of `NbvSettings` from options; those of a fit, added to `fit`, under `train`."""
     settings, train = dict[str, Any](), dict(fit or {})
     for name, value in given.items():
         where = train if name in TrainSettings.model_fields and name != "seed" else settings
@@ -231,8 +230,7 @@ def settings_of(given: dict[str, Any], fit: dict[str, Any] | None = None) -> dic
 
 
 def with_settings_as_options(function: Any, panels: dict[str, tuple[str, ...]] = PANELS) -> Any:
-    """Give a command an option for each setting in `panels`; only options given reach
-    `**options`."""
+    """Give a command an option for each setting in `panels`, passed as `**options`."""
     signature = inspect.signature(function, eval_str=True)
     parameters = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
     for panel, names in panels.items():

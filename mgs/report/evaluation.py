@@ -132,8 +132,7 @@ def evaluate_model(
 def _measured(
     frame: Frame, rendered: tuple[np.ndarray, ...], folder: Path | None
 ) -> dict[str, float]:
-    """METRICS of one view, and SURFACE_METRICS that it has a truth for. Its picture goes into the
-    folder."""
+    """METRICS and SURFACE_METRICS of one view; writes its picture into the folder."""
     (truth, weight), mask, (rgb, alpha, depth) = frame.target(), frame.mask(), rendered
     true_depth = frame.depth() if frame.depth_path else None
     shares = frame.rock_path is not None
@@ -294,8 +293,7 @@ def _informed(run: Run) -> dict[str, dict[str, int]]:
 
 
 def _subject(gaussians: Gaussians, frames: Sequence[Frame], trained: list[str]) -> str:
-    """Hash of all that the metrics of a run depend on: model, cameras and files of all views, and
-    versions without the commit."""
+    """Hash of all that the metrics of a run depend on."""
     kinds = ("image", "mask", "rock", "depth")
     views = [
         [frame.name, camera_digest(frame.camera), frame_digests(frame, kinds)] for frame in frames

@@ -1,8 +1,8 @@
 """Live capture: a pose goes out as a JSON file, and a picture of it comes back.
 
-Of a run, RUN/dataset has the poses (transforms.json), the pictures taken, undistorted, with masks
-(of the prior where none came), and captured/NAME.json, the record that is written last. What was
-received lies in RUN/dataset/flight, or in the watched folder; what was refused is renamed there.
+RUN/dataset has the poses (transforms.json), the pictures taken, undistorted, with masks, and
+captured/NAME.json, the record that is written last. What was received lies in RUN/dataset/flight or
+the watched folder; what was refused is renamed there.
 """
 
 from __future__ import annotations

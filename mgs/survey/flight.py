@@ -17,11 +17,13 @@ from mgs.errors import InputError
 from mgs.seeds import generator
 from mgs.survey.depth_sensor import SIGMA_FROM_MAD, noisy_depth
 from mgs.survey.fusion import focus
-from mgs.survey.odometry import agrees, chain, drifting_odometry
 from mgs.survey.registration import (
     CLOSURE_OVERLAP,
     GRID,
     Edge,
+    agrees,
+    chain,
+    drifting_odometry,
     loop_candidates,
     optimise,
     register,
