@@ -132,7 +132,7 @@ def cleared(name: str, places: dict[str, Path]) -> Path:
 
 
 def contents(work: Path) -> dict[str, object]:
-    """Every file below a folder but its timings and commit: bytes, or of checkpoints the arrays."""
+    """Every file below a folder but its commit: bytes, or of checkpoints the arrays."""
     found: dict[str, object] = {}
     for path in sorted(work.rglob("*")):
         key, data = str(path.relative_to(work)), path.read_bytes() if path.is_file() else b""
@@ -141,7 +141,7 @@ def contents(work: Path) -> dict[str, object]:
         if path.suffix == ".npz":
             with np.load(path) as arrays:
                 found[key] = [arrays[n].tobytes() for n in arrays.files if n != "json"]
-        elif path.name != "timings.json":
+        else:
             found[key] = data
     return found
 

@@ -299,4 +299,4 @@ def test_a_run_of_other_frames_or_without_settings_is_named(dataset, tmp_path):
         run_folder.check_same_frames(out, other)
     (out / "config.json").write_text("{}")
     with pytest.raises(InputError, match="no settings"):
-        run_folder.read_settings(out)
+        run_folder.open_run(out)

@@ -230,15 +230,15 @@ def test_settings_without_an_option_are_named_by_their_key(
 
 def test_options_win_over_a_file_of_settings(dataset, prior, tmp_path, capsys, monkeypatch):
     """The config.json of a run is such a file, too."""
-    monkeypatch.setattr(nbv_command, "resume_and_print", lambda *given, live: None)
+    monkeypatch.setattr(nbv_command, "resume_and_print", lambda *given, **more: None)
     file, first, second = (tmp_path / name for name in ("mine.toml", "first", "second"))
     text = f'dataset = "{dataset.name}"\nprior = "{prior}"\nseeds = 3\nbudget = 2\n'
     file.write_text(text + "[train]\npasses = 2\n")
     command("nbv", "--config", file, "--budget", 1, "--out", first)
-    made = run_folder.read_settings(first)
+    made = run_folder.open_run(first).settings
     assert (made.seeds, made.budget, made.train.passes, made.prior) == (3, 1, 2, prior.resolve())
     command("nbv", "--config", first / "config.json", "--policy", "random", "--out", second)
-    assert run_folder.read_settings(second) == made.model_copy(update={"policy": "random"})
+    assert run_folder.open_run(second).settings == made.model_copy(update={"policy": "random"})
     for wrong, said in {
         "budgett = 1": "mine.toml: budgett: Extra inputs are not permitted; correct it",
         "budget = -1": "mine.toml: budget: must be at least 0; correct it",
@@ -255,7 +255,7 @@ def test_options_reach_the_run(dataset, prior, tmp_path):
     options += " --nearest 5 --travel 2.5 --batch 3 --stop-gain 1e-9 --stop-uncertainty 1e-9"
     run = tmp_path / "run"
     command("nbv", dataset, "--prior", prior, "--out", run, *options.split())
-    state, settings = run_folder.read_checkpoint(run), run_folder.read_settings(run)
+    state, settings = run_folder.read_checkpoint(run), run_folder.open_run(run).settings
     assert settings.train.rates == {"colour": 0.1, "scale": 0.04, "rotation": 0.02, "opacity": 0}
     assert settings.train.alpha_weight == 0.3
     assert settings.prior_std == criteria.PRIOR_STD | {"scale": 2.0}
@@ -298,3 +298,42 @@ def test_a_run_of_a_policy_of_ones_own_can_be_read_without_it(loaded, tmp_path, 
     assert read_run(run).policy == "mine"
     with pytest.raises(InputError, match=r"^policy mine: unknown; choose one of d-optimal"):
         tiny.resume(run, loaded)
+<<<<<<< HEAD
+=======
+
+
+@pytest.mark.parametrize("moved", ["dataset", "prior"])
+def test_a_dataset_or_prior_that_moved_is_named(dataset, prior, tmp_path, capsys, moved):
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    (tmp_path / moved).rename(tmp_path / "elsewhere")
+    said = refused(capsys, ["nbv", "--resume", run], run)
+    where = f"run/config.json: {moved} {tmp_path / moved} is not there"
+    assert f"{where}; if it was moved, correct `{moved}`" in said
+
+
+def test_a_run_that_exists_is_not_started_again(dataset, prior, tmp_path, capsys):
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    said = refused(capsys, ["nbv", dataset, "--prior", prior, "--out", run], run)
+    assert f"{run}: a run is there already; choose" in said
+    assert f"--force; `mgs nbv --resume {run}` continues it" in said
+
+
+@pytest.mark.parametrize("option", ["--budget 9", "--exposure", "--prior-std colour=1"])
+def test_resume_takes_no_other_setting(dataset, prior, tmp_path, capsys, option):
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    said = refused(capsys, ["nbv", "--resume", run, *option.split()], run)
+    where = f"--resume takes its settings from {run / 'config.json'}; change it there"
+    assert f"nbv: {option.split()[0]}: {where}" in said
+    said = refused(capsys, ["nbv", "--resume", run, "--policy", "random"], run)
+    assert f"--policy random: is not the policy of {run}, d-optimal" in said
+
+
+def test_steps_are_logged_for_tensorboard(dataset, prior, tmp_path):
+    pytest.importorskip("tensorboardX")
+    short = ["--seed-views", 3, "--budget", 1, "--passes", 1, "--evaluate-every", 1]
+    run = tmp_path / "run"
+    command("nbv", dataset, "--prior", prior, "--out", run, *short, "--tensorboard")
+    (log,) = (run / "tensorboard").iterdir()
+    logged = log.read_bytes()
+    assert all(name in logged for name in (b"psnr", b"information_gain", b"newest_view/render"))
+>>>>>>> main

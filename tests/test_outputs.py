@@ -170,7 +170,7 @@ WHOLE = {
 @pytest.mark.parametrize("name", WHOLE)
 def test_a_result_appears_whole(tmp_path, monkeypatch, name):
     """Nothing is under its name while its picture, the last file, is drawn."""
-    module = importlib.import_module(f"mgs.{name}.figure")
+    module = importlib.import_module({"survey": "mgs.survey.folder"}.get(name, "mgs.prior.figure"))
     draw, drawn, out = getattr(module, f"draw_{name}"), [], tmp_path / "out"
     root, (option, files) = synthetic.write_dataset(tmp_path / "data").root, WHOLE[name]
 

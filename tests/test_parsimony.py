@@ -203,4 +203,4 @@ def test_a_run_is_pruned_beside_its_model(data, tmp_path, capsys):
     assert f"400 Gaussians, {len(left)} stay" in said
     assert "PSNR on the test views" in said
     assert (run / "gaussians.ply").read_bytes() == whole
-    assert "noise 0.0 must be positive" in refused(capsys, ["prune", run, "--noise", 0])
+    assert "noise 0.0 must be positive" in refused(capsys, ["prune", run, "--force", "--noise", 0])

@@ -24,7 +24,7 @@ from mgs.data.clouds import SparseCloud, read_cloud, views_of, write_cloud
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.data.importers import import_source
 from mgs.data.lens import shrunk
-from mgs.data.masks import make_masks, refined_mask
+from mgs.data.masks import make_masks
 from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh
 from mgs.data.sources import read_source
 from mgs.data.up import degrees_between, unit_up, up_of_cameras, upright
@@ -375,18 +375,6 @@ def test_masks_are_made_of_the_prior(data, tmp_path):
     assert exit_code("dataset", "masks", tmp_path / "d") == 2
 
 
-def test_outlines_move_to_where_the_colour_changes():
-    v, u = np.mgrid[:80, :100]
-    disc = np.hypot(v - 40, u - 50) < 25
-    rgb = np.where(disc[..., None], [0.6, 0.2, 0.1], [0.1, 0.3, 0.6])
-    rgb = rgb + 0.02 * np.random.default_rng(0).random((80, 100, 3))
-    rough = np.hypot(v - 41, u - 48) < 23
-    refined = refined_mask(rough, rgb, 6)
-    assert (refined ^ disc).sum() < 0.1 * (rough ^ disc).sum()
-    assert np.array_equal(refined, refined_mask(rough, rgb, 6))
-    assert not refined_mask(np.zeros((80, 100), bool), rgb, 6).any()
-
-
 # What cannot be used: how to make the dataset, options, what the error says.
 
 
@@ -480,7 +468,7 @@ def test_test_views_get_masks_too(data, tmp_path):
     bare(tmp_path / "d/test", data)
     ball = trimesh.creation.icosphere(2, 0.4)
     mesh = Mesh(ball.vertices, ball.faces, np.ones(len(ball.faces), bool))
-    made = make_masks(load_dataset(tmp_path / "d"), mesh, 0.1)
+    made = make_masks(load_dataset(tmp_path / "d"), mesh)
     tests = load_dataset(tmp_path / "d/test")
     assert all(0 < frame.mask().mean() < 0.9 for frame in tests.frames)
     assert not any("no masks" in line for line in check_dataset(made).problems)
@@ -489,6 +477,14 @@ def test_test_views_get_masks_too(data, tmp_path):
     assert any("test views have no masks" in line for line in check_dataset(made).problems)
 
 
+<<<<<<< HEAD
+=======
+def test_mask_files_must_not_be_there_yet(exact, tmp_path):
+    with pytest.raises(InputError, match="has a mask already"):
+        make_masks(load_dataset(exact), read_mesh(exact / "rock.glb"))
+
+
+>>>>>>> main
 def test_a_part_with_few_points_belongs_to_the_object_above_the_ground():
     """Few points in shade are no cluster of their own; other things, farther off, stay out."""
     rng = np.random.default_rng(0)

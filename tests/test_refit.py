@@ -32,7 +32,7 @@ from mgs.report.evidence import (
     regularisation,
     worth,
 )  # fmt: skip
-from mgs.report.refitting import REFITTED, refit_run
+from mgs.report.smaller import REFITTED, refit_run
 from mgs.run.folder import open_run
 from mgs.run.nbv import run_nbv
 from mgs.run.settings import NbvSettings

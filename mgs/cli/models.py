@@ -18,7 +18,7 @@ from mgs.files import check_new_file, folder_locked, working_in
 from mgs.policy.criteria import LEARN_LOSS, PRUNE_NOISE
 
 if TYPE_CHECKING:
-    from mgs.report.refitting import RefittedRun
+    from mgs.report.smaller import RefittedRun
 
 
 def evaluate(
@@ -45,9 +45,8 @@ def evaluate(
     the pixels of the rock. metrics.json also has the errors of alpha and depth, where the dataset
     has their truth.
     """
-    from mgs.report.measuring import evaluate as measured
-    from mgs.report.pruning import PRUNED
-    from mgs.report.refitting import REFITTED
+    from mgs.report.evaluation import evaluate as measured
+    from mgs.report.smaller import PRUNED, REFITTED
     from mgs.report.tables import metrics_row
 
     runtime.start()
@@ -156,7 +155,7 @@ def prune(
     The change of the training images is measured, and stays within --noise. Nothing is fitted
     again, and the run itself stays as it is.
     """
-    from mgs.report.pruning import PRUNED, prune_run
+    from mgs.report.smaller import PRUNED, prune_run
     from mgs.run.folder import open_run
 
     for run in runs:
@@ -200,7 +199,7 @@ def refit(
     are not learned keep the prior's values, and are marked in the file. The run itself stays as it
     is.
     """
-    from mgs.report.refitting import REFITTED, refit_run
+    from mgs.report.smaller import REFITTED, refit_run
     from mgs.run.folder import open_run
 
     for run in runs:

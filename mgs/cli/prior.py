@@ -19,13 +19,9 @@ from mgs.files import Ours, atomic_folder
 
 if TYPE_CHECKING:
     from mgs.data.dataset import Dataset
-    from mgs.data.frames import Frame
     from mgs.prior.build import Prior
     from mgs.prior.segmentation import SegmentedCloud
     from mgs.prior.settings import PriorSettings
-
-SEEDS = 4
-"""Seed frames in the paper; the table says what share of the samples they see."""
 
 FILES = ("prior.json", "mesh.ply", "points.ply", "prior.png")
 """Names in a folder of this command."""
@@ -103,7 +99,7 @@ def prior(
     from mgs.data.meshes import GLTF
     from mgs.prior.build import prior_from_mesh, save_prior
     from mgs.prior.figure import draw_prior
-    from mgs.prior.initial import AGREEMENT, colour_agreement, with_share_seen
+    from mgs.prior.initial import AGREEMENT, colour_agreement
     from mgs.prior.photographs import source_of
     from mgs.prior.settings import PriorSettings
 
@@ -132,8 +128,6 @@ def prior(
             console.print(f"prior from {chosen}" + ("" if source or points else WHY[chosen]))
             options = {"source": chosen, "points": points, "up": upward}
             result, segmented = _built(loaded, settings, folder, progress, **options)
-        progress("seed frames")
-        result = with_share_seen(result, _seed_frames(loaded, result))
         if result.numbers["from"] != "random" and not loaded.on_demand:
             progress("colours of the surface")
             agreed = colour_agreement(result, loaded.frames)
@@ -176,17 +170,6 @@ def _built(
         raise InputError(f"{refused.line} (the points: {picture})") from None
 
 
-def _seed_frames(dataset: Dataset, prior: Prior) -> list[Frame]:
-    """The frames that `mgs nbv` would take as its SEEDS seeds, or all if there are fewer."""
-    from mgs.data.up import upright
-    from mgs.policy.poses import seed_views
-
-    turn = upright(prior.up)
-    positions = np.stack([frame.camera.position for frame in dataset.frames]) @ turn.T
-    middle = turn @ prior.points.mean(0)
-    return [dataset.frames[k] for k in seed_views(positions, middle, min(SEEDS, len(dataset)))]
-
-
 def _random(numbers: dict[str, Any]) -> str:
     """Line about a random start."""
     unit = "m" if numbers["unit"] == "m" else "units"
@@ -217,10 +200,6 @@ def _table(numbers: dict[str, Any]) -> Table:
     table.add_row("samples, N = A / spacing²", f"{n:,} = {area:.4f} / {spacing:.6f}²")
     behind = f"a sample each, and {numbers['backed']:,} behind the surface"
     table.add_row("Gaussians", f"{n + numbers['backed']:,}: {behind}")
-    mean, least = (numbers[f"nearest_neighbour_{key}"] / spacing for key in ("mean", "min"))
-    table.add_row("nearest neighbour over spacing", f"mean {mean:.2f}, least {least:.2f}")
-    seen = f"{numbers['seen_by_seeds']:.1%}; the rest starts grey"
-    table.add_row(f"samples that {SEEDS} evenly spaced frames see", seen)
     if "colour_agreement" in numbers:
         agreed = f"{numbers['colour_agreement']:.0%}"
         table.add_row("colour variance that all frames agree on", agreed)

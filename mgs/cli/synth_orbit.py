@@ -12,7 +12,7 @@ from rich.console import Console
 
 from mgs import runtime
 from mgs.camera import MAX_PIXELS
-from mgs.cli.options import Force, argument, option
+from mgs.cli.options import Force, Seed, argument, option
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError, row_named
 from mgs.files import Ours, clear_folder
@@ -68,14 +68,7 @@ def synth_orbit(
     rotation_noise: Annotated[
         float, option("Noise on the rotations there, degrees per axis.", min=0)
     ] = 0.0,
-    seed: Annotated[
-        int,
-        option(
-            "Root seed: the same gives the same dataset bit for bit, but timings.json.",
-            "--random-seed",
-            min=0,
-        ),
-    ] = 0,
+    seed: Seed = 0,
     force: Force = False,
 ) -> None:
     """Render a dataset with Mitsuba: an orbit around a rock, with photoreal images, depth, rock

@@ -130,8 +130,7 @@ def shown_view(runs: Sequence[RunFiles], dataset: Dataset) -> tuple[Frame, str]:
 
 
 def _median_view(runs: Sequence[RunFiles], frames: Sequence[Frame], views: str) -> Frame:
-    """The frame of median PSNR, mean over the runs; of an even number, the better of two. views:
-    key of metrics.json that lists them."""
+    """The frame of median PSNR, mean over the runs, by the key `views` of metrics.json."""
     measured = [{v["name"]: v["psnr"] for v in (run.metrics or {}).get(views, [])} for run in runs]
 
     def mean_psnr(frame: Frame) -> float:
@@ -154,8 +153,7 @@ def _caption(run: RunFiles, views: str, name: str) -> str:
 
 
 def _psnr_panels(runs: Mapping[str, RunFiles], every: str) -> dict[str, figures.Curves]:
-    """Panels of `psnr_figure`: over the test views, or else over all views, which are called
-    `every`. Empty if a run was measured on neither."""
+    """Panels of `psnr_figure`, over the test views or else `every`; empty without PSNR."""
     for prefix, views in (("test_", "test views"), ("", every)):
         panels = {
             f"PSNR, {views}": step_curves(runs, f"{prefix}psnr"),

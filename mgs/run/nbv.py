@@ -59,10 +59,8 @@ def run_nbv(
     progress: Progress = no_progress,
     **settings: Any,
 ) -> Run:
-    """Choose views one by one, as the paper does: `start_run`, then `resume_nbv`.
-
-    dataset, out, settings: as `start_run`. Callbacks, result and errors: as `resume_nbv`.
-    """
+    """Choose views one by one, as the paper does: `start_run`, then `resume_nbv`, with their
+    arguments and errors."""
     run = start_run(dataset, out, progress=progress, **settings)
     return resume_nbv(run, on_step, progress, run.policy, settings.get("live"))
 
