@@ -105,25 +105,3 @@ def test_poses_that_are_not_allowed_are_never_taken(dataset, prior, tmp_path, ca
     problem = Problem(run_folder.open_run(tmp_path / "run").dataset, settings, tiny.operations())
     opposite = problem.flight.legs[0, 6]
     assert 6 < opposite == pytest.approx(2 * np.sqrt(5) + 2 * (np.pi - 2 * np.arccos(2 / 3)), 0.01)
-<<<<<<< HEAD
-=======
-
-
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        (["--flight-length", "-1"], "--flight-length -1.0: must be at least 1e-06"),
-        (["--flight-time", "nan"], "--flight-time nan"),
-        (["--hover", "-1"], "--hover -1.0: must be at least 0"),
-        (["--speed", "0"], "--speed 0"),
-        (["--flight-length", "9"], "takes 15.2 m and 17 s; raise --flight-length"),
-        (["--no-fly", "4"], "allow 0 of its 12 poses, fewer than 3 seeds"),
-        (["--clearance", "30"], "allow 0 of its 12 poses, fewer than 3 seeds"),
-        (["--flight-length", "30", "--travel", "2"], "leave out --travel"),
-    ],
-)
-def test_limits_that_cannot_be_are_one_line(dataset, prior, tmp_path, capsys, given, words):
-    arguments = ["nbv", dataset, "--prior", prior, "--seed-views", 3, "--out", tmp_path / "run"]
-    assert words in refused(capsys, [*arguments, *given], tmp_path)
-    assert not (tmp_path / "run").exists()
->>>>>>> main

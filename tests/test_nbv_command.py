@@ -298,34 +298,6 @@ def test_a_run_of_a_policy_of_ones_own_can_be_read_without_it(loaded, tmp_path, 
     assert read_run(run).policy == "mine"
     with pytest.raises(InputError, match=r"^policy mine: unknown; choose one of d-optimal"):
         tiny.resume(run, loaded)
-<<<<<<< HEAD
-=======
-
-
-@pytest.mark.parametrize("moved", ["dataset", "prior"])
-def test_a_dataset_or_prior_that_moved_is_named(dataset, prior, tmp_path, capsys, moved):
-    run = tiny.write_run(tmp_path / "run", dataset, prior)
-    (tmp_path / moved).rename(tmp_path / "elsewhere")
-    said = refused(capsys, ["nbv", "--resume", run], run)
-    where = f"run/config.json: {moved} {tmp_path / moved} is not there"
-    assert f"{where}; if it was moved, correct `{moved}`" in said
-
-
-def test_a_run_that_exists_is_not_started_again(dataset, prior, tmp_path, capsys):
-    run = tiny.write_run(tmp_path / "run", dataset, prior)
-    said = refused(capsys, ["nbv", dataset, "--prior", prior, "--out", run], run)
-    assert f"{run}: a run is there already; choose" in said
-    assert f"--force; `mgs nbv --resume {run}` continues it" in said
-
-
-@pytest.mark.parametrize("option", ["--budget 9", "--exposure", "--prior-std colour=1"])
-def test_resume_takes_no_other_setting(dataset, prior, tmp_path, capsys, option):
-    run = tiny.write_run(tmp_path / "run", dataset, prior)
-    said = refused(capsys, ["nbv", "--resume", run, *option.split()], run)
-    where = f"--resume takes its settings from {run / 'config.json'}; change it there"
-    assert f"nbv: {option.split()[0]}: {where}" in said
-    said = refused(capsys, ["nbv", "--resume", run, "--policy", "random"], run)
-    assert f"--policy random: is not the policy of {run}, d-optimal" in said
 
 
 def test_steps_are_logged_for_tensorboard(dataset, prior, tmp_path):
@@ -336,4 +308,3 @@ def test_steps_are_logged_for_tensorboard(dataset, prior, tmp_path):
     (log,) = (run / "tensorboard").iterdir()
     logged = log.read_bytes()
     assert all(name in logged for name in (b"psnr", b"information_gain", b"newest_view/render"))
->>>>>>> main

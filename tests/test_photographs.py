@@ -477,14 +477,11 @@ def test_test_views_get_masks_too(data, tmp_path):
     assert any("test views have no masks" in line for line in check_dataset(made).problems)
 
 
-<<<<<<< HEAD
-=======
 def test_mask_files_must_not_be_there_yet(exact, tmp_path):
     with pytest.raises(InputError, match="has a mask already"):
         make_masks(load_dataset(exact), read_mesh(exact / "rock.glb"))
 
 
->>>>>>> main
 def test_a_part_with_few_points_belongs_to_the_object_above_the_ground():
     """Few points in shade are no cluster of their own; other things, farther off, stay out."""
     rng = np.random.default_rng(0)
