@@ -31,7 +31,7 @@ from mgs.run.folder import open_run
 from mgs.splat import render
 from mgs.splat_ply import write_ply
 from mgs.view import layers
-from mgs.view.server import Viewer, check_address, window_camera
+from mgs.view.server import FILLED, Viewer, check_address, window_camera
 from mgs.view.subject import read_subject, scaled
 
 
@@ -268,7 +268,10 @@ def start_camera(subject) -> Camera:
     offset = first.position - centre
     focal = HEIGHT * first.K[1, 1] / first.height
     K = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
-    eye = centre + 1.6 * offset + [0, 0, np.linalg.norm(offset)]
+    away = offset + np.linalg.norm(offset) * np.array([0, 0, 1])
+    size = np.quantile(np.linalg.norm(subject.gaussians.means - centre, axis=1), 0.95)
+    distance = size / (FILLED * np.tan(np.arctan(HEIGHT / 2 / focal)))
+    eye = centre + distance * away / np.linalg.norm(away)
     return Camera(K, WIDTH, HEIGHT, look_at(eye, centre))
 
 

@@ -53,6 +53,9 @@ SELECTED = (255, 220, 60)
 THIN: dict[str, Any] = {"thickness": 1.5, "thickness_units": "screen"}
 """Thickness of lines, pixels of the screen."""
 
+FILLED = 0.35
+"""Share of the window's height that the object fills at first."""
+
 BLACK = np.zeros((2, 2, 3), np.uint8)
 """Background without an image of the kernel."""
 
@@ -162,13 +165,14 @@ class Viewer:
         server.scene.set_background_image(BLACK)
         centre, size = self._extent()
         server.initial_camera.look_at = centre
-        up, turn = np.array(subject.up), upright(subject.up)
-        direction = turn.T @ np.array([1.0, -1.0, 0.8]) * 2 * size
-        if subject.views:  # above and behind the first camera, so that the cameras are seen too
-            eye = subject.views[0].frame.camera.position
-            direction = 1.6 * (eye - centre) + np.linalg.norm(eye - centre) * up
+        direction = upright(subject.up).T @ np.array([1.0, -1.0, 0.8])
+        if subject.views:  # from above, so that no camera is before the object
+            offset = subject.views[0].frame.camera.position - centre
+            direction = offset + np.linalg.norm(offset) * np.array(subject.up)
             server.initial_camera.fov = _vertical_fov(subject.views[0].frame.camera)
-        server.initial_camera.position = centre + direction
+        distance = size / (FILLED * np.tan(server.initial_camera.fov / 2))
+        direction /= max(float(np.linalg.norm(direction)), 1e-9)
+        server.initial_camera.position = centre + distance * direction
         if subject.mesh is not None:
             mesh = subject.mesh
             vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
@@ -260,7 +264,7 @@ class Viewer:
             f"/cameras/views/{name}",
             _vertical_fov(camera),
             camera.width / camera.height,
-            scale=(0.3 if view.role == "candidate" else 0.6) * size,
+            scale=(0.2 if view.role == "candidate" else 0.4) * size,
             color=SELECTED if name == self.selected else COLOURS[view.role],
             wxyz=SO3.from_matrix(pose[:3, :3]).wxyz,
             position=pose[:3, 3],
